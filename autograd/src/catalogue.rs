@@ -1,0 +1,205 @@
+//! The catalogue: every operation with the inputs it is checked on and its values at extremes.
+
+use crate::elementwise::{Binary, Map, Unary, Zip};
+use crate::ops::trigonometric;
+use crate::ops::{Activation, Segments, activation, arithmetic, exponential, linear, matmul, reduce, segment, shape};
+use crate::{Dual, Op};
+use raygrad_tensor::{Layout, Shape, Tensor};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Where an elementwise formula is sampled, and what it gives at extremes.
+#[derive(Debug, Clone, Default)]
+pub struct Cases {
+    linear: bool,
+    /// For each input the ranges that samples are drawn from.
+    domains: Vec<Vec<Range<f64>>>,
+    extremes: Vec<Extreme>,
+}
+
+/// The exact value and gradients at one point, chosen because naive formulas fail there.
+#[derive(Debug, Clone)]
+pub struct Extreme {
+    /// The inputs.
+    pub x: Vec<f64>,
+    /// The value; NaN if it is to be NaN.
+    pub y: f64,
+    /// The gradient of each input for a gradient of 1.
+    pub grads: Vec<f64>,
+}
+
+impl Cases {
+    /// The function is linear, which is checked too.
+    pub fn linear(&mut self) -> &mut Self {
+        self.linear = true;
+        self
+    }
+
+    /// The range of the next input.
+    pub fn domain(&mut self, range: Range<f64>) -> &mut Self {
+        self.domains.push(vec![range]);
+        self
+    }
+
+    /// A further range of the last input, for a function with a gap: samples alternate between the ranges.
+    pub fn domain_also(&mut self, range: Range<f64>) -> &mut Self {
+        if let Some(last) = self.domains.last_mut() {
+            last.push(range);
+        }
+        self
+    }
+
+    /// The value `y` and the gradients at `x`.
+    pub fn at<const N: usize>(&mut self, x: [f64; N], y: f64, grads: [f64; N]) -> &mut Self {
+        self.extremes.push(Extreme { x: x.into(), y, grads: grads.into() });
+        self
+    }
+}
+
+/// An elementwise formula on dual numbers.
+type DualFormula = Box<dyn Fn(&[Dual]) -> Dual>;
+
+/// One operation as the checks see it: for f64, for f32, and what to feed it.
+pub struct Entry {
+    /// The operation's name.
+    pub name: &'static str,
+    /// Whether it is linear in all inputs together.
+    pub linear: bool,
+    /// Sets of inputs.
+    pub samples: Vec<Vec<Tensor<f64>>>,
+    /// Exact values.
+    pub extremes: Vec<Extreme>,
+    pub(crate) f64: Arc<dyn Op<f64>>,
+    pub(crate) f32: Arc<dyn Op<f32>>,
+    pub(crate) dual: Option<DualFormula>,
+}
+
+impl Entry {
+    /// An operation without samples.
+    pub fn new<O: Op<f64> + Op<f32> + Clone>(op: O) -> Self {
+        Entry::of(op.clone(), op)
+    }
+
+    /// As [`new`](Self::new), for an operation that holds tensors and so has a value of its own in each precision.
+    pub fn of(f64: impl Op<f64>, f32: impl Op<f32>) -> Self {
+        let name = f64.name();
+        let (f64, f32) = (Arc::new(f64), Arc::new(f32));
+        Entry { name, linear: false, samples: vec![], extremes: vec![], f64, f32, dual: None }
+    }
+
+    /// A further set of inputs, of these shapes, with values in -1..1.
+    pub fn sample(mut self, shapes: &[&[usize]]) -> Self {
+        let inputs =
+            shapes.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 7 * self.samples.len()));
+        let inputs = inputs.collect();
+        self.samples.push(inputs);
+        self
+    }
+
+    /// A further set of inputs.
+    pub fn sample_of(mut self, inputs: Vec<Tensor<f64>>) -> Self {
+        self.samples.push(inputs);
+        self
+    }
+
+    /// The operation is linear, which is checked too.
+    pub fn linear(self) -> Self {
+        Entry { linear: true, ..self }
+    }
+
+    /// A function of one number.
+    pub fn unary<U: Unary>(op: U) -> Self {
+        let mut cases = Cases::default();
+        op.cases(&mut cases);
+        let entry = Entry { dual: Some(Box::new(move |x| op.f(x[0]))), ..Entry::new(Map(op)) };
+        entry.elementwise(cases, &[&[&[2, 3]], &[&[]], &[&[0, 3]], &[&[37]]])
+    }
+
+    /// A function of two numbers.
+    pub fn binary<B: Binary>(op: B) -> Self {
+        let mut cases = Cases::default();
+        op.cases(&mut cases);
+        let entry = Entry { dual: Some(Box::new(move |x| op.f(x[0], x[1]))), ..Entry::new(Zip(op)) };
+        let same: &[&[usize]] = &[&[2, 3], &[2, 3]];
+        entry.elementwise(
+            cases,
+            &[same, &[&[4, 1], &[3]], &[&[], &[2]], &[&[0, 1], &[3]], &[&[2, 1, 2], &[1]], &[&[], &[]]],
+        )
+    }
+
+    fn elementwise(self, cases: Cases, shapes: &[&[&[usize]]]) -> Self {
+        let set = |(k, shapes): (usize, &&[&[usize]])| {
+            shapes.iter().zip(&cases.domains).enumerate().map(|(i, (s, d))| spread(s, d, i + 7 * k)).collect()
+        };
+        let samples = shapes.iter().enumerate().map(set).collect();
+        Entry { samples, linear: cases.linear, extremes: cases.extremes, ..self }
+    }
+}
+
+/// Reproducible values that fill the ranges evenly and follow no pattern that an error could hide in.
+pub(crate) fn spread(shape: &[usize], ranges: &[Range<f64>], salt: usize) -> Tensor<f64> {
+    const GOLDEN: f64 = 0.618_033_988_749_894_9;
+    Tensor::from_fn(shape, |i| {
+        let range = &ranges[i % ranges.len()];
+        let unit = ((i + 1) as f64 * GOLDEN + salt as f64 * 0.377).fract();
+        range.start + unit * (range.end - range.start)
+    })
+}
+
+/// Every operation of this crate.
+pub fn catalogue() -> Vec<Entry> {
+    let shape = |extents: &[usize]| Shape::from_slice(extents);
+    let segments = || Segments::new([0, 3, 3, 4, 7]);
+    let matmul = |transpose_a, transpose_b| Entry::new(matmul::Matmul { transpose_a, transpose_b });
+    let view = |from: &[usize], layout: fn(Layout) -> Layout| shape::View {
+        from: Shape::from_slice(from),
+        layout: layout(Layout::contiguous(from)),
+    };
+    let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
+    vec![
+        Entry::binary(arithmetic::Add),
+        Entry::binary(arithmetic::Sub),
+        Entry::binary(arithmetic::Mul),
+        Entry::binary(arithmetic::Div),
+        Entry::unary(arithmetic::Affine { scale: -2.5, shift: 0.75 }),
+        Entry::unary(arithmetic::Alias),
+        Entry::new(arithmetic::IfPositive).sample(&[&[2, 3], &[2, 3], &[3]]).sample(&[&[4], &[], &[4]]),
+        Entry::unary(exponential::Exp),
+        Entry::unary(exponential::Expm1),
+        Entry::unary(exponential::Ln),
+        Entry::unary(exponential::Ln1p),
+        Entry::unary(exponential::Sqrt),
+        Entry::unary(trigonometric::Sin),
+        Entry::unary(trigonometric::Cos),
+        Entry::unary(trigonometric::SinPi),
+        Entry::unary(trigonometric::CosPi),
+        Entry::unary(trigonometric::Tanh),
+        Entry::unary(activation::Relu),
+        Entry::unary(activation::Sigmoid),
+        Entry::unary(activation::Softplus),
+        matmul(false, false).sample(&[&[3, 4], &[4, 2]]).sample(&[&[0, 4], &[4, 2]]).sample(&[&[3, 0], &[0, 2]]),
+        matmul(true, false).sample(&[&[4, 3], &[4, 2]]),
+        matmul(false, true).sample(&[&[3, 4], &[2, 4]]),
+        matmul(true, true).sample(&[&[4, 3], &[2, 4]]),
+        Entry::new(linear::LinearOp(Activation::Identity))
+            .sample(&[&[5, 3], &[3, 4], &[4]])
+            .sample(&[&[5, 3], &[3, 4]]),
+        Entry::new(linear::LinearOp(Activation::Relu))
+            .sample(&[&[5, 3], &[3, 4], &[4]])
+            .sample(&[&[2, 5, 3], &[3, 4]])
+            .sample(&[&[0, 3], &[3, 4], &[4]]),
+        Entry::new(reduce::SumTo { shape: shape(&[]) }).linear().sample(&[&[2, 3]]).sample(&[&[]]).sample(&[&[0, 2]]),
+        Entry::new(reduce::SumTo { shape: shape(&[3, 1]) }).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
+        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]) }).linear().sample(&[&[3, 1]]).sample(&[&[]]),
+        Entry::new(shape::Reshape { shape: shape(&[3, 2]) }).linear().sample(&[&[2, 3]]).sample(&[&[6]]),
+        Entry::new(view(&[2, 3, 4], |layout| layout.permuted(&[2, 0, 1]))).linear().sample(&[&[2, 3, 4]]),
+        Entry::new(view(&[4, 5], |layout| layout.sliced(1, 4, 2, -3))).linear().sample(&[&[4, 5]]),
+        Entry::new(shape::Scatter(view(&[4, 5], |layout| layout.sliced(1, 1, 3, 1)))).linear().sample(&[&[4, 3]]),
+        Entry::new(shape::Concat { axis: 1 }).linear().sample(&[&[2, 3], &[2, 1], &[2, 0]]).sample(&[&[2, 3]]),
+        Entry::new(segment::SegmentSum(segments())).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
+        Entry::new(segment::SegmentExpand(segments())).linear().sample(&[&[4]]).sample(&[&[4, 2]]),
+        Entry::new(cumsum(false, false)).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
+        Entry::new(cumsum(true, false)).linear().sample(&[&[7]]),
+        Entry::new(cumsum(true, true)).linear().sample(&[&[7, 3]]),
+    ]
+}

@@ -1,0 +1,113 @@
+//! Dual numbers: forward-mode derivatives, the oracle of elementwise formulas.
+
+use raygrad_tensor::Real;
+use std::f64::consts::PI;
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+/// `value + slope * e` with `e^2 = 0`: a number and its derivative.
+///
+/// ```
+/// use raygrad_autograd::{Dual, Real};
+/// let x = Dual { value: 2.0, slope: 1.0 };
+/// let y = x * x * x.like(5.0);
+/// assert_eq!((y.value, y.slope), (20.0, 20.0));
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Dual {
+    /// The number.
+    pub value: f64,
+    /// Its derivative.
+    pub slope: f64,
+}
+
+impl Dual {
+    /// `f(x)` for an `f` with value `y` and derivative `dy` there. A slope of 0 stays 0 even where `dy` is infinite.
+    fn chain(self, y: f64, dy: f64) -> Dual {
+        Dual { value: y, slope: if self.slope == 0.0 { 0.0 } else { self.slope * dy } }
+    }
+}
+
+impl Add for Dual {
+    type Output = Dual;
+    fn add(self, b: Dual) -> Dual {
+        Dual { value: self.value + b.value, slope: self.slope + b.slope }
+    }
+}
+
+impl Sub for Dual {
+    type Output = Dual;
+    fn sub(self, b: Dual) -> Dual {
+        self + -b
+    }
+}
+
+impl Mul for Dual {
+    type Output = Dual;
+    fn mul(self, b: Dual) -> Dual {
+        Dual { value: self.value * b.value, slope: self.slope * b.value + self.value * b.slope }
+    }
+}
+
+impl Div for Dual {
+    type Output = Dual;
+    fn div(self, b: Dual) -> Dual {
+        let slope = (self.slope * b.value - self.value * b.slope) / (b.value * b.value);
+        Dual { value: self.value / b.value, slope }
+    }
+}
+
+impl Neg for Dual {
+    type Output = Dual;
+    fn neg(self) -> Dual {
+        Dual { value: -self.value, slope: -self.slope }
+    }
+}
+
+impl Real for Dual {
+    fn like(&self, value: f64) -> Self {
+        Dual { value, slope: 0.0 }
+    }
+    fn if_positive(&self, yes: Self, no: Self) -> Self {
+        if self.value > 0.0 { yes } else { no }
+    }
+    fn exp(self) -> Self {
+        self.chain(self.value.exp(), self.value.exp())
+    }
+    fn expm1(self) -> Self {
+        self.chain(self.value.exp_m1(), self.value.exp())
+    }
+    fn ln(self) -> Self {
+        self.chain(self.value.ln(), 1.0 / self.value)
+    }
+    fn ln1p(self) -> Self {
+        self.chain(self.value.ln_1p(), 1.0 / (1.0 + self.value))
+    }
+    fn sin(self) -> Self {
+        self.chain(self.value.sin(), self.value.cos())
+    }
+    fn cos(self) -> Self {
+        self.chain(self.value.cos(), -self.value.sin())
+    }
+    fn sin_pi(self) -> Self {
+        let (sin, cos) = (PI * (self.value % 2.0)).sin_cos();
+        self.chain(sin, PI * cos)
+    }
+    fn cos_pi(self) -> Self {
+        let (sin, cos) = (PI * (self.value % 2.0)).sin_cos();
+        self.chain(cos, -PI * sin)
+    }
+    fn tanh(self) -> Self {
+        self.chain(self.value.tanh(), self.value.cosh().powi(-2))
+    }
+    fn sigmoid(self) -> Self {
+        let half = 0.5 * self.value;
+        self.chain(0.5 + 0.5 * half.tanh(), 0.25 * half.cosh().powi(-2))
+    }
+    fn softplus(self) -> Self {
+        let value = self.value.max(0.0) + (-self.value.abs()).exp().ln_1p();
+        self.chain(value, 0.5 + 0.5 * (0.5 * self.value).tanh())
+    }
+    fn sqrt(self) -> Self {
+        self.chain(self.value.sqrt(), 0.5 / self.value.sqrt())
+    }
+}

@@ -1,0 +1,200 @@
+//! Elementwise operations: a formula and its derivative, written once for every kind of number.
+
+use crate::catalogue::Cases;
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, map, sum_to};
+
+/// A function of one number.
+///
+/// Mark [`f`](Self::f) and [`vjp`](Self::vjp) `#[inline(always)]`: only inlined code is vectorised.
+pub trait Unary: Copy + Send + Sync + 'static {
+    /// The operation's name.
+    const NAME: &'static str;
+    /// Which of `x` and `y` the derivative reads; what it does not read is passed as NaN.
+    const READS: Reads;
+    /// The function.
+    fn f<E: Real>(&self, x: E) -> E;
+    /// Its vector-Jacobian product: the gradient of `x` for the gradient `g` of `y = f(x)`.
+    fn vjp<E: Real>(&self, g: E, x: E, y: E) -> E;
+    /// Where it is sampled in checks, and exact values at extremes.
+    fn cases(&self, cases: &mut Cases);
+}
+
+/// A function of two numbers, with NumPy's broadcasting.
+///
+/// Mark the methods `#[inline(always)]`, as those of [`Unary`].
+pub trait Binary: Copy + Send + Sync + 'static {
+    /// The operation's name.
+    const NAME: &'static str;
+    /// Which of `a`, `b` (inputs 0 and 1) and `y` the derivatives read; what they do not read is passed as NaN.
+    const READS: Reads;
+    /// The function.
+    fn f<E: Real>(&self, a: E, b: E) -> E;
+    /// The gradient of `a` for the gradient `g` of `y = f(a, b)`.
+    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, y: E) -> E;
+    /// The gradient of `b`.
+    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, y: E) -> E;
+    /// Where it is sampled in checks, and exact values at extremes.
+    fn cases(&self, cases: &mut Cases);
+}
+
+/// A [`Unary`] formula as an operation.
+#[derive(Clone, Copy)]
+pub struct Map<U>(pub U);
+
+/// A [`Binary`] formula as an operation.
+#[derive(Clone, Copy)]
+pub struct Zip<B>(pub B);
+
+/// What a derivative gets for a value that it said it does not read.
+#[inline(always)]
+fn unread<T: Scalar>() -> T {
+    T::from_f64(f64::NAN)
+}
+
+#[inline(always)]
+fn kept<T: Scalar>(reads: bool, value: T) -> T {
+    if reads { value } else { unread() }
+}
+
+impl<T: Scalar, U: Unary> Op<T> for Map<U> {
+    fn name(&self) -> &'static str {
+        U::NAME
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(Shape::from_slice(x[0]))
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        map(
+            [x[0]],
+            pool,
+            #[inline(always)]
+            |[x]| self.0.f(x),
+        )
+    }
+
+    fn reads(&self) -> Reads {
+        U::READS
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (reads_x, reads_y) = (U::READS.input(0), U::READS.output());
+        if cx.recording() {
+            let nan = || cx.g().constant(f64::NAN);
+            let (x, y) = (if reads_x { cx.x(0) } else { nan() }, if reads_y { cx.y() } else { nan() });
+            return Grads::one(self.0.vjp(cx.g().clone(), x, y));
+        }
+        let g = cx.g().value();
+        let grad = match (reads_x, reads_y) {
+            (false, false) => map(
+                [g],
+                cx.pool(),
+                #[inline(always)]
+                |[g]| self.0.vjp(g, unread(), unread()),
+            ),
+            (true, false) => map(
+                [g, cx.x(0).value()],
+                cx.pool(),
+                #[inline(always)]
+                |[g, x]| self.0.vjp(g, x, unread()),
+            ),
+            (false, true) => map(
+                [g, cx.y().value()],
+                cx.pool(),
+                #[inline(always)]
+                |[g, y]| self.0.vjp(g, unread(), y),
+            ),
+            (true, true) => map(
+                [g, cx.x(0).value(), cx.y().value()],
+                cx.pool(),
+                #[inline(always)]
+                |[g, x, y]| self.0.vjp(g, x, y),
+            ),
+        };
+        Grads::one(cx.constant(grad))
+    }
+}
+
+impl<B: Binary> Zip<B> {
+    /// One input's gradient as a tensor of the output's shape.
+    fn grad<T: Scalar>(&self, cx: &Vjp<'_, '_, T>, f: impl Fn(T, T, T, T) -> T) -> Tensor<T> {
+        let g = cx.g().value();
+        // A value that is not read costs a register, not a pass: `g` stands in for it and is replaced by NaN.
+        let reads = [B::READS.input(0), B::READS.input(1), B::READS.output()];
+        let read = |reads: bool, value: &dyn Fn() -> Tensor<T>| if reads { value() } else { g.clone() };
+        let a = read(reads[0], &|| cx.x(0).into_value());
+        let b = read(reads[1], &|| cx.x(1).into_value());
+        let y = read(reads[2], &|| cx.y().into_value());
+        map(
+            [g, &a, &b, &y],
+            cx.pool(),
+            #[inline(always)]
+            |[g, a, b, y]| f(g, kept(reads[0], a), kept(reads[1], b), kept(reads[2], y)),
+        )
+    }
+}
+
+impl<T: Scalar, B: Binary> Op<T> for Zip<B> {
+    fn name(&self) -> &'static str {
+        B::NAME
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        map(
+            [x[0], x[1]],
+            pool,
+            #[inline(always)]
+            |[a, b]| self.0.f(a, b),
+        )
+    }
+
+    fn reads(&self) -> Reads {
+        B::READS
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        if cx.recording() {
+            let nan = || cx.g().constant(f64::NAN);
+            let a = if B::READS.input(0) { cx.x(0) } else { nan() };
+            let b = if B::READS.input(1) { cx.x(1) } else { nan() };
+            let y = if B::READS.output() { cx.y() } else { nan() };
+            let g = cx.g().clone();
+            let ga = cx.needs(0).then(|| self.0.vjp_a(g.clone(), a.clone(), b.clone(), y.clone()).sum_to(cx.shape(0)));
+            let gb = cx.needs(1).then(|| self.0.vjp_b(g, a, b, y).sum_to(cx.shape(1)));
+            return Grads::new([ga, gb]);
+        }
+        let reduced = |grad: Tensor<T>, i: usize| -> Var<'t, T> {
+            if grad.shape() == cx.shape(i) {
+                return cx.constant(grad);
+            }
+            cx.constant(sum_to(&grad, cx.shape(i), cx.pool()))
+        };
+        let ga = cx.needs(0).then(|| {
+            reduced(
+                self.grad(
+                    cx,
+                    #[inline(always)]
+                    |g, a, b, y| self.0.vjp_a(g, a, b, y),
+                ),
+                0,
+            )
+        });
+        let gb = cx.needs(1).then(|| {
+            reduced(
+                self.grad(
+                    cx,
+                    #[inline(always)]
+                    |g, a, b, y| self.0.vjp_b(g, a, b, y),
+                ),
+                1,
+            )
+        });
+        Grads::new([ga, gb])
+    }
+}

@@ -1,0 +1,242 @@
+//! The four operations, and multiplication and addition of constants.
+
+use crate::catalogue::Cases;
+use crate::elementwise::{Binary, Map, Unary, Zip};
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, map};
+
+/// y = a + b.
+#[derive(Clone, Copy)]
+pub struct Add;
+impl Binary for Add {
+    const NAME: &'static str = "add";
+    const READS: Reads = Reads::NOTHING;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        a + b
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
+        g
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
+        g
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
+        c.at([1e30, -1e30], 0.0, [1.0, 1.0]).at([f64::INFINITY, 1.0], f64::INFINITY, [1.0, 1.0]);
+    }
+}
+
+/// y = a - b.
+#[derive(Clone, Copy)]
+pub struct Sub;
+impl Binary for Sub {
+    const NAME: &'static str = "sub";
+    const READS: Reads = Reads::NOTHING;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        a - b
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
+        g
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
+        -g
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
+        c.at([1e30, 1e30], 0.0, [1.0, -1.0]).at([1.0, f64::INFINITY], f64::NEG_INFINITY, [1.0, -1.0]);
+    }
+}
+
+/// y = a b.
+#[derive(Clone, Copy)]
+pub struct Mul;
+impl Binary for Mul {
+    const NAME: &'static str = "mul";
+    const READS: Reads = Reads::INPUTS;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        a * b
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, _a: E, b: E, _y: E) -> E {
+        g * b
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, a: E, _b: E, _y: E) -> E {
+        g * a
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(-3.0..3.0);
+        c.at([0.0, 5.0], 0.0, [5.0, 0.0]).at([f64::INFINITY, 2.0], f64::INFINITY, [2.0, f64::INFINITY]);
+        c.at([0.0, f64::INFINITY], f64::NAN, [f64::INFINITY, 0.0]);
+    }
+}
+
+/// y = a / b; da = g / b, db = -g y / b. Division by 0 gives what IEEE 754 says.
+#[derive(Clone, Copy)]
+pub struct Div;
+impl Binary for Div {
+    const NAME: &'static str = "div";
+    const READS: Reads = Reads::only(&[1]).and_output();
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        a / b
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, _a: E, b: E, _y: E) -> E {
+        g / b
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, _a: E, b: E, y: E) -> E {
+        -(g * y / b)
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(0.5..3.0);
+        c.at([0.0, 2.0], 0.0, [0.5, 0.0]).at([1.0, f64::INFINITY], 0.0, [0.0, 0.0]);
+        c.at([1.0, 0.0], f64::INFINITY, [f64::INFINITY, f64::NEG_INFINITY]);
+    }
+}
+
+/// y = scale x + shift.
+#[derive(Clone, Copy)]
+pub struct Affine {
+    /// The factor.
+    pub scale: f64,
+    /// The summand.
+    pub shift: f64,
+}
+impl Unary for Affine {
+    const NAME: &'static str = "affine";
+    const READS: Reads = Reads::NOTHING;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        let (scale, shift) = (x.like(self.scale), x.like(self.shift));
+        x * scale + shift
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
+        let scale = g.like(self.scale);
+        g * scale
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).at([0.0], self.shift, [self.scale]);
+        c.at([f64::INFINITY], f64::INFINITY * self.scale, [self.scale]);
+    }
+}
+
+/// y = x, as a new node: separates an input's own share of a gradient from that of inputs which depend on it.
+#[derive(Clone, Copy)]
+pub struct Alias;
+impl Unary for Alias {
+    const NAME: &'static str = "alias";
+    const READS: Reads = Reads::NOTHING;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
+        g
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.linear().domain(-3.0..3.0).at([f64::INFINITY], f64::INFINITY, [1.0]);
+    }
+}
+
+/// y = yes where x > 0, else no. The choice has derivative 0; a NaN chooses `no`.
+#[derive(Clone, Copy)]
+pub struct IfPositive;
+
+impl<T: Scalar> Op<T> for IfPositive {
+    fn name(&self) -> &'static str {
+        "if_positive"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        raygrad_tensor::broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        map(
+            [x[0], x[1], x[2]],
+            pool,
+            #[inline(always)]
+            |[x, yes, no]| x.if_positive(yes, no),
+        )
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::only(&[0])
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, g, zero) = (cx.x(0), cx.g(), cx.g().constant(0.0));
+        let yes = cx.needs(1).then(|| x.if_positive(g, &zero).sum_to(cx.shape(1)));
+        let no = cx.needs(2).then(|| x.if_positive(&zero, g).sum_to(cx.shape(2)));
+        Grads::new([None, yes, no])
+    }
+}
+
+#[track_caller]
+pub(crate) fn add<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
+    a.tape().apply(Zip(Add), &[a, b])
+}
+
+#[track_caller]
+pub(crate) fn sub<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
+    a.tape().apply(Zip(Sub), &[a, b])
+}
+
+#[track_caller]
+pub(crate) fn mul<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
+    a.tape().apply(Zip(Mul), &[a, b])
+}
+
+#[track_caller]
+pub(crate) fn div<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
+    a.tape().apply(Zip(Div), &[a, b])
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// `scale * self + shift` for constants.
+    #[track_caller]
+    pub fn affine(&self, scale: f64, shift: f64) -> Self {
+        self.tape().apply(Map(Affine { scale, shift }), &[self])
+    }
+
+    /// `self * self`.
+    #[track_caller]
+    pub fn square(&self) -> Self {
+        self * self
+    }
+
+    /// The same value as a new node.
+    #[track_caller]
+    pub(crate) fn alias(&self) -> Self {
+        self.tape().apply(Map(Alias), &[self])
+    }
+
+    /// `yes` where this is greater than 0, else (also where it is NaN) `no`; all three broadcast together. The
+    /// gradient goes to whichever was chosen, and none to `self`.
+    ///
+    /// ```
+    /// # use raygrad_autograd::Tape;
+    /// # use raygrad_tensor::Tensor;
+    /// let tape = Tape::<f32>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[3], vec![-2.0, 0.0, 3.0]));
+    /// assert_eq!(x.if_positive(&x, &x.constant(9.0)).value().as_slice(), [9.0, 9.0, 3.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[track_caller]
+    pub fn if_positive(&self, yes: &Self, no: &Self) -> Self {
+        self.tape().apply(IfPositive, &[self, yes, no])
+    }
+}

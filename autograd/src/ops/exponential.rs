@@ -1,0 +1,138 @@
+//! Exponentials, logarithms and the square root.
+
+use crate::catalogue::Cases;
+use crate::elementwise::{Map, Unary};
+use crate::{Reads, Var};
+use raygrad_tensor::{Real, Scalar};
+
+const INF: f64 = f64::INFINITY;
+
+/// y = e^x; dx = g y.
+#[derive(Clone, Copy)]
+pub struct Exp;
+impl Unary for Exp {
+    const NAME: &'static str = "exp";
+    const READS: Reads = Reads::OUTPUT;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.exp()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+        g * y
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).at([-INF], 0.0, [0.0]).at([-1000.0], 0.0, [0.0]).at([INF], INF, [INF]);
+    }
+}
+
+/// y = e^x - 1; dx = g (y + 1).
+#[derive(Clone, Copy)]
+pub struct Expm1;
+impl Unary for Expm1 {
+    const NAME: &'static str = "expm1";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.expm1()
+    }
+    // e^x and not y + 1: the sum would lose every digit where y is near -1.
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        g * x.exp()
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).at([1e-20], 1e-20, [1.0]).at([-INF], -1.0, [0.0]).at([INF], INF, [INF]);
+    }
+}
+
+/// y = ln x; dx = g / x.
+#[derive(Clone, Copy)]
+pub struct Ln;
+impl Unary for Ln {
+    const NAME: &'static str = "ln";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.ln()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        g / x
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([1.0], 0.0, [1.0]).at([INF], INF, [0.0]);
+    }
+}
+
+/// y = ln(1 + x); dx = g / (1 + x).
+#[derive(Clone, Copy)]
+pub struct Ln1p;
+impl Unary for Ln1p {
+    const NAME: &'static str = "ln1p";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.ln1p()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        let one = x.like(1.0);
+        g / (one + x)
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-0.5..3.0).at([1e-20], 1e-20, [1.0]).at([-1.0], -INF, [INF]).at([INF], INF, [0.0]);
+    }
+}
+
+/// y = sqrt x; dx = g / (2 y). The gradient at 0 is infinite.
+#[derive(Clone, Copy)]
+pub struct Sqrt;
+impl Unary for Sqrt {
+    const NAME: &'static str = "sqrt";
+    const READS: Reads = Reads::OUTPUT;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.sqrt()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+        let half = g.like(0.5);
+        g * half / y
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.5..3.0).at([0.0], 0.0, [INF]).at([4.0], 2.0, [0.25]).at([INF], INF, [0.0]);
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// `e^self`.
+    #[track_caller]
+    pub fn exp(&self) -> Self {
+        self.tape().apply(Map(Exp), &[self])
+    }
+
+    /// `e^self - 1`, accurate near 0.
+    #[track_caller]
+    pub fn expm1(&self) -> Self {
+        self.tape().apply(Map(Expm1), &[self])
+    }
+
+    /// The natural logarithm: -inf at 0, NaN below.
+    #[track_caller]
+    pub fn ln(&self) -> Self {
+        self.tape().apply(Map(Ln), &[self])
+    }
+
+    /// `ln(1 + self)`, accurate near 0.
+    #[track_caller]
+    pub fn ln1p(&self) -> Self {
+        self.tape().apply(Map(Ln1p), &[self])
+    }
+
+    /// The square root: NaN below 0, infinite gradient at 0.
+    #[track_caller]
+    pub fn sqrt(&self) -> Self {
+        self.tape().apply(Map(Sqrt), &[self])
+    }
+}

@@ -1,0 +1,16 @@
+//! The operations, each in one place: formula, derivative, documentation, sample inputs and extreme values. An
+//! operation is added by writing it in the file of its kind and listing it in [`catalogue`](crate::catalogue).
+
+pub(crate) mod activation;
+pub(crate) mod arithmetic;
+pub(crate) mod exponential;
+pub(crate) mod linear;
+pub(crate) mod matmul;
+pub(crate) mod reduce;
+pub(crate) mod segment;
+pub(crate) mod shape;
+pub(crate) mod trigonometric;
+
+pub(crate) use arithmetic::{add, div, mul, sub};
+pub use linear::Activation;
+pub use segment::Segments;

@@ -1,0 +1,120 @@
+//! Sums, means and their adjoint, broadcasting.
+
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, broadcast_to, sum_to};
+
+/// y = x summed over the axes along which `shape` would have to be stretched to become x; dx = g broadcast.
+#[derive(Clone)]
+pub struct SumTo {
+    /// The shape of the output: broadcasts to the shape of the input.
+    pub shape: Shape,
+}
+
+impl<T: Scalar> Op<T> for SumTo {
+    fn name(&self) -> &'static str {
+        "sum"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        match broadcast_shape(&[x[0], &self.shape]) {
+            Some(wide) if wide.as_slice() == x[0] => Ok(self.shape.clone()),
+            _ => Err(format!("cannot be summed to {:?}", self.shape)),
+        }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        sum_to(x[0], &self.shape, pool)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.g().broadcast_to(cx.shape(0)))
+    }
+}
+
+/// y = x stretched to `shape`; dx = g summed over the stretched axes.
+#[derive(Clone)]
+pub struct BroadcastTo {
+    /// The shape of the output.
+    pub shape: Shape,
+}
+
+impl<T: Scalar> Op<T> for BroadcastTo {
+    fn name(&self) -> &'static str {
+        "broadcast_to"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        match broadcast_shape(&[x[0], &self.shape]) {
+            Some(wide) if wide == self.shape => Ok(wide),
+            _ => Err(format!("does not broadcast to {:?}", self.shape)),
+        }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        broadcast_to(x[0], &self.shape, pool)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.g().sum_to(cx.shape(0)))
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The sum of all elements, pairwise, as a scalar.
+    #[track_caller]
+    pub fn sum(&self) -> Self {
+        self.sum_to(&[])
+    }
+
+    /// The mean of all elements, as a scalar; NaN for an empty tensor.
+    #[track_caller]
+    pub fn mean(&self) -> Self {
+        self.sum() / self.value().len() as f64
+    }
+
+    /// The sum over `axes`, which stay as axes of extent 1.
+    ///
+    /// # Panics
+    /// If an axis does not exist.
+    #[track_caller]
+    pub fn sum_axes(&self, axes: &[usize]) -> Self {
+        let mut shape = Shape::from_slice(self.shape());
+        for &axis in axes {
+            assert!(axis < shape.len(), "sum over axis {axis} of a tensor of shape {shape:?}");
+            shape[axis] = 1;
+        }
+        self.sum_to(&shape)
+    }
+
+    /// The sum over the axes along which `shape` would have to be stretched to become the shape of this tensor.
+    ///
+    /// # Panics
+    /// If `shape` does not broadcast to the shape of this tensor.
+    #[track_caller]
+    pub fn sum_to(&self, shape: &[usize]) -> Self {
+        if self.shape() == shape {
+            return self.clone();
+        }
+        self.tape().apply(SumTo { shape: shape.into() }, &[self])
+    }
+
+    /// This tensor stretched to `shape`.
+    ///
+    /// # Panics
+    /// If it does not broadcast to `shape`.
+    #[track_caller]
+    pub fn broadcast_to(&self, shape: &[usize]) -> Self {
+        if self.shape() == shape {
+            return self.clone();
+        }
+        self.tape().apply(BroadcastTo { shape: shape.into() }, &[self])
+    }
+}

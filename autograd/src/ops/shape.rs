@@ -1,0 +1,228 @@
+//! Operations that move elements: reshape, permute, slice, flip, concat.
+
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor};
+
+/// y = x under another shape.
+#[derive(Clone)]
+pub struct Reshape {
+    /// The shape of the output.
+    pub shape: Shape,
+}
+
+impl<T: Scalar> Op<T> for Reshape {
+    fn name(&self) -> &'static str {
+        "reshape"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0].iter().product::<usize>() != self.shape.iter().product::<usize>() {
+            return Err(format!("{:?} holds another number of elements", self.shape));
+        }
+        Ok(self.shape.clone())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], _pool: &Pool<T>) -> Tensor<T> {
+        x[0].reshape(&self.shape)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.g().reshape(cx.shape(0)))
+    }
+}
+
+/// y = the elements of x that a layout names: permute, slice and flip. dx = [`Scatter`] of g.
+#[derive(Clone)]
+pub struct View {
+    /// The shape of the input.
+    pub from: Shape,
+    /// Where each element of the output stands in the input.
+    pub layout: Layout,
+}
+
+/// The adjoint of [`View`]: zeros of the input's shape, with g added where the layout says.
+#[derive(Clone)]
+pub struct Scatter(
+    /// The view.
+    pub View,
+);
+
+impl<T: Scalar> Op<T> for View {
+    fn name(&self) -> &'static str {
+        "view"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0] != self.from.as_slice() {
+            return Err(format!("the layout was made for {:?}", self.from));
+        }
+        Ok(Shape::from_slice(self.layout.shape()))
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(self.layout.shape());
+        self.layout.read(x[0].as_slice(), out.as_mut_slice());
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.tape().apply(Scatter(self.clone()), &[cx.g()]))
+    }
+}
+
+impl<T: Scalar> Op<T> for Scatter {
+    fn name(&self) -> &'static str {
+        "scatter_view"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0] != self.0.layout.shape() {
+            return Err(format!("the layout covers {:?}", self.0.layout.shape()));
+        }
+        Ok(self.0.from.clone())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.full(&self.0.from, T::ZERO);
+        self.0.layout.add(x[0].as_slice(), out.as_mut_slice());
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.tape().apply(self.0.clone(), &[cx.g()]))
+    }
+}
+
+/// y = several tensors one after another along an axis; each gradient is the slice of g that it made.
+#[derive(Clone, Copy)]
+pub struct Concat {
+    /// The axis.
+    pub axis: usize,
+}
+
+impl<T: Scalar> Op<T> for Concat {
+    fn name(&self) -> &'static str {
+        "concat"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let mut shape = Shape::from_slice(x[0]);
+        if self.axis >= shape.len() {
+            return Err(format!("there is no axis {}", self.axis));
+        }
+        for other in &x[1..] {
+            let same = |i: usize| i == self.axis || other[i] == shape[i];
+            if other.len() != shape.len() || !(0..shape.len()).all(same) {
+                return Err(format!("the extents differ elsewhere than along axis {}", self.axis));
+            }
+        }
+        shape[self.axis] = x.iter().map(|x| x[self.axis]).sum();
+        Ok(shape)
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut shape = Shape::from_slice(x[0].shape());
+        shape[self.axis] = x.iter().map(|x| x.shape()[self.axis]).sum();
+        let mut out = pool.tensor(&shape);
+        let run = |shape: &[usize]| shape[self.axis..].iter().product::<usize>();
+        let total = run(&shape);
+        let mut start = 0;
+        for x in x {
+            let count = run(x.shape());
+            if count > 0 {
+                for (out, x) in out.as_mut_slice().chunks_exact_mut(total).zip(x.as_slice().chunks_exact(count)) {
+                    out[start..start + count].copy_from_slice(x);
+                }
+            }
+            start += count;
+        }
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let mut start = 0;
+        Grads::new((0..cx.len()).map(|i| {
+            let len = cx.shape(i)[self.axis];
+            start += len;
+            cx.needs(i).then(|| cx.g().slice(self.axis, start - len, len))
+        }))
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The same elements under another shape; nothing is copied.
+    ///
+    /// # Panics
+    /// If the shape holds another number of elements.
+    #[track_caller]
+    pub fn reshape(&self, shape: &[usize]) -> Self {
+        if self.shape() == shape {
+            return self.clone();
+        }
+        self.tape().apply(Reshape { shape: shape.into() }, &[self])
+    }
+
+    #[track_caller]
+    fn view(&self, layout: Layout) -> Self {
+        self.tape().apply(View { from: self.shape().into(), layout }, &[self])
+    }
+
+    /// Axis `i` of the result is axis `axes[i]` of this tensor.
+    ///
+    /// # Panics
+    /// If `axes` does not name every axis once.
+    #[track_caller]
+    pub fn permute(&self, axes: &[usize]) -> Self {
+        self.view(Layout::contiguous(self.shape()).permuted(axes))
+    }
+
+    /// `len` entries along `axis`, from `start` on.
+    ///
+    /// # Panics
+    /// If the axis does not exist or the entries leave it.
+    #[track_caller]
+    pub fn slice(&self, axis: usize, start: usize, len: usize) -> Self {
+        assert!(axis < self.shape().len(), "slice along axis {axis} of a tensor of shape {:?}", self.shape());
+        if start == 0 && len == self.shape()[axis] {
+            return self.clone();
+        }
+        self.view(Layout::contiguous(self.shape()).sliced(axis, start, len, 1))
+    }
+
+    /// The entries along `axis` in reverse order.
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn flip(&self, axis: usize) -> Self {
+        assert!(axis < self.shape().len(), "flip along axis {axis} of a tensor of shape {:?}", self.shape());
+        let len = self.shape()[axis];
+        self.view(Layout::contiguous(self.shape()).sliced(axis, len.saturating_sub(1), len, -1))
+    }
+
+    /// Tensors one after another along `axis`.
+    ///
+    /// # Panics
+    /// If there is none, the axis does not exist, or other extents differ.
+    #[track_caller]
+    pub fn concat(parts: &[&Self], axis: usize) -> Self {
+        let Some(first) = parts.first() else { panic!("concat of no tensors") };
+        first.tape().apply(Concat { axis }, parts)
+    }
+}

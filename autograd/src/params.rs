@@ -1,0 +1,245 @@
+//! Parameters: named tensors outside any tape, so that many tapes share one model.
+
+use crate::{Tape, Var};
+use raygrad_tensor::{Scalar, Tensor};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use std::collections::HashMap;
+use std::ops::Index;
+
+/// A handle on a parameter of one [`Params`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct ParamId(usize);
+
+/// A named store of parameters, in the order in which they were added.
+///
+/// Layers hold [`ParamId`]s and are pure functions of the bound parameters and their input.
+///
+/// ```
+/// use raygrad_autograd::{Params, Tape, Tensor};
+/// let mut params = Params::<f32>::new();
+/// let weight = params.add("weight", Tensor::full(&[2], 3.0));
+/// let tape = Tape::new();
+/// let bound = params.bind(&tape);
+/// let loss = bound[weight].square().sum();
+/// assert_eq!(loss.grad(&bound.vars())[0].as_slice(), [6.0, 6.0]);
+/// ```
+#[derive(Debug, Clone, Default)]
+pub struct Params<T: Scalar> {
+    names: Vec<String>,
+    values: Vec<Tensor<T>>,
+}
+
+/// Why stored parameters do not fit a model.
+#[derive(Debug, thiserror::Error)]
+pub enum ParamsError {
+    /// The bytes are not a safetensors file.
+    #[error("not a safetensors file: {0}")]
+    Format(#[from] safetensors::SafeTensorError),
+    /// A parameter of the model is not in the file.
+    #[error("`{0}` is missing: the file belongs to a model of another configuration")]
+    Missing(String),
+    /// The file holds a parameter that the model does not have.
+    #[error("`{0}` is not a parameter of this model: the file belongs to a model of another configuration")]
+    Unknown(String),
+    /// A parameter has another shape or number type in the file.
+    #[error("`{name}` is {found} in the file and {expected} in this model")]
+    Mismatch {
+        /// The parameter.
+        name: String,
+        /// Type and shape in the file.
+        found: String,
+        /// Type and shape in the model.
+        expected: String,
+    },
+}
+
+impl<T: Scalar> Params<T> {
+    /// An empty store.
+    pub fn new() -> Self {
+        Params { names: vec![], values: vec![] }
+    }
+
+    /// Adds a parameter.
+    ///
+    /// # Panics
+    /// If the name is taken.
+    #[track_caller]
+    pub fn add(&mut self, name: impl Into<String>, value: Tensor<T>) -> ParamId {
+        let name = name.into();
+        assert!(!self.names.contains(&name), "there is already a parameter `{name}`");
+        self.names.push(name);
+        self.values.push(value);
+        ParamId(self.values.len() - 1)
+    }
+
+    /// Number of parameters (tensors).
+    pub fn len(&self) -> usize {
+        self.values.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.values.is_empty()
+    }
+
+    /// Number of elements of all parameters together.
+    pub fn elements(&self) -> usize {
+        self.values.iter().map(Tensor::len).sum()
+    }
+
+    /// Names and values in order.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = (&str, &Tensor<T>)> {
+        self.names.iter().map(String::as_str).zip(&self.values)
+    }
+
+    /// The values in order.
+    pub fn values(&self) -> &[Tensor<T>] {
+        &self.values
+    }
+
+    /// The values in order, for an optimiser.
+    pub fn values_mut(&mut self) -> &mut [Tensor<T>] {
+        &mut self.values
+    }
+
+    /// One value.
+    pub fn get(&self, id: ParamId) -> &Tensor<T> {
+        &self.values[id.0]
+    }
+
+    /// The parameters as leaves of a tape.
+    #[track_caller]
+    pub fn bind<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
+        Bound(self.values.iter().map(|value| tape.leaf(value.clone())).collect())
+    }
+
+    /// The parameters as constants of a tape, for evaluation.
+    pub fn bind_constant<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
+        Bound(self.values.iter().map(|value| tape.constant(value.clone())).collect())
+    }
+
+    /// The same parameters in another precision.
+    pub fn cast<U: Scalar>(&self) -> Params<U> {
+        Params { names: self.names.clone(), values: self.values.iter().map(Tensor::cast).collect() }
+    }
+
+    /// The parameters and some words about them as a safetensors file.
+    ///
+    /// # Errors
+    /// If the format cannot hold them.
+    pub fn to_safetensors(&self, metadata: HashMap<String, String>) -> Result<Vec<u8>, ParamsError> {
+        let bytes: Vec<Vec<u8>> = self
+            .values
+            .iter()
+            .map(|value| {
+                let mut out = Vec::with_capacity(size_of_val(value.as_slice()));
+                value.as_slice().iter().for_each(|x| x.write_le(&mut out));
+                out
+            })
+            .collect();
+        let mut views = Vec::with_capacity(self.len());
+        for ((name, value), bytes) in self.iter().zip(&bytes) {
+            views.push((name, TensorView::new(dtype::<T>(), value.shape().to_vec(), bytes)?));
+        }
+        Ok(safetensors::serialize(views, Some(metadata))?)
+    }
+
+    /// Replaces every value by that of the same name in a safetensors file. Nothing changes if one does not fit.
+    ///
+    /// # Errors
+    /// If the bytes are no safetensors file, or names, shapes or number types differ from those of this store.
+    pub fn load_safetensors(&mut self, bytes: &[u8]) -> Result<(), ParamsError> {
+        let file = SafeTensors::deserialize(bytes)?;
+        let mut values = Vec::with_capacity(self.len());
+        for (name, value) in self.iter() {
+            let Ok(found) = file.tensor(name) else { return Err(ParamsError::Missing(name.into())) };
+            if found.shape() != value.shape() || found.dtype() != dtype::<T>() {
+                return Err(ParamsError::Mismatch {
+                    name: name.into(),
+                    found: format!("{:?}{:?}", found.dtype(), found.shape()),
+                    expected: format!("{:?}{:?}", dtype::<T>(), value.shape()),
+                });
+            }
+            let elements = found.data().chunks_exact(size_of::<T>()).map(T::read_le).collect();
+            values.push(Tensor::from_vec(value.shape(), elements));
+        }
+        if let Some(unknown) = file.names().iter().find(|name| !self.names.iter().any(|own| own == *name)) {
+            return Err(ParamsError::Unknown(unknown.to_string()));
+        }
+        self.values = values;
+        Ok(())
+    }
+}
+
+fn dtype<T: Scalar>() -> Dtype {
+    if size_of::<T>() == 4 { Dtype::F32 } else { Dtype::F64 }
+}
+
+/// Parameters on a tape; index it with a [`ParamId`].
+#[derive(Debug)]
+pub struct Bound<'t, T: Scalar>(Vec<Var<'t, T>>);
+
+impl<'t, T: Scalar> Bound<'t, T> {
+    /// Variables in place of parameters, in the order of the store: what a check of a whole model differentiates.
+    pub fn from_vars(vars: Vec<Var<'t, T>>) -> Self {
+        Bound(vars)
+    }
+
+    /// All parameters in the order of the store, to take gradients with respect to.
+    pub fn vars(&self) -> Vec<&Var<'t, T>> {
+        self.0.iter().collect()
+    }
+}
+
+impl<'t, T: Scalar> Index<ParamId> for Bound<'t, T> {
+    type Output = Var<'t, T>;
+    fn index(&self, id: ParamId) -> &Var<'t, T> {
+        &self.0[id.0]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn store() -> Params<f32> {
+        let mut params = Params::new();
+        params.add("a", Tensor::from_vec(&[2], vec![1.0, f32::MIN_POSITIVE]));
+        params.add("b", Tensor::from_vec(&[1, 2], vec![-0.0, 3.5]));
+        params
+    }
+
+    #[test]
+    fn a_stored_model_comes_back_bit_for_bit() {
+        let params = store();
+        let bytes = params.to_safetensors(HashMap::new()).unwrap();
+        let mut other = params.clone();
+        other.values_mut()[0].as_mut_slice().fill(9.0);
+        other.load_safetensors(&bytes).unwrap();
+        for (a, b) in params.values().iter().zip(other.values()) {
+            let bits = |x: &Tensor<f32>| x.as_slice().iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(a), bits(b));
+        }
+    }
+
+    #[test]
+    fn another_model_is_refused_and_nothing_changes() {
+        let mut wide = Params::<f32>::new();
+        wide.add("a", Tensor::zeros(&[3]));
+        wide.add("b", Tensor::zeros(&[1, 2]));
+        let bytes = wide.to_safetensors(HashMap::new()).unwrap();
+        let mut params = store();
+        let message = params.load_safetensors(&bytes).unwrap_err().to_string();
+        assert!(message.contains("`a` is F32[3] in the file and F32[2]"), "{message}");
+        assert_eq!(params.values()[0].as_slice()[0], 1.0);
+        let mut more = store();
+        more.add("c", Tensor::zeros(&[1]));
+        assert!(matches!(
+            more.load_safetensors(&store().to_safetensors(HashMap::new()).unwrap()),
+            Err(ParamsError::Missing(_))
+        ));
+        let bytes = more.to_safetensors(HashMap::new()).unwrap();
+        assert!(matches!(params.load_safetensors(&bytes), Err(ParamsError::Unknown(_))));
+        assert!(params.load_safetensors(b"no tensors").is_err());
+    }
+}

@@ -1,0 +1,223 @@
+//! The backward sweep: from the root down the tape, visiting only what leads to the wanted gradients.
+
+use crate::tape::find_non_finite;
+use crate::{Error, Grads, Op, Tape, Var, Vjp};
+use raygrad_tensor::{Scalar, Tensor, add_assign};
+use smallvec::SmallVec;
+use std::panic::Location;
+
+/// What a sweep leaves behind.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Keep {
+    /// The graph stays as it is.
+    Graph,
+    /// Saved values are freed as the sweep passes.
+    Nothing,
+    /// The graph stays, and the gradients are recorded on it.
+    GraphAndGradients,
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The gradients of this one-element tensor with respect to `wrt`; zeros where it does not depend on one. The graph
+    /// stays, so further gradients can be taken.
+    ///
+    /// # Panics
+    /// If this tensor has not exactly one element, the graph was freed, or the NaN finder is on and finds something.
+    #[track_caller]
+    pub fn grad(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
+        or_panic(self.try_grad(wrt))
+    }
+
+    /// As [`grad`](Self::grad), with an error instead of a panic.
+    ///
+    /// # Errors
+    /// If this tensor has not exactly one element, the graph was freed, or the NaN finder is on and finds something.
+    #[track_caller]
+    pub fn try_grad(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
+        Ok(values(sweep(self, self.seed()?, wrt, Keep::Graph)?))
+    }
+
+    /// As [`grad`](Self::grad), but frees the saved values as the sweep passes, so that their buffers serve again at
+    /// once: what a training step wants.
+    ///
+    /// # Panics
+    /// As [`grad`](Self::grad).
+    #[track_caller]
+    pub fn grad_once(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
+        or_panic(self.try_grad_once(wrt))
+    }
+
+    /// As [`grad_once`](Self::grad_once), with an error instead of a panic.
+    ///
+    /// # Errors
+    /// As [`try_grad`](Self::try_grad).
+    #[track_caller]
+    pub fn try_grad_once(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
+        Ok(values(sweep(self, self.seed()?, wrt, Keep::Nothing)?))
+    }
+
+    /// The gradients as variables on the graph: they can be differentiated again.
+    ///
+    /// ```
+    /// use raygrad_autograd::Tape;
+    /// use raygrad_tensor::Tensor;
+    /// let tape = Tape::<f64>::new();
+    /// let x = tape.leaf(Tensor::scalar(0.5));
+    /// let mut y = x.sin();
+    /// for _ in 0..3 {
+    ///     y = y.grad_graph(&[&x]).remove(0);
+    /// }
+    /// assert!((y.item() + 0.5_f64.cos()).abs() < 1e-15); // the third derivative of sin is -cos
+    /// ```
+    ///
+    /// # Panics
+    /// As [`grad`](Self::grad).
+    #[track_caller]
+    pub fn grad_graph(&self, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
+        or_panic(self.seed().and_then(|seed| sweep(self, seed, wrt, Keep::GraphAndGradients)))
+    }
+
+    /// The vector-Jacobian product: the gradients of `sum(self * seed)` with respect to `wrt`, recorded on the graph.
+    ///
+    /// # Panics
+    /// If `seed` has another shape than this tensor, and as [`grad`](Self::grad).
+    #[track_caller]
+    pub fn vjp(&self, seed: &Var<'t, T>, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
+        assert_eq!(seed.shape(), self.shape(), "the seed of a vector-Jacobian product has the shape of the output");
+        or_panic(sweep(self, seed.clone(), wrt, Keep::GraphAndGradients))
+    }
+
+    #[track_caller]
+    fn seed(&self) -> Result<Var<'t, T>, Error> {
+        if self.value.len() != 1 {
+            return Err(Error::NotScalar { shape: self.shape().into(), at: Location::caller() });
+        }
+        Ok(self.tape.constant(self.tape.pool().full(self.shape(), T::ONE)))
+    }
+}
+
+#[track_caller]
+fn or_panic<R>(result: Result<R, Error>) -> R {
+    match result {
+        Ok(value) => value,
+        Err(error) => panic!("{error}"),
+    }
+}
+
+fn values<T: Scalar>(grads: Vec<Var<'_, T>>) -> Vec<Tensor<T>> {
+    grads.into_iter().map(|grad| grad.value).collect()
+}
+
+#[track_caller]
+fn sweep<'t, T: Scalar>(
+    root: &Var<'t, T>,
+    seed: Var<'t, T>,
+    wrt: &[&Var<'t, T>],
+    keep: Keep,
+) -> Result<Vec<Var<'t, T>>, Error> {
+    let (tape, at) = (root.tape, Location::caller());
+    for x in wrt {
+        assert!(std::ptr::eq(x.tape, tape), "a gradient with respect to a variable of another tape");
+    }
+    let zeros = |x: &Var<'t, T>| tape.constant(tape.pool().full(x.shape(), T::ZERO));
+    let lowest = wrt.iter().filter_map(|x| x.node).min();
+    let (Some(top), Some(bottom)) = (root.node, lowest) else { return Ok(wrt.iter().map(|&x| zeros(x)).collect()) };
+    let needed = reach(tape, bottom, top, wrt);
+    let record = keep == Keep::GraphAndGradients;
+    // One slot for each node between the lowest variable and the root.
+    let mut grads: Vec<Option<Var<'t, T>>> = vec![None; needed.len()];
+    if top >= bottom && needed[(top - bottom) as usize] {
+        grads[(top - bottom) as usize] = Some(seed);
+    }
+    tape.with_recording(record, || {
+        for index in (bottom..=top).rev() {
+            let slot = (index - bottom) as usize;
+            if grads[slot].is_none() {
+                continue;
+            }
+            let node = match keep {
+                Keep::Nothing => tape.nodes.borrow_mut()[index as usize].take(),
+                _ => tape.nodes.borrow()[index as usize].clone(),
+            };
+            let Some(node) = node else { return Err(Error::Freed { at }) };
+            let wanted = wrt.iter().any(|x| x.node == Some(index));
+            let g = if wanted { grads[slot].clone() } else { grads[slot].take() };
+            let (Some(op), Some(g)) = (&node.op, g) else { continue };
+            let needs: SmallVec<[bool; 4]> =
+                node.inputs.iter().map(|&(input, _)| leads(input, bottom, &needed)).collect();
+            let cx =
+                Vjp { tape, g, op: op.name(), inputs: &node.inputs, output: &node.output, node: index, needs: &needs };
+            let given = differentiate(&**op, &cx)?;
+            drop(cx);
+            for (i, grad) in given.0.into_iter().enumerate() {
+                let (Some(grad), Some(input)) = (grad, node.inputs[i].0) else { continue };
+                if !needs[i] {
+                    continue;
+                }
+                debug_assert_eq!(grad.shape(), node.inputs[i].1.shape(), "gradient of input {i} of {}", op.name());
+                if tape.checks_finite() {
+                    find_non_finite(op.name(), &format!("the gradient of input {i}"), &grad.value, node.at)?;
+                }
+                accumulate(&mut grads[(input - bottom) as usize], grad, record);
+            }
+        }
+        Ok(())
+    })?;
+    let take = |x: &&Var<'t, T>| {
+        let slot = x.node.filter(|&node| node >= bottom && node <= top).map(|node| (node - bottom) as usize);
+        slot.and_then(|slot| grads[slot].clone()).unwrap_or_else(|| zeros(x))
+    };
+    Ok(wrt.iter().map(take).collect())
+}
+
+/// Whether an input is a node that the sweep passes and that depends on a wanted variable.
+fn leads(input: Option<u32>, bottom: u32, needed: &[bool]) -> bool {
+    input.is_some_and(|i| i >= bottom && needed[(i - bottom) as usize])
+}
+
+/// Which nodes between `bottom` and `top` depend on a wanted variable.
+fn reach<T: Scalar>(tape: &Tape<T>, bottom: u32, top: u32, wrt: &[&Var<'_, T>]) -> Vec<bool> {
+    let nodes = tape.nodes.borrow();
+    let mut needed = vec![false; (top.max(bottom) - bottom) as usize + 1];
+    for x in wrt {
+        if let Some(node) = x.node
+            && let Some(flag) = needed.get_mut((node - bottom) as usize)
+        {
+            *flag = true;
+        }
+    }
+    for slot in 0..needed.len() {
+        needed[slot] = needed[slot]
+            || match nodes.get(bottom as usize + slot) {
+                Some(Some(node)) => node.inputs.iter().any(|&(input, _)| leads(input, bottom, &needed)),
+                // A freed node: if the sweep arrives there, it reports it.
+                _ => true,
+            };
+    }
+    needed
+}
+
+/// One vector-Jacobian product; through the reference of a fused operation if the result is recorded.
+fn differentiate<'t, T: Scalar>(op: &dyn Op<T>, cx: &Vjp<'t, '_, T>) -> Result<Grads<'t, T>, Error> {
+    if cx.recording() && op.is_fused() {
+        // Fresh copies on the graph: an input that depends on another one is to get its own share only.
+        let inputs: Vec<_> = (0..cx.len()).map(|i| cx.x(i).alias()).collect();
+        if let Some(y) = op.reference(&inputs) {
+            let wanted: Vec<_> = inputs.iter().zip(cx.needs).filter(|(_, needed)| **needed).map(|(x, _)| x).collect();
+            let mut given = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients)?.into_iter();
+            return Ok(Grads::new(cx.needs.iter().map(|&needed| if needed { given.next() } else { None })));
+        }
+    }
+    Ok(op.vjp(cx))
+}
+
+fn accumulate<'t, T: Scalar>(slot: &mut Option<Var<'t, T>>, grad: Var<'t, T>, record: bool) {
+    *slot = Some(match slot.take() {
+        None => grad,
+        Some(sum) if record => sum + grad,
+        Some(mut sum) => {
+            add_assign(sum.value.as_mut_slice(), grad.value.as_slice());
+            sum
+        }
+    });
+}

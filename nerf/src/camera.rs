@@ -1,0 +1,80 @@
+//! Pinhole cameras and the rays through their pixels.
+
+use glam::{DAffine3, DVec3};
+
+/// A straight line `origin + t * direction`, `t >= 0`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ray {
+    /// Where the ray starts, in scene units.
+    pub origin: DVec3,
+    /// Its direction, of length 1: `t` is a distance in scene units.
+    pub direction: DVec3,
+}
+
+impl Ray {
+    /// The point at distance `t`.
+    pub fn at(&self, t: f64) -> DVec3 {
+        self.origin + t * self.direction
+    }
+}
+
+/// A pinhole camera.
+///
+/// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates
+/// are continuous, with `(0, 0)` at the upper left corner of the image, so the centre of the pixel in column `i` and
+/// row `j` is `(i + 0.5, j + 0.5)`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Camera {
+    /// Image width in pixels.
+    pub width: usize,
+    /// Image height in pixels.
+    pub height: usize,
+    /// Horizontal and vertical focal length in pixels.
+    pub focal: [f64; 2],
+    /// The principal point in pixels.
+    pub centre: [f64; 2],
+    /// Camera-to-world transform: a rotation and a translation.
+    pub pose: DAffine3,
+}
+
+impl Camera {
+    /// A camera with square pixels and its principal point in the middle of the image.
+    ///
+    /// `angle_x` is the horizontal field of view in radians: `focal = width / (2 tan(angle_x / 2))`.
+    pub fn from_angle(width: usize, height: usize, angle_x: f64, pose: DAffine3) -> Self {
+        let focal = 0.5 * width as f64 / (0.5 * angle_x).tan();
+        Camera { width, height, focal: [focal; 2], centre: [0.5 * width as f64, 0.5 * height as f64], pose }
+    }
+
+    /// A pose at `eye` that looks at `target`, with `up` upwards in the image.
+    ///
+    /// `up` must not be parallel to the viewing direction.
+    pub fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
+        let back = (eye - target).normalize();
+        let right = up.cross(back).normalize();
+        DAffine3 { matrix3: glam::DMat3::from_cols(right, back.cross(right), back), translation: eye }
+    }
+
+    /// The ray through the continuous pixel position `(x, y)`.
+    pub fn ray(&self, x: f64, y: f64) -> Ray {
+        let local = DVec3::new((x - self.centre[0]) / self.focal[0], -(y - self.centre[1]) / self.focal[1], -1.0);
+        Ray { origin: self.pose.translation, direction: (self.pose.matrix3 * local).normalize() }
+    }
+
+    /// The ray through the centre of the pixel in column `column` and row `row`.
+    pub fn pixel_ray(&self, column: usize, row: usize) -> Ray {
+        self.ray(column as f64 + 0.5, row as f64 + 0.5)
+    }
+
+    /// The same view at another image size.
+    pub fn resized(&self, width: usize, height: usize) -> Self {
+        let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);
+        Camera {
+            width,
+            height,
+            focal: [self.focal[0] * sx, self.focal[1] * sy],
+            centre: [self.centre[0] * sx, self.centre[1] * sy],
+            pose: self.pose,
+        }
+    }
+}

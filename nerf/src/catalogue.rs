@@ -1,0 +1,10 @@
+//! This crate's operations, for the checks.
+
+use raygrad_autograd::Entry;
+
+/// Every operation of this crate, with the inputs it is checked on.
+pub fn catalogue() -> Vec<Entry> {
+    let mut entries = crate::encoding::entries();
+    entries.extend(crate::composite::entries());
+    entries
+}

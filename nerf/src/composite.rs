@@ -1,0 +1,278 @@
+//! Volume rendering: what arrives at the eye from the samples along a ray.
+
+use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
+use raygrad_tensor::{lanes, map};
+
+/// Composites the features of packed samples, front to back (Mildenhall et al. 2020, equation 3; Max 1995).
+///
+/// Inputs are the density `sigma [samples]`, at least 0, and `features [samples, channels]`: colour, depth or whatever
+/// else. The output is `[rays, channels + 1]`: the sum of `w_i features_i`, with
+/// `w_i = T_i alpha_i`, `alpha_i = 1 - exp(-sigma_i delta_i)`, `T_i = exp(-sum of sigma_j delta_j for j < i)`, and as last
+/// channel the transmittance that is left behind the last sample, which a background is multiplied by.
+///
+/// The gradient runs back to front, `B_i = alpha_i c_i + (1 - alpha_i) B_(i+1)` and
+/// `dL/dsigma_i = delta_i T_(i+1) g (c_i - B_(i+1))`: nothing is divided by a transmittance, so it is accurate behind
+/// opaque samples too. A density of 0 counts as no optical depth even if `delta` is infinite; there the density gradient is defined as 0.
+#[derive(Debug, Clone)]
+pub struct Composite<T: Scalar> {
+    delta: Tensor<T>,
+    segments: Segments,
+}
+
+impl<T: Scalar> Composite<T> {
+    /// For samples that stand for intervals of length `delta` `[samples]`.
+    ///
+    /// # Panics
+    /// If an interval is negative or NaN, or there is not one for each row of the segments.
+    #[track_caller]
+    pub fn new(delta: Tensor<T>, segments: Segments) -> Self {
+        assert_eq!(delta.shape(), [segments.rows()], "one interval for each sample");
+        assert!(delta.as_slice().iter().all(|&delta| delta >= T::ZERO), "intervals are at least 0");
+        Composite { delta, segments }
+    }
+
+    /// Optical depth of each sample's interval.
+    #[inline(always)]
+    fn depth(sigma: T, delta: T) -> T {
+        // Not sigma * delta alone, which is NaN for 0 times infinity.
+        if sigma == T::ZERO { T::ZERO } else { sigma * delta }
+    }
+
+    /// For each sample the transmittance in front of it and its alpha.
+    fn transmittance_and_alpha(&self, sigma: &Tensor<T>, pool: &Pool<T>) -> [Tensor<T>; 2] {
+        let mut transmittance = pool.tensor(sigma.shape());
+        let out = transmittance.as_mut_slice();
+        for rows in self.segments.ranges() {
+            let mut sum = 0.0;
+            for i in rows {
+                out[i] = T::from_f64(sum);
+                sum += Self::depth(sigma.as_slice()[i], self.delta.as_slice()[i]).to_f64();
+            }
+        }
+        let transmittance = map(
+            [&transmittance],
+            pool,
+            #[inline(always)]
+            |[tau]| (-tau).exp(),
+        );
+        let alpha = map(
+            [sigma, &self.delta],
+            pool,
+            #[inline(always)]
+            |[sigma, delta]| -(-Self::depth(sigma, delta)).expm1(),
+        );
+        [transmittance, alpha]
+    }
+
+    /// The weight `w_i` of each sample, `[samples]`, for a density `sigma [samples]`.
+    ///
+    /// # Panics
+    /// If there is not one density for each sample.
+    pub fn weights(&self, sigma: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        assert_eq!(sigma.shape(), self.delta.shape(), "one density for each sample");
+        let [transmittance, alpha] = self.transmittance_and_alpha(sigma, pool);
+        map(
+            [&transmittance, &alpha],
+            pool,
+            #[inline(always)]
+            |[t, a]| t * a,
+        )
+    }
+}
+
+impl<T: Scalar> Op<T> for Composite<T> {
+    fn name(&self) -> &'static str {
+        "composite"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let samples = self.segments.rows();
+        match (x[0], x[1]) {
+            (&[sigma], &[features, channels]) if sigma == samples && features == samples => {
+                Ok([self.segments.len(), channels + 1].into_iter().collect())
+            }
+            _ => Err(format!("densities must be [{samples}] and features [{samples}, channels]")),
+        }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let channels = x[1].shape()[1];
+        let features = x[1].as_slice();
+        let [transmittance, alpha] = self.transmittance_and_alpha(x[0], pool);
+        let (transmittance, alpha) = (transmittance.as_slice(), alpha.as_slice());
+        let mut out = pool.tensor(&[self.segments.len(), channels + 1]);
+        let mut sums = vec![0.0_f64; channels];
+        for (out, rows) in out.as_mut_slice().chunks_exact_mut(channels + 1).zip(self.segments.ranges()) {
+            sums.fill(0.0);
+            let mut depth = 0.0;
+            for i in rows {
+                let weight = (transmittance[i] * alpha[i]).to_f64();
+                for (sum, feature) in sums.iter_mut().zip(&features[i * channels..]) {
+                    *sum += weight * feature.to_f64();
+                }
+                depth += Self::depth(x[0].as_slice()[i], self.delta.as_slice()[i]).to_f64();
+            }
+            for (out, &sum) in out.iter_mut().zip(&sums) {
+                *out = T::from_f64(sum);
+            }
+            out[channels] = T::from_f64((-depth).exp());
+        }
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::INPUTS
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (sigma, features) = (cx.x(0).into_value(), cx.x(1).into_value());
+        let channels = features.shape()[1];
+        let pool = cx.pool();
+        let [transmittance, alpha] = self.transmittance_and_alpha(&sigma, pool);
+        let (transmittance, alpha, delta) = (transmittance.as_slice(), alpha.as_slice(), self.delta.as_slice());
+        // e^-x, not 1 - alpha, which has no digits behind an opaque sample.
+        let mut passed = pool.tensor(sigma.shape());
+        lanes(
+            [sigma.as_slice(), delta],
+            passed.as_mut_slice(),
+            #[inline(always)]
+            |[sigma, delta]| (-Self::depth(sigma, delta)).exp(),
+        );
+        let passed = passed.as_slice();
+        let (mut d_sigma, mut d_features) = (pool.tensor(sigma.shape()), pool.tensor(features.shape()));
+        let (d_sigma_out, d_features_out) = (d_sigma.as_mut_slice(), d_features.as_mut_slice());
+        let mut behind = vec![T::ZERO; channels + 1];
+        for (ray, rows) in self.segments.ranges().enumerate() {
+            let g = &cx.g().value().as_slice()[ray * (channels + 1)..(ray + 1) * (channels + 1)];
+            // Behind the last sample there are no features, and all that is left of the light.
+            behind.fill(T::ZERO);
+            behind[channels] = T::ONE;
+            for i in rows.rev() {
+                let weight = transmittance[i] * alpha[i];
+                let mut difference = -(g[channels] * behind[channels]);
+                for c in 0..channels {
+                    let feature = features.as_slice()[i * channels + c];
+                    d_features_out[i * channels + c] = weight * g[c];
+                    difference += g[c] * (feature - behind[c]);
+                    behind[c] = alpha[i] * feature + passed[i] * behind[c];
+                }
+                behind[channels] *= passed[i];
+                let slope = delta[i] * (transmittance[i] * passed[i]) * difference;
+                d_sigma_out[i] = if delta[i].is_finite() { slope } else { T::ZERO };
+            }
+        }
+        Grads::new([Some(cx.constant(d_sigma)), Some(cx.constant(d_features))])
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let (sigma, features) = (&x[0], &x[1]);
+        let depth = sigma * sigma.tape().constant(self.delta.clone());
+        let transmittance = (-depth.segment_cumsum(&self.segments, true)).exp();
+        let weights = transmittance * -(-&depth).expm1();
+        let weighted = features * weights.reshape(&[self.segments.rows(), 1]);
+        let left = (-depth.segment_sum(&self.segments)).exp().reshape(&[self.segments.len(), 1]);
+        Some(Var::concat(&[&weighted.segment_sum(&self.segments), &left], 1))
+    }
+}
+
+/// The catalogue entries of this file. [`Composite`] holds a tensor of its own number type, so each precision has its own.
+pub(crate) fn entries() -> Vec<Entry> {
+    let delta = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.5, 0.125, 0.5, 1.0, 0.0, 0.375]);
+    let segments = || Segments::new([0, 3, 3, 4, 7]);
+    let entry = || Entry::of(Composite::new(delta(), segments()), Composite::new(delta().cast::<f32>(), segments()));
+    let sigma = |values: [f64; 7]| Tensor::from_vec(&[7], values.to_vec());
+    let features = |channels: usize| Tensor::from_fn(&[7, channels], |i| ((i * 29) % 17) as f64 / 17.0);
+    let none = || (Tensor::zeros(&[0]), Segments::new([0, 0]));
+    vec![
+        entry().sample_of(vec![sigma([0.4, 1.3, 2.0, 0.1, 3.0, 0.7, 0.2]), features(3)]),
+        entry().sample_of(vec![sigma([30.0, 0.5, 9.0, 0.01, 20.0, 5.0, 40.0]), features(1)]),
+        Entry::of(Composite::new(none().0, none().1), Composite::new(none().0.cast::<f32>(), none().1))
+            .sample_of(vec![Tensor::zeros(&[0]), Tensor::zeros(&[0, 3])]),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_autograd::Tape;
+
+    /// Output and gradients of sigma and features for one ray and a gradient of 1 in every channel.
+    fn one_ray<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64]) -> [Vec<f64>; 3] {
+        let tensor = |x: &[f64], shape: &[usize]| Tensor::from_vec(shape, x.iter().map(|&x| T::from_f64(x)).collect());
+        let n = sigma.len();
+        let tape = Tape::new();
+        let s = tape.leaf(tensor(sigma, &[n]));
+        let c = tape.leaf(tensor(colour, &[n, 1]));
+        let out = tape.apply(Composite::new(tensor(delta, &[n]), Segments::uniform(1, n)), &[&s, &c]);
+        let grads = out.slice(1, 0, 1).sum().grad(&[&s, &c]);
+        [out.value(), &grads[0], &grads[1]].map(|x| x.as_slice().iter().map(|x| x.to_f64()).collect())
+    }
+
+    #[test]
+    fn constant_density_and_colour_give_the_exact_integral() {
+        // numerics.md, section 2, without the background: c (1 - E) and E.
+        let n = 64;
+        let [out, ..] = one_ray::<f64>(&vec![1.3; n], &vec![4.0 / n as f64; n], &vec![0.8; n]);
+        let e = (-5.2_f64).exp();
+        assert!((out[0] - 0.8 * (1.0 - e)).abs() < 1e-14);
+        assert!((out[1] - e).abs() < 1e-15);
+        assert!((out[0] + out[1] - 0.801_103_312_884_184_1).abs() < 1e-14);
+    }
+
+    #[test]
+    fn no_samples_nothing_and_everything() {
+        let [out, ..] = one_ray::<f32>(&[], &[], &[]);
+        assert_eq!(out, [0.0, 1.0], "no samples: the background");
+        let [out, ..] = one_ray::<f32>(&[0.0; 3], &[1.0; 3], &[0.9; 3]);
+        assert_eq!(out, [0.0, 1.0], "empty space: the background");
+        let [out, d_sigma, _] = one_ray::<f32>(&[1e30; 3], &[1.0; 3], &[0.25, 0.5, 0.75]);
+        assert_eq!(out, [0.25, 0.0], "opaque: the first colour");
+        assert_eq!(d_sigma, [0.0; 3]);
+        let [out, d_sigma, _] = one_ray::<f32>(&[0.5, 0.0], &[1.0, f64::INFINITY], &[0.25, 0.5]);
+        assert!((out[1] - (-0.5_f64).exp()).abs() < 1e-7 && d_sigma[1] == 0.0, "an empty infinite interval");
+    }
+
+    #[test]
+    fn tiny_optical_depths_keep_their_digits() {
+        let n = 1024;
+        let [out, ..] = one_ray::<f32>(&vec![1e-3; n], &vec![1.0 / n as f64; n], &vec![1.0; n]);
+        let exact = -(-1e-3_f64).exp_m1();
+        assert!((out[0] / exact - 1.0).abs() < 2e-7, "{} against {exact}", out[0]);
+    }
+
+    #[test]
+    fn the_gradient_survives_opaque_samples() {
+        // alpha = (.3, 1, .5), c = (.2, .9, .4): dC/dalpha = (-.7, .49 T, 0); dC/dx_i = (1 - alpha_i) dC/dalpha_i.
+        let x = [-(0.7_f64.ln()), f64::INFINITY, 2.0_f64.ln()];
+        let [out, d_sigma, d_colour] = one_ray::<f64>(&[x[0], 1e300, x[2]], &[1.0; 3], &[0.2, 0.9, 0.4]);
+        assert!((out[0] - (0.3 * 0.2 + 0.7 * 0.9)).abs() < 1e-15);
+        assert!((d_sigma[0] - 0.7 * -0.7).abs() < 1e-15 && d_sigma[1] == 0.0 && d_sigma[2] == 0.0);
+        assert!((d_colour[1] - 0.7).abs() < 1e-15 && d_colour[2] == 0.0);
+    }
+
+    #[test]
+    fn f32_keeps_its_accuracy_behind_dense_samples() {
+        let n = 192;
+        let wave = |i: usize, k: f64| 0.5 + 0.5 * (i as f64 * k).sin();
+        for scale in [0.5, 5.0, 40.0] {
+            let round = |x: f64| f64::from(x as f32);
+            let sigma: Vec<f64> = (0..n).map(|i| round(scale * wave(i, 0.13))).collect();
+            let delta: Vec<f64> = (0..n).map(|i| round(4.0 / n as f64 * (0.5 + wave(i, 0.7)))).collect();
+            let colour: Vec<f64> = (0..n).map(|i| round(wave(i, 0.31))).collect();
+            let [single, d_single, _] = one_ray::<f32>(&sigma, &delta, &colour);
+            let [double, d_double, _] = one_ray::<f64>(&sigma, &delta, &colour);
+            assert!((single[0] - double[0]).abs() <= 1e-6, "scale {scale}: {} against {}", single[0], double[0]);
+            let mut tau = 0.0;
+            for i in 0..n {
+                let error = (d_single[i] - d_double[i]).abs();
+                let t = (-tau as f64).exp();
+                assert!(error <= 1e-5 * delta[i] * t + 1e-38, "scale {scale}, sample {i}: {error:e}, T {t:e}");
+                tau += sigma[i] * delta[i];
+            }
+        }
+    }
+}

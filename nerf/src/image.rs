@@ -1,0 +1,246 @@
+//! Images in memory: rows of f32 channels.
+
+use std::path::Path;
+
+use image::{DynamicImage, ImageReader};
+
+use crate::error::{Error, Result};
+
+/// An image of `channels` values a pixel, row by row from the top.
+///
+/// Colours keep the transfer curve of the file they came from (sRGB for PNG and JPEG) and lie in 0..=1: that is the
+/// space in which NeRF is trained and measured. Alpha, where there is a fourth channel, is not premultiplied.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Image {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Number of rows.
+    pub height: usize,
+    /// Values in a pixel: 1 grey, 3 RGB, 4 RGBA.
+    pub channels: usize,
+    /// `height * width * channels` values.
+    pub data: Vec<f32>,
+}
+
+impl Image {
+    /// An image of zeros.
+    pub fn new(width: usize, height: usize, channels: usize) -> Self {
+        Image { width, height, channels, data: vec![0.0; width * height * channels] }
+    }
+
+    /// The channels of the pixel in column `x` and row `y`.
+    ///
+    /// # Panics
+    /// If the pixel lies outside the image.
+    pub fn pixel(&self, x: usize, y: usize) -> &[f32] {
+        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} image", self.width, self.height);
+        let start = (y * self.width + x) * self.channels;
+        &self.data[start..start + self.channels]
+    }
+
+    /// As [`pixel`](Self::pixel), for writing.
+    ///
+    /// # Panics
+    /// If the pixel lies outside the image.
+    pub fn pixel_mut(&mut self, x: usize, y: usize) -> &mut [f32] {
+        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} image", self.width, self.height);
+        let start = (y * self.width + x) * self.channels;
+        &mut self.data[start..start + self.channels]
+    }
+
+    /// Reads a PNG or JPEG file, whichever its contents say it is: RGBA if it has transparency, otherwise RGB.
+    ///
+    /// Values are the stored integers over their maximum (255, or 65535 for 16-bit files); grey becomes three equal
+    /// channels.
+    ///
+    /// # Errors
+    /// If the file cannot be read or decoded; the error names it.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let decoded = reader(path)?.decode().map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+        Ok(Self::from_decoded(decoded))
+    }
+
+    /// Width and height of an image file, read from its header alone.
+    pub(crate) fn size_of_file(path: &Path) -> Result<[usize; 2]> {
+        let size = reader(path)?.into_dimensions();
+        let (width, height) = size.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+        Ok([width as usize, height as usize])
+    }
+
+    fn from_decoded(decoded: DynamicImage) -> Self {
+        let (width, height) = (decoded.width() as usize, decoded.height() as usize);
+        let format = decoded.color();
+        let eight_bits = format.bytes_per_pixel() == format.channel_count();
+        let bytes = |values: Vec<u8>| values.into_iter().map(|v| f32::from(v) / 255.0).collect();
+        let words = |values: Vec<u16>| values.into_iter().map(|v| f32::from(v) / 65535.0).collect();
+        let (channels, data) = match (format.has_alpha(), eight_bits) {
+            (false, true) => (3, bytes(decoded.into_rgb8().into_raw())),
+            (true, true) => (4, bytes(decoded.into_rgba8().into_raw())),
+            (false, false) => (3, words(decoded.into_rgb16().into_raw())),
+            (true, false) => (4, words(decoded.into_rgba16().into_raw())),
+        };
+        Image { width, height, channels, data }
+    }
+
+    /// The image at `1 / factor` of its size: each pixel is the average of a box of `factor x factor` pixels.
+    ///
+    /// In an RGBA image colours are weighted by their alpha, so what hides in transparent pixels does not bleed into
+    /// their neighbours; a box that is wholly transparent becomes zero.
+    ///
+    /// # Panics
+    /// If `factor` is 0 or does not divide both the width and the height. (Cropping instead would change what the
+    /// camera of the image sees.)
+    #[track_caller]
+    pub fn downscaled(&self, factor: usize) -> Image {
+        let divides = factor > 0 && self.width.is_multiple_of(factor) && self.height.is_multiple_of(factor);
+        assert!(divides, "a factor of {factor} does not divide a {}x{} image", self.width, self.height);
+        if factor == 1 {
+            return self.clone();
+        }
+        let mut out = Image::new(self.width / factor, self.height / factor, self.channels);
+        for y in 0..out.height {
+            for x in 0..out.width {
+                self.average_box(x * factor, y * factor, factor, out.pixel_mut(x, y));
+            }
+        }
+        out
+    }
+
+    /// The average over the box of side `side` whose upper left pixel is `(left, top)`, in f64 so that a constant
+    /// image keeps its value to the last bit.
+    fn average_box(&self, left: usize, top: usize, side: usize, out: &mut [f32]) {
+        let mut sum = [0.0f64; 4];
+        let mut weight = 0.0f64;
+        for y in top..top + side {
+            for x in left..left + side {
+                let pixel = self.pixel(x, y);
+                let alpha = if self.channels == 4 { f64::from(pixel[3]) } else { 1.0 };
+                weight += alpha;
+                for (sum, &value) in sum.iter_mut().zip(pixel).take(3) {
+                    *sum += alpha * f64::from(value);
+                }
+            }
+        }
+        for (out, sum) in out.iter_mut().zip(sum).take(3) {
+            *out = if weight == 0.0 { 0.0 } else { (sum / weight) as f32 };
+        }
+        if self.channels == 4 {
+            out[3] = (weight / (side * side) as f64) as f32;
+        }
+    }
+
+    /// Images side by side, from left to right.
+    ///
+    /// # Panics
+    /// If there are none, or if their heights or channels differ.
+    #[track_caller]
+    pub fn hconcat(images: &[&Image]) -> Image {
+        assert!(!images.is_empty(), "no images to put side by side");
+        let (height, channels) = (images[0].height, images[0].channels);
+        for other in images {
+            assert!(
+                other.height == height && other.channels == channels,
+                "images side by side need one height and one number of channels"
+            );
+        }
+        let width = images.iter().map(|i| i.width).sum();
+        let mut data = Vec::with_capacity(width * height * channels);
+        for y in 0..height {
+            for image in images {
+                let row = image.width * channels;
+                data.extend_from_slice(&image.data[y * row..(y + 1) * row]);
+            }
+        }
+        Image { width, height, channels, data }
+    }
+
+    /// Stops at the caller's line unless both images have one shape.
+    #[track_caller]
+    pub(crate) fn assert_same_shape(&self, other: &Image) {
+        let shape = |i: &Image| [i.height, i.width, i.channels];
+        assert_eq!(shape(self), shape(other), "the images differ in height, width or channels");
+    }
+}
+
+fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>> {
+    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
+    reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(width: usize, height: usize, channels: usize, data: &[f32]) -> Image {
+        assert_eq!(data.len(), width * height * channels);
+        Image { width, height, channels, data: data.to_vec() }
+    }
+
+    #[test]
+    fn downscaling_averages_boxes() {
+        let grey = image(4, 2, 1, &[0.0, 1.0, 0.25, 0.25, 0.5, 0.5, 0.25, 0.25]);
+        assert_eq!(grey.downscaled(2), image(2, 1, 1, &[0.5, 0.25]));
+        assert_eq!(grey.downscaled(1), grey);
+    }
+
+    #[test]
+    fn downscaling_keeps_a_constant_exactly() {
+        for value in [0.1f32, 1.0 / 3.0, 0.6, 0.9999999] {
+            let rgba: Vec<f32> = (0..36).flat_map(|_| [value, 1.0 - value, value * value, 0.7]).collect();
+            let small = image(6, 6, 4, &rgba).downscaled(3);
+            assert_eq!(small.data, rgba[..16]);
+        }
+    }
+
+    #[test]
+    fn transparent_colours_do_not_bleed() {
+        // One opaque red pixel, one half transparent blue, two invisible green ones.
+        let rgba = image(2, 2, 4, &[1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.5, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]);
+        assert_eq!(rgba.downscaled(2).data, [2.0 / 3.0, 0.0, 1.0 / 3.0, 0.375]);
+        let invisible = image(2, 2, 4, &[0.3, 0.4, 0.5, 0.0].repeat(4));
+        assert_eq!(invisible.downscaled(2).data, [0.0; 4]);
+    }
+
+    #[test]
+    #[should_panic(expected = "a factor of 3 does not divide a 4x6 image")]
+    fn downscaling_does_not_crop() {
+        Image::new(4, 6, 3).downscaled(3);
+    }
+
+    #[test]
+    fn hconcat_joins_rows() {
+        let (a, b) = (image(1, 2, 1, &[1.0, 2.0]), image(2, 2, 1, &[3.0, 4.0, 5.0, 6.0]));
+        assert_eq!(Image::hconcat(&[&a, &b]), image(3, 2, 1, &[1.0, 3.0, 4.0, 2.0, 5.0, 6.0]));
+    }
+
+    #[test]
+    #[should_panic(expected = "one height")]
+    fn hconcat_refuses_other_heights() {
+        Image::hconcat(&[&Image::new(1, 2, 1), &Image::new(1, 3, 1)]);
+    }
+
+    #[test]
+    fn every_pixel_format_becomes_rgb_or_rgba() {
+        for byte in 0..=255 {
+            let value = f32::from(byte) / 255.0;
+            let grey = DynamicImage::ImageLuma8(image::GrayImage::from_raw(1, 1, vec![byte]).unwrap());
+            assert_eq!(Image::from_decoded(grey).data, [value; 3]);
+            let clear = DynamicImage::ImageLumaA8(image::ImageBuffer::from_raw(1, 1, vec![byte, 51]).unwrap());
+            assert_eq!(Image::from_decoded(clear).data, [value, value, value, 0.2]);
+        }
+        let deep = DynamicImage::ImageRgba16(image::ImageBuffer::from_raw(1, 1, vec![0, 65535, 13107, 65535]).unwrap());
+        assert_eq!(Image::from_decoded(deep).data, [0.0, 1.0, 0.2, 1.0]);
+    }
+
+    #[test]
+    fn open_names_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("noise.png");
+        let missing = Image::open(&path).unwrap_err().to_string();
+        assert!(missing.contains("noise.png: cannot be read"), "{missing}");
+        std::fs::write(&path, b"not a picture").unwrap();
+        let garbage = Image::open(&path).unwrap_err().to_string();
+        assert!(garbage.contains("noise.png: cannot be decoded"), "{garbage}");
+    }
+}

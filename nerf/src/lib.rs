@@ -1,0 +1,44 @@
+//! Neural radiance fields on the [`raygrad_autograd`] tape. This crate knows no command line.
+//!
+//! Data flows one way, with a named type at each arrow:
+//! [`Dataset`](dataset::Dataset) → [`Rays`] → a [`sampler`] → [`Samples`] → a [`Field`] → [`Composite`] → pixels → loss
+//! → gradients → ordered reduction → optimiser. Each stage can be used alone.
+
+pub mod background;
+mod bounds;
+mod camera;
+mod catalogue;
+pub mod colormap;
+mod composite;
+mod config;
+pub mod dataset;
+mod encoding;
+mod error;
+mod field;
+mod image;
+pub mod metrics;
+mod model;
+mod output;
+mod rays;
+mod render;
+pub mod sampler;
+pub mod scene;
+mod startup;
+mod store;
+mod train;
+
+pub use self::image::Image;
+pub use background::Background;
+pub use bounds::{clip_span, intersect_box};
+pub use camera::{Camera, Ray};
+pub use catalogue::catalogue;
+pub use composite::Composite;
+pub use config::{Config, Preset};
+pub use encoding::PositionalEncoding;
+pub use error::{Error, Result};
+pub use field::{Classic, ClassicConfig, Density, DensityActivation, Field};
+pub use model::{Extent, Model, Rendered, over_background, squared_error};
+pub use output::{quantise, write_atomic};
+pub use rays::{Rays, Samples};
+pub use render::Picture;
+pub use train::{Budget, StepStats, Trainer};

@@ -1,0 +1,99 @@
+//! Rays and the samples along them, packed: the samples of all rays stand one after another.
+
+use crate::camera::Ray;
+use raygrad_autograd::{Pool, Scalar, Segments, Tensor};
+
+/// A batch of rays.
+#[derive(Debug, Clone, Default)]
+pub struct Rays<T> {
+    /// Origins in scene units.
+    pub origins: Vec<[T; 3]>,
+    /// Unit directions.
+    pub directions: Vec<[T; 3]>,
+    /// For each ray the distances `[near, far]` between which it is sampled; equal where there is nothing to sample.
+    pub spans: Vec<[T; 2]>,
+}
+
+impl<T: Scalar> Rays<T> {
+    /// No rays.
+    pub fn new() -> Self {
+        Rays { origins: vec![], directions: vec![], spans: vec![] }
+    }
+
+    /// Adds a ray that is sampled over `[near, far]`.
+    pub fn push(&mut self, ray: &Ray, span: [f64; 2]) {
+        self.origins.push(ray.origin.to_array().map(T::from_f64));
+        self.directions.push(ray.direction.to_array().map(T::from_f64));
+        self.spans.push(span.map(T::from_f64));
+    }
+
+    /// Number of rays.
+    pub fn len(&self) -> usize {
+        self.origins.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.origins.is_empty()
+    }
+
+    /// The rays with these numbers.
+    ///
+    /// # Panics
+    /// If the range leaves the batch.
+    pub fn slice(&self, range: std::ops::Range<usize>) -> Self {
+        Rays {
+            origins: self.origins[range.clone()].to_vec(),
+            directions: self.directions[range.clone()].to_vec(),
+            spans: self.spans[range].to_vec(),
+        }
+    }
+}
+
+/// Where rays are sampled: `segments` says which rows belong to which ray.
+#[derive(Debug, Clone)]
+pub struct Samples<T: Scalar> {
+    /// Positions, `[samples, 3]`, in scene units.
+    pub positions: Tensor<T>,
+    /// Unit viewing directions, `[rays, 3]`.
+    pub directions: Tensor<T>,
+    /// Distances along the rays, `[samples]`, rising within a ray.
+    pub t: Tensor<T>,
+    /// Length of the interval that each sample stands for, `[samples]`.
+    pub delta: Tensor<T>,
+    /// The rows of each ray.
+    pub segments: Segments,
+}
+
+impl<T: Scalar> Samples<T> {
+    /// Samples at distances `t`, each standing for an interval of length `delta`.
+    ///
+    /// # Panics
+    /// If there are not as many distances and intervals as rows, or not as many segments as rays.
+    pub fn new(rays: &Rays<T>, segments: Segments, t: Tensor<T>, delta: Tensor<T>, pool: &Pool<T>) -> Self {
+        assert_eq!(segments.len(), rays.len(), "one segment for each ray");
+        assert_eq!([t.len(), delta.len()], [segments.rows(); 2], "one distance and one interval for each sample");
+        let mut positions = pool.tensor(&[segments.rows(), 3]);
+        let out = positions.as_mut_slice();
+        for (ray, rows) in segments.ranges().enumerate() {
+            let (origin, direction) = (rays.origins[ray], rays.directions[ray]);
+            for (position, &t) in out[3 * rows.start..3 * rows.end].chunks_exact_mut(3).zip(&t.as_slice()[rows]) {
+                for axis in 0..3 {
+                    position[axis] = origin[axis] + t * direction[axis];
+                }
+            }
+        }
+        let directions = pool.copy_of(&[rays.len(), 3], rays.directions.as_flattened());
+        Samples { positions, directions, t, delta, segments }
+    }
+
+    /// Number of samples.
+    pub fn len(&self) -> usize {
+        self.segments.rows()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}

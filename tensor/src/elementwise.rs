@@ -1,0 +1,130 @@
+//! One loop for every elementwise kernel, with broadcasting as NumPy does it.
+
+use crate::{Layout, Pool, Scalar, Shape, Tensor, simd};
+
+/// The common shape of tensors that broadcast together: shapes are aligned at their last axis, and an axis of extent 1
+/// (or an absent one) stretches to the extent of the others. `None` if two extents disagree.
+///
+/// ```
+/// use raygrad_tensor::broadcast_shape;
+/// assert_eq!(broadcast_shape(&[&[4, 1], &[3]]).unwrap().as_slice(), [4, 3]);
+/// assert!(broadcast_shape(&[&[4], &[3]]).is_none());
+/// ```
+pub fn broadcast_shape(shapes: &[&[usize]]) -> Option<Shape> {
+    let ndim = shapes.iter().map(|shape| shape.len()).max().unwrap_or(0);
+    let mut out = Shape::from_elem(1, ndim);
+    for shape in shapes {
+        let lead = ndim - shape.len();
+        for (o, &extent) in out[lead..].iter_mut().zip(*shape) {
+            match (*o, extent) {
+                (_, 1) => {}
+                (1, _) => *o = extent,
+                (a, b) if a == b => {}
+                _ => return None,
+            }
+        }
+    }
+    Some(out)
+}
+
+/// `x` stretched to `shape`; shares the elements of `x` if the shape is the same.
+///
+/// # Panics
+/// If `x` does not broadcast to `shape`.
+#[track_caller]
+pub fn broadcast_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Tensor<T> {
+    if x.shape() == shape {
+        return x.clone();
+    }
+    if x.len() == shape.iter().product() {
+        return x.reshape(shape);
+    }
+    let mut out = pool.tensor(shape);
+    Layout::broadcast(x.shape(), shape).read(x.as_slice(), out.as_mut_slice());
+    out
+}
+
+/// `f` of the elements at each index of `N` tensors that broadcast together, in one vectorised pass.
+///
+/// `f` should be branch-free and inlined for the loop to vectorise.
+///
+/// # Panics
+/// If the shapes do not broadcast.
+#[track_caller]
+pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: impl Fn([T; N]) -> T) -> Tensor<T> {
+    let shapes = x.map(|x| x.shape());
+    let mut out;
+    if shapes.iter().all(|&shape| shape == shapes[0]) {
+        out = pool.tensor(shapes[0]);
+        lanes(x.map(|x| x.as_slice()), out.as_mut_slice(), f);
+    } else {
+        let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
+        out = pool.tensor(&shape);
+        let wide = x.map(|x| broadcast_to(x, &shape, pool));
+        lanes(std::array::from_fn(|i| wide[i].as_slice()), out.as_mut_slice(), f);
+    }
+    out
+}
+
+/// `out[i] = f([x[0][i], x[1][i], ..])` with the best instruction set of the processor.
+///
+/// # Panics
+/// If a slice is shorter than `out`.
+pub fn lanes<T: Scalar, const N: usize>(x: [&[T]; N], out: &mut [T], f: impl Fn([T; N]) -> T) {
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            // Cut to one length in here, where the compiler can still drop the bounds checks.
+            let n = out.len();
+            let x = x.map(
+                #[inline(always)]
+                |x| &x[..n],
+            );
+            for i in 0..n {
+                out[i] = f(std::array::from_fn(
+                    #[inline(always)]
+                    |k| x[k][i],
+                ));
+            }
+        },
+    );
+}
+
+/// `a += b`, elementwise.
+///
+/// # Panics
+/// If the lengths differ.
+pub fn add_assign<T: Scalar>(a: &mut [T], b: &[T]) {
+    assert_eq!(a.len(), b.len(), "add_assign of slices of different lengths");
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for (a, &b) in a.iter_mut().zip(b) {
+                *a += b;
+            }
+        },
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn broadcasting_follows_numpy() {
+        let pool = Pool::new();
+        let column = Tensor::from_vec(&[2, 1], vec![10.0, 20.0_f64]);
+        let row = Tensor::from_vec(&[3], vec![1.0, 2.0, 3.0]);
+        let sum = map([&column, &row], &pool, |[a, b]| a + b);
+        assert_eq!(sum.shape(), [2, 3]);
+        assert_eq!(sum.as_slice(), [11.0, 12.0, 13.0, 21.0, 22.0, 23.0]);
+        let empty = Tensor::zeros(&[0, 1]);
+        assert_eq!(map([&empty, &row], &pool, |[a, b]| a * b).shape(), [0, 3]);
+    }
+
+    #[test]
+    #[should_panic(expected = "do not broadcast")]
+    fn shapes_that_disagree_panic() {
+        map([&Tensor::<f32>::zeros(&[2]), &Tensor::zeros(&[3])], &Pool::none(), |[a, b]| a + b);
+    }
+}

@@ -1,0 +1,234 @@
+//! Strided layouts: one walk that serves broadcast, permute, slice and flip, and their adjoints.
+
+use crate::{Scalar, Shape};
+use smallvec::SmallVec;
+
+/// Which element of a buffer stands at each index of a shape: `offset + sum(index[i] * strides[i])`.
+///
+/// Stride 0 repeats an element (broadcast), a negative stride walks backwards (flip).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Layout {
+    shape: Shape,
+    strides: SmallVec<[isize; 4]>,
+    offset: isize,
+    /// Number of elements of the buffer that the layout points into.
+    source: usize,
+}
+
+impl Layout {
+    /// The row-major layout of a whole buffer of this shape.
+    pub fn contiguous(shape: &[usize]) -> Self {
+        let mut strides = SmallVec::from_elem(1, shape.len());
+        for i in (1..shape.len()).rev() {
+            strides[i - 1] = strides[i] * shape[i] as isize;
+        }
+        Layout { shape: Shape::from_slice(shape), strides, offset: 0, source: shape.iter().product() }
+    }
+
+    /// The shape that the layout covers.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// A buffer of shape `from` stretched to shape `to`, as NumPy broadcasts.
+    ///
+    /// # Panics
+    /// If `from` does not broadcast to `to`.
+    #[track_caller]
+    pub fn broadcast(from: &[usize], to: &[usize]) -> Self {
+        let inner = Layout::contiguous(from);
+        assert!(from.len() <= to.len(), "cannot broadcast {from:?} to {to:?}");
+        let lead = to.len() - from.len();
+        let mut strides = SmallVec::from_elem(0, to.len());
+        for (i, &extent) in from.iter().enumerate() {
+            assert!(extent == to[lead + i] || extent == 1, "cannot broadcast {from:?} to {to:?}");
+            if extent == to[lead + i] {
+                strides[lead + i] = inner.strides[i];
+            }
+        }
+        Layout { shape: Shape::from_slice(to), strides, ..inner }
+    }
+
+    /// Axis `i` of the result is axis `axes[i]` of this layout.
+    ///
+    /// # Panics
+    /// If `axes` is not a permutation of the axes.
+    #[track_caller]
+    pub fn permuted(&self, axes: &[usize]) -> Self {
+        let mut seen = SmallVec::<[bool; 8]>::from_elem(false, self.shape.len());
+        assert_eq!(axes.len(), self.shape.len(), "{axes:?} does not name every axis of {:?} once", self.shape);
+        for &axis in axes {
+            assert!(axis < seen.len() && !seen[axis], "{axes:?} does not name every axis of {:?} once", self.shape);
+            seen[axis] = true;
+        }
+        Layout {
+            shape: axes.iter().map(|&axis| self.shape[axis]).collect(),
+            strides: axes.iter().map(|&axis| self.strides[axis]).collect(),
+            ..*self
+        }
+    }
+
+    /// `len` elements along `axis`, from `start` on, every `step`-th; a negative step walks backwards.
+    ///
+    /// # Panics
+    /// If an element lies outside the axis.
+    #[track_caller]
+    pub fn sliced(&self, axis: usize, start: usize, len: usize, step: isize) -> Self {
+        let extent = self.shape[axis];
+        let last = start as isize + step * (len as isize - 1);
+        let inside = |i: isize| (0..extent as isize).contains(&i);
+        assert!(
+            len == 0 || (inside(start as isize) && inside(last)),
+            "slice of {len} from {start} by {step} leaves the extent {extent} of axis {axis}"
+        );
+        let mut out = self.clone();
+        out.shape[axis] = len;
+        out.strides[axis] *= step;
+        if len > 0 {
+            out.offset += start as isize * self.strides[axis];
+        }
+        out
+    }
+
+    /// Axes of extent 1 dropped and neighbours that form one run merged: fewer, longer inner loops.
+    fn collapsed(&self) -> SmallVec<[(usize, isize); 4]> {
+        let mut axes = SmallVec::<[(usize, isize); 4]>::new();
+        for (&extent, &stride) in self.shape.iter().zip(&self.strides) {
+            match axes.last_mut() {
+                _ if extent == 1 => {}
+                Some((outer, outer_stride)) if *outer_stride == stride * extent as isize => {
+                    *outer *= extent;
+                    *outer_stride = stride;
+                }
+                _ => axes.push((extent, stride)),
+            }
+        }
+        axes
+    }
+
+    /// Calls `f(first position in the buffer, stride, first position in row-major order, count)` for every run along
+    /// the innermost axis.
+    #[inline(always)]
+    fn runs(&self, mut f: impl FnMut(usize, isize, usize, usize)) {
+        if self.shape.contains(&0) {
+            return;
+        }
+        let mut axes = self.collapsed();
+        let (count, stride) = axes.pop().unwrap_or((1, 1));
+        let mut index = SmallVec::<[usize; 4]>::from_elem(0, axes.len());
+        let (mut position, mut out) = (self.offset, 0);
+        loop {
+            f(position as usize, stride, out, count);
+            out += count;
+            let mut axis = axes.len();
+            loop {
+                if axis == 0 {
+                    return;
+                }
+                axis -= 1;
+                index[axis] += 1;
+                position += axes[axis].1;
+                if index[axis] < axes[axis].0 {
+                    break;
+                }
+                position -= axes[axis].1 * axes[axis].0 as isize;
+                index[axis] = 0;
+            }
+        }
+    }
+
+    /// Copies the elements that the layout names from `source`, in row-major order, to `out`.
+    ///
+    /// # Panics
+    /// If a slice has another length than the layout says.
+    pub fn read<T: Scalar>(&self, source: &[T], out: &mut [T]) {
+        assert_eq!(source.len(), self.source, "source of a layout of {:?}", self.shape);
+        assert_eq!(out.len(), self.shape.iter().product::<usize>(), "output of a layout of {:?}", self.shape);
+        self.runs(|position, stride, start, count| {
+            let out = &mut out[start..start + count];
+            match stride {
+                0 => out.fill(source[position]),
+                1 => out.copy_from_slice(&source[position..position + count]),
+                _ => {
+                    for (i, out) in out.iter_mut().enumerate() {
+                        *out = source[(position as isize + i as isize * stride) as usize];
+                    }
+                }
+            }
+        });
+    }
+
+    /// The adjoint of [`read`](Self::read): adds `values` to the elements of `target` that the layout names. Elements
+    /// that it names more than once receive a pairwise-accurate sum only along the innermost axis.
+    ///
+    /// # Panics
+    /// If a slice has another length than the layout says.
+    pub fn add<T: Scalar>(&self, values: &[T], target: &mut [T]) {
+        assert_eq!(target.len(), self.source, "target of a layout of {:?}", self.shape);
+        assert_eq!(values.len(), self.shape.iter().product::<usize>(), "values of a layout of {:?}", self.shape);
+        self.runs(|position, stride, start, count| {
+            let values = &values[start..start + count];
+            match stride {
+                0 => target[position] += crate::reduce::sum(values),
+                1 => crate::elementwise::add_assign(&mut target[position..position + count], values),
+                _ => {
+                    for (i, &value) in values.iter().enumerate() {
+                        target[(position as isize + i as isize * stride) as usize] += value;
+                    }
+                }
+            }
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn naive(layout: &Layout, source: &[f64]) -> Vec<f64> {
+        let total: usize = layout.shape.iter().product();
+        let at = |mut i: usize| {
+            let mut position = layout.offset;
+            for axis in (0..layout.shape.len()).rev() {
+                position += (i % layout.shape[axis]) as isize * layout.strides[axis];
+                i /= layout.shape[axis];
+            }
+            source[position as usize]
+        };
+        (0..total).map(at).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn every_walk_agrees_with_the_definition(
+            shape in prop::collection::vec(0usize..5, 0..4), turn in 0usize..4, flip: bool, lead in 0usize..3
+        ) {
+            let source: Vec<f64> = (0..shape.iter().product()).map(|i| i as f64).collect();
+            let mut axes: Vec<usize> = (0..shape.len()).collect();
+            axes.rotate_left(if shape.is_empty() { 0 } else { turn % shape.len() });
+            let mut layouts = vec![Layout::contiguous(&shape), Layout::contiguous(&shape).permuted(&axes)];
+            if let Some(&extent) = shape.first()
+                && flip && extent > 0 {
+                layouts.push(Layout::contiguous(&shape).sliced(0, extent - 1, extent, -1));
+                layouts.push(Layout::contiguous(&shape).sliced(0, 0, extent.div_ceil(2), 2).permuted(&axes));
+            }
+            let mut wide = vec![2; lead];
+            wide.extend(shape.iter().map(|&extent| if extent == 1 { 3 } else { extent }));
+            layouts.push(Layout::broadcast(&shape, &wide));
+            for layout in layouts {
+                let expected = naive(&layout, &source);
+                let mut out = vec![f64::NAN; expected.len()];
+                layout.read(&source, &mut out);
+                prop_assert_eq!(&out, &expected);
+                // <read x, v> = <x, add v>
+                let v: Vec<f64> = (0..out.len()).map(|i| (i % 7) as f64 - 3.0).collect();
+                let mut back = vec![0.0; source.len()];
+                layout.add(&v, &mut back);
+                let forward: f64 = out.iter().zip(&v).map(|(a, b)| a * b).sum();
+                let adjoint: f64 = source.iter().zip(&back).map(|(a, b)| a * b).sum();
+                prop_assert!((forward - adjoint).abs() < 1e-9);
+            }
+        }
+    }
+}

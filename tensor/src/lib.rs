@@ -1,0 +1,30 @@
+//! Dense tensors of `f32` or `f64` over [`ndarray`], and the kernels that work on them. This crate knows no graph.
+//!
+//! * [`Tensor`]: always contiguous and row-major; a clone is a reference count.
+//! * [`Pool`]: gives the buffers of dropped tensors to the next ones.
+//! * [`matmul`]: matrix products with transposed operands by stride.
+//! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
+//! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
+//! * [`Layout`]: broadcast, permute, slice, flip, and their adjoints.
+//! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
+//!
+//! All work happens on the calling thread; parallelism belongs to the caller.
+
+mod elementwise;
+mod layout;
+pub mod matmul;
+mod pool;
+mod real;
+mod reduce;
+mod scalar;
+pub mod simd;
+mod tensor;
+pub mod vmath;
+
+pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, map};
+pub use layout::Layout;
+pub use pool::Pool;
+pub use real::Real;
+pub use reduce::{sum, sum_axes, sum_rows, sum_to};
+pub use scalar::Scalar;
+pub use tensor::{Shape, Tensor};

@@ -1,0 +1,134 @@
+//! The number types a tensor can hold.
+
+use crate::Real;
+use std::fmt::{Debug, Display};
+use std::iter::Sum;
+use std::ops::{AddAssign, MulAssign, SubAssign};
+
+mod sealed {
+    pub trait Sealed {}
+    impl Sealed for f32 {}
+    impl Sealed for f64 {}
+}
+
+/// `f32` or `f64`.
+pub trait Scalar:
+    sealed::Sealed
+    + Copy
+    + Debug
+    + Default
+    + Display
+    + PartialEq
+    + PartialOrd
+    + Send
+    + Sync
+    + Sum
+    + Real
+    + AddAssign
+    + SubAssign
+    + MulAssign
+    + 'static
+{
+    /// `"f32"` or `"f64"`.
+    const NAME: &'static str;
+    /// 0.
+    const ZERO: Self;
+    /// 1.
+    const ONE: Self;
+    /// The distance from 1 to the next larger number.
+    const EPSILON: f64;
+
+    /// The nearest number to `x`.
+    fn from_f64(x: f64) -> Self;
+    /// The same number, exactly.
+    fn to_f64(self) -> f64;
+    /// Neither infinite nor NaN.
+    fn is_finite(self) -> bool;
+    /// Little-endian bytes, as safetensors stores them.
+    fn write_le(self, out: &mut Vec<u8>);
+    /// The inverse of [`write_le`](Self::write_le).
+    ///
+    /// # Panics
+    /// If `bytes` has another length than the type.
+    fn read_le(bytes: &[u8]) -> Self;
+
+    /// `c = a b`, or `c += a b` with `accumulate`; sizes are checked by [`crate::matmul::gemm`], the one caller.
+    ///
+    /// # Safety
+    /// `a` (`m x k`), `b` (`k x n`) and `c` (`m x n`) must be valid for every index that the dimensions and the
+    /// `[row, column]` strides reach, and `c` must not overlap the others.
+    #[doc(hidden)]
+    unsafe fn gemm_raw(
+        mkn: [usize; 3],
+        a: (*const Self, [isize; 2]),
+        b: (*const Self, [isize; 2]),
+        c: *mut Self,
+        accumulate: bool,
+    );
+}
+
+macro_rules! scalar {
+    ($t:ident, $matrixmultiply:path) => {
+        impl Scalar for $t {
+            const NAME: &'static str = stringify!($t);
+            const ZERO: Self = 0.0;
+            const ONE: Self = 1.0;
+            const EPSILON: f64 = $t::EPSILON as f64;
+
+            #[inline(always)]
+            fn from_f64(x: f64) -> Self {
+                x as $t
+            }
+            #[inline(always)]
+            fn to_f64(self) -> f64 {
+                self as f64
+            }
+            #[inline(always)]
+            fn is_finite(self) -> bool {
+                $t::is_finite(self)
+            }
+            fn write_le(self, out: &mut Vec<u8>) {
+                out.extend_from_slice(&self.to_le_bytes());
+            }
+            fn read_le(bytes: &[u8]) -> Self {
+                let mut le = [0; size_of::<$t>()];
+                le.copy_from_slice(bytes);
+                $t::from_le_bytes(le)
+            }
+
+            #[cfg(feature = "gemm")]
+            unsafe fn gemm_raw(
+                [m, k, n]: [usize; 3],
+                (a, [a_row, a_col]): (*const Self, [isize; 2]),
+                (b, [b_row, b_col]): (*const Self, [isize; 2]),
+                c: *mut Self,
+                accumulate: bool,
+            ) {
+                let (one, serial) = (1.0, gemm::Parallelism::None);
+                // SAFETY: the caller's promise, with the strides in the order that `gemm` asks for (column, row).
+                unsafe {
+                    gemm::gemm(
+                        m, n, k, c, 1, n as isize, accumulate, a, a_col, a_row, b, b_col, b_row, one, one, false,
+                        false, false, serial,
+                    );
+                }
+            }
+
+            #[cfg(not(feature = "gemm"))]
+            unsafe fn gemm_raw(
+                [m, k, n]: [usize; 3],
+                (a, [a_row, a_col]): (*const Self, [isize; 2]),
+                (b, [b_row, b_col]): (*const Self, [isize; 2]),
+                c: *mut Self,
+                accumulate: bool,
+            ) {
+                let beta = if accumulate { 1.0 } else { 0.0 };
+                // SAFETY: the caller's promise.
+                unsafe { $matrixmultiply(m, k, n, 1.0, a, a_row, a_col, b, b_row, b_col, beta, c, n as isize, 1) }
+            }
+        }
+    };
+}
+
+scalar!(f32, matrixmultiply::sgemm);
+scalar!(f64, matrixmultiply::dgemm);

@@ -1,0 +1,47 @@
+//! Single precision: at most 1 ULP for `exp` and `ln`, 2 ULP for the others, over all 2^32 arguments.
+
+mod erf;
+mod exp;
+mod log;
+mod trig;
+
+pub use erf::erf;
+pub use exp::{exp, exp2, expm1, sigmoid, tanh};
+pub use log::{ln, ln1p, log2, softplus};
+pub use trig::{cos, cos_pi, sin, sin_pi};
+
+/// Adding this and subtracting it again rounds to the nearest integer (ties to even) for |x| < 2^22, because an ulp is
+/// one there; between the two, the low bits of the sum hold that integer.
+const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23
+
+/// The nearest integer to `a * b`, |a b| < 2^22, as a number and as an integer. Meaningless, but harmless, on NaN.
+#[inline(always)]
+fn round_product(a: f32, b: f32) -> (f32, i32) {
+    let t = a.mul_add(b, ROUND);
+    (t - ROUND, (t.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32))
+}
+
+/// 2^n for -126 <= n <= 127, made from its bits.
+#[inline(always)]
+fn power_of_two(n: i32) -> f32 {
+    f32::from_bits((n.wrapping_add(127) as u32) << 23)
+}
+
+/// `x` limited to `lo..=hi`, but NaN stays NaN (`f32::max` would drop it). Two instructions.
+#[inline(always)]
+fn clamp(x: f32, lo: f32, hi: f32) -> f32 {
+    let x = if x < lo { lo } else { x };
+    if x > hi { hi } else { x }
+}
+
+/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`: Horner's rule for the even and for the odd powers, side by side,
+/// because a single chain would be waited for.
+#[inline(always)]
+fn polynomial<const N: usize>(x: f32, c: [f32; N]) -> f32 {
+    let x2 = x * x;
+    let (mut last, mut other) = (c[N - 1], c[N - 2]);
+    for i in (0..N - 2).rev() {
+        (last, other) = (other, last.mul_add(x2, c[i]));
+    }
+    last.mul_add(x, other)
+}

@@ -1,0 +1,112 @@
+//! Logarithms, and softplus.
+//!
+//! All write the argument as `2^k m` with m between sqrt(1/2) and sqrt(2), and share one rational function for
+//! `ln(1 + f)`, `f = m - 1`.
+
+use super::{exp, polynomial};
+use std::f64::consts::{FRAC_1_SQRT_2, LN_2, LOG2_E, SQRT_2};
+
+/// ln 2 in two parts. The first has 42 significant bits: times an integer below 2^11 it is exact.
+const LN_2_HIGH: f64 = 0.693_147_180_559_890_3;
+const LN_2_LOW: f64 = 5.497_923_018_708_371e-14;
+
+/// log2(e) - LOG2_E.
+const LOG2_E_LOW: f64 = 2.035_527_374_093_103_3e-17;
+
+/// `ln((1 + s) / (1 - s)) = 2 s + s z R(z)`, `z = s^2`, for |s| <= (sqrt(2) - 1) / (sqrt(2) + 1), relative error 2^-59.
+const R: [f64; 7] = [
+    0.666_666_666_666_673_4,
+    0.399_999_999_994_169_85,
+    0.285_714_287_419_182_26,
+    0.222_221_986_178_973_15,
+    0.181_835_621_513_325_25,
+    0.153_141_028_950_237_98,
+    0.147_954_552_965_288_7,
+];
+
+/// Splits a positive normal number into `(m, k)` with `x = 2^k m`.
+#[inline(always)]
+fn split(x: f64) -> (f64, i32) {
+    // Relative to sqrt(1/2), the exponent field is k and the rest is what m has beyond sqrt(1/2).
+    let origin = FRAC_1_SQRT_2.to_bits();
+    let bits = x.to_bits().wrapping_sub(origin);
+    (f64::from_bits((bits & 0x000f_ffff_ffff_ffff).wrapping_add(origin)), (bits >> 32) as i32 >> 20)
+}
+
+/// Splits any positive number into `(m, k)`; subnormals are scaled into the normal range first.
+#[inline(always)]
+fn split_any(x: f64) -> (f64, i32) {
+    let tiny = x < f64::MIN_POSITIVE;
+    let (m, k) = split(if tiny { x * 4_503_599_627_370_496.0 } else { x });
+    (m, if tiny { k.wrapping_sub(52) } else { k })
+}
+
+/// `ln(1 + f) - f` for sqrt(1/2) <= 1 + f <= sqrt(2).
+///
+/// With `s = f / (2 + f)`, 1 + f is (1 + s) / (1 - s), and `2 s = f - s f`, `s f = f^2/2 - s f^2/2` take the quotient's
+/// rounding error out of the leading terms.
+#[inline(always)]
+fn ln1p_tail(f: f64) -> f64 {
+    let s = f / (2.0 + f);
+    let z = s * s;
+    let half = 0.5 * f * f;
+    s.mul_add(z.mul_add(polynomial(z, R), half), -half)
+}
+
+/// Puts in the results outside of 0 < x < infinity, where y, the logarithm of x, is meaningless.
+#[inline(always)]
+fn specials(x: f64, y: f64) -> f64 {
+    let y = if x < f64::INFINITY { y } else { x };
+    let outside = if x == 0.0 { f64::NEG_INFINITY } else { f64::NAN };
+    if x > 0.0 { y } else { outside }
+}
+
+/// The natural logarithm, within 1 ULP; negative infinity at 0, NaN below.
+#[inline(always)]
+pub fn ln(x: f64) -> f64 {
+    let (m, k) = split_any(x);
+    let k = f64::from(k);
+    let f = m - 1.0; // exact
+    let y = k.mul_add(LN_2_HIGH, k.mul_add(LN_2_LOW, ln1p_tail(f)) + f);
+    specials(x, y)
+}
+
+/// The logarithm to base 2, within 2 ULP and exact for powers of two; negative infinity at 0, NaN below.
+#[inline(always)]
+pub fn log2(x: f64) -> f64 {
+    let (m, k) = split_any(x);
+    let f = m - 1.0;
+    let tail = ln1p_tail(f).mul_add(LOG2_E, f * LOG2_E_LOW);
+    specials(x, f64::from(k) + f.mul_add(LOG2_E, tail))
+}
+
+/// `ln(1 + x)` without cancellation near 0, within 2 ULP; negative infinity at -1, NaN below.
+///
+/// `1 + x` is rounded to u and `c = (1 + x) - u` is what the rounding lost; both are reduced by the same power of two.
+#[inline(always)]
+pub fn ln1p(x: f64) -> f64 {
+    let u = 1.0 + x;
+    let back = u - 1.0;
+    let c = (1.0 - (u - back)) + (x - back); // exact
+    let (m, k) = split(u);
+    // 2^-k by its bits; from k = 1023 on that is 0, and c does not matter any more since x is an integer by far.
+    let shrink = f64::from_bits((1023_i32.wrapping_sub(k).max(0) as u64) << 52);
+    let k = f64::from(k);
+    let f = c.mul_add(shrink, m - 1.0);
+    let y = k.mul_add(LN_2_HIGH, k.mul_add(LN_2_LOW, ln1p_tail(f)) + f);
+    specials(u, y).copysign(x)
+}
+
+/// `ln(1 + e^x)`, within 2 ULP.
+///
+/// Computed as `max(x, 0) + ln(1 + e^-|x|)`: no overflow above, and `e^x` to all its digits far below 0.
+#[inline(always)]
+pub fn softplus(x: f64) -> f64 {
+    let e = exp(-x.abs());
+    // ln(1 + e) for e in [0, 1]: above sqrt(2), 1 + e is halved. The choice is arithmetic, because LLVM would make two
+    // copies of the polynomial out of an `if`.
+    let k = f64::from(u8::from(e > SQRT_2 - 1.0));
+    let f = (e - k) * k.mul_add(-0.5, 1.0);
+    let y = k.mul_add(LN_2, ln1p_tail(f) + f);
+    y + if x > 0.0 { x } else { 0.0 }
+}

@@ -1,0 +1,118 @@
+//! Accuracy of the f32 functions of `vmath`, against f64 references.
+
+use std::f64::consts::PI;
+
+use raygrad_tensor::{simd, vmath::f32 as vm};
+use rayon::prelude::*;
+
+/// A name, the function applied to a slice, an f64 reference, and the bound in ULP.
+type Case = (&'static str, fn(&[f32], &mut [f32]), fn(f64) -> f64, f64);
+
+macro_rules! case {
+    ($f:ident, $reference:expr, $bound:expr) => {
+        (
+            stringify!($f),
+            |x, y| {
+                simd::dispatch(
+                    #[inline(always)]
+                    || {
+                        for (y, &x) in y.iter_mut().zip(x) {
+                            *y = vm::$f(x);
+                        }
+                    },
+                )
+            },
+            $reference,
+            $bound,
+        )
+    };
+}
+
+const CASES: [Case; 14] = [
+    case!(exp, f64::exp, 1.0),
+    case!(exp2, f64::exp2, 1.0),
+    case!(expm1, f64::exp_m1, 2.0),
+    case!(ln, f64::ln, 1.0),
+    case!(ln1p, f64::ln_1p, 2.0),
+    case!(log2, f64::log2, 2.0),
+    case!(sin, f64::sin, 2.0),
+    case!(cos, f64::cos, 2.0),
+    case!(sin_pi, sin_pi, 2.0),
+    case!(cos_pi, |x| sin_pi(x.abs() % 2.0 + 0.5), 2.0),
+    case!(tanh, f64::tanh, 2.0),
+    case!(sigmoid, |x| 1.0 / (1.0 + (-x).exp()), 2.0),
+    case!(softplus, |x| x.max(0.0) + (-x.abs()).exp().ln_1p(), 2.0),
+    case!(erf, libm::erf, 2.0),
+];
+
+/// sin(pi x) for an x that came from f32 (plus one half): the reduction to |r| <= 1/4 is exact in f64.
+fn sin_pi(x: f64) -> f64 {
+    let y = x - 2.0 * (x / 2.0).round();
+    let n = (2.0 * y).round();
+    let r = PI * (y - n / 2.0);
+    match n as i32 & 3 {
+        0 => r.sin(),
+        1 => r.cos(),
+        2 => -r.sin(),
+        _ => -r.cos(),
+    }
+}
+
+/// |got - reference| in units of the spacing of f32 numbers at the reference.
+fn ulp_error(got: f32, reference: f64) -> f64 {
+    if got.is_nan() || reference.is_nan() {
+        return if got.is_nan() && reference.is_nan() { 0.0 } else { f64::INFINITY };
+    }
+    if got == reference as f32 && got.is_infinite() {
+        return 0.0;
+    }
+    // Infinity stands where the next number after the largest would be.
+    let got = if got.is_infinite() { 2.0_f64.powi(128).copysign(got.into()) } else { got.into() };
+    let exponent = ((reference.to_bits() >> 52) & 0x7ff) as i32 - 1023;
+    let ulp = f64::from_bits(((exponent.clamp(-126, 127) - 23 + 1023) as u64) << 52);
+    (got - reference).abs() / ulp
+}
+
+/// The largest error over every `step`-th bit pattern, with its argument.
+fn worst((_, f, reference, _): Case, step: u64) -> (f64, f32) {
+    const CHUNK: u64 = 1 << 12;
+    let count = (1_u64 << 32).div_ceil(step);
+    (0..count.div_ceil(CHUNK))
+        .into_par_iter()
+        .map(|chunk| {
+            let patterns = (chunk * CHUNK)..((chunk + 1) * CHUNK).min(count);
+            let x: Vec<f32> = patterns.map(|i| f32::from_bits((i * step) as u32)).collect();
+            let mut y = vec![0.0; x.len()];
+            f(&x, &mut y);
+            let errors = x.iter().zip(&y).map(|(&x, &y)| (ulp_error(y, reference(x.into())), x));
+            errors.fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
+        })
+        .reduce(|| (0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
+}
+
+/// Prints a line a function and asserts all bounds.
+fn check(step: u64) {
+    println!("{:<9} {:>8}  at", "function", "max ULP");
+    let failed: Vec<_> = CASES
+        .into_iter()
+        .filter(|&case| {
+            let (error, at) = worst(case, step);
+            println!("{:<9} {error:>8.4}  {at:e} = {:#010x}", case.0, at.to_bits());
+            error > case.3
+        })
+        .map(|case| case.0)
+        .collect();
+    assert!(failed.is_empty(), "beyond their bounds: {failed:?}");
+}
+
+#[test]
+fn every_997th_argument() {
+    check(997);
+}
+
+#[test]
+#[ignore = "2^32 inputs a function: minutes; \
+            run with cargo test --release -p raygrad-tensor --test ulp -- --ignored --nocapture"]
+fn every_argument() {
+    check(1);
+}
