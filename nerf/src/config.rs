@@ -87,9 +87,9 @@ impl Config {
                 fine: ClassicConfig { depth: 4, width: 128, skips: vec![], view_width: 64, ..paper },
                 coarse_samples: 48,
                 fine_samples: 32,
-                batch: 512,
+                batch: 256,
                 tile: 16,
-                schedule: Schedule::Exponential { from: 2e-3, to: 1e-4, warmup: 0.005 },
+                schedule: Schedule::Exponential { from: 4e-3, to: 1e-4, warmup: 0.005 },
                 ..classic
             },
         }

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{Dataset, Frame, Split};
+use super::{Dataset, Frame, Split, evenly_spaced};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::image::Image;
@@ -29,8 +29,8 @@ pub(super) fn transforms_file(folder: &Path, split: Split) -> PathBuf {
     folder.join(format!("transforms_{split}.json"))
 }
 
-/// As [`super::load`], for a folder in this format.
-pub(super) fn load(folder: &Path, split: Split, downscale: usize) -> Result<Dataset> {
+/// As [`super::load_views`], for a folder in this format.
+pub(super) fn load(folder: &Path, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
     let file = transforms_file(folder, split);
     let transforms = Transforms::read(&file)?;
     let (mut present, mut skipped) = (Vec::new(), Vec::new());
@@ -44,6 +44,7 @@ pub(super) fn load(folder: &Path, split: Split, downscale: usize) -> Result<Data
         let what = format!("none of the images exists, not even that of the first, `{}`", skipped[0]);
         return Err(Error::field(&file, "frames", what));
     }
+    let present = evenly_spaced(present, views);
     let [width, height] = common_size(&file, &present)?;
     if !width.is_multiple_of(downscale) || !height.is_multiple_of(downscale) {
         let what = format!("{downscale} does not divide the image size {width}x{height}");

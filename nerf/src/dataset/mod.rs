@@ -105,7 +105,18 @@ impl Dataset {
 /// width and the height. Every error names the file and the field. A single absent image is no error: see
 /// [`Dataset::skipped`].
 pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<Dataset> {
+    load_views(folder, split, downscale, usize::MAX)
+}
+
+/// As [`load`], but reads only `views` [evenly spaced](evenly_spaced) photographs of those that exist.
+///
+/// # Errors
+/// As [`load`], where photographs that are not read cannot be at fault; if `views` is 0.
+pub fn load_views(folder: impl AsRef<Path>, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
     let folder = folder.as_ref();
+    if views == 0 {
+        return Err(Error::setting("views", "must be 1 or more, is 0"));
+    }
     if downscale == 0 {
         return Err(Error::setting("downscale", "must be 1 or more, is 0"));
     }
@@ -114,7 +125,7 @@ pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<
         return Err(Error::file(folder, what));
     }
     if Split::ALL.into_iter().any(|split| blender::transforms_file(folder, split).is_file()) {
-        return blender::load(folder, split, downscale);
+        return blender::load(folder, split, downscale, views);
     }
     let what = match folder.join("transforms.json").is_file() {
         true => {
@@ -125,9 +136,28 @@ pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<
     Err(Error::file(folder, what))
 }
 
+/// At most `count` of the items, in order and evenly spaced from the first: of `n` items those numbered `i n / count`,
+/// rounded down.
+pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
+    let (n, count) = (items.len(), count.min(items.len()));
+    let mut wanted = (0..count).map(|i| i * n / count).peekable();
+    items.into_iter().enumerate().filter(|(i, _)| wanted.next_if_eq(i).is_some()).map(|(_, item)| item).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn evenly_spaced_items_start_with_the_first() {
+        let of_ten = |count| evenly_spaced((0..10).collect(), count);
+        assert_eq!(of_ten(3), [0, 3, 6]);
+        assert_eq!(of_ten(5), [0, 2, 4, 6, 8]);
+        assert_eq!(of_ten(1), [0]);
+        assert!(of_ten(0).is_empty());
+        assert_eq!(of_ten(11), of_ten(10));
+        assert_eq!(of_ten(10).len(), 10);
+    }
 
     #[test]
     fn split_names_round_trip() {
