@@ -20,7 +20,7 @@ pub use dual::Dual;
 pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};
 pub use layers::{Init, Linear, Mlp};
-pub use op::{Grads, Op, Reads, Vjp};
+pub use op::{Gradient, Grads, Op, Reads, SparseGrad, Vjp};
 pub use ops::{Activation, Segments};
 pub use optim::{Adam, AdamConfig, Schedule};
 pub use params::{Bound, ParamId, Params, ParamsError};

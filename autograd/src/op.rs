@@ -3,6 +3,8 @@
 use crate::{ShapeError, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
+use std::any::Any;
+use std::sync::Arc;
 
 /// An operation of one output. A user's own operation implements this too, and runs with [`Tape::apply`].
 ///
@@ -211,16 +213,59 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
 }
 
 /// The gradients of an operation's inputs, in their order.
-pub struct Grads<'t, T: Scalar>(pub(crate) SmallVec<[Option<Var<'t, T>>; 3]>);
+pub struct Grads<'t, T: Scalar>(pub(crate) SmallVec<[Option<Given<'t, T>>; 3]>);
+
+/// One gradient that an operation gives.
+#[derive(Clone)]
+pub(crate) enum Given<'t, T: Scalar> {
+    Dense(Var<'t, T>),
+    Sparse(Arc<dyn SparseGrad<T>>),
+}
 
 impl<'t, T: Scalar> Grads<'t, T> {
     /// The gradient of a single input.
     pub fn one(grad: Var<'t, T>) -> Self {
-        Grads(smallvec::smallvec![Some(grad)])
+        Grads(smallvec::smallvec![Some(Given::Dense(grad))])
     }
 
     /// The gradients of several inputs; `None` where it is zero or nobody needs it.
     pub fn new(grads: impl IntoIterator<Item = Option<Var<'t, T>>>) -> Self {
-        Grads(grads.into_iter().collect())
+        Grads(grads.into_iter().map(|grad| grad.map(Given::Dense)).collect())
+    }
+
+    /// The same with a sparse gradient for input `i`. Only where the pass is not recorded: a sparse gradient cannot be
+    /// differentiated.
+    ///
+    /// # Panics
+    /// If there is no input `i`.
+    #[track_caller]
+    pub fn with_sparse(mut self, i: usize, grad: Arc<dyn SparseGrad<T>>) -> Self {
+        self.0[i] = Some(Given::Sparse(grad));
+        self
+    }
+}
+
+/// The gradient of a table of which few rows were used (an embedding, a hash grid), in whatever form the operation finds
+/// cheap. It stays sparse up to [`Var::grad_sparse`](crate::Var::grad_sparse); all other gradients add it up.
+pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
+    /// The shape of the table.
+    fn shape(&self) -> &[usize];
+    /// Adds it to a dense gradient of that shape.
+    fn add_to(&self, dense: &mut Tensor<T>);
+}
+
+/// A gradient as [`Var::grad_sparse`](crate::Var::grad_sparse) gives it.
+pub enum Gradient<T: Scalar> {
+    /// One number for each element.
+    Dense(Tensor<T>),
+    /// Several sparse gradients whose sum it is, in the order of the backward sweep.
+    Sparse(Vec<Arc<dyn SparseGrad<T>>>),
+}
+
+impl<T: Scalar> Gradient<T> {
+    /// The parts of a sparse gradient that are of type `G`; none of a dense one.
+    pub fn parts<G: SparseGrad<T>>(self) -> Vec<Arc<G>> {
+        let Gradient::Sparse(parts) = self else { return vec![] };
+        parts.into_iter().filter_map(|part| (part as Arc<dyn Any + Send + Sync>).downcast().ok()).collect()
     }
 }

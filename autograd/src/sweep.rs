@@ -1,10 +1,12 @@
 //! The backward sweep: from the root down the tape, visiting only what leads to the wanted gradients.
 
 use crate::tape::find_non_finite;
+use crate::op::{Given, Gradient, SparseGrad};
 use crate::{Error, Grads, Op, Tape, Var, Vjp};
 use raygrad_tensor::{Scalar, Tensor, add_assign};
 use smallvec::SmallVec;
 use std::panic::Location;
+use std::sync::Arc;
 
 /// What a sweep leaves behind.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -34,7 +36,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If this tensor has not exactly one element, the graph was freed, or the NaN finder is on and finds something.
     #[track_caller]
     pub fn try_grad(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
-        Ok(values(sweep(self, self.seed()?, wrt, Keep::Graph)?))
+        Ok(values(self.tape, sweep(self, self.seed()?, wrt, Keep::Graph)?))
     }
 
     /// As [`grad`](Self::grad), but frees the saved values as the sweep passes, so that their buffers serve again at
@@ -53,7 +55,21 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`try_grad`](Self::try_grad).
     #[track_caller]
     pub fn try_grad_once(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
-        Ok(values(sweep(self, self.seed()?, wrt, Keep::Nothing)?))
+        Ok(values(self.tape, sweep(self, self.seed()?, wrt, Keep::Nothing)?))
+    }
+
+    /// As [`grad_once`](Self::grad_once), but leaves the gradients of tables sparse where an operation gives them so.
+    ///
+    /// # Panics
+    /// As [`grad`](Self::grad).
+    #[track_caller]
+    pub fn grad_sparse(&self, wrt: &[&Var<'t, T>]) -> Vec<Gradient<T>> {
+        let sums = or_panic(self.seed().and_then(|seed| sweep(self, seed, wrt, Keep::Nothing)));
+        let gradient = |sum| match sum {
+            Sum::Dense(grad) => Gradient::Dense(grad.value),
+            Sum::Sparse(parts) => Gradient::Sparse(parts),
+        };
+        sums.into_iter().map(gradient).collect()
     }
 
     /// The gradients as variables on the graph: they can be differentiated again.
@@ -74,7 +90,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`grad`](Self::grad).
     #[track_caller]
     pub fn grad_graph(&self, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
-        or_panic(self.seed().and_then(|seed| sweep(self, seed, wrt, Keep::GraphAndGradients)))
+        let sums = or_panic(self.seed().and_then(|seed| sweep(self, seed, wrt, Keep::GraphAndGradients)));
+        sums.into_iter().map(|sum| sum.dense(self.tape)).collect()
     }
 
     /// The vector-Jacobian product: the gradients of `sum(self * seed)` with respect to `wrt`, recorded on the graph.
@@ -84,7 +101,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn vjp(&self, seed: &Var<'t, T>, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         assert_eq!(seed.shape(), self.shape(), "the seed of a vector-Jacobian product has the shape of the output");
-        or_panic(sweep(self, seed.clone(), wrt, Keep::GraphAndGradients))
+        let sums = or_panic(sweep(self, seed.clone(), wrt, Keep::GraphAndGradients));
+        sums.into_iter().map(|sum| sum.dense(self.tape)).collect()
     }
 
     #[track_caller]
@@ -104,8 +122,54 @@ fn or_panic<R>(result: Result<R, Error>) -> R {
     }
 }
 
-fn values<T: Scalar>(grads: Vec<Var<'_, T>>) -> Vec<Tensor<T>> {
-    grads.into_iter().map(|grad| grad.value).collect()
+fn values<T: Scalar>(tape: &Tape<T>, sums: Vec<Sum<'_, T>>) -> Vec<Tensor<T>> {
+    sums.into_iter().map(|sum| sum.dense(tape).value).collect()
+}
+
+/// What has arrived at a node so far.
+#[derive(Clone)]
+enum Sum<'t, T: Scalar> {
+    Dense(Var<'t, T>),
+    Sparse(Vec<Arc<dyn SparseGrad<T>>>),
+}
+
+impl<'t, T: Scalar> Sum<'t, T> {
+    fn new(given: Given<'t, T>) -> Self {
+        match given {
+            Given::Dense(grad) => Sum::Dense(grad),
+            Given::Sparse(part) => Sum::Sparse(vec![part]),
+        }
+    }
+
+    fn dense(self, tape: &'t Tape<T>) -> Var<'t, T> {
+        match self {
+            Sum::Dense(grad) => grad,
+            Sum::Sparse(parts) => {
+                let mut sum = tape.pool().full(parts[0].shape(), T::ZERO);
+                parts.iter().for_each(|part| part.add_to(&mut sum));
+                tape.constant(sum)
+            }
+        }
+    }
+
+    fn add(self, given: Given<'t, T>, tape: &'t Tape<T>) -> Self {
+        match (self, given) {
+            (Sum::Dense(sum), Given::Dense(grad)) if tape.is_recording() => Sum::Dense(sum + grad),
+            (Sum::Dense(mut sum), Given::Dense(grad)) => {
+                add_assign(sum.value.as_mut_slice(), grad.value.as_slice());
+                Sum::Dense(sum)
+            }
+            (Sum::Dense(mut sum), Given::Sparse(part)) => {
+                part.add_to(&mut sum.value);
+                Sum::Dense(sum)
+            }
+            (Sum::Sparse(mut parts), Given::Sparse(part)) => {
+                parts.push(part);
+                Sum::Sparse(parts)
+            }
+            (sparse, dense) => Sum::Dense(sparse.dense(tape)).add(dense, tape),
+        }
+    }
 }
 
 #[track_caller]
@@ -114,20 +178,20 @@ fn sweep<'t, T: Scalar>(
     seed: Var<'t, T>,
     wrt: &[&Var<'t, T>],
     keep: Keep,
-) -> Result<Vec<Var<'t, T>>, Error> {
+) -> Result<Vec<Sum<'t, T>>, Error> {
     let (tape, at) = (root.tape, Location::caller());
     for x in wrt {
         assert!(std::ptr::eq(x.tape, tape), "a gradient with respect to a variable of another tape");
     }
-    let zeros = |x: &Var<'t, T>| tape.constant(tape.pool().full(x.shape(), T::ZERO));
+    let zeros = |x: &Var<'t, T>| Sum::Dense(tape.constant(tape.pool().full(x.shape(), T::ZERO)));
     let lowest = wrt.iter().filter_map(|x| x.node).min();
     let (Some(top), Some(bottom)) = (root.node, lowest) else { return Ok(wrt.iter().map(|&x| zeros(x)).collect()) };
     let needed = reach(tape, bottom, top, wrt);
     let record = keep == Keep::GraphAndGradients;
     // One slot for each node between the lowest variable and the root.
-    let mut grads: Vec<Option<Var<'t, T>>> = vec![None; needed.len()];
+    let mut grads: Vec<Option<Sum<'t, T>>> = vec![None; needed.len()];
     if top >= bottom && needed[(top - bottom) as usize] {
-        grads[(top - bottom) as usize] = Some(seed);
+        grads[(top - bottom) as usize] = Some(Sum::Dense(seed));
     }
     tape.with_recording(record, || {
         for index in (bottom..=top).rev() {
@@ -143,6 +207,7 @@ fn sweep<'t, T: Scalar>(
             let wanted = wrt.iter().any(|x| x.node == Some(index));
             let g = if wanted { grads[slot].clone() } else { grads[slot].take() };
             let (Some(op), Some(g)) = (&node.op, g) else { continue };
+            let g = g.dense(tape);
             let needs: SmallVec<[bool; 4]> =
                 node.inputs.iter().map(|&(input, _)| leads(input, bottom, &needed)).collect();
             let cx =
@@ -154,11 +219,17 @@ fn sweep<'t, T: Scalar>(
                 if !needs[i] {
                     continue;
                 }
-                debug_assert_eq!(grad.shape(), node.inputs[i].1.shape(), "gradient of input {i} of {}", op.name());
-                if tape.checks_finite() {
-                    find_non_finite(op.name(), &format!("the gradient of input {i}"), &grad.value, node.at)?;
+                if let Given::Dense(grad) = &grad {
+                    debug_assert_eq!(grad.shape(), node.inputs[i].1.shape(), "gradient of input {i} of {}", op.name());
+                    if tape.checks_finite() {
+                        find_non_finite(op.name(), &format!("the gradient of input {i}"), &grad.value, node.at)?;
+                    }
                 }
-                accumulate(&mut grads[(input - bottom) as usize], grad, record);
+                let slot = &mut grads[(input - bottom) as usize];
+                *slot = Some(match slot.take() {
+                    Some(sum) => sum.add(grad, tape),
+                    None => Sum::new(grad),
+                });
             }
         }
         Ok(())
@@ -204,20 +275,10 @@ fn differentiate<'t, T: Scalar>(op: &dyn Op<T>, cx: &Vjp<'t, '_, T>) -> Result<G
         let inputs: Vec<_> = (0..cx.len()).map(|i| cx.x(i).alias()).collect();
         if let Some(y) = op.reference(&inputs) {
             let wanted: Vec<_> = inputs.iter().zip(cx.needs).filter(|(_, needed)| **needed).map(|(x, _)| x).collect();
-            let mut given = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients)?.into_iter();
+            let sums = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients)?;
+            let mut given = sums.into_iter().map(|sum| sum.dense(cx.tape));
             return Ok(Grads::new(cx.needs.iter().map(|&needed| if needed { given.next() } else { None })));
         }
     }
     Ok(op.vjp(cx))
-}
-
-fn accumulate<'t, T: Scalar>(slot: &mut Option<Var<'t, T>>, grad: Var<'t, T>, record: bool) {
-    *slot = Some(match slot.take() {
-        None => grad,
-        Some(sum) if record => sum + grad,
-        Some(mut sum) => {
-            add_assign(sum.value.as_mut_slice(), grad.value.as_slice());
-            sum
-        }
-    });
 }

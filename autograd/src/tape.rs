@@ -151,22 +151,51 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     pub fn try_apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Result<Var<'t, T>, Error> {
         let at = Location::caller();
-        for x in inputs {
-            assert!(std::ptr::eq(x.tape, self), "{}: an input belongs to another tape", op.name());
-        }
-        let shapes: SmallVec<[&[usize]; 4]> = inputs.iter().map(|x| x.shape()).collect();
-        let shape = op.shape(&shapes).map_err(|what| Error::Shape {
-            op: op.name(),
-            shapes: shapes.iter().map(|shape| Shape::from_slice(shape)).collect(),
-            what,
-            at,
-        })?;
+        let shape = self.check_shapes(&op, inputs, at)?;
         let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
         let value = op.forward(&values, &self.pool);
         debug_assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
         if self.checks_finite() {
             find_non_finite(op.name(), "output", &value, at)?;
         }
+        Ok(self.record(op, inputs, value, at))
+    }
+
+    /// Records an operation whose output is known already, from an earlier unrecorded run on the same inputs.
+    ///
+    /// # Panics
+    /// If the shapes do not fit, or `value` has not the shape of the output.
+    #[track_caller]
+    pub fn apply_known<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>], value: Tensor<T>) -> Var<'t, T> {
+        let at = Location::caller();
+        match self.check_shapes(&op, inputs, at) {
+            Ok(shape) => assert_eq!(value.shape(), shape.as_slice(), "{}: a known output of another shape", op.name()),
+            Err(error) => panic!("{error}"),
+        }
+        self.record(op, inputs, value, at)
+    }
+
+    /// The shape of the output.
+    fn check_shapes(&self, op: &impl Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Shape, Error> {
+        for x in inputs {
+            assert!(std::ptr::eq(x.tape, self), "{}: an input belongs to another tape", op.name());
+        }
+        let shapes: SmallVec<[&[usize]; 4]> = inputs.iter().map(|x| x.shape()).collect();
+        op.shape(&shapes).map_err(|what| Error::Shape {
+            op: op.name(),
+            shapes: shapes.iter().map(|shape| Shape::from_slice(shape)).collect(),
+            what,
+            at,
+        })
+    }
+
+    fn record<'t>(
+        &'t self,
+        op: impl Op<T>,
+        inputs: &[&Var<'t, T>],
+        value: Tensor<T>,
+        at: &'static Location<'static>,
+    ) -> Var<'t, T> {
         let node = if self.recording.get() && inputs.iter().any(|x| x.node.is_some()) {
             let reads = op.reads();
             let kept = |(i, x): (usize, &&Var<'t, T>)| (x.node, Kept::new(&x.value, reads.input(i)));
@@ -176,7 +205,7 @@ impl<T: Scalar> Tape<T> {
         } else {
             None
         };
-        Ok(Var { tape: self, value, node })
+        Var { tape: self, value, node }
     }
 }
 

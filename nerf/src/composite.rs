@@ -1,26 +1,42 @@
 //! Volume rendering: what arrives at the eye from the samples along a ray.
 
 use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
-use raygrad_tensor::{lanes, map};
+use raygrad_tensor::map;
 
 /// Composites the features of packed samples, front to back (Mildenhall et al. 2020, equation 3; Max 1995).
 ///
-/// Inputs are the density `sigma [samples]`, at least 0, and `features [samples, channels]`: colour, depth or whatever
-/// else. The output is `[rays, channels + 1]`: the sum of `w_i features_i`, with
-/// `w_i = T_i alpha_i`, `alpha_i = 1 - exp(-sigma_i delta_i)`, `T_i = exp(-sum of sigma_j delta_j for j < i)`, and as last
-/// channel the transmittance that is left behind the last sample, which a background is multiplied by.
+/// Inputs are the density `[samples]`, at least 0 (or its logarithm, see [`of_log_density`](Self::of_log_density)), and
+/// `features [samples, channels]`: colour, depth or whatever else. The output is `[rays, channels + 1]`: the sum of
+/// `w_i features_i`, with `w_i = T_i alpha_i`, `alpha_i = 1 - exp(-x_i)`, `T_i = exp(-sum of x_j for j < i)` and the
+/// optical depth `x_i = sigma_i delta_i`; and as last channel the transmittance that is left behind the last sample,
+/// which a background is multiplied by.
 ///
 /// The gradient runs back to front, `B_i = alpha_i c_i + (1 - alpha_i) B_(i+1)` and
-/// `dL/dsigma_i = delta_i T_(i+1) g (c_i - B_(i+1))`: nothing is divided by a transmittance, so it is accurate behind
-/// opaque samples too. A density of 0 counts as no optical depth even if `delta` is infinite; there the density gradient is defined as 0.
+/// `dL/dx_i = T_(i+1) g (c_i - B_(i+1))`: nothing is divided by a transmittance, so it is accurate behind opaque samples
+/// too. A density of 0 counts as no optical depth even if `delta` is infinite; where `delta` is infinite the gradient of
+/// the density is defined as 0.
 #[derive(Debug, Clone)]
 pub struct Composite<T: Scalar> {
     delta: Tensor<T>,
     segments: Segments,
+    log_density: bool,
+}
+
+/// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
+const MOST_LOG_DENSITY: f64 = 80.0;
+
+/// What happens to light on its way, for each sample.
+struct Light<T: Scalar> {
+    /// Optical depth of the sample's interval.
+    depth: Tensor<T>,
+    /// Light that arrives at the sample.
+    transmittance: Tensor<T>,
+    /// Share of it that the sample blocks.
+    alpha: Tensor<T>,
 }
 
 impl<T: Scalar> Composite<T> {
-    /// For samples that stand for intervals of length `delta` `[samples]`.
+    /// For densities of samples that stand for intervals of length `delta` `[samples]`.
     ///
     /// # Panics
     /// If an interval is negative or NaN, or there is not one for each row of the segments.
@@ -28,55 +44,72 @@ impl<T: Scalar> Composite<T> {
     pub fn new(delta: Tensor<T>, segments: Segments) -> Self {
         assert_eq!(delta.shape(), [segments.rows()], "one interval for each sample");
         assert!(delta.as_slice().iter().all(|&delta| delta >= T::ZERO), "intervals are at least 0");
-        Composite { delta, segments }
+        Composite { delta, segments, log_density: false }
     }
 
-    /// Optical depth of each sample's interval.
-    #[inline(always)]
-    fn depth(sigma: T, delta: T) -> T {
-        // Not sigma * delta alone, which is NaN for 0 times infinity.
-        if sigma == T::ZERO { T::ZERO } else { sigma * delta }
+    /// The same for logarithms z of densities, `sigma = e^z`. The exponential is part of the operation, whose gradient
+    /// `x e^-x` stays finite and right where that of a separate exponential is infinity times 0.
+    #[track_caller]
+    pub fn of_log_density(delta: Tensor<T>, segments: Segments) -> Self {
+        Composite { log_density: true, ..Composite::new(delta, segments) }
     }
 
-    /// For each sample the transmittance in front of it and its alpha.
-    fn transmittance_and_alpha(&self, sigma: &Tensor<T>, pool: &Pool<T>) -> [Tensor<T>; 2] {
-        let mut transmittance = pool.tensor(sigma.shape());
-        let out = transmittance.as_mut_slice();
+    fn light(&self, density: &Tensor<T>, pool: &Pool<T>) -> Light<T> {
+        let most = T::from_f64(MOST_LOG_DENSITY);
+        let depth = if self.log_density {
+            map(
+                [density, &self.delta],
+                pool,
+                #[inline(always)]
+                |[z, delta]| (if z > most { most } else { z }).exp() * delta,
+            )
+        } else {
+            map(
+                [density, &self.delta],
+                pool,
+                #[inline(always)]
+                // Not the product alone, which is NaN for 0 times infinity.
+                |[sigma, delta]| if sigma == T::ZERO { T::ZERO } else { sigma * delta },
+            )
+        };
+        let mut before = pool.tensor(density.shape());
+        let out = before.as_mut_slice();
         for rows in self.segments.ranges() {
             let mut sum = 0.0;
             for i in rows {
                 out[i] = T::from_f64(sum);
-                sum += Self::depth(sigma.as_slice()[i], self.delta.as_slice()[i]).to_f64();
+                sum += depth.as_slice()[i].to_f64();
             }
         }
         let transmittance = map(
-            [&transmittance],
+            [&before],
             pool,
             #[inline(always)]
             |[tau]| (-tau).exp(),
         );
         let alpha = map(
-            [sigma, &self.delta],
+            [&depth],
             pool,
             #[inline(always)]
-            |[sigma, delta]| -(-Self::depth(sigma, delta)).expm1(),
+            |[depth]| -(-depth).expm1(),
         );
-        [transmittance, alpha]
+        Light { depth, transmittance, alpha }
     }
 
-    /// The weight `w_i` of each sample, `[samples]`, for a density `sigma [samples]`.
+    /// The transmittance `T_i` in front of each sample and its weight `w_i`, each `[samples]`.
     ///
     /// # Panics
     /// If there is not one density for each sample.
-    pub fn weights(&self, sigma: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
-        assert_eq!(sigma.shape(), self.delta.shape(), "one density for each sample");
-        let [transmittance, alpha] = self.transmittance_and_alpha(sigma, pool);
-        map(
+    pub fn transmittance_and_weights(&self, density: &Tensor<T>, pool: &Pool<T>) -> [Tensor<T>; 2] {
+        assert_eq!(density.shape(), self.delta.shape(), "one density for each sample");
+        let Light { transmittance, alpha, .. } = self.light(density, pool);
+        let weights = map(
             [&transmittance, &alpha],
             pool,
             #[inline(always)]
             |[t, a]| t * a,
-        )
+        );
+        [transmittance, weights]
     }
 }
 
@@ -88,7 +121,7 @@ impl<T: Scalar> Op<T> for Composite<T> {
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
         let samples = self.segments.rows();
         match (x[0], x[1]) {
-            (&[sigma], &[features, channels]) if sigma == samples && features == samples => {
+            (&[density], &[features, channels]) if density == samples && features == samples => {
                 Ok([self.segments.len(), channels + 1].into_iter().collect())
             }
             _ => Err(format!("densities must be [{samples}] and features [{samples}, channels]")),
@@ -98,24 +131,25 @@ impl<T: Scalar> Op<T> for Composite<T> {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let channels = x[1].shape()[1];
         let features = x[1].as_slice();
-        let [transmittance, alpha] = self.transmittance_and_alpha(x[0], pool);
-        let (transmittance, alpha) = (transmittance.as_slice(), alpha.as_slice());
+        let light = self.light(x[0], pool);
+        let (depth, transmittance, alpha) =
+            (light.depth.as_slice(), light.transmittance.as_slice(), light.alpha.as_slice());
         let mut out = pool.tensor(&[self.segments.len(), channels + 1]);
         let mut sums = vec![0.0_f64; channels];
         for (out, rows) in out.as_mut_slice().chunks_exact_mut(channels + 1).zip(self.segments.ranges()) {
             sums.fill(0.0);
-            let mut depth = 0.0;
+            let mut total = 0.0;
             for i in rows {
                 let weight = (transmittance[i] * alpha[i]).to_f64();
                 for (sum, feature) in sums.iter_mut().zip(&features[i * channels..]) {
                     *sum += weight * feature.to_f64();
                 }
-                depth += Self::depth(x[0].as_slice()[i], self.delta.as_slice()[i]).to_f64();
+                total += depth[i].to_f64();
             }
             for (out, &sum) in out.iter_mut().zip(&sums) {
                 *out = T::from_f64(sum);
             }
-            out[channels] = T::from_f64((-depth).exp());
+            out[channels] = T::from_f64((-total).exp());
         }
         out
     }
@@ -125,22 +159,22 @@ impl<T: Scalar> Op<T> for Composite<T> {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (sigma, features) = (cx.x(0).into_value(), cx.x(1).into_value());
+        let (density, features) = (cx.x(0).into_value(), cx.x(1).into_value());
         let channels = features.shape()[1];
         let pool = cx.pool();
-        let [transmittance, alpha] = self.transmittance_and_alpha(&sigma, pool);
-        let (transmittance, alpha, delta) = (transmittance.as_slice(), alpha.as_slice(), self.delta.as_slice());
+        let light = self.light(&density, pool);
+        let (depth, transmittance, alpha) =
+            (light.depth.as_slice(), light.transmittance.as_slice(), light.alpha.as_slice());
         // e^-x, not 1 - alpha, which has no digits behind an opaque sample.
-        let mut passed = pool.tensor(sigma.shape());
-        lanes(
-            [sigma.as_slice(), delta],
-            passed.as_mut_slice(),
+        let passed = map(
+            [&light.depth],
+            pool,
             #[inline(always)]
-            |[sigma, delta]| (-Self::depth(sigma, delta)).exp(),
+            |[depth]| (-depth).exp(),
         );
-        let passed = passed.as_slice();
-        let (mut d_sigma, mut d_features) = (pool.tensor(sigma.shape()), pool.tensor(features.shape()));
-        let (d_sigma_out, d_features_out) = (d_sigma.as_mut_slice(), d_features.as_mut_slice());
+        let (passed, delta) = (passed.as_slice(), self.delta.as_slice());
+        let (mut d_density, mut d_features) = (pool.tensor(density.shape()), pool.tensor(features.shape()));
+        let (d_density_out, d_features_out) = (d_density.as_mut_slice(), d_features.as_mut_slice());
         let mut behind = vec![T::ZERO; channels + 1];
         for (ray, rows) in self.segments.ranges().enumerate() {
             let g = &cx.g().value().as_slice()[ray * (channels + 1)..(ray + 1) * (channels + 1)];
@@ -157,11 +191,13 @@ impl<T: Scalar> Op<T> for Composite<T> {
                     behind[c] = alpha[i] * feature + passed[i] * behind[c];
                 }
                 behind[channels] *= passed[i];
-                let slope = delta[i] * (transmittance[i] * passed[i]) * difference;
-                d_sigma_out[i] = if delta[i].is_finite() { slope } else { T::ZERO };
+                // dx/dz = x for x = e^z delta, and dx/dsigma = delta.
+                let slope = if self.log_density { depth[i] } else { delta[i] };
+                let d_depth = transmittance[i] * passed[i] * difference;
+                d_density_out[i] = if slope.is_finite() { slope * d_depth } else { T::ZERO };
             }
         }
-        Grads::new([Some(cx.constant(d_sigma)), Some(cx.constant(d_features))])
+        Grads::new([Some(cx.constant(d_density)), Some(cx.constant(d_features))])
     }
 
     fn is_fused(&self) -> bool {
@@ -169,8 +205,9 @@ impl<T: Scalar> Op<T> for Composite<T> {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let (sigma, features) = (&x[0], &x[1]);
-        let depth = sigma * sigma.tape().constant(self.delta.clone());
+        let features = &x[1];
+        let sigma = if self.log_density { x[0].exp() } else { x[0].clone() };
+        let depth = &sigma * sigma.tape().constant(self.delta.clone());
         let transmittance = (-depth.segment_cumsum(&self.segments, true)).exp();
         let weights = transmittance * -(-&depth).expm1();
         let weighted = features * weights.reshape(&[self.segments.rows(), 1]);
@@ -190,6 +227,11 @@ pub(crate) fn entries() -> Vec<Entry> {
     vec![
         entry().sample_of(vec![sigma([0.4, 1.3, 2.0, 0.1, 3.0, 0.7, 0.2]), features(3)]),
         entry().sample_of(vec![sigma([30.0, 0.5, 9.0, 0.01, 20.0, 5.0, 40.0]), features(1)]),
+        Entry::of(
+            Composite::of_log_density(delta(), segments()),
+            Composite::of_log_density(delta().cast::<f32>(), segments()),
+        )
+        .sample_of(vec![sigma([0.4, -1.3, 2.0, -3.1, 1.0, 0.7, 0.2]), features(2)]),
         Entry::of(Composite::new(none().0, none().1), Composite::new(none().0.cast::<f32>(), none().1))
             .sample_of(vec![Tensor::zeros(&[0]), Tensor::zeros(&[0, 3])]),
     ]
@@ -213,6 +255,25 @@ mod tests {
     }
 
     #[test]
+    fn the_exponential_density_has_no_bad_gradient() {
+        // One sample of colour 1: C = 1 - e^-x, dC/dz = x e^-x with x = e^z delta.
+        for z in [-200.0, -20.0, 0.0, 15.0, 16.0, 88.0, 89.0, 200.0_f64] {
+            for delta in [1e-6_f32, 1e-3, 1.0] {
+                let tape = Tape::new();
+                let density = tape.leaf(Tensor::from_vec(&[1], vec![z as f32]));
+                let feature = tape.constant(Tensor::ones(&[1, 1]));
+                let op = Composite::of_log_density(Tensor::from_vec(&[1], vec![delta]), Segments::uniform(1, 1));
+                let color = tape.apply(op, &[&density, &feature]).slice(1, 0, 1).sum();
+                let x = z.exp() * f64::from(delta);
+                let (value, slope) = (f64::from(color.item()), f64::from(color.grad(&[&density])[0].item()));
+                let expected = if x > 700.0 { 0.0 } else { x * (-x).exp() };
+                assert!((value + (-x).exp_m1()).abs() <= 2e-7 * value.max(1e-30), "z {z}, delta {delta}: {value}");
+                assert!((slope - expected).abs() <= 1e-5 * expected + 1e-37, "z {z}, delta {delta}: {slope} {expected}");
+            }
+        }
+    }
+
+    #[test]
     fn constant_density_and_colour_give_the_exact_integral() {
         // numerics.md, section 2, without the background: c (1 - E) and E.
         let n = 64;
@@ -220,7 +281,7 @@ mod tests {
         let e = (-5.2_f64).exp();
         assert!((out[0] - 0.8 * (1.0 - e)).abs() < 1e-14);
         assert!((out[1] - e).abs() < 1e-15);
-        assert!((out[0] + out[1] - 0.801_103_312_884_184_1).abs() < 1e-14);
+        assert!((out[0] + out[1] - 0.801_103_312_884_152_1).abs() < 1e-14);
     }
 
     #[test]

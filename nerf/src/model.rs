@@ -116,7 +116,8 @@ impl<T: Scalar> Model<T> {
         jitter: &mut Jitter<'_>,
         pool: &Pool<T>,
     ) -> Samples<T> {
-        let weights = Composite::new(first.delta.clone(), first.segments.clone()).weights(sigma, pool);
+        let composite = Composite::new(first.delta.clone(), first.segments.clone());
+        let [_, weights] = composite.transmittance_and_weights(sigma, pool);
         let Config { fine_samples, uniform_share, .. } = self.config;
         importance(rays, first, weights.as_slice(), fine_samples, uniform_share, jitter, pool)
     }

@@ -4,7 +4,7 @@ use crate::Result;
 use crate::config::Config;
 use crate::field::Field;
 use crate::model::{Extent, Model};
-use crate::train::{StepStats, stream};
+use crate::train::stream;
 use rand::RngExt;
 use raygrad_autograd::{Bound, Scalar, Tape, Tensor, Var};
 
@@ -14,10 +14,10 @@ const PROBES: usize = 512;
 const ALIVE: f64 = 0.01;
 /// Seeds to try before the last one is taken as it is.
 const ATTEMPTS: u32 = 32;
-/// Steps after which opacity is judged, and until which it may end a run.
+/// Steps of a model after which its opacity is judged, and until which it may end a run.
 const JUDGED: std::ops::Range<u64> = 100..1000;
-/// Restarts of a run: a scene that is empty in truth must not restart for ever.
-const RESTARTS: u32 = 3;
+/// Collapses that end a run: a scene that is empty in truth must not restart for ever.
+const COLLAPSES: u32 = 3;
 
 /// The first of the models with seeds `seed`, `seed + 1`, .. whose fields have a gradient to learn from, and how many
 /// were passed over.
@@ -48,7 +48,8 @@ fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     moved as f64 / PROBES as f64
 }
 
-/// Whether a run in its first steps shows nothing at all: the collapse to an all-background image.
-pub(crate) fn has_collapsed(stats: &StepStats) -> bool {
-    JUDGED.contains(&stats.step) && stats.opacity < 1e-3 && stats.restarts < RESTARTS
+/// Whether a model in its first steps shows nothing at all: the collapse to an all-background image. `steps` is how many
+/// it has taken, and `collapses` how many models of the run have collapsed before it.
+pub(crate) fn has_collapsed(steps: u64, opacity: f64, collapses: u32) -> bool {
+    JUDGED.contains(&steps) && opacity < 1e-3 && collapses < COLLAPSES
 }

@@ -74,6 +74,8 @@ pub struct Trainer {
     slots: Vec<Slot>,
     elapsed: Duration,
     done: StepStats,
+    /// How many models of this run have collapsed.
+    collapses: u32,
 }
 
 /// One step's rays and what they should show.
@@ -121,7 +123,7 @@ impl Trainer {
             skipped: 0,
             restarts,
         };
-        Ok(Trainer { adam: Adam::new(config.adam), model, data, slots, elapsed: Duration::ZERO, done })
+        Ok(Trainer { adam: Adam::new(config.adam), model, data, slots, elapsed: Duration::ZERO, done, collapses: 0 })
     }
 
     /// What the last step did.
@@ -186,7 +188,7 @@ impl Trainer {
             skipped: self.done.skipped + skipped as u64,
             restarts: self.done.restarts,
         };
-        if startup::has_collapsed(&self.done) {
+        if startup::has_collapsed(self.adam.steps(), self.done.opacity, self.collapses) {
             self.restart();
         }
         self.done
@@ -195,6 +197,7 @@ impl Trainer {
     /// Begins again with other random parameters.
     fn restart(&mut self) {
         let config = self.model.config.clone();
+        self.collapses += 1;
         self.done.restarts += 1;
         let seed = config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
         if let Ok((model, _)) = startup::living_model(&config, self.model.extent, seed) {

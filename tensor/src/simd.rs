@@ -64,10 +64,22 @@ pub fn name() -> &'static str {
 
 fn arch() -> Arch {
     static ARCH: OnceLock<Arch> = OnceLock::new();
-    *ARCH.get_or_init(|| match std::env::var("RAYGRAD_SIMD") {
-        Err(_) => Arch::new(),
-        Ok(cap) => capped(&cap).unwrap_or_else(|| panic!("RAYGRAD_SIMD is {cap:?}: set it to scalar, v3 or v4")),
-    })
+    *ARCH.get_or_init(|| from_environment().unwrap_or_else(|message| panic!("{message}")))
+}
+
+/// Whether `RAYGRAD_SIMD` has a usable value: for a program that wants to say so itself before [`dispatch`] panics.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_environment() -> Result<(), String> {
+    from_environment().map(drop)
+}
+
+fn from_environment() -> Result<Arch, String> {
+    match std::env::var("RAYGRAD_SIMD") {
+        Err(_) => Ok(Arch::new()),
+        Ok(cap) => capped(&cap).ok_or_else(|| format!("RAYGRAD_SIMD is {cap:?}: set it to scalar, v3 or v4")),
+    }
 }
 
 /// The best instruction set up to `cap`; `None` if there is no cap of that name.
