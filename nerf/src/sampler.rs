@@ -13,7 +13,7 @@ pub enum Jitter<'a> {
 }
 
 impl Jitter<'_> {
-    fn draw(&mut self) -> f64 {
+    pub(crate) fn draw(&mut self) -> f64 {
         match self {
             Jitter::Middle => 0.5,
             Jitter::Random(rng) => rng.random::<f64>(),

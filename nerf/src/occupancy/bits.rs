@@ -1,0 +1,85 @@
+//! Sets of cells as words of bits: growing, coarsening, and the box around them.
+
+use super::lattice::{CELLS, EDGE, Lattice, cell};
+use glam::DVec3;
+
+/// For each axis how far apart the bits of neighbouring cells are.
+const STRIDES: [usize; 3] = [1, EDGE, EDGE * EDGE];
+/// For each axis the bits of the cells at the lower face of a block.
+const LOWER: [u64; 3] = [0x1111_1111_1111_1111, 0x000f_000f_000f_000f, 0x0000_0000_0000_ffff];
+
+/// Adds the cells that touch a set's cells by a face, an edge or a corner, within each cascade and from each cascade to
+/// the one around it.
+pub(super) fn dilate(words: &mut [u64], lattice: &Lattice) {
+    coarsen(words, lattice);
+    for cascade in 0..lattice.cascades {
+        let words = &mut words[lattice.cascade(cascade)];
+        for axis in 0..3 {
+            dilate_axis(words, lattice.side(), axis);
+        }
+    }
+}
+
+/// Adds each cell's two neighbours along an axis.
+fn dilate_axis(words: &mut [u64], side: usize, axis: usize) {
+    let (shift, far, lower) = (STRIDES[axis], (EDGE - 1) * STRIDES[axis], LOWER[axis]);
+    let upper = lower << far;
+    let stride = side.pow(axis as u32);
+    // Rows of blocks along the axis: each word needs its neighbours as they were.
+    for start in (0..words.len()).filter(|start| start / stride % side == 0) {
+        let mut before = 0;
+        for i in 0..side {
+            let word = words[start + i * stride];
+            let after = if i + 1 < side { words[start + (i + 1) * stride] } else { 0 };
+            let inner = (word & !upper) << shift | (word & !lower) >> shift;
+            words[start + i * stride] = word | inner | (before & upper) >> far | (after & lower) << far;
+            before = word;
+        }
+    }
+}
+
+/// Adds to the inner part of each cascade the cells in which a smaller cascade has any.
+///
+/// Nothing looks up a single cell there, but a block without any is then empty in all cascades.
+pub(super) fn coarsen(words: &mut [u64], lattice: &Lattice) {
+    let (side, quarter) = (lattice.side(), lattice.side() / 4);
+    for cascade in 1..lattice.cascades {
+        for word in lattice.cascade(cascade - 1) {
+            let fine = words[word];
+            if fine == 0 {
+                continue;
+            }
+            let (_, block) = lattice.place(word);
+            let coarse = block.map(|b| quarter + b / 2);
+            let target = lattice.cascade(cascade).start + coarse[0] + side * (coarse[1] + side * coarse[2]);
+            for bit in (0..CELLS).filter(|bit| fine >> bit & 1 == 1) {
+                let cell = cell(bit);
+                let bit: usize = (0..3).map(|a| STRIDES[a] * (block[a] % 2 * 2 + cell[a] / 2)).sum();
+                words[target] |= 1 << bit;
+            }
+        }
+    }
+}
+
+/// Number of cells that are looked at and set.
+pub(super) fn count(words: &[u64], lattice: &Lattice) -> usize {
+    let used = words.iter().enumerate().filter(|(i, _)| lattice.is_used(*i));
+    used.map(|(_, word)| word.count_ones() as usize).sum()
+}
+
+/// The box around the set cells in scene units; `None` if there are none.
+pub(super) fn bounds(words: &[u64], lattice: &Lattice) -> Option<[DVec3; 2]> {
+    let mut found: Option<[DVec3; 2]> = None;
+    for (i, &word) in words.iter().enumerate().filter(|(i, word)| **word != 0 && lattice.is_used(*i)) {
+        let [corner, size] = lattice.block(i);
+        let (mut low, mut high) = ([0.0; 3], [0.0; 3]);
+        for axis in 0..3 {
+            let layer = |k: usize| word & LOWER[axis] << (k * STRIDES[axis]) != 0;
+            low[axis] = (0..EDGE).find(|&k| layer(k)).unwrap_or(0) as f64;
+            high[axis] = (0..EDGE).rfind(|&k| layer(k)).map_or(EDGE, |k| k + 1) as f64;
+        }
+        let (low, high) = (corner + size * DVec3::from(low), corner + size * DVec3::from(high));
+        found = Some(found.map_or([low, high], |[l, h]| [l.min(low), h.max(high)]));
+    }
+    found
+}

@@ -1,0 +1,65 @@
+//! Grids as bytes, to be stored beside a model.
+
+use super::lattice::CELLS;
+use super::leaps::Leaps;
+use super::{OccupancyConfig, OccupancyGrid};
+use crate::{Error, Result};
+use glam::DVec3;
+
+/// What a stored grid begins with: a name and a version.
+const MAGIC: [u8; 8] = *b"raygocc1";
+/// Bytes before the words: magic, resolution and cascades (u32), lower and upper corner (f64).
+const HEADER: usize = 8 + 2 * 4 + 6 * 8;
+
+impl OccupancyGrid {
+    /// The whole grid: a header, one word for each block, one `f32` for each cell; little-endian. 8.6 MB at 128^3.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = Vec::with_capacity(HEADER + 8 * self.words.len() + 4 * self.densities.len());
+        bytes.extend(MAGIC);
+        for number in [self.resolution(), self.cascades()] {
+            bytes.extend((number as u32).to_le_bytes());
+        }
+        for number in self.bounds().map(|corner| corner.to_array()).as_flattened() {
+            bytes.extend(number.to_le_bytes());
+        }
+        self.words.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
+        self.densities.iter().for_each(|density| bytes.extend(density.to_le_bytes()));
+        bytes
+    }
+
+    /// The grid that [`to_bytes`](Self::to_bytes) wrote.
+    ///
+    /// # Errors
+    /// If the bytes are cut short, too long or no grid.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
+        let error = |what: String| Error::setting("occupancy grid", what);
+        if bytes.len() < HEADER || bytes[..MAGIC.len()] != MAGIC {
+            return Err(error("is not an occupancy grid of this version".into()));
+        }
+        let mut rest = &bytes[MAGIC.len()..];
+        let [resolution, cascades] = [0; 2].map(|_| u32::from_le_bytes(take(&mut rest)) as usize);
+        let corners = [[0; 3]; 2].map(|corner| DVec3::from(corner.map(|_| f64::from_le_bytes(take(&mut rest)))));
+        let config = OccupancyConfig { resolution, cascades, ..OccupancyConfig::default() };
+        // Before anything is allocated for it.
+        config.check()?;
+        let cells = resolution.pow(3) * cascades;
+        let needed = HEADER + cells / CELLS * 8 + cells * 4;
+        if bytes.len() != needed {
+            return Err(error(format!("has {} bytes where {needed} belong; write it again", bytes.len())));
+        }
+        let mut grid = OccupancyGrid::new(corners, &config)?;
+        grid.words.iter_mut().for_each(|word| *word = u64::from_le_bytes(take(&mut rest)));
+        grid.densities.iter_mut().for_each(|density| *density = f32::from_le_bytes(take(&mut rest)));
+        grid.leaps = Leaps::new(&grid.words, &grid.lattice);
+        Ok(grid)
+    }
+}
+
+/// Takes the first `N` bytes off a slice that holds as many.
+fn take<const N: usize>(bytes: &mut &[u8]) -> [u8; N] {
+    let mut out = [0; N];
+    let (head, rest) = bytes.split_at(N);
+    out.copy_from_slice(head);
+    *bytes = rest;
+    out
+}

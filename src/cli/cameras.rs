@@ -1,0 +1,129 @@
+//! Cameras for pictures: an orbit like the training cameras, and views at other sizes.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use glam::DVec3;
+use raygrad::nerf::dataset::Dataset;
+use raygrad::nerf::{Camera, Error, Extent, Result};
+use serde::{Deserialize, Serialize};
+
+/// The average training camera: what is needed to fly around a scene without its photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Viewpoint {
+    /// Width of the training images in pixels.
+    pub width: usize,
+    /// Their height.
+    pub height: usize,
+    /// Horizontal field of view in radians.
+    pub angle_x: f64,
+    /// Mean distance of the cameras from the centre of the scene's box, in scene units.
+    pub distance: f64,
+    /// Their mean angle above the horizon as seen from there, in radians.
+    pub elevation: f64,
+}
+
+/// At an elevation closer to the poles than this, in radians, there is no telling where up is.
+const FROM_POLE: f64 = 0.1;
+
+impl Viewpoint {
+    /// The average of a dataset's cameras; it has at least one.
+    pub fn of(data: &Dataset) -> Self {
+        let camera = &data.frames[0].camera;
+        let count = data.frames.len() as f64;
+        let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
+        let offsets = || data.frames.iter().map(|frame| frame.camera.pose.translation - centre);
+        let elevation = offsets().map(|offset| offset.z.atan2(offset.truncate().length())).sum::<f64>() / count;
+        Viewpoint {
+            width: camera.width,
+            height: camera.height,
+            angle_x: 2.0 * (0.5 * camera.width as f64 / camera.focal[0]).atan(),
+            distance: offsets().map(DVec3::length).sum::<f64>() / count,
+            elevation: elevation.clamp(FROM_POLE - FRAC_PI_2, FRAC_PI_2 - FROM_POLE),
+        }
+    }
+
+    /// Whether the numbers are usable.
+    pub fn check(&self) -> Result<()> {
+        let positive = |x: f64| x > 0.0 && x.is_finite();
+        let checks = [
+            ("viewpoint.width", self.width > 0),
+            ("viewpoint.height", self.height > 0),
+            ("viewpoint.angle_x", positive(self.angle_x) && self.angle_x < PI),
+            ("viewpoint.distance", positive(self.distance)),
+            ("viewpoint.elevation", self.elevation.abs() < FRAC_PI_2),
+        ];
+        match checks.iter().find(|(_, good)| !good) {
+            Some((name, _)) => Err(Error::setting(name, "is out of range")),
+            None => Ok(()),
+        }
+    }
+
+    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards.
+    pub fn orbit(&self, extent: &Extent, count: usize) -> Vec<Camera> {
+        let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        let camera = |i: usize| {
+            let (sin, cos) = (i as f64 / count as f64 * TAU).sin_cos();
+            let (height, radius) = self.elevation.sin_cos();
+            let eye = centre + self.distance * DVec3::new(radius * cos, radius * sin, height);
+            let pose = Camera::look_at(eye, centre, DVec3::Z);
+            Camera::from_angle(self.width, self.height, self.angle_x, pose)
+        };
+        (0..count).map(camera).collect()
+    }
+}
+
+/// The view of a camera at another image size: all that it sees stays in the picture, pixels keep their shape, and a
+/// side that is longer in proportion shows more.
+pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
+    let old = [camera.width as f64, camera.height as f64];
+    let new = [width as f64, height as f64];
+    let scale = (new[0] / old[0]).min(new[1] / old[1]);
+    let centre = |axis: usize| 0.5 * new[axis] + scale * (camera.centre[axis] - 0.5 * old[axis]);
+    Camera { width, height, focal: camera.focal.map(|f| f * scale), centre: [centre(0), centre(1)], pose: camera.pose }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::dataset::{Split, embedded};
+
+    fn viewpoint() -> (Viewpoint, Extent) {
+        let data = embedded(Split::Test, 8);
+        (Viewpoint::of(&data), Extent { bounds: data.bounds, span: [data.near, data.far] })
+    }
+
+    #[test]
+    fn an_orbit_keeps_distance_elevation_and_angle() {
+        let (view, extent) = viewpoint();
+        let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        for camera in view.orbit(&extent, 7) {
+            let offset = camera.pose.translation - centre;
+            assert!((offset.length() - view.distance).abs() < 1e-12);
+            assert!((offset.z - view.distance * view.elevation.sin()).abs() < 1e-12);
+            assert!(camera.ray(4.0, 4.0).at(view.distance).distance(centre) < 1e-12);
+        }
+        assert!((view.angle_x - raygrad::nerf::scene::ANGLE_X).abs() < 1e-12);
+        view.check().unwrap();
+    }
+
+    #[test]
+    fn a_fitted_view_keeps_what_was_seen() {
+        let (view, extent) = viewpoint();
+        let camera = &view.orbit(&extent, 1)[0];
+        assert_eq!(fitted(camera, [8, 8]), *camera);
+        let wide = fitted(camera, [32, 16]);
+        // The square in the middle of the wide picture is the old picture.
+        for (x, y) in [(0.0, 0.0), (8.0, 0.0), (3.0, 5.0)] {
+            let (old, new) = (camera.ray(x, y), wide.ray(8.0 + 2.0 * x, 2.0 * y));
+            assert!(old.direction.distance(new.direction) < 1e-12);
+        }
+    }
+
+    #[test]
+    fn nonsense_is_named() {
+        let (view, _) = viewpoint();
+        let message = Viewpoint { distance: -1.0, ..view }.check().unwrap_err().to_string();
+        assert_eq!(message, "`viewpoint.distance`: is out of range");
+    }
+}

@@ -1,0 +1,174 @@
+//! `raygrad eval`: how close a model comes to photographs.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
+use raygrad::nerf::metrics::{SSIM_WINDOW, psnr, ssim};
+use raygrad::nerf::{Background, Error, Image, Model, Picture, Result, colormap};
+use serde::Serialize;
+
+use super::output::{depth_colors, make_folder, print};
+use super::parse;
+use super::progress::Progress;
+use super::run::{Run, write_json};
+use super::scene::Scene;
+
+/// Views of which a picture is written.
+const PICTURES: usize = 10;
+
+/// Compare a model with photographs: PSNR and SSIM
+///
+/// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder that `raygrad train` made
+    run: PathBuf,
+    /// Folder of the photographs, if they are no longer where they were for training
+    #[arg(long)]
+    scene: Option<Scene>,
+    /// Photographs to compare with: train, val or test
+    #[arg(long, default_value = "test")]
+    split: Split,
+    /// Compare with this many evenly spaced photographs [default: all]
+    #[arg(long, value_name = "N", value_parser = parse::count(usize::MAX))]
+    views: Option<usize>,
+    /// Print what eval.json holds in place of a table
+    #[arg(long)]
+    json: bool,
+}
+
+/// The result: `eval.json`.
+#[derive(Serialize)]
+struct Report {
+    raygrad: &'static str,
+    scene: Scene,
+    split: Split,
+    /// Number of views.
+    views: usize,
+    width: usize,
+    height: usize,
+    downscale: usize,
+    /// What photographs with transparency are composited over.
+    background: Background,
+    /// Where in a pixel its ray passes: 0.5 is the centre.
+    pixel_offset: f64,
+    /// `none`: floating-point renders, clamped to 0..=1, are compared.
+    quantisation: &'static str,
+    /// The mean of the views' PSNR in dB; null if it is infinite.
+    psnr_mean: f64,
+    /// The mean of the views' SSIM; null if the images are smaller than its window.
+    ssim_mean: Option<f64>,
+    /// Mean rendering time of a view.
+    seconds_per_view: f64,
+    per_view: Vec<Score>,
+}
+
+/// The result for one view.
+#[derive(Serialize)]
+struct Score {
+    name: String,
+    psnr: f64,
+    ssim: Option<f64>,
+}
+
+/// Evaluates, writes the files and prints the result.
+pub fn run(args: &Args) -> Result<()> {
+    let run = Run::open(&args.run)?;
+    let model = run.model()?;
+    let scene = run.scene(args.scene.as_ref())?;
+    let data = scene.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
+    let pictures = run.file("eval");
+    make_folder(&pictures)?;
+    let (per_view, seconds_per_view) = compare(&model, &data, &pictures)?;
+    let report = Report {
+        raygrad: env!("CARGO_PKG_VERSION"),
+        scene: scene.absolute()?,
+        split: args.split,
+        views: per_view.len(),
+        width: data.frames[0].image.width,
+        height: data.frames[0].image.height,
+        downscale: run.config.downscale,
+        background: shown_background(&model),
+        pixel_offset: 0.5,
+        quantisation: "none",
+        psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
+        ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
+        seconds_per_view,
+        per_view,
+    };
+    let file = run.file("eval.json");
+    write_json(&file, &report)?;
+    if args.json {
+        let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(&file, e))?;
+        return print(&format!("{text}\n"));
+    }
+    print(&format!("{}written: {}, {}\n", table(&report), file.display(), pictures.display()))
+}
+
+/// The background that images are compared over: a random one is for training only.
+fn shown_background(model: &Model<f32>) -> Background {
+    match model.config.background {
+        Background::Random => Background::White,
+        fixed => fixed,
+    }
+}
+
+/// The mean, unless there is nothing or something is missing.
+fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
+    let count = values.len();
+    let sum: Option<f64> = values.sum();
+    sum.filter(|_| count > 0).map(|sum| sum / count as f64)
+}
+
+/// Scores all views and draws some; also the mean time of rendering one, in seconds.
+fn compare(model: &Model<f32>, data: &Dataset, pictures: &Path) -> Result<(Vec<Score>, f64)> {
+    let background = model.config.background.shown();
+    let drawn = evenly_spaced((0..data.frames.len()).collect(), PICTURES);
+    let mut scores = Vec::with_capacity(data.frames.len());
+    let mut seconds = 0.0;
+    let mut progress = Progress::new();
+    for (i, frame) in data.frames.iter().enumerate() {
+        let start = Instant::now();
+        let mut picture = model.view(&frame.camera, background);
+        seconds += start.elapsed().as_secs_f64();
+        picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
+        let truth = frame.image.over(background);
+        let score = score(frame.name.clone(), &picture.color, &truth);
+        if drawn.contains(&i) {
+            draw(&picture, &truth, model.extent.span).save_png(pictures.join(format!("{i:03}.png")))?;
+        }
+        let done = i + 1;
+        progress.set(done as f64 / data.frames.len() as f64, || {
+            format!("view {done} of {}  {}  PSNR {:.2}", data.frames.len(), score.name, score.psnr)
+        });
+        scores.push(score);
+    }
+    Ok((scores, seconds / data.frames.len() as f64))
+}
+
+fn score(name: String, render: &Image, truth: &Image) -> Score {
+    let large_enough = truth.width >= SSIM_WINDOW && truth.height >= SSIM_WINDOW;
+    Score { name, psnr: psnr(render, truth), ssim: large_enough.then(|| ssim(render, truth)) }
+}
+
+/// Photograph, render, error and depth, side by side.
+fn draw(picture: &Picture, truth: &Image, span: [f64; 2]) -> Image {
+    let error = colormap::error_map(&picture.color, truth);
+    Image::hconcat(&[truth, &picture.color, &error, &depth_colors(picture, span)])
+}
+
+fn table(report: &Report) -> String {
+    let ssim = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
+    let mean_of = format!("mean of {}", report.views);
+    let names = report.per_view.iter().map(|score| score.name.len());
+    let width = names.chain([mean_of.len()]).max().unwrap_or(0);
+    let mut text = format!("{:width$}  {:>7}  {:>7}\n", "view", "PSNR", "SSIM");
+    for Score { name, psnr, ssim: similarity } in &report.per_view {
+        text += &format!("{name:width$}  {psnr:>7.2}  {:>7}\n", ssim(*similarity));
+    }
+    text += &format!("{mean_of:width$}  {:>7.2}  {:>7}\n", report.psnr_mean, ssim(report.ssim_mean));
+    let Report { split, background, seconds_per_view, .. } = report;
+    let size = format!("{}x{}", report.width, report.height);
+    text + &format!("{split} views of {size} over {background}, {seconds_per_view:.2} s to render each\n")
+}

@@ -1,0 +1,28 @@
+//! Ctrl-C: the first asks to stop, the second stops.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::output::{complain, note};
+
+/// Exit code of a program that was interrupted: 128 + SIGINT, as a shell reports it.
+pub const EXIT_CODE: u8 = 130;
+
+static REQUESTED: AtomicBool = AtomicBool::new(false);
+
+/// From now on a first Ctrl-C only sets [`requested`]; a second one ends the program at once.
+pub fn listen() {
+    let handler = || {
+        if REQUESTED.swap(true, Ordering::Relaxed) {
+            std::process::exit(EXIT_CODE.into());
+        }
+        note("stopping after this step; Ctrl-C again stops at once");
+    };
+    if let Err(error) = ctrlc::set_handler(handler) {
+        complain(&format!("warning: Ctrl-C will not save the model: {error}"));
+    }
+}
+
+/// Whether there was a Ctrl-C.
+pub fn requested() -> bool {
+    REQUESTED.load(Ordering::Relaxed)
+}

@@ -1,0 +1,105 @@
+//! Reads the command line, runs what it asks for, and turns errors into one line and an exit code.
+//!
+//! Exit codes: 0 done, 1 an error, 2 a command line that cannot be understood, 130 interrupted.
+
+mod animation;
+mod cameras;
+mod eval;
+
+mod interrupt;
+mod output;
+mod parse;
+mod preview;
+mod progress;
+mod render;
+mod run;
+mod scene;
+mod train;
+mod watch;
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use raygrad::nerf::{Error, Result};
+use raygrad::tensor::simd;
+
+use output::{complain, print};
+
+/// Neural radiance fields on a CPU: photographs and camera poses in, new views out.
+///
+/// Without a command, trains on a scene that is built in, for a minute or two, and renders a picture.
+#[derive(Parser)]
+#[command(name = "raygrad", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+    /// Threads to work with [default: as many as there are processors]
+    #[arg(long, global = true, value_name = "N", value_parser = parse::count(1024))]
+    threads: Option<usize>,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Train(train::Args),
+    Eval(eval::Args),
+    Render(render::Args),
+}
+
+/// Runs the program.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    run(cli).unwrap_or_else(|error| {
+        complain(&error.to_string());
+        ExitCode::FAILURE
+    })
+}
+
+fn run(cli: Cli) -> Result<ExitCode> {
+    simd::check_environment().map_err(|what| Error::setting("environment", what))?;
+    if let Some(threads) = cli.threads {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
+        pool.map_err(|e| Error::setting("threads", e))?;
+    }
+    match cli.command {
+        None => first_run(),
+        Some(Command::Train(args)) => {
+            let trained = train::run(&args)?;
+            suggest(&trained.folder)?;
+            Ok(trained.exit_code())
+        }
+        Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
+        Some(Command::Render(args)) => render::run(&args).map(|()| ExitCode::SUCCESS),
+    }
+}
+
+/// What the bare program does: trains with all defaults and renders a picture.
+fn first_run() -> Result<ExitCode> {
+    let trained = train::run(&train::Args::default())?;
+    if !trained.interrupted {
+        render::run(&render::Args::picture(&trained.folder))?;
+    }
+    suggest(&trained.folder)?;
+    Ok(trained.exit_code())
+}
+
+/// Prints what can be done with a run.
+fn suggest(folder: &Path) -> Result<()> {
+    let folder = folder.display();
+    print(&format!(
+        "next     raygrad render {folder} --out {folder}/orbit.gif   to fly around the scene\n         \
+         raygrad eval {folder}   to measure it on views it has not seen\n"
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Cli;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+        let _ = super::train::Args::default();
+    }
+}

@@ -1,0 +1,61 @@
+//! Values on the command line: counts, durations and image sizes.
+
+use std::time::Duration;
+
+use clap::builder::{RangedU64ValueParser, TypedValueParser};
+
+/// A whole number from 1 to `most`.
+pub fn count(most: usize) -> impl TypedValueParser<Value = usize> {
+    RangedU64ValueParser::<usize>::new().range(1..=most as u64)
+}
+
+/// A duration such as `90s`, `10m` or `1.5h`.
+pub fn duration(text: &str) -> Result<Duration, String> {
+    let usage = || "write a number and a unit: 90s, 10m or 1.5h".to_owned();
+    let (number, unit) = text.char_indices().next_back().map(|(last, _)| text.split_at(last)).ok_or_else(usage)?;
+    let seconds = match unit {
+        "s" => 1.0,
+        "m" => 60.0,
+        "h" => 3600.0,
+        _ => return Err(usage()),
+    };
+    let number: f64 = number.parse().map_err(|_| usage())?;
+    match Duration::try_from_secs_f64(number * seconds) {
+        Ok(duration) if !duration.is_zero() => Ok(duration),
+        _ => Err("must be more than 0 and finite".to_owned()),
+    }
+}
+
+/// Most pixels on a side of an image.
+const LARGEST: usize = 16384;
+
+/// Width and height, such as `400x300`.
+pub fn size(text: &str) -> Result<[usize; 2], String> {
+    let usage = || format!("write WIDTHxHEIGHT such as 400x300, each from 1 to {LARGEST}");
+    let (width, height) = text.split_once('x').ok_or_else(usage)?;
+    let side = |text: &str| text.parse().ok().filter(|side| (1..=LARGEST).contains(side)).ok_or_else(usage);
+    Ok([side(width)?, side(height)?])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations() {
+        assert_eq!(duration("90s"), Ok(Duration::from_secs(90)));
+        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
+        assert_eq!(duration("1h"), Ok(Duration::from_secs(3600)));
+        for bad in ["", "s", "10", "m10", "10 d", "1e999h", "NaNs", "-1s", "0s", "5µ"] {
+            assert!(duration(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn sizes() {
+        assert_eq!(size("400x300"), Ok([400, 300]));
+        for bad in ["", "x", "400", "0x0", "400x0", "-1x5", "4x3x2", "16385x1", "99999999999999999999x1"] {
+            assert!(size(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,73 @@
+//! How far along a long task is, on standard error: a bar on a terminal, a line now and then elsewhere.
+
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use super::output;
+
+/// Parts of the bar.
+const PARTS: u64 = 1000;
+/// Time between lines where there is no bar.
+const INTERVAL: Duration = Duration::from_secs(5);
+
+/// A progress display; dropping it clears the bar.
+pub struct Progress {
+    bar: ProgressBar,
+    last_line: Instant,
+}
+
+impl Progress {
+    /// A display at 0.
+    pub fn new() -> Self {
+        let bar = ProgressBar::with_draw_target(Some(PARTS), ProgressDrawTarget::stderr());
+        let style = ProgressStyle::with_template("{wide_bar:.cyan/dim} {percent:>3} %  {msg}");
+        bar.set_style(style.expect("the template is a constant of the right form"));
+        Progress { bar, last_line: Instant::now() }
+    }
+
+    /// Shows that `fraction` of the task is done, and a few words.
+    pub fn set(&mut self, fraction: f64, words: impl FnOnce() -> String) {
+        if !self.bar.is_hidden() {
+            self.bar.set_position((fraction.min(1.0) * PARTS as f64) as u64);
+            self.bar.set_message(words());
+        } else if self.last_line.elapsed() >= INTERVAL {
+            self.last_line = Instant::now();
+            output::note(&format!("{:3.0} %  {}", 100.0 * fraction.min(1.0), words()));
+        }
+    }
+
+    /// Shows a line that stays.
+    pub fn note(&self, line: &str) {
+        self.bar.suspend(|| output::note(line));
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+/// A duration as people say it: `42 s`, `3 min 20 s`, `2 h 05 min`.
+pub fn spoken(seconds: f64) -> String {
+    let seconds = seconds.round() as u64;
+    match seconds {
+        0..60 => format!("{seconds} s"),
+        60..3600 => format!("{} min {:02} s", seconds / 60, seconds % 60),
+        _ => format!("{} h {:02} min", seconds / 3600, seconds / 60 % 60),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::spoken;
+
+    #[test]
+    fn durations_are_spoken() {
+        assert_eq!(spoken(0.4), "0 s");
+        assert_eq!(spoken(59.6), "1 min 00 s");
+        assert_eq!(spoken(200.0), "3 min 20 s");
+        assert_eq!(spoken(7500.0), "2 h 05 min");
+    }
+}

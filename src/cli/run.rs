@@ -1,0 +1,163 @@
+//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, and later `eval.json` and pictures.
+
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Config, Error, Extent, Model, Result, write_atomic};
+use serde::{Deserialize, Serialize};
+
+use super::cameras::Viewpoint;
+use super::output::make_folder;
+use super::scene::Scene;
+
+/// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
+const DEFAULT: &str = "run";
+
+/// What a run is about: `config.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// The version of raygrad that made it.
+    pub raygrad: String,
+    /// Its photographs.
+    pub scene: Scene,
+    /// The factor by which they were made smaller.
+    pub downscale: usize,
+    /// The region that the model covers.
+    pub extent: Extent,
+    /// Where the photographs were taken from, on average.
+    pub viewpoint: Viewpoint,
+    /// The model and how it is trained.
+    pub config: Config,
+}
+
+/// A run on disk.
+#[derive(Debug)]
+pub struct Run {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// The contents of its `config.json`.
+    pub config: RunConfig,
+}
+
+impl Run {
+    /// Makes the folder of a new run, which [`choose_folder`] has found to be free.
+    pub fn create(folder: PathBuf, config: RunConfig) -> Result<Run> {
+        make_folder(&folder)?;
+        make_folder(&folder.join("previews"))?;
+        write_json(&folder.join("config.json"), &config)?;
+        Ok(Run { folder, config })
+    }
+
+    /// The run in a folder.
+    pub fn open(folder: &Path) -> Result<Run> {
+        if !folder.is_dir() {
+            let what = if folder.exists() { "is not a folder" } else { "there is no such folder" };
+            return Err(Error::file(folder, what));
+        }
+        let file = folder.join("config.json");
+        let text = std::fs::read_to_string(&file).map_err(|e| match e.kind() {
+            ErrorKind::NotFound => {
+                Error::file(folder, "is not a run: it has no config.json; `raygrad train` makes runs")
+            }
+            _ => Error::file(&file, format!("cannot be read: {e}")),
+        })?;
+        let config: RunConfig =
+            serde_json::from_str(&text).map_err(|e| Error::file(&file, format!("is not a run's: {e}")))?;
+        config.check().map_err(|e| Error::file(&file, e))?;
+        Ok(Run { folder: folder.into(), config })
+    }
+
+    /// The path of one of the run's files.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.folder.join(name)
+    }
+
+    /// The file that holds the parameters.
+    pub fn model_file(&self) -> PathBuf {
+        self.file("model.safetensors")
+    }
+
+    /// Where the photographs are: as `given`, or else where they were for training.
+    pub fn scene<'a>(&'a self, given: Option<&'a Scene>) -> Result<&'a Scene> {
+        match (given, &self.config.scene) {
+            (None, Scene::Folder(folder)) if !folder.exists() => {
+                Err(Error::file(folder, "the run's photographs are no longer here: say with --scene where they are"))
+            }
+            (given, trained) => Ok(given.unwrap_or(trained)),
+        }
+    }
+
+    /// The run's model as it was last saved.
+    pub fn model(&self) -> Result<Model<f32>> {
+        Model::load(self.model_file(), self.config.config.clone(), self.config.extent)
+    }
+}
+
+impl RunConfig {
+    /// Whether the numbers are usable. The model checks its own.
+    fn check(&self) -> Result<()> {
+        if self.downscale == 0 {
+            return Err(Error::setting("downscale", "must be 1 or more, is 0"));
+        }
+        let [near, far] = self.extent.span;
+        if !(near >= 0.0 && near < far && far.is_finite()) {
+            return Err(Error::setting("extent.span", format!("{near} to {far} is no span")));
+        }
+        self.config.check()?;
+        self.viewpoint.check()
+    }
+}
+
+/// Writes a value as JSON, replacing the file as a whole.
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+    let mut text = serde_json::to_string_pretty(value).map_err(|e| Error::file(path, e))?;
+    text.push('\n');
+    write_atomic(path, text.as_bytes())
+}
+
+/// Where a new run may go without harm to anything: to `wanted` or, if nothing is wanted, to the first free one of
+/// `run`, `run-2`, `run-3` ...
+pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
+    if let Some(folder) = wanted {
+        return match contents(folder)? {
+            Contents::Nothing => Ok(folder.into()),
+            Contents::Run => {
+                Err(Error::file(folder, "already holds a run: choose another --out, or remove that folder"))
+            }
+            Contents::Other => Err(holds_other_files(folder)),
+        };
+    }
+    let numbered = (2..).map(|i| format!("{DEFAULT}-{i}"));
+    for folder in std::iter::once(DEFAULT.to_owned()).chain(numbered).map(PathBuf::from) {
+        match contents(&folder)? {
+            Contents::Nothing => return Ok(folder),
+            Contents::Run => (),
+            Contents::Other => return Err(holds_other_files(&folder)),
+        }
+    }
+    unreachable!("there is no end to the numbers")
+}
+
+fn holds_other_files(folder: &Path) -> Error {
+    Error::file(folder, "holds files that are not a run's: choose another folder with --out")
+}
+
+/// What there is at a path.
+enum Contents {
+    /// Nothing, or an empty folder.
+    Nothing,
+    Run,
+    Other,
+}
+
+fn contents(folder: &Path) -> Result<Contents> {
+    if folder.join("config.json").is_file() {
+        return Ok(Contents::Run);
+    }
+    match std::fs::read_dir(folder) {
+        Ok(mut entries) => Ok(if entries.next().is_none() { Contents::Nothing } else { Contents::Other }),
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(Contents::Nothing),
+        Err(e) => Err(Error::file(folder, format!("cannot be used as the run's folder: {e}"))),
+    }
+}

@@ -1,0 +1,163 @@
+//! `raygrad train`: photographs to a model.
+
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::Parser;
+use raygrad::nerf::dataset::{Dataset, Split};
+use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
+
+use super::cameras::Viewpoint;
+use super::output::print;
+use super::preview::Preview;
+use super::progress::spoken;
+use super::run::{Run, RunConfig, choose_folder};
+use super::scene::Scene;
+use super::watch::Watch;
+use super::{interrupt, parse};
+
+/// Train a model on a scene
+///
+/// Ctrl-C finishes the step, saves the model and exits with code 130; a second Ctrl-C exits at once.
+#[derive(Parser)]
+pub struct Args {
+    /// Folder with transforms_train.json and its images, or the scene that is built in
+    #[arg(default_value = "embedded")]
+    scene: Scene,
+    /// Size of model: small (minutes) or classic (the paper's, hours)
+    #[arg(long, default_value = "small")]
+    preset: Preset,
+    /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it [default: by preset]
+    #[arg(long, value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
+    budget: Option<Duration>,
+    /// Number of training steps in place of a time: the same seed then gives the same model, bit by bit
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    steps: Option<u64>,
+    /// Seed of everything random
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+    /// Train at 1/K of the images' size
+    #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
+    downscale: usize,
+    /// What lies behind transparent images: white, black or random
+    #[arg(long, default_value_t)]
+    background: Background,
+    /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
+    #[arg(long, value_name = "RUN")]
+    out: Option<PathBuf>,
+    /// Leave positional encoding out, to see what it is for
+    #[arg(long)]
+    no_encoding: bool,
+}
+
+impl Default for Args {
+    /// What `raygrad train` means without arguments.
+    fn default() -> Self {
+        Args::parse_from(["train"])
+    }
+}
+
+/// A run that was trained.
+pub struct Trained {
+    /// Its folder.
+    pub folder: PathBuf,
+    /// Whether Ctrl-C ended it.
+    pub interrupted: bool,
+}
+
+impl Trained {
+    /// With which code the program should exit.
+    pub fn exit_code(&self) -> ExitCode {
+        if self.interrupted { interrupt::EXIT_CODE.into() } else { ExitCode::SUCCESS }
+    }
+}
+
+/// Trains and leaves the model in a new folder.
+pub fn run(args: &Args) -> Result<Trained> {
+    let folder = choose_folder(args.out.as_deref())?;
+    let data = Arc::new(args.scene.load(Split::Train, args.downscale, usize::MAX)?);
+    let mut trainer = Trainer::new(args.config(&data)?, data.clone())?;
+    let run = Run::create(folder, args.run_config(&trainer, &data)?)?;
+    describe(&run, &trainer, &data)?;
+
+    let background = args.background.shown();
+    let preview = Preview::choose(&args.scene, args.downscale, &data, background);
+    let budget = args.budget();
+    let mut watch = Watch::new(&run, &trainer, budget, preview)?;
+    interrupt::listen();
+    let mut watched = Ok(());
+    trainer.run(budget, |trainer| {
+        watched = watch.step(trainer);
+        if watched.is_err() || interrupt::requested() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    let interrupted = interrupt::requested();
+    // The model comes first: what went wrong beside it is reported once it is safe.
+    let finished = watch.finish(&trainer, !interrupted);
+    watched.and(finished)?;
+    summarise(&run, &trainer.stats(), interrupted)?;
+    Ok(Trained { folder: run.folder, interrupted })
+}
+
+impl Args {
+    fn config(&self, data: &Dataset) -> Result<Config> {
+        if self.background == Background::Random && !data.has_alpha() {
+            return Err(Error::setting("background", "random needs images with transparency, and these have none"));
+        }
+        let config = Config { seed: self.seed, background: self.background, ..Config::preset(self.preset) };
+        Ok(if self.no_encoding { config.without_encoding() } else { config })
+    }
+
+    fn run_config(&self, trainer: &Trainer, data: &Dataset) -> Result<RunConfig> {
+        Ok(RunConfig {
+            raygrad: env!("CARGO_PKG_VERSION").to_owned(),
+            scene: self.scene.absolute()?,
+            downscale: self.downscale,
+            extent: trainer.model.extent,
+            viewpoint: Viewpoint::of(data),
+            config: trainer.model.config.clone(),
+        })
+    }
+
+    fn budget(&self) -> Budget {
+        match (self.steps, self.budget) {
+            (Some(steps), _) => Budget::Steps(steps),
+            (None, Some(time)) => Budget::Time(time),
+            (None, None) => Budget::Time(default_budget(self.preset)),
+        }
+    }
+}
+
+/// Training time after which a preset shows what it can do.
+fn default_budget(preset: Preset) -> Duration {
+    match preset {
+        Preset::Small => Duration::from_secs(100),
+        Preset::Classic => Duration::from_secs(3600),
+    }
+}
+
+fn describe(run: &Run, trainer: &Trainer, data: &Dataset) -> Result<()> {
+    let (views, image) = (data.frames.len(), &data.frames[0].image);
+    print(&format!(
+        "scene    {}: {views} views of {}x{}\nmodel    {} parameters, {} threads\nrun      {}\n",
+        run.config.scene,
+        image.width,
+        image.height,
+        trainer.model.params.elements(),
+        rayon::current_num_threads(),
+        run.folder.display()
+    ))
+}
+
+fn summarise(run: &Run, stats: &StepStats, interrupted: bool) -> Result<()> {
+    let what = if interrupted { "stopped " } else { "trained " };
+    print(&format!(
+        "{what} {} steps in {}, {:.0} rays/s; the model is {}\n",
+        stats.step,
+        spoken(stats.train_seconds),
+        stats.rays as f64 / stats.train_seconds,
+        run.model_file().display()
+    ))
+}

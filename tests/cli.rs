@@ -1,0 +1,375 @@
+//! The command line, from outside: the built program on small folders.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use raygrad::nerf::Image;
+use raygrad::nerf::dataset::{Split, embedded, evenly_spaced};
+use raygrad::nerf::scene::ANGLE_X;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// Width and height of the test images.
+const SIZE: usize = 24;
+
+/// A temporary folder with a dataset in `scene`; commands run there.
+struct Place(TempDir);
+
+impl Place {
+    fn empty() -> Self {
+        Place(tempfile::tempdir().unwrap())
+    }
+
+    /// With a small dataset in the Blender format: 6 views to train on, 2 to validate, 3 to test.
+    fn with_scene() -> Self {
+        let place = Place::empty();
+        for (split, views) in [(Split::Train, 6), (Split::Val, 2), (Split::Test, 3)] {
+            std::fs::create_dir_all(place.path(&format!("scene/{split}"))).unwrap();
+            let mut frames = vec![];
+            for (i, frame) in evenly_spaced(embedded(split, SIZE).frames, views).into_iter().enumerate() {
+                let name = format!("{split}/r_{i}");
+                frame.image.save_png(place.path(&format!("scene/{name}.png"))).unwrap();
+                let (rotation, eye) = (frame.camera.pose.matrix3, frame.camera.pose.translation);
+                let row = |r: usize| [rotation.row(r).x, rotation.row(r).y, rotation.row(r).z, eye[r]];
+                let matrix = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+                frames.push(json!({ "file_path": format!("./{name}"), "transform_matrix": matrix }));
+            }
+            place.write_transforms(split, &json!({ "camera_angle_x": ANGLE_X, "frames": frames }));
+        }
+        place
+    }
+
+    /// With a dataset and a run of a few steps in `run`.
+    fn with_run() -> Self {
+        let place = Place::with_scene();
+        place.succeeds("train scene --steps 3");
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn transforms(&self, split: Split) -> Value {
+        self.json(&format!("scene/transforms_{split}.json"))
+    }
+
+    fn write_transforms(&self, split: Split, transforms: &Value) {
+        std::fs::write(self.path(&format!("scene/transforms_{split}.json")), transforms.to_string()).unwrap();
+    }
+
+    fn json(&self, name: &str) -> Value {
+        serde_json::from_slice(&self.bytes(name)).unwrap()
+    }
+
+    fn bytes(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.path(name)).unwrap()
+    }
+
+    fn command(&self, arguments: &str) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raygrad"));
+        command.args(arguments.split_whitespace()).current_dir(self.0.path());
+        command
+    }
+
+    fn succeeds(&self, arguments: &str) -> String {
+        let output = self.command(arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments}: {output:?}");
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    /// Fails with one line that starts with the program's name and holds every one of `expected`.
+    #[track_caller]
+    fn fails(&self, arguments: &str, expected: &[&str]) {
+        complained(arguments, &self.command(arguments).output().unwrap(), expected);
+    }
+}
+
+#[track_caller]
+fn complained(what: &str, output: &Output, expected: &[&str]) {
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{what}: {message}");
+    let one_line = message.starts_with("raygrad: ") && message.trim_end().lines().count() == 1;
+    assert!(one_line && expected.iter().all(|part| message.contains(part)), "{what}: {message}");
+}
+
+/// The image in a PNG file.
+fn png(path: &Path) -> Image {
+    Image::open(path).unwrap()
+}
+
+#[test]
+fn a_run_is_complete_and_can_be_evaluated() {
+    let place = Place::with_run();
+    let config = place.json("run/config.json");
+    assert_eq!(config["raygrad"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(config["downscale"], 1);
+    assert!(config["scene"]["folder"].as_str().unwrap().ends_with("scene"));
+    let metrics = String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
+    let steps: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(steps.iter().map(|line| line["step"].as_u64().unwrap()).collect::<Vec<_>>(), [1, 3]);
+    assert!(steps.iter().all(|line| line["loss"].as_f64().unwrap() > 0.0 && line["psnr"].is_f64()));
+    let preview = png(&place.path("run/previews/000003.png"));
+    assert_eq!([preview.width, preview.height], [2 * SIZE, SIZE]);
+
+    let printed: Value = serde_json::from_str(&place.succeeds("eval run --json")).unwrap();
+    assert_eq!(printed, place.json("run/eval.json"));
+    let fields = ["split", "views", "background", "width", "height", "pixel_offset", "quantisation"];
+    let values = fields.map(|field| printed[field].clone());
+    assert_eq!(json!(values), json!(["test", 3, "white", SIZE, SIZE, 0.5, "none"]));
+    let views = printed["per_view"].as_array().unwrap();
+    assert_eq!(
+        json!(views.iter().map(|v| &v["name"]).collect::<Vec<_>>()),
+        json!(["test/r_0", "test/r_1", "test/r_2"])
+    );
+    for metric in ["psnr", "ssim"] {
+        let mean = views.iter().map(|view| view[metric].as_f64().unwrap()).sum::<f64>() / 3.0;
+        assert!((printed[format!("{metric}_mean")].as_f64().unwrap() - mean).abs() < 1e-9);
+    }
+    assert!(printed["seconds_per_view"].as_f64().unwrap() > 0.0);
+    let picture = png(&place.path("run/eval/002.png"));
+    assert_eq!([picture.width, picture.height], [4 * SIZE, SIZE]);
+
+    let table = place.succeeds("eval run --split val --views 1");
+    assert!(table.contains("mean of 1") && table.contains("val/r_0") && !table.contains("val/r_1"), "{table}");
+}
+
+#[test]
+fn pictures_and_animations() {
+    let place = Place::with_run();
+    place.succeeds("render run --frames 2");
+    let [first, second] = ["0000", "0001"].map(|name| png(&place.path(&format!("run/orbit/{name}.png"))));
+    assert_eq!([first.width, first.height], [SIZE, SIZE]);
+    assert_ne!(first, second);
+    assert!(!place.path("run/orbit/0002.png").exists());
+    place.succeeds("render run --size 20x10 --out wide.PNG --depth");
+    let wide = png(&place.path("wide.PNG"));
+    assert_eq!([wide.width, wide.height], [20, 10]);
+    place.succeeds("render run --path test --out test.gif");
+    let gif = place.bytes("test.gif");
+    let mut decoder = gif::Decoder::new(&gif[..]).unwrap();
+    let mut frames = 0;
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        assert_eq!([frame.width as usize, frame.height as usize, frame.delay as usize], [SIZE, SIZE, 4]);
+        frames += 1;
+    }
+    assert_eq!(frames, 3);
+    // An orbit needs no photographs, and where they went can be said.
+    std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
+    place.succeeds("render run --frames 1 --out one.png");
+    place.fails("eval run", &["scene: ", "--scene"]);
+    place.fails("render run --path test", &["scene: ", "--scene"]);
+    place.succeeds("eval run --scene moved --views 1");
+}
+
+#[test]
+fn the_embedded_scene_needs_no_files() {
+    let place = Place::empty();
+    let printed = place.succeeds("train --steps 1 --downscale 10 --no-encoding --background random");
+    assert!(printed.contains("embedded: 60 views of 20x20") && printed.contains("raygrad eval run"), "{printed}");
+    let config = place.json("run/config.json");
+    assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
+    assert_eq!(config["config"]["fine"]["position_levels"], 0);
+    place.succeeds("eval run --views 1");
+    assert_eq!(place.json("run/eval.json")["background"], "white");
+    place.succeeds("render run --out one.png");
+    place.fails("train --downscale 3", &["`downscale`", "200x200"]);
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
+    let place = Place::with_scene();
+    place.succeeds("train scene --steps 4 --seed 7 --threads 1 --out one");
+    place.succeeds("train scene --steps 4 --seed 7 --threads 2 --out two");
+    place.succeeds("train scene --steps 4 --seed 8 --threads 2 --out other");
+    let [one, two, other] = ["one", "two", "other"].map(|run| place.bytes(&format!("{run}/model.safetensors")));
+    assert!(one == two && one != other);
+}
+
+#[test]
+fn nothing_is_overwritten() {
+    let place = Place::with_run();
+    let before = place.bytes("run/model.safetensors");
+    assert!(place.succeeds("train scene --steps 1").contains("run-2"));
+    assert!(place.succeeds("train scene --steps 1").contains("run-3"));
+    place.fails("train scene --steps 1 --out run", &["run: already holds a run", "--out"]);
+    place.fails("train scene --steps 1 --out scene", &["scene: holds files that are not a run's"]);
+    assert_eq!(place.bytes("run/model.safetensors"), before);
+    assert!(!place.path("scene/config.json").exists());
+    // An empty folder is as good as none.
+    std::fs::create_dir(place.path("empty")).unwrap();
+    place.succeeds("train scene --steps 1 --out empty");
+    std::fs::remove_file(place.path("run/config.json")).unwrap();
+    place.fails("train scene --steps 1", &["run: holds files that are not a run's"]);
+    assert_eq!(place.bytes("run/model.safetensors"), before);
+}
+
+#[test]
+fn bad_scenes_are_named_and_leave_no_run() {
+    let place = Place::with_scene();
+    let file = "scene/transforms_train.json";
+    let good = place.transforms(Split::Train);
+    let edited = |edit: fn(&mut Value)| {
+        let mut transforms = good.clone();
+        edit(&mut transforms);
+        transforms.to_string()
+    };
+    let no_frames = edited(|t| t["frames"] = json!([]));
+    let not_finite = edited(|t| t["frames"][2]["transform_matrix"][1][3] = json!("X")).replace("\"X\"", "NaN");
+    let not_rigid = edited(|t| t["frames"][1]["transform_matrix"][0][0] = json!(7.0));
+    let bad = [
+        ("{", ["is not valid JSON", "line 1"]),
+        (&no_frames, ["`frames`", "is empty"]),
+        (&not_finite, ["`frames[2].transform_matrix`", "not a finite number"]),
+        (&not_rigid, ["`frames[1].transform_matrix`", "must be a rotation"]),
+    ];
+    for (text, expected) in bad {
+        std::fs::write(place.path(file), text).unwrap();
+        place.fails("train scene", &[&[file][..], &expected].concat());
+    }
+    place.write_transforms(Split::Train, &good);
+    std::fs::write(place.path("scene/train/r_3.png"), b"no picture").unwrap();
+    place.fails("train scene", &["`frames[3].file_path`", "r_3.png", "cannot be decoded"]);
+    Image::new(SIZE, SIZE + 1, 3).save_png(place.path("scene/train/r_3.png")).unwrap();
+    place.fails("train scene", &["`frames[3].file_path`", "has 24x25 pixels"]);
+    place.fails("train scene --downscale 5", &["`frames[3].file_path`"]);
+    place.fails("train absent", &["absent: there is no such folder"]);
+    place.fails("train .", &[".: is not a dataset"]);
+    assert!(!place.path("run").exists());
+}
+
+#[test]
+fn absent_images_are_skipped_with_a_warning() {
+    let place = Place::with_scene();
+    std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
+    let output = place.command("train scene --steps 1").output().unwrap();
+    let (printed, warned) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success() && printed.contains("5 views of 24x24"), "{printed}{warned}");
+    assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is absent"), "{warned}");
+}
+
+#[test]
+fn bad_runs_are_named() {
+    let place = Place::with_run();
+    std::fs::create_dir(place.path("empty")).unwrap();
+    for command in ["eval", "render"] {
+        place.fails(&format!("{command} absent"), &["absent: there is no such folder"]);
+        place.fails(&format!("{command} empty"), &["empty: is not a run", "config.json"]);
+    }
+    let config = place.json("run/config.json");
+    let write = |config: &str| std::fs::write(place.path("run/config.json"), config).unwrap();
+    let edited = |path: &str, value: Value| {
+        let mut config = config.clone();
+        *config.pointer_mut(path).unwrap() = value;
+        config.to_string()
+    };
+    let bad = [
+        ("{ \"raygrad\": ".to_owned(), ["run/config.json", "line 1"]),
+        ("{}".to_owned(), ["run/config.json", "missing field"]),
+        (edited("/downscale", json!(0)), ["run/config.json", "`downscale`"]),
+        (edited("/extent/span", json!([6.0, 2.0])), ["run/config.json", "`extent.span`"]),
+        (edited("/extent/bounds/0/0", json!(9.0)), ["`bounds`", "is no box"]),
+        (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`"]),
+        (edited("/config/batch", json!(0)), ["run/config.json", "`batch`"]),
+        (edited("/config/fine/width", json!(64)), ["run/model.safetensors", "in the file"]),
+        (edited("/config/fine/depth", json!(3)), ["run/model.safetensors", "another configuration"]),
+    ];
+    for (text, expected) in bad {
+        write(&text);
+        place.fails("eval run", &expected);
+    }
+    write(&config.to_string());
+    let model = place.bytes("run/model.safetensors");
+    std::fs::write(place.path("run/model.safetensors"), &model[..model.len() / 2]).unwrap();
+    place.fails("eval run", &["run/model.safetensors: not a safetensors file"]);
+    std::fs::remove_file(place.path("run/model.safetensors")).unwrap();
+    place.fails("render run", &["run/model.safetensors: "]);
+    assert!(!place.path("run/eval.json").exists() && !place.path("run/orbit").exists());
+}
+
+#[test]
+fn bad_places_to_write_are_named() {
+    let place = Place::with_run();
+    place.fails("train scene --steps 1 --out scene/transforms_test.json/run", &["transforms_test.json/run: cannot be"]);
+    place.fails("train scene --steps 1 --out scene/transforms_test.json", &["transforms_test.json: cannot be used"]);
+    place.fails("render run --out run/config.json/frames", &["run/config.json/frames: cannot be created"]);
+    place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
+    std::fs::create_dir(place.path("folder.gif")).unwrap();
+    place.fails("render run --out folder.gif", &["folder.gif: is a folder"]);
+    // Where pictures should go there is a file.
+    std::fs::write(place.path("run/eval"), b"").unwrap();
+    place.fails("eval run", &["run/eval: cannot be created"]);
+    assert_eq!(place.bytes("run/eval"), b"");
+}
+
+#[test]
+fn bad_arguments_are_usage_errors() {
+    let place = Place::empty();
+    let bad = [
+        ("fly", "unrecognized subcommand"),
+        ("train --no-such", "unexpected argument"),
+        ("train --budget 10m --steps 5", "cannot be used with"),
+        ("train --budget 10", "90s, 10m or 1.5h"),
+        ("train --budget 0s", "more than 0"),
+        ("train --steps 0", "0 is not in 1.."),
+        ("train --downscale 0", "0 is not in 1.."),
+        ("train --threads 0", "0 is not in 1.."),
+        ("train --preset huge", "use classic or small"),
+        ("train --background grey", "white, black or random"),
+        ("eval", "required arguments"),
+        ("eval run --split all", "must be train, val or test"),
+        ("eval run --views 0", "0 is not in 1.."),
+        ("render run --size 0x0", "WIDTHxHEIGHT"),
+        ("render run --path spiral", "possible values: orbit, test"),
+    ];
+    for (arguments, expected) in bad {
+        let output = place.command(arguments).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && message.contains(expected), "{arguments}: {message}");
+    }
+    let output = place.command("train --steps 1").env("RAYGRAD_SIMD", "avx").output().unwrap();
+    complained("RAYGRAD_SIMD", &output, &["RAYGRAD_SIMD is \"avx\"", "scalar, v3 or v4"]);
+    assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 0);
+}
+
+#[test]
+fn a_closed_pipe_is_no_error() {
+    let place = Place::with_run();
+    let mut child = place.command("eval run").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+    assert!(place.path("run/eval.json").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_saves_the_model() {
+    let place = Place::with_scene();
+    let mut command = place.command("train scene --budget 1h");
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // The first line of the metrics says that training has begun.
+    wait(&mut child, || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0));
+    let untrained = place.bytes("run/model.safetensors");
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("stopped"), "{output:?}");
+    assert_ne!(place.bytes("run/model.safetensors"), untrained);
+    place.succeeds("eval run --views 1");
+}
+
+/// Waits until something holds, for as long as the program runs and at most a minute.
+fn wait(child: &mut Child, holds: impl Fn() -> bool) {
+    let start = Instant::now();
+    while !holds() {
+        let running = child.try_wait().unwrap().is_none() && start.elapsed() < Duration::from_secs(60);
+        if !running {
+            let _ = child.kill();
+            panic!("the program ended, or did not get there in a minute");
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
