@@ -9,3 +9,8 @@
 pub use raygrad_autograd as autograd;
 pub use raygrad_nerf as nerf;
 pub use raygrad_tensor as tensor;
+
+/// The README's examples, as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+pub struct Readme;
