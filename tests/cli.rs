@@ -170,7 +170,7 @@ fn the_embedded_scene_needs_no_files() {
     assert!(printed.contains("embedded: 60 views of 20x20") && printed.contains("raygrad eval run"), "{printed}");
     let config = place.json("run/config.json");
     assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
-    assert_eq!(config["config"]["fine"]["position_levels"], 0);
+    assert_eq!(config["config"]["field"]["position_levels"], 0);
     place.succeeds("eval run --views 1");
     assert_eq!(place.json("run/eval.json")["background"], "white");
     place.succeeds("render run --out one.png");
@@ -271,9 +271,9 @@ fn bad_runs_are_named() {
         (edited("/extent/span", json!([6.0, 2.0])), ["run/config.json", "`extent.span`"]),
         (edited("/extent/bounds/0/0", json!(9.0)), ["`bounds`", "is no box"]),
         (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`"]),
-        (edited("/config/batch", json!(0)), ["run/config.json", "`batch`"]),
-        (edited("/config/fine/width", json!(64)), ["run/model.safetensors", "in the file"]),
-        (edited("/config/fine/depth", json!(3)), ["run/model.safetensors", "another configuration"]),
+        (edited("/config/sampler/batch", json!(0)), ["run/config.json", "`batch`"]),
+        (edited("/config/field/width", json!(64)), ["run/model.safetensors", "in the file"]),
+        (edited("/config/field/depth", json!(3)), ["run/model.safetensors", "another configuration"]),
     ];
     for (text, expected) in bad {
         write(&text);
@@ -315,7 +315,7 @@ fn bad_arguments_are_usage_errors() {
         ("train --steps 0", "0 is not in 1.."),
         ("train --downscale 0", "0 is not in 1.."),
         ("train --threads 0", "0 is not in 1.."),
-        ("train --preset huge", "use classic or small"),
+        ("train --preset huge", "use classic, small or instant"),
         ("train --background grey", "white, black or random"),
         ("eval", "required arguments"),
         ("eval run --split all", "must be train, val or test"),

@@ -2,7 +2,9 @@
 
 use crate::elementwise::{Binary, Map, Unary, Zip};
 use crate::ops::trigonometric;
-use crate::ops::{Activation, Segments, activation, arithmetic, exponential, linear, matmul, reduce, segment, shape};
+use crate::ops::{
+    Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
+};
 use crate::{Dual, Op};
 use raygrad_tensor::{Layout, Shape, Tensor};
 use std::ops::Range;
@@ -196,6 +198,12 @@ pub fn catalogue() -> Vec<Entry> {
         Entry::new(view(&[4, 5], |layout| layout.sliced(1, 4, 2, -3))).linear().sample(&[&[4, 5]]),
         Entry::new(shape::Scatter(view(&[4, 5], |layout| layout.sliced(1, 1, 3, 1)))).linear().sample(&[&[4, 3]]),
         Entry::new(shape::Concat { axis: 1 }).linear().sample(&[&[2, 3], &[2, 1], &[2, 0]]).sample(&[&[2, 3]]),
+        Entry::new(gather::GatherRows { index: [2, 0, 2, 3].into() }).linear().sample(&[&[4]]).sample(&[&[5, 3]]),
+        Entry::new(gather::GatherRows { index: [].into() }).linear().sample(&[&[4]]).sample(&[&[0, 3]]),
+        Entry::new(gather::ScatterRows { index: [2, 0, 2].into(), rows: 4 })
+            .linear()
+            .sample(&[&[3]])
+            .sample(&[&[3, 2]]),
         Entry::new(segment::SegmentSum(segments())).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
         Entry::new(segment::SegmentExpand(segments())).linear().sample(&[&[4]]).sample(&[&[4, 2]]),
         Entry::new(cumsum(false, false)).linear().sample(&[&[7]]).sample(&[&[7, 2]]),

@@ -89,11 +89,11 @@ impl Real for Dual {
         self.chain(self.value.cos(), -self.value.sin())
     }
     fn sin_pi(self) -> Self {
-        let (sin, cos) = (PI * (self.value % 2.0)).sin_cos();
+        let (sin, cos) = sin_cos_pi(self.value);
         self.chain(sin, PI * cos)
     }
     fn cos_pi(self) -> Self {
-        let (sin, cos) = (PI * (self.value % 2.0)).sin_cos();
+        let (sin, cos) = sin_cos_pi(self.value);
         self.chain(cos, -PI * sin)
     }
     fn tanh(self) -> Self {
@@ -110,4 +110,10 @@ impl Real for Dual {
     fn sqrt(self) -> Self {
         self.chain(self.value.sqrt(), 0.5 / self.value.sqrt())
     }
+}
+
+/// Sine and cosine of `pi x`, from the distance to the nearest whole number.
+fn sin_cos_pi(x: f64) -> (f64, f64) {
+    let (sin, cos) = (PI * (x - x.round())).sin_cos();
+    if x.round() % 2.0 == 0.0 { (sin, cos) } else { (-sin, -cos) }
 }

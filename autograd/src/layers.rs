@@ -27,11 +27,11 @@ impl Init {
     }
 }
 
-/// A dense layer: `activation(x weight + bias)`.
+/// A dense layer: `activation(x weight + bias)`, or without the bias.
 #[derive(Debug, Clone)]
 pub struct Linear {
     weight: ParamId,
-    bias: ParamId,
+    bias: Option<ParamId>,
     activation: Activation,
 }
 
@@ -40,14 +40,29 @@ impl Linear {
     pub fn new<T: Scalar>(
         params: &mut Params<T>,
         name: &str,
+        sizes: [usize; 2],
+        activation: Activation,
+        init: Init,
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Self {
+        let layer = Linear::without_bias(params, name, sizes, activation, init, rng);
+        Linear { bias: Some(params.add(format!("{name}.bias"), Tensor::zeros(&sizes[1..]))), ..layer }
+    }
+
+    /// As [`new`](Self::new), with a weight only.
+    pub fn without_bias<T: Scalar>(
+        params: &mut Params<T>,
+        name: &str,
         [inputs, outputs]: [usize; 2],
         activation: Activation,
         init: Init,
         rng: &mut (impl Rng + ?Sized),
     ) -> Self {
-        let weight = params.add(format!("{name}.weight"), init.weight(inputs, outputs, rng));
-        let bias = params.add(format!("{name}.bias"), Tensor::zeros(&[outputs]));
-        Linear { weight, bias, activation }
+        Linear {
+            weight: params.add(format!("{name}.weight"), init.weight(inputs, outputs, rng)),
+            bias: None,
+            activation,
+        }
     }
 
     /// The layer's output.
@@ -56,7 +71,7 @@ impl Linear {
     /// If the last extent of `x` is not the number of inputs.
     #[track_caller]
     pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, x: &Var<'t, T>) -> Var<'t, T> {
-        x.linear(&params[self.weight], Some(&params[self.bias]), self.activation)
+        x.linear(&params[self.weight], self.bias.map(|bias| &params[bias]), self.activation)
     }
 }
 

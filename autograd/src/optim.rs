@@ -58,11 +58,20 @@ impl<T: Scalar> Adam<T> {
     #[track_caller]
     pub fn step(&mut self, params: &mut [Tensor<T>], grads: &[Tensor<T>], rate: f64) -> usize {
         assert_eq!(params.len(), grads.len(), "as many gradients as parameters");
-        if self.moments.is_empty() {
-            let zeros = |x: &Tensor<T>| (vec![T::ZERO; x.len()], vec![T::ZERO; x.len()]);
-            self.moments = params.iter().map(zeros).collect();
-        }
-        assert_eq!(params.len(), self.moments.len(), "as many parameters as in the first step");
+        self.step_pairs(params.iter_mut().zip(grads), rate)
+    }
+
+    /// As [`step`](Self::step), for parameters that come with their gradients: always the same ones, in the same order.
+    ///
+    /// # Panics
+    /// As [`step`](Self::step).
+    #[track_caller]
+    pub fn step_pairs<'a>(
+        &mut self,
+        pairs: impl Iterator<Item = (&'a mut Tensor<T>, &'a Tensor<T>)>,
+        rate: f64,
+    ) -> usize {
+        let first = self.step == 0;
         self.step += 1;
         let AdamConfig { beta1, beta2, epsilon } = self.config;
         // 1 - beta^t without cancellation.
@@ -74,13 +83,20 @@ impl<T: Scalar> Adam<T> {
             rate: T::from_f64(rate * root / correction(beta1)),
             epsilon: T::from_f64(epsilon * root),
         };
-        let mut skipped = 0;
-        for ((param, grad), (m, v)) in params.iter_mut().zip(grads).zip(&mut self.moments) {
+        let (mut skipped, mut count) = (0, 0);
+        for (i, (param, grad)) in pairs.enumerate() {
             assert_eq!(param.shape(), grad.shape(), "a gradient has the shape of its parameter");
+            if first {
+                self.moments.push((vec![T::ZERO; param.len()], vec![T::ZERO; param.len()]));
+            }
+            let (m, v) = &mut self.moments[i];
+            assert_eq!(m.len(), param.len(), "the same parameters as in the first step");
             let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
             let values = param.as_mut_slice().par_chunks_mut(CHUNK).zip(grad.as_slice().par_chunks(CHUNK));
             skipped += values.zip(moments).map(|((x, g), (m, v))| update.apply(x, g, m, v)).sum::<usize>();
+            count += 1;
         }
+        assert_eq!(count, self.moments.len(), "as many parameters as in the first step");
         skipped
     }
 }

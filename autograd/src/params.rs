@@ -107,6 +107,11 @@ impl<T: Scalar> Params<T> {
         &self.values[id.0]
     }
 
+    /// One value, for an optimiser.
+    pub fn get_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
+        &mut self.values[id.0]
+    }
+
     /// The parameters as leaves of a tape.
     #[track_caller]
     pub fn bind<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
@@ -123,11 +128,15 @@ impl<T: Scalar> Params<T> {
         Params { names: self.names.clone(), values: self.values.iter().map(Tensor::cast).collect() }
     }
 
-    /// The parameters and some words about them as a safetensors file.
+    /// The parameters as a safetensors file, with some words about them and further named bytes.
     ///
     /// # Errors
     /// If the format cannot hold them.
-    pub fn to_safetensors(&self, metadata: HashMap<String, String>) -> Result<Vec<u8>, ParamsError> {
+    pub fn to_safetensors(
+        &self,
+        metadata: HashMap<String, String>,
+        blobs: &[(&str, Vec<u8>)],
+    ) -> Result<Vec<u8>, ParamsError> {
         let bytes: Vec<Vec<u8>> = self
             .values
             .iter()
@@ -137,18 +146,22 @@ impl<T: Scalar> Params<T> {
                 out
             })
             .collect();
-        let mut views = Vec::with_capacity(self.len());
+        let mut views = Vec::with_capacity(self.len() + blobs.len());
         for ((name, value), bytes) in self.iter().zip(&bytes) {
             views.push((name, TensorView::new(dtype::<T>(), value.shape().to_vec(), bytes)?));
+        }
+        for (name, bytes) in blobs {
+            views.push((name, TensorView::new(Dtype::U8, vec![bytes.len()], bytes)?));
         }
         Ok(safetensors::serialize(views, Some(metadata))?)
     }
 
-    /// Replaces every value by that of the same name in a safetensors file. Nothing changes if one does not fit.
+    /// Replaces every value by that of the same name in a safetensors file, and returns the further bytes that the file
+    /// holds by their names. Nothing changes if a value does not fit.
     ///
     /// # Errors
     /// If the bytes are no safetensors file, or names, shapes or number types differ from those of this store.
-    pub fn load_safetensors(&mut self, bytes: &[u8]) -> Result<(), ParamsError> {
+    pub fn load_safetensors(&mut self, bytes: &[u8]) -> Result<HashMap<String, Vec<u8>>, ParamsError> {
         let file = SafeTensors::deserialize(bytes)?;
         let mut values = Vec::with_capacity(self.len());
         for (name, value) in self.iter() {
@@ -163,11 +176,16 @@ impl<T: Scalar> Params<T> {
             let elements = found.data().chunks_exact(size_of::<T>()).map(T::read_le).collect();
             values.push(Tensor::from_vec(value.shape(), elements));
         }
-        if let Some(unknown) = file.names().iter().find(|name| !self.names.iter().any(|own| own == *name)) {
-            return Err(ParamsError::Unknown(unknown.to_string()));
+        let mut blobs = HashMap::new();
+        for (name, view) in file.tensors() {
+            if view.dtype() == Dtype::U8 {
+                blobs.insert(name, view.data().to_vec());
+            } else if !self.names.contains(&name) {
+                return Err(ParamsError::Unknown(name));
+            }
         }
         self.values = values;
-        Ok(())
+        Ok(blobs)
     }
 }
 
@@ -212,10 +230,11 @@ mod tests {
     #[test]
     fn a_stored_model_comes_back_bit_for_bit() {
         let params = store();
-        let bytes = params.to_safetensors(HashMap::new()).unwrap();
+        let bytes = params.to_safetensors(HashMap::new(), &[("more", vec![1, 2, 3])]).unwrap();
         let mut other = params.clone();
         other.values_mut()[0].as_mut_slice().fill(9.0);
-        other.load_safetensors(&bytes).unwrap();
+        let blobs = other.load_safetensors(&bytes).unwrap();
+        assert_eq!(blobs["more"], [1, 2, 3]);
         for (a, b) in params.values().iter().zip(other.values()) {
             let bits = |x: &Tensor<f32>| x.as_slice().iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             assert_eq!(bits(a), bits(b));
@@ -227,7 +246,7 @@ mod tests {
         let mut wide = Params::<f32>::new();
         wide.add("a", Tensor::zeros(&[3]));
         wide.add("b", Tensor::zeros(&[1, 2]));
-        let bytes = wide.to_safetensors(HashMap::new()).unwrap();
+        let bytes = wide.to_safetensors(HashMap::new(), &[]).unwrap();
         let mut params = store();
         let message = params.load_safetensors(&bytes).unwrap_err().to_string();
         assert!(message.contains("`a` is F32[3] in the file and F32[2]"), "{message}");
@@ -235,10 +254,10 @@ mod tests {
         let mut more = store();
         more.add("c", Tensor::zeros(&[1]));
         assert!(matches!(
-            more.load_safetensors(&store().to_safetensors(HashMap::new()).unwrap()),
+            more.load_safetensors(&store().to_safetensors(HashMap::new(), &[]).unwrap()),
             Err(ParamsError::Missing(_))
         ));
-        let bytes = more.to_safetensors(HashMap::new()).unwrap();
+        let bytes = more.to_safetensors(HashMap::new(), &[]).unwrap();
         assert!(matches!(params.load_safetensors(&bytes), Err(ParamsError::Unknown(_))));
         assert!(params.load_safetensors(b"no tensors").is_err());
     }

@@ -1,7 +1,7 @@
 //! The backward sweep: from the root down the tape, visiting only what leads to the wanted gradients.
 
-use crate::tape::find_non_finite;
 use crate::op::{Given, Gradient, SparseGrad};
+use crate::tape::find_non_finite;
 use crate::{Error, Grads, Op, Tape, Var, Vjp};
 use raygrad_tensor::{Scalar, Tensor, add_assign};
 use smallvec::SmallVec;

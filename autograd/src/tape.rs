@@ -176,7 +176,12 @@ impl<T: Scalar> Tape<T> {
     }
 
     /// The shape of the output.
-    fn check_shapes(&self, op: &impl Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Shape, Error> {
+    fn check_shapes(
+        &self,
+        op: &impl Op<T>,
+        inputs: &[&Var<'_, T>],
+        at: &'static Location<'static>,
+    ) -> Result<Shape, Error> {
         for x in inputs {
             assert!(std::ptr::eq(x.tape, self), "{}: an input belongs to another tape", op.name());
         }

@@ -27,7 +27,7 @@ pub fn viridis(t: f32) -> [f32; 3] {
 }
 
 /// An RGB picture of a one-channel depth image, in [`viridis`]: yellow at `near` and closer, dark violet at `far` and
-/// beyond, linear in depth between. NaN, no depth, is black.
+/// beyond, linear in depth between. A depth of 0 says that nothing is there: it is black, as NaN is.
 ///
 /// # Panics
 /// If `depth` has more than one channel, or unless `near < far`.
@@ -36,7 +36,8 @@ pub fn depth_map(depth: &Image, near: f64, far: f64) -> Image {
     assert_eq!(depth.channels, 1, "a depth image has one channel");
     assert!(near < far, "near {near} must be less than far {far}");
     let nearness = |z: f32| ((far - f64::from(z)) / (far - near)) as f32;
-    let data = depth.data.iter().flat_map(|&z| viridis(nearness(z))).collect();
+    let color = |&z: &f32| viridis(if z == 0.0 { f32::NAN } else { nearness(z) });
+    let data = depth.data.iter().flat_map(color).collect();
     Image { width: depth.width, height: depth.height, channels: 3, data }
 }
 
@@ -93,9 +94,9 @@ mod tests {
     #[test]
     fn depth_runs_from_yellow_to_violet() {
         let map = depth_map(&grey(&[2.0, 4.0, 6.0, 0.0, f32::INFINITY, f32::NAN]), 2.0, 6.0);
-        let expected = [1.0, 0.5, 0.0, 1.0, 0.0].map(viridis);
-        assert_eq!(map.data[..15], expected.concat());
-        assert_eq!(map.data[15..], [0.0; 3]);
+        let expected = [1.0, 0.5, 0.0, f32::NAN, 0.0, f32::NAN].map(viridis);
+        assert_eq!(map.data, expected.concat());
+        assert_eq!(map.data[9..12], [0.0; 3], "nothing there: black");
     }
 
     #[test]

@@ -268,7 +268,10 @@ mod tests {
                 let (value, slope) = (f64::from(color.item()), f64::from(color.grad(&[&density])[0].item()));
                 let expected = if x > 700.0 { 0.0 } else { x * (-x).exp() };
                 assert!((value + (-x).exp_m1()).abs() <= 2e-7 * value.max(1e-30), "z {z}, delta {delta}: {value}");
-                assert!((slope - expected).abs() <= 1e-5 * expected + 1e-37, "z {z}, delta {delta}: {slope} {expected}");
+                assert!(
+                    (slope - expected).abs() <= 1e-5 * expected + 1e-37,
+                    "z {z}, delta {delta}: {slope} {expected}"
+                );
             }
         }
     }
@@ -327,10 +330,10 @@ mod tests {
             let [single, d_single, _] = one_ray::<f32>(&sigma, &delta, &colour);
             let [double, d_double, _] = one_ray::<f64>(&sigma, &delta, &colour);
             assert!((single[0] - double[0]).abs() <= 1e-6, "scale {scale}: {} against {}", single[0], double[0]);
-            let mut tau = 0.0;
+            let mut tau = 0.0_f64;
             for i in 0..n {
                 let error = (d_single[i] - d_double[i]).abs();
-                let t = (-tau as f64).exp();
+                let t = (-tau).exp();
                 assert!(error <= 1e-5 * delta[i] * t + 1e-38, "scale {scale}, sample {i}: {error:e}, T {t:e}");
                 tau += sigma[i] * delta[i];
             }

@@ -1,20 +1,28 @@
 //! What to train and how: the presets and every number behind them.
 
 use crate::background::Background;
-use crate::field::{ClassicConfig, DensityActivation};
+use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig};
+use crate::hash_grid::HashGridConfig;
+use crate::hierarchical::HierarchicalConfig;
+use crate::marching::MarchingConfig;
+use crate::occupancy::Skip;
 use crate::{Error, Result};
 use raygrad_autograd::{AdamConfig, Schedule};
 use serde::{Deserialize, Serialize};
+use std::fmt;
 use std::str::FromStr;
 
 /// A named configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
     /// The paper's networks and numbers: 64 + 128 samples, two networks of 8 layers of 256.
     Classic,
-    /// A quarter of the depth and half of the width: a recognisable scene in minutes.
+    /// The same idea with half of the depth and of the width: a recognisable scene in minutes.
+    #[default]
     Small,
+    /// A hash grid marched through an occupancy grid: a good scene in a minute.
+    Instant,
 }
 
 impl FromStr for Preset {
@@ -23,33 +31,46 @@ impl FromStr for Preset {
         match name {
             "classic" => Ok(Preset::Classic),
             "small" => Ok(Preset::Small),
-            _ => Err(Error::setting("preset", format!("there is no `{name}`; use classic or small"))),
+            "instant" => Ok(Preset::Instant),
+            _ => Err(Error::setting("preset", format!("there is no `{name}`; use classic, small or instant"))),
         }
     }
+}
+
+impl fmt::Display for Preset {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Preset::Classic => "classic",
+            Preset::Small => "small",
+            Preset::Instant => "instant",
+        })
+    }
+}
+
+/// Where rays are sampled. Any field can be sampled either way.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum SamplerConfig {
+    /// Stratified samples through a network of their own, then more where it found something.
+    Hierarchical(HierarchicalConfig),
+    /// Even steps through the occupied cells of a grid.
+    Marching(MarchingConfig),
 }
 
 /// A model and how it is trained. It is stored with the model, so that a run can be read back.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// The network that finds where to look.
-    pub coarse: ClassicConfig,
-    /// The network that is rendered.
-    pub fine: ClassicConfig,
-    /// Stratified samples a ray.
-    pub coarse_samples: usize,
-    /// Further samples a ray where the coarse network found something.
-    pub fine_samples: usize,
-    /// Share of the further samples that is spread evenly, in 0..=1.
-    pub uniform_share: f64,
-    /// Rays in a training step.
-    pub batch: usize,
-    /// Rays in a tile: one tape, on one core.
-    pub tile: usize,
+    /// What is fitted.
+    pub field: FieldConfig,
+    /// Where it is sampled.
+    pub sampler: SamplerConfig,
     /// Learning rate over the run.
     pub schedule: Schedule,
-    /// The optimiser's constants.
+    /// The optimiser's constants, for networks.
     pub adam: AdamConfig,
+    /// The optimiser's constants for the rows of a table.
+    pub table_adam: AdamConfig,
     /// What photographs with alpha are composited over.
     pub background: Background,
     /// Seed of everything random.
@@ -60,39 +81,65 @@ impl Config {
     /// The numbers of a preset.
     pub fn preset(preset: Preset) -> Self {
         let paper = ClassicConfig::paper();
+        let small = ClassicConfig { depth: 4, width: 128, skips: vec![], view_width: 64, ..paper.clone() };
+        let proposal =
+            ClassicConfig { depth: 2, width: 64, skips: vec![], view_width: 32, position_levels: 6, ..paper.clone() };
         let classic = Config {
-            coarse: paper.clone(),
-            fine: paper.clone(),
-            coarse_samples: 64,
-            fine_samples: 128,
-            uniform_share: 0.01,
-            batch: 1024,
-            tile: 8,
+            field: FieldConfig::Classic(paper.clone()),
+            sampler: SamplerConfig::Hierarchical(HierarchicalConfig::default()),
             schedule: Schedule::Exponential { from: 5e-4, to: 5e-6, warmup: 0.0 },
             adam: AdamConfig::default(),
+            table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
             background: Background::White,
             seed: 0,
         };
         match preset {
             Preset::Classic => classic,
             Preset::Small => Config {
-                coarse: ClassicConfig {
-                    depth: 2,
-                    width: 64,
-                    skips: vec![],
-                    view_width: 32,
-                    position_levels: 6,
-                    ..paper.clone()
-                },
-                fine: ClassicConfig { depth: 4, width: 128, skips: vec![], view_width: 64, ..paper },
-                coarse_samples: 48,
-                fine_samples: 32,
-                batch: 256,
-                tile: 16,
+                field: FieldConfig::Classic(small),
+                sampler: SamplerConfig::Hierarchical(HierarchicalConfig {
+                    proposal,
+                    coarse: 48,
+                    fine: 32,
+                    batch: 256,
+                    tile: 16,
+                    ..HierarchicalConfig::default()
+                }),
                 schedule: Schedule::Exponential { from: 4e-3, to: 1e-4, warmup: 0.005 },
                 ..classic
             },
+            Preset::Instant => Config {
+                field: FieldConfig::Instant(InstantConfig {
+                    grid: HashGridConfig::cpu(),
+                    density_width: 64,
+                    features: 16,
+                    color_width: 64,
+                    color_depth: 2,
+                    direction_degree: 4,
+                }),
+                sampler: SamplerConfig::Marching(MarchingConfig::default()),
+                schedule: Schedule::Exponential { from: 2e-2, to: 5e-4, warmup: 0.005 },
+                adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
+                background: Background::Random,
+                ..classic
+            },
         }
+    }
+
+    /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves the sampler alone).
+    pub fn with_skip(mut self, skip: Skip) -> Self {
+        match &mut self.sampler {
+            SamplerConfig::Marching(marching) => marching.occupancy.skip = skip,
+            SamplerConfig::Hierarchical(_) if skip == Skip::Off => {}
+            SamplerConfig::Hierarchical(hierarchical) => {
+                // As many samples as the networks saw before, on more rays.
+                let samples = hierarchical.batch * (hierarchical.coarse + hierarchical.fine);
+                let mut marching = MarchingConfig { samples, ..MarchingConfig::default() };
+                marching.occupancy.skip = skip;
+                self.sampler = SamplerConfig::Marching(marching);
+            }
+        }
+        self
     }
 
     /// Whether the numbers make sense together.
@@ -100,36 +147,45 @@ impl Config {
     /// # Errors
     /// If one is out of range.
     pub fn check(&self) -> Result<()> {
-        let counts = [
-            ("coarse_samples", self.coarse_samples, 1, 1 << 12),
-            ("fine_samples", self.fine_samples, 0, 1 << 12),
-            ("batch", self.batch, 1, 1 << 20),
-            ("tile", self.tile, 1, 1 << 16),
-        ];
-        for (name, value, low, high) in counts {
-            if !(low..=high).contains(&value) {
-                return Err(Error::setting(name, format!("is {value}; use {low} to {high}")));
-            }
+        match &self.sampler {
+            SamplerConfig::Hierarchical(config) => config.check(),
+            SamplerConfig::Marching(config) => config.check(),
         }
-        if !(0.0..=1.0).contains(&self.uniform_share) {
-            return Err(Error::setting("uniform_share", format!("is {}; use 0 to 1", self.uniform_share)));
-        }
-        Ok(())
     }
 
-    /// The same without positional encoding: both networks see bare coordinates.
+    fn classic_fields(&mut self) -> impl Iterator<Item = &mut ClassicConfig> {
+        let field = match &mut self.field {
+            FieldConfig::Classic(config) => Some(config),
+            FieldConfig::Instant(_) => None,
+        };
+        let proposal = match &mut self.sampler {
+            SamplerConfig::Hierarchical(config) => Some(&mut config.proposal),
+            SamplerConfig::Marching(_) => None,
+        };
+        field.into_iter().chain(proposal)
+    }
+
+    /// The same without positional encoding: classic networks see bare coordinates.
     pub fn without_encoding(mut self) -> Self {
-        for field in [&mut self.coarse, &mut self.fine] {
+        for field in self.classic_fields() {
             (field.position_levels, field.direction_levels) = (0, 0);
         }
         self
     }
 
-    /// The same with the paper's ReLU density.
+    /// The same with the paper's ReLU density in classic networks.
     pub fn with_relu_density(mut self) -> Self {
-        for field in [&mut self.coarse, &mut self.fine] {
+        for field in self.classic_fields() {
             field.density = DensityActivation::Relu;
         }
         self
     }
+}
+
+/// An error unless `low <= value <= high`.
+pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, low: V, high: V) -> Result<()> {
+    if value >= low && value <= high {
+        return Ok(());
+    }
+    Err(Error::setting(name, format!("is {value}; use {low} to {high}")))
 }

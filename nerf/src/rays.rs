@@ -37,6 +37,14 @@ impl<T: Scalar> Rays<T> {
         self.origins.is_empty()
     }
 
+    /// The same rays in another precision.
+    pub fn cast<U: Scalar>(&self) -> Rays<U> {
+        fn all<const N: usize, T: Scalar, U: Scalar>(x: &[[T; N]]) -> Vec<[U; N]> {
+            x.iter().map(|x| x.map(|x| U::from_f64(x.to_f64()))).collect()
+        }
+        Rays { origins: all(&self.origins), directions: all(&self.directions), spans: all(&self.spans) }
+    }
+
     /// The rays with these numbers.
     ///
     /// # Panics
@@ -85,6 +93,30 @@ impl<T: Scalar> Samples<T> {
         }
         let directions = pool.copy_of(&[rays.len(), 3], rays.directions.as_flattened());
         Samples { positions, directions, t, delta, segments }
+    }
+
+    /// The samples with these rising numbers; rays keep their number, some without samples.
+    ///
+    /// # Panics
+    /// If a number is out of range.
+    pub fn select(&self, rows: &[u32], pool: &Pool<T>) -> Self {
+        let mut offsets = Vec::with_capacity(self.segments.len() + 1);
+        offsets.push(0);
+        let mut taken = 0;
+        for range in self.segments.ranges() {
+            taken += rows[taken..].partition_point(|&row| (row as usize) < range.end);
+            offsets.push(taken as u32);
+        }
+        let (mut positions, mut t, mut delta) =
+            (pool.tensor(&[rows.len(), 3]), pool.tensor(&[rows.len()]), pool.tensor(&[rows.len()]));
+        let (p, out_t, out_delta) = (positions.as_mut_slice(), t.as_mut_slice(), delta.as_mut_slice());
+        for (i, &row) in rows.iter().enumerate() {
+            let row = row as usize;
+            p[3 * i..3 * i + 3].copy_from_slice(&self.positions.as_slice()[3 * row..3 * row + 3]);
+            out_t[i] = self.t.as_slice()[row];
+            out_delta[i] = self.delta.as_slice()[row];
+        }
+        Samples { positions, directions: self.directions.clone(), t, delta, segments: Segments::new(offsets) }
     }
 
     /// Number of samples.

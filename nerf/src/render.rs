@@ -3,11 +3,13 @@
 use crate::bounds::clip_span;
 use crate::camera::Camera;
 use crate::image::Image;
-use crate::model::Model;
+use crate::model::{Model, Sampler};
 use crate::rays::Rays;
 use crate::sampler::Jitter;
+use crate::view::Viewer;
 use raygrad_autograd::Tape;
 use rayon::prelude::*;
+use std::ops::Add;
 
 /// What a model sees from a camera.
 #[derive(Debug, Clone)]
@@ -18,56 +20,79 @@ pub struct Picture {
     pub depth: Image,
     /// Share of the ray's light that is blocked, 0..=1.
     pub opacity: Image,
+    /// How often fields were asked.
+    pub evaluations: Evaluations,
 }
 
-/// Rays that are evaluated together.
-const TILE: usize = 32;
+/// How often fields were asked.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Evaluations {
+    /// For a density.
+    pub density: u64,
+    /// For a colour.
+    pub color: u64,
+}
+
+impl Add for Evaluations {
+    type Output = Evaluations;
+    fn add(self, other: Evaluations) -> Evaluations {
+        Evaluations { density: self.density + other.density, color: self.color + other.color }
+    }
+}
+
+/// Colour `[3]`, distance and transmittance of a ray, each times the light that the samples block.
+pub(crate) type RayValues = [f32; 5];
+
+/// Rays that are evaluated together: hierarchical, and marching.
+const TILE: [usize; 2] = [32, 512];
 /// Below this opacity a pixel has no depth.
 const VISIBLE: f32 = 1e-3;
 
 impl Model<f32> {
-    /// The view from `camera` over a background colour, samples in the middle of their bins: the same bits each time,
-    /// on any number of threads.
+    /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
+    /// time, on any number of threads.
     pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
-        let (width, pixels) = (camera.width, camera.width * camera.height);
+        let pixels = camera.width * camera.height;
         let image = |channels| Image::new(camera.width, camera.height, channels);
-        let mut picture = Picture { color: image(3), depth: image(1), opacity: image(1) };
-        let color = picture.color.data.par_chunks_mut(3 * TILE);
-        let depth = picture.depth.data.par_chunks_mut(TILE);
-        let opacity = picture.opacity.data.par_chunks_mut(TILE);
-        color.zip(depth).zip(opacity).enumerate().for_each_init(
-            Tape::new,
-            |tape, (tile, ((color, depth), opacity))| {
+        let (mut color, mut depth, mut opacity) = (image(3), image(1), image(1));
+        let tile = TILE[usize::from(matches!(self.sampler, Sampler::Marching(_)))];
+        let parts = color.data.par_chunks_mut(3 * tile).zip(depth.data.par_chunks_mut(tile));
+        let parts = parts.zip(opacity.data.par_chunks_mut(tile)).enumerate();
+        let evaluations = parts
+            .map_init(Viewer::default, |viewer, (part, ((color, depth), opacity))| {
                 let mut rays = Rays::new();
-                for pixel in tile * TILE..((tile + 1) * TILE).min(pixels) {
-                    let ray = camera.pixel_ray(pixel % width, pixel / width);
+                for pixel in part * tile..((part + 1) * tile).min(pixels) {
+                    let ray = camera.pixel_ray(pixel % camera.width, pixel / camera.width);
                     rays.push(&ray, clip_span(&ray, self.extent.bounds, self.extent.span));
                 }
-                self.view_rays(tape, &rays, background, color, depth, opacity);
-                tape.clear();
-            },
-        );
-        picture
+                let mut values = vec![[0.0; 5]; rays.len()];
+                let evaluations = self.view_rays(viewer, &rays, &mut values);
+                for (i, [r, g, b, distance, left]) in values.into_iter().enumerate() {
+                    for (channel, value) in [r, g, b].into_iter().enumerate() {
+                        color[3 * i + channel] = value + left * background[channel];
+                    }
+                    opacity[i] = 1.0 - left;
+                    depth[i] = if opacity[i] > VISIBLE { distance / opacity[i] } else { 0.0 };
+                }
+                evaluations
+            })
+            .reduce(Evaluations::default, |a, b| a + b);
+        Picture { color, depth, opacity, evaluations }
     }
 
-    fn view_rays(
-        &self,
-        tape: &Tape<f32>,
-        rays: &Rays<f32>,
-        background: [f32; 3],
-        color: &mut [f32],
-        depth: &mut [f32],
-        opacity: &mut [f32],
-    ) {
-        let params = self.params.bind_constant(tape);
-        let rendered = self.render(tape, &params, rays, &mut Jitter::Middle, true).fine;
-        for (ray, values) in rendered.value().as_slice().chunks_exact(5).enumerate() {
-            let (distance, left) = (values[3], values[4]);
-            for channel in 0..3 {
-                color[3 * ray + channel] = values[channel] + left * background[channel];
+    fn view_rays(&self, viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [RayValues]) -> Evaluations {
+        match &self.sampler {
+            Sampler::Hierarchical(sampler) => {
+                let tape = Tape::with_pool(viewer.pool.clone());
+                let params = self.params.bind_constant(&tape);
+                let rendered = sampler.render(&*self.field, &params, rays, &mut Jitter::Middle, true, &tape).fine;
+                for (out, values) in out.iter_mut().zip(rendered.value().as_slice().chunks_exact(5)) {
+                    out.copy_from_slice(values);
+                }
+                let each = (rays.len() * sampler.config.evaluations()) as u64;
+                Evaluations { density: each, color: each }
             }
-            opacity[ray] = 1.0 - left;
-            depth[ray] = if opacity[ray] > VISIBLE { distance / opacity[ray] } else { 0.0 };
+            Sampler::Marching(sampler) => viewer.march(self, sampler, rays, out),
         }
     }
 }

@@ -42,7 +42,7 @@ fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     let tape = Tape::new();
     let params: Bound<'_, f32> = model.params.bind_constant(&tape);
     let positions: Var<'_, f32> = tape.leaf(points);
-    let density = field.density(&params, &positions).sigma;
+    let density = field.density(&params, &field.encode(&params, &positions)).sigma();
     let slopes = density.sum().grad(&[&positions]);
     let moved = slopes[0].as_slice().chunks_exact(3).filter(|slope| slope.iter().any(|x| *x != f32::ZERO)).count();
     moved as f64 / PROBES as f64

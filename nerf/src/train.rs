@@ -1,27 +1,32 @@
 //! Training: tiles of rays on as many cores as there are, and the same bits on any number of them.
 
-use crate::bounds::clip_span;
-use crate::config::Config;
+use crate::batch::{Batch, draw};
+use crate::config::{Config, SamplerConfig};
 use crate::dataset::Dataset;
+use crate::hash_grid::{HashGrad, TableOptimizer};
 use crate::metrics::psnr_from_mse;
-use crate::model::{Extent, Model, squared_error};
-use crate::rays::Rays;
-use crate::sampler::Jitter;
+use crate::model::{Extent, Model, Sampler};
+use crate::slot::{Slot, Work, sum_slots};
 use crate::startup;
-use crate::{Error, Result, background};
-use rand::{RngExt, SeedableRng};
+use crate::{Error, Result};
+use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Adam, Tape, Tensor};
-use raygrad_tensor::add_assign;
+use raygrad_autograd::{Adam, Pool};
 use rayon::prelude::*;
 use serde::Serialize;
-use std::ops::{ControlFlow, Range};
+use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
 /// number of threads, and as many as threads can work at a time.
 const SLOTS: usize = 16;
+/// Tiles of a marching step for each slot.
+const TILES_A_SLOT: usize = 2;
+/// Rays of a marching step: the least, and the most.
+const RAYS: [usize; 2] = [256, 1 << 16];
+/// Steps between updates of the occupancy grid.
+const GRID_EVERY: u64 = 16;
 
 /// How long to train.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,7 +37,7 @@ pub enum Budget {
     Time(Duration),
 }
 
-/// What one step did.
+/// What one step did, and the run so far.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct StepStats {
     /// Number of the step, from 1.
@@ -41,14 +46,18 @@ pub struct StepStats {
     pub train_seconds: f64,
     /// Rays so far.
     pub rays: u64,
-    /// Evaluations of a field so far.
+    /// Evaluations of a density so far.
     pub samples: u64,
-    /// The loss: mean squared error of the coarse field plus that of the fine field.
+    /// Evaluations of a colour, and of all gradients, so far.
+    pub shaded: u64,
+    /// The loss: mean squared error, of a hierarchical model that of the coarse field plus that of the fine one.
     pub loss: f64,
-    /// PSNR of the fine field on this step's rays, in dB.
+    /// PSNR on this step's rays, in dB.
     pub psnr: f64,
-    /// Mean opacity that the fine field gives this step's rays, 0 to 1.
+    /// Mean opacity of this step's rays, 0 to 1.
     pub opacity: f64,
+    /// Share of the occupancy grid that is occupied; 1 without a grid.
+    pub occupied: f64,
     /// The learning rate.
     pub rate: f64,
     /// Elements whose gradient was not finite, so far; they were left alone.
@@ -57,32 +66,23 @@ pub struct StepStats {
     pub restarts: u32,
 }
 
-/// One slot's tape and sums, kept from step to step so that nothing is allocated.
-struct Slot {
-    tape: Tape<f32>,
-    grads: Vec<Tensor<f32>>,
-    /// Summed squared errors of the coarse and the fine field, and summed opacity.
-    sums: [f64; 3],
-}
-
 /// A model in training.
 pub struct Trainer {
     /// The model as it is now.
     pub model: Model<f32>,
     data: Arc<Dataset>,
     adam: Adam<f32>,
+    /// For the table of the field, if it has one.
+    table: Option<TableOptimizer>,
     slots: Vec<Slot>,
+    /// For what happens outside of the slots.
+    pool: Pool<f32>,
+    /// Rays of the next step.
+    batch: usize,
     elapsed: Duration,
-    done: StepStats,
     /// How many models of this run have collapsed.
     collapses: u32,
-}
-
-/// One step's rays and what they should show.
-struct Batch {
-    rays: Rays<f32>,
-    target: Vec<[f32; 3]>,
-    background: Vec<[f32; 3]>,
+    done: StepStats,
 }
 
 /// A generator for one purpose: mixes the parts so that neighbouring numbers give unrelated streams.
@@ -109,21 +109,44 @@ impl Trainer {
         }
         let extent = Extent { bounds: data.bounds, span: [data.near, data.far] };
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
-        let grads = || model.params.values().iter().map(|value| Tensor::zeros(value.shape())).collect();
-        let slots = (0..SLOTS).map(|_| Slot { tape: Tape::new(), grads: grads(), sums: [0.0; 3] }).collect();
+        let batch = match &config.sampler {
+            SamplerConfig::Hierarchical(config) => config.batch,
+            SamplerConfig::Marching(_) => RAYS[0],
+        };
         let done = StepStats {
             step: 0,
             train_seconds: 0.0,
             rays: 0,
             samples: 0,
+            shaded: 0,
             loss: f64::NAN,
             psnr: f64::NAN,
             opacity: f64::NAN,
+            occupied: 1.0,
             rate: 0.0,
             skipped: 0,
             restarts,
         };
-        Ok(Trainer { adam: Adam::new(config.adam), model, data, slots, elapsed: Duration::ZERO, done, collapses: 0 })
+        let mut trainer = Trainer {
+            adam: Adam::new(config.adam),
+            table: None,
+            slots: (0..SLOTS).map(|_| Slot::new()).collect(),
+            pool: Pool::new(),
+            model,
+            data,
+            batch,
+            elapsed: Duration::ZERO,
+            collapses: 0,
+            done,
+        };
+        trainer.reset_optimisers();
+        Ok(trainer)
+    }
+
+    fn reset_optimisers(&mut self) {
+        let config = &self.model.config;
+        self.adam = Adam::new(config.adam);
+        self.table = self.model.field.table().map(|(_, grid)| TableOptimizer::new(grid.clone(), config.table_adam));
     }
 
     /// What the last step did.
@@ -140,127 +163,122 @@ impl Trainer {
                 Budget::Time(time) => self.elapsed.as_secs_f64() / time.as_secs_f64().max(1e-9),
             };
             if fraction >= 1.0 {
-                return;
+                break;
             }
             self.step(fraction);
             if observe(self).is_break() {
-                return;
+                break;
             }
         }
+        let start = Instant::now();
+        self.model.finish_grid();
+        self.elapsed += start.elapsed();
     }
 
     /// One training step; `fraction` says how much of the run is done, for the schedule.
     pub fn step(&mut self, fraction: f64) -> StepStats {
         let start = Instant::now();
-        let config = &self.model.config;
-        let (batch_size, tile) = (config.batch, config.tile);
         let number = self.done.step + 1;
         // A restart draws other rays too.
-        let seed = config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
-        let batch = draw(&self.data, batch_size, config, &mut stream(seed, [number, 0]));
-        let tiles = batch_size.div_ceil(tile);
-        let model = &self.model;
-        self.slots.par_iter_mut().enumerate().for_each(|(index, slot)| {
-            slot.sums = [0.0; 3];
-            for (turn, which) in (index..tiles).step_by(SLOTS).enumerate() {
-                let rays = which * tile..((which + 1) * tile).min(batch_size);
-                slot.tile(model, &batch, rays, turn == 0, &mut stream(seed, [number, 1 + which as u64]));
-            }
-        });
-        let used = &mut self.slots[..tiles.min(SLOTS)];
-        sum_slots(used);
-        let rate = config.schedule.rate(fraction);
-        let skipped = self.adam.step(self.model.params.values_mut(), &used[0].grads, rate);
-        let sums = used.iter().fold([0.0; 3], |sum, slot| std::array::from_fn(|i| sum[i] + slot.sums[i]));
-        let values = 3.0 * batch_size as f64;
+        let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
+        self.update_grid(number, seed);
         let config = &self.model.config;
-        let samples = batch_size * (2 * config.coarse_samples + config.fine_samples);
+        let batch = draw(&self.data, self.batch, config.background, &mut stream(seed, [number, 0]));
+        let tile = match &config.sampler {
+            SamplerConfig::Hierarchical(config) => config.tile,
+            SamplerConfig::Marching(_) => self.batch.div_ceil(SLOTS * TILES_A_SLOT),
+        };
+        let work = self.differentiate(&batch, tile, seed, number);
+        let rate = self.model.config.schedule.rate(fraction);
+        let skipped = self.descend(rate, tile);
+        let values = 3.0 * self.batch as f64;
         self.elapsed += start.elapsed();
         self.done = StepStats {
             step: number,
             train_seconds: self.elapsed.as_secs_f64(),
-            rays: self.done.rays + batch_size as u64,
-            samples: self.done.samples + samples as u64,
-            loss: (sums[0] + sums[1]) / values,
-            psnr: psnr_from_mse(sums[1] / values),
-            opacity: sums[2] / batch_size as f64,
+            rays: self.done.rays + self.batch as u64,
+            samples: self.done.samples + work.samples,
+            shaded: self.done.shaded + work.shaded,
+            loss: (work.proposal_error + work.error) / values,
+            psnr: psnr_from_mse(work.error / values),
+            opacity: work.opacity / self.batch as f64,
+            occupied: self.done.occupied,
             rate,
-            skipped: self.done.skipped + skipped as u64,
+            skipped: self.done.skipped + skipped,
             restarts: self.done.restarts,
         };
+        self.adapt_batch(&work);
         if startup::has_collapsed(self.adam.steps(), self.done.opacity, self.collapses) {
             self.restart();
         }
         self.done
     }
 
+    /// All tiles' gradients, left in the slots.
+    fn differentiate(&mut self, batch: &Batch, tile: usize, seed: u64, number: u64) -> Work {
+        let model = &self.model;
+        let tiles = batch.rays.len().div_ceil(tile);
+        self.slots.par_iter_mut().enumerate().for_each(|(index, slot)| {
+            slot.begin();
+            for which in (index..tiles).step_by(SLOTS) {
+                let rays = which * tile..((which + 1) * tile).min(batch.rays.len());
+                slot.tile(model, batch, rays, &mut stream(seed, [number, 1 + which as u64]));
+            }
+        });
+        self.slots.iter().fold(Work::default(), |sum, slot| sum + slot.work)
+    }
+
+    /// Moves the parameters; returns how many elements were left alone.
+    fn descend(&mut self, rate: f64, tile: usize) -> u64 {
+        let used = self.batch.div_ceil(tile).min(SLOTS);
+        sum_slots(&mut self.slots[..used]);
+        let table_id = self.model.field.table().map(|(id, _)| id);
+        let mut skipped = 0;
+        if let (Some(id), Some(table)) = (table_id, &mut self.table) {
+            // Tiles in their order, whatever slot they fell to.
+            let turns = self.slots[..used].iter().map(|slot| slot.tables.len()).max().unwrap_or(0);
+            let parts =
+                (0..turns).flat_map(|turn| self.slots[..used].iter().filter_map(move |slot| slot.tables.get(turn)));
+            let parts: Vec<Arc<HashGrad<f32>>> = parts.cloned().collect();
+            skipped += table.step(self.model.params.get_mut(id), &parts, rate).skipped as u64;
+            self.slots.iter_mut().for_each(|slot| slot.tables.clear());
+        }
+        let grads = &self.slots[0].grads;
+        let dense = self.model.params.values_mut().iter_mut().zip(grads).filter_map(|(p, g)| Some((p, g.as_ref()?)));
+        skipped + self.adam.step_pairs(dense, rate) as u64
+    }
+
+    /// Chooses the number of rays so that the next step has as many samples as it should.
+    fn adapt_batch(&mut self, work: &Work) {
+        if let Sampler::Marching(marching) = &self.model.sampler {
+            let each = (work.samples as f64 / self.batch as f64).max(0.5);
+            let rays = marching.config.samples as f64 / each;
+            // Not at once: the number of samples a ray is noisy.
+            let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
+            self.batch = rays.next_multiple_of(SLOTS * TILES_A_SLOT).clamp(RAYS[0], RAYS[1]);
+        }
+    }
+
+    fn update_grid(&mut self, number: u64, seed: u64) {
+        if number % GRID_EVERY != 1 || number == 1 {
+            return;
+        }
+        let Model { sampler, field, params, .. } = &mut self.model;
+        if let Sampler::Marching(marching) = sampler {
+            marching.update(&**field, params, &self.pool, number, seed);
+            self.done.occupied = marching.grid.occupied_share();
+        }
+    }
+
     /// Begins again with other random parameters.
     fn restart(&mut self) {
         let config = self.model.config.clone();
-        self.collapses += 1;
         self.done.restarts += 1;
+        self.collapses += 1;
         let seed = config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
         if let Ok((model, _)) = startup::living_model(&config, self.model.extent, seed) {
             self.model = model;
         }
-        self.adam = Adam::new(config.adam);
+        self.reset_optimisers();
     }
-}
-
-impl Slot {
-    /// Adds one tile's gradients to the slot's; `first` replaces what the last step left there.
-    fn tile(&mut self, model: &Model<f32>, batch: &Batch, rays: Range<usize>, first: bool, rng: &mut Pcg64Mcg) {
-        let tape = &self.tape;
-        let params = model.params.bind(tape);
-        let part = batch.rays.slice(rays.clone());
-        let copy = |values: &[[f32; 3]]| tape.pool().copy_of(&[part.len(), 3], values.as_flattened());
-        let (target, background) = (copy(&batch.target[rays.clone()]), copy(&batch.background[rays]));
-        let rendered = model.render(tape, &params, &part, &mut Jitter::Random(rng), false);
-        let coarse = squared_error(&rendered.coarse, &target, &background);
-        let fine = squared_error(&rendered.fine, &target, &background);
-        self.sums[0] += f64::from(coarse.item());
-        self.sums[1] += f64::from(fine.item());
-        let left = rendered.fine.value().as_slice().chunks_exact(rendered.fine.shape()[1]);
-        self.sums[2] += left.map(|ray| 1.0 - f64::from(ray[ray.len() - 1])).sum::<f64>();
-        let loss = (coarse + fine) * (1.0 / (3.0 * batch.rays.len() as f64));
-        drop(rendered);
-        let grads = loss.grad_once(&params.vars());
-        for (sum, grad) in self.grads.iter_mut().zip(&grads) {
-            if first {
-                sum.as_mut_slice().copy_from_slice(grad.as_slice());
-            } else {
-                add_assign(sum.as_mut_slice(), grad.as_slice());
-            }
-        }
-        drop((grads, loss, params, target, background));
-        self.tape.clear();
-    }
-}
-
-/// Adds the gradients of all slots, in order, to those of the first; parallel over parameters.
-fn sum_slots(slots: &mut [Slot]) {
-    let Some((first, rest)) = slots.split_first_mut() else { return };
-    // A tape cannot be shared between threads, but the sums beside it can.
-    let rest: Vec<&[Tensor<f32>]> = rest.iter().map(|slot| &slot.grads[..]).collect();
-    first.grads.par_iter_mut().enumerate().for_each(|(i, sum)| {
-        for grads in &rest {
-            add_assign(sum.as_mut_slice(), grads[i].as_slice());
-        }
-    });
-}
-
-/// Random pixels of random photographs.
-fn draw(data: &Dataset, count: usize, config: &Config, rng: &mut Pcg64Mcg) -> Batch {
-    let mut batch =
-        Batch { rays: Rays::new(), target: Vec::with_capacity(count), background: Vec::with_capacity(count) };
-    for _ in 0..count {
-        let frame = &data.frames[rng.random_range(0..data.frames.len())];
-        let (x, y) = (rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height));
-        let ray = frame.camera.pixel_ray(x, y);
-        let color = config.background.draw(rng);
-        batch.rays.push(&ray, clip_span(&ray, data.bounds, [data.near, data.far]));
-        batch.target.push(background::over(frame.image.pixel(x, y), color));
-        batch.background.push(color);
-    }
-    batch
 }

@@ -41,7 +41,7 @@ pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
     let mut depth = picture.depth.clone();
     for (depth, &opacity) in depth.data.iter_mut().zip(&picture.opacity.data) {
         if opacity < 0.5 {
-            *depth = f32::NAN;
+            *depth = 0.0;
         }
     }
     colormap::depth_map(&depth, near, far)

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raygrad::nerf::dataset::{Dataset, Split};
+use raygrad::nerf::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
 
 use super::cameras::Viewpoint;
@@ -27,9 +28,13 @@ pub struct Args {
     /// Folder with transforms_train.json and its images, or the scene that is built in
     #[arg(default_value = "embedded")]
     scene: Scene,
-    /// Size of model: small (minutes) or classic (the paper's, hours)
-    #[arg(long, default_value = "small")]
+    /// Kind of model: instant (a minute), small (minutes) or classic (the paper's, hours)
+    #[arg(long, default_value_t)]
     preset: Preset,
+    /// How much empty space to pass over: off, lossless or fast [default: fast for instant; small and classic sample
+    /// hierarchically instead]
+    #[arg(long)]
+    skip: Option<Skip>,
     /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it [default: by preset]
     #[arg(long, value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
     budget: Option<Duration>,
@@ -42,9 +47,9 @@ pub struct Args {
     /// Train at 1/K of the images' size
     #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
-    /// What lies behind transparent images: white, black or random
-    #[arg(long, default_value_t)]
-    background: Background,
+    /// What lies behind transparent images: white, black or random [default: random for instant, else white]
+    #[arg(long)]
+    background: Option<Background>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -79,11 +84,12 @@ impl Trained {
 pub fn run(args: &Args) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let data = Arc::new(args.scene.load(Split::Train, args.downscale, usize::MAX)?);
-    let mut trainer = Trainer::new(args.config(&data)?, data.clone())?;
+    let config = args.config(&data)?;
+    let background = config.background.shown();
+    let mut trainer = Trainer::new(config, data.clone())?;
     let run = Run::create(folder, args.run_config(&trainer, &data)?)?;
     describe(&run, &trainer, &data)?;
 
-    let background = args.background.shown();
     let preview = Preview::choose(&args.scene, args.downscale, &data, background);
     let budget = args.budget();
     let mut watch = Watch::new(&run, &trainer, budget, preview)?;
@@ -103,10 +109,20 @@ pub fn run(args: &Args) -> Result<Trained> {
 
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
-        if self.background == Background::Random && !data.has_alpha() {
-            return Err(Error::setting("background", "random needs images with transparency, and these have none"));
+        let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
+        if let Some(background) = self.background {
+            config.background = background;
         }
-        let config = Config { seed: self.seed, background: self.background, ..Config::preset(self.preset) };
+        if config.background == Background::Random && !data.has_alpha() {
+            if self.background.is_some() {
+                let what = "random needs images with transparency, and these have none";
+                return Err(Error::setting("background", what));
+            }
+            config.background = Background::White;
+        }
+        if let Some(skip) = self.skip {
+            config = config.with_skip(skip);
+        }
         Ok(if self.no_encoding { config.without_encoding() } else { config })
     }
 
@@ -133,6 +149,7 @@ impl Args {
 /// Training time after which a preset shows what it can do.
 fn default_budget(preset: Preset) -> Duration {
     match preset {
+        Preset::Instant => Duration::from_secs(45),
         Preset::Small => Duration::from_secs(100),
         Preset::Classic => Duration::from_secs(3600),
     }

@@ -6,6 +6,8 @@ use crate::{Pool, Scalar, Shape, Tensor, simd};
 const LANES: usize = 32;
 /// Rows that are added one after another before pairs are formed.
 const BLOCK: usize = 16;
+/// Columns that are summed together: four 512-bit registers of f32.
+const STRIP: usize = 64;
 
 /// The sum of a slice.
 ///
@@ -50,7 +52,7 @@ fn chunk<T: Scalar>(x: &[T]) -> T {
     let mut width = LANES / 2;
     while width > 0 {
         for i in 0..width {
-            lanes[i] = lanes[i] + lanes[i + width];
+            lanes[i] += lanes[i + width];
         }
         width /= 2;
     }
@@ -66,26 +68,35 @@ pub fn sum_rows<T: Scalar>(x: &[T], out: &mut [T]) {
         return;
     }
     assert_eq!(x.len() % out.len(), 0, "{} values are no whole rows of {}", x.len(), out.len());
-    let rows = x.len() / out.len();
-    if rows <= BLOCK {
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                out.fill(T::ZERO);
-                for row in x.chunks_exact(out.len()) {
-                    for (out, &x) in out.iter_mut().zip(row) {
-                        *out += x;
-                    }
-                }
-            },
-        );
-        return;
+    let stride = out.len();
+    for (strip, out) in out.chunks_mut(STRIP).enumerate() {
+        let sums = pairwise_rows(x, stride, strip * STRIP, out.len());
+        out.copy_from_slice(&sums[..out.len()]);
     }
-    let half = (rows / 2).next_multiple_of(BLOCK) * out.len();
-    let mut rest = vec![T::ZERO; out.len()];
-    sum_rows(&x[..half], out);
-    sum_rows(&x[half..], &mut rest);
-    crate::elementwise::add_assign(out, &rest);
+}
+
+/// The sums of columns `first..first + width` of the rows of length `stride`; `width` is at most [`STRIP`].
+fn pairwise_rows<T: Scalar>(x: &[T], stride: usize, first: usize, width: usize) -> [T; STRIP] {
+    let rows = x.len() / stride;
+    if rows > BLOCK {
+        let half = (rows / 2).next_multiple_of(BLOCK) * stride;
+        let mut sums = pairwise_rows(&x[..half], stride, first, width);
+        let rest = pairwise_rows(&x[half..], stride, first, width);
+        sums.iter_mut().zip(rest).for_each(|(sum, rest)| *sum += rest);
+        return sums;
+    }
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let mut sums = [T::ZERO; STRIP];
+            for row in x.chunks_exact(stride) {
+                for (sum, &x) in sums.iter_mut().zip(&row[first..first + width]) {
+                    *sum += x;
+                }
+            }
+            sums
+        },
+    )
 }
 
 /// The sum over `axes`, which stay as axes of extent 1.

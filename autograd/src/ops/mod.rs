@@ -4,6 +4,7 @@
 pub(crate) mod activation;
 pub(crate) mod arithmetic;
 pub(crate) mod exponential;
+pub(crate) mod gather;
 pub(crate) mod linear;
 pub(crate) mod matmul;
 pub(crate) mod reduce;

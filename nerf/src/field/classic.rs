@@ -110,20 +110,27 @@ impl Classic {
     }
 
     #[track_caller]
-    fn encode<'t, T: Scalar>(&self, x: &Var<'t, T>, levels: usize) -> Var<'t, T> {
+    fn sinusoids<'t, T: Scalar>(&self, x: &Var<'t, T>, levels: usize) -> Var<'t, T> {
         x.tape().apply(PositionalEncoding { levels, input: true }, &[x])
     }
 }
 
 impl<T: Scalar> Field<T> for Classic {
-    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
-        let samples = positions.shape()[0];
+    fn encode<'t>(&self, _params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
         let centre = self.centre.to_array().map(T::from_f64);
         let centre = positions.tape().constant(Tensor::from_vec(&[3], centre.to_vec()));
-        let local = (positions - centre) * self.scale;
-        let hidden = self.trunk.forward(params, &self.encode(&local, self.config.position_levels));
-        let raw = self.density.forward(params, &hidden).reshape(&[samples]);
-        Density { sigma: self.config.density.apply(&raw), features: hidden }
+        self.sinusoids(&((positions - centre) * self.scale), self.config.position_levels)
+    }
+
+    fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
+        // Nothing to learn from: without a gradient of the positions the encoding is a constant.
+        if positions.is_on_graph() { self.encode(params, positions) } else { positions.tape().constant(known) }
+    }
+
+    fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
+        let features = self.trunk.forward(params, encoding);
+        let raw = self.density.forward(params, &features).reshape(&[encoding.shape()[0]]);
+        Density { value: self.config.density.apply(&raw), log: false, features }
     }
 
     fn color<'t>(
@@ -134,7 +141,7 @@ impl<T: Scalar> Field<T> for Classic {
         segments: &Segments,
     ) -> Var<'t, T> {
         let feature = self.feature.forward(params, features);
-        let seen = self.encode(directions, self.config.direction_levels).segment_expand(segments);
+        let seen = self.sinusoids(directions, self.config.direction_levels).segment_expand(segments);
         let hidden = self.view.forward(params, &Var::concat(&[&feature, &seen], 1));
         self.color.forward(params, &hidden).sigmoid()
     }

@@ -26,7 +26,7 @@ fn dilate_axis(words: &mut [u64], side: usize, axis: usize) {
     let upper = lower << far;
     let stride = side.pow(axis as u32);
     // Rows of blocks along the axis: each word needs its neighbours as they were.
-    for start in (0..words.len()).filter(|start| start / stride % side == 0) {
+    for start in (0..words.len()).filter(|start| (start / stride).is_multiple_of(side)) {
         let mut before = 0;
         for i in 0..side {
             let word = words[start + i * stride];

@@ -6,7 +6,8 @@ use std::ops::Range;
 /// Cells along an edge of a block.
 pub(super) const EDGE: usize = 4;
 /// Cells in a block: the bits of its word.
-pub(super) const CELLS: usize = EDGE * EDGE * EDGE;
+pub(super) const CELLS: usize = u64::BITS as usize;
+const _: () = assert!(EDGE * EDGE * EDGE == CELLS);
 
 /// The geometry of a grid, without its content.
 ///

@@ -1,17 +1,18 @@
 //! Marching rays through the occupied cells of a grid.
 
 use super::OccupancyGrid;
-use super::lattice::{EDGE, Lattice};
 use crate::rays::{Rays, Samples};
 use crate::sampler::Jitter;
 use raygrad_autograd::{Pool, Segments};
 use raygrad_tensor::simd;
 
+mod frame;
 mod spacing;
 #[cfg(test)]
 mod tests;
 
-use spacing::{Cone, Spacing, Uniform};
+use frame::{Frame, LatticeRay, Numbering};
+use spacing::{Cone, LANES, Spacing, Uniform};
 pub use spacing::{MAX_STEPS, Step};
 
 /// The samples that rays have in occupied cells, packed. Kept from call to call, so that nothing is allocated.
@@ -41,110 +42,6 @@ impl MarchBuffer {
     }
 }
 
-/// A ray in units of the smallest cells, mirrored so that no coordinate falls along it.
-///
-/// Mirroring leaves one case of each comparison, and makes a sample on a face belong to the cell that the ray enters.
-struct LatticeRay {
-    origin: [f32; 3],
-    slope: [f32; 3],
-    /// Reciprocals of the slopes; infinite for a slope of 0.
-    inverse: [f32; 3],
-    /// Bit `a` is set if axis `a` is mirrored.
-    octant: usize,
-}
-
-impl LatticeRay {
-    /// `None` if a number is not finite.
-    #[inline(always)]
-    fn new(origin: [f32; 3], direction: [f32; 3], frame: &Frame) -> Option<Self> {
-        let mut ray = LatticeRay { origin: [0.0; 3], slope: [0.0; 3], inverse: [0.0; 3], octant: 0 };
-        let mut sum = 0.0;
-        for axis in 0..3 {
-            // Far from the origin of the scene the difference has no digits in f32.
-            let place = (f64::from(origin[axis]) - frame.low[axis]) * frame.scale[axis];
-            let slope = f64::from(direction[axis]) * frame.scale[axis];
-            let mirrored = slope < 0.0;
-            ray.octant |= usize::from(mirrored) << axis;
-            ray.origin[axis] = (if mirrored { frame.size - place } else { place }) as f32;
-            ray.slope[axis] = slope.abs() as f32;
-            if ray.slope[axis] == 0.0 {
-                // The upper face belongs to the box, but to no cell.
-                ray.origin[axis] = if place == frame.size { frame.size.next_down() as f32 } else { ray.origin[axis] };
-            }
-            ray.inverse[axis] = 1.0 / ray.slope[axis];
-            sum += ray.origin[axis] + ray.slope[axis];
-        }
-        sum.is_finite().then_some(ray)
-    }
-
-    /// The point at distance `t`. Fused, so that it never falls with rising `t`.
-    #[inline(always)]
-    fn at(&self, t: f32) -> [f32; 3] {
-        std::array::from_fn(
-            #[inline(always)]
-            |axis| t.mul_add(self.slope[axis], self.origin[axis]),
-        )
-    }
-
-    /// The distance at which the ray has reached `planes` on all axes (entering a box by its lower planes), or on any
-    /// (leaving it by its upper ones).
-    #[inline(always)]
-    fn reaches(&self, planes: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(
-            #[inline(always)]
-            |axis| (planes[axis] - self.origin[axis]) * self.inverse[axis],
-        )
-    }
-}
-
-/// What all rays of a batch need to know of the grid.
-struct Frame {
-    /// Lower corner of the outermost box, in scene units.
-    low: [f64; 3],
-    /// Smallest cells in a scene unit.
-    scale: [f64; 3],
-    /// Smallest cells along the outermost box.
-    size: f64,
-    cells: i32,
-    /// Half the cells of a cascade.
-    half: i32,
-    cascades: u32,
-    side: isize,
-    blocks: isize,
-}
-
-impl Frame {
-    fn new(lattice: &Lattice) -> Self {
-        let [low, high] = lattice.extent(lattice.cascades - 1);
-        // At most 2^17: exact in every number type here.
-        let cells = lattice.resolution << (lattice.cascades - 1);
-        Frame {
-            low: low.to_array(),
-            scale: (cells as f64 / (high - low)).to_array(),
-            size: cells as f64,
-            cells: cells as i32,
-            half: (lattice.resolution / 2) as i32,
-            cascades: lattice.cascades as u32,
-            side: lattice.side() as isize,
-            blocks: lattice.blocks() as isize,
-        }
-    }
-
-    /// The cascade that a cell belongs to.
-    #[inline(always)]
-    fn cascade(&self, cell: [i32; 3]) -> u32 {
-        let mut cascade = 0;
-        if self.cascades > 1 {
-            let outward = |x: i32| x.max(self.cells - 1 - x) - self.cells / 2;
-            let radius = outward(cell[0]).max(outward(cell[1])).max(outward(cell[2]));
-            while radius >= self.half << cascade {
-                cascade += 1;
-            }
-        }
-        cascade
-    }
-}
-
 impl OccupancyGrid {
     /// The samples of rays that lie in occupied cells.
     ///
@@ -167,15 +64,26 @@ impl OccupancyGrid {
         out.offsets.reserve(rays.len() + 1);
         out.offsets.push(0);
         if step.cone > 0.0 && step.cone != out.cone {
-            (out.cone, _) = (step.cone, out.growth.clear());
+            out.growth.clear();
+            out.cone = step.cone;
         }
         let mut found = Found { t: std::mem::take(&mut out.t), delta: std::mem::take(&mut out.delta), len: 0 };
+        // As long as each other, should the caller have changed one.
+        found.delta.resize(found.t.len(), 0.0);
         simd::dispatch(
             #[inline(always)]
             || {
                 for i in 0..rays.len() {
                     let jitter = jitter.draw() as f32;
-                    out.steps += self.march_ray(&frame, rays, i, step, jitter, &mut out.growth, &mut found);
+                    let ray = LatticeRay::new(rays.origins[i], rays.directions[i], rays.spans[i], &frame);
+                    if let Some(ray) = ray {
+                        let growth = &mut out.growth;
+                        out.steps += if frame.cascades > 1 {
+                            self.march_ray::<true>(&frame, &ray, step, jitter, growth, &mut found)
+                        } else {
+                            self.march_ray::<false>(&frame, &ray, step, jitter, growth, &mut found)
+                        };
+                    }
                     // 2^32 samples are 16 GiB of distances.
                     out.offsets.push(u32::try_from(found.len).unwrap_or_else(|_| panic!("2^32 samples or more")));
                 }
@@ -193,98 +101,91 @@ impl OccupancyGrid {
 
     /// Adds one ray's samples and returns how many it would have if every cell were occupied.
     #[inline(always)]
-    fn march_ray(
+    fn march_ray<const NESTED: bool>(
         &self,
         frame: &Frame,
-        rays: &Rays<f32>,
-        which: usize,
+        ray: &LatticeRay,
         step: &Step,
         jitter: f32,
         growth: &mut Vec<f32>,
         found: &mut Found,
     ) -> u64 {
-        let [mut near, mut far] = rays.spans[which];
-        let Some(ray) = LatticeRay::new(rays.origins[which], rays.directions[which], frame) else { return 0 };
-        if !(near < far) {
-            return 0;
-        }
-        let (enter, leave) = (ray.reaches([0.0; 3]), ray.reaches([frame.size as f32; 3]));
-        for axis in 0..3 {
-            (near, far) = (near.max(enter[axis]), far.min(leave[axis]));
-        }
-        near = near.max(0.0);
-        if !(near < far) {
-            return 0;
-        }
         if step.cone > 0.0 {
-            let spacing = Cone::new(step, near, far, jitter, growth);
-            self.walk::<_, true>(frame, &ray, &spacing, far, step.max_samples, found)
+            let spacing = Cone::new(step, ray.span, jitter, growth);
+            self.walk::<_, true, NESTED>(frame, ray, &spacing, step.max_samples, found)
         } else {
-            let spacing = Uniform::new(step.length, near, jitter);
-            self.walk::<_, false>(frame, &ray, &spacing, far, step.max_samples, found)
+            let spacing = Uniform::new(step, ray.span, jitter);
+            self.walk::<_, false, NESTED>(frame, ray, &spacing, step.max_samples, found)
         }
     }
 
-    /// Leaps from block to block, and tests the samples in blocks that are not empty.
+    /// Leaps over empty blocks, and tests samples in groups from those on that are not empty.
     #[inline(always)]
-    fn walk<S: Spacing, const DELTA: bool>(
+    fn walk<S: Spacing, const DELTA: bool, const NESTED: bool>(
         &self,
         frame: &Frame,
         ray: &LatticeRay,
         spacing: &S,
-        far: f32,
         max_samples: usize,
         found: &mut Found,
     ) -> u64 {
-        let (first, end) = inside(frame, ray, spacing, far);
+        let (first, end) = inside(frame, ray, spacing);
         let limit = found.len.saturating_add(max_samples);
         let leaps = self.leaps.octant(ray.octant);
-        // In the mirrored numbering blocks count down along mirrored axes, from the far corner.
-        let (mut stride, mut corner, mut flip) = ([1, frame.side, frame.side * frame.side], 0, 0);
-        for axis in 0..3 {
-            if ray.octant >> axis & 1 == 1 {
-                corner += stride[axis] * (frame.side - 1);
-                stride[axis] = -stride[axis];
-                flip |= (EDGE - 1) << (2 * axis);
-            }
-        }
+        let numbering = Numbering::new(frame, ray.octant);
         let mut i = first;
         while i < end && found.len < limit {
-            let cell = ray.at(spacing.at(i)).map(
-                #[inline(always)]
-                |x| x as i32,
-            );
-            let cascade = frame.cascade(cell);
-            let (shift, offset) = (cascade + 2, frame.cells / 2 - (frame.half << cascade));
-            let block = cell.map(
-                #[inline(always)]
-                |x| (x - offset) >> shift,
-            );
-            let index = corner
-                + cascade as isize * frame.blocks
-                + stride[0] * block[0] as isize
-                + stride[1] * block[1] as isize
-                + stride[2] * block[2] as isize;
-            let leap = leaps[index as usize];
-            let faces = block.map(
-                #[inline(always)]
-                |b| (((b + i32::from(leap.max(1))) << shift) + offset) as f32,
-            );
-            let next = first_beyond(ray, spacing, faces, i, end);
+            let (cascade, block, _) = frame.locate::<NESTED>(ray.at(spacing.at(i)));
+            let leap = leaps[numbering.word(cascade, block)];
             if leap == 0 {
-                let word = self.words[index as usize];
-                found.test::<_, DELTA>(ray, spacing, i..next, Block { word, cascade, flip });
+                let occupied = self.test::<NESTED>(frame, &numbering, ray, &spacing.group(i)) & first_lanes(end - i);
+                found.add::<_, DELTA>(spacing, i, occupied);
                 found.len = found.len.min(limit);
+                i += LANES;
+            } else {
+                let faces = block.map(
+                    #[inline(always)]
+                    |b| frame.face(cascade, b + i32::from(leap)),
+                );
+                i = first_beyond(ray, spacing, faces, i, end);
             }
-            i = next;
         }
         (end - first) as u64
     }
+
+    /// Which of the samples at these distances lie in occupied cells, one bit for each; any, beyond the box.
+    #[inline(always)]
+    fn test<const NESTED: bool>(
+        &self,
+        frame: &Frame,
+        numbering: &Numbering,
+        ray: &LatticeRay,
+        t: &[f32; LANES],
+    ) -> u32 {
+        let (mut words, mut bits) = ([0; LANES], [0; LANES]);
+        for lane in 0..LANES {
+            let (cascade, block, cell) = frame.locate::<NESTED>(ray.at(t[lane]));
+            words[lane] = numbering.word(cascade, block) as u32;
+            bits[lane] = numbering.bit(cell);
+        }
+        let mut occupied = 0;
+        for lane in 0..LANES {
+            occupied |= ((self.words[words[lane] as usize] >> bits[lane]) as u32 & 1) << lane;
+        }
+        occupied
+    }
+}
+
+/// A bit for each of the first `count` lanes, or for all.
+#[inline(always)]
+fn first_lanes(count: usize) -> u32 {
+    (1 << count.min(LANES)) - 1
 }
 
 /// The first sample and the one after the last that are before `far` and in the box.
 #[inline(always)]
-fn inside<S: Spacing>(frame: &Frame, ray: &LatticeRay, spacing: &S, far: f32) -> (usize, usize) {
+fn inside<S: Spacing>(frame: &Frame, ray: &LatticeRay, spacing: &S) -> (usize, usize) {
+    let far = ray.span[1];
     let mut end = spacing.steps_to(far);
     while end > 0 && spacing.at(end - 1) >= far {
         end -= 1;
@@ -318,15 +219,6 @@ fn first_beyond<S: Spacing>(ray: &LatticeRay, spacing: &S, faces: [f32; 3], i: u
     }
 }
 
-/// A block that is not empty.
-#[derive(Clone, Copy)]
-struct Block {
-    word: u64,
-    cascade: u32,
-    /// What to flip in the number of a cell in the mirrored block.
-    flip: usize,
-}
-
 /// Samples so far: the first `len` elements, of more that are there to be overwritten.
 struct Found {
     t: Vec<f32>,
@@ -335,35 +227,27 @@ struct Found {
 }
 
 impl Found {
-    /// Adds those of a range of samples, all in one block, whose cells are occupied.
+    /// Adds those of a group of samples that have their bit set.
     #[inline(always)]
-    fn test<S: Spacing, const DELTA: bool>(
-        &mut self,
-        ray: &LatticeRay,
-        spacing: &S,
-        samples: std::ops::Range<usize>,
-        block: Block,
-    ) {
-        let needed = self.len + samples.len();
-        if self.t.len() < needed {
-            self.t.resize(2 * needed, 0.0);
-        }
-        if DELTA && self.delta.len() < needed {
-            self.delta.resize(2 * needed, 0.0);
-        }
-        for i in samples {
-            let t = spacing.at(i);
-            let cell = ray.at(t).map(
-                #[inline(always)]
-                |x| (x as i32 >> block.cascade) as usize % EDGE,
-            );
-            let bit = (cell[0] + EDGE * cell[1] + EDGE * EDGE * cell[2]) ^ block.flip;
-            // Written in any case, counted if it is occupied: no branch to predict.
-            self.t[self.len] = t;
+    fn add<S: Spacing, const DELTA: bool>(&mut self, spacing: &S, group: usize, mut set: u32) {
+        if self.t.len() < self.len + 2 * LANES {
+            let room = 2 * self.len + 4 * LANES;
+            self.t.resize(room, 0.0);
             if DELTA {
-                self.delta[self.len] = spacing.width(i);
+                self.delta.resize(room, 0.0);
             }
-            self.len += (block.word >> bit & 1) as usize;
+        }
+        // Samples in a row, of which there are few in a group, are written as a whole group from the first one on: what
+        // follows them is overwritten by the next ones.
+        while set != 0 {
+            let (skipped, count) = (set.trailing_zeros(), (set >> set.trailing_zeros()).trailing_ones());
+            let first = group + skipped as usize;
+            self.t[self.len..][..LANES].copy_from_slice(&spacing.group(first));
+            if DELTA {
+                self.delta[self.len..][..LANES].copy_from_slice(&spacing.widths(first));
+            }
+            self.len += count as usize;
+            set &= !(((1 << count) - 1) << skipped);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Looking at a field: a few cells at a time in training, all that matter before rendering.
 
-use super::lattice::{CELLS, EDGE, cell};
+use super::lattice::{CELLS, cell};
 use super::{OccupancyGrid, TASK, bits, exceeding};
 use crate::train::stream;
 use rand::RngExt;
@@ -202,6 +202,3 @@ impl OccupancyGrid {
         tasks.map_init(Waiting::default, look).sum()
     }
 }
-
-// A block has as many cells as a word has bits.
-const _: () = assert!(EDGE * EDGE * EDGE == u64::BITS as usize);

@@ -6,11 +6,16 @@ use serde::{Deserialize, Serialize};
 /// A ray is marched for no more steps than this.
 pub const MAX_STEPS: usize = 1 << 20;
 
+/// Samples that are worked on at a time.
+pub(super) const LANES: usize = 16;
+/// What the steps of a cone hold beyond the last: a group may begin at the last sample of another.
+const SPARE: usize = 2 * LANES;
+
 /// How far apart samples are.
 ///
 /// At distance `t` a step is `length + cone t` long. Sample `i` of a ray that enters at `near` lies at
 /// `t_i = t_0 + (length + cone t_0) ((1 + cone)^i - 1) / cone` with `t_0 = near + jitter (length + cone near)`, which is
-/// `t_0 + i length` for a cone of 0: each from `i` with one rounding of the sum, within 1 ULP however large `i` is.
+/// `t_0 + i length` for a cone of 0: each directly from `i`, so within 1 ULP, or 2 with a cone, however large `i` is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Step {
@@ -48,9 +53,11 @@ impl Step {
 pub(super) trait Spacing {
     /// The distance of sample `i`, which never falls with `i`.
     fn at(&self, i: usize) -> f32;
-    /// The length that sample `i` stands for.
-    fn width(&self, i: usize) -> f32;
-    /// The number of samples before the distance `t`, but for rounding; at most `max_steps`.
+    /// The distances of samples `first` and the next.
+    fn group(&self, first: usize) -> [f32; LANES];
+    /// The lengths that they stand for.
+    fn widths(&self, first: usize) -> [f32; LANES];
+    /// The number of samples before the distance `t`, wrong by one or by rounding; at most `max_steps`.
     fn steps_to(&self, t: f32) -> usize;
     /// One more than the largest sample there is.
     fn max_steps(&self) -> usize;
@@ -65,7 +72,8 @@ pub(super) struct Uniform {
 
 impl Uniform {
     #[inline(always)]
-    pub fn new(length: f32, near: f32, jitter: f32) -> Self {
+    pub fn new(step: &Step, [near, _]: [f32; 2], jitter: f32) -> Self {
+        let length = step.length;
         Uniform { start: jitter.mul_add(length, near), length, inverse: 1.0 / length }
     }
 }
@@ -73,18 +81,27 @@ impl Uniform {
 impl Spacing for Uniform {
     #[inline(always)]
     fn at(&self, i: usize) -> f32 {
-        // i is at most 2^20: exact.
-        (i as f32).mul_add(self.length, self.start)
+        // i is little more than 2^20: exact, and a conversion from i32 is one instruction.
+        (i as i32 as f32).mul_add(self.length, self.start)
     }
 
     #[inline(always)]
-    fn width(&self, _: usize) -> f32 {
-        self.length
+    fn group(&self, first: usize) -> [f32; LANES] {
+        let mut out = [0.0; LANES];
+        for lane in 0..LANES {
+            out[lane] = self.at(first + lane);
+        }
+        out
+    }
+
+    #[inline(always)]
+    fn widths(&self, _: usize) -> [f32; LANES] {
+        [self.length; LANES]
     }
 
     #[inline(always)]
     fn steps_to(&self, t: f32) -> usize {
-        (((t - self.start) * self.inverse).clamp(-1.0, MAX_STEPS as f32 - 1.0) as i32 + 1) as usize
+        whole((t - self.start) * self.inverse, (MAX_STEPS - 1) as f32) as usize + 1
     }
 
     #[inline(always)]
@@ -106,12 +123,17 @@ pub(super) struct Cone<'a> {
 impl<'a> Cone<'a> {
     /// `growth` is extended by what this ray needs.
     #[inline(always)]
-    pub fn new(step: &Step, near: f32, far: f32, jitter: f32, growth: &'a mut Vec<f32>) -> Self {
+    pub fn new(step: &Step, [near, far]: [f32; 2], jitter: f32, growth: &'a mut Vec<f32>) -> Self {
         let from_near = step.cone.mul_add(near, step.length);
         let start = jitter.mul_add(from_near, near);
         let from_start = step.cone.mul_add(start, step.length);
         let cone = f64::from(step.cone);
-        while growth.len() < MAX_STEPS && growth.last().is_none_or(|last| last.mul_add(from_start, start) < far) {
+        // Up to `far`, and as far again as a group from the last sample on reaches.
+        let is_short = |growth: &[f32]| match growth.len().checked_sub(SPARE + 1) {
+            Some(last) => last + 1 < MAX_STEPS && growth[last].mul_add(from_start, start) < far,
+            None => true,
+        };
+        while is_short(growth) {
             growth.push(((growth.len() as f64 * cone.ln_1p()).exp_m1() / cone) as f32);
         }
         Cone { start, from_start, from_near, cone: step.cone, growth }
@@ -125,17 +147,42 @@ impl Spacing for Cone<'_> {
     }
 
     #[inline(always)]
-    fn width(&self, i: usize) -> f32 {
-        self.from_near * self.cone.mul_add(self.growth[i], 1.0)
+    fn group(&self, first: usize) -> [f32; LANES] {
+        let (mut out, growth) = ([0.0; LANES], &self.growth[first..first + LANES]);
+        for lane in 0..LANES {
+            out[lane] = growth[lane].mul_add(self.from_start, self.start);
+        }
+        out
+    }
+
+    #[inline(always)]
+    fn widths(&self, first: usize) -> [f32; LANES] {
+        let (mut out, growth) = ([0.0; LANES], &self.growth[first..first + LANES]);
+        for lane in 0..LANES {
+            out[lane] = self.from_near * self.cone.mul_add(growth[lane], 1.0);
+        }
+        out
     }
 
     #[inline(always)]
     fn steps_to(&self, t: f32) -> usize {
-        self.growth.partition_point(|g| g.mul_add(self.from_start, self.start) < t)
+        self.growth[..self.max_steps()].partition_point(|g| g.mul_add(self.from_start, self.start) < t)
     }
 
     #[inline(always)]
     fn max_steps(&self) -> usize {
-        self.growth.len()
+        self.growth.len() - SPARE
     }
+}
+
+/// The whole part of a number that is limited to `0..=last` first; `last` is at most 2^30, and NaN becomes 0.
+///
+/// `as` also limits, to all of `i32`, but is compiled to code for one lane at a time.
+#[inline(always)]
+pub(super) fn whole(x: f32, last: f32) -> i32 {
+    debug_assert!(last <= (1 << 30) as f32);
+    let x = if x > 0.0 { x } else { 0.0 };
+    let x = if x < last { x } else { last };
+    // SAFETY: x is neither NaN nor infinite, and its whole part is in 0..=2^30.
+    unsafe { x.to_int_unchecked() }
 }

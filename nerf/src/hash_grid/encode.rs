@@ -1,0 +1,231 @@
+//! The encoding as an operation.
+
+use super::kernel::{BLOCK, Cells, Points};
+use super::{HashGrad, HashGrid, HashGridConfig, HashLevel};
+use raygrad_autograd::{Entry, Grads, Op, Pool, Scalar, Shape, ShapeError, Tensor, Touched, Var, Vjp};
+use raygrad_tensor::simd;
+use std::sync::Arc;
+
+/// Calls `$self.$method::<F>(..)` with the grid's number of features as `F`.
+macro_rules! with_features {
+    ($grid:expr, $method:ident($($argument:expr),*)) => {
+        match $grid.features() {
+            1 => $grid.$method::<_, 1>($($argument),*),
+            2 => $grid.$method::<_, 2>($($argument),*),
+            4 => $grid.$method::<_, 4>($($argument),*),
+            8 => $grid.$method::<_, 8>($($argument),*),
+            _ => unreachable!("`HashGrid::new` allows 1, 2, 4 and 8"),
+        }
+    };
+}
+
+impl HashGrid {
+    /// The features of `positions` (`[samples, 3]`, clamped to the unit cube) to `out` (`[samples, width]`).
+    pub(super) fn encode<T: Scalar>(&self, positions: &[T], table: &[T], out: &mut [T]) {
+        with_features!(self, encode_rows(positions, table, out))
+    }
+
+    fn encode_rows<T: Scalar, const F: usize>(&self, positions: &[T], table: &[T], out: &mut [T]) {
+        assert_eq!(table.len(), self.rows() * F, "a table of the grid's rows");
+        let (table, _) = table.as_chunks::<F>();
+        let width = self.width();
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let (mut points, mut cells) = (Points::new(), Cells::new());
+                for (positions, out) in positions.chunks(3 * BLOCK).zip(out.chunks_mut(width * BLOCK)) {
+                    points.load(positions);
+                    for (l, level) in self.levels().iter().enumerate() {
+                        cells.locate(level, &points);
+                        cells.gather(&table[level.rows.clone()], out, width, l * F);
+                    }
+                }
+            },
+        );
+    }
+
+    /// Adds to `grad` the gradient of one level's rows, `[rows of the level, features]`, that `d_out` (`[samples, width]`,
+    /// the gradient of the encoding of `positions`, `[samples, 3]`) makes, in the order of the samples, and marks the rows
+    /// it touches. Samples whose gradient on this level is all zero touch nothing.
+    ///
+    /// # Panics
+    /// If there is no such level or a length does not fit.
+    #[track_caller]
+    pub fn scatter_level<T: Scalar>(
+        &self,
+        level: usize,
+        positions: &[T],
+        d_out: &[T],
+        grad: &mut [T],
+        touched: &mut Touched,
+    ) {
+        let (rows, samples) = (self.levels()[level].rows.len(), positions.len() / 3);
+        assert_eq!(positions.len(), 3 * samples, "positions of three coordinates");
+        assert_eq!(d_out.len(), samples * self.width(), "gradients of {samples} encoded positions");
+        assert_eq!(grad.len(), rows * self.features(), "a gradient of the rows of level {level}");
+        assert_eq!(touched.groups(), rows.div_ceil(Touched::GROUP), "marks of the rows of level {level}");
+        with_features!(self, scatter_rows(level, positions, d_out, grad, touched))
+    }
+
+    fn scatter_rows<T: Scalar, const F: usize>(
+        &self,
+        level: usize,
+        positions: &[T],
+        d_out: &[T],
+        grad: &mut [T],
+        touched: &mut Touched,
+    ) {
+        let (grad, _) = grad.as_chunks_mut::<F>();
+        let width = self.width();
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let (mut points, mut cells) = (Points::new(), Cells::new());
+                for (positions, d_out) in positions.chunks(3 * BLOCK).zip(d_out.chunks(width * BLOCK)) {
+                    points.load(positions);
+                    cells.locate(&self.levels()[level], &points);
+                    cells.scatter(d_out, width, level * F, grad, touched);
+                }
+            },
+        );
+    }
+
+    /// Adds to `grad` (`[samples, 3]`) the gradient of `positions` that `d_out` (`[samples, width]`) makes.
+    pub(super) fn slopes<T: Scalar>(&self, positions: &[T], table: &[T], d_out: &[T], grad: &mut [T]) {
+        with_features!(self, slope_rows(positions, table, d_out, grad))
+    }
+
+    fn slope_rows<T: Scalar, const F: usize>(&self, positions: &[T], table: &[T], d_out: &[T], grad: &mut [T]) {
+        let (table, _) = table.as_chunks::<F>();
+        let width = self.width();
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let (mut points, mut cells) = (Points::new(), Cells::new());
+                let gradients = d_out.chunks(width * BLOCK).zip(grad.chunks_mut(3 * BLOCK));
+                for (positions, (d_out, grad)) in positions.chunks(3 * BLOCK).zip(gradients) {
+                    points.load(positions);
+                    for (l, level) in self.levels().iter().enumerate() {
+                        cells.locate(level, &points);
+                        let scale = T::from_f64(f64::from(level.resolution));
+                        cells.slopes(&table[level.rows.clone()], d_out, width, l * F, scale, grad);
+                    }
+                    for (grad, &x) in grad.iter_mut().zip(positions) {
+                        // Outside of the cube the features are constant.
+                        *grad = if x < T::ZERO || x > T::ONE { T::ZERO } else { *grad };
+                    }
+                }
+            },
+        );
+    }
+}
+
+/// The features of positions on all levels of a grid, interpolated trilinearly between the corners of their cells.
+///
+/// Inputs are positions `[samples, 3]` in the unit cube and the table `[rows, features]` of the grid; the output is
+/// `[samples, levels * features]`, coarsest level first. On a level of `N` cells a side, `x N` lies in the cell
+/// `min(floor(x N), N - 1)`.
+///
+/// A position outside of the cube counts as the nearest one on it, with gradient 0 along the axes that are outside. A NaN
+/// coordinate makes the sample's features NaN. The gradient of the position jumps where cells meet; there it is the one
+/// of the upper cell.
+#[derive(Debug, Clone)]
+pub struct HashEncoding(
+    /// The grid.
+    pub HashGrid,
+);
+
+impl<T: Scalar> Op<T> for HashEncoding {
+    fn name(&self) -> &'static str {
+        "hash_encoding"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let table = [self.0.rows(), self.0.features()];
+        match x[0] {
+            &[samples, 3] if x[1] == table => Ok([samples, self.0.width()].into_iter().collect()),
+            _ => Err(format!("positions must be [samples, 3] and the table {table:?}")),
+        }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(&[x[0].shape()[0], self.0.width()]);
+        self.0.encode(x[0].as_slice(), x[1].as_slice(), out.as_mut_slice());
+        out
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (positions, table) = (cx.x(0).into_value(), cx.x(1).into_value());
+        let d_out = cx.g().value().clone();
+        let d_positions = cx.needs(0).then(|| {
+            let mut grad = cx.pool().full(positions.shape(), T::ZERO);
+            self.0.slopes(positions.as_slice(), table.as_slice(), d_out.as_slice(), grad.as_mut_slice());
+            cx.constant(grad)
+        });
+        let grads = Grads::new([d_positions, None]);
+        if !cx.needs(1) {
+            return grads;
+        }
+        grads.with_sparse(1, Arc::new(HashGrad { grid: self.0.clone(), positions, d_out }))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let levels: Vec<_> = self.0.levels().iter().map(|level| reference_level(level, &x[0], &x[1])).collect();
+        Some(Var::concat(&levels.iter().collect::<Vec<_>>(), 1))
+    }
+}
+
+/// The features of one level, `[samples, features]`, out of plain operations: only the choice of the cell is constant.
+fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var<'t, T>) -> Var<'t, T> {
+    let (tape, values) = (x.tape(), x.value());
+    let column = |f: &dyn Fn(T) -> T, axis: usize| {
+        tape.constant(Tensor::from_fn(&[values.shape()[0], 1], |i| f(values.as_slice()[3 * i + axis])))
+    };
+    let clamp = |x: T| {
+        if x < T::ZERO {
+            T::ZERO
+        } else if x > T::ONE {
+            T::ONE
+        } else {
+            x
+        }
+    };
+    let scale = f64::from(level.resolution);
+    // The conversion makes NaN 0.
+    let cell = |x: T| ((clamp(x) * T::from_f64(scale)).to_f64() as u32).min(level.resolution - 1);
+    let place: [Var<'t, T>; 3] = std::array::from_fn(|axis| {
+        let inside = column(&|x| if x < T::ZERO || x > T::ONE { T::ZERO } else { T::ONE }, axis);
+        let clamped = x.slice(1, axis, 1) * inside + column(&|x| if x > T::ONE { T::ONE } else { T::ZERO }, axis);
+        clamped * scale - column(&|x| T::from_f64(cell(x).into()), axis)
+    });
+    let corner = |corner: u32| {
+        let side = |axis: usize| corner >> axis & 1;
+        let row = |x: &[T]| level.row(std::array::from_fn(|axis| cell(x[axis]) + side(axis)));
+        let rows = values.as_slice().chunks_exact(3).map(|x| level.rows.start as u32 + row(x)).collect();
+        let weight = |axis: usize| if side(axis) == 1 { place[axis].clone() } else { 1.0 - &place[axis] };
+        table.gather_rows(&rows) * (weight(0) * (weight(1) * weight(2)))
+    };
+    (1..8).fold(corner(0), |sum, k| sum + corner(k))
+}
+
+/// The catalogue entries of this file: dense and hashed levels, with positions that no check moves across a border.
+pub(crate) fn entries() -> Vec<Entry> {
+    let entry = |levels, features, log2_table, coarsest, finest| {
+        let config = HashGridConfig { levels, features, log2_table, coarsest, finest };
+        HashGrid::new(&config).ok().map(|grid| {
+            let table = |seed: u64| {
+                let tiny = grid.init::<f64>(seed);
+                Tensor::from_fn(tiny.shape(), |i| 1e4 * tiny.as_slice()[i])
+            };
+            let positions = |values: &[f64]| Tensor::from_vec(&[values.len() / 3, 3], values.to_vec());
+            Entry::new(HashEncoding(grid.clone()))
+                .sample_of(vec![positions(&[0.11, 0.53, 0.92, 0.42, 0.07, 0.28, 0.46, 0.22, 0.71]), table(1)])
+                .sample_of(vec![positions(&[]), table(2)])
+        })
+    };
+    [entry(3, 2, 7, 2, 9), entry(1, 1, 10, 4, 4), entry(2, 4, 4, 3, 5)].into_iter().flatten().collect()
+}

@@ -1,0 +1,287 @@
+//! The hash grid against a plain oracle, at its borders, and as a linear map with an adjoint.
+
+use super::*;
+use proptest::prelude::*;
+use raygrad_autograd::{AdamConfig, Check, Op, Pool, Scalar, Tape, Tensor, Touched, check_op};
+use std::sync::Arc;
+
+fn grid(levels: usize, features: usize, log2_table: u32, coarsest: usize, finest: usize) -> HashGrid {
+    HashGrid::new(&HashGridConfig { levels, features, log2_table, coarsest, finest }).unwrap()
+}
+
+fn encode<T: Scalar>(grid: &HashGrid, positions: &[f64], table: &Tensor<T>) -> Vec<f64> {
+    let positions = Tensor::from_vec(&[positions.len() / 3, 3], positions.iter().map(|&x| T::from_f64(x)).collect());
+    let out = HashEncoding(grid.clone()).forward(&[&positions, table], &Pool::none());
+    out.as_slice().iter().map(|x| x.to_f64()).collect()
+}
+
+/// Reproducible numbers in 0..1.
+fn units(count: usize, salt: u64) -> Vec<f64> {
+    let table = grid(1, 1, 4, 1, 1);
+    (0..count as u64).map(|i| 0.5 + 5e3 * table.init::<f64>(salt + 1000 * i).as_slice()[0]).collect()
+}
+
+/// The features at one position, written down as the paper says them, in f64.
+fn oracle(grid: &HashGrid, x: &[f64], table: &Tensor<f64>) -> Vec<f64> {
+    let features = grid.features();
+    let mut out = vec![];
+    for level in grid.levels() {
+        let n = f64::from(level.resolution);
+        let cell: Vec<f64> = x.iter().map(|x| (x.clamp(0.0, 1.0) * n).floor().min(n - 1.0)).collect();
+        let mut sum = vec![0.0; features];
+        for corner in 0..8 {
+            let (mut weight, mut at) = (1.0, [0_u64; 3]);
+            for axis in 0..3 {
+                let (high, place) = (corner >> axis & 1, x[axis].clamp(0.0, 1.0) * n - cell[axis]);
+                weight *= if high == 1 { place } else { 1.0 - place };
+                at[axis] = cell[axis] as u64 + high;
+            }
+            let side = n as u64 + 1;
+            let row = if level.hashed {
+                (at[0] ^ (at[1] * 2_654_435_761) ^ (at[2] * 805_459_861)) % level.rows.len() as u64
+            } else {
+                at[0] + side * (at[1] + side * at[2])
+            };
+            let first = (level.rows.start + row as usize) * features;
+            for (sum, value) in sum.iter_mut().zip(&table.as_slice()[first..]) {
+                *sum += weight * value;
+            }
+        }
+        out.extend(sum);
+    }
+    out
+}
+
+#[test]
+fn the_papers_grid_has_the_papers_levels() {
+    let paper = HashGrid::new(&HashGridConfig::paper()).unwrap();
+    let resolutions: Vec<_> = paper.levels().iter().map(|level| level.resolution).collect();
+    assert_eq!(resolutions, [16, 22, 30, 42, 58, 80, 111, 153, 212, 294, 406, 561, 776, 1072, 1482, 2048]);
+    assert_eq!(paper.levels()[0].rows, 0..4920, "17^3 = 4913 corners, in whole groups");
+    assert!(!paper.levels()[4].hashed && paper.levels()[5].hashed && paper.width() == 32);
+    assert!(paper.levels().iter().skip(5).all(|level| level.rows.len() == 1 << 19));
+    assert!(paper.levels().windows(2).all(|pair| pair[0].rows.end == pair[1].rows.start));
+    assert_eq!(HashGrid::new(&HashGridConfig::cpu()).unwrap().levels()[7].resolution, 2048);
+}
+
+#[test]
+fn settings_out_of_range_are_named() {
+    let wrong = [
+        (HashGridConfig { finest: 65537, ..HashGridConfig::paper() }, "`finest`"),
+        (HashGridConfig { coarsest: 0, ..HashGridConfig::paper() }, "`coarsest`"),
+        (HashGridConfig { features: 3, ..HashGridConfig::paper() }, "`features`"),
+        (HashGridConfig { levels: 0, ..HashGridConfig::paper() }, "`levels`"),
+        (HashGridConfig { log2_table: 25, ..HashGridConfig::paper() }, "`log2_table`"),
+    ];
+    for (config, name) in wrong {
+        let error = HashGrid::new(&config).unwrap_err().to_string();
+        assert!(error.starts_with(name), "{error}");
+    }
+}
+
+#[test]
+fn every_check_passes() {
+    for entry in entries() {
+        check_op(&Check::default(), &entry).unwrap();
+    }
+    assert_eq!(entries().len(), 3);
+}
+
+#[test]
+fn agrees_with_the_formula_at_every_width_and_block_length() {
+    for features in [1, 2, 4, 8] {
+        let grid = grid(5, features, 9, 3, 40);
+        assert!(!grid.levels()[0].hashed && grid.levels()[4].hashed);
+        let table = grid.init::<f64>(7);
+        for samples in [1, 63, 64, 65, 200] {
+            let positions = units(3 * samples, 1);
+            let got = encode(&grid, &positions, &table);
+            let single = encode(&grid, &positions, &table.cast::<f32>());
+            for (i, x) in positions.chunks(3).enumerate() {
+                for (j, expected) in oracle(&grid, x, &table).into_iter().enumerate() {
+                    let k = i * grid.width() + j;
+                    assert!((got[k] - expected).abs() <= 1e-18 + 1e-12 * expected.abs(), "{x:?}");
+                    // Rounding the position moves the place in the cell by at most 2^-24 * 40.
+                    assert!((single[k] - expected).abs() <= 2e-9, "{x:?}");
+                }
+            }
+        }
+    }
+}
+
+/// Coordinates at which naive formulas leave the cube or the cell.
+fn extremes(n: u32) -> Vec<f64> {
+    let border = (n / 2) as f32 / n as f32;
+    let near = [border.next_down(), border, border.next_up(), f32::MIN_POSITIVE, 1.0 - f32::EPSILON / 2.0];
+    let outside = [0.0, -0.0, 1.0, -1e-9, 1.0 + 1e-6, -3.0, 7e30, f32::INFINITY, f32::NEG_INFINITY];
+    near.into_iter().chain(outside).map(f64::from).collect()
+}
+
+#[test]
+fn rows_stay_in_bounds() {
+    // Bounds are asserted here, since the kernels do not check them: with rows that are all 1, whatever is read is 1.
+    for n in [16, 17, 1000, 2048, 65535, 65536] {
+        for (log2_table, levels) in [(4, 1), (15, 1), (15, 2)] {
+            let grid = grid(levels, 2, log2_table, n as usize, n as usize);
+            let table = Tensor::<f32>::ones(&[grid.rows(), 2]);
+            let mut x = extremes(n);
+            x.push(f64::NAN);
+            let positions: Vec<f64> = (0..x.len().pow(3))
+                .flat_map(|i| [x[i % x.len()], x[i / x.len() % x.len()], x[i / x.len().pow(2)]])
+                .collect();
+            let out = encode(&grid, &positions, &table);
+            for (x, out) in positions.chunks(3).zip(out.chunks(grid.width())) {
+                if x.iter().any(|x| x.is_nan()) {
+                    assert!(out.iter().all(|y| y.is_nan()), "{x:?}: {out:?}");
+                } else {
+                    // The weights sum to 1.
+                    assert!(out.iter().all(|y| (y - 1.0).abs() <= 2e-7), "{x:?}: {out:?}");
+                }
+            }
+            let ones = vec![1.0_f32; positions.len() / 3 * grid.width()];
+            let positions: Vec<f32> = positions.iter().map(|&x| x as f32).collect();
+            for (l, level) in grid.levels().iter().enumerate() {
+                let mut touched = Touched::new(level.rows.len());
+                let mut grad = vec![0.0_f32; level.rows.len() * 2];
+                grid.scatter_level(l, &positions, &ones, &mut grad, &mut touched);
+            }
+        }
+    }
+}
+
+#[test]
+fn values_are_continuous_across_cell_borders() {
+    for n in [16_u32, 100, 2048, 65536] {
+        let grid = grid(1, 2, 12, n as usize, n as usize);
+        let table = grid.init::<f32>(3);
+        for cell in [1, n / 3, n / 2, n - 1] {
+            let border = cell as f32 / n as f32;
+            let at = |x: f32| encode(&grid, &[x.into(), 0.3, 0.7], &table);
+            let (below, above) = (at(border.next_down()), at(border.next_up()));
+            // Features differ by at most 2e-4 over a cell, and two steps of f32 are this share of one.
+            let share = f64::from(border.next_up() - border.next_down()) * f64::from(n);
+            for (a, b) in below.iter().zip(above) {
+                assert!((a - b).abs() <= 2e-4 * share + 1e-10, "{a} {b} at {border} of {n}");
+            }
+        }
+    }
+}
+
+#[test]
+fn outside_of_the_cube_counts_as_its_border_without_gradient() {
+    let grid = grid(3, 2, 7, 2, 9);
+    let table = grid.init::<f64>(1);
+    assert_eq!(encode(&grid, &[-1e-9, 0.3, 1.5], &table), encode(&grid, &[0.0, 0.3, 1.0], &table));
+    let tape = Tape::new();
+    let x = tape.leaf(Tensor::from_vec(&[1, 3], vec![-1e-9, 0.3, 1.5]));
+    let table = tape.leaf(table);
+    let [dx, _] = tape.apply(HashEncoding(grid), &[&x, &table]).sum().grad(&[&x, &table]).try_into().unwrap();
+    assert!(dx.as_slice()[0] == 0.0 && dx.as_slice()[2] == 0.0 && dx.as_slice()[1] != 0.0);
+}
+
+proptest! {
+    #[test]
+    fn scatter_is_the_adjoint_of_encode(seed in 0_u64..1000, samples in 1_usize..150) {
+        let grid = grid(4, 2, 8, 3, 33);
+        let (table, positions) = (grid.init::<f64>(seed), units(3 * samples, seed));
+        let d_out = units(samples * grid.width(), seed + 1);
+        let out = encode(&grid, &positions, &table);
+        let forward: f64 = out.iter().zip(&d_out).map(|(a, b)| a * b).sum();
+        let mut backward = 0.0;
+        for (l, level) in grid.levels().iter().enumerate() {
+            let mut grad = vec![0.0; level.rows.len() * 2];
+            grid.scatter_level(l, &positions, &d_out, &mut grad, &mut Touched::new(level.rows.len()));
+            let values = &table.as_slice()[level.rows.start * 2..];
+            backward += grad.iter().zip(values).map(|(a, b)| a * b).sum::<f64>();
+        }
+        prop_assert!((forward - backward).abs() <= 1e-14, "{forward:e} {backward:e}");
+    }
+}
+
+#[test]
+fn scatter_marks_every_row_it_adds_to_and_skips_zeros() {
+    let grid = grid(2, 4, 9, 5, 50);
+    let positions: Vec<f32> = units(3 * 20, 5).iter().map(|&x| x as f32).collect();
+    let mut d_out: Vec<f32> = units(20 * grid.width(), 6).iter().map(|&x| x as f32).collect();
+    for (level, rows) in grid.levels().iter().map(|level| level.rows.len()).enumerate() {
+        let (mut grad, mut touched) = (vec![0.0; rows * 4], Touched::new(rows));
+        grid.scatter_level(level, &positions, &d_out, &mut grad, &mut touched);
+        for (row, grad) in grad.chunks(4).enumerate() {
+            assert!(grad == [0.0; 4] || touched.group(row / Touched::GROUP), "row {row}");
+        }
+    }
+    d_out.fill(0.0);
+    let (mut grad, mut touched) =
+        (vec![0.0; grid.levels()[1].rows.len() * 4], Touched::new(grid.levels()[1].rows.len()));
+    grid.scatter_level(1, &positions, &d_out, &mut grad, &mut touched);
+    assert!((0..touched.groups()).all(|group| !touched.group(group)));
+}
+
+fn tiles(grid: &HashGrid, count: usize) -> Vec<Arc<HashGrad<f32>>> {
+    let tensor = |shape: &[usize], salt| {
+        let values = units(shape.iter().product(), salt);
+        Tensor::from_fn(shape, |i| values[i] as f32)
+    };
+    (0..count as u64)
+        .map(|t| {
+            Arc::new(HashGrad {
+                grid: grid.clone(),
+                positions: tensor(&[90, 3], t),
+                d_out: tensor(&[90, grid.width()], 100 + t),
+            })
+        })
+        .collect()
+}
+
+#[test]
+fn the_optimiser_gives_the_same_bits_on_any_number_of_threads() {
+    let grid = grid(5, 2, 10, 4, 64);
+    let tiles = tiles(&grid, 3);
+    let run = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mut optimizer = TableOptimizer::new(grid.clone(), AdamConfig::default());
+        let mut table = grid.init::<f32>(1);
+        let stats: Vec<_> = (0..5).map(|_| pool.install(|| optimizer.step(&mut table, &tiles, 1e-2))).collect();
+        (table, stats)
+    };
+    let one = run(1);
+    assert!(one.1.iter().all(|stats| stats.touched > 1000 && stats.skipped == 0));
+    assert!(one == run(2) && one == run(4));
+}
+
+#[test]
+fn the_optimiser_uses_the_gradient_of_the_tape() {
+    let grid = grid(3, 2, 6, 4, 16);
+    let tiles = tiles(&grid, 2);
+    let start = grid.init::<f32>(1);
+    let mut dense = vec![0.0_f32; start.len()];
+    for tile in &tiles {
+        let tape = Tape::new();
+        let table = tape.leaf(start.clone());
+        let out = tape.apply(HashEncoding(grid.clone()), &[&tape.constant(tile.positions.clone()), &table]);
+        let grad = (out * tape.constant(tile.d_out.clone())).sum().grad(&[&table]).remove(0);
+        raygrad_tensor::add_assign(&mut dense, grad.as_slice());
+    }
+    let mut table = start.clone();
+    let stats = TableOptimizer::new(grid, AdamConfig::default()).step(&mut table, &tiles, 1e-2);
+    assert_eq!(stats.touched, dense.chunks(2).filter(|row| *row != [0.0; 2]).count());
+    // Adam's first step is the learning rate against the gradient's sign.
+    for ((after, before), g) in table.as_slice().iter().zip(start.as_slice()).zip(dense) {
+        let expected = if g == 0.0 { 0.0 } else { -1e-2 * g.signum() };
+        assert!((after - before - expected).abs() <= 1e-5, "{before} to {after}, gradient {g}");
+    }
+}
+
+#[test]
+fn a_nan_gradient_is_skipped_and_forgotten() {
+    let grid = grid(2, 2, 6, 4, 16);
+    let mut tiles = tiles(&grid, 1);
+    let mut optimizer = TableOptimizer::new(grid.clone(), AdamConfig::default());
+    let mut table = grid.init::<f32>(1);
+    Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = f32::NAN;
+    let bad = optimizer.step(&mut table, &tiles, 1e-2);
+    assert!((1..=8).contains(&bad.skipped) && table.is_finite());
+    Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = 1.0;
+    assert_eq!(optimizer.step(&mut table, &tiles, 1e-2).skipped, 0);
+    assert_eq!(optimizer.step(&mut table, &[], 1e-2), TableStats::default());
+}

@@ -1,0 +1,163 @@
+//! Marching: even steps through the occupied cells of a grid, and as little work as possible on each.
+
+use crate::Result;
+use crate::config::check_range;
+use crate::field::Field;
+use crate::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
+use crate::pass::composite_encoded;
+use crate::rays::{Rays, Samples};
+use crate::sampler::Jitter;
+use raygrad_autograd::{Bound, Params, Pool, Scalar, Segments, Tape, Tensor, Var};
+use serde::{Deserialize, Serialize};
+
+/// Numbers of a [`Marching`] sampler.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MarchingConfig {
+    /// The occupancy grid, and what may be skipped with it.
+    pub occupancy: OccupancyConfig,
+    /// Length of a step as a share of the longest side of the box.
+    pub step: f64,
+    /// Samples in a training step; the number of rays follows.
+    pub samples: usize,
+    /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
+    /// much.
+    pub termination: f64,
+}
+
+impl Default for MarchingConfig {
+    fn default() -> Self {
+        let occupancy = OccupancyConfig { skip: Skip::Fast, ..OccupancyConfig::default() };
+        MarchingConfig { occupancy, step: 1.0 / 300.0, samples: 1 << 15, termination: 1e-3 }
+    }
+}
+
+impl MarchingConfig {
+    pub(crate) fn check(&self) -> Result<()> {
+        self.occupancy.check()?;
+        check_range("step", self.step, 1e-5, 1.0)?;
+        check_range("samples", self.samples, 1, 1 << 24)?;
+        check_range("termination", self.termination, 0.0, 1.0)
+    }
+}
+
+/// In training, cells whose optical depth a step is below this (or below the mean) are passed over.
+const TRAINING_DEPTH: f32 = 0.01;
+/// Training steps in which all cells are looked at.
+const WARM_UP: u64 = 256;
+
+/// The occupancy grid and the numbers.
+#[derive(Debug, Clone)]
+pub struct Marching {
+    /// The numbers.
+    pub config: MarchingConfig,
+    /// Which cells hold something.
+    pub grid: OccupancyGrid,
+}
+
+impl Marching {
+    /// The length of a step in scene units.
+    pub fn step(&self) -> f32 {
+        let [low, high] = self.grid.outer_bounds();
+        (self.config.step * (high - low).max_element()) as f32
+    }
+
+    /// Samples in occupied cells, at even steps from a random start in each ray's span.
+    pub fn samples<T: Scalar>(
+        &self,
+        rays: &Rays<T>,
+        jitter: &mut Jitter<'_>,
+        buffer: &mut MarchBuffer,
+        pool: &Pool<T>,
+    ) -> Samples<T> {
+        self.grid.march(&rays.cast(), &Step::uniform(self.step()), jitter, buffer);
+        let tensor = |values: &[f32]| {
+            let mut out = pool.tensor(&[values.len()]);
+            out.as_mut_slice().iter_mut().zip(values).for_each(|(out, &x)| *out = T::from_f64(x.into()));
+            out
+        };
+        Samples::new(rays, Segments::new(&buffer.offsets[..]), tensor(&buffer.t), tensor(&buffer.delta), pool)
+    }
+
+    /// Looks at some cells of a field in training and passes over those that hold little. `step` counts training steps.
+    pub(crate) fn update(
+        &mut self,
+        field: &dyn Field<f32>,
+        params: &Params<f32>,
+        pool: &Pool<f32>,
+        step: u64,
+        seed: u64,
+    ) {
+        if self.config.occupancy.skip == Skip::Off {
+            return;
+        }
+        let plan = if step < WARM_UP { Update::ALL } else { Update::PARTIAL };
+        self.grid.update(&plan, seed, step, &|points, out| densities(field, params, pool, points, out));
+        let min_sigma = TRAINING_DEPTH / self.step();
+        self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
+    }
+
+    /// Looks at every part that may hold something, closely, for rendering with the error bound of the configuration.
+    pub(crate) fn finish(&mut self, field: &dyn Field<f32>, params: &Params<f32>, pool: &Pool<f32>) {
+        let skip = self.config.occupancy.skip;
+        if skip != Skip::Off {
+            let min_sigma = skip.min_sigma(self.grid.diagonal());
+            self.grid.rebuild(min_sigma, true, &|points, out| densities(field, params, pool, points, out));
+        }
+    }
+}
+
+/// A field's densities, for the occupancy grid.
+fn densities(field: &dyn Field<f32>, params: &Params<f32>, pool: &Pool<f32>, points: &[[f32; 3]], out: &mut [f32]) {
+    let tape = Tape::with_pool(pool.clone());
+    let params = params.bind_constant(&tape);
+    let positions = tape.constant(pool.copy_of(&[points.len(), 3], points.as_flattened()));
+    let density = field.density(&params, &field.encode(&params, &positions));
+    out.copy_from_slice(density.sigma().value().as_slice());
+}
+
+/// Marched samples, composited.
+pub struct Marched<'t, T: Scalar> {
+    /// `[rays, 4 or 5]`: colour, distance if asked for, and the transmittance that is left.
+    pub rendered: Var<'t, T>,
+    /// Samples that had light left in front of them.
+    pub kept: usize,
+}
+
+/// Composites marched samples in two passes: an unrecorded one for the densities, and a recorded one on the samples that
+/// more than `termination` of the light reaches, which takes its encodings from the first. What is dropped changes a
+/// pixel by at most `termination` times the range of colours.
+pub fn composite_visible<'t, T: Scalar>(
+    field: &dyn Field<T>,
+    params: &Bound<'t, T>,
+    samples: &Samples<T>,
+    termination: f64,
+    with_depth: bool,
+    tape: &'t Tape<T>,
+) -> Marched<'t, T> {
+    let (encoding, transmittance) = tape.no_grad(|| {
+        let encoding = field.encode(params, &tape.constant(samples.positions.clone()));
+        let density = field.density(params, &encoding);
+        let composite = density.composite(samples.delta.clone(), samples.segments.clone());
+        let [transmittance, _] = composite.transmittance_and_weights(density.value.value(), tape.pool());
+        (encoding.into_value(), transmittance)
+    });
+    let least = T::from_f64(termination);
+    let rows = transmittance.as_slice().iter().enumerate().filter(|(_, t)| **t > least);
+    let rows: Vec<u32> = rows.map(|(row, _)| row as u32).collect();
+    let visible = samples.select(&rows, tape.pool());
+    let known = select_rows(&encoding, &rows, tape);
+    let encoding = field.encode_known(params, &tape.constant(visible.positions.clone()), known);
+    let (rendered, _) = composite_encoded(field, params, &visible, &encoding, with_depth, tape);
+    Marched { rendered, kept: rows.len() }
+}
+
+/// The rows of a matrix with these numbers.
+fn select_rows<T: Scalar>(x: &Tensor<T>, rows: &[u32], tape: &Tape<T>) -> Tensor<T> {
+    let width = x.shape()[1];
+    let mut out = tape.pool().tensor(&[rows.len(), width]);
+    for (out, &row) in out.as_mut_slice().chunks_exact_mut(width.max(1)).zip(rows) {
+        out.copy_from_slice(&x.as_slice()[row as usize * width..(row as usize + 1) * width]);
+    }
+    out
+}

@@ -1,0 +1,50 @@
+//! Forward passes over samples, as graph code: fields, compositing, background, loss.
+
+use crate::field::Field;
+use crate::rays::Samples;
+use raygrad_autograd::{Bound, Scalar, Tape, Tensor, Var};
+
+/// Colour (and distance, if `with_depth`) of samples, composited along their rays: `[rays, 4 or 5]`, the last channel
+/// being the transmittance that is left. Also the weight of each sample, as a constant.
+pub fn composite_samples<'t, T: Scalar>(
+    field: &dyn Field<T>,
+    params: &Bound<'t, T>,
+    samples: &Samples<T>,
+    with_depth: bool,
+    tape: &'t Tape<T>,
+) -> (Var<'t, T>, Tensor<T>) {
+    let encoding = field.encode(params, &tape.constant(samples.positions.clone()));
+    composite_encoded(field, params, samples, &encoding, with_depth, tape)
+}
+
+/// As [`composite_samples`], from the encoding of the samples' positions.
+pub fn composite_encoded<'t, T: Scalar>(
+    field: &dyn Field<T>,
+    params: &Bound<'t, T>,
+    samples: &Samples<T>,
+    encoding: &Var<'t, T>,
+    with_depth: bool,
+    tape: &'t Tape<T>,
+) -> (Var<'t, T>, Tensor<T>) {
+    let density = field.density(params, encoding);
+    let directions = tape.constant(samples.directions.clone());
+    let mut features = field.color(params, &density.features, &directions, &samples.segments);
+    if with_depth {
+        features = Var::concat(&[&features, &tape.constant(samples.t.reshape(&[samples.len(), 1]))], 1);
+    }
+    let composite = density.composite(samples.delta.clone(), samples.segments.clone());
+    let [_, weights] = composite.transmittance_and_weights(density.value.value(), tape.pool());
+    (tape.apply(composite, &[&density.value, &features]), weights)
+}
+
+/// The colour of composited features `[rays, 3 or more, + 1]` over a background `[rays, 3]`.
+pub fn over_background<'t, T: Scalar>(rendered: &Var<'t, T>, background: &Tensor<T>) -> Var<'t, T> {
+    let channels = rendered.shape()[1];
+    let left = rendered.slice(1, channels - 1, 1);
+    rendered.slice(1, 0, 3) + left * rendered.tape().constant(background.clone())
+}
+
+/// The sum of squared differences between composited colours and `target` `[rays, 3]`.
+pub fn squared_error<'t, T: Scalar>(rendered: &Var<'t, T>, target: &Tensor<T>, background: &Tensor<T>) -> Var<'t, T> {
+    (over_background(rendered, background) - rendered.tape().constant(target.clone())).square().sum()
+}

@@ -1,0 +1,142 @@
+//! One worker's share of a training step: a tape, and sums of gradients.
+
+use crate::batch::Batch;
+use crate::hash_grid::HashGrad;
+use crate::marching::composite_visible;
+use crate::model::{Model, Sampler};
+use crate::occupancy::MarchBuffer;
+use crate::pass::squared_error;
+use crate::sampler::Jitter;
+use rand_pcg::Pcg64Mcg;
+use raygrad_autograd::{Gradient, Tape, Tensor, Var};
+use raygrad_tensor::add_assign;
+use rayon::prelude::*;
+use std::ops::{Add, Range};
+use std::sync::Arc;
+
+/// What was done and what came out, summed over rays.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Work {
+    /// Evaluations of a density.
+    pub samples: u64,
+    /// Evaluations of a colour.
+    pub shaded: u64,
+    /// Squared error of the sampler's own field.
+    pub proposal_error: f64,
+    /// Squared error of the field.
+    pub error: f64,
+    /// Opacity.
+    pub opacity: f64,
+}
+
+impl Add for Work {
+    type Output = Work;
+    fn add(self, other: Work) -> Work {
+        Work {
+            samples: self.samples + other.samples,
+            shaded: self.shaded + other.shaded,
+            proposal_error: self.proposal_error + other.proposal_error,
+            error: self.error + other.error,
+            opacity: self.opacity + other.opacity,
+        }
+    }
+}
+
+/// A tape and sums, kept from step to step so that nothing is allocated.
+pub(crate) struct Slot {
+    tape: Tape<f32>,
+    buffer: MarchBuffer,
+    /// Whether a tile of this step is in the sums.
+    started: bool,
+    /// Summed gradient of each dense parameter; None for a table.
+    pub grads: Vec<Option<Tensor<f32>>>,
+    /// The table's gradients, tile by tile.
+    pub tables: Vec<Arc<HashGrad<f32>>>,
+    pub work: Work,
+}
+
+impl Slot {
+    pub fn new() -> Self {
+        Slot {
+            tape: Tape::new(),
+            buffer: MarchBuffer::default(),
+            started: false,
+            grads: vec![],
+            tables: vec![],
+            work: Work::default(),
+        }
+    }
+
+    /// Forgets the last step.
+    pub fn begin(&mut self) {
+        self.started = false;
+        self.work = Work::default();
+    }
+
+    /// Adds one tile's gradients to the sums.
+    pub fn tile(&mut self, model: &Model<f32>, batch: &Batch, rays: Range<usize>, rng: &mut Pcg64Mcg) {
+        let Slot { tape, buffer, grads, tables, work, started } = self;
+        let params = model.params.bind(tape);
+        let part = batch.rays.slice(rays.clone());
+        let copy = |values: &[[f32; 3]]| tape.pool().copy_of(&[part.len(), 3], values.as_flattened());
+        let (target, background) = (copy(&batch.target[rays.clone()]), copy(&batch.background[rays]));
+        let jitter = &mut Jitter::Random(rng);
+        let loss = match &model.sampler {
+            Sampler::Hierarchical(sampler) => {
+                let rendered = sampler.render(&*model.field, &params, &part, jitter, false, tape);
+                let (coarse, fine) = (
+                    squared_error(&rendered.coarse, &target, &background),
+                    squared_error(&rendered.fine, &target, &background),
+                );
+                let evaluations = (part.len() * sampler.config.evaluations()) as u64;
+                work.count(evaluations, evaluations, coarse.item(), fine.item(), &rendered.fine);
+                coarse + fine
+            }
+            Sampler::Marching(sampler) => {
+                let samples = sampler.samples(&part, jitter, buffer, tape.pool());
+                let marched =
+                    composite_visible(&*model.field, &params, &samples, sampler.config.termination, false, tape);
+                let fine = squared_error(&marched.rendered, &target, &background);
+                work.count(samples.len() as u64, marched.kept as u64, 0.0, fine.item(), &marched.rendered);
+                fine
+            }
+        };
+        let loss = loss * (1.0 / (3.0 * batch.rays.len() as f64));
+        let given = loss.grad_sparse(&params.vars());
+        grads.resize_with(given.len(), || None);
+        for (sum, grad) in grads.iter_mut().zip(given) {
+            match (grad, sum) {
+                (Gradient::Dense(grad), Some(sum)) if *started => add_assign(sum.as_mut_slice(), grad.as_slice()),
+                (Gradient::Dense(grad), Some(sum)) => sum.as_mut_slice().copy_from_slice(grad.as_slice()),
+                (Gradient::Dense(grad), sum) => *sum = Some(grad),
+                (sparse, _) => tables.extend(sparse.parts()),
+            }
+        }
+        *started = true;
+        drop((loss, params, target, background));
+        self.tape.clear();
+    }
+}
+
+impl Work {
+    fn count(&mut self, samples: u64, shaded: u64, proposal_error: f32, error: f32, rendered: &Var<'_, f32>) {
+        let left = rendered.value().as_slice().chunks_exact(rendered.shape()[1]);
+        let opacity = left.map(|ray| 1.0 - f64::from(ray[ray.len() - 1])).sum();
+        let (proposal_error, error) = (f64::from(proposal_error), f64::from(error));
+        *self = *self + Work { samples, shaded, proposal_error, error, opacity };
+    }
+}
+
+/// Adds the gradients of all slots, in order, to those of the first; parallel over parameters.
+pub(crate) fn sum_slots(slots: &mut [Slot]) {
+    let Some((first, rest)) = slots.split_first_mut() else { return };
+    // A tape cannot be shared between threads, but the sums beside it can.
+    let rest: Vec<&[Option<Tensor<f32>>]> = rest.iter().map(|slot| &slot.grads[..]).collect();
+    first.grads.par_iter_mut().enumerate().for_each(|(i, sum)| {
+        for grads in &rest {
+            if let (Some(sum), Some(grad)) = (&mut *sum, &grads[i]) {
+                add_assign(sum.as_mut_slice(), grad.as_slice());
+            }
+        }
+    });
+}

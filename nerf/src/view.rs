@@ -1,0 +1,179 @@
+//! Rendering by marching: densities front to back in rounds until the light is used up, colours where they matter.
+
+use crate::marching::Marching;
+use crate::model::Model;
+use crate::occupancy::{MarchBuffer, Skip};
+use crate::rays::Rays;
+use crate::render::{Evaluations, RayValues};
+use crate::sampler::Jitter;
+use raygrad_autograd::{Pool, Segments, Tape};
+use std::sync::Arc;
+
+/// Samples that a ray takes in a round: few while most rays end early.
+const ROUND: usize = 8;
+
+/// What may be left out along one ray.
+struct Limits {
+    /// A ray ends where less light than this is left.
+    termination: f32,
+    /// Samples whose weights add up to at most this have no colour of their own.
+    color_budget: f32,
+}
+
+impl Limits {
+    /// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling
+    /// the rest.
+    fn of(skip: Skip) -> Self {
+        match skip {
+            Skip::Off => Limits { termination: 0.0, color_budget: 0.0 },
+            Skip::Lossless => Limits { termination: 1e-4, color_budget: 1e-4 },
+            Skip::Fast => Limits { termination: 1e-3, color_budget: 2e-3 },
+        }
+    }
+}
+
+/// Buffers of one worker.
+#[derive(Default)]
+pub(crate) struct Viewer {
+    pub pool: Pool<f32>,
+    marched: MarchBuffer,
+    rays: Vec<RayState>,
+}
+
+/// How far a ray has come.
+#[derive(Clone, Copy, Default)]
+struct RayState {
+    /// Optical depth so far.
+    depth: f64,
+    /// Weight of samples without a colour, and of all samples.
+    uncolored: f32,
+    weight: f32,
+}
+
+/// A sample of a round that gets a colour.
+struct Shaded {
+    row: u32,
+    weight: f32,
+}
+
+impl Viewer {
+    /// Colour, distance and remaining transmittance of each ray.
+    pub fn march(
+        &mut self,
+        model: &Model<f32>,
+        sampler: &Marching,
+        rays: &Rays<f32>,
+        out: &mut [RayValues],
+    ) -> Evaluations {
+        let limits = Limits::of(sampler.config.occupancy.skip);
+        let step = crate::occupancy::Step::uniform(sampler.step());
+        sampler.grid.march(rays, &step, &mut Jitter::Middle, &mut self.marched);
+        self.rays.clear();
+        self.rays.resize(rays.len(), RayState::default());
+        let range = |ray: usize| self.marched.offsets[ray] as usize..self.marched.offsets[ray + 1] as usize;
+        let mut alive: Vec<u32> = (0..rays.len() as u32).filter(|&ray| !range(ray as usize).is_empty()).collect();
+        let mut evaluations = Evaluations::default();
+        let mut round = 0;
+        while !alive.is_empty() {
+            evaluations = evaluations + self.round(model, rays, &alive, round, &limits, out);
+            round += 1;
+            let most = f64::from(limits.termination);
+            alive.retain(|&ray| {
+                let samples = self.marched.offsets[ray as usize + 1] - self.marched.offsets[ray as usize];
+                (samples as usize) > round * ROUND && (-self.rays[ray as usize].depth).exp() > most
+            });
+        }
+        for (out, state) in out.iter_mut().zip(&self.rays) {
+            finish(out, state, &limits);
+        }
+        evaluations
+    }
+
+    /// The next samples of all rays that are alive.
+    fn round(
+        &mut self,
+        model: &Model<f32>,
+        rays: &Rays<f32>,
+        alive: &[u32],
+        round: usize,
+        limits: &Limits,
+        out: &mut [RayValues],
+    ) -> Evaluations {
+        let MarchBuffer { t, delta, offsets, .. } = &self.marched;
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = model.params.bind_constant(&tape);
+        let mut rows = Vec::with_capacity(alive.len() * ROUND);
+        let mut ends = Vec::with_capacity(alive.len());
+        let mut positions = Vec::with_capacity(3 * alive.len() * ROUND);
+        for &ray in alive {
+            let ray = ray as usize;
+            let start = offsets[ray] as usize + round * ROUND;
+            for row in start..(start + ROUND).min(offsets[ray + 1] as usize) {
+                rows.push(row);
+                positions.extend((0..3).map(|axis| rays.origins[ray][axis] + t[row] * rays.directions[ray][axis]));
+            }
+            ends.push(rows.len());
+        }
+        let positions = tape.constant(tape.pool().copy_of(&[rows.len(), 3], &positions));
+        let density = model.field.density(&params, &model.field.encode(&params, &positions));
+        let sigma = density.sigma();
+        let sigma = sigma.value().as_slice();
+        let (mut shaded, mut shaded_ends) = (Vec::with_capacity(rows.len()), vec![0_u32]);
+        let mut start = 0;
+        for (&ray, &end) in alive.iter().zip(&ends) {
+            let state = &mut self.rays[ray as usize];
+            for row in start..end {
+                let depth = f64::from(sigma[row]) * f64::from(delta[rows[row]]);
+                let weight = ((-state.depth).exp() * -(-depth).exp_m1()) as f32;
+                state.depth += depth;
+                state.weight += weight;
+                out[ray as usize][3] += weight * t[rows[row]];
+                // Small weights first come first served, within the budget.
+                if state.uncolored + weight <= limits.color_budget && 4.0 * weight <= limits.color_budget
+                    || weight == 0.0
+                {
+                    state.uncolored += weight;
+                } else {
+                    shaded.push(Shaded { row: row as u32, weight });
+                }
+            }
+            start = end;
+            shaded_ends.push(shaded.len() as u32);
+        }
+        let count = Evaluations { density: rows.len() as u64, color: shaded.len() as u64 };
+        if shaded.is_empty() {
+            return count;
+        }
+        let index: Arc<[u32]> = shaded.iter().map(|shaded| shaded.row).collect();
+        let directions: Vec<[f32; 3]> = alive.iter().map(|&ray| rays.directions[ray as usize]).collect();
+        let directions = tape.constant(tape.pool().copy_of(&[alive.len(), 3], directions.as_flattened()));
+        let segments = Segments::new(shaded_ends);
+        let color = model.field.color(&params, &density.features.gather_rows(&index), &directions, &segments);
+        for (&ray, range) in alive.iter().zip(segments.ranges()) {
+            for i in range {
+                for channel in 0..3 {
+                    out[ray as usize][channel] += shaded[i].weight * color.value().as_slice()[3 * i + channel];
+                }
+            }
+        }
+        count
+    }
+}
+
+/// Makes up for what was left out.
+fn finish(out: &mut RayValues, state: &RayState, limits: &Limits) {
+    let left = (-state.depth).exp() as f32;
+    let colored = state.weight - state.uncolored;
+    if colored > 0.0 {
+        // The light that would have gone on stays with what is in front.
+        let ended = left <= limits.termination;
+        let total = if ended { 1.0 } else { state.weight };
+        out[..3].iter_mut().for_each(|value| *value *= total / colored);
+        if ended {
+            out[3] *= total / state.weight;
+        }
+        out[4] = if ended { 0.0 } else { left };
+    } else {
+        out[4] = left;
+    }
+}

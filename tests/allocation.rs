@@ -1,0 +1,84 @@
+//! After its first steps, training takes every tensor from the pools of its tapes: nothing of tensor size is allocated.
+//!
+//! The test has a binary of its own, because it counts what the whole process allocates.
+
+use raygrad::nerf::dataset::{Split, embedded};
+use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, SamplerConfig, Trainer};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+/// Rays in a step: so few that the lists of rays, which are drawn anew for each step, stay below [`SIZE`].
+const BATCH: usize = 128;
+
+/// Bytes of the smallest tensor that a tile's work makes, one number for each coarse sample: 8 rays of 64 samples.
+const SIZE: usize = 8 * 64 * 4;
+
+/// How many allocations of at least [`SIZE`] bytes there were.
+static LARGE: AtomicUsize = AtomicUsize::new(0);
+
+/// The system's allocator, counting.
+struct Counting;
+
+fn count(layout: Layout, size: usize) {
+    // Vectors of f32 are aligned as an f32 is. That leaves out the scratch space of the matrix product, which is aligned
+    // to cache lines, and the tape's own bookkeeping, which holds pointers.
+    if size >= SIZE && layout.align() == align_of::<f32>() {
+        LARGE.fetch_add(1, Relaxed);
+    }
+}
+
+// SAFETY: every request goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count(layout, layout.size());
+        // SAFETY: the caller's promises are passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: as above.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count(layout, size);
+        // SAFETY: as above.
+        unsafe { System.realloc(ptr, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+#[test]
+fn a_step_allocates_nothing_of_tensor_size() {
+    let data = Arc::new(embedded(Split::Val, 32));
+    let mut small = Config::preset(Preset::Small);
+    let quarter = ClassicConfig { width: 64, view_width: 32, ..ClassicConfig::paper() };
+    let mut classic = Config { field: FieldConfig::Classic(quarter.clone()), ..Config::preset(Preset::Classic) };
+    for config in [&mut small, &mut classic] {
+        let SamplerConfig::Hierarchical(sampler) = &mut config.sampler else { panic!("not hierarchical") };
+        sampler.batch = BATCH;
+    }
+    if let SamplerConfig::Hierarchical(sampler) = &mut classic.sampler {
+        sampler.proposal = quarter;
+    }
+    for (name, config) in [("small", small), ("classic at a quarter of its width", classic)] {
+        let SamplerConfig::Hierarchical(sampler) = &config.sampler else { panic!("not hierarchical") };
+        assert!(4 * sampler.tile * sampler.coarse >= SIZE, "{name}");
+        for threads in [1, 2] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
+            let mut counts = [0; 6];
+            for count in &mut counts {
+                let before = LARGE.load(Relaxed);
+                pool.install(|| trainer.step(0.1));
+                *count = LARGE.load(Relaxed) - before;
+            }
+            println!("{name}, {threads} threads: {counts:?}");
+            assert!(counts[0] > 100, "the first step fills the pools, so the counter should have seen it");
+            assert_eq!(counts[2..], [0; 4], "{name}, {threads} threads");
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! The gradient checker is checked: each way in which an operation can be wrong is caught, by the check that is meant
+//! to catch it.
+
+use raygrad::autograd::{
+    Check, Entry, Extreme, Grads, Op, Pool, Scalar, Shape, ShapeError, Tensor, Var, Vjp, check_op,
+};
+use raygrad::tensor::{broadcast_shape, map};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// What is wrong with [`Wave`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Fault {
+    Nothing,
+    WrongSign,
+    TwiceTheGradient,
+    MissingReduction,
+    NanGradient,
+    GradientToTheWrongInput,
+    ForgottenInput,
+    /// The values of the recorded gradient are right, but it is cut off the graph.
+    WrongSecondDerivative,
+    /// The recorded gradient has other values than the unrecorded one.
+    AnotherGradientWhenRecorded,
+    /// The fused value is not that of the reference; their gradients agree.
+    WrongReference,
+    MissingReference,
+    WrongInSinglePrecision,
+    /// No two runs give the same bits, though every one is accurate.
+    Nondeterministic,
+}
+
+use Fault::*;
+
+/// y = a sin b with broadcasting; da = g sin b, db = g a cos b, each summed to the shape of its input. With one fault.
+#[derive(Clone)]
+struct Wave {
+    fault: Fault,
+    runs: Arc<AtomicU32>,
+}
+
+impl<T: Scalar> Op<T> for Wave {
+    fn name(&self) -> &'static str {
+        "wave"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let run = self.runs.fetch_add(1, Ordering::Relaxed);
+        let error = match self.fault {
+            WrongInSinglePrecision if size_of::<T>() == 4 => 1e-5,
+            Nondeterministic => f64::from(run % 7) * 1e-15,
+            _ => 0.0,
+        };
+        map([x[0], x[1]], pool, |[a, b]| a * b.sin() + T::from_f64(error))
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (a, mut b, g) = (cx.x(0), cx.x(1), cx.g());
+        if self.fault == WrongSecondDerivative {
+            b = b.detach();
+        }
+        let mut da = (g * b.sin()).sum_to(cx.shape(0));
+        let mut db = g * a * b.cos();
+        if self.fault != MissingReduction {
+            db = db.sum_to(cx.shape(1));
+        }
+        match self.fault {
+            WrongSign => db = -db,
+            TwiceTheGradient => da = da * 2.0,
+            NanGradient => db = db * f64::NAN,
+            GradientToTheWrongInput => (da, db) = (db.sum_to(cx.shape(0)), da.sum_to(cx.shape(1))),
+            ForgottenInput => return Grads::one(da),
+            AnotherGradientWhenRecorded if cx.recording() => da = da * (1.0 + 1e-8),
+            _ => {}
+        }
+        Grads::new([Some(da), Some(db)])
+    }
+
+    fn is_fused(&self) -> bool {
+        matches!(self.fault, WrongReference | MissingReference)
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        (self.fault == WrongReference).then(|| &x[0] * x[1].sin() + 1e-9)
+    }
+}
+
+fn entry(fault: Fault) -> Entry {
+    let entry = Entry::new(Wave { fault, runs: Arc::default() });
+    if fault == MissingReduction { entry.sample(&[&[2, 3], &[3]]) } else { entry.sample(&[&[2, 3], &[2, 3]]) }
+}
+
+/// What the checker says of an entry; a panic within the tape, which debug builds have for wrong shapes, is a word too.
+fn verdict(entry: &Entry) -> Result<(), String> {
+    match catch_unwind(AssertUnwindSafe(|| check_op(&Check::default(), entry))) {
+        Ok(result) => result.map(|_| ()),
+        Err(panic) => Err(panic.downcast_ref::<String>().cloned().unwrap_or_default()),
+    }
+}
+
+#[track_caller]
+fn assert_caught(entry: &Entry, by: &str) {
+    match verdict(entry) {
+        Ok(()) => panic!("passed, but should fail with `{by}`"),
+        Err(error) => assert!(error.contains(by), "`{error}` instead of `{by}`"),
+    }
+}
+
+#[test]
+fn the_correct_operation_passes() {
+    assert_eq!(verdict(&entry(Nothing).sample(&[&[2, 3], &[3]]).sample(&[&[], &[0, 2]])), Ok(()));
+}
+
+#[test]
+fn every_fault_is_caught_by_the_check_meant_for_it() {
+    let first = "first derivative, direction";
+    let faults = [
+        (WrongSign, first),
+        (TwiceTheGradient, first),
+        (MissingReduction, if cfg!(debug_assertions) { "gradient of input 1 of wave" } else { first }),
+        (NanGradient, "got NaN"),
+        (GradientToTheWrongInput, first),
+        (ForgottenInput, first),
+        (WrongSecondDerivative, "second derivative, direction"),
+        (AnotherGradientWhenRecorded, "the recorded gradient against the unrecorded one"),
+        (WrongReference, "fused against reference"),
+        (MissingReference, "a fused operation without a reference"),
+        (WrongInSinglePrecision, "f32 against f64"),
+        (Nondeterministic, "two runs differ"),
+    ];
+    for (fault, by) in faults {
+        println!("{fault:?}");
+        assert_caught(&entry(fault), by);
+    }
+}
+
+#[test]
+fn claims_about_an_operation_are_checked() {
+    assert_caught(&entry(Nothing).linear(), "f(-2 x) / -2");
+    let at = |y, grads: [f64; 2]| {
+        let mut entry = entry(Nothing);
+        entry.extremes.push(Extreme { x: vec![2.0, 0.0], y, grads: grads.to_vec() });
+        entry
+    };
+    assert_eq!(verdict(&at(0.0, [0.0, 2.0])), Ok(()));
+    assert_caught(&at(1e-9, [0.0, 2.0]), "the value at [2.0, 0.0]");
+    assert_caught(&at(0.0, [0.0, 2.1]), "gradient 1 at [2.0, 0.0]");
+}
