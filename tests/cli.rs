@@ -43,7 +43,7 @@ impl Place {
     /// With a dataset and a run of a few steps in `run`.
     fn with_run() -> Self {
         let place = Place::with_scene();
-        place.succeeds("train scene --steps 3");
+        place.succeeds("train scene --preset small --steps 3");
         place
     }
 
@@ -166,7 +166,7 @@ fn pictures_and_animations() {
 #[test]
 fn the_embedded_scene_needs_no_files() {
     let place = Place::empty();
-    let printed = place.succeeds("train --steps 1 --downscale 10 --no-encoding --background random");
+    let printed = place.succeeds("train --preset small --steps 1 --downscale 10 --no-encoding --background random");
     assert!(printed.contains("embedded: 60 views of 20x20") && printed.contains("raygrad eval run"), "{printed}");
     let config = place.json("run/config.json");
     assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
@@ -180,9 +180,9 @@ fn the_embedded_scene_needs_no_files() {
 #[test]
 fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
     let place = Place::with_scene();
-    place.succeeds("train scene --steps 4 --seed 7 --threads 1 --out one");
-    place.succeeds("train scene --steps 4 --seed 7 --threads 2 --out two");
-    place.succeeds("train scene --steps 4 --seed 8 --threads 2 --out other");
+    place.succeeds("train scene --preset small --steps 4 --seed 7 --threads 1 --out one");
+    place.succeeds("train scene --preset small --steps 4 --seed 7 --threads 2 --out two");
+    place.succeeds("train scene --preset small --steps 4 --seed 8 --threads 2 --out other");
     let [one, two, other] = ["one", "two", "other"].map(|run| place.bytes(&format!("{run}/model.safetensors")));
     assert!(one == two && one != other);
 }
@@ -191,17 +191,17 @@ fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
 fn nothing_is_overwritten() {
     let place = Place::with_run();
     let before = place.bytes("run/model.safetensors");
-    assert!(place.succeeds("train scene --steps 1").contains("run-2"));
-    assert!(place.succeeds("train scene --steps 1").contains("run-3"));
-    place.fails("train scene --steps 1 --out run", &["run: already holds a run", "--out"]);
-    place.fails("train scene --steps 1 --out scene", &["scene: holds files that are not a run's"]);
+    assert!(place.succeeds("train scene --preset small --steps 1").contains("run-2"));
+    assert!(place.succeeds("train scene --preset small --steps 1").contains("run-3"));
+    place.fails("train scene --preset small --steps 1 --out run", &["run: already holds a run", "--out"]);
+    place.fails("train scene --preset small --steps 1 --out scene", &["scene: holds files that are not a run's"]);
     assert_eq!(place.bytes("run/model.safetensors"), before);
     assert!(!place.path("scene/config.json").exists());
     // An empty folder is as good as none.
     std::fs::create_dir(place.path("empty")).unwrap();
-    place.succeeds("train scene --steps 1 --out empty");
+    place.succeeds("train scene --preset small --steps 1 --out empty");
     std::fs::remove_file(place.path("run/config.json")).unwrap();
-    place.fails("train scene --steps 1", &["run: holds files that are not a run's"]);
+    place.fails("train scene --preset small --steps 1", &["run: holds files that are not a run's"]);
     assert_eq!(place.bytes("run/model.safetensors"), before);
 }
 
@@ -226,14 +226,14 @@ fn bad_scenes_are_named_and_leave_no_run() {
     ];
     for (text, expected) in bad {
         std::fs::write(place.path(file), text).unwrap();
-        place.fails("train scene", &[&[file][..], &expected].concat());
+        place.fails("train scene --preset small", &[&[file][..], &expected].concat());
     }
     place.write_transforms(Split::Train, &good);
     std::fs::write(place.path("scene/train/r_3.png"), b"no picture").unwrap();
-    place.fails("train scene", &["`frames[3].file_path`", "r_3.png", "cannot be decoded"]);
+    place.fails("train scene --preset small", &["`frames[3].file_path`", "r_3.png", "cannot be decoded"]);
     Image::new(SIZE, SIZE + 1, 3).save_png(place.path("scene/train/r_3.png")).unwrap();
-    place.fails("train scene", &["`frames[3].file_path`", "has 24x25 pixels"]);
-    place.fails("train scene --downscale 5", &["`frames[3].file_path`"]);
+    place.fails("train scene --preset small", &["`frames[3].file_path`", "has 24x25 pixels"]);
+    place.fails("train scene --preset small --downscale 5", &["`frames[3].file_path`"]);
     place.fails("train absent", &["absent: there is no such folder"]);
     place.fails("train .", &[".: is not a dataset"]);
     assert!(!place.path("run").exists());
@@ -243,10 +243,22 @@ fn bad_scenes_are_named_and_leave_no_run() {
 fn absent_images_are_skipped_with_a_warning() {
     let place = Place::with_scene();
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
-    let output = place.command("train scene --steps 1").output().unwrap();
+    let output = place.command("train scene --preset small --steps 1").output().unwrap();
     let (printed, warned) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success() && printed.contains("5 views of 24x24"), "{printed}{warned}");
     assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is absent"), "{warned}");
+}
+
+#[test]
+fn an_instant_model_comes_back_with_its_occupancy_grid() {
+    let place = Place::with_scene();
+    place.succeeds("train scene --preset instant --steps 2");
+    place.succeeds("eval run --views 1");
+    assert!(place.json("run/eval.json")["psnr_mean"].as_f64().unwrap() > 3.0);
+    let model = place.path("run/model.safetensors");
+    let bytes = std::fs::read(&model).unwrap();
+    std::fs::write(&model, &bytes[..bytes.len() / 2]).unwrap();
+    place.fails("eval run", &["run/model.safetensors"]);
 }
 
 #[test]
@@ -291,8 +303,14 @@ fn bad_runs_are_named() {
 #[test]
 fn bad_places_to_write_are_named() {
     let place = Place::with_run();
-    place.fails("train scene --steps 1 --out scene/transforms_test.json/run", &["transforms_test.json/run: cannot be"]);
-    place.fails("train scene --steps 1 --out scene/transforms_test.json", &["transforms_test.json: cannot be used"]);
+    place.fails(
+        "train scene --preset small --steps 1 --out scene/transforms_test.json/run",
+        &["transforms_test.json/run: cannot be"],
+    );
+    place.fails(
+        "train scene --preset small --steps 1 --out scene/transforms_test.json",
+        &["transforms_test.json: cannot be used"],
+    );
     place.fails("render run --out run/config.json/frames", &["run/config.json/frames: cannot be created"]);
     place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
     std::fs::create_dir(place.path("folder.gif")).unwrap();
@@ -347,7 +365,7 @@ fn a_closed_pipe_is_no_error() {
 #[test]
 fn ctrl_c_saves_the_model() {
     let place = Place::with_scene();
-    let mut command = place.command("train scene --budget 1h");
+    let mut command = place.command("train scene --preset small --budget 1h");
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     // The first line of the metrics says that training has begun.
     wait(&mut child, || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0));

@@ -102,18 +102,23 @@ impl<T: Scalar> Rule<T> {
         }
     }
 
-    /// One row's values, gradient and moments; each slice as long as the first.
+    /// Learning rate and epsilon with the bias corrected after `step` steps, at least 1.
     #[inline(always)]
-    fn update(&self, [x, g, m, v]: [&mut [T]; 4], rate: T, epsilon: T) {
+    fn corrected(&self, step: u32, rate: T) -> [T; 2] {
+        let [rate_factor, epsilon_factor] = self.corrections[step as usize - 1];
+        [rate * rate_factor, self.epsilon * epsilon_factor]
+    }
+
+    /// The new value and moments of an element with gradient `g`.
+    #[inline(always)]
+    fn element(&self, [x, g, m, v]: [T; 4], [rate, epsilon]: [T; 2]) -> [T; 3] {
         let tiny = T::from_f64(1e-30);
-        for i in 0..x.len() {
-            let first = self.beta[0] * m[i] + self.rest[0] * g[i];
-            // The square of a large finite gradient overflows to infinity, which makes the step 0.
-            let second = self.beta[1] * v[i] + self.rest[1] * (g[i] * g[i]);
-            m[i] = if first > tiny || first < -tiny { first } else { T::ZERO };
-            v[i] = if second > tiny { second } else { T::ZERO };
-            x[i] -= rate * m[i] / (v[i].sqrt() + epsilon);
-        }
+        let m = self.beta[0] * m + self.rest[0] * g;
+        // The square of a large finite gradient overflows to infinity, which makes the step 0.
+        let v = self.beta[1] * v + self.rest[1] * (g * g);
+        let m = if m > tiny || m < -tiny { m } else { T::ZERO };
+        let v = if v > tiny { v } else { T::ZERO };
+        [x - rate * m / (v.sqrt() + epsilon), m, v]
     }
 }
 
@@ -125,22 +130,16 @@ impl<T: Scalar> RowAdam<T> {
     #[track_caller]
     pub fn new(config: AdamConfig, rows: usize, features: usize) -> Self {
         assert!(features > 0, "rows without features");
-        let groups = rows.div_ceil(Touched::GROUP);
-        RowAdam {
-            rule: Arc::new(Rule::new(config)),
-            features,
-            moments: vec![T::ZERO; groups * Touched::GROUP * features * 2],
-            steps: vec![0; rows],
-        }
+        RowAdam { rule: Arc::new(Rule::new(config)), features, moments: vec![], steps: vec![] }.fresh(rows)
     }
 
-    /// The same constants, and nothing seen, for another range of `rows` rows.
+    /// The same constants, shared, and nothing seen, for another range of `rows` rows.
     pub fn fresh(&self, rows: usize) -> Self {
-        let groups = rows.div_ceil(Touched::GROUP);
+        let padded = rows.next_multiple_of(Touched::GROUP);
         RowAdam {
             rule: self.rule.clone(),
             features: self.features,
-            moments: vec![T::ZERO; groups * Touched::GROUP * self.features * 2],
+            moments: vec![T::ZERO; 2 * padded * self.features],
             steps: vec![0; rows],
         }
     }
@@ -156,57 +155,95 @@ impl<T: Scalar> RowAdam<T> {
         assert_eq!((table.len(), grad.len()), (len, len), "a table and a gradient of the optimiser's rows");
         assert_eq!(touched.groups(), self.steps.len().div_ceil(Touched::GROUP), "marks for the optimiser's rows");
         let rate = T::from_f64(rate);
-        // The number of features as a constant where it is a usual one: the loops below are then unrolled.
         simd::dispatch(
             #[inline(always)]
-            || match self.features {
-                1 => self.update(1, table, grad, touched, rate),
-                2 => self.update(2, table, grad, touched, rate),
-                4 => self.update(4, table, grad, touched, rate),
-                8 => self.update(8, table, grad, touched, rate),
-                features => self.update(features, table, grad, touched, rate),
-            },
+            || self.visit(table, grad, touched, rate),
         )
     }
 
     #[inline(always)]
-    fn update(&mut self, features: usize, x: &mut [T], g: &mut [T], touched: &mut Touched, rate: T) -> RowStats {
+    fn visit(&mut self, table: &mut [T], grad: &mut [T], touched: &mut Touched, rate: T) -> RowStats {
         let mut stats = RowStats::default();
+        let (rule, features, total) = (&*self.rule, self.features, self.steps.len());
         let size = Touched::GROUP * features;
         for (group, mark) in touched.0.iter_mut().enumerate() {
             if *mark == 0 {
                 continue;
             }
             *mark = 0;
+            let rows = group * Touched::GROUP..total.min((group + 1) * Touched::GROUP);
+            let elements = rows.start * features..rows.end * features;
             let (m, v) = self.moments[2 * group * size..2 * (group + 1) * size].split_at_mut(size);
-            let first = group * Touched::GROUP;
-            let rows = (self.steps.len() - first).min(Touched::GROUP);
-            for k in 0..rows {
-                let (row, in_group) = ((first + k) * features, k * features);
-                let x = &mut x[row..row + features];
-                let g = &mut g[row..row + features];
-                let m = &mut m[in_group..in_group + features];
-                let v = &mut v[in_group..in_group + features];
-                let (mut any, mut finite) = (false, true);
-                for &g in g.iter() {
-                    any |= g != T::ZERO;
-                    finite &= g.is_finite();
-                }
-                if any && finite {
-                    let steps = &mut self.steps[first + k];
-                    *steps = (*steps + 1).min(self.rule.corrections.len() as u32);
-                    let [rate_factor, epsilon_factor] = self.rule.corrections[*steps as usize - 1];
-                    self.rule.update([x, g, m, v], rate * rate_factor, self.rule.epsilon * epsilon_factor);
-                }
-                stats.touched += usize::from(any && finite);
-                stats.skipped += usize::from(!finite);
-                for g in g {
-                    *g = T::ZERO;
-                }
+            let steps = &mut self.steps[rows];
+            let group = Group { x: &mut table[elements.clone()], g: &mut grad[elements], m, v, steps };
+            // The usual widths as constants: the loops over a row then unroll into one vector.
+            match features {
+                1 => group.update::<1>(1, rule, rate, &mut stats),
+                2 => group.update::<2>(2, rule, rate, &mut stats),
+                4 => group.update::<4>(4, rule, rate, &mut stats),
+                8 => group.update::<8>(8, rule, rate, &mut stats),
+                wide if wide % 8 == 0 => group.update::<8>(wide, rule, rate, &mut stats),
+                odd => group.update::<1>(odd, rule, rate, &mut stats),
             }
         }
         stats
     }
+}
+
+/// Neighbouring rows and all that belongs to them.
+struct Group<'a, T> {
+    x: &'a mut [T],
+    g: &'a mut [T],
+    m: &'a mut [T],
+    v: &'a mut [T],
+    steps: &'a mut [u32],
+}
+
+impl<T: Scalar> Group<'_, T> {
+    /// Updates each row by itself, in pieces of `W` features, of which `features` is a multiple.
+    #[inline(always)]
+    fn update<const W: usize>(self, features: usize, rule: &Rule<T>, rate: T, stats: &mut RowStats) {
+        let len = self.steps.len() * features;
+        let (x, g, m, v) = (&mut self.x[..len], &mut self.g[..len], &mut self.m[..len], &mut self.v[..len]);
+        for (row, step) in self.steps.iter_mut().enumerate() {
+            let start = row * features;
+            let (mut any, mut finite) = (false, true);
+            for piece in 0..features / W {
+                let g: [T; W] = load(g, start + piece * W);
+                for i in 0..W {
+                    any |= g[i] != T::ZERO;
+                    finite &= g[i].is_finite();
+                }
+            }
+            stats.touched += usize::from(any & finite);
+            stats.skipped += usize::from(!finite);
+            if any & finite {
+                *step = (*step + 1).min(rule.corrections.len() as u32);
+                let corrected = rule.corrected(*step, rate);
+                for piece in 0..features / W {
+                    let at = start + piece * W;
+                    let [mut new_x, g, mut new_m, mut new_v]: [[T; W]; 4] =
+                        [load(x, at), load(g, at), load(m, at), load(v, at)];
+                    for i in 0..W {
+                        let old = [new_x[i], g[i], new_m[i], new_v[i]];
+                        [new_x[i], new_m[i], new_v[i]] = rule.element(old, corrected);
+                    }
+                    x[at..at + W].copy_from_slice(&new_x);
+                    m[at..at + W].copy_from_slice(&new_m);
+                    v[at..at + W].copy_from_slice(&new_v);
+                }
+            }
+            g[start..start + features].fill(T::ZERO);
+        }
+    }
+}
+
+/// `W` numbers from place `at` on. A copy cannot overlap what is written meanwhile, so that the loops over it vectorise.
+#[inline(always)]
+fn load<T: Scalar, const W: usize>(from: &[T], at: usize) -> [T; W] {
+    let mut piece = [T::ZERO; W];
+    piece.copy_from_slice(&from[at..at + W]);
+    piece
 }
 
 #[cfg(test)]
@@ -215,7 +252,7 @@ mod tests {
     use crate::Adam;
     use raygrad_tensor::Tensor;
 
-    /// A table, its gradient and marks for all of it.
+    /// Marks for all rows.
     fn touched(rows: usize) -> Touched {
         let mut touched = Touched::new(rows);
         (0..rows).for_each(|row| touched.mark(row));
@@ -224,7 +261,7 @@ mod tests {
 
     #[test]
     fn equals_dense_adam_where_every_row_has_a_gradient() {
-        for (rows, features) in [(21, 1), (8, 2), (13, 4), (30, 8), (5, 3), (1, 70)] {
+        for (rows, features) in [(21, 1), (8, 2), (13, 4), (30, 8), (5, 3), (1, 70), (3, 24)] {
             let config = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
             let mut dense = Adam::<f32>::new(config);
             let mut lazy = RowAdam::<f32>::new(config, rows, features);

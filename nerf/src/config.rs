@@ -19,9 +19,9 @@ pub enum Preset {
     /// The paper's networks and numbers: 64 + 128 samples, two networks of 8 layers of 256.
     Classic,
     /// The same idea with half of the depth and of the width: a recognisable scene in minutes.
-    #[default]
     Small,
     /// A hash grid marched through an occupancy grid: a good scene in a minute.
+    #[default]
     Instant,
 }
 

@@ -4,6 +4,7 @@ use super::kernel::{BLOCK, Cells, Points};
 use super::{HashGrad, HashGrid, HashGridConfig, HashLevel};
 use raygrad_autograd::{Entry, Grads, Op, Pool, Scalar, Shape, ShapeError, Tensor, Touched, Var, Vjp};
 use raygrad_tensor::simd;
+use std::mem::swap;
 use std::sync::Arc;
 
 /// Calls `$self.$method::<F>(..)` with the grid's number of features as `F`.
@@ -28,16 +29,22 @@ impl HashGrid {
     fn encode_rows<T: Scalar, const F: usize>(&self, positions: &[T], table: &[T], out: &mut [T]) {
         assert_eq!(table.len(), self.rows() * F, "a table of the grid's rows");
         let (table, _) = table.as_chunks::<F>();
-        let width = self.width();
+        let (levels, width) = (self.levels(), self.width());
         simd::dispatch(
             #[inline(always)]
             || {
-                let (mut points, mut cells) = (Points::new(), Cells::new());
+                let mut points = Points::new();
+                let (mut cells, mut next) = (&mut Cells::new(), &mut Cells::new());
                 for (positions, out) in positions.chunks(3 * BLOCK).zip(out.chunks_mut(width * BLOCK)) {
                     points.load(positions);
-                    for (l, level) in self.levels().iter().enumerate() {
-                        cells.locate(level, &points);
+                    cells.locate(&levels[0], &points);
+                    for (l, level) in levels.iter().enumerate() {
+                        if let Some(finer) = levels.get(l + 1) {
+                            next.locate(finer, &points);
+                            next.prefetch(&table[finer.rows.clone()]);
+                        }
                         cells.gather(&table[level.rows.clone()], out, width, l * F);
+                        swap(&mut cells, &mut next);
                     }
                 }
             },
@@ -46,7 +53,7 @@ impl HashGrid {
 
     /// Adds to `grad` the gradient of one level's rows, `[rows of the level, features]`, that `d_out` (`[samples, width]`,
     /// the gradient of the encoding of `positions`, `[samples, 3]`) makes, in the order of the samples, and marks the rows
-    /// it touches. Samples whose gradient on this level is all zero touch nothing.
+    /// it touches. Samples whose gradient on this level is all zero touch nothing; one with a NaN coordinate gives NaN.
     ///
     /// # Panics
     /// If there is no such level or a length does not fit.
