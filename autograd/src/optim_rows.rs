@@ -166,11 +166,26 @@ impl<T: Scalar> RowAdam<T> {
         let mut stats = RowStats::default();
         let (rule, features, total) = (&*self.rule, self.features, self.steps.len());
         let size = Touched::GROUP * features;
-        for (group, mark) in touched.0.iter_mut().enumerate() {
-            if *mark == 0 {
+        // Marked groups up to `ahead` have been told to the caches; `told` of them are still to be visited.
+        let (mut ahead, mut told) = (0, 0);
+        for group in 0..touched.0.len() {
+            if touched.0[group] == 0 {
                 continue;
             }
-            *mark = 0;
+            touched.0[group] = 0;
+            while told < AHEAD && ahead + 1 < touched.0.len() {
+                ahead = ahead.max(group) + 1;
+                if touched.0.get(ahead).is_some_and(|mark| *mark != 0) {
+                    told += 1;
+                    let rows = ahead * Touched::GROUP;
+                    let at = rows * features;
+                    prefetch_lines(&table[at..], size);
+                    prefetch_lines(&grad[at..], size);
+                    prefetch_lines(&self.moments[2 * at..], 2 * size);
+                    prefetch_lines(&self.steps[rows..], Touched::GROUP);
+                }
+            }
+            told = told.saturating_sub(1);
             let rows = group * Touched::GROUP..total.min((group + 1) * Touched::GROUP);
             let elements = rows.start * features..rows.end * features;
             let (m, v) = self.moments[2 * group * size..2 * (group + 1) * size].split_at_mut(size);
@@ -187,6 +202,19 @@ impl<T: Scalar> RowAdam<T> {
             }
         }
         stats
+    }
+}
+
+/// How many groups ahead of the one that is updated the caches are told of: rows are visited in ascending order, but
+/// with gaps that the processor cannot foresee.
+const AHEAD: usize = 8;
+
+/// Asks for the cache lines of the first `len` of `values`.
+#[inline(always)]
+fn prefetch_lines<T>(values: &[T], len: usize) {
+    let line = 64 / size_of::<T>();
+    for i in (0..len.min(values.len())).step_by(line) {
+        simd::prefetch(&values[i]);
     }
 }
 

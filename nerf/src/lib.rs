@@ -29,6 +29,7 @@ mod rays;
 mod render;
 pub mod sampler;
 pub mod scene;
+mod silhouette;
 mod slot;
 mod spherical;
 mod startup;

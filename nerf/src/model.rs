@@ -4,7 +4,7 @@ use crate::config::{Config, SamplerConfig};
 use crate::field::Field;
 use crate::hierarchical::Hierarchical;
 use crate::marching::Marching;
-use crate::occupancy::{MarchBuffer, OccupancyGrid};
+use crate::occupancy::{MarchBuffer, OccupancyGrid, Skip};
 use crate::pass::{composite_samples, squared_error};
 use crate::rays::{Rays, Samples};
 use crate::sampler::Jitter;
@@ -120,6 +120,15 @@ impl<T: Scalar> Model<T> {
         };
         let errors = self.fields().into_iter().zip(samples).map(error);
         errors.reduce(|sum, error| sum + error).unwrap_or_else(|| tape.constant(Tensor::scalar(T::ZERO)))
+    }
+}
+
+impl<T: Scalar> Model<T> {
+    /// Chooses what [`view`](Model::view) may leave out from now on. A model without an occupancy grid leaves out nothing.
+    pub fn set_skip(&mut self, skip: Skip) {
+        if let Sampler::Marching(marching) = &mut self.sampler {
+            marching.config.occupancy.skip = skip;
+        }
     }
 }
 

@@ -21,6 +21,8 @@ pub(crate) struct Work {
     pub samples: u64,
     /// Evaluations of a colour.
     pub shaded: u64,
+    /// Samples there would be of either if nothing in the box were skipped.
+    pub unskipped: u64,
     /// Squared error of the sampler's own field.
     pub proposal_error: f64,
     /// Squared error of the field.
@@ -35,6 +37,7 @@ impl Add for Work {
         Work {
             samples: self.samples + other.samples,
             shaded: self.shaded + other.shaded,
+            unskipped: self.unskipped + other.unskipped,
             proposal_error: self.proposal_error + other.proposal_error,
             error: self.error + other.error,
             opacity: self.opacity + other.opacity,
@@ -89,7 +92,7 @@ impl Slot {
                     squared_error(&rendered.fine, &target, &background),
                 );
                 let evaluations = (part.len() * sampler.config.evaluations()) as u64;
-                work.count(evaluations, evaluations, coarse.item(), fine.item(), &rendered.fine);
+                work.count([evaluations; 3], coarse.item(), fine.item(), &rendered.fine);
                 coarse + fine
             }
             Sampler::Marching(sampler) => {
@@ -97,7 +100,8 @@ impl Slot {
                 let marched =
                     composite_visible(&*model.field, &params, &samples, sampler.config.termination, false, tape);
                 let fine = squared_error(&marched.rendered, &target, &background);
-                work.count(samples.len() as u64, marched.kept as u64, 0.0, fine.item(), &marched.rendered);
+                let evaluations = [samples.len() as u64, marched.kept as u64, buffer.steps];
+                work.count(evaluations, 0.0, fine.item(), &marched.rendered);
                 fine
             }
         };
@@ -119,11 +123,13 @@ impl Slot {
 }
 
 impl Work {
-    fn count(&mut self, samples: u64, shaded: u64, proposal_error: f32, error: f32, rendered: &Var<'_, f32>) {
+    /// `evaluations`: of densities, of colours, and of either if nothing were skipped.
+    fn count(&mut self, evaluations: [u64; 3], proposal_error: f32, error: f32, rendered: &Var<'_, f32>) {
         let left = rendered.value().as_slice().chunks_exact(rendered.shape()[1]);
         let opacity = left.map(|ray| 1.0 - f64::from(ray[ray.len() - 1])).sum();
         let (proposal_error, error) = (f64::from(proposal_error), f64::from(error));
-        *self = *self + Work { samples, shaded, proposal_error, error, opacity };
+        let [samples, shaded, unskipped] = evaluations;
+        *self = *self + Work { samples, shaded, unskipped, proposal_error, error, opacity };
     }
 }
 

@@ -10,6 +10,7 @@ use clap::Parser;
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
+use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::output::print;
@@ -56,6 +57,9 @@ pub struct Args {
     /// Leave positional encoding out, to see what it is for
     #[arg(long)]
     no_encoding: bool,
+    /// Change one number of the preset, such as sampler.samples=16384; config.json in a run's folder shows them all
+    #[arg(long, value_name = "NAME=VALUE", value_parser = parse::setting)]
+    set: Vec<(String, Value)>,
 }
 
 impl Default for Args {
@@ -123,7 +127,10 @@ impl Args {
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
-        Ok(if self.no_encoding { config.without_encoding() } else { config })
+        if self.no_encoding {
+            config = config.without_encoding();
+        }
+        self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))
     }
 
     fn run_config(&self, trainer: &Trainer, data: &Dataset) -> Result<RunConfig> {
@@ -144,6 +151,18 @@ impl Args {
             (None, None) => Budget::Time(default_budget(self.preset)),
         }
     }
+}
+
+/// The configuration with the number of that dotted name replaced.
+fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
+    let unknown = |_| Error::setting(name, "cannot be changed");
+    let mut all = serde_json::to_value(config).map_err(unknown)?;
+    let pointer = format!("/{}", name.replace('.', "/"));
+    let place = all.pointer_mut(&pointer).ok_or_else(|| {
+        Error::setting(name, "there is no such number; config.json in a run's folder shows the names")
+    })?;
+    *place = value.clone();
+    serde_json::from_value(all).map_err(|e| Error::setting(name, format!("cannot be {value}: {e}")))
 }
 
 /// Training time after which a preset shows what it can do.

@@ -83,15 +83,27 @@ impl HashGrid {
         touched: &mut Touched,
     ) {
         let (grad, _) = grad.as_chunks_mut::<F>();
-        let width = self.width();
+        let (width, column) = (self.width(), level * F);
         simd::dispatch(
             #[inline(always)]
             || {
-                let (mut points, mut cells) = (Points::new(), Cells::new());
-                for (positions, d_out) in positions.chunks(3 * BLOCK).zip(d_out.chunks(width * BLOCK)) {
-                    points.load(positions);
-                    cells.locate(&self.levels()[level], &points);
-                    cells.scatter(d_out, width, level * F, grad, touched);
+                let mut points = Points::new();
+                let (mut cells, mut next) = (&mut Cells::new(), &mut Cells::new());
+                let mut blocks = positions.chunks(3 * BLOCK);
+                let level = &self.levels()[level];
+                if let Some(first) = blocks.next() {
+                    points.load(first);
+                    cells.locate(level, &points);
+                }
+                for d_out in d_out.chunks(width * BLOCK) {
+                    // A small batch meets most rows for the first time since the last step.
+                    if let Some(block) = blocks.next() {
+                        points.load(block);
+                        next.locate(level, &points);
+                        next.prefetch(grad);
+                    }
+                    cells.scatter(d_out, width, column, grad, touched);
+                    swap(&mut cells, &mut next);
                 }
             },
         );
