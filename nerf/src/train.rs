@@ -50,7 +50,7 @@ pub struct StepStats {
     pub samples: u64,
     /// Evaluations of a colour, and of all gradients, so far.
     pub shaded: u64,
-    /// The loss: mean squared error, of a hierarchical model that of the coarse field plus that of the fine one.
+    /// The mean loss, of a hierarchical model that of the coarse field plus that of the fine one.
     pub loss: f64,
     /// PSNR on this step's rays, in dB.
     pub psnr: f64,
@@ -199,7 +199,7 @@ impl Trainer {
             rays: self.done.rays + self.batch as u64,
             samples: self.done.samples + work.samples,
             shaded: self.done.shaded + work.shaded,
-            loss: (work.proposal_error + work.error) / values,
+            loss: work.loss / values,
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,

@@ -71,7 +71,7 @@ fn settings_out_of_range_are_named() {
         (HashGridConfig { coarsest: 0, ..HashGridConfig::paper() }, "`coarsest`"),
         (HashGridConfig { features: 3, ..HashGridConfig::paper() }, "`features`"),
         (HashGridConfig { levels: 0, ..HashGridConfig::paper() }, "`levels`"),
-        (HashGridConfig { log2_table: 25, ..HashGridConfig::paper() }, "`log2_table`"),
+        (HashGridConfig { log2_table: 29, ..HashGridConfig::paper() }, "`log2_table`"),
     ];
     for (config, name) in wrong {
         let error = HashGrid::new(&config).unwrap_err().to_string();
@@ -84,12 +84,12 @@ fn every_check_passes() {
     for entry in entries() {
         check_op(&Check::default(), &entry).unwrap();
     }
-    assert_eq!(entries().len(), 3);
+    assert_eq!(entries().len(), 4);
 }
 
 #[test]
 fn agrees_with_the_formula_at_every_width_and_block_length() {
-    for features in [1, 2, 4, 8] {
+    for features in [1, 2, 4, 8, 16, 32] {
         let grid = grid(5, features, 9, 3, 40);
         assert!(!grid.levels()[0].hashed && grid.levels()[4].hashed);
         let table = grid.init::<f64>(7);
