@@ -24,7 +24,7 @@ pub enum Preset {
     /// A hash grid marched through an occupancy grid: a good scene in a minute.
     #[default]
     Instant,
-    /// A grid of voxels, marched in the same way: no network, and twenty times the memory.
+    /// A grid of voxels, marched in the same way: no network, and five times the parameters.
     Voxel,
 }
 
