@@ -28,7 +28,7 @@ pub struct MarchingConfig {
 impl Default for MarchingConfig {
     fn default() -> Self {
         let occupancy = OccupancyConfig { skip: Skip::Fast, ..OccupancyConfig::default() };
-        MarchingConfig { occupancy, step: 1.0 / 300.0, samples: 1 << 15, termination: 1e-3 }
+        MarchingConfig { occupancy, step: 1.0 / 300.0, samples: 1 << 14, termination: 1e-3 }
     }
 }
 

@@ -100,7 +100,9 @@ mod tests {
         assert!(!silhouette.is_clear(DVec3::new(0.0, 0.0, 12.0), 0.3), "behind the camera");
         assert!(!silhouette.is_clear(DVec3::new(1.0, 0.0, 9.9), 0.3), "around the camera");
         let (right, up) = (DVec3::new(1.0, 0.0, 0.0), DVec3::new(0.0, 1.0, 0.0));
-        assert!(silhouette.is_clear(right + up, 0.02) && !silhouette.is_clear(0.8 * right + 0.8 * up, 0.02));
+        assert!(
+            silhouette.is_clear(1.1 * right + 1.1 * up, 0.02) && !silhouette.is_clear(0.8 * right + 0.8 * up, 0.02)
+        );
         assert!(Silhouette::new(&camera, &Image::new(60, 60, 3)).is_none());
     }
 
@@ -108,7 +110,7 @@ mod tests {
     fn two_views_leave_the_box_that_both_see() {
         let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
         let mut grid =
-            OccupancyGrid::new([DVec3::splat(-2.0), DVec3::splat(2.0)], &OccupancyConfig::default()).unwrap();
+            OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
         for (camera, image) in &views {
             let silhouette = Silhouette::new(camera, image).unwrap();
             grid.carve(&|centre, radius| silhouette.is_clear(centre, radius));
@@ -119,6 +121,6 @@ mod tests {
         assert!(low.max_element() < -0.85 && low.min_element() > -1.35, "{low}");
         assert!(high.min_element() > 0.85 && high.max_element() < 1.35, "{high}");
         let share = grid.occupied_share();
-        assert!((0.08..0.2).contains(&share), "{share}");
+        assert!((0.2..0.4).contains(&share), "{share}");
     }
 }

@@ -55,7 +55,7 @@ pub struct StepStats {
     pub unskipped: u64,
     /// Rows of the field's table that were moved so far.
     pub rows: u64,
-    /// The loss: mean squared error, of a hierarchical model that of the coarse field plus that of the fine one.
+    /// The mean loss, of a hierarchical model that of the coarse field plus that of the fine one.
     pub loss: f64,
     /// PSNR on this step's rays, in dB.
     pub psnr: f64,
@@ -220,7 +220,7 @@ impl Trainer {
             shaded: self.done.shaded + work.shaded,
             unskipped: self.done.unskipped + work.unskipped,
             rows: self.done.rows,
-            loss: (work.proposal_error + work.error) / values,
+            loss: work.loss / values,
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,

@@ -29,14 +29,15 @@ pub struct Args {
     /// Folder with transforms_train.json and its images, or the scene that is built in
     #[arg(default_value = "embedded")]
     scene: Scene,
-    /// Kind of model: instant (a minute), small (minutes) or classic (the paper's, hours)
+    /// Kind of model: instant (a minute), voxel (no network), small (minutes) or classic (the paper's, hours)
     #[arg(long, default_value_t)]
     preset: Preset,
-    /// How much empty space to pass over: off, lossless or fast [default: fast for instant; small and classic sample
-    /// hierarchically instead]
+    /// How much empty space to pass over: off, lossless or fast [default: fast for instant and voxel; small and classic
+    /// sample hierarchically instead]
     #[arg(long)]
     skip: Option<Skip>,
-    /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it [default: by preset]
+    /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it, and the table of an instant model grows with it
+    /// [default: by preset]
     #[arg(long, value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
     budget: Option<Duration>,
     /// Number of training steps in place of a time: the same seed then gives the same model, bit by bit
@@ -48,7 +49,7 @@ pub struct Args {
     /// Train at 1/K of the images' size
     #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
-    /// What lies behind transparent images: white, black or random [default: random for instant, else white]
+    /// What lies behind transparent images: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
@@ -114,6 +115,9 @@ pub fn run(args: &Args) -> Result<Trained> {
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
+        if let Budget::Time(time) = self.budget() {
+            config = config.with_budget(time.as_secs_f64());
+        }
         if let Some(background) = self.background {
             config.background = background;
         }
@@ -168,7 +172,7 @@ fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
 /// Training time after which a preset shows what it can do.
 fn default_budget(preset: Preset) -> Duration {
     match preset {
-        Preset::Instant => Duration::from_secs(45),
+        Preset::Instant | Preset::Voxel => Duration::from_secs(45),
         Preset::Small => Duration::from_secs(100),
         Preset::Classic => Duration::from_secs(3600),
     }

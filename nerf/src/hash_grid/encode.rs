@@ -15,7 +15,9 @@ macro_rules! with_features {
             2 => $grid.$method::<_, 2>($($argument),*),
             4 => $grid.$method::<_, 4>($($argument),*),
             8 => $grid.$method::<_, 8>($($argument),*),
-            _ => unreachable!("`HashGrid::new` allows 1, 2, 4 and 8"),
+            16 => $grid.$method::<_, 16>($($argument),*),
+            32 => $grid.$method::<_, 32>($($argument),*),
+            _ => unreachable!("`HashGrid::new` allows powers of two from 1 to 32"),
         }
     };
 }
@@ -246,5 +248,8 @@ pub(crate) fn entries() -> Vec<Entry> {
                 .sample_of(vec![positions(&[]), table(2)])
         })
     };
-    [entry(3, 2, 7, 2, 9), entry(1, 1, 10, 4, 4), entry(2, 4, 4, 3, 5)].into_iter().flatten().collect()
+    [entry(3, 2, 7, 2, 9), entry(1, 1, 10, 4, 4), entry(2, 4, 4, 3, 5), entry(1, 16, 6, 3, 3)]
+        .into_iter()
+        .flatten()
+        .collect()
 }

@@ -193,15 +193,17 @@ impl OccupancyGrid {
         bits::bounds(&self.words, &self.lattice)
     }
 
-    /// The mean density of the cells that were looked at, in 1 / scene unit; 0 if there are none. Carved cells and
-    /// densities that are not finite do not count.
+    /// The mean density of the cells that were looked at, in 1 / scene unit; 0 if there are none. Carved cells do not
+    /// count.
     pub fn mean_density(&self) -> f64 {
         // In tasks of fixed size, so that the sum has the same bits at any number of threads.
         let sums: Vec<(f64, usize)> = self
             .densities
             .par_chunks(CELLS * TASK)
             .map(|part| {
-                part.iter().filter(|x| x.is_finite()).fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1))
+                part.iter()
+                    .filter(|x| !x.is_nan() && **x != carve::CARVED)
+                    .fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1))
             })
             .collect();
         let (sum, count) = sums.iter().fold((0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
