@@ -58,8 +58,9 @@ impl Add for RowStats {
     }
 }
 
-/// Groups that one task visits.
-const CHUNK: usize = 1 << 12;
+/// Groups that one task visits: so many that the levels of a hash grid, whose gradient is still in the caches of the core
+/// that added it up, are not torn apart, and so few that a large voxel grid keeps several cores busy.
+const CHUNK: usize = 1 << 16;
 
 /// Lazy Adam: the update of [`Adam`](crate::Adam) for those rows of a table whose gradient is not zero.
 ///

@@ -35,16 +35,16 @@ impl HashGridConfig {
         HashGridConfig { levels: 16, features: 2, log2_table: 19, coarsest: 16, finest: 2048 }
     }
 
-    /// As many features on half as many levels, so half as many places of memory to visit, up to about the resolution of
-    /// the photographs; and as many rows as pay within `seconds` of training on two cores: more of them hold more detail,
-    /// but each takes its steps, and those that are not in the caches take longer.
+    /// Rows of more features on fewer levels, so fewer places of memory to visit, up to about the resolution of the
+    /// photographs; and as many of both as pay within `seconds` of training on two cores: more of them hold more detail,
+    /// but take longer, the more so if they do not fit the caches.
     pub fn cpu(seconds: f64) -> Self {
-        let (log2_table, finest) = match seconds {
-            ..=100.0 => (17, 512),
-            ..=300.0 => (18, 512),
-            _ => (19, 1024),
+        let (levels, log2_table, finest) = match seconds {
+            ..=100.0 => (6, 17, 512),
+            ..=300.0 => (8, 18, 512),
+            _ => (8, 19, 1024),
         };
-        HashGridConfig { levels: 8, features: 4, log2_table, coarsest: 16, finest }
+        HashGridConfig { levels, features: 4, log2_table, coarsest: 16, finest }
     }
 
     fn check(&self) -> Result<()> {
