@@ -20,10 +20,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
-/// number of threads, and as many as threads can work at a time.
+/// number of threads, and as many as threads can work at a time. A marching step has one tile for each: with more, smaller
+/// ones, recording them would cost a two-core machine an eighth of its time.
 const SLOTS: usize = 8;
-/// Tiles of a marching step for each slot.
-const TILES_A_SLOT: usize = 1;
 /// Rays of a marching step: the least, and the most.
 const RAYS: [usize; 2] = [256, 1 << 16];
 /// Steps between updates of the occupancy grid.
@@ -205,7 +204,7 @@ impl Trainer {
         let batch = draw(&self.data, self.batch, config.background, &mut stream(seed, [number, 0]));
         let tile = match &config.sampler {
             SamplerConfig::Hierarchical(config) => config.tile,
-            SamplerConfig::Marching(_) => self.batch.div_ceil(SLOTS * TILES_A_SLOT),
+            SamplerConfig::Marching(_) => self.batch.div_ceil(SLOTS),
         };
         let work = self.differentiate(&batch, tile, seed, number);
         let rate = self.model.config.schedule.rate(fraction);
@@ -278,7 +277,7 @@ impl Trainer {
             let rays = marching.config.samples as f64 / each;
             // Not at once: the number of samples a ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
-            self.batch = rays.next_multiple_of(SLOTS * TILES_A_SLOT).clamp(RAYS[0], RAYS[1]);
+            self.batch = rays.next_multiple_of(SLOTS).clamp(RAYS[0], RAYS[1]);
         }
     }
 
