@@ -1,7 +1,9 @@
 //! Reverse-mode automatic differentiation over [`raygrad_tensor`], with gradients of gradients. This crate knows no rays.
 
 mod catalogue;
+mod catalogue_arrays;
 mod check;
+mod composed;
 mod dual;
 mod elementwise;
 mod error;
@@ -10,6 +12,7 @@ mod op;
 mod ops;
 mod optim;
 mod optim_rows;
+mod parallel;
 mod params;
 mod sweep;
 mod tape;
@@ -22,10 +25,10 @@ pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};
 pub use layers::{Init, Linear, Mlp};
 pub use op::{Gradient, Grads, Op, Reads, SparseGrad, Vjp};
-pub use ops::{Activation, Segments};
+pub use ops::{Activation, Conv2dConfig, INFER, Pool2dConfig, Segments};
 pub use optim::{Adam, AdamConfig, Schedule};
 pub use optim_rows::{RowAdam, RowStats, Touched};
 pub use params::{Bound, ParamId, Params, ParamsError};
-pub use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor};
+pub use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
 pub use tape::Tape;
 pub use var::Var;
