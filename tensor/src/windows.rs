@@ -17,8 +17,8 @@ pub struct Windows {
 }
 
 impl Windows {
-    /// Windows of `kernel` elements on an image of `[height, width]`; `floor((image + 2 padding - dilation (kernel - 1)
-    /// - 1) / stride) + 1` of them along each axis.
+    /// Windows of `kernel` elements on an image of `[height, width]`. Along each axis there are
+    /// `(image + 2 padding - span) / stride + 1` of them, rounded down, where `span = dilation (kernel - 1) + 1`.
     ///
     /// # Errors
     /// If a kernel extent, stride or dilation is 0, or a window is larger than the padded image; in words.
