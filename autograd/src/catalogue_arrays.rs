@@ -137,7 +137,7 @@ fn images() -> Vec<Entry> {
     let plain = Conv2dConfig::default();
     let uneven = Conv2dConfig { stride: [2, 1], padding: [1, 2], dilation: [1, 2] };
     let pool = Pool2dConfig { kernel: [3, 2], stride: [2, 1], padding: [1, 0] };
-    let indices = [3, 0, 5, 5, 1, 2];
+    let indices = [3, 0, 3, 5, 1, 2];
     vec![
         Entry::new(convolution::Conv2d(plain))
             .sample(&[&[2, 2, 3, 4], &[3, 2, 2, 2]])
