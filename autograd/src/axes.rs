@@ -6,8 +6,8 @@ use std::ops::RangeFull;
 
 /// The axes of a reduction: one (`-1`), several (`[0, -1]`), or all (`..`). A negative axis counts from the last one.
 ///
-/// They disappear from the shape, unless [`keepdims`](Self::keepdims) leaves them there with extent 1, for the result to
-/// broadcast against the input.
+/// They disappear from the shape, unless [`keepdims`](Self::keepdims) leaves them there with extent 1, for the result
+/// to broadcast against the input.
 ///
 /// ```
 /// use raygrad_autograd::{Axes, Tape, Tensor};

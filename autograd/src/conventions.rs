@@ -1,12 +1,12 @@
 //! Conventions: what operations give at ties, kinks and the edges of their domains.
 //!
-//! Wherever a function has no derivative, the one below is what its operation gives: the value and the gradient of each input
-//! for an output gradient of ones. Inputs are separated by semicolons. The table is a test: it is read from this text, and
-//! every row is evaluated in `f32` and `f64`, with the gradient recorded and not recorded.
+//! Wherever a function has no derivative, the one below is what its operation gives: the value and the gradient of each
+//! input for an output gradient of ones. Inputs are separated by semicolons. The table is a test: it is read from this
+//! text, and every row is evaluated in `f32` and `f64`, with the gradient recorded and not recorded.
 //!
 //! The rules behind it: NaN goes through, unless the result does not depend on it; a tie is shared evenly; a step has
-//! gradient 0; a kink has the gradient of the side that its formula takes; and where infinity times 0 would be NaN but a
-//! limit exists, that limit is the value.
+//! gradient 0; a kink has the gradient of the side that its formula takes; and where infinity times 0 would be NaN but
+//! a limit exists, that limit is the value.
 //!
 //! ## Kinks and steps
 //!

@@ -59,8 +59,8 @@ fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, out: &mut [T], pick:
     );
 }
 
-/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements that equal it. If the result is
-/// NaN, no element does, and all get 0.
+/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements that equal it. If the result
+/// is NaN, no element does, and all get 0.
 ///
 /// # Panics
 /// If the lengths do not fit.
@@ -112,8 +112,8 @@ pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]
     );
 }
 
-/// Where the greatest elements (the smallest ones without `greatest`) are along the middle axis: the first of equal ones,
-/// and the first NaN if there is one.
+/// Where the greatest elements (the smallest ones without `greatest`) are along the middle axis: the first of equal
+/// ones, and the first NaN if there is one.
 ///
 /// # Panics
 /// If the length does not fit, or `count` is 0 and the result is not empty.
@@ -126,7 +126,7 @@ pub fn arg_extremum<T: Scalar>(x: &[T], [outer, count, inner]: Middle, greatest:
         let mut value = x[..inner].to_vec();
         for (row, x) in x.chunks_exact(inner).enumerate().skip(1) {
             for i in 0..inner {
-                let is_nan = |x: T| x != x;
+                let is_nan = |x: T| x.partial_cmp(&x).is_none();
                 if !is_nan(value[i]) && (better(x[i], value[i]) || is_nan(x[i])) {
                     (value[i], best[i]) = (x[i], row);
                 }

@@ -164,8 +164,8 @@ macro_rules! real {
             fn atan2(self, x: Self) -> Self {
                 $t::atan2(self, x)
             }
-            /// Within 4 ULP: from `expm1` near 0, and from the square of `e^(x/2)` where `e^-x` does not matter, so that
-            /// it overflows only where it must.
+            /// Within 4 ULP: from `expm1` near 0, and from the square of `e^(x/2)` where `e^-x` does not matter, so
+            /// that it overflows only where it must.
             #[inline(always)]
             fn sinh(self) -> Self {
                 let a = $t::abs(self);

@@ -1,7 +1,7 @@
 //! Kernels on the rows of a matrix: softmax and its relatives, layer normalisation.
 //!
-//! A matrix is worked on in blocks of whole rows that fit in a core's nearest cache. What an element needs on its own (an
-//! exponential) runs over the whole block, so that rows shorter than a register are as fast as long ones.
+//! A matrix is worked on in blocks of whole rows that fit in a core's nearest cache. What an element needs on its own
+//! (an exponential) runs over the whole block, so that rows shorter than a register are as fast as long ones.
 
 use crate::reduce::{chunk, sum};
 use crate::{Pool, Scalar, simd};
@@ -104,8 +104,8 @@ fn top<T: Scalar>(x: &[T]) -> T {
     )
 }
 
-/// `out = x - shift` for each row of the block, with `shift` its greatest element, or 0 if that is infinite and `limits`
-/// are wanted. The shifts go to `shifts`.
+/// `out = x - shift` for each row of the block, with `shift` its greatest element, or 0 if that is infinite and
+/// `limits` are wanted. The shifts go to `shifts`.
 #[inline(always)]
 fn shifted<T: Scalar>(x: &[T], n: usize, out: &mut [T], shifts: &mut [T], limits: bool) {
     for ((x, out), shift) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(shifts) {
@@ -126,8 +126,8 @@ fn exponentials<T: Scalar>(x: &mut [T]) {
     }
 }
 
-/// `ln sum x` of powers of which at least one is 1, unless the row was not shifted by a finite element: without the 1, so
-/// that what little the others add to it is not rounded off.
+/// `ln sum x` of powers of which at least one is 1, unless the row was not shifted by a finite element: without the 1,
+/// so that what little the others add to it is not rounded off.
 #[inline(always)]
 fn ln_total<T: Scalar>(powers: &[T]) -> T {
     let rest = total_of(
@@ -334,7 +334,8 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
     );
 }
 
-/// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by `n`.
+/// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
+/// `n`.
 ///
 /// # Panics
 /// If `gain` and `bias` have different lengths or a row has another one, or `out` is shorter than `x`.
@@ -362,8 +363,8 @@ pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out
 
 /// The gradients of [`layer_norm_rows`]: that of `x` to `dx`, those of gain and bias to `dgain` and `dbias`.
 ///
-/// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps), dgain = sum of g u and
-/// dbias = sum of g over the rows. These sums are carried in f64.
+/// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps), dgain = sum of g u
+/// and dbias = sum of g over the rows. These sums are carried in f64.
 ///
 /// # Panics
 /// If a slice is shorter than its counterpart.

@@ -5,8 +5,8 @@ use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::extremum::{Middle, arg_extremum, extremum, extremum_grad};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
-/// y = the greatest (or smallest) element over axes `from..behind`, which stay with extent 1; dx = g, shared evenly among
-/// the elements that equal y, as PyTorch's `amax` does it.
+/// y = the greatest (or smallest) element over axes `from..behind`, which stay with extent 1; dx = g, shared evenly
+/// among the elements that equal y, as PyTorch's `amax` does it.
 #[derive(Debug, Clone, Copy)]
 pub struct Extremum {
     /// The first axis.
@@ -140,8 +140,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         arg_extremum(x, middle, greatest)
     }
 
-    /// Where the greatest elements along `axis` are: an index for each element of the remaining shape, in row-major order.
-    /// The first of equal ones, and the first NaN if there is one. There is no gradient.
+    /// Where the greatest elements along `axis` are: an index for each element of the remaining shape, in row-major
+    /// order. The first of equal ones, and the first NaN if there is one. There is no gradient.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

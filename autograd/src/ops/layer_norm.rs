@@ -4,8 +4,8 @@ use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{layer_norm_rows, layer_norm_rows_grad};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
-/// y = (x - mean) / sqrt(variance + eps) gain + bias along the last axis, for x `[.., n]`, gain and bias `[n]`. The gradients
-/// are those of [`layer_norm_rows_grad`].
+/// y = (x - mean) / sqrt(variance + eps) gain + bias along the last axis, for x `[.., n]`, gain and bias `[n]`. The
+/// gradients are those of [`layer_norm_rows_grad`].
 #[derive(Clone, Copy)]
 pub struct LayerNorm {
     /// Added to the variance.
@@ -58,9 +58,9 @@ impl<T: Scalar> Op<T> for LayerNorm {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// Layer normalisation along the last axis, `(self - mean) / sqrt(variance + eps) * gain + bias`: `[.., n]` with `gain`
-    /// and `bias` of shape `[n]`. The variance is divided by `n`; mean and variance are taken in two passes, so a large mean
-    /// costs no digits.
+    /// Layer normalisation along the last axis, `(self - mean) / sqrt(variance + eps) * gain + bias`: `[.., n]` with
+    /// `gain` and `bias` of shape `[n]`. The variance is divided by `n`; mean and variance are taken in two passes, so
+    /// a large mean costs no digits.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -100,8 +100,8 @@ impl Binary for Huber {
     }
 }
 
-/// With r = a - b: y = r^2 / (2 beta) for |r| < beta, else |r| - beta / 2; da = g r / beta limited to +-1, db = -da. For beta = 0
-/// this is |r|.
+/// With r = a - b: y = r^2 / (2 beta) for |r| < beta, else |r| - beta / 2; da = g r / beta limited to +-1, db = -da.
+/// For beta = 0 this is |r|.
 #[derive(Clone, Copy)]
 pub struct SmoothL1 {
     /// Where the parabola goes over into its tangents; may be 0.
@@ -155,8 +155,8 @@ impl SmoothL1 {
     }
 }
 
-/// y = b softplus(-a) + (1 - b) softplus(a): minus the logarithm of the probability that a logit a gives to a target b in 0..=1;
-/// da = g ((1 - b) s(a) - b s(-a)), db = -g a. No term cancels another, so small losses keep their digits.
+/// y = b softplus(-a) + (1 - b) softplus(a): minus the logarithm of the probability that a logit a gives to a target b
+/// in 0..=1; da = g ((1 - b) s(a) - b s(-a)), db = -g a. No term cancels another, so small losses keep their digits.
 #[derive(Clone, Copy)]
 pub struct BinaryCrossEntropy;
 impl Binary for BinaryCrossEntropy {
@@ -330,8 +330,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.smooth_l1(target, beta).mean()
     }
 
-    /// The cross-entropy of each element, `-t ln s - (1 - t) ln(1 - s)`, with `s` the [`sigmoid`](Self::sigmoid) of this
-    /// logit and `t` the target in 0..=1. Finite and accurate for any finite logit.
+    /// The cross-entropy of each element, `-t ln s - (1 - t) ln(1 - s)`, with `s` the [`sigmoid`](Self::sigmoid) of
+    /// this logit and `t` the target in 0..=1. Finite and accurate for any finite logit.
     ///
     /// # Panics
     /// If the shapes differ.
@@ -349,8 +349,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.binary_cross_entropy(target).mean()
     }
 
-    /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` with a class below `n` for each row, to
-    /// `[..]`.
+    /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` with a class below `n` for each
+    /// row, to `[..]`.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -57,8 +57,8 @@ fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &P
     )
 }
 
-/// y = the variance over the axes along which `shape` has extent 1: the sum of squared deviations from the mean, divided by
-/// `n - correction`; dx = 2 g (x - mean) / (n - correction).
+/// y = the variance over the axes along which `shape` has extent 1: the sum of squared deviations from the mean,
+/// divided by `n - correction`; dx = 2 g (x - mean) / (n - correction).
 #[derive(Clone)]
 pub struct Variance {
     /// The shape of the output, with as many axes as the input.
@@ -137,8 +137,8 @@ fn over_unless_zero<'t, T: Scalar>(g: &Var<'t, T>, y: &Var<'t, T>) -> Var<'t, T>
     zero.where_(&is_zero, &(g / one.where_(&is_zero, y)))
 }
 
-/// y = sqrt(sum of x^2) over the axes along which `shape` has extent 1, without overflow on the way; dx = g x / y, 0 where y
-/// is 0.
+/// y = sqrt(sum of x^2) over the axes along which `shape` has extent 1, without overflow on the way; dx = g x / y, 0
+/// where y is 0.
 #[derive(Clone)]
 pub struct Norm {
     /// The shape of the output, with as many axes as the input.
@@ -229,8 +229,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// The variance over any axes: the sum of squared deviations from the mean, divided by the number of elements less
-    /// `correction` (`ddof` in NumPy: 0 for the elements at hand, 1 for an unbiased estimate from a sample). NaN or infinite if
-    /// that is not positive. Two passes, so a large mean costs no digits.
+    /// `correction` (`ddof` in NumPy: 0 for the elements at hand, 1 for an unbiased estimate from a sample). NaN or
+    /// infinite if that is not positive. Two passes, so a large mean costs no digits.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.
@@ -247,7 +247,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.std_over(.., correction)
     }
 
-    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over), with gradient 0 where it is 0.
+    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over), with gradient 0 where it
+    /// is 0.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.
@@ -264,8 +265,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.norm_over(..)
     }
 
-    /// The Euclidean norm over any axes, `sqrt(sum of squares)`: accurate even where the squares would overflow or vanish.
-    /// The gradient is 0 where the norm is.
+    /// The Euclidean norm over any axes, `sqrt(sum of squares)`: accurate even where the squares would overflow or
+    /// vanish. The gradient is 0 where the norm is.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

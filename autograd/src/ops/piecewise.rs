@@ -231,8 +231,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Zip(Minimum), &[self, other])
     }
 
-    /// The elements limited to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is 0
-    /// beyond. An infinite limit is none.
+    /// The elements limited to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is
+    /// 0 beyond. An infinite limit is none.
     ///
     /// # Panics
     /// If `low` is not at most `high`.

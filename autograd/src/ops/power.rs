@@ -183,14 +183,15 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Map(Powi { exponent }), &[self])
     }
 
-    /// `self` to a constant real power: NaN for a negative base and a broken exponent; exponent 0 gives 1 with gradient 0.
+    /// `self` to a constant real power: NaN for a negative base and a broken exponent; exponent 0 gives 1 with gradient
+    /// 0.
     #[track_caller]
     pub fn powf(&self, exponent: f64) -> Self {
         self.tape().apply(Map(Powf { exponent }), &[self])
     }
 
-    /// `self` to the power of `exponent`; broadcasts. At base 0 the gradient of the exponent is 0 unless that is negative, and
-    /// for a negative base it is NaN.
+    /// `self` to the power of `exponent`; broadcasts. At base 0 the gradient of the exponent is 0 unless that is
+    /// negative, and for a negative base it is NaN.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
@@ -199,7 +200,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Zip(Pow), &[self, exponent])
     }
 
-    /// `self * ln(y)`, which is 0 where `self` is 0 even if `y` is 0 or negative; broadcasts. An entropy is `-p.xlogy(&p)`.
+    /// `self * ln(y)`, which is 0 where `self` is 0 even if `y` is 0 or negative; broadcasts. An entropy is
+    /// `-p.xlogy(&p)`.
     ///
     /// # Panics
     /// If the shapes do not broadcast.

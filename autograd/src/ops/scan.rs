@@ -40,7 +40,8 @@ impl Walk {
         }
     }
 
-    /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the end.
+    /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the
+    /// end.
     fn neighbour<'t, T: Scalar>(self, x: &Var<'t, T>, next: bool, fill: f64) -> Var<'t, T> {
         let n = x.shape()[self.axis];
         if n == 0 {
@@ -92,8 +93,8 @@ impl<T: Scalar> Op<T> for Cumsum {
     }
 }
 
-/// y = product of x up to and with each entry. dx: the gradients of all later products, carried back by [`Recurrence`], times
-/// the product before the entry; nothing is divided, so zeros do no harm.
+/// y = product of x up to and with each entry. dx: the gradients of all later products, carried back by [`Recurrence`],
+/// times the product before the entry; nothing is divided, so zeros do no harm.
 #[derive(Clone, Copy)]
 pub struct Cumprod(
     /// The order.
@@ -130,8 +131,8 @@ impl<T: Scalar> Op<T> for Cumprod {
     }
 }
 
-/// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence, the other way, of g with the next
-/// factor; da = db y[i - 1].
+/// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence, the other way, of g with the
+/// next factor; da = db y[i - 1].
 #[derive(Clone, Copy)]
 pub struct Recurrence(
     /// The order.
@@ -259,8 +260,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk(axis, true, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
-    /// The products of the entries along `axis` up to each one and with it, carried in f64. The gradient is right whatever
-    /// entries are 0.
+    /// The products of the entries along `axis` up to each one and with it, carried in f64. The gradient is right
+    /// whatever entries are 0.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -269,8 +270,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk(axis, false, |walk, x| x.tape().apply(Cumprod(walk), &[x]))
     }
 
-    /// `y[i] = self[i] y[i - 1] + summand[i]` along `axis`, with 0 before the first entry: a first-order linear recurrence,
-    /// such as a discounted sum or an exponential moving average.
+    /// `y[i] = self[i] y[i - 1] + summand[i]` along `axis`, with 0 before the first entry: a first-order linear
+    /// recurrence, such as a discounted sum or an exponential moving average.
     ///
     /// # Panics
     /// If the shapes differ or the axis does not exist.

@@ -190,8 +190,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.logsumexp_over(..)
     }
 
-    /// `ln(sum(e^self))` over any axes, without overflow; -inf, with gradient 0, over none of the elements and over nothing
-    /// but -inf.
+    /// `ln(sum(e^self))` over any axes, without overflow; -inf, with gradient 0, over none of the elements and over
+    /// nothing but -inf.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.
