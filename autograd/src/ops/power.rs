@@ -61,7 +61,7 @@ impl Unary for Powi {
             n if n > 0 => {
                 c.at([0.0], 0.0, [0.0]).at([-1.0], (-1.0_f64).powi(n), [f64::from(n) * (-1.0_f64).powi(n - 1)])
             }
-            n => c.at([0.0], INF.copysign((-1.0_f64).powi(n)), [f64::from(n) * INF]).at([INF], 0.0, [0.0]),
+            n => c.at([0.0], INF, [f64::from(n) * INF]).at([INF], 0.0, [0.0]),
         };
     }
 }
