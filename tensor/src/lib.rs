@@ -8,17 +8,20 @@
 //! * [`Layout`]: broadcast, permute, slice, flip, diagonal, and their adjoints.
 //! * [`Windows`]: what a convolution or a pooling sees of an image.
 //! * [`Indices`]: integer arrays for sorting, searching and gathering.
+//! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
 //! All work happens on the calling thread; parallelism belongs to the caller.
 
 mod elementwise;
+pub mod extremum;
 mod indices;
 mod layout;
 pub mod matmul;
 mod pool;
 mod real;
 mod reduce;
+pub mod rows;
 mod scalar;
 pub mod simd;
 mod tensor;
