@@ -11,6 +11,7 @@
 //! All work happens on the calling thread; parallelism belongs to the caller.
 
 mod elementwise;
+mod lane;
 mod layout;
 pub mod matmul;
 mod pool;
@@ -21,7 +22,8 @@ pub mod simd;
 mod tensor;
 pub mod vmath;
 
-pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, map};
+pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, lanes_either, map, map_either};
+pub use lane::Lane;
 pub use layout::Layout;
 pub use pool::Pool;
 pub use real::Real;
