@@ -58,7 +58,7 @@ fn reduce_far(x: f64) -> (f64, u64) {
     }
     let bits = x.to_bits();
     let m = (bits & 0x000f_ffff_ffff_ffff) | 0x0010_0000_0000_0000;
-    let e = (bits >> 52) as usize - 1075 + 64; // and 64 for the zeros ahead
+    let e = (bits >> 52) as usize + 64 - 1075; // 64 for the zeros ahead
     let (word, shift) = ((e - 2) / 64, (e - 2) % 64);
     let digits = |i: usize| {
         let pair = u128::from(TWO_BY_PI[word + i]) << 64 | u128::from(TWO_BY_PI[word + i + 1]);
