@@ -47,13 +47,7 @@ fn split_any(x: f64) -> (f64, i32) {
 /// rounding error out of the leading terms.
 #[inline(always)]
 fn ln1p_tail(f: f64) -> f64 {
-    // The quotient as in `divide`, on the interval from 1.70 to 2.42: a parabola of relative error 2^-9.6, and 2^-38.
-    let b = 2.0 + f;
-    let y = polynomial(b, [1.477_775_7, -0.722_460_32, 0.116_866_09]);
-    let y = y.mul_add((-b).mul_add(y, 1.0), y);
-    let y = y.mul_add((-b).mul_add(y, 1.0), y);
-    let q = f * y;
-    let s = (-b).mul_add(q, f).mul_add(y, q);
+    let s = f / (2.0 + f);
     let z = s * s;
     let half = 0.5 * f * f;
     s.mul_add(z.mul_add(polynomial(z, R), half), -half)

@@ -46,16 +46,3 @@ fn polynomial<const N: usize>(x: f64, c: [f64; N]) -> f64 {
     }
     last.mul_add(x, other)
 }
-
-/// `a / b` for 1 <= b <= 2, as good as rounded once. A vector division takes longer than all of these products.
-///
-/// The reciprocal starts as a cubic (of Chebyshev, relative error 2^-9), gets to 2^-36 by two steps of Newton's method, and the
-/// quotient's remainder does the rest.
-#[inline(always)]
-fn divide(a: f64, b: f64) -> f64 {
-    let y = polynomial(b, [2.828_422_9, -2.939_341_4, 1.331_022_5, -0.221_837_09]);
-    let y = y.mul_add((-b).mul_add(y, 1.0), y);
-    let y = y.mul_add((-b).mul_add(y, 1.0), y);
-    let q = a * y;
-    (-b).mul_add(q, a).mul_add(y, q)
-}
