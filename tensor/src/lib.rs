@@ -16,6 +16,7 @@
 mod elementwise;
 pub mod extremum;
 mod indices;
+mod lane;
 mod layout;
 pub mod matmul;
 mod pool;
@@ -28,8 +29,9 @@ mod tensor;
 pub mod vmath;
 mod windows;
 
-pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, map};
+pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, lanes_either, map, map_either};
 pub use indices::Indices;
+pub use lane::Lane;
 pub use layout::Layout;
 pub use pool::Pool;
 pub use real::Real;
