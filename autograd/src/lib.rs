@@ -2,9 +2,13 @@
 
 mod catalogue;
 mod check;
+mod checkpoint;
+pub mod derivatives;
+mod dot;
 mod dual;
 mod elementwise;
 mod error;
+mod hook;
 mod layers;
 mod op;
 mod ops;
@@ -22,7 +26,7 @@ pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};
 pub use layers::{Init, Linear, Mlp};
 pub use op::{Gradient, Grads, Op, Reads, SparseGrad, Vjp};
-pub use ops::{Activation, Segments};
+pub use ops::{Activation, RowGrad, Segments};
 pub use optim::{Adam, AdamConfig, Schedule};
 pub use optim_rows::{RowAdam, RowStats, Touched};
 pub use params::{Bound, ParamId, Params, ParamsError};

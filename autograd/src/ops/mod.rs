@@ -13,5 +13,6 @@ pub(crate) mod shape;
 pub(crate) mod trigonometric;
 
 pub(crate) use arithmetic::{add, div, mul, sub};
+pub use gather::RowGrad;
 pub use linear::Activation;
 pub use segment::Segments;
