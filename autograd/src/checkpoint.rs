@@ -125,7 +125,7 @@ impl<T: Scalar> Tape<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Activation, Gradient, RowGrad, SparseGrad};
+    use crate::{Activation, Gradient, RowGrad};
 
     fn bits<T: Scalar>(x: &Tensor<T>) -> Vec<u64> {
         x.as_slice().iter().map(|x| x.to_f64().to_bits()).collect()

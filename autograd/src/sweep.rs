@@ -269,9 +269,11 @@ fn sums<'t, T: Scalar>(
                 continue;
             }
             let node = match keep {
-                Keep::Nothing => tape.nodes.borrow_mut()[index as usize].take(),
-                _ => tape.nodes.borrow()[index as usize].clone(),
+                // A leaf holds no values, and may be one of other graphs too.
+                Keep::Nothing => tape.nodes.borrow_mut()[index as usize].take_if(|node| node.op.is_some()),
+                _ => None,
             };
+            let node = node.or_else(|| tape.nodes.borrow()[index as usize].clone());
             let Some(node) = node else { return Err(Error::Freed { at }) };
             if node.op.is_none() && !tape.checks_finite() {
                 continue;
@@ -279,7 +281,8 @@ fn sums<'t, T: Scalar>(
             let wanted = wrt.iter().any(|x| x.node == Some(index));
             let Some(sum) = (if wanted { grads[slot].clone() } else { grads[slot].take() }) else { continue };
             let name = node.op.as_ref().map_or(LEAF, |op| op.name());
-            sum.check(tape, "the gradient of the output", name, node.at)?;
+            let what = if node.op.is_some() { "the gradient of the output" } else { "the gradient" };
+            sum.check(tape, what, name, node.at)?;
             let Some(op) = &node.op else { continue };
             let g = sum.dense(tape);
             let needs: SmallVec<[bool; 4]> =
