@@ -260,6 +260,7 @@ fn unit<T: Scalar>(shape: &[usize], place: usize) -> Tensor<T> {
 mod tests {
     use super::*;
     use crate::Activation;
+    use std::slice::from_ref;
 
     fn vector(values: &[f64]) -> Tensor<f64> {
         Tensor::from_vec(&[values.len()], values.to_vec())
@@ -404,10 +405,10 @@ mod tests {
         assert_eq!(hessian(|x| x[0].square().sum(), &[empty()])[0][0].shape(), [0, 2, 0, 2]);
         assert_eq!(hvp(|x| x[0].square().sum(), &[empty()], &[empty()])[0].shape(), [0, 2]);
         let at = Tensor::scalar(3.0);
-        assert_eq!(jacobian(|x| x[0].square(), std::slice::from_ref(&at))[0], Tensor::scalar(6.0));
-        assert_eq!(hessian(|x| x[0].square(), std::slice::from_ref(&at))[0][0], Tensor::scalar(2.0));
+        assert_eq!(jacobian(|x| x[0].square(), from_ref(&at))[0], Tensor::scalar(6.0));
+        assert_eq!(hessian(|x| x[0].square(), from_ref(&at))[0][0], Tensor::scalar(2.0));
         // A function that does not depend on its input.
-        let (y, slope) = jvp(|x| x[0].constant(1.0), &[at.clone()], &[at.clone()]);
+        let (y, slope) = jvp(|x| x[0].constant(1.0), from_ref(&at), from_ref(&at));
         assert_eq!((y.item(), slope.item()), (1.0, 0.0));
         assert_eq!(hessian(|x| x[0].constant(1.0), &[at])[0][0], Tensor::scalar(0.0));
     }
