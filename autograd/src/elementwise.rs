@@ -84,7 +84,8 @@ impl<T: Scalar, U: Unary> Op<T> for Map<U> {
         if cx.recording() {
             let nan = || cx.g().constant(f64::NAN);
             let (x, y) = (if reads_x { cx.x(0) } else { nan() }, if reads_y { cx.y() } else { nan() });
-            return Grads::one(self.0.vjp(cx.g().clone(), x, y));
+            // A formula may give a constant, which has no axes.
+            return Grads::one(self.0.vjp(cx.g().clone(), x, y).broadcast_to(cx.shape(0)));
         }
         let g = cx.g().value();
         let grad = match (reads_x, reads_y) {
@@ -165,8 +166,9 @@ impl<T: Scalar, B: Binary> Op<T> for Zip<B> {
             let b = if B::READS.input(1) { cx.x(1) } else { nan() };
             let y = if B::READS.output() { cx.y() } else { nan() };
             let g = cx.g().clone();
-            let ga = cx.needs(0).then(|| self.0.vjp_a(g.clone(), a.clone(), b.clone(), y.clone()).sum_to(cx.shape(0)));
-            let gb = cx.needs(1).then(|| self.0.vjp_b(g, a, b, y).sum_to(cx.shape(1)));
+            let reduced = |grad: Var<'t, T>, i| grad.broadcast_to(cx.g().shape()).sum_to(cx.shape(i));
+            let ga = cx.needs(0).then(|| reduced(self.0.vjp_a(g.clone(), a.clone(), b.clone(), y.clone()), 0));
+            let gb = cx.needs(1).then(|| reduced(self.0.vjp_b(g, a, b, y), 1));
             return Grads::new([ga, gb]);
         }
         let reduced = |grad: Tensor<T>, i: usize| -> Var<'t, T> {

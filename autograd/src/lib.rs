@@ -1,10 +1,12 @@
 //! Reverse-mode automatic differentiation over [`raygrad_tensor`], with gradients of gradients. This crate knows no rays.
 
+mod axes;
 mod catalogue;
 mod check;
 mod checkpoint;
 pub mod derivatives;
 mod dot;
+pub mod conventions;
 mod dual;
 mod elementwise;
 mod error;
@@ -21,6 +23,7 @@ mod sweep;
 mod tape;
 mod var;
 
+pub use axes::Axes;
 pub use catalogue::{Cases, Entry, Extreme, catalogue};
 pub use check::{Check, Report, check_function, check_op};
 pub use dual::Dual;

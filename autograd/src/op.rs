@@ -62,7 +62,9 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
         Ok(self.vjp(cx))
     }
 
-    /// Whether [`reference`](Self::reference) gives a value. The operation then reads all its inputs.
+    /// Whether the tape goes through [`reference`](Self::reference), which then gives a value, where a gradient is itself
+    /// differentiated. The operation then reads all its inputs. An operation whose [`vjp`](Self::vjp) can be recorded
+    /// leaves this false, and may still have a reference as an oracle.
     fn is_fused(&self) -> bool {
         false
     }

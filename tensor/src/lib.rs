@@ -5,17 +5,20 @@
 //! * [`matmul`]: matrix products with transposed operands by stride.
 //! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
+//! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`Layout`]: broadcast, permute, slice, flip, and their adjoints.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
 //! All work happens on the calling thread; parallelism belongs to the caller.
 
 mod elementwise;
+pub mod extremum;
 mod layout;
 pub mod matmul;
 mod pool;
 mod real;
 mod reduce;
+pub mod rows;
 mod scalar;
 pub mod simd;
 mod tensor;

@@ -38,7 +38,7 @@ fn pairwise<T: Scalar>(x: &[T]) -> T {
 }
 
 #[inline(always)]
-fn chunk<T: Scalar>(x: &[T]) -> T {
+pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
     let mut lanes = [T::ZERO; LANES];
     let mut rows = x.chunks_exact(LANES);
     for row in &mut rows {

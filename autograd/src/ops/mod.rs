@@ -4,12 +4,21 @@
 pub(crate) mod activation;
 pub(crate) mod arithmetic;
 pub(crate) mod exponential;
+pub(crate) mod extremum;
 pub(crate) mod gather;
+pub(crate) mod layer_norm;
 pub(crate) mod linear;
+pub(crate) mod loss;
 pub(crate) mod matmul;
+pub(crate) mod moments;
+pub(crate) mod piecewise;
+pub(crate) mod power;
 pub(crate) mod reduce;
+pub(crate) mod scan;
 pub(crate) mod segment;
+pub(crate) mod select;
 pub(crate) mod shape;
+pub(crate) mod softmax;
 pub(crate) mod trigonometric;
 
 pub(crate) use arithmetic::{add, div, mul, sub};
