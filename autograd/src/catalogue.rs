@@ -310,7 +310,7 @@ fn core() -> Vec<Entry> {
         layout: layout(Layout::contiguous(from)),
     };
     let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
-    vec![
+    let mut entries = vec![
         Entry::binary(arithmetic::Add),
         Entry::binary(arithmetic::Sub),
         Entry::binary(arithmetic::Mul),
@@ -361,5 +361,7 @@ fn core() -> Vec<Entry> {
         Entry::new(cumsum(false, false)).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
         Entry::new(cumsum(true, false)).linear().sample(&[&[7]]),
         Entry::new(cumsum(true, true)).linear().sample(&[&[7, 3]]),
-    ]
+    ];
+    entries.extend(crate::catalogue_arrays::entries());
+    entries
 }
