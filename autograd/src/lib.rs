@@ -33,7 +33,7 @@ pub use dual::Dual;
 pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};
 pub use files::write_atomic;
-pub use layers::{Dropout, Embedding, Init, Layer, Linear, Mlp, Pass, Sequential};
+pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Pass, Sequential};
 pub use npz::NpzError;
 pub use op::{Gradient, Grads, Op, Reads, SparseGrad, Vjp};
 pub use ops::{Activation, Conv2dConfig, INFER, Pool2dConfig, RowGrad, Segments};

@@ -6,7 +6,6 @@
 //! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
 //! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
-//! * [`Layout`]: broadcast, permute, slice, flip, and their adjoints.
 //! * [`Layout`]: broadcast, permute, slice, flip, diagonal, and their adjoints.
 //! * [`Windows`]: what a convolution or a pooling sees of an image.
 //! * [`Indices`]: integer arrays for sorting, searching and gathering.

@@ -1,15 +1,19 @@
 //! Layers: handles on parameters, and pure functions of (parameters, input).
 
+mod conv2d;
 mod dropout;
 mod embedding;
 mod init;
+mod layer_norm;
 mod linear;
 mod mlp;
 mod sequential;
 
+pub use conv2d::Conv2d;
 pub use dropout::Dropout;
 pub use embedding::Embedding;
 pub use init::Init;
+pub use layer_norm::LayerNorm;
 pub use linear::Linear;
 pub use mlp::Mlp;
 pub use sequential::Sequential;
