@@ -30,6 +30,7 @@ pub(crate) mod vector;
 
 pub(crate) use arithmetic::{add, div, mul, sub};
 pub use convolution::Conv2dConfig;
+pub use gather::RowGrad;
 pub use linear::Activation;
 pub use pooling::Pool2dConfig;
 pub use segment::Segments;
