@@ -7,7 +7,10 @@
 
 use rand::rngs::StdRng;
 use rand::{Rng, RngExt, SeedableRng};
-use raygrad::autograd::{Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Params, Pool, Tape, Tensor, Var};
+use raygrad::autograd::{
+    Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Init, Linear, Mlp, Params, Pool, Pool2dConfig, Tape,
+    Tensor, Var,
+};
 use raygrad::tensor::add_assign;
 use rayon::prelude::*;
 use std::time::Instant;
@@ -147,7 +150,7 @@ fn head(params: &mut Params<f32>, sizes: [usize; 2], rng: &mut impl Rng) -> Line
 
 /// The mean cross entropy of logits and one-hot targets.
 fn cross_entropy<'t>(logits: &Var<'t, f32>, target: &Var<'t, f32>) -> Var<'t, f32> {
-    (logits.exp().sum_axes(&[1]).ln() - (logits * target).sum_axes(&[1])).mean()
+    -(logits.log_softmax(-1) * target).sum_over(1).mean()
 }
 
 fn training() {
@@ -168,6 +171,20 @@ fn training() {
     let shards = Shard::batch(128, &[784], 10, one_hot);
     train("train MLP 784-512-512-10, 128 rows, cross entropy", params, &shards, |bound, x, target| {
         cross_entropy(&last.forward(bound, &trunk.forward(bound, x)), target)
+    });
+
+    let mut params = Params::new();
+    let padded = Conv2dConfig { padding: [1, 1], ..Conv2dConfig::default() };
+    let mut conv =
+        |name, channels| Conv2d::new(&mut params, name, channels, [3, 3], padded, Activation::Relu, Init::He, rng);
+    let (first, second) = (conv("first", [1, 8]), conv("second", [8, 16]));
+    let last = head(&mut params, [16 * 7 * 7, 10], rng);
+    let shards = Shard::batch(64, &[1, 28, 28], 10, one_hot);
+    train("train CNN 8-16, 64 images 28x28, cross entropy", params, &shards, |bound, x, target| {
+        let pool = Pool2dConfig::new([2, 2]);
+        let h = first.forward(bound, x).max_pool2d(&pool);
+        let h = second.forward(bound, &h).max_pool2d(&pool);
+        cross_entropy(&last.forward(bound, &h.reshape(&[h.shape()[0], 16 * 7 * 7])), target)
     });
 }
 
@@ -193,4 +210,12 @@ fn operations() {
     operation("sum over axis 0, 4096x1024", &[4096, 1024], |x| x.sum_axes(&[0]));
     operation("sum over axis 1, 4096x1024", &[4096, 1024], |x| x.sum_axes(&[1]));
     operation("sum, 4096x1024", &[4096, 1024], |x| x.sum());
+    // Weighted, since the sum of a softmax is constant.
+    let weight = Tensor::from_fn(&[1024, 512], |i| (i as f32 * 0.7).sin());
+    operation("softmax 1024x512", &[1024, 512], |x| x.softmax(-1) * x.tape().constant(weight.clone()));
+    let (gain, bias) = (Tensor::ones(&[512]), Tensor::zeros(&[512]));
+    operation("layer norm 1024x512", &[1024, 512], |x| {
+        let (gain, bias) = (x.tape().leaf(gain.clone()), x.tape().leaf(bias.clone()));
+        x.layer_norm(&gain, &bias, 1e-5) * x.tape().constant(weight.clone())
+    });
 }
