@@ -54,7 +54,9 @@ fn reductions_over_every_set_of_axes_agree_with_plain_loops() {
             let reduced: Vec<bool> = (0..shape.len()).map(|axis| mask >> axis & 1 == 1).collect();
             let groups = groups(&x, &reduced);
             // Alternately from the start and from the end.
-            let number = |axis: usize| if axis % 2 == 0 { axis as isize } else { axis as isize - shape.len() as isize };
+            let number = |axis: usize| {
+                if axis.is_multiple_of(2) { axis as isize } else { axis as isize - shape.len() as isize }
+            };
             let axes: Vec<isize> = (0..shape.len()).filter(|&axis| reduced[axis]).map(number).collect();
             for (name, reduce, plain) in REDUCTIONS {
                 let no_elements = groups.iter().any(Vec::is_empty);
@@ -96,9 +98,10 @@ fn derivatives_of_reductions_agree_with_differences() {
 }
 
 type Scan = for<'t> fn(&Var<'t, f64>, isize) -> Var<'t, f64>;
+type Lines = fn(&[f64]) -> Vec<f64>;
 
 /// Operations that keep the shape, with what they make of one line.
-const SCANS: [(&str, Scan, fn(&[f64]) -> Vec<f64>); 5] = [
+const SCANS: [(&str, Scan, Lines); 5] = [
     ("cumsum", |x, axis| x.cumsum(axis), |x| (1..=x.len()).map(|n| x[..n].iter().sum()).collect()),
     ("reverse_cumsum", |x, axis| x.reverse_cumsum(axis), |x| (0..x.len()).map(|n| x[n..].iter().sum()).collect()),
     ("cumprod", |x, axis| x.cumprod(axis), |x| (1..=x.len()).map(|n| x[..n].iter().product()).collect()),
@@ -140,7 +143,8 @@ fn scans_along_every_axis_agree_with_plain_loops_and_differences() {
                         assert!((got - expected).abs() < 1e-14, "{context}: {got} for {expected}");
                     }
                 }
-                let result = check_function(&Check::default(), &[x.clone()], |x| scan(&x[0], axis as isize));
+                let result =
+                    check_function(&Check::default(), std::slice::from_ref(&x), |x| scan(&x[0], axis as isize));
                 assert!(result.is_ok(), "{context}: {result:?}");
             }
         }

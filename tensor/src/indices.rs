@@ -169,7 +169,7 @@ mod tests {
             prop_assert_eq!(got.shape(), &shape[..]);
             let inner: usize = shape[axis + 1..].iter().product();
             let rank = |i: usize| if x.as_slice()[i].is_nan() { 9 } else { x.as_slice()[i] as i32 };
-            for start in (0..x.len()).filter(|i| i / inner.max(1) % shape[axis] == 0) {
+            for start in (0..x.len()).filter(|i| (i / inner.max(1)).is_multiple_of(shape[axis])) {
                 let lane: Vec<_> = (0..shape[axis]).map(|k| got.as_slice()[start + k * inner]).collect();
                 let mut all = lane.clone();
                 all.sort();
