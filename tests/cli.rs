@@ -250,11 +250,18 @@ fn absent_images_are_skipped_with_a_warning() {
 }
 
 #[test]
-fn an_instant_model_comes_back_with_its_occupancy_grid() {
+fn marched_models_come_back_with_their_occupancy_grids() {
     let place = Place::with_scene();
     place.succeeds("train scene --preset instant --steps 2");
-    place.succeeds("eval run --views 1");
-    assert!(place.json("run/eval.json")["psnr_mean"].as_f64().unwrap() > 3.0);
+    place.succeeds(
+        "train scene --preset voxel --set field.resolution=24 --set loss={\"huber\":{\"delta\":0.1}} --steps 2",
+    );
+    for run in ["run", "run-2"] {
+        place.succeeds(&format!("eval {run} --views 1"));
+        assert!(place.json(&format!("{run}/eval.json"))["psnr_mean"].as_f64().unwrap() > 3.0);
+    }
+    assert_eq!(place.json("run-2/config.json")["config"]["field"]["resolution"], 24);
+    place.fails("train scene --preset voxel --set field.resolution=513", &["`resolution`", "use 1 to 512"]);
     let model = place.path("run/model.safetensors");
     let bytes = std::fs::read(&model).unwrap();
     std::fs::write(&model, &bytes[..bytes.len() / 2]).unwrap();
@@ -333,7 +340,7 @@ fn bad_arguments_are_usage_errors() {
         ("train --steps 0", "0 is not in 1.."),
         ("train --downscale 0", "0 is not in 1.."),
         ("train --threads 0", "0 is not in 1.."),
-        ("train --preset huge", "use classic, small or instant"),
+        ("train --preset huge", "use classic, small, instant or voxel"),
         ("train --background grey", "white, black or random"),
         ("eval", "required arguments"),
         ("eval run --split all", "must be train, val or test"),

@@ -3,7 +3,7 @@
 use raygrad::nerf::dataset::{Dataset, Split, embedded};
 use raygrad::nerf::hash_grid::HashGridConfig;
 use raygrad::nerf::hierarchical::HierarchicalConfig;
-use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, SamplerConfig, StepStats, Trainer};
+use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, SamplerConfig, StepStats, Trainer, VoxelConfig};
 use std::sync::Arc;
 
 /// Small networks, with more tiles than there are slots that sum gradients, and a last tile that is not full.
@@ -34,6 +34,12 @@ fn instant(seed: u64) -> Config {
     config
 }
 
+/// A grid of voxels with enough rows for several tasks of the optimiser, marched.
+fn voxel(seed: u64) -> Config {
+    let field = FieldConfig::Voxel(VoxelConfig { resolution: 48, direction_degree: 2 });
+    Config { field, sampler: instant(seed).sampler, seed, ..Config::preset(Preset::Voxel) }
+}
+
 /// What some steps and a view of the result leave, in bits.
 #[derive(Debug, PartialEq)]
 struct Outcome {
@@ -61,8 +67,9 @@ fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: usize) -> O
 #[test]
 fn training_and_rendering_give_the_same_bits_on_any_number_of_threads() {
     let data = Arc::new(embedded(Split::Val, 32));
-    // The instant model takes more steps: its occupancy grid is to change on the way.
-    for (name, config, steps) in [("hierarchical", config(7), 5), ("instant", instant(7), 40)] {
+    // Marched models take more steps: their occupancy grids are to change on the way.
+    for (name, config, steps) in [("hierarchical", config(7), 5), ("instant", instant(7), 40), ("voxel", voxel(7), 40)]
+    {
         let one = outcome(&data, config.clone(), steps, 1);
         for threads in [1, 2, 4] {
             let other = outcome(&data, config.clone(), steps, threads);

@@ -8,8 +8,8 @@ use raygrad::nerf::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampler::Jitter;
 use raygrad::nerf::scene::{Scene, train_cameras};
 use raygrad::nerf::{
-    ClassicConfig, Composite, Config, Extent, FieldConfig, Model, PositionalEncoding, Preset, Rays, SamplerConfig,
-    Samples, catalogue, clip_span,
+    ClassicConfig, Composite, Config, Extent, FieldConfig, Loss as LossKind, Model, PositionalEncoding, Preset, Rays,
+    SamplerConfig, Samples, VoxelConfig, catalogue, clip_span,
 };
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -156,6 +156,26 @@ fn so_has_the_loss_of_the_instant_field() {
     let report = check_function(&check, loss.model.params.values(), |vars| loss.at(&Bound::from_vars(vars.to_vec())));
     println!("{report:?}");
     assert!(report.unwrap().comparisons > 2 * 40);
+}
+
+#[test]
+fn so_has_the_loss_of_the_voxel_field() {
+    for loss in [LossKind::Mse, LossKind::Huber { delta: 0.2 }] {
+        let mut config = Config { loss, ..Config::preset(Preset::Voxel) };
+        config.field = FieldConfig::Voxel(VoxelConfig { resolution: 3, direction_degree: 2 });
+        if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+            sampler.step = 0.1;
+        }
+        let mut loss = Loss::new(config, 3, 1).double();
+        // Coefficients of the size that training gives them.
+        let (table, _) = loss.model.field.table().unwrap();
+        loss.model.params.get_mut(table).as_mut_slice().iter_mut().for_each(|x| *x *= 1e4);
+        let check = Check { step: 1e-5, tolerance: 1e-8, ..Check::default() };
+        let params = loss.model.params.values();
+        let report = check_function(&check, params, |vars| loss.at(&Bound::from_vars(vars.to_vec())));
+        println!("{report:?}");
+        assert!(report.unwrap().comparisons > 2 * 40);
+    }
 }
 
 /// A direction of length 1 in the space of all parameters.

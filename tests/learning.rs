@@ -4,7 +4,9 @@ use raygrad::nerf::dataset::{Dataset, Split, embedded, load};
 use raygrad::nerf::hash_grid::HashGridConfig;
 use raygrad::nerf::hierarchical::HierarchicalConfig;
 use raygrad::nerf::occupancy::Skip;
-use raygrad::nerf::{Budget, ClassicConfig, Config, FieldConfig, Image, Preset, SamplerConfig, Trainer, metrics};
+use raygrad::nerf::{
+    Budget, ClassicConfig, Config, FieldConfig, Image, Loss, Preset, SamplerConfig, Trainer, VoxelConfig, metrics,
+};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
@@ -40,6 +42,12 @@ fn instant() -> Config {
     config
 }
 
+/// A coarse grid of voxels, marched with few samples.
+fn voxel() -> Config {
+    let field = FieldConfig::Voxel(VoxelConfig { resolution: 32, direction_degree: 2 });
+    Config { field, sampler: instant().sampler, ..Config::preset(Preset::Voxel) }
+}
+
 /// The mean PSNR, in dB, of held-out views after 200 steps on `train`, and that of blank pictures.
 fn learn(config: Config, train: Dataset, test: &Dataset) -> [f64; 2] {
     let white = [1.0; 3];
@@ -61,7 +69,15 @@ fn learn(config: Config, train: Dataset, test: &Dataset) -> [f64; 2] {
 fn the_embedded_scene_is_learnt_in_seconds() {
     // Any field is to work with any sampler.
     let marched = config().with_skip(Skip::Fast);
-    for (name, config) in [("hierarchical", config()), ("marched", marched), ("instant", instant())] {
+    let huber = Config { loss: Loss::Huber { delta: 0.1 }, ..instant() };
+    let configs = [
+        ("hierarchical", config()),
+        ("marched", marched),
+        ("instant", instant()),
+        ("huber", huber),
+        ("voxel", voxel()),
+    ];
+    for (name, config) in configs {
         let [learnt, blank] = learn(config, embedded(Split::Train, 40), &embedded(Split::Test, 40));
         println!("{name}: {learnt:.2} dB against {blank:.2} dB of blank pictures");
         assert!(learnt > 18.0 && learnt > blank + 8.0, "{name}: {learnt:.2} dB against {blank:.2} dB");

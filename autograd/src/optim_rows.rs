@@ -2,6 +2,8 @@
 
 use crate::AdamConfig;
 use raygrad_tensor::{Scalar, simd};
+use rayon::prelude::*;
+use std::ops::Add;
 use std::sync::Arc;
 
 /// Which rows of a table may hold a gradient, by groups of [`Touched::GROUP`] neighbours.
@@ -48,6 +50,16 @@ pub struct RowStats {
     /// Rows that were left alone because their gradient holds an infinite value or NaN.
     pub skipped: usize,
 }
+
+impl Add for RowStats {
+    type Output = RowStats;
+    fn add(self, other: RowStats) -> RowStats {
+        RowStats { touched: self.touched + other.touched, skipped: self.skipped + other.skipped }
+    }
+}
+
+/// Groups that one task visits.
+const CHUNK: usize = 1 << 12;
 
 /// Lazy Adam: the update of [`Adam`](crate::Adam) for those rows of a table whose gradient is not zero.
 ///
@@ -144,8 +156,8 @@ impl<T: Scalar> RowAdam<T> {
         }
     }
 
-    /// Moves the marked rows of `table` `[rows, features]` against their gradient with learning rate `rate`, in
-    /// ascending order; then `grad` is zero and nothing is marked any more.
+    /// Moves the marked rows of `table` `[rows, features]` against their gradient with learning rate `rate`; then `grad`
+    /// is zero and nothing is marked any more. Work on many rows is spread over the current rayon pool.
     ///
     /// # Panics
     /// If a length is not that of this optimiser's rows.
@@ -155,26 +167,62 @@ impl<T: Scalar> RowAdam<T> {
         assert_eq!((table.len(), grad.len()), (len, len), "a table and a gradient of the optimiser's rows");
         assert_eq!(touched.groups(), self.steps.len().div_ceil(Touched::GROUP), "marks for the optimiser's rows");
         let rate = T::from_f64(rate);
-        simd::dispatch(
-            #[inline(always)]
-            || self.visit(table, grad, touched, rate),
-        )
+        let RowAdam { rule, features, moments, steps } = self;
+        let (rule, features, rows) = (&**rule, *features, CHUNK * Touched::GROUP);
+        let state = moments.par_chunks_mut(2 * rows * features).zip(steps.par_chunks_mut(rows));
+        let values = table.par_chunks_mut(rows * features).zip(grad.par_chunks_mut(rows * features));
+        let chunks = touched.0.par_chunks_mut(CHUNK).zip(state.zip(values));
+        let stats = chunks.map(|(marks, ((moments, steps), (table, grad)))| {
+            simd::dispatch(
+                #[inline(always)]
+                || Chunk { rule, features, marks, moments, steps, table, grad }.visit(rate),
+            )
+        });
+        stats.reduce(RowStats::default, RowStats::add)
     }
+}
 
+/// Neighbouring groups of rows and all that belongs to them.
+struct Chunk<'a, T> {
+    rule: &'a Rule<T>,
+    features: usize,
+    marks: &'a mut [u8],
+    moments: &'a mut [T],
+    steps: &'a mut [u32],
+    table: &'a mut [T],
+    grad: &'a mut [T],
+}
+
+impl<T: Scalar> Chunk<'_, T> {
     #[inline(always)]
-    fn visit(&mut self, table: &mut [T], grad: &mut [T], touched: &mut Touched, rate: T) -> RowStats {
-        let mut stats = RowStats::default();
-        let (rule, features, total) = (&*self.rule, self.features, self.steps.len());
+    fn visit(self, rate: T) -> RowStats {
+        let Chunk { rule, features, marks, moments, steps, table, grad } = self;
+        let (mut stats, total) = (RowStats::default(), steps.len());
         let size = Touched::GROUP * features;
-        for (group, mark) in touched.0.iter_mut().enumerate() {
-            if *mark == 0 {
+        // Marked groups up to `ahead` have been told to the caches; `told` of them are still to be visited.
+        let (mut ahead, mut told) = (0, 0);
+        for group in 0..marks.len() {
+            if marks[group] == 0 {
                 continue;
             }
-            *mark = 0;
+            marks[group] = 0;
+            while told < AHEAD && ahead + 1 < marks.len() {
+                ahead = ahead.max(group) + 1;
+                if marks.get(ahead).is_some_and(|mark| *mark != 0) {
+                    told += 1;
+                    let rows = ahead * Touched::GROUP;
+                    let at = rows * features;
+                    prefetch_lines(&table[at..], size);
+                    prefetch_lines(&grad[at..], size);
+                    prefetch_lines(&moments[2 * at..], 2 * size);
+                    prefetch_lines(&steps[rows..], Touched::GROUP);
+                }
+            }
+            told = told.saturating_sub(1);
             let rows = group * Touched::GROUP..total.min((group + 1) * Touched::GROUP);
             let elements = rows.start * features..rows.end * features;
-            let (m, v) = self.moments[2 * group * size..2 * (group + 1) * size].split_at_mut(size);
-            let steps = &mut self.steps[rows];
+            let (m, v) = moments[2 * group * size..2 * (group + 1) * size].split_at_mut(size);
+            let steps = &mut steps[rows];
             let group = Group { x: &mut table[elements.clone()], g: &mut grad[elements], m, v, steps };
             // The usual widths as constants: the loops over a row then unroll into one vector.
             match features {
@@ -187,6 +235,19 @@ impl<T: Scalar> RowAdam<T> {
             }
         }
         stats
+    }
+}
+
+/// How many groups ahead of the one that is updated the caches are told of: rows are visited in ascending order, but
+/// with gaps that the processor cannot foresee.
+const AHEAD: usize = 8;
+
+/// Asks for the cache lines of the first `len` of `values`.
+#[inline(always)]
+fn prefetch_lines<T>(values: &[T], len: usize) {
+    let line = 64 / size_of::<T>();
+    for i in (0..len.min(values.len())).step_by(line) {
+        simd::prefetch(&values[i]);
     }
 }
 

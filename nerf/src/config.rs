@@ -1,9 +1,10 @@
 //! What to train and how: the presets and every number behind them.
 
 use crate::background::Background;
-use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig};
+use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
 use crate::hash_grid::HashGridConfig;
 use crate::hierarchical::HierarchicalConfig;
+use crate::loss::Loss;
 use crate::marching::MarchingConfig;
 use crate::occupancy::Skip;
 use crate::{Error, Result};
@@ -23,6 +24,8 @@ pub enum Preset {
     /// A hash grid marched through an occupancy grid: a good scene in a minute.
     #[default]
     Instant,
+    /// A grid of voxels, marched in the same way: no network, and five times the parameters.
+    Voxel,
 }
 
 impl FromStr for Preset {
@@ -32,7 +35,8 @@ impl FromStr for Preset {
             "classic" => Ok(Preset::Classic),
             "small" => Ok(Preset::Small),
             "instant" => Ok(Preset::Instant),
-            _ => Err(Error::setting("preset", format!("there is no `{name}`; use classic, small or instant"))),
+            "voxel" => Ok(Preset::Voxel),
+            _ => Err(Error::setting("preset", format!("there is no `{name}`; use classic, small, instant or voxel"))),
         }
     }
 }
@@ -43,6 +47,7 @@ impl fmt::Display for Preset {
             Preset::Classic => "classic",
             Preset::Small => "small",
             Preset::Instant => "instant",
+            Preset::Voxel => "voxel",
         })
     }
 }
@@ -65,6 +70,9 @@ pub struct Config {
     pub field: FieldConfig,
     /// Where it is sampled.
     pub sampler: SamplerConfig,
+    /// What is minimised.
+    #[serde(default)]
+    pub loss: Loss,
     /// Learning rate over the run.
     pub schedule: Schedule,
     /// The optimiser's constants, for networks.
@@ -87,6 +95,7 @@ impl Config {
         let classic = Config {
             field: FieldConfig::Classic(paper.clone()),
             sampler: SamplerConfig::Hierarchical(HierarchicalConfig::default()),
+            loss: Loss::Mse,
             schedule: Schedule::Exponential { from: 5e-4, to: 5e-6, warmup: 0.0 },
             adam: AdamConfig::default(),
             table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
@@ -110,7 +119,7 @@ impl Config {
             },
             Preset::Instant => Config {
                 field: FieldConfig::Instant(InstantConfig {
-                    grid: HashGridConfig::cpu(),
+                    grid: HashGridConfig::cpu(60.0),
                     density_width: 64,
                     features: 16,
                     color_width: 64,
@@ -118,12 +127,27 @@ impl Config {
                     direction_degree: 4,
                 }),
                 sampler: SamplerConfig::Marching(MarchingConfig::default()),
-                schedule: Schedule::Exponential { from: 2e-2, to: 5e-4, warmup: 0.005 },
+                schedule: Schedule::Exponential { from: 1e-2, to: 5e-4, warmup: 0.005 },
                 adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
                 background: Background::Random,
                 ..classic
             },
+            Preset::Voxel => Config {
+                field: FieldConfig::Voxel(VoxelConfig { resolution: 128, direction_degree: 2 }),
+                sampler: SamplerConfig::Marching(MarchingConfig::default()),
+                schedule: Schedule::Exponential { from: 5e-2, to: 5e-3, warmup: 0.0 },
+                background: Background::Random,
+                ..classic
+            },
         }
+    }
+
+    /// The same for a training time: the table of a hash grid is as large as pays within it, see [`HashGridConfig::cpu`].
+    pub fn with_budget(mut self, seconds: f64) -> Self {
+        if let FieldConfig::Instant(field) = &mut self.field {
+            field.grid = HashGridConfig::cpu(seconds);
+        }
+        self
     }
 
     /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves the sampler alone).
@@ -147,6 +171,7 @@ impl Config {
     /// # Errors
     /// If one is out of range.
     pub fn check(&self) -> Result<()> {
+        self.loss.check()?;
         match &self.sampler {
             SamplerConfig::Hierarchical(config) => config.check(),
             SamplerConfig::Marching(config) => config.check(),
@@ -156,7 +181,7 @@ impl Config {
     fn classic_fields(&mut self) -> impl Iterator<Item = &mut ClassicConfig> {
         let field = match &mut self.field {
             FieldConfig::Classic(config) => Some(config),
-            FieldConfig::Instant(_) => None,
+            FieldConfig::Instant(_) | FieldConfig::Voxel(_) => None,
         };
         let proposal = match &mut self.sampler {
             SamplerConfig::Hierarchical(config) => Some(&mut config.proposal),

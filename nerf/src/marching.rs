@@ -28,7 +28,7 @@ pub struct MarchingConfig {
 impl Default for MarchingConfig {
     fn default() -> Self {
         let occupancy = OccupancyConfig { skip: Skip::Fast, ..OccupancyConfig::default() };
-        MarchingConfig { occupancy, step: 1.0 / 300.0, samples: 1 << 15, termination: 1e-3 }
+        MarchingConfig { occupancy, step: 1.0 / 300.0, samples: 1 << 14, termination: 1e-3 }
     }
 }
 
@@ -97,12 +97,15 @@ impl Marching {
         self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
     }
 
-    /// Looks at every part that may hold something, closely, for rendering with the error bound of the configuration.
+    /// Looks closely at what is occupied, and leaves out what rendering may leave out by the configuration's error bound.
+    ///
+    /// What training passed over stays empty: the field was never asked there, and what it would say is not part of the
+    /// scene that was fitted.
     pub(crate) fn finish(&mut self, field: &dyn Field<f32>, params: &Params<f32>, pool: &Pool<f32>) {
         let skip = self.config.occupancy.skip;
         if skip != Skip::Off {
             let min_sigma = skip.min_sigma(self.grid.diagonal());
-            self.grid.rebuild(min_sigma, true, &|points, out| densities(field, params, pool, points, out));
+            self.grid.prune(min_sigma, &|points, out| densities(field, params, pool, points, out));
         }
     }
 }

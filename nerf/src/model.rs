@@ -4,8 +4,8 @@ use crate::config::{Config, SamplerConfig};
 use crate::field::Field;
 use crate::hierarchical::Hierarchical;
 use crate::marching::Marching;
-use crate::occupancy::{MarchBuffer, OccupancyGrid};
-use crate::pass::{composite_samples, squared_error};
+use crate::occupancy::{MarchBuffer, OccupancyGrid, Skip};
+use crate::pass::composite_samples;
 use crate::rays::{Rays, Samples};
 use crate::sampler::Jitter;
 use crate::{Error, Result};
@@ -101,7 +101,7 @@ impl<T: Scalar> Model<T> {
     }
 
     /// The training loss at given samples, a differentiable function of the parameters alone: the sum over fields, rays
-    /// and channels of squared errors against `target` `[rays, 3]` over `background` `[rays, 3]`.
+    /// and channels of the configured loss against `target` `[rays, 3]` over `background` `[rays, 3]`.
     ///
     /// # Panics
     /// If there is not one set of samples for each of [`fields`](Self::fields).
@@ -116,10 +116,19 @@ impl<T: Scalar> Model<T> {
         assert_eq!(samples.len(), self.fields().len(), "one set of samples for each field");
         let error = |(field, samples): (&dyn Field<T>, &Samples<T>)| {
             let (rendered, _) = composite_samples(field, params, samples, false, tape);
-            squared_error(&rendered, target, background)
+            self.config.loss.sum(&rendered, target, background)
         };
         let errors = self.fields().into_iter().zip(samples).map(error);
         errors.reduce(|sum, error| sum + error).unwrap_or_else(|| tape.constant(Tensor::scalar(T::ZERO)))
+    }
+}
+
+impl<T: Scalar> Model<T> {
+    /// Chooses what [`view`](Model::view) may leave out from now on. A model without an occupancy grid leaves out nothing.
+    pub fn set_skip(&mut self, skip: Skip) {
+        if let Sampler::Marching(marching) = &mut self.sampler {
+            marching.config.occupancy.skip = skip;
+        }
     }
 }
 

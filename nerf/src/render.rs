@@ -31,12 +31,18 @@ pub struct Evaluations {
     pub density: u64,
     /// For a colour.
     pub color: u64,
+    /// How often it would have been for each if nothing but the outside of the box were left out.
+    pub unskipped: u64,
 }
 
 impl Add for Evaluations {
     type Output = Evaluations;
     fn add(self, other: Evaluations) -> Evaluations {
-        Evaluations { density: self.density + other.density, color: self.color + other.color }
+        Evaluations {
+            density: self.density + other.density,
+            color: self.color + other.color,
+            unskipped: self.unskipped + other.unskipped,
+        }
     }
 }
 
@@ -80,6 +86,26 @@ impl Model<f32> {
         Picture { color, depth, opacity, evaluations }
     }
 
+    /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole: something
+    /// to look at while the rest is computed, for a third more work. Each picture is rendered when the iterator is asked
+    /// for it.
+    ///
+    /// # Panics
+    /// If `coarsest` is not a power of two.
+    pub fn progressive<'a>(
+        &'a self,
+        camera: &'a Camera,
+        background: [f32; 3],
+        coarsest: usize,
+    ) -> impl Iterator<Item = Picture> + 'a {
+        assert!(coarsest.is_power_of_two(), "{coarsest} is not a power of two");
+        let halvings = (0..=coarsest.trailing_zeros()).rev();
+        halvings.map(move |halvings| {
+            let [width, height] = [camera.width, camera.height].map(|side| side.div_ceil(1 << halvings));
+            self.view(&camera.resized(width, height), background)
+        })
+    }
+
     fn view_rays(&self, viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [RayValues]) -> Evaluations {
         match &self.sampler {
             Sampler::Hierarchical(sampler) => {
@@ -90,9 +116,29 @@ impl Model<f32> {
                     out.copy_from_slice(values);
                 }
                 let each = (rays.len() * sampler.config.evaluations()) as u64;
-                Evaluations { density: each, color: each }
+                Evaluations { density: each, color: each, unskipped: each }
             }
             Sampler::Marching(sampler) => viewer.march(self, sampler, rays, out),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Preset};
+    use crate::model::Extent;
+    use glam::DVec3;
+
+    #[test]
+    fn a_progressive_view_ends_with_the_view_itself() {
+        let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [0.0, 10.0] };
+        let model = Model::new(Config::preset(Preset::Small), extent, 0).unwrap();
+        let pose = Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y);
+        let camera = Camera::from_angle(13, 9, 0.6, pose);
+        let pictures: Vec<Picture> = model.progressive(&camera, [1.0; 3], 4).collect();
+        let sizes: Vec<_> = pictures.iter().map(|p| [p.color.width, p.color.height]).collect();
+        assert_eq!(sizes, [[4, 3], [7, 5], [13, 9]]);
+        assert_eq!(pictures[2].color, model.view(&camera, [1.0; 3]).color);
     }
 }

@@ -5,7 +5,6 @@ use crate::hash_grid::HashGrad;
 use crate::marching::composite_visible;
 use crate::model::{Model, Sampler};
 use crate::occupancy::MarchBuffer;
-use crate::pass::squared_error;
 use crate::sampler::Jitter;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Gradient, Tape, Tensor, Var};
@@ -21,8 +20,10 @@ pub(crate) struct Work {
     pub samples: u64,
     /// Evaluations of a colour.
     pub shaded: u64,
-    /// Squared error of the sampler's own field.
-    pub proposal_error: f64,
+    /// Samples there would be of either if nothing in the box were skipped.
+    pub unskipped: u64,
+    /// What is minimised, before the mean over rays and channels.
+    pub loss: f64,
     /// Squared error of the field.
     pub error: f64,
     /// Opacity.
@@ -35,7 +36,8 @@ impl Add for Work {
         Work {
             samples: self.samples + other.samples,
             shaded: self.shaded + other.shaded,
-            proposal_error: self.proposal_error + other.proposal_error,
+            unskipped: self.unskipped + other.unskipped,
+            loss: self.loss + other.loss,
             error: self.error + other.error,
             opacity: self.opacity + other.opacity,
         }
@@ -84,21 +86,23 @@ impl Slot {
         let loss = match &model.sampler {
             Sampler::Hierarchical(sampler) => {
                 let rendered = sampler.render(&*model.field, &params, &part, jitter, false, tape);
-                let (coarse, fine) = (
-                    squared_error(&rendered.coarse, &target, &background),
-                    squared_error(&rendered.fine, &target, &background),
-                );
+                let coarse = model.config.loss.sum(&rendered.coarse, &target, &background);
+                let fine = model.config.loss.sum(&rendered.fine, &target, &background);
+                let error = model.config.loss.squared_error(&fine, &rendered.fine, &target, &background);
                 let evaluations = (part.len() * sampler.config.evaluations()) as u64;
-                work.count(evaluations, evaluations, coarse.item(), fine.item(), &rendered.fine);
-                coarse + fine
+                let loss = coarse + fine;
+                work.count([evaluations; 3], loss.item(), error, &rendered.fine);
+                loss
             }
             Sampler::Marching(sampler) => {
                 let samples = sampler.samples(&part, jitter, buffer, tape.pool());
                 let marched =
                     composite_visible(&*model.field, &params, &samples, sampler.config.termination, false, tape);
-                let fine = squared_error(&marched.rendered, &target, &background);
-                work.count(samples.len() as u64, marched.kept as u64, 0.0, fine.item(), &marched.rendered);
-                fine
+                let loss = model.config.loss.sum(&marched.rendered, &target, &background);
+                let error = model.config.loss.squared_error(&loss, &marched.rendered, &target, &background);
+                let evaluations = [samples.len() as u64, marched.kept as u64, buffer.steps];
+                work.count(evaluations, loss.item(), error, &marched.rendered);
+                loss
             }
         };
         let loss = loss * (1.0 / (3.0 * batch.rays.len() as f64));
@@ -119,11 +123,13 @@ impl Slot {
 }
 
 impl Work {
-    fn count(&mut self, samples: u64, shaded: u64, proposal_error: f32, error: f32, rendered: &Var<'_, f32>) {
+    /// `evaluations`: of densities, of colours, and of either if nothing were skipped.
+    fn count(&mut self, evaluations: [u64; 3], loss: f32, error: f32, rendered: &Var<'_, f32>) {
         let left = rendered.value().as_slice().chunks_exact(rendered.shape()[1]);
         let opacity = left.map(|ray| 1.0 - f64::from(ray[ray.len() - 1])).sum();
-        let (proposal_error, error) = (f64::from(proposal_error), f64::from(error));
-        *self = *self + Work { samples, shaded, proposal_error, error, opacity };
+        let (loss, error) = (f64::from(loss), f64::from(error));
+        let [samples, shaded, unskipped] = evaluations;
+        *self = *self + Work { samples, shaded, unskipped, loss, error, opacity };
     }
 }
 

@@ -46,3 +46,51 @@ impl Model<f32> {
         Ok(model)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Preset, SamplerConfig};
+    use crate::field::{FieldConfig, VoxelConfig};
+    use crate::scene::train_cameras;
+    use glam::DVec3;
+
+    fn voxel(direction_degree: usize) -> Config {
+        let mut config = Config::preset(Preset::Voxel);
+        config.field = FieldConfig::Voxel(VoxelConfig { resolution: 20, direction_degree });
+        if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+            sampler.occupancy.resolution = 16;
+        }
+        config
+    }
+
+    #[test]
+    fn a_voxel_model_comes_back_as_it_was() {
+        let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] };
+        let mut model = Model::new(voxel(2), extent, 3).unwrap();
+        // A ball in one corner, so that the occupancy grid has something to remember.
+        let (table, _) = model.field.table().unwrap();
+        let rows = model.params.get_mut(table).as_mut_slice().chunks_exact_mut(16).enumerate();
+        rows.for_each(|(i, row)| row[0] = if i % 21 < 9 && i / 441 < 9 { 4.0 } else { -20.0 });
+        model.finish_grid();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.safetensors");
+        model.save(&path).unwrap();
+        let read = Model::load(&path, voxel(2), extent).unwrap();
+        assert_eq!(read.params.values(), model.params.values());
+        let (Sampler::Marching(old), Sampler::Marching(new)) = (&model.sampler, &read.sampler) else { panic!() };
+        assert!(new.grid.occupied_share() < 0.5 && new.grid.to_bytes() == old.grid.to_bytes());
+        let camera = &train_cameras(4, 24)[1];
+        let [seen, again] = [&model, &read].map(|model| model.view(camera, [1.0; 3]));
+        assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));
+        let error = Model::load(&path, voxel(3), extent).err().unwrap().to_string();
+        assert!(error.contains("field.table"), "{error}");
+    }
+
+    #[test]
+    fn a_configuration_from_before_there_was_a_choice_of_losses_still_loads() {
+        let mut value = serde_json::to_value(voxel(2)).unwrap();
+        value.as_object_mut().unwrap().remove("loss").unwrap();
+        assert_eq!(serde_json::from_value::<Config>(value).unwrap(), voxel(2));
+    }
+}

@@ -6,9 +6,10 @@ use crate::dataset::Dataset;
 use crate::hash_grid::{HashGrad, TableOptimizer};
 use crate::metrics::psnr_from_mse;
 use crate::model::{Extent, Model, Sampler};
+use crate::occupancy::Skip;
 use crate::slot::{Slot, Work, sum_slots};
-use crate::startup;
 use crate::{Error, Result};
+use crate::{silhouette, startup};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Adam, Pool};
@@ -20,9 +21,9 @@ use std::time::{Duration, Instant};
 
 /// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
 /// number of threads, and as many as threads can work at a time.
-const SLOTS: usize = 16;
+const SLOTS: usize = 8;
 /// Tiles of a marching step for each slot.
-const TILES_A_SLOT: usize = 2;
+const TILES_A_SLOT: usize = 1;
 /// Rays of a marching step: the least, and the most.
 const RAYS: [usize; 2] = [256, 1 << 16];
 /// Steps between updates of the occupancy grid.
@@ -50,7 +51,11 @@ pub struct StepStats {
     pub samples: u64,
     /// Evaluations of a colour, and of all gradients, so far.
     pub shaded: u64,
-    /// The loss: mean squared error, of a hierarchical model that of the coarse field plus that of the fine one.
+    /// Evaluations of each that there would have been so far if nothing in the box were skipped.
+    pub unskipped: u64,
+    /// Rows of the field's table that were moved so far.
+    pub rows: u64,
+    /// The mean loss, of a hierarchical model that of the coarse field plus that of the fine one.
     pub loss: f64,
     /// PSNR on this step's rays, in dB.
     pub psnr: f64,
@@ -119,6 +124,8 @@ impl Trainer {
             rays: 0,
             samples: 0,
             shaded: 0,
+            unskipped: 0,
+            rows: 0,
             loss: f64::NAN,
             psnr: f64::NAN,
             opacity: f64::NAN,
@@ -140,6 +147,7 @@ impl Trainer {
             done,
         };
         trainer.reset_optimisers();
+        trainer.carve();
         Ok(trainer)
     }
 
@@ -147,6 +155,17 @@ impl Trainer {
         let config = &self.model.config;
         self.adam = Adam::new(config.adam);
         self.table = self.model.field.table().map(|(_, grid)| TableOptimizer::new(grid.clone(), config.table_adam));
+    }
+
+    /// Leaves out what the silhouettes of the photographs show to be empty.
+    fn carve(&mut self) {
+        if let Sampler::Marching(marching) = &mut self.model.sampler {
+            let config = marching.config.occupancy;
+            if config.silhouettes && config.skip != Skip::Off {
+                silhouette::carve(&mut marching.grid, &self.data);
+                self.done.occupied = marching.grid.occupied_share();
+            }
+        }
     }
 
     /// What the last step did.
@@ -199,7 +218,9 @@ impl Trainer {
             rays: self.done.rays + self.batch as u64,
             samples: self.done.samples + work.samples,
             shaded: self.done.shaded + work.shaded,
-            loss: (work.proposal_error + work.error) / values,
+            unskipped: self.done.unskipped + work.unskipped,
+            rows: self.done.rows,
+            loss: work.loss / values,
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,
@@ -240,7 +261,9 @@ impl Trainer {
             let parts =
                 (0..turns).flat_map(|turn| self.slots[..used].iter().filter_map(move |slot| slot.tables.get(turn)));
             let parts: Vec<Arc<HashGrad<f32>>> = parts.cloned().collect();
-            skipped += table.step(self.model.params.get_mut(id), &parts, rate).skipped as u64;
+            let moved = table.step(self.model.params.get_mut(id), &parts, rate);
+            self.done.rows += moved.touched as u64;
+            skipped += moved.skipped as u64;
             self.slots.iter_mut().for_each(|slot| slot.tables.clear());
         }
         let grads = &self.slots[0].grads;
@@ -279,6 +302,7 @@ impl Trainer {
         if let Ok((model, _)) = startup::living_model(&config, self.model.extent, seed) {
             self.model = model;
         }
+        self.carve();
         self.reset_optimisers();
     }
 }

@@ -72,7 +72,7 @@ impl Viewer {
         self.rays.resize(rays.len(), RayState::default());
         let range = |ray: usize| self.marched.offsets[ray] as usize..self.marched.offsets[ray + 1] as usize;
         let mut alive: Vec<u32> = (0..rays.len() as u32).filter(|&ray| !range(ray as usize).is_empty()).collect();
-        let mut evaluations = Evaluations::default();
+        let mut evaluations = Evaluations { unskipped: self.marched.steps, ..Evaluations::default() };
         let mut round = 0;
         while !alive.is_empty() {
             evaluations = evaluations + self.round(model, rays, &alive, round, &limits, out);
@@ -140,7 +140,7 @@ impl Viewer {
             start = end;
             shaded_ends.push(shaded.len() as u32);
         }
-        let count = Evaluations { density: rows.len() as u64, color: shaded.len() as u64 };
+        let count = Evaluations { density: rows.len() as u64, color: shaded.len() as u64, unskipped: 0 };
         if shaded.is_empty() {
             return count;
         }

@@ -5,7 +5,8 @@ use std::time::Instant;
 
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
 use raygrad::nerf::metrics::{SSIM_WINDOW, psnr, ssim};
-use raygrad::nerf::{Background, Error, Image, Model, Picture, Result, colormap};
+use raygrad::nerf::occupancy::Skip;
+use raygrad::nerf::{Background, Error, Evaluations, Image, Model, Picture, Result, colormap};
 use serde::Serialize;
 
 use super::output::{depth_colors, make_folder, print};
@@ -33,6 +34,9 @@ pub struct Args {
     /// Compare with this many evenly spaced photographs [default: all]
     #[arg(long, value_name = "N", value_parser = parse::count(usize::MAX))]
     views: Option<usize>,
+    /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
+    #[arg(long)]
+    skip: Option<Skip>,
     /// Print what eval.json holds in place of a table
     #[arg(long)]
     json: bool,
@@ -61,6 +65,10 @@ struct Report {
     ssim_mean: Option<f64>,
     /// Mean rendering time of a view.
     seconds_per_view: f64,
+    /// Evaluations of densities and of colours for each pixel, and of both if nothing in the box were skipped.
+    density_per_pixel: f64,
+    color_per_pixel: f64,
+    unskipped_per_pixel: f64,
     per_view: Vec<Score>,
 }
 
@@ -75,12 +83,17 @@ struct Score {
 /// Evaluates, writes the files and prints the result.
 pub fn run(args: &Args) -> Result<()> {
     let run = Run::open(&args.run)?;
-    let model = run.model()?;
+    let mut model = run.model()?;
+    if let Some(skip) = args.skip {
+        model.set_skip(skip);
+    }
     let scene = run.scene(args.scene.as_ref())?;
     let data = scene.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     let pictures = run.file("eval");
     make_folder(&pictures)?;
-    let (per_view, seconds_per_view) = compare(&model, &data, &pictures)?;
+    let (per_view, seconds_per_view, evaluations) = compare(&model, &data, &pictures)?;
+    let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
+    let per_pixel = |count: u64| count as f64 / pixels as f64;
     let report = Report {
         raygrad: env!("CARGO_PKG_VERSION"),
         scene: scene.absolute()?,
@@ -95,6 +108,9 @@ pub fn run(args: &Args) -> Result<()> {
         psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
         ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
         seconds_per_view,
+        density_per_pixel: per_pixel(evaluations.density),
+        color_per_pixel: per_pixel(evaluations.color),
+        unskipped_per_pixel: per_pixel(evaluations.unskipped),
         per_view,
     };
     let file = run.file("eval.json");
@@ -121,17 +137,18 @@ fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     sum.filter(|_| count > 0).map(|sum| sum / count as f64)
 }
 
-/// Scores all views and draws some; also the mean time of rendering one, in seconds.
-fn compare(model: &Model<f32>, data: &Dataset, pictures: &Path) -> Result<(Vec<Score>, f64)> {
+/// Scores all views and draws some; also the mean time of rendering one, in seconds, and what was evaluated for all.
+fn compare(model: &Model<f32>, data: &Dataset, pictures: &Path) -> Result<(Vec<Score>, f64, Evaluations)> {
     let background = model.config.background.shown();
     let drawn = evenly_spaced((0..data.frames.len()).collect(), PICTURES);
     let mut scores = Vec::with_capacity(data.frames.len());
-    let mut seconds = 0.0;
+    let (mut seconds, mut evaluations) = (0.0, Evaluations::default());
     let mut progress = Progress::new();
     for (i, frame) in data.frames.iter().enumerate() {
         let start = Instant::now();
         let mut picture = model.view(&frame.camera, background);
         seconds += start.elapsed().as_secs_f64();
+        evaluations = evaluations + picture.evaluations;
         picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
         let truth = frame.image.over(background);
         let score = score(frame.name.clone(), &picture.color, &truth);
@@ -144,7 +161,7 @@ fn compare(model: &Model<f32>, data: &Dataset, pictures: &Path) -> Result<(Vec<S
         });
         scores.push(score);
     }
-    Ok((scores, seconds / data.frames.len() as f64))
+    Ok((scores, seconds / data.frames.len() as f64, evaluations))
 }
 
 fn score(name: String, render: &Image, truth: &Image) -> Score {

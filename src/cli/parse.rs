@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use clap::builder::{RangedU64ValueParser, TypedValueParser};
+use serde_json::Value;
 
 /// A whole number from 1 to `most`.
 pub fn count(most: usize) -> impl TypedValueParser<Value = usize> {
@@ -35,6 +36,13 @@ pub fn size(text: &str) -> Result<[usize; 2], String> {
     let (width, height) = text.split_once('x').ok_or_else(usage)?;
     let side = |text: &str| text.parse().ok().filter(|side| (1..=LARGEST).contains(side)).ok_or_else(usage);
     Ok([side(width)?, side(height)?])
+}
+
+/// `NAME=VALUE`; the value is JSON, or else a plain word.
+pub fn setting(text: &str) -> Result<(String, Value), String> {
+    let (name, value) = text.split_once('=').ok_or("write NAME=VALUE")?;
+    let value = serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.to_owned()));
+    Ok((name.to_owned(), value))
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use raygrad::nerf::dataset::Split;
+use raygrad::nerf::occupancy::Skip;
 use raygrad::nerf::scene::test_cameras;
 use raygrad::nerf::{Camera, Error, Image, Result, write_atomic};
 
@@ -37,6 +38,9 @@ pub struct Args {
     /// Folder for PNG frames, or a file: FILE.png for the first frame, FILE.gif for an animation [default: RUN/PATH]
     #[arg(long, value_name = "DIR|FILE")]
     out: Option<PathBuf>,
+    /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
+    #[arg(long)]
+    skip: Option<Skip>,
     /// Show depth in false colour: yellow near, violet far, black where there is nothing
     #[arg(long)]
     depth: bool,
@@ -72,6 +76,7 @@ impl Args {
             frames: None,
             size: None,
             out: Some(run.join("picture.png")),
+            skip: None,
             depth: false,
             scene: None,
         }
@@ -81,7 +86,10 @@ impl Args {
 /// Renders and writes the files.
 pub fn run(args: &Args) -> Result<()> {
     let run = Run::open(&args.run)?;
-    let model = run.model()?;
+    let mut model = run.model()?;
+    if let Some(skip) = args.skip {
+        model.set_skip(skip);
+    }
     let out = args.out.clone().unwrap_or_else(|| run.file(args.path.name()));
     let kind = Kind::of(&out);
     let mut cameras = cameras(args, &run)?;

@@ -10,6 +10,7 @@ use clap::Parser;
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
+use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::output::print;
@@ -28,14 +29,15 @@ pub struct Args {
     /// Folder with transforms_train.json and its images, or the scene that is built in
     #[arg(default_value = "embedded")]
     scene: Scene,
-    /// Kind of model: instant (a minute), small (minutes) or classic (the paper's, hours)
+    /// Kind of model: instant (a minute), voxel (no network), small (minutes) or classic (the paper's, hours)
     #[arg(long, default_value_t)]
     preset: Preset,
-    /// How much empty space to pass over: off, lossless or fast [default: fast for instant; small and classic sample
-    /// hierarchically instead]
+    /// How much empty space to pass over: off, lossless or fast [default: fast for instant and voxel; small and classic
+    /// sample hierarchically instead]
     #[arg(long)]
     skip: Option<Skip>,
-    /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it [default: by preset]
+    /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it, and the table of an instant model grows with it
+    /// [default: by preset]
     #[arg(long, value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
     budget: Option<Duration>,
     /// Number of training steps in place of a time: the same seed then gives the same model, bit by bit
@@ -47,7 +49,7 @@ pub struct Args {
     /// Train at 1/K of the images' size
     #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
-    /// What lies behind transparent images: white, black or random [default: random for instant, else white]
+    /// What lies behind transparent images: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
@@ -56,6 +58,9 @@ pub struct Args {
     /// Leave positional encoding out, to see what it is for
     #[arg(long)]
     no_encoding: bool,
+    /// Change one number of the preset, such as sampler.samples=16384; config.json in a run's folder shows them all
+    #[arg(long, value_name = "NAME=VALUE", value_parser = parse::setting)]
+    set: Vec<(String, Value)>,
 }
 
 impl Default for Args {
@@ -110,6 +115,9 @@ pub fn run(args: &Args) -> Result<Trained> {
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
+        if let Budget::Time(time) = self.budget() {
+            config = config.with_budget(time.as_secs_f64());
+        }
         if let Some(background) = self.background {
             config.background = background;
         }
@@ -123,7 +131,10 @@ impl Args {
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
-        Ok(if self.no_encoding { config.without_encoding() } else { config })
+        if self.no_encoding {
+            config = config.without_encoding();
+        }
+        self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))
     }
 
     fn run_config(&self, trainer: &Trainer, data: &Dataset) -> Result<RunConfig> {
@@ -146,10 +157,22 @@ impl Args {
     }
 }
 
+/// The configuration with the number of that dotted name replaced.
+fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
+    let unknown = |_| Error::setting(name, "cannot be changed");
+    let mut all = serde_json::to_value(config).map_err(unknown)?;
+    let pointer = format!("/{}", name.replace('.', "/"));
+    let place = all.pointer_mut(&pointer).ok_or_else(|| {
+        Error::setting(name, "there is no such number; config.json in a run's folder shows the names")
+    })?;
+    *place = value.clone();
+    serde_json::from_value(all).map_err(|e| Error::setting(name, format!("cannot be {value}: {e}")))
+}
+
 /// Training time after which a preset shows what it can do.
 fn default_budget(preset: Preset) -> Duration {
     match preset {
-        Preset::Instant => Duration::from_secs(45),
+        Preset::Instant | Preset::Voxel => Duration::from_secs(45),
         Preset::Small => Duration::from_secs(100),
         Preset::Classic => Duration::from_secs(3600),
     }

@@ -62,6 +62,20 @@ pub fn name() -> &'static str {
     }
 }
 
+/// Asks for the cache line at `address`, which may be any, to be brought to the second-level cache.
+#[inline(always)]
+pub fn prefetch<T>(address: *const T) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        // SAFETY: a prefetch is a hint: it reads nothing that the program sees and faults at no address. The instruction
+        // belongs to SSE, which every x86-64 has. `prefetching_any_address_is_harmless` runs it.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(address.cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = address;
+}
+
 fn arch() -> Arch {
     static ARCH: OnceLock<Arch> = OnceLock::new();
     *ARCH.get_or_init(|| from_environment().unwrap_or_else(|message| panic!("{message}")))
@@ -98,6 +112,13 @@ fn capped(cap: &str) -> Option<Arch> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn prefetching_any_address_is_harmless() {
+        for address in [0, 1, 4096, usize::MAX] {
+            prefetch(std::ptr::without_provenance::<u64>(address));
+        }
+    }
 
     #[test]
     fn the_cap_is_obeyed() {

@@ -1,6 +1,7 @@
 //! The network of the NeRF paper.
 
 use super::{Density, DensityActivation, Field};
+use crate::config::check_range;
 use crate::encoding::PositionalEncoding;
 use crate::{Error, Result};
 use glam::DVec3;
@@ -46,9 +47,7 @@ impl ClassicConfig {
     fn check(&self) -> Result<()> {
         let positive = [("depth", self.depth), ("width", self.width), ("view_width", self.view_width)];
         for (name, value) in positive {
-            if !(1..=1 << 14).contains(&value) {
-                return Err(Error::setting(name, format!("is {value}; use 1 to 16384")));
-            }
+            check_range(name, value, 1, 1 << 14)?;
         }
         if self.position_levels > 24 || self.direction_levels > 24 {
             return Err(Error::setting("position_levels", "more than 24 frequencies are beyond the precision of f32"));

@@ -1,9 +1,10 @@
 //! A hash grid and two small networks.
 
 use super::{Density, Field};
+use crate::Result;
+use crate::config::check_range;
 use crate::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use crate::spherical::SphericalHarmonics;
-use crate::{Error, Result};
 use glam::DVec3;
 use rand::{Rng, RngExt};
 use raygrad_autograd::{Activation, Bound, Init, Linear, ParamId, Params, Scalar, Segments, Tensor, Var};
@@ -29,19 +30,11 @@ pub struct InstantConfig {
 
 impl InstantConfig {
     fn check(&self) -> Result<()> {
-        let sizes = [
-            ("density_width", self.density_width, 1, 1 << 12),
-            ("features", self.features, 1, 1 << 12),
-            ("color_width", self.color_width, 1, 1 << 12),
-            ("color_depth", self.color_depth, 1, 64),
-            ("direction_degree", self.direction_degree, 1, 4),
-        ];
-        for (name, value, low, high) in sizes {
-            if !(low..=high).contains(&value) {
-                return Err(Error::setting(name, format!("is {value}; use {low} to {high}")));
-            }
-        }
-        Ok(())
+        check_range("density_width", self.density_width, 1, 1 << 12)?;
+        check_range("features", self.features, 1, 1 << 12)?;
+        check_range("color_width", self.color_width, 1, 1 << 12)?;
+        check_range("color_depth", self.color_depth, 1, 64)?;
+        check_range("direction_degree", self.direction_degree, 1, 4)
     }
 }
 

@@ -2,9 +2,11 @@
 
 mod classic;
 mod instant;
+mod voxel;
 
 pub use classic::{Classic, ClassicConfig};
 pub use instant::{Instant, InstantConfig};
+pub use voxel::{Voxel, VoxelConfig};
 
 use crate::Result;
 use crate::composite::Composite;
@@ -77,6 +79,8 @@ pub enum FieldConfig {
     Classic(ClassicConfig),
     /// A hash grid with two small networks.
     Instant(InstantConfig),
+    /// A grid of voxels without a network.
+    Voxel(VoxelConfig),
 }
 
 impl FieldConfig {
@@ -94,6 +98,7 @@ impl FieldConfig {
         Ok(match self {
             FieldConfig::Classic(config) => std::sync::Arc::new(Classic::new(config, bounds, params, name, rng)?),
             FieldConfig::Instant(config) => std::sync::Arc::new(Instant::new(config, bounds, params, name, rng)?),
+            FieldConfig::Voxel(config) => std::sync::Arc::new(Voxel::new(config, bounds, params, name, rng)?),
         })
     }
 }

@@ -15,7 +15,9 @@ macro_rules! with_features {
             2 => $grid.$method::<_, 2>($($argument),*),
             4 => $grid.$method::<_, 4>($($argument),*),
             8 => $grid.$method::<_, 8>($($argument),*),
-            _ => unreachable!("`HashGrid::new` allows 1, 2, 4 and 8"),
+            16 => $grid.$method::<_, 16>($($argument),*),
+            32 => $grid.$method::<_, 32>($($argument),*),
+            _ => unreachable!("`HashGrid::new` allows powers of two from 1 to 32"),
         }
     };
 }
@@ -83,15 +85,27 @@ impl HashGrid {
         touched: &mut Touched,
     ) {
         let (grad, _) = grad.as_chunks_mut::<F>();
-        let width = self.width();
+        let (width, column) = (self.width(), level * F);
         simd::dispatch(
             #[inline(always)]
             || {
-                let (mut points, mut cells) = (Points::new(), Cells::new());
-                for (positions, d_out) in positions.chunks(3 * BLOCK).zip(d_out.chunks(width * BLOCK)) {
-                    points.load(positions);
-                    cells.locate(&self.levels()[level], &points);
-                    cells.scatter(d_out, width, level * F, grad, touched);
+                let mut points = Points::new();
+                let (mut cells, mut next) = (&mut Cells::new(), &mut Cells::new());
+                let mut blocks = positions.chunks(3 * BLOCK);
+                let level = &self.levels()[level];
+                if let Some(first) = blocks.next() {
+                    points.load(first);
+                    cells.locate(level, &points);
+                }
+                for d_out in d_out.chunks(width * BLOCK) {
+                    // A small batch meets most rows for the first time since the last step.
+                    if let Some(block) = blocks.next() {
+                        points.load(block);
+                        next.locate(level, &points);
+                        next.prefetch(grad);
+                    }
+                    cells.scatter(d_out, width, column, grad, touched);
+                    swap(&mut cells, &mut next);
                 }
             },
         );
@@ -234,5 +248,8 @@ pub(crate) fn entries() -> Vec<Entry> {
                 .sample_of(vec![positions(&[]), table(2)])
         })
     };
-    [entry(3, 2, 7, 2, 9), entry(1, 1, 10, 4, 4), entry(2, 4, 4, 3, 5)].into_iter().flatten().collect()
+    [entry(3, 2, 7, 2, 9), entry(1, 1, 10, 4, 4), entry(2, 4, 4, 3, 5), entry(1, 16, 6, 3, 3)]
+        .into_iter()
+        .flatten()
+        .collect()
 }

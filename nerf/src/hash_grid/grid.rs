@@ -1,5 +1,6 @@
 //! The geometry of a hash grid: levels, resolutions and rows.
 
+use crate::config::check_range;
 use crate::{Error, Result};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -14,9 +15,9 @@ use std::sync::Arc;
 pub struct HashGridConfig {
     /// Number of resolutions, 1 to 32.
     pub levels: usize,
-    /// Features in a row of the table: 1, 2, 4 or 8.
+    /// Features in a row of the table: 1, 2, 4, 8, 16 or 32.
     pub features: usize,
-    /// Binary logarithm of the most rows that a level may have, 4 to 24.
+    /// Binary logarithm of the most rows that a level may have, 4 to 28.
     pub log2_table: u32,
     /// Cells along an axis of the coarsest level, at least 1.
     pub coarsest: usize,
@@ -26,30 +27,33 @@ pub struct HashGridConfig {
 }
 
 impl HashGridConfig {
+    /// The largest `log2_table`: a grid of 512 cells along an axis then still has a row for each corner.
+    pub(crate) const MOST_LOG2_TABLE: u32 = 28;
+
     /// The paper's: 16 levels of 2 features from 16 to 2048, tables of 2^19 rows.
     pub fn paper() -> Self {
         HashGridConfig { levels: 16, features: 2, log2_table: 19, coarsest: 16, finest: 2048 }
     }
 
-    /// As many features on half as many levels, with half of the rows: half as many places of memory to visit.
-    pub fn cpu() -> Self {
-        HashGridConfig { levels: 8, features: 4, log2_table: 18, coarsest: 16, finest: 2048 }
+    /// As many features on half as many levels, so half as many places of memory to visit, up to about the resolution of
+    /// the photographs; and as many rows as pay within `seconds` of training on two cores: more of them hold more detail,
+    /// but each takes its steps, and those that are not in the caches take longer.
+    pub fn cpu(seconds: f64) -> Self {
+        let (log2_table, finest) = match seconds {
+            ..=100.0 => (17, 512),
+            ..=300.0 => (18, 512),
+            _ => (19, 1024),
+        };
+        HashGridConfig { levels: 8, features: 4, log2_table, coarsest: 16, finest }
     }
 
     fn check(&self) -> Result<()> {
-        let ranges = [
-            ("levels", self.levels, 1, 32),
-            ("log2_table", self.log2_table as usize, 4, 24),
-            ("coarsest", self.coarsest, 1, self.finest),
-            ("finest", self.finest, self.coarsest, 1 << 16),
-        ];
-        for (name, value, low, high) in ranges {
-            if !(low..=high).contains(&value) {
-                return Err(Error::setting(name, format!("is {value}; use {low} to {high}")));
-            }
-        }
-        if ![1, 2, 4, 8].contains(&self.features) {
-            return Err(Error::setting("features", format!("is {}; use 1, 2, 4 or 8", self.features)));
+        check_range("levels", self.levels, 1, 32)?;
+        check_range("log2_table", self.log2_table, 4, Self::MOST_LOG2_TABLE)?;
+        check_range("coarsest", self.coarsest, 1, self.finest)?;
+        check_range("finest", self.finest, self.coarsest, 1 << 16)?;
+        if ![1, 2, 4, 8, 16, 32].contains(&self.features) {
+            return Err(Error::setting("features", format!("is {}; use 1, 2, 4, 8, 16 or 32", self.features)));
         }
         Ok(())
     }

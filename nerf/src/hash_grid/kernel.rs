@@ -3,11 +3,12 @@
 //! Samples come in blocks. For a block and a level, rows and weights of all corners are computed first, side by side in
 //! vector registers; then the rows are visited one sample after the other. While a level is read, the rows of
 //! the next one are prefetched: the table is larger than the caches near a core, and without that reading takes twice as
-//! long. Adding visits one level of many samples at a time and gains nothing from it. Products are not fused, so the bits
-//! are the same on every instruction set.
+//! long. Adding visits one level of many samples at a time; there the rows of the next block are prefetched. Products are
+//! not fused, so the bits are the same on every instruction set.
 
 use super::grid::{HashLevel, PRIMES};
 use raygrad_autograd::{Scalar, Touched};
+use raygrad_tensor::simd;
 
 /// Samples of a block.
 pub(super) const BLOCK: usize = 64;
@@ -97,7 +98,7 @@ impl<T: Scalar> Cells<T> {
     pub(super) fn prefetch<const F: usize>(&self, table: &[[T; F]]) {
         for i in 0..self.len {
             for corner in 0..8 {
-                prefetch(table.as_ptr().wrapping_add(self.rows[corner][i] as usize));
+                simd::prefetch(table.as_ptr().wrapping_add(self.rows[corner][i] as usize));
             }
         }
     }
@@ -131,22 +132,58 @@ impl<T: Scalar> Cells<T> {
         grad: &mut [[T; F]],
         touched: &mut Touched,
     ) {
+        // Neighbouring samples of a ray often share a cell, above all on coarse levels: their gradients are added up
+        // beside each other before the table is touched.
+        let (mut sums, mut cell) = ([[T::ZERO; F]; 8], None);
         for (i, d_out) in d_out.chunks_exact(width).enumerate().take(self.len) {
             let mut g = [T::ZERO; F];
             g.copy_from_slice(&d_out[column..column + F]);
             if g == [T::ZERO; F] {
                 continue;
             }
-            for corner in 0..8 {
-                let row = self.rows[corner][i] as usize;
-                let weight = self.weights[corner][i];
-                // SAFETY: as in `gather`.
-                let out = unsafe { grad.get_unchecked_mut(row) };
-                for f in 0..F {
-                    out[f] += weight * g[f];
+            let same = cell.is_some_and(
+                #[inline(always)]
+                |last: usize| self.same_rows(last, i),
+            );
+            if !same {
+                if let Some(last) = cell {
+                    self.flush(last, &mut sums, grad, touched);
                 }
-                touched.mark(row);
+                cell = Some(i);
             }
+            for corner in 0..8 {
+                for f in 0..F {
+                    sums[corner][f] += self.weights[corner][i] * g[f];
+                }
+            }
+        }
+        if let Some(last) = cell {
+            self.flush(last, &mut sums, grad, touched);
+        }
+    }
+
+    /// Whether the corners of two samples of the block have the same rows.
+    #[inline(always)]
+    fn same_rows(&self, a: usize, b: usize) -> bool {
+        let mut same = true;
+        for rows in &self.rows {
+            same &= rows[a] == rows[b];
+        }
+        same
+    }
+
+    /// Adds the sums of sample `i`'s corners to their rows and empties them.
+    #[inline(always)]
+    fn flush<const F: usize>(&self, i: usize, sums: &mut [[T; F]; 8], grad: &mut [[T; F]], touched: &mut Touched) {
+        for corner in 0..8 {
+            let row = self.rows[corner][i] as usize;
+            // SAFETY: as in `gather`.
+            let out = unsafe { grad.get_unchecked_mut(row) };
+            for f in 0..F {
+                out[f] += sums[corner][f];
+                sums[corner][f] = T::ZERO;
+            }
+            touched.mark(row);
         }
     }
 
@@ -189,18 +226,4 @@ impl<T: Scalar> Cells<T> {
             }
         }
     }
-}
-
-/// Asks for the cache line at `address`, which may be any, to be brought to the second-level cache.
-#[inline(always)]
-fn prefetch<R>(address: *const R) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
-        // SAFETY: a prefetch is a hint: it reads nothing that the program sees and faults at no address. The instruction
-        // belongs to SSE, which every x86-64 has. `agrees_with_the_formula_at_every_width_and_block_length` runs it.
-        unsafe { _mm_prefetch::<_MM_HINT_T1>(address.cast()) };
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = address;
 }

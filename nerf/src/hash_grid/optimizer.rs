@@ -104,6 +104,6 @@ impl Step<'_> {
         let (coarse, fine) = levels.split_at_mut(half);
         let (coarse_table, fine_table) = table.split_at_mut(coarse.iter().map(|level| level.grad.len()).sum());
         let (a, b) = rayon::join(|| self.run(first, coarse, coarse_table), || self.run(first + half, fine, fine_table));
-        TableStats { touched: a.touched + b.touched, skipped: a.skipped + b.skipped }
+        a + b
     }
 }

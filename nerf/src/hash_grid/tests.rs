@@ -61,7 +61,7 @@ fn the_papers_grid_has_the_papers_levels() {
     assert!(!paper.levels()[4].hashed && paper.levels()[5].hashed && paper.width() == 32);
     assert!(paper.levels().iter().skip(5).all(|level| level.rows.len() == 1 << 19));
     assert!(paper.levels().windows(2).all(|pair| pair[0].rows.end == pair[1].rows.start));
-    assert_eq!(HashGrid::new(&HashGridConfig::cpu()).unwrap().levels()[7].resolution, 2048);
+    assert_eq!(HashGrid::new(&HashGridConfig::cpu(60.0)).unwrap().levels()[7].resolution, 512);
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn settings_out_of_range_are_named() {
         (HashGridConfig { coarsest: 0, ..HashGridConfig::paper() }, "`coarsest`"),
         (HashGridConfig { features: 3, ..HashGridConfig::paper() }, "`features`"),
         (HashGridConfig { levels: 0, ..HashGridConfig::paper() }, "`levels`"),
-        (HashGridConfig { log2_table: 25, ..HashGridConfig::paper() }, "`log2_table`"),
+        (HashGridConfig { log2_table: 29, ..HashGridConfig::paper() }, "`log2_table`"),
     ];
     for (config, name) in wrong {
         let error = HashGrid::new(&config).unwrap_err().to_string();
@@ -84,12 +84,12 @@ fn every_check_passes() {
     for entry in entries() {
         check_op(&Check::default(), &entry).unwrap();
     }
-    assert_eq!(entries().len(), 3);
+    assert_eq!(entries().len(), 4);
 }
 
 #[test]
 fn agrees_with_the_formula_at_every_width_and_block_length() {
-    for features in [1, 2, 4, 8] {
+    for features in [1, 2, 4, 8, 16, 32] {
         let grid = grid(5, features, 9, 3, 40);
         assert!(!grid.levels()[0].hashed && grid.levels()[4].hashed);
         let table = grid.init::<f64>(7);

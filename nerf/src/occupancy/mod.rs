@@ -47,6 +47,7 @@
 //! ```
 
 mod bits;
+mod carve;
 mod lattice;
 mod leaps;
 mod march;
@@ -80,11 +81,14 @@ pub struct OccupancyConfig {
     pub cascades: usize,
     /// What may be skipped when rendering.
     pub skip: Skip,
+    /// Whether training carves the grid with the silhouettes of photographs that have transparency, at the start: a cell
+    /// that a fully transparent part of a photograph shows stays empty. No error, if transparent pixels are right.
+    pub silhouettes: bool,
 }
 
 impl Default for OccupancyConfig {
     fn default() -> Self {
-        OccupancyConfig { resolution: 128, cascades: 1, skip: Skip::Lossless }
+        OccupancyConfig { resolution: 128, cascades: 1, skip: Skip::Lossless, silhouettes: true }
     }
 }
 
@@ -189,13 +193,18 @@ impl OccupancyGrid {
         bits::bounds(&self.words, &self.lattice)
     }
 
-    /// The mean density of the cells that were looked at, in 1 / scene unit; 0 if there are none.
+    /// The mean density of the cells that were looked at, in 1 / scene unit; 0 if there are none. Carved cells do not
+    /// count.
     pub fn mean_density(&self) -> f64 {
         // In tasks of fixed size, so that the sum has the same bits at any number of threads.
         let sums: Vec<(f64, usize)> = self
             .densities
             .par_chunks(CELLS * TASK)
-            .map(|part| part.iter().filter(|x| !x.is_nan()).fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1)))
+            .map(|part| {
+                part.iter()
+                    .filter(|x| !x.is_nan() && **x != carve::CARVED)
+                    .fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1))
+            })
             .collect();
         let (sum, count) = sums.iter().fold((0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         if count == 0 { 0.0 } else { sum / count as f64 }

@@ -1,0 +1,121 @@
+//! A grid of voxels and no network.
+
+use super::{Density, Field};
+use crate::Result;
+use crate::config::check_range;
+use crate::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use crate::spherical::SphericalHarmonics;
+use glam::DVec3;
+use rand::{Rng, RngExt};
+use raygrad_autograd::{Bound, ParamId, Params, Scalar, Segments, Tensor, Var};
+use serde::{Deserialize, Serialize};
+
+/// Size of a [`Voxel`] field.
+///
+/// The table has `(resolution + 1)^3` rows of `1 + 3 direction_degree^2` numbers, rounded up to a power of two: 137 MB at
+/// 128 and degree 2. Training takes four times as much, for the gradient and two moments.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VoxelConfig {
+    /// Cells along the longest side of the box, 1 to 512.
+    pub resolution: usize,
+    /// Degree of the spherical harmonics that a colour is made of, 1 to 3.
+    pub direction_degree: usize,
+}
+
+impl VoxelConfig {
+    fn check(&self) -> Result<()> {
+        check_range("resolution", self.resolution, 1, 512)?;
+        check_range("direction_degree", self.direction_degree, 1, 3)
+    }
+}
+
+/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in a box of side 1.
+const LOG_DENSITY_SHIFT: f64 = 1.0;
+/// What the logarithm of the density is multiplied by: without a network before it, it moves by little more than the
+/// learning rate in a step, and has further to go than a colour.
+const LOG_DENSITY_GAIN: f64 = 10.0;
+
+/// A field as in Fridovich-Keil et al. 2022, "Plenoxels: Radiance Fields without Neural Networks", section 3.2: each
+/// corner of a dense grid has a density and, for each colour, coefficients of spherical harmonics; what lies between the
+/// corners is interpolated trilinearly. The colour is the sigmoid of the harmonics' sum. Unlike the paper's, the density
+/// is the exponential of what is interpolated, and the grid keeps its resolution and every voxel.
+///
+/// A row of the table is the logarithm of the density, then the coefficients of red, green and blue, then padding.
+#[derive(Debug, Clone)]
+pub struct Voxel {
+    grid: HashGrid,
+    table: ParamId,
+    /// `(x - low) * scale` lies in the unit cube for x in the box.
+    low: DVec3,
+    scale: f64,
+    direction: SphericalHarmonics,
+}
+
+impl Voxel {
+    /// A field for the box `bounds` (lower and upper corner) with one new parameter, `<name>.table`, in `params`.
+    ///
+    /// # Errors
+    /// If the configuration is out of range.
+    pub fn new<T: Scalar>(
+        config: &VoxelConfig,
+        bounds: [DVec3; 2],
+        params: &mut Params<T>,
+        name: &str,
+        rng: &mut impl Rng,
+    ) -> Result<Self> {
+        config.check()?;
+        let direction = SphericalHarmonics::new(config.direction_degree);
+        let grid = HashGrid::new(&HashGridConfig {
+            levels: 1,
+            features: (1 + 3 * direction.width()).next_power_of_two(),
+            log2_table: HashGridConfig::MOST_LOG2_TABLE,
+            coarsest: config.resolution,
+            finest: config.resolution,
+        })?;
+        let table = params.add(format!("{name}.table"), grid.init(rng.random()));
+        let scale = 1.0 / (bounds[1] - bounds[0]).max_element();
+        Ok(Voxel { grid, table, low: bounds[0], scale, direction })
+    }
+
+    /// Positions in the unit cube.
+    #[track_caller]
+    fn local<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
+        let shift = (-self.low * self.scale).to_array().map(T::from_f64);
+        positions * self.scale + positions.tape().constant(Tensor::from_vec(&[3], shift.to_vec()))
+    }
+}
+
+impl<T: Scalar> Field<T> for Voxel {
+    fn encode<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
+        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.local(positions), &params[self.table]])
+    }
+
+    fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
+        let inputs = [&self.local(positions), &params[self.table]];
+        positions.tape().apply_known(HashEncoding(self.grid.clone()), &inputs, known)
+    }
+
+    fn density<'t>(&self, _params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
+        let raw = encoding.slice(1, 0, 1).reshape(&[encoding.shape()[0]]);
+        Density { value: raw * LOG_DENSITY_GAIN - LOG_DENSITY_SHIFT, log: true, features: encoding.clone() }
+    }
+
+    fn color<'t>(
+        &self,
+        _params: &Bound<'t, T>,
+        features: &Var<'t, T>,
+        directions: &Var<'t, T>,
+        segments: &Segments,
+    ) -> Var<'t, T> {
+        let (samples, width) = (features.shape()[0], self.direction.width());
+        let seen = directions.tape().apply(self.direction, &[directions]).segment_expand(segments);
+        let coefficients = features.slice(1, 1, 3 * width).reshape(&[samples, 3, width]);
+        let sum = (coefficients * seen.reshape(&[samples, 1, width])).sum_axes(&[2]);
+        sum.reshape(&[samples, 3]).sigmoid()
+    }
+
+    fn table(&self) -> Option<(ParamId, &HashGrid)> {
+        Some((self.table, &self.grid))
+    }
+}

@@ -1,0 +1,48 @@
+//! Cells that are known to be empty before anything is learned, and stay so.
+
+use super::lattice::{CELLS, cell};
+use super::{OccupancyGrid, TASK};
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// The density of a cell that is empty for good: below any threshold, and never looked at.
+pub(super) const CARVED: f32 = f32::NEG_INFINITY;
+
+/// The cells of a block that are not carved.
+pub(super) fn uncarved(densities: &[f32]) -> u64 {
+    densities.iter().enumerate().fold(0, |word, (bit, &x)| word | u64::from(x != CARVED) << bit)
+}
+
+impl OccupancyGrid {
+    /// Marks as empty for good the cells for which `is_empty(centre, radius)` holds, a ball around the cell in scene
+    /// units. They are never looked at again. What is occupied changes with the next [`threshold`](Self::threshold) or
+    /// [`occupy_all_but_carved`](Self::occupy_all_but_carved).
+    pub fn carve(&mut self, is_empty: &(dyn Fn(DVec3, f64) -> bool + Sync)) {
+        let lattice = &self.lattice;
+        self.densities.par_chunks_mut(CELLS * TASK).enumerate().for_each(|(task, densities)| {
+            for (word, densities) in densities.chunks_exact_mut(CELLS).enumerate() {
+                let [corner, size] = lattice.block(task * TASK + word);
+                let mut left = uncarved(densities);
+                // Most blocks are empty as a whole.
+                if left != 0 && is_empty(corner + 2.0 * size, 2.0 * size.length()) {
+                    densities.fill(CARVED);
+                    left = 0;
+                }
+                while left != 0 {
+                    let bit = left.trailing_zeros() as usize;
+                    left &= left - 1;
+                    let centre = corner + size * (DVec3::from(cell(bit).map(|i| i as f64)) + 0.5);
+                    if is_empty(centre, 0.5 * size.length()) {
+                        densities[bit] = CARVED;
+                    }
+                }
+            }
+        });
+    }
+
+    /// Makes all cells that are not carved the occupied ones.
+    pub fn occupy_all_but_carved(&mut self) {
+        let words = self.exceeding(CARVED);
+        self.occupy(words, false);
+    }
+}
