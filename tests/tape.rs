@@ -344,3 +344,126 @@ fn the_nan_finder_names_operation_line_and_index() {
     tape.check_finite(false);
     assert_eq!(root.sum().grad(&[&x])[0].as_slice(), [0.25, 0.5, f64::INFINITY]);
 }
+
+#[test]
+fn the_nan_finder_says_where_a_bad_value_came_in() {
+    let tape = Tape::<f64>::new();
+    tape.check_finite(true);
+    let message = panic_of(|| tape.leaf(vector(&[1.0, f64::INFINITY])));
+    let expected = format!("leaf: the value is inf at index [1] (recorded at {}:{}:", file!(), line!() - 1);
+    assert!(message.starts_with(&expected), "{message}");
+    // A constant is not looked at, but what is computed from it says whose fault it is.
+    let (x, bad) = (tape.leaf(vector(&[1.0, 2.0])), tape.constant(vector(&[f64::NAN, 0.0])));
+    let message = panic_of(|| &x + &bad);
+    assert!(message.starts_with("add: output (and input 1 was not finite before) is NaN at index [0]"), "{message}");
+}
+
+#[test]
+fn the_nan_finder_checks_recorded_gradients_sums_and_sparse_ones() {
+    let tape = Tape::<f32>::new();
+    tape.check_finite(true);
+    let starts = |message: String, expected: &str, line: u32| {
+        assert!(message.starts_with(&format!("{expected} (recorded at {}:{line}:", file!())), "{message}");
+    };
+    // The line is the user's also where the gradient is made of recorded operations.
+    let x = tape.leaf(Tensor::from_vec(&[2], vec![1.0, 0.0]));
+    let root = x.sqrt();
+    let line = line!() - 1;
+    starts(panic_of(|| root.sum().grad_graph(&[&x])), "sqrt: the gradient of input 0 is inf at index [1]", line);
+    // Two finite shares whose sum overflows: at a leaf, and before an operation.
+    let x = tape.leaf(Tensor::from_vec(&[2], vec![1e-3, 1e-3]));
+    let line = line!() - 1;
+    let sum = (&x * 3e38 + &x * 3e38).slice(0, 0, 1).sum();
+    starts(sum.try_grad(&[&x]).unwrap_err().to_string(), "leaf: the gradient is inf at index [0]", line);
+    let h = x.affine(0.5, 0.0);
+    let line = line!() - 1;
+    let sum = (&h * 3e38 + &h * 3e38).slice(0, 0, 1).sum();
+    starts(
+        sum.try_grad(&[&x]).unwrap_err().to_string(),
+        "affine: the gradient of the output is inf at index [0]",
+        line,
+    );
+    // A sparse gradient with two rows in one place.
+    let rows = x.gather_rows(&[0, 0].into());
+    let line = line!() - 1;
+    let sum = (rows * 3e38).sum();
+    starts(
+        sum.try_grad(&[&x]).unwrap_err().to_string(),
+        "gather_rows: the gradient of input 0 is inf at index [0]",
+        line,
+    );
+    assert!(panic_of(|| sum.grad_sparse(&[&x])).contains("gather_rows: the gradient of input 0 is inf"));
+    // What overflows inside a gradient is not reported if the gradient is finite: softplus of a large number.
+    let large = tape.leaf(Tensor::scalar(200.0));
+    assert_eq!(large.softplus().grad_graph(&[&large])[0].item(), 1.0);
+}
+
+#[test]
+fn one_tape_gives_many_gradients_of_many_results() {
+    let tape = Tape::new();
+    let x = tape.leaf(vector(&[0.3, -1.2]));
+    let h = x.sin() * &x;
+    let (first, second) = (h.exp().sum(), (&h * &h).sum());
+    let both = &first + &second;
+    let [a, b] = [&first, &second].map(|y| y.grad(&[&x]).remove(0));
+    let sum: Vec<_> = a.as_slice().iter().zip(b.as_slice()).map(|(a, b)| a + b).collect();
+    assert_close("both", both.grad(&[&x])[0].as_slice(), &sum, 1e-15);
+    // In any order and of any kind, and none of them changes the graph's values.
+    let recorded = first.grad_graph(&[&x]).remove(0);
+    assert_close("recorded", recorded.value().as_slice(), a.as_slice(), 1e-15);
+    let seed = tape.constant(Tensor::scalar(2.0));
+    assert_close(
+        "vjp",
+        first.vjp(&seed, &[&x])[0].value().as_slice(),
+        &a.as_slice().iter().map(|a| 2.0 * a).collect::<Vec<_>>(),
+        1e-15,
+    );
+    assert_eq!(first.grad_with(&Tensor::scalar(1.0), &[&x, &h])[0], a);
+    assert_eq!(second.grad(&[&x])[0], b);
+    recorded.sum().grad(&[&x]);
+    assert_eq!(first.grad(&[&x])[0], a);
+    // The last one frees what it passes, and only that: not the leaf, which other graphs have too.
+    let apart = x.cos().sum();
+    assert_eq!(first.grad_once(&[&x])[0], a);
+    assert!(second.try_grad(&[&x]).is_err());
+    assert_close("apart", apart.grad(&[&x])[0].as_slice(), &[-0.3_f64.sin(), 1.2_f64.sin()], 1e-15);
+}
+
+#[test]
+fn scopes_without_recording_nest_and_end() {
+    let tape = Tape::new();
+    let x = tape.leaf(vector(&[2.0]));
+    let (inner, outer) = tape.no_grad(|| {
+        let inner = tape.no_grad(|| x.exp());
+        assert!(!tape.is_recording(), "the inner scope gives back what it found");
+        // A derivative inside records what it needs, but its result is not on a graph that the scope could miss.
+        let grads = x.square().sum().grad(&[&x]);
+        assert_eq!(grads[0].as_slice(), [0.0], "nothing was recorded");
+        (inner, x.square())
+    });
+    assert!(tape.is_recording() && !inner.is_on_graph() && !outer.is_on_graph());
+    assert_eq!(tape.len(), 1);
+    // A leaf that is made inside is a leaf, and what follows after the scope is recorded.
+    let leaf = tape.no_grad(|| tape.leaf(vector(&[3.0])));
+    assert_eq!((&leaf * &outer).sum().grad(&[&leaf])[0].as_slice(), [4.0]);
+}
+
+#[test]
+fn empty_and_scalar_tensors_pass_through_everything_of_a_tape() {
+    for shape in [&[][..], &[0], &[3, 0, 2], &[1]] {
+        let tape = Tape::<f64>::new();
+        tape.check_finite(true);
+        let x = tape.leaf(Tensor::full(shape, 0.5));
+        let h = x.map_grad(|g| g * 1.0).inspect_grad(|_| ());
+        let y = tape.checkpoint(&[&h], |x| x[0].tanh() * &x[0]);
+        let total = (&y + &h).sum();
+        let first = total.grad_graph(&[&x]).remove(0);
+        let second = first.square().sum().grad(&[&x]).remove(0);
+        assert_eq!((first.shape(), second.shape()), (shape, shape));
+        let tanh = 0.5_f64.tanh();
+        let slope = tanh + 0.5 * (1.0 - tanh * tanh) + 1.0;
+        assert!(first.value().as_slice().iter().all(|g| (g - slope).abs() < 1e-15));
+        assert_eq!(total.grad_sparse(&[&x]).len(), 1);
+        assert!(tape.to_dot().contains("freed"));
+    }
+}

@@ -5,6 +5,7 @@ use crate::ops::trigonometric;
 use crate::ops::{
     Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
 };
+use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, scan, select, softmax};
 use crate::{Dual, Op};
 use raygrad_tensor::{Layout, Shape, Tensor};
 use std::ops::Range;
@@ -150,6 +151,157 @@ pub(crate) fn spread(shape: &[usize], ranges: &[Range<f64>], salt: usize) -> Ten
 
 /// Every operation of this crate.
 pub fn catalogue() -> Vec<Entry> {
+    [core(), elementwise(), reductions(), losses()].into_iter().flatten().collect()
+}
+
+/// Functions of one, two and three numbers.
+fn elementwise() -> Vec<Entry> {
+    use select::Compare::{Equal, Greater, GreaterEqual, Less, LessEqual, NotEqual};
+    // Powers of both signs, of 0 and of 1 have conventions of their own.
+    let powi = [0, 1, 2, 3, 5, -1, -4].map(|exponent| Entry::unary(power::Powi { exponent }));
+    let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::unary(power::Powf { exponent }));
+    // Values that are equal in places, and that no step of a difference takes past each other.
+    let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
+    let compare = [Greater, GreaterEqual, Less, LessEqual].map(|comparison| {
+        let apart = |i: usize| Tensor::from_fn(&[2, 3], |k| (k + i * (2 * k % 3)) as f64 + 0.5 * i as f64);
+        let apart = vec![apart(0), apart(1)];
+        Entry::new(comparison).sample_of(apart).sample(&[&[0, 1], &[3]]).sample(&[&[], &[]])
+    });
+    let equal = [Equal, NotEqual].map(|comparison| {
+        Entry::new(comparison).sample(&[&[2, 3], &[3]]).sample(&[&[0, 1], &[3]]).sample(&[&[], &[2]])
+    });
+    let mask = |shape: &[usize]| ranks(shape, 3);
+    let choice = |shape: &[usize], others: [&[usize]; 2]| {
+        let others = others.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 3));
+        std::iter::once(mask(shape)).chain(others).collect::<Vec<_>>()
+    };
+    let rest = vec![
+        Entry::unary(exponential::Exp2),
+        Entry::unary(exponential::Log2),
+        Entry::unary(exponential::Rsqrt),
+        Entry::unary(exponential::Erf),
+        Entry::unary(trigonometric::Tan),
+        Entry::unary(trigonometric::Asin),
+        Entry::unary(trigonometric::Acos),
+        Entry::unary(trigonometric::Atan),
+        Entry::binary(trigonometric::Atan2),
+        Entry::unary(trigonometric::Sinh),
+        Entry::unary(trigonometric::Cosh),
+        Entry::unary(activation::LogSigmoid),
+        Entry::unary(activation::LeakyRelu { slope: 0.125 }),
+        Entry::unary(activation::Elu { alpha: 1.5 }),
+        Entry::unary(activation::Gelu),
+        Entry::unary(activation::GeluTanh),
+        Entry::unary(activation::Silu),
+        Entry::unary(piecewise::Abs),
+        Entry::unary(piecewise::Sign),
+        Entry::binary(piecewise::Maximum),
+        Entry::binary(piecewise::Minimum),
+        Entry::unary(piecewise::Clamp { low: -1.0, high: 2.0 }),
+        Entry::unary(piecewise::Floor),
+        Entry::unary(piecewise::Ceil),
+        Entry::unary(piecewise::Round),
+        Entry::unary(power::Reciprocal),
+        Entry::binary(power::Pow),
+        Entry::binary(power::Xlogy),
+        Entry::new(select::Where)
+            .sample_of(choice(&[2, 3], [&[2, 3], &[3]]))
+            .sample_of(choice(&[3], [&[2, 1], &[]]))
+            .sample_of(choice(&[0, 3], [&[3], &[1]]))
+            .sample_of(choice(&[], [&[], &[]])),
+        Entry::new(select::Lerp).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[3], &[2, 1], &[]]).sample(&[
+            &[0, 3],
+            &[3],
+            &[1],
+        ]),
+    ];
+    powi.into_iter().chain(powf).chain(compare).chain(equal).chain(rest).collect()
+}
+
+/// What makes fewer numbers out of many, and what runs along an axis.
+fn reductions() -> Vec<Entry> {
+    let shape = |extents: &[usize]| Shape::from_slice(extents);
+    let variance = |extents: &[usize], correction| moments::Variance { shape: shape(extents), correction };
+    let extremum = |from, behind, greatest| {
+        // Far enough apart for the steps of differences.
+        let apart = |extents: &[usize]| Tensor::from_fn(extents, |i| ((i * 7 + 3) % 24) as f64 * 0.1 - 1.0);
+        let entry = Entry::new(extremum::Extremum { from, behind, greatest });
+        let empty: &[usize] = if from == 0 { &[2, 3, 0] } else { &[0, 2, 3] };
+        entry.sample_of(vec![apart(&[2, 3, 4])]).sample(&[empty])
+    };
+    let zeros = |extents: &[usize], every: usize| {
+        let values = spread(extents, &[-1.5..1.5], 2);
+        vec![Tensor::from_fn(extents, |i| if i % every == 1 { 0.0 } else { values.as_slice()[i] })]
+    };
+    let walk = |axis, reverse| scan::Walk { axis, reverse };
+    let wide: &[&[usize]] = &[&[3, 40]];
+    vec![
+        extremum(1, 3, true),
+        extremum(0, 2, false),
+        extremum(1, 1, true),
+        Entry::new(moments::Variance { correction: 1.0, ..variance(&[2, 1], 0.0) })
+            .sample(&[&[2, 5]])
+            .sample(&[&[2, 40]]),
+        Entry::new(variance(&[1, 3, 1], 0.0)).sample(&[&[2, 3, 4]]).sample(&[&[5, 3, 1]]),
+        Entry::new(variance(&[], 0.0)).sample(&[&[]]),
+        Entry::new(variance(&[0, 1], 0.0)).sample(&[&[0, 4]]),
+        Entry::new(moments::Deviation(variance(&[2, 1], 1.0))).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
+        Entry::new(moments::Deviation(variance(&[1, 3, 1], 0.0))).sample(&[&[2, 3, 4]]),
+        Entry::new(moments::Norm { shape: shape(&[2, 1]) }).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
+        Entry::new(moments::Norm { shape: shape(&[1, 3]) }).sample(&[&[4, 3]]),
+        Entry::new(moments::Norm { shape: shape(&[]) }).sample(&[&[]]),
+        Entry::new(moments::Norm { shape: shape(&[1, 1]) }).sample(&[&[2, 3]]),
+        Entry::new(scan::Cumsum(walk(1, false))).linear().sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]).sample(&[&[2, 0]]),
+        Entry::new(scan::Cumsum(walk(0, true))).linear().sample(&[&[5]]).sample(&[&[3, 2]]).sample(&[&[0]]),
+        Entry::new(scan::Cumprod(walk(1, false)))
+            .sample(&[&[2, 4]])
+            .sample_of(zeros(&[3, 4], 2))
+            .sample_of(zeros(&[3, 4, 2], 5))
+            .sample(&[&[2, 0]]),
+        Entry::new(scan::Cumprod(walk(0, true))).sample(&[&[4]]).sample_of(zeros(&[5], 3)),
+        Entry::new(scan::Recurrence(walk(0, false))).sample(&[&[5], &[5]]).sample(&[&[4, 2], &[4, 2]]),
+        Entry::new(scan::Recurrence(walk(1, true))).sample(&[&[2, 4], &[2, 4]]).sample(&[&[2, 0], &[2, 0]]),
+        Entry::new(scan::Product)
+            .sample(&[&[2, 4]])
+            .sample_of(zeros(&[3, 4], 5))
+            .sample_of(zeros(&[2, 5], 2))
+            .sample(&[&[2, 0]])
+            .sample(&[&[1]]),
+        Entry::new(softmax::Softmax)
+            .sample(&[&[2, 5]])
+            .sample(wide)
+            .sample(&[&[0, 3]])
+            .sample(&[&[2, 0]])
+            .sample(&[&[1]]),
+        Entry::new(softmax::LogSoftmax).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[2, 0]]),
+        Entry::new(softmax::LogSumExp).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[3]]),
+        Entry::new(layer_norm::LayerNorm { eps: 1e-3 })
+            .sample(&[&[3, 5], &[5], &[5]])
+            .sample(&[&[2, 20, 3], &[3], &[3]])
+            .sample(&[&[2, 40], &[40], &[40]])
+            .sample(&[&[0, 3], &[3], &[3]])
+            .sample(&[&[2, 0], &[0], &[0]]),
+    ]
+}
+
+/// Losses.
+fn losses() -> Vec<Entry> {
+    let cross_entropy = |classes: &[u32]| Entry::new(loss::CrossEntropy { classes: classes.into() });
+    vec![
+        Entry::binary(loss::SquaredError),
+        Entry::binary(loss::AbsoluteError),
+        Entry::binary(loss::Huber { delta: 0.5 }),
+        Entry::binary(loss::SmoothL1 { beta: 0.5 }),
+        Entry::binary(loss::SmoothL1 { beta: 0.0 }),
+        Entry::binary(loss::BinaryCrossEntropy),
+        cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
+        cross_entropy(&[1]).sample(&[&[2]]),
+        cross_entropy(&[]).sample(&[&[0, 3]]),
+    ]
+}
+
+/// Arithmetic, products, shapes, tables and segments.
+fn core() -> Vec<Entry> {
     let shape = |extents: &[usize]| Shape::from_slice(extents);
     let segments = || Segments::new([0, 3, 3, 4, 7]);
     let matmul = |transpose_a, transpose_b| Entry::new(matmul::Matmul { transpose_a, transpose_b });
@@ -158,7 +310,7 @@ pub fn catalogue() -> Vec<Entry> {
         layout: layout(Layout::contiguous(from)),
     };
     let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
-    vec![
+    let mut entries = vec![
         Entry::binary(arithmetic::Add),
         Entry::binary(arithmetic::Sub),
         Entry::binary(arithmetic::Mul),
@@ -209,5 +361,7 @@ pub fn catalogue() -> Vec<Entry> {
         Entry::new(cumsum(false, false)).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
         Entry::new(cumsum(true, false)).linear().sample(&[&[7]]),
         Entry::new(cumsum(true, true)).linear().sample(&[&[7, 3]]),
-    ]
+    ];
+    entries.extend(crate::catalogue_arrays::entries());
+    entries
 }

@@ -192,6 +192,9 @@ impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
     fn vjp<'t>(&self, cx: &crate::Vjp<'t, '_, T>) -> crate::Grads<'t, T> {
         (**self).vjp(cx)
     }
+    fn try_vjp<'t>(&self, cx: &crate::Vjp<'t, '_, T>) -> Result<crate::Grads<'t, T>, crate::Error> {
+        (**self).try_vjp(cx)
+    }
     fn is_fused(&self) -> bool {
         (**self).is_fused()
     }

@@ -1,7 +1,7 @@
 //! Dual numbers: forward-mode derivatives, the oracle of elementwise formulas.
 
 use raygrad_tensor::Real;
-use std::f64::consts::PI;
+use std::f64::consts::{FRAC_2_SQRT_PI, LN_2, PI};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// `value + slope * e` with `e^2 = 0`: a number and its derivative.
@@ -109,6 +109,69 @@ impl Real for Dual {
     }
     fn sqrt(self) -> Self {
         self.chain(self.value.sqrt(), 0.5 / self.value.sqrt())
+    }
+    fn exp2(self) -> Self {
+        self.chain(self.value.exp2(), LN_2 * self.value.exp2())
+    }
+    fn log2(self) -> Self {
+        self.chain(self.value.log2(), 1.0 / (LN_2 * self.value))
+    }
+    fn erf(self) -> Self {
+        let slope = FRAC_2_SQRT_PI * (-self.value * self.value).exp();
+        self.chain(raygrad_tensor::vmath::f64::erf(self.value), slope)
+    }
+    fn tan(self) -> Self {
+        self.chain(self.value.tan(), self.value.cos().powi(-2))
+    }
+    fn asin(self) -> Self {
+        self.chain(self.value.asin(), 1.0 / (1.0 - self.value * self.value).sqrt())
+    }
+    fn acos(self) -> Self {
+        self.chain(self.value.acos(), -1.0 / (1.0 - self.value * self.value).sqrt())
+    }
+    fn atan(self) -> Self {
+        self.chain(self.value.atan(), 1.0 / (1.0 + self.value * self.value))
+    }
+    fn atan2(self, x: Self) -> Self {
+        let square = self.value * self.value + x.value * x.value;
+        let slope = (self.slope * x.value - self.value * x.slope) / square;
+        Dual { value: self.value.atan2(x.value), slope }
+    }
+    fn sinh(self) -> Self {
+        self.chain(self.value.sinh(), self.value.cosh())
+    }
+    fn cosh(self) -> Self {
+        self.chain(self.value.cosh(), self.value.sinh())
+    }
+    fn powi(self, exponent: i32) -> Self {
+        let slope = if exponent == 0 { 0.0 } else { f64::from(exponent) * self.value.powi(exponent - 1) };
+        self.chain(self.value.powi(exponent), slope)
+    }
+    fn pow(self, exponent: Self) -> Self {
+        let value = self.value.powf(exponent.value);
+        let base = self.chain(value, exponent.value * self.value.powf(exponent.value - 1.0));
+        base + Dual { value: 0.0, slope: exponent.chain(value, value * self.value.ln()).slope }
+    }
+    fn abs(self) -> Self {
+        if self.value < 0.0 { -self } else { self }
+    }
+    fn sign(self) -> Self {
+        self.like(if self.value == 0.0 { 0.0 } else { self.value.signum() })
+    }
+    fn maximum(self, other: Self) -> Self {
+        if self.value > other.value { self } else { other }
+    }
+    fn minimum(self, other: Self) -> Self {
+        if self.value < other.value { self } else { other }
+    }
+    fn floor(self) -> Self {
+        self.like(self.value.floor())
+    }
+    fn ceil(self) -> Self {
+        self.like(self.value.ceil())
+    }
+    fn round(self) -> Self {
+        self.like(self.value.round_ties_even())
     }
 }
 

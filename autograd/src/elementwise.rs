@@ -2,7 +2,7 @@
 
 use crate::catalogue::Cases;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, map, sum_to};
+use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, map_real, sum_to};
 
 /// A function of one number.
 ///
@@ -48,13 +48,13 @@ pub struct Zip<B>(pub B);
 
 /// What a derivative gets for a value that it said it does not read.
 #[inline(always)]
-fn unread<T: Scalar>() -> T {
-    T::from_f64(f64::NAN)
+fn unread<E: Real>(g: &E) -> E {
+    g.like(f64::NAN)
 }
 
 #[inline(always)]
-fn kept<T: Scalar>(reads: bool, value: T) -> T {
-    if reads { value } else { unread() }
+fn kept<E: Real>(reads: bool, value: E) -> E {
+    if reads { value } else { unread(&value) }
 }
 
 impl<T: Scalar, U: Unary> Op<T> for Map<U> {
@@ -67,12 +67,7 @@ impl<T: Scalar, U: Unary> Op<T> for Map<U> {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        map(
-            [x[0]],
-            pool,
-            #[inline(always)]
-            |[x]| self.0.f(x),
-        )
+        map_real!([x[0]], pool, |[x]| self.0.f(x))
     }
 
     fn reads(&self) -> Reads {
@@ -84,42 +79,29 @@ impl<T: Scalar, U: Unary> Op<T> for Map<U> {
         if cx.recording() {
             let nan = || cx.g().constant(f64::NAN);
             let (x, y) = (if reads_x { cx.x(0) } else { nan() }, if reads_y { cx.y() } else { nan() });
-            return Grads::one(self.0.vjp(cx.g().clone(), x, y));
+            // A formula may give a constant, which has no axes.
+            return Grads::one(self.0.vjp(cx.g().clone(), x, y).broadcast_to(cx.shape(0)));
         }
         let g = cx.g().value();
         let grad = match (reads_x, reads_y) {
-            (false, false) => map(
-                [g],
-                cx.pool(),
-                #[inline(always)]
-                |[g]| self.0.vjp(g, unread(), unread()),
-            ),
-            (true, false) => map(
-                [g, cx.x(0).value()],
-                cx.pool(),
-                #[inline(always)]
-                |[g, x]| self.0.vjp(g, x, unread()),
-            ),
-            (false, true) => map(
-                [g, cx.y().value()],
-                cx.pool(),
-                #[inline(always)]
-                |[g, y]| self.0.vjp(g, unread(), y),
-            ),
-            (true, true) => map(
-                [g, cx.x(0).value(), cx.y().value()],
-                cx.pool(),
-                #[inline(always)]
-                |[g, x, y]| self.0.vjp(g, x, y),
-            ),
+            (false, false) => map_real!([g], cx.pool(), |[g]| self.0.vjp(g, unread(&g), unread(&g))),
+            (true, false) => {
+                map_real!([g, cx.x(0).value()], cx.pool(), |[g, x]| self.0.vjp(g, x, unread(&g)))
+            }
+            (false, true) => {
+                map_real!([g, cx.y().value()], cx.pool(), |[g, y]| self.0.vjp(g, unread(&g), y))
+            }
+            (true, true) => {
+                map_real!([g, cx.x(0).value(), cx.y().value()], cx.pool(), |[g, x, y]| self.0.vjp(g, x, y))
+            }
         };
         Grads::one(cx.constant(grad))
     }
 }
 
 impl<B: Binary> Zip<B> {
-    /// One input's gradient as a tensor of the output's shape.
-    fn grad<T: Scalar>(&self, cx: &Vjp<'_, '_, T>, f: impl Fn(T, T, T, T) -> T) -> Tensor<T> {
+    /// One input's gradient as a tensor of the output's shape: that of `a` or that of `b`.
+    fn grad<T: Scalar, const OF_A: bool>(&self, cx: &Vjp<'_, '_, T>) -> Tensor<T> {
         let g = cx.g().value();
         // A value that is not read costs a register, not a pass: `g` stands in for it and is replaced by NaN.
         let reads = [B::READS.input(0), B::READS.input(1), B::READS.output()];
@@ -127,12 +109,10 @@ impl<B: Binary> Zip<B> {
         let a = read(reads[0], &|| cx.x(0).into_value());
         let b = read(reads[1], &|| cx.x(1).into_value());
         let y = read(reads[2], &|| cx.y().into_value());
-        map(
-            [g, &a, &b, &y],
-            cx.pool(),
-            #[inline(always)]
-            |[g, a, b, y]| f(g, kept(reads[0], a), kept(reads[1], b), kept(reads[2], y)),
-        )
+        map_real!([g, &a, &b, &y], cx.pool(), |[g, a, b, y]| {
+            let (a, b, y) = (kept(reads[0], a), kept(reads[1], b), kept(reads[2], y));
+            if OF_A { self.0.vjp_a(g, a, b, y) } else { self.0.vjp_b(g, a, b, y) }
+        })
     }
 }
 
@@ -146,12 +126,7 @@ impl<T: Scalar, B: Binary> Op<T> for Zip<B> {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        map(
-            [x[0], x[1]],
-            pool,
-            #[inline(always)]
-            |[a, b]| self.0.f(a, b),
-        )
+        map_real!([x[0], x[1]], pool, |[a, b]| self.0.f(a, b))
     }
 
     fn reads(&self) -> Reads {
@@ -165,8 +140,9 @@ impl<T: Scalar, B: Binary> Op<T> for Zip<B> {
             let b = if B::READS.input(1) { cx.x(1) } else { nan() };
             let y = if B::READS.output() { cx.y() } else { nan() };
             let g = cx.g().clone();
-            let ga = cx.needs(0).then(|| self.0.vjp_a(g.clone(), a.clone(), b.clone(), y.clone()).sum_to(cx.shape(0)));
-            let gb = cx.needs(1).then(|| self.0.vjp_b(g, a, b, y).sum_to(cx.shape(1)));
+            let reduced = |grad: Var<'t, T>, i| grad.broadcast_to(cx.g().shape()).sum_to(cx.shape(i));
+            let ga = cx.needs(0).then(|| reduced(self.0.vjp_a(g.clone(), a.clone(), b.clone(), y.clone()), 0));
+            let gb = cx.needs(1).then(|| reduced(self.0.vjp_b(g, a, b, y), 1));
             return Grads::new([ga, gb]);
         }
         let reduced = |grad: Tensor<T>, i: usize| -> Var<'t, T> {
@@ -175,26 +151,8 @@ impl<T: Scalar, B: Binary> Op<T> for Zip<B> {
             }
             cx.constant(sum_to(&grad, cx.shape(i), cx.pool()))
         };
-        let ga = cx.needs(0).then(|| {
-            reduced(
-                self.grad(
-                    cx,
-                    #[inline(always)]
-                    |g, a, b, y| self.0.vjp_a(g, a, b, y),
-                ),
-                0,
-            )
-        });
-        let gb = cx.needs(1).then(|| {
-            reduced(
-                self.grad(
-                    cx,
-                    #[inline(always)]
-                    |g, a, b, y| self.0.vjp_b(g, a, b, y),
-                ),
-                1,
-            )
-        });
+        let ga = cx.needs(0).then(|| reduced(self.grad::<T, true>(cx), 0));
+        let gb = cx.needs(1).then(|| reduced(self.grad::<T, false>(cx), 1));
         Grads::new([ga, gb])
     }
 }

@@ -1,6 +1,6 @@
 //! What an operation is: a forward kernel and a vector-Jacobian product.
 
-use crate::{ShapeError, Tape, Var};
+use crate::{Error, ShapeError, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
 use std::any::Any;
@@ -53,7 +53,18 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
     /// may be left out.
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T>;
 
-    /// Whether [`reference`](Self::reference) gives a value. The operation then reads all its inputs.
+    /// As [`vjp`](Self::vjp), for an operation that takes gradients itself and hands their errors on. The sweep calls
+    /// this one.
+    ///
+    /// # Errors
+    /// None, unless the operation overrides it.
+    fn try_vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Result<Grads<'t, T>, Error> {
+        Ok(self.vjp(cx))
+    }
+
+    /// Whether the tape goes through [`reference`](Self::reference), which then gives a value, where a gradient is itself
+    /// differentiated. The operation then reads all its inputs. An operation whose [`vjp`](Self::vjp) can be recorded
+    /// leaves this false, and may still have a reference as an oracle.
     fn is_fused(&self) -> bool {
         false
     }
@@ -220,6 +231,8 @@ pub struct Grads<'t, T: Scalar>(pub(crate) SmallVec<[Option<Given<'t, T>>; 3]>);
 pub(crate) enum Given<'t, T: Scalar> {
     Dense(Var<'t, T>),
     Sparse(Arc<dyn SparseGrad<T>>),
+    /// Several gradients to add in this order, none of them `Parts`.
+    Parts(Vec<Given<'t, T>>),
 }
 
 impl<'t, T: Scalar> Grads<'t, T> {

@@ -1,7 +1,7 @@
 //! The backward sweep: from the root down the tape, visiting only what leads to the wanted gradients.
 
 use crate::op::{Given, Gradient, SparseGrad};
-use crate::tape::find_non_finite;
+use crate::tape::{LEAF, find_non_finite};
 use crate::{Error, Grads, Op, Tape, Var, Vjp};
 use raygrad_tensor::{Scalar, Tensor, add_assign};
 use smallvec::SmallVec;
@@ -64,10 +64,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`grad`](Self::grad).
     #[track_caller]
     pub fn grad_sparse(&self, wrt: &[&Var<'t, T>]) -> Vec<Gradient<T>> {
-        let sums = or_panic(self.seed().and_then(|seed| sweep(self, seed, wrt, Keep::Nothing)));
+        let sums = or_panic(sweep(self, or_panic(self.seed()), wrt, Keep::Nothing));
         let gradient = |sum| match sum {
             Sum::Dense(grad) => Gradient::Dense(grad.value),
             Sum::Sparse(parts) => Gradient::Sparse(parts),
+            Sum::Parts(_) => unreachable!("only `parts` leaves shares apart"),
         };
         sums.into_iter().map(gradient).collect()
     }
@@ -90,7 +91,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`grad`](Self::grad).
     #[track_caller]
     pub fn grad_graph(&self, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
-        let sums = or_panic(self.seed().and_then(|seed| sweep(self, seed, wrt, Keep::GraphAndGradients)));
+        let sums = or_panic(sweep(self, or_panic(self.seed()), wrt, Keep::GraphAndGradients));
         sums.into_iter().map(|sum| sum.dense(self.tape)).collect()
     }
 
@@ -103,6 +104,16 @@ impl<'t, T: Scalar> Var<'t, T> {
         assert_eq!(seed.shape(), self.shape(), "the seed of a vector-Jacobian product has the shape of the output");
         let sums = or_panic(sweep(self, seed.clone(), wrt, Keep::GraphAndGradients));
         sums.into_iter().map(|sum| sum.dense(self.tape)).collect()
+    }
+
+    /// The vector-Jacobian product without a record of it: the gradients of `sum(self * seed)` with respect to `wrt`.
+    ///
+    /// # Panics
+    /// If `seed` has another shape than this tensor, and as [`grad`](Self::grad).
+    #[track_caller]
+    pub fn grad_with(&self, seed: &Tensor<T>, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
+        assert_eq!(seed.shape(), self.shape(), "the seed of a vector-Jacobian product has the shape of the output");
+        values(self.tape, or_panic(sweep(self, self.tape.constant(seed.clone()), wrt, Keep::Graph)))
     }
 
     #[track_caller]
@@ -131,13 +142,34 @@ fn values<T: Scalar>(tape: &Tape<T>, sums: Vec<Sum<'_, T>>) -> Vec<Tensor<T>> {
 enum Sum<'t, T: Scalar> {
     Dense(Var<'t, T>),
     Sparse(Vec<Arc<dyn SparseGrad<T>>>),
+    /// Shares that somebody else is to add, in the order in which they came.
+    Parts(Vec<Given<'t, T>>),
 }
 
 impl<'t, T: Scalar> Sum<'t, T> {
-    fn new(given: Given<'t, T>) -> Self {
-        match given {
-            Given::Dense(grad) => Sum::Dense(grad),
-            Given::Sparse(part) => Sum::Sparse(vec![part]),
+    /// What is there after `given` has arrived.
+    fn gather(sum: Option<Self>, given: Given<'t, T>, tape: &'t Tape<T>) -> Option<Self> {
+        match (sum, given) {
+            (sum, Given::Parts(parts)) => parts.into_iter().fold(sum, |sum, part| Sum::gather(sum, part, tape)),
+            (Some(sum), given) => Some(sum.add(given, tape)),
+            (None, Given::Dense(grad)) => Some(Sum::Dense(grad)),
+            (None, Given::Sparse(part)) => Some(Sum::Sparse(vec![part])),
+        }
+    }
+
+    /// The first bad element, if the NaN finder is on.
+    fn check(
+        &self,
+        tape: &'t Tape<T>,
+        what: &str,
+        op: &'static str,
+        at: &'static Location<'static>,
+    ) -> Result<(), Error> {
+        match self {
+            _ if !tape.checks_finite() => Ok(()),
+            Sum::Dense(grad) => find_non_finite(op, what, &grad.value, at),
+            Sum::Sparse(_) => find_non_finite(op, what, &self.clone().dense(tape).value, at),
+            Sum::Parts(_) => Ok(()),
         }
     }
 
@@ -149,6 +181,7 @@ impl<'t, T: Scalar> Sum<'t, T> {
                 parts.iter().for_each(|part| part.add_to(&mut sum));
                 tape.constant(sum)
             }
+            Sum::Parts(_) => unreachable!("shares are left apart at leaves only"),
         }
     }
 
@@ -167,11 +200,16 @@ impl<'t, T: Scalar> Sum<'t, T> {
                 parts.push(part);
                 Sum::Sparse(parts)
             }
+            (Sum::Parts(mut parts), given) => {
+                parts.push(given);
+                Sum::Parts(parts)
+            }
             (sparse, dense) => Sum::Dense(sparse.dense(tape)).add(dense, tape),
         }
     }
 }
 
+/// The gradients of `sum(root * seed)` with respect to `wrt`.
 #[track_caller]
 fn sweep<'t, T: Scalar>(
     root: &Var<'t, T>,
@@ -179,66 +217,103 @@ fn sweep<'t, T: Scalar>(
     wrt: &[&Var<'t, T>],
     keep: Keep,
 ) -> Result<Vec<Sum<'t, T>>, Error> {
+    let tape = root.tape;
+    let zeros = |x: &Var<'t, T>| Sum::Dense(tape.constant(tape.pool().full(x.shape(), T::ZERO)));
+    let sums = sums(root, seed, wrt, keep, false)?;
+    Ok(sums.into_iter().zip(wrt).map(|(sum, x)| sum.unwrap_or_else(|| zeros(x))).collect())
+}
+
+/// As an unrecorded sweep that frees the graph, but with the shares of each of `leaves` apart, in the order in which they
+/// came. Who adds them to a sum gets the bits of a sweep that had not been interrupted.
+#[track_caller]
+pub(crate) fn parts<'t, T: Scalar>(
+    root: &Var<'t, T>,
+    seed: Var<'t, T>,
+    leaves: &[&Var<'t, T>],
+) -> Result<Vec<Vec<Given<'t, T>>>, Error> {
+    let parts = |sum| if let Some(Sum::Parts(parts)) = sum { parts } else { vec![] };
+    Ok(sums(root, seed, leaves, Keep::Nothing, true)?.into_iter().map(parts).collect())
+}
+
+/// What has arrived at each of `wrt`, if anything; with `apart` they are leaves and their shares are not added.
+#[track_caller]
+fn sums<'t, T: Scalar>(
+    root: &Var<'t, T>,
+    seed: Var<'t, T>,
+    wrt: &[&Var<'t, T>],
+    keep: Keep,
+    apart: bool,
+) -> Result<Vec<Option<Sum<'t, T>>>, Error> {
     let (tape, at) = (root.tape, Location::caller());
     for x in wrt {
         assert!(std::ptr::eq(x.tape, tape), "a gradient with respect to a variable of another tape");
     }
-    let zeros = |x: &Var<'t, T>| Sum::Dense(tape.constant(tape.pool().full(x.shape(), T::ZERO)));
     let lowest = wrt.iter().filter_map(|x| x.node).min();
-    let (Some(top), Some(bottom)) = (root.node, lowest) else { return Ok(wrt.iter().map(|&x| zeros(x)).collect()) };
+    let (Some(top), Some(bottom)) = (root.node, lowest) else { return Ok(vec![None; wrt.len()]) };
     let needed = reach(tape, bottom, top, wrt);
-    let record = keep == Keep::GraphAndGradients;
     // One slot for each node between the lowest variable and the root.
     let mut grads: Vec<Option<Sum<'t, T>>> = vec![None; needed.len()];
-    if top >= bottom && needed[(top - bottom) as usize] {
-        grads[(top - bottom) as usize] = Some(Sum::Dense(seed));
+    let place =
+        |x: &Var<'t, T>| x.node.filter(|&node| node >= bottom && node <= top).map(|node| (node - bottom) as usize);
+    if apart {
+        wrt.iter().filter_map(|x| place(x)).for_each(|slot| grads[slot] = Some(Sum::Parts(vec![])));
     }
-    tape.with_recording(record, || {
+    if top >= bottom && needed[(top - bottom) as usize] {
+        let slot = &mut grads[(top - bottom) as usize];
+        *slot = Sum::gather(slot.take(), Given::Dense(seed), tape);
+    }
+    tape.with_recording(keep == Keep::GraphAndGradients, || {
         for index in (bottom..=top).rev() {
             let slot = (index - bottom) as usize;
             if grads[slot].is_none() {
                 continue;
             }
             let node = match keep {
-                Keep::Nothing => tape.nodes.borrow_mut()[index as usize].take(),
-                _ => tape.nodes.borrow()[index as usize].clone(),
+                // A leaf holds no values, and may be one of other graphs too.
+                Keep::Nothing => tape.nodes.borrow_mut()[index as usize].take_if(|node| node.op.is_some()),
+                _ => None,
             };
+            let node = node.or_else(|| tape.nodes.borrow()[index as usize].clone());
             let Some(node) = node else { return Err(Error::Freed { at }) };
+            if node.op.is_none() && !tape.checks_finite() {
+                continue;
+            }
             let wanted = wrt.iter().any(|x| x.node == Some(index));
-            let g = if wanted { grads[slot].clone() } else { grads[slot].take() };
-            let (Some(op), Some(g)) = (&node.op, g) else { continue };
-            let g = g.dense(tape);
+            let Some(sum) = (if wanted { grads[slot].clone() } else { grads[slot].take() }) else { continue };
+            let name = node.op.as_ref().map_or(LEAF, |op| op.name());
+            let what = if node.op.is_some() { "the gradient of the output" } else { "the gradient" };
+            sum.check(tape, what, name, node.at)?;
+            let Some(op) = &node.op else { continue };
+            let g = sum.dense(tape);
             let needs: SmallVec<[bool; 4]> =
                 node.inputs.iter().map(|&(input, _)| leads(input, bottom, &needed)).collect();
-            let cx =
-                Vjp { tape, g, op: op.name(), inputs: &node.inputs, output: &node.output, node: index, needs: &needs };
-            let given = differentiate(&**op, &cx)?;
-            drop(cx);
-            for (i, grad) in given.0.into_iter().enumerate() {
-                let (Some(grad), Some(input)) = (grad, node.inputs[i].0) else { continue };
-                if !needs[i] {
-                    continue;
-                }
-                if let Given::Dense(grad) = &grad {
-                    debug_assert_eq!(grad.shape(), node.inputs[i].1.shape(), "gradient of input {i} of {}", op.name());
-                    if tape.checks_finite() {
-                        find_non_finite(op.name(), &format!("the gradient of input {i}"), &grad.value, node.at)?;
+            let cx = Vjp { tape, g, op: name, inputs: &node.inputs, output: &node.output, node: index, needs: &needs };
+            tape.differentiating(node.at, || {
+                let given = differentiate(&**op, &cx)?;
+                drop(cx);
+                for (i, grad) in given.0.into_iter().enumerate() {
+                    let (Some(grad), Some(input)) = (grad, node.inputs[i].0) else { continue };
+                    if !needs[i] {
+                        continue;
                     }
+                    if let Given::Dense(grad) = &grad {
+                        debug_assert_eq!(grad.shape(), node.inputs[i].1.shape(), "gradient of input {i} of {name}");
+                    }
+                    if tape.checks_finite() {
+                        let sum = Sum::gather(None, grad.clone(), tape);
+                        sum.map_or(Ok(()), |sum| {
+                            sum.check(tape, &format!("the gradient of input {i}"), name, node.at)
+                        })?;
+                    }
+                    let slot = &mut grads[(input - bottom) as usize];
+                    *slot = Sum::gather(slot.take(), grad, tape);
                 }
-                let slot = &mut grads[(input - bottom) as usize];
-                *slot = Some(match slot.take() {
-                    Some(sum) => sum.add(grad, tape),
-                    None => Sum::new(grad),
-                });
-            }
+                Ok(())
+            })?;
         }
         Ok(())
     })?;
-    let take = |x: &&Var<'t, T>| {
-        let slot = x.node.filter(|&node| node >= bottom && node <= top).map(|node| (node - bottom) as usize);
-        slot.and_then(|slot| grads[slot].clone()).unwrap_or_else(|| zeros(x))
-    };
-    Ok(wrt.iter().map(take).collect())
+    Ok(wrt.iter().map(|x| place(x).and_then(|slot| grads[slot].clone())).collect())
 }
 
 /// Whether an input is a node that the sweep passes and that depends on a wanted variable.
@@ -280,5 +355,5 @@ fn differentiate<'t, T: Scalar>(op: &dyn Op<T>, cx: &Vjp<'t, '_, T>) -> Result<G
             return Ok(Grads::new(cx.needs.iter().map(|&needed| if needed { given.next() } else { None })));
         }
     }
-    Ok(op.vjp(cx))
+    op.try_vjp(cx)
 }

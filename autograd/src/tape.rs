@@ -34,6 +34,8 @@ pub struct Tape<T: Scalar> {
     pool: Pool<T>,
     recording: Cell<bool>,
     check_finite: Cell<bool>,
+    /// While a gradient is worked out: the line of the user's code that recorded what is being differentiated.
+    differentiating: Cell<Option<&'static Location<'static>>>,
 }
 
 impl<T: Scalar> Default for Tape<T> {
@@ -50,7 +52,13 @@ impl<T: Scalar> Tape<T> {
 
     /// An empty tape whose tensors come from `pool`.
     pub fn with_pool(pool: Pool<T>) -> Self {
-        Tape { nodes: RefCell::default(), pool, recording: Cell::new(true), check_finite: Cell::new(false) }
+        Tape {
+            nodes: RefCell::default(),
+            pool,
+            recording: Cell::new(true),
+            check_finite: Cell::new(false),
+            differentiating: Cell::new(None),
+        }
     }
 
     /// Forgets every operation; the pool stays. The borrow proves that no [`Var`] is left.
@@ -73,14 +81,32 @@ impl<T: Scalar> Tape<T> {
         self.len() == 0
     }
 
-    /// Turns the NaN finder on or off: every value and every gradient is checked, and the first one that is infinite
-    /// or NaN is an error that says operation, line and index.
+    /// Turns the NaN finder on or off: every leaf, every value, every share of a gradient and every sum of shares is
+    /// checked, and the first one that is infinite or NaN is an error that says operation, line and index.
+    ///
+    /// The line is always the user's own: where a recorded gradient is at fault, that of the operation whose gradient
+    /// it is. What an operation computes inside its vector-Jacobian product may overflow as long as the gradient that
+    /// comes out is finite.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f64>::new();
+    /// tape.check_finite(true);
+    /// let x = tape.leaf(Tensor::from_vec(&[2], vec![4.0, 0.0]));
+    /// let error = x.sqrt().sum().try_grad(&[&x]).unwrap_err();
+    /// assert!(error.to_string().starts_with("sqrt: the gradient of input 0 is inf at index [1]"));
+    /// ```
     pub fn check_finite(&self, on: bool) {
         self.check_finite.set(on);
     }
 
     pub(crate) fn checks_finite(&self) -> bool {
         self.check_finite.get()
+    }
+
+    /// Whether values are checked now: not while a gradient is worked out, since the gradient itself is checked then.
+    fn checks_values(&self) -> bool {
+        self.check_finite.get() && self.differentiating.get().is_none()
     }
 
     /// Whether operations are recorded now.
@@ -94,22 +120,34 @@ impl<T: Scalar> Tape<T> {
     }
 
     pub(crate) fn with_recording<R>(&self, on: bool, f: impl FnOnce() -> R) -> R {
-        /// Restores the flag even if `f` panics.
-        struct Restore<'a>(&'a Cell<bool>, bool);
-        impl Drop for Restore<'_> {
-            fn drop(&mut self) {
-                self.0.set(self.1);
-            }
-        }
-        let _restore = Restore(&self.recording, self.recording.replace(on));
-        f()
+        with_cell(&self.recording, on, f)
+    }
+
+    /// Runs `f` as part of the gradient of what was recorded at `at`: nodes that it adds carry that line.
+    pub(crate) fn differentiating<R>(&self, at: &'static Location<'static>, f: impl FnOnce() -> R) -> R {
+        with_cell(&self.differentiating, Some(at), f)
+    }
+
+    /// The line of the user's code that an operation belongs to.
+    #[track_caller]
+    pub(crate) fn line(&self) -> &'static Location<'static> {
+        self.differentiating.get().unwrap_or(Location::caller())
     }
 
     /// A variable that gradients can be taken with respect to.
+    ///
+    /// # Panics
+    /// If the NaN finder is on and the value is not finite.
     #[track_caller]
     pub fn leaf(&self, value: Tensor<T>) -> Var<'_, T> {
+        let at = self.line();
+        if self.checks_values()
+            && let Err(error) = find_non_finite(LEAF, "the value", &value, at)
+        {
+            panic!("{error}");
+        }
         let output = Kept::Shape(Shape::from_slice(value.shape()));
-        let node = Node { op: None, inputs: SmallVec::new(), output, at: Location::caller() };
+        let node = Node { op: None, inputs: SmallVec::new(), output, at };
         Var { tape: self, value, node: Some(self.push(node)) }
     }
 
@@ -150,29 +188,51 @@ impl<T: Scalar> Tape<T> {
     /// If an input belongs to another tape.
     #[track_caller]
     pub fn try_apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Result<Var<'t, T>, Error> {
-        let at = Location::caller();
+        let at = self.line();
         let shape = self.check_shapes(&op, inputs, at)?;
         let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
         let value = op.forward(&values, &self.pool);
         debug_assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
-        if self.checks_finite() {
-            find_non_finite(op.name(), "output", &value, at)?;
-        }
+        self.check_output(op.name(), inputs, &value, at)?;
         Ok(self.record(op, inputs, value, at))
     }
 
     /// Records an operation whose output is known already, from an earlier unrecorded run on the same inputs.
     ///
     /// # Panics
-    /// If the shapes do not fit, or `value` has not the shape of the output.
+    /// If the shapes do not fit, `value` has not the shape of the output, or the NaN finder is on and finds something.
     #[track_caller]
     pub fn apply_known<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>], value: Tensor<T>) -> Var<'t, T> {
-        let at = Location::caller();
+        let at = self.line();
         match self.check_shapes(&op, inputs, at) {
             Ok(shape) => assert_eq!(value.shape(), shape.as_slice(), "{}: a known output of another shape", op.name()),
             Err(error) => panic!("{error}"),
         }
+        if let Err(error) = self.check_output(op.name(), inputs, &value, at) {
+            panic!("{error}");
+        }
         self.record(op, inputs, value, at)
+    }
+
+    /// If the NaN finder is on and the output is not finite: an error that also says which input was so before.
+    fn check_output(
+        &self,
+        op: &'static str,
+        inputs: &[&Var<'_, T>],
+        value: &Tensor<T>,
+        at: &'static Location<'static>,
+    ) -> Result<(), Error> {
+        if !self.checks_values() {
+            return Ok(());
+        }
+        find_non_finite(op, "output", value, at).map_err(|mut error| {
+            if let Error::NonFinite { what, .. } = &mut error
+                && let Some(input) = inputs.iter().position(|x| !x.value.is_finite())
+            {
+                *what = format!("output (and input {input} was not finite before)");
+            }
+            error
+        })
     }
 
     /// The shape of the output.
@@ -194,7 +254,7 @@ impl<T: Scalar> Tape<T> {
         })
     }
 
-    fn record<'t>(
+    pub(crate) fn record<'t>(
         &'t self,
         op: impl Op<T>,
         inputs: &[&Var<'t, T>],
@@ -212,6 +272,21 @@ impl<T: Scalar> Tape<T> {
         };
         Var { tape: self, value, node }
     }
+}
+
+/// What errors and drawings call a node without operation.
+pub(crate) const LEAF: &str = "leaf";
+
+/// Runs `f` with another value in a cell, which gets its own back even if `f` panics.
+fn with_cell<C: Copy, R>(cell: &Cell<C>, value: C, f: impl FnOnce() -> R) -> R {
+    struct Restore<'a, C: Copy>(&'a Cell<C>, C);
+    impl<C: Copy> Drop for Restore<'_, C> {
+        fn drop(&mut self) {
+            self.0.set(self.1);
+        }
+    }
+    let _restore = Restore(cell, cell.replace(value));
+    f()
 }
 
 /// The first element that is not finite, as an error.

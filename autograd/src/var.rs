@@ -212,4 +212,61 @@ impl<T: Scalar> Real for Var<'_, T> {
     fn sqrt(self) -> Self {
         Var::sqrt(&self)
     }
+    fn exp2(self) -> Self {
+        Var::exp2(&self)
+    }
+    fn log2(self) -> Self {
+        Var::log2(&self)
+    }
+    fn erf(self) -> Self {
+        Var::erf(&self)
+    }
+    fn tan(self) -> Self {
+        Var::tan(&self)
+    }
+    fn asin(self) -> Self {
+        Var::asin(&self)
+    }
+    fn acos(self) -> Self {
+        Var::acos(&self)
+    }
+    fn atan(self) -> Self {
+        Var::atan(&self)
+    }
+    fn sinh(self) -> Self {
+        Var::sinh(&self)
+    }
+    fn cosh(self) -> Self {
+        Var::cosh(&self)
+    }
+    fn abs(self) -> Self {
+        Var::abs(&self)
+    }
+    fn sign(self) -> Self {
+        Var::sign(&self)
+    }
+    fn floor(self) -> Self {
+        Var::floor(&self)
+    }
+    fn ceil(self) -> Self {
+        Var::ceil(&self)
+    }
+    fn round(self) -> Self {
+        Var::round(&self)
+    }
+    fn atan2(self, x: Self) -> Self {
+        Var::atan2(&self, &x)
+    }
+    fn pow(self, exponent: Self) -> Self {
+        Var::pow(&self, &exponent)
+    }
+    fn maximum(self, other: Self) -> Self {
+        Var::maximum(&self, &other)
+    }
+    fn minimum(self, other: Self) -> Self {
+        Var::minimum(&self, &other)
+    }
+    fn powi(self, exponent: i32) -> Self {
+        Var::powi(&self, exponent)
+    }
 }

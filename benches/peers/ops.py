@@ -1,6 +1,6 @@
 """Small peers in eager PyTorch: operation overhead, small training steps, single operations, vector math.
 
-One line of JSON each. The backward pass of an operation starts from a gradient of ones.
+One line of JSON each, of the same work as benches/framework.rs and rust-peers; vector math in turns: vmath.py.
 """
 
 import argparse
@@ -13,13 +13,13 @@ import measure
 
 
 def recorded_scalars(args):
-    """x <- sin(w x), 500 times over: 1000 recorded operations on 0-dimensional tensors."""
-    w = torch.tensor(1.001, requires_grad=True)
+    """x <- w x + w, 500 times over: 1000 recorded operations on 0-dimensional tensors."""
+    w = torch.tensor(0.999, requires_grad=True)
 
     def chain():
         x = w
         for _ in range(500):
-            x = torch.sin(w * x)
+            x = w * x + w
         return x
 
     forward, _ = measure.timed(chain, args.repeats, args.warmup)
@@ -38,14 +38,14 @@ def training_steps(args):
     narrow = nn.Sequential(nn.Linear(32, 64), relu, nn.Linear(64, 64), relu, nn.Linear(64, 64), relu, nn.Linear(64, 3))
     dense = nn.Sequential(nn.Linear(784, 512), relu, nn.Linear(512, 512), relu, nn.Linear(512, 10))
     conv = nn.Sequential(
-        *(nn.Conv2d(1, 16, 3, padding=1), relu, pool, nn.Conv2d(16, 32, 3, padding=1), relu, pool),
-        *(nn.Flatten(), nn.Linear(32 * 7 * 7, 10)),
+        *(nn.Conv2d(1, 8, 3, padding=1), relu, pool, nn.Conv2d(8, 16, 3, padding=1), relu, pool),
+        *(nn.Flatten(), nn.Linear(16 * 7 * 7, 10)),
     )
     images, classes = torch.rand(64, 1, 28, 28), torch.arange(128) % 10
     cases = (
         ("train MLP 32-64-64-64-3, 256 rows, MSE", narrow, F.mse_loss, torch.rand(256, 32), torch.rand(256, 3)),
         ("train MLP 784-512-512-10, 128 rows, cross entropy", dense, F.cross_entropy, torch.rand(128, 784), classes),
-        ("train CNN 16-32, 64 images 28x28, cross entropy", conv, F.cross_entropy, images, classes[:64]),
+        ("train CNN 8-16, 64 images 28x28, cross entropy", conv, F.cross_entropy, images, classes[:64]),
     )
     for what, model, loss_of, x, target in cases:
         adam = torch.optim.Adam(model.parameters(), fused=True)
@@ -62,20 +62,22 @@ def training_steps(args):
 
 
 def single_operations(args):
-    matrix, million = torch.randn(512, 1024), torch.randn(1_000_000)
+    """The gradient of the sum of f(x)."""
+    rows, weight = torch.randn(1024, 512), torch.randn(1024, 512)
+    gain, bias = torch.ones(512, requires_grad=True), torch.zeros(512, requires_grad=True)
+    million, matrix = torch.randn(1_000_000), torch.randn(4096, 1024)
     cases = (
-        ("softmax 512x1024", lambda x: x.softmax(-1), matrix),
-        ("layer norm 512x1024", lambda x: F.layer_norm(x, x.shape[-1:]), matrix),
-        ("sin(x) exp(-x x) + tanh(x), 1M", lambda x: x.sin() * (-x * x).exp() + x.tanh(), million),
-        ("sum, 1M", torch.sum, million),
+        ("softmax 1024x512", lambda x: x.softmax(-1) * weight, rows),
+        ("layer norm 1024x512", lambda x: F.layer_norm(x, x.shape[-1:], gain, bias) * weight, rows),
+        ("elementwise chain, 1M", lambda x: (x * 1.5 + 0.5).tanh() * x + (x * x * -0.5).exp() - x, million),
+        ("sum over axis 0, 4096x1024", lambda x: x.sum(0), matrix),
+        ("sum over axis 1, 4096x1024", lambda x: x.sum(1), matrix),
+        ("sum, 4096x1024", torch.sum, matrix),
     )
     for what, f, x in cases:
-        with torch.no_grad():
-            forward, _ = measure.timed(lambda: f(x), args.repeats, args.warmup)
-            gradient = torch.ones_like(f(x))
         x = x.clone().requires_grad_()
-        both, _ = measure.timed(lambda: torch.autograd.grad(f(x), x, gradient), args.repeats, args.warmup)
-        report(args, what, seconds_forward=forward, seconds_forward_backward=both)
+        seconds, _ = measure.timed(lambda: torch.autograd.grad(f(x).sum(), x), args.repeats, args.warmup)
+        report(args, what, seconds_forward_backward=seconds)
 
 
 def vector_math(args):

@@ -1,6 +1,6 @@
 //! One loop for every elementwise kernel, with broadcasting as NumPy does it.
 
-use crate::{Layout, Pool, Scalar, Shape, Tensor, simd};
+use crate::{Lane, Layout, Pool, Scalar, Shape, Tensor, simd};
 
 /// The common shape of tensors that broadcast together: shapes are aligned at their last axis, and an axis of extent 1
 /// (or an absent one) stretches to the extent of the others. `None` if two extents disagree.
@@ -52,16 +52,74 @@ pub fn broadcast_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -
 /// If the shapes do not broadcast.
 #[track_caller]
 pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: impl Fn([T; N]) -> T) -> Tensor<T> {
+    broadcast_loop(
+        x,
+        pool,
+        #[inline(always)]
+        |x, out| lanes(x, out, f),
+    )
+}
+
+/// As [`map`], for a formula that is read for quick numbers and for plain ones (see [`Lane`]): sines and cosines cost a
+/// third that way, and the bits are the same. Both closures have to compute the same; [`map_real!`](crate::map_real)
+/// writes the second.
+///
+/// # Panics
+/// If the shapes do not broadcast.
+#[track_caller]
+pub fn map_either<T: Scalar, const N: usize>(
+    x: [&Tensor<T>; N],
+    pool: &Pool<T>,
+    quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true>,
+    plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false>,
+) -> Tensor<T> {
+    broadcast_loop(
+        x,
+        pool,
+        #[inline(always)]
+        |x, out| lanes_either(x, out, quick, plain),
+    )
+}
+
+/// [`map_either`] for a formula that is generic over [`Real`](crate::Real), written once.
+///
+/// ```
+/// use raygrad_tensor::{Pool, Real, Tensor, map_real};
+/// let (x, amplitude) = (Tensor::from_vec(&[2], vec![0.0, 1e30]), Tensor::scalar(2.0));
+/// let y = map_real!([&x, &amplitude], &Pool::none(), |[x, a]| a * x.sin());
+/// assert_eq!(y.as_slice(), [0.0, 0.01866293786235165]);
+/// ```
+#[macro_export]
+macro_rules! map_real {
+    ($x:expr, $pool:expr, |$arguments:pat_param| $formula:expr) => {
+        $crate::map_either(
+            $x,
+            $pool,
+            #[inline(always)]
+            |$arguments| $formula,
+            #[inline(always)]
+            |$arguments| $formula,
+        )
+    };
+}
+
+/// Calls `run` with slices of one length: the tensors, stretched to their common shape, and the output.
+#[track_caller]
+fn broadcast_loop<T: Scalar, const N: usize>(
+    x: [&Tensor<T>; N],
+    pool: &Pool<T>,
+    run: impl FnOnce([&[T]; N], &mut [T]),
+) -> Tensor<T> {
     let shapes = x.map(|x| x.shape());
     let mut out;
     if shapes.iter().all(|&shape| shape == shapes[0]) {
         out = pool.tensor(shapes[0]);
-        lanes(x.map(|x| x.as_slice()), out.as_mut_slice(), f);
+        run(x.map(|x| x.as_slice()), out.as_mut_slice());
     } else {
         let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
         out = pool.tensor(&shape);
         let wide = x.map(|x| broadcast_to(x, &shape, pool));
-        lanes(std::array::from_fn(|i| wide[i].as_slice()), out.as_mut_slice(), f);
+        run(std::array::from_fn(|i| wide[i].as_slice()), out.as_mut_slice());
     }
     out
 }
@@ -90,6 +148,54 @@ pub fn lanes<T: Scalar, const N: usize>(x: [&[T]; N], out: &mut [T], f: impl Fn(
     );
 }
 
+/// Elements that [`lanes_either`] computes before it looks whether the quick formula held for all of them.
+const BLOCK: usize = 1024;
+
+/// `out[i] = plain([x[0][i], x[1][i], ..])`, by way of `quick` where that gives the same: see [`map_either`].
+///
+/// # Panics
+/// If a slice is shorter than `out`.
+pub fn lanes_either<T: Scalar, const N: usize>(
+    x: [&[T]; N],
+    out: &mut [T],
+    quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true>,
+    plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false>,
+) {
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let mut start = 0;
+            for out in out.chunks_mut(BLOCK) {
+                let n = out.len();
+                let x = x.map(
+                    #[inline(always)]
+                    |x| &x[start..][..n],
+                );
+                let mut outside = T::Flags::default();
+                for i in 0..n {
+                    let y = quick(std::array::from_fn(
+                        #[inline(always)]
+                        |k| Lane::new(x[k][i]),
+                    ));
+                    let (value, flags) = y.parts();
+                    out[i] = value;
+                    outside = outside | flags;
+                }
+                if T::is_set(outside) {
+                    for i in 0..n {
+                        let y = plain(std::array::from_fn(
+                            #[inline(always)]
+                            |k| Lane::new(x[k][i]),
+                        ));
+                        out[i] = y.parts().0;
+                    }
+                }
+                start += n;
+            }
+        },
+    );
+}
+
 /// `a += b`, elementwise.
 ///
 /// # Panics
@@ -109,6 +215,7 @@ pub fn add_assign<T: Scalar>(a: &mut [T], b: &[T]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Real;
 
     #[test]
     fn broadcasting_follows_numpy() {
@@ -120,6 +227,25 @@ mod tests {
         assert_eq!(sum.as_slice(), [11.0, 12.0, 13.0, 21.0, 22.0, 23.0]);
         let empty = Tensor::zeros(&[0, 1]);
         assert_eq!(map([&empty, &row], &pool, |[a, b]| a * b).shape(), [0, 3]);
+    }
+
+    #[test]
+    fn one_large_angle_in_a_block_is_reduced_as_it_must_be() {
+        fn check<T: Scalar>(large: f64) {
+            let mut x = vec![T::from_f64(0.7); 3 * BLOCK];
+            for i in [5, BLOCK, 3 * BLOCK - 1] {
+                x[i] = T::from_f64(large);
+            }
+            let x = Tensor::from_vec(&[x.len()], x);
+            let half = Tensor::scalar(T::from_f64(0.5));
+            // The angle is an intermediate result, and the last operation is not the sine.
+            let y = crate::map_real!([&x, &half], &Pool::none(), |[x, h]| (x * x).sin() + h.cos());
+            for (&x, &y) in x.as_slice().iter().zip(y.as_slice()) {
+                assert_eq!(y, Real::sin(x * x) + Real::cos(T::from_f64(0.5)));
+            }
+        }
+        check::<f32>(1e9);
+        check::<f64>(1e100);
     }
 
     #[test]

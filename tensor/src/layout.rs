@@ -90,6 +90,26 @@ impl Layout {
         out
     }
 
+    /// The diagonal through axes `a` and `b`, which becomes the last axis: the elements whose index along `b` is that
+    /// along `a` plus `offset`. It is empty if the offset leaves the matrix.
+    ///
+    /// # Panics
+    /// If an axis does not exist or both are the same.
+    #[track_caller]
+    pub fn diagonal(&self, a: usize, b: usize, offset: isize) -> Self {
+        let ndim = self.shape.len();
+        assert!(a < ndim && b < ndim && a != b, "the diagonal through axes {a} and {b} of {:?}", self.shape);
+        let (row, column) = (offset.min(0).unsigned_abs(), offset.max(0).unsigned_abs());
+        let len = self.shape[a].saturating_sub(row).min(self.shape[b].saturating_sub(column));
+        let others = (0..ndim).filter(|&axis| axis != a && axis != b);
+        let mut shape: Shape = others.clone().map(|axis| self.shape[axis]).collect();
+        let mut strides: SmallVec<[isize; 4]> = others.map(|axis| self.strides[axis]).collect();
+        shape.push(len);
+        strides.push(self.strides[a] + self.strides[b]);
+        let start = if len == 0 { 0 } else { row as isize * self.strides[a] + column as isize * self.strides[b] };
+        Layout { shape, strides, offset: self.offset + start, ..*self }
+    }
+
     /// Axes of extent 1 dropped and neighbours that form one run merged: fewer, longer inner loops.
     fn collapsed(&self) -> SmallVec<[(usize, isize); 4]> {
         let mut axes = SmallVec::<[(usize, isize); 4]>::new();
@@ -158,6 +178,26 @@ impl Layout {
         });
     }
 
+    /// The inverse of [`read`](Self::read): copies `values` to the elements of `target` that the layout names; the
+    /// others stay.
+    ///
+    /// # Panics
+    /// If a slice has another length than the layout says.
+    pub fn write<T: Scalar>(&self, values: &[T], target: &mut [T]) {
+        assert_eq!(target.len(), self.source, "target of a layout of {:?}", self.shape);
+        assert_eq!(values.len(), self.shape.iter().product::<usize>(), "values of a layout of {:?}", self.shape);
+        self.runs(|position, stride, start, count| {
+            let values = &values[start..start + count];
+            if stride == 1 {
+                target[position..position + count].copy_from_slice(values);
+            } else {
+                for (i, &value) in values.iter().enumerate() {
+                    target[(position as isize + i as isize * stride) as usize] = value;
+                }
+            }
+        });
+    }
+
     /// The adjoint of [`read`](Self::read): adds `values` to the elements of `target` that the layout names. Elements
     /// that it names more than once receive a pairwise-accurate sum only along the innermost axis.
     ///
@@ -186,6 +226,19 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    #[test]
+    fn diagonals_lie_where_numpy_has_them() {
+        let x: Vec<f64> = (0..12).map(f64::from).collect();
+        for (offset, expected) in
+            [(0, vec![0.0, 5.0, 10.0]), (2, vec![2.0, 7.0]), (-1, vec![4.0, 9.0]), (4, vec![]), (-9, vec![])]
+        {
+            let layout = Layout::contiguous(&[3, 4]).diagonal(0, 1, offset);
+            let mut out = vec![f64::NAN; expected.len()];
+            layout.read(&x, &mut out);
+            assert_eq!(out, expected);
+        }
+    }
+
     fn naive(layout: &Layout, source: &[f64]) -> Vec<f64> {
         let total: usize = layout.shape.iter().product();
         let at = |mut i: usize| {
@@ -212,6 +265,19 @@ mod tests {
                 && flip && extent > 0 {
                 layouts.push(Layout::contiguous(&shape).sliced(0, extent - 1, extent, -1));
                 layouts.push(Layout::contiguous(&shape).sliced(0, 0, extent.div_ceil(2), 2).permuted(&axes));
+            }
+            if shape.len() > 1 {
+                layouts.push(Layout::contiguous(&shape).diagonal(0, 1, lead as isize - 1));
+                layouts.push(Layout::contiguous(&shape).diagonal(shape.len() - 1, 0, 1));
+            }
+            // All but the broadcast name each element at most once, so that writing undoes reading.
+            for layout in &layouts {
+                let values = naive(layout, &source);
+                let mut copy = vec![f64::NAN; source.len()];
+                layout.write(&values, &mut copy);
+                prop_assert_eq!(naive(layout, &copy), values);
+                let untouched = copy.iter().filter(|x| x.is_nan()).count();
+                prop_assert_eq!(untouched, source.len() - layout.shape.iter().product::<usize>());
             }
             let mut wide = vec![2; lead];
             wide.extend(shape.iter().map(|&extent| if extent == 1 { 3 } else { extent }));

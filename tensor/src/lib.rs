@@ -5,26 +5,37 @@
 //! * [`matmul`]: matrix products with transposed operands by stride.
 //! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
-//! * [`Layout`]: broadcast, permute, slice, flip, and their adjoints.
+//! * [`Layout`]: broadcast, permute, slice, flip, diagonal, and their adjoints.
+//! * [`Windows`]: what a convolution or a pooling sees of an image.
+//! * [`Indices`]: integer arrays for sorting, searching and gathering.
+//! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
 //! All work happens on the calling thread; parallelism belongs to the caller.
 
 mod elementwise;
+pub mod extremum;
+mod indices;
+mod lane;
 mod layout;
 pub mod matmul;
 mod pool;
 mod real;
 mod reduce;
+pub mod rows;
 mod scalar;
 pub mod simd;
 mod tensor;
 pub mod vmath;
+mod windows;
 
-pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, map};
+pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, lanes_either, map, map_either};
+pub use indices::Indices;
+pub use lane::Lane;
 pub use layout::Layout;
 pub use pool::Pool;
 pub use real::Real;
 pub use reduce::{sum, sum_axes, sum_rows, sum_to};
 pub use scalar::Scalar;
 pub use tensor::{Shape, Tensor};
+pub use windows::Windows;

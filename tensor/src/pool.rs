@@ -15,15 +15,26 @@ pub struct Pool<T: Scalar>(Option<Arc<Mutex<Shelves<T>>>>);
 
 /// Free buffers by capacity class.
 struct Shelves<T> {
+    /// Those of the smallest class, which scalars take: finding their shelf should not cost more than their arithmetic.
+    small: Vec<Vec<T>>,
     free: HashMap<usize, Vec<Vec<T>>>,
     allocated: usize,
 }
 
+impl<T> Shelves<T> {
+    fn of(&mut self, class: usize) -> &mut Vec<Vec<T>> {
+        if class == SMALLEST { &mut self.small } else { self.free.entry(class).or_default() }
+    }
+}
+
+/// The capacity of the smallest class.
+const SMALLEST: usize = 64;
+
 /// Buffers are rounded up to a quarter of a power of two, so that sizes that vary from step to step share them; at
 /// most 25 % of a buffer is unused.
 fn class(len: usize) -> usize {
-    if len <= 64 {
-        return 64;
+    if len <= SMALLEST {
+        return SMALLEST;
     }
     let quarter = (len.next_power_of_two() / 8).max(1);
     len.div_ceil(quarter) * quarter
@@ -32,7 +43,7 @@ fn class(len: usize) -> usize {
 impl<T: Scalar> Pool<T> {
     /// An empty pool.
     pub fn new() -> Self {
-        Pool(Some(Arc::new(Mutex::new(Shelves { free: HashMap::new(), allocated: 0 }))))
+        Pool(Some(Arc::new(Mutex::new(Shelves { small: vec![], free: HashMap::new(), allocated: 0 }))))
     }
 
     /// No pool: tensors allocate and free as vectors do.
@@ -54,7 +65,7 @@ impl<T: Scalar> Pool<T> {
     pub fn take(&self, len: usize) -> Vec<T> {
         let Some(mut shelves) = self.shelves() else { return vec![T::ZERO; len] };
         let class = class(len);
-        let mut buffer = match shelves.free.get_mut(&class).and_then(Vec::pop) {
+        let mut buffer = match shelves.of(class).pop() {
             Some(buffer) => buffer,
             None => {
                 shelves.allocated += class;
@@ -75,7 +86,7 @@ impl<T: Scalar> Pool<T> {
         if capacity == class(capacity)
             && let Some(mut shelves) = self.shelves()
         {
-            shelves.free.entry(capacity).or_default().push(buffer);
+            shelves.of(capacity).push(buffer);
         }
     }
 

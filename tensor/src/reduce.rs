@@ -8,6 +8,10 @@ const LANES: usize = 32;
 const BLOCK: usize = 16;
 /// Columns that are summed together: four 512-bit registers of f32.
 const STRIP: usize = 64;
+/// The same for a matrix that does not fit a core's cache: memory wants longer runs, and registers do not matter then.
+const WIDE_STRIP: usize = 512;
+/// Bytes from which a matrix counts as such.
+const CACHE: usize = 1 << 20;
 
 /// The sum of a slice.
 ///
@@ -38,7 +42,7 @@ fn pairwise<T: Scalar>(x: &[T]) -> T {
 }
 
 #[inline(always)]
-fn chunk<T: Scalar>(x: &[T]) -> T {
+pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
     let mut lanes = [T::ZERO; LANES];
     let mut rows = x.chunks_exact(LANES);
     for row in &mut rows {
@@ -68,20 +72,28 @@ pub fn sum_rows<T: Scalar>(x: &[T], out: &mut [T]) {
         return;
     }
     assert_eq!(x.len() % out.len(), 0, "{} values are no whole rows of {}", x.len(), out.len());
+    if size_of_val(x) < CACHE {
+        sum_strips::<T, STRIP>(x, out);
+    } else {
+        sum_strips::<T, WIDE_STRIP>(x, out);
+    }
+}
+
+fn sum_strips<T: Scalar, const STRIP: usize>(x: &[T], out: &mut [T]) {
     let stride = out.len();
     for (strip, out) in out.chunks_mut(STRIP).enumerate() {
-        let sums = pairwise_rows(x, stride, strip * STRIP, out.len());
+        let sums = pairwise_rows::<T, STRIP>(x, stride, strip * STRIP, out.len());
         out.copy_from_slice(&sums[..out.len()]);
     }
 }
 
-/// The sums of columns `first..first + width` of the rows of length `stride`; `width` is at most [`STRIP`].
-fn pairwise_rows<T: Scalar>(x: &[T], stride: usize, first: usize, width: usize) -> [T; STRIP] {
+/// The sums of columns `first..first + width` of the rows of length `stride`; `width` is at most `STRIP`.
+fn pairwise_rows<T: Scalar, const STRIP: usize>(x: &[T], stride: usize, first: usize, width: usize) -> [T; STRIP] {
     let rows = x.len() / stride;
     if rows > BLOCK {
         let half = (rows / 2).next_multiple_of(BLOCK) * stride;
-        let mut sums = pairwise_rows(&x[..half], stride, first, width);
-        let rest = pairwise_rows(&x[half..], stride, first, width);
+        let mut sums = pairwise_rows::<T, STRIP>(&x[..half], stride, first, width);
+        let rest = pairwise_rows::<T, STRIP>(&x[half..], stride, first, width);
         sums.iter_mut().zip(rest).for_each(|(sum, rest)| *sum += rest);
         return sums;
     }

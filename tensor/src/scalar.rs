@@ -1,9 +1,9 @@
 //! The number types a tensor can hold.
 
-use crate::Real;
+use crate::{Real, vmath};
 use std::fmt::{Debug, Display};
 use std::iter::Sum;
-use std::ops::{AddAssign, MulAssign, SubAssign};
+use std::ops::{AddAssign, BitOr, MulAssign, SubAssign};
 
 mod sealed {
     pub trait Sealed {}
@@ -52,6 +52,22 @@ pub trait Scalar:
     /// If `bytes` has another length than the type.
     fn read_le(bytes: &[u8]) -> Self;
 
+    /// Flags of as many bits as the number, so that they share a vector's lanes. The highest bit is the flag.
+    #[doc(hidden)]
+    type Flags: Copy + Debug + Default + BitOr<Output = Self::Flags>;
+    /// Flagged if `sin_quick` and `cos_quick` do not hold for this number; NaN is, infinities are.
+    #[doc(hidden)]
+    fn outside(self) -> Self::Flags;
+    /// Whether the flag is set.
+    #[doc(hidden)]
+    fn is_set(flags: Self::Flags) -> bool;
+    /// The sine, unless [`outside`](Self::outside).
+    #[doc(hidden)]
+    fn sin_quick(self) -> Self;
+    /// The cosine, unless [`outside`](Self::outside).
+    #[doc(hidden)]
+    fn cos_quick(self) -> Self;
+
     /// `c = a b`, or `c += a b` with `accumulate`; sizes are checked by [`crate::matmul::gemm`], the one caller.
     ///
     /// # Safety
@@ -68,7 +84,7 @@ pub trait Scalar:
 }
 
 macro_rules! scalar {
-    ($t:ident, $matrixmultiply:path) => {
+    ($t:ident, $bits:ident, $matrixmultiply:path) => {
         impl Scalar for $t {
             const NAME: &'static str = stringify!($t);
             const ZERO: Self = 0.0;
@@ -94,6 +110,25 @@ macro_rules! scalar {
                 let mut le = [0; size_of::<$t>()];
                 le.copy_from_slice(bytes);
                 $t::from_le_bytes(le)
+            }
+
+            type Flags = $bits;
+            #[inline(always)]
+            fn outside(self) -> $bits {
+                // Below zero, and so with its highest bit set, where |x| is greater.
+                vmath::$t::QUICK.to_bits().wrapping_sub(self.abs().to_bits())
+            }
+            #[inline(always)]
+            fn is_set(flags: $bits) -> bool {
+                flags > $bits::MAX / 2
+            }
+            #[inline(always)]
+            fn sin_quick(self) -> Self {
+                vmath::$t::sin_quick(self)
+            }
+            #[inline(always)]
+            fn cos_quick(self) -> Self {
+                vmath::$t::cos_quick(self)
             }
 
             #[cfg(feature = "gemm")]
@@ -130,5 +165,5 @@ macro_rules! scalar {
     };
 }
 
-scalar!(f32, matrixmultiply::sgemm);
-scalar!(f64, matrixmultiply::dgemm);
+scalar!(f32, u32, matrixmultiply::sgemm);
+scalar!(f64, u64, matrixmultiply::dgemm);

@@ -1,9 +1,10 @@
-//! Exponentials, logarithms and the square root.
+//! Exponentials, logarithms, square roots and the error function.
 
 use crate::catalogue::Cases;
 use crate::elementwise::{Map, Unary};
 use crate::{Reads, Var};
 use raygrad_tensor::{Real, Scalar};
+use std::f64::consts::{FRAC_2_SQRT_PI, LN_2, LOG2_E};
 
 const INF: f64 = f64::INFINITY;
 
@@ -105,6 +106,88 @@ impl Unary for Sqrt {
     }
 }
 
+/// y = 2^x; dx = g y ln 2.
+#[derive(Clone, Copy)]
+pub struct Exp2;
+impl Unary for Exp2 {
+    const NAME: &'static str = "exp2";
+    const READS: Reads = Reads::OUTPUT;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.exp2()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+        let ln_2 = g.like(LN_2);
+        g * (y * ln_2)
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).at([3.0], 8.0, [8.0 * LN_2]).at([-INF], 0.0, [0.0]).at([INF], INF, [INF]);
+    }
+}
+
+/// y = log2 x; dx = g / (x ln 2).
+#[derive(Clone, Copy)]
+pub struct Log2;
+impl Unary for Log2 {
+    const NAME: &'static str = "log2";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.log2()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        let log2_e = g.like(LOG2_E);
+        g * log2_e / x
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([8.0], 3.0, [0.125 * LOG2_E]).at([INF], INF, [0.0]);
+    }
+}
+
+/// y = 1 / sqrt x; dx = -g y^3 / 2.
+#[derive(Clone, Copy)]
+pub struct Rsqrt;
+impl Unary for Rsqrt {
+    const NAME: &'static str = "rsqrt";
+    const READS: Reads = Reads::OUTPUT;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        let one = x.like(1.0);
+        one / x.sqrt()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+        let half = g.like(-0.5);
+        g * half * (y.clone() * y.clone() * y)
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.5..3.0).at([0.0], INF, [-INF]).at([4.0], 0.5, [-0.0625]).at([INF], 0.0, [0.0]);
+        c.at([-1.0], f64::NAN, [f64::NAN]);
+    }
+}
+
+/// y = erf x; dx = g 2/sqrt(pi) e^(-x^2).
+#[derive(Clone, Copy)]
+pub struct Erf;
+impl Unary for Erf {
+    const NAME: &'static str = "erf";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        x.erf()
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        let scale = g.like(FRAC_2_SQRT_PI);
+        g * (scale * (-(x.clone() * x)).exp())
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).at([0.0], 0.0, [FRAC_2_SQRT_PI]).at([-INF], -1.0, [0.0]).at([30.0], 1.0, [0.0]);
+    }
+}
+
 impl<'t, T: Scalar> Var<'t, T> {
     /// `e^self`.
     #[track_caller]
@@ -134,5 +217,29 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn sqrt(&self) -> Self {
         self.tape().apply(Map(Sqrt), &[self])
+    }
+
+    /// `2^self`.
+    #[track_caller]
+    pub fn exp2(&self) -> Self {
+        self.tape().apply(Map(Exp2), &[self])
+    }
+
+    /// The logarithm to base 2: -inf at 0, NaN below.
+    #[track_caller]
+    pub fn log2(&self) -> Self {
+        self.tape().apply(Map(Log2), &[self])
+    }
+
+    /// `1 / sqrt(self)`: inf at 0, where the gradient is -inf; NaN below.
+    #[track_caller]
+    pub fn rsqrt(&self) -> Self {
+        self.tape().apply(Map(Rsqrt), &[self])
+    }
+
+    /// The error function, `2/sqrt(pi) * integral from 0 to self of e^-t^2 dt`.
+    #[track_caller]
+    pub fn erf(&self) -> Self {
+        self.tape().apply(Map(Erf), &[self])
     }
 }

@@ -1,10 +1,10 @@
 //! Rows of a tensor by number: embeddings and tables.
 
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Grads, Op, Reads, ShapeError, SparseGrad, Touched, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
-/// y[i] = x[index[i]] along the first axis; dx = [`ScatterRows`] of g.
+/// y[i] = x[index[i]] along the first axis; dx = [`ScatterRows`] of g, unrecorded as a sparse [`RowGrad`].
 #[derive(Clone)]
 pub struct GatherRows {
     /// For each row of the output its row of the input. A clone is a reference count.
@@ -61,7 +61,11 @@ impl<T: Scalar> Op<T> for GatherRows {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.g().scatter_rows(&self.index, cx.shape(0)[0]))
+        if cx.recording() {
+            return Grads::one(cx.g().scatter_rows(&self.index, cx.shape(0)[0]));
+        }
+        let grad = RowGrad::new(cx.shape(0), self.index.clone(), cx.g().value().clone());
+        Grads::new([None]).with_sparse(0, Arc::new(grad))
     }
 }
 
@@ -98,6 +102,72 @@ impl<T: Scalar> Op<T> for ScatterRows {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         Grads::one(cx.g().gather_rows(&self.index))
+    }
+}
+
+/// The gradient of a table of which some rows were gathered: the rows of the output's gradient and where they belong.
+#[derive(Debug, Clone)]
+pub struct RowGrad<T: Scalar> {
+    shape: Shape,
+    index: Arc<[u32]>,
+    rows: Tensor<T>,
+}
+
+impl<T: Scalar> RowGrad<T> {
+    /// The gradient of a table of this shape to which `rows` `[index.len(), ..]` are to be added at `index`.
+    ///
+    /// # Panics
+    /// If the table is a scalar, an index is not below its number of rows, or the rows have another shape.
+    #[track_caller]
+    pub fn new(shape: &[usize], index: Arc<[u32]>, rows: Tensor<T>) -> Self {
+        assert!(!shape.is_empty(), "the gradient of a table without rows");
+        if let Err(error) = check_index(&index, shape[0]) {
+            panic!("the gradient of a table of shape {shape:?}: {error}");
+        }
+        let fits = rows.shape().split_first() == Some((&index.len(), &shape[1..]));
+        assert!(fits, "rows of shape {:?} at {} places of a table of shape {shape:?}", rows.shape(), index.len());
+        RowGrad { shape: shape.into(), index, rows }
+    }
+
+    /// For each row its place in the table. A row of the table can come several times.
+    pub fn index(&self) -> &Arc<[u32]> {
+        &self.index
+    }
+
+    /// The rows, in the order of [`index`](Self::index).
+    pub fn rows(&self) -> &Tensor<T> {
+        &self.rows
+    }
+
+    /// Adds the rows to a dense gradient in order, and marks those that it touches.
+    ///
+    /// # Panics
+    /// If `dense` is not as long as the table, or there are fewer marks than rows.
+    #[track_caller]
+    pub fn scatter(&self, dense: &mut [T], touched: &mut Touched) {
+        self.index.iter().for_each(|&row| touched.mark(row as usize));
+        self.add(dense);
+    }
+
+    #[track_caller]
+    fn add(&self, dense: &mut [T]) {
+        assert_eq!(dense.len(), self.shape.iter().product::<usize>(), "a dense gradient of the table");
+        let width: usize = self.shape[1..].iter().product();
+        for (row, &place) in self.rows.as_slice().chunks_exact(width.max(1)).zip(self.index.iter()) {
+            for (sum, &g) in dense[place as usize * width..][..width].iter_mut().zip(row) {
+                *sum += g;
+            }
+        }
+    }
+}
+
+impl<T: Scalar> SparseGrad<T> for RowGrad<T> {
+    fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    fn add_to(&self, dense: &mut Tensor<T>) {
+        self.add(dense.as_mut_slice());
     }
 }
 
@@ -147,6 +217,33 @@ mod tests {
         let error = tape.try_apply(ScatterRows { index: [0].into(), rows: 5 }, &[&x]).unwrap_err().to_string();
         assert!(error.contains("one for each index"), "{error}");
         assert!(tape.try_apply(GatherRows { index: [0].into() }, &[&tape.constant(Tensor::scalar(1.0))]).is_err());
+    }
+
+    #[test]
+    fn the_sparse_gradient_is_the_dense_one_to_the_bit() {
+        let index: Arc<[u32]> = [3, 0, 3, 3, 1].into();
+        let run = |sparse: bool| {
+            let tape = Tape::<f32>::new();
+            let table = tape.leaf(Tensor::from_fn(&[5, 3], |i| (i as f32).sin()));
+            let y = table.gather_rows(&index);
+            let loss = (y.exp() * &y).sum();
+            if !sparse {
+                // The recorded gradient is dense.
+                return loss.grad_graph(&[&table])[0].value().as_slice().to_vec();
+            }
+            let parts = loss.grad_sparse(&[&table]).remove(0).parts::<RowGrad<f32>>();
+            let (mut dense, mut touched) = (vec![0.0; 15], Touched::new(5));
+            parts.iter().for_each(|part| part.scatter(&mut dense, &mut touched));
+            assert!(parts.len() == 1 && parts[0].rows().shape() == [5, 3] && touched.group(0));
+            dense
+        };
+        assert_eq!(run(true), run(false));
+    }
+
+    #[test]
+    #[should_panic(expected = "index 1 is 4, but there are 4 rows")]
+    fn a_row_gradient_beyond_its_table_is_refused() {
+        RowGrad::new(&[4, 2], [0, 4].into(), Tensor::<f32>::zeros(&[2, 2]));
     }
 
     #[test]

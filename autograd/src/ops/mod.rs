@@ -3,15 +3,35 @@
 
 pub(crate) mod activation;
 pub(crate) mod arithmetic;
+pub(crate) mod arrange;
+pub(crate) mod convolution;
+pub(crate) mod einsum;
 pub(crate) mod exponential;
+pub(crate) mod extremum;
 pub(crate) mod gather;
+pub(crate) mod index;
+pub(crate) mod layer_norm;
 pub(crate) mod linear;
+pub(crate) mod loss;
 pub(crate) mod matmul;
+pub(crate) mod matrix;
+pub(crate) mod moments;
+pub(crate) mod piecewise;
+pub(crate) mod pooling;
+pub(crate) mod power;
 pub(crate) mod reduce;
+pub(crate) mod scan;
 pub(crate) mod segment;
+pub(crate) mod select;
 pub(crate) mod shape;
+pub(crate) mod softmax;
 pub(crate) mod trigonometric;
+pub(crate) mod vector;
 
 pub(crate) use arithmetic::{add, div, mul, sub};
+pub use convolution::Conv2dConfig;
+pub use gather::RowGrad;
 pub use linear::Activation;
+pub use pooling::Pool2dConfig;
 pub use segment::Segments;
+pub use shape::INFER;

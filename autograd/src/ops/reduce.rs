@@ -1,6 +1,7 @@
 //! Sums, means and their adjoint, broadcasting.
 
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::axes::Resolved;
+use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, broadcast_to, sum_to};
 
 /// y = x summed over the axes along which `shape` would have to be stretched to become x; dx = g broadcast.
@@ -78,6 +79,43 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn mean(&self) -> Self {
         self.sum() / self.value().len() as f64
+    }
+
+    /// The sum over any axes; 0 over none of the elements.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Axes, Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
+    /// assert_eq!(x.sum_over(-1).value().as_slice(), [3.0, 7.0]);
+    /// assert_eq!(x.sum_over(Axes::from(0).keepdims()).shape(), [1, 2]);
+    /// ```
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice.
+    #[track_caller]
+    pub fn sum_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        self.sum_to(&axes.kept()).reshape(&axes.result())
+    }
+
+    /// The mean over any axes; NaN over none of the elements.
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice.
+    #[track_caller]
+    pub fn mean_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        (self.sum_to(&axes.kept()) / axes.count() as f64).reshape(&axes.result())
+    }
+
+    /// `[elements that stay, elements that are reduced]`, with the reduced axes moved to the end.
+    #[track_caller]
+    pub(crate) fn rows_over(&self, axes: &Resolved) -> Self {
+        let order = axes.reduced_last();
+        let sorted = order.is_sorted();
+        let rows = axes.kept().iter().product();
+        if sorted { self.clone() } else { self.permute(&order) }.reshape(&[rows, axes.count()])
     }
 
     /// The sum over `axes`, which stay as axes of extent 1.

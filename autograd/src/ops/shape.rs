@@ -1,7 +1,10 @@
-//! Operations that move elements: reshape, permute, slice, flip, concat.
+//! Operations that move elements: reshape, permute, slice, flip, pad, concat.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor};
+
+/// Stands for the extent that follows from the others, in [`Var::reshape`].
+pub const INFER: usize = usize::MAX;
 
 /// y = x under another shape.
 #[derive(Clone)]
@@ -105,6 +108,42 @@ impl<T: Scalar> Op<T> for Scatter {
     }
 }
 
+/// y = a constant, with x at the elements that a layout names; dx = the [`View`] of g.
+#[derive(Clone)]
+pub struct Pad {
+    /// Where x stands in the output.
+    pub view: View,
+    /// What stands elsewhere.
+    pub value: f64,
+}
+
+impl<T: Scalar> Op<T> for Pad {
+    fn name(&self) -> &'static str {
+        "pad"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0] != self.view.layout.shape() {
+            return Err(format!("the layout covers {:?}", self.view.layout.shape()));
+        }
+        Ok(self.view.from.clone())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.full(&self.view.from, T::from_f64(self.value));
+        self.view.layout.write(x[0].as_slice(), out.as_mut_slice());
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.tape().apply(self.view.clone(), &[cx.g()]))
+    }
+}
+
 /// y = several tensors one after another along an axis; each gradient is the slice of g that it made.
 #[derive(Clone, Copy)]
 pub struct Concat {
@@ -166,21 +205,62 @@ impl<T: Scalar> Op<T> for Concat {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The same elements under another shape; nothing is copied.
+    /// The same elements under another shape; nothing is copied. One extent may be [`INFER`]: it follows from the
+    /// others.
+    ///
+    /// ```
+    /// use raygrad_autograd::{INFER, Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let images = tape.constant(Tensor::zeros(&[8, 3, 4, 4]));
+    /// assert_eq!(images.reshape(&[8, INFER]).shape(), [8, 48]);
+    /// ```
     ///
     /// # Panics
-    /// If the shape holds another number of elements.
+    /// If the shape holds another number of elements, more than one extent is to be inferred, or the one does not
+    /// follow from the others because they do not divide the number of elements or one of them is 0.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
+        if let Some(axis) = shape.iter().position(|&extent| extent == INFER) {
+            let mut known = Shape::from_slice(shape);
+            known[axis] = 1;
+            assert!(!known.contains(&INFER), "reshape: only one extent can be inferred");
+            let (len, product) = (self.value().len(), known.iter().product::<usize>());
+            let divides = product > 0 && len.is_multiple_of(product);
+            assert!(divides, "reshape of {:?}: no extent follows from the others, {known:?}", self.shape());
+            known[axis] = len / product;
+            return self.reshape(&known);
+        }
         if self.shape() == shape {
             return self.clone();
         }
         self.tape().apply(Reshape { shape: shape.into() }, &[self])
     }
 
+    /// The elements that a layout of this tensor's shape names.
     #[track_caller]
-    fn view(&self, layout: Layout) -> Self {
+    pub(crate) fn view(&self, layout: Layout) -> Self {
         self.tape().apply(View { from: self.shape().into(), layout }, &[self])
+    }
+
+    /// Zeros of this shape, with this tensor added where the layout says.
+    #[track_caller]
+    pub(crate) fn scatter_view(&self, shape: &[usize], layout: Layout) -> Self {
+        self.tape().apply(Scatter(View { from: shape.into(), layout }), &[self])
+    }
+
+    /// This tensor with `padding[i]` entries of `value` before and behind along each axis `i`.
+    ///
+    /// # Panics
+    /// If there is not one pair for each axis.
+    #[track_caller]
+    pub fn pad(&self, padding: &[[usize; 2]], value: f64) -> Self {
+        assert_eq!(padding.len(), self.shape().len(), "pad by {padding:?} a tensor of shape {:?}", self.shape());
+        let from: Shape = self.shape().iter().zip(padding).map(|(&extent, [a, b])| a + extent + b).collect();
+        let mut layout = Layout::contiguous(&from);
+        for (axis, (&extent, pad)) in self.shape().iter().zip(padding).enumerate() {
+            layout = layout.sliced(axis, pad[0], extent, 1);
+        }
+        self.tape().apply(Pad { view: View { from, layout }, value }, &[self])
     }
 
     /// Axis `i` of the result is axis `axes[i]` of this tensor.

@@ -2,7 +2,7 @@
 //!
 //! All share one reduction, `x = n ln 2 + r` with integer n and |r| <= ln 2 / 2, and one polynomial for `e^r - 1`.
 
-use super::{clamp, polynomial, power_of_two, round_product};
+use super::{ROUND, clamp, polynomial, power_of_two, round_product};
 use std::f32::consts::{LN_2, LOG2_E};
 
 /// ln 2 in two parts. The first has 15 significant bits: times an integer below 2^8 it is exact.
@@ -17,10 +17,16 @@ const EXPM1: [f32; 6] = [0.5, 0.166_666_66, 0.041_666_48, 0.008_333_564, 0.001_3
 #[inline(always)]
 fn reduce(x: f32) -> (f32, i32) {
     let (n, bits) = round_product(x, LOG2_E);
+    (expm1_of_rest(x, n), bits)
+}
+
+/// `e^r - 1` for `r = x - n ln 2`.
+#[inline(always)]
+fn expm1_of_rest(x: f32, n: f32) -> f32 {
     let high = n.mul_add(-LN_2_HIGH, x); // exact
     let r = n.mul_add(-LN_2_LOW, high);
     let r_low = n.mul_add(-LN_2_LOW, high - r);
-    ((r * r).mul_add(polynomial(r, EXPM1), r_low) + r, bits)
+    (r * r).mul_add(polynomial(r, EXPM1), r_low) + r
 }
 
 /// `p * 2^n` for -252 <= n <= 254 and rounded once: two factors, because 2^n alone may be out of range.
@@ -41,6 +47,17 @@ fn scale(p: f32, n: i32) -> f32 {
 pub fn exp(x: f32) -> f32 {
     let (p, n) = reduce(clamp(x, -104.0, 89.0));
     scale(1.0 + p, n)
+}
+
+/// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps: 2^n cannot overflow, so n + 64 is the exponent of one
+/// factor, and the other is 2^-64. The rounding to n adds the exponent's bias as well.
+#[inline(always)]
+pub(super) fn exp_minus(x: f32) -> f32 {
+    const BIASED: f32 = ROUND + 191.0; // 127 + 64
+    let x = if -x < -104.0 { -104.0 } else { -x };
+    let t = x.mul_add(LOG2_E, BIASED);
+    let p = expm1_of_rest(x, t - BIASED);
+    (1.0 + p) * f32::from_bits(t.to_bits() << 23) * (1.0 / 18_446_744_073_709_551_616.0)
 }
 
 /// `2^x`, within 1 ULP and exact for integers; 0 below -150, infinite from 128.
@@ -87,7 +104,7 @@ pub fn tanh(x: f32) -> f32 {
 /// for the rounding of `1 + e` and of the quotient.
 #[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {
-    let e = exp(-x.abs());
+    let e = exp_minus(x.abs());
     let y = if x < 0.0 { e } else { 1.0 } / (1.0 + e);
     if y < 0.25 { (-e).mul_add(y, e) } else { y }
 }

@@ -3,7 +3,7 @@
 //! All write the argument as `2^k m` with m between sqrt(1/2) and sqrt(2), and share one polynomial for `ln(1 + f)`,
 //! `f = m - 1`.
 
-use super::{exp, polynomial};
+use super::{exp::exp_minus, polynomial};
 use std::f32::consts::{FRAC_1_SQRT_2, LN_2, LOG2_E, SQRT_2};
 
 /// ln 2 in two parts. The first has 15 significant bits: times an integer below 2^8 it is exact.
@@ -114,7 +114,7 @@ pub fn ln1p(x: f32) -> f32 {
 /// ```
 #[inline(always)]
 pub fn softplus(x: f32) -> f32 {
-    let e = exp(-x.abs());
+    let e = exp_minus(x.abs());
     // ln(1 + e) for e in [0, 1]: above sqrt(2), 1 + e is halved. The choice is arithmetic, because LLVM would make two
     // copies of the polynomial out of an `if`.
     let k = f32::from(u8::from(e > SQRT_2 - 1.0));

@@ -8,7 +8,8 @@ mod trig;
 pub use erf::erf;
 pub use exp::{exp, exp2, expm1, sigmoid, tanh};
 pub use log::{ln, ln1p, log2, softplus};
-pub use trig::{cos, cos_pi, sin, sin_pi};
+pub(crate) use trig::QUICK;
+pub use trig::{cos, cos_pi, cos_quick, sin, sin_pi, sin_quick};
 
 /// Adding this and subtracting it again rounds to the nearest integer (ties to even) for |x| < 2^22, because an ulp is
 /// one there; between the two, the low bits of the sum hold that integer.

@@ -1,6 +1,6 @@
 //! The error function.
 
-use super::{clamp, exp, polynomial};
+use super::{clamp, exp::exp_minus, polynomial};
 
 /// The error function `2/sqrt(pi) * integral from 0 to x of e^-t^2 dt`, within 2 ULP; exactly +-1 beyond 5.93.
 ///
@@ -45,6 +45,6 @@ pub fn erf(x: f64) -> f64 {
     ];
     let a = clamp(x.abs(), 0.0, 6.0);
     let near = x.mul_add(polynomial(a * a, P), x);
-    let far = (1.0 - exp(polynomial(a, Q))).copysign(x);
+    let far = (1.0 - exp_minus(-polynomial(a, Q))).copysign(x);
     if a < 0.92 { near } else { far }
 }

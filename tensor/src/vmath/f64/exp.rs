@@ -2,7 +2,7 @@
 //!
 //! All share one reduction, `x = n ln 2 + r` with integer n and |r| <= ln 2 / 2, and one polynomial for `e^r - 1`.
 
-use super::{clamp, polynomial, power_of_two, round_product};
+use super::{ROUND, clamp, polynomial, power_of_two, round_product};
 use std::f64::consts::{LN_2, LOG2_E};
 
 /// ln 2 in two parts. The first has 42 significant bits: times an integer below 2^11 it is exact.
@@ -35,9 +35,15 @@ fn expm1_near(r: f64, low: f64) -> f64 {
 #[inline(always)]
 fn reduce(x: f64) -> (f64, i32) {
     let (n, bits) = round_product(x, LOG2_E);
+    (expm1_of_rest(x, n), bits)
+}
+
+/// `e^r - 1` for `r = x - n ln 2`.
+#[inline(always)]
+fn expm1_of_rest(x: f64, n: f64) -> f64 {
     let high = n.mul_add(-LN_2_HIGH, x); // exact
     let r = n.mul_add(-LN_2_LOW, high);
-    (expm1_near(r, n.mul_add(-LN_2_LOW, high - r)), bits)
+    expm1_near(r, n.mul_add(-LN_2_LOW, high - r))
 }
 
 /// `p * 2^n` for -2044 <= n <= 2046 and rounded once: two factors, because 2^n alone may be out of range.
@@ -52,6 +58,17 @@ fn scale(p: f64, n: i32) -> f64 {
 pub fn exp(x: f64) -> f64 {
     let (p, n) = reduce(clamp(x, -746.0, 710.0));
     scale(1.0 + p, n)
+}
+
+/// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps: 2^n cannot overflow, so n + 64 is the exponent of one
+/// factor, and the other is 2^-64. The rounding to n adds the exponent's bias as well.
+#[inline(always)]
+pub(super) fn exp_minus(x: f64) -> f64 {
+    const BIASED: f64 = ROUND + 1087.0; // 1023 + 64
+    let x = if -x < -746.0 { -746.0 } else { -x };
+    let t = x.mul_add(LOG2_E, BIASED);
+    let p = expm1_of_rest(x, t - BIASED);
+    (1.0 + p) * f64::from_bits(t.to_bits() << 52) * (1.0 / 18_446_744_073_709_551_616.0)
 }
 
 /// `2^x`, within 1 ULP and exact for integers; 0 below -1075, infinite from 1024.
@@ -111,7 +128,7 @@ pub fn tanh(x: f64) -> f64 {
 /// for the rounding of `1 + e` and of the quotient.
 #[inline(always)]
 pub fn sigmoid(x: f64) -> f64 {
-    let e = exp(-x.abs());
+    let e = exp_minus(x.abs());
     let y = if x < 0.0 { e } else { 1.0 } / (1.0 + e);
     if y < 0.25 { (-e).mul_add(y, e) } else { y }
 }

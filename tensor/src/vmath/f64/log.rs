@@ -3,7 +3,7 @@
 //! All write the argument as `2^k m` with m between sqrt(1/2) and sqrt(2), and share one rational function for
 //! `ln(1 + f)`, `f = m - 1`.
 
-use super::{exp, polynomial};
+use super::{exp::exp_minus, polynomial};
 use std::f64::consts::{FRAC_1_SQRT_2, LN_2, LOG2_E, SQRT_2};
 
 /// ln 2 in two parts. The first has 42 significant bits: times an integer below 2^11 it is exact.
@@ -102,7 +102,7 @@ pub fn ln1p(x: f64) -> f64 {
 /// Computed as `max(x, 0) + ln(1 + e^-|x|)`: no overflow above, and `e^x` to all its digits far below 0.
 #[inline(always)]
 pub fn softplus(x: f64) -> f64 {
-    let e = exp(-x.abs());
+    let e = exp_minus(x.abs());
     // ln(1 + e) for e in [0, 1]: above sqrt(2), 1 + e is halved. The choice is arithmetic, because LLVM would make two
     // copies of the polynomial out of an `if`.
     let k = f64::from(u8::from(e > SQRT_2 - 1.0));

@@ -1,0 +1,156 @@
+//! Which axes a reduction runs over.
+
+use raygrad_tensor::Shape;
+use smallvec::SmallVec;
+use std::ops::RangeFull;
+
+/// The axes of a reduction: one (`-1`), several (`[0, -1]`), or all (`..`). A negative axis counts from the last one.
+///
+/// They disappear from the shape, unless [`keepdims`](Self::keepdims) leaves them there with extent 1, for the result
+/// to broadcast against the input.
+///
+/// ```
+/// use raygrad_autograd::{Axes, Tape, Tensor};
+/// let tape = Tape::<f32>::new();
+/// let x = tape.leaf(Tensor::ones(&[2, 3, 4]));
+/// assert_eq!(x.sum_over(-1).shape(), [2, 3]);
+/// assert_eq!(x.sum_over([0, -1]).shape(), [3]);
+/// assert!(x.max_over(..).shape().is_empty());
+/// assert_eq!(x.var_over(Axes::from(1).keepdims(), 1).shape(), [2, 1, 4]);
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Axes {
+    /// None for all.
+    axes: Option<SmallVec<[isize; 4]>>,
+    keepdims: bool,
+}
+
+impl Axes {
+    /// The same axes, which stay in the shape with extent 1.
+    pub fn keepdims(self) -> Self {
+        Axes { keepdims: true, ..self }
+    }
+
+    /// For a tensor of this shape: which axes are reduced.
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice.
+    #[track_caller]
+    pub(crate) fn resolve(&self, shape: &[usize]) -> Resolved {
+        let mut reduced: SmallVec<[bool; 4]> = SmallVec::from_elem(self.axes.is_none(), shape.len());
+        for &axis in self.axes.iter().flatten() {
+            let i = axis_of(axis, shape);
+            assert!(!reduced[i], "axis {axis} of a tensor of shape {shape:?} is named twice");
+            reduced[i] = true;
+        }
+        Resolved { shape: Shape::from_slice(shape), reduced, keepdims: self.keepdims }
+    }
+}
+
+/// The number of an axis that may be counted from the last one.
+///
+/// # Panics
+/// If it does not exist.
+#[track_caller]
+pub(crate) fn axis_of(axis: isize, shape: &[usize]) -> usize {
+    let from_start = if axis < 0 { axis + shape.len() as isize } else { axis };
+    assert!((0..shape.len() as isize).contains(&from_start), "axis {axis} of a tensor of shape {shape:?}");
+    from_start as usize
+}
+
+impl From<isize> for Axes {
+    fn from(axis: isize) -> Self {
+        Axes::from([axis])
+    }
+}
+
+impl<const N: usize> From<[isize; N]> for Axes {
+    fn from(axes: [isize; N]) -> Self {
+        Axes::from(&axes[..])
+    }
+}
+
+impl From<&[isize]> for Axes {
+    fn from(axes: &[isize]) -> Self {
+        Axes { axes: Some(SmallVec::from_slice(axes)), keepdims: false }
+    }
+}
+
+impl From<RangeFull> for Axes {
+    fn from(_: RangeFull) -> Self {
+        Axes { axes: None, keepdims: false }
+    }
+}
+
+/// The axes of a reduction of a tensor of known shape.
+pub(crate) struct Resolved {
+    shape: Shape,
+    reduced: SmallVec<[bool; 4]>,
+    keepdims: bool,
+}
+
+impl Resolved {
+    /// The shape with every reduced axis of extent 1.
+    pub fn kept(&self) -> Shape {
+        self.shape.iter().zip(&self.reduced).map(|(&extent, &reduced)| if reduced { 1 } else { extent }).collect()
+    }
+
+    /// The shape that the caller gets.
+    pub fn result(&self) -> Shape {
+        if self.keepdims {
+            return self.kept();
+        }
+        self.shape.iter().zip(&self.reduced).filter(|(_, reduced)| !**reduced).map(|(&extent, _)| extent).collect()
+    }
+
+    /// How many elements go into one.
+    pub fn count(&self) -> usize {
+        self.shape.iter().zip(&self.reduced).filter(|(_, reduced)| **reduced).map(|(&extent, _)| extent).product()
+    }
+
+    /// The axes from the first to behind the last reduced one, if those between are all reduced (or of extent 1);
+    /// `None` if they are not neighbours.
+    pub fn run(&self) -> Option<(usize, usize)> {
+        let Some(first) = self.reduced.iter().position(|&reduced| reduced) else { return Some((0, 0)) };
+        let behind = self.reduced.iter().rposition(|&reduced| reduced)? + 1;
+        let dense = (first..behind).all(|axis| self.reduced[axis] || self.shape[axis] == 1);
+        dense.then_some((first, behind))
+    }
+
+    /// The order of axes that puts the reduced ones last.
+    pub fn reduced_last(&self) -> SmallVec<[usize; 4]> {
+        let of = |wanted: bool| (0..self.shape.len()).filter(move |&axis| self.reduced[axis] == wanted);
+        of(false).chain(of(true)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn axes_count_from_either_end() {
+        let shape = [2, 3, 4];
+        let resolved = Axes::from([-1, 0]).resolve(&shape);
+        assert_eq!((resolved.result().as_slice(), resolved.count()), (&[3][..], 8));
+        assert_eq!(resolved.kept().as_slice(), [1, 3, 1]);
+        assert_eq!((resolved.run(), resolved.reduced_last().as_slice()), (None, &[1, 0, 2][..]));
+        assert_eq!(Axes::from([1, 2]).resolve(&shape).run(), Some((1, 3)));
+        assert_eq!(Axes::from([0, 2]).resolve(&[2, 1, 4]).run(), Some((0, 3)));
+        assert_eq!(Axes::from(..).keepdims().resolve(&shape).result().as_slice(), [1, 1, 1]);
+        assert_eq!(Axes::from([]).resolve(&shape).count(), 1);
+        assert_eq!(Axes::from(..).resolve(&[]).count(), 1);
+    }
+
+    #[test]
+    #[should_panic(expected = "axis 3 of a tensor of shape [2, 3, 4]")]
+    fn an_axis_that_does_not_exist_panics() {
+        Axes::from(3).resolve(&[2, 3, 4]);
+    }
+
+    #[test]
+    #[should_panic(expected = "named twice")]
+    fn an_axis_named_twice_panics() {
+        Axes::from([0, -3]).resolve(&[2, 3, 4]);
+    }
+}

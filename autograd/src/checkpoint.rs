@@ -1,0 +1,256 @@
+//! Rematerialisation: a part of a computation keeps its inputs only, and runs again when its gradient is asked for.
+
+use crate::op::Given;
+use crate::sweep::parts;
+use crate::{Error, Grads, Op, ShapeError, Tape, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use smallvec::SmallVec;
+
+/// y = f(x), of which nothing but x is kept.
+///
+/// The backward pass runs `f` once more, on a tape of its own that shares the pool, and sweeps back over that. As `f` is
+/// also its own reference, a recorded pass goes through the plain operations.
+struct Checkpoint<F> {
+    f: F,
+    shape: Shape,
+}
+
+impl<T, F> Op<T> for Checkpoint<F>
+where
+    T: Scalar,
+    F: for<'a> Fn(&[Var<'a, T>]) -> Var<'a, T> + Send + Sync + 'static,
+{
+    fn name(&self) -> &'static str {
+        "checkpoint"
+    }
+
+    fn shape(&self, _x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(self.shape.clone())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let tape = Tape::with_pool(pool.clone());
+        let x: Vec<_> = x.iter().map(|&x| tape.constant(x.clone())).collect();
+        (self.f)(&x).into_value()
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        match self.try_vjp(cx) {
+            Ok(grads) => grads,
+            Err(error) => panic!("{error}"),
+        }
+    }
+
+    fn try_vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Result<Grads<'t, T>, Error> {
+        let tape = Tape::with_pool(cx.pool().clone());
+        tape.check_finite(cx.tape().checks_finite());
+        // One leaf for each variable, even if it is several inputs: its shares then arrive in one order.
+        let first = |i: usize| (0..i).find(|&j| cx.inputs[j].0 == cx.inputs[i].0 && cx.needs(j)).unwrap_or(i);
+        let mut x: Vec<Var<'_, T>> = Vec::with_capacity(cx.len());
+        for i in 0..cx.len() {
+            let value = cx.x(i).into_value();
+            x.push(match cx.needs(i) {
+                false => tape.constant(value),
+                true if first(i) < i => x[first(i)].clone(),
+                true => tape.leaf(value),
+            });
+        }
+        let leaves: SmallVec<[usize; 4]> = (0..cx.len()).filter(|&i| cx.needs(i) && first(i) == i).collect();
+        let y = (self.f)(&x);
+        let seed = tape.constant(cx.g().value().clone());
+        let mut given: Vec<Option<Given<'t, T>>> = vec![None; cx.len()];
+        let wanted: Vec<_> = leaves.iter().map(|&i| &x[i]).collect();
+        for (&i, shares) in leaves.iter().zip(parts(&y, seed, &wanted)?) {
+            // From the tape of the replay to that of the pass.
+            let moved = |share| match share {
+                Given::Dense(grad) => Some(Given::Dense(cx.constant(grad.into_value()))),
+                Given::Sparse(part) => Some(Given::Sparse(part)),
+                Given::Parts(_) => None,
+            };
+            given[i] = Some(Given::Parts(shares.into_iter().filter_map(moved).collect()));
+        }
+        Ok(Grads(given.into_iter().collect()))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some((self.f)(x))
+    }
+}
+
+impl<T: Scalar> Tape<T> {
+    /// `f(inputs)`, of which the tape keeps nothing but the inputs: the backward pass runs `f` again and differentiates
+    /// that. A chain of `n` operations cut into `sqrt(n)` such segments needs memory for about `2 sqrt(n)` values
+    /// instead of `n`, for the time of one more forward pass (Chen et al. 2016, "Training Deep Nets with Sublinear
+    /// Memory Cost").
+    ///
+    /// `f` gets the inputs in their order and must compute the same at each run: what is random comes from a seed. It
+    /// cannot capture variables, so that none escapes differentiation; constants are tensors that it puts on
+    /// `x[0].tape()`. Segments nest.
+    ///
+    /// A gradient has the same bits as without a checkpoint, and stays sparse where it would be. The gradient of a
+    /// gradient works too, but saves nothing: a recorded pass (`grad_graph`, `vjp`) records what `f` does, and sums
+    /// shares in another order.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f64>::new();
+    /// let x = tape.leaf(Tensor::scalar(0.5));
+    /// let y = tape.checkpoint(&[&x], |x| x[0].sin().exp().square());
+    /// assert_eq!(tape.len(), 2); // the leaf and the checkpoint
+    /// assert_eq!(y.grad(&[&x]), x.sin().exp().square().grad(&[&x]));
+    /// ```
+    ///
+    /// # Panics
+    /// If an input belongs to another tape, and where `f` panics.
+    #[track_caller]
+    pub fn checkpoint<'t>(
+        &'t self,
+        inputs: &[&Var<'t, T>],
+        f: impl for<'a> Fn(&[Var<'a, T>]) -> Var<'a, T> + Send + Sync + 'static,
+    ) -> Var<'t, T> {
+        for x in inputs {
+            assert!(std::ptr::eq(x.tape(), self), "checkpoint: an input belongs to another tape");
+        }
+        let detached: Vec<_> = inputs.iter().map(|x| x.detach()).collect();
+        let value = self.no_grad(|| f(&detached)).into_value();
+        let shape = Shape::from_slice(value.shape());
+        self.record(Checkpoint { f, shape }, inputs, value, self.line())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Activation, Gradient, RowGrad};
+
+    fn bits<T: Scalar>(x: &Tensor<T>) -> Vec<u64> {
+        x.as_slice().iter().map(|x| x.to_f64().to_bits()).collect()
+    }
+
+    /// Uses its inputs often and in an order in which another association would show.
+    fn segment<'t>(x: &[Var<'t, f32>]) -> Var<'t, f32> {
+        let h = x[0].matmul(&x[1]).tanh();
+        let k = (&h * &x[0] + x[2].sigmoid()) * 1.7;
+        (k.matmul(&x[1]) + &x[0] * &x[2] + &x[0]).softplus()
+    }
+
+    fn leaf<'t>(tape: &'t Tape<f32>, salt: usize) -> Var<'t, f32> {
+        tape.leaf(Tensor::from_fn(&[7, 7], |i| ((i * 31 + salt * 17) as f32 * 0.123).sin()))
+    }
+
+    #[test]
+    fn a_gradient_has_the_bits_of_the_plain_computation() {
+        // Inputs are used before, in and after the segments; one is given twice; segments nest.
+        let run = |checked: bool| {
+            let tape = Tape::<f32>::new();
+            let [x, w, b] = [0, 1, 2].map(|salt| leaf(&tape, salt));
+            let mut h = &x * 0.3 + &w * &b;
+            for round in 0..4 {
+                let inputs = if round == 2 { [&h, &w, &w] } else { [&h, &w, &b] };
+                h = match (checked, round) {
+                    (false, _) => segment(&inputs.map(Clone::clone)),
+                    (true, 3) => tape.checkpoint(&inputs, |x| x[0].tape().checkpoint(&[&x[0], &x[1], &x[2]], segment)),
+                    (true, _) => tape.checkpoint(&inputs, segment),
+                };
+                h = h + &b * &w + &x;
+            }
+            let loss = (h * &x).mean();
+            let mut all = loss.grad(&[&x, &w, &b]);
+            all.extend(loss.grad_once(&[&b]));
+            all.push(loss.into_value());
+            all.iter().flat_map(bits).collect::<Vec<_>>()
+        };
+        assert_eq!(run(true), run(false));
+    }
+
+    #[test]
+    fn memory_is_lower_by_what_the_segments_do_not_keep() {
+        let run = |checked: bool| {
+            let tape = Tape::<f32>::new();
+            let x = tape.leaf(tape.pool().full(&[1000], 0.1));
+            let mut h = x.clone();
+            for _ in 0..8 {
+                h = if checked { tape.checkpoint(&[&h], eight) } else { eight(&[h]) };
+            }
+            let grad = h.sum().grad_once(&[&x]).remove(0);
+            (tape.pool().allocated(), bits(&grad))
+        };
+        fn eight<'t>(x: &[Var<'t, f32>]) -> Var<'t, f32> {
+            (0..8).fold(x[0].clone(), |h, _| h.sin())
+        }
+        let ((plain, expected), (checked, got)) = (run(false), run(true));
+        assert_eq!(got, expected);
+        // 64 saved inputs against 8 at the borders and 8 within the segment that runs again.
+        assert!(plain >= 64 * 1000, "{plain} elements");
+        assert!(checked <= 24 * 1024, "{checked} elements instead of {plain}");
+    }
+
+    #[test]
+    fn gradients_of_gradients_are_those_of_the_plain_computation() {
+        let run = |checked: bool| {
+            let tape = Tape::<f64>::new();
+            let x = tape.leaf(Tensor::from_vec(&[3], vec![0.3, -0.8, 1.4]));
+            fn f<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
+                (&x[0] * x[1].sin()).exp() * &x[0]
+            }
+            // The second input depends on the first.
+            let h = x.square();
+            let y = if checked { tape.checkpoint(&[&x, &h], f) } else { f(&[x.clone(), h]) };
+            let first = y.sum().grad_graph(&[&x]).remove(0);
+            let second = first.square().sum().grad_graph(&[&x]).remove(0);
+            let third = second.sum().grad(&[&x]).remove(0);
+            [first.into_value(), second.into_value(), third].map(|x| x.as_slice().to_vec())
+        };
+        for (got, expected) in run(true).iter().flatten().zip(run(false).iter().flatten()) {
+            assert!((got - expected).abs() <= 1e-12 * expected.abs().max(1.0), "{got} instead of {expected}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_wanted_constant_or_not_recorded_costs_nothing() {
+        let tape = Tape::<f64>::new();
+        let (x, c) = (tape.leaf(Tensor::ones(&[2])), tape.constant(Tensor::ones(&[2])));
+        assert!(!tape.checkpoint(&[&c], |x| x[0].exp()).is_on_graph());
+        assert!(!tape.no_grad(|| tape.checkpoint(&[&x], |x| x[0].exp())).is_on_graph());
+        let y = tape.checkpoint(&[&x, &c], |x| &x[0] * &x[1]);
+        assert_eq!(y.sum().grad(&[&c, &x]), [Tensor::zeros(&[2]), Tensor::ones(&[2])]);
+        // A part that does not depend on its inputs, and empty and scalar tensors.
+        let y = tape.checkpoint(&[&x], |x| x[0].tape().constant(Tensor::scalar(2.0)));
+        assert_eq!(y.grad(&[&x])[0].as_slice(), [0.0; 2]);
+        let empty = tape.leaf(Tensor::zeros(&[0, 3]));
+        assert_eq!(tape.checkpoint(&[&empty], |x| x[0].exp().sum()).grad(&[&empty])[0].shape(), [0, 3]);
+    }
+
+    #[test]
+    fn a_sparse_gradient_stays_sparse() {
+        let tape = Tape::<f64>::new();
+        let table = tape.leaf(Tensor::from_fn(&[5, 2], |i| i as f64));
+        let y = tape.checkpoint(&[&table], |x| x[0].gather_rows(&[3, 1, 3].into()).square());
+        let parts = y.sum().grad_sparse(&[&table]).remove(0);
+        let Gradient::Sparse(parts) = parts else { panic!("a dense gradient") };
+        let mut dense = Tensor::zeros(&[5, 2]);
+        parts.iter().for_each(|part| part.add_to(&mut dense));
+        assert_eq!(dense.as_slice(), [0.0, 0.0, 4.0, 6.0, 0.0, 0.0, 24.0, 28.0, 0.0, 0.0]);
+        let _: &RowGrad<f64> = (&*parts[0] as &dyn std::any::Any).downcast_ref().unwrap();
+    }
+
+    #[test]
+    fn the_nan_finder_looks_inside() {
+        let tape = Tape::<f64>::new();
+        tape.check_finite(true);
+        let x = tape.leaf(Tensor::from_vec(&[2], vec![1.0, 0.0]));
+        let y = tape.checkpoint(&[&x], |x| x[0].sqrt().sum());
+        let line = line!() - 1;
+        let error = y.try_grad(&[&x]).unwrap_err().to_string();
+        let expected = format!("sqrt: the gradient of input 0 is inf at index [1] (recorded at {}:{line}:", file!());
+        assert!(error.starts_with(&expected), "{error}");
+        // Layers run in it like anything else.
+        let w = tape.leaf(Tensor::ones(&[2, 1]));
+        let y = tape.checkpoint(&[&x, &w], |x| x[0].reshape(&[1, 2]).linear(&x[1], None, Activation::Relu).sum());
+        assert_eq!(y.grad(&[&w])[0].as_slice(), [1.0, 0.0]);
+    }
+}

@@ -1,0 +1,236 @@
+//! Conventions: what operations give at ties, kinks and the edges of their domains.
+//!
+//! Wherever a function has no derivative, the one below is what its operation gives: the value and the gradient of each
+//! input for an output gradient of ones. Inputs are separated by semicolons. The table is a test: it is read from this
+//! text, and every row is evaluated in `f32` and `f64`, with the gradient recorded and not recorded.
+//!
+//! The rules behind it: NaN goes through, unless the result does not depend on it; a tie is shared evenly; a step has
+//! gradient 0; a kink has the gradient of the side that its formula takes; and where infinity times 0 would be NaN but
+//! a limit exists, that limit is the value.
+//!
+//! ## Kinks and steps
+//!
+//! | operation | at | value | gradient | remark |
+//! |---|---|---|---|---|
+//! | `abs(x)` | `0` | `0` | `0` | the mean of both sides |
+//! | `sign(x)` | `0` | `0` | `0` | 0 everywhere else too |
+//! | `sign(x)` | `NaN` | `NaN` | `0` | |
+//! | `relu(x)` | `0` | `0` | `0` | the side below |
+//! | `leaky_relu(x, 0.1)` | `0` | `0` | `0.1` | the side below |
+//! | `elu(x, 1.5)` | `0` | `0` | `1.5` | the side below |
+//! | `clamp(x, -1, 2)` | `2` | `2` | `1` | the limits belong to the inside |
+//! | `clamp(x, -1, 2)` | `-1` | `-1` | `1` | |
+//! | `clamp(x, -1, 2)` | `3` | `2` | `0` | |
+//! | `clamp(x, -1, 2)` | `NaN` | `NaN` | `1` | |
+//! | `floor(x)` | `2` | `2` | `0` | 0 everywhere |
+//! | `ceil(x)` | `2` | `2` | `0` | |
+//! | `round(x)` | `0.5` | `0` | `0` | ties go to the even number |
+//! | `round(x)` | `1.5` | `2` | `0` | |
+//! | `absolute_error(a, b)` | `1; 1` | `0` | `0; 0` | |
+//! | `huber(a, b, 2)` | `2; 0` | `2` | `2; -2` | both sides agree |
+//! | `smooth_l1(a, b, 0)` | `1; 1` | `0` | `0; 0` | |
+//!
+//! ## Ties and choices
+//!
+//! | operation | at | value | gradient | remark |
+//! |---|---|---|---|---|
+//! | `maximum(a, b)` | `2; 2` | `2` | `0.5; 0.5` | shared evenly |
+//! | `maximum(a, b)` | `NaN; 1` | `NaN` | `0.5; 0.5` | NaN wins |
+//! | `minimum(a, b)` | `2; 2` | `2` | `0.5; 0.5` | |
+//! | `minimum(a, b)` | `1; NaN` | `NaN` | `0.5; 0.5` | |
+//! | `max(x)` | `[3, 1, 3]` | `3` | `[0.5, 0, 0.5]` | shared evenly, as PyTorch's `amax` |
+//! | `min(x)` | `[1, 1, 1, 1, 3]` | `1` | `[0.25, 0.25, 0.25, 0.25, 0]` | |
+//! | `max(x)` | `[1, NaN]` | `NaN` | `[0, 0]` | NaN wins; nothing equals it |
+//! | `gt(a, b)` | `1; NaN` | `0` | `0; 0` | comparisons are constants |
+//! | `eq(a, b)` | `NaN; NaN` | `0` | `0; 0` | |
+//! | `ne(a, b)` | `NaN; NaN` | `1` | `0; 0` | |
+//! | `where(mask, a, b)` | `0; 1; 2` | `2` | `0; 0; 1` | the mask has no gradient |
+//! | `where(mask, a, b)` | `NaN; 1; 2` | `1` | `0; 1; 0` | all but 0 is true |
+//! | `if_positive(x, a, b)` | `NaN; 1; 2` | `2` | `0; 0; 1` | |
+//!
+//! ## Edges of domains
+//!
+//! | operation | at | value | gradient | remark |
+//! |---|---|---|---|---|
+//! | `sqrt(x)` | `0` | `0` | `inf` | |
+//! | `sqrt(x)` | `-1` | `NaN` | `NaN` | |
+//! | `rsqrt(x)` | `0` | `inf` | `-inf` | |
+//! | `reciprocal(x)` | `0` | `inf` | `-inf` | |
+//! | `div(a, b)` | `1; 0` | `inf` | `inf; -inf` | |
+//! | `ln(x)` | `0` | `-inf` | `inf` | |
+//! | `ln(x)` | `-1` | `NaN` | `-1` | 1 / x needs no logarithm |
+//! | `log2(x)` | `0` | `-inf` | `inf` | |
+//! | `ln1p(x)` | `-1` | `-inf` | `inf` | |
+//! | `asin(x)` | `1` | `1.5707963267948966` | `inf` | |
+//! | `acos(x)` | `-1` | `3.141592653589793` | `-inf` | |
+//! | `asin(x)` | `2` | `NaN` | `NaN` | |
+//! | `atan2(a, b)` | `0; 0` | `0` | `0; 0` | no direction, no gradient |
+//! | `atan2(a, b)` | `0; -1` | `3.141592653589793` | `-1; 0` | the cut is reached from above |
+//! | `powi(x, 0)` | `0` | `1` | `0` | 0^0 = 1 |
+//! | `powi(x, -1)` | `0` | `inf` | `-inf` | |
+//! | `powf(x, 0.5)` | `0` | `0` | `inf` | |
+//! | `powf(x, 0.5)` | `-1` | `NaN` | `NaN` | |
+//! | `pow(a, b)` | `0; 0` | `1` | `0; 0` | 0^0 = 1, and constant on both sides |
+//! | `pow(a, b)` | `0; 2` | `0` | `0; 0` | |
+//! | `pow(a, b)` | `0; -1` | `inf` | `-inf; -inf` | |
+//! | `pow(a, b)` | `-2; 3` | `-8` | `12; NaN` | whole exponents have powers, but no neighbours |
+//! | `xlogy(a, b)` | `0; 0` | `0` | `0; 0` | 0 whatever b is |
+//! | `xlogy(a, b)` | `0; -1` | `0` | `0; 0` | |
+//! | `xlogy(a, b)` | `2; 0` | `-inf` | `-inf; inf` | |
+//!
+//! ## Zeros and no elements in reductions
+//!
+//! | operation | at | value | gradient | remark |
+//! |---|---|---|---|---|
+//! | `norm(x)` | `[0, 0]` | `0` | `[0, 0]` | |
+//! | `norm_l1(x)` | `[0, -2]` | `2` | `[0, -1]` | |
+//! | `std(x, 1)` | `[2, 2]` | `0` | `[0, 0]` | |
+//! | `prod(x)` | `[0, 3]` | `0` | `[3, 0]` | nothing is divided |
+//! | `prod(x)` | `[0, 3, 0]` | `0` | `[0, 0, 0]` | |
+//! | `cumprod(x)` | `[2, 0, 3]` | `[2, 0, 0]` | `[1, 8, 0]` | |
+//! | `sum(x)` | `[]` | `0` | `[]` | |
+//! | `prod(x)` | `[]` | `1` | `[]` | |
+//! | `mean(x)` | `[]` | `NaN` | `[]` | |
+//! | `logsumexp(x)` | `[]` | `-inf` | `[]` | |
+//! | `logsumexp(x)` | `[-inf, -inf]` | `-inf` | `[0, 0]` | |
+//! | `softmax(x)` | `[-inf, 0]` | `[0, 1]` | `[0, 0]` | |
+//! | `softmax(x)` | `[-inf, -inf]` | `[NaN, NaN]` | `[NaN, NaN]` | no distribution |
+//! | `cross_entropy(x, 0)` | `[0, -inf]` | `0` | `[0, 0]` | |
+//! | `cross_entropy(x, 1)` | `[0, -inf]` | `inf` | `[1, -1]` | |
+//!
+//! ## Limits at infinity
+//!
+//! | operation | at | value | gradient | remark |
+//! |---|---|---|---|---|
+//! | `sigmoid(x)` | `-inf` | `0` | `0` | |
+//! | `softplus(x)` | `inf` | `inf` | `1` | |
+//! | `log_sigmoid(x)` | `-inf` | `-inf` | `1` | |
+//! | `gelu(x)` | `-inf` | `0` | `0` | not NaN, as 0 times infinity would be |
+//! | `gelu_tanh(x)` | `-inf` | `0` | `0` | |
+//! | `silu(x)` | `-inf` | `0` | `0` | |
+//! | `silu(x)` | `inf` | `inf` | `1` | |
+//! | `tanh(x)` | `inf` | `1` | `0` | |
+//! | `binary_cross_entropy(a, b)` | `1000; 0` | `1000` | `1; -1000` | |
+
+#[cfg(test)]
+mod tests {
+    use crate::{Scalar, Tape, Tensor, Var};
+
+    /// The operation that a row of the table names.
+    fn apply<'t, T: Scalar>(operation: &str, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let (a, b, c) = (&x[0], x.get(1).unwrap_or(&x[0]), x.get(2).unwrap_or(&x[0]));
+        Some(match operation {
+            "abs(x)" => a.abs(),
+            "sign(x)" => a.sign(),
+            "relu(x)" => a.relu(),
+            "leaky_relu(x, 0.1)" => a.leaky_relu(0.1),
+            "elu(x, 1.5)" => a.elu(1.5),
+            "clamp(x, -1, 2)" => a.clamp(-1.0, 2.0),
+            "floor(x)" => a.floor(),
+            "ceil(x)" => a.ceil(),
+            "round(x)" => a.round(),
+            "absolute_error(a, b)" => a.absolute_error(b),
+            "huber(a, b, 2)" => a.huber(b, 2.0),
+            "smooth_l1(a, b, 0)" => a.smooth_l1(b, 0.0),
+            "maximum(a, b)" => a.maximum(b),
+            "minimum(a, b)" => a.minimum(b),
+            "max(x)" => a.max(),
+            "min(x)" => a.min(),
+            "gt(a, b)" => a.gt(b),
+            "eq(a, b)" => a.eq(b),
+            "ne(a, b)" => a.ne(b),
+            "where(mask, a, b)" => b.where_(a, c),
+            "if_positive(x, a, b)" => a.if_positive(b, c),
+            "sqrt(x)" => a.sqrt(),
+            "rsqrt(x)" => a.rsqrt(),
+            "reciprocal(x)" => a.reciprocal(),
+            "div(a, b)" => a / b,
+            "ln(x)" => a.ln(),
+            "log2(x)" => a.log2(),
+            "ln1p(x)" => a.ln1p(),
+            "asin(x)" => a.asin(),
+            "acos(x)" => a.acos(),
+            "atan2(a, b)" => a.atan2(b),
+            "powi(x, 0)" => a.powi(0),
+            "powi(x, -1)" => a.powi(-1),
+            "powf(x, 0.5)" => a.powf(0.5),
+            "pow(a, b)" => a.pow(b),
+            "xlogy(a, b)" => a.xlogy(b),
+            "norm(x)" => a.norm(),
+            "norm_l1(x)" => a.norm_l1(),
+            "std(x, 1)" => a.std(1),
+            "prod(x)" => a.prod(),
+            "cumprod(x)" => a.cumprod(0),
+            "sum(x)" => a.sum(),
+            "mean(x)" => a.mean(),
+            "logsumexp(x)" => a.logsumexp(),
+            "softmax(x)" => a.softmax(-1),
+            "cross_entropy(x, 0)" => a.cross_entropy(&[0]),
+            "cross_entropy(x, 1)" => a.cross_entropy(&[1]),
+            "sigmoid(x)" => a.sigmoid(),
+            "softplus(x)" => a.softplus(),
+            "log_sigmoid(x)" => a.log_sigmoid(),
+            "gelu(x)" => a.gelu(),
+            "gelu_tanh(x)" => a.gelu_tanh(),
+            "silu(x)" => a.silu(),
+            "tanh(x)" => a.tanh(),
+            "binary_cross_entropy(a, b)" => a.binary_cross_entropy(b),
+            _ => return None,
+        })
+    }
+
+    /// Numbers and lists of numbers, separated by semicolons.
+    fn tensors<T: Scalar>(text: &str) -> Vec<Tensor<T>> {
+        let number = |text: &str| T::from_f64(text.trim().parse().unwrap_or_else(|_| panic!("{text:?} is no number")));
+        let tensor = |text: &str| match text.trim().strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
+            Some(list) => {
+                let values: Vec<T> = list.split(',').filter(|part| !part.is_empty()).map(number).collect();
+                Tensor::from_vec(&[values.len()], values)
+            }
+            None => Tensor::scalar(number(text)),
+        };
+        text.split(';').map(tensor).collect()
+    }
+
+    fn same<T: Scalar>(got: &[Tensor<T>], expected: &[Tensor<T>]) -> bool {
+        let equal = |(a, b): (&T, &T)| {
+            let (a, b) = (a.to_f64(), b.to_f64());
+            a == b || a.is_nan() && b.is_nan() || (a - b).abs() <= 4.0 * T::EPSILON * b.abs()
+        };
+        let pair = |(a, b): (&Tensor<T>, &Tensor<T>)| {
+            a.shape() == b.shape() && a.as_slice().iter().zip(b.as_slice()).all(equal)
+        };
+        got.len() == expected.len() && got.iter().zip(expected).all(pair)
+    }
+
+    fn check<T: Scalar>(row: &[&str]) -> Result<(), String> {
+        let tape = Tape::<T>::new();
+        let x: Vec<_> = tensors(row[1]).into_iter().map(|x| tape.leaf(x)).collect();
+        let wrt: Vec<_> = x.iter().collect();
+        let y = apply(row[0], &x).ok_or_else(|| format!("{} is not among the operations of the test", row[0]))?;
+        let sum = y.sum();
+        let recorded: Vec<_> = sum.grad_graph(&wrt).into_iter().map(Var::into_value).collect();
+        let (grads, y) = (sum.grad(&wrt), [y.into_value()]);
+        for (what, got, expected) in
+            [("value", &y[..], row[2]), ("gradient", &grads, row[3]), ("recorded", &recorded, row[3])]
+        {
+            if !same(got, &tensors(expected)) {
+                return Err(format!("{} at {} in {}: {what} {got:?} for {expected}", row[0], row[1], T::NAME));
+            }
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn every_row_of_the_table_is_what_the_operation_gives() {
+        let rows = include_str!("conventions.rs").lines().filter_map(|line| line.strip_prefix("//! | `"));
+        let (mut count, mut failures) = (0, vec![]);
+        for row in rows {
+            let cells: Vec<_> = row.split('|').map(|cell| cell.trim().trim_matches('`')).collect();
+            failures.extend([check::<f32>(&cells), check::<f64>(&cells)].into_iter().filter_map(Result::err));
+            count += 1;
+        }
+        assert!(count >= 79, "only {count} rows were found");
+        assert!(failures.is_empty(), "{}", failures.join("\n"));
+    }
+}

@@ -1,0 +1,421 @@
+//! Derivatives of functions: products with the Jacobian from either side, the Jacobian, the Hessian and products with it.
+//!
+//! A function takes variables and gives one; it is differentiated at tensors. The [`Var`] methods of the same names work
+//! on a graph that is there already, and those that record ([`Var::vjp`], [`Var::jvp`], [`Var::hvp`],
+//! [`Var::grad_graph`]) can be taken of each other to any order:
+//!
+//! ```
+//! use raygrad_autograd::{Tape, Tensor};
+//! let tape = Tape::<f64>::new();
+//! let x = tape.leaf(Tensor::scalar(2.0));
+//! let one = tape.constant(Tensor::scalar(1.0));
+//! let y = x.square() * x.square();
+//! let first = y.jvp(&[&x], &[&one]); // 4 x^3
+//! let second = first.jvp(&[&x], &[&one]); // 12 x^2
+//! assert_eq!((first.item(), second.item()), (32.0, 48.0));
+//! assert_eq!(second.grad(&[&x])[0].item(), 48.0); // 24 x
+//! ```
+//!
+//! An operation that is not differentiable somewhere has the conventions of its own documentation there.
+
+use crate::{Tape, Var};
+use raygrad_tensor::{Scalar, Shape, Tensor};
+
+/// Runs `f` at `x` on a tape of its own, and `then` on the result and the leaves.
+fn at<T: Scalar, R>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+    then: impl for<'t> FnOnce(Var<'t, T>, &[&Var<'t, T>]) -> R,
+) -> R {
+    let tape = Tape::new();
+    let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
+    let y = f(&leaves);
+    then(y, &leaves.iter().collect::<Vec<_>>())
+}
+
+/// The value of a function of one-element result, and its gradient with respect to each input.
+///
+/// ```
+/// use raygrad_autograd::{Tensor, derivatives::value_and_grad};
+/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let (y, grads) = value_and_grad(|x| x[0].square().sum(), &[x]);
+/// assert_eq!((y, grads[0].as_slice()), (10.0, &[6.0, -2.0][..]));
+/// ```
+///
+/// # Panics
+/// If the result has not exactly one element.
+#[track_caller]
+pub fn value_and_grad<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+) -> (T, Vec<Tensor<T>>) {
+    at(f, x, |y, wrt| (y.item(), y.grad_once(wrt)))
+}
+
+/// The value and the vector-Jacobian product (reverse mode): for each input the gradient of `sum(f(x) * seed)`.
+///
+/// ```
+/// use raygrad_autograd::{Tensor, derivatives::vjp};
+/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let (y, grads) = vjp(|x| x[0].square(), &[x], &Tensor::from_vec(&[2], vec![1.0, 10.0]));
+/// assert_eq!((y.as_slice(), grads[0].as_slice()), (&[9.0, 1.0][..], &[6.0, -20.0][..]));
+/// ```
+///
+/// # Panics
+/// If `seed` has another shape than the result.
+#[track_caller]
+pub fn vjp<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+    seed: &Tensor<T>,
+) -> (Tensor<T>, Vec<Tensor<T>>) {
+    at(f, x, |y, wrt| (y.value().clone(), y.grad_with(seed, wrt)))
+}
+
+/// The value and the Jacobian-vector product (forward mode): the derivative of `f(x + h v)` by `h` at 0, of the shape of
+/// the result. See [`Var::jvp`] for how and at what cost.
+///
+/// ```
+/// use raygrad_autograd::{Tensor, derivatives::jvp};
+/// let vector = |values: [f64; 2]| Tensor::from_vec(&[2], values.to_vec());
+/// let (y, slope) = jvp(|x| &x[0] * &x[1], &[vector([3.0, -1.0]), vector([2.0, 5.0])], &[vector([1.0, 0.0]), vector([0.0, 1.0])]);
+/// assert_eq!((y.as_slice(), slope.as_slice()), (&[6.0, -5.0][..], &[2.0, -1.0][..]));
+/// ```
+///
+/// # Panics
+/// If there is not one `v` of the same shape for each `x`.
+#[track_caller]
+pub fn jvp<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+    v: &[Tensor<T>],
+) -> (Tensor<T>, Tensor<T>) {
+    at(f, x, |y, wrt| {
+        let v: Vec<_> = v.iter().map(|v| y.tape().constant(v.clone())).collect();
+        (y.value().clone(), y.jvp(wrt, &v.iter().collect::<Vec<_>>()).into_value())
+    })
+}
+
+/// The Jacobian: for each input a tensor of the shape of the result followed by that of the input. See
+/// [`Var::jacobian`] for the cost.
+///
+/// ```
+/// use raygrad_autograd::{Tensor, derivatives::jacobian};
+/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let j = jacobian(|x| x[0].square(), &[x]);
+/// assert_eq!((j[0].shape(), j[0].as_slice()), (&[2, 2][..], &[6.0, 0.0, 0.0, -2.0][..]));
+/// ```
+pub fn jacobian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &[Tensor<T>]) -> Vec<Tensor<T>> {
+    at(f, x, |y, wrt| y.jacobian(wrt))
+}
+
+/// The Hessian of a function of one-element result: `[i][j]` is the derivative of the gradient of input `i` by input
+/// `j`, a tensor of the shape of input `i` followed by that of input `j`.
+///
+/// ```
+/// use raygrad_autograd::{Tensor, derivatives::hessian};
+/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let h = hessian(|x| x[0].square().sum() * &x[1], &[x, Tensor::scalar(0.5)]);
+/// assert_eq!(h[0][0].as_slice(), [1.0, 0.0, 0.0, 1.0]);
+/// assert_eq!((h[0][1].as_slice(), h[1][0].as_slice()), (&[6.0, -2.0][..], &[6.0, -2.0][..]));
+/// assert_eq!(h[1][1].as_slice(), [0.0]);
+/// ```
+///
+/// # Panics
+/// If the result has not exactly one element.
+#[track_caller]
+pub fn hessian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &[Tensor<T>]) -> Vec<Vec<Tensor<T>>> {
+    at(f, x, |y, wrt| y.hessian(wrt))
+}
+
+/// The product of the Hessian of a function of one-element result with `v`, which holds a tensor for each input: about
+/// three gradients' work, whatever the number of inputs.
+///
+/// ```
+/// use raygrad_autograd::{Tensor, derivatives::hvp};
+/// let vector = |values: [f64; 2]| Tensor::from_vec(&[2], values.to_vec());
+/// let product = hvp(|x| (x[0].square() * &x[0]).sum(), &[vector([3.0, -1.0])], &[vector([1.0, 10.0])]);
+/// assert_eq!(product[0].as_slice(), [18.0, -60.0]);
+/// ```
+///
+/// # Panics
+/// If the result has not exactly one element, or there is not one `v` of the same shape for each `x`.
+#[track_caller]
+pub fn hvp<T: Scalar>(
+    f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
+    x: &[Tensor<T>],
+    v: &[Tensor<T>],
+) -> Vec<Tensor<T>> {
+    at(f, x, |y, wrt| {
+        let v: Vec<_> = v.iter().map(|v| y.tape().constant(v.clone())).collect();
+        y.hvp(wrt, &v.iter().collect::<Vec<_>>()).into_iter().map(Var::into_value).collect()
+    })
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The Jacobian-vector product, recorded: the derivative of this tensor when each of `wrt` moves along its tangent.
+    ///
+    /// It is the gradient of a gradient: the vector-Jacobian product `u J` is linear in its seed `u`, so that the
+    /// gradient of `(u J) . v` by `u` is `J v`, at any `u`. That takes one recorded sweep and one more, about three
+    /// times the work of a gradient, but no rule of its own for any operation.
+    ///
+    /// # Panics
+    /// If there is not one tangent of the same shape for each variable, the graph was freed, or the NaN finder is on
+    /// and finds something.
+    #[track_caller]
+    pub fn jvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Var<'t, T> {
+        self.tape.with_recording(true, || {
+            let seed = self.tape.leaf(self.tape.pool().full(self.shape(), T::ZERO));
+            let grads = self.vjp(&seed, wrt);
+            inner(self.tape, &grads, tangents).grad_graph(&[&seed]).remove(0)
+        })
+    }
+
+    /// The product of the Hessian of this one-element tensor with the tangents, recorded: for each of `wrt` the
+    /// derivative of its gradient when all move along their tangents.
+    ///
+    /// # Panics
+    /// If this tensor has not exactly one element, and as [`jvp`](Self::jvp).
+    #[track_caller]
+    pub fn hvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
+        self.tape.with_recording(true, || {
+            let grads = self.grad_graph(wrt);
+            inner(self.tape, &grads, tangents).grad_graph(wrt)
+        })
+    }
+
+    /// The Jacobian with respect to each of `wrt`: tensors of the shape of this one followed by that of the variable.
+    ///
+    /// It takes as many sweeps as there are elements, in this tensor or in the variables, whichever are fewer.
+    ///
+    /// # Panics
+    /// If the graph was freed, or the NaN finder is on and finds something.
+    #[track_caller]
+    pub fn jacobian(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
+        let inputs: usize = wrt.iter().map(|x| x.value.len()).sum();
+        let outputs = self.value.len();
+        let shape = |x: &Var<'t, T>| -> Shape { self.shape().iter().chain(x.shape()).copied().collect() };
+        let mut all: Vec<_> = wrt.iter().map(|x| Tensor::zeros(&shape(x))).collect();
+        if inputs >= outputs {
+            // Row by row.
+            for row in 0..outputs {
+                for (whole, grad) in all.iter_mut().zip(self.grad_with(&unit(self.shape(), row), wrt)) {
+                    let width = grad.len();
+                    whole.as_mut_slice()[row * width..(row + 1) * width].copy_from_slice(grad.as_slice());
+                }
+            }
+            return all;
+        }
+        // Column by column: the gradient by the seed of the vector-Jacobian product.
+        let seed = self.tape.with_recording(true, || self.tape.leaf(Tensor::zeros(self.shape())));
+        for (whole, grad) in all.iter_mut().zip(self.vjp(&seed, wrt)) {
+            let width = grad.value.len();
+            for column in 0..width {
+                let values = grad.grad_with(&unit(grad.shape(), column), &[&seed]).remove(0);
+                for (whole, &value) in whole.as_mut_slice()[column..].iter_mut().step_by(width).zip(values.as_slice()) {
+                    *whole = value;
+                }
+            }
+        }
+        all
+    }
+
+    /// The Hessian of this one-element tensor: `[i][j]` is the derivative of the gradient of `wrt[i]` by `wrt[j]`, of the
+    /// shape of the one followed by that of the other.
+    ///
+    /// It takes a recorded sweep and another one for each element of the variables.
+    ///
+    /// # Panics
+    /// If this tensor has not exactly one element, and as [`jacobian`](Self::jacobian).
+    #[track_caller]
+    pub fn hessian(&self, wrt: &[&Var<'t, T>]) -> Vec<Vec<Tensor<T>>> {
+        self.grad_graph(wrt).iter().map(|grad| grad.jacobian(wrt)).collect()
+    }
+}
+
+/// `sum_i a_i . v_i`.
+#[track_caller]
+fn inner<'t, T: Scalar>(tape: &'t Tape<T>, a: &[Var<'t, T>], v: &[&Var<'t, T>]) -> Var<'t, T> {
+    assert_eq!(a.len(), v.len(), "as many tangents as variables");
+    let mut total: Option<Var<'t, T>> = None;
+    for (a, v) in a.iter().zip(v) {
+        assert_eq!(a.shape(), v.shape(), "a tangent has the shape of its variable");
+        let product = (a * *v).sum();
+        total = Some(match total {
+            Some(total) => total + product,
+            None => product,
+        });
+    }
+    total.unwrap_or_else(|| tape.constant(Tensor::scalar(T::ZERO)))
+}
+
+/// 1 at one place, else 0.
+fn unit<T: Scalar>(shape: &[usize], place: usize) -> Tensor<T> {
+    let mut unit = Tensor::zeros(shape);
+    unit.as_mut_slice()[place] = T::ONE;
+    unit
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Activation;
+    use std::slice::from_ref;
+
+    fn vector(values: &[f64]) -> Tensor<f64> {
+        Tensor::from_vec(&[values.len()], values.to_vec())
+    }
+
+    #[track_caller]
+    fn assert_close(got: &[f64], expected: &[f64], tolerance: f64) {
+        assert_eq!(got.len(), expected.len());
+        for (got, expected) in got.iter().zip(expected) {
+            let error = (got - expected).abs() / expected.abs().max(1.0);
+            assert!(error <= tolerance, "{got} instead of {expected}");
+        }
+    }
+
+    /// `[a^2 b, sin a, e^b]` from `[a, b]`.
+    fn curve<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
+        let (a, b) = (x[0].slice(0, 0, 1), x[0].slice(0, 1, 1));
+        Var::concat(&[&(a.square() * &b), &a.sin(), &b.exp()], 0)
+    }
+
+    const AT: [f64; 2] = [0.7, -1.3];
+
+    /// The Jacobian of `curve`, by hand.
+    fn slopes() -> [f64; 6] {
+        let [a, b] = AT;
+        [2.0 * a * b, a * a, a.cos(), 0.0, 0.0, b.exp()]
+    }
+
+    #[test]
+    fn a_jacobian_is_right_by_rows_and_by_columns() {
+        // Three results of two inputs go by columns, the transposed relation by rows.
+        let tall = jacobian(curve, &[vector(&AT)]).remove(0);
+        assert_eq!(tall.shape(), [3, 2]);
+        assert_close(tall.as_slice(), &slopes(), 1e-14);
+        let wide = jacobian(|x| curve(x).slice(0, 0, 2), &[vector(&AT)]).remove(0);
+        assert_eq!(wide.shape(), [2, 2]);
+        assert_close(wide.as_slice(), &slopes()[..4], 1e-14);
+        // Two inputs, of which one has no influence, and shapes of several axes.
+        let both = jacobian(|x| x[0].reshape(&[1, 2, 1]) * 3.0, &[vector(&AT), Tensor::ones(&[2, 2])]);
+        assert_eq!((both[0].shape(), both[1].shape()), (&[1, 2, 1, 2][..], &[1, 2, 1, 2, 2][..]));
+        assert_eq!((both[0].as_slice(), both[1].as_slice()), (&[3.0, 0.0, 0.0, 3.0][..], &[0.0; 8][..]));
+    }
+
+    #[test]
+    fn products_with_the_jacobian_agree_with_it_from_both_sides() {
+        let (v, u) = ([0.3, -2.0], [1.0, -0.5, 4.0]);
+        let j = slopes();
+        let (y, slope) = jvp(curve, &[vector(&AT)], &[vector(&v)]);
+        assert_close(y.as_slice(), &[AT[0] * AT[0] * AT[1], AT[0].sin(), AT[1].exp()], 1e-14);
+        assert_close(slope.as_slice(), &[0, 1, 2].map(|i| j[2 * i] * v[0] + j[2 * i + 1] * v[1]), 1e-14);
+        let (y, grads) = vjp(curve, &[vector(&AT)], &vector(&u));
+        assert_eq!(y.shape(), [3]);
+        assert_close(grads[0].as_slice(), &[0, 1].map(|k| (0..3).map(|i| u[i] * j[2 * i + k]).sum()), 1e-14);
+    }
+
+    /// A small network of fused layers, its input and weights as variables.
+    fn network<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
+        let h = x[0].linear(&x[1], Some(&x[2]), Activation::Relu);
+        (h.linear(&x[3], None, Activation::Identity).tanh() * &x[0]).square().sum()
+    }
+
+    fn network_inputs() -> Vec<Tensor<f64>> {
+        let shapes: [&[usize]; 4] = [&[3, 2], &[2, 4], &[4], &[4, 2]];
+        let value = |salt: usize| move |i: usize| ((i * 7 + salt * 5 + 3) as f64 * 0.77).sin();
+        shapes.iter().enumerate().map(|(k, shape)| Tensor::from_fn(shape, value(k))).collect()
+    }
+
+    #[test]
+    fn the_hessian_is_symmetric_and_the_derivative_of_the_gradient() {
+        let x = network_inputs();
+        let whole = hessian(network, &x);
+        let v: Vec<_> = x.iter().map(|x| Tensor::from_fn(x.shape(), |i| (i as f64 * 1.3 + 0.2).cos())).collect();
+        let product = hvp(network, &x, &v);
+        let mut differences = 0;
+        for i in 0..x.len() {
+            let mut row = vec![0.0; x[i].len()];
+            for j in 0..x.len() {
+                let (a, b) = (whole[i][j].as_slice(), whole[j][i].as_slice());
+                let width = x[j].len();
+                for (k, row) in row.iter_mut().enumerate() {
+                    for l in 0..width {
+                        assert!((a[k * width + l] - b[l * x[i].len() + k]).abs() <= 1e-13);
+                        *row += a[k * width + l] * v[j].as_slice()[l];
+                    }
+                }
+            }
+            assert_close(product[i].as_slice(), &row, 1e-12);
+            differences += row.len();
+        }
+        assert_eq!(differences, 6 + 8 + 4 + 8);
+        // The same product from differences of gradients.
+        let gradient = |h: f64| {
+            let moved: Vec<_> = x
+                .iter()
+                .zip(&v)
+                .map(|(x, v)| Tensor::from_fn(x.shape(), |i| x.as_slice()[i] + h * v.as_slice()[i]))
+                .collect();
+            value_and_grad(network, &moved).1
+        };
+        let (plus, minus) = (gradient(1e-6), gradient(-1e-6));
+        for ((plus, minus), product) in plus.iter().zip(&minus).zip(&product) {
+            for i in 0..plus.len() {
+                let numeric = (plus.as_slice()[i] - minus.as_slice()[i]) / 2e-6;
+                let error = (numeric - product.as_slice()[i]).abs() / numeric.abs().max(1.0);
+                assert!(error < 1e-7, "{} instead of {numeric}", product.as_slice()[i]);
+            }
+        }
+    }
+
+    #[test]
+    fn orders_mix_freely() {
+        // f = sin(a) e^(b): every mixed derivative is known.
+        let tape = Tape::<f64>::new();
+        let (a, b) = (tape.leaf(Tensor::scalar(0.4)), tape.leaf(Tensor::scalar(-0.2)));
+        let (one, zero) = (tape.constant(Tensor::scalar(1.0)), tape.constant(Tensor::scalar(0.0)));
+        let f = a.sin() * b.exp();
+        let (s, c, e) = (0.4_f64.sin(), 0.4_f64.cos(), (-0.2_f64).exp());
+        let fa = f.jvp(&[&a, &b], &[&one, &zero]);
+        let faa = fa.grad_graph(&[&a]).remove(0);
+        let faab = faa.jvp(&[&b], &[&one]);
+        let faabb = faab.vjp(&one, &[&b]).remove(0);
+        let values = [&fa, &faa, &faab, &faabb].map(|x| x.item());
+        assert_close(&values, &[c * e, -s * e, -s * e, -s * e], 1e-14);
+        let third = fa.hvp(&[&a, &b], &[&one, &one]);
+        // d/da and d/db of f_a along (1, 1): f_aaa + f_aab, f_aab + f_abb.
+        assert_close(&[third[0].item(), third[1].item()], &[(-c - s) * e, (-s + c) * e], 1e-14);
+        // A Jacobian of a gradient that is recorded, inside a scope that records nothing.
+        let inside = tape.no_grad(|| f.jvp(&[&a], &[&one]));
+        assert!(inside.is_on_graph() && inside.item() == fa.item());
+        assert_close(fa.jacobian(&[&a, &b])[1].as_slice(), &[c * e], 1e-14);
+    }
+
+    #[test]
+    fn empty_and_scalar_tensors_have_derivatives_too() {
+        let empty = || Tensor::<f64>::zeros(&[0, 2]);
+        assert_eq!(jacobian(|x| x[0].exp(), &[empty()])[0].shape(), [0, 2, 0, 2]);
+        assert_eq!(jacobian(|x| x[0].sum(), &[empty()])[0].shape(), [0, 2]);
+        let (y, slope) = jvp(|x| x[0].exp(), &[empty()], &[empty()]);
+        assert_eq!((y.shape(), slope.shape()), (&[0, 2][..], &[0, 2][..]));
+        assert_eq!(jvp(|x| x[0].exp().sum(), &[empty()], &[empty()]).1, Tensor::scalar(0.0));
+        assert_eq!(vjp(|x| x[0].exp(), &[empty()], &empty()).1[0].shape(), [0, 2]);
+        assert_eq!(hessian(|x| x[0].square().sum(), &[empty()])[0][0].shape(), [0, 2, 0, 2]);
+        assert_eq!(hvp(|x| x[0].square().sum(), &[empty()], &[empty()])[0].shape(), [0, 2]);
+        let at = Tensor::scalar(3.0);
+        assert_eq!(jacobian(|x| x[0].square(), from_ref(&at))[0], Tensor::scalar(6.0));
+        assert_eq!(hessian(|x| x[0].square(), from_ref(&at))[0][0], Tensor::scalar(2.0));
+        // A function that does not depend on its input.
+        let (y, slope) = jvp(|x| x[0].constant(1.0), from_ref(&at), from_ref(&at));
+        assert_eq!((y.item(), slope.item()), (1.0, 0.0));
+        assert_eq!(hessian(|x| x[0].constant(1.0), &[at])[0][0], Tensor::scalar(0.0));
+    }
+
+    #[test]
+    #[should_panic(expected = "a tangent has the shape of its variable")]
+    fn a_tangent_of_another_shape_is_refused() {
+        jvp(|x| x[0].exp(), &[vector(&AT)], &[Tensor::scalar(1.0)]);
+    }
+}

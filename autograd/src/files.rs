@@ -1,0 +1,25 @@
+//! Files that are whole or untouched.
+
+use std::io::{Result, Write};
+use std::path::Path;
+
+/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched.
+///
+/// The bytes go to a temporary file in the same folder, reach the disk, and only then take the name `path`: an
+/// interruption or a full disk never leaves a partial file, nor harms one that was there before.
+///
+/// # Errors
+/// If the folder does not exist or the file cannot be written.
+pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
+    let path = path.as_ref();
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut builder = tempfile::Builder::new();
+    // Temporary files are private by default; this one becomes an ordinary file, as far as the umask allows.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder)?;
+    file.write_all(bytes)?;
+    file.as_file().sync_all()?;
+    file.persist(path).map_err(|error| error.error)?;
+    Ok(())
+}

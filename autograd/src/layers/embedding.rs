@@ -1,0 +1,87 @@
+//! Embeddings.
+
+use super::Init;
+use crate::{Bound, ParamId, Params, Var};
+use rand::Rng;
+use raygrad_tensor::Scalar;
+use std::sync::Arc;
+
+/// A table with a row of numbers for each of many things: words, images, places.
+///
+/// The gradient of the table is sparse: [`Var::grad_sparse`] gives [`RowGrad`](crate::RowGrad)s, and
+/// [`TableAdam`](crate::TableAdam) reads and moves only the rows in them. All other gradients and optimisers see a table
+/// that is mostly zeros.
+///
+/// ```
+/// use raygrad_autograd::{AdamConfig, Embedding, Init, Params, RowGrad, TableAdam, Tape};
+/// use rand::SeedableRng;
+/// let mut rng = rand::rngs::StdRng::seed_from_u64(1);
+/// let mut params = Params::<f32>::new();
+/// let words = Embedding::new(&mut params, "words", [1000, 8], Init::Normal(0.1), &mut rng);
+/// let mut adam = TableAdam::new(AdamConfig::default(), [1000, 8]);
+///
+/// let tape = Tape::new();
+/// let bound = params.bind(&tape);
+/// let vectors = words.forward(&bound, &[17, 4, 17].into());
+/// assert_eq!(vectors.shape(), [3, 8]);
+/// let gradient = vectors.square().sum().grad_sparse(&[&bound[words.table()]]).remove(0);
+/// let stats = adam.step(params.get_mut(words.table()), &gradient.parts::<RowGrad<f32>>(), 1e-3);
+/// assert_eq!(stats.touched, 2);
+/// ```
+#[derive(Debug, Clone, Copy)]
+pub struct Embedding {
+    table: ParamId,
+}
+
+impl Embedding {
+    /// A table of `rows` rows of `width` numbers, the parameter `<name>.weight`.
+    pub fn new<T: Scalar>(
+        params: &mut Params<T>,
+        name: &str,
+        [rows, width]: [usize; 2],
+        init: Init,
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Self {
+        Embedding { table: params.add(format!("{name}.weight"), init.weight(rows, width, rng)) }
+    }
+
+    /// The table's parameter.
+    pub fn table(&self) -> ParamId {
+        self.table
+    }
+
+    /// The rows of these numbers: `[index.len(), width]`.
+    ///
+    /// # Panics
+    /// If a number is not below that of the rows.
+    #[track_caller]
+    pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, index: &Arc<[u32]>) -> Var<'t, T> {
+        params[self.table].gather_rows(index)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Check, Tape, Tensor, check_function};
+    use rand::SeedableRng;
+
+    #[test]
+    fn a_table_is_learned_through_dense_gradients_too() {
+        let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(1);
+        let mut params = Params::<f64>::new();
+        let layer = Embedding::new(&mut params, "words", [5, 3], Init::Uniform(1.0), &mut rng);
+        assert_eq!(params.iter().map(|(name, _)| name).collect::<Vec<_>>(), ["words.weight"]);
+        let table = params.values()[0].clone();
+        check_function(&Check::default(), std::slice::from_ref(&table), |x| {
+            layer.forward(&Bound::from_vars(x.to_vec()), &[4, 1, 4].into()).exp()
+        })
+        .unwrap();
+        let tape = Tape::new();
+        let bound = params.bind(&tape);
+        let y = layer.forward(&bound, &[4, 1].into());
+        assert_eq!(y.value().as_slice(), [&table.as_slice()[12..15], &table.as_slice()[3..6]].concat());
+        assert_eq!(layer.forward(&bound, &[].into()).shape(), [0, 3]);
+        assert_eq!(layer.forward(&bound, &[].into()).sum().grad(&bound.vars())[0], Tensor::zeros(&[5, 3]));
+    }
+}

@@ -1,0 +1,160 @@
+//! How weights start.
+
+use rand::{Rng, RngExt};
+use raygrad_tensor::{Scalar, Tensor};
+use std::f64::consts::TAU;
+
+/// How the weights of a layer start.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Init {
+    /// Uniform within `sqrt(6 / (inputs + outputs))` of 0 (Glorot and Bengio 2010, equation 16).
+    Glorot,
+    /// Normal with variance `2 / (inputs + outputs)` (the same, equation 12).
+    GlorotNormal,
+    /// Uniform within `sqrt(6 / inputs)` of 0 (He et al. 2015, equation 10): keeps the variance through ReLU layers.
+    He,
+    /// Normal with variance `2 / inputs` (the same, equation 10).
+    HeNormal,
+    /// Uniform within this bound of 0.
+    Uniform(f64),
+    /// Normal with this standard deviation.
+    Normal(f64),
+    /// This factor times a random orthogonal matrix, every one equally likely: rows or columns, whichever are fewer, are
+    /// orthogonal and of this length (Saxe, McClelland and Ganguli 2014).
+    Orthogonal(f64),
+    /// 0, for what another layer sets going.
+    Zeros,
+}
+
+impl Init {
+    /// A weight matrix `[inputs, outputs]`.
+    pub fn weight<T: Scalar>(self, inputs: usize, outputs: usize, rng: &mut (impl Rng + ?Sized)) -> Tensor<T> {
+        self.tensor(&[inputs, outputs], [inputs, outputs], rng)
+    }
+
+    /// A weight of any shape for a layer each of whose outputs depends on `inputs` numbers and each of whose inputs
+    /// reaches `outputs` numbers. [`Orthogonal`](Self::Orthogonal) sees a matrix whose rows are the first axis.
+    pub fn tensor<T: Scalar>(
+        self,
+        shape: &[usize],
+        [inputs, outputs]: [usize; 2],
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Tensor<T> {
+        let both = (inputs + outputs).max(1) as f64;
+        let inputs = inputs.max(1) as f64;
+        match self {
+            Init::Glorot => uniform((6.0 / both).sqrt(), shape, rng),
+            Init::He => uniform((6.0 / inputs).sqrt(), shape, rng),
+            Init::Uniform(bound) => uniform(bound, shape, rng),
+            Init::GlorotNormal => Tensor::from_fn(shape, |_| T::from_f64((2.0 / both).sqrt() * normal(rng))),
+            Init::HeNormal => Tensor::from_fn(shape, |_| T::from_f64((2.0 / inputs).sqrt() * normal(rng))),
+            Init::Normal(deviation) => Tensor::from_fn(shape, |_| T::from_f64(deviation * normal(rng))),
+            Init::Orthogonal(gain) => orthogonal(gain, shape, rng),
+            Init::Zeros => Tensor::zeros(shape),
+        }
+    }
+}
+
+fn uniform<T: Scalar>(bound: f64, shape: &[usize], rng: &mut (impl Rng + ?Sized)) -> Tensor<T> {
+    Tensor::from_fn(shape, |_| T::from_f64(bound * (2.0 * rng.random::<f64>() - 1.0)))
+}
+
+/// A normal variable of variance 1 (Box and Muller 1958).
+fn normal(rng: &mut (impl Rng + ?Sized)) -> f64 {
+    // 1 - u is in (0, 1], so that the logarithm is finite.
+    (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt() * (TAU * rng.random::<f64>()).cos()
+}
+
+/// The orthogonal factor of a matrix of normal variables, whose triangular factor has a positive diagonal: so every
+/// orthogonal matrix is equally likely (Mezzadri 2007).
+fn orthogonal<T: Scalar>(gain: f64, shape: &[usize], rng: &mut (impl Rng + ?Sized)) -> Tensor<T> {
+    let rows = shape.first().copied().unwrap_or(1);
+    let columns: usize = shape.iter().skip(1).product();
+    let (count, length) = (rows.min(columns), rows.max(columns));
+    let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
+    while basis.len() < count {
+        let mut v: Vec<f64> = (0..length).map(|_| normal(rng)).collect();
+        // Gram-Schmidt twice is orthogonal to the last digits (Giraud et al. 2005).
+        for _ in 0..2 {
+            for unit in &basis {
+                let along: f64 = v.iter().zip(unit).map(|(v, u)| v * u).sum();
+                v.iter_mut().zip(unit).for_each(|(v, u)| *v -= along * u);
+            }
+        }
+        let norm = v.iter().map(|v| v * v).sum::<f64>().sqrt();
+        // What is left of a vector that the others span is noise: draw another.
+        if norm > 1e-8 {
+            v.iter_mut().for_each(|v| *v /= norm);
+            basis.push(v);
+        }
+    }
+    Tensor::from_fn(shape, |i| {
+        let (row, column) = (i / columns, i % columns);
+        T::from_f64(gain * if rows <= columns { basis[row][column] } else { basis[column][row] })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
+
+    fn rng() -> Pcg64Mcg {
+        Pcg64Mcg::seed_from_u64(5)
+    }
+
+    #[test]
+    fn values_have_the_variance_and_the_bounds_that_their_formula_says() {
+        let n = 200.0 * 300.0;
+        let cases = [
+            (Init::Glorot, 2.0 / 500.0, 1.8),
+            (Init::GlorotNormal, 2.0 / 500.0, 3.0),
+            (Init::He, 2.0 / 200.0, 1.8),
+            (Init::HeNormal, 2.0 / 200.0, 3.0),
+            (Init::Uniform(0.3), 0.03, 1.8),
+            (Init::Normal(0.5), 0.25, 3.0),
+        ];
+        for (init, variance, fourth) in cases {
+            let x = init.weight::<f64>(200, 300, &mut rng());
+            let moment = |k: i32| x.as_slice().iter().map(|x| x.powi(k)).sum::<f64>() / n;
+            assert!(moment(1).abs() < 5.0 * (variance / n).sqrt(), "{init:?}: mean {}", moment(1));
+            assert!((moment(2) / variance - 1.0).abs() < 0.03, "{init:?}: variance {}", moment(2));
+            // The fourth moment tells a uniform variable (1.8) from a normal one (3).
+            let ratio = moment(4) / moment(2).powi(2);
+            assert!((ratio - fourth).abs() < 0.1, "{init:?}: {ratio}");
+            if fourth < 2.0 {
+                let bound = (3.0 * variance).sqrt();
+                assert!(x.as_slice().iter().all(|x| x.abs() <= bound), "{init:?} leaves {bound}");
+            }
+        }
+        assert_eq!(Init::Zeros.weight::<f32>(2, 3, &mut rng()), Tensor::zeros(&[2, 3]));
+    }
+
+    #[test]
+    fn an_orthogonal_matrix_is_orthogonal_along_its_shorter_side() {
+        for shape in [&[7, 7][..], &[40, 9], &[9, 40], &[6, 3, 5], &[1, 4], &[4], &[0, 3], &[3, 0]] {
+            let gain = 2.5_f64.sqrt();
+            let x = Init::Orthogonal(gain).tensor::<f64>(shape, [1, 1], &mut rng());
+            assert_eq!(x.shape(), shape);
+            let rows = shape[0];
+            let columns: usize = shape[1..].iter().product();
+            let at = |i: usize, j: usize| x.as_slice()[if rows <= columns { i * columns + j } else { j * columns + i }];
+            let (count, length) = (rows.min(columns), rows.max(columns));
+            for i in 0..count {
+                for j in 0..count {
+                    let product: f64 = (0..length).map(|k| at(i, k) * at(j, k)).sum();
+                    let expected = if i == j { 2.5 } else { 0.0 };
+                    assert!((product - expected).abs() < 1e-13, "{shape:?}: {i} and {j}: {product}");
+                }
+            }
+        }
+        // Equally likely: the mean of an element over many draws is 0, its square 1 / n.
+        let mut rng = rng();
+        let draws: Vec<_> = (0..4000).map(|_| Init::Orthogonal(1.0).weight::<f64>(3, 3, &mut rng)).collect();
+        for place in 0..9 {
+            let mean = |k| draws.iter().map(|x| x.as_slice()[place].powi(k)).sum::<f64>() / 4000.0;
+            assert!(mean(1).abs() < 0.05 && (mean(2) - 1.0 / 3.0).abs() < 0.03, "{place}: {} {}", mean(1), mean(2));
+        }
+    }
+}

@@ -1,0 +1,79 @@
+//! Layer normalisation as one fused operation.
+
+use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::rows::{layer_norm_rows, layer_norm_rows_grad};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+
+/// y = (x - mean) / sqrt(variance + eps) gain + bias along the last axis, for x `[.., n]`, gain and bias `[n]`. The
+/// gradients are those of [`layer_norm_rows_grad`].
+#[derive(Clone, Copy)]
+pub struct LayerNorm {
+    /// Added to the variance.
+    pub eps: f64,
+}
+
+impl<T: Scalar> Op<T> for LayerNorm {
+    fn name(&self) -> &'static str {
+        "layer_norm"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let Some(&n) = x[0].last() else { return Err("a scalar has no last axis".into()) };
+        if x[1] != [n] || x[2] != [n] {
+            return Err(format!("gain and bias must have shape [{n}]"));
+        }
+        Ok(Shape::from_slice(x[0]))
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let [x, gain, bias] = [x[0], x[1], x[2]].map(Tensor::as_slice);
+        layer_norm_rows(x, gain, bias, self.eps, out.as_mut_slice());
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::INPUTS
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, gain) = (cx.x(0), cx.x(1));
+        let pool = cx.pool();
+        let [mut dx, mut dgain, mut dbias] = [cx.shape(0), cx.shape(1), cx.shape(2)].map(|shape| pool.tensor(shape));
+        let [x, gain, g] = [x.value(), gain.value(), cx.g().value()].map(Tensor::as_slice);
+        let grads = [dx.as_mut_slice(), dgain.as_mut_slice(), dbias.as_mut_slice()];
+        layer_norm_rows_grad(x, gain, g, self.eps, grads, pool);
+        Grads::new([dx, dgain, dbias].map(|grad| Some(cx.constant(grad))))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let centred = &x[0] - x[0].mean_over(Axes::from(-1).keepdims());
+        let variance = centred.square().mean_over(Axes::from(-1).keepdims());
+        Some(centred / (variance + self.eps).sqrt() * &x[1] + &x[2])
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// Layer normalisation along the last axis, `(self - mean) / sqrt(variance + eps) * gain + bias`: `[.., n]` with
+    /// `gain` and `bias` of shape `[n]`. The variance is divided by `n`; mean and variance are taken in two passes, so
+    /// a large mean costs no digits.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f64>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[1, 2], vec![10.0, 14.0]));
+    /// let (gain, bias) = (tape.leaf(Tensor::ones(&[2])), tape.leaf(Tensor::full(&[2], 0.5)));
+    /// assert_eq!(x.layer_norm(&gain, &bias, 0.0).value().as_slice(), [-0.5, 1.5]);
+    /// ```
+    ///
+    /// # Panics
+    /// If the shapes do not fit.
+    #[track_caller]
+    pub fn layer_norm(&self, gain: &Self, bias: &Self, eps: f64) -> Self {
+        self.tape().apply(LayerNorm { eps }, &[self, gain, bias])
+    }
+}

@@ -1,0 +1,411 @@
+//! Losses: how far predictions are from their targets.
+
+use crate::catalogue::Cases;
+use crate::elementwise::{Binary, Zip};
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
+use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor};
+use std::sync::Arc;
+
+const INF: f64 = f64::INFINITY;
+
+/// y = (a - b)^2; da = 2 g (a - b), db = -da.
+#[derive(Clone, Copy)]
+pub struct SquaredError;
+impl Binary for SquaredError {
+    const NAME: &'static str = "squared_error";
+    const READS: Reads = Reads::INPUTS;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        let r = a - b;
+        r.clone() * r
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        let two = g.like(2.0);
+        g * (two * (a - b))
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        let two = g.like(2.0);
+        g * (two * (b - a))
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(-3.0..3.0).at([1.0, 1.0], 0.0, [0.0, 0.0]).at([3.0, 1.0], 4.0, [4.0, -4.0]);
+    }
+}
+
+/// y = |a - b|; da = g sign(a - b), so 0 at the kink, db = -da.
+#[derive(Clone, Copy)]
+pub struct AbsoluteError;
+impl Binary for AbsoluteError {
+    const NAME: &'static str = "absolute_error";
+    const READS: Reads = Reads::INPUTS;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        (a - b).abs()
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        g * (a - b).sign()
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        g * (b - a).sign()
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
+        c.at([1.0, 1.0], 0.0, [0.0, 0.0]).at([-INF, 1.0], INF, [-1.0, 1.0]);
+    }
+}
+
+/// `x` limited to `-most..=most`.
+#[inline(always)]
+fn limited<E: Real>(x: E, most: f64) -> E {
+    let (low, high) = (x.like(-most), x.like(most));
+    let below = (low.clone() - x.clone()).if_positive(low, x.clone());
+    (x - high.clone()).if_positive(high, below)
+}
+
+/// With r = a - b: y = r^2 / 2 for |r| <= delta, else delta (|r| - delta / 2); da = g r limited to +-delta, db = -da.
+#[derive(Clone, Copy)]
+pub struct Huber {
+    /// Where the parabola goes over into its tangents.
+    pub delta: f64,
+}
+impl Binary for Huber {
+    const NAME: &'static str = "huber";
+    const READS: Reads = Reads::INPUTS;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        let (half, delta) = (a.like(0.5), a.like(self.delta));
+        let r = (a - b).abs();
+        let near = half.clone() * (r.clone() * r.clone());
+        let far = delta.clone() * (r.clone() - half * delta.clone());
+        (r - delta).if_positive(far, near)
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        g * limited(a - b, self.delta)
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        g * limited(b - a, self.delta)
+    }
+    fn cases(&self, c: &mut Cases) {
+        let d = self.delta;
+        c.domain(0.1 * d..0.9 * d).domain_also(2.5 * d..4.0 * d).domain(-0.05 * d..0.05 * d);
+        c.at([1.0, 1.0], 0.0, [0.0, 0.0]).at([d, 0.0], 0.5 * d * d, [d, -d]).at([INF, 0.0], INF, [d, -d]);
+        c.at([-1e30, 0.0], 1e30 * d, [-d, d]);
+    }
+}
+
+/// With r = a - b: y = r^2 / (2 beta) for |r| < beta, else |r| - beta / 2; da = g r / beta limited to +-1, db = -da.
+/// For beta = 0 this is |r|.
+#[derive(Clone, Copy)]
+pub struct SmoothL1 {
+    /// Where the parabola goes over into its tangents; may be 0.
+    pub beta: f64,
+}
+impl Binary for SmoothL1 {
+    const NAME: &'static str = "smooth_l1";
+    const READS: Reads = Reads::INPUTS;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        let half = a.like(0.5);
+        let (beta, width) = (a.like(self.beta), a.like(self.width()));
+        let r = (a - b).abs();
+        let near = half.clone() * (r.clone() * r.clone()) / width;
+        let far = r.clone() - half * beta.clone();
+        (beta - r).if_positive(near, far)
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        let r = a - b;
+        let near = limited(r.clone() / r.like(self.width()), 1.0);
+        g * self.slope(r, near)
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        let r = b - a;
+        let near = limited(r.clone() / r.like(self.width()), 1.0);
+        g * self.slope(r, near)
+    }
+    fn cases(&self, c: &mut Cases) {
+        let w = self.beta.max(0.1);
+        c.domain(0.1 * w..0.9 * w).domain_also(2.5 * w..4.0 * w).domain(-0.05 * w..0.05 * w);
+        c.at([1.0, 1.0], 0.0, [0.0, 0.0]).at([w, 0.0], w - 0.5 * self.beta, [1.0, -1.0]).at(
+            [INF, 0.0],
+            INF,
+            [1.0, -1.0],
+        );
+    }
+}
+
+impl SmoothL1 {
+    /// What the parabola is divided by: any number if there is none.
+    #[inline(always)]
+    fn width(&self) -> f64 {
+        if self.beta == 0.0 { 1.0 } else { self.beta }
+    }
+
+    #[inline(always)]
+    fn slope<E: Real>(&self, r: E, near: E) -> E {
+        if self.beta == 0.0 { r.sign() } else { near }
+    }
+}
+
+/// y = b softplus(-a) + (1 - b) softplus(a): minus the logarithm of the probability that a logit a gives to a target b
+/// in 0..=1; da = g ((1 - b) s(a) - b s(-a)), db = -g a. No term cancels another, so small losses keep their digits.
+#[derive(Clone, Copy)]
+pub struct BinaryCrossEntropy;
+impl Binary for BinaryCrossEntropy {
+    const NAME: &'static str = "binary_cross_entropy";
+    const READS: Reads = Reads::INPUTS;
+    #[inline(always)]
+    fn f<E: Real>(&self, a: E, b: E) -> E {
+        let (zero, one) = (a.like(0.0), a.like(1.0));
+        // softplus(+-a) = softplus(-|a|) + max(+-a, 0).
+        let tail = (-a.clone().abs()).softplus();
+        let against = (one - b.clone()) * a.if_positive(a.clone(), zero.clone());
+        let towards = b * (-a.clone()).if_positive(-a, zero);
+        tail + against + towards
+    }
+    #[inline(always)]
+    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+        let one = b.like(1.0);
+        g * ((one - b.clone()) * a.clone().sigmoid() - b * (-a).sigmoid())
+    }
+    #[inline(always)]
+    fn vjp_b<E: Real>(&self, g: E, a: E, _b: E, _y: E) -> E {
+        -(g * a)
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(-3.0..3.0).domain(0.1..0.9).at([0.0, 1.0], std::f64::consts::LN_2, [-0.5, 0.0]);
+        c.at([40.0, 1.0], 4.248_354_255_291_589e-18, [-4.248_354_255_291_589e-18, -40.0]).at(
+            [-200.0, 1.0],
+            200.0,
+            [-1.0, 200.0],
+        );
+        c.at([-40.0, 0.0], 4.248_354_255_291_589e-18, [4.248_354_255_291_589e-18, 40.0]).at(
+            [1e30, 0.0],
+            1e30,
+            [1.0, -1e30],
+        );
+    }
+}
+
+/// y = ln sum e^x - x[class] of each row of logits: `[.., n]` to `[..]`; dx = g (softmax - 1 at the class).
+#[derive(Clone)]
+pub struct CrossEntropy {
+    /// The class of each row. A clone is a reference count.
+    pub classes: Arc<[u32]>,
+}
+
+impl<T: Scalar> Op<T> for CrossEntropy {
+    fn name(&self) -> &'static str {
+        "cross_entropy"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let Some((&n, rest)) = x[0].split_last() else { return Err("a scalar has no classes".into()) };
+        let rows: usize = rest.iter().product();
+        if rows != self.classes.len() {
+            return Err(format!("{} classes for {rows} rows", self.classes.len()));
+        }
+        match self.classes.iter().enumerate().find(|&(_, &class)| class as usize >= n) {
+            Some((i, class)) => Err(format!("row {i} has class {class}, but there are {n} classes")),
+            None => Ok(Shape::from_slice(rest)),
+        }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let axes = x[0].ndim() - 1;
+        let mut out = pool.tensor(&x[0].shape()[..axes]);
+        cross_entropy_rows(x[0].as_slice(), x[0].shape()[axes], &self.classes, out.as_mut_slice(), pool);
+        out
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, g) = (cx.x(0), cx.g().value().as_slice());
+        let mut out = cx.pool().tensor(x.shape());
+        let n = x.shape()[x.shape().len() - 1];
+        cross_entropy_rows_grad(x.value().as_slice(), n, &self.classes, g, out.as_mut_slice(), cx.pool());
+        Grads::one(cx.constant(out))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let axes = x[0].shape().len() - 1;
+        let n = x[0].shape()[axes];
+        let logs = x[0].log_softmax(-1);
+        let index = self.classes.iter().enumerate().map(|(row, &class)| (row * n) as u32 + class).collect();
+        Some(-logs.reshape(&[logs.value().len()]).gather_rows(&index).reshape(&x[0].shape()[..axes]))
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// A loss of each element; no broadcasting, which in a loss is a mistake more often than not.
+    #[track_caller]
+    fn loss(&self, loss: impl Binary, target: &Self) -> Self {
+        assert_eq!(self.shape(), target.shape(), "a loss of a prediction and a target of different shapes");
+        self.tape().apply(Zip(loss), &[self, target])
+    }
+
+    /// `(self - target)^2` of each element.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn squared_error(&self, target: &Self) -> Self {
+        self.loss(SquaredError, target)
+    }
+
+    /// The mean squared error: the mean of [`squared_error`](Self::squared_error), as a scalar.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn mse_loss(&self, target: &Self) -> Self {
+        self.squared_error(target).mean()
+    }
+
+    /// `|self - target|` of each element. The gradient at equality is 0.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn absolute_error(&self, target: &Self) -> Self {
+        self.loss(AbsoluteError, target)
+    }
+
+    /// The mean absolute error: the mean of [`absolute_error`](Self::absolute_error), as a scalar.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn l1_loss(&self, target: &Self) -> Self {
+        self.absolute_error(target).mean()
+    }
+
+    /// Huber's loss of each element: with `r = self - target`, `r^2 / 2` up to `|r| = delta`, and beyond the tangents
+    /// `delta (|r| - delta / 2)`.
+    ///
+    /// # Panics
+    /// If the shapes differ or `delta` is not positive.
+    #[track_caller]
+    pub fn huber(&self, target: &Self, delta: f64) -> Self {
+        assert!(delta > 0.0, "the width of Huber's loss is {delta}");
+        self.loss(Huber { delta }, target)
+    }
+
+    /// The mean of [`huber`](Self::huber), as a scalar.
+    ///
+    /// # Panics
+    /// As [`huber`](Self::huber).
+    #[track_caller]
+    pub fn huber_loss(&self, target: &Self, delta: f64) -> Self {
+        self.huber(target, delta).mean()
+    }
+
+    /// Huber's loss divided by `beta`, so that its tangents have slope 1; for `beta` 0 the absolute error.
+    ///
+    /// # Panics
+    /// If the shapes differ or `beta` is negative.
+    #[track_caller]
+    pub fn smooth_l1(&self, target: &Self, beta: f64) -> Self {
+        assert!(beta >= 0.0, "the width of the smooth L1 loss is {beta}");
+        self.loss(SmoothL1 { beta }, target)
+    }
+
+    /// The mean of [`smooth_l1`](Self::smooth_l1), as a scalar.
+    ///
+    /// # Panics
+    /// As [`smooth_l1`](Self::smooth_l1).
+    #[track_caller]
+    pub fn smooth_l1_loss(&self, target: &Self, beta: f64) -> Self {
+        self.smooth_l1(target, beta).mean()
+    }
+
+    /// The cross-entropy of each element, `-t ln s - (1 - t) ln(1 - s)`, with `s` the [`sigmoid`](Self::sigmoid) of
+    /// this logit and `t` the target in 0..=1. Finite and accurate for any finite logit.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn binary_cross_entropy(&self, target: &Self) -> Self {
+        self.loss(BinaryCrossEntropy, target)
+    }
+
+    /// The mean of [`binary_cross_entropy`](Self::binary_cross_entropy) from logits, as a scalar.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn binary_cross_entropy_loss(&self, target: &Self) -> Self {
+        self.binary_cross_entropy(target).mean()
+    }
+
+    /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` with a class below `n` for each
+    /// row, to `[..]`.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f64>::new();
+    /// let logits = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 0.0, 3.0_f64.ln(), 0.0]));
+    /// let loss = logits.cross_entropy(&[1, 0]);
+    /// assert!((loss.value().as_slice()[0] - 2.0_f64.ln()).abs() < 1e-15); // 1/2 for the right class
+    /// assert!((loss.value().as_slice()[1] - (4.0_f64 / 3.0).ln()).abs() < 1e-15); // 3/4
+    /// ```
+    ///
+    /// # Panics
+    /// If there is not one class for each row, or one is not below `n`.
+    #[track_caller]
+    pub fn cross_entropy(&self, classes: &[usize]) -> Self {
+        let class = |&class: &usize| u32::try_from(class).unwrap_or(u32::MAX);
+        self.tape().apply(CrossEntropy { classes: classes.iter().map(class).collect() }, &[self])
+    }
+
+    /// The mean of [`cross_entropy`](Self::cross_entropy) over the rows, as a scalar; NaN for no rows.
+    ///
+    /// # Panics
+    /// As [`cross_entropy`](Self::cross_entropy).
+    #[track_caller]
+    pub fn cross_entropy_loss(&self, classes: &[usize]) -> Self {
+        self.cross_entropy(classes).mean()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{Tape, Tensor};
+
+    #[test]
+    #[should_panic(expected = "different shapes")]
+    fn a_loss_does_not_broadcast() {
+        let tape = Tape::<f32>::new();
+        let _ = tape.constant(Tensor::zeros(&[4, 1])).mse_loss(&tape.constant(Tensor::zeros(&[4])));
+    }
+
+    #[test]
+    #[should_panic(expected = "row 1 has class 3, but there are 3 classes")]
+    fn a_class_that_does_not_exist_is_reported() {
+        let tape = Tape::<f32>::new();
+        let _ = tape.constant(Tensor::zeros(&[2, 3])).cross_entropy_loss(&[0, 3]);
+    }
+
+    #[test]
+    fn losses_are_means() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from_vec(&[2], vec![3.0, 0.5]));
+        let t = tape.constant(Tensor::from_vec(&[2], vec![0.0, 0.0]));
+        assert_eq!(x.mse_loss(&t).item(), 9.25 / 2.0);
+        assert_eq!(x.l1_loss(&t).item(), 3.5 / 2.0);
+        assert_eq!(x.huber_loss(&t, 2.0).item(), (4.0 + 0.125) / 2.0);
+        assert_eq!(x.smooth_l1_loss(&t, 2.0).item(), (2.0 + 0.0625) / 2.0);
+        assert_eq!(x.smooth_l1_loss(&t, 0.0).item(), x.l1_loss(&t).item());
+    }
+}

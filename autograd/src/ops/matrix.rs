@@ -1,0 +1,106 @@
+//! Parts of matrices: triangles and diagonals of the last two axes.
+
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor};
+
+/// y = x where column - row is at least (upper) or at most (lower) a number, else 0; dx is the same of g.
+#[derive(Clone, Copy)]
+pub struct Triangle {
+    /// Whether the upper triangle stays.
+    pub upper: bool,
+    /// Column minus row on the diagonal that bounds the triangle and belongs to it.
+    pub diagonal: isize,
+}
+
+impl<T: Scalar> Op<T> for Triangle {
+    fn name(&self) -> &'static str {
+        "triangle"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0].len() < 2 { Err("a matrix has two axes at least".into()) } else { Ok(x[0].into()) }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.copy_of(x[0].shape(), x[0].as_slice());
+        let [.., rows, columns] = *x[0].shape() else { unreachable!("`shape` wants two axes") };
+        for (row, out) in out.as_mut_slice().chunks_exact_mut(columns.max(1)).enumerate() {
+            let diagonal = (row % rows) as isize + self.diagonal;
+            if self.upper {
+                out[..diagonal.clamp(0, columns as isize) as usize].fill(T::ZERO);
+            } else {
+                out[(diagonal + 1).clamp(0, columns as isize) as usize..].fill(T::ZERO);
+            }
+        }
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.tape().apply(*self, &[cx.g()]))
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The lower triangle of each matrix, zeros elsewhere: what stands on or below the diagonal number `diagonal`,
+    /// which counts from the main one towards the upper right.
+    ///
+    /// # Panics
+    /// If there are less than two axes.
+    #[track_caller]
+    pub fn tril(&self, diagonal: isize) -> Self {
+        self.tape().apply(Triangle { upper: false, diagonal }, &[self])
+    }
+
+    /// The upper triangle of each matrix, zeros elsewhere: what stands on or above the diagonal number `diagonal`,
+    /// which counts from the main one towards the upper right.
+    ///
+    /// # Panics
+    /// If there are less than two axes.
+    #[track_caller]
+    pub fn triu(&self, diagonal: isize) -> Self {
+        self.tape().apply(Triangle { upper: true, diagonal }, &[self])
+    }
+
+    /// A diagonal of each matrix, `[.., m, n]` to `[.., k]`. Number `diagonal` counts from the main one towards the upper
+    /// right; it is empty beyond the corners.
+    ///
+    /// # Panics
+    /// If there are less than two axes.
+    #[track_caller]
+    pub fn diagonal(&self, diagonal: isize) -> Self {
+        let ndim = self.shape().len();
+        assert!(ndim >= 2, "diagonal of a tensor of shape {:?}", self.shape());
+        self.view(Layout::contiguous(self.shape()).diagonal(ndim - 2, ndim - 1, diagonal))
+    }
+
+    /// Matrices with the rows of this tensor on a diagonal and zeros elsewhere, `[.., k]` to `[.., n, n]` with
+    /// `n = k + abs(diagonal)`: the adjoint of [`diagonal`](Self::diagonal).
+    ///
+    /// # Panics
+    /// If this is a scalar.
+    #[track_caller]
+    pub fn diag_embed(&self, diagonal: isize) -> Self {
+        let Some((&len, lead)) = self.shape().split_last() else { panic!("the diagonal of a matrix from a scalar") };
+        let n = len + diagonal.unsigned_abs();
+        let shape: Shape = lead.iter().copied().chain([n, n]).collect();
+        let layout = Layout::contiguous(&shape).diagonal(shape.len() - 2, shape.len() - 1, diagonal);
+        self.scatter_view(&shape, layout)
+    }
+
+    /// The diagonal of a matrix, or the matrix with a vector on its diagonal, as in NumPy.
+    ///
+    /// # Panics
+    /// If there are not one or two axes.
+    #[track_caller]
+    pub fn diag(&self, diagonal: isize) -> Self {
+        match self.shape().len() {
+            1 => self.diag_embed(diagonal),
+            2 => self.diagonal(diagonal),
+            _ => panic!("diag of a tensor of shape {:?}: use diagonal or diag_embed", self.shape()),
+        }
+    }
+}

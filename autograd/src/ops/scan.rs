@@ -1,0 +1,308 @@
+//! Cumulative sums and products, the recurrence that their derivatives lead to, and the product.
+
+use crate::axes::axis_of;
+use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+
+/// The order in which a scan walks an axis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Walk {
+    /// The axis.
+    pub axis: usize,
+    /// From the last entry to the first.
+    pub reverse: bool,
+}
+
+impl Walk {
+    fn back(self) -> Self {
+        Walk { reverse: !self.reverse, ..self }
+    }
+
+    fn check(&self, x: &[usize]) -> Result<Shape, ShapeError> {
+        if self.axis < x.len() { Ok(Shape::from_slice(x)) } else { Err(format!("there is no axis {}", self.axis)) }
+    }
+
+    /// Calls `f(state, i)` for every element in the order of the walk, with one state, that starts as `start`, for each
+    /// line along the axis. States are f64: what is carried on is not rounded.
+    #[inline(always)]
+    fn run(self, shape: &[usize], start: f64, mut f: impl FnMut(&mut f64, usize)) {
+        let (count, inner) = (shape[self.axis], shape[self.axis + 1..].iter().product::<usize>());
+        let outer: usize = shape[..self.axis].iter().product();
+        let mut states = vec![start; inner];
+        for o in 0..outer {
+            states.fill(start);
+            for step in 0..count {
+                let row = o * count + if self.reverse { count - 1 - step } else { step };
+                for (j, state) in states.iter_mut().enumerate() {
+                    f(state, row * inner + j);
+                }
+            }
+        }
+    }
+
+    /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the
+    /// end.
+    fn neighbour<'t, T: Scalar>(self, x: &Var<'t, T>, next: bool, fill: f64) -> Var<'t, T> {
+        let n = x.shape()[self.axis];
+        if n == 0 {
+            return x.clone();
+        }
+        let mut shape = Shape::from_slice(x.shape());
+        shape[self.axis] = 1;
+        let end = x.tape().constant(x.tape().pool().full(&shape, T::from_f64(fill)));
+        if self.reverse == next {
+            Var::concat(&[&end, &x.slice(self.axis, 0, n - 1)], self.axis)
+        } else {
+            Var::concat(&[&x.slice(self.axis, 1, n - 1), &end], self.axis)
+        }
+    }
+}
+
+/// y = sum of x up to and with each entry; dx = the sum of g the other way.
+#[derive(Clone, Copy)]
+pub struct Cumsum(
+    /// The order.
+    pub Walk,
+);
+
+impl<T: Scalar> Op<T> for Cumsum {
+    fn name(&self) -> &'static str {
+        "cumsum"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        self.0.check(x[0])
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let (x, y, shape) = (x[0].as_slice(), out.as_mut_slice(), x[0].shape());
+        self.0.run(shape, 0.0, |sum, i| {
+            *sum += x[i].to_f64();
+            y[i] = T::from_f64(*sum);
+        });
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        Grads::one(cx.tape().apply(Cumsum(self.0.back()), &[cx.g()]))
+    }
+}
+
+/// y = product of x up to and with each entry. dx: the gradients of all later products, carried back by [`Recurrence`],
+/// times the product before the entry; nothing is divided, so zeros do no harm.
+#[derive(Clone, Copy)]
+pub struct Cumprod(
+    /// The order.
+    pub Walk,
+);
+
+impl<T: Scalar> Op<T> for Cumprod {
+    fn name(&self) -> &'static str {
+        "cumprod"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        self.0.check(x[0])
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let (x, y, shape) = (x[0].as_slice(), out.as_mut_slice(), x[0].shape());
+        self.0.run(shape, 1.0, |product, i| {
+            *product *= x[i].to_f64();
+            y[i] = T::from_f64(*product);
+        });
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::ALL
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let next = self.0.neighbour(&cx.x(0), true, 0.0);
+        let later = cx.tape().apply(Recurrence(self.0.back()), &[&next, cx.g()]);
+        Grads::one(later * self.0.neighbour(&cx.y(), false, 1.0))
+    }
+}
+
+/// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence, the other way, of g with the
+/// next factor; da = db y[i - 1].
+#[derive(Clone, Copy)]
+pub struct Recurrence(
+    /// The order.
+    pub Walk,
+);
+
+impl<T: Scalar> Op<T> for Recurrence {
+    fn name(&self) -> &'static str {
+        "recurrence"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0] != x[1] {
+            return Err("factors and summands must have one shape".into());
+        }
+        self.0.check(x[0])
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let (a, b, y, shape) = (x[0].as_slice(), x[1].as_slice(), out.as_mut_slice(), x[0].shape());
+        self.0.run(shape, 0.0, |state, i| {
+            *state = a[i].to_f64() * *state + b[i].to_f64();
+            y[i] = T::from_f64(*state);
+        });
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::only(&[0]).and_output()
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let next = self.0.neighbour(&cx.x(0), true, 0.0);
+        let db = cx.tape().apply(Recurrence(self.0.back()), &[&next, cx.g()]);
+        let da = cx.needs(0).then(|| &db * self.0.neighbour(&cx.y(), false, 0.0));
+        Grads::new([da, Some(db)])
+    }
+}
+
+/// y = the product of each row (along the last axis); dx = g times the product of all others.
+#[derive(Clone, Copy)]
+pub struct Product;
+
+impl<T: Scalar> Op<T> for Product {
+    fn name(&self) -> &'static str {
+        "prod"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let Some((_, rest)) = x[0].split_last() else { return Err("a scalar has no rows".into()) };
+        Ok(Shape::from_slice(rest))
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let axes = x[0].ndim() - 1;
+        let mut out = pool.full(&x[0].shape()[..axes], T::ONE);
+        let n = x[0].shape()[axes];
+        for (x, out) in x[0].as_slice().chunks_exact(n.max(1)).zip(out.as_mut_slice()) {
+            *out = T::from_f64(x.iter().map(|x| x.to_f64()).product());
+        }
+        out
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, g) = (cx.x(0), cx.g());
+        let axis = x.shape().len() - 1;
+        if cx.recording() {
+            // The products before and behind each entry.
+            let (forth, back) = (Walk { axis, reverse: false }, Walk { axis, reverse: true });
+            let around = |walk: Walk| walk.neighbour(&cx.tape().apply(Cumprod(walk), &[&x]), false, 1.0);
+            let mut column = Shape::from_slice(g.shape());
+            column.push(1);
+            return Grads::one(around(forth) * around(back) * g.reshape(&column));
+        }
+        let mut out = cx.pool().tensor(x.shape());
+        let n = x.shape()[axis].max(1);
+        let rows = x.value().as_slice().chunks_exact(n).zip(out.as_mut_slice().chunks_exact_mut(n));
+        for ((x, out), g) in rows.zip(g.value().as_slice()) {
+            product_of_others(x, g.to_f64(), out);
+        }
+        Grads::one(cx.constant(out))
+    }
+}
+
+/// `g` times the product of all other elements of the row, in f64. A quotient where there is no zero, so that partial
+/// products that overflow do no harm; only where there is one is the rest multiplied up.
+fn product_of_others<T: Scalar>(x: &[T], g: f64, out: &mut [T]) {
+    let others: f64 = x.iter().filter(|x| **x != T::ZERO).map(|x| x.to_f64()).product();
+    let zeros = x.iter().filter(|x| **x == T::ZERO).count();
+    for (out, x) in out.iter_mut().zip(x) {
+        *out = T::from_f64(match (zeros, *x == T::ZERO) {
+            (0, _) => g * (others / x.to_f64()),
+            (1, true) => g * others,
+            _ => 0.0,
+        });
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// A scan along an axis that may be counted from the last one; a scalar counts as one entry.
+    #[track_caller]
+    fn walk(&self, axis: isize, reverse: bool, scan: impl Fn(Walk, &Self) -> Self) -> Self {
+        if self.shape().is_empty() {
+            return scan(Walk { axis: axis_of(axis, &[1]), reverse }, &self.reshape(&[1])).reshape(&[]);
+        }
+        scan(Walk { axis: axis_of(axis, self.shape()), reverse }, self)
+    }
+
+    /// The sums of the entries along `axis` up to each one and with it, carried in f64.
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn cumsum(&self, axis: isize) -> Self {
+        self.walk(axis, false, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
+    }
+
+    /// The sums of the entries along `axis` from each one (with it) to the last, carried in f64.
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn reverse_cumsum(&self, axis: isize) -> Self {
+        self.walk(axis, true, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
+    }
+
+    /// The products of the entries along `axis` up to each one and with it, carried in f64. The gradient is right
+    /// whatever entries are 0.
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn cumprod(&self, axis: isize) -> Self {
+        self.walk(axis, false, |walk, x| x.tape().apply(Cumprod(walk), &[x]))
+    }
+
+    /// `y[i] = self[i] y[i - 1] + summand[i]` along `axis`, with 0 before the first entry: a first-order linear
+    /// recurrence, such as a discounted sum or an exponential moving average.
+    ///
+    /// # Panics
+    /// If the shapes differ or the axis does not exist.
+    #[track_caller]
+    pub fn recurrence(&self, summand: &Self, axis: isize) -> Self {
+        let walk = Walk { axis: axis_of(axis, self.shape()), reverse: false };
+        self.tape().apply(Recurrence(walk), &[self, summand])
+    }
+
+    /// The product of all elements, as a scalar; see [`prod_over`](Self::prod_over).
+    #[track_caller]
+    pub fn prod(&self) -> Self {
+        self.prod_over(..)
+    }
+
+    /// The product over any axes; 1 over none of the elements. The gradient is right whatever elements are 0.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[3, 3], vec![2.0, 3.0, 4.0, 2.0, 0.0, 4.0, 0.0, 3.0, 0.0]));
+    /// let y = x.prod_over(-1);
+    /// assert_eq!(y.value().as_slice(), [24.0, 0.0, 0.0]);
+    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [12.0, 8.0, 6.0, 0.0, 8.0, 0.0, 0.0, 0.0, 0.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice.
+    #[track_caller]
+    pub fn prod_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        self.tape().apply(Product, &[&self.rows_over(&axes)]).reshape(&axes.result())
+    }
+}

@@ -1,0 +1,203 @@
+//! Softmax, its logarithm, and the logarithm of a sum of exponentials.
+
+use crate::axes::axis_of;
+use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::rows;
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+
+/// The shape, if it has a last axis, and the extent of that.
+fn last_axis(x: &[usize]) -> Result<(Shape, usize), ShapeError> {
+    match x.last() {
+        Some(&n) => Ok((Shape::from_slice(x), n)),
+        None => Err("a scalar has no last axis".into()),
+    }
+}
+
+/// The last axis of a variable that an operation has accepted, as axes of a sum.
+fn kept_last() -> Axes {
+    Axes::from(-1).keepdims()
+}
+
+/// y = e^(x - max) / sum e^(x - max) along the last axis; dx = y (g - sum g y).
+#[derive(Clone, Copy)]
+pub struct Softmax;
+
+impl<T: Scalar> Op<T> for Softmax {
+    fn name(&self) -> &'static str {
+        "softmax"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(last_axis(x[0])?.0)
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        rows::softmax_rows(x[0].as_slice(), x[0].shape()[x[0].ndim() - 1], out.as_mut_slice(), pool);
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::OUTPUT
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (y, g) = (cx.y(), cx.g());
+        if cx.recording() {
+            return Grads::one(&y * (g - (g * &y).sum_over(kept_last())));
+        }
+        let mut out = cx.pool().tensor(y.shape());
+        let n = y.shape()[y.shape().len() - 1];
+        rows::softmax_rows_grad(y.value().as_slice(), g.value().as_slice(), n, out.as_mut_slice());
+        Grads::one(cx.constant(out))
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let powers = x[0].exp();
+        Some(&powers / powers.sum_over(kept_last()))
+    }
+}
+
+/// y = x - max - ln sum e^(x - max) along the last axis; dx = g - e^y sum g.
+#[derive(Clone, Copy)]
+pub struct LogSoftmax;
+
+impl<T: Scalar> Op<T> for LogSoftmax {
+    fn name(&self) -> &'static str {
+        "log_softmax"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(last_axis(x[0])?.0)
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        rows::log_softmax_rows(x[0].as_slice(), x[0].shape()[x[0].ndim() - 1], out.as_mut_slice(), pool);
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::OUTPUT
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (y, g) = (cx.y(), cx.g());
+        if cx.recording() {
+            return Grads::one(g - y.exp() * g.sum_over(kept_last()));
+        }
+        let mut out = cx.pool().tensor(y.shape());
+        let n = y.shape()[y.shape().len() - 1];
+        rows::log_softmax_rows_grad(y.value().as_slice(), g.value().as_slice(), n, out.as_mut_slice());
+        Grads::one(cx.constant(out))
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some(&x[0] - x[0].exp().sum_over(kept_last()).ln())
+    }
+}
+
+/// y = ln sum e^x along the last axis, which goes; dx = g e^(x - y), and 0 where y is -inf.
+#[derive(Clone, Copy)]
+pub struct LogSumExp;
+
+impl<T: Scalar> Op<T> for LogSumExp {
+    fn name(&self) -> &'static str {
+        "logsumexp"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let (mut shape, _) = last_axis(x[0])?;
+        shape.pop();
+        Ok(shape)
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let last = x[0].ndim() - 1;
+        let mut out = pool.tensor(&x[0].shape()[..last]);
+        rows::logsumexp_rows(x[0].as_slice(), x[0].shape()[last], out.as_mut_slice(), pool);
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::ALL
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, y) = (cx.x(0), cx.y());
+        let mut column = Shape::from_slice(y.shape());
+        column.push(1);
+        // x - y would be NaN where both are -inf; there e^x is the 0 that is wanted.
+        let nothing = y.eq(&y.constant(f64::NEG_INFINITY));
+        let y = y.constant(0.0).where_(&nothing, &y).reshape(&column);
+        Grads::one((x - y).exp() * cx.g().reshape(&column))
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some(x[0].exp().sum_over(-1).ln())
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// An operation along the last axis, done along another one; a scalar counts as one entry.
+    #[track_caller]
+    fn along(&self, axis: isize, op: impl Op<T>) -> Self {
+        let ndim = self.shape().len();
+        if ndim == 0 {
+            axis_of(axis, &[1]);
+            return self.tape().apply(op, &[&self.reshape(&[1])]).reshape(&[]);
+        }
+        let axis = axis_of(axis, self.shape());
+        if axis == ndim - 1 {
+            return self.tape().apply(op, &[self]);
+        }
+        let mut order: Shape = (0..ndim).collect();
+        order.swap(axis, ndim - 1);
+        self.tape().apply(op, &[&self.permute(&order)]).permute(&order)
+    }
+
+    /// Softmax along `axis`: `e^self` divided by its sum, without overflow. Entries of -inf get probability 0; a row of
+    /// nothing else is NaN. Fastest along the last axis.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f64>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 3.0_f64.ln(), 1000.0, 1000.0]));
+    /// let y = x.softmax(-1);
+    /// assert!((y.value().as_slice()[1] - 0.75).abs() < 1e-15);
+    /// assert_eq!(y.value().as_slice()[2..], [0.5, 0.5]);
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn softmax(&self, axis: isize) -> Self {
+        self.along(axis, Softmax)
+    }
+
+    /// The logarithm of [`softmax`](Self::softmax) along `axis`, accurate also where that vanishes.
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn log_softmax(&self, axis: isize) -> Self {
+        self.along(axis, LogSoftmax)
+    }
+
+    /// `ln(sum(e^self))` of all elements, as a scalar; see [`logsumexp_over`](Self::logsumexp_over).
+    #[track_caller]
+    pub fn logsumexp(&self) -> Self {
+        self.logsumexp_over(..)
+    }
+
+    /// `ln(sum(e^self))` over any axes, without overflow; -inf, with gradient 0, over none of the elements and over
+    /// nothing but -inf.
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice.
+    #[track_caller]
+    pub fn logsumexp_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        self.tape().apply(LogSumExp, &[&self.rows_over(&axes)]).reshape(&axes.result())
+    }
+}

@@ -1,0 +1,238 @@
+//! Vectors along the last axis: cross product and direction.
+
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, broadcast_to};
+
+/// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
+#[derive(Clone, Copy)]
+pub struct Cross;
+
+impl<T: Scalar> Op<T> for Cross {
+    fn name(&self) -> &'static str {
+        "cross"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0].last() != Some(&3) || x[1].last() != Some(&3) {
+            return Err("the last axis of both must have three entries".into());
+        }
+        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let Some(shape) = broadcast_shape(&[x[0].shape(), x[1].shape()]) else {
+            unreachable!("`shape` has accepted these extents")
+        };
+        let (a, b) = (broadcast_to(x[0], &shape, pool), broadcast_to(x[1], &shape, pool));
+        let mut out = pool.tensor(&shape);
+        let pairs = a.as_slice().chunks_exact(3).zip(b.as_slice().chunks_exact(3));
+        for (y, (a, b)) in out.as_mut_slice().chunks_exact_mut(3).zip(pairs) {
+            y[0] = a[1] * b[2] - a[2] * b[1];
+            y[1] = a[2] * b[0] - a[0] * b[2];
+            y[2] = a[0] * b[1] - a[1] * b[0];
+        }
+        out
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let da = cx.needs(0).then(|| cx.x(1).cross(cx.g()).sum_to(cx.shape(0)));
+        let db = cx.needs(1).then(|| cx.g().cross(&cx.x(0)).sum_to(cx.shape(1)));
+        Grads::new([da, db])
+    }
+}
+
+/// y = x / |x| along the last axis; dx = (g - y (y . g)) / |x|.
+///
+/// Rows are divided by their largest element first, so that neither tiny nor huge ones lose digits. A row of zeros gives
+/// zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest number.
+#[derive(Clone, Copy)]
+pub struct Normalize;
+
+/// The largest absolute value of a row, NaN if there is one.
+fn largest<T: Scalar>(row: &[T]) -> T {
+    let mut largest = T::ZERO;
+    for &x in row {
+        let x = if x < T::ZERO { -x } else { x };
+        largest = if x <= largest { largest } else { x };
+        if x.partial_cmp(&x).is_none() {
+            return x;
+        }
+    }
+    largest
+}
+
+/// The norm of `row / scale`, with the quotients written to `unit`.
+fn scaled_norm<T: Scalar>(row: &[T], scale: T, unit: &mut [T], squares: &mut [T]) -> T {
+    for ((unit, square), &x) in unit.iter_mut().zip(squares.iter_mut()).zip(row) {
+        *unit = x / scale;
+        *square = *unit * *unit;
+    }
+    raygrad_tensor::sum(squares).sqrt()
+}
+
+/// The gradient of one row, in place of `g`.
+fn row_gradient<T: Scalar>(x: &[T], g: &mut [T], unit: &mut [T], products: &mut [T]) {
+    let scale = largest(x);
+    if scale == T::ZERO {
+        g.fill(T::ZERO);
+        return;
+    }
+    let norm = scaled_norm(x, scale, unit, products);
+    for ((unit, product), &g) in unit.iter_mut().zip(products.iter_mut()).zip(g.iter()) {
+        *unit = *unit / norm;
+        *product = *unit * g;
+    }
+    let along = raygrad_tensor::sum(products);
+    let most = T::from_f64(if size_of::<T>() == 4 { f32::MAX.into() } else { f64::MAX });
+    for (g, &unit) in g.iter_mut().zip(unit.iter()) {
+        let across = (*g - unit * along) / norm;
+        let quotient = across / scale;
+        *g = if quotient.is_finite() || !across.is_finite() {
+            quotient
+        } else if quotient > T::ZERO {
+            most
+        } else {
+            -most
+        };
+    }
+}
+
+impl<T: Scalar> Op<T> for Normalize {
+    fn name(&self) -> &'static str {
+        "normalize"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        if x[0].is_empty() { Err("a scalar has no direction".into()) } else { Ok(x[0].into()) }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let mut out = pool.tensor(x[0].shape());
+        let width = x[0].shape()[x[0].ndim() - 1].max(1);
+        let mut squares = vec![T::ZERO; width];
+        for (x, y) in x[0].as_slice().chunks_exact(width).zip(out.as_mut_slice().chunks_exact_mut(width)) {
+            let scale = largest(x);
+            if scale == T::ZERO {
+                y.fill(T::ZERO);
+                continue;
+            }
+            let norm = scaled_norm(x, scale, y, &mut squares);
+            y.iter_mut().for_each(|y| *y = *y / norm);
+        }
+        out
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::INPUTS
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let mut grad = cx.g().value().clone();
+        let width = cx.shape(0)[cx.shape(0).len() - 1].max(1);
+        let (mut unit, mut products) = (vec![T::ZERO; width], vec![T::ZERO; width]);
+        for (x, g) in cx.x(0).value().as_slice().chunks_exact(width).zip(grad.as_mut_slice().chunks_exact_mut(width)) {
+            row_gradient(x, g, &mut unit, &mut products);
+        }
+        Grads::one(cx.constant(grad))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let (tape, shape) = (x[0].tape(), x[0].shape());
+        let mut column = Shape::from_slice(shape);
+        let width = std::mem::replace(&mut column[shape.len() - 1], 1);
+        let scales: Vec<T> = match width {
+            0 => vec![T::ONE; column.iter().product()],
+            _ => x[0].value().as_slice().chunks_exact(width).map(largest).collect(),
+        };
+        // The scale of a row cancels, so it is a constant. A row of zeros is divided by infinity: 0 with gradient 0.
+        let zero = |&scale: &T| scale == T::ZERO;
+        let scale = |scale| if zero(scale) { T::from_f64(f64::INFINITY) } else { *scale };
+        let scale = tape.constant(Tensor::from_vec(&column, scales.iter().map(scale).collect()));
+        let one = |scale| if zero(scale) { T::ONE } else { T::ZERO };
+        let one = tape.constant(Tensor::from_vec(&column, scales.iter().map(one).collect()));
+        let unit = &x[0] / scale;
+        let square = unit.square().sum_axes(&[shape.len() - 1]);
+        Some(unit / (square + one).sqrt())
+    }
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The cross product along the last axis, of extent 3; other axes broadcast.
+    ///
+    /// # Panics
+    /// If a last axis has not three entries or the shapes do not broadcast.
+    #[track_caller]
+    pub fn cross(&self, other: &Self) -> Self {
+        self.tape().apply(Cross, &[self, other])
+    }
+
+    /// The rows of the last axis divided by their length. Rows of any size keep their digits (1e-40 and 1e30 alike). A
+    /// row of zeros gives zeros with gradient 0; where the gradient of a tiny row would overflow it is the largest
+    /// number; NaN gives NaN, and so does a row with an infinite element.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![3e-23, 4e-23, 0.0, 0.0]));
+    /// assert_eq!(x.normalize().value().as_slice(), [0.6, 0.8, 0.0, 0.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If this is a scalar.
+    #[track_caller]
+    pub fn normalize(&self) -> Self {
+        self.tape().apply(Normalize, &[self])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Tape;
+
+    #[test]
+    fn rows_of_any_size_keep_their_digits() {
+        for scale in [1e-44_f32, 1e-40, 1e-23, 1.0, 1e20, f32::MAX / 4.0] {
+            let tape = Tape::<f32>::new();
+            let row = [3.0 * scale, -4.0 * scale, 0.0];
+            let x = tape.leaf(Tensor::from_vec(&[3], row.to_vec()));
+            let y = x.normalize();
+            let length = row.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
+            for (&y, &x) in y.value().as_slice().iter().zip(&row) {
+                assert!((f64::from(y) - f64::from(x) / length).abs() <= 1.2e-7, "{scale:e}: {y}");
+            }
+            // Across the row the gradient is 1 / length; along it, 0.
+            let across = y.slice(0, 2, 1).sum().grad(&[&x]).remove(0);
+            let expected = (1.0 / length).min(f32::MAX.into());
+            assert!((f64::from(across.as_slice()[2]) / expected - 1.0).abs() < 1e-6, "{scale:e}: {across:?}");
+            let along = (&y * &y).sum().grad(&[&x]).remove(0);
+            assert!(along.is_finite());
+        }
+    }
+
+    #[test]
+    fn a_row_of_zeros_has_no_gradient_of_any_order() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 0.0, 3.0, 4.0]));
+        let y = x.normalize();
+        let first = y.slice(1, 0, 1).sum().grad_graph(&[&x]).remove(0);
+        assert_eq!(first.value().as_slice()[..2], [0.0, 0.0]);
+        assert!((first.value().as_slice()[2] - 0.128).abs() < 1e-15, "{first:?}");
+        let second = first.square().sum().grad(&[&x]).remove(0);
+        assert_eq!(second.as_slice()[..2], [0.0, 0.0]);
+        assert!(second.is_finite() && second.as_slice()[2] != 0.0);
+    }
+
+    #[test]
+    fn a_nan_stays_in_its_row() {
+        let tape = Tape::<f32>::new();
+        let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, f32::NAN, 0.0, 2.0]));
+        let y = x.normalize();
+        assert!(y.value().as_slice()[..2].iter().all(|y| y.is_nan()));
+        assert_eq!(y.value().as_slice()[2..], [0.0, 1.0]);
+    }
+}

@@ -1,0 +1,130 @@
+//! Learning rates over the course of a run.
+
+use serde::{Deserialize, Serialize};
+
+/// A learning rate over the course of a run, as a function of the fraction of the budget (steps, time, samples) that is
+/// done: the same schedule then fits a short run and a long one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// The same throughout.
+    Constant {
+        /// The rate.
+        rate: f64,
+    },
+    /// `from + (to - from) fraction`, after a linear rise from 0. With `to` equal to `from`: constant after a warm-up.
+    Linear {
+        /// The rate at the start.
+        from: f64,
+        /// The rate at the end.
+        to: f64,
+        /// The fraction of the run over which the rate rises.
+        warmup: f64,
+    },
+    /// `from * factor^k` after `k` times `every` of the run: a staircase.
+    Step {
+        /// The rate at the start.
+        from: f64,
+        /// What each stair multiplies it by.
+        factor: f64,
+        /// The fraction of the run that a stair takes.
+        every: f64,
+        /// The fraction of the run over which the rate rises.
+        warmup: f64,
+    },
+    /// `from * (to / from)^fraction`, after a linear rise from 0 over the first `warmup` of the run.
+    Exponential {
+        /// The rate at the start.
+        from: f64,
+        /// The rate at the end.
+        to: f64,
+        /// The fraction of the run over which the rate rises.
+        warmup: f64,
+    },
+    /// Half a cosine wave from `from` to `to` (Loshchilov and Hutter 2017, equation 5, one period), after a linear rise
+    /// from 0.
+    Cosine {
+        /// The rate at the start.
+        from: f64,
+        /// The rate at the end.
+        to: f64,
+        /// The fraction of the run over which the rate rises.
+        warmup: f64,
+    },
+}
+
+impl Schedule {
+    /// The learning rate when `fraction` (0 to 1) of the run is done. The warm-up multiplies the rate, so it does not
+    /// delay what follows.
+    pub fn rate(&self, fraction: f64) -> f64 {
+        let fraction = fraction.clamp(0.0, 1.0);
+        let rise = |warmup: f64| if fraction < warmup { fraction / warmup } else { 1.0 };
+        match *self {
+            Schedule::Constant { rate } => rate,
+            Schedule::Linear { from, to, warmup } => rise(warmup) * (from + (to - from) * fraction),
+            Schedule::Step { from, factor, every, warmup } => {
+                // A fraction such as 0.3 is a little less than three times 0.1.
+                let stairs = (fraction / every + 1e-9).floor();
+                rise(warmup) * from * factor.powf(stairs)
+            }
+            Schedule::Exponential { from, to, warmup } => rise(warmup) * from * (to / from).powf(fraction),
+            Schedule::Cosine { from, to, warmup } => {
+                let half = 0.5 + 0.5 * (std::f64::consts::PI * fraction).cos();
+                rise(warmup) * (to + (from - to) * half)
+            }
+        }
+    }
+
+    /// The learning rate of step number `step`, counted from 0, of `steps`: the fraction in the middle of the step, so
+    /// that a warm-up does not begin with a step of rate 0.
+    pub fn at_step(&self, step: u64, steps: u64) -> f64 {
+        self.rate((step as f64 + 0.5) / steps.max(1) as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[track_caller]
+    fn assert_rates(schedule: Schedule, rates: &[(f64, f64)]) {
+        for &(fraction, rate) in rates {
+            let got = schedule.rate(fraction);
+            assert!((got - rate).abs() < 1e-15, "{schedule:?} at {fraction}: {got} instead of {rate}");
+        }
+    }
+
+    #[test]
+    fn schedules_hit_their_ends() {
+        let decay = Schedule::Exponential { from: 1e-2, to: 1e-4, warmup: 0.1 };
+        assert_eq!(decay.rate(0.0), 0.0);
+        assert!((decay.rate(0.5) - 1e-3).abs() < 1e-12);
+        assert!((decay.rate(1.0) - 1e-4).abs() < 1e-12 && decay.rate(2.0) == decay.rate(1.0));
+    }
+
+    #[test]
+    fn every_form_passes_its_points() {
+        assert_rates(Schedule::Constant { rate: 0.3 }, &[(-1.0, 0.3), (0.0, 0.3), (1.0, 0.3)]);
+        let linear = Schedule::Linear { from: 1.0, to: 0.2, warmup: 0.5 };
+        assert_rates(linear, &[(0.0, 0.0), (0.25, 0.5 * 0.8), (0.5, 0.6), (1.0, 0.2), (7.0, 0.2)]);
+        let flat = Schedule::Linear { from: 0.4, to: 0.4, warmup: 0.1 };
+        assert_rates(flat, &[(0.05, 0.2), (0.1, 0.4), (0.7, 0.4)]);
+        let cosine = Schedule::Cosine { from: 1.0, to: 0.1, warmup: 0.0 };
+        assert_rates(cosine, &[(0.0, 1.0), (1.0 / 3.0, 0.1 + 0.9 * 0.75), (0.5, 0.55), (1.0, 0.1)]);
+        assert_rates(Schedule::Cosine { from: 1.0, to: 0.0, warmup: 0.5 }, &[(0.25, 0.5 * (0.5 + 0.125_f64.sqrt()))]);
+        let step = Schedule::Step { from: 1.0, factor: 0.5, every: 0.1, warmup: 0.0 };
+        for stair in 0..=10 {
+            let rate = 0.5_f64.powi(stair);
+            assert_rates(step, &[(f64::from(stair) / 10.0, rate), (0.1 * f64::from(stair), rate)]);
+            assert_rates(step, &[(0.0999 + 0.1 * f64::from(stair), rate)]);
+        }
+    }
+
+    #[test]
+    fn the_first_step_of_a_warmup_is_not_lost() {
+        let schedule = Schedule::Linear { from: 1.0, to: 1.0, warmup: 0.1 };
+        let rates: Vec<_> = (0..100).map(|step| schedule.at_step(step, 100)).collect();
+        assert!((rates[0] - 0.05).abs() < 1e-15 && (rates[9] - 0.95).abs() < 1e-15 && rates[10] == 1.0);
+        assert_eq!(schedule.at_step(0, 0), 1.0);
+    }
+}

@@ -1,0 +1,192 @@
+//! The greatest or smallest elements along an axis, and where they are.
+
+use crate::reduce::chunk;
+use crate::rows::fold_lanes;
+use crate::{Scalar, simd};
+
+/// A tensor as the kernels see it: `[outer, count, inner]`, reduced along the axis in the middle.
+pub type Middle = [usize; 3];
+
+/// The greatest elements (the smallest ones without `greatest`) along the middle axis: `[outer, count, inner]` to
+/// `[outer, inner]`. A NaN among them is the result.
+///
+/// # Panics
+/// If the lengths do not fit, or `count` is 0 and `out` is not empty.
+pub fn extremum<T: Scalar>(x: &[T], middle: Middle, greatest: bool, out: &mut [T]) {
+    if greatest {
+        along(
+            x,
+            middle,
+            out,
+            #[inline(always)]
+            |a, b| a.maximum(b),
+        );
+    } else {
+        along(
+            x,
+            middle,
+            out,
+            #[inline(always)]
+            |a, b| a.minimum(b),
+        );
+    }
+}
+
+fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, out: &mut [T], pick: impl Fn(T, T) -> T) {
+    assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner), "extremum of {:?}", [outer, count, inner]);
+    if out.is_empty() {
+        return;
+    }
+    assert!(count > 0, "extremum of no elements");
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            if inner == 1 {
+                for (x, out) in x.chunks_exact(count).zip(out) {
+                    *out = fold_lanes(x, &pick);
+                }
+                return;
+            }
+            for (x, out) in x.chunks_exact(count * inner).zip(out.chunks_exact_mut(inner)) {
+                out.copy_from_slice(&x[..inner]);
+                for row in x.chunks_exact(inner) {
+                    for i in 0..inner {
+                        out[i] = pick(out[i], row[i]);
+                    }
+                }
+            }
+        },
+    );
+}
+
+/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements that equal it. If the result
+/// is NaN, no element does, and all get 0.
+///
+/// # Panics
+/// If the lengths do not fit.
+pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]: Middle, out: &mut [T]) {
+    assert_eq!((x.len(), y.len()), (outer * count * inner, outer * inner), "extremum of {:?}", [outer, count, inner]);
+    assert_eq!((out.len(), g.len()), (x.len(), y.len()), "gradient of an extremum");
+    if x.is_empty() {
+        return;
+    }
+    let run = count * inner;
+    let mut shares = vec![T::ZERO; inner];
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let shares = &mut shares[..inner];
+            let rows = x.chunks_exact(run).zip(out.chunks_exact_mut(run));
+            for ((x, out), (y, g)) in rows.zip(y.chunks_exact(inner).zip(g.chunks_exact(inner))) {
+                // 1 where an element equals the result; their number goes to `shares`.
+                if inner == 1 {
+                    let mut number = 0.0;
+                    for i in 0..count {
+                        out[i] = if x[i] == y[0] { T::ONE } else { T::ZERO };
+                    }
+                    for part in out.chunks(1 << 12) {
+                        number += chunk(part).to_f64();
+                    }
+                    let share = T::from_f64(g[0].to_f64() / number);
+                    for out in out {
+                        *out = if *out > T::ZERO { share } else { T::ZERO };
+                    }
+                    continue;
+                }
+                shares.fill(T::ZERO);
+                for x in x.chunks_exact(inner) {
+                    for i in 0..inner {
+                        shares[i] += if x[i] == y[i] { T::ONE } else { T::ZERO };
+                    }
+                }
+                for i in 0..inner {
+                    shares[i] = g[i] / shares[i];
+                }
+                for (x, out) in x.chunks_exact(inner).zip(out.chunks_exact_mut(inner)) {
+                    for i in 0..inner {
+                        out[i] = if x[i] == y[i] { shares[i] } else { T::ZERO };
+                    }
+                }
+            }
+        },
+    );
+}
+
+/// Where the greatest elements (the smallest ones without `greatest`) are along the middle axis: the first of equal
+/// ones, and the first NaN if there is one.
+///
+/// # Panics
+/// If the length does not fit, or `count` is 0 and the result is not empty.
+pub fn arg_extremum<T: Scalar>(x: &[T], [outer, count, inner]: Middle, greatest: bool) -> Vec<usize> {
+    assert_eq!(x.len(), outer * count * inner, "extremum of {:?}", [outer, count, inner]);
+    assert!(count > 0 || outer * inner == 0, "extremum of no elements");
+    let better = |x: T, than: T| if greatest { x > than } else { x < than };
+    let mut best = vec![0; outer * inner];
+    for (x, best) in x.chunks_exact((count * inner).max(1)).zip(best.chunks_exact_mut(inner.max(1))) {
+        let mut value = x[..inner].to_vec();
+        for (row, x) in x.chunks_exact(inner).enumerate().skip(1) {
+            for i in 0..inner {
+                let is_nan = |x: T| x.partial_cmp(&x).is_none();
+                if !is_nan(value[i]) && (better(x[i], value[i]) || is_nan(x[i])) {
+                    (value[i], best[i]) = (x[i], row);
+                }
+            }
+        }
+    }
+    best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn extremes_along_any_axis_agree_with_a_plain_loop(
+            outer in 0usize..4, count in 1usize..90, inner in 0usize..5, greatest: bool, seed in 0usize..100
+        ) {
+            let x: Vec<f32> = (0..outer * count * inner).map(|i| ((i * 31 + seed * 17) % 23) as f32 - 11.0).collect();
+            let mut y = vec![0.0; outer * inner];
+            extremum(&x, [outer, count, inner], greatest, &mut y);
+            let g: Vec<f32> = (0..y.len()).map(|i| i as f32 + 1.0).collect();
+            let mut dx = vec![7.0; x.len()];
+            extremum_grad(&x, &y, &g, [outer, count, inner], &mut dx);
+            let arg = arg_extremum(&x, [outer, count, inner], greatest);
+            for o in 0..outer {
+                for i in 0..inner {
+                    let column: Vec<f32> = (0..count).map(|c| x[(o * count + c) * inner + i]).collect();
+                    let pick = if greatest { f32::max } else { f32::min };
+                    let best = column.iter().copied().fold(column[0], pick);
+                    let ties = column.iter().filter(|&&x| x == best).count() as f32;
+                    let at = o * inner + i;
+                    prop_assert_eq!(y[at], best);
+                    prop_assert_eq!(arg[at], column.iter().position(|&x| x == best).unwrap());
+                    for c in 0..count {
+                        let share = if column[c] == best { g[at] / ties } else { 0.0 };
+                        prop_assert_eq!(dx[(o * count + c) * inner + i], share);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_nan_wins_wherever_it_stands() {
+        for count in [3, 100] {
+            for at in 0..count {
+                let mut x = vec![1.0_f32; count];
+                x[at] = f32::NAN;
+                for greatest in [true, false] {
+                    let mut y = [0.0];
+                    extremum(&x, [1, count, 1], greatest, &mut y);
+                    assert!(y[0].is_nan(), "{count} {at}");
+                    assert_eq!(arg_extremum(&x, [1, count, 1], greatest), [at]);
+                    let mut dx = vec![1.0; count];
+                    extremum_grad(&x, &y, &[1.0], [1, count, 1], &mut dx);
+                    assert!(dx.iter().all(|&dx| dx == 0.0));
+                }
+            }
+        }
+    }
+}

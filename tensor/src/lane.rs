@@ -1,0 +1,121 @@
+//! The numbers of a vectorised loop over a formula, with the short reduction of sine and cosine where it is enough.
+
+use crate::{Real, Scalar};
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+/// A number in a loop of [`map_either`](crate::map_either). With `QUICK`, its sine and cosine take the short argument
+/// reduction only, and it remembers whether that was enough; without, it is just a number.
+///
+/// The reduction for arguments of any size costs several times the rest of a sine, and hardly an argument needs it. A
+/// loop cannot branch for each element and stay vectorised. So a formula is read for quick numbers first, and once more
+/// for plain ones where a block of elements turns out to have had an argument that was too large. The bits are those of
+/// the plain numbers in any case. A formula without sines leaves no trace of this.
+#[derive(Debug, Clone, Copy)]
+pub struct Lane<T: Scalar, const QUICK: bool> {
+    value: T,
+    /// Whether an argument on the way to `value` was too large: see [`Scalar::outside`].
+    outside: T::Flags,
+}
+
+impl<T: Scalar, const QUICK: bool> Lane<T, QUICK> {
+    #[inline(always)]
+    pub(crate) fn new(value: T) -> Self {
+        Lane { value, outside: T::Flags::default() }
+    }
+
+    #[inline(always)]
+    pub(crate) fn parts(self) -> (T, T::Flags) {
+        (self.value, self.outside)
+    }
+
+    #[inline(always)]
+    fn with(self, value: T) -> Self {
+        Lane { value, ..self }
+    }
+}
+
+macro_rules! operator {
+    ($trait:ident, $method:ident) => {
+        impl<T: Scalar, const QUICK: bool> $trait for Lane<T, QUICK> {
+            type Output = Self;
+            #[inline(always)]
+            #[allow(clippy::suspicious_arithmetic_impl)] // flags are joined whatever the operator
+            fn $method(self, other: Self) -> Self {
+                Lane { value: self.value.$method(other.value), outside: self.outside | other.outside }
+            }
+        }
+    };
+}
+
+operator!(Add, add);
+operator!(Sub, sub);
+operator!(Mul, mul);
+operator!(Div, div);
+
+impl<T: Scalar, const QUICK: bool> Neg for Lane<T, QUICK> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        self.with(-self.value)
+    }
+}
+
+/// The functions that have one reduction.
+macro_rules! plain {
+    ($($f:ident)+) => {
+        $(
+            #[inline(always)]
+            fn $f(self) -> Self {
+                self.with(self.value.$f())
+            }
+        )+
+    };
+}
+
+/// The functions that have two.
+macro_rules! angle {
+    ($($f:ident $quick:ident)+) => {
+        $(
+            #[inline(always)]
+            fn $f(self) -> Self {
+                if QUICK {
+                    Lane { value: self.value.$quick(), outside: self.outside | self.value.outside() }
+                } else {
+                    self.with(self.value.$f())
+                }
+            }
+        )+
+    };
+}
+
+/// The functions of two numbers.
+macro_rules! joined {
+    ($($f:ident)+) => {
+        $(
+            #[inline(always)]
+            fn $f(self, other: Self) -> Self {
+                Lane { value: self.value.$f(other.value), outside: self.outside | other.outside }
+            }
+        )+
+    };
+}
+
+impl<T: Scalar, const QUICK: bool> Real for Lane<T, QUICK> {
+    #[inline(always)]
+    fn like(&self, value: f64) -> Self {
+        Lane::new(T::from_f64(value))
+    }
+    #[inline(always)]
+    fn if_positive(&self, yes: Self, no: Self) -> Self {
+        let value = self.value.if_positive(yes.value, no.value);
+        Lane { value, outside: self.outside | yes.outside | no.outside }
+    }
+    angle! { sin sin_quick cos cos_quick }
+    plain! { exp expm1 ln ln1p sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh }
+    plain! { abs sign floor ceil round }
+    joined! { atan2 pow maximum minimum }
+    #[inline(always)]
+    fn powi(self, exponent: i32) -> Self {
+        self.with(self.value.powi(exponent))
+    }
+}

@@ -1,0 +1,544 @@
+//! Kernels on the rows of a matrix: softmax and its relatives, layer normalisation.
+//!
+//! A matrix is worked on in blocks of whole rows that fit in a core's nearest cache. What an element needs on its own
+//! (an exponential) runs over the whole block, so that rows shorter than a register are as fast as long ones.
+
+use crate::reduce::{chunk, sum};
+use crate::{Pool, Scalar, simd};
+
+/// Elements of a block: 16 kB of f32.
+const BLOCK: usize = 4096;
+/// Independent partial results: two 512-bit registers of f32.
+const LANES: usize = 32;
+/// Rows whose gradients are added up in their own type before they go into f64 sums.
+const GROUP: usize = 16;
+
+/// Elements of a block of whole rows of `n`.
+fn block(n: usize) -> usize {
+    n * (BLOCK / n).max(1)
+}
+
+/// `pick` of all elements, which must not be none; `pick` may be applied in any order.
+#[inline(always)]
+pub(crate) fn fold_lanes<T: Scalar>(x: &[T], pick: impl Fn(T, T) -> T) -> T {
+    if x.len() < LANES {
+        let mut best = x[0];
+        for &x in &x[1..] {
+            best = pick(best, x);
+        }
+        return best;
+    }
+    let mut lanes = [T::ZERO; LANES];
+    lanes.copy_from_slice(&x[..LANES]);
+    let mut rows = x[LANES..].chunks_exact(LANES);
+    for row in &mut rows {
+        for i in 0..LANES {
+            lanes[i] = pick(lanes[i], row[i]);
+        }
+    }
+    for (lane, &x) in lanes.iter_mut().zip(rows.remainder()) {
+        *lane = pick(*lane, x);
+    }
+    let mut width = LANES / 2;
+    while width > 0 {
+        for i in 0..width {
+            lanes[i] = pick(lanes[i], lanes[i + width]);
+        }
+        width /= 2;
+    }
+    lanes[0]
+}
+
+/// The sum of a row: inlined if it is short, pairwise if it is long.
+#[inline(always)]
+fn total<T: Scalar>(x: &[T]) -> T {
+    if x.len() < LANES {
+        let mut sum = T::ZERO;
+        for &x in x {
+            sum += x;
+        }
+        sum
+    } else if x.len() <= BLOCK {
+        chunk(x)
+    } else {
+        sum(x)
+    }
+}
+
+/// The sum of `f` of the elements of `a` and `b` at each index.
+#[inline(always)]
+fn total_of<T: Scalar>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
+    let n = a.len();
+    let b = &b[..n];
+    let mut lanes = [T::ZERO; LANES];
+    let whole = n - n % LANES;
+    let mut start = 0;
+    while start < whole {
+        let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
+        for i in 0..LANES {
+            lanes[i] += f(a[i], b[i]);
+        }
+        start += LANES;
+    }
+    let (a, b) = (&a[whole..], &b[whole..]);
+    if whole == 0 {
+        let mut sum = T::ZERO;
+        for i in 0..a.len() {
+            sum += f(a[i], b[i]);
+        }
+        return sum;
+    }
+    for i in 0..a.len() {
+        lanes[i] += f(a[i], b[i]);
+    }
+    chunk(&lanes)
+}
+
+/// The greatest element of a row, as far as there is an order; a row with NaN comes out as NaN anyway.
+#[inline(always)]
+fn top<T: Scalar>(x: &[T]) -> T {
+    fold_lanes(
+        x,
+        #[inline(always)]
+        |a, b| if b > a { b } else { a },
+    )
+}
+
+/// `out = x - shift` for each row of the block, with `shift` its greatest element, or 0 if that is infinite and
+/// `limits` are wanted. The shifts go to `shifts`.
+#[inline(always)]
+fn shifted<T: Scalar>(x: &[T], n: usize, out: &mut [T], shifts: &mut [T], limits: bool) {
+    for ((x, out), shift) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(shifts) {
+        let greatest = top(x);
+        let by = if limits && !greatest.is_finite() { T::ZERO } else { greatest };
+        *shift = by;
+        for (out, &x) in out.iter_mut().zip(x) {
+            *out = x - by;
+        }
+    }
+}
+
+/// `e^x` of every element, in place.
+#[inline(always)]
+fn exponentials<T: Scalar>(x: &mut [T]) {
+    for x in x {
+        *x = x.exp();
+    }
+}
+
+/// `ln sum x` of powers of which at least one is 1, unless the row was not shifted by a finite element: without the 1,
+/// so that what little the others add to it is not rounded off.
+#[inline(always)]
+fn ln_total<T: Scalar>(powers: &[T]) -> T {
+    let rest = total_of(
+        powers,
+        powers,
+        #[inline(always)]
+        |x, _| if x == T::ONE { T::ZERO } else { x },
+    );
+    let ones = total_of(
+        powers,
+        powers,
+        #[inline(always)]
+        |x, _| if x == T::ONE { T::ONE } else { T::ZERO },
+    );
+    (rest + (ones - T::ONE)).ln1p()
+}
+
+/// Softmax of each row of `n` elements: `e^(x - max) / sum e^(x - max)`.
+///
+/// # Panics
+/// If `out` is shorter than `x`.
+pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
+    if x.is_empty() {
+        return;
+    }
+    let mut shifts = pool.take(block(n) / n);
+    for (x, out) in x.chunks(block(n)).zip(out[..x.len()].chunks_mut(block(n))) {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                shifted(x, n, out, &mut shifts, false);
+                exponentials(out);
+                for row in out.chunks_exact_mut(n) {
+                    let scale = T::ONE / total(row);
+                    for out in row {
+                        *out *= scale;
+                    }
+                }
+            },
+        );
+    }
+    pool.give(shifts);
+}
+
+/// The gradient of softmax, from its output: `y (g - sum g y)` in each row.
+///
+/// # Panics
+/// If `g` or `out` is shorter than `y`.
+pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
+    if y.is_empty() {
+        return;
+    }
+    let len = y.len();
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for ((y, g), out) in y.chunks_exact(n).zip(g[..len].chunks_exact(n)).zip(out[..len].chunks_exact_mut(n)) {
+                let mean = total_of(
+                    y,
+                    g,
+                    #[inline(always)]
+                    |y, g| y * g,
+                );
+                for i in 0..n {
+                    out[i] = y[i] * (g[i] - mean);
+                }
+            }
+        },
+    );
+}
+
+/// The logarithm of softmax of each row: `x - max - ln sum e^(x - max)`.
+///
+/// # Panics
+/// If `out` is shorter than `x`.
+pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
+    if x.is_empty() {
+        return;
+    }
+    let (mut powers, mut shifts) = (pool.take(block(n)), pool.take(block(n) / n));
+    for (x, out) in x.chunks(block(n)).zip(out[..x.len()].chunks_mut(block(n))) {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let powers = &mut powers[..x.len()];
+                shifted(x, n, out, &mut shifts, false);
+                powers.copy_from_slice(out);
+                exponentials(powers);
+                for (out, powers) in out.chunks_exact_mut(n).zip(powers.chunks_exact(n)) {
+                    let ln = ln_total(powers);
+                    for out in out {
+                        *out -= ln;
+                    }
+                }
+            },
+        );
+    }
+    pool.give(powers);
+    pool.give(shifts);
+}
+
+/// The gradient of the logarithm of softmax, from its output: `g - e^y sum g` in each row.
+///
+/// # Panics
+/// If `g` or `out` is shorter than `y`.
+pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
+    if y.is_empty() {
+        return;
+    }
+    let len = y.len();
+    for ((y, g), out) in y.chunks(block(n)).zip(g[..len].chunks(block(n))).zip(out[..len].chunks_mut(block(n))) {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                out.copy_from_slice(y);
+                exponentials(out);
+                for (out, g) in out.chunks_exact_mut(n).zip(g.chunks_exact(n)) {
+                    let sum = total(g);
+                    for i in 0..n {
+                        out[i] = g[i] - out[i] * sum;
+                    }
+                }
+            },
+        );
+    }
+}
+
+/// `ln sum e^x` of each row of `n` elements; -inf for an empty row and for one of nothing but -inf.
+///
+/// # Panics
+/// If `x` is not `out.len()` rows of `n`.
+pub fn logsumexp_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
+    ln_sums(x, n, out, pool, |_, shift, ln| shift + ln);
+}
+
+/// `out[i] = finish(i, shift, ln sum e^(x - shift))` for row `i`.
+fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: impl Fn(usize, T, T) -> T) {
+    assert_eq!(x.len(), n * out.len(), "{} rows of {n}", out.len());
+    if x.is_empty() {
+        out.fill(T::from_f64(f64::NEG_INFINITY));
+        return;
+    }
+    let rows = block(n) / n;
+    let (mut powers, mut shifts) = (pool.take(block(n)), pool.take(rows));
+    for (first, (x, out)) in x.chunks(block(n)).zip(out.chunks_mut(rows)).enumerate() {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let powers = &mut powers[..x.len()];
+                shifted(x, n, powers, &mut shifts, true);
+                exponentials(powers);
+                for (out, powers) in out.iter_mut().zip(powers.chunks_exact(n)) {
+                    *out = ln_total(powers);
+                }
+            },
+        );
+        for (i, (out, &shift)) in out.iter_mut().zip(&shifts).enumerate() {
+            *out = finish(first * rows + i, shift, *out);
+        }
+    }
+    pool.give(powers);
+    pool.give(shifts);
+}
+
+/// Mean and mean squared deviation of a row, the mean in two parts: their sum is accurate beyond the type's digits.
+///
+/// Two passes. The second measures from the rounded mean, and takes out what the rounding of the mean adds to the sum.
+#[inline(always)]
+fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
+    let count = T::from_f64(x.len() as f64);
+    let mean = total(x) / count;
+    let rest = total_of(
+        x,
+        x,
+        #[inline(always)]
+        |x, _| x - mean,
+    ) / count;
+    let square = total_of(
+        x,
+        x,
+        #[inline(always)]
+        |x, _| (x - mean) * (x - mean),
+    ) / count;
+    ([mean, rest], square - rest * rest)
+}
+
+/// The mean squared deviation from the mean, of each row of `n` elements; NaN for an empty row.
+///
+/// # Panics
+/// If `x` is not `out.len()` rows of `n`.
+pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
+    assert_eq!(x.len(), n * out.len(), "{} rows of {n}", out.len());
+    if n == 0 {
+        out.fill(T::from_f64(f64::NAN));
+        return;
+    }
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for (x, out) in x.chunks_exact(n).zip(out) {
+                *out = moments(x).1;
+            }
+        },
+    );
+}
+
+/// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
+/// `n`.
+///
+/// # Panics
+/// If `gain` and `bias` have different lengths or a row has another one, or `out` is shorter than `x`.
+pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out: &mut [T]) {
+    let n = gain.len();
+    assert_eq!(bias.len(), n, "gain and bias of one length");
+    if x.is_empty() {
+        return;
+    }
+    let (eps, len) = (T::from_f64(eps), x.len());
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let (gain, bias) = (&gain[..n], &bias[..n]);
+            for (x, out) in x.chunks_exact(n).zip(out[..len].chunks_exact_mut(n)) {
+                let ([mean, rest], variance) = moments(x);
+                let scale = T::ONE / (variance + eps).sqrt();
+                for i in 0..n {
+                    out[i] = ((x[i] - mean) - rest) * scale * gain[i] + bias[i];
+                }
+            }
+        },
+    );
+}
+
+/// The gradients of [`layer_norm_rows`]: that of `x` to `dx`, those of gain and bias to `dgain` and `dbias`.
+///
+/// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps), dgain = sum of g u
+/// and dbias = sum of g over the rows. These sums are carried in f64.
+///
+/// # Panics
+/// If a slice is shorter than its counterpart.
+pub fn layer_norm_rows_grad<T: Scalar>(
+    x: &[T],
+    gain: &[T],
+    g: &[T],
+    eps: f64,
+    [dx, dgain, dbias]: [&mut [T]; 3],
+    pool: &Pool<T>,
+) {
+    let n = gain.len();
+    let mut sums = vec![0.0_f64; 2 * n];
+    let mut scratch = pool.take(3 * n);
+    let (eps, len) = (T::from_f64(eps), x.len());
+    let count = T::from_f64(n as f64);
+    for ((x, g), dx) in
+        x.chunks(GROUP * n.max(1)).zip(g[..len].chunks(GROUP * n.max(1))).zip(dx[..len].chunks_mut(GROUP * n.max(1)))
+    {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let (unit, group) = scratch[..3 * n].split_at_mut(n);
+                group.fill(T::ZERO);
+                let (group_gain, group_bias) = group.split_at_mut(n);
+                let gain = &gain[..n];
+                for ((x, g), dx) in x.chunks_exact(n).zip(g.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
+                    let ([mean, rest], variance) = moments(x);
+                    let scale = T::ONE / (variance + eps).sqrt();
+                    for i in 0..n {
+                        unit[i] = ((x[i] - mean) - rest) * scale;
+                        dx[i] = g[i] * gain[i];
+                        group_gain[i] += g[i] * unit[i];
+                        group_bias[i] += g[i];
+                    }
+                    let level = total(dx) / count;
+                    let slope = total_of(
+                        dx,
+                        unit,
+                        #[inline(always)]
+                        |h, u| h * u,
+                    ) / count;
+                    for i in 0..n {
+                        dx[i] = ((dx[i] - level) - unit[i] * slope) * scale;
+                    }
+                }
+                for (sum, &part) in sums.iter_mut().zip(&*group) {
+                    *sum += part.to_f64();
+                }
+            },
+        );
+    }
+    pool.give(scratch);
+    for (out, &sum) in dgain.iter_mut().chain(dbias).zip(&sums) {
+        *out = T::from_f64(sum);
+    }
+}
+
+/// The cross-entropy of each row of `n` logits: `ln sum e^x - x[class]`.
+///
+/// # Panics
+/// If `x` is not a row for each class, or a class is not below `n`.
+pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &mut [T], pool: &Pool<T>) {
+    // The distance from the greatest logit first: where that is the class, nothing cancels.
+    ln_sums(x, n, out, pool, |row, shift, ln| (shift - x[row * n + classes[row] as usize]) + ln);
+}
+
+/// The gradient of [`cross_entropy_rows`]: `g (softmax - 1 at the class)`, with the probability of all other classes
+/// added up where 1 less that of the class would lose its digits.
+///
+/// # Panics
+/// As [`cross_entropy_rows`], or if `out` is shorter than `x`.
+pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
+    softmax_rows(x, n, out, pool);
+    if n == 0 {
+        return;
+    }
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            for ((row, &class), &g) in out.chunks_exact_mut(n).zip(classes).zip(g) {
+                row[class as usize] = T::ZERO;
+                row[class as usize] = -total(row);
+                for out in row {
+                    *out *= g;
+                }
+            }
+        },
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Lengths around the widths of lanes and blocks.
+    const LENGTHS: [usize; 8] = [1, 2, 7, 31, 32, 33, 1000, 5000];
+
+    fn matrix(rows: usize, n: usize) -> Vec<f32> {
+        (0..rows * n).map(|i| ((i * 7919) % 1013) as f32 * 0.02 - 10.0).collect()
+    }
+
+    fn assert_close(got: &[f32], expected: impl Iterator<Item = f64>, tolerance: f64) {
+        for (i, (&got, expected)) in got.iter().zip(expected).enumerate() {
+            let error = (f64::from(got) - expected).abs() / expected.abs().max(1e-3);
+            assert!(error <= tolerance, "{i}: {got} for {expected}");
+        }
+    }
+
+    #[test]
+    fn softmax_and_its_relatives_agree_with_plain_loops() {
+        let pool = Pool::new();
+        for n in LENGTHS {
+            let rows = 9;
+            let x = matrix(rows, n);
+            let sums: Vec<f64> = x.chunks(n).map(|row| row.iter().map(|&x| f64::from(x).exp()).sum()).collect();
+            let mut y = vec![0.0; x.len()];
+            softmax_rows(&x, n, &mut y, &pool);
+            let mut all = vec![0.0; x.len()];
+            assert_close(&y, x.iter().enumerate().map(|(i, &x)| f64::from(x).exp() / sums[i / n]), 3e-6);
+            log_softmax_rows(&x, n, &mut all, &pool);
+            let exact = |(i, &x): (usize, &f32)| f64::from(x) - sums[i / n].ln();
+            assert_close(&all, x.iter().enumerate().map(exact), 5e-6);
+            let mut ln = vec![0.0; rows];
+            logsumexp_rows(&x, n, &mut ln, &pool);
+            assert_close(&ln, sums.iter().map(|sum| sum.ln()), 1e-6);
+            let g: Vec<f32> = matrix(rows, n).into_iter().rev().collect();
+            softmax_rows_grad(&y, &g, n, &mut all);
+            let wide = |i: usize| f64::from(y[i]) * f64::from(g[i]);
+            let inner = |i: usize| (i / n * n..i / n * n + n).map(wide).sum::<f64>();
+            assert_close(&all, (0..x.len()).map(|i| wide(i) - f64::from(y[i]) * inner(i)), 1e-3);
+        }
+    }
+
+    #[test]
+    fn infinite_logits_have_their_limits() {
+        let (pool, inf) = (Pool::new(), f32::INFINITY);
+        let mut out = [0.0; 4];
+        logsumexp_rows(&[-inf, -inf, inf, 0.0, -inf, 2.0, f32::NAN, inf], 2, &mut out, &pool);
+        assert_eq!(out[..3], [-inf, inf, 2.0]);
+        assert!(out[3].is_nan());
+        let mut out = [0.0; 3];
+        softmax_rows(&[-inf, 1e30, -1e30], 3, &mut out, &pool);
+        assert_eq!(out, [0.0, 1.0, 0.0]);
+        logsumexp_rows(&[], 0, &mut out, &pool);
+        assert_eq!(out, [-inf; 3]);
+    }
+
+    #[test]
+    fn the_variance_survives_a_large_offset() {
+        for n in LENGTHS.into_iter().filter(|&n| n > 1) {
+            let x: Vec<f32> = matrix(1, n).iter().map(|x| x + 30_000.0).collect();
+            let mean = x.iter().map(|&x| f64::from(x)).sum::<f64>() / n as f64;
+            let exact = x.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / n as f64;
+            let mut out = [0.0];
+            variance_rows(&x, n, &mut out);
+            assert!((f64::from(out[0]) / exact - 1.0).abs() < 1e-5, "{n}: {} for {exact}", out[0]);
+            // Normalised, the row has mean 0 and variance 1 to the last digits.
+            let mut unit = vec![0.0; n];
+            layer_norm_rows(&x, &vec![1.0; n], &vec![0.0; n], 0.0, &mut unit);
+            let mean = unit.iter().map(|&x| f64::from(x)).sum::<f64>() / n as f64;
+            assert!(mean.abs() < 2e-7, "{n}: {mean}");
+        }
+    }
+
+    #[test]
+    fn a_confident_prediction_keeps_its_gradient() {
+        let mut loss = [0.0];
+        cross_entropy_rows(&[0.0_f32, 20.0, 0.0], 3, &[1], &mut loss, &Pool::new());
+        assert_close(&loss, [(2.0 * (-20.0_f64).exp()).ln_1p()].into_iter(), 1e-12);
+        let mut out = [0.0_f32; 3];
+        cross_entropy_rows_grad(&[0.0, 20.0, 0.0], 3, &[1], &[1.0], &mut out, &Pool::new());
+        let p = (-20.0_f64).exp();
+        assert_close(&out, [p, -2.0 * p, p].into_iter(), 1e-12);
+        assert!(out[1] < -3.9e-9, "{out:?}");
+    }
+}

@@ -1,0 +1,384 @@
+//! The windows that a 2-D convolution or pooling sees of an image. One image at a time: a batch is the caller's loop.
+
+use crate::{Scalar, simd};
+use std::ops::Range;
+
+/// Where the windows lie: window `(i, j)` starts at row `i * stride[0] - padding[0]` and column
+/// `j * stride[1] - padding[1]` of the image, and its elements are `dilation` apart. What lies outside the image is
+/// padding.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Windows {
+    image: [usize; 2],
+    kernel: [usize; 2],
+    stride: [usize; 2],
+    padding: [usize; 2],
+    dilation: [usize; 2],
+    output: [usize; 2],
+}
+
+impl Windows {
+    /// Windows of `kernel` elements on an image of `[height, width]`. Along each axis there are
+    /// `(image + 2 padding - span) / stride + 1` of them, rounded down, where `span = dilation (kernel - 1) + 1`.
+    ///
+    /// # Errors
+    /// If a kernel extent, stride or dilation is 0, or a window is larger than the padded image; in words.
+    pub fn new(
+        image: [usize; 2],
+        kernel: [usize; 2],
+        stride: [usize; 2],
+        padding: [usize; 2],
+        dilation: [usize; 2],
+    ) -> Result<Self, String> {
+        let mut output = [0; 2];
+        for axis in 0..2 {
+            if kernel[axis] == 0 || stride[axis] == 0 || dilation[axis] == 0 {
+                return Err(format!("kernel {kernel:?}, stride {stride:?} and dilation {dilation:?} must be positive"));
+            }
+            let (extent, span) = (image[axis] + 2 * padding[axis], dilation[axis] * (kernel[axis] - 1) + 1);
+            if span > extent {
+                return Err(format!(
+                    "a kernel {kernel:?} with dilation {dilation:?} does not fit an image {image:?} with padding \
+                     {padding:?}"
+                ));
+            }
+            output[axis] = (extent - span) / stride[axis] + 1;
+        }
+        Ok(Windows { image, kernel, stride, padding, dilation, output })
+    }
+
+    /// Number of windows along each axis: the extents of the output.
+    pub fn output(&self) -> [usize; 2] {
+        self.output
+    }
+
+    /// Number of windows.
+    pub fn count(&self) -> usize {
+        self.output[0] * self.output[1]
+    }
+
+    /// Number of elements of a window.
+    pub fn kernel_len(&self) -> usize {
+        self.kernel[0] * self.kernel[1]
+    }
+
+    /// Whether every window is one pixel and every pixel a window, so that [`unfold`](Self::unfold) would only copy.
+    pub fn are_pixels(&self) -> bool {
+        self.kernel == [1, 1] && self.stride == [1, 1] && self.padding == [0, 0]
+    }
+
+    /// Along one axis: the windows whose element `k` lies inside the image.
+    #[inline(always)]
+    fn inside(&self, axis: usize, k: usize) -> Range<usize> {
+        let (stride, offset) = (self.stride[axis], k * self.dilation[axis]);
+        let first = self.padding[axis].saturating_sub(offset).div_ceil(stride);
+        let end = (self.image[axis] + self.padding[axis]).saturating_sub(offset).div_ceil(stride);
+        let end = end.min(self.output[axis]);
+        first.min(end)..end
+    }
+
+    /// Calls `f(k, windows, first)` for each element `k` of a window and each row of windows in which some see that
+    /// element inside the image: the numbers of these windows, and where the first of them sees it. The next one sees
+    /// it `stride[1]` further on.
+    #[inline(always)]
+    fn runs(&self, mut f: impl FnMut(usize, Range<usize>, usize)) {
+        for ki in 0..self.kernel[0] {
+            let rows = self.inside(0, ki);
+            for kj in 0..self.kernel[1] {
+                let columns = self.inside(1, kj);
+                if columns.is_empty() {
+                    continue;
+                }
+                let x = columns.start * self.stride[1] + kj * self.dilation[1] - self.padding[1];
+                for i in rows.clone() {
+                    let y = i * self.stride[0] + ki * self.dilation[0] - self.padding[0];
+                    let start = i * self.output[1];
+                    f(ki * self.kernel[1] + kj, start + columns.start..start + columns.end, y * self.image[1] + x);
+                }
+            }
+        }
+    }
+
+    /// The elements of a channel.
+    fn pixels(&self) -> usize {
+        self.image[0] * self.image[1]
+    }
+
+    /// That an image and its unfolded form, with `per_channel` values a channel, have as many channels.
+    #[track_caller]
+    fn check(&self, image: usize, unfolded: usize, per_channel: usize) {
+        let channels = unfolded / per_channel;
+        assert_eq!(channels * per_channel, unfolded, "{unfolded} values for windows {self:?}");
+        assert_eq!(image, channels * self.pixels(), "an image of {image} values for windows {self:?}");
+    }
+
+    /// Writes the windows of an image `[channels, height, width]` to `out` as the columns of a matrix
+    /// `[channels * kernel_len, count]`, padding as 0 ("im2col"). A convolution is then a matrix product.
+    ///
+    /// # Panics
+    /// If a slice has another length.
+    #[track_caller]
+    pub fn unfold<T: Scalar>(&self, image: &[T], out: &mut [T]) {
+        let (count, per_channel) = (self.count(), self.kernel_len() * self.count());
+        self.check(image.len(), out.len(), per_channel);
+        if self.padding != [0, 0] {
+            out.fill(T::ZERO);
+        }
+        let step = self.stride[1];
+        let images = image.chunks_exact(self.pixels().max(1));
+        for (image, out) in images.zip(out.chunks_exact_mut(per_channel)) {
+            self.runs(|k, windows, first| {
+                let out = &mut out[k * count..][windows];
+                if step == 1 {
+                    out.copy_from_slice(&image[first..first + out.len()]);
+                } else {
+                    for (out, &x) in out.iter_mut().zip(image[first..].iter().step_by(step)) {
+                        *out = x;
+                    }
+                }
+            });
+        }
+    }
+
+    /// The adjoint of [`unfold`](Self::unfold): adds each column to the pixels that its window sees ("col2im").
+    ///
+    /// # Panics
+    /// If a slice has another length.
+    #[track_caller]
+    pub fn fold<T: Scalar>(&self, columns: &[T], image: &mut [T]) {
+        let (count, per_channel) = (self.count(), self.kernel_len() * self.count());
+        self.check(image.len(), columns.len(), per_channel);
+        for (image, columns) in image.chunks_exact_mut(self.pixels().max(1)).zip(columns.chunks_exact(per_channel)) {
+            self.add_runs(
+                image,
+                #[inline(always)]
+                |k, windows| &columns[k * count..][windows],
+            );
+        }
+    }
+
+    /// Adds `values(k, windows)` to the pixels that are element `k` of these windows.
+    #[inline(always)]
+    fn add_runs<'a, T: Scalar>(&self, image: &mut [T], values: impl Fn(usize, Range<usize>) -> &'a [T]) {
+        let step = self.stride[1];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                self.runs(
+                    #[inline(always)]
+                    |k, windows, first| {
+                        let values = values(k, windows);
+                        if step == 1 {
+                            let pixels = &mut image[first..first + values.len()];
+                            for (pixel, &value) in pixels.iter_mut().zip(values) {
+                                *pixel += value;
+                            }
+                        } else {
+                            for (pixel, &value) in image[first..].iter_mut().step_by(step).zip(values) {
+                                *pixel += value;
+                            }
+                        }
+                    },
+                );
+            },
+        );
+    }
+
+    /// The sum of each window of one channel `[height, width]`; padding counts as 0.
+    ///
+    /// # Panics
+    /// If a slice has another length.
+    #[track_caller]
+    pub fn sums<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
+        self.check(plane.len(), out.len(), self.count());
+        out.fill(T::ZERO);
+        let step = self.stride[1];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                self.runs(
+                    #[inline(always)]
+                    |_, windows, first| {
+                        let out = &mut out[windows];
+                        let plane = &plane[first..];
+                        for i in 0..out.len() {
+                            out[i] += plane[i * step];
+                        }
+                    },
+                );
+            },
+        );
+    }
+
+    /// The adjoint of [`sums`](Self::sums): adds each value to every pixel that its window sees.
+    ///
+    /// # Panics
+    /// If a slice has another length.
+    #[track_caller]
+    pub fn spread<T: Scalar>(&self, values: &[T], plane: &mut [T]) {
+        self.check(plane.len(), values.len(), self.count());
+        self.add_runs(
+            plane,
+            #[inline(always)]
+            |_, windows| &values[windows],
+        );
+    }
+
+    /// The largest element of each window of one channel `[height, width]`, NaN if there is one; padding does not
+    /// count. A window without a pixel gives `-inf`.
+    ///
+    /// # Panics
+    /// If a slice has another length.
+    #[track_caller]
+    pub fn maxima<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
+        self.check(plane.len(), out.len(), self.count());
+        out.fill(T::from_f64(f64::NEG_INFINITY));
+        let step = self.stride[1];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                self.runs(
+                    #[inline(always)]
+                    |_, windows, first| {
+                        let out = &mut out[windows];
+                        let plane = &plane[first..];
+                        for i in 0..out.len() {
+                            let x = plane[i * step];
+                            out[i] = if beats(x, out[i]) { x } else { out[i] };
+                        }
+                    },
+                );
+            },
+        );
+    }
+
+    /// Where the elements stand that [`maxima`](Self::maxima) finds: the first one in row-major order where several
+    /// are equal, the last NaN where there is one. `best` is scratch space for the maxima.
+    ///
+    /// # Panics
+    /// If a slice has another length, or a window sees no pixel.
+    #[track_caller]
+    pub fn arg_maxima<T: Scalar>(&self, plane: &[T], best: &mut [T], out: &mut [u32]) {
+        self.check(plane.len(), out.len(), self.count());
+        assert_eq!(best.len(), out.len(), "scratch space for the maxima");
+        const NONE: u32 = u32::MAX;
+        out.fill(NONE);
+        let step = self.stride[1];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                self.runs(
+                    #[inline(always)]
+                    |_, windows, first| {
+                        let (out, best) = (&mut out[windows.clone()], &mut best[windows]);
+                        let pixels = &plane[first..];
+                        for i in 0..out.len() {
+                            let x = pixels[i * step];
+                            let wins = out[i] == NONE || beats(x, best[i]);
+                            best[i] = if wins { x } else { best[i] };
+                            out[i] = if wins { (first + i * step) as u32 } else { out[i] };
+                        }
+                    },
+                );
+            },
+        );
+        assert!(!out.contains(&NONE), "a window of {self:?} sees no pixel");
+    }
+}
+
+/// Whether `x` takes the place of the largest element so far. NaN does, and keeps it but for another NaN.
+#[inline(always)]
+fn beats<T: Scalar>(x: T, best: T) -> bool {
+    #[allow(clippy::eq_op)] // NaN differs from itself.
+    let nan = x != x;
+    x > best || nan
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Element `(ki, kj)` of window `(i, j)` of a plane; None in the padding.
+    fn element(w: &Windows, plane: &[f64], [i, j]: [usize; 2], [ki, kj]: [usize; 2]) -> Option<f64> {
+        let at = |axis: usize, i: usize, k: usize| {
+            (i * w.stride[axis] + k * w.dilation[axis]).checked_sub(w.padding[axis]).filter(|&y| y < w.image[axis])
+        };
+        Some(plane[at(0, i, ki)? * w.image[1] + at(1, j, kj)?])
+    }
+
+    proptest! {
+        #[test]
+        fn every_walk_agrees_with_the_definition(
+            image in [0usize..7, 1usize..8], kernel in [1usize..4, 1usize..4], stride in [1usize..4, 1usize..4],
+            padding in [0usize..3, 0usize..3], dilation in [1usize..3, 1usize..3], channels in 0usize..3
+        ) {
+            let Ok(w) = Windows::new(image, kernel, stride, padding, dilation) else { return Ok(()) };
+            let pixels = image[0] * image[1];
+            let x: Vec<f64> = (0..channels * pixels).map(|i| ((i * 37) % 11) as f64 - 5.0).collect();
+            let mut columns = vec![f64::NAN; channels * w.kernel_len() * w.count()];
+            w.unfold(&x, &mut columns);
+            let v: Vec<f64> = (0..columns.len()).map(|i| ((i * 17) % 7) as f64 - 3.0).collect();
+            let mut back = vec![0.0; x.len()];
+            w.fold(&v, &mut back);
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            prop_assert_eq!(dot(&columns, &v), dot(&x, &back));
+            for c in 0..channels {
+                let plane = &x[c * pixels..(c + 1) * pixels];
+                let (mut sums, mut maxima) = (vec![f64::NAN; w.count()], vec![f64::NAN; w.count()]);
+                w.sums(plane, &mut sums);
+                w.maxima(plane, &mut maxima);
+                let v = &v[..w.count()];
+                let mut back = vec![0.0; pixels];
+                w.spread(v, &mut back);
+                prop_assert_eq!(dot(&sums, v), dot(plane, &back));
+                let mut seen = true;
+                for window in 0..w.count() {
+                    let (mut sum, mut largest) = (0.0, f64::NEG_INFINITY);
+                    for k in 0..w.kernel_len() {
+                        let at = [window / w.output[1], window % w.output[1]];
+                        let x = element(&w, plane, at, [k / kernel[1], k % kernel[1]]);
+                        prop_assert_eq!(columns[(c * w.kernel_len() + k) * w.count() + window], x.unwrap_or(0.0));
+                        sum += x.unwrap_or(0.0);
+                        largest = largest.max(x.unwrap_or(f64::NEG_INFINITY));
+                    }
+                    prop_assert_eq!(sums[window], sum);
+                    prop_assert_eq!(maxima[window], largest);
+                    seen &= largest.is_finite();
+                }
+                if seen {
+                    let (mut index, mut best) = (vec![0; w.count()], vec![0.0; w.count()]);
+                    w.arg_maxima(plane, &mut best, &mut index);
+                    let found: Vec<f64> = index.iter().map(|&i| plane[i as usize]).collect();
+                    prop_assert_eq!(&found, &maxima);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_first_of_equal_maxima_wins_and_a_nan_beats_all() {
+        let w = Windows::new([2, 4], [2, 2], [2, 2], [0, 0], [1, 1]).unwrap();
+        let (mut index, mut best) = ([0; 2], [0.0; 2]);
+        w.arg_maxima(
+            &[3.0, 3.0, -f32::INFINITY, -f32::INFINITY, 3.0, 1.0, -f32::INFINITY, -f32::INFINITY],
+            &mut best,
+            &mut index,
+        );
+        assert_eq!(index, [0, 2]);
+        let plane = [f32::NAN, 3.0, 1.0, 2.0, 4.0, 1.0, f32::NAN, 5.0];
+        let mut out = [0.0; 2];
+        w.maxima(&plane, &mut out);
+        w.arg_maxima(&plane, &mut best, &mut index);
+        assert!(out.iter().all(|x| x.is_nan()));
+        assert_eq!(index, [0, 6]);
+    }
+
+    #[test]
+    fn impossible_windows_are_errors() {
+        let one = [1, 1];
+        assert!(Windows::new([2, 2], [3, 3], one, [0, 0], one).unwrap_err().contains("does not fit"));
+        assert!(Windows::new([2, 2], [2, 2], one, [0, 0], [2, 1]).unwrap_err().contains("does not fit"));
+        assert!(Windows::new([2, 2], one, [0, 1], [0, 0], one).unwrap_err().contains("must be positive"));
+        assert_eq!(Windows::new([5, 6], [3, 2], [2, 3], [1, 0], [1, 2]).unwrap().output(), [3, 2]);
+    }
+}
