@@ -86,13 +86,13 @@ impl<T: Scalar, U: Unary> Op<T> for Map<U> {
         let grad = match (reads_x, reads_y) {
             (false, false) => map_real!([g], cx.pool(), |[g]| self.0.vjp(g, unread(&g), unread(&g))),
             (true, false) => {
-                map_real!([g, cx.x(0).value()], cx.pool(), |[g, x]| self.0.vjp(g, x, unread(&g)))
+                map_real!([g, cx.input(0)], cx.pool(), |[g, x]| self.0.vjp(g, x, unread(&g)))
             }
             (false, true) => {
-                map_real!([g, cx.y().value()], cx.pool(), |[g, y]| self.0.vjp(g, unread(&g), y))
+                map_real!([g, cx.output()], cx.pool(), |[g, y]| self.0.vjp(g, unread(&g), y))
             }
             (true, true) => {
-                map_real!([g, cx.x(0).value(), cx.y().value()], cx.pool(), |[g, x, y]| self.0.vjp(g, x, y))
+                map_real!([g, cx.input(0), cx.output()], cx.pool(), |[g, x, y]| self.0.vjp(g, x, y))
             }
         };
         Grads::one(cx.constant(grad))
@@ -105,11 +105,10 @@ impl<B: Binary> Zip<B> {
         let g = cx.g().value();
         // A value that is not read costs a register, not a pass: `g` stands in for it and is replaced by NaN.
         let reads = [B::READS.input(0), B::READS.input(1), B::READS.output()];
-        let read = |reads: bool, value: &dyn Fn() -> Tensor<T>| if reads { value() } else { g.clone() };
-        let a = read(reads[0], &|| cx.x(0).into_value());
-        let b = read(reads[1], &|| cx.x(1).into_value());
-        let y = read(reads[2], &|| cx.y().into_value());
-        map_real!([g, &a, &b, &y], cx.pool(), |[g, a, b, y]| {
+        let a = if reads[0] { cx.input(0) } else { g };
+        let b = if reads[1] { cx.input(1) } else { g };
+        let y = if reads[2] { cx.output() } else { g };
+        map_real!([g, a, b, y], cx.pool(), |[g, a, b, y]| {
             let (a, b, y) = (kept(reads[0], a), kept(reads[1], b), kept(reads[2], y));
             if OF_A { self.0.vjp_a(g, a, b, y) } else { self.0.vjp_b(g, a, b, y) }
         })

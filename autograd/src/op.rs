@@ -174,10 +174,33 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
         self.kept(self.output, Some(self.node), "the output")
     }
 
+    /// The value of input `i`, for a pass that is not recorded.
+    ///
+    /// # Panics
+    /// As [`x`](Self::x).
+    #[track_caller]
+    pub fn input(&self, i: usize) -> &Tensor<T> {
+        self.value_of(&self.inputs[i].1, "an input")
+    }
+
+    /// The value of the output, for a pass that is not recorded.
+    ///
+    /// # Panics
+    /// As [`y`](Self::y).
+    #[track_caller]
+    pub fn output(&self) -> &Tensor<T> {
+        self.value_of(self.output, "the output")
+    }
+
     #[track_caller]
     fn kept(&self, kept: &Kept<T>, node: Option<u32>, what: &str) -> Var<'t, T> {
+        Var { tape: self.tape, value: self.value_of(kept, what).clone(), node }
+    }
+
+    #[track_caller]
+    fn value_of<'k>(&self, kept: &'k Kept<T>, what: &str) -> &'k Tensor<T> {
         match kept {
-            Kept::Value(value) => Var { tape: self.tape, value: value.clone(), node },
+            Kept::Value(value) => value,
             Kept::Shape(_) => panic!("{}: `vjp` reads {what} that `reads` leaves out", self.op),
         }
     }

@@ -189,12 +189,18 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     pub fn try_apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Result<Var<'t, T>, Error> {
         let at = self.line();
-        let shape = self.check_shapes(&op, inputs, at)?;
+        let value = self.run(&op, inputs, at)?;
+        Ok(self.record(op, inputs, value, at))
+    }
+
+    /// The output of an operation, without a record. It takes any operation, so that it is compiled once.
+    fn run(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Tensor<T>, Error> {
+        let shape = self.check_shapes(op, inputs, at)?;
         let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
         let value = op.forward(&values, &self.pool);
         debug_assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
         self.check_output(op.name(), inputs, &value, at)?;
-        Ok(self.record(op, inputs, value, at))
+        Ok(value)
     }
 
     /// Records an operation whose output is known already, from an earlier unrecorded run on the same inputs.
@@ -238,7 +244,7 @@ impl<T: Scalar> Tape<T> {
     /// The shape of the output.
     fn check_shapes(
         &self,
-        op: &impl Op<T>,
+        op: &dyn Op<T>,
         inputs: &[&Var<'_, T>],
         at: &'static Location<'static>,
     ) -> Result<Shape, Error> {
@@ -261,15 +267,25 @@ impl<T: Scalar> Tape<T> {
         value: Tensor<T>,
         at: &'static Location<'static>,
     ) -> Var<'t, T> {
-        let node = if self.recording.get() && inputs.iter().any(|x| x.node.is_some()) {
-            let reads = op.reads();
-            let kept = |(i, x): (usize, &&Var<'t, T>)| (x.node, Kept::new(&x.value, reads.input(i)));
-            let inputs = inputs.iter().enumerate().map(kept).collect();
-            let output = Kept::new(&value, reads.output());
-            Some(self.push(Node { op: Some(Box::new(op)), inputs, output, at }))
+        if self.recording.get() && inputs.iter().any(|x| x.node.is_some()) {
+            self.append(Box::new(op), inputs, value, at)
         } else {
-            None
-        };
+            self.constant(value)
+        }
+    }
+
+    fn append<'t>(
+        &'t self,
+        op: Box<dyn Op<T>>,
+        inputs: &[&Var<'t, T>],
+        value: Tensor<T>,
+        at: &'static Location<'static>,
+    ) -> Var<'t, T> {
+        let reads = op.reads();
+        let kept = |(i, x): (usize, &&Var<'t, T>)| (x.node, Kept::new(&x.value, reads.input(i)));
+        let inputs = inputs.iter().enumerate().map(kept).collect();
+        let output = Kept::new(&value, reads.output());
+        let node = Some(self.push(Node { op: Some(op), inputs, output, at }));
         Var { tape: self, value, node }
     }
 }

@@ -110,18 +110,69 @@ fn broadcast_loop<T: Scalar, const N: usize>(
     pool: &Pool<T>,
     run: impl FnOnce([&[T]; N], &mut [T]),
 ) -> Tensor<T> {
-    let shapes = x.map(|x| x.shape());
-    let mut out;
-    if shapes.iter().all(|&shape| shape == shapes[0]) {
-        out = pool.tensor(shapes[0]);
-        run(x.map(|x| x.as_slice()), out.as_mut_slice());
-    } else {
-        let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
-        out = pool.tensor(&shape);
-        let wide = x.map(|x| broadcast_to(x, &shape, pool));
-        run(std::array::from_fn(|i| wide[i].as_slice()), out.as_mut_slice());
-    }
+    let (operands, mut out) = operands(x, pool);
+    run(slices(&operands), out.as_mut_slice());
     out
+}
+
+/// A tensor of the operand's shape or of the common one.
+enum Operand<'a, T: Scalar> {
+    AsItIs(&'a Tensor<T>),
+    Stretched(Tensor<T>),
+}
+
+/// The tensors, stretched to their common shape, and an output of that shape. Apart from the loop, so that it is compiled
+/// once and not for each formula; as are the next three functions, which do what the closures of `std::array` would.
+#[track_caller]
+fn operands<'a, T: Scalar, const N: usize>(x: [&'a Tensor<T>; N], pool: &Pool<T>) -> ([Operand<'a, T>; N], Tensor<T>) {
+    let shapes = x.map(|x| x.shape());
+    if shapes.iter().all(|&shape| shape == shapes[0]) {
+        return (x.map(Operand::AsItIs), pool.tensor(shapes[0]));
+    }
+    let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
+    (x.map(|x| Operand::Stretched(broadcast_to(x, &shape, pool))), pool.tensor(&shape))
+}
+
+fn slices<'a, T: Scalar, const N: usize>(x: &'a [Operand<'_, T>; N]) -> [&'a [T]; N] {
+    x.each_ref().map(|x| match x {
+        Operand::AsItIs(x) => x.as_slice(),
+        Operand::Stretched(x) => x.as_slice(),
+    })
+}
+
+/// The `n` elements of each slice from `start` on.
+#[inline(always)]
+fn cut<T, const N: usize>(mut x: [&[T]; N], start: usize, n: usize) -> [&[T]; N] {
+    let mut k = 0;
+    while k < N {
+        x[k] = &x[k][start..][..n];
+        k += 1;
+    }
+    x
+}
+
+/// Element `i` of each slice.
+#[inline(always)]
+fn gather<T: Scalar, const N: usize>(x: &[&[T]; N], i: usize) -> [T; N] {
+    let mut values = [T::ZERO; N];
+    let mut k = 0;
+    while k < N {
+        values[k] = x[k][i];
+        k += 1;
+    }
+    values
+}
+
+/// [`gather`] into the numbers of [`lanes_either`].
+#[inline(always)]
+fn gather_lanes<T: Scalar, const N: usize, const QUICK: bool>(x: &[&[T]; N], i: usize) -> [Lane<T, QUICK>; N] {
+    let mut values = [Lane::new(T::ZERO); N];
+    let mut k = 0;
+    while k < N {
+        values[k] = Lane::new(x[k][i]);
+        k += 1;
+    }
+    values
 }
 
 /// `out[i] = f([x[0][i], x[1][i], ..])` with the best instruction set of the processor.
@@ -134,15 +185,9 @@ pub fn lanes<T: Scalar, const N: usize>(x: [&[T]; N], out: &mut [T], f: impl Fn(
         || {
             // Cut to one length in here, where the compiler can still drop the bounds checks.
             let n = out.len();
-            let x = x.map(
-                #[inline(always)]
-                |x| &x[..n],
-            );
+            let x = cut(x, 0, n);
             for i in 0..n {
-                out[i] = f(std::array::from_fn(
-                    #[inline(always)]
-                    |k| x[k][i],
-                ));
+                out[i] = f(gather(&x, i));
             }
         },
     );
@@ -167,27 +212,16 @@ pub fn lanes_either<T: Scalar, const N: usize>(
             let mut start = 0;
             for out in out.chunks_mut(BLOCK) {
                 let n = out.len();
-                let x = x.map(
-                    #[inline(always)]
-                    |x| &x[start..][..n],
-                );
+                let x = cut(x, start, n);
                 let mut outside = T::Flags::default();
                 for i in 0..n {
-                    let y = quick(std::array::from_fn(
-                        #[inline(always)]
-                        |k| Lane::new(x[k][i]),
-                    ));
-                    let (value, flags) = y.parts();
+                    let (value, flags) = quick(gather_lanes(&x, i)).parts();
                     out[i] = value;
                     outside = outside | flags;
                 }
                 if T::is_set(outside) {
                     for i in 0..n {
-                        let y = plain(std::array::from_fn(
-                            #[inline(always)]
-                            |k| Lane::new(x[k][i]),
-                        ));
-                        out[i] = y.parts().0;
+                        out[i] = plain(gather_lanes(&x, i)).parts().0;
                     }
                 }
                 start += n;
