@@ -5,7 +5,7 @@
 //! cargo run --release -p raygrad-nerf --example hash_speed [levels features log2_table]
 //! ```
 
-use raygrad_autograd::{AdamConfig, Op, Pool, RowAdam, Tensor, Touched};
+use raygrad_autograd::{AdamConfig, Op, Pool, RowAdam, RowSums, Tensor};
 use raygrad_nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use std::time::Instant;
 
@@ -68,17 +68,17 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
     let (mut scatter, mut adam, mut moved) = (0.0, 0.0, 0);
     for (l, level) in grid.levels().iter().enumerate() {
         let rows = level.rows.len();
-        let (mut grad, mut touched) = (vec![0.0; rows * grid.features()], Touched::new(rows));
+        let mut sums = RowSums::new(rows, grid.features());
         let mut optimizer = RowAdam::<f32>::new(constants, rows, grid.features());
         let values = &mut table.as_mut_slice()[level.rows.start * grid.features()..level.rows.end * grid.features()];
         let mut least = [f64::INFINITY; 2];
         for run in 0..RUNS {
             let start = Instant::now();
             for (positions, d_out) in &tiles {
-                grid.scatter_level(l, positions.as_slice(), d_out.as_slice(), &mut grad, &mut touched);
+                grid.scatter_level(l, positions.as_slice(), d_out.as_slice(), &mut sums);
             }
             let middle = Instant::now();
-            let stats = optimizer.step(values, &mut grad, &mut touched, 1e-2);
+            let stats = optimizer.step(values, &mut sums, 1e-2);
             let times = [middle.duration_since(start), middle.elapsed()];
             for (least, time) in least.iter_mut().zip(times) {
                 *least = least.min(time.as_secs_f64());

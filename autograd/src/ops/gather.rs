@@ -1,6 +1,6 @@
 //! Rows of a tensor by number: embeddings and tables.
 
-use crate::{Grads, Op, Reads, ShapeError, SparseGrad, Touched, Var, Vjp};
+use crate::{Grads, Op, Reads, RowSums, ShapeError, SparseGrad, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
@@ -139,14 +139,17 @@ impl<T: Scalar> RowGrad<T> {
         &self.rows
     }
 
-    /// Adds the rows to a dense gradient in order, and marks those that it touches.
+    /// Adds the rows to the sums of their table's rows, in order.
     ///
     /// # Panics
-    /// If `dense` is not as long as the table, or there are fewer marks than rows.
+    /// If `sums` belongs to a table of another size.
     #[track_caller]
-    pub fn scatter(&self, dense: &mut [T], touched: &mut Touched) {
-        self.index.iter().for_each(|&row| touched.mark(row as usize));
-        self.add(dense);
+    pub fn scatter(&self, sums: &mut RowSums<T>) {
+        let width: usize = self.shape[1..].iter().product();
+        assert_eq!([sums.table_rows(), sums.features()], [self.shape[0], width], "sums of the table's rows");
+        for (share, &row) in self.rows.as_slice().chunks_exact(width).zip(self.index.iter()) {
+            sums.add(row as usize, share);
+        }
     }
 
     #[track_caller]
@@ -232,9 +235,10 @@ mod tests {
                 return loss.grad_graph(&[&table])[0].value().as_slice().to_vec();
             }
             let parts = loss.grad_sparse(&[&table]).remove(0).parts::<RowGrad<f32>>();
-            let (mut dense, mut touched) = (vec![0.0; 15], Touched::new(5));
-            parts.iter().for_each(|part| part.scatter(&mut dense, &mut touched));
-            assert!(parts.len() == 1 && parts[0].rows().shape() == [5, 3] && touched.group(0));
+            let (mut dense, mut sums) = (vec![0.0; 15], RowSums::new(5, 3));
+            parts.iter().for_each(|part| part.scatter(&mut sums));
+            assert!(parts.len() == 1 && parts[0].rows().shape() == [5, 3] && sums.rows() == [3, 0, 1]);
+            sums.add_to(&mut dense);
             dense
         };
         assert_eq!(run(true), run(false));

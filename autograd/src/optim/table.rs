@@ -1,15 +1,14 @@
 //! Lazy Adam for an embedding's table.
 
-use crate::{AdamConfig, RowAdam, RowGrad, RowStats, Touched};
+use crate::{AdamConfig, RowAdam, RowGrad, RowStats, RowSums};
 use raygrad_tensor::{Scalar, Tensor};
 
 /// [`RowAdam`] for a table whose gradient comes as [`RowGrad`]s: reads and moves only the rows that were gathered.
 #[derive(Debug, Clone)]
 pub struct TableAdam<T: Scalar> {
     adam: RowAdam<T>,
-    /// The sum of the gradients, zero between steps.
-    sum: Vec<T>,
-    touched: Touched,
+    /// The sum of the gradients, nothing between steps.
+    sums: RowSums<T>,
 }
 
 impl<T: Scalar> TableAdam<T> {
@@ -19,11 +18,7 @@ impl<T: Scalar> TableAdam<T> {
     /// If `width` is 0.
     #[track_caller]
     pub fn new(config: AdamConfig, [rows, width]: [usize; 2]) -> Self {
-        TableAdam {
-            adam: RowAdam::new(config, rows, width),
-            sum: vec![T::ZERO; rows * width],
-            touched: Touched::new(rows),
-        }
+        TableAdam { adam: RowAdam::new(config, rows, width), sums: RowSums::new(rows, width) }
     }
 
     /// Adds up the parts in their order and moves the rows whose gradient is not zero; see [`RowAdam`] for how that
@@ -34,9 +29,9 @@ impl<T: Scalar> TableAdam<T> {
     #[track_caller]
     pub fn step(&mut self, table: &mut Tensor<T>, parts: &[impl AsRef<RowGrad<T>>], rate: f64) -> RowStats {
         for part in parts {
-            part.as_ref().scatter(&mut self.sum, &mut self.touched);
+            part.as_ref().scatter(&mut self.sums);
         }
-        self.adam.step(table.as_mut_slice(), &mut self.sum, &mut self.touched, rate)
+        self.adam.step(table.as_mut_slice(), &mut self.sums, rate)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::kernel::{BLOCK, Cells, Points};
 use super::{HashGrad, HashGrid, HashGridConfig, HashLevel};
-use raygrad_autograd::{Entry, Grads, Op, Pool, Scalar, Shape, ShapeError, Tensor, Touched, Var, Vjp};
+use raygrad_autograd::{Entry, Grads, Op, Pool, RowSums, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::simd;
 use std::mem::swap;
 use std::sync::Arc;
@@ -53,27 +53,19 @@ impl HashGrid {
         );
     }
 
-    /// Adds to `grad` the gradient of one level's rows, `[rows of the level, features]`, that `d_out` (`[samples, width]`,
-    /// the gradient of the encoding of `positions`, `[samples, 3]`) makes, in the order of the samples, and marks the rows
-    /// it touches. Samples whose gradient on this level is all zero touch nothing; one with a NaN coordinate gives NaN.
+    /// Adds to `grad` the gradient of one level's rows that `d_out` (`[samples, width]`, the gradient of the encoding of
+    /// `positions`, `[samples, 3]`) makes, in the order of the samples. Samples whose gradient on this level is all zero
+    /// touch nothing; one with a NaN coordinate gives NaN.
     ///
     /// # Panics
     /// If there is no such level or a length does not fit.
     #[track_caller]
-    pub fn scatter_level<T: Scalar>(
-        &self,
-        level: usize,
-        positions: &[T],
-        d_out: &[T],
-        grad: &mut [T],
-        touched: &mut Touched,
-    ) {
+    pub fn scatter_level<T: Scalar>(&self, level: usize, positions: &[T], d_out: &[T], grad: &mut RowSums<T>) {
         let (rows, samples) = (self.levels()[level].rows.len(), positions.len() / 3);
         assert_eq!(positions.len(), 3 * samples, "positions of three coordinates");
         assert_eq!(d_out.len(), samples * self.width(), "gradients of {samples} encoded positions");
-        assert_eq!(grad.len(), rows * self.features(), "a gradient of the rows of level {level}");
-        assert_eq!(touched.groups(), rows.div_ceil(Touched::GROUP), "marks of the rows of level {level}");
-        with_features!(self, scatter_rows(level, positions, d_out, grad, touched))
+        assert_eq!(grad.table_rows(), rows, "sums of the rows of level {level}");
+        with_features!(self, scatter_rows(level, positions, d_out, grad))
     }
 
     fn scatter_rows<T: Scalar, const F: usize>(
@@ -81,10 +73,9 @@ impl HashGrid {
         level: usize,
         positions: &[T],
         d_out: &[T],
-        grad: &mut [T],
-        touched: &mut Touched,
+        grad: &mut RowSums<T>,
     ) {
-        let (grad, _) = grad.as_chunks_mut::<F>();
+        let mut grad = grad.of_width::<F>();
         let (width, column) = (self.width(), level * F);
         simd::dispatch(
             #[inline(always)]
@@ -98,13 +89,12 @@ impl HashGrid {
                     cells.locate(level, &points);
                 }
                 for d_out in d_out.chunks(width * BLOCK) {
-                    // A small batch meets most rows for the first time since the last step.
                     if let Some(block) = blocks.next() {
                         points.load(block);
                         next.locate(level, &points);
-                        next.prefetch(grad);
+                        next.prefetch_sums(&grad);
                     }
-                    cells.scatter(d_out, width, column, grad, touched);
+                    cells.scatter(d_out, width, column, &mut grad);
                     swap(&mut cells, &mut next);
                 }
             },

@@ -4,7 +4,7 @@ use crate::config::check_range;
 use crate::{Error, Result};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Scalar, Tensor, Touched};
+use raygrad_autograd::{Scalar, Tensor};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::Arc;
@@ -94,8 +94,8 @@ pub(super) const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 ///
 /// Level `l` has `N_l = floor(coarsest b^l)` cells along an axis, `b = (finest / coarsest)^(1 / (levels - 1))`
 /// (equations 2 and 3), so `N_l + 1` corners. A level with few enough corners has a row for each; a finer one hashes its
-/// corners to `2^log2_table` rows. Rows are rounded up to whole groups of [`Touched`], so that levels can be updated in
-/// parallel.
+/// corners to `2^log2_table` rows. Rows are rounded up to a multiple of 16, so that
+/// each level begins with a line of the caches.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HashGrid {
     levels: Arc<[HashLevel]>,
@@ -117,7 +117,7 @@ impl HashGrid {
             // The tiny excess makes the last level the finest in spite of rounding.
             let resolution = config.coarsest as f64 * (l as f64 * growth).exp() * (1.0 + 1e-12);
             let corners = (resolution as usize + 1).pow(3);
-            let count = corners.min(most).next_multiple_of(Touched::GROUP);
+            let count = corners.min(most).next_multiple_of(16);
             first += count;
             HashLevel { resolution: resolution as u32, hashed: corners > most, rows: first - count..first }
         };

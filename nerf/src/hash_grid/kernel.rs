@@ -7,7 +7,7 @@
 //! not fused, so the bits are the same on every instruction set.
 
 use super::grid::{HashLevel, PRIMES};
-use raygrad_autograd::{Scalar, Touched};
+use raygrad_autograd::{RowAdder, Scalar};
 use raygrad_tensor::simd;
 
 /// Samples of a block.
@@ -129,8 +129,7 @@ impl<T: Scalar> Cells<T> {
         d_out: &[T],
         width: usize,
         column: usize,
-        grad: &mut [[T; F]],
-        touched: &mut Touched,
+        grad: &mut RowAdder<'_, T, F>,
     ) {
         // Neighbouring samples of a ray often share a cell, above all on coarse levels: their gradients are added up
         // beside each other before the table is touched.
@@ -147,7 +146,7 @@ impl<T: Scalar> Cells<T> {
             );
             if !same {
                 if let Some(last) = cell {
-                    self.flush(last, &mut sums, grad, touched);
+                    self.flush(last, &mut sums, grad);
                 }
                 cell = Some(i);
             }
@@ -158,7 +157,7 @@ impl<T: Scalar> Cells<T> {
             }
         }
         if let Some(last) = cell {
-            self.flush(last, &mut sums, grad, touched);
+            self.flush(last, &mut sums, grad);
         }
     }
 
@@ -174,16 +173,20 @@ impl<T: Scalar> Cells<T> {
 
     /// Adds the sums of sample `i`'s corners to their rows and empties them.
     #[inline(always)]
-    fn flush<const F: usize>(&self, i: usize, sums: &mut [[T; F]; 8], grad: &mut [[T; F]], touched: &mut Touched) {
+    fn flush<const F: usize>(&self, i: usize, sums: &mut [[T; F]; 8], grad: &mut RowAdder<'_, T, F>) {
         for corner in 0..8 {
-            let row = self.rows[corner][i] as usize;
-            // SAFETY: as in `gather`.
-            let out = unsafe { grad.get_unchecked_mut(row) };
-            for f in 0..F {
-                out[f] += sums[corner][f];
-                sums[corner][f] = T::ZERO;
+            grad.add(self.rows[corner][i] as usize, &sums[corner]);
+            sums[corner] = [T::ZERO; F];
+        }
+    }
+
+    /// Starts to load what adding to the rows of all corners reads first.
+    #[inline(always)]
+    pub(super) fn prefetch_sums<const F: usize>(&self, grad: &RowAdder<'_, T, F>) {
+        for i in 0..self.len {
+            for corner in 0..8 {
+                grad.prefetch(self.rows[corner][i] as usize);
             }
-            touched.mark(row);
         }
     }
 

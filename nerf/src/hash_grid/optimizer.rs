@@ -1,7 +1,7 @@
 //! Training the table: gradients of samples are added level by level, and only rows that got one are updated.
 
 use super::HashGrid;
-use raygrad_autograd::{AdamConfig, RowAdam, RowStats, Scalar, SparseGrad, Tensor, Touched};
+use raygrad_autograd::{AdamConfig, RowAdam, RowStats, RowSums, Scalar, SparseGrad, Tensor};
 use std::sync::Arc;
 
 /// What a tile leaves for the table: where its samples are, and the gradients of their features.
@@ -24,8 +24,9 @@ impl<T: Scalar> SparseGrad<T> for HashGrad<T> {
         let features = self.grid.features();
         for (number, level) in self.grid.levels().iter().enumerate() {
             let part = &mut dense.as_mut_slice()[level.rows.start * features..level.rows.end * features];
-            let mut touched = Touched::new(level.rows.len());
-            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), part, &mut touched);
+            let mut sums = RowSums::new(level.rows.len(), features);
+            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut sums);
+            sums.add_to(part);
         }
     }
 }
@@ -48,10 +49,8 @@ pub struct TableOptimizer {
 #[derive(Debug, Clone)]
 struct Level {
     adam: RowAdam<f32>,
-    /// Zero between steps.
-    grad: Vec<f32>,
     /// Nothing between steps.
-    touched: Touched,
+    sums: RowSums<f32>,
 }
 
 impl TableOptimizer {
@@ -59,11 +58,7 @@ impl TableOptimizer {
     /// would stall rows that are seldom visited.
     pub fn new(grid: HashGrid, config: AdamConfig) -> Self {
         let adam = RowAdam::new(config, 0, grid.features());
-        let level = |rows: usize| Level {
-            adam: adam.fresh(rows),
-            grad: vec![0.0; rows * grid.features()],
-            touched: Touched::new(rows),
-        };
+        let level = |rows| Level { adam: adam.fresh(rows), sums: RowSums::new(rows, grid.features()) };
         TableOptimizer { levels: grid.levels().iter().map(|l| level(l.rows.len())).collect(), grid }
     }
 
@@ -96,13 +91,14 @@ impl Step<'_> {
         if let [level] = levels {
             for grad in self.grads {
                 let (positions, d_out) = (grad.positions.as_slice(), grad.d_out.as_slice());
-                self.grid.scatter_level(first, positions, d_out, &mut level.grad, &mut level.touched);
+                self.grid.scatter_level(first, positions, d_out, &mut level.sums);
             }
-            return level.adam.step(table, &mut level.grad, &mut level.touched, self.rate);
+            return level.adam.step(table, &mut level.sums, self.rate);
         }
         let half = levels.len() / 2;
         let (coarse, fine) = levels.split_at_mut(half);
-        let (coarse_table, fine_table) = table.split_at_mut(coarse.iter().map(|level| level.grad.len()).sum());
+        let coarse_rows: usize = coarse.iter().map(|level| level.sums.table_rows()).sum();
+        let (coarse_table, fine_table) = table.split_at_mut(coarse_rows * self.grid.features());
         let (a, b) = rayon::join(|| self.run(first, coarse, coarse_table), || self.run(first + half, fine, fine_table));
         a + b
     }

@@ -2,7 +2,7 @@
 
 use super::*;
 use proptest::prelude::*;
-use raygrad_autograd::{AdamConfig, Check, Op, Pool, Scalar, Tape, Tensor, Touched, check_op};
+use raygrad_autograd::{AdamConfig, Check, Op, Pool, RowSums, Scalar, Tape, Tensor, check_op};
 use std::sync::Arc;
 
 fn grid(levels: usize, features: usize, log2_table: u32, coarsest: usize, finest: usize) -> HashGrid {
@@ -141,9 +141,7 @@ fn rows_stay_in_bounds() {
             let ones = vec![1.0_f32; positions.len() / 3 * grid.width()];
             let positions: Vec<f32> = positions.iter().map(|&x| x as f32).collect();
             for (l, level) in grid.levels().iter().enumerate() {
-                let mut touched = Touched::new(level.rows.len());
-                let mut grad = vec![0.0_f32; level.rows.len() * 2];
-                grid.scatter_level(l, &positions, &ones, &mut grad, &mut touched);
+                grid.scatter_level(l, &positions, &ones, &mut RowSums::new(level.rows.len(), 2));
             }
         }
     }
@@ -189,32 +187,29 @@ proptest! {
         let forward: f64 = out.iter().zip(&d_out).map(|(a, b)| a * b).sum();
         let mut backward = 0.0;
         for (l, level) in grid.levels().iter().enumerate() {
-            let mut grad = vec![0.0; level.rows.len() * 2];
-            grid.scatter_level(l, &positions, &d_out, &mut grad, &mut Touched::new(level.rows.len()));
-            let values = &table.as_slice()[level.rows.start * 2..];
-            backward += grad.iter().zip(values).map(|(a, b)| a * b).sum::<f64>();
+            let mut sums = RowSums::new(level.rows.len(), 2);
+            grid.scatter_level(l, &positions, &d_out, &mut sums);
+            for (&row, sum) in sums.rows().iter().zip(sums.sums().chunks(2)) {
+                let values = &table.as_slice()[(level.rows.start + row as usize) * 2..];
+                backward += sum[0] * values[0] + sum[1] * values[1];
+            }
         }
         prop_assert!((forward - backward).abs() <= 1e-14, "{forward:e} {backward:e}");
     }
 }
 
 #[test]
-fn scatter_marks_every_row_it_adds_to_and_skips_zeros() {
+fn a_gradient_of_zero_touches_no_row() {
     let grid = grid(2, 4, 9, 5, 50);
-    let positions: Vec<f32> = units(3 * 20, 5).iter().map(|&x| x as f32).collect();
-    let mut d_out: Vec<f32> = units(20 * grid.width(), 6).iter().map(|&x| x as f32).collect();
-    for (level, rows) in grid.levels().iter().map(|level| level.rows.len()).enumerate() {
-        let (mut grad, mut touched) = (vec![0.0; rows * 4], Touched::new(rows));
-        grid.scatter_level(level, &positions, &d_out, &mut grad, &mut touched);
-        for (row, grad) in grad.chunks(4).enumerate() {
-            assert!(grad == [0.0; 4] || touched.group(row / Touched::GROUP), "row {row}");
-        }
-    }
+    let positions = units(3 * 20, 5);
+    let mut d_out = units(20 * grid.width(), 6);
+    let mut sums = RowSums::new(grid.levels()[1].rows.len(), 4);
+    grid.scatter_level(1, &positions, &d_out, &mut sums);
+    assert!((8..=160).contains(&sums.rows().len()) && sums.sums().iter().all(|&sum| sum != 0.0));
+    sums.clear();
     d_out.fill(0.0);
-    let (mut grad, mut touched) =
-        (vec![0.0; grid.levels()[1].rows.len() * 4], Touched::new(grid.levels()[1].rows.len()));
-    grid.scatter_level(1, &positions, &d_out, &mut grad, &mut touched);
-    assert!((0..touched.groups()).all(|group| !touched.group(group)));
+    grid.scatter_level(1, &positions, &d_out, &mut sums);
+    assert!(sums.rows().is_empty());
 }
 
 fn tiles(grid: &HashGrid, count: usize) -> Vec<Arc<HashGrad<f32>>> {
