@@ -41,7 +41,7 @@ pub struct RowAdam<T> {
     rule: Arc<Rule<T>>,
     features: usize,
     /// For each row first its first moments, then its second ones: one place in memory to visit.
-    moments: Vec<T>,
+    moments: Lines<T>,
     /// Steps of each row, at most the length of the rule's corrections.
     steps: Vec<u32>,
 }
@@ -108,7 +108,7 @@ impl<T: Scalar> RowAdam<T> {
     #[track_caller]
     pub fn new(config: AdamConfig, rows: usize, features: usize) -> Self {
         assert!(features > 0, "rows without features");
-        RowAdam { rule: Arc::new(Rule::new(config)), features, moments: vec![], steps: vec![] }.fresh(rows)
+        RowAdam { rule: Arc::new(Rule::new(config)), features, moments: Lines::zeros(0), steps: vec![] }.fresh(rows)
     }
 
     /// The same constants, shared, and nothing seen, for another range of `rows` rows.
@@ -116,7 +116,7 @@ impl<T: Scalar> RowAdam<T> {
         RowAdam {
             rule: self.rule.clone(),
             features: self.features,
-            moments: vec![T::ZERO; 2 * rows * self.features],
+            moments: Lines::zeros(2 * rows * self.features),
             steps: vec![0; rows],
         }
     }
@@ -137,7 +137,7 @@ impl<T: Scalar> RowAdam<T> {
             features,
             rate,
             table: Rows::new(table),
-            moments: Rows::new(&mut self.moments),
+            moments: Rows::new(self.moments.as_mut_slice()),
             steps: Rows::new(&mut self.steps),
         };
         let chunks = sums.rows().par_chunks(CHUNK).zip(sums.sums().par_chunks(CHUNK * features));
@@ -152,6 +152,31 @@ impl<T: Scalar> RowAdam<T> {
         stats
     }
 }
+
+/// Numbers that begin where a line of the caches begins, so that a row of a power of two of them takes as few lines as it
+/// can. (A clone may begin elsewhere.)
+#[derive(Debug, Clone)]
+struct Lines<T> {
+    values: Vec<T>,
+    start: usize,
+    len: usize,
+}
+
+impl<T: Scalar> Lines<T> {
+    fn zeros(len: usize) -> Self {
+        let line = LINE / size_of::<T>();
+        let values = vec![T::ZERO; len + line];
+        let start = values.as_ptr().align_offset(LINE).min(line);
+        Lines { values, start, len }
+    }
+
+    fn as_mut_slice(&mut self) -> &mut [T] {
+        &mut self.values[self.start..self.start + self.len]
+    }
+}
+
+/// Bytes of a line of the caches.
+const LINE: usize = 64;
 
 /// Rows that several tasks write to, each to rows of its own.
 struct Rows<'a, T> {
@@ -187,7 +212,7 @@ impl<'a, T> Rows<'a, T> {
     /// Asks the caches for the elements from `start` on.
     #[inline(always)]
     fn prefetch(&self, start: usize, len: usize) {
-        let line = 64 / size_of::<T>();
+        let line = LINE / size_of::<T>();
         for at in (start..start + len).step_by(line).chain([start + len - 1]) {
             simd::prefetch(self.first.wrapping_add(at));
         }
@@ -364,7 +389,7 @@ mod tests {
             adam.step(&mut table, &mut sums(&gradients, 1), 1.0);
             assert!(table.iter().zip(before).all(|(x, before)| (x - before).abs() <= 3.2), "{table:?}");
         }
-        assert!(adam.moments.iter().all(|m| !m.is_subnormal()), "{:?}", adam.moments);
+        assert!(adam.moments.as_mut_slice().iter().all(|m| !m.is_subnormal()), "{:?}", adam.moments);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The rays of a training step and what they should show.
+//! Training rays and what they should show.
 
 use crate::background::{Background, over};
 use crate::bounds::clip_span;

@@ -54,9 +54,10 @@ impl<T: Scalar> Composite<T> {
         Composite { log_density: true, ..Composite::new(delta, segments) }
     }
 
-    fn light(&self, density: &Tensor<T>, pool: &Pool<T>) -> Light<T> {
+    /// The optical depth of each sample's interval, `[samples]`, for densities `[samples]`.
+    pub(crate) fn optical_depth(&self, density: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
         let most = T::from_f64(MOST_LOG_DENSITY);
-        let depth = if self.log_density {
+        if self.log_density {
             map(
                 [density, &self.delta],
                 pool,
@@ -71,7 +72,11 @@ impl<T: Scalar> Composite<T> {
                 // Not the product alone, which is NaN for 0 times infinity.
                 |[sigma, delta]| if sigma == T::ZERO { T::ZERO } else { sigma * delta },
             )
-        };
+        }
+    }
+
+    fn light(&self, density: &Tensor<T>, pool: &Pool<T>) -> Light<T> {
+        let depth = self.optical_depth(density, pool);
         let mut before = pool.tensor(density.shape());
         let out = before.as_mut_slice();
         for rows in self.segments.ranges() {

@@ -37,6 +37,7 @@ mod startup;
 mod store;
 mod train;
 mod view;
+pub mod visible;
 
 pub use self::image::Image;
 pub use background::Background;

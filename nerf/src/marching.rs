@@ -4,10 +4,9 @@ use crate::Result;
 use crate::config::check_range;
 use crate::field::Field;
 use crate::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
-use crate::pass::composite_encoded;
 use crate::rays::{Rays, Samples};
 use crate::sampler::Jitter;
-use raygrad_autograd::{Bound, Params, Pool, Scalar, Segments, Tape, Tensor, Var};
+use raygrad_autograd::{Params, Pool, Scalar, Segments, Tape};
 use serde::{Deserialize, Serialize};
 
 /// Numbers of a [`Marching`] sampler.
@@ -117,50 +116,4 @@ fn densities(field: &dyn Field<f32>, params: &Params<f32>, pool: &Pool<f32>, poi
     let positions = tape.constant(pool.copy_of(&[points.len(), 3], points.as_flattened()));
     let density = field.density(&params, &field.encode(&params, &positions));
     out.copy_from_slice(density.sigma().value().as_slice());
-}
-
-/// Marched samples, composited.
-pub struct Marched<'t, T: Scalar> {
-    /// `[rays, 4 or 5]`: colour, distance if asked for, and the transmittance that is left.
-    pub rendered: Var<'t, T>,
-    /// Samples that had light left in front of them.
-    pub kept: usize,
-}
-
-/// Composites marched samples in two passes: an unrecorded one for the densities, and a recorded one on the samples that
-/// more than `termination` of the light reaches, which takes its encodings from the first. What is dropped changes a
-/// pixel by at most `termination` times the range of colours.
-pub fn composite_visible<'t, T: Scalar>(
-    field: &dyn Field<T>,
-    params: &Bound<'t, T>,
-    samples: &Samples<T>,
-    termination: f64,
-    with_depth: bool,
-    tape: &'t Tape<T>,
-) -> Marched<'t, T> {
-    let (encoding, transmittance) = tape.no_grad(|| {
-        let encoding = field.encode(params, &tape.constant(samples.positions.clone()));
-        let density = field.density(params, &encoding);
-        let composite = density.composite(samples.delta.clone(), samples.segments.clone());
-        let [transmittance, _] = composite.transmittance_and_weights(density.value.value(), tape.pool());
-        (encoding.into_value(), transmittance)
-    });
-    let least = T::from_f64(termination);
-    let rows = transmittance.as_slice().iter().enumerate().filter(|(_, t)| **t > least);
-    let rows: Vec<u32> = rows.map(|(row, _)| row as u32).collect();
-    let visible = samples.select(&rows, tape.pool());
-    let known = select_rows(&encoding, &rows, tape);
-    let encoding = field.encode_known(params, &tape.constant(visible.positions.clone()), known);
-    let (rendered, _) = composite_encoded(field, params, &visible, &encoding, with_depth, tape);
-    Marched { rendered, kept: rows.len() }
-}
-
-/// The rows of a matrix with these numbers.
-fn select_rows<T: Scalar>(x: &Tensor<T>, rows: &[u32], tape: &Tape<T>) -> Tensor<T> {
-    let width = x.shape()[1];
-    let mut out = tape.pool().tensor(&[rows.len(), width]);
-    for (out, &row) in out.as_mut_slice().chunks_exact_mut(width.max(1)).zip(rows) {
-        out.copy_from_slice(&x.as_slice()[row as usize * width..(row as usize + 1) * width]);
-    }
-    out
 }

@@ -1,6 +1,6 @@
 //! Forward passes over samples, as graph code: fields, compositing, background, loss.
 
-use crate::field::Field;
+use crate::field::{Density, Field};
 use crate::rays::Samples;
 use raygrad_autograd::{Bound, Scalar, Tape, Tensor, Var};
 
@@ -14,27 +14,28 @@ pub fn composite_samples<'t, T: Scalar>(
     tape: &'t Tape<T>,
 ) -> (Var<'t, T>, Tensor<T>) {
     let encoding = field.encode(params, &tape.constant(samples.positions.clone()));
-    composite_encoded(field, params, samples, &encoding, with_depth, tape)
+    let density = field.density(params, &encoding);
+    let composite = density.composite(samples.delta.clone(), samples.segments.clone());
+    let [_, weights] = composite.transmittance_and_weights(density.value.value(), tape.pool());
+    (composite_density(field, params, samples, &density, with_depth, tape), weights)
 }
 
-/// As [`composite_samples`], from the encoding of the samples' positions.
-pub fn composite_encoded<'t, T: Scalar>(
+/// As [`composite_samples`], from the density at the samples' positions, and without the weights.
+pub fn composite_density<'t, T: Scalar>(
     field: &dyn Field<T>,
     params: &Bound<'t, T>,
     samples: &Samples<T>,
-    encoding: &Var<'t, T>,
+    density: &Density<'t, T>,
     with_depth: bool,
     tape: &'t Tape<T>,
-) -> (Var<'t, T>, Tensor<T>) {
-    let density = field.density(params, encoding);
+) -> Var<'t, T> {
     let directions = tape.constant(samples.directions.clone());
     let mut features = field.color(params, &density.features, &directions, &samples.segments);
     if with_depth {
         features = Var::concat(&[&features, &tape.constant(samples.t.reshape(&[samples.len(), 1]))], 1);
     }
     let composite = density.composite(samples.delta.clone(), samples.segments.clone());
-    let [_, weights] = composite.transmittance_and_weights(density.value.value(), tape.pool());
-    (tape.apply(composite, &[&density.value, &features]), weights)
+    tape.apply(composite, &[&density.value, &features])
 }
 
 /// The colour of composited features `[rays, 3 or more, + 1]` over a background `[rays, 3]`.

@@ -109,12 +109,13 @@ impl<T: Scalar> Samples<T> {
         }
         let (mut positions, mut t, mut delta) =
             (pool.tensor(&[rows.len(), 3]), pool.tensor(&[rows.len()]), pool.tensor(&[rows.len()]));
-        let (p, out_t, out_delta) = (positions.as_mut_slice(), t.as_mut_slice(), delta.as_mut_slice());
+        let all = (self.positions.as_slice(), self.t.as_slice(), self.delta.as_slice());
+        let out = (positions.as_mut_slice(), t.as_mut_slice(), delta.as_mut_slice());
         for (i, &row) in rows.iter().enumerate() {
             let row = row as usize;
-            p[3 * i..3 * i + 3].copy_from_slice(&self.positions.as_slice()[3 * row..3 * row + 3]);
-            out_t[i] = self.t.as_slice()[row];
-            out_delta[i] = self.delta.as_slice()[row];
+            out.0[3 * i..3 * i + 3].copy_from_slice(&all.0[3 * row..3 * row + 3]);
+            out.1[i] = all.1[row];
+            out.2[i] = all.2[row];
         }
         Samples { positions, directions: self.directions.clone(), t, delta, segments: Segments::new(offsets) }
     }

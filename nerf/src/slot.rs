@@ -1,21 +1,24 @@
 //! One worker's share of a training step: a tape, and sums of gradients.
 
-use crate::batch::Batch;
+use crate::batch::draw;
+use crate::dataset::Dataset;
 use crate::hash_grid::HashGrad;
-use crate::marching::composite_visible;
 use crate::model::{Model, Sampler};
 use crate::occupancy::MarchBuffer;
 use crate::sampler::Jitter;
+use crate::visible::composite_visible;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Gradient, Tape, Tensor, Var};
 use raygrad_tensor::add_assign;
 use rayon::prelude::*;
-use std::ops::{Add, Range};
+use std::ops::Add;
 use std::sync::Arc;
 
 /// What was done and what came out, summed over rays.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Work {
+    /// Samples placed on rays.
+    pub marched: u64,
     /// Evaluations of a density.
     pub samples: u64,
     /// Evaluations of a colour.
@@ -34,6 +37,7 @@ impl Add for Work {
     type Output = Work;
     fn add(self, other: Work) -> Work {
         Work {
+            marched: self.marched + other.marched,
             samples: self.samples + other.samples,
             shaded: self.shaded + other.shaded,
             unskipped: self.unskipped + other.unskipped,
@@ -75,37 +79,39 @@ impl Slot {
         self.work = Work::default();
     }
 
-    /// Adds one tile's gradients to the sums.
-    pub fn tile(&mut self, model: &Model<f32>, batch: &Batch, rays: Range<usize>, rng: &mut Pcg64Mcg) {
+    /// Draws a tile of `count` of the step's `total` rays and adds its gradients to the sums.
+    pub fn tile(&mut self, model: &Model<f32>, data: &Dataset, [count, total]: [usize; 2], rng: &mut Pcg64Mcg) {
         let Slot { tape, buffer, grads, tables, work, started } = self;
         let params = model.params.bind(tape);
-        let part = batch.rays.slice(rays.clone());
-        let copy = |values: &[[f32; 3]]| tape.pool().copy_of(&[part.len(), 3], values.as_flattened());
-        let (target, background) = (copy(&batch.target[rays.clone()]), copy(&batch.background[rays]));
+        let batch = draw(data, count, model.config.background, rng);
+        let rays = &batch.rays;
+        let copy = |values: &[[f32; 3]]| tape.pool().copy_of(&[count, 3], values.as_flattened());
+        let (target, background) = (copy(&batch.target), copy(&batch.background));
         let jitter = &mut Jitter::Random(rng);
         let loss = match &model.sampler {
             Sampler::Hierarchical(sampler) => {
-                let rendered = sampler.render(&*model.field, &params, &part, jitter, false, tape);
+                let rendered = sampler.render(&*model.field, &params, rays, jitter, false, tape);
                 let coarse = model.config.loss.sum(&rendered.coarse, &target, &background);
                 let fine = model.config.loss.sum(&rendered.fine, &target, &background);
                 let error = model.config.loss.squared_error(&fine, &rendered.fine, &target, &background);
-                let evaluations = (part.len() * sampler.config.evaluations()) as u64;
+                let evaluations = (count * sampler.config.evaluations()) as u64;
                 let loss = coarse + fine;
-                work.count([evaluations; 3], loss.item(), error, &rendered.fine);
+                work.count([evaluations; 4], loss.item(), error, &rendered.fine);
                 loss
             }
             Sampler::Marching(sampler) => {
-                let samples = sampler.samples(&part, jitter, buffer, tape.pool());
+                let samples = sampler.samples(rays, jitter, buffer, tape.pool());
                 let marched =
                     composite_visible(&*model.field, &params, &samples, sampler.config.termination, false, tape);
                 let loss = model.config.loss.sum(&marched.rendered, &target, &background);
                 let error = model.config.loss.squared_error(&loss, &marched.rendered, &target, &background);
-                let evaluations = [samples.len() as u64, marched.kept as u64, buffer.steps];
+                let [all, evaluated, kept] = [samples.len(), marched.evaluated, marched.kept].map(|n| n as u64);
+                let evaluations = [all, evaluated, kept, buffer.steps];
                 work.count(evaluations, loss.item(), error, &marched.rendered);
                 loss
             }
         };
-        let loss = loss * (1.0 / (3.0 * batch.rays.len() as f64));
+        let loss = loss * (1.0 / (3.0 * total as f64));
         let given = loss.grad_sparse(&params.vars());
         grads.resize_with(given.len(), || None);
         for (sum, grad) in grads.iter_mut().zip(given) {
@@ -123,13 +129,14 @@ impl Slot {
 }
 
 impl Work {
-    /// `evaluations`: of densities, of colours, and of either if nothing were skipped.
-    fn count(&mut self, evaluations: [u64; 3], loss: f32, error: f32, rendered: &Var<'_, f32>) {
+    /// `evaluations`: samples placed, those asked for a density, those asked for a colour, and samples if nothing were
+    /// skipped.
+    fn count(&mut self, evaluations: [u64; 4], loss: f32, error: f32, rendered: &Var<'_, f32>) {
         let left = rendered.value().as_slice().chunks_exact(rendered.shape()[1]);
         let opacity = left.map(|ray| 1.0 - f64::from(ray[ray.len() - 1])).sum();
         let (loss, error) = (f64::from(loss), f64::from(error));
-        let [samples, shaded, unskipped] = evaluations;
-        *self = *self + Work { samples, shaded, unskipped, loss, error, opacity };
+        let [marched, samples, shaded, unskipped] = evaluations;
+        *self = *self + Work { marched, samples, shaded, unskipped, loss, error, opacity };
     }
 }
 

@@ -1,6 +1,5 @@
 //! Training: tiles of rays on as many cores as there are, and the same bits on any number of them.
 
-use crate::batch::{Batch, draw};
 use crate::config::{Config, SamplerConfig};
 use crate::dataset::Dataset;
 use crate::hash_grid::{HashGrad, TableOptimizer};
@@ -46,6 +45,8 @@ pub struct StepStats {
     pub train_seconds: f64,
     /// Rays so far.
     pub rays: u64,
+    /// Samples placed on rays so far: without a grid all, with one those in occupied cells.
+    pub marched: u64,
     /// Evaluations of a density so far.
     pub samples: u64,
     /// Evaluations of a colour, and of all gradients, so far.
@@ -121,6 +122,7 @@ impl Trainer {
             step: 0,
             train_seconds: 0.0,
             rays: 0,
+            marched: 0,
             samples: 0,
             shaded: 0,
             unskipped: 0,
@@ -200,13 +202,11 @@ impl Trainer {
         // A restart draws other rays too.
         let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
         self.update_grid(number, seed);
-        let config = &self.model.config;
-        let batch = draw(&self.data, self.batch, config.background, &mut stream(seed, [number, 0]));
-        let tile = match &config.sampler {
+        let tile = match &self.model.config.sampler {
             SamplerConfig::Hierarchical(config) => config.tile,
             SamplerConfig::Marching(_) => self.batch.div_ceil(SLOTS),
         };
-        let work = self.differentiate(&batch, tile, seed, number);
+        let work = self.differentiate(tile, seed, number);
         let rate = self.model.config.schedule.rate(fraction);
         let skipped = self.descend(rate, tile);
         let values = 3.0 * self.batch as f64;
@@ -215,6 +215,7 @@ impl Trainer {
             step: number,
             train_seconds: self.elapsed.as_secs_f64(),
             rays: self.done.rays + self.batch as u64,
+            marched: self.done.marched + work.marched,
             samples: self.done.samples + work.samples,
             shaded: self.done.shaded + work.shaded,
             unskipped: self.done.unskipped + work.unskipped,
@@ -235,14 +236,13 @@ impl Trainer {
     }
 
     /// All tiles' gradients, left in the slots.
-    fn differentiate(&mut self, batch: &Batch, tile: usize, seed: u64, number: u64) -> Work {
-        let model = &self.model;
-        let tiles = batch.rays.len().div_ceil(tile);
+    fn differentiate(&mut self, tile: usize, seed: u64, number: u64) -> Work {
+        let (model, data, total) = (&self.model, &*self.data, self.batch);
         self.slots.par_iter_mut().enumerate().for_each(|(index, slot)| {
             slot.begin();
-            for which in (index..tiles).step_by(SLOTS) {
-                let rays = which * tile..((which + 1) * tile).min(batch.rays.len());
-                slot.tile(model, batch, rays, &mut stream(seed, [number, 1 + which as u64]));
+            for which in (index..total.div_ceil(tile)).step_by(SLOTS) {
+                let count = tile.min(total - which * tile);
+                slot.tile(model, data, [count, total], &mut stream(seed, [number, which as u64]));
             }
         });
         self.slots.iter().fold(Work::default(), |sum, slot| sum + slot.work)
@@ -273,7 +273,7 @@ impl Trainer {
     /// Chooses the number of rays so that the next step has as many samples as it should.
     fn adapt_batch(&mut self, work: &Work) {
         if let Sampler::Marching(marching) = &self.model.sampler {
-            let each = (work.samples as f64 / self.batch as f64).max(0.5);
+            let each = (work.marched as f64 / self.batch as f64).max(0.5);
             let rays = marching.config.samples as f64 / each;
             // Not at once: the number of samples a ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;

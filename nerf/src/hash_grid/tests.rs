@@ -57,7 +57,7 @@ fn the_papers_grid_has_the_papers_levels() {
     let paper = HashGrid::new(&HashGridConfig::paper()).unwrap();
     let resolutions: Vec<_> = paper.levels().iter().map(|level| level.resolution).collect();
     assert_eq!(resolutions, [16, 22, 30, 42, 58, 80, 111, 153, 212, 294, 406, 561, 776, 1072, 1482, 2048]);
-    assert_eq!(paper.levels()[0].rows, 0..4920, "17^3 = 4913 corners, in whole groups");
+    assert_eq!(paper.levels()[0].rows, 0..4928, "17^3 = 4913 corners, in whole lines");
     assert!(!paper.levels()[4].hashed && paper.levels()[5].hashed && paper.width() == 32);
     assert!(paper.levels().iter().skip(5).all(|level| level.rows.len() == 1 << 19));
     assert!(paper.levels().windows(2).all(|pair| pair[0].rows.end == pair[1].rows.start));
