@@ -28,6 +28,9 @@ pub trait Binary: Copy + Send + Sync + 'static {
     const NAME: &'static str;
     /// Which of `a`, `b` (inputs 0 and 1) and `y` the derivatives read; what they do not read is passed as NaN.
     const READS: Reads;
+    /// Whether the gradient of `a`, and that of `b`, is the gradient of `y` as it is: the tape then hands it on, without a
+    /// pass over its elements.
+    const PASSES: [bool; 2] = [false; 2];
     /// The function.
     fn f<E: Real>(&self, a: E, b: E) -> E;
     /// The gradient of `a` for the gradient `g` of `y = f(a, b)`.
@@ -103,6 +106,9 @@ impl<B: Binary> Zip<B> {
     /// One input's gradient as a tensor of the output's shape: that of `a` or that of `b`.
     fn grad<T: Scalar, const OF_A: bool>(&self, cx: &Vjp<'_, '_, T>) -> Tensor<T> {
         let g = cx.g().value();
+        if B::PASSES[usize::from(!OF_A)] {
+            return g.clone();
+        }
         // A value that is not read costs a register, not a pass: `g` stands in for it and is replaced by NaN.
         let reads = [B::READS.input(0), B::READS.input(1), B::READS.output()];
         let a = if reads[0] { cx.input(0) } else { g };

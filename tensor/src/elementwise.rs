@@ -110,9 +110,8 @@ fn broadcast_loop<T: Scalar, const N: usize>(
     pool: &Pool<T>,
     run: impl FnOnce([&[T]; N], &mut [T]),
 ) -> Tensor<T> {
-    let (operands, mut out) = operands(x, pool);
-    run(slices(&operands), out.as_mut_slice());
-    out
+    let (operands, shape) = operands(x, pool);
+    pool.filled(&shape, |out| run(slices(&operands), out))
 }
 
 /// A tensor of the operand's shape or of the common one.
@@ -121,16 +120,16 @@ enum Operand<'a, T: Scalar> {
     Stretched(Tensor<T>),
 }
 
-/// The tensors, stretched to their common shape, and an output of that shape. Apart from the loop, so that it is compiled
-/// once and not for each formula; as are the next three functions, which do what the closures of `std::array` would.
+/// The tensors, stretched to their common shape, and that shape. Apart from the loop, so that it is compiled once and not for
+/// each formula; as are the next three functions, which do what the closures of `std::array` would.
 #[track_caller]
-fn operands<'a, T: Scalar, const N: usize>(x: [&'a Tensor<T>; N], pool: &Pool<T>) -> ([Operand<'a, T>; N], Tensor<T>) {
+fn operands<'a, T: Scalar, const N: usize>(x: [&'a Tensor<T>; N], pool: &Pool<T>) -> ([Operand<'a, T>; N], Shape) {
     let shapes = x.map(|x| x.shape());
     if shapes.iter().all(|&shape| shape == shapes[0]) {
-        return (x.map(Operand::AsItIs), pool.tensor(shapes[0]));
+        return (x.map(Operand::AsItIs), Shape::from_slice(shapes[0]));
     }
     let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
-    (x.map(|x| Operand::Stretched(broadcast_to(x, &shape, pool))), pool.tensor(&shape))
+    (x.map(|x| Operand::Stretched(broadcast_to(x, &shape, pool))), shape)
 }
 
 fn slices<'a, T: Scalar, const N: usize>(x: &'a [Operand<'_, T>; N]) -> [&'a [T]; N] {

@@ -15,35 +15,31 @@ pub struct Pool<T: Scalar>(Option<Arc<Mutex<Shelves<T>>>>);
 
 /// Free buffers by capacity class.
 struct Shelves<T> {
-    /// Those of the smallest class, which scalars take: finding their shelf should not cost more than their arithmetic.
-    small: Vec<Vec<T>>,
     free: HashMap<usize, Vec<Vec<T>>>,
     allocated: usize,
 }
 
-impl<T> Shelves<T> {
-    fn of(&mut self, class: usize) -> &mut Vec<Vec<T>> {
-        if class == SMALLEST { &mut self.small } else { self.free.entry(class).or_default() }
-    }
-}
-
-/// The capacity of the smallest class.
-const SMALLEST: usize = 64;
+/// Tensors of at most this many elements, scalars above all, do without the pool: an allocator is quicker with them.
+const SMALL: usize = 64;
 
 /// Buffers are rounded up to a quarter of a power of two, so that sizes that vary from step to step share them; at
 /// most 25 % of a buffer is unused.
 fn class(len: usize) -> usize {
-    if len <= SMALLEST {
-        return SMALLEST;
-    }
     let quarter = (len.next_power_of_two() / 8).max(1);
     len.div_ceil(quarter) * quarter
+}
+
+/// Unlike `vec!`, which asks the allocator for cleared memory; that is the slow way to get a little of it.
+fn zeros<T: Scalar>(len: usize) -> Vec<T> {
+    let mut values = Vec::with_capacity(len);
+    values.resize(len, T::ZERO);
+    values
 }
 
 impl<T: Scalar> Pool<T> {
     /// An empty pool.
     pub fn new() -> Self {
-        Pool(Some(Arc::new(Mutex::new(Shelves { small: vec![], free: HashMap::new(), allocated: 0 }))))
+        Pool(Some(Arc::new(Mutex::new(Shelves { free: HashMap::new(), allocated: 0 }))))
     }
 
     /// No pool: tensors allocate and free as vectors do.
@@ -65,7 +61,7 @@ impl<T: Scalar> Pool<T> {
     pub fn take(&self, len: usize) -> Vec<T> {
         let Some(mut shelves) = self.shelves() else { return vec![T::ZERO; len] };
         let class = class(len);
-        let mut buffer = match shelves.of(class).pop() {
+        let mut buffer = match shelves.free.get_mut(&class).and_then(Vec::pop) {
             Some(buffer) => buffer,
             None => {
                 shelves.allocated += class;
@@ -86,21 +82,29 @@ impl<T: Scalar> Pool<T> {
         if capacity == class(capacity)
             && let Some(mut shelves) = self.shelves()
         {
-            shelves.of(capacity).push(buffer);
+            shelves.free.entry(capacity).or_default().push(buffer);
         }
     }
 
     /// A tensor of this shape with unspecified (old) values, to be overwritten.
     pub fn tensor(&self, shape: &[usize]) -> Tensor<T> {
+        self.filled(shape, |_| ())
+    }
+
+    /// A tensor of this shape whose elements `fill` writes; it finds unspecified (old) values there.
+    ///
+    /// It costs less than [`tensor`](Self::tensor) and writing to that.
+    pub fn filled(&self, shape: &[usize], fill: impl FnOnce(&mut [T])) -> Tensor<T> {
         let len = shape.iter().product();
-        Tensor::pooled(Shape::from_slice(shape), self.take(len), self.clone())
+        let small = len <= SMALL;
+        let mut values = if small { zeros(len) } else { self.take(len) };
+        fill(&mut values);
+        Tensor::pooled(Shape::from_slice(shape), values, if small { Pool::none() } else { self.clone() })
     }
 
     /// A tensor filled with `value`.
     pub fn full(&self, shape: &[usize], value: T) -> Tensor<T> {
-        let mut tensor = self.tensor(shape);
-        tensor.as_mut_slice().fill(value);
-        tensor
+        self.filled(shape, |out| out.fill(value))
     }
 
     /// A tensor of this shape with a copy of `values`.
@@ -109,10 +113,10 @@ impl<T: Scalar> Pool<T> {
     /// If the number of values is not the product of the shape.
     #[track_caller]
     pub fn copy_of(&self, shape: &[usize], values: &[T]) -> Tensor<T> {
-        let mut tensor = self.tensor(shape);
-        assert_eq!(tensor.len(), values.len(), "{} values for a tensor of shape {shape:?}", values.len());
-        tensor.as_mut_slice().copy_from_slice(values);
-        tensor
+        self.filled(shape, |out| {
+            assert_eq!(out.len(), values.len(), "{} values for a tensor of shape {shape:?}", values.len());
+            out.copy_from_slice(values);
+        })
     }
 
     pub(crate) fn is_some(&self) -> bool {

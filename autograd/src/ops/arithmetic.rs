@@ -11,6 +11,7 @@ pub struct Add;
 impl Binary for Add {
     const NAME: &'static str = "add";
     const READS: Reads = Reads::NOTHING;
+    const PASSES: [bool; 2] = [true, true];
     #[inline(always)]
     fn f<E: Real>(&self, a: E, b: E) -> E {
         a + b
@@ -35,6 +36,7 @@ pub struct Sub;
 impl Binary for Sub {
     const NAME: &'static str = "sub";
     const READS: Reads = Reads::NOTHING;
+    const PASSES: [bool; 2] = [true, false];
     #[inline(always)]
     fn f<E: Real>(&self, a: E, b: E) -> E {
         a - b
