@@ -6,6 +6,7 @@ use raygrad_autograd::Entry;
 pub fn catalogue() -> Vec<Entry> {
     let mut entries = crate::encoding::entries();
     entries.extend(crate::composite::entries());
+    entries.extend(crate::quadrature::entries());
     entries.extend(crate::hash_grid::entries());
     entries.extend(crate::spherical::entries());
     entries

@@ -116,6 +116,53 @@ impl<T: Scalar> Composite<T> {
         );
         [transmittance, weights]
     }
+
+    /// The gradients of the density and of the features for the gradient `g` of the output.
+    pub(crate) fn backward(
+        &self,
+        density: &Tensor<T>,
+        features: &Tensor<T>,
+        g: &Tensor<T>,
+        pool: &Pool<T>,
+    ) -> [Tensor<T>; 2] {
+        let channels = features.shape()[1];
+        let light = self.light(density, pool);
+        let (depth, transmittance, alpha) =
+            (light.depth.as_slice(), light.transmittance.as_slice(), light.alpha.as_slice());
+        // e^-x, not 1 - alpha, which has no digits behind an opaque sample.
+        let passed = map(
+            [&light.depth],
+            pool,
+            #[inline(always)]
+            |[depth]| (-depth).exp(),
+        );
+        let (passed, delta) = (passed.as_slice(), self.delta.as_slice());
+        let (mut d_density, mut d_features) = (pool.tensor(density.shape()), pool.tensor(features.shape()));
+        let (d_density_out, d_features_out) = (d_density.as_mut_slice(), d_features.as_mut_slice());
+        let mut behind = vec![T::ZERO; channels + 1];
+        for (ray, rows) in self.segments.ranges().enumerate() {
+            let g = &g.as_slice()[ray * (channels + 1)..(ray + 1) * (channels + 1)];
+            // Behind the last sample there are no features, and all that is left of the light.
+            behind.fill(T::ZERO);
+            behind[channels] = T::ONE;
+            for i in rows.rev() {
+                let weight = transmittance[i] * alpha[i];
+                let mut difference = -(g[channels] * behind[channels]);
+                for c in 0..channels {
+                    let feature = features.as_slice()[i * channels + c];
+                    d_features_out[i * channels + c] = weight * g[c];
+                    difference += g[c] * (feature - behind[c]);
+                    behind[c] = alpha[i] * feature + passed[i] * behind[c];
+                }
+                behind[channels] *= passed[i];
+                // dx/dz = x for x = e^z delta, and dx/dsigma = delta.
+                let slope = if self.log_density { depth[i] } else { delta[i] };
+                let d_depth = transmittance[i] * passed[i] * difference;
+                d_density_out[i] = if slope.is_finite() { slope * d_depth } else { T::ZERO };
+            }
+        }
+        [d_density, d_features]
+    }
 }
 
 impl<T: Scalar> Op<T> for Composite<T> {
@@ -165,44 +212,7 @@ impl<T: Scalar> Op<T> for Composite<T> {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (density, features) = (cx.x(0).into_value(), cx.x(1).into_value());
-        let channels = features.shape()[1];
-        let pool = cx.pool();
-        let light = self.light(&density, pool);
-        let (depth, transmittance, alpha) =
-            (light.depth.as_slice(), light.transmittance.as_slice(), light.alpha.as_slice());
-        // e^-x, not 1 - alpha, which has no digits behind an opaque sample.
-        let passed = map(
-            [&light.depth],
-            pool,
-            #[inline(always)]
-            |[depth]| (-depth).exp(),
-        );
-        let (passed, delta) = (passed.as_slice(), self.delta.as_slice());
-        let (mut d_density, mut d_features) = (pool.tensor(density.shape()), pool.tensor(features.shape()));
-        let (d_density_out, d_features_out) = (d_density.as_mut_slice(), d_features.as_mut_slice());
-        let mut behind = vec![T::ZERO; channels + 1];
-        for (ray, rows) in self.segments.ranges().enumerate() {
-            let g = &cx.g().value().as_slice()[ray * (channels + 1)..(ray + 1) * (channels + 1)];
-            // Behind the last sample there are no features, and all that is left of the light.
-            behind.fill(T::ZERO);
-            behind[channels] = T::ONE;
-            for i in rows.rev() {
-                let weight = transmittance[i] * alpha[i];
-                let mut difference = -(g[channels] * behind[channels]);
-                for c in 0..channels {
-                    let feature = features.as_slice()[i * channels + c];
-                    d_features_out[i * channels + c] = weight * g[c];
-                    difference += g[c] * (feature - behind[c]);
-                    behind[c] = alpha[i] * feature + passed[i] * behind[c];
-                }
-                behind[channels] *= passed[i];
-                // dx/dz = x for x = e^z delta, and dx/dsigma = delta.
-                let slope = if self.log_density { depth[i] } else { delta[i] };
-                let d_depth = transmittance[i] * passed[i] * difference;
-                d_density_out[i] = if slope.is_finite() { slope * d_depth } else { T::ZERO };
-            }
-        }
-        Grads::new([Some(cx.constant(d_density)), Some(cx.constant(d_features))])
+        Grads::new(self.backward(&density, &features, cx.g().value(), cx.pool()).map(|d| Some(cx.constant(d))))
     }
 
     fn is_fused(&self) -> bool {

@@ -4,6 +4,7 @@
 //! [`Dataset`](dataset::Dataset) → [`Rays`] → a [`sampler`] → [`Samples`] → a [`Field`] → [`Composite`] → pixels → loss
 //! → gradients → ordered reduction → optimiser. Each stage can be used alone.
 
+pub mod analytic;
 pub mod background;
 mod batch;
 mod bounds;
@@ -13,6 +14,7 @@ pub mod colormap;
 mod composite;
 mod config;
 pub mod dataset;
+mod dense;
 mod encoding;
 mod error;
 mod field;
@@ -26,6 +28,7 @@ mod model;
 pub mod occupancy;
 mod output;
 pub mod pass;
+pub mod quadrature;
 mod rays;
 mod render;
 pub mod sampler;
@@ -46,6 +49,7 @@ pub use camera::{Camera, Ray};
 pub use catalogue::catalogue;
 pub use composite::Composite;
 pub use config::{Config, Preset, SamplerConfig};
+pub use dense::DenseView;
 pub use encoding::PositionalEncoding;
 pub use error::{Error, Result};
 pub use field::{Classic, ClassicConfig, Density, DensityActivation, Field, FieldConfig, Instant, InstantConfig};
@@ -58,3 +62,4 @@ pub use rays::{Rays, Samples};
 pub use render::{Evaluations, Picture};
 pub use spherical::SphericalHarmonics;
 pub use train::{Budget, StepStats, Trainer};
+pub use view::Limits;

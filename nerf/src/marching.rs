@@ -4,6 +4,7 @@ use crate::Result;
 use crate::config::check_range;
 use crate::field::Field;
 use crate::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
+use crate::quadrature::Quadrature;
 use crate::rays::{Rays, Samples};
 use crate::sampler::Jitter;
 use raygrad_autograd::{Params, Pool, Scalar, Segments, Tape};
@@ -17,17 +18,26 @@ pub struct MarchingConfig {
     pub occupancy: OccupancyConfig,
     /// Length of a step as a share of the longest side of the box.
     pub step: f64,
-    /// Samples in a training step; the number of rays follows.
+    /// Evaluations of a density in a training step; the number of rays follows.
     pub samples: usize,
     /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
     /// much.
     pub termination: f64,
+    /// How the integral along a ray is approximated; a step is an interval.
+    #[serde(default)]
+    pub quadrature: Quadrature,
 }
 
 impl Default for MarchingConfig {
     fn default() -> Self {
         let occupancy = OccupancyConfig { skip: Skip::Fast, ..OccupancyConfig::default() };
-        MarchingConfig { occupancy, step: 1.0 / 300.0, samples: 1 << 14, termination: 1e-3 }
+        MarchingConfig {
+            occupancy,
+            step: 1.0 / 300.0,
+            samples: 1 << 14,
+            termination: 1e-3,
+            quadrature: Quadrature::Midpoint,
+        }
     }
 }
 
@@ -36,6 +46,7 @@ impl MarchingConfig {
         self.occupancy.check()?;
         check_range("step", self.step, 1e-5, 1.0)?;
         check_range("samples", self.samples, 1, 1 << 24)?;
+        self.quadrature.check()?;
         check_range("termination", self.termination, 0.0, 1.0)
     }
 }
@@ -110,7 +121,13 @@ impl Marching {
 }
 
 /// A field's densities, for the occupancy grid.
-fn densities(field: &dyn Field<f32>, params: &Params<f32>, pool: &Pool<f32>, points: &[[f32; 3]], out: &mut [f32]) {
+pub(crate) fn densities(
+    field: &dyn Field<f32>,
+    params: &Params<f32>,
+    pool: &Pool<f32>,
+    points: &[[f32; 3]],
+    out: &mut [f32],
+) {
     let tape = Tape::with_pool(pool.clone());
     let params = params.bind_constant(&tape);
     let positions = tape.constant(pool.copy_of(&[points.len(), 3], points.as_flattened()));

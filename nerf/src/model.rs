@@ -3,7 +3,7 @@
 use crate::config::{Config, SamplerConfig};
 use crate::field::Field;
 use crate::hierarchical::Hierarchical;
-use crate::marching::Marching;
+use crate::marching::{Marching, densities};
 use crate::occupancy::{MarchBuffer, OccupancyGrid, Skip};
 use crate::pass::composite_samples;
 use crate::rays::{Rays, Samples};
@@ -115,7 +115,13 @@ impl<T: Scalar> Model<T> {
         let tape = params.vars()[0].tape();
         assert_eq!(samples.len(), self.fields().len(), "one set of samples for each field");
         let error = |(field, samples): (&dyn Field<T>, &Samples<T>)| {
-            let (rendered, _) = composite_samples(field, params, samples, false, tape);
+            let rendered = match &self.sampler {
+                Sampler::Hierarchical(_) => composite_samples(field, params, samples, false, tape).0,
+                Sampler::Marching(sampler) => {
+                    let rule = sampler.config.quadrature;
+                    rule.plan_for(field, params, samples, 0.0, tape).plan.render(field, params, false, tape)
+                }
+            };
             self.config.loss.sum(&rendered, target, background)
         };
         let errors = self.fields().into_iter().zip(samples).map(error);
@@ -132,7 +138,30 @@ impl<T: Scalar> Model<T> {
     }
 }
 
+impl<T: Scalar> Model<T> {
+    /// The same model in another precision: the same samples, occupied cells and parameters, the latter rounded if need
+    /// be.
+    ///
+    /// # Errors
+    /// If the configuration is out of range, which that of a model in use is not.
+    pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
+        let mut model = Model::new(self.config.clone(), self.extent, 0)?;
+        model.params = self.params.cast();
+        model.sampler = self.sampler.clone();
+        Ok(model)
+    }
+}
+
 impl Model<f32> {
+    /// The field's density at each of these positions (scene units), in 1 / scene unit, into the slot of the same number:
+    /// what an [`OccupancyGrid`] asks for.
+    ///
+    /// # Panics
+    /// If there are not as many slots as positions.
+    pub fn densities(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        densities(&*self.field, &self.params, &Pool::new(), points, out);
+    }
+
     /// Looks closely at everything that the occupancy grid, if there is one, may hold: for rendering within the error
     /// bound of the configuration. [`Trainer::run`](crate::Trainer::run) ends with it.
     pub fn finish_grid(&mut self) {

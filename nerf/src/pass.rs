@@ -29,13 +29,26 @@ pub fn composite_density<'t, T: Scalar>(
     with_depth: bool,
     tape: &'t Tape<T>,
 ) -> Var<'t, T> {
-    let directions = tape.constant(samples.directions.clone());
-    let mut features = field.color(params, &density.features, &directions, &samples.segments);
-    if with_depth {
-        features = Var::concat(&[&features, &tape.constant(samples.t.reshape(&[samples.len(), 1]))], 1);
-    }
+    let features = features(field, params, samples, density, with_depth, tape);
     let composite = density.composite(samples.delta.clone(), samples.segments.clone());
     tape.apply(composite, &[&density.value, &features])
+}
+
+/// The features of samples of this density that are composited: colour, and distance if `with_depth`.
+pub(crate) fn features<'t, T: Scalar>(
+    field: &dyn Field<T>,
+    params: &Bound<'t, T>,
+    samples: &Samples<T>,
+    density: &Density<'t, T>,
+    with_depth: bool,
+    tape: &'t Tape<T>,
+) -> Var<'t, T> {
+    let directions = tape.constant(samples.directions.clone());
+    let color = field.color(params, &density.features, &directions, &samples.segments);
+    if !with_depth {
+        return color;
+    }
+    Var::concat(&[&color, &tape.constant(samples.t.reshape(&[samples.len(), 1]))], 1)
 }
 
 /// The colour of composited features `[rays, 3 or more, + 1]` over a background `[rays, 3]`.

@@ -4,9 +4,10 @@ use crate::bounds::clip_span;
 use crate::camera::Camera;
 use crate::image::Image;
 use crate::model::{Model, Sampler};
+use crate::occupancy::Skip;
 use crate::rays::Rays;
 use crate::sampler::Jitter;
-use crate::view::Viewer;
+use crate::view::{Limits, Viewer};
 use raygrad_autograd::Tape;
 use rayon::prelude::*;
 use std::ops::Add;
@@ -52,12 +53,22 @@ pub(crate) type RayValues = [f32; 5];
 /// Rays that are evaluated together: hierarchical, and marching.
 const TILE: [usize; 2] = [32, 512];
 /// Below this opacity a pixel has no depth.
-const VISIBLE: f32 = 1e-3;
+pub(crate) const VISIBLE: f32 = 1e-3;
 
 impl Model<f32> {
     /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
     /// time, on any number of threads.
     pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
+        let skip = match &self.sampler {
+            Sampler::Marching(sampler) => sampler.config.occupancy.skip,
+            Sampler::Hierarchical(_) => Skip::Off,
+        };
+        self.view_within(camera, background, &Limits::of(skip))
+    }
+
+    /// As [`view`](Self::view), with these limits in place of those that go with the configuration. A hierarchical
+    /// sampler leaves out nothing and pays no heed to them.
+    pub fn view_within(&self, camera: &Camera, background: [f32; 3], limits: &Limits) -> Picture {
         let pixels = camera.width * camera.height;
         let image = |channels| Image::new(camera.width, camera.height, channels);
         let (mut color, mut depth, mut opacity) = (image(3), image(1), image(1));
@@ -72,7 +83,7 @@ impl Model<f32> {
                     rays.push(&ray, clip_span(&ray, self.extent.bounds, self.extent.span));
                 }
                 let mut values = vec![[0.0; 5]; rays.len()];
-                let evaluations = self.view_rays(viewer, &rays, &mut values);
+                let evaluations = self.view_rays(viewer, &rays, limits, &mut values);
                 for (i, [r, g, b, distance, left]) in values.into_iter().enumerate() {
                     for (channel, value) in [r, g, b].into_iter().enumerate() {
                         color[3 * i + channel] = value + left * background[channel];
@@ -106,7 +117,7 @@ impl Model<f32> {
         })
     }
 
-    fn view_rays(&self, viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [RayValues]) -> Evaluations {
+    fn view_rays(&self, viewer: &mut Viewer, rays: &Rays<f32>, limits: &Limits, out: &mut [RayValues]) -> Evaluations {
         match &self.sampler {
             Sampler::Hierarchical(sampler) => {
                 let tape = Tape::with_pool(viewer.pool.clone());
@@ -118,7 +129,7 @@ impl Model<f32> {
                 let each = (rays.len() * sampler.config.evaluations()) as u64;
                 Evaluations { density: each, color: each, unskipped: each }
             }
-            Sampler::Marching(sampler) => viewer.march(self, sampler, rays, out),
+            Sampler::Marching(sampler) => viewer.march(self, sampler, rays, limits, out),
         }
     }
 }

@@ -6,7 +6,6 @@ use crate::hash_grid::HashGrad;
 use crate::model::{Model, Sampler};
 use crate::occupancy::MarchBuffer;
 use crate::sampler::Jitter;
-use crate::visible::composite_visible;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Gradient, Tape, Tensor, Var};
 use raygrad_tensor::add_assign;
@@ -101,12 +100,12 @@ impl Slot {
             }
             Sampler::Marching(sampler) => {
                 let samples = sampler.samples(rays, jitter, buffer, tape.pool());
-                let marched =
-                    composite_visible(&*model.field, &params, &samples, sampler.config.termination, false, tape);
+                let (rule, termination) = (sampler.config.quadrature, sampler.config.termination);
+                let marched = rule.render(&*model.field, &params, &samples, termination, false, tape);
                 let loss = model.config.loss.sum(&marched.rendered, &target, &background);
                 let error = model.config.loss.squared_error(&loss, &marched.rendered, &target, &background);
-                let [all, evaluated, kept] = [samples.len(), marched.evaluated, marched.kept].map(|n| n as u64);
-                let evaluations = [all, evaluated, kept, buffer.steps];
+                let [all, asked, kept] = [samples.len(), marched.asked, marched.kept].map(|n| n as u64);
+                let evaluations = [all, asked, kept, buffer.steps];
                 work.count(evaluations, loss.item(), error, &marched.rendered);
                 loss
             }

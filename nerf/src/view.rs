@@ -2,7 +2,8 @@
 
 use crate::marching::Marching;
 use crate::model::Model;
-use crate::occupancy::{MarchBuffer, Skip};
+use crate::occupancy::{MarchBuffer, Skip, Step};
+use crate::quadrature::Quadrature;
 use crate::rays::Rays;
 use crate::render::{Evaluations, RayValues};
 use crate::sampler::Jitter;
@@ -11,19 +12,25 @@ use std::sync::Arc;
 
 /// Samples that a ray takes in a round: few while most rays end early.
 const ROUND: usize = 8;
+/// Steps that a ray takes at a time where rules composite intervals themselves: the nodes at their ends are asked twice.
+const CHUNK: usize = 16;
 
-/// What may be left out along one ray.
-struct Limits {
-    /// A ray ends where less light than this is left.
-    termination: f32,
-    /// Samples whose weights add up to at most this have no colour of their own.
-    color_budget: f32,
+/// What may be left out along one ray when rendering with an occupancy grid.
+///
+/// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling the
+/// rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// A ray ends where less light than this is left, 0 to 1.
+    pub termination: f32,
+    /// Samples whose weights add up to at most this have no colour of their own, 0 to 1. Quadratures of two nodes an
+    /// interval colour every sample.
+    pub color_budget: f32,
 }
 
 impl Limits {
-    /// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling
-    /// the rest.
-    fn of(skip: Skip) -> Self {
+    /// What goes with skipping that much empty space.
+    pub fn of(skip: Skip) -> Self {
         match skip {
             Skip::Off => Limits { termination: 0.0, color_budget: 0.0 },
             Skip::Lossless => Limits { termination: 1e-4, color_budget: 1e-4 },
@@ -63,11 +70,19 @@ impl Viewer {
         model: &Model<f32>,
         sampler: &Marching,
         rays: &Rays<f32>,
+        limits: &Limits,
         out: &mut [RayValues],
     ) -> Evaluations {
-        let limits = Limits::of(sampler.config.occupancy.skip);
-        let step = crate::occupancy::Step::uniform(sampler.step());
+        let step = Step::uniform(sampler.step());
         sampler.grid.march(rays, &step, &mut Jitter::Middle, &mut self.marched);
+        match sampler.config.quadrature {
+            Quadrature::Midpoint => {}
+            Quadrature::Left => {
+                let MarchBuffer { t, delta, .. } = &mut self.marched;
+                t.iter_mut().zip(delta).for_each(|(t, delta)| *t -= 0.5 * *delta);
+            }
+            rule => return self.composite(model, rule, rays, limits, out),
+        }
         self.rays.clear();
         self.rays.resize(rays.len(), RayState::default());
         let range = |ray: usize| self.marched.offsets[ray] as usize..self.marched.offsets[ray + 1] as usize;
@@ -75,7 +90,7 @@ impl Viewer {
         let mut evaluations = Evaluations { unskipped: self.marched.steps, ..Evaluations::default() };
         let mut round = 0;
         while !alive.is_empty() {
-            evaluations = evaluations + self.round(model, rays, &alive, round, &limits, out);
+            evaluations = evaluations + self.round(model, rays, &alive, round, limits, out);
             round += 1;
             let most = f64::from(limits.termination);
             alive.retain(|&ray| {
@@ -84,7 +99,46 @@ impl Viewer {
             });
         }
         for (out, state) in out.iter_mut().zip(&self.rays) {
-            finish(out, state, &limits);
+            finish(out, state, limits);
+        }
+        evaluations
+    }
+
+    /// The view by a rule that composites intervals itself, front to back in chunks of steps.
+    fn composite(
+        &mut self,
+        model: &Model<f32>,
+        rule: Quadrature,
+        rays: &Rays<f32>,
+        limits: &Limits,
+        out: &mut [RayValues],
+    ) -> Evaluations {
+        let steps = self.marched.samples(rays, &self.pool);
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = model.params.bind_constant(&tape);
+        let mut evaluations = Evaluations { unskipped: self.marched.steps, ..Evaluations::default() };
+        let mut left = vec![1.0_f32; rays.len()];
+        for chunk in (0..).step_by(CHUNK) {
+            let ranges = steps.segments.ranges().enumerate().filter(|(ray, _)| left[*ray] > limits.termination);
+            let rows: Vec<u32> = ranges
+                .flat_map(|(_, rows)| (rows.start + chunk).min(rows.end)..(rows.start + chunk + CHUNK).min(rows.end))
+                .map(|row| row as u32)
+                .collect();
+            if rows.is_empty() {
+                break;
+            }
+            let seen = rule.render(&*model.field, &params, &steps.select(&rows, &self.pool), 0.0, true, &tape);
+            evaluations.density += seen.asked as u64;
+            evaluations.color += if let Quadrature::Adaptive { .. } = rule { seen.asked } else { seen.kept } as u64;
+            let values = seen.rendered.value().as_slice().chunks_exact(5);
+            for ((out, left), values) in out.iter_mut().zip(&mut left).zip(values) {
+                out[..4].iter_mut().zip(values).for_each(|(out, value)| *out += *left * value);
+                *left *= values[4];
+            }
+        }
+        for (out, left) in out.iter_mut().zip(left) {
+            let state = RayState { depth: -f64::from(left).ln(), weight: 1.0 - left, uncolored: 0.0 };
+            finish(out, &state, limits);
         }
         evaluations
     }

@@ -1,0 +1,55 @@
+//! A medium as a field.
+
+use super::Medium;
+use crate::field::{Density, Field};
+use raygrad_autograd::{Bound, ParamId, Params, Scalar, Segments, Tensor, Var};
+use std::sync::Arc;
+
+/// A medium that is rendered like any field. Its amplitudes are a parameter, so they have gradients and can be trained;
+/// positions have none.
+#[derive(Debug, Clone)]
+pub struct AnalyticField {
+    medium: Arc<dyn Medium>,
+    amplitudes: ParamId,
+}
+
+impl AnalyticField {
+    /// A field with one new parameter, `amplitudes` `[amplitudes]`, in `params`.
+    pub fn new<T: Scalar>(medium: Arc<dyn Medium>, params: &mut Params<T>) -> Self {
+        let values: Vec<T> = medium.amplitudes().into_iter().map(T::from_f64).collect();
+        let amplitudes = params.add("amplitudes", Tensor::from_vec(&[values.len()], values));
+        AnalyticField { medium, amplitudes }
+    }
+}
+
+/// The positions in the rows of a tensor.
+fn positions<T: Scalar>(x: &Tensor<T>) -> impl Iterator<Item = [f64; 3]> + '_ {
+    x.as_slice().chunks_exact(3).map(|x| [x[0], x[1], x[2]].map(T::to_f64))
+}
+
+impl<T: Scalar> Field<T> for AnalyticField {
+    fn encode<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
+        positions.tape().constant(positions.value().clone())
+    }
+
+    fn encode_known<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
+        positions.tape().constant(known)
+    }
+
+    fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
+        let amplitudes = &params[self.amplitudes];
+        let (samples, count) = (encoding.shape()[0], amplitudes.shape()[0]);
+        let mut shapes = vec![0.0; samples * count];
+        for (position, out) in positions(encoding.value()).zip(shapes.chunks_exact_mut(count)) {
+            self.medium.shapes(position, out);
+        }
+        let shapes = Tensor::from_vec(&[samples, count], shapes.into_iter().map(T::from_f64).collect());
+        let value = (amplitudes * encoding.tape().constant(shapes)).sum_axes(&[1]).reshape(&[samples]);
+        Density { value, log: false, features: encoding.clone() }
+    }
+
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Var<'t, T>, _: &Segments) -> Var<'t, T> {
+        let colors = positions(features.value()).flat_map(|position| [T::from_f64(self.medium.color(position)); 3]);
+        features.tape().constant(Tensor::from_vec(features.shape(), colors.collect()))
+    }
+}

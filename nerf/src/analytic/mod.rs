@@ -1,0 +1,138 @@
+//! Scenes whose pictures are known exactly: what a quadrature, a renderer or a gradient is measured against.
+//!
+//! A [`Medium`] says what density and colour are at a place; an [`AnalyticScene`] is one of them seen along one ray, with
+//! the colour, the depth and the transmittance that the integrals of volume rendering
+//!
+//! ```text
+//! C = integral of T sigma c dt + T(D) background,   Z = integral of T sigma t dt,   T(t) = exp(-integral of sigma)
+//! ```
+//!
+//! have over `[0, D]`, and their derivatives. [`AnalyticField`] makes a medium a [`Field`](crate::Field), so that everything
+//! that renders or trains a field does the same with these.
+
+mod ball;
+mod field;
+mod layers;
+mod smooth;
+#[cfg(test)]
+mod tests;
+
+pub use ball::Ball;
+pub use field::AnalyticField;
+pub use layers::{Layer, Layers};
+pub use smooth::{Exponential, Gaussian};
+
+use crate::camera::Ray;
+use glam::DVec3;
+use std::fmt::Debug;
+use std::sync::Arc;
+
+/// Density and colour at every place.
+///
+/// The density is a sum of amplitudes, each times a shape of its own: with respect to the amplitudes there are gradients.
+pub trait Medium: Debug + Send + Sync {
+    /// The amplitudes, in 1 / scene unit.
+    fn amplitudes(&self) -> Vec<f64>;
+
+    /// What each amplitude is multiplied by at a place; `out` has one slot for each.
+    fn shapes(&self, position: [f64; 3], out: &mut [f64]);
+
+    /// The colour at a place, the same grey in all channels, 0 to 1. Where there is no density it is what a neighbour has.
+    fn color(&self, position: [f64; 3]) -> f64;
+
+    /// The density at a place, in 1 / scene unit.
+    fn sigma(&self, position: [f64; 3]) -> f64 {
+        let amplitudes = self.amplitudes();
+        let mut shapes = vec![0.0; amplitudes.len()];
+        self.shapes(position, &mut shapes);
+        amplitudes.iter().zip(shapes).map(|(amplitude, shape)| amplitude * shape).sum()
+    }
+}
+
+/// The exact integrals along a ray.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Exact {
+    /// Colour over the background.
+    pub color: f64,
+    /// Distance times weight, not divided by the opacity, in scene units.
+    pub depth: f64,
+    /// Light that is left at the end.
+    pub transmittance: f64,
+    /// The derivative of the colour by each amplitude.
+    pub d_color: Vec<f64>,
+    /// That of the depth.
+    pub d_depth: Vec<f64>,
+    /// That of the transmittance.
+    pub d_transmittance: Vec<f64>,
+}
+
+/// A medium, the ray that it is seen along, and what is seen.
+#[derive(Debug, Clone)]
+pub struct AnalyticScene {
+    /// A short name.
+    pub name: &'static str,
+    /// What there is.
+    pub medium: Arc<dyn Medium>,
+    /// Where from, and in which direction.
+    pub ray: Ray,
+    /// The length `D` of the ray, in scene units.
+    pub length: f64,
+    /// The colour behind it.
+    pub background: f64,
+    /// What is seen.
+    pub exact: Exact,
+}
+
+impl AnalyticScene {
+    /// Density and colour at distance `t`.
+    pub fn at(&self, t: f64) -> [f64; 2] {
+        let position = self.ray.at(t).to_array();
+        [self.medium.sigma(position), self.medium.color(position)]
+    }
+
+    /// A box around the ray, of side `length`: lower and upper corner.
+    pub fn bounds(&self) -> [DVec3; 2] {
+        let middle = self.ray.at(0.5 * self.length);
+        [middle - 0.5 * self.length, middle + 0.5 * self.length]
+    }
+}
+
+/// The scenes of the benchmark, each on a ray of length 4 over white: constant density with constant and with linear
+/// colour, an exponential atmosphere, a wide and a narrow Gaussian layer, two slabs, and a ball seen off its centre.
+pub fn scenes() -> Vec<AnalyticScene> {
+    const LENGTH: f64 = 4.0;
+    const BACKGROUND: f64 = 1.0;
+    let along_z = Ray { origin: DVec3::ZERO, direction: DVec3::Z };
+    let scene = |name, medium: Arc<dyn Medium>, ray, exact| AnalyticScene {
+        name,
+        medium,
+        ray,
+        length: LENGTH,
+        background: BACKGROUND,
+        exact,
+    };
+    let layers = |name, layers: &[Layer]| {
+        let layers = Layers::new(layers);
+        let exact = layers.exact(LENGTH, BACKGROUND);
+        scene(name, Arc::new(layers), along_z, exact)
+    };
+    let layer = |[from, to]: [f64; 2], sigma, color| Layer { from, to, sigma, color };
+    let gaussian = |name, sigma, width| {
+        let gaussian = Gaussian { sigma, mean: 2.1, width, color: [0.1, 0.7], length: LENGTH };
+        let exact = gaussian.exact(BACKGROUND);
+        scene(name, Arc::new(gaussian), along_z, exact)
+    };
+    let exponential = Exponential { sigma: 3.0, rate: 0.8, color: [0.2, 0.5] };
+    let ball = Ball { centre: DVec3::new(0.0, 0.0, 2.0), radius: 0.5, sigma: 3.0, color: 0.6 };
+    let beside = Ray { origin: DVec3::new(0.3, 0.0, 0.0), ..along_z };
+    let through = ball.along(&beside).exact(LENGTH, BACKGROUND);
+    vec![
+        layers("constant", &[layer([0.0, LENGTH], 1.3, [0.8, 0.0])]),
+        layers("linear colour", &[layer([0.0, LENGTH], 1.3, [0.2, 0.15])]),
+        scene("exponential", Arc::new(exponential), along_z, exponential.exact(LENGTH, BACKGROUND)),
+        gaussian("gaussian", 4.0, 0.4),
+        gaussian("narrow gaussian", 100.0, 0.03),
+        layers("slabs", &[layer([0.7, 1.3], 1.1, [0.9, 0.0]), layer([2.2, 2.9], 6.0, [0.2, 0.0])]),
+        scene("sphere", Arc::new(ball), beside, through),
+    ]
+}
