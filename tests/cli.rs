@@ -144,6 +144,11 @@ fn pictures_and_animations() {
     assert_ne!(first, second);
     assert!(!place.path("run/orbit/0002.png").exists());
     place.succeeds("render run --size 20x10 --out wide.PNG --depth");
+    place.succeeds("render run --size 20x10 --out single.png");
+    place.succeeds("render run --size 20x10 --out double.png --precision f64");
+    let [single, double] = ["single.png", "double.png"].map(|name| png(&place.path(name)));
+    let differences = single.data.iter().zip(&double.data).map(|(a, b)| (a - b).abs());
+    assert!(differences.fold(0.0, f32::max) <= 1.5 / 255.0, "both precisions show the same");
     let wide = png(&place.path("wide.PNG"));
     assert_eq!([wide.width, wide.height], [20, 10]);
     place.succeeds("render run --path test --out test.gif");
@@ -397,4 +402,41 @@ fn wait(child: &mut Child, holds: impl Fn() -> bool) {
         }
         std::thread::sleep(Duration::from_millis(5));
     }
+}
+
+#[test]
+fn any_quadrature_can_be_chosen_and_comes_back() {
+    let place = Place::with_scene();
+    let set = "--set sampler.samples=512 --set sampler.occupancy.resolution=32 --set field.resolution=16";
+    for rule in ["left", "piecewise-linear", "gauss2", r#"{"adaptive":{"tolerance":0.01}}"#] {
+        place
+            .succeeds(&format!("train scene --preset voxel --steps 3 {set} --set sampler.quadrature={rule} --out run"));
+        let stored = place.json("run/config.json")["config"]["sampler"]["quadrature"].clone();
+        assert_eq!(stored, serde_json::from_str::<Value>(rule).unwrap_or_else(|_| json!(rule)));
+        let report: Value = serde_json::from_str(&place.succeeds("eval run --json --precision f64")).unwrap();
+        assert!(report["psnr_mean"].as_f64().unwrap() > 0.0 && report["precision"] == "f64", "{rule}: {report}");
+        std::fs::remove_dir_all(place.path("run")).unwrap();
+    }
+    let train = format!("train scene --preset voxel --steps 3 {set} --set sampler.quadrature");
+    place.fails(&format!("{train}=simpson"), &["sampler.quadrature", "simpson"]);
+    let adaptive = r#"{"adaptive":{"tolerance":7}}"#;
+    place.fails(&format!("{train}={adaptive}"), &["quadrature.adaptive.tolerance", "is 7"]);
+}
+
+#[test]
+fn the_quadrature_benchmark_leaves_tables_plots_and_a_page() {
+    let place = Place::empty();
+    let printed = place.succeeds("bench --suite quadrature --quick --out results");
+    assert!(printed.contains("in 128 evaluations") && printed.contains("report.html"), "{printed}");
+    let text = |name: &str| String::from_utf8(place.bytes(&format!("results/{name}"))).unwrap();
+    let table = text("quadrature.csv");
+    assert!(table.starts_with("scene,rule,evaluations,") && table.lines().count() > 150, "{table}");
+    let page = text("report.html");
+    assert!(page.contains("<svg") && page.contains("processor") && page.contains("quadrature-128.csv"));
+    for figure in ["quadrature-colour", "quadrature-depth", "quadrature-gradient", "quadrature-time"] {
+        assert!(text(&format!("{figure}.svg")).contains("midpoint"));
+        assert!(png(&place.path(&format!("results/{figure}.png"))).width > 1000);
+    }
+    std::fs::write(place.path("file"), "").unwrap();
+    place.fails("bench --suite quadrature --quick --out file", &["file: cannot be created"]);
 }

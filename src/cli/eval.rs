@@ -6,11 +6,12 @@ use std::time::Instant;
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
 use raygrad::nerf::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::occupancy::Skip;
-use raygrad::nerf::{Background, Error, Evaluations, Image, Model, Picture, Result, colormap};
+use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, colormap};
 use serde::Serialize;
 
 use super::output::{depth_colors, make_folder, print};
 use super::parse;
+use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::{Run, write_json};
 use super::scene::Scene;
@@ -37,6 +38,9 @@ pub struct Args {
     /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
     #[arg(long)]
     skip: Option<Skip>,
+    /// Arithmetic of the pictures
+    #[arg(long, value_enum, default_value_t)]
+    precision: Precision,
     /// Print what eval.json holds in place of a table
     #[arg(long)]
     json: bool,
@@ -55,6 +59,8 @@ struct Report {
     downscale: usize,
     /// What photographs with transparency are composited over.
     background: Background,
+    /// `f32`, or `f64` with nothing left out but empty cells.
+    precision: Precision,
     /// Where in a pixel its ray passes: 0.5 is the centre.
     pixel_offset: f64,
     /// `none`: floating-point renders, clamped to 0..=1, are compared.
@@ -91,7 +97,9 @@ pub fn run(args: &Args) -> Result<()> {
     let data = scene.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     let pictures = run.file("eval");
     make_folder(&pictures)?;
-    let (per_view, seconds_per_view, evaluations) = compare(&model, &data, &pictures)?;
+    let (background, span) = (model.config.background, model.extent.span);
+    let renderer = Renderer::new(model, args.precision)?;
+    let (per_view, seconds_per_view, evaluations) = compare(&renderer, background, span, &data, &pictures)?;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
     let per_pixel = |count: u64| count as f64 / pixels as f64;
     let report = Report {
@@ -102,7 +110,8 @@ pub fn run(args: &Args) -> Result<()> {
         width: data.frames[0].image.width,
         height: data.frames[0].image.height,
         downscale: run.config.downscale,
-        background: shown_background(&model),
+        background: shown_background(background),
+        precision: args.precision,
         pixel_offset: 0.5,
         quantisation: "none",
         psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
@@ -123,8 +132,8 @@ pub fn run(args: &Args) -> Result<()> {
 }
 
 /// The background that images are compared over: a random one is for training only.
-fn shown_background(model: &Model<f32>) -> Background {
-    match model.config.background {
+fn shown_background(trained: Background) -> Background {
+    match trained {
         Background::Random => Background::White,
         fixed => fixed,
     }
@@ -138,22 +147,28 @@ fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
 }
 
 /// Scores all views and draws some; also the mean time of rendering one, in seconds, and what was evaluated for all.
-fn compare(model: &Model<f32>, data: &Dataset, pictures: &Path) -> Result<(Vec<Score>, f64, Evaluations)> {
-    let background = model.config.background.shown();
+fn compare(
+    renderer: &Renderer,
+    background: Background,
+    span: [f64; 2],
+    data: &Dataset,
+    pictures: &Path,
+) -> Result<(Vec<Score>, f64, Evaluations)> {
+    let background = background.shown();
     let drawn = evenly_spaced((0..data.frames.len()).collect(), PICTURES);
     let mut scores = Vec::with_capacity(data.frames.len());
     let (mut seconds, mut evaluations) = (0.0, Evaluations::default());
     let mut progress = Progress::new();
     for (i, frame) in data.frames.iter().enumerate() {
         let start = Instant::now();
-        let mut picture = model.view(&frame.camera, background);
+        let mut picture = renderer.view(&frame.camera, background);
         seconds += start.elapsed().as_secs_f64();
         evaluations = evaluations + picture.evaluations;
         picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
         let truth = frame.image.over(background);
         let score = score(frame.name.clone(), &picture.color, &truth);
         if drawn.contains(&i) {
-            draw(&picture, &truth, model.extent.span).save_png(pictures.join(format!("{i:03}.png")))?;
+            draw(&picture, &truth, span).save_png(pictures.join(format!("{i:03}.png")))?;
         }
         let done = i + 1;
         progress.set(done as f64 / data.frames.len() as f64, || {

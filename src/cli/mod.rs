@@ -3,12 +3,14 @@
 //! Exit codes: 0 done, 1 an error, 2 a command line that cannot be understood, 130 interrupted.
 
 mod animation;
+mod bench;
 mod cameras;
 mod eval;
 
 mod interrupt;
 mod output;
 mod parse;
+mod precision;
 mod preview;
 mod progress;
 mod render;
@@ -44,6 +46,7 @@ enum Command {
     Train(train::Args),
     Eval(eval::Args),
     Render(render::Args),
+    Bench(bench::Args),
 }
 
 /// Runs the program.
@@ -69,6 +72,7 @@ fn run(cli: Cli) -> Result<ExitCode> {
             Ok(trained.exit_code())
         }
         Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
+        Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Render(args)) => render::run(&args).map(|()| ExitCode::SUCCESS),
     }
 }

@@ -12,6 +12,7 @@ use super::animation::Animation;
 use super::cameras::fitted;
 use super::output::{check_writable, depth_colors, make_folder, print};
 use super::parse;
+use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::Run;
 use super::scene::Scene;
@@ -41,6 +42,9 @@ pub struct Args {
     /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
     #[arg(long)]
     skip: Option<Skip>,
+    /// Arithmetic of the pictures
+    #[arg(long, value_enum, default_value_t)]
+    precision: Precision,
     /// Show depth in false colour: yellow near, violet far, black where there is nothing
     #[arg(long)]
     depth: bool,
@@ -77,6 +81,7 @@ impl Args {
             size: None,
             out: Some(run.join("picture.png")),
             skip: None,
+            precision: Precision::F32,
             depth: false,
             scene: None,
         }
@@ -98,10 +103,12 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let mut sink = Sink::new(kind, &out, [cameras[0].width, cameras[0].height])?;
     let background = model.config.background.shown();
+    let span = model.extent.span;
+    let renderer = Renderer::new(model, args.precision)?;
     let mut progress = Progress::new();
     for (i, camera) in cameras.iter().enumerate() {
-        let picture = model.view(camera, background);
-        let image = if args.depth { depth_colors(&picture, model.extent.span) } else { picture.color };
+        let picture = renderer.view(camera, background);
+        let image = if args.depth { depth_colors(&picture, span) } else { picture.color };
         sink.push(i, &image)?;
         let (done, all) = (i + 1, cameras.len());
         progress.set(done as f64 / all as f64, || format!("frame {done} of {all}"));

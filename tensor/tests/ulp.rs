@@ -1,104 +1,11 @@
 //! Accuracy of the functions of `vmath`: f32 against f64 references, f64 against values from 220-bit arithmetic.
 
-use std::f64::consts::PI;
-
-use raygrad_tensor::{Pool, Real, Tensor, map_real, simd, vmath, vmath::f32 as vm};
+use raygrad_tensor::vmath::survey::{Function, doubles, singles, ulp_error};
+use raygrad_tensor::{Pool, Real, Tensor, map_real, vmath};
 use rayon::prelude::*;
 
-/// A name, the function applied to a slice, an f64 reference, and the bound in ULP.
-type Case = (&'static str, fn(&[f32], &mut [f32]), fn(f64) -> f64, f64);
-
-macro_rules! case {
-    ($f:ident, $reference:expr, $bound:expr) => {
-        (
-            stringify!($f),
-            |x, y| {
-                simd::dispatch(
-                    #[inline(always)]
-                    || {
-                        for (y, &x) in y.iter_mut().zip(x) {
-                            *y = vm::$f(x);
-                        }
-                    },
-                )
-            },
-            $reference,
-            $bound,
-        )
-    };
-}
-
-/// As `case`, for a function with a quick form: where that holds, it must give the same bits.
-macro_rules! either_case {
-    ($f:ident, $reference:expr, $bound:expr) => {
-        (
-            stringify!($f),
-            |x, y| {
-                let x = Tensor::from_vec(&[x.len()], x.to_vec());
-                y.copy_from_slice(map_real!([&x], &Pool::none(), |[x]| x.$f()).as_slice());
-                let plain = raygrad_tensor::map(
-                    [&x],
-                    &Pool::none(),
-                    #[inline(always)]
-                    |[x]| vm::$f(x),
-                );
-                for ((&y, &plain), &x) in y.iter().zip(plain.as_slice()).zip(x.as_slice()) {
-                    assert!(y.to_bits() == plain.to_bits() || y.is_nan(), "two values for {x:e}: {y:e}, {plain:e}");
-                }
-            },
-            $reference,
-            $bound,
-        )
-    };
-}
-
-const CASES: [Case; 14] = [
-    case!(exp, f64::exp, 1.0),
-    case!(exp2, f64::exp2, 1.0),
-    case!(expm1, f64::exp_m1, 2.0),
-    case!(ln, f64::ln, 1.0),
-    case!(ln1p, f64::ln_1p, 2.0),
-    case!(log2, f64::log2, 2.0),
-    either_case!(sin, f64::sin, 2.0),
-    either_case!(cos, f64::cos, 2.0),
-    case!(sin_pi, sin_pi, 2.0),
-    case!(cos_pi, |x| sin_pi(x.abs() % 2.0 + 0.5), 2.0),
-    case!(tanh, f64::tanh, 2.0),
-    case!(sigmoid, |x| 1.0 / (1.0 + (-x).exp()), 2.0),
-    case!(softplus, |x| x.max(0.0) + (-x.abs()).exp().ln_1p(), 2.0),
-    case!(erf, libm::erf, 2.0),
-];
-
-/// sin(pi x) for an x that came from f32 (plus one half): the reduction to |r| <= 1/4 is exact in f64.
-fn sin_pi(x: f64) -> f64 {
-    let y = x - 2.0 * (x / 2.0).round();
-    let n = (2.0 * y).round();
-    let r = PI * (y - n / 2.0);
-    match n as i32 & 3 {
-        0 => r.sin(),
-        1 => r.cos(),
-        2 => -r.sin(),
-        _ => -r.cos(),
-    }
-}
-
-/// |got - reference| in units of the spacing of f32 numbers at the reference.
-fn ulp_error(got: f32, reference: f64) -> f64 {
-    if got.is_nan() || reference.is_nan() {
-        return if got.is_nan() && reference.is_nan() { 0.0 } else { f64::INFINITY };
-    }
-    if got == reference as f32 && got.is_infinite() {
-        return 0.0;
-    }
-    // Infinity stands where the next number after the largest would be.
-    let got = if got.is_infinite() { 2.0_f64.powi(128).copysign(got.into()) } else { got.into() };
-    let exponent = ((reference.to_bits() >> 52) & 0x7ff) as i32 - 1023;
-    let ulp = f64::from_bits(((exponent.clamp(-126, 127) - 23 + 1023) as u64) << 52);
-    (got - reference).abs() / ulp
-}
-
 /// The largest error over every `step`-th bit pattern, with its argument.
-fn worst((_, f, reference, _): Case, step: u64) -> (f64, f32) {
+fn worst(function: &Function<f32>, step: u64) -> (f64, f32) {
     const CHUNK: u64 = 1 << 12;
     let count = (1_u64 << 32).div_ceil(step);
     (0..count.div_ceil(CHUNK))
@@ -107,26 +14,57 @@ fn worst((_, f, reference, _): Case, step: u64) -> (f64, f32) {
             let patterns = (chunk * CHUNK)..((chunk + 1) * CHUNK).min(count);
             let x: Vec<f32> = patterns.map(|i| f32::from_bits((i * step) as u32)).collect();
             let mut y = vec![0.0; x.len()];
-            f(&x, &mut y);
-            let errors = x.iter().zip(&y).map(|(&x, &y)| (ulp_error(y, reference(x.into())), x));
+            (function.apply)(&x, &mut y);
+            if let "sin" | "cos" = function.name {
+                // A quick form is used where it holds, and must give the same bits.
+                assert_same_bits(&x, &y, &plain_form(function.name == "sin", &x));
+            }
+            let errors = x.iter().zip(&y).map(|(&x, &y)| (ulp_error(y, (function.reference)(x.into())), x));
             errors.fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
         })
         .reduce(|| (0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
+}
+
+/// Sines or cosines by the reduction for any argument.
+fn plain_form(sine: bool, x: &[f32]) -> Vec<f32> {
+    let x = Tensor::from_vec(&[x.len()], x.to_vec());
+    let y = if sine {
+        raygrad_tensor::map(
+            [&x],
+            &Pool::none(),
+            #[inline(always)]
+            |[x]| vmath::f32::sin(x),
+        )
+    } else {
+        raygrad_tensor::map(
+            [&x],
+            &Pool::none(),
+            #[inline(always)]
+            |[x]| vmath::f32::cos(x),
+        )
+    };
+    y.as_slice().to_vec()
+}
+
+fn assert_same_bits(x: &[f32], y: &[f32], plain: &[f32]) {
+    for ((&y, plain), &x) in y.iter().zip(plain).zip(x) {
+        assert!(y.to_bits() == plain.to_bits() || y.is_nan(), "two values for {x:e}: {y:e}, {plain:e}");
+    }
 }
 
 /// Prints a line a function and asserts all bounds; with `VMATH_ONLY=sin,cos`, those of these functions.
 fn check(step: u64) {
     let only = std::env::var("VMATH_ONLY").unwrap_or_default();
     println!("{:<9} {:>8}  at", "f32", "max ULP");
-    let failed: Vec<_> = CASES
+    let failed: Vec<_> = singles()
         .into_iter()
-        .filter(|case| only.is_empty() || only.split(',').any(|name| name == case.0))
-        .filter(|&case| {
-            let (error, at) = worst(case, step);
-            println!("{:<9} {error:>8.4}  {at:e} = {:#010x}", case.0, at.to_bits());
-            error > case.3
+        .filter(|function| only.is_empty() || only.split(',').any(|name| name == function.name))
+        .filter(|function| {
+            let (error, at) = worst(function, step);
+            println!("{:<9} {error:>8.4}  {at:e} = {:#010x}", function.name, at.to_bits());
+            error > function.bound
         })
-        .map(|case| case.0)
+        .map(|function| function.name)
         .collect();
     assert!(failed.is_empty(), "beyond their bounds: {failed:?}");
 }
@@ -143,28 +81,6 @@ fn every_argument() {
     check(1);
 }
 
-/// A name, the function applied to a slice, and the bound in ULP.
-type Case64 = (&'static str, fn(&[f64]) -> Tensor<f64>, f64);
-
-macro_rules! cases_f64 {
-    ($($f:ident $bound:literal),+) => {
-        [$((
-            stringify!($f),
-            |x| {
-                let x = Tensor::from_vec(&[x.len()], x.to_vec());
-                raygrad_tensor::map([&x], &Pool::none(), #[inline(always)] |[x]| vmath::f64::$f(x))
-            },
-            $bound,
-        )),+]
-    };
-}
-
-/// In the order of `reference/vmath_f64.py`.
-const CASES_F64: [Case64; 14] = cases_f64![
-    exp 1.0, exp2 1.0, expm1 2.0, ln 1.0, ln1p 2.0, log2 2.0, sin 2.0, cos 2.0, sin_pi 2.0, cos_pi 2.0, tanh 2.0,
-    sigmoid 2.0, softplus 2.0, erf 2.0
-];
-
 /// The records of `reference/vmath_f64.py`: argument, nearest f64 to the value, and the rest in ULP.
 fn records() -> Vec<(f64, f64, f64)> {
     let path = std::env::var("VMATH_F64").unwrap_or_else(|_| "tests/reference/vmath_f64.bin".into());
@@ -178,14 +94,18 @@ fn records() -> Vec<(f64, f64, f64)> {
 #[test]
 fn f64_within_its_bounds_on_samples_and_hard_cases() {
     let records = records();
-    let count = records.len() / CASES_F64.len();
-    assert!(count >= 900 && records.len().is_multiple_of(CASES_F64.len()));
+    // In the order of `reference/vmath_f64.py`.
+    let functions = doubles();
+    let count = records.len() / functions.len();
+    assert!(count >= 900 && records.len().is_multiple_of(functions.len()));
     println!("{:<9} {:>8}  at", "f64", "max ULP");
     let mut failed = Vec::new();
-    for ((name, f, bound), records) in CASES_F64.into_iter().zip(records.chunks(count)) {
+    for (Function { name, apply, bound, .. }, records) in functions.into_iter().zip(records.chunks(count)) {
         let x: Vec<f64> = records.iter().map(|r| r.0).collect();
         let (mut worst, mut at) = (0.0, 0.0);
-        for (&got, &(x, y, rest)) in f(&x).as_slice().iter().zip(records) {
+        let mut found = vec![0.0; x.len()];
+        apply(&x, &mut found);
+        for (&got, &(x, y, rest)) in found.iter().zip(records) {
             let ulp = y.abs().next_up() - y.abs();
             let error = ((got - y) / ulp - rest).abs();
             if !(error <= worst) {

@@ -1,0 +1,111 @@
+//! `raygrad bench`: run time against error, as tables, plots and one page.
+
+mod draw;
+mod figure;
+mod kernels;
+mod machine;
+mod quadrature;
+mod render;
+mod report;
+mod stopwatch;
+mod table;
+mod train;
+
+use std::path::{Path, PathBuf};
+
+use clap::ValueEnum;
+use raygrad::nerf::Result;
+
+use super::output::{make_folder, note, print};
+use figure::Figure;
+use table::Table;
+
+/// Measure run time against error: CSV tables, SVG and PNG plots, and one page with all of them
+///
+/// Counts of work stand beside every time. Times are medians of runs in turns with a baseline (A B B A), and a control
+/// says how much of a difference is chance.
+#[derive(clap::Args)]
+pub struct Args {
+    /// What to measure
+    #[arg(long, value_enum, default_value_t = Suite::All)]
+    suite: Suite,
+    /// Less of everything: two minutes on two cores
+    #[arg(long)]
+    quick: bool,
+    /// Folder for the results; files of the same names are replaced
+    #[arg(long, value_name = "DIR", default_value = "bench")]
+    out: PathBuf,
+    /// Also measure a training step of PyTorch and of JAX, if they are installed (in the repository only)
+    #[arg(long)]
+    peers: bool,
+    /// A run to render, in place of the built-in scene trained briefly
+    #[arg(long, value_name = "RUN")]
+    run: Option<PathBuf>,
+}
+
+/// A group of measurements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Suite {
+    /// Rules for the integral along a ray, on scenes known exactly
+    Quadrature,
+    /// Elementary functions, matrix products, the hash grid
+    Kernels,
+    /// Settings of the renderer, on one trained model
+    Render,
+    /// Quality against training time
+    Train,
+    /// Everything
+    All,
+}
+
+/// What a suite found.
+#[derive(Debug, Default)]
+pub struct Results {
+    /// Tables, in order.
+    pub tables: Vec<Table>,
+    /// Figures, in order.
+    pub figures: Vec<Figure>,
+    /// Sentences that sum it up.
+    pub findings: Vec<String>,
+}
+
+/// Measures and writes the files.
+pub fn run(args: &Args) -> Result<()> {
+    make_folder(&args.out)?;
+    let wanted = |suite| args.suite == suite || args.suite == Suite::All;
+    let mut sections = vec![];
+    if wanted(Suite::Quadrature) {
+        note("quadrature: rules on scenes that are known exactly");
+        sections.push(save("Quadrature", "--suite quadrature", quadrature::run(args.quick), &args.out)?);
+    }
+    if wanted(Suite::Kernels) {
+        note("kernels: elementary functions, matrix products, the hash grid");
+        sections.push(save("Kernels", "--suite kernels", kernels::run(args.quick)?, &args.out)?);
+    }
+    if wanted(Suite::Render) {
+        note("render: settings of the renderer on one model");
+        sections.push(save("Rendering", "--suite render", render::run(args.quick, args.run.as_deref())?, &args.out)?);
+    }
+    if wanted(Suite::Train) {
+        note("train: quality against time");
+        sections.push(save("Training", "--suite train", train::run(args.quick, args.peers)?, &args.out)?);
+    }
+    let page = args.out.join("report.html");
+    report::save(&page, &sections, args.quick)?;
+    let findings = sections.iter().flat_map(|section| &section.findings);
+    let findings: String = findings.map(|finding| format!("{finding}\n")).collect();
+    print(&format!("{findings}written: {}, and tables and plots beside it\n", page.display()))
+}
+
+/// Writes a suite's tables and figures.
+fn save(title: &str, command: &str, results: Results, folder: &Path) -> Result<report::Section> {
+    results.tables.iter().try_for_each(|table| table.save(folder))?;
+    let drawn = results.figures.into_iter().map(|figure| Ok((draw::save(&figure, folder)?, figure.caption)));
+    Ok(report::Section {
+        title: title.to_owned(),
+        command: format!("raygrad bench {command}"),
+        figures: drawn.collect::<Result<_>>()?,
+        tables: results.tables,
+        findings: results.findings,
+    })
+}

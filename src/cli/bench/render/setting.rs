@@ -1,0 +1,152 @@
+//! Ways to render one model.
+
+use raygrad::nerf::marching::Marching;
+use raygrad::nerf::occupancy::{Skip, Threshold, Update};
+use raygrad::nerf::quadrature::Quadrature;
+use raygrad::nerf::{Camera, Evaluations, Image, Limits, Model, Result, Sampler};
+
+/// The background of all pictures.
+pub const WHITE: [f64; 3] = [1.0; 3];
+
+/// Which cells are passed over.
+#[derive(Debug, Clone, Copy)]
+pub enum Cells {
+    /// Those that training passed over.
+    Trained,
+    /// Also those that an optical depth of so much along a ray may be in.
+    Depth(f64),
+    /// Also those in which one random sample found less than this optical depth a step.
+    OneSample(f64),
+}
+
+/// One way to render.
+#[derive(Debug, Clone)]
+pub struct Setting {
+    /// What it changes of the default.
+    pub group: &'static str,
+    /// What it is changed to.
+    pub name: String,
+    /// As a share of the longest side of the box.
+    pub step: f64,
+    /// Cells that are passed over.
+    pub cells: Cells,
+    /// What is left out along a ray.
+    pub limits: Limits,
+    /// The rule for the integral along a ray.
+    pub rule: Quadrature,
+    /// All arithmetic in f64, nothing but empty cells left out.
+    pub double: bool,
+}
+
+impl Setting {
+    /// What `raygrad render` does by default: the baseline of all times.
+    pub fn base(step: f64) -> Self {
+        Setting {
+            group: "skip",
+            name: "fast".to_owned(),
+            step,
+            cells: Cells::Depth(Skip::Fast.max_depth()),
+            limits: Limits::of(Skip::Fast),
+            rule: Quadrature::Midpoint,
+            double: false,
+        }
+    }
+
+    /// The model with its sampler set so, and the cells emptied.
+    pub fn model(&self, model: &Model<f32>) -> Model<f32> {
+        let mut model = model.clone();
+        let pruned = match &model.sampler {
+            Sampler::Marching(sampler) => Some(self.sampler(&model, sampler.clone())),
+            Sampler::Hierarchical(_) => None,
+        };
+        if let Some(sampler) = pruned {
+            model.sampler = Sampler::Marching(sampler);
+        }
+        model
+    }
+
+    fn sampler(&self, model: &Model<f32>, mut sampler: Marching) -> Marching {
+        let ask = |points: &[[f32; 3]], out: &mut [f32]| model.densities(points, out);
+        sampler.config.step = self.step;
+        sampler.config.quadrature = self.rule;
+        match self.cells {
+            Cells::Trained => {}
+            Cells::Depth(depth) => {
+                let min_sigma = (depth / sampler.grid.diagonal()) as f32;
+                sampler.grid.prune(min_sigma, &ask);
+            }
+            Cells::OneSample(depth) => {
+                // Occupied cells only, and nothing of what was known of them.
+                let plan = Update { every: u32::MAX, occupied_every: 1, samples: 1, decay: 0.0 };
+                sampler.grid.update(&plan, 0, 0, &ask);
+                let min_sigma = depth as f32 / sampler.step();
+                sampler.grid.threshold(&Threshold { min_sigma, or_mean: false, dilate: false });
+            }
+        }
+        sampler
+    }
+
+    /// The view of such a [`model`](Self::model).
+    pub fn render(&self, model: &Model<f32>, camera: &Camera) -> Result<(Image, Evaluations)> {
+        if self.double {
+            let view = model.cast::<f64>()?.dense_view(camera, WHITE, 1);
+            return Ok((view.picture().color, view.evaluations));
+        }
+        let picture = model.view_within(camera, WHITE.map(|x| x as f32), &self.limits);
+        Ok((picture.color, picture.evaluations))
+    }
+}
+
+/// All settings; `step` is the model's own.
+pub fn settings(step: f64) -> Vec<Setting> {
+    let base = Setting::base(step);
+    let exact = Limits { termination: 0.0, color_budget: 0.0 };
+    let of = |group: &'static str, name: String, setting: Setting| Setting { group, name, ..setting };
+    let mut out = vec![
+        of("skip", "off".into(), Setting { cells: Cells::Trained, limits: exact, ..base.clone() }),
+        of(
+            "skip",
+            "lossless".into(),
+            Setting {
+                cells: Cells::Depth(Skip::Lossless.max_depth()),
+                limits: Limits::of(Skip::Lossless),
+                ..base.clone()
+            },
+        ),
+        base.clone(),
+    ];
+    for factor in [0.25, 0.5, 2.0, 4.0] {
+        out.push(of("step", format!("x {factor}"), Setting { step: step * factor, ..base.clone() }));
+    }
+    for depth in [5e-4, 5e-3, 0.5, 2.0] {
+        out.push(of("threshold", format!("depth {depth}"), Setting { cells: Cells::Depth(depth), ..base.clone() }));
+    }
+    for termination in [0.0, 1e-4, 1e-2, 0.1] {
+        let limits = Limits { termination, ..base.limits };
+        out.push(of("termination", format!("{termination}"), Setting { limits, ..base.clone() }));
+    }
+    for color_budget in [0.0, 1e-4, 2e-2, 0.1] {
+        let limits = Limits { color_budget, ..base.limits };
+        out.push(of("colour budget", format!("{color_budget}"), Setting { limits, ..base.clone() }));
+    }
+    for rule in [Quadrature::Left, Quadrature::PiecewiseLinear, Quadrature::Gauss2] {
+        for factor in [1.0, 2.0, 4.0] {
+            let setting = Setting { step: step * factor, rule, ..base.clone() };
+            out.push(of("quadrature", format!("{rule} x {factor}"), setting));
+        }
+    }
+    for tolerance in [1e-2, 1e-3] {
+        let rule = Quadrature::Adaptive { tolerance };
+        out.push(of("quadrature", rule.to_string(), Setting { step: step * 4.0, rule, ..base.clone() }));
+    }
+    let unskipped = Setting { cells: Cells::Trained, limits: exact, ..base.clone() };
+    out.push(of("precision", "f64".into(), Setting { double: true, ..unskipped }));
+    let ngp = Setting {
+        step: 3.0_f64.sqrt() / 1024.0,
+        cells: Cells::OneSample(0.01),
+        limits: Limits { termination: 0.01, color_budget: 0.0 },
+        ..base
+    };
+    out.push(of("instant-ngp", "its rules".into(), ngp));
+    out
+}

@@ -1,0 +1,42 @@
+//! Rendering in single precision, as fast as the model allows, or in double precision with nothing left out.
+
+use clap::ValueEnum;
+use raygrad::nerf::{Camera, Model, Picture, Result};
+use serde::Serialize;
+
+/// The arithmetic of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// Single precision
+    #[default]
+    F32,
+    /// Double precision, and every sample in an occupied cell: slow, to measure others against
+    F64,
+}
+
+/// A model in the precision that it is rendered in.
+pub enum Renderer {
+    /// As trained.
+    Single(Box<Model<f32>>),
+    /// The same numbers, and all arithmetic on them in f64.
+    Double(Box<Model<f64>>),
+}
+
+impl Renderer {
+    /// A renderer for a model.
+    pub fn new(model: Model<f32>, precision: Precision) -> Result<Self> {
+        Ok(match precision {
+            Precision::F32 => Renderer::Single(Box::new(model)),
+            Precision::F64 => Renderer::Double(Box::new(model.cast()?)),
+        })
+    }
+
+    /// The view from a camera over a background.
+    pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
+        match self {
+            Renderer::Single(model) => model.view(camera, background),
+            Renderer::Double(model) => model.dense_view(camera, background.map(f64::from), 1).picture(),
+        }
+    }
+}
