@@ -1,9 +1,8 @@
-//! Gradient checks: an operation is examined against finite differences, dual numbers, its own reference and itself.
+//! Gradient checks: derivatives of a function against finite differences.
 
-use crate::catalogue::{Entry, spread};
-use crate::{Dual, Op, Tape, Var};
-use raygrad_tensor::{Scalar, Tensor};
-use std::sync::Arc;
+use crate::catalogue::spread;
+use crate::{Tape, Var};
+use raygrad_tensor::Tensor;
 
 /// How hard to check, and what error to accept.
 #[derive(Debug, Clone)]
@@ -32,24 +31,29 @@ pub struct Report {
     pub first_order: f64,
     /// Second derivatives against finite differences of first ones.
     pub second_order: f64,
-    /// Values and gradients in f32 against f64.
+    /// Values and gradients in f32 against f64, as a distance relative to the norm.
     pub single: f64,
+    /// The same element by element, in units in the last place of f32; an element that is smaller than the root mean
+    /// square of its tensor counts as that large.
+    pub ulps: f64,
     /// Number of comparisons.
     pub comparisons: usize,
 }
 
 impl Report {
-    fn merge(&mut self, other: Report) {
+    /// Takes the worse of each error, and all comparisons.
+    pub fn merge(&mut self, other: Report) {
         self.first_order = self.first_order.max(other.first_order);
         self.second_order = self.second_order.max(other.second_order);
         self.single = self.single.max(other.single);
+        self.ulps = self.ulps.max(other.ulps);
         self.comparisons += other.comparisons;
     }
 }
 
 /// A comparison that NaN fails: the error of `got` against `expected` relative to `scale`, which must not exceed
 /// `tolerance`.
-fn compare(what: &str, got: f64, expected: f64, scale: f64, tolerance: f64) -> Result<f64, String> {
+pub(crate) fn compare(what: &str, got: f64, expected: f64, scale: f64, tolerance: f64) -> Result<f64, String> {
     if got == expected {
         return Ok(0.0);
     }
@@ -61,7 +65,8 @@ fn compare(what: &str, got: f64, expected: f64, scale: f64, tolerance: f64) -> R
     }
 }
 
-fn inner(a: &[Tensor<f64>], b: &[Tensor<f64>]) -> f64 {
+/// The sum of all products of elements.
+pub(crate) fn inner(a: &[Tensor<f64>], b: &[Tensor<f64>]) -> f64 {
     a.iter().zip(b).flat_map(|(a, b)| a.as_slice().iter().zip(b.as_slice())).map(|(a, b)| a * b).sum()
 }
 
@@ -174,160 +179,4 @@ pub fn check_function(
     let (second, count) = against_differences("second derivative", check, &both, &second, &gradient)?;
     report.merge(Report { second_order: second, comparisons: count + 1, ..Report::default() });
     Ok(report)
-}
-
-impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
-    fn name(&self) -> &'static str {
-        (**self).name()
-    }
-    fn shape(&self, x: &[&[usize]]) -> Result<raygrad_tensor::Shape, crate::ShapeError> {
-        (**self).shape(x)
-    }
-    fn forward(&self, x: &[&Tensor<T>], pool: &raygrad_tensor::Pool<T>) -> Tensor<T> {
-        (**self).forward(x, pool)
-    }
-    fn reads(&self) -> crate::Reads {
-        (**self).reads()
-    }
-    fn vjp<'t>(&self, cx: &crate::Vjp<'t, '_, T>) -> crate::Grads<'t, T> {
-        (**self).vjp(cx)
-    }
-    fn try_vjp<'t>(&self, cx: &crate::Vjp<'t, '_, T>) -> Result<crate::Grads<'t, T>, crate::Error> {
-        (**self).try_vjp(cx)
-    }
-    fn is_fused(&self) -> bool {
-        (**self).is_fused()
-    }
-    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        (**self).reference(x)
-    }
-}
-
-/// Value and gradients of an operation for a fixed seed.
-fn evaluate<T: Scalar>(op: &Arc<dyn Op<T>>, x: &[Tensor<T>], reference: bool) -> Option<Vec<Tensor<T>>> {
-    let tape = Tape::new();
-    let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
-    let wrt: Vec<_> = leaves.iter().collect();
-    let y = if reference { op.reference(&leaves)? } else { tape.apply(op.clone(), &wrt) };
-    let seed = tape.constant(spread(y.shape(), &[0.3..1.3], 3).cast());
-    let mut all = (&y * seed).sum().grad(&wrt);
-    all.push(y.into_value());
-    Some(all)
-}
-
-/// Compares lists of tensors by their L2 distance relative to the norm, NaN failing.
-fn compare_all<T: Scalar>(
-    what: &str,
-    got: &[Tensor<T>],
-    expected: &[Tensor<f64>],
-    tolerance: f64,
-) -> Result<f64, String> {
-    let mut worst = 0.0_f64;
-    for (i, (got, expected)) in got.iter().zip(expected).enumerate() {
-        if got.shape() != expected.shape() {
-            return Err(format!("{what}, result {i}: shape {:?} instead of {:?}", got.shape(), expected.shape()));
-        }
-        let distance = got.as_slice().iter().zip(expected.as_slice()).map(|(g, e)| (g.to_f64() - e).powi(2));
-        let norm = expected.as_slice().iter().map(|e| e * e).sum::<f64>().sqrt().max(1e-3);
-        let error = distance.sum::<f64>().sqrt();
-        worst = worst.max(compare(&format!("{what}, result {i}"), error, 0.0, norm, tolerance)?);
-    }
-    Ok(worst)
-}
-
-/// Examines an operation as the catalogue describes it: first and second derivatives against finite differences in
-/// f64, f32 against f64, a fused operation against its reference, an elementwise formula against dual numbers, a linear
-/// operation for linearity, exact values and gradients at extremes, and the same bits when run twice.
-///
-/// # Errors
-/// If a check fails, in words.
-pub fn check_op(check: &Check, entry: &Entry) -> Result<Report, String> {
-    let mut report = Report::default();
-    for (k, x) in entry.samples.iter().enumerate() {
-        let shapes: Vec<_> = x.iter().map(Tensor::shape).collect();
-        let context = |error: String| format!("{} sample {k} {shapes:?}: {error}", entry.name);
-        report.merge(check_function(check, x, apply(&entry.f64)).map_err(context)?);
-        let Some(double) = evaluate(&entry.f64, x, false) else { continue };
-        if evaluate(&entry.f64, x, false).as_deref() != Some(&double[..]) {
-            return Err(context("two runs differ".into()));
-        }
-        let singles: Vec<Tensor<f32>> = x.iter().map(Tensor::cast).collect();
-        // The f64 side gets what the f32 side sees, so that only the arithmetic differs.
-        let rounded: Vec<Tensor<f64>> = singles.iter().map(Tensor::cast).collect();
-        if let (Some(single), Some(double)) =
-            (evaluate(&entry.f32, &singles, false), evaluate(&entry.f64, &rounded, false))
-        {
-            report.single = report.single.max(compare_all("f32 against f64", &single, &double, 2e-6).map_err(context)?);
-        }
-        if let Some(reference) = evaluate(&entry.f64, x, true) {
-            compare_all("fused against reference", &double, &reference, 1e-12).map_err(context)?;
-        } else if entry.f64.is_fused() {
-            return Err(context("a fused operation without a reference".into()));
-        }
-        if entry.linear {
-            let two =
-                |c: f64| x.iter().map(|x| Tensor::from_fn(x.shape(), |i| c * x.as_slice()[i])).collect::<Vec<_>>();
-            if let (Some(mut a), Some(b)) = (evaluate(&entry.f64, &two(-2.0), false), evaluate(&entry.f64, x, false)) {
-                a.iter_mut().last().into_iter().flat_map(|y| y.as_mut_slice()).for_each(|y| *y *= -0.5);
-                compare_all("f(-2 x) / -2 and the gradients against those at x", &a, &b, 1e-12).map_err(context)?;
-            }
-        }
-        if let Some(formula) = &entry.dual {
-            against_duals(formula, &double, x).map_err(context)?;
-        }
-    }
-    for extreme in &entry.extremes {
-        extreme_case(&entry.f64, extreme, 1e-9).map_err(|error| format!("{} in f64: {error}", entry.name))?;
-        extreme_case(&entry.f32, extreme, 5e-7).map_err(|error| format!("{} in f32: {error}", entry.name))?;
-        report.comparisons += 2;
-    }
-    Ok(report)
-}
-
-/// An operation as a function, for [`check_function`].
-fn apply(op: &Arc<dyn Op<f64>>) -> impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64> + '_ {
-    fn hint<F: for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64>>(f: F) -> F {
-        f
-    }
-    hint(|x| x[0].tape().apply(op.clone(), &x.iter().collect::<Vec<_>>()))
-}
-
-/// An elementwise operation on inputs of equal shape against its formula on dual numbers.
-fn against_duals(formula: &dyn Fn(&[Dual]) -> Dual, got: &[Tensor<f64>], x: &[Tensor<f64>]) -> Result<(), String> {
-    if x.iter().any(|other| other.shape() != x[0].shape()) {
-        return Ok(());
-    }
-    let seed = spread(x[0].shape(), &[0.3..1.3], 3);
-    for i in 0..x[0].len() {
-        for which in 0..x.len() {
-            let slope = |k| if k == which { 1.0 } else { 0.0 };
-            let duals: Vec<_> = (0..x.len()).map(|k| Dual { value: x[k].as_slice()[i], slope: slope(k) }).collect();
-            let y = formula(&duals);
-            let (value, grad) = (got[x.len()].as_slice()[i], got[which].as_slice()[i] / seed.as_slice()[i]);
-            compare("the value against dual numbers", value, y.value, y.value.abs().max(1e-3), 1e-13)?;
-            compare("the gradient against dual numbers", grad, y.slope, y.slope.abs().max(1e-3), 1e-12)?;
-        }
-    }
-    Ok(())
-}
-
-fn extreme_case<T: Scalar>(op: &Arc<dyn Op<T>>, extreme: &crate::Extreme, tolerance: f64) -> Result<(), String> {
-    let tape = Tape::new();
-    let leaves: Vec<_> = extreme.x.iter().map(|&x| tape.leaf(Tensor::scalar(T::from_f64(x)))).collect();
-    let wrt: Vec<_> = leaves.iter().collect();
-    let y = tape.apply(op.clone(), &wrt);
-    let grads = y.grad(&wrt);
-    let same = |what: &str, got: T, expected: f64| {
-        // The expectation as this type holds it: what overflows or underflows there is to do so.
-        let expected = T::from_f64(expected).to_f64();
-        if expected.is_nan() && got.to_f64().is_nan() {
-            return Ok(0.0);
-        }
-        compare(&format!("{what} at {:?}", extreme.x), got.to_f64(), expected, expected.abs(), tolerance)
-    };
-    same("the value", y.item(), extreme.y)?;
-    for (i, (grad, &expected)) in grads.iter().zip(&extreme.grads).enumerate() {
-        same(&format!("gradient {i}"), grad.item(), expected)?;
-    }
-    Ok(())
 }

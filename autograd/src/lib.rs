@@ -1,9 +1,27 @@
-//! Reverse-mode automatic differentiation over [`raygrad_tensor`], with gradients of gradients. This crate knows no rays.
+//! Reverse-mode automatic differentiation over [`raygrad_tensor`], with gradients of gradients, gradient checks, layers
+//! and optimisers. This crate knows no rays.
+//!
+//! ```
+//! use raygrad_autograd::{Tape, Tensor};
+//! let tape = Tape::<f64>::new();
+//! let x = tape.leaf(Tensor::from_vec(&[2], vec![3.0, -1.0]));
+//! let y = (x.square() * &x).sum();
+//! assert_eq!(y.grad(&[&x])[0].as_slice(), [27.0, 3.0]); // 3 x^2
+//! ```
+//!
+//! * [`guide`]: from a first gradient to an operation of one's own and a trained model.
+//! * [`Tape`], [`Var`]: what is recorded; every operation is a method of [`Var`].
+//! * [`derivatives`]: of functions: Jacobian, Hessian, and products with them.
+//! * [`conventions`]: values and gradients at ties, kinks and the edges of domains.
+//! * [`Op`], [`Unary`], [`Binary`]: operations of one's own; [`check_op`] examines them, [`catalogue`](catalogue()) lists
+//!   this crate's.
+//! * [`Params`], [`Layer`], [`Optimizer`]: models and their training.
 
 mod axes;
 mod catalogue;
 mod catalogue_arrays;
 mod check;
+mod check_op;
 mod checkpoint;
 mod composed;
 pub mod conventions;
@@ -13,6 +31,7 @@ mod dual;
 mod elementwise;
 mod error;
 mod files;
+pub mod guide;
 mod hook;
 mod layers;
 mod npz;
@@ -29,7 +48,8 @@ mod var;
 
 pub use axes::Axes;
 pub use catalogue::{Cases, Entry, Extreme, catalogue};
-pub use check::{Check, Report, check_function, check_op};
+pub use check::{Check, Report, check_function};
+pub use check_op::check_op;
 pub use dual::Dual;
 pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};

@@ -22,6 +22,16 @@ fn every_operation_passes_every_check() {
     }
     println!("{} entries, {comparisons} comparisons", catalogue().len());
     assert!(failures.is_empty(), "{}", failures.join("\n"));
+    assert!(comparisons >= 20_000, "samples were lost: {comparisons} comparisons");
+}
+
+#[test]
+fn the_table_of_errors_has_every_operation() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/operations.md");
+    let table = std::fs::read_to_string(path).unwrap();
+    let missing: BTreeSet<_> = catalogue().iter().map(|entry| format!("| `{}` |", entry.name)).collect();
+    let missing: Vec<_> = missing.into_iter().filter(|row| !table.contains(row.as_str())).collect();
+    assert!(missing.is_empty(), "run the example check_table: docs/operations.md has no rows {missing:?}");
 }
 
 #[test]

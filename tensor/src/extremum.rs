@@ -1,5 +1,6 @@
 //! The greatest or smallest elements along an axis, and where they are.
 
+use crate::indices::index;
 use crate::reduce::chunk;
 use crate::rows::fold_lanes;
 use crate::{Scalar, simd};
@@ -116,8 +117,8 @@ pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]
 /// ones, and the first NaN if there is one.
 ///
 /// # Panics
-/// If the length does not fit, or `count` is 0 and the result is not empty.
-pub fn arg_extremum<T: Scalar>(x: &[T], [outer, count, inner]: Middle, greatest: bool) -> Vec<usize> {
+/// If the length does not fit, `count` is 0 and the result is not empty, or `count` is above 2^32.
+pub fn arg_extremum<T: Scalar>(x: &[T], [outer, count, inner]: Middle, greatest: bool) -> Vec<u32> {
     assert_eq!(x.len(), outer * count * inner, "extremum of {:?}", [outer, count, inner]);
     assert!(count > 0 || outer * inner == 0, "extremum of no elements");
     let better = |x: T, than: T| if greatest { x > than } else { x < than };
@@ -125,6 +126,7 @@ pub fn arg_extremum<T: Scalar>(x: &[T], [outer, count, inner]: Middle, greatest:
     for (x, best) in x.chunks_exact((count * inner).max(1)).zip(best.chunks_exact_mut(inner.max(1))) {
         let mut value = x[..inner].to_vec();
         for (row, x) in x.chunks_exact(inner).enumerate().skip(1) {
+            let row = index(row);
             for i in 0..inner {
                 let is_nan = |x: T| x.partial_cmp(&x).is_none();
                 if !is_nan(value[i]) && (better(x[i], value[i]) || is_nan(x[i])) {
@@ -161,7 +163,7 @@ mod tests {
                     let ties = column.iter().filter(|&&x| x == best).count() as f32;
                     let at = o * inner + i;
                     prop_assert_eq!(y[at], best);
-                    prop_assert_eq!(arg[at], column.iter().position(|&x| x == best).unwrap());
+                    prop_assert_eq!(arg[at] as usize, column.iter().position(|&x| x == best).unwrap());
                     for c in 0..count {
                         let share = if column[c] == best { g[at] / ties } else { 0.0 };
                         prop_assert_eq!(dx[(o * count + c) * inner + i], share);
@@ -181,7 +183,7 @@ mod tests {
                     let mut y = [0.0];
                     extremum(&x, [1, count, 1], greatest, &mut y);
                     assert!(y[0].is_nan(), "{count} {at}");
-                    assert_eq!(arg_extremum(&x, [1, count, 1], greatest), [at]);
+                    assert_eq!(arg_extremum(&x, [1, count, 1], greatest), [at as u32]);
                     let mut dx = vec![1.0; count];
                     extremum_grad(&x, &y, &[1.0], [1, count, 1], &mut dx);
                     assert!(dx.iter().all(|&dx| dx == 0.0));

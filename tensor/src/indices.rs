@@ -79,7 +79,7 @@ fn order<T: Scalar>(a: &T, b: &T) -> Ordering {
 
 /// A position along an axis as an index.
 #[track_caller]
-fn index(i: usize) -> u32 {
+pub(crate) fn index(i: usize) -> u32 {
     u32::try_from(i).unwrap_or_else(|_| panic!("an axis of more than 2^32 entries cannot be indexed"))
 }
 

@@ -183,14 +183,12 @@ impl Windows {
         );
     }
 
-    /// The sum of each window of one channel `[height, width]`; padding counts as 0.
-    ///
-    /// # Panics
-    /// If a slice has another length.
+    /// For each window of one channel `f(.. f(f(start, x), x') ..)` of the pixels it sees, in their order.
+    #[inline(always)]
     #[track_caller]
-    pub fn sums<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
+    fn reduce<T: Scalar>(&self, plane: &[T], out: &mut [T], start: T, f: impl Fn(T, T) -> T) {
         self.check(plane.len(), out.len(), self.count());
-        out.fill(T::ZERO);
+        out.fill(start);
         let step = self.stride[1];
         simd::dispatch(
             #[inline(always)]
@@ -201,11 +199,26 @@ impl Windows {
                         let out = &mut out[windows];
                         let plane = &plane[first..];
                         for i in 0..out.len() {
-                            out[i] += plane[i * step];
+                            out[i] = f(out[i], plane[i * step]);
                         }
                     },
                 );
             },
+        );
+    }
+
+    /// The sum of each window of one channel `[height, width]`; padding counts as 0.
+    ///
+    /// # Panics
+    /// If a slice has another length.
+    #[track_caller]
+    pub fn sums<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
+        self.reduce(
+            plane,
+            out,
+            T::ZERO,
+            #[inline(always)]
+            |sum, x| sum + x,
         );
     }
 
@@ -230,24 +243,12 @@ impl Windows {
     /// If a slice has another length.
     #[track_caller]
     pub fn maxima<T: Scalar>(&self, plane: &[T], out: &mut [T]) {
-        self.check(plane.len(), out.len(), self.count());
-        out.fill(T::from_f64(f64::NEG_INFINITY));
-        let step = self.stride[1];
-        simd::dispatch(
+        self.reduce(
+            plane,
+            out,
+            T::from_f64(f64::NEG_INFINITY),
             #[inline(always)]
-            || {
-                self.runs(
-                    #[inline(always)]
-                    |_, windows, first| {
-                        let out = &mut out[windows];
-                        let plane = &plane[first..];
-                        for i in 0..out.len() {
-                            let x = plane[i * step];
-                            out[i] = if beats(x, out[i]) { x } else { out[i] };
-                        }
-                    },
-                );
-            },
+            |best, x| if beats(x, best) { x } else { best },
         );
     }
 

@@ -1,7 +1,7 @@
 //! The greatest and smallest elements along axes, and where they are.
 
 use crate::axes::axis_of;
-use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Axes, Grads, Indices, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::extremum::{Middle, arg_extremum, extremum, extremum_grad};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
@@ -125,11 +125,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     #[track_caller]
-    fn arg_extremum(&self, axis: isize, greatest: bool) -> Vec<usize> {
+    fn arg_extremum(&self, axis: isize, greatest: bool) -> Indices {
         let (x, shape) = (self.value().as_slice(), self.shape());
         if shape.is_empty() {
             axis_of(axis, &[1]);
-            return vec![0];
+            return Indices::new(&[], [0]);
         }
         let axis = axis_of(axis, shape);
         let middle = [shape[..axis].iter().product(), shape[axis], shape[axis + 1..].iter().product()];
@@ -137,24 +137,26 @@ impl<'t, T: Scalar> Var<'t, T> {
             middle[1] > 0 || middle[0] * middle[2] == 0,
             "no elements to choose from along axis {axis} of {shape:?}"
         );
-        arg_extremum(x, middle, greatest)
+        let mut rest = Shape::from_slice(shape);
+        rest.remove(axis);
+        Indices::new(&rest, arg_extremum(x, middle, greatest))
     }
 
-    /// Where the greatest elements along `axis` are: an index for each element of the remaining shape, in row-major
-    /// order. The first of equal ones, and the first NaN if there is one. There is no gradient.
+    /// Where the greatest elements along `axis` are: an index for each element of the shape that remains without that
+    /// axis. The first of equal ones, and the first NaN if there is one. There is no gradient.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from_vec(&[2, 3], vec![1.0, 5.0, 2.0, 3.0, 0.0, 3.0]));
-    /// assert_eq!(x.argmax(-1), [1, 0]);
-    /// assert_eq!(x.argmax(0), [1, 0, 1]);
+    /// assert_eq!(x.argmax(-1).as_slice(), [1, 0]);
+    /// assert_eq!(x.argmax(0).as_slice(), [1, 0, 1]);
     /// ```
     ///
     /// # Panics
     /// If the axis does not exist, or there are no elements to choose from.
     #[track_caller]
-    pub fn argmax(&self, axis: isize) -> Vec<usize> {
+    pub fn argmax(&self, axis: isize) -> Indices {
         self.arg_extremum(axis, true)
     }
 
@@ -163,14 +165,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// As [`argmax`](Self::argmax).
     #[track_caller]
-    pub fn argmin(&self, axis: isize) -> Vec<usize> {
+    pub fn argmin(&self, axis: isize) -> Indices {
         self.arg_extremum(axis, false)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use crate::{Tape, Tensor};
+    use crate::{Indices, Tape, Tensor};
 
     #[test]
     fn axes_that_are_no_neighbours_are_reduced_together() {
@@ -195,7 +197,8 @@ mod tests {
         let tape = Tape::<f32>::new();
         assert_eq!(tape.constant(Tensor::zeros(&[0, 3])).max_over(1).shape(), [0]);
         let x = tape.leaf(Tensor::scalar(2.0));
-        assert_eq!((x.min().item(), x.argmin(-1)), (2.0, vec![0]));
+        assert_eq!((x.min().item(), x.argmin(-1)), (2.0, Indices::new(&[], [0])));
+        assert_eq!(tape.constant(Tensor::zeros(&[2, 3, 0])).argmax(1).shape(), [2, 0]);
         assert_eq!(x.max().grad(&[&x])[0].item(), 1.0);
     }
 }

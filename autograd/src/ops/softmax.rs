@@ -18,6 +18,13 @@ fn kept_last() -> Axes {
     Axes::from(-1).keepdims()
 }
 
+/// A tensor of the shape of `x`, whose rows `kernel(x, row length, out)` writes.
+fn by_rows<T: Scalar>(x: &Tensor<T>, pool: &Pool<T>, kernel: impl FnOnce(&[T], usize, &mut [T])) -> Tensor<T> {
+    let mut out = pool.tensor(x.shape());
+    kernel(x.as_slice(), x.shape()[x.ndim() - 1], out.as_mut_slice());
+    out
+}
+
 /// y = e^(x - max) / sum e^(x - max) along the last axis; dx = y (g - sum g y).
 #[derive(Clone, Copy)]
 pub struct Softmax;
@@ -32,9 +39,7 @@ impl<T: Scalar> Op<T> for Softmax {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let mut out = pool.tensor(x[0].shape());
-        rows::softmax_rows(x[0].as_slice(), x[0].shape()[x[0].ndim() - 1], out.as_mut_slice(), pool);
-        out
+        by_rows(x[0], pool, |x, n, out| rows::softmax_rows(x, n, out, pool))
     }
 
     fn reads(&self) -> Reads {
@@ -46,10 +51,8 @@ impl<T: Scalar> Op<T> for Softmax {
         if cx.recording() {
             return Grads::one(&y * (g - (g * &y).sum_over(kept_last())));
         }
-        let mut out = cx.pool().tensor(y.shape());
-        let n = y.shape()[y.shape().len() - 1];
-        rows::softmax_rows_grad(y.value().as_slice(), g.value().as_slice(), n, out.as_mut_slice());
-        Grads::one(cx.constant(out))
+        let g = g.value().as_slice();
+        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::softmax_rows_grad(y, g, n, out))))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
@@ -72,9 +75,7 @@ impl<T: Scalar> Op<T> for LogSoftmax {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let mut out = pool.tensor(x[0].shape());
-        rows::log_softmax_rows(x[0].as_slice(), x[0].shape()[x[0].ndim() - 1], out.as_mut_slice(), pool);
-        out
+        by_rows(x[0], pool, |x, n, out| rows::log_softmax_rows(x, n, out, pool))
     }
 
     fn reads(&self) -> Reads {
@@ -86,10 +87,8 @@ impl<T: Scalar> Op<T> for LogSoftmax {
         if cx.recording() {
             return Grads::one(g - y.exp() * g.sum_over(kept_last()));
         }
-        let mut out = cx.pool().tensor(y.shape());
-        let n = y.shape()[y.shape().len() - 1];
-        rows::log_softmax_rows_grad(y.value().as_slice(), g.value().as_slice(), n, out.as_mut_slice());
-        Grads::one(cx.constant(out))
+        let g = g.value().as_slice();
+        Grads::one(cx.constant(by_rows(y.value(), cx.pool(), |y, n, out| rows::log_softmax_rows_grad(y, g, n, out))))
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {

@@ -1,13 +1,14 @@
 //! The gradient checker is checked: each way in which an operation can be wrong is caught, by the check that is meant
 //! to catch it.
 
-use raygrad::autograd::{
-    Check, Entry, Extreme, Grads, Op, Pool, Scalar, Shape, ShapeError, Tensor, Var, Vjp, check_op,
+use raygrad_autograd::{
+    Check, Entry, Extreme, Grads, Map, Op, Pool, Scalar, Shape, ShapeError, Tensor, Var, Vjp, check_op,
 };
-use raygrad::tensor::{broadcast_shape, map};
+use raygrad_tensor::{broadcast_shape, map};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use thrice::Thrice;
 
 /// What is wrong with [`Wave`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,8 +28,15 @@ enum Fault {
     WrongReference,
     MissingReference,
     WrongInSinglePrecision,
+    /// Exact but for one element in f32.
+    WrongElementInSinglePrecision,
     /// No two runs give the same bits, though every one is accurate.
     Nondeterministic,
+    /// The kernel adds to what it finds in a buffer that holds old values.
+    StaleBuffer,
+    /// A gradient that is wrong where both inputs are one variable.
+    ConfusedByAliases,
+    NanValue,
 }
 
 use Fault::*;
@@ -56,7 +64,18 @@ impl<T: Scalar> Op<T> for Wave {
             Nondeterministic => f64::from(run % 7) * 1e-15,
             _ => 0.0,
         };
-        map([x[0], x[1]], pool, |[a, b]| a * b.sin() + T::from_f64(error))
+        let mut y = map([x[0], x[1]], pool, |[a, b]| a * b.sin() + T::from_f64(error));
+        match self.fault {
+            StaleBuffer => {
+                let mut sum = pool.tensor(y.shape());
+                sum.as_mut_slice().iter_mut().zip(y.as_slice()).for_each(|(sum, &y)| *sum += y);
+                return sum;
+            }
+            WrongElementInSinglePrecision if size_of::<T>() == 4 => y.as_mut_slice()[0] += T::from_f64(1.5e-6),
+            NanValue => y.as_mut_slice()[0] = T::from_f64(f64::NAN),
+            _ => {}
+        }
+        y
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
@@ -64,6 +83,7 @@ impl<T: Scalar> Op<T> for Wave {
         if self.fault == WrongSecondDerivative {
             b = b.detach();
         }
+        let aliased = a.value().as_slice().as_ptr() == b.value().as_slice().as_ptr();
         let mut da = (g * b.sin()).sum_to(cx.shape(0));
         let mut db = g * a * b.cos();
         if self.fault != MissingReduction {
@@ -75,6 +95,7 @@ impl<T: Scalar> Op<T> for Wave {
             NanGradient => db = db * f64::NAN,
             GradientToTheWrongInput => (da, db) = (db.sum_to(cx.shape(0)), da.sum_to(cx.shape(1))),
             ForgottenInput => return Grads::one(da),
+            ConfusedByAliases if aliased => da = da * 2.0,
             AnotherGradientWhenRecorded if cx.recording() => da = da * (1.0 + 1e-8),
             _ => {}
         }
@@ -92,7 +113,12 @@ impl<T: Scalar> Op<T> for Wave {
 
 fn entry(fault: Fault) -> Entry {
     let entry = Entry::new(Wave { fault, runs: Arc::default() });
-    if fault == MissingReduction { entry.sample(&[&[2, 3], &[3]]) } else { entry.sample(&[&[2, 3], &[2, 3]]) }
+    match fault {
+        MissingReduction => entry.sample(&[&[2, 3], &[3]]),
+        // Tensors of up to 64 elements have no old buffers.
+        WrongElementInSinglePrecision | StaleBuffer => entry.sample(&[&[10, 7], &[10, 7]]),
+        _ => entry.sample(&[&[2, 3], &[2, 3]]),
+    }
 }
 
 /// What the checker says of an entry; a panic within the tape, which debug builds have for wrong shapes, is a word too.
@@ -130,8 +156,12 @@ fn every_fault_is_caught_by_the_check_meant_for_it() {
         (AnotherGradientWhenRecorded, "the recorded gradient against the unrecorded one"),
         (WrongReference, "fused against reference"),
         (MissingReference, "a fused operation without a reference"),
-        (WrongInSinglePrecision, "f32 against f64"),
+        (WrongInSinglePrecision, "f32 against f64, result"),
+        (WrongElementInSinglePrecision, "f32 against f64 in units in the last place"),
         (Nondeterministic, "two runs differ"),
+        (StaleBuffer, "old values of a buffer"),
+        (ConfusedByAliases, "one variable as inputs 0 and 1 against two"),
+        (NanValue, "NaN"),
     ];
     for (fault, by) in faults {
         println!("{fault:?}");
@@ -150,4 +180,39 @@ fn claims_about_an_operation_are_checked() {
     assert_eq!(verdict(&at(0.0, [0.0, 2.0])), Ok(()));
     assert_caught(&at(1e-9, [0.0, 2.0]), "the value at [2.0, 0.0]");
     assert_caught(&at(0.0, [0.0, 2.1]), "gradient 1 at [2.0, 0.0]");
+}
+
+/// In a module of its own, since [`Real`](raygrad_autograd::Real) has methods that take variables by value.
+mod thrice {
+    use raygrad_autograd::{Cases, Reads, Real, Unary};
+
+    /// y = 3 x with a gradient that is off by less than differences can see.
+    #[derive(Clone, Copy)]
+    pub struct Thrice;
+
+    impl Unary for Thrice {
+        const NAME: &'static str = "thrice";
+        const READS: Reads = Reads::NOTHING;
+        #[inline(always)]
+        fn f<E: Real>(&self, x: E) -> E {
+            let three = x.like(3.0);
+            x * three
+        }
+        #[inline(always)]
+        fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
+            let three = g.like(3.0 + 1e-9);
+            g * three
+        }
+        fn cases(&self, cases: &mut Cases) {
+            cases.domain(-1.0..1.0);
+        }
+    }
+}
+
+#[test]
+fn faults_too_small_for_differences_are_caught_by_the_exact_checks() {
+    assert_caught(&Entry::unary(Thrice), "the gradient against dual numbers");
+    let by = "the output along a gradient against the input along its adjoint";
+    assert_caught(&Entry::new(Map(Thrice)).linear().sample(&[&[2, 3]]), by);
+    assert_eq!(verdict(&Entry::new(Map(Thrice)).sample(&[&[2, 3]])), Ok(()));
 }

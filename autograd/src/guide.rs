@@ -1,0 +1,145 @@
+//! A guide: from a first gradient to an operation of one's own and a trained model.
+//!
+//! # A gradient
+//!
+//! A [`Tape`](crate::Tape) writes down what is done with its variables, and a gradient reads that backwards. A *leaf* is
+//! what gradients are taken by; a *constant* is not. Arithmetic broadcasts as in NumPy.
+//!
+//! ```
+//! use raygrad_autograd::{Tape, Tensor};
+//! let tape = Tape::<f64>::new();
+//! let x = tape.leaf(Tensor::from_vec(&[3], vec![1.0, 2.0, 3.0]));
+//! let y = (0.5 * x.square()).sum();
+//! assert_eq!(y.item(), 7.0);
+//! assert_eq!(y.grad(&[&x])[0].as_slice(), [1.0, 2.0, 3.0]);
+//! ```
+//!
+//! There is no global state: any number of tapes run on any threads, and a tape's memory goes with it.
+//!
+//! # Gradients of gradients
+//!
+//! [`Var::grad_graph`](crate::Var::grad_graph) puts the gradient itself on the tape, so that it can be part of a loss or
+//! be differentiated again.
+//!
+//! ```
+//! use raygrad_autograd::{Tape, Tensor};
+//! let tape = Tape::<f64>::new();
+//! let x = tape.leaf(Tensor::scalar(2.0));
+//! let y = x.powi(4);
+//! let slope = &y.grad_graph(&[&x])[0]; // 4 x^3
+//! let penalty = (slope - 30.0).square();
+//! assert_eq!(penalty.grad(&[&x])[0].item(), 192.0); // 2 (4 x^3 - 30) 12 x^2
+//! ```
+//!
+//! For a function rather than a graph, [`derivatives`](crate::derivatives) has what is usually wanted: value and
+//! gradient, products with the Jacobian from either side, Jacobian, Hessian and products with it.
+//!
+//! ```
+//! use raygrad_autograd::{Tensor, derivatives::hvp};
+//! let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+//! let v = Tensor::from_vec(&[2], vec![1.0, 0.0]);
+//! let product = hvp(|x| x[0].powi(3).sum(), &[x], &[v]); // the Hessian is diag(6 x)
+//! assert_eq!(product[0].as_slice(), [18.0, 0.0]);
+//! ```
+//!
+//! # What goes wrong, and how one hears of it
+//!
+//! A wrong shape says which operation, which shapes and where it was called, as a panic or, from
+//! [`Tape::try_apply`](crate::Tape::try_apply), as an error. The NaN finder names the operation, the line and the index
+//! of the first number that is not finite, forwards or backwards. What operations give at kinks, ties and the edges of
+//! their domains is one table: [`conventions`](crate::conventions).
+//!
+//! ```
+//! use raygrad_autograd::{Tape, Tensor};
+//! let tape = Tape::<f64>::new();
+//! tape.check_finite(true);
+//! let x = tape.leaf(Tensor::from_vec(&[2], vec![4.0, 0.0]));
+//! let error = x.sqrt().sum().try_grad(&[&x]).unwrap_err();
+//! assert!(error.to_string().starts_with("sqrt: the gradient of input 0 is inf at index [1]"));
+//! ```
+//!
+//! # An operation of one's own
+//!
+//! A function of one number is a [`Unary`](crate::Unary): its formula and its derivative, written once for every kind of
+//! number. With `f32` and `f64` that compiles to one vectorised loop; with [`Var`](crate::Var) it records itself, which
+//! gives the higher derivatives; with [`Dual`](crate::Dual) it checks itself.
+//!
+//! ```
+//! use raygrad_autograd::{Cases, Check, Entry, Map, Reads, Real, Tape, Tensor, Unary, check_op};
+//!
+//! /// y = 1 / (1 + x^2); dx = -2 g x y^2.
+//! #[derive(Clone, Copy)]
+//! struct Lorentz;
+//!
+//! impl Unary for Lorentz {
+//!     const NAME: &'static str = "lorentz";
+//!     const READS: Reads = Reads::ALL; // the derivative reads x and y, so the tape keeps both
+//!     #[inline(always)]
+//!     fn f<E: Real>(&self, x: E) -> E {
+//!         let one = x.like(1.0);
+//!         one.clone() / (one + x.clone() * x)
+//!     }
+//!     #[inline(always)]
+//!     fn vjp<E: Real>(&self, g: E, x: E, y: E) -> E {
+//!         let two = g.like(2.0);
+//!         -(g * two * (x * y.clone()) * y)
+//!     }
+//!     fn cases(&self, cases: &mut Cases) {
+//!         // Where it is sampled, and exact values and gradients at points where formulas like to fail.
+//!         cases.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([1e10], 1e-20, [-2e-30]);
+//!     }
+//! }
+//!
+//! let tape = Tape::<f64>::new();
+//! let x = tape.leaf(Tensor::scalar(1.0));
+//! let y = tape.apply(Map(Lorentz), &[&x]);
+//! assert_eq!((y.item(), y.grad(&[&x])[0].item()), (0.5, -0.5));
+//!
+//! let report = check_op(&Check::default(), &Entry::unary(Lorentz)).unwrap();
+//! assert!(report.first_order < 1e-9 && report.second_order < 1e-9);
+//! ```
+//!
+//! [`check_op`](crate::check_op) is the examination that every operation of this crate has to pass: finite differences of
+//! first and second order, dual numbers, f32 against f64, extremes, inputs of any origin, the same bits twice. A wrong
+//! sign, a forgotten factor or a missing sum does not get through. [`Binary`](crate::Binary) is the same for two numbers;
+//! anything else is an [`Op`](crate::Op), whose derivative is written with variables. An operation may be *fused*: then it
+//! carries a `reference` made of plain operations, which is its oracle and its second derivative. A function that is made
+//! of operations needs no derivative at all, and [`check_function`](crate::check_function) checks what it uses.
+//!
+//! # A model that learns
+//!
+//! Parameters live in a store, [`Params`](crate::Params), outside of any tape. A layer is a handle on some of them and a
+//! function of (parameters, input). A training step binds the store to a fresh tape, takes the gradient of a loss, and
+//! hands it to an optimiser.
+//!
+//! ```
+//! use rand::SeedableRng;
+//! use raygrad_autograd::{Activation, Adam, AdamConfig, Init, Linear, Optimizer, Params, Pass, Schedule, Sequential};
+//! use raygrad_autograd::{Tape, Tensor};
+//!
+//! let mut rng = rand::rngs::StdRng::seed_from_u64(1);
+//! let mut params = Params::<f32>::new();
+//! let hidden = Linear::new(&mut params, "hidden", [1, 24], Activation::Identity, Init::Glorot, &mut rng);
+//! let out = Linear::new(&mut params, "out", [24, 1], Activation::Identity, Init::Glorot, &mut rng);
+//! let model = Sequential::new().then(hidden).map(|x| x.tanh()).then(out);
+//!
+//! let x = Tensor::from_fn(&[64, 1], |i| i as f32 / 16.0 - 2.0);
+//! let wave = Tensor::from_fn(&[64, 1], |i| (1.5 * x.as_slice()[i]).sin());
+//! let mut adam = Adam::new(AdamConfig::default());
+//! let schedule = Schedule::Cosine { from: 3e-2, to: 0.0, warmup: 0.1 };
+//! let mut last = f32::NAN;
+//! for step in 0..400 {
+//!     let tape = Tape::new();
+//!     let bound = params.bind(&tape);
+//!     let y = model.forward(&bound, &tape.constant(x.clone()), Pass::Train(step));
+//!     let loss = y.mse_loss(&tape.constant(wave.clone()));
+//!     last = loss.item();
+//!     adam.update(&mut params, &loss.grad_once(&bound.vars()), schedule.at_step(step, 400));
+//! }
+//! assert!(last < 1e-3, "{last}");
+//! ```
+//!
+//! `grad_once` frees what it has used as it goes; a tape made with [`Tape::with_pool`](crate::Tape::with_pool) gets its
+//! buffers from the last step, so that a running loop allocates nothing of tensor size. A large model's activations
+//! need not all be kept: [`Tape::checkpoint`](crate::Tape::checkpoint) computes a part again when its gradient is due.
+//! [`Params`](crate::Params) reads and writes safetensors and NumPy's npz.

@@ -1,0 +1,100 @@
+//! Newton's method for a function of many variables without ever writing down its Hessian: conjugate gradients need only
+//! products with it, which cost a few gradients each. Rosenbrock's curved valley, where gradient descent crawls.
+//!
+//! ```text
+//! cargo run --release --example 07_newton
+//! ```
+
+use raygrad::autograd::{Tape, Tensor, Var, derivatives::value_and_grad};
+
+const DIMENSIONS: usize = 100;
+
+/// The sum of `100 (x[i + 1] - x[i]^2)^2 + (1 - x[i])^2`; 0 where all are 1.
+fn rosenbrock<'t>(x: &Var<'t, f64>) -> Var<'t, f64> {
+    let (head, tail) = (x.slice(0, 0, DIMENSIONS - 1), x.slice(0, 1, DIMENSIONS - 1));
+    (100.0 * (tail - head.square()).square() + (1.0 - head).square()).sum()
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// `a + h b`.
+fn moved(a: &[f64], h: f64, b: &[f64]) -> Vec<f64> {
+    a.iter().zip(b).map(|(a, b)| a + h * b).collect()
+}
+
+/// Value, gradient, Newton's direction `-H^-1 g` as far as the curvature along the way is positive, and the number of
+/// products with the Hessian that it took.
+fn newton(x: &[f64]) -> (f64, Vec<f64>, Vec<f64>, usize) {
+    let tape = Tape::new();
+    let x = tape.leaf(Tensor::from_vec(&[x.len()], x.to_vec()));
+    let y = rosenbrock(&x);
+    // Recorded once; a product with the Hessian is the gradient of its gradient along a direction.
+    let slope = y.grad_graph(&[&x]).remove(0);
+    let g = slope.value().as_slice().to_vec();
+    let mut solution = vec![0.0; g.len()];
+    let mut residual: Vec<f64> = g.iter().map(|g| -g).collect();
+    let mut direction = residual.clone();
+    // Loose far away, tight close to the minimum: fast convergence in the end.
+    let size = dot(&g, &g).sqrt();
+    let enough = size * size.sqrt().min(0.1);
+    for products in 0..2 * g.len() {
+        let square = dot(&residual, &residual);
+        if square.sqrt() <= enough {
+            return (y.item(), g, solution, products);
+        }
+        let along = Tensor::from_vec(&[g.len()], direction.clone());
+        let image = slope.grad_with(&along, &[&x]).remove(0);
+        let curvature = dot(&direction, image.as_slice());
+        if curvature <= 0.0 {
+            // Downhill without end: go along what there is, or straight down.
+            let solution = if products == 0 { direction } else { solution };
+            return (y.item(), g, solution, products + 1);
+        }
+        let step = square / curvature;
+        solution = moved(&solution, step, &direction);
+        residual = moved(&residual, -step, image.as_slice());
+        direction = moved(&residual, dot(&residual, &residual) / square, &direction);
+    }
+    (y.item(), g, solution, 2 * g.len())
+}
+
+fn value(x: &[f64]) -> f64 {
+    let tape = Tape::new();
+    rosenbrock(&tape.constant(Tensor::from_vec(&[x.len()], x.to_vec()))).item()
+}
+
+fn main() {
+    let start: Vec<f64> = (0..DIMENSIONS).map(|i| if i % 2 == 0 { -1.2 } else { 1.0 }).collect();
+    println!("Rosenbrock's function of {DIMENSIONS} variables");
+    let (mut x, mut products) = (start.clone(), 0);
+    for iteration in 0..200 {
+        let (y, g, direction, used) = newton(&x);
+        products += used;
+        let size = dot(&g, &g).sqrt();
+        if iteration % 10 == 0 || size < 1e-6 {
+            println!("  iteration {iteration:3}: value {y:9.2e}, gradient {size:8.1e}, {products} Hessian products");
+        }
+        if size < 1e-10 {
+            break;
+        }
+        // Half as far until the value falls enough (Armijo).
+        let slope = dot(&g, &direction);
+        let mut h = 1.0;
+        while value(&moved(&x, h, &direction)) > y + 1e-4 * h * slope && h > 1e-12 {
+            h *= 0.5;
+        }
+        x = moved(&x, h, &direction);
+    }
+    let farthest = x.iter().map(|x| (x - 1.0).abs()).fold(0.0, f64::max);
+    println!("  all variables are 1 within {farthest:.0e}");
+
+    let mut x = start;
+    let steps = 20_000;
+    for _ in 0..steps {
+        let (_, g) = value_and_grad(|x| rosenbrock(&x[0]), &[Tensor::from_vec(&[x.len()], x.clone())]);
+        x = moved(&x, -5e-4, g[0].as_slice());
+    }
+    println!("Gradient descent for comparison, {steps} steps: value {:.2e}", value(&x));
+}
