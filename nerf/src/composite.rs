@@ -1,5 +1,6 @@
 //! Volume rendering: what arrives at the eye from the samples along a ray.
 
+use crate::{Error, Result};
 use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
 
@@ -36,15 +37,29 @@ struct Light<T: Scalar> {
 }
 
 impl<T: Scalar> Composite<T> {
-    /// For densities of samples that stand for intervals of length `delta` `[samples]`.
+    /// For densities of samples that stand for intervals of length `delta` `[samples]`. The operation panics where a
+    /// density is negative; ask [`check`](Self::check) first if one may be.
     ///
     /// # Panics
-    /// If an interval is negative or NaN, or there is not one for each row of the segments.
+    /// As [`try_new`](Self::try_new).
     #[track_caller]
     pub fn new(delta: Tensor<T>, segments: Segments) -> Self {
-        assert_eq!(delta.shape(), [segments.rows()], "one interval for each sample");
-        assert!(delta.as_slice().iter().all(|&delta| delta >= T::ZERO), "intervals are at least 0");
-        Composite { delta, segments, log_density: false }
+        Composite::try_new(delta, segments).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// As [`new`](Self::new).
+    ///
+    /// # Errors
+    /// If an interval is negative or NaN, or there is not one for each row of the segments.
+    pub fn try_new(delta: Tensor<T>, segments: Segments) -> Result<Self> {
+        if delta.shape() != [segments.rows()] {
+            let what = format!("has shape {:?}: one interval for each of {} samples", delta.shape(), segments.rows());
+            return Err(Error::setting("delta", what));
+        }
+        match delta.as_slice().iter().position(|&delta| !(delta >= T::ZERO)) {
+            Some(i) => Err(Error::setting(format!("delta[{i}]"), format!("is {}; use 0 or more", delta.as_slice()[i]))),
+            None => Ok(Composite { delta, segments, log_density: false }),
+        }
     }
 
     /// The same for logarithms z of densities, `sigma = e^z`. The exponential is part of the operation, whose gradient
@@ -54,8 +69,27 @@ impl<T: Scalar> Composite<T> {
         Composite { log_density: true, ..Composite::new(delta, segments) }
     }
 
+    /// Whether every density is one: at least 0, or NaN, which is somebody else's fault and passes through. Any number is
+    /// the logarithm of one.
+    ///
+    /// # Errors
+    /// If a density is negative; the error says which.
+    pub fn check(&self, density: &Tensor<T>) -> Result<()> {
+        match density.as_slice().iter().position(|&sigma| sigma < T::ZERO) {
+            Some(i) if !self.log_density => {
+                let what =
+                    format!("is {}; a density is at least 0: end the network with a softplus", density.as_slice()[i]);
+                Err(Error::setting(format!("density[{i}]"), what))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// The optical depth of each sample's interval, `[samples]`, for densities `[samples]`.
     pub(crate) fn optical_depth(&self, density: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        if let Err(error) = self.check(density) {
+            panic!("{error}");
+        }
         let most = T::from_f64(MOST_LOG_DENSITY);
         if self.log_density {
             map(
@@ -101,6 +135,38 @@ impl<T: Scalar> Composite<T> {
         Light { depth, transmittance, alpha }
     }
 
+    /// Optical depths out of plain operations.
+    fn depth<'t>(&self, density: &Var<'t, T>) -> Var<'t, T> {
+        let sigma = if self.log_density { density.exp() } else { density.clone() };
+        let constant = |f: &dyn Fn(T, T) -> T| {
+            let pairs = self.delta.as_slice().iter().zip(sigma.value().as_slice());
+            let values = pairs.map(|(&delta, &sigma)| f(delta, sigma)).collect();
+            sigma.tape().constant(Tensor::from_vec(self.delta.shape(), values))
+        };
+        // An infinite interval adds a constant: nothing to no density, and infinity to any.
+        let finite = constant(&|delta, _| if delta.is_finite() { delta } else { T::ZERO });
+        if self.delta.is_finite() {
+            return sigma * finite;
+        }
+        let infinite = constant(&|delta, sigma| if delta.is_finite() || sigma == T::ZERO { T::ZERO } else { delta });
+        sigma * finite + infinite
+    }
+
+    fn weights_from<'t>(&self, depth: &Var<'t, T>) -> Var<'t, T> {
+        let transmittance = (-depth.segment_cumsum(&self.segments, true)).exp();
+        transmittance * -(-depth).expm1()
+    }
+
+    /// The weight `w_i` of each sample, `[samples]`, out of plain operations: for losses of the weights themselves, such
+    /// as [`Distortion`](crate::Distortion).
+    ///
+    /// # Panics
+    /// If there is not one density for each sample.
+    #[track_caller]
+    pub fn weights<'t>(&self, density: &Var<'t, T>) -> Var<'t, T> {
+        self.weights_from(&self.depth(density))
+    }
+
     /// The transmittance `T_i` in front of each sample and its weight `w_i`, each `[samples]`.
     ///
     /// # Panics
@@ -123,7 +189,7 @@ impl<T: Scalar> Op<T> for Composite<T> {
         "composite"
     }
 
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+    fn shape(&self, x: &[&[usize]]) -> std::result::Result<Shape, ShapeError> {
         let samples = self.segments.rows();
         match (x[0], x[1]) {
             (&[density], &[features, channels]) if density == samples && features == samples => {
@@ -210,12 +276,8 @@ impl<T: Scalar> Op<T> for Composite<T> {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let features = &x[1];
-        let sigma = if self.log_density { x[0].exp() } else { x[0].clone() };
-        let depth = &sigma * sigma.tape().constant(self.delta.clone());
-        let transmittance = (-depth.segment_cumsum(&self.segments, true)).exp();
-        let weights = transmittance * -(-&depth).expm1();
-        let weighted = features * weights.reshape(&[self.segments.rows(), 1]);
+        let (features, depth) = (&x[1], self.depth(&x[0]));
+        let weighted = features * self.weights_from(&depth).reshape(&[self.segments.rows(), 1]);
         let left = (-depth.segment_sum(&self.segments)).exp().reshape(&[self.segments.len(), 1]);
         Some(Var::concat(&[&weighted.segment_sum(&self.segments), &left], 1))
     }

@@ -1,6 +1,6 @@
 //! The geometry of a hash grid: levels, resolutions and rows.
 
-use crate::config::check_range;
+use crate::config::{check_parameters, check_range};
 use crate::{Error, Result};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -122,6 +122,7 @@ impl HashGrid {
             HashLevel { resolution: resolution as u32, hashed: corners > most, rows: first - count..first }
         };
         let levels: Arc<[HashLevel]> = (0..config.levels).map(level).collect();
+        check_parameters(first * config.features)?;
         Ok(HashGrid { levels, features: config.features, shape: [first, config.features] })
     }
 
