@@ -5,7 +5,8 @@
 mod animation;
 mod cameras;
 mod eval;
-
+#[cfg(test)]
+mod fuzz;
 mod interrupt;
 mod output;
 mod parse;

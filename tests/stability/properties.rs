@@ -67,7 +67,7 @@ fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: boo
     let grads = out.slice(1, 0, 1).sum().grad(&[&density, &features]);
     prop_assert!(grads.iter().all(Tensor::is_finite), "{grads:?}");
     // And by way of plain operations, once more differentiated, where nothing overflows in truth.
-    if delta.iter().all(|&d| d < 1e3) && sigma.iter().all(|&s| s < 50.0) {
+    if delta.iter().all(|&d| d < 1e3) && sigma.iter().all(|&s| s < 20.0) {
         let first = op().weights(&density).sum().grad_graph(&[&density]).remove(0);
         prop_assert!(first.value().is_finite());
         prop_assert!(first.sum().grad(&[&density])[0].is_finite());
@@ -82,12 +82,12 @@ fn activations<T: Scalar>(a: f64, b: f64) -> Outcome {
     let x = tape.leaf(vector::<T>(&[low, high, -low]));
     let (s, p) = (x.sigmoid(), x.softplus());
     let (s_values, p_values) = (numbers(s.value()), numbers(p.value()));
-    prop_assert!(s_values[0] <= s_values[1] && s_values.iter().all(|s| (0.0..=1.0).contains(s)));
-    prop_assert!((s_values[0] + s_values[2] - 1.0).abs() <= T::EPSILON);
-    prop_assert!(
-        p_values[0] <= p_values[1] * (1.0 + T::EPSILON)
-            && p_values.iter().zip([low, high, -low]).all(|(p, x)| *p >= x.max(0.0))
-    );
+    // Two units in the last place for the functions' own rounding.
+    let (more, less) = (1.0 + 2.0 * T::EPSILON, 1.0 - 2.0 * T::EPSILON);
+    prop_assert!(s_values[0] <= s_values[1] * more && s_values.iter().all(|s| (0.0..=1.0).contains(s)));
+    prop_assert!((s_values[0] + s_values[2] - 1.0).abs() <= 2.0 * T::EPSILON);
+    prop_assert!(p_values[0] <= p_values[1] * more);
+    prop_assert!(p_values.iter().zip([low, high, -low]).all(|(p, x)| *p >= x.max(0.0) * less));
     for y in [s, p, x.log_sigmoid(), x.tanh(), x.silu(), x.gelu(), x.relu()] {
         finite("slope", &y.sum().grad(&[&x])[0]);
     }
@@ -185,7 +185,7 @@ fn grid_cells<T: Scalar>(points: &[[f64; 3]]) -> Outcome {
 fn adam_steps<T: Scalar>(gradients: &[f64], table: bool) -> Outcome {
     let config = AdamConfig::default();
     let config = if table { AdamConfig { beta2: 0.99, epsilon: 1e-15, ..config } } else { config };
-    let bound = f64::max(1.0, (1.0 - config.beta1) / (1.0 - config.beta2).sqrt());
+    let bound = crate::optimiser::bound(&config);
     let mut adam = Adam::<T>::new(config);
     let mut x = [Tensor::zeros(&[1])];
     for &g in gradients {

@@ -94,6 +94,9 @@ smallest = mpf(2) ** -126
 row("steps after which .9^k is denormal in f32", mp.ceil(log(smallest) / log(mpf(".9"))), "828")
 row("bound of Adam's step / lr for the default betas", (1 - mpf(".9")) / sqrt(1 - mpf(".999")))
 row("bound of Adam's step / lr for the table's betas", (1 - mpf(".9")) / sqrt(1 - mpf(".99")))
+for name, beta2 in [("default", mpf(".999")), ("table's", mpf(".99"))]:
+    most = (1 - mpf(".9")) / sqrt((1 - beta2) * (1 - mpf(".81") / beta2))
+    row(f"bound of Adam's step / lr for the {name} betas, by Cauchy and Schwarz", most, {"default": "3.16", "table's": "1"}[name])
 # One late gradient after many steps without: m decays from .1 g, v from .001 g^2, both corrections are 1.
 late = sum(mpf(".1") * mpf(".9") ** k / sqrt(mpf(".001") * mpf(".999") ** k) for k in range(5000))
 row("way / lr after one late gradient, dense Adam in all", late)
