@@ -246,25 +246,29 @@ impl<T: Scalar> Op<T> for Composite<T> {
         let (passed, delta) = (passed.as_slice(), self.delta.as_slice());
         let (mut d_density, mut d_features) = (pool.tensor(density.shape()), pool.tensor(features.shape()));
         let (d_density_out, d_features_out) = (d_density.as_mut_slice(), d_features.as_mut_slice());
-        let mut behind = vec![T::ZERO; channels + 1];
+        // In f64, so that the light from behind keeps its digits on rays of any number of samples.
+        let mut behind = vec![0.0_f64; channels + 1];
         for (ray, rows) in self.segments.ranges().enumerate() {
             let g = &cx.g().value().as_slice()[ray * (channels + 1)..(ray + 1) * (channels + 1)];
             // Behind the last sample there are no features, and all that is left of the light.
-            behind.fill(T::ZERO);
-            behind[channels] = T::ONE;
+            behind.fill(0.0);
+            behind[channels] = 1.0;
             for i in rows.rev() {
                 let weight = transmittance[i] * alpha[i];
-                let mut difference = -(g[channels] * behind[channels]);
+                let blocked = alpha[i].to_f64();
+                // What passes: of thin samples 1 - alpha has all digits and adds up with alpha, of thick ones e^-x has.
+                let passes = if blocked < 0.5 { 1.0 - blocked } else { passed[i].to_f64() };
+                let mut difference = -(g[channels].to_f64() * behind[channels]);
                 for c in 0..channels {
-                    let feature = features.as_slice()[i * channels + c];
+                    let feature = features.as_slice()[i * channels + c].to_f64();
                     d_features_out[i * channels + c] = weight * g[c];
-                    difference += g[c] * (feature - behind[c]);
-                    behind[c] = alpha[i] * feature + passed[i] * behind[c];
+                    difference += g[c].to_f64() * (feature - behind[c]);
+                    behind[c] = blocked * feature + passes * behind[c];
                 }
-                behind[channels] *= passed[i];
+                behind[channels] *= passes;
                 // dx/dz = x for x = e^z delta, and dx/dsigma = delta.
                 let slope = if self.log_density { depth[i] } else { delta[i] };
-                let d_depth = transmittance[i] * passed[i] * difference;
+                let d_depth = transmittance[i] * passed[i] * T::from_f64(difference);
                 d_density_out[i] = if slope.is_finite() { slope * d_depth } else { T::ZERO };
             }
         }

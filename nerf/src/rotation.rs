@@ -2,45 +2,38 @@
 
 use raygrad_autograd::{Entry, Real, Scalar, Shape, Tensor, Var};
 
-/// `sin(r) / r` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
+/// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
 ///
 /// Written with [`Real`], so that with variables it has derivatives of every order. Each branch sees an argument that it
 /// is good for, since a gradient of 0 times infinity would be NaN.
 #[inline(always)]
-fn sinc_of_root<E: Real>(s: E) -> E {
-    /// `(-1)^k / (2k + 1)!`: beyond s = 1 the first term left out is 2e-20.
-    const SERIES: [f64; 11] = [
-        1.0,
-        -1.0 / 6.0,
-        1.0 / 120.0,
-        -1.0 / 5_040.0,
-        1.0 / 362_880.0,
-        -1.0 / 39_916_800.0,
-        1.0 / 6_227_020_800.0,
-        -1.0 / 1_307_674_368_000.0,
-        1.0 / 355_687_428_096_000.0,
-        -1.0 / 121_645_100_408_832_000.0,
-        1.0 / 51_090_942_171_709_440_000.0,
-    ];
+fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
     let one = s.like(1.0);
     let excess = s.clone() - one.clone();
     let (near, far) = (excess.if_positive(one.clone(), s.clone()), excess.if_positive(s.clone(), one));
-    let series = SERIES.iter().rev().fold(s.like(0.0), |sum, &c| sum * near.clone() + s.like(c));
+    // Up to s = 1 the first terms left out are below 1e-20. `1 - s / (n (n + 1)) (1 - s / ((n + 2) (n + 3)) (..))`.
+    let series = |first: u32| {
+        (0..11).rev().fold(s.like(1.0), |sum, k| {
+            let n = f64::from(first + 2 * k);
+            s.like(1.0) - s.like(1.0 / (n * (n + 1.0))) * near.clone() * sum
+        })
+    };
     let root = far.sqrt();
-    let closed = root.clone().sin() / root;
-    excess.if_positive(closed, series)
+    let sinc = root.clone().sin() / root.clone();
+    [excess.if_positive(sinc, series(2)), excess.if_positive(root.cos(), series(1))]
 }
 
 /// The matrix, row by row, of the rotation by `|w|` radians about `w` (Rodrigues): `1 + a K + b K^2` with the matrix K of
-/// `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`, for which `2 sin^2(|w|/2) / |w|^2` has all its digits.
+/// `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`. Both come from half the angle, as for a quaternion: `b` as
+/// `2 sin^2(|w|/2) / |w|^2` has all its digits, and rounding leaves the matrix a rotation, also near half a turn.
 #[inline(always)]
 pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
     let square = |e: &E| e.clone() * e.clone();
     let [xx, yy, zz] = [square(&x), square(&y), square(&z)];
     let s = xx.clone() + yy.clone() + zz.clone();
-    let half = sinc_of_root(s.like(0.25) * s.clone());
-    let b = s.like(0.5) * half.clone() * half;
-    let a = sinc_of_root(s.clone());
+    let [half, cos] = sinc_and_cos_of_root(s.like(0.25) * s.clone());
+    let b = s.like(0.5) * half.clone() * half.clone();
+    let a = half * cos;
     let one = s.like(1.0);
     let across = |p: &E, q: &E| b.clone() * (p.clone() * q.clone());
     let [ax, ay, az] = [a.clone() * x.clone(), a.clone() * y.clone(), a * z.clone()];

@@ -85,9 +85,10 @@ fn many_rows_to_few_places<T: Scalar>() {
     }
 }
 
-/// As many shares as a training step has for one row of a hash table, whose sums are kept in the table's own precision.
+/// As many shares as a slot of a training step has samples, all for one row of a table: such sums are kept in the table's
+/// own precision.
 fn shares_of_one_row_of_a_table<T: Scalar>() {
-    let n = 4096;
+    let n = 2048;
     let mut random = noise(23);
     for signed in [false, true] {
         let shares: Vec<f64> = (0..n).map(|_| round::<T>(if signed { random() - 0.5 } else { random() })).collect();
