@@ -3,9 +3,9 @@
 use crate::support::*;
 use raygrad::autograd::{Bound, Scalar, Segments, Tape, Tensor, Var};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::marching::composite_visible;
 use raygrad::nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
 use raygrad::nerf::sampler::Jitter;
+use raygrad::nerf::visible::composite_visible;
 use raygrad::nerf::{Camera, Config, Density, Extent, Field, Model, Preset, SamplerConfig, Samples};
 use std::sync::Arc;
 
@@ -47,7 +47,7 @@ fn training_ends_rays_within_the_bound<T: Scalar>() {
             let samples = Samples::new(&rays, Segments::uniform(1, n), t, vector(&vec![delta; n]), tape.pool());
             let params = Bound::from_vars(vec![]);
             let fog = Fog { sigma: 1.0, white_behind };
-            let all = composite_visible(&fog, &params, &samples, -1.0, false, &tape);
+            let all = composite_visible(&fog, &params, &samples, 0.0, false, &tape);
             let some = composite_visible(&fog, &params, &samples, eps, false, &tape);
             assert_eq!(all.kept, n);
             assert!(some.kept <= n && (eps == 0.0 || some.kept.abs_diff(steps) <= 1), "{eps}: {} kept", some.kept);
