@@ -57,7 +57,8 @@ fn newton(x: &[f64]) -> (f64, Vec<f64>, Vec<f64>, usize) {
         residual = moved(&residual, -step, image.as_slice());
         direction = moved(&residual, dot(&residual, &residual) / square, &direction);
     }
-    (y.item(), g, solution, 2 * g.len())
+    let products = 2 * g.len();
+    (y.item(), g, solution, products)
 }
 
 fn value(x: &[f64]) -> f64 {

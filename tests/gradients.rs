@@ -29,8 +29,9 @@ fn operations_in(folder: &Path, names: &mut BTreeSet<String>) {
             continue;
         }
         let text = std::fs::read_to_string(&path).unwrap();
-        let bodies = text.split("fn name(&self) -> &'static str {").skip(1);
-        names.extend(bodies.filter_map(|body| Some(body.split('"').nth(1)?.to_string())));
+        for start in ["fn name(&self) -> &'static str {", "const NAME: &'static str =", "Entry::function("] {
+            names.extend(text.split(start).skip(1).filter_map(|body| Some(body.split('"').nth(1)?.to_string())));
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! An optimiser for tables of which a step touches few rows: embeddings, hash grids.
 
+use crate::optim::{TINY, TINY_SQUARE, limited};
 use crate::{AdamConfig, RowSums};
 use raygrad_tensor::{Scalar, simd};
 use rayon::prelude::*;
@@ -90,12 +91,12 @@ impl<T: Scalar> Rule<T> {
     /// The new value and moments of an element with gradient `g`.
     #[inline(always)]
     fn element(&self, [x, g, m, v]: [T; 4], [rate, epsilon]: [T; 2]) -> [T; 3] {
-        let tiny = T::from_f64(1e-30);
+        let (tiny, tiny_square) = (T::from_f64(TINY), T::from_f64(TINY_SQUARE));
+        let g = limited(g);
         let m = self.beta[0] * m + self.rest[0] * g;
-        // The square of a large finite gradient overflows to infinity, which makes the step 0.
         let v = self.beta[1] * v + self.rest[1] * (g * g);
         let m = if m > tiny || m < -tiny { m } else { T::ZERO };
-        let v = if v > tiny { v } else { T::ZERO };
+        let v = if v > tiny_square { v } else { T::ZERO };
         [x - rate * m / (v.sqrt() + epsilon), m, v]
     }
 }

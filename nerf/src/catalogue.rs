@@ -9,5 +9,9 @@ pub fn catalogue() -> Vec<Entry> {
     entries.extend(crate::quadrature::entries());
     entries.extend(crate::hash_grid::entries());
     entries.extend(crate::spherical::entries());
+    entries.extend(crate::color_space::entries());
+    entries.extend(crate::contraction::entries());
+    entries.extend(crate::distortion::entries());
+    entries.extend(crate::rotation::entries());
     entries
 }

@@ -1,5 +1,6 @@
 //! Volume rendering: what arrives at the eye from the samples along a ray.
 
+use crate::{Error, Result};
 use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
 
@@ -36,15 +37,29 @@ struct Light<T: Scalar> {
 }
 
 impl<T: Scalar> Composite<T> {
-    /// For densities of samples that stand for intervals of length `delta` `[samples]`.
+    /// For densities of samples that stand for intervals of length `delta` `[samples]`. The operation panics where a
+    /// density is negative; ask [`check`](Self::check) first if one may be.
     ///
     /// # Panics
-    /// If an interval is negative or NaN, or there is not one for each row of the segments.
+    /// As [`try_new`](Self::try_new).
     #[track_caller]
     pub fn new(delta: Tensor<T>, segments: Segments) -> Self {
-        assert_eq!(delta.shape(), [segments.rows()], "one interval for each sample");
-        assert!(delta.as_slice().iter().all(|&delta| delta >= T::ZERO), "intervals are at least 0");
-        Composite { delta, segments, log_density: false }
+        Composite::try_new(delta, segments).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// As [`new`](Self::new).
+    ///
+    /// # Errors
+    /// If an interval is negative or NaN, or there is not one for each row of the segments.
+    pub fn try_new(delta: Tensor<T>, segments: Segments) -> Result<Self> {
+        if delta.shape() != [segments.rows()] {
+            let what = format!("has shape {:?}: one interval for each of {} samples", delta.shape(), segments.rows());
+            return Err(Error::setting("delta", what));
+        }
+        match delta.as_slice().iter().position(|&delta| !(delta >= T::ZERO)) {
+            Some(i) => Err(Error::setting(format!("delta[{i}]"), format!("is {}; use 0 or more", delta.as_slice()[i]))),
+            None => Ok(Composite { delta, segments, log_density: false }),
+        }
     }
 
     /// The same for logarithms z of densities, `sigma = e^z`. The exponential is part of the operation, whose gradient
@@ -54,8 +69,27 @@ impl<T: Scalar> Composite<T> {
         Composite { log_density: true, ..Composite::new(delta, segments) }
     }
 
+    /// Whether every density is one: at least 0, or NaN, which is somebody else's fault and passes through. Any number is
+    /// the logarithm of one.
+    ///
+    /// # Errors
+    /// If a density is negative; the error says which.
+    pub fn check(&self, density: &Tensor<T>) -> Result<()> {
+        let density = density.as_slice();
+        match density.iter().position(|&sigma| !self.log_density && sigma < T::ZERO) {
+            Some(i) => {
+                let what = format!("is {}; a density is at least 0: end the network with a softplus", density[i]);
+                Err(Error::setting(format!("density[{i}]"), what))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// The optical depth of each sample's interval, `[samples]`, for densities `[samples]`.
     pub(crate) fn optical_depth(&self, density: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+        if let Err(error) = self.check(density) {
+            panic!("{error}");
+        }
         let most = T::from_f64(MOST_LOG_DENSITY);
         if self.log_density {
             map(
@@ -101,6 +135,38 @@ impl<T: Scalar> Composite<T> {
         Light { depth, transmittance, alpha }
     }
 
+    /// Optical depths out of plain operations.
+    fn depth<'t>(&self, density: &Var<'t, T>) -> Var<'t, T> {
+        let sigma = if self.log_density { density.exp() } else { density.clone() };
+        let constant = |f: &dyn Fn(T, T) -> T| {
+            let pairs = self.delta.as_slice().iter().zip(sigma.value().as_slice());
+            let values = pairs.map(|(&delta, &sigma)| f(delta, sigma)).collect();
+            sigma.tape().constant(Tensor::from_vec(self.delta.shape(), values))
+        };
+        // An infinite interval adds a constant: nothing to no density, and infinity to any.
+        let finite = constant(&|delta, _| if delta.is_finite() { delta } else { T::ZERO });
+        if self.delta.is_finite() {
+            return sigma * finite;
+        }
+        let infinite = constant(&|delta, sigma| if delta.is_finite() || sigma == T::ZERO { T::ZERO } else { delta });
+        sigma * finite + infinite
+    }
+
+    fn weights_from<'t>(&self, depth: &Var<'t, T>) -> Var<'t, T> {
+        let transmittance = (-depth.segment_cumsum(&self.segments, true)).exp();
+        transmittance * -(-depth).expm1()
+    }
+
+    /// The weight `w_i` of each sample, `[samples]`, out of plain operations: for losses of the weights themselves, such
+    /// as [`Distortion`](crate::Distortion).
+    ///
+    /// # Panics
+    /// If there is not one density for each sample.
+    #[track_caller]
+    pub fn weights<'t>(&self, density: &Var<'t, T>) -> Var<'t, T> {
+        self.weights_from(&self.depth(density))
+    }
+
     /// The transmittance `T_i` in front of each sample and its weight `w_i`, each `[samples]`.
     ///
     /// # Panics
@@ -139,25 +205,29 @@ impl<T: Scalar> Composite<T> {
         let (passed, delta) = (passed.as_slice(), self.delta.as_slice());
         let (mut d_density, mut d_features) = (pool.tensor(density.shape()), pool.tensor(features.shape()));
         let (d_density_out, d_features_out) = (d_density.as_mut_slice(), d_features.as_mut_slice());
-        let mut behind = vec![T::ZERO; channels + 1];
-        for (ray, rows) in self.segments.ranges().enumerate() {
-            let g = &g.as_slice()[ray * (channels + 1)..(ray + 1) * (channels + 1)];
+        let features = features.as_slice();
+        // In f64, so that the light from behind keeps its digits on rays of any number of samples.
+        let mut behind = vec![0.0_f64; channels + 1];
+        for (g, rows) in g.as_slice().chunks_exact(channels + 1).zip(self.segments.ranges()) {
             // Behind the last sample there are no features, and all that is left of the light.
-            behind.fill(T::ZERO);
-            behind[channels] = T::ONE;
+            behind.fill(0.0);
+            behind[channels] = 1.0;
             for i in rows.rev() {
                 let weight = transmittance[i] * alpha[i];
-                let mut difference = -(g[channels] * behind[channels]);
+                let blocked = alpha[i].to_f64();
+                // What passes: of thin samples 1 - alpha has all digits and adds up with alpha, of thick ones e^-x has.
+                let passes = if blocked < 0.5 { 1.0 - blocked } else { passed[i].to_f64() };
+                let mut difference = -(g[channels].to_f64() * behind[channels]);
                 for c in 0..channels {
-                    let feature = features.as_slice()[i * channels + c];
+                    let feature = features[i * channels + c].to_f64();
                     d_features_out[i * channels + c] = weight * g[c];
-                    difference += g[c] * (feature - behind[c]);
-                    behind[c] = alpha[i] * feature + passed[i] * behind[c];
+                    difference += g[c].to_f64() * (feature - behind[c]);
+                    behind[c] = blocked * feature + passes * behind[c];
                 }
-                behind[channels] *= passed[i];
+                behind[channels] *= passes;
                 // dx/dz = x for x = e^z delta, and dx/dsigma = delta.
                 let slope = if self.log_density { depth[i] } else { delta[i] };
-                let d_depth = transmittance[i] * passed[i] * difference;
+                let d_depth = transmittance[i] * passed[i] * T::from_f64(difference);
                 d_density_out[i] = if slope.is_finite() { slope * d_depth } else { T::ZERO };
             }
         }
@@ -170,7 +240,7 @@ impl<T: Scalar> Op<T> for Composite<T> {
         "composite"
     }
 
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+    fn shape(&self, x: &[&[usize]]) -> std::result::Result<Shape, ShapeError> {
         let samples = self.segments.rows();
         match (x[0], x[1]) {
             (&[density], &[features, channels]) if density == samples && features == samples => {
@@ -220,12 +290,8 @@ impl<T: Scalar> Op<T> for Composite<T> {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let features = &x[1];
-        let sigma = if self.log_density { x[0].exp() } else { x[0].clone() };
-        let depth = &sigma * sigma.tape().constant(self.delta.clone());
-        let transmittance = (-depth.segment_cumsum(&self.segments, true)).exp();
-        let weights = transmittance * -(-&depth).expm1();
-        let weighted = features * weights.reshape(&[self.segments.rows(), 1]);
+        let (features, depth) = (&x[1], self.depth(&x[0]));
+        let weighted = features * self.weights_from(&depth).reshape(&[self.segments.rows(), 1]);
         let left = (-depth.segment_sum(&self.segments)).exp().reshape(&[self.segments.len(), 1]);
         Some(Var::concat(&[&weighted.segment_sum(&self.segments), &left], 1))
     }

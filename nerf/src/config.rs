@@ -127,7 +127,7 @@ impl Config {
                     direction_degree: 4,
                 }),
                 sampler: SamplerConfig::Marching(MarchingConfig::default()),
-                schedule: Schedule::Exponential { from: 1e-2, to: 5e-4, warmup: 0.005 },
+                schedule: Schedule::Linear { from: 2e-2, to: 0.0, warmup: 0.005 },
                 adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
                 background: Background::Random,
                 ..classic
@@ -213,4 +213,14 @@ pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, lo
         return Ok(());
     }
     Err(Error::setting(name, format!("is {value}; use {low} to {high}")))
+}
+
+/// An error if a field would have more parameters than fit the memory of any machine that this runs on: an allocation that
+/// fails ends the program.
+pub(crate) fn check_parameters(count: usize) -> Result<()> {
+    const MOST: usize = 1 << 33;
+    if count <= MOST {
+        return Ok(());
+    }
+    Err(Error::setting("field", format!("has {count} parameters; use smaller numbers, for at most {MOST} parameters")))
 }

@@ -1,6 +1,6 @@
 //! Positional encoding: sinusoids of rising frequency let a network hold fine detail.
 
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::simd;
 
 /// y = (x, sin(pi x), cos(pi x), sin(2 pi x), cos(2 pi x), .. cos(2^(levels-1) pi x)), each for all channels of x in turn
@@ -31,6 +31,13 @@ impl PositionalEncoding {
     }
 }
 
+/// `x - 2 round(x / 2)`, exactly: the sinusoids of all levels have the period 2. Without it `2^k x` can be infinite.
+#[inline(always)]
+fn reduce<E: Real>(x: E) -> E {
+    let turns = (x.like(0.5) * x.clone()).round();
+    x - turns.like(2.0) * turns
+}
+
 impl<T: Scalar> Op<T> for PositionalEncoding {
     fn name(&self) -> &'static str {
         "positional_encoding"
@@ -52,9 +59,19 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
             return out;
         }
         let rows = (BLOCK / channels).max(1);
-        let (mut sines, mut cosines) = (vec![T::ZERO; rows * channels], vec![T::ZERO; rows * channels]);
+        let mut buffers = [(); 3].map(|()| vec![T::ZERO; rows * channels]);
+        let [sines, cosines, reduced] = &mut buffers;
         let blocks = x[0].as_slice().chunks(rows * channels).zip(out.as_mut_slice().chunks_mut(rows * width));
         for (x, out) in blocks {
+            let reduced = &mut reduced[..x.len()];
+            simd::dispatch(
+                #[inline(always)]
+                || {
+                    for i in 0..x.len() {
+                        reduced[i] = reduce(x[i]);
+                    }
+                },
+            );
             let mut copy = |from: &[T], column: usize| {
                 for (out, from) in out.chunks_exact_mut(width).zip(from.chunks_exact(channels)) {
                     out[column..column + channels].copy_from_slice(from);
@@ -71,8 +88,8 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
                 simd::dispatch(
                     #[inline(always)]
                     || {
-                        for i in 0..x.len() {
-                            let y = frequency * x[i];
+                        for i in 0..reduced.len() {
+                            let y = frequency * reduced[i];
                             sines[i] = y.sin_pi();
                             cosines[i] = y.cos_pi();
                         }
@@ -118,9 +135,10 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let x = &x[0];
         let mut parts = if self.input { vec![x.clone()] } else { vec![] };
+        let reduced = reduce(x.clone());
         for level in 0..self.levels {
-            let y = x * (level as f64).exp2();
-            parts.extend([y.sin_pi(), y.cos_pi()]);
+            let y = &reduced * (level as f64).exp2();
+            parts.extend([Var::sin_pi(&y), Var::cos_pi(&y)]);
         }
         if parts.is_empty() {
             return Some(x.slice(x.shape().len() - 1, 0, 0));

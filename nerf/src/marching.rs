@@ -34,7 +34,7 @@ impl Default for MarchingConfig {
         MarchingConfig {
             occupancy,
             step: 1.0 / 300.0,
-            samples: 1 << 14,
+            samples: 1 << 15,
             termination: 1e-3,
             quadrature: Quadrature::Midpoint,
         }

@@ -1,6 +1,7 @@
 //! Where to sample a ray: stratified bins, and more samples where a first pass found something.
 
 use crate::rays::{Rays, Samples};
+use crate::{Error, Result};
 use rand::{Rng, RngExt};
 use raygrad_autograd::{Pool, Scalar, Segments};
 
@@ -43,7 +44,8 @@ pub fn stratified<T: Scalar>(rays: &Rays<T>, count: usize, jitter: &mut Jitter<'
 /// `coarse`) describes over the bins, merged with the coarse ones in order (Mildenhall et al. 2020, section 5.2).
 ///
 /// The density is an explicit mixture, `1 - uniform_share` of it from the weights: a ray whose weights are all zero is
-/// sampled evenly, and no region is starved. Each sample stands for the interval up to half way to its neighbours, the
+/// sampled evenly, and no region is starved. So is a ray with a weight that is negative, infinite or NaN: what made it
+/// shows in the colours. Each sample stands for the interval up to half way to its neighbours, the
 /// outermost up to near and far.
 ///
 /// # Panics
@@ -69,7 +71,9 @@ pub fn importance<T: Scalar>(
         for (i, u) in u.iter_mut().enumerate() {
             *u = (i as f64 + jitter.draw()) / count as f64;
         }
-        invert_cdf(&weights[own.clone()], uniform_share, &u, &mut drawn);
+        if invert_cdf(&weights[own.clone()], uniform_share, &u, &mut drawn).is_err() {
+            drawn.copy_from_slice(&u);
+        }
         let (t, delta) = (&mut t.as_mut_slice()[rows.clone()], &mut delta.as_mut_slice()[rows]);
         // Both lists rise, so a merge keeps the order.
         let (known, mut a, mut b) = (&coarse.t.as_slice()[own], 0, 0);
@@ -114,17 +118,28 @@ fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
 /// Inverts the cumulative distribution of a histogram of equal bins over `[0, 1]` at the rising numbers `u` in
 /// `[0, 1)`: `out[i]` rises with `u[i]` and lies in `[0, 1]`.
 ///
-/// The density is `(1 - uniform_share) weights / sum + uniform_share`, uniform where the sum is 0. Negative and NaN
-/// weights count as 0.
+/// The density is `(1 - uniform_share) weights / sum + uniform_share`, uniform where the sum is 0. Only the proportions of
+/// the weights matter, whatever their size.
+///
+/// # Errors
+/// If a weight is negative, infinite or NaN; `out` is then as it was.
 ///
 /// # Panics
 /// If there is no bin.
-pub fn invert_cdf<T: Scalar>(weights: &[T], uniform_share: f64, u: &[f64], out: &mut [f64]) {
+pub fn invert_cdf<T: Scalar>(weights: &[T], uniform_share: f64, u: &[f64], out: &mut [f64]) -> Result<()> {
     assert!(!weights.is_empty(), "a distribution over no bins");
-    let weight = |i: usize| if weights[i] > T::ZERO { weights[i].to_f64() } else { 0.0 };
+    let mut largest = 0.0_f64;
+    for (bin, weight) in weights.iter().enumerate() {
+        if !(weight.is_finite() && *weight >= T::ZERO) {
+            return Err(Error::setting(format!("weights[{bin}]"), format!("is {weight}; use 0 or more")));
+        }
+        largest = largest.max(weight.to_f64());
+    }
+    // In units of the largest, so that no sum overflows.
+    let weight = |i: usize| if largest > 0.0 { weights[i].to_f64() / largest } else { 0.0 };
     let n = weights.len() as f64;
     let total: f64 = (0..weights.len()).map(weight).sum();
-    let share = if total > 0.0 && total.is_finite() { uniform_share } else { 1.0 };
+    let share = if total > 0.0 { uniform_share } else { 1.0 };
     let mass = |i: usize| share / n + if share < 1.0 { (1.0 - share) * (weight(i) / total) } else { 0.0 };
     let (mut bin, mut below) = (0, 0.0);
     for (&u, out) in u.iter().zip(out) {
@@ -137,6 +152,7 @@ pub fn invert_cdf<T: Scalar>(weights: &[T], uniform_share: f64, u: &[f64], out: 
         let inside = if mass > 0.0 { ((u - below) / mass).clamp(0.0, 1.0) } else { 0.5 };
         *out = (bin as f64 + inside) / n;
     }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -178,19 +194,21 @@ mod tests {
     fn zero_weights_are_uniform_and_one_hot_stays_in_its_bin() {
         let u: Vec<f64> = (0..100).map(|i| (i as f64 + 0.5) / 100.0).collect();
         let mut out = vec![0.0; 100];
-        invert_cdf(&[0.0_f32; 7], 0.01, &u, &mut out);
+        invert_cdf(&[0.0_f32; 7], 0.01, &u, &mut out).unwrap();
         assert!(out.iter().zip(&u).all(|(x, u)| (x - u).abs() < 1e-12));
         for scale in [1.0, 1e-30_f32] {
             let mut weights = [0.0; 10];
             weights[3] = scale;
-            invert_cdf(&weights, 0.0, &u, &mut out);
+            invert_cdf(&weights, 0.0, &u, &mut out).unwrap();
             assert!(out.iter().all(|x| (0.3..=0.4).contains(x)), "{out:?}");
-            invert_cdf(&weights, 0.1, &u, &mut out);
+            invert_cdf(&weights, 0.1, &u, &mut out).unwrap();
             let outside = out.iter().filter(|x| !(0.3..=0.4).contains(*x)).count();
             assert!((8..=10).contains(&outside), "a tenth, less the bin's own share: {outside}");
         }
-        invert_cdf(&[f32::NAN, 1.0, -1.0], 0.0, &[0.0, 1.0 - 2.0_f64.powi(-24)], &mut out);
-        assert!(out[0] >= 1.0 / 3.0 && out[1] <= 2.0 / 3.0);
+        for bad in [f32::NAN, -1.0, f32::INFINITY] {
+            let error = invert_cdf(&[1.0, bad], 0.1, &u, &mut out).unwrap_err().to_string();
+            assert!(error.starts_with("`weights[1]`: is "), "{error}");
+        }
     }
 
     proptest! {
@@ -203,7 +221,7 @@ mod tests {
             let n = 20_000;
             let u: Vec<f64> = (0..n).map(|i| (i as f64 + 0.5) / n as f64).collect();
             let mut out = vec![0.0; n];
-            invert_cdf(&weights, 0.05, &u, &mut out);
+            invert_cdf(&weights, 0.05, &u, &mut out).unwrap();
             prop_assert!(out.windows(2).all(|pair| pair[0] <= pair[1]));
             prop_assert!(out.iter().all(|x| (0.0..=1.0).contains(x)));
             let total: f32 = weights.iter().sum();

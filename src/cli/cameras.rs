@@ -26,6 +26,9 @@ pub struct Viewpoint {
 /// At an elevation closer to the poles than this, in radians, there is no telling where up is.
 const FROM_POLE: f64 = 0.1;
 
+/// Most pixels on a side of a training image: more would only come from a damaged file.
+const LARGEST: usize = 1 << 16;
+
 impl Viewpoint {
     /// The average of a dataset's cameras; it has at least one.
     pub fn of(data: &Dataset) -> Self {
@@ -47,8 +50,8 @@ impl Viewpoint {
     pub fn check(&self) -> Result<()> {
         let positive = |x: f64| x > 0.0 && x.is_finite();
         let checks = [
-            ("viewpoint.width", self.width > 0),
-            ("viewpoint.height", self.height > 0),
+            ("viewpoint.width", (1..=LARGEST).contains(&self.width)),
+            ("viewpoint.height", (1..=LARGEST).contains(&self.height)),
             ("viewpoint.angle_x", positive(self.angle_x) && self.angle_x < PI),
             ("viewpoint.distance", positive(self.distance)),
             ("viewpoint.elevation", self.elevation.abs() < FRAC_PI_2),

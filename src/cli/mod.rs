@@ -6,7 +6,8 @@ mod animation;
 mod bench;
 mod cameras;
 mod eval;
-
+#[cfg(test)]
+mod fuzz;
 mod interrupt;
 mod output;
 mod parse;

@@ -158,7 +158,7 @@ impl Args {
 }
 
 /// The configuration with the number of that dotted name replaced.
-fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
+pub fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
     let unknown = |_| Error::setting(name, "cannot be changed");
     let mut all = serde_json::to_value(config).map_err(unknown)?;
     let pointer = format!("/{}", name.replace('.', "/"));

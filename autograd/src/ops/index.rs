@@ -1,6 +1,7 @@
 //! Elements along an axis by number: gather, select, sort, and their adjoints. Indices are whole numbers outside the
 //! graph; gradients flow through what is picked.
 
+use super::gather::add_up;
 use crate::{Grads, Op, Reads, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
@@ -14,7 +15,7 @@ pub struct GatherAlong {
     pub index: Indices,
 }
 
-/// y[.., index[.., i, ..], ..] += x[.., i, ..] along an axis, onto zeros, in the order of i; dx = [`GatherAlong`] of g.
+/// y[.., index[.., i, ..], ..] += x[.., i, ..] along an axis, onto zeros, with sums in f64; dx = [`GatherAlong`] of g.
 #[derive(Clone)]
 pub struct ScatterAlong {
     /// The axis.
@@ -34,7 +35,7 @@ pub struct IndexSelect {
     pub index: Arc<[u32]>,
 }
 
-/// y[.., index[i], ..] += x[.., i, ..] along an axis, onto zeros, in the order of i; dx = [`IndexSelect`] of g.
+/// y[.., index[i], ..] += x[.., i, ..] along an axis, onto zeros, with sums in f64; dx = [`IndexSelect`] of g.
 #[derive(Clone)]
 pub struct IndexAdd {
     /// The axis.
@@ -137,8 +138,10 @@ impl<T: Scalar> Op<T> for ScatterAlong {
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let mut out = pool.full(&resized(x[0].shape(), self.axis, self.extent), T::ZERO);
-        let (from, to) = (x[0].as_slice(), out.as_mut_slice());
-        each(&self.index, self.axis, self.extent, |i, j| to[j] += from[i]);
+        let from = x[0].as_slice();
+        add_up(out.as_mut_slice(), |sums| {
+            each(&self.index, self.axis, self.extent, |i, j| sums[j] += from[i].to_f64())
+        });
         out
     }
 
@@ -200,11 +203,13 @@ impl<T: Scalar> Op<T> for IndexAdd {
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let inner = inner(x[0].shape(), self.axis);
         let mut out = pool.full(&resized(x[0].shape(), self.axis, self.extent), T::ZERO);
-        for (row, x) in x[0].as_slice().chunks_exact(inner.max(1)).enumerate() {
-            let (block, k) = (row / self.index.len(), row % self.index.len());
-            let to = (block * self.extent + self.index[k] as usize) * inner;
-            raygrad_tensor::add_assign(&mut out.as_mut_slice()[to..to + inner], x);
-        }
+        add_up(out.as_mut_slice(), |sums| {
+            for (row, x) in x[0].as_slice().chunks_exact(inner.max(1)).enumerate() {
+                let (block, k) = (row / self.index.len(), row % self.index.len());
+                let to = (block * self.extent + self.index[k] as usize) * inner;
+                sums[to..to + inner].iter_mut().zip(x).for_each(|(sum, x)| *sum += x.to_f64());
+            }
+        });
         out
     }
 

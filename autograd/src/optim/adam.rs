@@ -1,14 +1,15 @@
 //! Adam and AdamW.
 
-use super::{CHUNK, Move, Optimizer, TINY, check_shapes, remember, slot};
+use super::{CHUNK, Move, Optimizer, TINY, TINY_SQUARE, check_shapes, limited, remember, slot};
 use raygrad_tensor::{Scalar, Tensor, simd};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Adam (Kingma and Ba 2015, algorithm 1).
 ///
-/// Bias corrections are computed in f64 from an integer step count, which each parameter has for itself. Moments below
-/// 1e-30 are set to 0, so that long runs without gradient do not fill memory with denormal numbers, which are slow. Work
+/// Bias corrections are computed in f64 from an integer step count, which each parameter has for itself. First moments
+/// below 1e-30 and second ones below 1e-37 are set to 0, so that long runs without gradient do not fill memory with
+/// denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their squares are finite. Work
 /// is spread over the current rayon pool; the result does not depend on the number of threads.
 #[derive(Debug, Clone)]
 pub struct Adam<T: Scalar> {
@@ -172,7 +173,7 @@ struct Update<T> {
 
 impl<T: Scalar> Update<T> {
     fn apply(&self, x: &mut [T], g: &[T], m: &mut [T], v: &mut [T]) -> usize {
-        let tiny = T::from_f64(TINY);
+        let (tiny, tiny_square) = (T::from_f64(TINY), T::from_f64(TINY_SQUARE));
         let n = x.len();
         let (g, m, v) = (&g[..n], &mut m[..n], &mut v[..n]);
         simd::dispatch(
@@ -181,11 +182,11 @@ impl<T: Scalar> Update<T> {
                 let mut skipped = 0;
                 for i in 0..n {
                     let good = g[i].is_finite();
-                    let first = self.beta[0] * m[i] + self.rest[0] * g[i];
-                    // The square of a large finite gradient overflows to infinity, which makes the step 0.
-                    let second = self.beta[1] * v[i] + self.rest[1] * (g[i] * g[i]);
+                    let g = limited(g[i]);
+                    let first = self.beta[0] * m[i] + self.rest[0] * g;
+                    let second = self.beta[1] * v[i] + self.rest[1] * (g * g);
                     let first = if first > tiny || first < -tiny { first } else { T::ZERO };
-                    let second = if second > tiny { second } else { T::ZERO };
+                    let second = if second > tiny_square { second } else { T::ZERO };
                     let kept = x[i] * self.keep;
                     let kept = if kept < self.tiniest && kept > -self.tiniest { T::ZERO } else { kept };
                     let moved = kept - self.rate * first / (second.sqrt() + self.epsilon);

@@ -79,7 +79,21 @@ pub trait Optimizer<T: Scalar> {
 const CHUNK: usize = 1 << 14;
 
 /// What an optimiser remembers is 0 below this.
-const TINY: f64 = 1e-30;
+pub(crate) const TINY: f64 = 1e-30;
+
+/// A mean of squares is 0 below this: the square of [`TINY`] would be a denormal f32, and this is the square of 3e-19. As
+/// far as epsilon is larger, nobody notices. (A limit of 1e-30 would make 0 of the squares of gradients of 1e-14, whose
+/// own mean is kept, and their step 10 learning rates.)
+pub(crate) const TINY_SQUARE: f64 = 1e-37;
+
+/// The largest gradient that second moments can hold: squared it is still a number, and an element that has met a larger
+/// one moves on. (An infinite second moment would never fade.)
+#[inline(always)]
+pub(crate) fn limited<T: Scalar>(g: T) -> T {
+    let most = T::from_f64(if size_of::<T>() == 4 { 1e19 } else { 1e154 });
+    let g = if g > most { most } else { g };
+    if g < -most { -most } else { g }
+}
 
 /// What an optimiser keeps under a number.
 fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {

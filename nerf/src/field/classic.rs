@@ -1,7 +1,7 @@
 //! The network of the NeRF paper.
 
 use super::{Density, DensityActivation, Field};
-use crate::config::check_range;
+use crate::config::{check_parameters, check_range};
 use crate::encoding::PositionalEncoding;
 use crate::{Error, Result};
 use glam::DVec3;
@@ -49,6 +49,7 @@ impl ClassicConfig {
         for (name, value) in positive {
             check_range(name, value, 1, 1 << 14)?;
         }
+        check_parameters(self.depth * self.width * (self.width + 200))?;
         if self.position_levels > 24 || self.direction_levels > 24 {
             return Err(Error::setting("position_levels", "more than 24 frequencies are beyond the precision of f32"));
         }

@@ -1,6 +1,6 @@
 //! The geometry of a hash grid: levels, resolutions and rows.
 
-use crate::config::check_range;
+use crate::config::{check_parameters, check_range};
 use crate::{Error, Result};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -39,12 +39,12 @@ impl HashGridConfig {
     /// photographs; and as many of both as pay within `seconds` of training on two cores: more of them hold more detail,
     /// but take longer, the more so if they do not fit the caches.
     pub fn cpu(seconds: f64) -> Self {
-        let (levels, log2_table, finest) = match seconds {
-            ..=100.0 => (6, 17, 512),
-            ..=300.0 => (8, 18, 512),
-            _ => (8, 19, 1024),
+        let (log2_table, finest) = match seconds {
+            ..=100.0 => (17, 512),
+            ..=300.0 => (18, 512),
+            _ => (19, 768),
         };
-        HashGridConfig { levels, features: 4, log2_table, coarsest: 16, finest }
+        HashGridConfig { levels: 8, features: 4, log2_table, coarsest: 16, finest }
     }
 
     fn check(&self) -> Result<()> {
@@ -122,6 +122,7 @@ impl HashGrid {
             HashLevel { resolution: resolution as u32, hashed: corners > most, rows: first - count..first }
         };
         let levels: Arc<[HashLevel]> = (0..config.levels).map(level).collect();
+        check_parameters(first * config.features)?;
         Ok(HashGrid { levels, features: config.features, shape: [first, config.features] })
     }
 

@@ -61,7 +61,7 @@ fn the_papers_grid_has_the_papers_levels() {
     assert!(!paper.levels()[4].hashed && paper.levels()[5].hashed && paper.width() == 32);
     assert!(paper.levels().iter().skip(5).all(|level| level.rows.len() == 1 << 19));
     assert!(paper.levels().windows(2).all(|pair| pair[0].rows.end == pair[1].rows.start));
-    assert_eq!(HashGrid::new(&HashGridConfig::cpu(60.0)).unwrap().levels()[5].resolution, 512);
+    assert_eq!(HashGrid::new(&HashGridConfig::cpu(60.0)).unwrap().levels()[7].resolution, 512);
 }
 
 #[test]

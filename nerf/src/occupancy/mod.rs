@@ -117,8 +117,8 @@ impl OccupancyConfig {
 pub struct Threshold {
     /// Cells with more than this density, in 1 / scene unit, are occupied.
     pub min_sigma: f32,
-    /// Whether the mean density of all cells takes the threshold's place where it is smaller: the customary rule in
-    /// training, with which a field that is faint everywhere is not skipped before it has taken shape.
+    /// Whether cells below the mean density of all cells are passed over instead, where that is smaller: the customary rule
+    /// in training, with which a field that is faint everywhere is not skipped before it has taken shape.
     pub or_mean: bool,
     /// Whether the 26 cells around an occupied cell are occupied too.
     pub dilate: bool,
@@ -214,7 +214,9 @@ impl OccupancyGrid {
     pub fn threshold(&mut self, rule: &Threshold) {
         let mut limit = rule.min_sigma;
         if rule.or_mean {
-            limit = limit.min(self.mean_density() as f32);
+            // The mean itself is not passed over: it may be that of a fog that is the same everywhere.
+            let mean = self.mean_density() as f32;
+            limit = limit.min(if mean > 0.0 { mean.next_down() } else { mean });
         }
         let words = self.exceeding(limit);
         self.occupy(words, rule.dilate);

@@ -90,16 +90,6 @@ fn highlight(roughness: f64, normal: DVec3, view: DVec3, sun: DVec3) -> f64 {
     distribution * fresnel / (smith(n_v) * smith(n_l))
 }
 
-/// The sRGB transfer curve: linear light in 0..=1 to code value in 0..=1.
-pub fn srgb_encode(linear: f64) -> f64 {
-    if linear <= 0.0031308 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
-}
-
-/// The inverse of [`srgb_encode`].
-pub fn srgb_decode(code: f64) -> f64 {
-    if code <= 0.04045 { code / 12.92 } else { ((code + 0.055) / 1.055).powf(2.4) }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::shape::Shape;
@@ -173,14 +163,5 @@ mod tests {
         assert!(directions.iter().all(|d| (d.length() - 1.0).abs() < 1e-12));
         assert!(directions.iter().all(|d| d.angle_between(SUN) < SUN_RADIUS));
         assert!((directions.iter().sum::<DVec3>() / 64.0).distance(SUN.normalize()) < 0.1 * SUN_RADIUS);
-    }
-
-    #[test]
-    fn srgb_codes_round_trip() {
-        for code in 0..=255 {
-            let code = code as f64 / 255.0;
-            assert!((srgb_encode(srgb_decode(code)) - code).abs() < 1e-6);
-        }
-        assert!((srgb_encode(0.5) - 0.735357).abs() < 1e-6);
     }
 }

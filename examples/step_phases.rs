@@ -1,0 +1,200 @@
+//! Where the time of a training step goes, and how far each phase is from what the machine could do: one thread, one tile
+//! of rays of a trained run.
+//!
+//! ```text
+//! raygrad train path/to/scene --out run
+//! cargo run --release --example step_phases -- run
+//! ```
+//!
+//! Networks are compared with a large matrix product, everything that looks up or changes rows of the table with fetching
+//! cache lines from random places of as much memory.
+
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use raygrad::autograd::{Gradient, Pool, Tape, Tensor};
+use raygrad::nerf::dataset::{Dataset, Split, load};
+use raygrad::nerf::hash_grid::{HashGrad, HashGrid, TableOptimizer};
+use raygrad::nerf::occupancy::MarchBuffer;
+use raygrad::nerf::sampler::Jitter;
+use raygrad::nerf::visible::composite_visible;
+use raygrad::nerf::{Config, Extent, FieldConfig, InstantConfig, Model, Rays, Sampler, clip_span};
+use raygrad::tensor::{Matrix, gemm, simd};
+use serde_json::Value;
+use std::error::Error;
+use std::hint::black_box;
+use std::path::Path;
+use std::time::Instant;
+
+/// Times that each phase is run; the least counts.
+const RUNS: usize = 20;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let run = std::env::args().nth(1).ok_or("name a run: step_phases RUN")?;
+    let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
+    let config: Config = serde_json::from_value(about["config"].clone())?;
+    let extent: Extent = serde_json::from_value(about["extent"].clone())?;
+    let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
+    let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
+    let data = load(folder, Split::Train, 1)?;
+    // The phases are those of one thread.
+    rayon::ThreadPoolBuilder::new().num_threads(1).build()?.install(|| measure(&model, &data))
+}
+
+/// The least time of several runs, in seconds.
+fn least(mut f: impl FnMut()) -> f64 {
+    let time = |_| {
+        let start = Instant::now();
+        f();
+        start.elapsed().as_secs_f64()
+    };
+    (0..RUNS).map(time).fold(f64::INFINITY, f64::min)
+}
+
+/// Operations a second of a large matrix product.
+fn matrix_rate() -> f64 {
+    let n = 1024;
+    let (a, b, mut c) = (vec![0.5_f32; n * n], vec![0.25_f32; n * n], vec![0.0_f32; n * n]);
+    let seconds = least(|| gemm(Matrix::new(&a, n, n), Matrix::new(&b, n, n), black_box(&mut c), false));
+    2.0 * (n * n * n) as f64 / seconds
+}
+
+/// Cache lines a second that arrive from random places of `bytes` of memory, asked for ahead of time.
+fn line_rate(bytes: usize) -> f64 {
+    let lines = (bytes / 64).max(1);
+    let memory = vec![[1.0_f32; 16]; lines];
+    let mut rng = StdRng::seed_from_u64(1);
+    let places: Vec<u32> = (0..1 << 18).map(|_| rng.random_range(0..lines as u32)).collect();
+    let seconds = least(|| {
+        let mut sum = 0.0;
+        for (i, &place) in places.iter().enumerate() {
+            if let Some(&later) = places.get(i + 16) {
+                simd::prefetch(&memory[later as usize]);
+            }
+            sum += memory[place as usize][0];
+        }
+        black_box(sum);
+    });
+    places.len() as f64 / seconds
+}
+
+/// A training batch of so many samples, more or less: rays and the colours that photographs show along them.
+fn batch(model: &Model<f32>, data: &Dataset, count: usize) -> (Rays<f32>, Vec<f32>) {
+    let mut rng = StdRng::seed_from_u64(7);
+    let (mut rays, mut target) = (Rays::new(), vec![]);
+    for _ in 0..count {
+        let frame = &data.frames[rng.random_range(0..data.frames.len())];
+        let (x, y) = (rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height));
+        let ray = frame.camera.pixel_ray(x, y);
+        rays.push(&ray, clip_span(&ray, model.extent.bounds, model.extent.span));
+        target.extend_from_slice(&frame.image.pixel(x, y)[..3]);
+    }
+    (rays, target)
+}
+
+/// Multiplications of the density network and of the colour network for a sample.
+fn network(config: &InstantConfig, grid: &HashGrid) -> [f64; 2] {
+    let density = config.density_width * (grid.width() + config.features);
+    let directions = config.direction_degree * config.direction_degree;
+    let first = (config.features + directions) * config.color_width;
+    let color = first + (config.color_depth - 1) * config.color_width * config.color_width + 3 * config.color_width;
+    [density as f64, color as f64]
+}
+
+fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
+    let (Sampler::Marching(sampler), FieldConfig::Instant(config)) = (&model.sampler, &model.config.field) else {
+        return Err("step_phases looks at instant models".into());
+    };
+    let (id, grid) = model.field.table().ok_or("a field without a table")?;
+    let (grid, field) = (grid.clone(), &*model.field);
+    // A tile is an eighth of a step.
+    let wanted = sampler.config.samples / 8;
+    let (probe, _) = batch(model, data, 256);
+    let (mut buffer, pool) = (MarchBuffer::default(), Pool::new());
+    let jitter = || StdRng::seed_from_u64(3);
+    let each = sampler.samples(&probe, &mut Jitter::Random(&mut jitter()), &mut buffer, &pool).len() as f64 / 256.0;
+    let (rays, target) = batch(model, data, (wanted as f64 / each.max(0.5)) as usize);
+    let march = least(|| drop(sampler.samples(&rays, &mut Jitter::Random(&mut jitter()), &mut buffer, &pool)));
+    let samples = sampler.samples(&rays, &mut Jitter::Random(&mut jitter()), &mut buffer, &pool);
+
+    let mut tape = Tape::new();
+    let target = Tensor::from_vec(&[rays.len(), 3], target);
+    let white = Tensor::ones(&[rays.len(), 3]);
+    let [mut whole, mut forward] = [f64::INFINITY; 2];
+    let (mut asked, mut kept, mut grad) = (0, 0, None);
+    for _ in 0..RUNS {
+        let params = model.params.bind(&tape);
+        let start = Instant::now();
+        let marched = composite_visible(field, &params, &samples, sampler.config.termination, false, &tape);
+        let loss = model.config.loss.sum(&marched.rendered, &target, &white);
+        let middle = start.elapsed().as_secs_f64();
+        let given = loss.grad_sparse(&params.vars());
+        whole = whole.min(start.elapsed().as_secs_f64());
+        forward = forward.min(middle);
+        (asked, kept) = (marched.evaluated, marched.kept);
+        grad = given.into_iter().find(|grad| matches!(grad, Gradient::Sparse(_)));
+        drop((marched, loss, params));
+        tape.clear();
+    }
+    let parts = grad.ok_or("no gradient of the table")?.parts::<HashGrad<f32>>();
+
+    // The densities that decide which samples light reaches, phase by phase.
+    let positions = Tensor::from_vec(&[asked, 3], samples.positions.as_slice()[..3 * asked].to_vec());
+    let (mut encode, mut density) = (f64::INFINITY, f64::INFINITY);
+    for _ in 0..RUNS {
+        let params = model.params.bind_constant(&tape);
+        let x = tape.constant(positions.clone());
+        let start = Instant::now();
+        let encoding = field.encode(&params, &x);
+        encode = encode.min(start.elapsed().as_secs_f64());
+        let start = Instant::now();
+        drop(field.density(&params, &encoding));
+        density = density.min(start.elapsed().as_secs_f64());
+        drop((encoding, x, params));
+        tape.clear();
+    }
+    let mut table = model.params.get(id).clone();
+    let mut optimizer = TableOptimizer::new(grid.clone(), model.config.table_adam);
+    let mut moved = 0;
+    // Eight tiles go to one step: rows that they share are moved once.
+    let tiles = vec![parts[0].clone(); 1];
+    let update = least(|| moved = optimizer.step(&mut table, &tiles, 1e-3).touched);
+
+    let (matrix, line) = (matrix_rate(), line_rate(4 * table.len()));
+    let lines_of_state = line_rate(4 * 4 * table.len());
+    let [density_work, color_work] = network(config, &grid).map(|work| 2.0 * work);
+    let lookups = (asked * grid.levels().len() * 8) as f64;
+    println!(
+        "a tile of {} rays: {} samples marched, {asked} asked for a density, {kept} lit",
+        rays.len(),
+        samples.len()
+    );
+    println!(
+        "large matrix product {:.0} GFLOP/s; random lines {:.0} M/s of the table, {:.0} M/s of table and moments",
+        1e-9 * matrix,
+        1e-6 * line,
+        1e-6 * lines_of_state
+    );
+    println!("{:<44}{:>8}{:>8}{:>24}{:>10}", "phase", "us", "share", "done", "of limit");
+    let total = march + whole + update;
+    let row = |name: &str, seconds: f64, done: String, limit: Option<f64>| {
+        let limit = limit.map_or("".into(), |limit| format!("{:.0} %", 100.0 * limit / seconds));
+        println!("{name:<44}{:>8.0}{:>6.0} %{done:>24}{limit:>10}", 1e6 * seconds, 100.0 * seconds / total);
+    };
+    let flop = |count: f64, seconds: f64| format!("{:.0} GFLOP/s", 1e-9 * count / seconds);
+    let lines = |count: f64, seconds: f64| format!("{:.0} M look-ups/s", 1e-6 * count / seconds);
+    row("march", march, format!("{:.0} M samples/s", 1e-6 * samples.len() as f64 / march), None);
+    row("look up the table", encode, lines(lookups, encode), Some(lookups / line));
+    let work = density_work * asked as f64;
+    row("density network", density, flop(work, density), Some(work / matrix));
+    let rest = (forward - encode - density).max(0.0);
+    let work = (density_work + color_work) * kept as f64;
+    row("lit samples: select, networks, composite, loss", rest, flop(work, rest), Some(work / matrix));
+    let backward = whole - forward;
+    let work = 2.0 * (density_work + color_work) * kept as f64;
+    row("backward", backward, flop(work, backward), Some(work / matrix));
+    // A moved row: its values, its moments, its step count.
+    let touched = 3.0 * moved as f64;
+    row("add up the table's gradient, move its rows", update, lines(touched, update), Some(touched / lines_of_state));
+    println!("{:<44}{:>8.0}", "sum", 1e6 * total);
+    Ok(())
+}

@@ -1,0 +1,130 @@
+//! The sRGB transfer curve: between linear light, in which light adds up, and code values, in which pictures are stored.
+//!
+//! NeRF is trained, and its images are blended, in code values as they stand in files: half of white over black is .5
+//! there, where half of the light would be .735. Use these operations for a model whose colours are light.
+
+use raygrad_autograd::{Cases, Entry, Map, Reads, Real, Scalar, Unary, Var};
+
+/// Linear light and code value where the line ends and the power begins (IEC 61966-2-1).
+const KNEE: [f64; 2] = [0.003_130_8, 0.040_45];
+const SLOPE: f64 = 12.92;
+const OFFSET: f64 = 0.055;
+const EXPONENT: f64 = 2.4;
+
+/// y = 12.92 x up to x = 0.0031308, else 1.055 x^(1/2.4) - 0.055: code values for linear light.
+///
+/// The line goes on below 0, and the curve beyond 1, so that the gradient is finite everywhere: at most 12.92. (The
+/// standard's rounded constants leave a step of 2.9e-8 at the knee.) NaN stays NaN.
+#[derive(Debug, Clone, Copy)]
+pub struct SrgbEncode;
+
+/// y = x / 12.92 up to x = 0.04045, else ((x + 0.055) / 1.055)^2.4: linear light for code values, the inverse of
+/// [`SrgbEncode`] up to the standard's rounding.
+#[derive(Debug, Clone, Copy)]
+pub struct SrgbDecode;
+
+/// `x` where it is beyond the knee, else the knee: what the power sees, so that the branch that is not taken has a finite
+/// gradient too.
+#[inline(always)]
+fn beyond<E: Real>(x: E, knee: f64) -> [E; 2] {
+    let excess = x.clone() - x.like(knee);
+    let limit = x.like(knee);
+    [excess.if_positive(x, limit), excess]
+}
+
+impl Unary for SrgbEncode {
+    const NAME: &'static str = "srgb_encode";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        let [clamped, excess] = beyond(x.clone(), KNEE[0]);
+        let line = x.like(SLOPE) * x.clone();
+        let power = x.like(1.0 + OFFSET) * clamped.pow(x.like(1.0 / EXPONENT)) - x.like(OFFSET);
+        // A NaN chooses the line, which it stays NaN on.
+        excess.if_positive(power, line)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        let [clamped, excess] = beyond(x.clone(), KNEE[0]);
+        let power = x.like((1.0 + OFFSET) / EXPONENT) * clamped.pow(x.like(1.0 / EXPONENT - 1.0));
+        g * excess.if_positive(power, x.like(SLOPE))
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.1..1.5).domain_also(-0.5..0.001);
+        c.at([0.0], 0.0, [SLOPE]).at([-0.1], -1.292, [SLOPE]).at([1e-8], 1.292e-7, [SLOPE]);
+        c.at([1.0], 1.0, [(1.0 + OFFSET) / EXPONENT]).at([0.5], 0.735_356_983_052_449_5, [0.658_631_902_9]);
+        c.at([f64::INFINITY], f64::INFINITY, [0.0]).at([f64::NAN], f64::NAN, [SLOPE]);
+    }
+}
+
+impl Unary for SrgbDecode {
+    const NAME: &'static str = "srgb_decode";
+    const READS: Reads = Reads::only(&[0]);
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        let [clamped, excess] = beyond(x.clone(), KNEE[1]);
+        let line = x.clone() / x.like(SLOPE);
+        let power = ((clamped + x.like(OFFSET)) / x.like(1.0 + OFFSET)).pow(x.like(EXPONENT));
+        excess.if_positive(power, line)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+        let [clamped, excess] = beyond(x.clone(), KNEE[1]);
+        let base = (clamped + x.like(OFFSET)) / x.like(1.0 + OFFSET);
+        let power = x.like(EXPONENT / (1.0 + OFFSET)) * base.pow(x.like(EXPONENT - 1.0));
+        g * excess.if_positive(power, x.like(1.0 / SLOPE))
+    }
+    fn cases(&self, c: &mut Cases) {
+        c.domain(0.1..1.5).domain_also(-0.5..0.03);
+        c.at([0.0], 0.0, [1.0 / SLOPE]).at([-0.1], -0.1 / SLOPE, [1.0 / SLOPE]);
+        c.at([1.0], 1.0, [EXPONENT / (1.0 + OFFSET)]).at([f64::NAN], f64::NAN, [1.0 / SLOPE]);
+    }
+}
+
+/// sRGB code values for linear light, of any shape; see [`SrgbEncode`].
+///
+/// ```
+/// use raygrad_autograd::{Tape, Tensor};
+/// use raygrad_nerf::srgb_encode;
+/// let tape = Tape::<f64>::new();
+/// let light = tape.leaf(Tensor::from_vec(&[3], vec![-0.1, 0.0, 0.5]));
+/// let codes = srgb_encode(&light);
+/// assert!((codes.value().as_slice()[2] - 0.735357).abs() < 1e-6);
+/// assert!(codes.sum().grad(&[&light])[0].as_slice().iter().all(|slope| slope.is_finite()));
+/// ```
+#[track_caller]
+pub fn srgb_encode<'t, T: Scalar>(light: &Var<'t, T>) -> Var<'t, T> {
+    light.tape().apply(Map(SrgbEncode), &[light])
+}
+
+/// Linear light for sRGB code values, of any shape; see [`SrgbDecode`].
+#[track_caller]
+pub fn srgb_decode<'t, T: Scalar>(codes: &Var<'t, T>) -> Var<'t, T> {
+    codes.tape().apply(Map(SrgbDecode), &[codes])
+}
+
+/// The catalogue entries of this file.
+pub(crate) fn entries() -> Vec<Entry> {
+    vec![Entry::unary(SrgbEncode), Entry::unary(SrgbDecode)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_autograd::{Check, check_op};
+
+    #[test]
+    fn every_check_passes() {
+        for entry in entries() {
+            check_op(&Check::default(), &entry).unwrap();
+        }
+    }
+
+    #[test]
+    fn codes_round_trip() {
+        for code in 0..=255 {
+            let code = f64::from(code) / 255.0;
+            assert!((SrgbEncode.f(SrgbDecode.f(code)) - code).abs() < 1e-6);
+        }
+    }
+}

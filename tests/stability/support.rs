@@ -1,0 +1,130 @@
+//! What the tests share: both precisions, comparisons that NaN fails, and the constants.
+
+use raygrad::autograd::{Scalar, Tensor};
+use raygrad::nerf::{Ray, Rays, glam::DVec3};
+use serde_json::Value;
+
+/// Makes a test in each precision of functions that are generic over the number type.
+macro_rules! both {
+    ($($(#[$attribute:meta])* $name:ident),* $(,)?) => {
+        mod single {
+            $($(#[$attribute])* #[test] fn $name() { super::$name::<f32>() })*
+        }
+        mod double {
+            $($(#[$attribute])* #[test] fn $name() { super::$name::<f64>() })*
+        }
+    };
+}
+
+/// A constant of `reference/constants.json`.
+#[track_caller]
+pub fn constant(name: &str) -> f64 {
+    let all: Value = serde_json::from_str(include_str!("reference/constants.json")).unwrap();
+    all[name].as_f64().unwrap_or_else(|| panic!("there is no constant `{name}`"))
+}
+
+/// The first in f32, the second in f64.
+pub fn by_type<T: Scalar>(single: f64, double: f64) -> f64 {
+    if size_of::<T>() == 4 { single } else { double }
+}
+
+/// The smallest number above 0.
+pub fn smallest<T: Scalar>() -> f64 {
+    by_type::<T>(f32::from_bits(1).into(), f64::from_bits(1))
+}
+
+/// The largest finite number.
+pub fn greatest<T: Scalar>() -> f64 {
+    by_type::<T>(f32::MAX.into(), f64::MAX)
+}
+
+/// The number as the type holds it.
+pub fn round<T: Scalar>(x: f64) -> f64 {
+    T::from_f64(x).to_f64()
+}
+
+/// A vector.
+pub fn vector<T: Scalar>(values: &[f64]) -> Tensor<T> {
+    tensor(&[values.len()], values)
+}
+
+/// A tensor.
+pub fn tensor<T: Scalar>(shape: &[usize], values: &[f64]) -> Tensor<T> {
+    Tensor::from_vec(shape, values.iter().map(|&x| T::from_f64(x)).collect())
+}
+
+/// Its elements.
+pub fn numbers<T: Scalar>(x: &Tensor<T>) -> Vec<f64> {
+    x.as_slice().iter().map(|x| x.to_f64()).collect()
+}
+
+/// `got` is `expected` to the relative `tolerance`, or to the smallest number that the type holds.
+#[track_caller]
+pub fn near<T: Scalar>(what: &str, got: f64, expected: f64, tolerance: f64) {
+    if got == expected {
+        return;
+    }
+    let error = (got - expected).abs();
+    assert!(error <= tolerance * expected.abs() + smallest::<T>(), "{what} in {}: {got:e} for {expected:e}", T::NAME);
+}
+
+/// `got` is within `tolerance` of `expected`.
+#[track_caller]
+pub fn within(what: &str, got: f64, expected: f64, tolerance: f64) {
+    assert!((got - expected).abs() <= tolerance, "{what}: {got:e} for {expected:e}, tolerance {tolerance:e}");
+}
+
+/// Neither infinite nor NaN.
+#[track_caller]
+pub fn finite<T: Scalar>(what: &str, x: &Tensor<T>) {
+    assert!(x.is_finite(), "{what} in {}: {x:?}", T::NAME);
+}
+
+/// The distance to the next larger number of the type, at `x`.
+pub fn ulp<T: Scalar>(x: f64) -> f64 {
+    if size_of::<T>() == 4 {
+        let x = (x.abs() as f32).min(f32::MAX.next_down());
+        f64::from(x.next_up() - x)
+    } else {
+        let x = x.abs().min(f64::MAX.next_down());
+        x.next_up() - x
+    }
+}
+
+/// The next number of the type, upwards or downwards.
+pub fn beside<T: Scalar>(x: f64, up: bool) -> f64 {
+    match (size_of::<T>() == 4, up) {
+        (true, true) => (x as f32).next_up().into(),
+        (true, false) => (x as f32).next_down().into(),
+        (false, true) => x.next_up(),
+        (false, false) => x.next_down(),
+    }
+}
+
+/// The text of the error or panic that `f` ends in.
+#[track_caller]
+pub fn panic_of<R>(f: impl FnOnce() -> R) -> String {
+    let Err(panic) = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)) else { panic!("nothing panicked") };
+    match panic.downcast::<String>() {
+        Ok(text) => *text,
+        Err(panic) => panic.downcast::<&str>().expect("a message is text").to_string(),
+    }
+}
+
+/// One ray along z from `(0, 0, z)`, sampled over `span`.
+pub fn ray_along_z<T: Scalar>(z: f64, span: [f64; 2]) -> Rays<T> {
+    let mut rays = Rays::new();
+    rays.push(&Ray { origin: DVec3::new(0.0, 0.0, z), direction: DVec3::Z }, span);
+    rays
+}
+
+/// A generator of numbers in 0..1 that needs no crate: the fractional parts of multiples of the golden ratio, scrambled.
+pub fn noise(seed: u64) -> impl FnMut() -> f64 {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x1234_5678_9abc_def1;
+    move || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}
