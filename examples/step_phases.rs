@@ -18,7 +18,8 @@ use raygrad::nerf::occupancy::MarchBuffer;
 use raygrad::nerf::sampler::Jitter;
 use raygrad::nerf::visible::composite_visible;
 use raygrad::nerf::{Config, Extent, FieldConfig, InstantConfig, Model, Rays, Sampler, clip_span};
-use raygrad::tensor::{Matrix, gemm, simd};
+use raygrad::tensor::matmul::{Matrix, gemm};
+use raygrad::tensor::simd;
 use serde_json::Value;
 use std::error::Error;
 use std::hint::black_box;
@@ -37,7 +38,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
     let data = load(folder, Split::Train, 1)?;
     // The phases are those of one thread.
-    rayon::ThreadPoolBuilder::new().num_threads(1).build()?.install(|| measure(&model, &data))
+    rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
+    measure(&model, &data)
 }
 
 /// The least time of several runs, in seconds.
@@ -155,9 +157,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     let mut table = model.params.get(id).clone();
     let mut optimizer = TableOptimizer::new(grid.clone(), model.config.table_adam);
     let mut moved = 0;
-    // Eight tiles go to one step: rows that they share are moved once.
-    let tiles = vec![parts[0].clone(); 1];
-    let update = least(|| moved = optimizer.step(&mut table, &tiles, 1e-3).touched);
+    let update = least(|| moved = optimizer.step(&mut table, &parts, 1e-3).touched);
 
     let (matrix, line) = (matrix_rate(), line_rate(4 * table.len()));
     let lines_of_state = line_rate(4 * 4 * table.len());

@@ -142,10 +142,16 @@ impl Config {
         }
     }
 
-    /// The same for a training time: the table of a hash grid is as large as pays within it, see [`HashGridConfig::cpu`].
+    /// The same for a training time: the table of a hash grid is as large as pays within it, see [`HashGridConfig::cpu`],
+    /// and beyond five minutes a step has twice the samples.
     pub fn with_budget(mut self, seconds: f64) -> Self {
         if let FieldConfig::Instant(field) = &mut self.field {
             field.grid = HashGridConfig::cpu(seconds);
+            if let SamplerConfig::Marching(marching) = &mut self.sampler
+                && seconds > 300.0
+            {
+                marching.samples *= 2;
+            }
         }
         self
     }

@@ -1,6 +1,5 @@
 //! Images to files: 8-bit quantisation, PNG, and writing that leaves no half-written file.
 
-use std::io::Write;
 use std::path::Path;
 
 use image::codecs::png::PngEncoder;
@@ -51,26 +50,14 @@ impl Image {
     }
 }
 
-/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched.
-///
-/// The bytes go to a temporary file in the same folder, reach the disk, and only then take the name `path`: an
-/// interruption or a full disk never leaves a partial file, nor harms one that was there before.
+/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched: see
+/// [`raygrad_autograd::write_atomic`].
 ///
 /// # Errors
 /// If the folder does not exist or the file cannot be written; the error names `path`.
 pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     let path = path.as_ref();
-    let failed = |e: std::io::Error| Error::file(path, format!("cannot be written: {e}"));
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut builder = tempfile::Builder::new();
-    // Temporary files are private by default; this one becomes an ordinary file, as far as the umask allows.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let mut file = builder.tempfile_in(folder).map_err(failed)?;
-    file.write_all(bytes).map_err(failed)?;
-    file.as_file().sync_all().map_err(failed)?;
-    file.persist(path).map_err(|e| failed(e.error))?;
-    Ok(())
+    raygrad_autograd::write_atomic(path, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
 }
 
 #[cfg(test)]

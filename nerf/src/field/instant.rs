@@ -1,12 +1,13 @@
 //! A hash grid and two small networks.
 
+use super::boxed_grid::BoxedGrid;
 use super::{Density, Field};
 use crate::Result;
 use crate::config::check_range;
-use crate::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use crate::hash_grid::{HashGrid, HashGridConfig};
 use crate::spherical::SphericalHarmonics;
 use glam::DVec3;
-use rand::{Rng, RngExt};
+use rand::Rng;
 use raygrad_autograd::{Activation, Bound, Init, Linear, ParamId, Params, Scalar, Segments, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
@@ -46,11 +47,7 @@ const LOG_DENSITY_SHIFT: f64 = 1.0;
 /// the first output.
 #[derive(Debug, Clone)]
 pub struct Instant {
-    grid: HashGrid,
-    table: ParamId,
-    /// `(x - low) * scale` lies in the unit cube for x in the box.
-    low: DVec3,
-    scale: f64,
+    grid: BoxedGrid,
     direction: SphericalHarmonics,
     density: [Linear; 2],
     color: Vec<Linear>,
@@ -69,8 +66,7 @@ impl Instant {
         rng: &mut impl Rng,
     ) -> Result<Self> {
         config.check()?;
-        let grid = HashGrid::new(&config.grid)?;
-        let table = params.add(format!("{name}.table"), grid.init(rng.random()));
+        let grid = BoxedGrid::new(&config.grid, bounds, params, name, rng)?;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let mut layer = |part: String, sizes, activation| {
             Linear::without_bias(params, &format!("{name}.{part}"), sizes, activation, Init::He, &mut *rng)
@@ -87,26 +83,17 @@ impl Instant {
             let (outputs, activation) = if last { (3, Activation::Identity) } else { (color_width, Activation::Relu) };
             color.push(layer(format!("color.{i}"), [inputs, outputs], activation));
         }
-        let scale = 1.0 / (bounds[1] - bounds[0]).max_element();
-        Ok(Instant { grid, table, low: bounds[0], scale, direction, density, color })
-    }
-
-    /// Positions in the unit cube.
-    #[track_caller]
-    fn local<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
-        let shift = (-self.low * self.scale).to_array().map(T::from_f64);
-        positions * self.scale + positions.tape().constant(Tensor::from_vec(&[3], shift.to_vec()))
+        Ok(Instant { grid, direction, density, color })
     }
 }
 
 impl<T: Scalar> Field<T> for Instant {
     fn encode<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.local(positions), &params[self.table]])
+        self.grid.encode(params, positions)
     }
 
     fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        let inputs = [&self.local(positions), &params[self.table]];
-        positions.tape().apply_known(HashEncoding(self.grid.clone()), &inputs, known)
+        self.grid.encode_known(params, positions, known)
     }
 
     fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
@@ -132,6 +119,6 @@ impl<T: Scalar> Field<T> for Instant {
     }
 
     fn table(&self) -> Option<(ParamId, &HashGrid)> {
-        Some((self.table, &self.grid))
+        Some(self.grid.table())
     }
 }

@@ -1,5 +1,6 @@
 //! Fields: functions of position and direction that give density and colour.
 
+mod boxed_grid;
 mod classic;
 mod instant;
 mod voxel;

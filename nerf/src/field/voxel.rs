@@ -1,12 +1,13 @@
 //! A grid of voxels and no network.
 
+use super::boxed_grid::BoxedGrid;
 use super::{Density, Field};
 use crate::Result;
 use crate::config::check_range;
-use crate::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use crate::hash_grid::{HashGrid, HashGridConfig};
 use crate::spherical::SphericalHarmonics;
 use glam::DVec3;
-use rand::{Rng, RngExt};
+use rand::Rng;
 use raygrad_autograd::{Bound, ParamId, Params, Scalar, Segments, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
@@ -44,11 +45,7 @@ const LOG_DENSITY_GAIN: f64 = 10.0;
 /// A row of the table is the logarithm of the density, then the coefficients of red, green and blue, then padding.
 #[derive(Debug, Clone)]
 pub struct Voxel {
-    grid: HashGrid,
-    table: ParamId,
-    /// `(x - low) * scale` lies in the unit cube for x in the box.
-    low: DVec3,
-    scale: f64,
+    grid: BoxedGrid,
     direction: SphericalHarmonics,
 }
 
@@ -66,34 +63,25 @@ impl Voxel {
     ) -> Result<Self> {
         config.check()?;
         let direction = SphericalHarmonics::new(config.direction_degree);
-        let grid = HashGrid::new(&HashGridConfig {
+        let grid = HashGridConfig {
             levels: 1,
             features: (1 + 3 * direction.width()).next_power_of_two(),
             log2_table: HashGridConfig::MOST_LOG2_TABLE,
             coarsest: config.resolution,
             finest: config.resolution,
-        })?;
-        let table = params.add(format!("{name}.table"), grid.init(rng.random()));
-        let scale = 1.0 / (bounds[1] - bounds[0]).max_element();
-        Ok(Voxel { grid, table, low: bounds[0], scale, direction })
-    }
-
-    /// Positions in the unit cube.
-    #[track_caller]
-    fn local<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
-        let shift = (-self.low * self.scale).to_array().map(T::from_f64);
-        positions * self.scale + positions.tape().constant(Tensor::from_vec(&[3], shift.to_vec()))
+        };
+        let grid = BoxedGrid::new(&grid, bounds, params, name, rng)?;
+        Ok(Voxel { grid, direction })
     }
 }
 
 impl<T: Scalar> Field<T> for Voxel {
     fn encode<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.local(positions), &params[self.table]])
+        self.grid.encode(params, positions)
     }
 
     fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        let inputs = [&self.local(positions), &params[self.table]];
-        positions.tape().apply_known(HashEncoding(self.grid.clone()), &inputs, known)
+        self.grid.encode_known(params, positions, known)
     }
 
     fn density<'t>(&self, _params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
@@ -116,6 +104,6 @@ impl<T: Scalar> Field<T> for Voxel {
     }
 
     fn table(&self) -> Option<(ParamId, &HashGrid)> {
-        Some((self.table, &self.grid))
+        Some(self.grid.table())
     }
 }
