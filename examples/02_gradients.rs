@@ -45,10 +45,10 @@ fn main() {
 
     // A Hessian, and its product with a vector, which costs no more for a million inputs than a few gradients.
     let point = Tensor::from_vec(&[2], vec![1.0, 2.0]);
-    let h = hessian(|x| (x[0].square().sum()).square(), std::slice::from_ref(&point)).remove(0).remove(0);
+    let h = hessian(|x| x[0].square().sum().square(), std::slice::from_ref(&point)).remove(0).remove(0);
     println!("\nHessian of |x|^4 at (1, 2)   {:?}", h.as_slice());
     let v = Tensor::from_vec(&[2], vec![1.0, -1.0]);
-    let product = hvp(|x| (x[0].square().sum()).square(), &[point], &[v]).remove(0);
+    let product = hvp(|x| x[0].square().sum().square(), &[point], &[v]).remove(0);
     println!("times (1, -1)                {:?}", product.as_slice());
 
     // And the check that all of this is right: finite differences of first and second order.

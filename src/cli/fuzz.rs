@@ -71,9 +71,10 @@ proptest! {
         names(&serde_json::to_value(&config).unwrap(), "", &mut all);
         for text in [text, format!("{}={typed}", which.get(&all))] {
             let Ok((name, value)) = parse::setting(&text) else { continue };
-            match changed(&config, &name, &value) {
-                Ok(config) => drop(config.check().map_err(|error| clear(error, "`"))),
-                Err(error) => clear(error, &name),
+            match changed(&config, &name, &value).and_then(|config| config.check()) {
+                Ok(()) => {}
+                // What is out of range is named by its last part.
+                Err(error) => clear(error, "`"),
             }
         }
     }
