@@ -3,7 +3,7 @@
 //! Each module holds the rows of the stress matrix and of the failure catalogue that belong together, in f32 and f64
 //! (`single::` and `double::`), through the public interface. Expected values that are not plain come from
 //! `reference/constants.json`, which `reference/constants.py` computes with 50 digits. docs/stability.md says which test
-//! stands for which row, and what happens without each remedy.
+//! stands for which row, and what the suite has found.
 
 #[macro_use]
 mod support;
