@@ -8,7 +8,7 @@ use raygrad_tensor::{Pool, Scalar, Tensor};
 use std::sync::Arc;
 
 /// Worst distance of f32 results from f64 ones, relative to the norm, and for one element in units in the last place.
-const SINGLE: (f64, f64) = (2e-6, 24.0);
+const SINGLE: (f64, f64) = (2e-6, 32.0);
 
 impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
     fn name(&self) -> &'static str {
@@ -180,7 +180,9 @@ fn same_bits(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], expected: &[Tensor<f64>])
 fn twice(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], i: usize, j: usize, shared: bool) -> Vec<Tensor<f64>> {
     let tape = Tape::new();
     let mut leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
-    leaves[j] = if shared { leaves[i].clone() } else { tape.leaf(x[i].clone()) };
+    // The other variable has memory of its own, too.
+    let copy = || Tensor::from_vec(x[i].shape(), x[i].as_slice().to_vec());
+    leaves[j] = if shared { leaves[i].clone() } else { tape.leaf(copy()) };
     let y = tape.apply(op.clone(), &leaves.iter().collect::<Vec<_>>());
     let mut wrt: Vec<_> = leaves.iter().collect();
     if shared {

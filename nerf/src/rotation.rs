@@ -32,8 +32,10 @@ pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
     let [xx, yy, zz] = [square(&x), square(&y), square(&z)];
     let s = xx.clone() + yy.clone() + zz.clone();
     let [half, cos] = sinc_and_cos_of_root(s.like(0.25) * s.clone());
-    let b = s.like(0.5) * half.clone() * half.clone();
-    let a = half * cos;
+    // The quaternion's length is 1 but for rounding, which would leave the matrix no rotation.
+    let length = cos.clone() * cos.clone() + s.like(0.25) * s.clone() * half.clone() * half.clone();
+    let b = s.like(0.5) * half.clone() * half.clone() / length.clone();
+    let a = half * cos / length;
     let one = s.like(1.0);
     let across = |p: &E, q: &E| b.clone() * (p.clone() * q.clone());
     let [ax, ay, az] = [a.clone() * x.clone(), a.clone() * y.clone(), a * z.clone()];

@@ -106,12 +106,13 @@ fn points<T: Scalar>(point: [f64; 3]) -> Outcome {
     prop_assert!(length(&inside) < 2.0);
     let encoded = tape.apply(PositionalEncoding { levels: 12, input: false }, &[&x]);
     prop_assert!(numbers(encoded.value()).iter().all(|y| y.abs() <= 1.0));
-    for y in [unit, inside, srgb_encode(&x)] {
+    for y in [unit, inside] {
         prop_assert!(y.value().is_finite() && y.sum().grad(&[&x])[0].is_finite(), "{:?}", y);
     }
     let near = tape.leaf(tensor::<T>(&[1, 3], &point.map(|x| x.clamp(-1e10, 1e10))));
-    let y = srgb_decode(&near);
-    prop_assert!(y.value().is_finite() && y.sum().grad(&[&near])[0].is_finite());
+    for y in [srgb_encode(&near), srgb_decode(&near)] {
+        prop_assert!(y.value().is_finite() && y.sum().grad(&[&near])[0].is_finite(), "{:?}", y);
+    }
     Ok(())
 }
 

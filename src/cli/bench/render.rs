@@ -319,7 +319,7 @@ mod tests {
         let [off, lossless, fast] = ["off", "lossless", "fast"].map(|name| find("skip", name));
         assert!(work(&fast.evaluations) <= work(&lossless.evaluations));
         assert!(work(&lossless.evaluations) <= work(&off.evaluations));
-        assert!(off.psnr >= lossless.psnr && lossless.psnr >= 40.0, "{} {}", off.psnr, lossless.psnr);
+        assert!(off.psnr >= lossless.psnr - 0.01 && lossless.psnr >= 40.0, "{} {}", off.psnr, lossless.psnr);
         // The bound is that of a fog at the threshold all along a ray, of ending early and of the colour budget.
         let bound = |skip: Skip| {
             let limits = Limits::of(skip);
