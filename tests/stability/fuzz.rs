@@ -188,10 +188,10 @@ proptest! {
             let Ok(config) = serde_json::from_slice::<Config>(&bytes) else { continue };
             if let Err(error) = config.check() {
                 clear(error, "`");
-            } else if is_small(&config) {
-                if let Err(error) = Model::<f32>::new(config, EXTENT, 0) {
-                    clear(error, "`");
-                }
+            } else if is_small(&config)
+                && let Err(error) = Model::<f32>::new(config, EXTENT, 0)
+            {
+                clear(error, "`");
             }
         }
     }

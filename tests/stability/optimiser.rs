@@ -38,7 +38,7 @@ fn ways<T: Scalar>(config: AdamConfig, gradients: &[Vec<f64>], rate: f64) -> Vec
 fn first_steps<T: Scalar>() {
     let gradients = vec![0.0, -0.0, 1e-30, 1e-10, -1e-10, 1.0, 1e30, -1e30, smallest::<T>(), greatest::<T>()];
     for config in [AdamConfig::default(), TABLE] {
-        let way = ways::<T>(config, &[gradients.clone()], 0.5).remove(0);
+        let way = ways::<T>(config, std::slice::from_ref(&gradients), 0.5).remove(0);
         for (g, way) in gradients.iter().zip(&way) {
             // The textbook's first step is lr g / (|g| + epsilon).
             let g = round::<T>(*g);

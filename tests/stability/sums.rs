@@ -17,7 +17,7 @@ fn long_sums<T: Scalar>() {
     drop((x, rows));
     let n = 1 << 20;
     let value = |i: usize| {
-        if i % 2 == 0 {
+        if i.is_multiple_of(2) {
             1.0
         } else if i % 4 == 1 {
             1e8
