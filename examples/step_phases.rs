@@ -31,14 +31,14 @@ const RUNS: usize = 20;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let run = std::env::args().nth(1).ok_or("name a run: step_phases RUN")?;
+    // The phases are those of one thread. Reading photographs would start a pool of all of them.
+    rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
     let extent: Extent = serde_json::from_value(about["extent"].clone())?;
     let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
     let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
     let data = load(folder, Split::Train, 1)?;
-    // The phases are those of one thread.
-    rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     measure(&model, &data)
 }
 
