@@ -18,7 +18,7 @@ Written by `cargo run --release -p raygrad-autograd --example check_table`. Ever
   extrapolation; relative to the derivative or the function's value, whichever is larger, and at least 1. The second
   derivatives are those of the gradient by all inputs and by the output's gradient. Limit: 1e-7.
 - **f32**: value and gradient in f32 against f64 from the same rounded inputs, as a distance relative to the norm (limit
-  2e-6), and the worst element in units in the last place (limit 24); an element smaller than the root mean square of its
+  2e-6), and the worst element in units in the last place (limit 32); an element smaller than the root mean square of its
   tensor counts as that large.
 
 Not in the table, because they pass or fail: the same bits when run again, on buffers with old values, on inputs from

@@ -151,16 +151,3 @@ pub(crate) fn entries() -> Vec<Entry> {
             .sample(&[&[2, 0]]),
     ]
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use raygrad_autograd::{Check, check_op};
-
-    #[test]
-    fn every_check_passes() {
-        for entry in entries() {
-            check_op(&Check::default(), &entry).unwrap();
-        }
-    }
-}

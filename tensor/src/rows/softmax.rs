@@ -1,98 +1,7 @@
-//! Kernels on the rows of a matrix: softmax and its relatives, layer normalisation.
-//!
-//! A matrix is worked on in blocks of whole rows that fit in a core's nearest cache. What an element needs on its own
-//! (an exponential) runs over the whole block, so that rows shorter than a register are as fast as long ones.
+//! Softmax, its logarithm, the logarithm of a sum of exponentials, and cross-entropy.
 
-use crate::reduce::{chunk, sum};
+use super::{block, fold_lanes, total, total_of};
 use crate::{Pool, Scalar, simd};
-
-/// Elements of a block: 16 kB of f32.
-const BLOCK: usize = 4096;
-/// Independent partial results: two 512-bit registers of f32.
-const LANES: usize = 32;
-/// Rows whose gradients are added up in their own type before they go into f64 sums.
-const GROUP: usize = 16;
-
-/// Elements of a block of whole rows of `n`.
-fn block(n: usize) -> usize {
-    n * (BLOCK / n).max(1)
-}
-
-/// `pick` of all elements, which must not be none; `pick` may be applied in any order.
-#[inline(always)]
-pub(crate) fn fold_lanes<T: Scalar>(x: &[T], pick: impl Fn(T, T) -> T) -> T {
-    if x.len() < LANES {
-        let mut best = x[0];
-        for &x in &x[1..] {
-            best = pick(best, x);
-        }
-        return best;
-    }
-    let mut lanes = [T::ZERO; LANES];
-    lanes.copy_from_slice(&x[..LANES]);
-    let mut rows = x[LANES..].chunks_exact(LANES);
-    for row in &mut rows {
-        for i in 0..LANES {
-            lanes[i] = pick(lanes[i], row[i]);
-        }
-    }
-    for (lane, &x) in lanes.iter_mut().zip(rows.remainder()) {
-        *lane = pick(*lane, x);
-    }
-    let mut width = LANES / 2;
-    while width > 0 {
-        for i in 0..width {
-            lanes[i] = pick(lanes[i], lanes[i + width]);
-        }
-        width /= 2;
-    }
-    lanes[0]
-}
-
-/// The sum of a row: inlined if it is short, pairwise if it is long.
-#[inline(always)]
-fn total<T: Scalar>(x: &[T]) -> T {
-    if x.len() < LANES {
-        let mut sum = T::ZERO;
-        for &x in x {
-            sum += x;
-        }
-        sum
-    } else if x.len() <= BLOCK {
-        chunk(x)
-    } else {
-        sum(x)
-    }
-}
-
-/// The sum of `f` of the elements of `a` and `b` at each index.
-#[inline(always)]
-fn total_of<T: Scalar>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
-    let n = a.len();
-    let b = &b[..n];
-    let mut lanes = [T::ZERO; LANES];
-    let whole = n - n % LANES;
-    let mut start = 0;
-    while start < whole {
-        let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
-        for i in 0..LANES {
-            lanes[i] += f(a[i], b[i]);
-        }
-        start += LANES;
-    }
-    let (a, b) = (&a[whole..], &b[whole..]);
-    if whole == 0 {
-        let mut sum = T::ZERO;
-        for i in 0..a.len() {
-            sum += f(a[i], b[i]);
-        }
-        return sum;
-    }
-    for i in 0..a.len() {
-        lanes[i] += f(a[i], b[i]);
-    }
-    chunk(&lanes)
-}
 
 /// The greatest element of a row, as far as there is an order; a row with NaN comes out as NaN anyway.
 #[inline(always)]
@@ -292,137 +201,6 @@ fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: 
     pool.give(shifts);
 }
 
-/// Mean and mean squared deviation of a row, the mean in two parts: their sum is accurate beyond the type's digits.
-///
-/// Two passes. The second measures from the rounded mean, and takes out what the rounding of the mean adds to the sum.
-#[inline(always)]
-fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
-    let count = T::from_f64(x.len() as f64);
-    let mean = total(x) / count;
-    let rest = total_of(
-        x,
-        x,
-        #[inline(always)]
-        |x, _| x - mean,
-    ) / count;
-    let square = total_of(
-        x,
-        x,
-        #[inline(always)]
-        |x, _| (x - mean) * (x - mean),
-    ) / count;
-    ([mean, rest], square - rest * rest)
-}
-
-/// The mean squared deviation from the mean, of each row of `n` elements; NaN for an empty row.
-///
-/// # Panics
-/// If `x` is not `out.len()` rows of `n`.
-pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
-    assert_eq!(x.len(), n * out.len(), "{} rows of {n}", out.len());
-    if n == 0 {
-        out.fill(T::from_f64(f64::NAN));
-        return;
-    }
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            for (x, out) in x.chunks_exact(n).zip(out) {
-                *out = moments(x).1;
-            }
-        },
-    );
-}
-
-/// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
-/// `n`.
-///
-/// # Panics
-/// If `gain` and `bias` have different lengths or a row has another one, or `out` is shorter than `x`.
-pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out: &mut [T]) {
-    let n = gain.len();
-    assert_eq!(bias.len(), n, "gain and bias of one length");
-    if x.is_empty() {
-        return;
-    }
-    let (eps, len) = (T::from_f64(eps), x.len());
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            let (gain, bias) = (&gain[..n], &bias[..n]);
-            for (x, out) in x.chunks_exact(n).zip(out[..len].chunks_exact_mut(n)) {
-                let ([mean, rest], variance) = moments(x);
-                let scale = T::ONE / (variance + eps).sqrt();
-                for i in 0..n {
-                    out[i] = ((x[i] - mean) - rest) * scale * gain[i] + bias[i];
-                }
-            }
-        },
-    );
-}
-
-/// The gradients of [`layer_norm_rows`]: that of `x` to `dx`, those of gain and bias to `dgain` and `dbias`.
-///
-/// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps), dgain = sum of g u
-/// and dbias = sum of g over the rows. These sums are carried in f64.
-///
-/// # Panics
-/// If a slice is shorter than its counterpart.
-pub fn layer_norm_rows_grad<T: Scalar>(
-    x: &[T],
-    gain: &[T],
-    g: &[T],
-    eps: f64,
-    [dx, dgain, dbias]: [&mut [T]; 3],
-    pool: &Pool<T>,
-) {
-    let n = gain.len();
-    let mut sums = vec![0.0_f64; 2 * n];
-    let mut scratch = pool.take(3 * n);
-    let (eps, len) = (T::from_f64(eps), x.len());
-    let count = T::from_f64(n as f64);
-    for ((x, g), dx) in
-        x.chunks(GROUP * n.max(1)).zip(g[..len].chunks(GROUP * n.max(1))).zip(dx[..len].chunks_mut(GROUP * n.max(1)))
-    {
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                let (unit, group) = scratch[..3 * n].split_at_mut(n);
-                group.fill(T::ZERO);
-                let (group_gain, group_bias) = group.split_at_mut(n);
-                let gain = &gain[..n];
-                for ((x, g), dx) in x.chunks_exact(n).zip(g.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
-                    let ([mean, rest], variance) = moments(x);
-                    let scale = T::ONE / (variance + eps).sqrt();
-                    for i in 0..n {
-                        unit[i] = ((x[i] - mean) - rest) * scale;
-                        dx[i] = g[i] * gain[i];
-                        group_gain[i] += g[i] * unit[i];
-                        group_bias[i] += g[i];
-                    }
-                    let level = total(dx) / count;
-                    let slope = total_of(
-                        dx,
-                        unit,
-                        #[inline(always)]
-                        |h, u| h * u,
-                    ) / count;
-                    for i in 0..n {
-                        dx[i] = ((dx[i] - level) - unit[i] * slope) * scale;
-                    }
-                }
-                for (sum, &part) in sums.iter_mut().zip(&*group) {
-                    *sum += part.to_f64();
-                }
-            },
-        );
-    }
-    pool.give(scratch);
-    for (out, &sum) in dgain.iter_mut().chain(dbias).zip(&sums) {
-        *out = T::from_f64(sum);
-    }
-}
-
 /// The cross-entropy of each row of `n` logits: `ln sum e^x - x[class]`.
 ///
 /// # Panics
@@ -458,21 +236,8 @@ pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g:
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::{LENGTHS, assert_close, matrix};
     use super::*;
-
-    /// Lengths around the widths of lanes and blocks.
-    const LENGTHS: [usize; 8] = [1, 2, 7, 31, 32, 33, 1000, 5000];
-
-    fn matrix(rows: usize, n: usize) -> Vec<f32> {
-        (0..rows * n).map(|i| ((i * 7919) % 1013) as f32 * 0.02 - 10.0).collect()
-    }
-
-    fn assert_close(got: &[f32], expected: impl Iterator<Item = f64>, tolerance: f64) {
-        for (i, (&got, expected)) in got.iter().zip(expected).enumerate() {
-            let error = (f64::from(got) - expected).abs() / expected.abs().max(1e-3);
-            assert!(error <= tolerance, "{i}: {got} for {expected}");
-        }
-    }
 
     #[test]
     fn softmax_and_its_relatives_agree_with_plain_loops() {
@@ -511,23 +276,6 @@ mod tests {
         assert_eq!(out, [0.0, 1.0, 0.0]);
         logsumexp_rows(&[], 0, &mut out, &pool);
         assert_eq!(out, [-inf; 3]);
-    }
-
-    #[test]
-    fn the_variance_survives_a_large_offset() {
-        for n in LENGTHS.into_iter().filter(|&n| n > 1) {
-            let x: Vec<f32> = matrix(1, n).iter().map(|x| x + 30_000.0).collect();
-            let mean = x.iter().map(|&x| f64::from(x)).sum::<f64>() / n as f64;
-            let exact = x.iter().map(|&x| (f64::from(x) - mean).powi(2)).sum::<f64>() / n as f64;
-            let mut out = [0.0];
-            variance_rows(&x, n, &mut out);
-            assert!((f64::from(out[0]) / exact - 1.0).abs() < 1e-5, "{n}: {} for {exact}", out[0]);
-            // Normalised, the row has mean 0 and variance 1 to the last digits.
-            let mut unit = vec![0.0; n];
-            layer_norm_rows(&x, &vec![1.0; n], &vec![0.0; n], 0.0, &mut unit);
-            let mean = unit.iter().map(|&x| f64::from(x)).sum::<f64>() / n as f64;
-            assert!(mean.abs() < 2e-7, "{n}: {mean}");
-        }
     }
 
     #[test]

@@ -1,0 +1,119 @@
+//! Kernels on the rows of a matrix: softmax and its relatives, layer normalisation.
+//!
+//! A matrix is worked on in blocks of whole rows that fit in a core's nearest cache. What an element needs on its own
+//! (an exponential) runs over the whole block, so that rows shorter than a register are as fast as long ones.
+
+mod moments;
+mod softmax;
+
+pub use moments::{layer_norm_rows, layer_norm_rows_grad, variance_rows};
+pub use softmax::{
+    cross_entropy_rows, cross_entropy_rows_grad, log_softmax_rows, log_softmax_rows_grad, logsumexp_rows, softmax_rows,
+    softmax_rows_grad,
+};
+
+use crate::Scalar;
+use crate::reduce::{chunk, sum};
+
+/// Elements of a block: 16 kB of f32.
+const BLOCK: usize = 4096;
+/// Independent partial results: two 512-bit registers of f32.
+const LANES: usize = 32;
+
+/// Elements of a block of whole rows of `n`.
+fn block(n: usize) -> usize {
+    n * (BLOCK / n).max(1)
+}
+
+/// `pick` of all elements, which must not be none; `pick` may be applied in any order.
+#[inline(always)]
+pub(crate) fn fold_lanes<T: Scalar>(x: &[T], pick: impl Fn(T, T) -> T) -> T {
+    if x.len() < LANES {
+        let mut best = x[0];
+        for &x in &x[1..] {
+            best = pick(best, x);
+        }
+        return best;
+    }
+    let mut lanes = [T::ZERO; LANES];
+    lanes.copy_from_slice(&x[..LANES]);
+    let mut rows = x[LANES..].chunks_exact(LANES);
+    for row in &mut rows {
+        for i in 0..LANES {
+            lanes[i] = pick(lanes[i], row[i]);
+        }
+    }
+    for (lane, &x) in lanes.iter_mut().zip(rows.remainder()) {
+        *lane = pick(*lane, x);
+    }
+    let mut width = LANES / 2;
+    while width > 0 {
+        for i in 0..width {
+            lanes[i] = pick(lanes[i], lanes[i + width]);
+        }
+        width /= 2;
+    }
+    lanes[0]
+}
+
+/// The sum of a row: inlined if it is short, pairwise if it is long.
+#[inline(always)]
+fn total<T: Scalar>(x: &[T]) -> T {
+    if x.len() < LANES {
+        let mut sum = T::ZERO;
+        for &x in x {
+            sum += x;
+        }
+        sum
+    } else if x.len() <= BLOCK {
+        chunk(x)
+    } else {
+        sum(x)
+    }
+}
+
+/// The sum of `f` of the elements of `a` and `b` at each index.
+#[inline(always)]
+fn total_of<T: Scalar>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
+    let n = a.len();
+    let b = &b[..n];
+    let mut lanes = [T::ZERO; LANES];
+    let whole = n - n % LANES;
+    let mut start = 0;
+    while start < whole {
+        let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
+        for i in 0..LANES {
+            lanes[i] += f(a[i], b[i]);
+        }
+        start += LANES;
+    }
+    let (a, b) = (&a[whole..], &b[whole..]);
+    if whole == 0 {
+        let mut sum = T::ZERO;
+        for i in 0..a.len() {
+            sum += f(a[i], b[i]);
+        }
+        return sum;
+    }
+    for i in 0..a.len() {
+        lanes[i] += f(a[i], b[i]);
+    }
+    chunk(&lanes)
+}
+
+#[cfg(test)]
+mod tests {
+    /// Lengths around the widths of lanes and blocks.
+    pub(super) const LENGTHS: [usize; 8] = [1, 2, 7, 31, 32, 33, 1000, 5000];
+
+    pub(super) fn matrix(rows: usize, n: usize) -> Vec<f32> {
+        (0..rows * n).map(|i| ((i * 7919) % 1013) as f32 * 0.02 - 10.0).collect()
+    }
+
+    pub(super) fn assert_close(got: &[f32], expected: impl Iterator<Item = f64>, tolerance: f64) {
+        for (i, (&got, expected)) in got.iter().zip(expected).enumerate() {
+            let error = (f64::from(got) - expected).abs() / expected.abs().max(1e-3);
+            assert!(error <= tolerance, "{i}: {got} for {expected}");
+        }
+    }
+}
