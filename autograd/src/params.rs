@@ -2,8 +2,6 @@
 
 use crate::{Move, Tape, Var};
 use raygrad_tensor::{Scalar, Tensor};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
-use std::collections::HashMap;
 use std::ops::Index;
 
 /// A handle on a parameter of one [`Params`].
@@ -37,30 +35,6 @@ struct Setting {
     frozen: bool,
     rate: f64,
     decay: f64,
-}
-
-/// Why stored parameters do not fit a model.
-#[derive(Debug, thiserror::Error)]
-pub enum ParamsError {
-    /// The bytes are not a safetensors file.
-    #[error("not a safetensors file: {0}")]
-    Format(#[from] safetensors::SafeTensorError),
-    /// A parameter of the model is not in the file.
-    #[error("`{0}` is missing: the file belongs to a model of another configuration")]
-    Missing(String),
-    /// The file holds a parameter that the model does not have.
-    #[error("`{0}` is not a parameter of this model: the file belongs to a model of another configuration")]
-    Unknown(String),
-    /// A parameter has another shape or number type in the file.
-    #[error("`{name}` is {found} in the file and {expected} in this model")]
-    Mismatch {
-        /// The parameter.
-        name: String,
-        /// Type and shape in the file.
-        found: String,
-        /// Type and shape in the model.
-        expected: String,
-    },
 }
 
 impl<T: Scalar> Params<T> {
@@ -243,70 +217,6 @@ impl<T: Scalar> Params<T> {
     pub(crate) fn replace(&mut self, values: Vec<Tensor<T>>) {
         self.values = values;
     }
-
-    /// The parameters as a safetensors file, with some words about them and further named bytes.
-    ///
-    /// # Errors
-    /// If the format cannot hold them.
-    pub fn to_safetensors(
-        &self,
-        metadata: HashMap<String, String>,
-        blobs: &[(&str, Vec<u8>)],
-    ) -> Result<Vec<u8>, ParamsError> {
-        let bytes: Vec<Vec<u8>> = self
-            .values
-            .iter()
-            .map(|value| {
-                let mut out = Vec::with_capacity(size_of_val(value.as_slice()));
-                value.as_slice().iter().for_each(|x| x.write_le(&mut out));
-                out
-            })
-            .collect();
-        let mut views = Vec::with_capacity(self.len() + blobs.len());
-        for ((name, value), bytes) in self.iter().zip(&bytes) {
-            views.push((name, TensorView::new(dtype::<T>(), value.shape().to_vec(), bytes)?));
-        }
-        for (name, bytes) in blobs {
-            views.push((name, TensorView::new(Dtype::U8, vec![bytes.len()], bytes)?));
-        }
-        Ok(safetensors::serialize(views, Some(metadata))?)
-    }
-
-    /// Replaces every value by that of the same name in a safetensors file, and returns the further bytes that the file
-    /// holds by their names. Nothing changes if a value does not fit.
-    ///
-    /// # Errors
-    /// If the bytes are no safetensors file, or names, shapes or number types differ from those of this store.
-    pub fn load_safetensors(&mut self, bytes: &[u8]) -> Result<HashMap<String, Vec<u8>>, ParamsError> {
-        let file = SafeTensors::deserialize(bytes)?;
-        let mut values = Vec::with_capacity(self.len());
-        for (name, value) in self.iter() {
-            let Ok(found) = file.tensor(name) else { return Err(ParamsError::Missing(name.into())) };
-            if found.shape() != value.shape() || found.dtype() != dtype::<T>() {
-                return Err(ParamsError::Mismatch {
-                    name: name.into(),
-                    found: format!("{:?}{:?}", found.dtype(), found.shape()),
-                    expected: format!("{:?}{:?}", dtype::<T>(), value.shape()),
-                });
-            }
-            let elements = found.data().chunks_exact(size_of::<T>()).map(T::read_le).collect();
-            values.push(Tensor::from_vec(value.shape(), elements));
-        }
-        let mut blobs = HashMap::new();
-        for (name, view) in file.tensors() {
-            if view.dtype() == Dtype::U8 {
-                blobs.insert(name, view.data().to_vec());
-            } else if !self.names.contains(&name) {
-                return Err(ParamsError::Unknown(name));
-            }
-        }
-        self.replace(values);
-        Ok(blobs)
-    }
-}
-
-fn dtype<T: Scalar>() -> Dtype {
-    if size_of::<T>() == 4 { Dtype::F32 } else { Dtype::F64 }
 }
 
 /// Parameters on a tape; index it with a [`ParamId`].
@@ -335,14 +245,8 @@ impl<'t, T: Scalar> Index<ParamId> for Bound<'t, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Optimizer, Sgd, SgdConfig};
-
-    fn store() -> Params<f32> {
-        let mut params = Params::new();
-        params.add("a", Tensor::from_vec(&[2], vec![1.0, f32::MIN_POSITIVE]));
-        params.add("b", Tensor::from_vec(&[1, 2], vec![-0.0, 3.5]));
-        params
-    }
+    use crate::{Optimizer, Sgd, SgdConfig, Storage};
+    use std::collections::HashMap;
 
     #[test]
     fn frozen_parameters_rest_and_others_have_their_own_rates() {
@@ -374,47 +278,12 @@ mod tests {
         assert_eq!(values, [0.9, 0.95, 1.0]);
         // Settings survive a change of precision and a load.
         let mut copy = params.cast::<f32>().cast::<f64>();
-        let bytes = params.to_safetensors(HashMap::new(), &[]).unwrap();
+        let bytes = params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap();
         copy.load_safetensors(&bytes).unwrap();
         assert!(copy.is_frozen(head) && copy.trainable_elements() == 4);
         copy.unfreeze(|_| true);
         let (constant, grad, values) = step(&mut copy, &mut sgd);
         assert_eq!((constant, grad), (vec![false; 3], Tensor::ones(&[2])));
         assert_eq!(values[2], 1.0 - 0.1 * 2.0);
-    }
-
-    #[test]
-    fn a_stored_model_comes_back_bit_for_bit() {
-        let params = store();
-        let bytes = params.to_safetensors(HashMap::new(), &[("more", vec![1, 2, 3])]).unwrap();
-        let mut other = params.clone();
-        other.values_mut()[0].as_mut_slice().fill(9.0);
-        let blobs = other.load_safetensors(&bytes).unwrap();
-        assert_eq!(blobs["more"], [1, 2, 3]);
-        for (a, b) in params.values().iter().zip(other.values()) {
-            let bits = |x: &Tensor<f32>| x.as_slice().iter().map(|x| x.to_bits()).collect::<Vec<_>>();
-            assert_eq!(bits(a), bits(b));
-        }
-    }
-
-    #[test]
-    fn another_model_is_refused_and_nothing_changes() {
-        let mut wide = Params::<f32>::new();
-        wide.add("a", Tensor::zeros(&[3]));
-        wide.add("b", Tensor::zeros(&[1, 2]));
-        let bytes = wide.to_safetensors(HashMap::new(), &[]).unwrap();
-        let mut params = store();
-        let message = params.load_safetensors(&bytes).unwrap_err().to_string();
-        assert!(message.contains("`a` is F32[3] in the file and F32[2]"), "{message}");
-        assert_eq!(params.values()[0].as_slice()[0], 1.0);
-        let mut more = store();
-        more.add("c", Tensor::zeros(&[1]));
-        assert!(matches!(
-            more.load_safetensors(&store().to_safetensors(HashMap::new(), &[]).unwrap()),
-            Err(ParamsError::Missing(_))
-        ));
-        let bytes = more.to_safetensors(HashMap::new(), &[]).unwrap();
-        assert!(matches!(params.load_safetensors(&bytes), Err(ParamsError::Unknown(_))));
-        assert!(params.load_safetensors(b"no tensors").is_err());
     }
 }

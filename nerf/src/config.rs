@@ -8,7 +8,7 @@ use crate::loss::Loss;
 use crate::marching::MarchingConfig;
 use crate::occupancy::Skip;
 use crate::{Error, Result};
-use raygrad_autograd::{AdamConfig, Schedule};
+use raygrad_autograd::{AdamConfig, Schedule, Storage};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -83,6 +83,9 @@ pub struct Config {
     pub background: Background,
     /// Seed of everything random.
     pub seed: u64,
+    /// The number type of parameters in the file that a model is saved to.
+    #[serde(default)]
+    pub storage: Storage,
 }
 
 impl Config {
@@ -101,6 +104,7 @@ impl Config {
             table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
             background: Background::White,
             seed: 0,
+            storage: Storage::Full,
         };
         match preset {
             Preset::Classic => classic,

@@ -86,7 +86,7 @@ impl<T: Scalar> Model<T> {
 /// same in every precision.
 fn even_steps<T: Scalar>(sampler: &Marching, rays: &Rays<T>, finer: usize, tape: &Tape<T>) -> (Samples<T>, u64) {
     let mut buffer = MarchBuffer::default();
-    let step = Step::uniform(sampler.step() / finer as f32);
+    let step = Step::uniform(sampler.view_step() / finer as f32);
     sampler.grid.march(&rays.cast(), &step, &mut Jitter::Middle, &mut buffer);
     let tensor =
         |values: &[f32]| Tensor::from_vec(&[values.len()], values.iter().map(|&x| T::from_f64(x.into())).collect());

@@ -16,8 +16,11 @@ use serde::{Deserialize, Serialize};
 pub struct MarchingConfig {
     /// The occupancy grid, and what may be skipped with it.
     pub occupancy: OccupancyConfig,
-    /// Length of a step as a share of the longest side of the box.
+    /// Length of a training step along a ray, as a share of the longest side of the box.
     pub step: f64,
+    /// The same in rendering. Training starts each ray at random, so it fits what finer steps show; they add .1 to .4 dB.
+    #[serde(default = "view_step")]
+    pub view_step: f64,
     /// Evaluations of a density in a training step; the number of rays follows.
     pub samples: usize,
     /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
@@ -28,13 +31,19 @@ pub struct MarchingConfig {
     pub quadrature: Quadrature,
 }
 
+/// On Lego, steps half as long add less than .01 dB.
+const fn view_step() -> f64 {
+    1.0 / 600.0
+}
+
 impl Default for MarchingConfig {
     fn default() -> Self {
         let occupancy = OccupancyConfig { skip: Skip::Fast, ..OccupancyConfig::default() };
         MarchingConfig {
             occupancy,
-            step: 1.0 / 300.0,
-            samples: 1 << 15,
+            step: 1.0 / 200.0,
+            view_step: view_step(),
+            samples: 24576,
             termination: 1e-3,
             quadrature: Quadrature::Midpoint,
         }
@@ -45,6 +54,7 @@ impl MarchingConfig {
     pub(crate) fn check(&self) -> Result<()> {
         self.occupancy.check()?;
         check_range("step", self.step, 1e-5, 1.0)?;
+        check_range("view_step", self.view_step, 1e-5, 1.0)?;
         check_range("samples", self.samples, 1, 1 << 24)?;
         self.quadrature.check()?;
         check_range("termination", self.termination, 0.0, 1.0)
@@ -66,10 +76,19 @@ pub struct Marching {
 }
 
 impl Marching {
-    /// The length of a step in scene units.
+    /// The length of a training step in scene units.
     pub fn step(&self) -> f32 {
+        self.length(self.config.step)
+    }
+
+    /// The length of a step in scene units when rendering.
+    pub fn view_step(&self) -> f32 {
+        self.length(self.config.view_step)
+    }
+
+    fn length(&self, share: f64) -> f32 {
         let [low, high] = self.grid.outer_bounds();
-        (self.config.step * (high - low).max_element()) as f32
+        (share * (high - low).max_element()) as f32
     }
 
     /// Samples in occupied cells, at even steps from a random start in each ray's span.

@@ -12,7 +12,7 @@ use std::path::Path;
 const GRID: &str = "occupancy";
 
 impl Model<f32> {
-    /// Writes the parameters, and the occupancy grid if there is one, as safetensors: beside the file first and then over
+    /// Writes the parameters in the number type of the configuration, and the occupancy grid if there is one, as safetensors: beside the file first and then over
     /// it.
     ///
     /// # Errors
@@ -23,7 +23,10 @@ impl Model<f32> {
             Sampler::Hierarchical(_) => vec![],
             Sampler::Marching(sampler) => vec![(GRID, sampler.grid.to_bytes())],
         };
-        let bytes = self.params.to_safetensors(metadata, &blobs).map_err(|error| Error::file(&path, error))?;
+        let bytes = self
+            .params
+            .to_safetensors(self.config.storage, metadata, &blobs)
+            .map_err(|error| Error::file(&path, error))?;
         write_atomic(path, &bytes)
     }
 
@@ -54,6 +57,7 @@ mod tests {
     use crate::field::{FieldConfig, VoxelConfig};
     use crate::scene::train_cameras;
     use glam::DVec3;
+    use raygrad_autograd::Storage;
 
     fn voxel(direction_degree: usize) -> Config {
         let mut config = Config::preset(Preset::Voxel);
@@ -85,6 +89,22 @@ mod tests {
         assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));
         let error = Model::load(&path, voxel(3), extent).err().unwrap().to_string();
         assert!(error.contains("field.table"), "{error}");
+    }
+
+    #[test]
+    fn sixteen_bits_take_half_of_the_file() {
+        let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.safetensors");
+        let sizes = [Storage::Full, Storage::F16, Storage::Bf16].map(|storage| {
+            let mut model = Model::new(Config { storage, ..voxel(2) }, extent, 3).unwrap();
+            model.save(&path).unwrap();
+            let read = Model::load(&path, model.config.clone(), extent).unwrap();
+            model.params.round_to(storage);
+            assert_eq!(read.params.values(), model.params.values());
+            path.metadata().unwrap().len() as f64
+        });
+        assert!(sizes[1] < 0.51 * sizes[0] && sizes[2] == sizes[1], "{sizes:?}");
     }
 
     #[test]

@@ -73,7 +73,7 @@ impl Viewer {
         limits: &Limits,
         out: &mut [RayValues],
     ) -> Evaluations {
-        let step = Step::uniform(sampler.step());
+        let step = Step::uniform(sampler.view_step());
         sampler.grid.march(rays, &step, &mut Jitter::Middle, &mut self.marched);
         match sampler.config.quadrature {
             Quadrature::Midpoint => {}

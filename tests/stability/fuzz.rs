@@ -2,7 +2,7 @@
 
 use crate::damage::{clear, damage, damaged};
 use proptest::prelude::*;
-use raygrad::autograd::{Params, Scalar, Tensor};
+use raygrad::autograd::{Params, Scalar, Storage, Tensor};
 use raygrad::nerf::dataset::{Split, load, load_views};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::hash_grid::HashGridConfig;
@@ -122,7 +122,7 @@ proptest! {
     #[test]
     fn parameters_as_safetensors(damage in damage(), noise in prop::collection::vec(any::<u8>(), 0..64)) {
         let metadata = || HashMap::from([("format".to_string(), "raygrad".to_string())]);
-        let bytes = params::<f32>().to_safetensors(metadata(), &[("blob", vec![1, 2, 3])]).unwrap();
+        let bytes = params::<f32>().to_safetensors(Storage::Full, metadata(), &[("blob", vec![1, 2, 3])]).unwrap();
         for bytes in [damaged(&bytes, &damage), noise, bytes[..bytes.len() / 2].to_vec()] {
             let mut single = params::<f32>();
             let before = single.values().to_vec();

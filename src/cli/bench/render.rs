@@ -55,7 +55,7 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
     let Sampler::Marching(sampler) = &model.sampler else {
         return Err(Error::setting("run", "samples hierarchically; choose one that marches, such as preset instant"));
     };
-    let step = sampler.config.step;
+    let step = sampler.config.view_step;
     note("render: the reference in f64");
     let reference = references(&model, &views)?;
     let mut outcomes = vec![];
@@ -308,7 +308,7 @@ mod tests {
         let scale = Scale { steps: 60, size: 32, views: 1, rounds: 1 };
         let (model, views) = trained(&scale).unwrap();
         let reference = references(&model, &views).unwrap();
-        let step = 1.0 / 300.0;
+        let step = 1.0 / 600.0;
         let base = Setting::base(step);
         let baseline = base.model(&model);
         let all = settings(step);

@@ -1,5 +1,6 @@
 //! Ways to render one model.
 
+use raygrad::autograd::Storage;
 use raygrad::nerf::marching::Marching;
 use raygrad::nerf::occupancy::{Skip, Threshold, Update};
 use raygrad::nerf::quadrature::Quadrature;
@@ -36,6 +37,8 @@ pub struct Setting {
     pub rule: Quadrature,
     /// All arithmetic in f64, nothing but empty cells left out.
     pub double: bool,
+    /// What the parameters are rounded to.
+    pub storage: Storage,
 }
 
 impl Setting {
@@ -49,12 +52,14 @@ impl Setting {
             limits: Limits::of(Skip::Fast),
             rule: Quadrature::Midpoint,
             double: false,
+            storage: Storage::Full,
         }
     }
 
     /// The model with its sampler set so, and the cells emptied.
     pub fn model(&self, model: &Model<f32>) -> Model<f32> {
         let mut model = model.clone();
+        model.params.round_to(self.storage);
         let pruned = match &model.sampler {
             Sampler::Marching(sampler) => Some(self.sampler(&model, sampler.clone())),
             Sampler::Hierarchical(_) => None,
@@ -67,7 +72,7 @@ impl Setting {
 
     fn sampler(&self, model: &Model<f32>, mut sampler: Marching) -> Marching {
         let ask = |points: &[[f32; 3]], out: &mut [f32]| model.densities(points, out);
-        sampler.config.step = self.step;
+        sampler.config.view_step = self.step;
         sampler.config.quadrature = self.rule;
         match self.cells {
             Cells::Trained => {}
@@ -79,7 +84,7 @@ impl Setting {
                 // Occupied cells only, and nothing of what was known of them.
                 let plan = Update { every: u32::MAX, occupied_every: 1, samples: 1, decay: 0.0 };
                 sampler.grid.update(&plan, 0, 0, &ask);
-                let min_sigma = depth as f32 / sampler.step();
+                let min_sigma = depth as f32 / sampler.view_step();
                 sampler.grid.threshold(&Threshold { min_sigma, or_mean: false, dilate: false });
             }
         }
@@ -97,7 +102,7 @@ impl Setting {
     }
 }
 
-/// All settings; `step` is the model's own.
+/// All settings; `step` is that of the model's views.
 pub fn settings(step: f64) -> Vec<Setting> {
     let base = Setting::base(step);
     let exact = Limits { termination: 0.0, color_budget: 0.0 };
@@ -141,6 +146,9 @@ pub fn settings(step: f64) -> Vec<Setting> {
     }
     let unskipped = Setting { cells: Cells::Trained, limits: exact, ..base.clone() };
     out.push(of("precision", "f64".into(), Setting { double: true, ..unskipped }));
+    for (name, storage) in [("f16", Storage::F16), ("bf16", Storage::Bf16)] {
+        out.push(of("precision", format!("{name} parameters"), Setting { storage, ..base.clone() }));
+    }
     let ngp = Setting {
         step: 3.0_f64.sqrt() / 1024.0,
         cells: Cells::OneSample(0.01),
