@@ -137,8 +137,8 @@ fn reference(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>]) -> Option<Vec<Tensor<f64>
     results(x, &Pool::new(), |x| op.reference(x))
 }
 
-/// A pool whose buffers of up to about a thousand elements hold NaN: what an operation forgets to write shows, in tensors
-/// that are large enough (above 64 elements) to take their memory from the pool.
+/// A pool whose buffers of up to about a thousand elements hold NaN: what an operation forgets to write shows. (Tensors of up
+/// to 64 elements have memory of their own, which holds NaN where assertions are on.)
 fn poisoned() -> Pool<f64> {
     let pool = Pool::new();
     let sizes = (4..9).flat_map(|power| (4..8).map(move |quarters| quarters << power));

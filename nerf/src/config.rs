@@ -147,14 +147,16 @@ impl Config {
     }
 
     /// The same for a training time: the table of a hash grid is as large as pays within it, see [`HashGridConfig::cpu`],
-    /// and beyond five minutes a step has twice the samples.
+    /// beyond 100 seconds the steps along a ray grow shorter as training goes on, and beyond 300 a training step has twice
+    /// as many samples.
     pub fn with_budget(mut self, seconds: f64) -> Self {
         if let FieldConfig::Instant(field) = &mut self.field {
             field.grid = HashGridConfig::cpu(seconds);
             if let SamplerConfig::Marching(marching) = &mut self.sampler
-                && seconds > 300.0
+                && seconds > 100.0
             {
-                marching.samples *= 2;
+                (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / 450.0));
+                marching.samples *= if seconds > 300.0 { 2 } else { 1 };
             }
         }
         self
@@ -166,8 +168,8 @@ impl Config {
             SamplerConfig::Marching(marching) => marching.occupancy.skip = skip,
             SamplerConfig::Hierarchical(_) if skip == Skip::Off => {}
             SamplerConfig::Hierarchical(hierarchical) => {
-                // As many samples as the networks saw before, on more rays.
-                let samples = hierarchical.batch * (hierarchical.coarse + hierarchical.fine);
+                // As many rays as before, once a few samples are left of each.
+                let samples = 16 * hierarchical.batch;
                 let mut marching = MarchingConfig { samples, ..MarchingConfig::default() };
                 marching.occupancy.skip = skip;
                 self.sampler = SamplerConfig::Marching(marching);

@@ -18,6 +18,10 @@ pub struct MarchingConfig {
     pub occupancy: OccupancyConfig,
     /// Length of a training step along a ray, as a share of the longest side of the box.
     pub step: f64,
+    /// The same at the end of training, if it changes: evenly on a logarithmic scale. Long steps leave samples for more
+    /// rays, short ones show fine detail as it is.
+    #[serde(default)]
+    pub last_step: Option<f64>,
     /// The same in rendering. Training starts each ray at random, so it fits what finer steps show; they add .1 to .4 dB.
     #[serde(default = "view_step")]
     pub view_step: f64,
@@ -42,6 +46,7 @@ impl Default for MarchingConfig {
         MarchingConfig {
             occupancy,
             step: 1.0 / 200.0,
+            last_step: None,
             view_step: view_step(),
             samples: 24576,
             termination: 1e-3,
@@ -54,6 +59,7 @@ impl MarchingConfig {
     pub(crate) fn check(&self) -> Result<()> {
         self.occupancy.check()?;
         check_range("step", self.step, 1e-5, 1.0)?;
+        self.last_step.map_or(Ok(()), |step| check_range("last_step", step, 1e-5, 1.0))?;
         check_range("view_step", self.view_step, 1e-5, 1.0)?;
         check_range("samples", self.samples, 1, 1 << 24)?;
         self.quadrature.check()?;
@@ -73,12 +79,16 @@ pub struct Marching {
     pub config: MarchingConfig,
     /// Which cells hold something.
     pub grid: OccupancyGrid,
+    /// How much of training is done, 0 to 1.
+    pub progress: f64,
 }
 
 impl Marching {
-    /// The length of a training step in scene units.
+    /// The length of a training step in scene units, now.
     pub fn step(&self) -> f32 {
-        self.length(self.config.step)
+        let first = self.config.step;
+        let last = self.config.last_step.unwrap_or(first);
+        self.length(first * (last / first).powf(self.progress))
     }
 
     /// The length of a step in scene units when rendering.
@@ -152,4 +162,28 @@ pub(crate) fn densities(
     let positions = tape.constant(pool.copy_of(&[points.len(), 3], points.as_flattened()));
     let density = field.density(&params, &field.encode(&params, &positions));
     out.copy_from_slice(density.sigma().value().as_slice());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    #[test]
+    fn steps_shrink_evenly_from_the_first_to_the_last() {
+        let config = MarchingConfig { step: 0.01, last_step: Some(0.0025), ..MarchingConfig::default() };
+        let grid = OccupancyGrid::new([DVec3::ZERO, DVec3::new(1.0, 4.0, 2.0)], &config.occupancy).unwrap();
+        let mut marching = Marching { config, grid, progress: 0.0 };
+        let mut at = |progress: f64| {
+            marching.progress = progress;
+            [marching.step(), marching.view_step()]
+        };
+        for (progress, step) in [(0.0, 0.04), (0.5, 0.02), (1.0, 0.01)] {
+            let [now, view] = at(progress);
+            assert!((now / step - 1.0).abs() < 1e-6, "{progress}: {now}");
+            assert_eq!(view, 4.0 / 600.0);
+        }
+        let wrong = MarchingConfig { last_step: Some(0.0), ..MarchingConfig::default() };
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`last_step`"));
+    }
 }

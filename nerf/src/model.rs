@@ -75,6 +75,7 @@ impl<T: Scalar> Model<T> {
             SamplerConfig::Marching(config) => Sampler::Marching(Marching {
                 config: config.clone(),
                 grid: OccupancyGrid::new(extent.bounds, &config.occupancy)?,
+                progress: 0.0,
             }),
         };
         let field = config.field.build(extent.bounds, &mut params, "field", &mut rng)?;

@@ -1,4 +1,4 @@
-//! One worker's share of a training step: a tape, and sums of gradients.
+//! A share of a training step: sums of the gradients of some tiles, and what a tile is worked out with.
 
 use crate::batch::draw;
 use crate::dataset::Dataset;
@@ -47,10 +47,24 @@ impl Add for Work {
     }
 }
 
-/// A tape and sums, kept from step to step so that nothing is allocated.
-pub(crate) struct Slot {
+/// What one tile at a time is worked out with, kept so that nothing is allocated. There are as many as threads, so that
+/// memory does not grow with the number of slots.
+#[derive(Default)]
+pub(crate) struct Scratch {
     tape: Tape<f32>,
     buffer: MarchBuffer,
+}
+
+impl Scratch {
+    /// Frees memory that no tile since the last call has needed.
+    pub fn trim(&self) {
+        self.tape.pool().trim();
+    }
+}
+
+/// Sums over tiles, kept from step to step.
+#[derive(Default)]
+pub(crate) struct Slot {
     /// Whether a tile of this step is in the sums.
     started: bool,
     /// Summed gradient of each dense parameter; None for a table.
@@ -61,17 +75,6 @@ pub(crate) struct Slot {
 }
 
 impl Slot {
-    pub fn new() -> Self {
-        Slot {
-            tape: Tape::new(),
-            buffer: MarchBuffer::default(),
-            started: false,
-            grads: vec![],
-            tables: vec![],
-            work: Work::default(),
-        }
-    }
-
     /// Forgets the last step.
     pub fn begin(&mut self) {
         self.started = false;
@@ -79,8 +82,16 @@ impl Slot {
     }
 
     /// Draws a tile of `count` of the step's `total` rays and adds its gradients to the sums.
-    pub fn tile(&mut self, model: &Model<f32>, data: &Dataset, [count, total]: [usize; 2], rng: &mut Pcg64Mcg) {
-        let Slot { tape, buffer, grads, tables, work, started } = self;
+    pub fn tile(
+        &mut self,
+        scratch: &mut Scratch,
+        model: &Model<f32>,
+        data: &Dataset,
+        [count, total]: [usize; 2],
+        rng: &mut Pcg64Mcg,
+    ) {
+        let Slot { grads, tables, work, started } = self;
+        let Scratch { tape, buffer } = scratch;
         let params = model.params.bind(tape);
         let batch = draw(data, count, model.config.background, rng);
         let rays = &batch.rays;
@@ -123,7 +134,7 @@ impl Slot {
         }
         *started = true;
         drop((loss, params, target, background));
-        self.tape.clear();
+        tape.clear();
     }
 }
 
@@ -142,11 +153,9 @@ impl Work {
 /// Adds the gradients of all slots, in order, to those of the first; parallel over parameters.
 pub(crate) fn sum_slots(slots: &mut [Slot]) {
     let Some((first, rest)) = slots.split_first_mut() else { return };
-    // A tape cannot be shared between threads, but the sums beside it can.
-    let rest: Vec<&[Option<Tensor<f32>>]> = rest.iter().map(|slot| &slot.grads[..]).collect();
     first.grads.par_iter_mut().enumerate().for_each(|(i, sum)| {
-        for grads in &rest {
-            if let (Some(sum), Some(grad)) = (&mut *sum, &grads[i]) {
+        for slot in &*rest {
+            if let (Some(sum), Some(grad)) = (&mut *sum, &slot.grads[i]) {
                 add_assign(sum.as_mut_slice(), grad.as_slice());
             }
         }

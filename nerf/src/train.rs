@@ -6,7 +6,7 @@ use crate::hash_grid::{HashGrad, TableOptimizer};
 use crate::metrics::psnr_from_mse;
 use crate::model::{Extent, Model, Sampler};
 use crate::occupancy::Skip;
-use crate::slot::{Slot, Work, sum_slots};
+use crate::slot::{Scratch, Slot, Work, sum_slots};
 use crate::{Error, Result};
 use crate::{silhouette, startup};
 use rand::SeedableRng;
@@ -15,7 +15,7 @@ use raygrad_autograd::{Adam, Pool};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::ops::ControlFlow;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
@@ -26,6 +26,8 @@ const SLOTS: usize = 8;
 const RAYS: [usize; 2] = [256, 1 << 16];
 /// Steps between updates of the occupancy grid.
 const GRID_EVERY: u64 = 16;
+/// Steps between the times when memory that they did not need is freed: the number of samples changes as training goes on.
+const TRIM_EVERY: u64 = 256;
 
 /// How long to train.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -80,6 +82,8 @@ pub struct Trainer {
     /// For the table of the field, if it has one.
     table: Option<TableOptimizer>,
     slots: Vec<Slot>,
+    /// What no thread is working with.
+    scratch: Mutex<Vec<Scratch>>,
     /// For what happens outside of the slots.
     pool: Pool<f32>,
     /// Rays of the next step.
@@ -101,6 +105,11 @@ pub(crate) fn stream(seed: u64, parts: [u64; 2]) -> Pcg64Mcg {
         state ^= state >> 31;
     }
     Pcg64Mcg::seed_from_u64(state)
+}
+
+/// The list; it is whole at every point where a panic could strike.
+fn locked(scratch: &Mutex<Vec<Scratch>>) -> MutexGuard<'_, Vec<Scratch>> {
+    scratch.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Trainer {
@@ -138,7 +147,8 @@ impl Trainer {
         let mut trainer = Trainer {
             adam: Adam::new(config.adam),
             table: None,
-            slots: (0..SLOTS).map(|_| Slot::new()).collect(),
+            slots: (0..SLOTS).map(|_| Slot::default()).collect(),
+            scratch: Mutex::default(),
             pool: Pool::new(),
             model,
             data,
@@ -201,12 +211,19 @@ impl Trainer {
         let number = self.done.step + 1;
         // A restart draws other rays too.
         let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
+        if let Sampler::Marching(marching) = &mut self.model.sampler {
+            marching.progress = fraction;
+        }
         self.update_grid(number, seed);
         let tile = match &self.model.config.sampler {
             SamplerConfig::Hierarchical(config) => config.tile,
             SamplerConfig::Marching(_) => self.batch.div_ceil(SLOTS),
         };
         let work = self.differentiate(tile, seed, number);
+        if number.is_multiple_of(TRIM_EVERY) {
+            locked(&self.scratch).iter().for_each(Scratch::trim);
+            self.pool.trim();
+        }
         let rate = self.model.config.schedule.rate(fraction);
         let skipped = self.descend(rate, tile);
         let values = 3.0 * self.batch as f64;
@@ -237,13 +254,15 @@ impl Trainer {
 
     /// All tiles' gradients, left in the slots.
     fn differentiate(&mut self, tile: usize, seed: u64, number: u64) -> Work {
-        let (model, data, total) = (&self.model, &*self.data, self.batch);
+        let (model, data, total, free) = (&self.model, &*self.data, self.batch, &self.scratch);
         self.slots.par_iter_mut().enumerate().for_each(|(index, slot)| {
             slot.begin();
+            let mut scratch = locked(free).pop().unwrap_or_default();
             for which in (index..total.div_ceil(tile)).step_by(SLOTS) {
                 let count = tile.min(total - which * tile);
-                slot.tile(model, data, [count, total], &mut stream(seed, [number, which as u64]));
+                slot.tile(&mut scratch, model, data, [count, total], &mut stream(seed, [number, which as u64]));
             }
+            locked(free).push(scratch);
         });
         self.slots.iter().fold(Work::default(), |sum, slot| sum + slot.work)
     }

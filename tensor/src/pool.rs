@@ -15,8 +15,30 @@ pub struct Pool<T: Scalar>(Option<Arc<Mutex<Shelves<T>>>>);
 
 /// Free buffers by capacity class.
 struct Shelves<T> {
-    free: HashMap<usize, Vec<Vec<T>>>,
+    free: HashMap<usize, Shelf<T>>,
     allocated: usize,
+}
+
+/// Free buffers of one class.
+struct Shelf<T> {
+    buffers: Vec<Vec<T>>,
+    /// The fewest that lay here since the last [`Pool::trim`].
+    idle: usize,
+}
+
+// Not derived: that would ask the same of T.
+impl<T> Default for Shelf<T> {
+    fn default() -> Self {
+        Shelf { buffers: vec![], idle: 0 }
+    }
+}
+
+impl<T> Shelf<T> {
+    fn take(&mut self) -> Option<Vec<T>> {
+        let buffer = self.buffers.pop();
+        self.idle = self.idle.min(self.buffers.len());
+        buffer
+    }
 }
 
 /// Tensors of at most this many elements, scalars above all, do without the pool: an allocator is quicker with them.
@@ -29,10 +51,12 @@ fn class(len: usize) -> usize {
     len.div_ceil(quarter) * quarter
 }
 
+/// A new buffer that is to be overwritten; where assertions are on, what is forgotten shows as NaN.
+///
 /// Unlike `vec!`, which asks the allocator for cleared memory; that is the slow way to get a little of it.
-fn zeros<T: Scalar>(len: usize) -> Vec<T> {
-    let mut values = Vec::with_capacity(len);
-    values.resize(len, T::ZERO);
+fn unspecified<T: Scalar>(len: usize, capacity: usize) -> Vec<T> {
+    let mut values = Vec::with_capacity(capacity);
+    values.resize(len, if cfg!(debug_assertions) { T::from_f64(f64::NAN) } else { T::ZERO });
     values
 }
 
@@ -59,16 +83,14 @@ impl<T: Scalar> Pool<T> {
 
     /// A vector of `len` elements with unspecified (old) values.
     pub fn take(&self, len: usize) -> Vec<T> {
-        let Some(mut shelves) = self.shelves() else { return vec![T::ZERO; len] };
+        let Some(mut shelves) = self.shelves() else { return unspecified(len, len) };
         let class = class(len);
-        let mut buffer = match shelves.free.get_mut(&class).and_then(Vec::pop) {
+        let mut buffer = match shelves.free.get_mut(&class).and_then(Shelf::take) {
             Some(buffer) => buffer,
             None => {
                 shelves.allocated += class;
                 drop(shelves);
-                let mut buffer = Vec::with_capacity(class);
-                buffer.resize(len, T::ZERO);
-                return buffer;
+                return unspecified(len, class);
             }
         };
         drop(shelves);
@@ -82,8 +104,20 @@ impl<T: Scalar> Pool<T> {
         if capacity == class(capacity)
             && let Some(mut shelves) = self.shelves()
         {
-            shelves.free.entry(capacity).or_default().push(buffer);
+            shelves.free.entry(capacity).or_default().buffers.push(buffer);
         }
+    }
+
+    /// Frees the buffers that no tensor has needed since the last call: sizes that went out of use, and what only the
+    /// largest graph took.
+    pub fn trim(&self) {
+        let Some(mut shelves) = self.shelves() else { return };
+        for shelf in shelves.free.values_mut() {
+            // The oldest: those on top were the last to be used.
+            shelf.buffers.drain(..shelf.idle);
+            shelf.idle = shelf.buffers.len();
+        }
+        shelves.free.retain(|_, shelf| !shelf.buffers.is_empty());
     }
 
     /// A tensor of this shape with unspecified (old) values, to be overwritten.
@@ -97,7 +131,7 @@ impl<T: Scalar> Pool<T> {
     pub fn filled(&self, shape: &[usize], fill: impl FnOnce(&mut [T])) -> Tensor<T> {
         let len = shape.iter().product();
         let small = len <= SMALL;
-        let mut values = if small { zeros(len) } else { self.take(len) };
+        let mut values = if small { unspecified(len, len) } else { self.take(len) };
         fill(&mut values);
         Tensor::pooled(Shape::from_slice(shape), values, if small { Pool::none() } else { self.clone() })
     }
@@ -152,6 +186,31 @@ mod tests {
         drop(alias);
         assert_eq!(pool.tensor(&[998]).as_slice().as_ptr(), address);
         assert_eq!(pool.allocated(), 2 * class(1000));
+    }
+
+    #[test]
+    fn what_is_not_written_shows_where_assertions_are_on() {
+        for len in [1, SMALL, SMALL + 1, 5000] {
+            assert!(Pool::<f32>::new().tensor(&[len]).as_slice().iter().all(|x| x.is_nan() == cfg!(debug_assertions)));
+        }
+    }
+
+    #[test]
+    fn only_what_lies_idle_is_trimmed() {
+        let pool = Pool::<f32>::new();
+        let free = || pool.shelves().unwrap().free.values().map(|shelf| shelf.buffers.len()).sum::<usize>();
+        drop([100, 100, 100, 2000].map(|len| pool.tensor(&[len])));
+        pool.trim();
+        assert_eq!(free(), 4, "all were in use since the start");
+        drop([100, 100].map(|len| pool.tensor(&[len])));
+        pool.trim();
+        assert_eq!(free(), 2, "one of 100 and the one of 2000 lay idle");
+        let allocated = pool.allocated();
+        drop([100, 100].map(|len| pool.tensor(&[len])));
+        assert_eq!(pool.allocated(), allocated);
+        pool.trim();
+        pool.trim();
+        assert_eq!(free(), 0);
     }
 
     #[test]

@@ -117,6 +117,10 @@ fn gradient_keeps_its_digits_where_little_light_is_left<T: Scalar>() {
         depth += x[i];
     }
     assert!(depth > 13.0, "the light must fall to about 1e-6, is at {:e}", (-depth).exp());
+    // What passes a thick sample: 1 - alpha has lost its digits there, e^-x has not.
+    let (x, colour) = ([16.0, 0.5], [1.0, 0.25]);
+    let (_, got, _) = ray::<T>(&x, &colour);
+    near::<T>("depth 16", got[0], expected_slopes(&x, &colour)[0], by_type::<T>(1e-6, 1e-13));
 }
 
 /// Catalogue: a last interval of 1e10 makes a wall of a density of 1e-10.

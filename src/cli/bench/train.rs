@@ -95,13 +95,14 @@ fn courses(quick: bool) -> Vec<Course> {
         &[(Instant, Fast, 2, 5), (Instant, Off, 1, 5), (Voxel, Fast, 1, 5), (Small, Off, 1, 8)]
     } else {
         &[
-            (Instant, Fast, 3, 60),
-            (Instant, Off, 3, 60),
-            (Voxel, Fast, 3, 60),
-            (Voxel, Off, 1, 60),
-            (Small, Off, 3, 100),
-            (Small, Fast, 3, 100),
-            (Classic, Off, 1, 900),
+            (Instant, Fast, 3, 30),
+            (Instant, Off, 2, 30),
+            (Voxel, Fast, 2, 30),
+            (Voxel, Off, 1, 30),
+            (Small, Off, 2, 60),
+            (Small, Fast, 2, 60),
+            (Classic, Off, 1, 120),
+            (Classic, Fast, 1, 120),
         ]
     };
     let seeds = |&(preset, skip, seeds, seconds): &(Preset, Skip, u64, u64)| {
