@@ -96,13 +96,11 @@ fn main() -> raygrad::nerf::Result<()> {
         let (d, slope) = distance_and_slope(&network, &bound, &tape.leaf(points));
         let on_curve = d.slice(0, 0, BATCH).abs().mean();
         let eikonal = (slope - 1.0).square().mean();
-        // The value is 0 on the curve and nowhere else (Sitzmann et al. 2020, equation 6).
-        let elsewhere = (d.slice(0, BATCH, BATCH).abs() * -50.0).exp().mean();
         if step % (STEPS / 6) == 0 {
             let (off, bend) = (on_curve.item(), eikonal.item().sqrt());
             println!("step {step:4}: the curve is missed by {off:.4}, slopes are off 1 by {bend:.3}");
         }
-        let loss = 10.0 * on_curve + eikonal + 0.1 * elsewhere;
+        let loss = 10.0 * on_curve + eikonal;
         adam.update(&mut params, &loss.grad_once(&bound.vars()), schedule.at_step(step, STEPS));
     }
 
