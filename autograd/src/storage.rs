@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 
 /// The number type in which a file holds parameters. They are rounded once, when they are written; arithmetic stays in
-/// their own type.
+/// their own type. A parameter with a number too large for the type is stored in full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Storage {
@@ -22,13 +22,19 @@ pub enum Storage {
 }
 
 impl Storage {
-    /// The nearest number that is stored.
-    pub fn round<T: Scalar>(self, x: T) -> T {
+    /// The nearest number of the type.
+    fn round<T: Scalar>(self, x: T) -> T {
         match self {
             Storage::Full => x,
             Storage::F16 => T::from_f64(f16::from_f64(x.to_f64()).to_f64()),
             Storage::Bf16 => T::from_f64(bf16::from_f64(x.to_f64()).to_f64()),
         }
+    }
+
+    /// How these values are stored.
+    fn that_fits<T: Scalar>(self, values: &[T]) -> Self {
+        let fits = |x: &T| !x.is_finite() || self.round(*x).is_finite();
+        if values.iter().all(fits) { self } else { Storage::Full }
     }
 
     fn dtype<T: Scalar>(self) -> Dtype {
@@ -79,9 +85,6 @@ pub enum ParamsError {
     /// The file holds a parameter that the model does not have.
     #[error("`{0}` is not a parameter of this model: the file belongs to a model of another configuration")]
     Unknown(String),
-    /// A parameter holds a finite number that the wanted type does not.
-    #[error("`{0}` holds numbers too large for f16: store it as bf16 or in full")]
-    TooLarge(String),
     /// A parameter has another shape or number type in the file.
     #[error("`{name}` is {found} in the file and {expected} in this model")]
     Mismatch {
@@ -97,8 +100,10 @@ pub enum ParamsError {
 impl<T: Scalar> Params<T> {
     /// Rounds every value to what is stored.
     pub fn round_to(&mut self, storage: Storage) {
-        let values = self.values_mut().iter_mut().flat_map(|value| value.as_mut_slice());
-        values.for_each(|x| *x = storage.round(*x));
+        for value in self.values_mut() {
+            let storage = storage.that_fits(value.as_slice());
+            value.as_mut_slice().iter_mut().for_each(|x| *x = storage.round(*x));
+        }
     }
 
     /// The parameters as a safetensors file, with some words about them and further named bytes.
@@ -111,13 +116,13 @@ impl<T: Scalar> Params<T> {
         metadata: HashMap<String, String>,
         blobs: &[(&str, Vec<u8>)],
     ) -> Result<Vec<u8>, ParamsError> {
-        let fits = |x: &T| !x.is_finite() || storage.round(*x).is_finite();
-        if let Some((name, _)) = self.iter().find(|(_, value)| !value.as_slice().iter().all(fits)) {
-            return Err(ParamsError::TooLarge(name.into()));
-        }
-        let bytes: Vec<Vec<u8>> = self.values().iter().map(|value| storage.write(value.as_slice())).collect();
+        let written = |value: &Tensor<T>| {
+            let storage = storage.that_fits(value.as_slice());
+            (storage, storage.write(value.as_slice()))
+        };
+        let bytes: Vec<(Storage, Vec<u8>)> = self.values().iter().map(written).collect();
         let mut views = Vec::with_capacity(self.len() + blobs.len());
-        for ((name, value), bytes) in self.iter().zip(&bytes) {
+        for ((name, value), (storage, bytes)) in self.iter().zip(&bytes) {
             views.push((name, TensorView::new(storage.dtype::<T>(), value.shape().to_vec(), bytes)?));
         }
         for (name, bytes) in blobs {
@@ -221,13 +226,17 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_would_become_infinite_is_refused() {
+    fn what_would_become_infinite_is_stored_in_full() {
         let mut params = Params::<f64>::new();
-        params.add("small", Tensor::full(&[2], 1.0));
-        params.add("large", Tensor::full(&[2], 65520.0));
-        let error = params.to_safetensors(Storage::F16, HashMap::new(), &[]).unwrap_err().to_string();
-        assert!(error.starts_with("`large` holds numbers too large"), "{error}");
-        assert!(params.to_safetensors(Storage::Bf16, HashMap::new(), &[]).is_ok());
+        params.add("small", Tensor::full(&[2], 0.1));
+        params.add("large", Tensor::full(&[2], 65520.1));
+        let bytes = params.to_safetensors(Storage::F16, HashMap::new(), &[]).unwrap();
+        let mut read = params.clone();
+        read.load_safetensors(&bytes).unwrap();
+        assert_eq!(read.values()[1], params.values()[1]);
+        assert_ne!(read.values()[0], params.values()[0]);
+        params.round_to(Storage::F16);
+        assert_eq!(read.values(), params.values());
     }
 
     #[test]

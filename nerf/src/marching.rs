@@ -22,10 +22,10 @@ pub struct MarchingConfig {
     /// rays, short ones show fine detail as it is.
     #[serde(default)]
     pub last_step: Option<f64>,
-    /// The same in rendering. Training starts each ray at random, so it fits what finer steps show; they add .1 to .4 dB.
+    /// The same in rendering. Training starts each ray at random, so it fits what finer steps show.
     #[serde(default = "view_step")]
     pub view_step: f64,
-    /// Evaluations of a density in a training step; the number of rays follows.
+    /// Samples that a training step places on its rays; the number of rays follows.
     pub samples: usize,
     /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
     /// much.
@@ -35,7 +35,7 @@ pub struct MarchingConfig {
     pub quadrature: Quadrature,
 }
 
-/// On Lego, steps half as long add less than .01 dB.
+/// Figures are in docs/benchmarks.md, section Rendering.
 const fn view_step() -> f64 {
     1.0 / 600.0
 }

@@ -131,6 +131,7 @@ macro_rules! scalar {
                 vmath::$t::cos_quick(self)
             }
 
+            // SAFETY: the trait says what callers promise.
             #[cfg(feature = "gemm")]
             unsafe fn gemm_raw(
                 [m, k, n]: [usize; 3],
@@ -149,6 +150,7 @@ macro_rules! scalar {
                 }
             }
 
+            // SAFETY: the trait says what callers promise.
             #[cfg(not(feature = "gemm"))]
             unsafe fn gemm_raw(
                 [m, k, n]: [usize; 3],
