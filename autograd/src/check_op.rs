@@ -137,12 +137,12 @@ fn reference(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>]) -> Option<Vec<Tensor<f64>
     results(x, &Pool::new(), |x| op.reference(x))
 }
 
-/// A pool whose buffers of up to about a thousand elements hold NaN: what an operation forgets to write shows. (Tensors of up
-/// to 64 elements have memory of their own, which holds NaN where assertions are on.)
-fn poisoned() -> Pool<f64> {
+/// A pool whose buffers of up to about a thousand elements hold old numbers: what an operation forgets to write shows. (New
+/// buffers, and those of tensors of up to 64 elements, hold NaN where assertions are on.)
+fn used() -> Pool<f64> {
     let pool = Pool::new();
     let sizes = (4..9).flat_map(|power| (4..8).map(move |quarters| quarters << power));
-    let buffers: Vec<_> = sizes.flat_map(|size| [size; 8]).map(|size| pool.full(&[size], f64::NAN)).collect();
+    let buffers: Vec<_> = sizes.flat_map(|size| [size; 8]).map(|size| pool.full(&[size], 1e30)).collect();
     drop(buffers);
     pool
 }
@@ -162,7 +162,7 @@ fn same_bits(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], expected: &[Tensor<f64>])
     let reversed: Vec<Tensor<f64>> = x.iter().map(reversed).collect();
     let runs = [
         ("two runs differ", x, Pool::new()),
-        ("old values of a buffer that `Pool::tensor` gave are in the result", x, poisoned()),
+        ("old values of a buffer that `Pool::tensor` gave are in the result", x, used()),
         ("inputs from transposed arrays give other results", &transposed[..], Pool::new()),
         ("inputs from reversed arrays give other results", &reversed[..], Pool::new()),
     ];
