@@ -188,7 +188,7 @@ fn training() {
     });
 }
 
-/// The gradient of the sum of f(x), on one thread.
+/// The gradient of the sum of f(x).
 fn operation(what: &str, shape: &[usize], f: impl for<'t> Fn(&Var<'t, f32>) -> Var<'t, f32>) {
     let rng = &mut StdRng::seed_from_u64(0);
     let values = Tensor::from_fn(shape, |_| 4.0 * rng.random::<f32>() - 2.0);

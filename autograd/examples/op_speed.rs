@@ -33,7 +33,8 @@ fn time(shape: &[usize], call: Call) -> [f64; 2] {
     best
 }
 
-fn main() {
+fn main() -> Result<(), rayon::ThreadPoolBuildError> {
+    rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     println!("instruction set: {}, nanoseconds an element", raygrad_tensor::simd::name());
     println!("{:<24} {:>16} {:>9} {:>9}", "operation", "shape", "forward", "backward");
     let calls: [(&str, Call); 17] = [
@@ -61,4 +62,5 @@ fn main() {
             println!("{name:<24} {:>16} {forward:>9.3} {backward:>9.3}", format!("{shape:?}"));
         }
     }
+    Ok(())
 }

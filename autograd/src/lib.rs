@@ -39,7 +39,6 @@ mod op;
 mod ops;
 mod optim;
 mod optim_rows;
-mod parallel;
 mod params;
 mod row_sums;
 mod storage;

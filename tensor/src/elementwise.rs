@@ -1,5 +1,6 @@
 //! One loop for every elementwise kernel, with broadcasting as NumPy does it.
 
+use crate::parallel::{ELEMENT, pieces};
 use crate::{Lane, Layout, Pool, Scalar, Shape, Tensor, simd};
 
 /// The common shape of tensors that broadcast together: shapes are aligned at their last axis, and an axis of extent 1
@@ -51,12 +52,12 @@ pub fn broadcast_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -
 /// # Panics
 /// If the shapes do not broadcast.
 #[track_caller]
-pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: impl Fn([T; N]) -> T) -> Tensor<T> {
+pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: impl Fn([T; N]) -> T + Sync) -> Tensor<T> {
     broadcast_loop(
         x,
         pool,
         #[inline(always)]
-        |x, out| lanes(x, out, f),
+        |x, out| lanes(x, out, &f),
     )
 }
 
@@ -70,14 +71,14 @@ pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: imp
 pub fn map_either<T: Scalar, const N: usize>(
     x: [&Tensor<T>; N],
     pool: &Pool<T>,
-    quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true>,
-    plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false>,
+    quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true> + Sync,
+    plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false> + Sync,
 ) -> Tensor<T> {
     broadcast_loop(
         x,
         pool,
         #[inline(always)]
-        |x, out| lanes_either(x, out, quick, plain),
+        |x, out| lanes_either(x, out, &quick, &plain),
     )
 }
 
@@ -108,10 +109,11 @@ macro_rules! map_real {
 fn broadcast_loop<T: Scalar, const N: usize>(
     x: [&Tensor<T>; N],
     pool: &Pool<T>,
-    run: impl FnOnce([&[T]; N], &mut [T]),
+    run: impl Fn([&[T]; N], &mut [T]) + Sync,
 ) -> Tensor<T> {
     let (operands, shape) = operands(x, pool);
-    pool.filled(&shape, |out| run(slices(&operands), out))
+    let x = slices(&operands);
+    pool.filled(&shape, |out| pieces(out, 1, ELEMENT, &|start, out| run(cut(x, start, out.len()), out)))
 }
 
 /// A tensor of the operand's shape or of the common one.

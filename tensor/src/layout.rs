@@ -1,5 +1,6 @@
 //! Strided layouts: one walk that serves broadcast, permute, slice and flip, and their adjoints.
 
+use crate::parallel::{ELEMENT, PIECE, chunks};
 use crate::{Scalar, Shape};
 use smallvec::SmallVec;
 
@@ -164,6 +165,20 @@ impl Layout {
     pub fn read<T: Scalar>(&self, source: &[T], out: &mut [T]) {
         assert_eq!(source.len(), self.source, "source of a layout of {:?}", self.shape);
         assert_eq!(out.len(), self.shape.iter().product::<usize>(), "output of a layout of {:?}", self.shape);
+        // Cut along the first axis that can be.
+        let axis = self.shape.iter().position(|&extent| extent > 1).unwrap_or(self.shape.len());
+        let inner: usize = self.shape.iter().skip(axis + 1).product();
+        if out.len() <= PIECE || inner == 0 {
+            return self.read_piece(source, out);
+        }
+        let at_once = (PIECE / inner).max(1);
+        let work = ELEMENT * out.len();
+        chunks(out, at_once * inner, work, || (), &|_, i, out| {
+            self.sliced(axis, i * at_once, out.len() / inner, 1).read_piece(source, out);
+        });
+    }
+
+    fn read_piece<T: Scalar>(&self, source: &[T], out: &mut [T]) {
         self.runs(|position, stride, start, count| {
             let out = &mut out[start..start + count];
             match stride {

@@ -11,7 +11,8 @@
 //! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
-//! All work happens on the calling thread; parallelism belongs to the caller.
+//! Work on large tensors is spread over rayon's threads, unless the caller is one of these; see [`parallel`]. The bits
+//! do not depend on it.
 
 mod elementwise;
 pub mod extremum;
@@ -19,6 +20,7 @@ mod indices;
 mod lane;
 mod layout;
 pub mod matmul;
+pub mod parallel;
 mod pool;
 mod real;
 mod reduce;

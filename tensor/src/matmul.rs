@@ -1,5 +1,6 @@
 //! Matrix products: one function, with transposed operands by stride.
 
+use crate::parallel::{chunks, is_worthwhile};
 use crate::{Scalar, Tensor};
 
 /// A matrix in a slice: element `(i, j)` is `data[i * strides[0] + j * strides[1]]`.
@@ -43,6 +44,11 @@ impl<'a, T: Scalar> Matrix<'a, T> {
         self.columns
     }
 
+    /// `count` rows from `first` on.
+    fn some_rows(self, first: usize, count: usize) -> Self {
+        Matrix { data: &self.data[first * self.strides[0]..], rows: count, ..self }
+    }
+
     /// The same matrix with rows and columns exchanged; nothing is copied.
     pub fn t(self) -> Self {
         let [row, column] = self.strides;
@@ -50,7 +56,14 @@ impl<'a, T: Scalar> Matrix<'a, T> {
     }
 }
 
-/// `c = a b`, or `c += a b` if `accumulate`, on the calling thread; `c` is row-major.
+/// Rows of a piece of a product, about, at least: with fewer, each thread would mostly rearrange the right factor for
+/// itself, and below 65 the kernels add in another order.
+const PIECE: usize = 128;
+/// Multiplications and additions that take as long as one operation of a loop (see [`chunks`]).
+const PER_OPERATION: usize = 8;
+
+/// `c = a b`, or `c += a b` if `accumulate`; `c` is row-major. The rows of a large product are computed on all threads, unless
+/// the caller is one of rayon's.
 ///
 /// Sums run in the order of the underlying kernel, which depends on the sizes and on the processor's instruction set
 /// but never on the number of threads.
@@ -70,6 +83,13 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
             c.fill(T::ZERO);
         }
         return;
+    }
+    let work = m * n * k / PER_OPERATION;
+    if m >= 2 * PIECE && is_worthwhile(work) {
+        let rows = m.div_ceil((m / PIECE).min(2 * rayon::current_num_threads()).min(PIECE / 4));
+        return chunks(c, rows * n, work, || (), &|_, i, c| {
+            gemm(a.some_rows(i * rows, c.len() / n), b, c, accumulate);
+        });
     }
     let strides = |s: [usize; 2]| [s[0] as isize, s[1] as isize];
     let (left, right) = ((a.data.as_ptr(), strides(a.strides)), (b.data.as_ptr(), strides(b.strides)));

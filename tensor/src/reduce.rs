@@ -1,5 +1,6 @@
 //! Pairwise sums: the error grows with the logarithm of the length.
 
+use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
 use crate::{Pool, Scalar, Shape, Tensor, simd};
 
 /// Independent partial sums: fills two 512-bit registers of f32 and hides the latency of addition.
@@ -10,6 +11,8 @@ const BLOCK: usize = 16;
 const STRIP: usize = 64;
 /// The same for a matrix that does not fit a core's cache: memory wants longer runs, and registers do not matter then.
 const WIDE_STRIP: usize = 512;
+/// What an element costs that is only read.
+const READ: usize = ELEMENT / 2;
 /// Bytes from which a matrix counts as such.
 const CACHE: usize = 1 << 20;
 
@@ -24,21 +27,37 @@ const CACHE: usize = 1 << 20;
 /// assert!((sum / 1677.7216 - 1.0).abs() < 1e-6); // a plain loop is 14 % off
 /// ```
 pub fn sum<T: Scalar>(x: &[T]) -> T {
+    if is_worthwhile(READ * x.len()) {
+        return branches(x);
+    }
     simd::dispatch(
         #[inline(always)]
         || pairwise(x),
     )
 }
 
-fn pairwise<T: Scalar>(x: &[T]) -> T {
-    if x.len() > LANES * BLOCK {
-        // A multiple of the block keeps every chunk but the last in whole lanes.
-        let half = (x.len() / 2).next_multiple_of(LANES * BLOCK);
-        if half < x.len() {
-            return pairwise(&x[..half]) + pairwise(&x[half..]);
+/// [`pairwise`] with its branches on several threads.
+fn branches<T: Scalar>(x: &[T]) -> T {
+    match half(x) {
+        Some(half) if x.len() > PIECE => {
+            let (a, b) = rayon::join(|| branches(&x[..half]), || branches(&x[half..]));
+            a + b
         }
+        _ => sum(x),
     }
-    chunk(x)
+}
+
+fn pairwise<T: Scalar>(x: &[T]) -> T {
+    match half(x) {
+        Some(half) => pairwise(&x[..half]) + pairwise(&x[half..]),
+        None => chunk(x),
+    }
+}
+
+/// Where a sum is cut in two, if it is long enough: a multiple of the block keeps every chunk but the last in whole lanes.
+fn half<T>(x: &[T]) -> Option<usize> {
+    let half = (x.len() / 2).next_multiple_of(LANES * BLOCK);
+    (x.len() > LANES * BLOCK && half < x.len()).then_some(half)
 }
 
 #[inline(always)]
@@ -81,10 +100,10 @@ pub fn sum_rows<T: Scalar>(x: &[T], out: &mut [T]) {
 
 fn sum_strips<T: Scalar, const STRIP: usize>(x: &[T], out: &mut [T]) {
     let stride = out.len();
-    for (strip, out) in out.chunks_mut(STRIP).enumerate() {
+    chunks(out, STRIP, READ * x.len(), || (), &|_, strip, out| {
         let sums = pairwise_rows::<T, STRIP>(x, stride, strip * STRIP, out.len());
         out.copy_from_slice(&sums[..out.len()]);
-    }
+    });
 }
 
 /// The sums of columns `first..first + width` of the rows of length `stride`; `width` is at most `STRIP`.
@@ -167,12 +186,17 @@ fn sum_middle<T: Scalar>(x: &Tensor<T>, from: usize, to: usize, pool: &Pool<T>) 
         out.as_mut_slice().fill(T::ZERO);
         return out;
     }
-    let rows = x.as_slice().chunks_exact(count * inner);
-    if inner == 1 {
-        out.as_mut_slice().iter_mut().zip(rows).for_each(|(out, row)| *out = sum(row));
-    } else {
-        out.as_mut_slice().chunks_exact_mut(inner).zip(rows).for_each(|(out, rows)| sum_rows(rows, out));
-    }
+    let x = x.as_slice();
+    // One of the two cuts: sums are short and many, or few and long.
+    let at_once = if inner == 1 { (PIECE / count).max(1) } else { 1 };
+    chunks(out.as_mut_slice(), at_once * inner, READ * x.len(), || (), &|_, i, out| {
+        let sums = out.chunks_exact_mut(inner).zip(x[i * at_once * inner * count..].chunks_exact(count * inner));
+        if inner == 1 {
+            sums.for_each(|(out, row)| out[0] = sum(row));
+        } else {
+            sums.for_each(|(out, rows)| sum_rows(rows, out));
+        }
+    });
     out
 }
 

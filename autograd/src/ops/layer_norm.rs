@@ -41,9 +41,11 @@ impl<T: Scalar> Op<T> for LayerNorm {
         let pool = cx.pool();
         let [mut dx, mut dgain, mut dbias] = [cx.shape(0), cx.shape(1), cx.shape(2)].map(|shape| pool.tensor(shape));
         let [x, gain, g] = [x.value(), gain.value(), cx.g().value()].map(Tensor::as_slice);
-        let grads = [dx.as_mut_slice(), dgain.as_mut_slice(), dbias.as_mut_slice()];
-        layer_norm_rows_grad(x, gain, g, self.eps, grads, pool);
-        Grads::new([dx, dgain, dbias].map(|grad| Some(cx.constant(grad))))
+        let are_wanted = cx.needs(1) || cx.needs(2);
+        let sums = are_wanted.then(|| [dgain.as_mut_slice(), dbias.as_mut_slice()]);
+        layer_norm_rows_grad(x, gain, g, self.eps, dx.as_mut_slice(), sums, pool);
+        let [dx, dgain, dbias] = [dx, dgain, dbias].map(|grad| cx.constant(grad));
+        Grads::new([Some(dx), are_wanted.then_some(dgain), are_wanted.then_some(dbias)])
     }
 
     fn is_fused(&self) -> bool {

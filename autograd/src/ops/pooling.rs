@@ -1,6 +1,7 @@
 //! Max and average pooling of images `[n, channels, height, width]`. Channels run on rayon's threads.
 
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp, parallel};
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::parallel::chunks;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Windows};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -112,7 +113,7 @@ fn planes<T: Scalar>(
     let mut out = pool.tensor(shape);
     let (from, to) = (plane_len(x.shape()), plane_len(shape));
     let each = |_: &mut (), i: usize, out: &mut [T]| f(&x.as_slice()[i * from..][..from], out);
-    parallel::chunks(out.as_mut_slice(), to, 2 * x.len().max(shape.iter().product()), || (), each);
+    chunks(out.as_mut_slice(), to, 2 * x.len().max(shape.iter().product()), || (), &each);
     out
 }
 
@@ -125,7 +126,7 @@ impl MaxPool2d {
         let each = |best: &mut Vec<T>, i: usize, out: &mut [u32]| {
             windows.arg_maxima(&x.as_slice()[i * from..][..from], best, out);
         };
-        parallel::chunks(&mut index, to, 4 * x.len(), || vec![T::ZERO; to], each);
+        chunks(&mut index, to, 4 * x.len(), || vec![T::ZERO; to], &each);
         index.into()
     }
 }
@@ -183,7 +184,7 @@ impl<T: Scalar> Op<T> for GatherPlanes {
             let x = &x[0].as_slice()[i * from..][..from];
             out.iter_mut().zip(&self.index[i * to..]).for_each(|(out, &at)| *out = x[at as usize]);
         };
-        parallel::chunks(out.as_mut_slice(), to, self.index.len(), || (), each);
+        chunks(out.as_mut_slice(), to, self.index.len(), || (), &each);
         out
     }
 
@@ -216,7 +217,7 @@ impl<T: Scalar> Op<T> for ScatterPlanes {
             x.iter().zip(&self.index[i * from..]).for_each(|(&x, &at)| out[at as usize] += x);
         };
         let work = 2 * self.index.len() + out.len();
-        parallel::chunks(out.as_mut_slice(), to, work, || (), each);
+        chunks(out.as_mut_slice(), to, work, || (), &each);
         out
     }
 

@@ -20,7 +20,7 @@ pub enum Compare {
     NotEqual,
 }
 
-fn compared<T: Scalar>(x: &[&Tensor<T>], pool: &Pool<T>, holds: impl Fn(T, T) -> bool) -> Tensor<T> {
+fn compared<T: Scalar>(x: &[&Tensor<T>], pool: &Pool<T>, holds: impl Fn(T, T) -> bool + Sync) -> Tensor<T> {
     map(
         [x[0], x[1]],
         pool,

@@ -14,7 +14,7 @@ mod train;
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use raygrad::nerf::Result;
+use raygrad::nerf::{Error, Result};
 
 use super::output::{make_folder, note, print};
 use figure::Figure;
@@ -76,11 +76,16 @@ pub fn run(args: &Args) -> Result<()> {
     let mut sections = vec![];
     if wanted(Suite::Quadrature) {
         note("quadrature: rules on scenes that are known exactly");
-        sections.push(save("Quadrature", "--suite quadrature", quadrature::run(args.quick), &args.out)?);
+        sections.push(save(
+            "Quadrature",
+            "--suite quadrature",
+            on_one_thread(|| quadrature::run(args.quick))?,
+            &args.out,
+        )?);
     }
     if wanted(Suite::Kernels) {
         note("kernels: elementary functions, matrix products, the hash grid");
-        sections.push(save("Kernels", "--suite kernels", kernels::run(args.quick)?, &args.out)?);
+        sections.push(save("Kernels", "--suite kernels", on_one_thread(|| kernels::run(args.quick))??, &args.out)?);
     }
     if wanted(Suite::Render) {
         note("render: settings of the renderer on one model");
@@ -95,6 +100,12 @@ pub fn run(args: &Args) -> Result<()> {
     let findings = sections.iter().flat_map(|section| &section.findings);
     let findings: String = findings.map(|finding| format!("{finding}\n")).collect();
     print(&format!("{findings}written: {}, and tables and plots beside it\n", page.display()))
+}
+
+/// Runs `f` where no operation is spread over several threads.
+fn on_one_thread<R: Send>(f: impl FnOnce() -> R + Send) -> Result<R> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+    Ok(pool.map_err(|e| Error::setting("threads", e))?.install(f))
 }
 
 /// Writes a suite's tables and figures.

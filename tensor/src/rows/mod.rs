@@ -12,8 +12,9 @@ pub use softmax::{
     softmax_rows_grad,
 };
 
-use crate::Scalar;
+use crate::parallel::chunks;
 use crate::reduce::{chunk, sum};
+use crate::{Pool, Scalar, Tensor};
 
 /// Elements of a block: 16 kB of f32.
 const BLOCK: usize = 4096;
@@ -23,6 +24,20 @@ const LANES: usize = 32;
 /// Elements of a block of whole rows of `n`.
 fn block(n: usize) -> usize {
     n * (BLOCK / n).max(1)
+}
+
+/// What an element of a row costs: an exponential, and a few passes over what lies in cache.
+const ELEMENT: usize = 16;
+
+/// See [`blocks`].
+type Kernel<'a, T> = &'a (dyn Fn(&mut [T], usize, &mut [T]) + Sync);
+
+/// Calls `f(scratch, start, rows)` for blocks of rows of `out`, each of `n` elements, which begin at element `start`, with
+/// `scratch` elements of space.
+fn blocks<T: Scalar>(out: &mut [T], n: usize, scratch: usize, pool: &Pool<T>, f: Kernel<'_, T>) {
+    let (len, work) = (block(n), ELEMENT * out.len());
+    let each = |scratch: &mut Tensor<T>, i: usize, out: &mut [T]| f(scratch.as_mut_slice(), i * len, out);
+    chunks(out, len, work, || pool.tensor(&[scratch]), &each);
 }
 
 /// `pick` of all elements, which must not be none; `pick` may be applied in any order.
@@ -75,30 +90,54 @@ fn total<T: Scalar>(x: &[T]) -> T {
 /// The sum of `f` of the elements of `a` and `b` at each index.
 #[inline(always)]
 fn total_of<T: Scalar>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
+    let [sum] = totals_of(
+        a,
+        b,
+        #[inline(always)]
+        |a, b| [f(a, b)],
+    );
+    sum
+}
+
+/// The sums of the values of `f` of the elements of `a` and `b` at each index, in one pass.
+#[inline(always)]
+fn totals_of<T: Scalar, const K: usize>(a: &[T], b: &[T], f: impl Fn(T, T) -> [T; K]) -> [T; K] {
     let n = a.len();
     let b = &b[..n];
-    let mut lanes = [T::ZERO; LANES];
+    let mut lanes = [[T::ZERO; LANES]; K];
     let whole = n - n % LANES;
     let mut start = 0;
     while start < whole {
         let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
         for i in 0..LANES {
-            lanes[i] += f(a[i], b[i]);
+            let values = f(a[i], b[i]);
+            for k in 0..K {
+                lanes[k][i] += values[k];
+            }
         }
         start += LANES;
     }
     let (a, b) = (&a[whole..], &b[whole..]);
+    let mut sums = [T::ZERO; K];
     if whole == 0 {
-        let mut sum = T::ZERO;
         for i in 0..a.len() {
-            sum += f(a[i], b[i]);
+            let values = f(a[i], b[i]);
+            for k in 0..K {
+                sums[k] += values[k];
+            }
         }
-        return sum;
+        return sums;
     }
     for i in 0..a.len() {
-        lanes[i] += f(a[i], b[i]);
+        let values = f(a[i], b[i]);
+        for k in 0..K {
+            lanes[k][i] += values[k];
+        }
     }
-    chunk(&lanes)
+    for k in 0..K {
+        sums[k] = chunk(&lanes[k]);
+    }
+    sums
 }
 
 #[cfg(test)]

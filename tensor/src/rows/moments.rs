@@ -1,10 +1,13 @@
 //! Mean and variance of rows, and layer normalisation.
 
-use super::{total, total_of};
-use crate::{Pool, Scalar, simd};
+use super::{ELEMENT, block, blocks, total, totals_of};
+use crate::parallel::chunks;
+use crate::{Pool, Scalar, Tensor, simd};
 
 /// Rows whose gradients are added up in their own type before they go into f64 sums.
 const GROUP: usize = 16;
+/// Parts of a matrix, at most, that have sums of their own.
+const PARTS: usize = 16;
 
 /// Mean and mean squared deviation of a row, the mean in two parts: their sum is accurate beyond the type's digits.
 ///
@@ -13,19 +16,14 @@ const GROUP: usize = 16;
 fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
     let count = T::from_f64(x.len() as f64);
     let mean = total(x) / count;
-    let rest = total_of(
+    let [rest, square] = totals_of(
         x,
         x,
         #[inline(always)]
-        |x, _| x - mean,
-    ) / count;
-    let square = total_of(
-        x,
-        x,
-        #[inline(always)]
-        |x, _| (x - mean) * (x - mean),
-    ) / count;
-    ([mean, rest], square - rest * rest)
+        |x, _| [x - mean, (x - mean) * (x - mean)],
+    );
+    let rest = rest / count;
+    ([mean, rest], square / count - rest * rest)
 }
 
 /// The mean squared deviation from the mean, of each row of `n` elements; NaN for an empty row.
@@ -38,14 +36,17 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
         out.fill(T::from_f64(f64::NAN));
         return;
     }
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            for (x, out) in x.chunks_exact(n).zip(out) {
-                *out = moments(x).1;
-            }
-        },
-    );
+    let rows = block(n) / n;
+    chunks(out, rows, ELEMENT * x.len(), || (), &|_, i, out| {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for (x, out) in x[i * rows * n..].chunks_exact(n).zip(out) {
+                    *out = moments(x).1;
+                }
+            },
+        );
+    });
 }
 
 /// Layer normalisation of each row: `(x - mean) / sqrt(variance + eps) * gain + bias`, with the variance divided by
@@ -59,23 +60,25 @@ pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out
     if x.is_empty() {
         return;
     }
-    let (eps, len) = (T::from_f64(eps), x.len());
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            let (gain, bias) = (&gain[..n], &bias[..n]);
-            for (x, out) in x.chunks_exact(n).zip(out[..len].chunks_exact_mut(n)) {
-                let ([mean, rest], variance) = moments(x);
-                let scale = T::ONE / (variance + eps).sqrt();
-                for i in 0..n {
-                    out[i] = ((x[i] - mean) - rest) * scale * gain[i] + bias[i];
+    let eps = T::from_f64(eps);
+    blocks(&mut out[..x.len()], n, 0, &Pool::none(), &|_, start, out| {
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let (gain, bias) = (&gain[..n], &bias[..n]);
+                for (x, out) in x[start..].chunks_exact(n).zip(out.chunks_exact_mut(n)) {
+                    let ([mean, rest], variance) = moments(x);
+                    let scale = T::ONE / (variance + eps).sqrt();
+                    for i in 0..n {
+                        out[i] = ((x[i] - mean) - rest) * scale * gain[i] + bias[i];
+                    }
                 }
-            }
-        },
-    );
+            },
+        );
+    });
 }
 
-/// The gradients of [`layer_norm_rows`]: that of `x` to `dx`, those of gain and bias to `dgain` and `dbias`.
+/// The gradients of [`layer_norm_rows`]: that of `x` to `dx`; those of gain and bias to `sums`, if they are wanted.
 ///
 /// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps), dgain = sum of g u
 /// and dbias = sum of g over the rows. These sums are carried in f64.
@@ -87,23 +90,55 @@ pub fn layer_norm_rows_grad<T: Scalar>(
     gain: &[T],
     g: &[T],
     eps: f64,
-    [dx, dgain, dbias]: [&mut [T]; 3],
+    dx: &mut [T],
+    sums: Option<[&mut [T]; 2]>,
     pool: &Pool<T>,
 ) {
     let n = gain.len();
-    let mut sums = vec![0.0_f64; 2 * n];
-    let mut scratch = pool.take(3 * n);
-    let (eps, len) = (T::from_f64(eps), x.len());
-    let count = T::from_f64(n as f64);
-    for ((x, g), dx) in
-        x.chunks(GROUP * n.max(1)).zip(g[..len].chunks(GROUP * n.max(1))).zip(dx[..len].chunks_mut(GROUP * n.max(1)))
-    {
+    let wanted = if sums.is_some() { 2 * n } else { 0 };
+    if !x.is_empty() {
+        // Of whole groups, so that what is added to what depends on the sizes alone.
+        let len = n * (x.len() / n).div_ceil(PARTS).next_multiple_of(GROUP);
+        let mut parts: Vec<_> = dx[..x.len()].chunks_mut(len).map(|dx| (dx, vec![0.0_f64; wanted])).collect();
+        chunks(
+            &mut parts,
+            1,
+            2 * ELEMENT * x.len(),
+            || pool.tensor(&[n + wanted]),
+            &|scratch: &mut Tensor<T>, i, part| {
+                for (dx, sums) in part {
+                    let (x, g) = (&x[i * len..][..dx.len()], &g[i * len..][..dx.len()]);
+                    layer_norm_grad(x, gain, g, eps, dx, sums, scratch.as_mut_slice());
+                }
+            },
+        );
+        if let Some([dgain, dbias]) = sums {
+            let total = |j: usize| parts.iter().map(|(_, sums)| sums[j]).sum::<f64>();
+            dgain.iter_mut().chain(dbias).enumerate().for_each(|(j, out)| *out = T::from_f64(total(j)));
+        }
+    } else if let Some([dgain, dbias]) = sums {
+        dgain.iter_mut().chain(dbias).for_each(|out| *out = T::ZERO);
+    }
+}
+
+/// One part of [`layer_norm_rows_grad`]; `sums`, of gain and bias, may be empty.
+fn layer_norm_grad<T: Scalar>(
+    x: &[T],
+    gain: &[T],
+    g: &[T],
+    eps: f64,
+    dx: &mut [T],
+    sums: &mut [f64],
+    scratch: &mut [T],
+) {
+    let n = gain.len();
+    let (eps, count) = (T::from_f64(eps), T::from_f64(n as f64));
+    for ((x, g), dx) in x.chunks(GROUP * n).zip(g.chunks(GROUP * n)).zip(dx.chunks_mut(GROUP * n)) {
         simd::dispatch(
             #[inline(always)]
             || {
-                let (unit, group) = scratch[..3 * n].split_at_mut(n);
+                let (unit, group) = scratch.split_at_mut(n);
                 group.fill(T::ZERO);
-                let (group_gain, group_bias) = group.split_at_mut(n);
                 let gain = &gain[..n];
                 for ((x, g), dx) in x.chunks_exact(n).zip(g.chunks_exact(n)).zip(dx.chunks_exact_mut(n)) {
                     let ([mean, rest], variance) = moments(x);
@@ -111,16 +146,21 @@ pub fn layer_norm_rows_grad<T: Scalar>(
                     for i in 0..n {
                         unit[i] = ((x[i] - mean) - rest) * scale;
                         dx[i] = g[i] * gain[i];
-                        group_gain[i] += g[i] * unit[i];
-                        group_bias[i] += g[i];
                     }
-                    let level = total(dx) / count;
-                    let slope = total_of(
+                    if !sums.is_empty() {
+                        let (group_gain, group_bias) = group.split_at_mut(n);
+                        for i in 0..n {
+                            group_gain[i] += g[i] * unit[i];
+                            group_bias[i] += g[i];
+                        }
+                    }
+                    let [level, slope] = totals_of(
                         dx,
                         unit,
                         #[inline(always)]
-                        |h, u| h * u,
-                    ) / count;
+                        |h, u| [h, h * u],
+                    );
+                    let (level, slope) = (level / count, slope / count);
                     for i in 0..n {
                         dx[i] = ((dx[i] - level) - unit[i] * slope) * scale;
                     }
@@ -130,10 +170,6 @@ pub fn layer_norm_rows_grad<T: Scalar>(
                 }
             },
         );
-    }
-    pool.give(scratch);
-    for (out, &sum) in dgain.iter_mut().chain(dbias).zip(&sums) {
-        *out = T::from_f64(sum);
     }
 }
 

@@ -1,7 +1,8 @@
 //! Softmax, its logarithm, the logarithm of a sum of exponentials, and cross-entropy.
 
-use super::{block, fold_lanes, total, total_of};
-use crate::{Pool, Scalar, simd};
+use super::{ELEMENT, block, blocks, fold_lanes, total, total_of};
+use crate::parallel::chunks;
+use crate::{Pool, Scalar, Tensor, simd};
 
 /// The greatest element of a row, as far as there is an order; a row with NaN comes out as NaN anyway.
 #[inline(always)]
@@ -62,12 +63,11 @@ pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>)
     if x.is_empty() {
         return;
     }
-    let mut shifts = pool.take(block(n) / n);
-    for (x, out) in x.chunks(block(n)).zip(out[..x.len()].chunks_mut(block(n))) {
+    blocks(&mut out[..x.len()], n, block(n) / n, pool, &|shifts, start, out| {
         simd::dispatch(
             #[inline(always)]
             || {
-                shifted(x, n, out, &mut shifts, false);
+                shifted(&x[start..][..out.len()], n, out, shifts, false);
                 exponentials(out);
                 for row in out.chunks_exact_mut(n) {
                     let scale = T::ONE / total(row);
@@ -77,8 +77,7 @@ pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>)
                 }
             },
         );
-    }
-    pool.give(shifts);
+    });
 }
 
 /// The gradient of softmax, from its output: `y (g - sum g y)` in each row.
@@ -89,23 +88,26 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
     if y.is_empty() {
         return;
     }
-    let len = y.len();
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            for ((y, g), out) in y.chunks_exact(n).zip(g[..len].chunks_exact(n)).zip(out[..len].chunks_exact_mut(n)) {
-                let mean = total_of(
-                    y,
-                    g,
-                    #[inline(always)]
-                    |y, g| y * g,
-                );
-                for i in 0..n {
-                    out[i] = y[i] * (g[i] - mean);
+    blocks(&mut out[..y.len()], n, 0, &Pool::none(), &|_, start, out| {
+        let len = out.len();
+        let (y, g) = (&y[start..][..len], &g[start..][..len]);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for ((y, g), out) in y.chunks_exact(n).zip(g.chunks_exact(n)).zip(out.chunks_exact_mut(n)) {
+                    let mean = total_of(
+                        y,
+                        g,
+                        #[inline(always)]
+                        |y, g| y * g,
+                    );
+                    for i in 0..n {
+                        out[i] = y[i] * (g[i] - mean);
+                    }
                 }
-            }
-        },
-    );
+            },
+        );
+    });
 }
 
 /// The logarithm of softmax of each row: `x - max - ln sum e^(x - max)`.
@@ -116,13 +118,13 @@ pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool
     if x.is_empty() {
         return;
     }
-    let (mut powers, mut shifts) = (pool.take(block(n)), pool.take(block(n) / n));
-    for (x, out) in x.chunks(block(n)).zip(out[..x.len()].chunks_mut(block(n))) {
+    blocks(&mut out[..x.len()], n, block(n) + block(n) / n, pool, &|scratch, start, out| {
+        let (powers, shifts) = scratch.split_at_mut(block(n));
         simd::dispatch(
             #[inline(always)]
             || {
-                let powers = &mut powers[..x.len()];
-                shifted(x, n, out, &mut shifts, false);
+                let powers = &mut powers[..out.len()];
+                shifted(&x[start..][..out.len()], n, out, shifts, false);
                 powers.copy_from_slice(out);
                 exponentials(powers);
                 for (out, powers) in out.chunks_exact_mut(n).zip(powers.chunks_exact(n)) {
@@ -133,9 +135,7 @@ pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool
                 }
             },
         );
-    }
-    pool.give(powers);
-    pool.give(shifts);
+    });
 }
 
 /// The gradient of the logarithm of softmax, from its output: `g - e^y sum g` in each row.
@@ -146,12 +146,12 @@ pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T
     if y.is_empty() {
         return;
     }
-    let len = y.len();
-    for ((y, g), out) in y.chunks(block(n)).zip(g[..len].chunks(block(n))).zip(out[..len].chunks_mut(block(n))) {
+    blocks(&mut out[..y.len()], n, 0, &Pool::none(), &|_, start, out| {
+        let g = &g[start..][..out.len()];
         simd::dispatch(
             #[inline(always)]
             || {
-                out.copy_from_slice(y);
+                out.copy_from_slice(&y[start..][..out.len()]);
                 exponentials(out);
                 for (out, g) in out.chunks_exact_mut(n).zip(g.chunks_exact(n)) {
                     let sum = total(g);
@@ -161,7 +161,7 @@ pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T
                 }
             },
         );
-    }
+    });
 }
 
 /// `ln sum e^x` of each row of `n` elements; -inf for an empty row and for one of nothing but -inf.
@@ -173,32 +173,32 @@ pub fn logsumexp_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T
 }
 
 /// `out[i] = finish(i, shift, ln sum e^(x - shift))` for row `i`.
-fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: impl Fn(usize, T, T) -> T) {
+fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: impl Fn(usize, T, T) -> T + Sync) {
     assert_eq!(x.len(), n * out.len(), "{} rows of {n}", out.len());
     if x.is_empty() {
         out.fill(T::from_f64(f64::NEG_INFINITY));
         return;
     }
     let rows = block(n) / n;
-    let (mut powers, mut shifts) = (pool.take(block(n)), pool.take(rows));
-    for (first, (x, out)) in x.chunks(block(n)).zip(out.chunks_mut(rows)).enumerate() {
+    let scratch = || pool.tensor(&[block(n) + rows]);
+    chunks(out, rows, ELEMENT * x.len(), scratch, &|scratch: &mut Tensor<T>, chunk, out| {
+        let (powers, shifts) = scratch.as_mut_slice().split_at_mut(block(n));
+        let first = chunk * rows;
         simd::dispatch(
             #[inline(always)]
             || {
-                let powers = &mut powers[..x.len()];
-                shifted(x, n, powers, &mut shifts, true);
+                let powers = &mut powers[..n * out.len()];
+                shifted(&x[n * first..][..n * out.len()], n, powers, shifts, true);
                 exponentials(powers);
                 for (out, powers) in out.iter_mut().zip(powers.chunks_exact(n)) {
                     *out = ln_total(powers);
                 }
             },
         );
-        for (i, (out, &shift)) in out.iter_mut().zip(&shifts).enumerate() {
-            *out = finish(first * rows + i, shift, *out);
+        for (i, (out, &shift)) in out.iter_mut().zip(&*shifts).enumerate() {
+            *out = finish(first + i, shift, *out);
         }
-    }
-    pool.give(powers);
-    pool.give(shifts);
+    });
 }
 
 /// The cross-entropy of each row of `n` logits: `ln sum e^x - x[class]`.
@@ -217,21 +217,24 @@ pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &m
 /// As [`cross_entropy_rows`], or if `out` is shorter than `x`.
 pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
     softmax_rows(x, n, out, pool);
-    if n == 0 {
+    if x.is_empty() {
         return;
     }
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            for ((row, &class), &g) in out.chunks_exact_mut(n).zip(classes).zip(g) {
-                row[class as usize] = T::ZERO;
-                row[class as usize] = -total(row);
-                for out in row {
-                    *out *= g;
+    blocks(&mut out[..x.len()], n, 0, pool, &|_, start, out| {
+        let first = start / n;
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for ((row, &class), &g) in out.chunks_exact_mut(n).zip(&classes[first..]).zip(&g[first..]) {
+                    row[class as usize] = T::ZERO;
+                    row[class as usize] = -total(row);
+                    for out in row {
+                        *out *= g;
+                    }
                 }
-            }
-        },
-    );
+            },
+        );
+    });
 }
 
 #[cfg(test)]
