@@ -9,20 +9,19 @@ use std::f64::consts::{LN_2, LOG2_E};
 const LN_2_HIGH: f64 = 0.693_147_180_559_890_3;
 const LN_2_LOW: f64 = 5.497_923_018_708_371e-14;
 
-/// `e^r - 1 = r + r^2 q(r)` for |r| <= ln 2 / 2, relative error 2^-64.
-const EXPM1: [f64; 12] = [
+/// `e^r - 1 = r + r^2 q(r)` for |r| <= ln 2 / 2, relative error 2^-60.
+const EXPM1: [f64; 11] = [
     0.5,
-    0.166_666_666_666_666_66,
+    0.166_666_666_666_666_7,
     0.041_666_666_666_666_67,
-    0.008_333_333_333_334_282,
-    0.001_388_888_888_888_343_6,
-    0.000_198_412_698_380_123_3,
-    2.480_158_732_464_138_4e-5,
-    2.755_732_418_785_565_3e-6,
-    2.755_727_585_047_257e-7,
-    2.504_862_960_935_101e-8,
-    2.091_357_421_395_875_3e-9,
-    1.698_469_329_502_118e-10,
+    0.008_333_333_333_326_141,
+    0.001_388_888_888_888_375_2,
+    0.000_198_412_698_748_004_93,
+    2.480_158_732_553_336_3e-5,
+    2.755_725_542_574_643_5e-6,
+    2.755_727_366_134_863_7e-7,
+    2.510_520_637_395_701e-8,
+    2.091_467_937_658_393_5e-9,
 ];
 
 /// `e^(r + low) - 1` for |r| <= ln 2 / 2 and a rounding error `low` of r.
@@ -31,11 +30,11 @@ fn expm1_near(r: f64, low: f64) -> f64 {
     (r * r).mul_add(polynomial(r, EXPM1), low) + r
 }
 
-/// Splits `x = n ln 2 + r` and returns `(e^r - 1, n)`.
+/// `e^r` for `r = x - n ln 2`.
 #[inline(always)]
-fn reduce(x: f64) -> (f64, i32) {
-    let (n, bits) = round_product(x, LOG2_E);
-    (expm1_of_rest(x, n), bits)
+fn exp_of_rest(x: f64, n: f64) -> f64 {
+    let r = n.mul_add(-LN_2_LOW, n.mul_add(-LN_2_HIGH, x));
+    1.0 + (r * r).mul_add(polynomial(r, EXPM1), r)
 }
 
 /// `e^r - 1` for `r = x - n ln 2`.
@@ -46,42 +45,59 @@ fn expm1_of_rest(x: f64, n: f64) -> f64 {
     expm1_near(r, n.mul_add(-LN_2_LOW, high - r))
 }
 
-/// `p * 2^n` for -2044 <= n <= 2046 and rounded once: two factors, because 2^n alone may be out of range.
+/// 2^64, by which results are scaled last: 2^n alone may be out of range, 2^(n - 64) or 2^(n + 64) is not.
+const FAR: f64 = 18_446_744_073_709_551_616.0;
+
+/// What to add to a number of the sign of `x` so that its rounding to an integer n adds the exponent's bias as well, and
+/// moves it by 64 towards 0: the low bits of the sum are the exponent field of 2^(n - 64) or 2^(n + 64).
 #[inline(always)]
-fn scale(p: f64, n: i32) -> f64 {
-    let half = n >> 1;
-    p * power_of_two(half) * power_of_two(n.wrapping_sub(half))
+fn bias(x: f64) -> f64 {
+    if x > 0.0 { ROUND + (1023.0 - 64.0) } else { ROUND + (1023.0 + 64.0) }
+}
+
+/// `p * 2^n` rounded once, for -1076 <= n <= 1024 and `t = n + bias(x)`.
+#[inline(always)]
+fn scale(p: f64, t: f64, x: f64) -> f64 {
+    p * f64::from_bits(t.to_bits() << 52) * if x > 0.0 { FAR } else { 1.0 / FAR }
 }
 
 /// `e^x`, within 1 ULP; 0 below -745.14, infinite above 709.78.
 #[inline(always)]
 pub fn exp(x: f64) -> f64 {
-    let (p, n) = reduce(clamp(x, -746.0, 710.0));
-    scale(1.0 + p, n)
+    let x = clamp(x, -746.0, 710.0);
+    let t = x.mul_add(LOG2_E, bias(x));
+    scale(exp_of_rest(x, t - bias(x)), t, x)
 }
 
-/// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps: 2^n cannot overflow, so n + 64 is the exponent of one
-/// factor, and the other is 2^-64. The rounding to n adds the exponent's bias as well.
+/// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps.
 #[inline(always)]
 pub(super) fn exp_minus(x: f64) -> f64 {
-    const BIASED: f64 = ROUND + 1087.0; // 1023 + 64
     let x = if -x < -746.0 { -746.0 } else { -x };
-    let t = x.mul_add(LOG2_E, BIASED);
-    let p = expm1_of_rest(x, t - BIASED);
-    (1.0 + p) * f64::from_bits(t.to_bits() << 52) * (1.0 / 18_446_744_073_709_551_616.0)
+    let t = x.mul_add(LOG2_E, bias(-1.0));
+    scale(exp_of_rest(x, t - bias(-1.0)), t, -1.0)
 }
 
 /// `2^x`, within 1 ULP and exact for integers; 0 below -1075, infinite from 1024.
 #[inline(always)]
 pub fn exp2(x: f64) -> f64 {
-    /// ln 2 - LN_2.
-    const LN_2_REST: f64 = 2.319_046_813_846_299_6e-17;
+    /// `2^f = 1 + f ln 2 + f^2 q(f)` for |f| <= 1/2, relative error 2^-60; with the rounding of ln 2, 2^-55.
+    const Q: [f64; 11] = [
+        0.240_226_506_959_100_72,
+        0.055_504_108_664_821_6,
+        0.009_618_129_107_628_479,
+        0.001_333_355_814_641_693_6,
+        0.000_154_035_303_933_759_14,
+        1.525_273_382_983_612e-5,
+        1.321_548_680_290_393_1e-6,
+        1.017_806_244_584_577_4e-7,
+        7.054_899_956_372_649e-9,
+        4.454_960_598_186_518_6e-10,
+        2.572_508_057_683_636e-11,
+    ];
     let x = clamp(x, -1076.0, 1024.0);
-    let (n, bits) = round_product(x, 1.0);
-    let f = x - n; // exact
-    let r = f * LN_2;
-    let low = f.mul_add(LN_2_REST, f.mul_add(LN_2, -r));
-    scale(1.0 + expm1_near(r, low), bits)
+    let t = x + bias(x);
+    let f = x - (t - bias(x)); // exact
+    scale(1.0 + f.mul_add(LN_2, f * f * polynomial(f, Q)), t, x)
 }
 
 /// `e^x - 1` without cancellation near 0, within 2 ULP; -1 below -37.5, infinite above 709.78.
@@ -90,9 +106,11 @@ pub fn exp2(x: f64) -> f64 {
 /// first term, since halving would cost a subnormal its last bit.
 #[inline(always)]
 pub fn expm1(x: f64) -> f64 {
-    let (p, n) = reduce(clamp(x, -40.0, 710.0));
-    let half = power_of_two(n.wrapping_sub(1));
-    let y = if n == 0 { p } else { 2.0 * p.mul_add(half, half - 0.5) };
+    let x = clamp(x, -40.0, 710.0);
+    let (n, bits) = round_product(x, LOG2_E);
+    let p = expm1_of_rest(x, n);
+    let half = power_of_two(bits.wrapping_sub(1));
+    let y = if bits == 0 { p } else { 2.0 * p.mul_add(half, half - 0.5) };
     y.copysign(x) // changes only the sign of zero
 }
 

@@ -24,33 +24,38 @@ const R: [f64; 7] = [
     0.147_954_552_965_288_7,
 ];
 
-/// Splits a positive normal number into `(m, k)` with `x = 2^k m`.
+/// Bits below the exponent field.
+const FRACTION: u64 = 0x000f_ffff_ffff_ffff;
+/// With this in the bits of an integer below 2^52, they are those of 2^52 plus the integer.
+const INTEGER: f64 = 4_503_599_627_370_496.0;
+
+/// Splits a positive normal number into `(m, k)` with `x = 2^k m`, and returns `k + 1023` in place of k, as an integer.
 #[inline(always)]
-fn split(x: f64) -> (f64, i32) {
+fn split(x: f64) -> (f64, u64) {
     // Relative to sqrt(1/2), the exponent field is k and the rest is what m has beyond sqrt(1/2).
     let origin = FRAC_1_SQRT_2.to_bits();
-    let bits = x.to_bits().wrapping_sub(origin);
-    (f64::from_bits((bits & 0x000f_ffff_ffff_ffff).wrapping_add(origin)), (bits >> 32) as i32 >> 20)
+    let bits = x.to_bits().wrapping_sub(origin.wrapping_sub(1023 << 52));
+    (f64::from_bits((bits & FRACTION).wrapping_add(origin)), bits >> 52)
 }
 
 /// Splits any positive number into `(m, k)`; subnormals are scaled into the normal range first.
 #[inline(always)]
-fn split_any(x: f64) -> (f64, i32) {
+fn split_any(x: f64) -> (f64, f64) {
     let tiny = x < f64::MIN_POSITIVE;
-    let (m, k) = split(if tiny { x * 4_503_599_627_370_496.0 } else { x });
-    (m, if tiny { k.wrapping_sub(52) } else { k })
+    let (m, biased) = split(x * if tiny { INTEGER } else { 1.0 });
+    let bias = if tiny { INTEGER + (1023.0 + 52.0) } else { INTEGER + 1023.0 };
+    (m, f64::from_bits(biased | INTEGER.to_bits()) - bias)
 }
 
 /// `ln(1 + f) - f` for sqrt(1/2) <= 1 + f <= sqrt(2).
 ///
-/// With `s = f / (2 + f)`, 1 + f is (1 + s) / (1 - s), and `2 s = f - s f`, `s f = f^2/2 - s f^2/2` take the quotient's
-/// rounding error out of the leading terms.
+/// With `s = f / (2 + f)`, 1 + f is (1 + s) / (1 - s), and `2 s = f - s f` takes the quotient's rounding error out of the
+/// leading term.
 #[inline(always)]
 fn ln1p_tail(f: f64) -> f64 {
     let s = f / (2.0 + f);
     let z = s * s;
-    let half = 0.5 * f * f;
-    s.mul_add(z.mul_add(polynomial(z, R), half), -half)
+    s * z.mul_add(polynomial(z, R), -f)
 }
 
 /// Puts in the results outside of 0 < x < infinity, where y, the logarithm of x, is meaningless.
@@ -65,7 +70,6 @@ fn specials(x: f64, y: f64) -> f64 {
 #[inline(always)]
 pub fn ln(x: f64) -> f64 {
     let (m, k) = split_any(x);
-    let k = f64::from(k);
     let f = m - 1.0; // exact
     let y = k.mul_add(LN_2_HIGH, k.mul_add(LN_2_LOW, ln1p_tail(f)) + f);
     specials(x, y)
@@ -77,7 +81,7 @@ pub fn log2(x: f64) -> f64 {
     let (m, k) = split_any(x);
     let f = m - 1.0;
     let tail = ln1p_tail(f).mul_add(LOG2_E, f * LOG2_E_LOW);
-    specials(x, f64::from(k) + f.mul_add(LOG2_E, tail))
+    specials(x, k + f.mul_add(LOG2_E, tail))
 }
 
 /// `ln(1 + x)` without cancellation near 0, within 2 ULP; negative infinity at -1, NaN below.
@@ -88,10 +92,10 @@ pub fn ln1p(x: f64) -> f64 {
     let u = 1.0 + x;
     let back = u - 1.0;
     let c = (1.0 - (u - back)) + (x - back); // exact
-    let (m, k) = split(u);
-    // 2^-k by its bits; from k = 1023 on that is 0, and c does not matter any more since x is an integer by far.
-    let shrink = f64::from_bits((1023_i32.wrapping_sub(k).max(0) as u64) << 52);
-    let k = f64::from(k);
+    let (m, biased) = split(u);
+    // 2^-k by its bits; k = 1023 would need a subnormal, but c does not matter any more since x is an integer by far.
+    let shrink = f64::from_bits(2046_u64.wrapping_sub(biased) << 52);
+    let k = f64::from_bits(biased | INTEGER.to_bits()) - (INTEGER + 1023.0);
     let f = c.mul_add(shrink, m - 1.0);
     let y = k.mul_add(LN_2_HIGH, k.mul_add(LN_2_LOW, ln1p_tail(f)) + f);
     specials(u, y).copysign(x)
