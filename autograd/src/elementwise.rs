@@ -110,12 +110,13 @@ impl<B: Binary> Zip<B> {
             return g.clone();
         }
         // A value that is not read costs a register, not a pass: `g` stands in for it and is replaced by NaN.
-        let reads = [B::READS.input(0), B::READS.input(1), B::READS.output()];
-        let a = if reads[0] { cx.input(0) } else { g };
-        let b = if reads[1] { cx.input(1) } else { g };
-        let y = if reads[2] { cx.output() } else { g };
+        // (Asked for again inside the loop: there a variable from outside would not be a constant to the compiler.)
+        let a = if B::READS.input(0) { cx.input(0) } else { g };
+        let b = if B::READS.input(1) { cx.input(1) } else { g };
+        let y = if B::READS.output() { cx.output() } else { g };
         map_real!([g, a, b, y], cx.pool(), |[g, a, b, y]| {
-            let (a, b, y) = (kept(reads[0], a), kept(reads[1], b), kept(reads[2], y));
+            let (a, b) = (kept(B::READS.input(0), a), kept(B::READS.input(1), b));
+            let y = kept(B::READS.output(), y);
             if OF_A { self.0.vjp_a(g, a, b, y) } else { self.0.vjp_b(g, a, b, y) }
         })
     }

@@ -189,6 +189,7 @@ macro_rules! real {
                     1 => self,
                     2 => self * self,
                     3 => self * self * self,
+                    4 => (self * self) * (self * self),
                     -1 => 1.0 / self,
                     // f64 holds every exponent, and its rounding does not show in f32.
                     _ => f64::powf(self as f64, f64::from(exponent)) as $t,

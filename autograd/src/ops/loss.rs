@@ -173,8 +173,10 @@ impl Binary for BinaryCrossEntropy {
     }
     #[inline(always)]
     fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        let one = b.like(1.0);
-        g * ((one - b.clone()) * a.clone().sigmoid() - b * (-a).sigmoid())
+        // With p = s(-|a|), s(a) is 1 - p or p. At a = 0 it is p, for the sake of the second derivative.
+        let p = a.if_positive(-a.clone(), a.clone()).sigmoid();
+        let towards = b.like(1.0) - b.clone() - p.clone();
+        g * a.if_positive(towards, p - b)
     }
     #[inline(always)]
     fn vjp_b<E: Real>(&self, g: E, a: E, _b: E, _y: E) -> E {

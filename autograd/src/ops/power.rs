@@ -66,6 +66,25 @@ impl Unary for Powi {
     }
 }
 
+/// [`Powi`] with an exponent that the compiler knows: where it is small, a few products that vectorise.
+#[derive(Clone, Copy)]
+pub struct Power<const N: i32>;
+impl<const N: i32> Unary for Power<N> {
+    const NAME: &'static str = "powi";
+    const READS: Reads = Powi::READS;
+    #[inline(always)]
+    fn f<E: Real>(&self, x: E) -> E {
+        Powi { exponent: N }.f(x)
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: E, y: E) -> E {
+        Powi { exponent: N }.vjp(g, x, y)
+    }
+    fn cases(&self, c: &mut Cases) {
+        Powi { exponent: N }.cases(c);
+    }
+}
+
 /// y = x^p, NaN for a negative x and a broken p; dx = g p x^(p - 1), 0 for p = 0.
 #[derive(Clone, Copy)]
 pub struct Powf {
@@ -180,7 +199,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// `self` to a whole power; exponent 0 gives 1, with gradient 0, whatever the base.
     #[track_caller]
     pub fn powi(&self, exponent: i32) -> Self {
-        self.tape().apply(Map(Powi { exponent }), &[self])
+        match exponent {
+            -1 => self.reciprocal(),
+            2 => self.tape().apply(Map(Power::<2>), &[self]),
+            3 => self.tape().apply(Map(Power::<3>), &[self]),
+            4 => self.tape().apply(Map(Power::<4>), &[self]),
+            _ => self.tape().apply(Map(Powi { exponent }), &[self]),
+        }
     }
 
     /// `self` to a constant real power: NaN for a negative base and a broken exponent; exponent 0 gives 1 with gradient

@@ -28,6 +28,22 @@ impl Walk {
     fn run(self, shape: &[usize], start: f64, mut f: impl FnMut(&mut f64, usize)) {
         let (count, inner) = (shape[self.axis], shape[self.axis + 1..].iter().product::<usize>());
         let outer: usize = shape[..self.axis].iter().product();
+        if inner == 1 {
+            // Several lines side by side: in one, each entry waits for the entry before.
+            const LINES: usize = 8;
+            let mut lines = |first: usize, states: &mut [f64]| {
+                for step in 0..count {
+                    let entry = if self.reverse { count - 1 - step } else { step };
+                    for (k, state) in states.iter_mut().enumerate() {
+                        f(state, (first + k) * count + entry);
+                    }
+                }
+            };
+            let whole = outer - outer % LINES;
+            (0..whole).step_by(LINES).for_each(|first| lines(first, &mut [start; LINES]));
+            (whole..outer).for_each(|line| lines(line, &mut [start]));
+            return;
+        }
         let mut states = vec![start; inner];
         for o in 0..outer {
             states.fill(start);
