@@ -1,6 +1,6 @@
 //! Pairwise sums: the error grows with the logarithm of the length.
 
-use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
+use crate::parallel::{ELEMENT, PIECE, chunks};
 use crate::{Pool, Scalar, Shape, Tensor, simd};
 
 /// Independent partial sums: fills two 512-bit registers of f32 and hides the latency of addition.
@@ -27,41 +27,81 @@ const CACHE: usize = 1 << 20;
 /// assert!((sum / 1677.7216 - 1.0).abs() < 1e-6); // a plain loop is 14 % off
 /// ```
 pub fn sum<T: Scalar>(x: &[T]) -> T {
-    if is_worthwhile(READ * x.len()) {
-        return branches(x);
+    if x.len() <= LANES * BLOCK {
+        return simd::dispatch(
+            #[inline(always)]
+            || chunk(x),
+        );
     }
+    if x.len() <= PIECE {
+        return folded(pairwise(x));
+    }
+    let mut parts = vec![[T::ZERO; LANES]; x.len().div_ceil(PIECE)];
+    chunks(&mut parts, 1, READ * x.len(), || (), &|_, i, part| {
+        part[0] = pairwise(&x[i * PIECE..][..PIECE.min(x.len() - i * PIECE)]);
+    });
+    let mut pairs = Pairs::<T, 40>::new();
+    parts.into_iter().for_each(|part| pairs.push(part));
+    folded(pairs.finish())
+}
+
+/// The sums of the elements of a piece in each lane.
+fn pairwise<T: Scalar>(x: &[T]) -> [T; LANES] {
+    const DEPTH: usize = (PIECE / (LANES * BLOCK)).ilog2() as usize + 1;
     simd::dispatch(
         #[inline(always)]
-        || pairwise(x),
+        || {
+            let mut pairs = Pairs::<T, DEPTH>::new();
+            for block in x.chunks(LANES * BLOCK) {
+                pairs.push(lanes(block));
+            }
+            pairs.finish()
+        },
     )
 }
 
-/// [`pairwise`] with its branches on several threads.
-fn branches<T: Scalar>(x: &[T]) -> T {
-    match half(x) {
-        Some(half) if x.len() > PIECE => {
-            let (a, b) = rayon::join(|| branches(&x[..half]), || branches(&x[half..]));
-            a + b
+/// A sum by pairs of terms that come one after another: pairs of terms, pairs of pairs, and so on.
+struct Pairs<T, const DEPTH: usize> {
+    /// Sums of runs of terms: as many as the 1s of `count` in binary, the longest first. `count` is below 2^DEPTH.
+    open: [[T; LANES]; DEPTH],
+    count: u64,
+}
+
+impl<T: Scalar, const DEPTH: usize> Pairs<T, DEPTH> {
+    #[inline(always)]
+    fn new() -> Self {
+        Pairs { open: [[T::ZERO; LANES]; DEPTH], count: 0 }
+    }
+
+    #[inline(always)]
+    fn push(&mut self, mut term: [T; LANES]) {
+        let mut top = self.count.count_ones() as usize;
+        for _ in 0..self.count.trailing_ones() {
+            top -= 1;
+            for i in 0..LANES {
+                term[i] += self.open[top][i];
+            }
         }
-        _ => sum(x),
+        self.open[top] = term;
+        self.count += 1;
+    }
+
+    #[inline(always)]
+    fn finish(self) -> [T; LANES] {
+        let runs = self.count.count_ones() as usize;
+        let mut total = self.open[runs.saturating_sub(1)];
+        for run in self.open[..runs.saturating_sub(1)].iter().rev() {
+            for i in 0..LANES {
+                total[i] += run[i];
+            }
+        }
+        total
     }
 }
 
-fn pairwise<T: Scalar>(x: &[T]) -> T {
-    match half(x) {
-        Some(half) => pairwise(&x[..half]) + pairwise(&x[half..]),
-        None => chunk(x),
-    }
-}
-
-/// Where a sum is cut in two, if it is long enough: a multiple of the block keeps every chunk but the last in whole lanes.
-fn half<T>(x: &[T]) -> Option<usize> {
-    let half = (x.len() / 2).next_multiple_of(LANES * BLOCK);
-    (x.len() > LANES * BLOCK && half < x.len()).then_some(half)
-}
-
+/// The sums of every `LANES`-th element.
 #[inline(always)]
-pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
+fn lanes<T: Scalar>(x: &[T]) -> [T; LANES] {
     let mut lanes = [T::ZERO; LANES];
     let mut rows = x.chunks_exact(LANES);
     for row in &mut rows {
@@ -72,6 +112,12 @@ pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
     for (lane, &value) in lanes.iter_mut().zip(rows.remainder()) {
         *lane += value;
     }
+    lanes
+}
+
+/// The sum of all lanes.
+#[inline(always)]
+fn folded<T: Scalar>(mut lanes: [T; LANES]) -> T {
     let mut width = LANES / 2;
     while width > 0 {
         for i in 0..width {
@@ -80,6 +126,12 @@ pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
         width /= 2;
     }
     lanes[0]
+}
+
+/// The sum of a slice that is not long.
+#[inline(always)]
+pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
+    folded(lanes(x))
 }
 
 /// `out[j] = sum over i of x[i * out.len() + j]`: the sum of the rows of a matrix, pairwise over the rows.
