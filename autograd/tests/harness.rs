@@ -32,7 +32,7 @@ enum Fault {
     WrongElementInSinglePrecision,
     /// No two runs give the same bits, though every one is accurate.
     Nondeterministic,
-    /// The kernel adds to numbers that it finds in a buffer; to NaN, what a new buffer holds where assertions are on, not.
+    /// The kernel adds to old numbers that it finds in a buffer, but overwrites NaN: only the check with a used buffer sees it.
     StaleBuffer,
     /// A gradient that is wrong where both inputs are one variable.
     ConfusedByAliases,

@@ -113,7 +113,7 @@ fn broadcast_loop<T: Scalar, const N: usize>(
 ) -> Tensor<T> {
     let (operands, shape) = operands(x, pool);
     let x = slices(&operands);
-    pool.filled(&shape, |out| pieces(out, 1, ELEMENT, &|start, out| run(cut(x, start, out.len()), out)))
+    pool.filled(&shape, |out| pieces(out, ELEMENT, &|start, out| run(cut(x, start, out.len()), out)))
 }
 
 /// A tensor of the operand's shape or of the common one.

@@ -56,9 +56,11 @@ impl<'a, T: Scalar> Matrix<'a, T> {
     }
 }
 
-/// Rows of a piece of a product, about, at least: with fewer, each thread would mostly rearrange the right factor for
-/// itself, and below 65 the kernels add in another order.
-const PIECE: usize = 128;
+/// Rows of a piece of a product, about, at least, and pieces, at most: with less in a piece each thread would mostly
+/// rearrange the right factor for itself. Small products, of up to 64 x 64 or 256 elements, are added up in another order;
+/// no piece is as small.
+const ROWS: usize = 128;
+const PIECES: usize = 32;
 /// Multiplications and additions that take as long as one operation of a loop (see [`chunks`]).
 const PER_OPERATION: usize = 8;
 
@@ -85,16 +87,17 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
         return;
     }
     let work = m * n * k / PER_OPERATION;
-    if m >= 2 * PIECE && is_worthwhile(work) {
-        let rows = m.div_ceil((m / PIECE).min(2 * rayon::current_num_threads()).min(PIECE / 4));
+    if m >= 2 * ROWS && n > 2 && is_worthwhile(work) {
+        let rows = m.div_ceil((m / ROWS).min(PIECES));
         return chunks(c, rows * n, work, || (), &|_, i, c| {
             gemm(a.some_rows(i * rows, c.len() / n), b, c, accumulate);
         });
     }
     let strides = |s: [usize; 2]| [s[0] as isize, s[1] as isize];
     let (left, right) = ((a.data.as_ptr(), strides(a.strides)), (b.data.as_ptr(), strides(b.strides)));
-    // SAFETY: `Matrix` holds rows * columns elements at permuted row-major strides, so every index is in its slice, and
-    // `c` has m * n elements and, as a mutable borrow, overlaps neither.
+    // SAFETY: `Matrix` holds rows * columns elements at permuted row-major strides, or some of the rows of such a matrix from
+    // their first element on, so every index is in its slice, and `c` has m * n elements and, as a mutable borrow, overlaps
+    // neither.
     unsafe { T::gemm_raw([m, k, n], left, right, c.as_mut_ptr(), accumulate) }
 }
 

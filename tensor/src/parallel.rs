@@ -1,8 +1,8 @@
 //! Large loops on all of rayon's threads, with the same bits at any number of them.
 //!
-//! An operation on a large tensor is cut into pieces that depend on the sizes alone. The pieces are worked on by all
-//! threads, unless the caller is one of rayon's threads already: whoever runs there has cut the work further outside,
-//! and an operation that waited for others would only delay it.
+//! An operation on a large tensor is cut into pieces, in a way that leaves what is added to what to the sizes alone. All
+//! threads work on the pieces, unless the caller is one of rayon's already: whoever runs there has cut the work further
+//! outside, and an operation that waited for others would only delay it.
 
 use crate::Scalar;
 use rayon::prelude::*;
@@ -45,15 +45,11 @@ pub fn chunks<T: Send, S>(
     }
 }
 
-/// Calls `f(start, piece)` for pieces of `out` that begin at element `start`, of a whole number of `rows` elements each:
-/// on all threads if `work` for each element is worth it.
-pub fn pieces<T: Scalar>(out: &mut [T], row: usize, work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
-    if out.len() <= PIECE {
-        return f(0, out);
-    }
-    let len = row * (PIECE / row).max(1);
+/// Calls `f(start, piece)` for pieces of `out` that begin at element `start`: on all threads if that is worth it, at
+/// `work` operations an element.
+pub(crate) fn pieces<T: Scalar>(out: &mut [T], work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
     let work = work * out.len();
-    chunks(out, len, work, || (), &|_, i, piece| f(i * len, piece));
+    chunks(out, PIECE, work, || (), &|_, i, piece| f(i * PIECE, piece));
 }
 
 #[cfg(test)]
@@ -79,6 +75,7 @@ mod tests {
             broadcast_to(&column, &[1, 1031, 517], &pool),
             broadcast_to(&Tensor::scalar(T::from_f64(2.5)), &[1031, 517], &pool),
             sum_axes(&x, &[0], &pool),
+            sum_axes(&x.reshape(&[517 * 1031 / 11, 11]), &[0], &pool),
             sum_axes(&x, &[1], &pool),
             sum_axes(&x.reshape(&[1031, 11, 47]), &[1], &pool),
             sum_axes(&x.reshape(&[1, 1031, 517]), &[1], &pool),
@@ -111,12 +108,15 @@ mod tests {
             let sums = Some([dgain, dbias]);
             rows::layer_norm_rows_grad(wide, row.as_slice(), wide, 1e-5, dx, sums, &pool);
         });
-        for (m, k, n) in [(1031, 517, 64), (517, 1031, 64), (96, 1533, 64), (300, 517, 1031)] {
+        for (m, k, n) in
+            [(1031, 517, 64), (517, 1031, 64), (96, 1533, 64), (300, 517, 1031), (1024, 8192, 1), (256, 16384, 2)]
+        {
             let [a, b] = [values::<T>(&[m, k], 4), values(&[k, n], 5)];
             let [a_t, b_t] = [values::<T>(&[k, m], 4), values(&[n, k], 5)];
             let [a, b, a_t, b_t] = [&a, &b, &a_t, &b_t].map(Matrix::rows_of);
             write(&[m, n], &|y| gemm(a, b, y, false));
             write(&[m, n], &|y| gemm(a_t.t(), b, y, false));
+            write(&[m, n], &|y| gemm(a, b_t.t(), y, false));
             write(&[m, n], &|y| {
                 y.fill(T::ONE);
                 gemm(a, b_t.t(), y, true);
@@ -153,6 +153,8 @@ mod tests {
     }
 
     fn check<T: Scalar>() {
+        // Not as many as the machine has, unless another test was first.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(3).build_global();
         // On one of rayon's threads nothing is cut.
         let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap().install(everything::<T>);
         let together = everything();

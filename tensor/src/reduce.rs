@@ -1,6 +1,6 @@
 //! Pairwise sums: the error grows with the logarithm of the length.
 
-use crate::parallel::{ELEMENT, PIECE, chunks};
+use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
 use crate::{Pool, Scalar, Shape, Tensor, simd};
 
 /// Independent partial sums: fills two 512-bit registers of f32 and hides the latency of addition.
@@ -151,20 +151,32 @@ pub fn sum_rows<T: Scalar>(x: &[T], out: &mut [T]) {
 }
 
 fn sum_strips<T: Scalar, const STRIP: usize>(x: &[T], out: &mut [T]) {
-    let stride = out.len();
-    chunks(out, STRIP, READ * x.len(), || (), &|_, strip, out| {
-        let sums = pairwise_rows::<T, STRIP>(x, stride, strip * STRIP, out.len());
+    let (stride, work) = (out.len(), READ * x.len());
+    // One of the two is cut: a wide matrix by strips, a narrow one by rows.
+    let threads = if stride <= STRIP && is_worthwhile(work) { rayon::current_num_threads() } else { 1 };
+    chunks(out, STRIP, work, || (), &|_, strip, out| {
+        let sums = pairwise_rows::<T, STRIP>(x, stride, strip * STRIP, out.len(), threads);
         out.copy_from_slice(&sums[..out.len()]);
     });
 }
 
 /// The sums of columns `first..first + width` of the rows of length `stride`; `width` is at most `STRIP`.
-fn pairwise_rows<T: Scalar, const STRIP: usize>(x: &[T], stride: usize, first: usize, width: usize) -> [T; STRIP] {
+fn pairwise_rows<T: Scalar, const STRIP: usize>(
+    x: &[T],
+    stride: usize,
+    first: usize,
+    width: usize,
+    threads: usize,
+) -> [T; STRIP] {
     let rows = x.len() / stride;
     if rows > BLOCK {
         let half = (rows / 2).next_multiple_of(BLOCK) * stride;
-        let mut sums = pairwise_rows::<T, STRIP>(&x[..half], stride, first, width);
-        let rest = pairwise_rows::<T, STRIP>(&x[half..], stride, first, width);
+        let part = |x: &[T]| pairwise_rows::<T, STRIP>(x, stride, first, width, threads / 2);
+        let (mut sums, rest) = if threads > 1 {
+            rayon::join(|| part(&x[..half]), || part(&x[half..]))
+        } else {
+            (part(&x[..half]), part(&x[half..]))
+        };
         sums.iter_mut().zip(rest).for_each(|(sum, rest)| *sum += rest);
         return sums;
     }

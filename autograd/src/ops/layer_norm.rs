@@ -39,13 +39,14 @@ impl<T: Scalar> Op<T> for LayerNorm {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (x, gain) = (cx.x(0), cx.x(1));
         let pool = cx.pool();
-        let [mut dx, mut dgain, mut dbias] = [cx.shape(0), cx.shape(1), cx.shape(2)].map(|shape| pool.tensor(shape));
-        let [x, gain, g] = [x.value(), gain.value(), cx.g().value()].map(Tensor::as_slice);
+        let mut dx = pool.tensor(cx.shape(0));
         let are_wanted = cx.needs(1) || cx.needs(2);
-        let sums = are_wanted.then(|| [dgain.as_mut_slice(), dbias.as_mut_slice()]);
-        layer_norm_rows_grad(x, gain, g, self.eps, dx.as_mut_slice(), sums, pool);
-        let [dx, dgain, dbias] = [dx, dgain, dbias].map(|grad| cx.constant(grad));
-        Grads::new([Some(dx), are_wanted.then_some(dgain), are_wanted.then_some(dbias)])
+        let mut sums = are_wanted.then(|| [cx.shape(1), cx.shape(2)].map(|shape| pool.tensor(shape)));
+        let [x, gain, g] = [x.value(), gain.value(), cx.g().value()].map(Tensor::as_slice);
+        let slices = sums.as_mut().map(|sums| sums.each_mut().map(Tensor::as_mut_slice));
+        layer_norm_rows_grad(x, gain, g, self.eps, dx.as_mut_slice(), slices, pool);
+        let [dgain, dbias] = sums.map_or([None, None], |sums| sums.map(|sum| Some(cx.constant(sum))));
+        Grads::new([Some(cx.constant(dx)), dgain, dbias])
     }
 
     fn is_fused(&self) -> bool {

@@ -156,7 +156,8 @@ impl SmoothL1 {
 }
 
 /// y = b softplus(-a) + (1 - b) softplus(a): minus the logarithm of the probability that a logit a gives to a target b
-/// in 0..=1; da = g ((1 - b) s(a) - b s(-a)), db = -g a. No term cancels another, so small losses keep their digits.
+/// in 0..=1; da = g (s(a) - b), from s(-|a|), db = -g a. No term of y cancels another, so small losses keep their digits;
+/// so do small gradients at the targets 0 and 1.
 #[derive(Clone, Copy)]
 pub struct BinaryCrossEntropy;
 impl Binary for BinaryCrossEntropy {

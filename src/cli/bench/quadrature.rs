@@ -86,7 +86,8 @@ fn errors_of(scene: &AnalyticScene, seen: &Integral) -> [f64; 3] {
     let exact = &scene.exact;
     let pairs = seen.d_color.iter().zip(&exact.d_color);
     // NaN wins.
-    let largest = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, |worst, x| if x <= worst { worst } else { x });
+    let largest =
+        pairs.map(|(a, b)| (a - b).abs()).fold(0.0, |worst, x| if x <= worst || worst.is_nan() { worst } else { x });
     [(seen.color - exact.color).abs(), (seen.depth - exact.depth).abs(), largest]
 }
 

@@ -117,7 +117,7 @@ fn measure(
         evaluations = evaluations + count;
         error += raygrad::nerf::metrics::mse(&image, reference);
         let differences = image.data.iter().zip(&reference.data).map(|(a, b)| f64::from((a - b).abs()));
-        largest = differences.fold(largest, |worst, x| if x <= worst { worst } else { x });
+        largest = differences.fold(largest, |worst, x| if x <= worst || worst.is_nan() { worst } else { x });
         truth += psnr(&image, &frame.image.over([1.0; 3]));
     }
     let count = reference.len() as f64;

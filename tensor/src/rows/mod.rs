@@ -27,7 +27,7 @@ fn block(n: usize) -> usize {
 }
 
 /// What an element of a row costs: an exponential, and a few passes over what lies in cache.
-const ELEMENT: usize = 16;
+const ROW_ELEMENT: usize = 16;
 
 /// See [`blocks`].
 type Kernel<'a, T> = &'a (dyn Fn(&mut [T], usize, &mut [T]) + Sync);
@@ -35,7 +35,7 @@ type Kernel<'a, T> = &'a (dyn Fn(&mut [T], usize, &mut [T]) + Sync);
 /// Calls `f(scratch, start, rows)` for blocks of rows of `out`, each of `n` elements, which begin at element `start`, with
 /// `scratch` elements of space.
 fn blocks<T: Scalar>(out: &mut [T], n: usize, scratch: usize, pool: &Pool<T>, f: Kernel<'_, T>) {
-    let (len, work) = (block(n), ELEMENT * out.len());
+    let (len, work) = (block(n), ROW_ELEMENT * out.len());
     let each = |scratch: &mut Tensor<T>, i: usize, out: &mut [T]| f(scratch.as_mut_slice(), i * len, out);
     chunks(out, len, work, || pool.tensor(&[scratch]), &each);
 }
@@ -102,24 +102,9 @@ fn total_of<T: Scalar>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
 /// The sums of the values of `f` of the elements of `a` and `b` at each index, in one pass.
 #[inline(always)]
 fn totals_of<T: Scalar, const K: usize>(a: &[T], b: &[T], f: impl Fn(T, T) -> [T; K]) -> [T; K] {
-    let n = a.len();
-    let b = &b[..n];
-    let mut lanes = [[T::ZERO; LANES]; K];
-    let whole = n - n % LANES;
-    let mut start = 0;
-    while start < whole {
-        let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
-        for i in 0..LANES {
-            let values = f(a[i], b[i]);
-            for k in 0..K {
-                lanes[k][i] += values[k];
-            }
-        }
-        start += LANES;
-    }
-    let (a, b) = (&a[whole..], &b[whole..]);
+    let b = &b[..a.len()];
     let mut sums = [T::ZERO; K];
-    if whole == 0 {
+    if a.len() < LANES {
         for i in 0..a.len() {
             let values = f(a[i], b[i]);
             for k in 0..K {
@@ -128,14 +113,31 @@ fn totals_of<T: Scalar, const K: usize>(a: &[T], b: &[T], f: impl Fn(T, T) -> [T
         }
         return sums;
     }
-    for i in 0..a.len() {
-        let values = f(a[i], b[i]);
-        for k in 0..K {
-            lanes[k][i] += values[k];
+    // Sums of blocks, so that the error of a long row grows with the number of blocks.
+    for (a, b) in a.chunks(BLOCK).zip(b.chunks(BLOCK)) {
+        let mut lanes = [[T::ZERO; LANES]; K];
+        let whole = a.len() - a.len() % LANES;
+        let mut start = 0;
+        while start < whole {
+            let (a, b) = (&a[start..start + LANES], &b[start..start + LANES]);
+            for i in 0..LANES {
+                let values = f(a[i], b[i]);
+                for k in 0..K {
+                    lanes[k][i] += values[k];
+                }
+            }
+            start += LANES;
         }
-    }
-    for k in 0..K {
-        sums[k] = chunk(&lanes[k]);
+        let (a, b) = (&a[whole..], &b[whole..]);
+        for i in 0..a.len() {
+            let values = f(a[i], b[i]);
+            for k in 0..K {
+                lanes[k][i] += values[k];
+            }
+        }
+        for k in 0..K {
+            sums[k] += chunk(&lanes[k]);
+        }
     }
     sums
 }

@@ -1,6 +1,6 @@
 //! Mean and variance of rows, and layer normalisation.
 
-use super::{ELEMENT, block, blocks, total, totals_of};
+use super::{ROW_ELEMENT, block, blocks, total, totals_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
@@ -37,7 +37,7 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
         return;
     }
     let rows = block(n) / n;
-    chunks(out, rows, ELEMENT * x.len(), || (), &|_, i, out| {
+    chunks(out, rows, ROW_ELEMENT * x.len(), || (), &|_, i, out| {
         simd::dispatch(
             #[inline(always)]
             || {
@@ -98,12 +98,12 @@ pub fn layer_norm_rows_grad<T: Scalar>(
     let wanted = if sums.is_some() { 2 * n } else { 0 };
     if !x.is_empty() {
         // Of whole groups, so that what is added to what depends on the sizes alone.
-        let len = n * (x.len() / n).div_ceil(PARTS).next_multiple_of(GROUP);
+        let len = n * (x.len() / n).div_ceil(PARTS).max(4 * GROUP).next_multiple_of(GROUP);
         let mut parts: Vec<_> = dx[..x.len()].chunks_mut(len).map(|dx| (dx, vec![0.0_f64; wanted])).collect();
         chunks(
             &mut parts,
             1,
-            2 * ELEMENT * x.len(),
+            2 * ROW_ELEMENT * x.len(),
             || pool.tensor(&[n + wanted]),
             &|scratch: &mut Tensor<T>, i, part| {
                 for (dx, sums) in part {

@@ -1,6 +1,6 @@
 //! Softmax, its logarithm, the logarithm of a sum of exponentials, and cross-entropy.
 
-use super::{ELEMENT, block, blocks, fold_lanes, total, total_of};
+use super::{ROW_ELEMENT, block, blocks, fold_lanes, total, total_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
@@ -181,7 +181,7 @@ fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: 
     }
     let rows = block(n) / n;
     let scratch = || pool.tensor(&[block(n) + rows]);
-    chunks(out, rows, ELEMENT * x.len(), scratch, &|scratch: &mut Tensor<T>, chunk, out| {
+    chunks(out, rows, ROW_ELEMENT * x.len(), scratch, &|scratch: &mut Tensor<T>, chunk, out| {
         let (powers, shifts) = scratch.as_mut_slice().split_at_mut(block(n));
         let first = chunk * rows;
         simd::dispatch(

@@ -46,13 +46,13 @@ def quarter_turns():
 # border of the short reduction.
 ANGLES = (math.ldexp(6381956970095103.0, 797), 2.0**30, 2.0**30 * 0.999, math.pi / 4, 3 * math.pi / 4)
 LN2 = math.log(2)
-HALVES = tuple((k + 0.5) * LN2 for k in range(-1000, 1000, 37))
+HALVES = tuple((k + 0.5) * LN2 for k in range(-1070, 1023))
 BOTH = (-1, 1)
 
 # Function, value, the three draws.
 CASES = (
     ("exp", mp.exp, lambda: random.uniform(-10, 10), lambda: random.uniform(-745, 709.7), about(HALVES)),
-    ("exp2", lambda x: mpf(2) ** x, lambda: random.uniform(-10, 10), lambda: random.uniform(-1074, 1023.9), about((0.5, -3.5, 100.5))),
+    ("exp2", lambda x: mpf(2) ** x, lambda: random.uniform(-10, 10), lambda: random.uniform(-1074, 1023.9), about(tuple(k + 0.5 for k in range(-60, 60)))),
     ("expm1", mp.expm1, lambda: random.uniform(-2, 2), exponents(-1070, 8, BOTH), about((LN2 / 2, -LN2 / 2, 1.5 * LN2, -37.0))),
     ("ln", mp.log, lambda: random.uniform(0, 10), exponents(-1074, 1023), about((1.0, math.sqrt(0.5), math.sqrt(2), 2.0))),
     ("ln1p", mp.log1p, lambda: random.uniform(-0.99, 10), exponents(-1070, 1023), about((math.sqrt(0.5) - 1, math.sqrt(2) - 1, -0.5, 1.0))),

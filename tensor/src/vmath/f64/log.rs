@@ -93,8 +93,8 @@ pub fn ln1p(x: f64) -> f64 {
     let back = u - 1.0;
     let c = (1.0 - (u - back)) + (x - back); // exact
     let (m, biased) = split(u);
-    // 2^-k by its bits; k = 1023 would need a subnormal, but c does not matter any more since x is an integer by far.
-    let shrink = f64::from_bits(2046_u64.wrapping_sub(biased) << 52);
+    // 2^-k by its bits; from k = 1023 on that is 0, and c does not matter any more since x is an integer by far.
+    let shrink = f64::from_bits(2046_u64.saturating_sub(biased) << 52);
     let k = f64::from_bits(biased | INTEGER.to_bits()) - (INTEGER + 1023.0);
     let f = c.mul_add(shrink, m - 1.0);
     let y = k.mul_add(LN_2_HIGH, k.mul_add(LN_2_LOW, ln1p_tail(f)) + f);
