@@ -161,3 +161,35 @@ pub(crate) fn sum_slots(slots: &mut [Slot]) {
         }
     });
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::{Split, embedded};
+    use crate::train::stream;
+    use crate::{Config, Extent, Preset};
+
+    #[test]
+    fn a_slot_holds_the_sum_of_its_tiles() {
+        let data = embedded(Split::Train, 12);
+        let extent = Extent { bounds: data.bounds, span: [data.near, data.far] };
+        let model = Model::new(Config::preset(Preset::Instant), extent, 1).unwrap();
+        let mut scratch = Scratch::default();
+        let mut slot = Slot::default();
+        // The second step finds the sums of the first.
+        let mut run = |tiles: &[u64]| {
+            slot.begin();
+            for &tile in tiles {
+                slot.tile(&mut scratch, &model, &data, [4, 8], &mut stream(7, [0, tile]));
+            }
+            let dense: Vec<Vec<f32>> = slot.grads.iter().flatten().map(|grad| grad.as_slice().to_vec()).collect();
+            (dense, slot.work.loss)
+        };
+        let [first, second, both] = [run(&[0]), run(&[1]), run(&[0, 1])];
+        assert!(!both.0.is_empty() && first.0 != second.0);
+        for ((a, b), sum) in first.0.iter().flatten().zip(second.0.iter().flatten()).zip(both.0.iter().flatten()) {
+            assert_eq!(a + b, *sum);
+        }
+        assert_eq!(first.1 + second.1, both.1);
+    }
+}

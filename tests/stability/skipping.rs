@@ -114,6 +114,18 @@ fn rendering_ends_rays_within_the_bound() {
     }
 }
 
+/// The light that would have gone on stays with what is in front: a white body over black is white, not 1 - 1e-3.
+#[test]
+fn a_ray_that_ends_early_has_the_whole_colour() {
+    for skip in [Skip::Lossless, Skip::Fast] {
+        let (mut model, camera) = fog_model(Fog { sigma: 10.0, white_behind: false }, skip);
+        model.finish_grid();
+        let view = model.view(&camera, [0.0; 3]);
+        let brightest = view.color.data.iter().fold(0.0_f32, |a, &b| a.max(b));
+        within("brightest", brightest.into(), 1.0, 1e-6);
+    }
+}
+
 /// Catalogue: sum w = 0. A pixel that shows nothing has the depth 0, and no NaN.
 #[test]
 fn the_depth_of_nothing_is_zero() {
