@@ -87,18 +87,6 @@ fn total<T: Scalar>(x: &[T]) -> T {
     }
 }
 
-/// The sum of `f` of the elements of `a` and `b` at each index.
-#[inline(always)]
-fn total_of<T: Scalar>(a: &[T], b: &[T], f: impl Fn(T, T) -> T) -> T {
-    let [sum] = totals_of(
-        a,
-        b,
-        #[inline(always)]
-        |a, b| [f(a, b)],
-    );
-    sum
-}
-
 /// The sums of the values of `f` of the elements of `a` and `b` at each index, in one pass.
 #[inline(always)]
 fn totals_of<T: Scalar, const K: usize>(a: &[T], b: &[T], f: impl Fn(T, T) -> [T; K]) -> [T; K] {

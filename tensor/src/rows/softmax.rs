@@ -1,6 +1,6 @@
 //! Softmax, its logarithm, the logarithm of a sum of exponentials, and cross-entropy.
 
-use super::{ROW_ELEMENT, block, blocks, fold_lanes, total, total_of};
+use super::{ROW_ELEMENT, block, blocks, fold_lanes, total, totals_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
@@ -40,17 +40,11 @@ fn exponentials<T: Scalar>(x: &mut [T]) {
 /// so that what little the others add to it is not rounded off.
 #[inline(always)]
 fn ln_total<T: Scalar>(powers: &[T]) -> T {
-    let rest = total_of(
+    let [rest, ones] = totals_of(
         powers,
         powers,
         #[inline(always)]
-        |x, _| if x == T::ONE { T::ZERO } else { x },
-    );
-    let ones = total_of(
-        powers,
-        powers,
-        #[inline(always)]
-        |x, _| if x == T::ONE { T::ONE } else { T::ZERO },
+        |x, _| if x == T::ONE { [T::ZERO, T::ONE] } else { [x, T::ZERO] },
     );
     (rest + (ones - T::ONE)).ln1p()
 }
@@ -95,11 +89,11 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
             #[inline(always)]
             || {
                 for ((y, g), out) in y.chunks_exact(n).zip(g.chunks_exact(n)).zip(out.chunks_exact_mut(n)) {
-                    let mean = total_of(
+                    let [mean] = totals_of(
                         y,
                         g,
                         #[inline(always)]
-                        |y, g| y * g,
+                        |y, g| [y * g],
                     );
                     for i in 0..n {
                         out[i] = y[i] * (g[i] - mean);
