@@ -159,7 +159,8 @@ fn elementwise() -> Vec<Entry> {
     use select::Compare::{Equal, Greater, GreaterEqual, Less, LessEqual, NotEqual};
     // Powers of both signs, of 0 and of 1 have conventions of their own.
     let powi = [0, 1, 5, -4].map(|exponent| Entry::unary(power::Powi { exponent }));
-    let powers = [Entry::unary(power::Power::<2>), Entry::unary(power::Power::<3>), Entry::unary(power::Power::<4>)];
+    let powers =
+        [Entry::unary(power::ConstPowi::<2>), Entry::unary(power::ConstPowi::<3>), Entry::unary(power::ConstPowi::<4>)];
     let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::unary(power::Powf { exponent }));
     // Values that are equal in places, and that no step of a difference takes past each other.
     let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);

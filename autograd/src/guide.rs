@@ -14,9 +14,9 @@
 //! assert_eq!(y.grad(&[&x])[0].as_slice(), [1.0, 2.0, 3.0]);
 //! ```
 //!
-//! There is no global state of its own: any number of tapes run on any threads, and a tape's memory goes with it. An operation on large
-//! tensors uses all of rayon's threads (`RAYON_NUM_THREADS` sets how many), unless it runs on one
-//! of them already, as in `ThreadPool::install`: there it keeps to its thread.
+//! Tapes share no state: any number of them run on any threads, and a tape's memory goes with it. An operation on large
+//! tensors uses all of rayon's threads (`RAYON_NUM_THREADS` sets how many), unless it runs on one of them already, as in
+//! `ThreadPool::install`: there it keeps to its thread.
 //!
 //! # Gradients of gradients
 //!

@@ -204,6 +204,7 @@ impl<'a, T> Rows<'a, T> {
     /// If there are not as many.
     #[inline(always)]
     #[allow(clippy::mut_from_ref)] // that is its point
+    // SAFETY: kept by the callers, whose rows are all different.
     unsafe fn get(&self, start: usize, len: usize) -> &mut [T] {
         assert!(start <= self.len && len <= self.len - start, "rows beyond the table");
         // SAFETY: the range lies within the slice that `new` borrowed, and the caller vouches that nobody else holds it.

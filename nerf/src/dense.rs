@@ -123,6 +123,7 @@ mod tests {
     use crate::occupancy::Skip;
     use crate::scene::train_cameras;
     use glam::DVec3;
+    use raygrad_autograd::Real;
 
     /// A voxel model with a ball in one corner.
     fn ball() -> Model<f32> {
@@ -147,7 +148,7 @@ mod tests {
         let worst = |values: std::ops::Range<usize>| {
             let pairs = exact.pixels.iter().zip(&single.pixels);
             let errors = pairs.flat_map(|(a, b)| values.clone().map(|i| (a[i] - b[i]).abs()));
-            errors.fold(0.0_f64, |worst, error| if error <= worst || worst.is_nan() { worst } else { error })
+            errors.fold(0.0_f64, Real::maximum)
         };
         // Densities are up to e^2, distances around 4.
         let (colour, all) = (worst(0..3), worst(0..exact.pixels[0].len()));
@@ -181,7 +182,7 @@ mod tests {
             sampler.config.quadrature = rule;
             let seen = model.view(camera, [1.0; 3]);
             let differences = seen.color.data.iter().zip(&reference.color.data).map(|(a, b)| (a - b).abs());
-            let worst = differences.fold(0.0, |worst, x| if x <= worst || worst.is_nan() { worst } else { x });
+            let worst = differences.fold(0.0, Real::maximum);
             println!("{rule:16} {worst:.1e} {:?}", seen.evaluations);
             assert!(worst <= 1e-2 && seen.evaluations.density > 0, "{rule}: {worst}");
         }

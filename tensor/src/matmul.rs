@@ -95,9 +95,8 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
     }
     let strides = |s: [usize; 2]| [s[0] as isize, s[1] as isize];
     let (left, right) = ((a.data.as_ptr(), strides(a.strides)), (b.data.as_ptr(), strides(b.strides)));
-    // SAFETY: `Matrix` holds rows * columns elements at permuted row-major strides, or some of the rows of such a matrix from
-    // their first element on, so every index is in its slice, and `c` has m * n elements and, as a mutable borrow, overlaps
-    // neither.
+    // SAFETY: a `Matrix` is all of a row-major slice or some rows or columns of one, so every index is in the slice; `c` has
+    // m * n elements and, as a mutable borrow, overlaps neither.
     unsafe { T::gemm_raw([m, k, n], left, right, c.as_mut_ptr(), accumulate) }
 }
 

@@ -74,6 +74,7 @@ pub trait Scalar:
     /// `a` (`m x k`), `b` (`k x n`) and `c` (`m x n`) must be valid for every index that the dimensions and the
     /// `[row, column]` strides reach, and `c` must not overlap the others.
     #[doc(hidden)]
+    // SAFETY: kept by `gemm`, which checks all sizes.
     unsafe fn gemm_raw(
         mkn: [usize; 3],
         a: (*const Self, [isize; 2]),

@@ -68,8 +68,8 @@ impl Unary for Powi {
 
 /// [`Powi`] with an exponent that the compiler knows: where it is small, a few products that vectorise.
 #[derive(Clone, Copy)]
-pub struct Power<const N: i32>;
-impl<const N: i32> Unary for Power<N> {
+pub struct ConstPowi<const N: i32>;
+impl<const N: i32> Unary for ConstPowi<N> {
     const NAME: &'static str = "powi";
     const READS: Reads = Powi::READS;
     #[inline(always)]
@@ -201,9 +201,9 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn powi(&self, exponent: i32) -> Self {
         match exponent {
             -1 => self.reciprocal(),
-            2 => self.tape().apply(Map(Power::<2>), &[self]),
-            3 => self.tape().apply(Map(Power::<3>), &[self]),
-            4 => self.tape().apply(Map(Power::<4>), &[self]),
+            2 => self.tape().apply(Map(ConstPowi::<2>), &[self]),
+            3 => self.tape().apply(Map(ConstPowi::<3>), &[self]),
+            4 => self.tape().apply(Map(ConstPowi::<4>), &[self]),
             _ => self.tape().apply(Map(Powi { exponent }), &[self]),
         }
     }

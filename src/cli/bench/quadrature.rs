@@ -2,7 +2,7 @@
 
 use std::hint::black_box;
 
-use raygrad::autograd::{Pool, Tape, Tensor};
+use raygrad::autograd::{Pool, Real, Tape, Tensor};
 use raygrad::nerf::Density;
 use raygrad::nerf::Rays;
 use raygrad::nerf::analytic::{AnalyticScene, scenes};
@@ -86,8 +86,7 @@ fn errors_of(scene: &AnalyticScene, seen: &Integral) -> [f64; 3] {
     let exact = &scene.exact;
     let pairs = seen.d_color.iter().zip(&exact.d_color);
     // NaN wins.
-    let largest =
-        pairs.map(|(a, b)| (a - b).abs()).fold(0.0, |worst, x| if x <= worst || worst.is_nan() { worst } else { x });
+    let largest = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, Real::maximum);
     [(seen.color - exact.color).abs(), (seen.depth - exact.depth).abs(), largest]
 }
 

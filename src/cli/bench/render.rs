@@ -5,6 +5,7 @@ mod setting;
 use std::path::Path;
 use std::sync::Arc;
 
+use raygrad::autograd::Real;
 use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced};
 use raygrad::nerf::metrics::{psnr, psnr_from_mse};
 use raygrad::nerf::{Config, Error, Evaluations, Image, Model, Preset, Result, Sampler, Trainer};
@@ -117,7 +118,7 @@ fn measure(
         evaluations = evaluations + count;
         error += raygrad::nerf::metrics::mse(&image, reference);
         let differences = image.data.iter().zip(&reference.data).map(|(a, b)| f64::from((a - b).abs()));
-        largest = differences.fold(largest, |worst, x| if x <= worst || worst.is_nan() { worst } else { x });
+        largest = differences.fold(largest, Real::maximum);
         truth += psnr(&image, &frame.image.over([1.0; 3]));
     }
     let count = reference.len() as f64;
