@@ -36,6 +36,13 @@ pub(crate) fn len_of(shape: &[usize]) -> usize {
     checked_len(shape).unwrap_or_else(|| panic!("a tensor of shape {shape:?} has too many elements"))
 }
 
+/// The permutation that undoes another one.
+pub(crate) fn inverse(order: &[usize]) -> Shape {
+    let mut back = Shape::from_elem(0, order.len());
+    order.iter().enumerate().for_each(|(i, &axis)| back[axis] = i);
+    back
+}
+
 impl Layout {
     /// The row-major layout of a whole buffer of this shape.
     ///
@@ -364,15 +371,11 @@ impl Layout {
         index
     }
 
-    /// The order of axes in which strides fall: that in which memory is walked from start to end. Axes of stride 0 come
-    /// first.
-    pub(crate) fn order(&self) -> Shape {
+    /// The order of axes in which memory is walked from start to end, if the elements lie one behind the other that way.
+    pub(crate) fn memory_order(&self) -> Option<Shape> {
         let mut axes: Shape = (0..self.shape.len()).collect();
-        axes.sort_by_key(|&axis| match self.strides[axis].unsigned_abs() {
-            0 => 0,
-            step => usize::MAX - step,
-        });
-        axes
+        axes.sort_by_key(|&axis| std::cmp::Reverse(self.strides[axis]));
+        self.permuted(&axes).is_packed().then_some(axes)
     }
 
     /// Axes of extent 1 dropped and neighbours that form one run merged: fewer, longer inner loops.

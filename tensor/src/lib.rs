@@ -37,7 +37,7 @@ mod windows;
 /// Slices for [`Tensor::slice`], as in ndarray: `s![.., -1, 1..3, ..;-1]`.
 pub use ndarray::s;
 
-pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, lanes_either, map, map_either};
+pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map_either};
 pub use indices::Indices;
 pub use lane::Lane;
 pub use layout::Layout;

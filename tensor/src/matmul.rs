@@ -1,15 +1,18 @@
 //! Matrix products: one function, with transposed operands by stride.
 
 use crate::parallel::{chunks, is_worthwhile};
-use crate::{Scalar, Tensor};
+use crate::{Layout, Scalar, Tensor, add_assign, sum_rows};
+use rayon::prelude::*;
+use std::ops::Range;
 
-/// A matrix in a slice: element `(i, j)` is `data[i * strides[0] + j * strides[1]]`.
+/// A matrix in a slice: element `(i, j)` is `data[offset + i * strides[0] + j * strides[1]]`.
 #[derive(Clone, Copy)]
 pub struct Matrix<'a, T> {
     data: &'a [T],
+    offset: isize,
     rows: usize,
     columns: usize,
-    strides: [usize; 2],
+    strides: [isize; 2],
 }
 
 impl<'a, T: Scalar> Matrix<'a, T> {
@@ -19,8 +22,9 @@ impl<'a, T: Scalar> Matrix<'a, T> {
     /// If `data` has another length.
     #[track_caller]
     pub fn new(data: &'a [T], rows: usize, columns: usize) -> Self {
-        assert_eq!(data.len(), rows * columns, "{} values for a {rows}x{columns} matrix", data.len());
-        Matrix { data, rows, columns, strides: [columns, 1] }
+        let len = rows.checked_mul(columns);
+        assert_eq!(Some(data.len()), len, "{} values for a {rows}x{columns} matrix", data.len());
+        Matrix { data, offset: 0, rows, columns, strides: [columns as isize, 1] }
     }
 
     /// The matrix whose rows are the last axis of `tensor`; all other axes count the rows.
@@ -31,7 +35,24 @@ impl<'a, T: Scalar> Matrix<'a, T> {
     pub fn rows_of(tensor: &'a Tensor<T>) -> Self {
         let Some(&columns) = tensor.shape().last() else { panic!("a scalar has no rows") };
         let rows = tensor.shape()[..tensor.ndim() - 1].iter().product();
-        Matrix::new(tensor.as_slice(), rows, columns)
+        match tensor.layout().reshaped(&[rows, columns]) {
+            Some(layout) => Matrix::of(tensor.buffer(), &layout, layout.offset()),
+            None => Matrix::new(tensor.as_slice(), rows, columns),
+        }
+    }
+
+    /// The matrix that the last two axes of a layout see from `offset` on.
+    ///
+    /// # Panics
+    /// If it leaves the buffer, or there are less than two axes.
+    #[track_caller]
+    pub fn of(data: &'a [T], layout: &Layout, offset: usize) -> Self {
+        let (&[.., rows, columns], &[.., row, column]) = (layout.shape(), layout.strides()) else {
+            panic!("a matrix of shape {:?}", layout.shape())
+        };
+        let inside = Layout::strided(&[rows, columns], &[row, column], offset as isize, data.len());
+        assert!(inside.is_some(), "a {rows}x{columns} matrix beyond the end of its buffer");
+        Matrix { data, offset: offset as isize, rows, columns, strides: [row, column] }
     }
 
     /// Number of rows.
@@ -44,9 +65,15 @@ impl<'a, T: Scalar> Matrix<'a, T> {
         self.columns
     }
 
-    /// `count` rows from `first` on.
-    fn some_rows(self, first: usize, count: usize) -> Self {
-        Matrix { data: &self.data[first * self.strides[0]..], rows: count, ..self }
+    /// The rows of this range, which is not empty.
+    fn some_rows(self, range: Range<usize>) -> Self {
+        debug_assert!(!range.is_empty() && range.end <= self.rows);
+        Matrix { offset: self.offset + range.start as isize * self.strides[0], rows: range.len(), ..self }
+    }
+
+    /// The columns of this range, which is not empty.
+    fn some_columns(self, range: Range<usize>) -> Self {
+        self.t().some_rows(range).t()
     }
 
     /// The same matrix with rows and columns exchanged; nothing is copied.
@@ -56,19 +83,21 @@ impl<'a, T: Scalar> Matrix<'a, T> {
     }
 }
 
-/// Rows of a piece of a product, about, at least, and pieces, at most: with less in a piece each thread would mostly
-/// rearrange the right factor for itself. Small products, of up to 64 x 64 or 256 elements, are added up in another order;
-/// no piece is as small.
+/// Rows or columns of a piece of a product, about, at least, and pieces, at most: with less in a piece each thread would
+/// mostly rearrange the other factor for itself. Small products, of up to 64 x 64 or 256 elements, are added up in another
+/// order; no piece is as small.
 const ROWS: usize = 128;
 const PIECES: usize = 32;
+/// Terms of a sum that is cut, at least, in a product that is too small otherwise.
+const DEPTH: usize = 1 << 12;
 /// Multiplications and additions that take as long as one operation of a loop (see [`chunks`]).
 const PER_OPERATION: usize = 8;
 
-/// `c = a b`, or `c += a b` if `accumulate`; `c` is row-major. The rows of a large product are computed on all threads, unless
-/// the caller is one of rayon's.
+/// `c = a b`, or `c += a b` if `accumulate`; `c` is row-major. A large product is cut by rows, by columns, or by depth, and
+/// its pieces are computed on all threads.
 ///
 /// Sums run in the order of the underlying kernel, which depends on the sizes and on the processor's instruction set
-/// but never on the number of threads.
+/// but never on the number of threads; those of over 8192 terms in a small product are cut, and their parts added by pairs.
 ///
 /// # Panics
 /// If the sizes do not fit together.
@@ -76,8 +105,8 @@ const PER_OPERATION: usize = 8;
 pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumulate: bool) {
     let (m, k, n) = (a.rows, a.columns, b.columns);
     assert_eq!(b.rows, k, "inner dimensions of {m}x{k} times {}x{n}", b.rows);
-    assert_eq!(c.len(), m * n, "{} values for a {m}x{n} product", c.len());
-    if m * n == 0 {
+    assert_eq!(Some(c.len()), m.checked_mul(n), "{} values for a {m}x{n} product", c.len());
+    if c.is_empty() {
         return;
     }
     if k == 0 {
@@ -86,18 +115,67 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
         }
         return;
     }
-    let work = m * n * k / PER_OPERATION;
+    let work = (m * n).saturating_mul(k) / PER_OPERATION;
     if m >= 2 * ROWS && n > 2 && is_worthwhile(work) {
         let rows = m.div_ceil((m / ROWS).min(PIECES));
-        return chunks(c, rows * n, work, || (), &|_, i, c| {
-            gemm(a.some_rows(i * rows, c.len() / n), b, c, accumulate);
+        chunks(c, rows * n, work, || (), &|_, i, c| {
+            let rows = i * rows..i * rows + c.len() / n;
+            gemm(a.some_rows(rows), b, c, accumulate);
         });
+    } else if m > 2 && n >= 2 * ROWS && is_worthwhile(work) {
+        let columns = n.div_ceil((n / ROWS).min(PIECES));
+        let target = Target(c.as_mut_ptr());
+        (0..n.div_ceil(columns)).into_par_iter().for_each(|i| {
+            let columns = i * columns..n.min((i + 1) * columns);
+            // SAFETY: the columns of the pieces differ, and all lie in `c`, which is borrowed until all are done. Tests of
+            // parallel.rs and `agrees_with_three_loops` run it.
+            unsafe { product(a, b.some_columns(columns.clone()), target.at(columns.start), n, accumulate) }
+        });
+    } else if m < 2 * ROWS && n < 2 * ROWS && k >= 2 * DEPTH {
+        let depth = k.div_ceil((k / DEPTH).min(PIECES));
+        let parts = k.div_ceil(depth);
+        let mut sums = vec![T::ZERO; parts * c.len()];
+        chunks(&mut sums, c.len(), work, || (), &|_, i, sum| {
+            let terms = i * depth..k.min((i + 1) * depth);
+            // SAFETY: `sum` has as many elements as `c`, m x n.
+            unsafe { product(a.some_columns(terms.clone()), b.some_rows(terms), sum.as_mut_ptr(), n, false) }
+        });
+        if accumulate {
+            let mut total = vec![T::ZERO; c.len()];
+            sum_rows(&sums, &mut total);
+            add_assign(c, &total);
+        } else {
+            sum_rows(&sums, c);
+        }
+    } else {
+        // SAFETY: `c` has m x n elements.
+        unsafe { product(a, b, c.as_mut_ptr(), n, accumulate) }
     }
-    let strides = |s: [usize; 2]| [s[0] as isize, s[1] as isize];
-    let (left, right) = ((a.data.as_ptr(), strides(a.strides)), (b.data.as_ptr(), strides(b.strides)));
-    // SAFETY: a `Matrix` is all of a row-major slice or some rows or columns of one, so every index is in the slice; `c` has
-    // m * n elements and, as a mutable borrow, overlaps neither.
-    unsafe { T::gemm_raw([m, k, n], left, right, c.as_mut_ptr(), accumulate) }
+}
+
+/// Where tasks write, each to columns of its own.
+#[derive(Clone, Copy)]
+struct Target<T>(*mut T);
+
+// SAFETY: a place to write to from several threads; who calls `at` sees to it that no two write to one element.
+unsafe impl<T: Send> Sync for Target<T> {}
+
+impl<T> Target<T> {
+    fn at(&self, column: usize) -> *mut T {
+        self.0.wrapping_add(column)
+    }
+}
+
+/// The product on this thread.
+///
+/// # Safety
+/// `c` is valid for `a.rows` rows of `b.columns` elements, `row` apart, and nobody else reads or writes them.
+// SAFETY: kept by `gemm`.
+unsafe fn product<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: *mut T, row: usize, accumulate: bool) {
+    let start = |x: &Matrix<'_, T>| (x.data.as_ptr().wrapping_offset(x.offset), x.strides);
+    // SAFETY: a `Matrix` stays in its slice, which its constructors check, and so do some of its rows or columns; the caller
+    // vouches for `c`.
+    unsafe { T::gemm_raw([a.rows, a.columns, b.columns], start(&a), start(&b), c, row, accumulate) }
 }
 
 #[cfg(test)]

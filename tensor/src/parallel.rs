@@ -1,11 +1,12 @@
 //! Large loops on all of rayon's threads, with the same bits at any number of them.
 //!
-//! An operation on a large tensor is cut into pieces, in a way that leaves what is added to what to the sizes alone. All
-//! threads work on the pieces, unless the caller is one of rayon's already: whoever runs there has cut the work further
-//! outside, and an operation that waited for others would only delay it.
+//! An operation on a large tensor is cut into pieces, in a way that leaves what is added to what to the sizes alone. The
+//! threads of the caller's rayon pool work on the pieces. Who has cut the work already, further outside, says so with
+//! [`serial`]: an operation that waited for others there would only delay it.
 
 use crate::Scalar;
 use rayon::prelude::*;
+use std::cell::Cell;
 
 /// Operations below which waking other threads costs more than it saves: some 50 microseconds of work.
 const WORTHWHILE: usize = 1 << 20;
@@ -16,9 +17,34 @@ pub(crate) const PIECE: usize = 1 << 15;
 /// What an element costs that is read, computed with a few operations and written.
 pub(crate) const ELEMENT: usize = 8;
 
-/// Whether `work` operations are worth more threads, and the caller is on none of rayon's.
+thread_local! {
+    static SERIAL: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs `f` with every operation on this thread alone: what the tasks of a loop that is itself parallel want, such as tiles
+/// with a tape each. A task that holds a lock needs it: a thread that waits for its helpers may take up another task
+/// meanwhile, and that would wait for the lock.
+///
+/// ```
+/// use raygrad_tensor::{Tensor, parallel, sum};
+/// use rayon::prelude::*;
+/// let parts: Vec<f32> = (0..8).into_par_iter().map(|i| parallel::serial(|| sum(&vec![i as f32; 1 << 20]))).collect();
+/// assert_eq!(parts[3], 3.0 * (1 << 20) as f32);
+/// ```
+pub fn serial<R>(f: impl FnOnce() -> R) -> R {
+    struct Restore(bool);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            SERIAL.set(self.0);
+        }
+    }
+    let _restore = Restore(SERIAL.replace(true));
+    f()
+}
+
+/// Whether `work` operations are worth more threads, and the caller has not cut the work already.
 pub(crate) fn is_worthwhile(work: usize) -> bool {
-    work >= WORTHWHILE && rayon::current_thread_index().is_none() && rayon::current_num_threads() > 1
+    work >= WORTHWHILE && !SERIAL.get() && rayon::current_num_threads() > 1
 }
 
 /// Calls `f(scratch, i, chunk i)` for every chunk of `len` elements of `out` (the last may be shorter), each thread with
@@ -40,7 +66,7 @@ pub fn chunks<T: Send, S>(
         let mut scratch = scratch();
         out.chunks_mut(len).enumerate().for_each(|(i, chunk)| f(&mut scratch, i, chunk));
     } else {
-        let each = |scratch: &mut S, (i, chunk): (usize, &mut [T])| f(scratch, i, chunk);
+        let each = |scratch: &mut S, (i, chunk): (usize, &mut [T])| serial(|| f(scratch, i, chunk));
         out.par_chunks_mut(len).enumerate().for_each_init(scratch, each);
     }
 }
@@ -54,8 +80,9 @@ pub(crate) fn pieces<T: Scalar>(out: &mut [T], work: usize, f: &(dyn Fn(usize, &
 
 #[cfg(test)]
 mod tests {
+    use super::{is_worthwhile, serial};
     use crate::matmul::{Matrix, gemm};
-    use crate::{Layout, Pool, Real, Scalar, Tensor, broadcast_to, map_real, rows, sum, sum_axes};
+    use crate::{Layout, Pool, Real, Scalar, Tensor, map_real, rows, sum, sum_axes};
 
     /// Of many magnitudes, so that the order of additions shows.
     fn values<T: Scalar>(shape: &[usize], seed: usize) -> Tensor<T> {
@@ -71,9 +98,9 @@ mod tests {
         let (row, column) = (values(&[517], 2), values(&[1031, 1], 3));
         let mut out = vec![
             map_real!([&x, &row, &column], &pool, |[x, a, b]| (x * a).sin() + b.tanh()),
-            broadcast_to(&row, &[1031, 517], &pool),
-            broadcast_to(&column, &[1, 1031, 517], &pool),
-            broadcast_to(&Tensor::scalar(T::from_f64(2.5)), &[1031, 517], &pool),
+            row.broadcast_to(&[1031, 517]),
+            column.broadcast_to(&[1, 1031, 517]),
+            Tensor::scalar(T::from_f64(2.5)).broadcast_to(&[1031, 517]),
             sum_axes(&x, &[0], &pool),
             sum_axes(&x.reshape(&[517 * 1031 / 11, 11]), &[0], &pool),
             sum_axes(&x, &[1], &pool),
@@ -110,6 +137,9 @@ mod tests {
         });
         for (m, k, n) in
             [(1031, 517, 64), (517, 1031, 64), (96, 1533, 64), (300, 517, 1031), (1024, 8192, 1), (256, 16384, 2)]
+                .into_iter()
+                // Cut by columns, by depth, by neither.
+                .chain([(24, 517, 2111), (3, 64, 100_003), (7, 60_001, 11), (64, 9001, 200), (1, 500_001, 1), (2, 9, 70_001)])
         {
             let [a, b] = [values::<T>(&[m, k], 4), values(&[k, n], 5)];
             let [a_t, b_t] = [values::<T>(&[k, m], 4), values(&[n, k], 5)];
@@ -134,8 +164,8 @@ mod tests {
         let doubled = map_real!([&x], &pool, |[x]| x + x);
         let rows = sum_axes(&x, &[1], &pool);
         let columns = sum_axes(&x.reshape(&[1031, 47, 11]), &[1], &pool);
-        let ([row, column], tall) = ([values(&[517], 2), values(&[1031, 1], 3)], [1031, 517]);
-        let [wide, high] = [&row, &column].map(|part| broadcast_to(part, &tall, &pool));
+        let ([row, column], tall) = ([values::<f32>(&[517], 2), values(&[1031, 1], 3)], [1031, 517]);
+        let [wide, high] = [&row, &column].map(|part| part.broadcast_to(&tall));
         for i in 0..1031 {
             for j in 0..517 {
                 assert_eq!(flipped[(516 - j) * 1031 + i], at(i, j));
@@ -153,16 +183,25 @@ mod tests {
     }
 
     fn check<T: Scalar>() {
-        // Not as many as the machine has, unless another test was first.
-        let _ = rayon::ThreadPoolBuilder::new().num_threads(3).build_global();
-        // On one of rayon's threads nothing is cut.
-        let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap().install(everything::<T>);
-        let together = everything();
-        assert_eq!(alone.len(), together.len());
-        for (i, (a, b)) in alone.iter().zip(&together).enumerate() {
-            assert!(a.iter().all(|a| a.is_finite()), "{i}");
-            assert!(a == b, "{i}");
+        let alone = serial(everything::<T>);
+        for threads in [1, 2, 3, 8] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let together = pool.install(everything::<T>);
+            assert_eq!(alone.len(), together.len());
+            for (i, (a, b)) in alone.iter().zip(&together).enumerate() {
+                assert!(a.iter().all(|a| a.is_finite()), "{i}");
+                assert!(a == b, "{i} on {threads} threads");
+            }
         }
+    }
+
+    #[test]
+    fn a_pool_of_the_callers_own_helps_unless_the_caller_is_one_of_many() {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let inside = pool.install(|| [is_worthwhile(1 << 30), serial(|| is_worthwhile(1 << 30)), is_worthwhile(1 << 30)]);
+        assert_eq!(inside, [true, false, true]);
+        let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        assert!(!alone.install(|| is_worthwhile(1 << 30)));
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! Pairwise sums: the error grows with the logarithm of the length.
 
 use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
-use crate::{Pool, Scalar, Shape, Tensor, simd};
+use crate::layout::inverse;
+use crate::{Pool, Scalar, Shape, Tensor, map, simd};
 
 /// Independent partial sums: fills two 512-bit registers of f32 and hides the latency of addition.
 const LANES: usize = 32;
@@ -209,31 +210,60 @@ pub fn sum_axes<T: Scalar>(x: &Tensor<T>, axes: &[usize], pool: &Pool<T>) -> Ten
 }
 
 /// The sum over the axes along which `shape` would have to be stretched to become `x.shape()`: the adjoint of
-/// [`broadcast_to`](crate::broadcast_to).
+/// [`Tensor::broadcast_to`]. A view is summed as it lies: along axes that repeat elements that is a product, and axes in
+/// another order are no obstacle.
 ///
 /// # Panics
 /// If `shape` does not broadcast to the shape of `x`.
 #[track_caller]
 pub fn sum_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Tensor<T> {
-    let lead = x.ndim().checked_sub(shape.len());
-    let Some(lead) = lead else { panic!("cannot sum {:?} to {shape:?}", x.shape()) };
-    let target = |axis: usize| if axis < lead { 1 } else { shape[axis - lead] };
+    let fits = |lead: &usize| shape.iter().zip(&x.shape()[*lead..]).all(|(&to, &from)| to == from || to == 1);
+    let Some(lead) = x.ndim().checked_sub(shape.len()).filter(fits) else {
+        panic!("cannot sum {:?} to {shape:?}", x.shape())
+    };
+    let kept: Shape = std::iter::repeat_n(1, lead).chain(shape.iter().copied()).collect();
+    sum_kept(x, &kept, pool).reshape(shape)
+}
+
+/// The sum over the axes whose extent is 1 in `kept`.
+fn sum_kept<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<T> {
+    if x.is_packed() {
+        return sum_packed(x, kept, pool);
+    }
+    let layout = x.layout();
+    let is_repeated = |&axis: &usize| layout.strides()[axis] == 0 && x.shape()[axis] > 1;
+    let repeated: Shape = (0..x.ndim()).filter(is_repeated).collect();
+    if !repeated.is_empty() {
+        let once = repeated.iter().fold(layout.clone(), |layout, &axis| layout.sliced(axis, 0, 1, 1));
+        let times: usize = repeated.iter().filter(|&&axis| kept[axis] == 1).map(|&axis| x.shape()[axis]).product();
+        let mut inner = Shape::from_slice(kept);
+        repeated.iter().for_each(|&axis| inner[axis] = 1);
+        let sum = sum_kept(&x.with_layout(once), &inner, pool);
+        let times = T::from_f64(times as f64);
+        return map([&sum], pool, |[sum]| sum * times).broadcast_to(kept);
+    }
+    let Some(order) = layout.memory_order() else { return sum_packed(x, kept, pool) };
+    let turned: Shape = order.iter().map(|&axis| kept[axis]).collect();
+    let sum = sum_packed(&x.with_layout(layout.permuted(&order)), &turned, pool);
+    sum.with_layout(sum.layout().permuted(&inverse(&order)))
+}
+
+fn sum_packed<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<T> {
     let mut current = x.clone();
     let mut axis = x.ndim();
     while axis > 0 {
         let end = axis;
         // A run of neighbouring axes that are all summed is one axis to the kernel.
-        while axis > 0 && target(axis - 1) == 1 && x.shape()[axis - 1] != 1 {
+        while axis > 0 && kept[axis - 1] == 1 && x.shape()[axis - 1] != 1 {
             axis -= 1;
         }
         if axis < end {
             current = sum_middle(&current, axis, end, pool);
         } else {
             axis -= 1;
-            assert_eq!(target(axis), x.shape()[axis], "cannot sum {:?} to {shape:?}", x.shape());
         }
     }
-    current.reshape(shape)
+    current
 }
 
 /// The sum over axes `from..to`, which become extents of 1.

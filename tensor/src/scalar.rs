@@ -72,7 +72,7 @@ pub trait Scalar:
     ///
     /// # Safety
     /// `a` (`m x k`), `b` (`k x n`) and `c` (`m x n`) must be valid for every index that the dimensions and the
-    /// `[row, column]` strides reach, and `c` must not overlap the others.
+    /// `[row, column]` strides reach, those of `c` being `[c_row, 1]`, and `c` must not overlap the others.
     #[doc(hidden)]
     // SAFETY: kept by `gemm`, which checks all sizes.
     unsafe fn gemm_raw(
@@ -80,6 +80,7 @@ pub trait Scalar:
         a: (*const Self, [isize; 2]),
         b: (*const Self, [isize; 2]),
         c: *mut Self,
+        c_row: usize,
         accumulate: bool,
     );
 }
@@ -139,13 +140,14 @@ macro_rules! scalar {
                 (a, [a_row, a_col]): (*const Self, [isize; 2]),
                 (b, [b_row, b_col]): (*const Self, [isize; 2]),
                 c: *mut Self,
+                c_row: usize,
                 accumulate: bool,
             ) {
                 let (one, serial) = (1.0, gemm::Parallelism::None);
                 // SAFETY: the caller's promise, with the strides in the order that `gemm` asks for (column, row).
                 unsafe {
                     gemm::gemm(
-                        m, n, k, c, 1, n as isize, accumulate, a, a_col, a_row, b, b_col, b_row, one, one, false,
+                        m, n, k, c, 1, c_row as isize, accumulate, a, a_col, a_row, b, b_col, b_row, one, one, false,
                         false, false, serial,
                     );
                 }
@@ -158,11 +160,12 @@ macro_rules! scalar {
                 (a, [a_row, a_col]): (*const Self, [isize; 2]),
                 (b, [b_row, b_col]): (*const Self, [isize; 2]),
                 c: *mut Self,
+                c_row: usize,
                 accumulate: bool,
             ) {
                 let beta = if accumulate { 1.0 } else { 0.0 };
                 // SAFETY: the caller's promise.
-                unsafe { $matrixmultiply(m, k, n, 1.0, a, a_row, a_col, b, b_row, b_col, beta, c, n as isize, 1) }
+                unsafe { $matrixmultiply(m, k, n, 1.0, a, a_row, a_col, b, b_row, b_col, beta, c, c_row as isize, 1) }
             }
         }
     };
