@@ -11,7 +11,7 @@ use raygrad::autograd::{
     Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Init, Linear, Mlp, Params, Pool, Pool2dConfig, Tape,
     Tensor, Var,
 };
-use raygrad::tensor::add_assign;
+use raygrad::tensor::{add_assign, parallel};
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -129,7 +129,7 @@ fn train(
             (mean.item(), mean.grad_once(&bound.vars()))
         };
         let (mut value, mut sum) = (0.0, Vec::<Tensor<f32>>::new());
-        for (part, grads) in shards.par_iter().map(gradient).collect::<Vec<_>>() {
+        for (part, grads) in shards.par_iter().map(|shard| parallel::serial(|| gradient(shard))).collect::<Vec<_>>() {
             value += f64::from(part);
             if sum.is_empty() {
                 sum = grads;

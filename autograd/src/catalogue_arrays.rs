@@ -104,13 +104,24 @@ fn indexing() -> Vec<Entry> {
 }
 
 fn algebra() -> Vec<Entry> {
-    let matmul = |transpose_a, transpose_b| Entry::new(matmul::Matmul { transpose_a, transpose_b });
     let row = |x: &[f64]| raygrad_tensor::Tensor::from_vec(&[x.len()], x.to_vec());
     vec![
-        matmul(false, false).sample(&[&[2, 3, 4], &[2, 4, 2]]).sample(&[&[2, 1, 2, 3], &[3, 3, 1]]),
-        matmul(true, false).sample(&[&[2, 4, 3], &[4, 2]]).sample(&[&[4, 3], &[2, 4, 2]]),
-        matmul(false, true).sample(&[&[1, 3, 4], &[2, 2, 4]]).sample(&[&[0, 2, 3], &[1, 2, 3]]),
-        matmul(true, true).sample(&[&[2, 4, 3], &[2, 2, 4]]).sample(&[&[2, 0, 3], &[2, 2, 0]]),
+        Entry::new(matmul::Matmul)
+            .sample(&[&[2, 3, 4], &[2, 4, 2]])
+            .sample(&[&[2, 1, 2, 3], &[3, 3, 1]])
+            .sample(&[&[0, 2, 3], &[1, 3, 2]]),
+        function!("matmul_left_transposed", |x| x[0].t().matmul(&x[1]))
+            .sample(&[&[2, 4, 3], &[4, 2]])
+            .sample(&[&[4, 3], &[2, 4, 2]])
+            .sample(&[&[4, 3], &[4, 2]]),
+        function!("matmul_right_transposed", |x| x[0].matmul(&x[1].t()))
+            .sample(&[&[1, 3, 4], &[2, 2, 4]])
+            .sample(&[&[0, 2, 3], &[1, 2, 3]])
+            .sample(&[&[3, 4], &[2, 4]]),
+        function!("matmul_both_transposed", |x| x[0].t().matmul(&x[1].t()))
+            .sample(&[&[2, 4, 3], &[2, 2, 4]])
+            .sample(&[&[2, 0, 3], &[2, 2, 0]])
+            .sample(&[&[4, 3], &[2, 4]]),
         function!("matmul", |x| x[0].matmul(&x[1]))
             .sample(&[&[3], &[3]])
             .sample(&[&[3], &[3, 2]])

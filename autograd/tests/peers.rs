@@ -237,9 +237,9 @@ fn algebra() -> Vec<Case> {
         "matmul.matrix_vector": |x| x[0].matmul(&x[1]);
         "matmul.batch": |x| x[0].matmul(&x[1]);
         "matmul.batch_matrix": |x| x[0].matmul(&x[1]);
-        "matmul.tn": |x| x[0].matmul_t(true, &x[1], false);
-        "matmul.nt": |x| x[0].matmul_t(false, &x[1], true);
-        "matmul.tt": |x| x[0].matmul_t(true, &x[1], true);
+        "matmul.tn": |x| x[0].t().matmul(&x[1]);
+        "matmul.nt": |x| x[0].matmul(&x[1].t());
+        "matmul.tt": |x| x[0].t().matmul(&x[1].t());
         "dot": |x| x[0].dot(&x[1]);
         "outer": |x| x[0].outer(&x[1]);
         "einsum": |x| Var::einsum("bij,bjk->bik", &[&x[0], &x[1]]);

@@ -27,7 +27,8 @@ fn product<'t>(a: &Var<'t, f64>, b: &Var<'t, f64>, fused: bool) -> Option<Var<'t
         let (last, first) = (if ta { rows } else { columns }, if tb { width } else { inner });
         last == first
     })?;
-    Some(a.matmul_t(ta, b, tb) * scale)
+    let turned = |x: &Var<'t, f64>, turn: bool| if turn { x.t() } else { x.clone() };
+    Some(turned(a, ta).matmul(&turned(b, tb)) * scale)
 }
 
 /// Every operation keeps its values within about -3..3, so that no depth of nesting makes differences useless.

@@ -10,6 +10,7 @@ use crate::rays::{Rays, Samples};
 use crate::render::{Evaluations, Picture, VISIBLE};
 use crate::sampler::Jitter;
 use raygrad_autograd::{Scalar, Segments, Tape, Tensor};
+use raygrad_tensor::parallel;
 use rayon::prelude::*;
 
 /// A view in double precision.
@@ -47,7 +48,7 @@ impl<T: Scalar> Model<T> {
                 let ray = camera.pixel_ray(pixel % camera.width, pixel / camera.width);
                 rays.push(&ray, clip_span(&ray, self.extent.bounds, self.extent.span));
             }
-            self.dense_rays(&rays, finer, out)
+            parallel::serial(|| self.dense_rays(&rays, finer, out))
         });
         let evaluations = evaluations.reduce(Evaluations::default, |a, b| a + b);
         for pixel in &mut pixels {

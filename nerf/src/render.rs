@@ -9,6 +9,7 @@ use crate::rays::Rays;
 use crate::sampler::Jitter;
 use crate::view::{Limits, Viewer};
 use raygrad_autograd::Tape;
+use raygrad_tensor::parallel;
 use rayon::prelude::*;
 use std::ops::Add;
 
@@ -83,7 +84,7 @@ impl Model<f32> {
                     rays.push(&ray, clip_span(&ray, self.extent.bounds, self.extent.span));
                 }
                 let mut values = vec![[0.0; 5]; rays.len()];
-                let evaluations = self.view_rays(viewer, &rays, limits, &mut values);
+                let evaluations = parallel::serial(|| self.view_rays(viewer, &rays, limits, &mut values));
                 for (i, [r, g, b, distance, left]) in values.into_iter().enumerate() {
                     for (channel, value) in [r, g, b].into_iter().enumerate() {
                         color[3 * i + channel] = value + left * background[channel];

@@ -12,6 +12,7 @@ use crate::{silhouette, startup};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Adam, Pool};
+use raygrad_tensor::parallel;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::ops::ControlFlow;
@@ -260,7 +261,8 @@ impl Trainer {
             let mut scratch = locked(free).pop().unwrap_or_default();
             for which in (index..total.div_ceil(tile)).step_by(SLOTS) {
                 let count = tile.min(total - which * tile);
-                slot.tile(&mut scratch, model, data, [count, total], &mut stream(seed, [number, which as u64]));
+                let rng = &mut stream(seed, [number, which as u64]);
+                parallel::serial(|| slot.tile(&mut scratch, model, data, [count, total], rng));
             }
             locked(free).push(scratch);
         });

@@ -104,7 +104,8 @@ pub(crate) fn broadcast_loop<T: Scalar, const N: usize>(
     }
     // Where nobody shows all elements in row-major order, those of an operand that has another order count: the result gets
     // the same.
-    let is_whole = |layout: &&Layout| !layout.strides().iter().zip(&shape).any(|(&stride, &extent)| stride == 0 && extent > 1);
+    let is_whole =
+        |layout: &&Layout| !layout.strides().iter().zip(&shape).any(|(&stride, &extent)| stride == 0 && extent > 1);
     if !layouts.iter().any(Layout::is_packed)
         && let Some(order) = layouts.iter().filter(is_whole).find_map(Layout::memory_order)
     {

@@ -233,7 +233,8 @@ impl Layout {
                 continue;
             }
             let (extent, stride) = (self.shape[axis] as isize, self.strides[axis]);
-            let outside = |place: isize| format!("{place} lies outside axis {axis} of a tensor of shape {:?}", self.shape);
+            let outside =
+                |place: isize| format!("{place} lies outside axis {axis} of a tensor of shape {:?}", self.shape);
             let from_start = |place: isize| if place < 0 { place + extent } else { place };
             match *place {
                 SliceInfoElem::Index(place) => {
@@ -297,7 +298,11 @@ impl Layout {
     pub fn reshaped(&self, shape: &[usize]) -> Option<Self> {
         assert_eq!(checked_len(shape), Some(self.len()), "cannot reshape {:?} to {shape:?}", self.shape);
         if self.is_empty() {
-            return Some(Layout { shape: Shape::from_slice(shape), strides: Strides::from_elem(0, shape.len()), ..*self });
+            return Some(Layout {
+                shape: Shape::from_slice(shape),
+                strides: Strides::from_elem(0, shape.len()),
+                ..*self
+            });
         }
         // Runs of axes that are one axis to memory, from the last one on, are cut into new axes.
         let runs = self.collapsed();
@@ -369,6 +374,16 @@ impl Layout {
             position /= extent;
         }
         index
+    }
+
+    /// Where what lies behind the first `lead` axes begins in the buffer, for every index of these, in row-major order.
+    pub(crate) fn offsets(&self, lead: usize) -> Vec<usize> {
+        let mut offsets = vec![self.offset as usize];
+        for (&extent, &stride) in self.shape[..lead].iter().zip(&self.strides) {
+            let next = |&start: &usize| (0..extent as isize).map(move |i| (start as isize + i * stride) as usize);
+            offsets = offsets.iter().flat_map(next).collect();
+        }
+        offsets
     }
 
     /// The order of axes in which memory is walked from start to end, if the elements lie one behind the other that way.

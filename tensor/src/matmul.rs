@@ -1,7 +1,7 @@
 //! Matrix products: one function, with transposed operands by stride.
 
 use crate::parallel::{chunks, is_worthwhile};
-use crate::{Layout, Scalar, Tensor, add_assign, sum_rows};
+use crate::{Layout, Pool, Scalar, Shape, Tensor, add_assign, broadcast_shape, sum_rows};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -151,6 +151,42 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
         // SAFETY: `c` has m x n elements.
         unsafe { product(a, b, c.as_mut_ptr(), n, accumulate) }
     }
+}
+
+/// The product of the matrices in the last two axes of `a` `[.., m, k]` and `b` `[.., k, n]`; the axes before count matrices,
+/// and broadcast. Views, transposes above all, are read as they lie. All threads work on one large product, or on many
+/// small ones.
+///
+/// ```
+/// use raygrad_tensor::{Pool, Tensor, matmul::matmul};
+/// let a = Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0_f32]);
+/// assert_eq!(matmul(&a, &a.t(), &Pool::none()).as_slice(), [5.0, 11.0, 11.0, 25.0]);
+/// ```
+///
+/// # Panics
+/// If a factor has less than two axes, the inner extents differ or the leading axes do not broadcast.
+#[track_caller]
+pub fn matmul<T: Scalar>(a: &Tensor<T>, b: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+    let (&[ref a_lead @ .., m, k], &[ref b_lead @ .., inner, n]) = (a.shape(), b.shape()) else {
+        panic!("matmul of shapes {:?} and {:?}: a matrix has two axes", a.shape(), b.shape())
+    };
+    let lead = broadcast_shape(&[a_lead, b_lead]).filter(|_| k == inner);
+    let Some(lead) = lead else { panic!("matmul of shapes {:?} and {:?}: they do not fit", a.shape(), b.shape()) };
+    let with = |last: [usize; 2]| lead.iter().copied().chain(last).collect::<Shape>();
+    let layouts = [a.layout().stretched(&with([m, k])), b.layout().stretched(&with([k, n]))];
+    pool.filled(&with([m, n]), |c| {
+        let ([a_at, b_at], work) = (layouts.each_ref().map(|x| x.offsets(lead.len())), m.saturating_mul(k) * n);
+        let one = |i: usize, c: &mut [T]| {
+            let left = Matrix::of(a.buffer(), &layouts[0], a_at[i]);
+            gemm(left, Matrix::of(b.buffer(), &layouts[1], b_at[i]), c, false);
+        };
+        if is_worthwhile(work / PER_OPERATION) {
+            c.chunks_mut(m * n).enumerate().for_each(|(i, c)| one(i, c));
+        } else {
+            let all = work.saturating_mul(a_at.len()) / PER_OPERATION;
+            chunks(c, m * n, all, || (), &|_, i, c| one(i, c));
+        }
+    })
 }
 
 /// Where tasks write, each to columns of its own.

@@ -139,7 +139,14 @@ mod tests {
             [(1031, 517, 64), (517, 1031, 64), (96, 1533, 64), (300, 517, 1031), (1024, 8192, 1), (256, 16384, 2)]
                 .into_iter()
                 // Cut by columns, by depth, by neither.
-                .chain([(24, 517, 2111), (3, 64, 100_003), (7, 60_001, 11), (64, 9001, 200), (1, 500_001, 1), (2, 9, 70_001)])
+                .chain([
+                    (24, 517, 2111),
+                    (3, 64, 100_003),
+                    (7, 60_001, 11),
+                    (64, 9001, 200),
+                    (1, 500_001, 1),
+                    (2, 9, 70_001),
+                ])
         {
             let [a, b] = [values::<T>(&[m, k], 4), values(&[k, n], 5)];
             let [a_t, b_t] = [values::<T>(&[k, m], 4), values(&[n, k], 5)];
@@ -198,7 +205,8 @@ mod tests {
     #[test]
     fn a_pool_of_the_callers_own_helps_unless_the_caller_is_one_of_many() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-        let inside = pool.install(|| [is_worthwhile(1 << 30), serial(|| is_worthwhile(1 << 30)), is_worthwhile(1 << 30)]);
+        let inside =
+            pool.install(|| [is_worthwhile(1 << 30), serial(|| is_worthwhile(1 << 30)), is_worthwhile(1 << 30)]);
         assert_eq!(inside, [true, false, true]);
         let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         assert!(!alone.install(|| is_worthwhile(1 << 30)));

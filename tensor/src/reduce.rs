@@ -1,7 +1,7 @@
 //! Pairwise sums: the error grows with the logarithm of the length.
 
-use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
 use crate::layout::inverse;
+use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
 use crate::{Pool, Scalar, Shape, Tensor, map, simd};
 
 /// Independent partial sums: fills two 512-bit registers of f32 and hides the latency of addition.

@@ -147,8 +147,25 @@ macro_rules! scalar {
                 // SAFETY: the caller's promise, with the strides in the order that `gemm` asks for (column, row).
                 unsafe {
                     gemm::gemm(
-                        m, n, k, c, 1, c_row as isize, accumulate, a, a_col, a_row, b, b_col, b_row, one, one, false,
-                        false, false, serial,
+                        m,
+                        n,
+                        k,
+                        c,
+                        1,
+                        c_row as isize,
+                        accumulate,
+                        a,
+                        a_col,
+                        a_row,
+                        b,
+                        b_col,
+                        b_row,
+                        one,
+                        one,
+                        false,
+                        false,
+                        false,
+                        serial,
                     );
                 }
             }

@@ -26,7 +26,8 @@ fn step() -> impl Strategy<Value = Step> {
     prop_oneof![
         n.clone().prop_map(Step::Turn),
         (n.clone(), n.clone()).prop_map(|(a, b)| Step::Swap(a, b)),
-        (n.clone(), n.clone(), n.clone(), prop_oneof![-3_isize..0, 1_isize..4]).prop_map(|(a, b, c, d)| Step::Cut(a, b, c, d)),
+        (n.clone(), n.clone(), n.clone(), prop_oneof![-3_isize..0, 1_isize..4])
+            .prop_map(|(a, b, c, d)| Step::Cut(a, b, c, d)),
         (n.clone(), n.clone()).prop_map(|(a, b)| Step::Pick(a, b)),
         n.clone().prop_map(Step::Flip),
         (n.clone(), 1_usize..4).prop_map(|(a, b)| Step::Stretch(a, b)),

@@ -26,7 +26,7 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
         1 => a * b,
         2 => a / b,
         3 => a.matmul(b),
-        4 => a.matmul_t(i % 2 == 0, b, j % 2 == 0),
+        4 => a.t().matmul(b),
         5 => a.dot(b),
         6 => a.outer(b),
         7 => a.cross(b),

@@ -18,8 +18,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.permute(&axes)
     }
 
-    /// The last two axes exchanged: the transpose of a matrix, or of each matrix of a batch. For a product,
-    /// [`matmul_t`](Self::matmul_t) spares the copy.
+    /// The last two axes exchanged: the transpose of a matrix, or of each matrix of a batch; nothing is copied.
     ///
     /// # Panics
     /// If there are less than two axes.

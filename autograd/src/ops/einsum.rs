@@ -109,15 +109,15 @@ impl<'t, T: Scalar> Labelled<'t, T> {
         self.x.permute(&axes)
     }
 
-    /// As matrices `[batch.., rows, columns]`, and whether they are to be read transposed: whatever order the tensor has
-    /// already is not copied.
-    fn matrices(&self, batch: &[char], rows: &[char], columns: &[char]) -> (Var<'t, T>, bool) {
+    /// As matrices `[batch.., rows, columns]`; whatever order the tensor has already is not copied.
+    fn matrices(&self, batch: &[char], rows: &[char], columns: &[char]) -> Var<'t, T> {
         let transpose = !rows.is_empty() && !columns.is_empty() && self.labels == [batch, columns, rows].concat();
         let (first, second) = if transpose { (columns, rows) } else { (rows, columns) };
         let product = |labels: &[char]| labels.iter().map(|&label| self.extent(label)).product::<usize>();
         let mut shape: Shape = batch.iter().map(|&label| self.extent(label)).collect();
         shape.extend([product(first), product(second)]);
-        (self.ordered(&[batch, first, second].concat()).reshape(&shape), transpose)
+        let x = self.ordered(&[batch, first, second].concat()).reshape(&shape);
+        if transpose { x.t() } else { x }
     }
 }
 
@@ -141,9 +141,7 @@ fn contract<'t, T: Scalar>(operands: Vec<Labelled<'t, T>>, result: &[char]) -> V
     let labels = [&batch[..], &left, &right].concat();
     let extent = |label: &char| if in_b(label) { b.extent(*label) } else { a.extent(*label) };
     let shape: Shape = labels.iter().map(extent).collect();
-    let (x, transpose_x) = a.matrices(&batch, &left, &inner);
-    let (y, transpose_y) = b.matrices(&batch, &inner, &right);
-    let x = x.matmul_t(transpose_x, &y, transpose_y).reshape(&shape);
+    let x = a.matrices(&batch, &left, &inner).matmul(&b.matrices(&batch, &inner, &right)).reshape(&shape);
     Labelled { x, labels }.ordered(result)
 }
 

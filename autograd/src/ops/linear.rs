@@ -2,7 +2,8 @@
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::matmul::{Matrix, gemm};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, map, simd, sum_rows};
+use raygrad_tensor::parallel::chunks;
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, map, simd, sum_to};
 use serde::{Deserialize, Serialize};
 
 /// What a dense layer applies to its output. Its derivative follows from the output alone.
@@ -23,6 +24,9 @@ pub struct LinearOp(
     /// The activation.
     pub Activation,
 );
+
+/// Elements of a piece that one thread finishes, about.
+const PIECE: usize = 1 << 15;
 
 /// Adds the bias to each row and applies ReLU, in place.
 #[inline(always)]
@@ -70,11 +74,14 @@ impl<T: Scalar> Op<T> for LinearOp {
         let relu = self.0 == Activation::Relu;
         let bias = x.get(2).map(|bias| bias.as_slice());
         if (bias.is_some() || relu) && outputs > 0 {
-            let rows = y.as_mut_slice().chunks_exact_mut(outputs);
-            simd::dispatch(
-                #[inline(always)]
-                || finish_rows(rows, bias, relu),
-            );
+            let (y, rows) = (y.as_mut_slice(), (PIECE / outputs).max(1));
+            let work = y.len() * 4;
+            chunks(y, rows * outputs, work, || (), &|_, _, y| {
+                simd::dispatch(
+                    #[inline(always)]
+                    || finish_rows(y.chunks_exact_mut(outputs), bias, relu),
+                );
+            });
         }
         y
     }
@@ -104,11 +111,7 @@ impl<T: Scalar> Op<T> for LinearOp {
         if cx.len() < 3 {
             return Grads::new([dx, dw]);
         }
-        let db = cx.needs(2).then(|| {
-            let mut out = cx.pool().tensor(cx.shape(2));
-            sum_rows(h.as_slice(), out.as_mut_slice());
-            cx.constant(out)
-        });
+        let db = cx.needs(2).then(|| cx.constant(sum_to(&h, cx.shape(2), cx.pool())));
         Grads::new([dx, dw, db])
     }
 

@@ -2,7 +2,7 @@
 
 use crate::axes::Resolved;
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, broadcast_to, sum_to};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, sum_to};
 
 /// y = x summed over the axes along which `shape` would have to be stretched to become x; dx = g broadcast.
 #[derive(Clone)]
@@ -55,8 +55,8 @@ impl<T: Scalar> Op<T> for BroadcastTo {
         }
     }
 
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        broadcast_to(x[0], &self.shape, pool)
+    fn forward(&self, x: &[&Tensor<T>], _pool: &Pool<T>) -> Tensor<T> {
+        x[0].broadcast_to(&self.shape)
     }
 
     fn reads(&self) -> Reads {

@@ -1,7 +1,7 @@
 //! Vectors along the last axis: cross product and direction.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, broadcast_to};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
 
 /// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
 #[derive(Clone, Copy)]
@@ -23,7 +23,7 @@ impl<T: Scalar> Op<T> for Cross {
         let Some(shape) = broadcast_shape(&[x[0].shape(), x[1].shape()]) else {
             unreachable!("`shape` has accepted these extents")
         };
-        let (a, b) = (broadcast_to(x[0], &shape, pool), broadcast_to(x[1], &shape, pool));
+        let (a, b) = (x[0].broadcast_to(&shape), x[1].broadcast_to(&shape));
         let mut out = pool.tensor(&shape);
         let pairs = a.as_slice().chunks_exact(3).zip(b.as_slice().chunks_exact(3));
         for (y, (a, b)) in out.as_mut_slice().chunks_exact_mut(3).zip(pairs) {

@@ -6,6 +6,7 @@ use super::{OccupancyGrid, TASK, bits, exceeding};
 use crate::train::stream;
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
+use raygrad_tensor::parallel;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -217,6 +218,6 @@ impl OccupancyGrid {
             count as u64
         };
         let tasks = self.densities.par_chunks_mut(CELLS * TASK).enumerate();
-        tasks.map_init(Waiting::default, look).sum()
+        tasks.map_init(Waiting::default, |waiting, task| parallel::serial(|| look(waiting, task))).sum()
     }
 }
