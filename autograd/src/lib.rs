@@ -17,7 +17,6 @@
 //!   this crate's.
 //! * [`Params`], [`Layer`], [`Optimizer`]: models and their training.
 
-mod axes;
 mod catalogue;
 mod catalogue_arrays;
 mod check;
@@ -47,7 +46,6 @@ mod sweep;
 mod tape;
 mod var;
 
-pub use axes::Axes;
 pub use catalogue::{Cases, Entry, Extreme, catalogue};
 pub use check::{Check, Report, check_function};
 pub use check_op::check_op;
@@ -64,7 +62,7 @@ pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, Move, Optimizer, Schedule
 pub use optim::{clip_norm, clip_value, global_norm};
 pub use optim_rows::{RowAdam, RowStats};
 pub use params::{Bound, ParamId, Params};
-pub use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
+pub use raygrad_tensor::{Axes, Indices, Pool, Real, Scalar, Shape, Tensor};
 pub use row_sums::{RowAdder, RowSums};
 pub use storage::{ParamsError, Storage};
 pub use tape::Tape;

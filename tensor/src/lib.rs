@@ -7,19 +7,23 @@
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
 //! * [`Layout`]: the strides of a view: broadcast, permute, slice, flip, diagonal, windows, and their adjoints.
 //! * [`Windows`]: what a convolution or a pooling sees of an image.
-//! * [`Indices`]: integer arrays for sorting, searching and gathering.
+//! * [`Indices`], [`Mask`]: integer and boolean arrays, for sorting, searching, gathering, comparing and picking.
 //! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
 //! Work on large tensors is spread over rayon's threads, unless the caller is one of these; see [`parallel`]. The bits
 //! do not depend on it.
 
+mod arithmetic;
+mod axes;
 mod convert;
+mod create;
 mod elementwise;
 pub mod extremum;
 mod indices;
 mod lane;
 mod layout;
+mod mask;
 pub mod matmul;
 pub mod parallel;
 mod pool;
@@ -28,6 +32,7 @@ mod reduce;
 pub mod rows;
 mod scalar;
 pub mod simd;
+mod statistics;
 mod tensor;
 mod view;
 pub mod vmath;
@@ -37,14 +42,16 @@ mod windows;
 /// Slices for [`Tensor::slice`], as in ndarray: `s![.., -1, 1..3, ..;-1]`.
 pub use ndarray::s;
 
+pub use axes::{Axes, Reduction, axis_of};
+pub use create::concat;
 pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map_either};
 pub use indices::Indices;
 pub use lane::Lane;
 pub use layout::Layout;
+pub use mask::Mask;
 pub use pool::Pool;
 pub use real::Real;
 pub use reduce::{sum, sum_axes, sum_rows, sum_to};
 pub use scalar::Scalar;
 pub use tensor::{Shape, Tensor};
-pub use view::axis_of;
 pub use windows::Windows;

@@ -89,6 +89,14 @@ impl<T: Scalar> Tensor<T> {
         Tensor { shape, data: self.data.clone(), view }
     }
 
+    /// Where the buffer came from, for what is made of it.
+    pub(crate) fn pool(&self) -> Pool<T> {
+        match &self.data {
+            Data::One(_) => Pool::none(),
+            Data::Shared(buffer) => buffer.pool.clone(),
+        }
+    }
+
     /// A tensor of this shape from its values in row-major order.
     ///
     /// # Panics
@@ -182,10 +190,7 @@ impl<T: Scalar> Tensor<T> {
             return &self.buffer()[view.layout.offset()..][..self.len()];
         }
         let packed = view.packed.get_or_init(|| {
-            let pool = match &self.data {
-                Data::One(_) => Pool::none(),
-                Data::Shared(buffer) => buffer.pool.clone(),
-            };
+            let pool = self.pool();
             let mut values = pool.take(self.len());
             view.layout.read(self.buffer(), &mut values);
             Buffer { values, pool }
@@ -211,11 +216,10 @@ impl<T: Scalar> Tensor<T> {
 
     /// Makes the elements the whole of a buffer of this tensor's own.
     fn own(&mut self) {
-        let pool = match &self.data {
-            Data::One(_) if self.view.is_none() => return,
-            Data::One(_) => Pool::none(),
-            Data::Shared(buffer) => buffer.pool.clone(),
-        };
+        if matches!(self.data, Data::One(_)) && self.view.is_none() {
+            return;
+        }
+        let pool = self.pool();
         // A packed copy that nobody else sees can be taken.
         let packed = self.view.take().and_then(|mut view| {
             let layout = view.layout.clone();

@@ -1,19 +1,8 @@
 //! Views of a tensor: other elements, or another order of them, without a copy.
 
-use crate::{Layout, Scalar, Shape, Tensor};
+use crate::{Layout, Scalar, Shape, Tensor, axis_of};
 use ndarray::SliceInfoElem;
 use std::ops::Range;
-
-/// The number of an axis that may be counted from the last one: -1 is the last.
-///
-/// # Panics
-/// If the axis does not exist.
-#[track_caller]
-pub fn axis_of(axis: isize, shape: &[usize]) -> usize {
-    let from_start = if axis < 0 { axis + shape.len() as isize } else { axis };
-    assert!((0..shape.len() as isize).contains(&from_start), "axis {axis} of a tensor of shape {shape:?}");
-    from_start as usize
-}
 
 impl<T: Scalar> Tensor<T> {
     /// The elements that a layout of a row-major tensor of this shape names. Without a copy, unless the layout steps over
@@ -22,7 +11,7 @@ impl<T: Scalar> Tensor<T> {
     /// # Panics
     /// If the layout was made for another number of elements.
     #[track_caller]
-    pub fn select(&self, layout: &Layout) -> Self {
+    pub fn seen_through(&self, layout: &Layout) -> Self {
         match layout.of(&self.layout()) {
             Some(layout) => self.with_layout(layout),
             None => self.packed().with_layout(layout.clone()),

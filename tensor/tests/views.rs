@@ -171,18 +171,18 @@ proptest! {
             }
             // A layout over all its elements, applied to it, is a view of the view.
             let whole = Layout::contiguous(view.shape());
-            prop_assert_eq!(&view.select(&whole), &view);
+            prop_assert_eq!(&view.seen_through(&whole), &view);
             if view.ndim() > 1 {
                 let axes: Vec<usize> = (0..view.ndim()).rev().collect();
-                prop_assert_eq!(view.select(&whole.permuted(&axes)), Tensor::from(array.view().reversed_axes()));
+                prop_assert_eq!(view.seen_through(&whole.permuted(&axes)), Tensor::from(array.view().reversed_axes()));
                 let every = whole.sliced(0, view.shape()[0].saturating_sub(1), view.shape()[0], -1);
                 let mut turned = array.clone();
                 turned.invert_axis(Axis(0));
-                prop_assert_eq!(view.select(&every), Tensor::from(turned));
+                prop_assert_eq!(view.seen_through(&every), Tensor::from(turned));
                 // One that steps over the ends of rows.
                 let flat = whole.reshaped(&[view.len()]).unwrap();
                 if view.len() > 2 {
-                    let picked = view.select(&flat.sliced(0, 1, view.len() - 2, 1));
+                    let picked = view.seen_through(&flat.sliced(0, 1, view.len() - 2, 1));
                     prop_assert_eq!(picked.as_slice(), &values[1..values.len() - 1]);
                 }
             }

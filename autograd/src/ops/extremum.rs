@@ -1,7 +1,7 @@
 //! The greatest and smallest elements along axes, and where they are.
 
-use crate::axes::axis_of;
 use crate::{Axes, Grads, Indices, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::axis_of;
 use raygrad_tensor::extremum::{Middle, arg_extremum, extremum, extremum_grad};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 

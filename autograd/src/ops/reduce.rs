@@ -1,7 +1,7 @@
 //! Sums, means and their adjoint, broadcasting.
 
-use crate::axes::Resolved;
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::Reduction;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, sum_to};
 
 /// y = x summed over the axes along which `shape` would have to be stretched to become x; dx = g broadcast.
@@ -111,7 +111,7 @@ impl<'t, T: Scalar> Var<'t, T> {
 
     /// `[elements that stay, elements that are reduced]`, with the reduced axes moved to the end.
     #[track_caller]
-    pub(crate) fn rows_over(&self, axes: &Resolved) -> Self {
+    pub(crate) fn rows_over(&self, axes: &Reduction) -> Self {
         let order = axes.reduced_last();
         let sorted = order.is_sorted();
         let rows = axes.kept().iter().product();

@@ -1,7 +1,7 @@
 //! Cumulative sums and products, the recurrence that their derivatives lead to, and the product.
 
-use crate::axes::axis_of;
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::axis_of;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// The order in which a scan walks an axis.

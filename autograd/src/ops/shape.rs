@@ -1,7 +1,7 @@
 //! Operations that move elements: reshape, permute, slice, flip, pad, concat.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor, concat};
 
 /// Stands for the extent that follows from the others, in [`Var::reshape`].
 pub const INFER: usize = usize::MAX;
@@ -67,7 +67,7 @@ impl<T: Scalar> Op<T> for View {
     }
 
     fn forward(&self, x: &[&Tensor<T>], _pool: &Pool<T>) -> Tensor<T> {
-        x[0].select(&self.layout)
+        x[0].seen_through(&self.layout)
     }
 
     fn reads(&self) -> Reads {
@@ -170,22 +170,7 @@ impl<T: Scalar> Op<T> for Concat {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let mut shape = Shape::from_slice(x[0].shape());
-        shape[self.axis] = x.iter().map(|x| x.shape()[self.axis]).sum();
-        let mut out = pool.tensor(&shape);
-        let run = |shape: &[usize]| shape[self.axis..].iter().product::<usize>();
-        let total = run(&shape);
-        let mut start = 0;
-        for x in x {
-            let count = run(x.shape());
-            if count > 0 {
-                for (out, x) in out.as_mut_slice().chunks_exact_mut(total).zip(x.as_slice().chunks_exact(count)) {
-                    out[start..start + count].copy_from_slice(x);
-                }
-            }
-            start += count;
-        }
-        out
+        concat(x, self.axis, pool)
     }
 
     fn reads(&self) -> Reads {

@@ -1,7 +1,7 @@
 //! Softmax, its logarithm, and the logarithm of a sum of exponentials.
 
-use crate::axes::axis_of;
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::axis_of;
 use raygrad_tensor::rows;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 

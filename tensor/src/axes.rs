@@ -1,6 +1,6 @@
 //! Which axes a reduction runs over.
 
-use raygrad_tensor::Shape;
+use crate::Shape;
 use smallvec::SmallVec;
 use std::ops::RangeFull;
 
@@ -10,9 +10,8 @@ use std::ops::RangeFull;
 /// to broadcast against the input.
 ///
 /// ```
-/// use raygrad_autograd::{Axes, Tape, Tensor};
-/// let tape = Tape::<f32>::new();
-/// let x = tape.leaf(Tensor::ones(&[2, 3, 4]));
+/// use raygrad_tensor::{Axes, Tensor};
+/// let x = Tensor::<f32>::ones(&[2, 3, 4]);
 /// assert_eq!(x.sum_over(-1).shape(), [2, 3]);
 /// assert_eq!(x.sum_over([0, -1]).shape(), [3]);
 /// assert!(x.max_over(..).shape().is_empty());
@@ -36,23 +35,23 @@ impl Axes {
     /// # Panics
     /// If an axis does not exist or is named twice.
     #[track_caller]
-    pub(crate) fn resolve(&self, shape: &[usize]) -> Resolved {
+    pub fn resolve(&self, shape: &[usize]) -> Reduction {
         let mut reduced: SmallVec<[bool; 4]> = SmallVec::from_elem(self.axes.is_none(), shape.len());
         for &axis in self.axes.iter().flatten() {
             let i = axis_of(axis, shape);
             assert!(!reduced[i], "axis {axis} of a tensor of shape {shape:?} is named twice");
             reduced[i] = true;
         }
-        Resolved { shape: Shape::from_slice(shape), reduced, keepdims: self.keepdims }
+        Reduction { shape: Shape::from_slice(shape), reduced, keepdims: self.keepdims }
     }
 }
 
-/// The number of an axis that may be counted from the last one.
+/// The number of an axis that may be counted from the last one: -1 is the last.
 ///
 /// # Panics
 /// If it does not exist.
 #[track_caller]
-pub(crate) fn axis_of(axis: isize, shape: &[usize]) -> usize {
+pub fn axis_of(axis: isize, shape: &[usize]) -> usize {
     let from_start = if axis < 0 { axis + shape.len() as isize } else { axis };
     assert!((0..shape.len() as isize).contains(&from_start), "axis {axis} of a tensor of shape {shape:?}");
     from_start as usize
@@ -83,13 +82,14 @@ impl From<RangeFull> for Axes {
 }
 
 /// The axes of a reduction of a tensor of known shape.
-pub(crate) struct Resolved {
+#[derive(Debug, Clone)]
+pub struct Reduction {
     shape: Shape,
     reduced: SmallVec<[bool; 4]>,
     keepdims: bool,
 }
 
-impl Resolved {
+impl Reduction {
     /// The shape with every reduced axis of extent 1.
     pub fn kept(&self) -> Shape {
         self.shape.iter().zip(&self.reduced).map(|(&extent, &reduced)| if reduced { 1 } else { extent }).collect()

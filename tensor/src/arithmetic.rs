@@ -1,0 +1,340 @@
+//! Arithmetic and functions of tensors without a tape, with NumPy's broadcasting.
+
+use crate::{Real, Scalar, Tensor, map, map_real};
+use std::iter::Sum;
+use std::ops::{Add, AddAssign, Div, DivAssign, Index, Mul, MulAssign, Neg, Sub, SubAssign};
+
+macro_rules! operator {
+    ($trait:ident $method:ident, $assign:ident $assign_method:ident, $op:tt) => {
+        impl<T: Scalar> $trait<&Tensor<T>> for &Tensor<T> {
+            type Output = Tensor<T>;
+            #[track_caller]
+            fn $method(self, other: &Tensor<T>) -> Tensor<T> {
+                map([self, other], &self.pool(), #[inline(always)] |[a, b]| a $op b)
+            }
+        }
+        impl<T: Scalar> $trait<Tensor<T>> for &Tensor<T> {
+            type Output = Tensor<T>;
+            #[track_caller]
+            fn $method(self, other: Tensor<T>) -> Tensor<T> {
+                self $op &other
+            }
+        }
+        impl<T: Scalar> $trait<&Tensor<T>> for Tensor<T> {
+            type Output = Tensor<T>;
+            #[track_caller]
+            fn $method(self, other: &Tensor<T>) -> Tensor<T> {
+                &self $op other
+            }
+        }
+        impl<T: Scalar> $trait<Tensor<T>> for Tensor<T> {
+            type Output = Tensor<T>;
+            #[track_caller]
+            fn $method(self, other: Tensor<T>) -> Tensor<T> {
+                &self $op &other
+            }
+        }
+        impl<T: Scalar> $trait<T> for &Tensor<T> {
+            type Output = Tensor<T>;
+            fn $method(self, other: T) -> Tensor<T> {
+                self $op &Tensor::scalar(other)
+            }
+        }
+        impl<T: Scalar> $trait<T> for Tensor<T> {
+            type Output = Tensor<T>;
+            fn $method(self, other: T) -> Tensor<T> {
+                &self $op other
+            }
+        }
+        operator!(left f32 $trait $method $op);
+        operator!(left f64 $trait $method $op);
+        impl<T: Scalar> $assign<&Tensor<T>> for Tensor<T> {
+            /// In place where nobody shares the elements.
+            ///
+            /// # Panics
+            /// If `other` does not broadcast to the shape of this tensor.
+            #[track_caller]
+            fn $assign_method(&mut self, other: &Tensor<T>) {
+                let other = other.broadcast_to(self.shape());
+                self.update(&other, |a, b| a $op b);
+            }
+        }
+        impl<T: Scalar> $assign<T> for Tensor<T> {
+            /// In place where nobody shares the elements.
+            fn $assign_method(&mut self, other: T) {
+                self.as_mut_slice().iter_mut().for_each(|a| *a = *a $op other);
+            }
+        }
+    };
+    (left $t:ident $trait:ident $method:ident $op:tt) => {
+        impl $trait<&Tensor<$t>> for $t {
+            type Output = Tensor<$t>;
+            fn $method(self, other: &Tensor<$t>) -> Tensor<$t> {
+                &Tensor::scalar(self) $op other
+            }
+        }
+        impl $trait<Tensor<$t>> for $t {
+            type Output = Tensor<$t>;
+            fn $method(self, other: Tensor<$t>) -> Tensor<$t> {
+                self $op &other
+            }
+        }
+    };
+}
+
+operator!(Add add, AddAssign add_assign, +);
+operator!(Sub sub, SubAssign sub_assign, -);
+operator!(Mul mul, MulAssign mul_assign, *);
+operator!(Div div, DivAssign div_assign, /);
+
+impl<T: Scalar> Neg for &Tensor<T> {
+    type Output = Tensor<T>;
+    fn neg(self) -> Tensor<T> {
+        self.map(|x| -x)
+    }
+}
+
+impl<T: Scalar> Neg for Tensor<T> {
+    type Output = Tensor<T>;
+    fn neg(self) -> Tensor<T> {
+        -&self
+    }
+}
+
+impl<T: Scalar> Sum for Tensor<T> {
+    /// The sum of tensors that broadcast together; a scalar 0 of none.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    fn sum<I: Iterator<Item = Tensor<T>>>(tensors: I) -> Self {
+        tensors.reduce(|a, b| a + b).unwrap_or_else(|| Tensor::scalar(T::ZERO))
+    }
+}
+
+impl<T: Scalar, const N: usize> Index<[usize; N]> for Tensor<T> {
+    type Output = T;
+    /// One element: `x[[i, j]]`.
+    ///
+    /// # Panics
+    /// If there are not as many axes as places, or a place lies outside its axis.
+    #[track_caller]
+    fn index(&self, index: [usize; N]) -> &T {
+        let inside = N == self.ndim() && index.iter().zip(self.shape()).all(|(i, extent)| i < extent);
+        assert!(inside, "no element {index:?} in a tensor of shape {:?}", self.shape());
+        let layout = self.layout();
+        let steps = index.iter().zip(layout.strides()).map(|(&i, &stride)| i as isize * stride);
+        &self.buffer()[(layout.offset() as isize + steps.sum::<isize>()) as usize]
+    }
+}
+
+/// A function of [`Real`] as a method.
+macro_rules! function {
+    ($($(#[$doc:meta])* $name:ident;)+) => {
+        impl<T: Scalar> Tensor<T> {
+            $(
+                $(#[$doc])*
+                pub fn $name(&self) -> Self {
+                    map_real!([self], &self.pool(), |[x]| Real::$name(x))
+                }
+            )+
+        }
+    };
+}
+
+function! {
+    /// `e^x` of each element.
+    exp;
+    /// `e^x - 1` of each element, accurate near 0.
+    expm1;
+    /// The natural logarithm of each element; NaN below 0.
+    ln;
+    /// `ln(1 + x)` of each element, accurate near 0.
+    ln1p;
+    /// The square root of each element; NaN below 0.
+    sqrt;
+    /// The absolute value of each element.
+    abs;
+    /// The sine of each element, an angle in radians.
+    sin;
+    /// The cosine of each element, an angle in radians.
+    cos;
+    /// The hyperbolic tangent of each element.
+    tanh;
+    /// `1 / (1 + e^-x)` of each element.
+    sigmoid;
+    /// Each element rounded down to a whole number.
+    floor;
+    /// Each element rounded up to a whole number.
+    ceil;
+    /// Each element rounded to the nearest whole number, ties to the even one.
+    round;
+}
+
+impl<T: Scalar> Tensor<T> {
+    /// `f` of each element, in one vectorised pass if `f` has no branches.
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::from([1.0, -2.0]).map(|x| x * x + 1.0), Tensor::from([2.0, 5.0]));
+    /// ```
+    pub fn map(&self, f: impl Fn(T) -> T + Sync) -> Self {
+        map(
+            [self],
+            &self.pool(),
+            #[inline(always)]
+            |[x]| f(x),
+        )
+    }
+
+    /// `f` of the elements of two tensors that broadcast together.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[track_caller]
+    pub fn zip(&self, other: &Self, f: impl Fn(T, T) -> T + Sync) -> Self {
+        map(
+            [self, other],
+            &self.pool(),
+            #[inline(always)]
+            |[a, b]| f(a, b),
+        )
+    }
+
+    /// `a = f(a, b)` for the elements `b` of a tensor of the same shape.
+    fn update(&mut self, other: &Self, f: impl Fn(T, T) -> T) {
+        let other = other.as_slice();
+        self.as_mut_slice().iter_mut().zip(other).for_each(|(a, &b)| *a = f(*a, b));
+    }
+
+    /// Each element to the power of a number.
+    pub fn powf(&self, exponent: T) -> Self {
+        map_real!([self, &Tensor::scalar(exponent)], &self.pool(), |[x, p]| Real::pow(x, p))
+    }
+
+    /// Each element to the power of a whole number.
+    pub fn powi(&self, exponent: i32) -> Self {
+        map_real!([self], &self.pool(), |[x]| Real::powi(x, exponent))
+    }
+
+    /// Each element's square.
+    pub fn square(&self) -> Self {
+        self.map(|x| x * x)
+    }
+
+    /// The greater of the elements of two tensors that broadcast together; NaN if one is.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[track_caller]
+    pub fn maximum(&self, other: impl Into<Self>) -> Self {
+        self.zip(&other.into(), |a, b| Real::maximum(a, b))
+    }
+
+    /// The smaller of the elements of two tensors that broadcast together; NaN if one is.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[track_caller]
+    pub fn minimum(&self, other: impl Into<Self>) -> Self {
+        self.zip(&other.into(), |a, b| Real::minimum(a, b))
+    }
+
+    /// Each element, but at least `low` and at most `high`; NaN stays NaN.
+    pub fn clamp(&self, low: T, high: T) -> Self {
+        self.map(|x| Real::minimum(Real::maximum(x, low), high))
+    }
+
+    /// The product of matrices in the last two axes; see [`matmul`](crate::matmul::matmul).
+    ///
+    /// # Panics
+    /// If a factor has less than two axes, the inner extents differ or the leading axes do not broadcast.
+    #[track_caller]
+    pub fn matmul(&self, other: &Self) -> Self {
+        crate::matmul::matmul(self, other, &self.pool())
+    }
+
+    /// Whether the shapes are the same and every element of this tensor is within `absolute + relative * |y|` of the
+    /// element `y` of the other, or equal to it. A NaN is close to nothing.
+    pub fn is_close(&self, other: &Self, relative: f64, absolute: f64) -> bool {
+        let close = |a: f64, b: f64| a == b || (a - b).abs() <= absolute + relative * b.abs();
+        self.shape() == other.shape() && self.iter().zip(other.iter()).all(|(a, b)| close(a.to_f64(), b.to_f64()))
+    }
+
+    /// The elements in row-major order.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = T> {
+        self.as_slice().iter().copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn operators_broadcast_in_every_combination() {
+        let (x, row) = (Tensor::from([[1.0, 2.0], [3.0, 4.0_f64]]), Tensor::from([10.0, 20.0]));
+        let sum = Tensor::from([[11.0, 22.0], [13.0, 24.0]]);
+        assert_eq!(
+            (&x + &row, &x + row.clone(), x.clone() + &row, x.clone() + row.clone()),
+            (sum.clone(), sum.clone(), sum.clone(), sum.clone())
+        );
+        assert_eq!(&row - &x, Tensor::from([[9.0, 18.0], [7.0, 16.0]]));
+        assert_eq!(12.0 / &x, Tensor::from([[12.0, 6.0], [4.0, 3.0]]));
+        assert_eq!((-&x * 2.0 + 1.0).to_vec(), [-1.0, -3.0, -5.0, -7.0]);
+        assert_eq!(1.0_f32 - Tensor::from([0.25]), Tensor::from([0.75]));
+        let mut y = x.clone();
+        y += &row;
+        y -= 1.0;
+        y *= &Tensor::from([[2.0], [0.0]]);
+        y /= 2.0;
+        assert_eq!((y.to_vec(), x[[0, 0]]), (vec![10.0, 21.0, 0.0, 0.0], 1.0));
+        assert_eq!([x.clone(), x.t(), x.clone()].into_iter().sum::<Tensor<f64>>(), &x * 2.0 + x.t());
+        assert_eq!(std::iter::empty::<Tensor<f32>>().sum::<Tensor<f32>>().item(), 0.0);
+        assert!(std::panic::catch_unwind(|| &x + &Tensor::zeros(&[3])).is_err());
+        let mut narrow = row.clone();
+        assert!(
+            std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| narrow += &x)).is_err(),
+            "it would have to grow"
+        );
+    }
+
+    #[test]
+    fn functions_are_those_of_numbers() {
+        let x = Tensor::from([0.3, 1.7, 2.5, -0.4_f64]);
+        for (got, f) in [
+            (x.exp(), f64::exp as fn(f64) -> f64),
+            (x.expm1(), f64::exp_m1),
+            (x.abs().ln(), |x| x.abs().ln()),
+            (x.ln1p(), f64::ln_1p),
+            (x.abs().sqrt(), |x| x.abs().sqrt()),
+            (x.sin(), f64::sin),
+            (x.cos(), f64::cos),
+            (x.tanh(), f64::tanh),
+            (x.sigmoid(), |x| 1.0 / (1.0 + (-x).exp())),
+            (x.floor(), f64::floor),
+            (x.ceil(), f64::ceil),
+            (x.round(), f64::round_ties_even),
+            (x.powi(3), |x| x * x * x),
+            (x.abs().powf(1.5), |x| x.abs().powf(1.5)),
+            (x.square(), |x| x * x),
+            (x.maximum(0.5), |x| x.max(0.5)),
+            (x.minimum(&Tensor::from([0.5; 4])), |x| x.min(0.5)),
+            (x.clamp(0.0, 2.0), |x| x.clamp(0.0, 2.0)),
+        ] {
+            assert!(got.is_close(&x.iter().map(f).collect(), 1e-14, 0.0), "{got}");
+        }
+        let nan = Tensor::from([f64::NAN]);
+        assert!(nan.clamp(0.0, 1.0)[[0]].is_nan() && nan.maximum(3.0)[[0]].is_nan() && !nan.is_close(&nan, 1.0, 1.0));
+        assert!(!x.is_close(&x.reshape(&[4, 1]), 1.0, 1.0));
+    }
+
+    #[test]
+    fn elements_are_found_in_views() {
+        let x = Tensor::<f32>::arange(0.0, 12.0, 1.0).reshape(&[3, 4]);
+        let view = x.t().flip(0);
+        assert_eq!((view[[0, 2]], view[[3, 0]], x.sum_over(0)[[1]]), (11.0, 0.0, 15.0));
+        assert_eq!(view.iter().nth(1), Some(7.0));
+        assert!(std::panic::catch_unwind(|| view[[4, 0]]).is_err() && std::panic::catch_unwind(|| view[[0]]).is_err());
+        assert_eq!(x.matmul(&x.t()).shape(), [3, 3]);
+    }
+}

@@ -1,0 +1,177 @@
+//! Tensors from rules and from lists.
+
+use crate::{Indices, Pool, Scalar, Shape, Tensor};
+
+/// Tensors one after another along an axis; at least one.
+///
+/// # Panics
+/// If there is none, the axis does not exist, or other extents differ.
+#[track_caller]
+pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> Tensor<T> {
+    let mut shape = Shape::from_slice(parts[0].shape());
+    for part in &parts[1..] {
+        let same = |i: usize| i == axis || part.shape()[i] == shape[i];
+        let fits = part.ndim() == shape.len() && (0..shape.len()).all(same);
+        assert!(fits, "concat of shapes {:?} and {:?} along axis {axis}", parts[0].shape(), part.shape());
+    }
+    shape[axis] = parts.iter().map(|part| part.shape()[axis]).sum();
+    pool.filled(&shape, |out| {
+        let run = |shape: &[usize]| shape[axis..].iter().product::<usize>();
+        let (total, mut start) = (run(&shape), 0);
+        for part in parts {
+            let count = run(part.shape());
+            if count > 0 {
+                for (out, part) in out.chunks_exact_mut(total).zip(part.as_slice().chunks_exact(count)) {
+                    out[start..start + count].copy_from_slice(part);
+                }
+            }
+            start += count;
+        }
+    })
+}
+
+impl<T: Scalar> Tensor<T> {
+    /// `start`, `start + step`, and so on up to, but without, `end`: `[n]` with n the ceiling of `(end - start) / step`.
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::arange(0.0, 1.0, 0.25), Tensor::from([0.0, 0.25, 0.5, 0.75]));
+    /// assert_eq!(Tensor::arange(3.0_f32, 0.0, -1.0), Tensor::from([3.0, 2.0, 1.0]));
+    /// ```
+    ///
+    /// # Panics
+    /// If the step is 0, one of the numbers is not finite, or there are too many entries for memory.
+    #[track_caller]
+    pub fn arange(start: T, end: T, step: T) -> Self {
+        let (first, by) = (start.to_f64(), step.to_f64());
+        let count = ((end.to_f64() - first) / by).ceil();
+        assert!(count.is_finite() && by.is_finite(), "arange from {start} to {end} by {step}");
+        Tensor::from_fn(&[count.max(0.0) as usize], |i| T::from_f64(first + i as f64 * by))
+    }
+
+    /// `count` numbers at equal distances from `start` to `end`, both of which are among them; one number is `start`.
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::linspace(0.0_f32, 1.0, 3), Tensor::from([0.0, 0.5, 1.0]));
+    /// ```
+    pub fn linspace(start: T, end: T, count: usize) -> Self {
+        let (first, last, most) = (start.to_f64(), end.to_f64(), count.saturating_sub(1).max(1) as f64);
+        // From the nearer end, so that both are exact.
+        let at = |i: usize| {
+            let (part, rest) = (i as f64 / most, (most - i as f64) / most);
+            if part <= 0.5 { first + (last - first) * part } else { last - (last - first) * rest }
+        };
+        Tensor::from_fn(&[count], |i| T::from_f64(at(i)))
+    }
+
+    /// The unit matrix `[n, n]`.
+    ///
+    /// # Panics
+    /// If it has more elements than memory can hold.
+    #[track_caller]
+    pub fn eye(n: usize) -> Self {
+        let mut out = Tensor::zeros(&[n, n]);
+        out.as_mut_slice().iter_mut().step_by(n + 1).for_each(|x| *x = T::ONE);
+        out
+    }
+
+    /// Tensors one after another along `axis`.
+    ///
+    /// # Panics
+    /// If there is none, the axis does not exist, or other extents differ.
+    #[track_caller]
+    pub fn concat(parts: &[&Self], axis: isize) -> Self {
+        let Some(first) = parts.first() else { panic!("concat of no tensors") };
+        concat(parts, crate::axis_of(axis, first.shape()), &first.pool())
+    }
+
+    /// Tensors of one shape along a new axis, which stands at place `axis`.
+    ///
+    /// # Panics
+    /// If there is none, their shapes differ, or there is no such place.
+    #[track_caller]
+    pub fn stack(parts: &[&Self], axis: isize) -> Self {
+        let Some(first) = parts.first() else { panic!("stack of no tensors") };
+        for part in parts {
+            assert_eq!(part.shape(), first.shape(), "stack of tensors of different shapes");
+        }
+        let parts: Vec<_> = parts.iter().map(|part| part.unsqueeze(axis)).collect();
+        Tensor::concat(&parts.iter().collect::<Vec<_>>(), axis)
+    }
+}
+
+impl<T: Scalar> From<Vec<T>> for Tensor<T> {
+    /// A vector.
+    fn from(values: Vec<T>) -> Self {
+        Tensor::from_vec(&[values.len()], values)
+    }
+}
+
+impl<T: Scalar, const N: usize> From<[T; N]> for Tensor<T> {
+    /// A vector.
+    fn from(values: [T; N]) -> Self {
+        Tensor::from(values.to_vec())
+    }
+}
+
+impl<T: Scalar, const N: usize, const M: usize> From<[[T; M]; N]> for Tensor<T> {
+    /// A matrix of these rows.
+    fn from(rows: [[T; M]; N]) -> Self {
+        Tensor::from_vec(&[N, M], rows.as_flattened().to_vec())
+    }
+}
+
+impl<T: Scalar> From<&Tensor<T>> for Tensor<T> {
+    /// A further reference.
+    fn from(x: &Tensor<T>) -> Self {
+        x.clone()
+    }
+}
+
+impl<T: Scalar> FromIterator<T> for Tensor<T> {
+    /// A vector.
+    fn from_iter<I: IntoIterator<Item = T>>(values: I) -> Self {
+        Tensor::from(values.into_iter().collect::<Vec<T>>())
+    }
+}
+
+impl<T: Scalar> From<&Indices> for Tensor<T> {
+    /// The indices as numbers; above 2^24 in f32 rounded to nearest.
+    fn from(indices: &Indices) -> Self {
+        Tensor::from_vec(indices.shape(), indices.as_slice().iter().map(|&i| T::from_f64(f64::from(i))).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::s;
+
+    #[test]
+    fn rules_give_what_numpy_gives() {
+        assert_eq!(Tensor::arange(0.0_f64, 0.95, 0.1).len(), 10);
+        assert_eq!(Tensor::arange(1.0_f32, 1.0, 2.0).len(), 0);
+        assert_eq!(Tensor::arange(5.0_f32, 1.0, 2.0).len(), 0);
+        let grid = Tensor::linspace(-0.1_f32, 0.3, 11);
+        assert_eq!((grid[[0]], grid[[10]]), (-0.1, 0.3));
+        assert!(grid.as_slice().is_sorted());
+        assert_eq!(Tensor::linspace(2.0_f64, 9.0, 1).to_vec(), [2.0]);
+        assert_eq!(Tensor::linspace(2.0_f64, 9.0, 0).len(), 0);
+        assert_eq!(Tensor::<f32>::eye(2), Tensor::from([[1.0, 0.0], [0.0, 1.0]]));
+        assert!(std::panic::catch_unwind(|| Tensor::arange(0.0, 1.0, 0.0_f32)).is_err());
+        assert!(std::panic::catch_unwind(|| Tensor::arange(0.0, f32::NAN, 1.0)).is_err());
+    }
+
+    #[test]
+    fn parts_come_together_from_views_too() {
+        let x = Tensor::<f64>::arange(0.0, 6.0, 1.0).reshape(&[2, 3]);
+        let both = Tensor::concat(&[&x, &x.slice(s![.., ..;-1])], -1);
+        assert_eq!(both, Tensor::from([[0.0, 1.0, 2.0, 2.0, 1.0, 0.0], [3.0, 4.0, 5.0, 5.0, 4.0, 3.0]]));
+        assert_eq!(Tensor::concat(&[&x, &x.slice(s![..0])], 0), x);
+        let pile = Tensor::stack(&[&x.t(), &x.t().flip(0)], 0);
+        assert_eq!((pile.shape(), pile[[1, 0, 1]]), (&[2, 3, 2][..], 5.0));
+        assert_eq!(Tensor::stack(&[&x, &x], -1).slice(s![.., .., 1]), x);
+        assert!(std::panic::catch_unwind(|| Tensor::concat(&[&x, &x.t()], 0)).is_err());
+    }
+}

@@ -1,0 +1,293 @@
+//! Boolean arrays: what comparisons give, and what picks elements.
+
+use crate::layout::checked_len;
+use crate::{Indices, Scalar, Shape, Tensor, axis_of};
+use std::fmt;
+use std::ops::{BitAnd, BitOr, BitXor, Not};
+use std::sync::Arc;
+
+/// Row-major truth values of some shape. A clone is a reference count.
+///
+/// ```
+/// use raygrad_tensor::Tensor;
+/// let x = Tensor::from([3.0, -1.0, 0.5]);
+/// let inside = x.gt(0.0) & x.lt(2.0);
+/// assert_eq!((inside.as_slice(), inside.count()), (&[false, false, true][..], 1));
+/// assert_eq!(inside.pick(&x, 9.0), Tensor::from([9.0, 9.0, 0.5]));
+/// assert_eq!(x.masked(&!inside), Tensor::from([3.0, -1.0]));
+/// ```
+#[derive(Clone, PartialEq, Eq)]
+pub struct Mask {
+    shape: Shape,
+    values: Arc<[bool]>,
+}
+
+impl Mask {
+    /// A mask of this shape from its values in row-major order.
+    ///
+    /// # Panics
+    /// If the number of values is not the product of the shape.
+    #[track_caller]
+    pub fn new(shape: &[usize], values: impl Into<Arc<[bool]>>) -> Self {
+        let values = values.into();
+        assert_eq!(checked_len(shape), Some(values.len()), "{} values for a mask of shape {shape:?}", values.len());
+        Mask { shape: Shape::from_slice(shape), values }
+    }
+
+    /// The extent of each axis.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// The values in row-major order.
+    pub fn as_slice(&self) -> &[bool] {
+        &self.values
+    }
+
+    /// How many are true.
+    pub fn count(&self) -> usize {
+        self.values.iter().filter(|&&x| x).count()
+    }
+
+    /// Whether one is true; not of none.
+    pub fn any(&self) -> bool {
+        self.values.contains(&true)
+    }
+
+    /// Whether all are true; so of none.
+    pub fn all(&self) -> bool {
+        !self.values.contains(&false)
+    }
+
+    /// The places of the true ones in row-major order: `[count]`.
+    ///
+    /// # Panics
+    /// If there are more than 2^32 elements.
+    #[track_caller]
+    pub fn nonzero(&self) -> Indices {
+        let places: Vec<u32> = (0..self.values.len()).filter(|&i| self.values[i]).map(crate::indices::index).collect();
+        Indices::new(&[places.len()], places)
+    }
+
+    /// 1 where it is true, 0 elsewhere.
+    pub fn cast<T: Scalar>(&self) -> Tensor<T> {
+        Tensor::from_vec(&self.shape, self.values.iter().map(|&x| if x { T::ONE } else { T::ZERO }).collect())
+    }
+
+    /// The elements of `yes` where it is true, those of `no` elsewhere (`numpy.where`, `torch.where`).
+    ///
+    /// # Panics
+    /// If `yes` or `no` does not broadcast to the shape of the mask.
+    #[track_caller]
+    pub fn pick<T: Scalar>(&self, yes: impl Into<Tensor<T>>, no: impl Into<Tensor<T>>) -> Tensor<T> {
+        let [yes, no] = [yes.into(), no.into()].map(|x| x.broadcast_to(&self.shape));
+        let pairs = self.values.iter().zip(yes.iter().zip(no.iter()));
+        Tensor::from_vec(&self.shape, pairs.map(|(&x, (yes, no))| if x { yes } else { no }).collect())
+    }
+
+    fn join(&self, other: &Mask, f: impl Fn(bool, bool) -> bool) -> Mask {
+        assert_eq!(self.shape, other.shape, "masks of different shapes");
+        Mask::new(&self.shape, self.values.iter().zip(&*other.values).map(|(&a, &b)| f(a, b)).collect::<Vec<_>>())
+    }
+}
+
+macro_rules! operator {
+    ($trait:ident $method:ident $op:tt) => {
+        impl $trait for &Mask {
+            type Output = Mask;
+            /// # Panics
+            /// If the shapes differ.
+            #[track_caller]
+            fn $method(self, other: &Mask) -> Mask {
+                self.join(other, |a, b| a $op b)
+            }
+        }
+        impl $trait for Mask {
+            type Output = Mask;
+            /// # Panics
+            /// If the shapes differ.
+            #[track_caller]
+            fn $method(self, other: Mask) -> Mask {
+                &self $op &other
+            }
+        }
+    };
+}
+
+operator!(BitAnd bitand &);
+operator!(BitOr bitor |);
+operator!(BitXor bitxor ^);
+
+impl Not for &Mask {
+    type Output = Mask;
+    fn not(self) -> Mask {
+        Mask::new(&self.shape, self.values.iter().map(|&x| !x).collect::<Vec<_>>())
+    }
+}
+
+impl Not for Mask {
+    type Output = Mask;
+    fn not(self) -> Mask {
+        !&self
+    }
+}
+
+impl fmt::Debug for Mask {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Mask{:?} {:?}", self.shape, self.values)
+    }
+}
+
+impl<T: Scalar> Tensor<T> {
+    #[track_caller]
+    fn compare(&self, other: &Self, f: impl Fn(T, T) -> bool) -> Mask {
+        let Some(shape) = crate::broadcast_shape(&[self.shape(), other.shape()]) else {
+            panic!("shapes {:?} and {:?} do not broadcast", self.shape(), other.shape())
+        };
+        let (a, b) = (self.broadcast_to(&shape), other.broadcast_to(&shape));
+        Mask::new(&shape, a.iter().zip(b.iter()).map(|(a, b)| f(a, b)).collect::<Vec<_>>())
+    }
+
+    /// Where elements are less than those of another tensor or than a number.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast; so for the other comparisons.
+    #[track_caller]
+    pub fn lt(&self, other: impl Into<Tensor<T>>) -> Mask {
+        self.compare(&other.into(), |a, b| a < b)
+    }
+
+    /// Where elements are at most those of another tensor or a number.
+    #[track_caller]
+    pub fn le(&self, other: impl Into<Tensor<T>>) -> Mask {
+        self.compare(&other.into(), |a, b| a <= b)
+    }
+
+    /// Where elements are greater than those of another tensor or than a number.
+    #[track_caller]
+    pub fn gt(&self, other: impl Into<Tensor<T>>) -> Mask {
+        self.compare(&other.into(), |a, b| a > b)
+    }
+
+    /// Where elements are at least those of another tensor or a number.
+    #[track_caller]
+    pub fn ge(&self, other: impl Into<Tensor<T>>) -> Mask {
+        self.compare(&other.into(), |a, b| a >= b)
+    }
+
+    /// Where elements equal those of another tensor or a number; a NaN equals nothing.
+    #[track_caller]
+    pub fn equals(&self, other: impl Into<Tensor<T>>) -> Mask {
+        self.compare(&other.into(), |a, b| a == b)
+    }
+
+    /// Where elements are NaN.
+    pub fn is_nan(&self) -> Mask {
+        !self.equals(self)
+    }
+
+    /// The elements where a mask is true, in row-major order: `[count]`.
+    ///
+    /// # Panics
+    /// If the mask has another shape.
+    #[track_caller]
+    pub fn masked(&self, mask: &Mask) -> Self {
+        assert_eq!(self.shape(), mask.shape(), "a mask of another shape");
+        self.iter().zip(mask.as_slice()).filter(|(_, keep)| **keep).map(|(x, _)| x).collect()
+    }
+
+    /// The entries with these numbers along `axis` (`numpy.take`): the axis becomes those of `index`.
+    ///
+    /// ```
+    /// use raygrad_tensor::{Indices, Tensor};
+    /// let x = Tensor::from([[1.0, 2.0], [3.0, 4.0]]);
+    /// assert_eq!(x.take(0, &Indices::new(&[3], [1, 0, 1])), Tensor::from([[3.0, 4.0], [1.0, 2.0], [3.0, 4.0]]));
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist or a number is not below its extent.
+    #[track_caller]
+    pub fn take(&self, axis: isize, index: &Indices) -> Self {
+        let axis = axis_of(axis, self.shape());
+        let (extent, inner) = (self.shape()[axis], self.shape()[axis + 1..].iter().product::<usize>());
+        if let Some(place) = index.as_slice().iter().position(|&i| i as usize >= extent) {
+            let number = index.as_slice()[place];
+            panic!(
+                "take: index {place} is {number}, but axis {axis} of a tensor of shape {:?} ends before",
+                self.shape()
+            )
+        }
+        let mut shape = Shape::from_slice(&self.shape()[..axis]);
+        shape.extend_from_slice(index.shape());
+        shape.extend_from_slice(&self.shape()[axis + 1..]);
+        let mut values = Vec::with_capacity(shape.iter().product());
+        for block in self.as_slice().chunks_exact((extent * inner).max(1)) {
+            for &i in index.as_slice() {
+                values.extend_from_slice(&block[i as usize * inner..][..inner]);
+            }
+        }
+        Tensor::from_vec(&shape, values)
+    }
+
+    /// The elements as indices.
+    ///
+    /// # Panics
+    /// If one is not a whole number from 0 to 2^32 - 1.
+    #[track_caller]
+    pub fn to_indices(&self) -> Indices {
+        let whole = |x: T| {
+            let value = x.to_f64();
+            assert!(value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value), "{x} is no index");
+            value as u32
+        };
+        Indices::new(self.shape(), self.iter().map(whole).collect::<Vec<_>>())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn comparisons_broadcast_and_masks_join() {
+        let x = Tensor::from([[1.0, 2.0], [3.0, f64::NAN]]);
+        let row = Tensor::from([2.0, 2.0]);
+        let is = |mask: Mask, values: [bool; 4]| assert_eq!(mask.as_slice(), values);
+        is(x.lt(&row), [true, false, false, false]);
+        is(x.le(&row), [true, true, false, false]);
+        is(x.gt(&row), [false, false, true, false]);
+        is(x.ge(2.0), [false, true, true, false]);
+        is(x.equals(x.t()), [true, false, false, false]);
+        is(x.is_nan(), [false, false, false, true]);
+        is(x.gt(1.5) & x.lt(2.5), [false, true, false, false]);
+        is(&x.gt(2.5) | &x.lt(1.5), [true, false, true, false]);
+        is(x.gt(1.5) ^ x.gt(2.5), [false, true, false, false]);
+        assert!(x.is_nan().any() && !x.is_nan().all() && Mask::new(&[0], []).all() && !Mask::new(&[0], []).any());
+        assert_eq!((x.gt(1.5).count(), x.gt(1.5).nonzero().as_slice()), (2, &[1, 2][..]));
+        assert_eq!(x.gt(1.5).cast::<f32>(), Tensor::from([[0.0, 1.0], [1.0, 0.0]]));
+        assert_eq!(x.is_nan().pick(&row, &x), Tensor::from([[1.0, 2.0], [3.0, 2.0]]));
+        assert_eq!(x.t().masked(&x.t().gt(0.0)), Tensor::from([1.0, 3.0, 2.0]));
+    }
+
+    #[test]
+    fn entries_are_taken_along_any_axis() {
+        let x = Tensor::<f64>::arange(0.0, 24.0, 1.0).reshape(&[2, 3, 4]);
+        let index = Indices::new(&[2, 2], [2, 0, 1, 1]);
+        for (axis, shape) in [(1, [2, 2, 2, 4]), (-1, [2, 3, 2, 2])] {
+            let (taken, own) = (x.take(axis, &index), axis_of(axis, x.shape()));
+            assert_eq!(taken.shape(), shape);
+            for (i, value) in taken.iter().enumerate() {
+                let at = ndarray::indices(shape).into_iter().nth(i).unwrap();
+                let at = [at.0, at.1, at.2, at.3];
+                let number = index.as_slice()[2 * at[own] + at[own + 1]] as usize;
+                let expected = if own == 1 { x[[at[0], number, at[3]]] } else { x[[at[0], at[1], number]] };
+                assert_eq!(value, expected);
+            }
+        }
+        assert!(std::panic::catch_unwind(|| x.take(0, &index)).is_err());
+        assert_eq!(Tensor::<f32>::from(&index).to_indices(), index);
+        assert!(std::panic::catch_unwind(|| Tensor::from([0.5]).to_indices()).is_err());
+        assert!(std::panic::catch_unwind(|| Tensor::from([-1.0]).to_indices()).is_err());
+        assert!(x.slice(crate::s![..0]).take(1, &index).is_empty());
+    }
+}

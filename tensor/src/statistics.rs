@@ -1,0 +1,234 @@
+//! Sums, means, extremes and the like of tensors without a tape.
+
+use crate::extremum::{arg_extremum, extremum};
+use crate::rows::variance_rows;
+use crate::{Axes, Indices, Real, Reduction, Scalar, Shape, Tensor, axis_of, sum_to};
+
+impl<T: Scalar> Tensor<T> {
+    /// The sum of all elements, pairwise.
+    pub fn sum(&self) -> T {
+        sum_to(self, &[], &self.pool()).item()
+    }
+
+    /// The sum over any axes; 0 over none of the elements.
+    ///
+    /// ```
+    /// use raygrad_tensor::{Axes, Tensor};
+    /// let x = Tensor::from([[1.0, 2.0], [3.0, 4.0]]);
+    /// assert_eq!(x.sum_over(-1), Tensor::from([3.0, 7.0]));
+    /// assert_eq!(x.sum_over(Axes::from(0).keepdims()), Tensor::from([[4.0, 6.0]]));
+    /// ```
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice; so for the others with axes.
+    #[track_caller]
+    pub fn sum_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        sum_to(self, &axes.kept(), &self.pool()).reshape(&axes.result())
+    }
+
+    /// The mean of all elements; NaN of none.
+    pub fn mean(&self) -> T {
+        T::from_f64(self.sum().to_f64() / self.len() as f64)
+    }
+
+    /// The mean over any axes; NaN over none of the elements.
+    #[track_caller]
+    pub fn mean_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        (sum_to(self, &axes.kept(), &self.pool()) / T::from_f64(axes.count() as f64)).reshape(&axes.result())
+    }
+
+    /// The reduced axes as the last one.
+    fn rows(&self, axes: &Reduction) -> Self {
+        let order: Vec<isize> = axes.reduced_last().iter().map(|&axis| axis as isize).collect();
+        self.permute(&order).reshape(&[axes.kept().iter().product(), axes.count()])
+    }
+
+    /// The mean squared deviation from the mean, over any axes, with `correction` (1 for a sample of a population) taken
+    /// from the count; NaN over none of the elements.
+    #[track_caller]
+    pub fn var_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        let (rows, count) = (self.rows(&axes), axes.count() as f64);
+        let scale = T::from_f64(count / (count - correction as f64).max(0.0));
+        let out = self.pool().filled(&axes.result(), |out| variance_rows(rows.as_slice(), axes.count(), out));
+        out * scale
+    }
+
+    /// The root of [`var_over`](Self::var_over).
+    #[track_caller]
+    pub fn std_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
+        self.var_over(axes, correction).sqrt()
+    }
+
+    #[track_caller]
+    fn extremum_over(&self, axes: Axes, greatest: bool) -> Self {
+        let axes = axes.resolve(self.shape());
+        let result = axes.result();
+        let none = axes.count() == 0 && !result.contains(&0);
+        assert!(!none, "the extremum of no elements of a tensor of shape {:?}", self.shape());
+        let rows = self.rows(&axes);
+        let middle = [rows.shape()[0], rows.shape()[1], 1];
+        self.pool().filled(&result, |out| extremum(rows.as_slice(), middle, greatest, out))
+    }
+
+    /// The greatest elements over any axes; NaN where one is.
+    ///
+    /// # Panics
+    /// If there are none, or an axis does not exist or is named twice.
+    #[track_caller]
+    pub fn max_over(&self, axes: impl Into<Axes>) -> Self {
+        self.extremum_over(axes.into(), true)
+    }
+
+    /// The smallest elements over any axes; NaN where one is.
+    ///
+    /// # Panics
+    /// As [`max_over`](Self::max_over).
+    #[track_caller]
+    pub fn min_over(&self, axes: impl Into<Axes>) -> Self {
+        self.extremum_over(axes.into(), false)
+    }
+
+    /// The greatest element; NaN if one is.
+    ///
+    /// # Panics
+    /// If there is none.
+    #[track_caller]
+    pub fn max(&self) -> T {
+        self.max_over(..).item()
+    }
+
+    /// The smallest element; NaN if one is.
+    ///
+    /// # Panics
+    /// If there is none.
+    #[track_caller]
+    pub fn min(&self) -> T {
+        self.min_over(..).item()
+    }
+
+    #[track_caller]
+    fn arg_over(&self, axis: isize, greatest: bool) -> Indices {
+        let axis = axis_of(axis, self.shape());
+        let (outer, inner) = (self.shape()[..axis].iter().product(), self.shape()[axis + 1..].iter().product());
+        let mut shape = Shape::from_slice(self.shape());
+        let count = shape.remove(axis);
+        Indices::new(&shape, arg_extremum(self.as_slice(), [outer, count, inner], greatest))
+    }
+
+    /// Where along an axis the greatest elements are: the first of equal ones, and the first NaN if there is one.
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::from([[1.0, 5.0, 5.0], [9.0, 0.0, 3.0]]).argmax(-1).as_slice(), [1, 0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist, or has no entries while others do.
+    #[track_caller]
+    pub fn argmax(&self, axis: isize) -> Indices {
+        self.arg_over(axis, true)
+    }
+
+    /// Where along an axis the smallest elements are; as [`argmax`](Self::argmax).
+    ///
+    /// # Panics
+    /// As [`argmax`](Self::argmax).
+    #[track_caller]
+    pub fn argmin(&self, axis: isize) -> Indices {
+        self.arg_over(axis, false)
+    }
+
+    /// The inner product of two tensors of one shape, pairwise.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn dot(&self, other: &Self) -> T {
+        assert_eq!(self.shape(), other.shape(), "the inner product of tensors of different shapes");
+        (self * other).sum()
+    }
+
+    /// The Euclidean norm of all elements, which overflows only where it is itself too large.
+    pub fn norm(&self) -> T {
+        if self.is_empty() {
+            return T::ZERO;
+        }
+        let largest = self.abs().max();
+        if largest == T::ZERO || !largest.is_finite() {
+            return largest;
+        }
+        let scaled = self / largest;
+        scaled.dot(&scaled).sqrt() * largest
+    }
+
+    /// The largest absolute difference of two tensors of one shape: 0 of no elements, NaN if there is one.
+    ///
+    /// # Panics
+    /// If the shapes differ.
+    #[track_caller]
+    pub fn distance(&self, other: &Self) -> T {
+        assert_eq!(self.shape(), other.shape(), "the distance of tensors of different shapes");
+        if self.is_empty() { T::ZERO } else { self.zip(other, |a, b| Real::abs(a - b)).max() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Axis;
+
+    #[test]
+    fn reductions_are_those_of_ndarray_on_any_axes_and_views() {
+        let x = Tensor::<f64>::from_fn(&[3, 4, 5], |i| ((i * 37) % 23) as f64 - 9.5);
+        for x in [x.clone(), x.permute(&[2, 0, 1]), x.flip(1).t()] {
+            let array = x.view();
+            for axis in 0..3 {
+                for signed in [axis as isize, axis as isize - 3] {
+                    assert!(x.sum_over(signed).is_close(&array.sum_axis(Axis(axis)).into(), 1e-13, 1e-13));
+                    assert!(x.mean_over(signed).is_close(&array.mean_axis(Axis(axis)).unwrap().into(), 1e-13, 1e-13));
+                    assert!(x.var_over(signed, 0).is_close(&array.var_axis(Axis(axis), 0.0).into(), 1e-13, 0.0));
+                    assert!(x.std_over(signed, 1).is_close(&array.std_axis(Axis(axis), 1.0).into(), 1e-13, 0.0));
+                    let fold =
+                        |start: f64, f: fn(f64, f64) -> f64| array.fold_axis(Axis(axis), start, |&a, &b| f(a, b));
+                    assert_eq!(x.max_over(signed), fold(f64::MIN, f64::max).into());
+                    assert_eq!(x.min_over(signed), fold(f64::MAX, f64::min).into());
+                    let (most, least) = (x.argmax(signed), x.argmin(signed));
+                    let lanes = array.lanes(Axis(axis)).into_iter().map(|lane| lane.to_vec());
+                    for ((lane, &most), &least) in lanes.zip(most.as_slice()).zip(least.as_slice()) {
+                        assert!(
+                            lane.iter().enumerate().all(
+                                |(i, &y)| y < lane[most as usize] || i >= most as usize && y == lane[most as usize]
+                            )
+                        );
+                        assert!(lane.iter().enumerate().all(
+                            |(i, &y)| y > lane[least as usize] || i >= least as usize && y == lane[least as usize]
+                        ));
+                    }
+                }
+            }
+            assert_eq!((x.sum(), x.max(), x.min()), (array.sum(), 12.5, -9.5));
+            assert_eq!(x.mean(), array.sum() / 60.0);
+            assert!((x.norm() - array.mapv(|x| x * x).sum().sqrt()).abs() < 1e-12);
+            assert!(
+                (x.var_over([0, -1], 1).shape(), x.max_over(Axes::from(1).keepdims()).ndim())
+                    == (&[x.shape()[1]][..], 3)
+            );
+        }
+    }
+
+    #[test]
+    fn extremes_and_empty_tensors() {
+        let huge = Tensor::from([3e200, -4e200]);
+        assert!((huge.norm() / 5e200 - 1.0).abs() < 1e-15 && Tensor::<f32>::zeros(&[3]).norm() == 0.0);
+        assert!(Tensor::from([1.0, f32::NAN]).max().is_nan() && Tensor::from([f32::NAN]).norm().is_nan());
+        let none = Tensor::<f32>::zeros(&[0, 2]);
+        assert_eq!((none.sum(), none.norm(), none.sum_over(0).to_vec()), (0.0, 0.0, vec![0.0; 2]));
+        assert!(none.mean().is_nan() && none.var_over(0, 0)[[1]].is_nan() && none.max_over(1).is_empty());
+        assert!(std::panic::catch_unwind(|| none.max_over(0)).is_err());
+        assert_eq!((huge.distance(&huge), none.distance(&none)), (0.0, 0.0));
+        assert!(Tensor::from([f32::NAN, 0.0]).distance(&Tensor::from([0.0, 1.0])).is_nan());
+    }
+}
