@@ -318,7 +318,7 @@ mod tests {
             (x.abs().powf(1.5), |x| x.abs().powf(1.5)),
             (x.square(), |x| x * x),
             (x.maximum(0.5), |x| x.max(0.5)),
-            (x.minimum(&Tensor::from([0.5; 4])), |x| x.min(0.5)),
+            (x.minimum(Tensor::from([0.5; 4])), |x| x.min(0.5)),
             (x.clamp(0.0, 2.0), |x| x.clamp(0.0, 2.0)),
         ] {
             assert!(got.is_close(&x.iter().map(f).collect(), 1e-14, 0.0), "{got}");

@@ -78,13 +78,16 @@ macro_rules! map_real {
     };
 }
 
+/// What a loop does with a part of each operand and of the output, all of one length.
+type Kernel<'a, T, const N: usize> = dyn Fn([&[T]; N], &mut [T]) + Sync + 'a;
+
 /// Calls `run` with slices of one length: parts of the tensors, stretched to their common shape, and of the output. Apart
 /// from the formula, so that it is compiled once and not for each.
 #[track_caller]
 pub(crate) fn broadcast_loop<T: Scalar, const N: usize>(
     x: [&Tensor<T>; N],
     pool: &Pool<T>,
-    run: &(dyn Fn([&[T]; N], &mut [T]) + Sync),
+    run: &Kernel<'_, T, N>,
 ) -> Tensor<T> {
     let shapes = x.map(|x| x.shape());
     if shapes.iter().all(|&shape| shape == shapes[0]) && x.iter().all(|x| x.is_packed()) {

@@ -219,22 +219,12 @@ impl<T: Scalar> Tensor<T> {
         if matches!(self.data, Data::One(_)) && self.view.is_none() {
             return;
         }
-        let pool = self.pool();
+        let (layout, pool) = (self.layout(), self.pool());
         // A packed copy that nobody else sees can be taken.
-        let packed = self.view.take().and_then(|mut view| {
-            let layout = view.layout.clone();
-            match Arc::get_mut(&mut view).and_then(|view| view.packed.take()) {
-                Some(packed) => Some(packed),
-                None => {
-                    let mut values = pool.take(layout.len());
-                    layout.read(self.buffer(), &mut values);
-                    Some(Buffer { values, pool: pool.clone() })
-                }
-            }
-        });
+        let packed = self.view.take().and_then(|mut view| Arc::get_mut(&mut view).and_then(|view| view.packed.take()));
         let buffer = packed.unwrap_or_else(|| {
-            let mut values = pool.take(self.len());
-            values.copy_from_slice(self.buffer());
+            let mut values = pool.take(layout.len());
+            layout.read(self.buffer(), &mut values);
             Buffer { values, pool }
         });
         self.data = match buffer.values[..] {
