@@ -14,6 +14,9 @@ impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
     fn name(&self) -> &'static str {
         (**self).name()
     }
+    fn arity(&self) -> Option<usize> {
+        (**self).arity()
+    }
     fn shape(&self, x: &[&[usize]]) -> Result<raygrad_tensor::Shape, crate::ShapeError> {
         (**self).shape(x)
     }
