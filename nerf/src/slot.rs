@@ -122,10 +122,17 @@ impl Slot {
             }
         };
         let loss = loss * (1.0 / (3.0 * total as f64));
-        let given = loss.backward(&params.vars());
-        grads.resize_with(given.len(), || None);
+        // Where rays meet nothing, the loss may be a constant: its gradients are zero.
+        let mut given = loss.tracked().backward(&params.vars()).into_iter();
+        grads.resize_with(model.params.len(), || None);
         let table = model.field.table().map(|(id, _)| id);
-        for ((id, sum), mut gradient) in model.params.ids().zip(grads).zip(given) {
+        for (id, sum) in model.params.ids().zip(grads) {
+            // A frozen parameter has no gradient.
+            let gradient = if model.params.is_frozen(id) { None } else { given.next() };
+            let Some(mut gradient) = gradient else {
+                *sum = None;
+                continue;
+            };
             if table == Some(id) {
                 tables.extend(gradient.take());
                 if gradient.is_zero() {

@@ -68,7 +68,7 @@ pub trait Optimizer<T: Scalar> {
     /// ([`Params::set_rate`], [`Params::set_decay`]), and returns how many elements were left alone.
     ///
     /// # Panics
-    /// If there is not one gradient of the same shape for each parameter, frozen or not.
+    /// If there is not one gradient of the same shape for each parameter that is not frozen.
     #[track_caller]
     fn update(&mut self, params: &mut Params<T>, grads: &[Tensor<T>], rate: f64) -> usize {
         self.advance(&mut params.moves(grads, rate))
