@@ -3,11 +3,14 @@
 use crate::support::{in_both, same, values, wide};
 use raygrad_tensor::{Layout, Scalar};
 
-/// A layout of a buffer of `source` elements, and where the element at an index stands in it.
+/// Where the element at an index stands in a buffer.
+type Position = Box<dyn Fn(&[usize]) -> usize>;
+
+/// A layout of a buffer of `source` elements, and the positions that it names.
 struct Case {
     layout: Layout,
     source: usize,
-    position: Box<dyn Fn(&[usize]) -> usize>,
+    position: Position,
 }
 
 /// Layouts of buffers `[a, b, c]`.
@@ -16,8 +19,7 @@ fn cases(a: usize, b: usize, c: usize) -> Vec<Case> {
     let source = a * b * c;
     let at = move |i: usize, j: usize, k: usize| (i * b + j) * c + k;
     let mut cases: Vec<Case> = vec![];
-    let mut case =
-        |layout: Layout, position: Box<dyn Fn(&[usize]) -> usize>| cases.push(Case { layout, source, position });
+    let mut case = |layout: Layout, position: Position| cases.push(Case { layout, source, position });
     case(whole.clone(), Box::new(move |x| at(x[0], x[1], x[2])));
     case(whole.permuted(&[2, 0, 1]), Box::new(move |x| at(x[1], x[2], x[0])));
     case(whole.permuted(&[0, 2, 1]), Box::new(move |x| at(x[0], x[2], x[1])));
@@ -35,7 +37,7 @@ fn cases(a: usize, b: usize, c: usize) -> Vec<Case> {
 
 /// Layouts that stretch a buffer.
 fn stretched(a: usize, b: usize, c: usize) -> Vec<Case> {
-    let case = |from: &[usize], position: Box<dyn Fn(&[usize]) -> usize>| Case {
+    let case = |from: &[usize], position: Position| Case {
         layout: Layout::broadcast(from, &[a, b, c]),
         source: from.iter().product(),
         position,

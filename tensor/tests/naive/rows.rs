@@ -151,3 +151,21 @@ fn norms<T: Scalar>() {
 fn moments_and_layer_normalisation() {
     in_both!(norms);
 }
+
+/// Numbers a few units in the last place apart: what the rounding of their mean adds is a share of their variance.
+fn narrow<T: Scalar>() {
+    let unit = T::EPSILON * 16_384.0;
+    for n in [2, 7, 31, 32, 33, 101, 4097] {
+        let offsets: Vec<f64> = (0..3 * n).map(|i| ((i * 7919 + i / 1013) % 11) as f64).collect();
+        let x: Vec<T> = offsets.iter().map(|offset| T::from_f64(30_000.0 + offset * unit)).collect();
+        let mut variances = nan::<T>(3);
+        variance_rows(&x, n, &mut variances);
+        let exact = offsets.chunks(n).map(|row| moments(row)[1] * unit * unit);
+        close(&format!("variance of {n} far from 0"), &variances, 256.0, exact.map(|variance| [variance, variance]));
+    }
+}
+
+#[test]
+fn variances_of_rows_far_from_zero() {
+    in_both!(narrow);
+}
