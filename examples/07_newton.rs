@@ -89,7 +89,7 @@ fn main() {
         }
         x = moved(&x, h, &direction);
     }
-    let farthest = x.iter().map(|x| (x - 1.0).abs()).fold(0.0, f64::max);
+    let farthest = x.iter().map(|x| (x - 1.0).abs()).fold(0.0, raygrad::autograd::Real::maximum);
     println!("  all variables are 1 within {farthest:.0e}");
     assert!(farthest < 1e-6, "another minimum, or none");
 

@@ -2,7 +2,9 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Activation, Bound, Check, Op, Scalar, Segments, Tape, Tensor, Var, check_function, check_op};
+use raygrad::autograd::{
+    Activation, Bound, Check, Op, Real, Scalar, Segments, Tape, Tensor, Var, check_function, check_op,
+};
 use raygrad::nerf::hash_grid::HashGridConfig;
 use raygrad::nerf::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampler::Jitter;
@@ -195,28 +197,33 @@ fn along(params: &[Tensor<f64>], direction: &[Tensor<f64>], h: f64) -> Vec<Tenso
     params.iter().zip(direction).map(pair).collect()
 }
 
+/// A difference across the kink of a ReLU is none: it counts at the step at which it is nearest. A wrong derivative is wrong
+/// at every step.
 #[test]
-fn deep_relu_networks_pass_in_the_median_of_twenty_directions() {
+fn deep_relu_networks_pass_in_every_one_of_twenty_directions() {
     let field = ClassicConfig { depth: 8, width: 24, view_width: 12, ..ClassicConfig::paper() };
     let config = hierarchical(field, 16, 16);
     for config in [config.clone(), config.with_relu_density()] {
         let loss = Loss::new(config, 4, 3).double();
         let (params, grads) = (loss.model.params.values(), loss.gradients());
         let mut rng = StdRng::seed_from_u64(8);
-        let step = 1e-5;
-        let mut errors: Vec<_> = (0..20)
-            .map(|_| {
-                let direction = unit_direction(params, &mut rng);
-                let moved = |h: f64| loss.value(&along(params, &direction, h));
-                let numeric = (moved(step) - moved(-step)) / (2.0 * step);
-                let products = grads.iter().zip(&direction).flat_map(|(g, d)| g.as_slice().iter().zip(d.as_slice()));
-                let analytic: f64 = products.map(|(g, d)| g * d).sum();
-                (numeric - analytic).abs() / analytic.abs()
-            })
-            .collect();
-        errors.sort_by(f64::total_cmp);
-        println!("median {:.1e}, worst {:.1e}", errors[10], errors[19]);
-        assert!(errors[10] <= 1e-7, "{errors:?}");
+        let norm = grads.iter().flat_map(|g| g.as_slice()).map(|g| g * g).sum::<f64>().sqrt();
+        let count = grads.iter().map(Tensor::len).sum::<usize>() as f64;
+        let error = || {
+            let direction = unit_direction(params, &mut rng);
+            let moved = |h: f64| loss.value(&along(params, &direction, h));
+            let products = grads.iter().zip(&direction).flat_map(|(g, d)| g.as_slice().iter().zip(d.as_slice()));
+            let analytic: f64 = products.map(|(g, d)| g * d).sum();
+            let numeric = |step: f64| (moved(step) - moved(-step)) / (2.0 * step);
+            // A unit vector without a pattern lies along the gradient by this much.
+            let scale = norm / count.sqrt();
+            let errors = [1e-4, 1e-5, 1e-6].map(|step| (numeric(step) - analytic).abs() / scale);
+            errors.into_iter().reduce(Real::minimum).unwrap()
+        };
+        let errors: Vec<_> = std::iter::repeat_with(error).take(20).collect();
+        let worst = errors.iter().copied().fold(0.0, Real::maximum);
+        println!("worst of twenty directions {worst:.1e}");
+        assert!(worst <= 1e-6, "{errors:?}");
     }
 }
 

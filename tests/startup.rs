@@ -38,7 +38,7 @@ fn density_share(model: &Model<f32>) -> f64 {
         let density = field.density(&params, &field.encode(&params, &tape.constant(points.clone()))).sigma();
         density.value().as_slice().iter().filter(|&&sigma| sigma > 0.0).count() as f64 / 400.0
     };
-    model.fields().into_iter().map(share).fold(1.0, f64::min)
+    model.fields().into_iter().map(share).fold(1.0, raygrad::autograd::Real::minimum)
 }
 
 #[test]

@@ -15,8 +15,9 @@ Written by `cargo run --release -p raygrad-autograd --example check_table`. Ever
 
 - **entries**: how often the operation is in the catalogue, with different settings; **checks**: comparisons made.
 - **first**, **second**: derivatives against central differences in f64, with a step scaled to the input and Richardson's
-  extrapolation; relative to the derivative or the function's value, whichever is larger, and at least 1. The second
-  derivatives are those of the gradient by all inputs and by the output's gradient. Limit: 1e-7.
+  extrapolation; relative to the norm of the gradient of the input that moves, and to what the rounding of the function's
+  values makes of a difference. The second derivatives are those of the gradient by all inputs and by the output's
+  gradient. Limit: 1e-7.
 - **f32**: value and gradient in f32 against f64 from the same rounded inputs, as a distance relative to the norm (limit
   2e-6), and the worst element in units in the last place (limit 32); an element smaller than the root mean square of its
   tensor counts as that large.

@@ -5,7 +5,7 @@ use crate::ops::trigonometric;
 use crate::ops::{
     Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
 };
-use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, scan, select, softmax};
+use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
 use crate::{Dual, Op};
 use raygrad_tensor::{Layout, Shape, Tensor};
 use std::ops::Range;
@@ -263,7 +263,7 @@ fn reductions() -> Vec<Entry> {
         Entry::new(scan::Cumprod(walk(0, true))).sample(&[&[4]]).sample_of(zeros(&[5], 3)),
         Entry::new(scan::Recurrence(walk(0, false))).sample(&[&[5], &[5]]).sample(&[&[4, 2], &[4, 2]]),
         Entry::new(scan::Recurrence(walk(1, true))).sample(&[&[2, 4], &[2, 4]]).sample(&[&[2, 0], &[2, 0]]),
-        Entry::new(scan::Product)
+        Entry::new(product::Product)
             .sample(&[&[2, 4]])
             .sample_of(zeros(&[3, 4], 5))
             .sample_of(zeros(&[2, 5], 2))

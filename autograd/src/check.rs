@@ -7,18 +7,19 @@ use raygrad_tensor::Tensor;
 /// How hard to check, and what error to accept.
 #[derive(Debug, Clone)]
 pub struct Check {
-    /// Worst relative error of first and second derivatives against finite differences.
+    /// Worst error of first and second derivatives against finite differences, relative to the norm of the gradient of the
+    /// input that moves. What the rounding of the function's values makes of a difference comes on top.
     pub tolerance: f64,
     /// Step of the central differences, relative to `max(1, |x|)`.
     pub step: f64,
-    /// Number of directions along which a derivative is taken if there are more inputs than that.
+    /// Number of directions along which the derivative by an input is taken if it has more elements than that.
     pub directions: usize,
     /// Whether gradients of gradients are checked.
     pub second_order: bool,
 }
 
 impl Default for Check {
-    /// 1e-7, with Richardson-extrapolated central differences of step 1e-3 along at most 48 directions.
+    /// 1e-7, with Richardson-extrapolated central differences of step 1e-3 along at most 48 directions an input.
     fn default() -> Self {
         Check { tolerance: 1e-7, step: 1e-3, directions: 48, second_order: true }
     }
@@ -65,9 +66,15 @@ pub(crate) fn compare(what: &str, got: f64, expected: f64, scale: f64, tolerance
     }
 }
 
+/// The sum of all products of elements, and the sum of their sizes.
+fn value_and_size(a: &[Tensor<f64>], b: &[Tensor<f64>]) -> [f64; 2] {
+    let products = a.iter().zip(b).flat_map(|(a, b)| a.as_slice().iter().zip(b.as_slice())).map(|(a, b)| a * b);
+    products.fold([0.0; 2], |[sum, size], x| [sum + x, size + x.abs()])
+}
+
 /// The sum of all products of elements.
 pub(crate) fn inner(a: &[Tensor<f64>], b: &[Tensor<f64>]) -> f64 {
-    a.iter().zip(b).flat_map(|(a, b)| a.as_slice().iter().zip(b.as_slice())).map(|(a, b)| a * b).sum()
+    value_and_size(a, b)[0]
 }
 
 /// `x + h d`.
@@ -77,43 +84,53 @@ fn moved(x: &[Tensor<f64>], d: &[Tensor<f64>], h: f64) -> Vec<Tensor<f64>> {
     x.iter().zip(d).map(pair).collect()
 }
 
-/// Directions to differentiate along: each coordinate if there are few, else vectors without a pattern.
-fn directions(x: &[Tensor<f64>], most: usize) -> Vec<Vec<Tensor<f64>>> {
-    let total: usize = x.iter().map(Tensor::len).sum();
-    let zeros = || x.iter().map(|x| Tensor::zeros(x.shape())).collect::<Vec<_>>();
-    if total > most {
-        let random = |k| x.iter().enumerate().map(|(i, x)| spread(x.shape(), &[-1.0..1.0], 13 * k + i + 5)).collect();
-        return (0..most).map(random).collect();
-    }
-    let mut all = vec![];
-    for (which, x) in x.iter().enumerate() {
-        for i in 0..x.len() {
-            let mut d = zeros();
-            d[which].as_mut_slice()[i] = x.as_slice()[i].abs().max(1.0);
-            all.push(d);
-        }
-    }
-    all
+/// Directions in which input number `which` of `x` moves alone: along each coordinate if there are few, else vectors without
+/// a pattern. With the size of an element that moves: the derivative is of the order of the gradient's norm times that.
+fn directions(x: &[Tensor<f64>], which: usize, most: usize) -> Vec<(Vec<Tensor<f64>>, f64)> {
+    let along = |d: Tensor<f64>| -> Vec<_> {
+        (0..x.len()).map(|k| if k == which { d.clone() } else { Tensor::zeros(x[k].shape()) }).collect()
+    };
+    let x = &x[which];
+    let unit = |i: usize| {
+        let mut d = Tensor::zeros(x.shape());
+        let size = x.as_slice()[i].abs().max(1.0);
+        d.as_mut_slice()[i] = size;
+        (along(d), size)
+    };
+    let random = |k: usize| {
+        let d = spread(x.shape(), &[-1.0..1.0], 13 * k + which + 5);
+        let size = (inner(std::slice::from_ref(&d), std::slice::from_ref(&d)) / d.len() as f64).sqrt();
+        (along(d), size)
+    };
+    if x.len() > most { (0..most).map(random).collect() } else { (0..x.len()).map(unit).collect() }
 }
 
-/// Compares `grads`, the gradients of `f` at `x`, with Richardson-extrapolated central differences.
+/// Roundings that the value of a function is taken to have, of the size of its terms.
+const ROUNDINGS: f64 = 16.0;
+
+/// Compares `grads`, the gradients of `f` at `x`, with Richardson-extrapolated central differences. `f` gives its value and
+/// the size of the terms that add up to it.
 fn against_differences(
     what: &str,
     check: &Check,
     x: &[Tensor<f64>],
     grads: &[Tensor<f64>],
-    f: &dyn Fn(&[Tensor<f64>]) -> f64,
+    f: &dyn Fn(&[Tensor<f64>]) -> [f64; 2],
 ) -> Result<(f64, usize), String> {
     let (mut worst, mut count) = (0.0_f64, 0);
-    let here = f(x).abs();
-    for (k, d) in directions(x, check.directions).iter().enumerate() {
-        let difference = |h: f64| (f(&moved(x, d, h)) - f(&moved(x, d, -h))) / (2.0 * h);
-        let numeric = (4.0 * difference(0.5 * check.step) - difference(check.step)) / 3.0;
-        let analytic = inner(grads, d);
-        let scale = numeric.abs().max(analytic.abs()).max(here).max(1.0);
-        let what = format!("{what}, direction {k}");
-        worst = worst.max(compare(&what, analytic, numeric, scale, check.tolerance)?);
-        count += 1;
+    // What rounding makes of a difference, as a scale: the tolerance times this is let pass.
+    let rounding = ROUNDINGS * f64::EPSILON * f(x)[1] / (check.step * check.tolerance);
+    for (which, grad) in grads.iter().enumerate() {
+        let norm = inner(std::slice::from_ref(grad), std::slice::from_ref(grad)).sqrt();
+        for (k, (d, size)) in directions(x, which, check.directions).iter().enumerate() {
+            let difference = |h: f64| (f(&moved(x, d, h))[0] - f(&moved(x, d, -h))[0]) / (2.0 * h);
+            let numeric = (4.0 * difference(0.5 * check.step) - difference(check.step)) / 3.0;
+            let analytic = inner(std::slice::from_ref(grad), &d[which..=which]);
+            let what = format!("{what} by input {which}, direction {k}");
+            let scale = norm * size + rounding;
+            worst = worst.max(compare(&what, analytic, numeric, scale, check.tolerance)?);
+            count += 1;
+        }
     }
     Ok((worst, count))
 }
@@ -144,11 +161,11 @@ pub fn check_function(
     let y = f(&leaves).tracked();
     let seed = spread(y.shape(), &[0.3..1.3], 3);
     // The function is reduced to one number by a fixed weighting of its outputs.
-    let number = |x: &[Tensor<f64>]| -> f64 {
+    let number = |x: &[Tensor<f64>]| {
         let tape = Tape::new();
         // Leaves, so that `f` may take gradients.
         let x: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
-        inner(&[f(&x).into_value()], std::slice::from_ref(&seed))
+        value_and_size(&[f(&x).into_value()], std::slice::from_ref(&seed))
     };
     let grads = (&y * tape.constant(seed.clone())).sum().grad(&wrt);
     let (first, count) = against_differences("first derivative", check, x, &grads, &number)?;
@@ -159,18 +176,22 @@ pub fn check_function(
     // The gradients, weighted, as a function of the inputs and of the output's gradient.
     let weights: Vec<_> = x.iter().enumerate().map(|(i, x)| spread(x.shape(), &[-1.0..1.0], 29 + i)).collect();
     let both: Vec<_> = x.iter().cloned().chain([seed]).collect();
-    let gradient = |x: &[Tensor<f64>]| -> f64 {
+    let gradient = |x: &[Tensor<f64>]| {
         let tape = Tape::new();
         let leaves: Vec<_> = x[..x.len() - 1].iter().map(|x| tape.leaf(x.clone())).collect();
         let seed = tape.constant(x[x.len() - 1].clone());
-        inner(&(f(&leaves) * seed).sum().grad(&leaves.iter().collect::<Vec<_>>()), &weights)
+        value_and_size(&(f(&leaves) * seed).sum().grad(&leaves.iter().collect::<Vec<_>>()), &weights)
     };
     let seed = tape.leaf(both[both.len() - 1].clone());
     let recorded = (f(&leaves) * &seed).sum().grad_graph(&wrt);
     let recorded_values: Vec<_> = recorded.iter().map(|grad| grad.value().clone()).collect();
-    let scale = inner(&grads, &grads).sqrt().max(1.0);
-    let what = "the recorded gradient against the unrecorded one";
-    compare(what, inner(&recorded_values, &weights), inner(&grads, &weights), scale, 1e-10)?;
+    for (i, (recorded, grad)) in recorded_values.iter().zip(&grads).enumerate() {
+        let what = format!("the recorded gradient against the unrecorded one, input {i}");
+        let norm = inner(std::slice::from_ref(grad), std::slice::from_ref(grad)).sqrt();
+        for (&recorded, &grad) in recorded.as_slice().iter().zip(grad.as_slice()) {
+            compare(&what, recorded, grad, norm.max(f64::MIN_POSITIVE), 1e-10)?;
+        }
+    }
     let mut total = tape.constant(Tensor::scalar(0.0));
     for (grad, weight) in recorded.iter().zip(&weights) {
         total = total + (grad * tape.constant(weight.clone())).sum();
@@ -178,6 +199,6 @@ pub fn check_function(
     let wrt: Vec<_> = leaves.iter().chain([&seed]).collect();
     let second = total.grad(&wrt);
     let (second, count) = against_differences("second derivative", check, &both, &second, &gradient)?;
-    report.merge(Report { second_order: second, comparisons: count + 1, ..Report::default() });
+    report.merge(Report { second_order: second, comparisons: count + grads.len(), ..Report::default() });
     Ok(report)
 }

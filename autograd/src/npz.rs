@@ -1,4 +1,7 @@
 //! Parameters as NumPy's `.npz`: a zip archive with a `.npy` file for each array.
+//!
+//! The crate `ndarray-npy` (0.10) is not used: it allocates what a header announces before it looks how much there is, so
+//! a file of a hundred bytes that claims 2^60 elements ends the process.
 
 use crate::{Params, write_atomic};
 use rawzip::{CompressionMethod, ZipArchive, ZipArchiveWriter};
@@ -222,7 +225,8 @@ fn parse<T: Scalar>(bytes: &[u8]) -> Result<Tensor<T>, What> {
     let version = bytes.get(..8).filter(|start| start.starts_with(b"\x93NUMPY")).ok_or_else(broken)?[6];
     let number = |bytes: &[u8]| bytes.iter().rev().fold(0, |sum, &byte| sum << 8 | usize::from(byte));
     let start = if version == 1 { 10 } else { 12 };
-    let end = start + bytes.get(8..start).map(number).ok_or_else(broken)?;
+    let length = bytes.get(8..start).map(number).ok_or_else(broken)?;
+    let end = start.checked_add(length).ok_or_else(broken)?;
     let text = bytes.get(start..end).and_then(|text| std::str::from_utf8(text).ok()).ok_or_else(broken)?;
     let found = field(text, "descr").unwrap_or_default().trim_start_matches(['\'', '"']);
     let found = found.split(['\'', '"']).next().unwrap_or_default();
@@ -232,9 +236,14 @@ fn parse<T: Scalar>(bytes: &[u8]) -> Result<Tensor<T>, What> {
     let extents = field(text, "shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(broken)?.0;
     let extents = extents.split(',').map(str::trim).filter(|extent| !extent.is_empty());
     let shape = extents.map(|extent| extent.parse().map_err(|_| broken())).collect::<Result<Shape, What>>()?;
-    let bits = shape.iter().try_fold(size_of::<T>(), |size, &extent| size.checked_mul(extent));
+    // Without its empty axes, too, a shape must be of a size that memory could hold: an array library may multiply these.
+    let mut size = shape.iter().filter(|&&extent| extent > 0);
+    let size = size.try_fold(size_of::<T>(), |size, &extent| size.checked_mul(extent));
+    let Some(size) = size.filter(|&size| isize::try_from(size).is_ok()) else {
+        return Err(format!("has shape {shape:?}, which is too large"));
+    };
     let data = &bytes[end..];
-    if bits != Some(data.len()) {
+    if data.len() != if shape.contains(&0) { 0 } else { size } {
         return Err(format!("holds {} bytes of elements, which is not what shape {shape:?} needs", data.len()));
     }
     let values: Vec<T> = data.chunks_exact(size_of::<T>()).map(T::read_le).collect();
@@ -387,6 +396,45 @@ mod tests {
         }
     }
 
+    /// A `.npy` file of version 2.
+    fn npy(header: &str, data: &[u8]) -> Vec<u8> {
+        let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
+        bytes.extend((header.len() as u32).to_le_bytes());
+        bytes.extend(header.as_bytes());
+        bytes.extend(data);
+        bytes
+    }
+
+    #[test]
+    fn a_shape_beyond_all_memory_is_an_error_and_takes_none() {
+        let whole = format!("{}", u64::MAX);
+        for shape in [
+            "(0, 9223372036854775808)",
+            "(9223372036854775808, 0)",
+            "(9223372036854775808, 2, 0)",
+            "(0, 4294967296, 4294967296)",
+            "(0, 1152921504606846976, 8)",
+            "(4294967296, 4294967296)",
+            "(9223372036854775808, 2)",
+            "(1152921504606846976,)",
+            &format!("({whole}, {whole})"),
+            "(36893488147419103232,)",
+            "(-1,)",
+        ] {
+            for order in ["False", "True"] {
+                let header = format!("{{'descr': '<f4', 'fortran_order': {order}, 'shape': {shape}, }}");
+                for data in [&[][..], &[0; 8]] {
+                    let error = parse::<f32>(&npy(&header, data)).expect_err(shape);
+                    let words = ["which is too large", "is not a whole npy file", "which is not what shape"];
+                    assert!(words.iter().any(|words| error.contains(words)), "{shape}: {error}");
+                }
+            }
+        }
+        // As large as an empty array may be.
+        let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 1152921504606846976), }";
+        assert_eq!(parse::<f32>(&npy(header, &[])).unwrap().shape(), [0, 1 << 60]);
+    }
+
     #[test]
     fn headers_are_those_of_numpy() {
         assert_eq!(header::<f32>(&[3, 4]).len(), 128);
@@ -399,10 +447,7 @@ mod tests {
             "{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }",
             "{\"shape\" : (3 ,) , \"fortran_order\":False,\"descr\":\"<f4\"}\n",
         ] {
-            let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
-            bytes.extend((text.len() as u32).to_le_bytes());
-            bytes.extend(text.as_bytes());
-            bytes.extend([0; 12]);
+            let bytes = npy(text, &[0; 12]);
             assert_eq!(parse::<f32>(&bytes).unwrap(), Tensor::zeros(&[3]));
             assert!(parse::<f32>(&bytes[..bytes.len() - 1]).unwrap_err().contains("11 bytes"));
         }

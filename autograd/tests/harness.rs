@@ -37,6 +37,8 @@ enum Fault {
     /// A gradient that is wrong where both inputs are one variable.
     ConfusedByAliases,
     NanValue,
+    /// A gradient so small that its error is below any absolute tolerance.
+    WrongWhereSmall,
 }
 
 use Fault::*;
@@ -74,6 +76,7 @@ impl<T: Scalar> Op<T> for Wave {
             }
             WrongElementInSinglePrecision if size_of::<T>() == 4 => y.as_mut_slice()[0] += T::from_f64(1.5e-6),
             NanValue => y.as_mut_slice()[0] = T::from_f64(f64::NAN),
+            WrongWhereSmall => y = map([&y], pool, |[y]| y * T::from_f64(1e-9)),
             _ => {}
         }
         y
@@ -97,6 +100,7 @@ impl<T: Scalar> Op<T> for Wave {
             GradientToTheWrongInput => (da, db) = (db.sum_to(cx.shape(0)), da.sum_to(cx.shape(1))),
             ForgottenInput => return Grads::new([Some(da), None]),
             ConfusedByAliases if aliased => da = da * 2.0,
+            WrongWhereSmall => (da, db) = (da * 1e-9, db * 1.02e-9),
             AnotherGradientWhenRecorded if cx.recording() => da = da * (1.0 + 1e-8),
             _ => {}
         }
@@ -145,7 +149,7 @@ fn the_correct_operation_passes() {
 
 #[test]
 fn every_fault_is_caught_by_the_check_meant_for_it() {
-    let first = "first derivative, direction";
+    let first = "first derivative by input";
     let faults = [
         (WrongSign, first),
         (TwiceTheGradient, first),
@@ -153,7 +157,7 @@ fn every_fault_is_caught_by_the_check_meant_for_it() {
         (NanGradient, "got NaN"),
         (GradientToTheWrongInput, first),
         (ForgottenInput, first),
-        (WrongSecondDerivative, "second derivative, direction"),
+        (WrongSecondDerivative, "second derivative by input"),
         (AnotherGradientWhenRecorded, "the recorded gradient against the unrecorded one"),
         (WrongReference, "fused against reference"),
         (MissingReference, "a fused operation without a reference"),
@@ -163,6 +167,7 @@ fn every_fault_is_caught_by_the_check_meant_for_it() {
         (StaleBuffer, "old values of a buffer"),
         (ConfusedByAliases, "one variable as inputs 0 and 1 against two"),
         (NanValue, "NaN"),
+        (WrongWhereSmall, first),
     ];
     for (fault, by) in faults {
         println!("{fault:?}");

@@ -1,7 +1,7 @@
 //! Reductions and scans over every set of axes, against plain loops and finite differences, down to no elements and no
 //! axes.
 
-use raygrad_autograd::{Axes, Check, Tape, Tensor, Var, check_function};
+use raygrad_autograd::{Axes, Check, Scalar, Tape, Tensor, Var, check_function};
 
 type Reduce = for<'t> fn(&Var<'t, f64>, Axes) -> Var<'t, f64>;
 type Plain = fn(&[f64]) -> f64;
@@ -161,14 +161,114 @@ fn a_recurrence_is_what_its_definition_says() {
     assert_eq!(y.sum().grad(&[&a])[0].as_slice()[..2], [0.0, 0.0]);
 }
 
+/// Value and gradient, unrecorded and recorded, of variance, deviation and layer normalisation along the first or the
+/// last axis.
+fn of_moments<T: Scalar>(x: &Tensor<f64>, first: bool) -> Vec<(String, Tensor<f64>)> {
+    let tape = Tape::<T>::new();
+    let x = tape.leaf(x.cast());
+    let rows = if first { x.t() } else { x.clone() };
+    let n = rows.shape()[1];
+    let weights = tape.constant(Tensor::from_fn(&[n], |i| T::from_f64((i as f64 * 0.7).sin())));
+    let (gain, bias) = (tape.constant(Tensor::ones(&[n])), tape.constant(Tensor::zeros(&[n])));
+    let axis = if first { 0 } else { 1 };
+    let results = [
+        ("var", x.var_over(axis, 1)),
+        ("std", x.std_over(axis, 0)),
+        ("layer_norm", rows.layer_norm(&gain, &bias, 1e-5) * weights),
+    ];
+    let each = |(name, y): (&str, Var<'_, T>)| {
+        let sum = y.sum();
+        let grads = [sum.grad(&[&x]).remove(0), sum.grad_graph(&[&x]).remove(0).into_value()];
+        let [grad, recorded] = grads.map(|grad| grad.cast());
+        let what = |part: &str| format!("{part} of {name} in {} along axis {axis}", T::NAME);
+        [(what("value"), y.value().cast()), (what("gradient"), grad), (what("recorded gradient"), recorded)]
+    };
+    results.into_iter().flat_map(each).collect()
+}
+
 #[test]
-fn products_with_large_and_small_factors_have_finite_gradients() {
-    let tape = Tape::<f32>::new();
-    let x = tape.leaf(Tensor::from_fn(&[200], |i| if i < 100 { 10.0 } else { 0.1 }));
-    let y = x.prod();
-    assert!((y.item() - 1.0).abs() < 1e-4, "{}", y.item());
-    let grad = y.grad(&[&x]).remove(0);
-    assert!((grad.as_slice()[0] - 0.1).abs() < 1e-5 && (grad.as_slice()[199] - 10.0).abs() < 1e-3);
+fn moments_of_numbers_far_from_zero_keep_their_digits() {
+    // Exact in f32, as is nothing of their mean.
+    let x = Tensor::<f64>::from_fn(&[37, 41], |i| 30_000.0 + ((i * 7919) % 1013) as f64 / 512.0);
+    for first in [false, true] {
+        for ((what, got), (_, expected)) in of_moments::<f32>(&x, first).iter().zip(of_moments::<f64>(&x, first)) {
+            assert_eq!(got.shape(), expected.shape());
+            let apart =
+                got.as_slice().iter().zip(expected.as_slice()).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+            let norm = expected.as_slice().iter().map(|b| b * b).sum::<f64>().sqrt();
+            assert!(apart <= 1e-6 * norm, "{what}: {apart:e} of {norm:e} apart");
+        }
+    }
+}
+
+/// The product of `x` and its gradient, recorded and not, against exact values to a few roundings.
+fn product_is<T: Scalar>(x: &[f64], value: f64, gradient: &[f64]) {
+    let tape = Tape::<T>::new();
+    let leaf = tape.leaf(Tensor::from_fn(&[x.len()], |i| T::from_f64(x[i])));
+    let y = leaf.prod();
+    let found = [y.grad(&[&leaf]).remove(0), y.grad_graph(&[&leaf]).remove(0).into_value()];
+    let check = |what: &str, got: T, expected: f64| {
+        let (got, expected) = (got.to_f64(), T::from_f64(expected).to_f64());
+        let close = (got - expected).abs() <= 8.0 * T::EPSILON * expected.abs();
+        let same = got == expected || close || got.is_nan() && expected.is_nan();
+        assert!(same, "{what} of the product of {x:?} in {}: {got:e} for {expected:e}", T::NAME);
+    };
+    check("value", y.item(), value);
+    for (what, found) in ["gradient", "recorded gradient"].into_iter().zip(found) {
+        found.as_slice().iter().zip(gradient).for_each(|(&got, &expected)| check(what, got, expected));
+        assert_eq!(found.len(), gradient.len());
+    }
+}
+
+#[test]
+fn products_do_not_overflow_or_vanish_on_the_way() {
+    // The powers of ten that overflow or vanish are those of f64 alone; the others those of f32 too.
+    product_is::<f64>(&[1e-200, 1e-200, 1e300], 1e-100, &[1e100, 1e100, 0.0]);
+    product_is::<f64>(&[1e-200, 1e-200, 1e300, 1e100], 1.0, &[1e200, 1e200, 1e-300, 1e-100]);
+    product_is::<f64>(&[1e200, -1e200, 1e-300, 0.0], 0.0, &[-0.0, 0.0, -0.0, -1e100]);
+    product_is::<f64>(&[1e300, 1e300, 1e-300, -1e-300], -1.0, &[-1e-300, -1e-300, -1e300, 1e300]);
+    product_is::<f64>(
+        &[2.0_f64.powi(-1000), 2.0_f64.powi(900), 2.0_f64.powi(1000)],
+        2.0_f64.powi(900),
+        &[f64::INFINITY, 1.0, 2.0_f64.powi(-100)],
+    );
+    product_is::<f32>(&[1e-30, 1e-30, 1e38], 1e-22, &[1e8, 1e8, 0.0]);
+    product_is::<f32>(&[1e-30, 1e-30, 1e30, 1e20, 1e10], 1.0, &[1e30, 1e30, 1e-30, 1e-20, 1e-10]);
+    // Long runs of one size, that only the others take back.
+    let side = |i: usize, large: f64, small: f64| if i < 1000 { large } else { small };
+    let x: Vec<f64> = (0..2000).map(|i| side(i, 8.0, 0.125)).collect();
+    let gradient: Vec<f64> = (0..2000).map(|i| side(i, 0.125, 8.0)).collect();
+    product_is::<f64>(&x, 1.0, &gradient);
+    product_is::<f32>(&x, 1.0, &gradient);
+}
+
+#[test]
+fn products_with_zeros_infinities_and_nan() {
+    fn check<T: Scalar>() {
+        let (inf, nan) = (f64::INFINITY, f64::NAN);
+        product_is::<T>(&[inf, 2.0], inf, &[2.0, inf]);
+        product_is::<T>(&[inf, 1e-30, 1e-30, 1e-30], inf, &[1e-90, inf, inf, inf]);
+        product_is::<T>(&[inf, 0.0], nan, &[0.0, inf]);
+        product_is::<T>(&[nan, 2.0, 0.0], nan, &[0.0, nan, nan]);
+        product_is::<T>(&[0.0, 1e30, 1e30, 1e-30, 1e-30], 0.0, &[1.0, 0.0, 0.0, 0.0, 0.0]);
+        product_is::<T>(&[0.0, 3.0, 0.0], 0.0, &[0.0; 3]);
+        product_is::<T>(&[-0.0], -0.0, &[1.0]);
+        product_is::<T>(&[], 1.0, &[]);
+    }
+    check::<f32>();
+    check::<f64>();
+}
+
+#[test]
+fn second_derivatives_of_products_with_zeros_and_large_factors() {
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(Tensor::from_vec(&[4], vec![0.0, 3.0, 1e300, 1e-290]));
+    let first = x.prod().grad_graph(&[&x]).remove(0);
+    // d2y / dx0 dx1 = x2 x3, where the first derivative for x1 is 0.
+    let second = first.slice(0, 1, 1).sum().grad(&[&x]).remove(0);
+    for (got, expected) in second.as_slice().iter().zip([1e10, 0.0, 0.0, 0.0]) {
+        assert!((got - expected).abs() <= 1e-5, "{second:?}");
+    }
 }
 
 #[test]

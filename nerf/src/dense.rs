@@ -158,14 +158,14 @@ mod tests {
         let view = model.view(camera, background.map(|x| x as f32));
         let picture = exact.picture();
         let differences = view.color.data.iter().zip(&picture.color.data).map(|(a, b)| (a - b).abs());
-        assert!(differences.fold(0.0, f32::max) <= 1e-5, "the view that leaves out nothing is the same");
+        assert!(differences.fold(0.0, Real::maximum) <= 1e-5, "the view that leaves out nothing is the same");
         assert!(
             picture.opacity.data.iter().any(|&x| x > 0.5) && exact.pixels != double.dense_view(camera, black, 1).pixels
         );
         let finer = double.dense_view(camera, background, 3);
         let difference = |view: &DenseView| {
             let pairs = view.pixels.iter().flatten().zip(exact.pixels.iter().flatten());
-            pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+            pairs.map(|(a, b)| (a - b).abs()).fold(0.0, Real::maximum)
         };
         assert!((1e-9..0.2).contains(&difference(&finer)), "{}", difference(&finer));
         assert!(finer.evaluations.density > 2 * exact.evaluations.density);

@@ -3,26 +3,36 @@
 use raygrad_tensor::vmath::survey::{Function, doubles, singles, ulp_error};
 use raygrad_tensor::{Pool, Real, Tensor, map_real, vmath};
 use rayon::prelude::*;
+use std::io::Write;
 
-/// The largest error over every `step`-th bit pattern, with its argument.
-fn worst(function: &Function<f32>, step: u64) -> (f64, f32) {
+/// Parts of all bit patterns that [`worst`] looks at one by one: from 0 to the largest number, and the same below 0.
+const PARTS: u64 = 16;
+
+/// The largest error over every `step`-th bit pattern of each part, with its argument.
+fn worst(function: &Function<f32>, step: u64) -> Vec<(f64, f32)> {
     const CHUNK: u64 = 1 << 12;
     let count = (1_u64 << 32).div_ceil(step);
-    (0..count.div_ceil(CHUNK))
-        .into_par_iter()
-        .map(|chunk| {
-            let patterns = (chunk * CHUNK)..((chunk + 1) * CHUNK).min(count);
-            let x: Vec<f32> = patterns.map(|i| f32::from_bits((i * step) as u32)).collect();
-            let mut y = vec![0.0; x.len()];
-            (function.apply)(&x, &mut y);
-            if let "sin" | "cos" = function.name {
-                // A quick form is used where it holds, and must give the same bits.
-                assert_same_bits(&x, &y, &plain_form(function.name == "sin", &x));
-            }
-            let errors = x.iter().zip(&y).map(|(&x, &y)| (ulp_error(y, (function.reference)(x.into())), x));
-            errors.fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
+    let of_part = |part: u64| (part * count / PARTS, (part + 1) * count / PARTS);
+    (0..PARTS)
+        .map(of_part)
+        .map(|(first, end)| {
+            (first / CHUNK..end.div_ceil(CHUNK))
+                .into_par_iter()
+                .map(|chunk| {
+                    let patterns = (chunk * CHUNK)..((chunk + 1) * CHUNK).min(count);
+                    let x: Vec<f32> = patterns.map(|i| f32::from_bits((i * step) as u32)).collect();
+                    let mut y = vec![0.0; x.len()];
+                    (function.apply)(&x, &mut y);
+                    if let "sin" | "cos" = function.name {
+                        // A quick form is used where it holds, and must give the same bits.
+                        assert_same_bits(&x, &y, &plain_form(function.name == "sin", &x));
+                    }
+                    let errors = x.iter().zip(&y).map(|(&x, &y)| (ulp_error(y, (function.reference)(x.into())), x));
+                    errors.fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
+                })
+                .reduce(|| (0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
         })
-        .reduce(|| (0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a })
+        .collect()
 }
 
 /// Sines or cosines by the reduction for any argument.
@@ -52,6 +62,38 @@ fn assert_same_bits(x: &[f32], y: &[f32], plain: &[f32]) {
     }
 }
 
+/// Adds the worst arguments of each part to the file that `VMATH_WORST` names, if it is set.
+fn record(name: &str, parts: &[(f64, f32)]) {
+    let Ok(path) = std::env::var("VMATH_WORST") else { return };
+    let mut file = std::fs::OpenOptions::new().append(true).create(true).open(path).unwrap();
+    for (error, at) in parts.iter().filter(|(error, _)| *error > 0.0) {
+        writeln!(file, "{name} {:#010x} {error:.4}", at.to_bits()).unwrap();
+    }
+}
+
+/// The worst arguments that surveys have found, of each function in each of 16 parts of all bit patterns.
+#[test]
+fn known_worst_arguments_are_within_the_bounds() {
+    let functions = singles();
+    let mut count = 0;
+    for line in include_str!("reference/vmath_f32_worst.txt").lines().filter(|line| !line.starts_with('#')) {
+        let [name, bits, ..] = line.split(' ').collect::<Vec<_>>()[..] else { panic!("{line:?}") };
+        let x = f32::from_bits(u32::from_str_radix(&bits[2..], 16).unwrap());
+        let function = functions.iter().find(|function| function.name == name).unwrap();
+        // In every place of a vector, and alone.
+        for n in [33, 1] {
+            let mut y = vec![0.0; n];
+            (function.apply)(&vec![x; n], &mut y);
+            for y in y {
+                let error = ulp_error(y, (function.reference)(x.into()));
+                assert!(error <= function.bound, "{name}({x:e}) is {y:e}, {error} ULP off");
+            }
+        }
+        count += 1;
+    }
+    assert!(count >= 7 * functions.len(), "only {count} arguments");
+}
+
 /// Prints a line a function and asserts all bounds; with `VMATH_ONLY=sin,cos`, those of these functions.
 fn check(step: u64) {
     let only = std::env::var("VMATH_ONLY").unwrap_or_default();
@@ -60,7 +102,9 @@ fn check(step: u64) {
         .into_iter()
         .filter(|function| only.is_empty() || only.split(',').any(|name| name == function.name))
         .filter(|function| {
-            let (error, at) = worst(function, step);
+            let parts = worst(function, step);
+            record(function.name, &parts);
+            let (error, at) = parts.into_iter().fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a });
             println!("{:<9} {error:>8.4}  {at:e} = {:#010x}", function.name, at.to_bits());
             error > function.bound
         })

@@ -1,7 +1,7 @@
 //! Compositing along a ray.
 
 use crate::support::*;
-use raygrad::autograd::{Pool, Scalar, Segments, Tape, Tensor, Var};
+use raygrad::autograd::{Pool, Real, Scalar, Segments, Tape, Tensor, Var};
 use raygrad::nerf::Composite;
 use raygrad::nerf::sampler::{Jitter, importance, stratified};
 
@@ -99,7 +99,7 @@ fn weights_and_what_is_left_are_everything<T: Scalar>() {
         let x: Vec<f64> = (0..500).map(|_| scale * random()).collect();
         let ([total, left], ..) = ray::<T>(&x, &[1.0; 500]);
         within(&format!("scale {scale}"), total + left, 1.0, by_type::<T>(1e-6, 1e-14));
-        worst = worst.max((total + left - 1.0).abs());
+        worst = Real::maximum(worst, (total + left - 1.0).abs());
     }
     println!("weights and what is left, {}: {worst:.1e} from 1", T::NAME);
 }
@@ -116,7 +116,7 @@ fn gradient_keeps_its_digits_where_little_light_is_left<T: Scalar>() {
     for i in 0..n {
         let light = f64::exp(-depth);
         within(&format!("sample {i}, T = {light:e}"), got[i], expected[i], by_type::<T>(1e-5, 1e-13) * light);
-        worst = worst.max((got[i] - expected[i]).abs() / light);
+        worst = Real::maximum(worst, (got[i] - expected[i]).abs() / light);
         depth += x[i];
     }
     println!("gradient of densities down to T = 1e-6, {}: {worst:.1e} T", T::NAME);

@@ -369,4 +369,22 @@ mod tests {
         assert_eq!(zero.index_add(1, &[1, 1, 1].into(), &source).value().as_slice(), [0.0, 1.0]);
         assert_eq!(zero.scatter_add(1, &Indices::new(&[1, 3], [1, 0, 1]), &source).value().as_slice(), [1.0, 0.0]);
     }
+    /// An axis with entries before and behind it, and fewer or more indices than entries.
+    #[test]
+    fn gathering_along_an_axis_in_the_middle_is_what_its_definition_says() {
+        let tape = Tape::<f64>::new();
+        let x = tape.constant(Tensor::from_fn(&[3, 4, 2], |i| i as f64));
+        for count in [1, 2, 4, 7] {
+            let index = |i: usize| (i * 7 % 4) as u32;
+            let indices = Indices::new(&[3, count, 2], (0..6 * count).map(index).collect::<Vec<_>>());
+            let place = |i: usize| (i / (2 * count) * 4 + index(i) as usize) * 2 + i % 2;
+            let y = x.gather(1, &indices);
+            let expected: Vec<f64> = (0..6 * count).map(|i| place(i) as f64).collect();
+            assert_eq!(y.value().as_slice(), expected);
+            let mut sums = vec![0.0; 24];
+            (0..6 * count).for_each(|i| sums[place(i)] += expected[i]);
+            let zero = tape.constant(Tensor::zeros(&[3, 4, 2]));
+            assert_eq!(zero.scatter_add(1, &indices, &y).value().as_slice(), sums);
+        }
+    }
 }

@@ -54,7 +54,8 @@ impl<T: Scalar> Op<T> for LayerNorm {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let centred = &x[0] - x[0].mean_over(Axes::from(-1).keepdims());
+        let kept = Axes::from(-1).resolve(x[0].shape()).kept();
+        let centred = x[0].centred(&kept);
         let variance = centred.square().mean_over(Axes::from(-1).keepdims());
         Some(centred / (variance + self.eps).sqrt() * &x[1] + &x[2])
     }

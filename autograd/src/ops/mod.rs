@@ -19,6 +19,7 @@ pub(crate) mod moments;
 pub(crate) mod piecewise;
 pub(crate) mod pooling;
 pub(crate) mod power;
+pub(crate) mod product;
 pub(crate) mod reduce;
 pub(crate) mod scan;
 pub(crate) mod segment;

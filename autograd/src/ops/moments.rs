@@ -26,24 +26,33 @@ fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &P
     if let Some(n) = trailing(x.shape(), shape) {
         variance_rows(x.as_slice(), n, out.as_mut_slice());
     } else {
+        // As `variance_rows`: measured from the rounded mean, less what its rounding adds.
         let scale = T::from_f64(1.0 / count);
-        let mean = map(
-            [&sum_to(x, shape, pool)],
+        let mean_of = |x: &Tensor<T>| {
+            map(
+                [&sum_to(x, shape, pool)],
+                pool,
+                #[inline(always)]
+                |[sum]| sum * scale,
+            )
+        };
+        let deviation = map(
+            [x, &mean_of(x)],
             pool,
             #[inline(always)]
-            |[sum]| sum * scale,
+            |[x, mean]| x - mean,
         );
         let square = map(
-            [x, &mean],
+            [&deviation],
             pool,
             #[inline(always)]
-            |[x, mean]| (x - mean) * (x - mean),
+            |[x]| x * x,
         );
         out = map(
-            [&sum_to(&square, shape, pool)],
+            [&mean_of(&square), &mean_of(&deviation)],
             pool,
             #[inline(always)]
-            |[sum]| sum * scale,
+            |[square, rest]| square - rest * rest,
         );
     }
     if correction == 0.0 {
@@ -78,8 +87,7 @@ impl Variance {
     /// `share (x - mean) / (n - correction)`.
     fn centred<'t, T: Scalar>(&self, x: &Var<'t, T>, share: &Var<'t, T>) -> Var<'t, T> {
         let count = x.value().len() as f64 / self.shape.iter().product::<usize>() as f64;
-        let mean = x.sum_to(&self.shape) * (1.0 / count);
-        (x - mean) * (share * (1.0 / (count - self.correction).max(0.0)))
+        x.centred(&self.shape) * (share * (1.0 / (count - self.correction).max(0.0)))
     }
 }
 
@@ -222,6 +230,14 @@ impl<T: Scalar> Op<T> for Norm {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
+    /// This tensor less its mean over the axes along which `shape` has extent 1. Twice: the second time takes out what the
+    /// rounding of a large mean has left.
+    pub(crate) fn centred(&self, shape: &[usize]) -> Self {
+        let share = shape.iter().product::<usize>() as f64 / self.value().len() as f64;
+        let once = self - self.sum_to(shape) * share;
+        &once - once.sum_to(shape) * share
+    }
+
     /// The variance of all elements, as a scalar; see [`var_over`](Self::var_over).
     #[track_caller]
     pub fn var(&self, correction: usize) -> Self {

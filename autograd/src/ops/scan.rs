@@ -1,8 +1,7 @@
-//! Cumulative sums and products, the recurrence that their derivatives lead to, and the product.
+//! Cumulative sums and products, and the recurrence that their derivatives lead to.
 
-use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::axis_of;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, axis_of};
 
 /// The order in which a scan walks an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,7 +57,7 @@ impl Walk {
 
     /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the
     /// end.
-    fn neighbour<'t, T: Scalar>(self, x: &Var<'t, T>, next: bool, fill: f64) -> Var<'t, T> {
+    pub(super) fn neighbour<'t, T: Scalar>(self, x: &Var<'t, T>, next: bool, fill: f64) -> Var<'t, T> {
         let n = x.shape()[self.axis];
         if n == 0 {
             return x.clone();
@@ -189,65 +188,6 @@ impl<T: Scalar> Op<T> for Recurrence {
     }
 }
 
-/// y = the product of each row (along the last axis); dx = g times the product of all others.
-#[derive(Clone, Copy)]
-pub struct Product;
-
-impl<T: Scalar> Op<T> for Product {
-    fn name(&self) -> &'static str {
-        "prod"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        let Some((_, rest)) = x[0].split_last() else { return Err("a scalar has no rows".into()) };
-        Ok(Shape::from_slice(rest))
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let axes = x[0].ndim() - 1;
-        let mut out = pool.full(&x[0].shape()[..axes], T::ONE);
-        let n = x[0].shape()[axes];
-        for (x, out) in x[0].as_slice().chunks_exact(n.max(1)).zip(out.as_mut_slice()) {
-            *out = T::from_f64(x.iter().map(|x| x.to_f64()).product());
-        }
-        out
-    }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let (x, g) = (cx.x(0), cx.g());
-        let axis = x.shape().len() - 1;
-        if cx.recording() {
-            // The products before and behind each entry.
-            let (forth, back) = (Walk { axis, reverse: false }, Walk { axis, reverse: true });
-            let around = |walk: Walk| walk.neighbour(&cx.tape().apply(Cumprod(walk), &[&x]), false, 1.0);
-            let mut column = Shape::from_slice(g.shape());
-            column.push(1);
-            return Grads::one(around(forth) * around(back) * g.reshape(&column));
-        }
-        let mut out = cx.pool().tensor(x.shape());
-        let n = x.shape()[axis].max(1);
-        let rows = x.value().as_slice().chunks_exact(n).zip(out.as_mut_slice().chunks_exact_mut(n));
-        for ((x, out), g) in rows.zip(g.value().as_slice()) {
-            product_of_others(x, g.to_f64(), out);
-        }
-        Grads::one(cx.constant(out))
-    }
-}
-
-/// `g` times the product of all other elements of the row, in f64. A quotient where there is no zero, so that partial
-/// products that overflow do no harm; only where there is one is the rest multiplied up.
-fn product_of_others<T: Scalar>(x: &[T], g: f64, out: &mut [T]) {
-    let others: f64 = x.iter().filter(|x| **x != T::ZERO).map(|x| x.to_f64()).product();
-    let zeros = x.iter().filter(|x| **x == T::ZERO).count();
-    for (out, x) in out.iter_mut().zip(x) {
-        *out = T::from_f64(match (zeros, *x == T::ZERO) {
-            (0, _) => g * (others / x.to_f64()),
-            (1, true) => g * others,
-            _ => 0.0,
-        });
-    }
-}
-
 impl<'t, T: Scalar> Var<'t, T> {
     /// A scan along an axis that may be counted from the last one; a scalar counts as one entry.
     #[track_caller]
@@ -295,30 +235,5 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn recurrence(&self, summand: &Self, axis: isize) -> Self {
         let walk = Walk { axis: axis_of(axis, self.shape()), reverse: false };
         self.tape().apply(Recurrence(walk), &[self, summand])
-    }
-
-    /// The product of all elements, as a scalar; see [`prod_over`](Self::prod_over).
-    #[track_caller]
-    pub fn prod(&self) -> Self {
-        self.prod_over(..)
-    }
-
-    /// The product over any axes; 1 over none of the elements. The gradient is right whatever elements are 0.
-    ///
-    /// ```
-    /// use raygrad_autograd::{Tape, Tensor};
-    /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[3, 3], vec![2.0, 3.0, 4.0, 2.0, 0.0, 4.0, 0.0, 3.0, 0.0]));
-    /// let y = x.prod_over(-1);
-    /// assert_eq!(y.value().as_slice(), [24.0, 0.0, 0.0]);
-    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [12.0, 8.0, 6.0, 0.0, 8.0, 0.0, 0.0, 0.0, 0.0]);
-    /// ```
-    ///
-    /// # Panics
-    /// If an axis does not exist or is named twice.
-    #[track_caller]
-    pub fn prod_over(&self, axes: impl Into<Axes>) -> Self {
-        let axes = axes.into().resolve(self.shape());
-        self.tape().apply(Product, &[&self.rows_over(&axes)]).reshape(&axes.result())
     }
 }

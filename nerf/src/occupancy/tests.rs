@@ -370,7 +370,8 @@ fn skipping_costs_no_more_than_its_bound() {
             assert_eq!(left.occupied_share() < 0.5, is_skipped);
             let ((reference, many), (skipped, few)) = (render(&all, &density), render(&left, &density));
             assert_eq!(few < many / 2, is_skipped, "{few} of {many}");
-            let error = reference.iter().zip(&skipped).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let error =
+                reference.iter().zip(&skipped).map(|(a, b)| (a - b).abs()).fold(0.0, raygrad_tensor::Real::maximum);
             assert!(f64::from(error) <= skip.error_bound(), "{skip}: {error}");
             assert_eq!(error > 0.0, is_skipped, "{skip}, fog {fog}: {error}");
         }

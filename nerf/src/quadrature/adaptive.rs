@@ -3,7 +3,7 @@
 use super::{Intervals, Plan, Quadrature, Share};
 use crate::field::Field;
 use crate::rays::Samples;
-use raygrad_autograd::{Bound, Scalar, Segments, Tape, Tensor};
+use raygrad_autograd::{Bound, Real, Scalar, Segments, Tape, Tensor};
 
 /// No interval is halved more often.
 const MOST_HALVINGS: usize = 24;
@@ -106,7 +106,8 @@ fn halved(links: &[Link], middles: &[f64], found: &mut impl Iterator<Item = Node
     out
 }
 
-/// The most that a pixel can change when the interval from a to b of this length is halved, if all light reaches it.
+/// The most that a pixel can change when the interval from a to b of this length is halved, if all light reaches it; NaN if
+/// a number is.
 fn change(a: Node, middle: Node, b: Node, length: f64) -> f64 {
     let passed = |a: Node, b: Node, length: f64| (-0.5 * length * (a.sigma + b.sigma)).exp();
     let [whole, near, far] = [passed(a, b, length), passed(a, middle, 0.5 * length), passed(middle, b, 0.5 * length)];
@@ -116,9 +117,9 @@ fn change(a: Node, middle: Node, b: Node, length: f64) -> f64 {
         let halves = (1.0 - near) * mean(a, middle) + near * (1.0 - far) * mean(middle, b);
         let emitted = halves - (1.0 - whole) * mean(a, b);
         // With black and with white behind.
-        emitted.abs().max((emitted + difference).abs())
+        Real::maximum(emitted.abs(), (emitted + difference).abs())
     };
-    (0..3).map(channel).fold(0.0, f64::max)
+    (0..3).map(channel).fold(0.0, Real::maximum)
 }
 
 /// Asks a field, unrecorded.

@@ -259,7 +259,7 @@ mod tests {
                 hits.set(hits.get() + 1);
             }
             for limit in [0.1, f64::INFINITY] {
-                let distance = shapes.iter().map(|shape| shape.distance(ray.origin)).fold(limit, f64::min);
+                let distance = shapes.iter().map(|shape| shape.distance(ray.origin)).fold(limit, raygrad_tensor::Real::minimum);
                 prop_assert_eq!(bvh.distance(ray.origin, limit), distance);
             }
         });

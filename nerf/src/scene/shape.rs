@@ -299,7 +299,7 @@ pub(crate) mod tests {
                 for side in [-1.0, 1.0] {
                     let face = middle + side * half * axis;
                     let points = (0..101 * 101).map(|i| face + (i % 101 - 50) as f64 * u + (i / 101 - 50) as f64 * v);
-                    let nearest = points.map(|point| shape.distance(point)).fold(f64::INFINITY, f64::min);
+                    let nearest = points.map(|point| shape.distance(point)).fold(f64::INFINITY, raygrad_tensor::Real::minimum);
                     prop_assert!((-1e-9..0.03).contains(&nearest), "{nearest}");
                 }
             }

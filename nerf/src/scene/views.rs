@@ -65,7 +65,7 @@ mod tests {
             let cameras = [train_cameras(train, 8), val_cameras(val, 8), test_cameras(test, 8)].concat();
             for (i, a) in cameras.iter().enumerate() {
                 let distances = cameras[..i].iter().map(|b| a.pose.translation.distance(b.pose.translation));
-                let nearest = distances.fold(f64::INFINITY, f64::min);
+                let nearest = distances.fold(f64::INFINITY, raygrad_tensor::Real::minimum);
                 assert!(nearest > 0.005, "{nearest} from view {i} of {train} + {val} + {test}");
             }
         }
@@ -76,7 +76,7 @@ mod tests {
         let cameras = train_cameras(60, 8);
         for direction in train_cameras(2000, 8).iter().map(|camera| camera.pose.translation) {
             let angles = cameras.iter().map(|camera| camera.pose.translation.angle_between(direction));
-            assert!(angles.fold(f64::INFINITY, f64::min) < 0.35);
+            assert!(angles.fold(f64::INFINITY, raygrad_tensor::Real::minimum) < 0.35);
         }
     }
 }

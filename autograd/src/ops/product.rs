@@ -1,0 +1,193 @@
+//! The product of the elements of each row, without overflow or underflow on the way.
+
+use super::scan::{Cumprod, Walk};
+use crate::{Axes, Grads, Op, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+
+/// y = the product of each row (along the last axis); dx = g times the product of all others.
+///
+/// Products are formed of [`balanced`] factors, so a value or a gradient that the type can hold comes out whatever the
+/// products of some of the elements are.
+#[derive(Clone, Copy)]
+pub struct Product;
+
+impl<T: Scalar> Op<T> for Product {
+    fn name(&self) -> &'static str {
+        "prod"
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let Some((_, rest)) = x[0].split_last() else { return Err("a scalar has no rows".into()) };
+        Ok(Shape::from_slice(rest))
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let axes = x[0].ndim() - 1;
+        let mut out = pool.full(&x[0].shape()[..axes], T::ONE);
+        let n = x[0].shape()[axes];
+        for (x, out) in x[0].as_slice().chunks_exact(n.max(1)).zip(out.as_mut_slice()) {
+            let (mut product, mut total) = (1.0, 0);
+            balanced(x, |_, factor, exponent| (product, total) = (product * factor, total + exponent));
+            *out = T::from_f64(scaled(product, 1.0, total));
+        }
+        out
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let (x, g) = (cx.x(0), cx.g());
+        if cx.recording() {
+            return Grads::one(recorded(&x, g));
+        }
+        let mut out = cx.pool().tensor(x.shape());
+        let n = x.shape()[x.shape().len() - 1].max(1);
+        let mut others = Others::default();
+        let rows = x.value().as_slice().chunks_exact(n).zip(out.as_mut_slice().chunks_exact_mut(n));
+        for ((x, out), &g) in rows.zip(g.value().as_slice()) {
+            others.of(x);
+            for (i, out) in out.iter_mut().enumerate() {
+                *out = T::from_f64(scaled(others.products[i], g.to_f64(), others.total - others.exponents[i]));
+            }
+        }
+        Grads::one(cx.constant(out))
+    }
+}
+
+/// The gradient as a formula of `x` and `g`: the products before and behind each entry. The powers of two that balance
+/// them are constants.
+fn recorded<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
+    let (axis, shape) = (x.shape().len() - 1, x.shape());
+    let mut others = Others::default();
+    let mut powers: [Vec<T>; 4] = Default::default();
+    for row in x.value().as_slice().chunks_exact(shape[axis].max(1)) {
+        others.of(row);
+        for (&product, &exponent) in others.products.iter().zip(&others.exponents) {
+            let is_ordinary = product != 0.0 && product.is_finite();
+            let [to_balanced, back] = [halves(-exponent), halves(others.total - exponent)];
+            // A limit where 0 times infinity, or infinity times 0, would come of it.
+            let most = if size_of::<T>() == 4 { 126 } else { 1022 };
+            let back = if is_ordinary { back } else { back.map(|half| half.clamp(-most, most)) };
+            for (powers, exponent) in powers.iter_mut().zip([to_balanced, back].into_iter().flatten()) {
+                powers.push(T::from_f64(power_of_two(exponent)));
+            }
+        }
+    }
+    let [down, down_too, up, up_too] = powers.map(|powers| x.tape().constant(Tensor::from_vec(shape, powers)));
+    let x = x * down * down_too;
+    let around = |reverse: bool| {
+        let walk = Walk { axis, reverse };
+        walk.neighbour(&x.tape().apply(Cumprod(walk), &[&x]), false, 1.0)
+    };
+    let mut column = Shape::from_slice(g.shape());
+    column.push(1);
+    around(false) * around(true) * up * g.reshape(&column) * up_too
+}
+
+/// Of each element of a row the product of all others: `products[i] * 2^(total - exponents[i])`.
+#[derive(Default)]
+struct Others {
+    factors: Vec<f64>,
+    products: Vec<f64>,
+    exponents: Vec<i64>,
+    total: i64,
+}
+
+impl Others {
+    fn of<T: Scalar>(&mut self, row: &[T]) {
+        for list in [&mut self.factors, &mut self.products] {
+            list.resize(row.len(), 0.0);
+        }
+        self.exponents.resize(row.len(), 0);
+        balanced(row, |i, factor, exponent| (self.factors[i], self.exponents[i]) = (factor, exponent));
+        self.total = self.exponents.iter().sum();
+        let mut behind = 1.0;
+        for (product, factor) in self.products.iter_mut().zip(&self.factors).rev() {
+            *product = behind;
+            behind *= factor;
+        }
+        let mut before = 1.0;
+        for (product, factor) in self.products.iter_mut().zip(&self.factors) {
+            *product *= before;
+            before *= factor;
+        }
+    }
+}
+
+/// Calls `f(i, factor, exponent)` with each element as `factor * 2^exponent`, such that the product of any run of
+/// neighbouring factors lies between 1/2 and 2. Zeros, infinities and NaN stay as they are and do not count.
+fn balanced<T: Scalar>(row: &[T], mut f: impl FnMut(usize, f64, i64)) {
+    // The product of all factors so far, in 1..2.
+    let mut product = 1.0;
+    for (i, x) in row.iter().enumerate() {
+        let x = x.to_f64();
+        if x == 0.0 || !x.is_finite() {
+            f(i, x, 0);
+            continue;
+        }
+        let (mut factor, mut exponent) = split(x);
+        product *= factor.abs();
+        if product >= 2.0 {
+            (product, factor, exponent) = (0.5 * product, 0.5 * factor, exponent + 1);
+        }
+        f(i, factor, exponent);
+    }
+}
+
+/// A finite number other than 0 as a factor in 1..2, with its sign, and an exponent of two.
+fn split(x: f64) -> (f64, i64) {
+    const MASK: u64 = 0x7ff << 52;
+    let lift = if x.is_normal() { 0 } else { 54 };
+    let bits = (x * power_of_two(lift)).to_bits();
+    (f64::from_bits(bits & !MASK | 1023 << 52), (bits >> 52 & 0x7ff) as i64 - 1023 - lift)
+}
+
+/// Two numbers that differ by 1 at most and add up to `exponent`.
+fn halves(exponent: i64) -> [i64; 2] {
+    [exponent / 2, exponent - exponent / 2]
+}
+
+/// `2^exponent`; 0 or infinity beyond the range of f64.
+fn power_of_two(exponent: i64) -> f64 {
+    match exponent {
+        ..-1074 => 0.0,
+        -1074..-1022 => f64::from_bits(1 << (exponent + 1074)),
+        -1022..1024 => f64::from_bits(((exponent + 1023) as u64) << 52),
+        _ => f64::INFINITY,
+    }
+}
+
+/// `product * g * 2^exponent`, for a product that is near 1, 0 or not finite.
+fn scaled(product: f64, g: f64, exponent: i64) -> f64 {
+    if product == 0.0 || !product.is_finite() {
+        return product * g;
+    }
+    let [up, up_too] = halves(exponent).map(power_of_two);
+    product * up * g * up_too
+}
+
+impl<'t, T: Scalar> Var<'t, T> {
+    /// The product of all elements, as a scalar; see [`prod_over`](Self::prod_over).
+    #[track_caller]
+    pub fn prod(&self) -> Self {
+        self.prod_over(..)
+    }
+
+    /// The product over any axes; 1 over none of the elements. The gradient is right whatever elements are 0, and
+    /// neither product nor gradient depends on whether the product of some of the elements is in the range of the type.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let x = tape.leaf(Tensor::from_vec(&[3, 3], vec![2.0, 3.0, 4.0, 2.0, 0.0, 4.0, 0.0, 3.0, 0.0]));
+    /// let y = x.prod_over(-1);
+    /// assert_eq!(y.value().as_slice(), [24.0, 0.0, 0.0]);
+    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [12.0, 8.0, 6.0, 0.0, 8.0, 0.0, 0.0, 0.0, 0.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If an axis does not exist or is named twice.
+    #[track_caller]
+    pub fn prod_over(&self, axes: impl Into<Axes>) -> Self {
+        let axes = axes.into().resolve(self.shape());
+        self.tape().apply(Product, &[&self.rows_over(&axes)]).reshape(&axes.result())
+    }
+}
