@@ -45,17 +45,9 @@ fn map_same<T: Scalar, const M: usize>(
     block: &Block<'_, T>,
 ) -> [Option<Tensor<T>>; M] {
     let x: SmallVec<[&[T]; 6]> = x.iter().map(|x| x.as_slice()).collect();
-    let mut results = [const { None }; M];
-    if let ([true], [result]) = (&wanted[..], &mut results[..]) {
-        *result = Some(pool.filled(shape, |out| run(&x, &mut [Some(out)], block)));
-        return results;
-    }
-    for (result, wanted) in results.iter_mut().zip(wanted) {
-        *result = wanted.then(|| pool.tensor(shape));
-    }
-    let mut out = results.each_mut().map(|result| result.as_mut().map(Tensor::as_mut_slice));
-    run(&x, &mut out, block);
-    results
+    let mut results = wanted.map(|wanted| wanted.then(|| pool.buffer(shape.iter().product())));
+    run(&x, &mut results.each_mut().map(|result| result.as_deref_mut()), block);
+    results.map(|result| result.map(|values| pool.wrap(shape, values)))
 }
 
 /// The results' slices; `None` for those that are not wanted.

@@ -129,10 +129,19 @@ impl<T: Scalar> Pool<T> {
     ///
     /// It costs less than [`tensor`](Self::tensor) and writing to that.
     pub fn filled(&self, shape: &[usize], fill: impl FnOnce(&mut [T])) -> Tensor<T> {
-        let len = shape.iter().product();
-        let small = len <= SMALL;
-        let mut values = if small { unspecified(len, len) } else { self.take(len) };
+        let mut values = self.buffer(shape.iter().product());
         fill(&mut values);
+        self.wrap(shape, values)
+    }
+
+    /// A vector for [`wrap`](Self::wrap) to make a tensor of, with unspecified (old) values.
+    pub(crate) fn buffer(&self, len: usize) -> Vec<T> {
+        if len <= SMALL { unspecified(len, len) } else { self.take(len) }
+    }
+
+    /// The tensor of this shape whose elements are those of a [`buffer`](Self::buffer).
+    pub(crate) fn wrap(&self, shape: &[usize], values: Vec<T>) -> Tensor<T> {
+        let small = values.len() <= SMALL;
         Tensor::pooled(Shape::from_slice(shape), values, if small { Pool::none() } else { self.clone() })
     }
 
