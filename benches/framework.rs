@@ -9,7 +9,7 @@ use rand::rngs::StdRng;
 use rand::{Rng, RngExt, SeedableRng};
 use raygrad::autograd::{
     Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Init, Linear, Mlp, Params, Pool, Pool2dConfig, Tape,
-    Tensor, Var,
+    Tensor, Var, formula,
 };
 use raygrad::tensor::{add_assign, parallel};
 use rayon::prelude::*;
@@ -206,6 +206,9 @@ fn operations() {
     operation("elementwise chain, 1M", &[1_000_000], |x| {
         let bump = (x * x * -0.5).exp();
         (x * 1.5 + 0.5).tanh() * x + bump - x
+    });
+    operation("elementwise chain, 1M, fused", &[1_000_000], |x| {
+        formula!(|x| (x * 1.5 + 0.5).tanh() * x + (x * x * -0.5).exp() - x).on([x])
     });
     operation("sum over axis 0, 4096x1024", &[4096, 1024], |x| x.sum_axes(&[0]));
     operation("sum over axis 1, 4096x1024", &[4096, 1024], |x| x.sum_axes(&[1]));

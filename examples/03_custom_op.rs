@@ -4,9 +4,11 @@
 //! cargo run --release --example 03_custom_op
 //! ```
 
-use raygrad::autograd::{Cases, Check, Entry, Map, Reads, Real, Tape, Tensor, Unary, check_op};
+use raygrad::autograd::{Cases, Check, Entry, Formula, Real, Tape, Tensor, check_op, formula};
 
-/// The soft sign, y = x / (1 + |x|), with a gradient that may have a mistake in it; dx = g / (1 + |x|)^2.
+/// The soft sign, y = x / (1 + |x|), with a gradient by hand that may have a mistake in it; dx = g / (1 + |x|)^2.
+///
+/// A formula needs none: left out, it follows from the formula. By hand it may be faster or keep more digits.
 #[derive(Clone, Copy)]
 struct SoftSign {
     mistake: Mistake,
@@ -20,48 +22,48 @@ enum Mistake {
     Naive,
 }
 
-impl Unary for SoftSign {
+impl Formula<1> for SoftSign {
     const NAME: &'static str = "softsign";
-    /// The gradient reads the input, so the tape keeps it.
-    const READS: Reads = Reads::INPUTS;
 
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let one = x.like(1.0);
-        x.clone() / (one + x.abs())
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        x / (x.like(1.0) + x.abs())
     }
 
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         let width = x.like(1.0) + x.abs();
-        match self.mistake {
-            Mistake::None => g / width.clone() / width,
-            Mistake::Sign => -(g / width.clone() / width),
+        [match self.mistake {
+            Mistake::None => g / width / width,
+            Mistake::Sign => -(g / width / width),
             Mistake::Square => g / width,
-            // The same in theory, but the square overflows.
-            Mistake::Naive => g * width.clone() / (width.clone() * width.clone() * width),
-        }
-    }
-
-    fn cases(&self, cases: &mut Cases) {
-        // Sampled on both sides of its kink, and at extremes: there is no tolerance for a NaN.
-        cases.domain(-3.0..-0.1).domain_also(0.1..3.0);
-        cases.at([0.0], 0.0, [1.0]).at([1e15], 1.0, [1e-30]).at([-f64::INFINITY], f64::NAN, [0.0]);
+            // The same in theory, but the cube overflows.
+            Mistake::Naive => g * width / (width * width * width),
+        }]
     }
 }
 
 fn main() {
-    // It runs as any other operation does, and has derivatives of every order, since its formulas record themselves.
+    // It runs as any other operation does, and has derivatives of every order.
     let tape = Tape::<f32>::new();
     let x = tape.leaf(Tensor::from_vec(&[3], vec![-1.0, 0.5, 3.0]));
-    let y = tape.apply(Map(SoftSign { mistake: Mistake::None }), &[&x]);
+    let y = SoftSign { mistake: Mistake::None }.on([&x]);
     let slope = y.sum().grad_graph(&[&x]).remove(0);
     println!("y      {:?}", y.value().as_slice());
     println!("slope  {:?}", slope.value().as_slice());
-    println!("bend   {:?}\n", slope.sum().grad(&[&x])[0].as_slice());
+    println!("bend   {:?}", slope.sum().grad(&[&x])[0].as_slice());
 
+    // In a line, of several operands that broadcast: one pass forward, and one that gives both gradients.
+    let width = tape.leaf(Tensor::scalar(2.0));
+    let grads = formula!(|x, w| x / (w + x.abs())).on([&x, &width]).sum().grad(&[&x, &width]);
+    println!("by x   {:?}\nby w   {:?}\n", grads[0].as_slice(), grads[1].as_slice());
+
+    // Sampled on both sides of its kink, and at extremes: there is no tolerance for a NaN.
+    let mut cases = Cases::default();
+    cases.domain(-3.0..-0.1).domain_also(0.1..3.0);
+    cases.at([0.0], 0.0, [1.0]).at([1e15], 1.0, [1e-30]).at([-f64::INFINITY], f64::NAN, [0.0]);
     for mistake in [Mistake::None, Mistake::Sign, Mistake::Square, Mistake::Naive] {
-        match check_op(&Check::default(), &Entry::unary(SoftSign { mistake })) {
+        match check_op(&Check::default(), &Entry::formula(SoftSign { mistake }, &cases)) {
             Ok(report) => println!(
                 "{mistake:?}: {} checks passed; worst errors {:.0e} (first order), {:.0e} (second), {:.1} ULP in f32",
                 report.comparisons, report.first_order, report.second_order, report.ulps

@@ -1,12 +1,12 @@
 //! The catalogue: every operation with the inputs it is checked on and its values at extremes.
 
-use crate::elementwise::{Binary, Map, Unary, Zip};
+use crate::formula::derived;
 use crate::ops::trigonometric;
 use crate::ops::{
     Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
 };
 use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
-use crate::{Dual, Op};
+use crate::{Elementwise, Formula, Op};
 use raygrad_tensor::{Layout, Shape, Tensor};
 use std::ops::Range;
 use std::sync::Arc;
@@ -52,6 +52,20 @@ impl Cases {
         self
     }
 
+    /// Sets of operands.
+    fn samples(&self) -> Vec<Vec<Tensor<f64>>> {
+        // The shapes of one operand, and of several: taken over and over where there are more.
+        let shapes: &[&[&[usize]]] = match self.domains.len() {
+            1 => &[&[&[2, 3]], &[&[]], &[&[0, 3]], &[&[37]]],
+            _ => &[&[&[2, 3]], &[&[4, 1], &[3]], &[&[], &[2]], &[&[0, 1], &[3]], &[&[2, 1, 2], &[1]], &[&[]]],
+        };
+        let set = |(k, shapes): (usize, &&[&[usize]])| {
+            let operands = self.domains.iter().zip(shapes.iter().cycle()).enumerate();
+            operands.map(|(i, (domain, shape))| spread(shape, domain, i + 7 * k)).collect()
+        };
+        shapes.iter().enumerate().map(set).collect()
+    }
+
     /// The value `y` and the gradients at `x`.
     pub fn at<const N: usize>(&mut self, x: [f64; N], y: f64, grads: [f64; N]) -> &mut Self {
         self.extremes.push(Extreme { x: x.into(), y, grads: grads.into() });
@@ -59,8 +73,14 @@ impl Cases {
     }
 }
 
-/// An elementwise formula on dual numbers.
-type DualFormula = Box<dyn Fn(&[Dual]) -> Dual>;
+/// A formula that has its cases with it, as all of the catalogue's have.
+pub trait Examined<const N: usize>: Formula<N> {
+    /// Where it is sampled in checks, and exact values at extremes.
+    fn cases(&self, cases: &mut Cases);
+}
+
+/// An elementwise formula and its derivatives by dual numbers, of the operands and the gradient of the result.
+pub(crate) type DualFormula = dyn Fn(&[f64], f64) -> (f64, Vec<f64>);
 
 /// One operation as the checks see it: for f64, for f32, and what to feed it.
 pub struct Entry {
@@ -74,7 +94,7 @@ pub struct Entry {
     pub extremes: Vec<Extreme>,
     pub(crate) f64: Arc<dyn Op<f64>>,
     pub(crate) f32: Arc<dyn Op<f32>>,
-    pub(crate) dual: Option<DualFormula>,
+    pub(crate) dual: Option<Box<DualFormula>>,
 }
 
 impl Entry {
@@ -110,32 +130,38 @@ impl Entry {
         Entry { linear: true, ..self }
     }
 
-    /// A function of one number.
-    pub fn unary<U: Unary>(op: U) -> Self {
+    /// A formula, with its cases.
+    pub fn examined<const N: usize>(formula: impl Examined<N>) -> Self {
         let mut cases = Cases::default();
-        op.cases(&mut cases);
-        let entry = Entry { dual: Some(Box::new(move |x| op.f(x[0]))), ..Entry::new(Map(op)) };
-        entry.elementwise(cases, &[&[&[2, 3]], &[&[]], &[&[0, 3]], &[&[37]]])
+        formula.cases(&mut cases);
+        Entry::formula(formula, &cases)
     }
 
-    /// A function of two numbers.
-    pub fn binary<B: Binary>(op: B) -> Self {
-        let mut cases = Cases::default();
-        op.cases(&mut cases);
-        let entry = Entry { dual: Some(Box::new(move |x| op.f(x[0], x[1]))), ..Entry::new(Zip(op)) };
-        let same: &[&[usize]] = &[&[2, 3], &[2, 3]];
-        entry.elementwise(
-            cases,
-            &[same, &[&[4, 1], &[3]], &[&[], &[2]], &[&[0, 1], &[3]], &[&[2, 1, 2], &[1]], &[&[], &[]]],
-        )
-    }
-
-    fn elementwise(self, cases: Cases, shapes: &[&[&[usize]]]) -> Self {
-        let set = |(k, shapes): (usize, &&[&[usize]])| {
-            shapes.iter().zip(&cases.domains).enumerate().map(|(i, (s, d))| spread(s, d, i + 7 * k)).collect()
+    /// A formula, sampled in as many domains as it has operands.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Cases, Check, Entry, check_op, formula};
+    /// let swish = formula!(|x, beta| x * (beta * x).sigmoid());
+    /// let mut cases = Cases::default();
+    /// cases.domain(-3.0..3.0).domain(0.5..2.0).at([0.0, 1.0], 0.0, [0.5, 0.0]);
+    /// check_op(&Check::default(), &Entry::formula(swish, &cases)).unwrap();
+    /// ```
+    ///
+    /// # Panics
+    /// If there is not one domain for each operand.
+    pub fn formula<F: Formula<N>, const N: usize>(formula: F, cases: &Cases) -> Self {
+        assert_eq!(cases.domains.len(), N, "{}: one domain for each operand", F::NAME);
+        let dual = move |x: &[f64], g: f64| {
+            let x = std::array::from_fn(|i| x[i]);
+            (formula.f(x), derived(&formula, g, x).to_vec())
         };
-        let samples = shapes.iter().enumerate().map(set).collect();
-        Entry { samples, linear: cases.linear, extremes: cases.extremes, ..self }
+        Entry {
+            samples: cases.samples(),
+            linear: cases.linear,
+            extremes: cases.extremes.clone(),
+            dual: Some(Box::new(dual)),
+            ..Entry::new(Elementwise(formula))
+        }
     }
 }
 
@@ -158,10 +184,13 @@ pub fn catalogue() -> Vec<Entry> {
 fn elementwise() -> Vec<Entry> {
     use select::Compare::{Equal, Greater, GreaterEqual, Less, LessEqual, NotEqual};
     // Powers of both signs, of 0 and of 1 have conventions of their own.
-    let powi = [0, 1, 5, -4].map(|exponent| Entry::unary(power::Powi { exponent }));
-    let powers =
-        [Entry::unary(power::ConstPowi::<2>), Entry::unary(power::ConstPowi::<3>), Entry::unary(power::ConstPowi::<4>)];
-    let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::unary(power::Powf { exponent }));
+    let powi = [0, 1, 5, -4].map(|exponent| Entry::examined(power::Powi { exponent }));
+    let powers = [
+        Entry::examined(power::ConstPowi::<2>),
+        Entry::examined(power::ConstPowi::<3>),
+        Entry::examined(power::ConstPowi::<4>),
+    ];
+    let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::examined(power::Powf { exponent }));
     // Values that are equal in places, and that no step of a difference takes past each other.
     let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
     let compare = [Greater, GreaterEqual, Less, LessEqual].map(|comparison| {
@@ -178,34 +207,34 @@ fn elementwise() -> Vec<Entry> {
         std::iter::once(mask(shape)).chain(others).collect::<Vec<_>>()
     };
     let rest = vec![
-        Entry::unary(exponential::Exp2),
-        Entry::unary(exponential::Log2),
-        Entry::unary(exponential::Rsqrt),
-        Entry::unary(exponential::Erf),
-        Entry::unary(trigonometric::Tan),
-        Entry::unary(trigonometric::Asin),
-        Entry::unary(trigonometric::Acos),
-        Entry::unary(trigonometric::Atan),
-        Entry::binary(trigonometric::Atan2),
-        Entry::unary(trigonometric::Sinh),
-        Entry::unary(trigonometric::Cosh),
-        Entry::unary(activation::LogSigmoid),
-        Entry::unary(activation::LeakyRelu { slope: 0.125 }),
-        Entry::unary(activation::Elu { alpha: 1.5 }),
-        Entry::unary(activation::Gelu),
-        Entry::unary(activation::GeluTanh),
-        Entry::unary(activation::Silu),
-        Entry::unary(piecewise::Abs),
-        Entry::unary(piecewise::Sign),
-        Entry::binary(piecewise::Maximum),
-        Entry::binary(piecewise::Minimum),
-        Entry::unary(piecewise::Clamp { low: -1.0, high: 2.0 }),
-        Entry::unary(piecewise::Floor),
-        Entry::unary(piecewise::Ceil),
-        Entry::unary(piecewise::Round),
-        Entry::unary(power::Reciprocal),
-        Entry::binary(power::Pow),
-        Entry::binary(power::Xlogy),
+        Entry::examined(exponential::Exp2),
+        Entry::examined(exponential::Log2),
+        Entry::examined(exponential::Rsqrt),
+        Entry::examined(exponential::Erf),
+        Entry::examined(trigonometric::Tan),
+        Entry::examined(trigonometric::Asin),
+        Entry::examined(trigonometric::Acos),
+        Entry::examined(trigonometric::Atan),
+        Entry::examined(trigonometric::Atan2),
+        Entry::examined(trigonometric::Sinh),
+        Entry::examined(trigonometric::Cosh),
+        Entry::examined(activation::LogSigmoid),
+        Entry::examined(activation::LeakyRelu { slope: 0.125 }),
+        Entry::examined(activation::Elu { alpha: 1.5 }),
+        Entry::examined(activation::Gelu),
+        Entry::examined(activation::GeluTanh),
+        Entry::examined(activation::Silu),
+        Entry::examined(piecewise::Abs),
+        Entry::examined(piecewise::Sign),
+        Entry::examined(piecewise::Maximum),
+        Entry::examined(piecewise::Minimum),
+        Entry::examined(piecewise::Clamp { low: -1.0, high: 2.0 }),
+        Entry::examined(piecewise::Floor),
+        Entry::examined(piecewise::Ceil),
+        Entry::examined(piecewise::Round),
+        Entry::examined(power::Reciprocal),
+        Entry::examined(power::Pow),
+        Entry::examined(power::Xlogy),
         Entry::new(select::Where)
             .sample_of(choice(&[2, 3], [&[2, 3], &[3]]))
             .sample_of(choice(&[3], [&[2, 1], &[]]))
@@ -290,12 +319,12 @@ fn reductions() -> Vec<Entry> {
 fn losses() -> Vec<Entry> {
     let cross_entropy = |classes: &[u32]| Entry::new(loss::CrossEntropy { classes: classes.into() });
     vec![
-        Entry::binary(loss::SquaredError),
-        Entry::binary(loss::AbsoluteError),
-        Entry::binary(loss::Huber { delta: 0.5 }),
-        Entry::binary(loss::SmoothL1 { beta: 0.5 }),
-        Entry::binary(loss::SmoothL1 { beta: 0.0 }),
-        Entry::binary(loss::BinaryCrossEntropy),
+        Entry::examined(loss::SquaredError),
+        Entry::examined(loss::AbsoluteError),
+        Entry::examined(loss::Huber { delta: 0.5 }),
+        Entry::examined(loss::SmoothL1 { beta: 0.5 }),
+        Entry::examined(loss::SmoothL1 { beta: 0.0 }),
+        Entry::examined(loss::BinaryCrossEntropy),
         cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
         cross_entropy(&[1]).sample(&[&[2]]),
         cross_entropy(&[]).sample(&[&[0, 3]]),
@@ -312,26 +341,26 @@ fn core() -> Vec<Entry> {
     };
     let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
     let mut entries = vec![
-        Entry::binary(arithmetic::Add),
-        Entry::binary(arithmetic::Sub),
-        Entry::binary(arithmetic::Mul),
-        Entry::binary(arithmetic::Div),
-        Entry::unary(arithmetic::Affine { scale: -2.5, shift: 0.75 }),
-        Entry::unary(arithmetic::Alias),
+        Entry::examined(arithmetic::Add),
+        Entry::examined(arithmetic::Sub),
+        Entry::examined(arithmetic::Mul),
+        Entry::examined(arithmetic::Div),
+        Entry::examined(arithmetic::Affine { scale: -2.5, shift: 0.75 }),
+        Entry::examined(arithmetic::Alias),
         Entry::new(arithmetic::IfPositive).sample(&[&[2, 3], &[2, 3], &[3]]).sample(&[&[4], &[], &[4]]),
-        Entry::unary(exponential::Exp),
-        Entry::unary(exponential::Expm1),
-        Entry::unary(exponential::Ln),
-        Entry::unary(exponential::Ln1p),
-        Entry::unary(exponential::Sqrt),
-        Entry::unary(trigonometric::Sin),
-        Entry::unary(trigonometric::Cos),
-        Entry::unary(trigonometric::SinPi),
-        Entry::unary(trigonometric::CosPi),
-        Entry::unary(trigonometric::Tanh),
-        Entry::unary(activation::Relu),
-        Entry::unary(activation::Sigmoid),
-        Entry::unary(activation::Softplus),
+        Entry::examined(exponential::Exp),
+        Entry::examined(exponential::Expm1),
+        Entry::examined(exponential::Ln),
+        Entry::examined(exponential::Ln1p),
+        Entry::examined(exponential::Sqrt),
+        Entry::examined(trigonometric::Sin),
+        Entry::examined(trigonometric::Cos),
+        Entry::examined(trigonometric::SinPi),
+        Entry::examined(trigonometric::CosPi),
+        Entry::examined(trigonometric::Tanh),
+        Entry::examined(activation::Relu),
+        Entry::examined(activation::Sigmoid),
+        Entry::examined(activation::Softplus),
         Entry::new(matmul::Matmul).sample(&[&[3, 4], &[4, 2]]).sample(&[&[0, 4], &[4, 2]]).sample(&[&[3, 0], &[0, 2]]),
         Entry::new(linear::LinearOp(Activation::Identity))
             .sample(&[&[5, 3], &[3, 4], &[4]])

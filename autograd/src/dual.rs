@@ -1,182 +1,332 @@
-//! Dual numbers: forward-mode derivatives, the oracle of elementwise formulas.
+//! Dual numbers: forward-mode derivatives, from which a formula's gradients follow.
 
+use crate::ops::piecewise::share;
+use crate::ops::power::{slope_of_base, slope_of_exponent};
+use crate::ops::trigonometric::{complement, turn};
 use raygrad_tensor::Real;
 use std::f64::consts::{FRAC_2_SQRT_PI, LN_2, PI};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// `value + slope * e` with `e^2 = 0`: a number and its derivative.
+/// A number and its derivatives in `N` directions: `value + sum of slopes[i] e_i`, with `e_i e_j = 0`.
+///
+/// A slope of `None` is 0 because the number does not depend on that direction, which costs nothing and meets no
+/// infinity. A formula that is read for dual numbers has the derivatives of its operations, with the conventions of
+/// [`conventions`](crate::conventions) at ties and kinks.
 ///
 /// ```
 /// use raygrad_autograd::{Dual, Real};
-/// let x = Dual { value: 2.0, slope: 1.0 };
+/// let x = Dual { value: 2.0, slopes: [Some(1.0)] };
 /// let y = x * x * x.like(5.0);
-/// assert_eq!((y.value, y.slope), (20.0, 20.0));
+/// assert_eq!((y.value, y.slopes), (20.0, [Some(20.0)]));
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Dual {
+pub struct Dual<E, const N: usize> {
     /// The number.
-    pub value: f64,
-    /// Its derivative.
-    pub slope: f64,
+    pub value: E,
+    /// Its derivatives.
+    pub slopes: [Option<E>; N],
 }
 
-impl Dual {
-    /// `f(x)` for an `f` with value `y` and derivative `dy` there. A slope of 0 stays 0 even where `dy` is infinite.
-    fn chain(self, y: f64, dy: f64) -> Dual {
-        Dual { value: y, slope: if self.slope == 0.0 { 0.0 } else { self.slope * dy } }
+// The loops of this file are written out, since calls of closures by `std::array` end vectorisation.
+impl<E: Real, const N: usize> Dual<E, N> {
+    /// A number that depends on nothing.
+    #[inline(always)]
+    fn constant(value: E) -> Self {
+        Dual { value, slopes: [None; N] }
+    }
+
+    /// The function with value `y`, and with the slope that `slope` makes of a slope of its argument.
+    #[inline(always)]
+    fn map(self, y: E, slope: impl Fn(E) -> E) -> Self {
+        let (mut slopes, mut k) = (self.slopes, 0);
+        while k < N {
+            if let Some(s) = slopes[k] {
+                slopes[k] = Some(slope(s));
+            }
+            k += 1;
+        }
+        Dual { value: y, slopes }
+    }
+
+    /// A function with value `y` and derivative `dy`.
+    #[inline(always)]
+    fn chain(self, y: E, dy: E) -> Self {
+        self.map(
+            y,
+            #[inline(always)]
+            |s| s * dy,
+        )
+    }
+
+    /// A function with value `y` and derivative `1 / x`.
+    #[inline(always)]
+    fn over(self, y: E, x: E) -> Self {
+        self.map(
+            y,
+            #[inline(always)]
+            |s| s / x,
+        )
+    }
+
+    /// A function of two numbers with value `y`, from the slope in either argument alone, and in both.
+    #[inline(always)]
+    fn join(
+        self,
+        other: Self,
+        y: E,
+        first: impl Fn(E) -> E,
+        second: impl Fn(E) -> E,
+        both: impl Fn(E, E) -> E,
+    ) -> Self {
+        let (mut slopes, mut k) = ([None; N], 0);
+        while k < N {
+            slopes[k] = match (self.slopes[k], other.slopes[k]) {
+                (None, None) => None,
+                (Some(s), None) => Some(first(s)),
+                (None, Some(t)) => Some(second(t)),
+                (Some(s), Some(t)) => Some(both(s, t)),
+            };
+            k += 1;
+        }
+        Dual { value: y, slopes }
+    }
+
+    /// As [`join`](Self::join), where the two slopes are added.
+    #[inline(always)]
+    fn sum(self, other: Self, y: E, first: impl Fn(E) -> E, second: impl Fn(E) -> E) -> Self {
+        self.join(
+            other,
+            y,
+            &first,
+            &second,
+            #[inline(always)]
+            |s, t| first(s) + second(t),
+        )
     }
 }
 
-impl Add for Dual {
-    type Output = Dual;
-    fn add(self, b: Dual) -> Dual {
-        Dual { value: self.value + b.value, slope: self.slope + b.slope }
+impl<E: Real, const N: usize> Add for Dual<E, N> {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, b: Self) -> Self {
+        self.sum(
+            b,
+            self.value + b.value,
+            #[inline(always)]
+            |s| s,
+            #[inline(always)]
+            |t| t,
+        )
     }
 }
 
-impl Sub for Dual {
-    type Output = Dual;
-    fn sub(self, b: Dual) -> Dual {
-        self + -b
+impl<E: Real, const N: usize> Sub for Dual<E, N> {
+    type Output = Self;
+    #[inline(always)]
+    fn sub(self, b: Self) -> Self {
+        self.join(
+            b,
+            self.value - b.value,
+            #[inline(always)]
+            |s| s,
+            #[inline(always)]
+            |t| -t,
+            #[inline(always)]
+            |s, t| s - t,
+        )
     }
 }
 
-impl Mul for Dual {
-    type Output = Dual;
-    fn mul(self, b: Dual) -> Dual {
-        Dual { value: self.value * b.value, slope: self.slope * b.value + self.value * b.slope }
+impl<E: Real, const N: usize> Mul for Dual<E, N> {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, b: Self) -> Self {
+        self.sum(
+            b,
+            self.value * b.value,
+            #[inline(always)]
+            |s| s * b.value,
+            #[inline(always)]
+            |t| t * self.value,
+        )
     }
 }
 
-impl Div for Dual {
-    type Output = Dual;
-    fn div(self, b: Dual) -> Dual {
-        let slope = (self.slope * b.value - self.value * b.slope) / (b.value * b.value);
-        Dual { value: self.value / b.value, slope }
+impl<E: Real, const N: usize> Div for Dual<E, N> {
+    type Output = Self;
+    #[inline(always)]
+    #[allow(clippy::suspicious_arithmetic_impl)] // the quotient rule
+    fn div(self, b: Self) -> Self {
+        let y = self.value / b.value;
+        self.join(
+            b,
+            y,
+            #[inline(always)]
+            |s| s / b.value,
+            #[inline(always)]
+            |t| -(t * y / b.value),
+            #[inline(always)]
+            |s, t| (s - t * y) / b.value,
+        )
     }
 }
 
-impl Neg for Dual {
-    type Output = Dual;
-    fn neg(self) -> Dual {
-        Dual { value: -self.value, slope: -self.slope }
+impl<E: Real, const N: usize> Neg for Dual<E, N> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        self.map(
+            -self.value,
+            #[inline(always)]
+            |s| -s,
+        )
     }
 }
 
-impl Real for Dual {
+/// Functions of one number, by value and derivative at `x`.
+macro_rules! chain {
+    ($($f:ident: |$x:ident| $y:expr, $dy:expr;)*) => {
+        $(
+            #[inline(always)]
+            fn $f(self) -> Self {
+                let $x = self.value;
+                self.chain($y, $dy)
+            }
+        )*
+    };
+}
+
+/// Functions of one number, by value and the reciprocal of the derivative at `x`.
+macro_rules! over {
+    ($($f:ident: |$x:ident| $y:expr, $over:expr;)*) => {
+        $(
+            #[inline(always)]
+            fn $f(self) -> Self {
+                let $x = self.value;
+                self.over($y, $over)
+            }
+        )*
+    };
+}
+
+/// Functions that are constant but for steps.
+macro_rules! steps {
+    ($($f:ident)*) => {
+        $(
+            #[inline(always)]
+            fn $f(self) -> Self {
+                Dual::constant(self.value.$f())
+            }
+        )*
+    };
+}
+
+impl<E: Real, const N: usize> Real for Dual<E, N> {
+    #[inline(always)]
     fn like(&self, value: f64) -> Self {
-        Dual { value, slope: 0.0 }
+        Dual::constant(self.value.like(value))
     }
+    #[inline(always)]
     fn if_positive(&self, yes: Self, no: Self) -> Self {
-        if self.value > 0.0 { yes } else { no }
+        let (x, zero) = (self.value, self.value.like(0.0));
+        yes.join(
+            no,
+            x.if_positive(yes.value, no.value),
+            #[inline(always)]
+            |s| x.if_positive(s, zero),
+            #[inline(always)]
+            |t| x.if_positive(zero, t),
+            #[inline(always)]
+            |s, t| x.if_positive(s, t),
+        )
     }
-    fn exp(self) -> Self {
-        self.chain(self.value.exp(), self.value.exp())
+    chain! {
+        exp: |x| x.exp(), x.exp();
+        expm1: |x| x.expm1(), x.exp();
+        sin: |x| x.sin(), x.cos();
+        cos: |x| x.cos(), -x.sin();
+        sin_pi: |x| x.sin_pi(), x.like(PI) * x.cos_pi();
+        cos_pi: |x| x.cos_pi(), x.like(-PI) * x.sin_pi();
+        // As products that keep their digits where the value is near 1.
+        tanh: |x| x.tanh(), (x.like(1.0) - x.tanh()) * (x.like(1.0) + x.tanh());
+        sigmoid: |x| x.sigmoid(), x.sigmoid() * (-x).sigmoid();
+        softplus: |x| x.softplus(), x.sigmoid();
+        exp2: |x| x.exp2(), x.exp2() * x.like(LN_2);
+        erf: |x| x.erf(), x.like(FRAC_2_SQRT_PI) * (-(x * x)).exp();
+        tan: |x| x.tan(), x.like(1.0) + x.tan() * x.tan();
+        sinh: |x| x.sinh(), x.cosh();
+        cosh: |x| x.cosh(), x.sinh();
+        abs: |x| x.abs(), x.sign();
     }
-    fn expm1(self) -> Self {
-        self.chain(self.value.exp_m1(), self.value.exp())
+    over! {
+        ln: |x| x.ln(), x;
+        ln1p: |x| x.ln1p(), x.like(1.0) + x;
+        log2: |x| x.log2(), x.like(LN_2) * x;
+        sqrt: |x| x.sqrt(), x.like(2.0) * x.sqrt();
+        asin: |x| x.asin(), complement(x);
+        acos: |x| x.acos(), -complement(x);
+        atan: |x| x.atan(), x.like(1.0) + x * x;
     }
-    fn ln(self) -> Self {
-        self.chain(self.value.ln(), 1.0 / self.value)
-    }
-    fn ln1p(self) -> Self {
-        self.chain(self.value.ln_1p(), 1.0 / (1.0 + self.value))
-    }
-    fn sin(self) -> Self {
-        self.chain(self.value.sin(), self.value.cos())
-    }
-    fn cos(self) -> Self {
-        self.chain(self.value.cos(), -self.value.sin())
-    }
-    fn sin_pi(self) -> Self {
-        let (sin, cos) = sin_cos_pi(self.value);
-        self.chain(sin, PI * cos)
-    }
-    fn cos_pi(self) -> Self {
-        let (sin, cos) = sin_cos_pi(self.value);
-        self.chain(cos, -PI * sin)
-    }
-    fn tanh(self) -> Self {
-        self.chain(self.value.tanh(), self.value.cosh().powi(-2))
-    }
-    fn sigmoid(self) -> Self {
-        let half = 0.5 * self.value;
-        self.chain(0.5 + 0.5 * half.tanh(), 0.25 * half.cosh().powi(-2))
-    }
-    fn softplus(self) -> Self {
-        let value = self.value.max(0.0) + (-self.value.abs()).exp().ln_1p();
-        self.chain(value, 0.5 + 0.5 * (0.5 * self.value).tanh())
-    }
-    fn sqrt(self) -> Self {
-        self.chain(self.value.sqrt(), 0.5 / self.value.sqrt())
-    }
-    fn exp2(self) -> Self {
-        self.chain(self.value.exp2(), LN_2 * self.value.exp2())
-    }
-    fn log2(self) -> Self {
-        self.chain(self.value.log2(), 1.0 / (LN_2 * self.value))
-    }
-    fn erf(self) -> Self {
-        let slope = FRAC_2_SQRT_PI * (-self.value * self.value).exp();
-        self.chain(raygrad_tensor::vmath::f64::erf(self.value), slope)
-    }
-    fn tan(self) -> Self {
-        self.chain(self.value.tan(), self.value.cos().powi(-2))
-    }
-    fn asin(self) -> Self {
-        self.chain(self.value.asin(), 1.0 / (1.0 - self.value * self.value).sqrt())
-    }
-    fn acos(self) -> Self {
-        self.chain(self.value.acos(), -1.0 / (1.0 - self.value * self.value).sqrt())
-    }
-    fn atan(self) -> Self {
-        self.chain(self.value.atan(), 1.0 / (1.0 + self.value * self.value))
-    }
+    steps! { sign floor ceil round }
+    #[inline(always)]
     fn atan2(self, x: Self) -> Self {
-        let square = self.value * self.value + x.value * x.value;
-        let slope = (self.slope * x.value - self.value * x.slope) / square;
-        Dual { value: self.value.atan2(x.value), slope }
+        let (a, b) = (self.value, x.value);
+        self.sum(
+            x,
+            a.atan2(b),
+            #[inline(always)]
+            |s| s * turn(b, a, b),
+            #[inline(always)]
+            |t| -(t * turn(a, a, b)),
+        )
     }
-    fn sinh(self) -> Self {
-        self.chain(self.value.sinh(), self.value.cosh())
-    }
-    fn cosh(self) -> Self {
-        self.chain(self.value.cosh(), self.value.sinh())
-    }
+    #[inline(always)]
     fn powi(self, exponent: i32) -> Self {
-        let slope = if exponent == 0 { 0.0 } else { f64::from(exponent) * self.value.powi(exponent - 1) };
-        self.chain(self.value.powi(exponent), slope)
+        let (x, y) = (self.value, self.value.powi(exponent));
+        if exponent == 0 {
+            return Dual::constant(y);
+        }
+        self.map(
+            y,
+            #[inline(always)]
+            |s| s * (x.like(f64::from(exponent)) * x.powi(exponent.saturating_sub(1))),
+        )
     }
+    #[inline(always)]
     fn pow(self, exponent: Self) -> Self {
-        let value = self.value.powf(exponent.value);
-        let base = self.chain(value, exponent.value * self.value.powf(exponent.value - 1.0));
-        base + Dual { value: 0.0, slope: exponent.chain(value, value * self.value.ln()).slope }
+        let (a, b) = (self.value, exponent.value);
+        let y = a.pow(b);
+        self.sum(
+            exponent,
+            y,
+            #[inline(always)]
+            |s| s * slope_of_base(a, b),
+            #[inline(always)]
+            |t| t * slope_of_exponent(a, b, y),
+        )
     }
-    fn abs(self) -> Self {
-        if self.value < 0.0 { -self } else { self }
-    }
-    fn sign(self) -> Self {
-        self.like(if self.value == 0.0 { 0.0 } else { self.value.signum() })
-    }
+    #[inline(always)]
     fn maximum(self, other: Self) -> Self {
-        if self.value > other.value { self } else { other }
+        let lead = self.value - other.value;
+        self.sum(
+            other,
+            self.value.maximum(other.value),
+            #[inline(always)]
+            |s| share(s, lead),
+            #[inline(always)]
+            |t| share(t, -lead),
+        )
     }
+    #[inline(always)]
     fn minimum(self, other: Self) -> Self {
-        if self.value < other.value { self } else { other }
+        let lead = other.value - self.value;
+        self.sum(
+            other,
+            self.value.minimum(other.value),
+            #[inline(always)]
+            |s| share(s, lead),
+            #[inline(always)]
+            |t| share(t, -lead),
+        )
     }
-    fn floor(self) -> Self {
-        self.like(self.value.floor())
-    }
-    fn ceil(self) -> Self {
-        self.like(self.value.ceil())
-    }
-    fn round(self) -> Self {
-        self.like(self.value.round_ties_even())
-    }
-}
-
-/// Sine and cosine of `pi x`, from the distance to the nearest whole number.
-fn sin_cos_pi(x: f64) -> (f64, f64) {
-    let (sin, cos) = (PI * (x - x.round())).sin_cos();
-    if x.round() % 2.0 == 0.0 { (sin, cos) } else { (-sin, -cos) }
 }

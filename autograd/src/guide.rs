@@ -76,51 +76,63 @@
 //!
 //! # An operation of one's own
 //!
-//! A function of one number is a [`Unary`](crate::Unary): its formula and its derivative, written once for every kind of
-//! number. With `f32` and `f64` that compiles to one vectorised loop; with [`Var`](crate::Var) it records itself, which
-//! gives the higher derivatives; with [`Dual`](crate::Dual) it checks itself.
+//! A chain of elementwise operations passes over memory once for each of them, and once more for each gradient. Written
+//! as a [`formula!`](crate::formula), it is one pass forward, without arrays in between, and one backward for the
+//! gradients of all operands. Nothing else is to be written: the gradients follow from the formula, which is read for
+//! [`Dual`](crate::Dual) numbers, and higher derivatives too.
 //!
 //! ```
-//! use raygrad_autograd::{Cases, Check, Entry, Map, Reads, Real, Tape, Tensor, Unary, check_op};
+//! use raygrad_autograd::{Tape, Tensor, formula};
+//! let tape = Tape::<f64>::new();
+//! let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 1.0, 2.0, 3.0]));
+//! let shift = tape.leaf(Tensor::from_vec(&[2], vec![0.5, -0.5]));
+//! let (steepness, limit) = (2.0, 6.0); // constants from outside are listed
+//! let y = formula!([steepness, limit] |x, b| (steepness * (x - b)).minimum(limit).exp() / 2.0).on([&x, &shift]);
+//! let grads = y.sum().grad(&[&x, &shift]);
+//! assert_eq!(grads[1].as_slice(), [-((-1.0_f64).exp() + 3.0_f64.exp()), -3.0_f64.exp()]); // 3.5 is beyond the limit
+//! ```
+//!
+//! An operation with a name is a [`Formula`](crate::Formula): a function written once for every kind of number. Its
+//! derivative can be written too, where another form has more digits or is faster.
+//!
+//! ```
+//! use raygrad_autograd::{Cases, Check, Entry, Formula, Real, Tape, Tensor, check_op};
 //!
 //! /// y = 1 / (1 + x^2); dx = -2 g x y^2.
 //! #[derive(Clone, Copy)]
 //! struct Lorentz;
 //!
-//! impl Unary for Lorentz {
+//! impl Formula<1> for Lorentz {
 //!     const NAME: &'static str = "lorentz";
-//!     const READS: Reads = Reads::ALL; // the derivative reads x and y, so the tape keeps both
 //!     #[inline(always)]
-//!     fn f<E: Real>(&self, x: E) -> E {
+//!     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
 //!         let one = x.like(1.0);
-//!         one.clone() / (one + x.clone() * x)
+//!         one / (one + x * x)
 //!     }
 //!     #[inline(always)]
-//!     fn vjp<E: Real>(&self, g: E, x: E, y: E) -> E {
-//!         let two = g.like(2.0);
-//!         -(g * two * (x * y.clone()) * y)
-//!     }
-//!     fn cases(&self, cases: &mut Cases) {
-//!         // Where it is sampled, and exact values and gradients at points where formulas like to fail.
-//!         cases.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([1e10], 1e-20, [-2e-30]);
+//!     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
+//!         [-(g.like(2.0) * g * (x * y) * y)] // the square of a large x would overflow
 //!     }
 //! }
 //!
 //! let tape = Tape::<f64>::new();
 //! let x = tape.leaf(Tensor::scalar(1.0));
-//! let y = tape.apply(Map(Lorentz), &[&x]);
+//! let y = Lorentz.on([&x]);
 //! assert_eq!((y.item(), y.grad(&[&x])[0].item()), (0.5, -0.5));
 //!
-//! let report = check_op(&Check::default(), &Entry::unary(Lorentz)).unwrap();
+//! // Where it is sampled, and exact values and gradients at points where formulas like to fail.
+//! let mut cases = Cases::default();
+//! cases.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([1e10], 1e-20, [-2e-30]);
+//! let report = check_op(&Check::default(), &Entry::formula(Lorentz, &cases)).unwrap();
 //! assert!(report.first_order < 1e-9 && report.second_order < 1e-9);
 //! ```
 //!
 //! [`check_op`](crate::check_op) is the examination that every operation of this crate has to pass: finite differences of
 //! first and second order, dual numbers, f32 against f64, extremes, inputs of any origin, the same bits twice. A wrong
-//! sign, a forgotten factor or a missing sum does not get through. [`Binary`](crate::Binary) is the same for two numbers;
-//! anything else is an [`Op`](crate::Op), whose derivative is written with variables. An operation may be *fused*: then it
-//! carries a `reference` made of plain operations, which is its oracle and its second derivative. A function that is made
-//! of operations needs no derivative at all, and [`check_function`](crate::check_function) checks what it uses.
+//! sign, a forgotten factor or a missing sum does not get through. What is not elementwise is an [`Op`](crate::Op), whose
+//! derivative is written with variables. An operation may be *fused*: then it carries a `reference` made of plain
+//! operations, which is its oracle and its second derivative. A function that is made of operations needs no derivative
+//! at all, and [`check_function`](crate::check_function) checks what it uses.
 //!
 //! # A model that learns
 //!

@@ -13,8 +13,8 @@
 //! * [`Tape`], [`Var`]: what is recorded; every operation is a method of [`Var`].
 //! * [`derivatives`]: of functions: Jacobian, Hessian, and products with them.
 //! * [`conventions`]: values and gradients at ties, kinks and the edges of domains.
-//! * [`Op`], [`Unary`], [`Binary`]: operations of one's own; [`check_op`] examines them, [`catalogue`](catalogue()) lists
-//!   this crate's.
+//! * [`Formula`], [`formula!`]: elementwise operations of one's own, in one pass forward and one backward.
+//! * [`Op`]: any other operation; [`check_op`] examines them, [`catalogue`](catalogue()) lists this crate's.
 //! * [`Params`], [`Layer`], [`Optimizer`]: models and their training.
 
 mod catalogue;
@@ -27,9 +27,9 @@ pub mod conventions;
 pub mod derivatives;
 mod dot;
 mod dual;
-mod elementwise;
 mod error;
 mod files;
+mod formula;
 mod grad;
 mod gradient;
 pub mod guide;
@@ -37,12 +37,15 @@ mod hook;
 mod layers;
 mod nodes;
 mod npz;
+mod number;
 mod op;
 mod ops;
 mod optim;
 mod optim_rows;
 mod params;
 mod path;
+mod reading;
+mod recorded;
 mod row_sums;
 mod storage;
 mod sum;
@@ -50,16 +53,17 @@ mod sweep;
 mod tape;
 mod var;
 
-pub use catalogue::{Cases, Entry, Extreme, catalogue};
+pub use catalogue::{Cases, Entry, Examined, Extreme, catalogue};
 pub use check::{Check, Report, check_function};
 pub use check_op::check_op;
 pub use dual::Dual;
-pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};
 pub use files::write_atomic;
+pub use formula::{Elementwise, Formula};
 pub use gradient::{Gradient, RowShare, SparseGrad};
 pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Pass, Sequential};
 pub use npz::NpzError;
+pub use number::{Number, Term};
 pub use op::{Grads, Op, Reads, Vjp};
 pub use ops::{Activation, Conv2dConfig, INFER, Pool2dConfig, RowGrad, Segments};
 pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, Move, Optimizer, Schedule, Sgd, SgdConfig, TableAdam};
@@ -67,6 +71,7 @@ pub use optim::{clip_norm, clip_value, global_norm};
 pub use optim_rows::{RowAdam, RowStats};
 pub use params::{Bound, ParamId, Params};
 pub use raygrad_tensor::{Axes, Indices, Pool, Real, Scalar, Shape, Tensor};
+pub use recorded::{Recorded, record};
 pub use row_sums::{RowAdder, RowSums};
 pub use storage::{ParamsError, Storage};
 pub use tape::Tape;

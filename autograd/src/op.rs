@@ -1,6 +1,7 @@
 //! What an operation is: a forward kernel and a vector-Jacobian product.
 
 use crate::nodes::CONSTANT;
+use crate::reading::Reading;
 use crate::{Error, ShapeError, SparseGrad, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
@@ -107,6 +108,11 @@ impl Reads {
             i += 1;
         }
         Reads { inputs: mask, output: false }
+    }
+
+    /// The inputs whose bits are set, and with the highest bit the output.
+    pub(crate) fn of_bits(bits: u32) -> Reads {
+        Reads { inputs: bits & !Reading::OUTPUT, output: bits & Reading::OUTPUT != 0 }
     }
 
     /// These and the output.

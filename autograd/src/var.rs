@@ -1,7 +1,7 @@
 //! A variable: a value and its place on the tape.
 
 use crate::{Tape, ops};
-use raygrad_tensor::{Real, Scalar, Tensor};
+use raygrad_tensor::{Scalar, Tensor};
 use std::fmt;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
@@ -175,108 +175,5 @@ impl<'t, T: Scalar> Neg for Var<'t, T> {
     #[track_caller]
     fn neg(self) -> Var<'t, T> {
         -&self
-    }
-}
-
-/// A formula read for variables records itself.
-impl<T: Scalar> Real for Var<'_, T> {
-    fn like(&self, value: f64) -> Self {
-        self.constant(value)
-    }
-    fn if_positive(&self, yes: Self, no: Self) -> Self {
-        Var::if_positive(self, &yes, &no)
-    }
-    fn exp(self) -> Self {
-        Var::exp(&self)
-    }
-    fn expm1(self) -> Self {
-        Var::expm1(&self)
-    }
-    fn ln(self) -> Self {
-        Var::ln(&self)
-    }
-    fn ln1p(self) -> Self {
-        Var::ln1p(&self)
-    }
-    fn sin(self) -> Self {
-        Var::sin(&self)
-    }
-    fn cos(self) -> Self {
-        Var::cos(&self)
-    }
-    fn sin_pi(self) -> Self {
-        Var::sin_pi(&self)
-    }
-    fn cos_pi(self) -> Self {
-        Var::cos_pi(&self)
-    }
-    fn tanh(self) -> Self {
-        Var::tanh(&self)
-    }
-    fn sigmoid(self) -> Self {
-        Var::sigmoid(&self)
-    }
-    fn softplus(self) -> Self {
-        Var::softplus(&self)
-    }
-    fn sqrt(self) -> Self {
-        Var::sqrt(&self)
-    }
-    fn exp2(self) -> Self {
-        Var::exp2(&self)
-    }
-    fn log2(self) -> Self {
-        Var::log2(&self)
-    }
-    fn erf(self) -> Self {
-        Var::erf(&self)
-    }
-    fn tan(self) -> Self {
-        Var::tan(&self)
-    }
-    fn asin(self) -> Self {
-        Var::asin(&self)
-    }
-    fn acos(self) -> Self {
-        Var::acos(&self)
-    }
-    fn atan(self) -> Self {
-        Var::atan(&self)
-    }
-    fn sinh(self) -> Self {
-        Var::sinh(&self)
-    }
-    fn cosh(self) -> Self {
-        Var::cosh(&self)
-    }
-    fn abs(self) -> Self {
-        Var::abs(&self)
-    }
-    fn sign(self) -> Self {
-        Var::sign(&self)
-    }
-    fn floor(self) -> Self {
-        Var::floor(&self)
-    }
-    fn ceil(self) -> Self {
-        Var::ceil(&self)
-    }
-    fn round(self) -> Self {
-        Var::round(&self)
-    }
-    fn atan2(self, x: Self) -> Self {
-        Var::atan2(&self, &x)
-    }
-    fn pow(self, exponent: Self) -> Self {
-        Var::pow(&self, &exponent)
-    }
-    fn maximum(self, other: Self) -> Self {
-        Var::maximum(&self, &other)
-    }
-    fn minimum(self, other: Self) -> Self {
-        Var::minimum(&self, &other)
-    }
-    fn powi(self, exponent: i32) -> Self {
-        Var::powi(&self, exponent)
     }
 }

@@ -2,13 +2,13 @@
 //! to catch it.
 
 use raygrad_autograd::{
-    Check, Entry, Extreme, Grads, Map, Op, Pool, Scalar, Shape, ShapeError, Tensor, Var, Vjp, check_op,
+    Cases, Check, Elementwise, Entry, Examined, Extreme, Formula, Grads, Op, Pool, Real, Scalar, Shape, ShapeError,
+    Tensor, Var, Vjp, check_op,
 };
 use raygrad_tensor::{broadcast_shape, map};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
-use thrice::Thrice;
 
 /// What is wrong with [`Wave`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -188,37 +188,32 @@ fn claims_about_an_operation_are_checked() {
     assert_caught(&at(0.0, [0.0, 2.1]), "gradient 1 at [2.0, 0.0]");
 }
 
-/// In a module of its own, since [`Real`](raygrad_autograd::Real) has methods that take variables by value.
-mod thrice {
-    use raygrad_autograd::{Cases, Reads, Real, Unary};
+/// y = 3 x with a gradient that is off by less than differences can see.
+#[derive(Clone, Copy)]
+struct Thrice;
 
-    /// y = 3 x with a gradient that is off by less than differences can see.
-    #[derive(Clone, Copy)]
-    pub struct Thrice;
+impl Formula<1> for Thrice {
+    const NAME: &'static str = "thrice";
+    #[inline(always)]
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        x.like(3.0) * x
+    }
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, _x: [E; 1], _y: E) -> [E; 1] {
+        [g.like(3.0 + 1e-9) * g]
+    }
+}
 
-    impl Unary for Thrice {
-        const NAME: &'static str = "thrice";
-        const READS: Reads = Reads::NOTHING;
-        #[inline(always)]
-        fn f<E: Real>(&self, x: E) -> E {
-            let three = x.like(3.0);
-            x * three
-        }
-        #[inline(always)]
-        fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-            let three = g.like(3.0 + 1e-9);
-            g * three
-        }
-        fn cases(&self, cases: &mut Cases) {
-            cases.domain(-1.0..1.0);
-        }
+impl Examined<1> for Thrice {
+    fn cases(&self, cases: &mut Cases) {
+        cases.domain(-1.0..1.0);
     }
 }
 
 #[test]
 fn faults_too_small_for_differences_are_caught_by_the_exact_checks() {
-    assert_caught(&Entry::unary(Thrice), "the gradient against dual numbers");
+    assert_caught(&Entry::examined(Thrice), "the gradient against dual numbers");
     let by = "the output along a gradient against the input along its adjoint";
-    assert_caught(&Entry::new(Map(Thrice)).linear().sample(&[&[2, 3]]), by);
-    assert_eq!(verdict(&Entry::new(Map(Thrice)).sample(&[&[2, 3]])), Ok(()));
+    assert_caught(&Entry::new(Elementwise(Thrice)).linear().sample(&[&[2, 3]]), by);
+    assert_eq!(verdict(&Entry::new(Elementwise(Thrice)).sample(&[&[2, 3]])), Ok(()));
 }

@@ -1,4 +1,4 @@
-"""Small peers in eager PyTorch: operation overhead, small training steps, single operations, vector math.
+"""Small peers in PyTorch: operation overhead, small training steps, single operations, fused chains, vector math.
 
 One line of JSON each, of the same work as benches/framework.rs and rust-peers; vector math in turns: vmath.py.
 """
@@ -69,7 +69,7 @@ def single_operations(args):
     cases = (
         ("softmax 1024x512", lambda x: x.softmax(-1) * weight, rows),
         ("layer norm 1024x512", lambda x: F.layer_norm(x, x.shape[-1:], gain, bias) * weight, rows),
-        ("elementwise chain, 1M", lambda x: (x * 1.5 + 0.5).tanh() * x + (x * x * -0.5).exp() - x, million),
+        ("elementwise chain, 1M", chain(torch), million),
         ("sum over axis 0, 4096x1024", lambda x: x.sum(0), matrix),
         ("sum over axis 1, 4096x1024", lambda x: x.sum(1), matrix),
         ("sum, 4096x1024", torch.sum, matrix),
@@ -81,6 +81,25 @@ def single_operations(args):
         written = lambda: torch.autograd.grad(f(x).sum(), x)[0].contiguous()
         seconds_written, _ = measure.timed(written, args.repeats, args.warmup)
         report(args, what, seconds_forward_backward=seconds, seconds_with_gradient_written=seconds_written)
+
+
+def chain(library):
+    """Ten elementwise operations."""
+    return lambda x: library.tanh(x * 1.5 + 0.5) * x + library.exp(x * x * -0.5) - x
+
+
+def fused_chain(args):
+    """The chain of `single_operations` with its gradient, compiled by PyTorch and by JAX."""
+    import jax
+
+    what, f, million = "elementwise chain, 1M, fused", chain(torch), torch.randn(1_000_000)
+    x, loss = million.clone().requires_grad_(), torch.compile(lambda x: f(x).sum())
+    seconds, _ = measure.timed(lambda: torch.autograd.grad(loss(x), x)[0].contiguous(), args.repeats, args.warmup)
+    measure.report("torch.compile", what, args.threads, seconds_forward_backward=seconds)
+    gradient = jax.jit(jax.value_and_grad(lambda x: chain(jax.numpy)(x).sum()))
+    x = jax.numpy.asarray(million.numpy())
+    seconds, _ = measure.timed(lambda: jax.block_until_ready(gradient(x)), args.repeats, args.warmup)
+    measure.report("jax.jit", what, args.threads, packages=("jax",), seconds_forward_backward=seconds)
 
 
 def vector_math(args):
@@ -106,6 +125,7 @@ GROUPS = {
     "scalars": recorded_scalars,
     "training": training_steps,
     "operations": single_operations,
+    "fused": fused_chain,
     "math": vector_math,
 }
 

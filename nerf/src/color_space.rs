@@ -3,7 +3,7 @@
 //! NeRF is trained, and its images are blended, in code values as they stand in files: half of white over black is .5
 //! there, where half of the light would be .735. Use these operations for a model whose colours are light.
 
-use raygrad_autograd::{Cases, Entry, Map, Reads, Real, Scalar, Unary, Var};
+use raygrad_autograd::{Cases, Entry, Examined, Formula, Real, Scalar, Var};
 
 /// Linear light and code value where the line ends and the power begins (IEC 61966-2-1).
 const KNEE: [f64; 2] = [0.003_130_8, 0.040_45];
@@ -27,28 +27,24 @@ pub struct SrgbDecode;
 /// gradient too.
 #[inline(always)]
 fn beyond<E: Real>(x: E, knee: f64) -> [E; 2] {
-    let excess = x.clone() - x.like(knee);
+    let excess = x - x.like(knee);
     let limit = x.like(knee);
     [excess.if_positive(x, limit), excess]
 }
 
-impl Unary for SrgbEncode {
+impl Formula<1> for SrgbEncode {
     const NAME: &'static str = "srgb_encode";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let [clamped, excess] = beyond(x.clone(), KNEE[0]);
-        let line = x.like(SLOPE) * x.clone();
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        let [clamped, excess] = beyond(x, KNEE[0]);
+        let line = x.like(SLOPE) * x;
         let power = x.like(1.0 + OFFSET) * clamped.pow(x.like(1.0 / EXPONENT)) - x.like(OFFSET);
         // A NaN chooses the line, which it stays NaN on.
         excess.if_positive(power, line)
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let [clamped, excess] = beyond(x.clone(), KNEE[0]);
-        let power = x.like((1.0 + OFFSET) / EXPONENT) * clamped.pow(x.like(1.0 / EXPONENT - 1.0));
-        g * excess.if_positive(power, x.like(SLOPE))
-    }
+}
+
+impl Examined<1> for SrgbEncode {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..1.5).domain_also(-0.5..0.001);
         c.at([0.0], 0.0, [SLOPE]).at([-0.1], -1.292, [SLOPE]).at([1e-8], 1.292e-7, [SLOPE]);
@@ -57,23 +53,18 @@ impl Unary for SrgbEncode {
     }
 }
 
-impl Unary for SrgbDecode {
+impl Formula<1> for SrgbDecode {
     const NAME: &'static str = "srgb_decode";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let [clamped, excess] = beyond(x.clone(), KNEE[1]);
-        let line = x.clone() / x.like(SLOPE);
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        let [clamped, excess] = beyond(x, KNEE[1]);
+        let line = x / x.like(SLOPE);
         let power = ((clamped + x.like(OFFSET)) / x.like(1.0 + OFFSET)).pow(x.like(EXPONENT));
         excess.if_positive(power, line)
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let [clamped, excess] = beyond(x.clone(), KNEE[1]);
-        let base = (clamped + x.like(OFFSET)) / x.like(1.0 + OFFSET);
-        let power = x.like(EXPONENT / (1.0 + OFFSET)) * base.pow(x.like(EXPONENT - 1.0));
-        g * excess.if_positive(power, x.like(1.0 / SLOPE))
-    }
+}
+
+impl Examined<1> for SrgbDecode {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..1.5).domain_also(-0.5..0.03);
         c.at([0.0], 0.0, [1.0 / SLOPE]).at([-0.1], -0.1 / SLOPE, [1.0 / SLOPE]);
@@ -94,18 +85,18 @@ impl Unary for SrgbDecode {
 /// ```
 #[track_caller]
 pub fn srgb_encode<'t, T: Scalar>(light: &Var<'t, T>) -> Var<'t, T> {
-    light.tape().apply(Map(SrgbEncode), &[light])
+    SrgbEncode.on([light])
 }
 
 /// Linear light for sRGB code values, of any shape; see [`SrgbDecode`].
 #[track_caller]
 pub fn srgb_decode<'t, T: Scalar>(codes: &Var<'t, T>) -> Var<'t, T> {
-    codes.tape().apply(Map(SrgbDecode), &[codes])
+    SrgbDecode.on([codes])
 }
 
 /// The catalogue entries of this file.
 pub(crate) fn entries() -> Vec<Entry> {
-    vec![Entry::unary(SrgbEncode), Entry::unary(SrgbDecode)]
+    vec![Entry::examined(SrgbEncode), Entry::examined(SrgbDecode)]
 }
 
 #[cfg(test)]
@@ -116,7 +107,7 @@ mod tests {
     fn codes_round_trip() {
         for code in 0..=255 {
             let code = f64::from(code) / 255.0;
-            assert!((SrgbEncode.f(SrgbDecode.f(code)) - code).abs() < 1e-6);
+            assert!((SrgbEncode.f([SrgbDecode.f([code])]) - code).abs() < 1e-6);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Positional encoding: sinusoids of rising frequency let a network hold fine detail.
 
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
 
 /// y = (x, sin(pi x), cos(pi x), sin(2 pi x), cos(2 pi x), .. cos(2^(levels-1) pi x)), each for all channels of x in turn
@@ -34,7 +34,7 @@ impl PositionalEncoding {
 /// `x - 2 round(x / 2)`, exactly: the sinusoids of all levels have the period 2. Without it `2^k x` can be infinite.
 #[inline(always)]
 fn reduce<E: Real>(x: E) -> E {
-    let turns = (x.like(0.5) * x.clone()).round();
+    let turns = (x.like(0.5) * x).round();
     x - turns.like(2.0) * turns
 }
 
@@ -135,7 +135,7 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let x = &x[0];
         let mut parts = if self.input { vec![x.clone()] } else { vec![] };
-        let reduced = reduce(x.clone());
+        let [reduced] = record([x], |[x]| [reduce(x)]);
         for level in 0..self.levels {
             let y = &reduced * (level as f64).exp2();
             parts.extend([Var::sin_pi(&y), Var::cos_pi(&y)]);

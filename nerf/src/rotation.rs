@@ -1,6 +1,6 @@
 //! Rotations for poses that are optimised: from and to rotation vectors, with gradients at every angle.
 
-use raygrad_autograd::{Entry, Real, Scalar, Shape, Tensor, Var};
+use raygrad_autograd::{Entry, Real, Scalar, Shape, Tensor, Var, record};
 
 /// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
 ///
@@ -9,17 +9,17 @@ use raygrad_autograd::{Entry, Real, Scalar, Shape, Tensor, Var};
 #[inline(always)]
 fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
     let one = s.like(1.0);
-    let excess = s.clone() - one.clone();
-    let (near, far) = (excess.if_positive(one.clone(), s.clone()), excess.if_positive(s.clone(), one));
+    let excess = s - one;
+    let (near, far) = (excess.if_positive(one, s), excess.if_positive(s, one));
     // Up to s = 1 the first terms left out are below 1e-20. `1 - s / (n (n + 1)) (1 - s / ((n + 2) (n + 3)) (..))`.
     let series = |first: u32| {
         (0..11).rev().fold(s.like(1.0), |sum, k| {
             let n = f64::from(first + 2 * k);
-            s.like(1.0) - s.like(1.0 / (n * (n + 1.0))) * near.clone() * sum
+            s.like(1.0) - s.like(1.0 / (n * (n + 1.0))) * near * sum
         })
     };
     let root = far.sqrt();
-    let sinc = root.clone().sin() / root.clone();
+    let sinc = root.sin() / root;
     [excess.if_positive(sinc, series(2)), excess.if_positive(root.cos(), series(1))]
 }
 
@@ -28,27 +28,26 @@ fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
 /// `2 sin^2(|w|/2) / |w|^2` has all its digits, and rounding leaves the matrix a rotation, also near half a turn.
 #[inline(always)]
 pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
-    let square = |e: &E| e.clone() * e.clone();
-    let [xx, yy, zz] = [square(&x), square(&y), square(&z)];
-    let s = xx.clone() + yy.clone() + zz.clone();
-    let [half, cos] = sinc_and_cos_of_root(s.like(0.25) * s.clone());
+    let [xx, yy, zz] = [x * x, y * y, z * z];
+    let s = xx + yy + zz;
+    let [half, cos] = sinc_and_cos_of_root(s.like(0.25) * s);
     // The quaternion's length is 1 but for rounding, which would leave the matrix no rotation.
-    let length = cos.clone() * cos.clone() + s.like(0.25) * s.clone() * half.clone() * half.clone();
-    let b = s.like(0.5) * half.clone() * half.clone() / length.clone();
+    let length = cos * cos + s.like(0.25) * s * half * half;
+    let b = s.like(0.5) * half * half / length;
     let a = half * cos / length;
     let one = s.like(1.0);
-    let across = |p: &E, q: &E| b.clone() * (p.clone() * q.clone());
-    let [ax, ay, az] = [a.clone() * x.clone(), a.clone() * y.clone(), a * z.clone()];
-    let diagonal = |p: E, q: E| one.clone() - b.clone() * (p + q);
+    let across = |p: E, q: E| b * (p * q);
+    let [ax, ay, az] = [a * x, a * y, a * z];
+    let diagonal = |p: E, q: E| one - b * (p + q);
     [
-        diagonal(yy.clone(), zz.clone()),
-        across(&x, &y) - az.clone(),
-        across(&x, &z) + ay.clone(),
-        across(&x, &y) + az,
-        diagonal(xx.clone(), zz),
-        across(&y, &z) - ax.clone(),
-        across(&x, &z) - ay,
-        across(&y, &z) + ax,
+        diagonal(yy, zz),
+        across(x, y) - az,
+        across(x, z) + ay,
+        across(x, y) + az,
+        diagonal(xx, zz),
+        across(y, z) - ax,
+        across(x, z) - ay,
+        across(y, z) + ax,
         diagonal(xx, yy),
     ]
 }
@@ -57,13 +56,8 @@ pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
 /// least 1.
 fn squares<E: Real>(m: &[E; 9]) -> [E; 4] {
     let one = m[0].like(1.0);
-    let [a, b, c] = [m[0].clone(), m[4].clone(), m[8].clone()];
-    [
-        one.clone() + a.clone() + b.clone() + c.clone(),
-        one.clone() + a.clone() - b.clone() - c.clone(),
-        one.clone() - a.clone() + b.clone() - c.clone(),
-        one - a - b + c,
-    ]
+    let [a, b, c] = [m[0], m[4], m[8]];
+    [one + a + b + c, one + a - b - c, one - a + b - c, one - a - b + c]
 }
 
 /// The rotation vector, of length 0 to pi, of a matrix given row by row whose quaternion has its largest element at
@@ -71,10 +65,10 @@ fn squares<E: Real>(m: &[E; 9]) -> [E; 4] {
 /// near 0 and near pi, as it is with `acos` of the trace.
 pub(crate) fn log_from<E: Real>(m: &[E; 9], largest: usize) -> [E; 3] {
     let four = squares(m);
-    let pivot = four[largest].clone().sqrt();
-    let inverse = m[0].like(1.0) / pivot.clone();
-    let sum = |i: usize, j: usize| (m[i].clone() + m[j].clone()) * inverse.clone();
-    let difference = |i: usize, j: usize| (m[i].clone() - m[j].clone()) * inverse.clone();
+    let pivot = four[largest].sqrt();
+    let inverse = m[0].like(1.0) / pivot;
+    let sum = |i: usize, j: usize| (m[i] + m[j]) * inverse;
+    let difference = |i: usize, j: usize| (m[i] - m[j]) * inverse;
     // Twice the quaternion; its length does not matter.
     let [w, x, y, z] = match largest {
         0 => [pivot, difference(7, 5), difference(2, 6), difference(3, 1)],
@@ -83,23 +77,23 @@ pub(crate) fn log_from<E: Real>(m: &[E; 9], largest: usize) -> [E; 3] {
         _ => [difference(3, 1), sum(2, 6), sum(5, 7), pivot],
     };
     // Of the two quaternions of a rotation the one with w >= 0, so that the angle is at most pi.
-    let flip = |q: E| (-w.clone()).if_positive(-q.clone(), q);
-    let [w, x, y, z] = [w.clone(), x, y, z].map(flip);
+    let flip = |q: E| (-w).if_positive(-q, q);
+    let [w, x, y, z] = [w, x, y, z].map(flip);
     // 2 atan2(v, w) / v with v = |(x, y, z)|, smooth through 0: in r = (v/w)^2 up to 1/16 a series of atan(v/w) / (v/w).
-    let v2 = x.clone() * x.clone() + y.clone() * y.clone() + z.clone() * z.clone();
-    let w2 = w.clone() * w.clone();
-    let excess = v2.clone() - w.like(0.0625) * w2.clone();
+    let v2 = x * x + y * y + z * z;
+    let w2 = w * w;
+    let excess = v2 - w.like(0.0625) * w2;
     let one = w.like(1.0);
-    let w_near = excess.if_positive(one.clone(), w.clone());
-    let r = excess.if_positive(v2.like(0.0), v2.clone()) / (w_near.clone() * w_near.clone());
+    let w_near = excess.if_positive(one, w);
+    let r = excess.if_positive(v2.like(0.0), v2) / (w_near * w_near);
     let series = (0..14).rev().fold(r.like(0.0), |sum, k| {
         let term = if k % 2 == 0 { 1.0 } else { -1.0 } / f64::from(2 * k + 1);
-        sum * r.clone() + r.like(term)
+        sum * r + r.like(term)
     });
     let v = excess.if_positive(v2, one).sqrt();
-    let far = v.clone().atan2(w) / v;
+    let far = v.atan2(w) / v;
     let factor = w2.like(2.0) * excess.if_positive(far, series / w_near);
-    [x, y, z].map(|q| factor.clone() * q)
+    [x, y, z].map(|q| factor * q)
 }
 
 /// Which element of a rotation matrix's quaternion is the largest.
@@ -129,7 +123,7 @@ pub fn rotation_exp<'t, T: Scalar>(vectors: &Var<'t, T>) -> Var<'t, T> {
     let axis = vectors.shape().len().saturating_sub(1);
     assert_eq!(vectors.shape().last(), Some(&3), "rotation vectors of three elements");
     let [x, y, z] = [0, 1, 2].map(|i| vectors.slice(axis, i, 1));
-    let parts = exp([x, y, z]);
+    let parts = record([&x, &y, &z], |vector| exp(vector));
     let shape: Shape = vectors.shape().iter().copied().chain([3]).collect();
     Var::concat(&parts.iter().collect::<Vec<_>>(), axis).reshape(&shape)
 }
@@ -171,7 +165,8 @@ pub fn rotation_log<'t, T: Scalar>(matrices: &Var<'t, T>) -> Var<'t, T> {
         let mask = Tensor::from_fn(&[count, 1], |i| if pivots[i] == pivot { T::ONE } else { T::ZERO });
         let mask = flat.tape().constant(mask);
         let seen = flat.where_(&mask, &flat.tape().constant(stand_in));
-        let vector = log_from(&std::array::from_fn(|k| seen.slice(1, k, 1)), pivot);
+        let elements: [_; 9] = std::array::from_fn(|k| seen.slice(1, k, 1));
+        let vector = record(elements.each_ref(), |matrix| log_from(&matrix, pivot));
         let vector = Var::concat(&vector.iter().collect::<Vec<_>>(), 1);
         out = Some(match out {
             Some(others) => vector.where_(&mask, &others),

@@ -1,6 +1,6 @@
 //! Spherical harmonics: a smooth basis for what depends on the direction of view.
 
-use raygrad_autograd::{Entry, Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+use raygrad_autograd::{Entry, Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
 
 /// The real spherical harmonics of the bands below a degree, as polynomials in the coordinates of a unit vector.
@@ -53,27 +53,26 @@ impl SphericalHarmonics {
 #[inline(always)]
 fn values<E: Real>([x, y, z]: [E; 3]) -> [E; MOST] {
     let times = |factor: f64, e: E| e.like(factor) * e;
-    let square = |e: &E| e.clone() * e.clone();
-    let [xx, yy, zz] = [square(&x), square(&y), square(&z)];
+    let [xx, yy, zz] = [x * x, y * y, z * z];
     let (one, three) = (x.like(1.0), x.like(3.0));
-    let xy = x.clone() * y.clone();
-    let five = times(5.0, zz.clone());
-    let difference = xx.clone() - yy.clone();
+    let xy = x * y;
+    let five = times(5.0, zz);
+    let difference = xx - yy;
     [
         x.like(BAND_0),
-        times(-BAND_1, y.clone()),
-        times(BAND_1, z.clone()),
-        times(-BAND_1, x.clone()),
-        times(BAND_2[0], xy.clone()),
-        times(-BAND_2[0], y.clone() * z.clone()),
-        times(BAND_2[1], times(3.0, zz) - one.clone()),
-        times(-BAND_2[0], x.clone() * z.clone()),
-        times(BAND_2[2], difference.clone()),
-        times(-BAND_3[4], y.clone() * (times(3.0, xx.clone()) - yy.clone())),
-        times(BAND_3[2], xy * z.clone()),
-        times(-BAND_3[1], y * (five.clone() - one.clone())),
-        times(BAND_3[0], z.clone() * (five.clone() - three)),
-        times(-BAND_3[1], x.clone() * (five - one)),
+        times(-BAND_1, y),
+        times(BAND_1, z),
+        times(-BAND_1, x),
+        times(BAND_2[0], xy),
+        times(-BAND_2[0], y * z),
+        times(BAND_2[1], times(3.0, zz) - one),
+        times(-BAND_2[0], x * z),
+        times(BAND_2[2], difference),
+        times(-BAND_3[4], y * (times(3.0, xx) - yy)),
+        times(BAND_3[2], xy * z),
+        times(-BAND_3[1], y * (five - one)),
+        times(BAND_3[0], z * (five - three)),
+        times(-BAND_3[1], x * (five - one)),
         times(BAND_3[3], z * difference),
         times(-BAND_3[4], x * (xx - times(3.0, yy))),
     ]
@@ -163,9 +162,9 @@ impl<T: Scalar> Op<T> for SphericalHarmonics {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let column = |axis| x[0].slice(1, axis, 1);
-        let all = values([column(0), column(1), column(2)]);
-        let columns = all[..self.width()].iter().map(|value| value.broadcast_to(&[x[0].shape()[0], 1]));
+        let [x, y, z] = [0, 1, 2].map(|axis| x[0].slice(1, axis, 1));
+        let all = record([&x, &y, &z], |direction| values(direction));
+        let columns = all[..self.width()].iter().map(|value| value.broadcast_to(x.shape()));
         Some(Var::concat(&columns.collect::<Vec<_>>().iter().collect::<Vec<_>>(), 1))
     }
 }

@@ -1,8 +1,6 @@
 //! One loop for every elementwise kernel, with broadcasting as NumPy does it.
 
-use crate::layout::inverse;
-use crate::parallel::{ELEMENT, PIECE, chunks, pieces};
-use crate::{Lane, Layout, Pool, Scalar, Shape, Tensor, simd};
+use crate::{Lane, Pool, Scalar, Shape, Tensor, map_fused, simd};
 
 /// The common shape of tensors that broadcast together: shapes are aligned at their last axis, and an axis of extent 1
 /// (or an absent one) stretches to the extent of the others. `None` if two extents disagree.
@@ -37,7 +35,7 @@ pub fn broadcast_shape(shapes: &[&[usize]]) -> Option<Shape> {
 /// If the shapes do not broadcast.
 #[track_caller]
 pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: impl Fn([T; N]) -> T + Sync) -> Tensor<T> {
-    broadcast_loop(x, pool, &|x, out| lanes(x, out, &f))
+    map_block(x, pool, |x, out| lanes(x, out, &f))
 }
 
 /// As [`map`], for a formula that is read for quick numbers and for plain ones (see [`Lane`]): sines and cosines cost a
@@ -53,7 +51,7 @@ pub fn map_either<T: Scalar, const N: usize>(
     quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true> + Sync,
     plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false> + Sync,
 ) -> Tensor<T> {
-    broadcast_loop(x, pool, &|x, out| lanes_either(x, out, &quick, &plain))
+    map_block(x, pool, |x, out| lanes_either(x, out, &quick, &plain))
 }
 
 /// [`map_either`] for a formula that is generic over [`Real`](crate::Real), written once.
@@ -78,101 +76,13 @@ macro_rules! map_real {
     };
 }
 
-/// What a loop does with a part of each operand and of the output, all of one length.
-type Kernel<'a, T, const N: usize> = dyn Fn([&[T]; N], &mut [T]) + Sync + 'a;
-
-/// Calls `run` with slices of one length: parts of the tensors, stretched to their common shape, and of the output. Apart
-/// from the formula, so that it is compiled once and not for each.
+/// One result of a pass over `N` tensors: see [`map_fused`].
 #[track_caller]
-pub(crate) fn broadcast_loop<T: Scalar, const N: usize>(
-    x: [&Tensor<T>; N],
-    pool: &Pool<T>,
-    run: &Kernel<'_, T, N>,
-) -> Tensor<T> {
-    let shapes = x.map(|x| x.shape());
-    if shapes.iter().all(|&shape| shape == shapes[0]) && x.iter().all(|x| x.is_packed()) {
-        let x = x.map(|x| x.as_slice());
-        return pool.filled(shapes[0], |out| pieces(out, ELEMENT, &|start, out| run(cut(x, start, out.len()), out)));
-    }
-    let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
-    let layouts = x.map(|x| x.layout().stretched(&shape));
-    let view = |i: usize, layout: Layout| x[i].with_layout(layout);
-    // What all operands repeat is worked out once, and the result repeats it.
-    let is_repeated = |&axis: &usize| shape[axis] > 1 && layouts.iter().all(|layout| layout.strides()[axis] == 0);
-    let repeated: Shape = (0..shape.len()).filter(is_repeated).collect();
-    if !repeated.is_empty() {
-        let once = |layout: &Layout| repeated.iter().fold(layout.clone(), |layout, &axis| layout.sliced(axis, 0, 1, 1));
-        let once: [Tensor<T>; N] = std::array::from_fn(|i| view(i, once(&layouts[i])));
-        return broadcast_loop(once.each_ref(), pool, run).broadcast_to(&shape);
-    }
-    // Where nobody shows all elements in row-major order, those of an operand that has another order count: the result gets
-    // the same.
-    let is_whole =
-        |layout: &&Layout| !layout.strides().iter().zip(&shape).any(|(&stride, &extent)| stride == 0 && extent > 1);
-    if !layouts.iter().any(Layout::is_packed)
-        && let Some(order) = layouts.iter().filter(is_whole).find_map(Layout::memory_order)
-    {
-        let turned: [Tensor<T>; N] = std::array::from_fn(|i| view(i, layouts[i].permuted(&order)));
-        let turned = broadcast_loop(turned.each_ref(), pool, run);
-        return turned.with_layout(turned.layout().permuted(&inverse(&order)));
-    }
-    let parts: [Part<'_, T>; N] = std::array::from_fn(|i| Part::of(x[i].buffer(), &layouts[i]));
-    pool.filled(&shape, |out| {
-        let work = ELEMENT * out.len();
-        let scratch = || parts.each_ref().map(Part::scratch);
-        chunks(out, PIECE, work, scratch, &|scratch: &mut [Vec<T>; N], i, out| {
-            for (j, out) in out.chunks_mut(STRETCH).enumerate() {
-                let start = i * PIECE + j * STRETCH;
-                let mut slices: [&[T]; N] = [&[]; N];
-                for (slice, (part, scratch)) in slices.iter_mut().zip(parts.iter().zip(scratch.iter_mut())) {
-                    *slice = part.cut(start, out.len(), scratch);
-                }
-                run(slices, out);
-            }
-        });
-    })
-}
-
-/// Elements of operands that are brought into order at once: several arrays of them stay in a core's first cache.
-const STRETCH: usize = 2048;
-
-/// An operand of a loop over a common shape.
-enum Part<'a, T: Scalar> {
-    /// Its elements are in order.
-    Packed(&'a [T]),
-    /// One number.
-    One(T),
-    /// They have to be brought into order.
-    Strided(&'a [T], &'a Layout),
-}
-
-impl<'a, T: Scalar> Part<'a, T> {
-    fn of(buffer: &'a [T], layout: &'a Layout) -> Self {
-        match buffer {
-            &[one] => Part::One(one),
-            _ if layout.is_packed() => Part::Packed(&buffer[layout.offset()..]),
-            _ => Part::Strided(buffer, layout),
-        }
-    }
-
-    fn scratch(&self) -> Vec<T> {
-        match *self {
-            Part::Packed(_) => vec![],
-            Part::One(value) => vec![value; STRETCH],
-            Part::Strided(..) => vec![T::ZERO; STRETCH],
-        }
-    }
-
-    /// `n` elements from `start` on.
-    fn cut<'s>(&'s self, start: usize, n: usize, scratch: &'s mut [T]) -> &'s [T] {
-        match self {
-            Part::Packed(x) => &x[start..][..n],
-            Part::One(_) => &scratch[..n],
-            Part::Strided(buffer, layout) => {
-                layout.read_range(buffer, start, &mut scratch[..n]);
-                &scratch[..n]
-            }
-        }
+fn map_block<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, block: impl Fn([&[T]; N], &mut [T]) + Sync) -> Tensor<T> {
+    let [result] = map_fused(&x, [true], pool, &|x, out| block(std::array::from_fn(|k| x[k]), out[0]));
+    match result {
+        Some(result) => result,
+        None => unreachable!("it is wanted"),
     }
 }
 

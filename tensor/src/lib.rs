@@ -4,6 +4,7 @@
 //! * [`Pool`]: gives the buffers of dropped tensors to the next ones.
 //! * [`matmul`]: matrix products with transposed operands by stride.
 //! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
+//! * [`map_fused`] and [`lanes_fused`]: several results of one such loop.
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
 //! * [`Layout`]: the strides of a view: broadcast, permute, slice, flip, diagonal, windows, and their adjoints.
 //! * [`Windows`]: what a convolution or a pooling sees of an image.
@@ -20,6 +21,7 @@ mod convert;
 mod create;
 mod elementwise;
 pub mod extremum;
+mod fused;
 mod indices;
 mod lane;
 mod layout;
@@ -45,6 +47,7 @@ pub use ndarray::s;
 pub use axes::{Axes, Reduction, axis_of};
 pub use create::concat;
 pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map_either};
+pub use fused::{Block, lanes_fused, map_fused};
 pub use indices::Indices;
 pub use lane::Lane;
 pub use layout::Layout;

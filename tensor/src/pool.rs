@@ -141,9 +141,19 @@ impl<T: Scalar> Pool<T> {
             fill(&mut one);
             return Tensor::one(Shape::from_slice(shape), one[0]);
         }
-        let small = len <= SMALL;
-        let mut values = if small { unspecified(len, len) } else { self.take(len) };
+        let mut values = self.buffer(len);
         fill(&mut values);
+        self.wrap(shape, values)
+    }
+
+    /// A vector for [`wrap`](Self::wrap) to make a tensor of, with unspecified (old) values.
+    pub(crate) fn buffer(&self, len: usize) -> Vec<T> {
+        if len <= SMALL { unspecified(len, len) } else { self.take(len) }
+    }
+
+    /// The tensor of this shape whose elements are those of a [`buffer`](Self::buffer).
+    pub(crate) fn wrap(&self, shape: &[usize], values: Vec<T>) -> Tensor<T> {
+        let small = values.len() <= SMALL;
         Tensor::pooled(Shape::from_slice(shape), values, if small { Pool::none() } else { self.clone() })
     }
 

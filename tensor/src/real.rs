@@ -5,11 +5,11 @@ use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// A real number, as an elementwise formula sees it.
 ///
-/// A formula that is generic over `Real` is read three ways: `f32` and `f64` compile to one vectorised loop,
-/// a variable of a tape records it (gradients of gradients), and a dual number carries a derivative along, as an oracle
-/// in tests. Formulas have no branches: they choose with [`if_positive`](Self::if_positive).
+/// A formula that is generic over `Real` is read in several ways: numbers compile to one vectorised loop, dual numbers
+/// carry derivatives along, and what stands for a variable of a tape writes the formula down there (gradients of
+/// gradients). Formulas have no branches: they choose with [`if_positive`](Self::if_positive).
 pub trait Real:
-    Clone + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {
     /// The constant `value`, of this number's kind.
     fn like(&self, value: f64) -> Self;

@@ -1,7 +1,7 @@
 //! The sRGB transfer curve, and the space in which blending happens.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Tape, Unary};
+use raygrad::autograd::{Formula, Scalar, Tape};
 use raygrad::nerf::{Image, SrgbDecode, SrgbEncode, background, quantise, srgb_decode, srgb_encode};
 
 /// Matrix: sRGB at -.1, 0, 1e-8, knee +- ulp, 1, 2. Catalogue: `where` + pow.
@@ -58,6 +58,6 @@ fn blending_happens_in_code_values() {
     let half = Image { width: 1, height: 1, channels: 4, data: vec![1.0, 1.0, 1.0, 0.5] };
     assert_eq!(half.over([0.0; 3]).data, [0.5; 3]);
     assert_eq!(background::over(&[1.0, 1.0, 1.0, 0.5], [0.0; 3]), [0.5; 3]);
-    let light = SrgbEncode.f(0.5 * SrgbDecode.f(1.0_f64));
+    let light = SrgbEncode.f([0.5 * SrgbDecode.f([1.0_f64])]);
     near::<f64>("in light", light, constant("sRGB(.5)"), 1e-14);
 }

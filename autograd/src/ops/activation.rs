@@ -1,8 +1,7 @@
 //! Activation functions.
 
-use crate::catalogue::Cases;
-use crate::elementwise::{Map, Unary};
-use crate::{Reads, Var};
+use crate::catalogue::{Cases, Examined};
+use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI};
 
@@ -11,21 +10,22 @@ const INF: f64 = f64::INFINITY;
 /// y = max(x, 0), NaN for NaN; dx = g where x > 0, else 0 (also at the kink).
 #[derive(Clone, Copy)]
 pub struct Relu;
-impl Unary for Relu {
+impl Formula<1> for Relu {
     const NAME: &'static str = "relu";
     // y is positive exactly where x is, and a fused layer can then overwrite x.
-    const READS: Reads = Reads::OUTPUT;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         // As a choice on -x, so that a NaN chooses itself.
         let zero = x.like(0.0);
-        (-x.clone()).if_positive(zero, x)
+        (-x).if_positive(zero, x)
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         let zero = g.like(0.0);
-        y.if_positive(g, zero)
+        [y.if_positive(g, zero)]
     }
+}
+impl Examined<1> for Relu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
         c.at([0.0], 0.0, [0.0]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([f64::NAN], f64::NAN, [0.0]);
@@ -35,17 +35,18 @@ impl Unary for Relu {
 /// y = 1 / (1 + e^-x); dx = g s(x) s(-x), which keeps digits where y is near 1.
 #[derive(Clone, Copy)]
 pub struct Sigmoid;
-impl Unary for Sigmoid {
+impl Formula<1> for Sigmoid {
     const NAME: &'static str = "sigmoid";
-    const READS: Reads = Reads::only(&[0]).and_output();
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sigmoid()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, y: E) -> E {
-        g * (y * (-x).sigmoid())
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
+        [g * (y * (-x).sigmoid())]
     }
+}
+impl Examined<1> for Sigmoid {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.5, [0.25]).at([-INF], 0.0, [0.0]).at([INF], 1.0, [0.0]);
         c.at([17.0], 0.999_999_958_600_600_9, [4.139_937_377e-8]).at([-89.0], 2.227_363_561e-39, [2.227_363_561e-39]);
@@ -55,17 +56,14 @@ impl Unary for Sigmoid {
 /// y = ln(1 + e^x); dx = g s(x).
 #[derive(Clone, Copy)]
 pub struct Softplus;
-impl Unary for Softplus {
+impl Formula<1> for Softplus {
     const NAME: &'static str = "softplus";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.softplus()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        g * x.sigmoid()
-    }
+}
+impl Examined<1> for Softplus {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-20.0], 2.061_153_620e-9, [2.061_153_618e-9]).at([89.0], 89.0, [1.0]);
         c.at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);
@@ -75,17 +73,14 @@ impl Unary for Softplus {
 /// y = ln(1 / (1 + e^-x)) = -softplus(-x); dx = g s(-x).
 #[derive(Clone, Copy)]
 pub struct LogSigmoid;
-impl Unary for LogSigmoid {
+impl Formula<1> for LogSigmoid {
     const NAME: &'static str = "log_sigmoid";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         -(-x).softplus()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        g * (-x).sigmoid()
-    }
+}
+impl Examined<1> for LogSigmoid {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], -std::f64::consts::LN_2, [0.5]).at([20.0], -2.061_153_620e-9, [2.061_153_618e-9]);
         c.at([-INF], -INF, [1.0]).at([INF], 0.0, [0.0]).at([-89.0], -89.0, [1.0]);
@@ -98,19 +93,15 @@ pub struct LeakyRelu {
     /// The slope below 0, positive.
     pub slope: f64,
 }
-impl Unary for LeakyRelu {
+impl Formula<1> for LeakyRelu {
     const NAME: &'static str = "leaky_relu";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let scaled = x.like(self.slope) * x.clone();
-        x.if_positive(x.clone(), scaled)
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        let scaled = x.like(self.slope) * x;
+        x.if_positive(x, scaled)
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let scaled = g.like(self.slope) * g.clone();
-        x.if_positive(g, scaled)
-    }
+}
+impl Examined<1> for LeakyRelu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
         c.at([0.0], 0.0, [self.slope]).at([-INF], -INF, [self.slope]).at([INF], INF, [1.0]);
@@ -124,21 +115,16 @@ pub struct Elu {
     /// Minus the limit at -inf.
     pub alpha: f64,
 }
-impl Unary for Elu {
+impl Formula<1> for Elu {
     const NAME: &'static str = "elu";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let below = x.like(self.alpha) * x.clone().expm1();
-        x.if_positive(x.clone(), below)
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        // Of min(x, 0): what is not chosen must not overflow either, or it would be NaN in the second derivative.
+        let below = x.like(self.alpha) * x.if_positive(x.like(0.0), x).expm1();
+        x.if_positive(x, below)
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        // e^min(x, 0): what is not chosen must not overflow either, or it would be NaN in the next derivative.
-        let zero = x.like(0.0);
-        let below = x.like(self.alpha) * x.if_positive(zero, x.clone()).exp();
-        g.clone() * x.if_positive(g.like(1.0), below)
-    }
+}
+impl Examined<1> for Elu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
         c.at([0.0], 0.0, [self.alpha]).at([-INF], -self.alpha, [0.0]).at([INF], INF, [1.0]).at(
@@ -153,22 +139,23 @@ impl Unary for Elu {
 /// density.
 #[derive(Clone, Copy)]
 pub struct Gelu;
-impl Unary for Gelu {
+impl Formula<1> for Gelu {
     const NAME: &'static str = "gelu";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let (half, root) = (x.like(0.5), x.like(FRAC_1_SQRT_2));
-        let share = half.clone() + half * (x.clone() * root).erf();
+        let share = half + half * (x * root).erf();
         scaled(x, share)
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         let (half, root) = (x.like(0.5), x.like(FRAC_1_SQRT_2));
-        let share = half.clone() + half.clone() * (x.clone() * root).erf();
-        let density = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2) * (-(half * (x.clone() * x.clone()))).exp();
-        g * (share + scaled(x, density))
+        let share = half + half * (x * root).erf();
+        let density = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2) * (-(half * (x * x))).exp();
+        [g * (share + scaled(x, density))]
     }
+}
+impl Examined<1> for Gelu {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at(
             [f64::NAN],
@@ -181,24 +168,25 @@ impl Unary for Gelu {
 /// y = x s(2 u), u = sqrt(2/pi) (x + 0.044715 x^3): [`Gelu`] by way of tanh, within 5e-4 of it.
 #[derive(Clone, Copy)]
 pub struct GeluTanh;
-impl Unary for GeluTanh {
+impl Formula<1> for GeluTanh {
     const NAME: &'static str = "gelu_tanh";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let share = gelu_argument(x.clone()).sigmoid();
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        let share = gelu_argument(x).sigmoid();
         scaled(x, share)
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let u = gelu_argument(x.clone());
-        let share = u.clone().sigmoid();
-        let density = share.clone() * (-u).sigmoid();
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
+        let u = gelu_argument(x);
+        let share = u.sigmoid();
+        let density = share * (-u).sigmoid();
         let (scale, cubic) = (x.like(GELU_SCALE), x.like(3.0 * GELU_CUBIC));
         // Where the density is 0, its factor may be infinite.
-        let slope = scale.clone() + scale * cubic * (x.clone() * x.clone());
-        g * (share + scaled(x * slope, density))
+        let slope = scale + scale * cubic * (x * x);
+        [g * (share + scaled(x * slope, density))]
     }
+}
+impl Examined<1> for GeluTanh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([1e30], 1e30, [1.0]);
         c.at([1.0], 0.841_191_990_608_276_8, [1.082964083845783]);
@@ -208,20 +196,21 @@ impl Unary for GeluTanh {
 /// y = x s(x), also called swish; dx = g (s(x) + x s(x) s(-x)).
 #[derive(Clone, Copy)]
 pub struct Silu;
-impl Unary for Silu {
+impl Formula<1> for Silu {
     const NAME: &'static str = "silu";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let share = x.clone().sigmoid();
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        let share = x.sigmoid();
         scaled(x, share)
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let share = x.clone().sigmoid();
-        let density = share.clone() * (-x.clone()).sigmoid();
-        g * (share + scaled(x, density))
+    fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
+        let share = x.sigmoid();
+        let density = share * (-x).sigmoid();
+        [g * (share + scaled(x, density))]
     }
+}
+impl Examined<1> for Silu {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);
         c.at([-20.0], -4.122_307_236e-8, [-3.916_191_867e-8]).at([f64::NAN], f64::NAN, [f64::NAN]);
@@ -231,8 +220,8 @@ impl Unary for Silu {
 /// `x share` for a share that tends to 0 faster than x grows: 0, and not NaN, where the share is 0.
 #[inline(always)]
 fn scaled<E: Real>(x: E, share: E) -> E {
-    let product = x * share.clone();
-    share.if_positive(product, share.clone())
+    let product = x * share;
+    share.if_positive(product, share)
 }
 
 const GELU_SCALE: f64 = 1.595_769_121_605_730_7; // 2 sqrt(2/pi)
@@ -242,7 +231,7 @@ const GELU_CUBIC: f64 = 0.044_715;
 #[inline(always)]
 fn gelu_argument<E: Real>(x: E) -> E {
     let (scale, cubic) = (x.like(GELU_SCALE), x.like(GELU_CUBIC));
-    let cube = x.clone() * x.clone() * x.clone();
+    let cube = x * x * x;
     scale * (x + cubic * cube)
 }
 
@@ -250,54 +239,54 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// `max(self, 0)`; NaN stays NaN. The gradient at 0 is 0.
     #[track_caller]
     pub fn relu(&self) -> Self {
-        self.tape().apply(Map(Relu), &[self])
+        Relu.on([self])
     }
 
     /// `1 / (1 + e^-self)`, accurate at both ends.
     #[track_caller]
     pub fn sigmoid(&self) -> Self {
-        self.tape().apply(Map(Sigmoid), &[self])
+        Sigmoid.on([self])
     }
 
     /// `ln(1 + e^self)`, accurate at both ends.
     #[track_caller]
     pub fn softplus(&self) -> Self {
-        self.tape().apply(Map(Softplus), &[self])
+        Softplus.on([self])
     }
 
     /// `ln(sigmoid(self))`, accurate at both ends.
     #[track_caller]
     pub fn log_sigmoid(&self) -> Self {
-        self.tape().apply(Map(LogSigmoid), &[self])
+        LogSigmoid.on([self])
     }
 
     /// `self` where it is positive, else `slope * self`. The gradient at 0 is `slope`.
     #[track_caller]
     pub fn leaky_relu(&self, slope: f64) -> Self {
-        self.tape().apply(Map(LeakyRelu { slope }), &[self])
+        LeakyRelu { slope }.on([self])
     }
 
     /// `self` where it is positive, else `alpha (e^self - 1)`. The gradient at 0 is `alpha`.
     #[track_caller]
     pub fn elu(&self, alpha: f64) -> Self {
-        self.tape().apply(Map(Elu { alpha }), &[self])
+        Elu { alpha }.on([self])
     }
 
     /// `self` times the normal distribution function of `self`: the exact form, by way of the error function.
     #[track_caller]
     pub fn gelu(&self) -> Self {
-        self.tape().apply(Map(Gelu), &[self])
+        Gelu.on([self])
     }
 
     /// [`gelu`](Self::gelu) in the form with tanh, which older models were trained with; within 5e-4 of the exact one.
     #[track_caller]
     pub fn gelu_tanh(&self) -> Self {
-        self.tape().apply(Map(GeluTanh), &[self])
+        GeluTanh.on([self])
     }
 
     /// `self * sigmoid(self)`, also called swish.
     #[track_caller]
     pub fn silu(&self) -> Self {
-        self.tape().apply(Map(Silu), &[self])
+        Silu.on([self])
     }
 }

@@ -1,29 +1,20 @@
 //! The four operations, and multiplication and addition of constants.
 
-use crate::catalogue::Cases;
-use crate::elementwise::{Binary, Map, Unary, Zip};
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::catalogue::{Cases, Examined};
+use crate::{Formula, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, map};
 
 /// y = a + b.
 #[derive(Clone, Copy)]
 pub struct Add;
-impl Binary for Add {
+impl Formula<2> for Add {
     const NAME: &'static str = "add";
-    const READS: Reads = Reads::NOTHING;
-    const PASSES: [bool; 2] = [true, true];
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a + b
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
-        g
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
-        g
-    }
+}
+impl Examined<2> for Add {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
         c.at([1e30, -1e30], 0.0, [1.0, 1.0]).at([f64::INFINITY, 1.0], f64::INFINITY, [1.0, 1.0]);
@@ -33,22 +24,14 @@ impl Binary for Add {
 /// y = a - b.
 #[derive(Clone, Copy)]
 pub struct Sub;
-impl Binary for Sub {
+impl Formula<2> for Sub {
     const NAME: &'static str = "sub";
-    const READS: Reads = Reads::NOTHING;
-    const PASSES: [bool; 2] = [true, false];
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a - b
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
-        g
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, _a: E, _b: E, _y: E) -> E {
-        -g
-    }
+}
+impl Examined<2> for Sub {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
         c.at([1e30, 1e30], 0.0, [1.0, -1.0]).at([1.0, f64::INFINITY], f64::NEG_INFINITY, [1.0, -1.0]);
@@ -58,21 +41,14 @@ impl Binary for Sub {
 /// y = a b.
 #[derive(Clone, Copy)]
 pub struct Mul;
-impl Binary for Mul {
+impl Formula<2> for Mul {
     const NAME: &'static str = "mul";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a * b
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, _a: E, b: E, _y: E) -> E {
-        g * b
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, _b: E, _y: E) -> E {
-        g * a
-    }
+}
+impl Examined<2> for Mul {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(-3.0..3.0);
         c.at([0.0, 5.0], 0.0, [5.0, 0.0]).at([f64::INFINITY, 2.0], f64::INFINITY, [2.0, f64::INFINITY]);
@@ -83,21 +59,14 @@ impl Binary for Mul {
 /// y = a / b; da = g / b, db = -g y / b. Division by 0 gives what IEEE 754 says.
 #[derive(Clone, Copy)]
 pub struct Div;
-impl Binary for Div {
+impl Formula<2> for Div {
     const NAME: &'static str = "div";
-    const READS: Reads = Reads::only(&[1]).and_output();
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a / b
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, _a: E, b: E, _y: E) -> E {
-        g / b
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, _a: E, b: E, y: E) -> E {
-        -(g * y / b)
-    }
+}
+impl Examined<2> for Div {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);
         c.at([0.0, 2.0], 0.0, [0.5, 0.0]).at([1.0, f64::INFINITY], 0.0, [0.0, 0.0]);
@@ -113,19 +82,15 @@ pub struct Affine {
     /// The summand.
     pub shift: f64,
 }
-impl Unary for Affine {
+impl Formula<1> for Affine {
     const NAME: &'static str = "affine";
-    const READS: Reads = Reads::NOTHING;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let (scale, shift) = (x.like(self.scale), x.like(self.shift));
         x * scale + shift
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-        let scale = g.like(self.scale);
-        g * scale
-    }
+}
+impl Examined<1> for Affine {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], self.shift, [self.scale]);
         c.at([f64::INFINITY], f64::INFINITY * self.scale, [self.scale]);
@@ -135,17 +100,14 @@ impl Unary for Affine {
 /// y = x, as a new node: separates an input's own share of a gradient from that of inputs which depend on it.
 #[derive(Clone, Copy)]
 pub struct Alias;
-impl Unary for Alias {
+impl Formula<1> for Alias {
     const NAME: &'static str = "alias";
-    const READS: Reads = Reads::NOTHING;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-        g
-    }
+}
+impl Examined<1> for Alias {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).at([f64::INFINITY], f64::INFINITY, [1.0]);
     }
@@ -187,29 +149,29 @@ impl<T: Scalar> Op<T> for IfPositive {
 
 #[track_caller]
 pub(crate) fn add<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
-    a.tape().apply(Zip(Add), &[a, b])
+    Add.on([a, b])
 }
 
 #[track_caller]
 pub(crate) fn sub<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
-    a.tape().apply(Zip(Sub), &[a, b])
+    Sub.on([a, b])
 }
 
 #[track_caller]
 pub(crate) fn mul<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
-    a.tape().apply(Zip(Mul), &[a, b])
+    Mul.on([a, b])
 }
 
 #[track_caller]
 pub(crate) fn div<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
-    a.tape().apply(Zip(Div), &[a, b])
+    Div.on([a, b])
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
     /// `scale * self + shift` for constants.
     #[track_caller]
     pub fn affine(&self, scale: f64, shift: f64) -> Self {
-        self.tape().apply(Map(Affine { scale, shift }), &[self])
+        Affine { scale, shift }.on([self])
     }
 
     /// `self * self`.
@@ -221,7 +183,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The same value as a new node.
     #[track_caller]
     pub(crate) fn alias(&self) -> Self {
-        self.tape().apply(Map(Alias), &[self])
+        Alias.on([self])
     }
 
     /// `yes` where this is greater than 0, else (also where it is NaN) `no`; all three broadcast together. The

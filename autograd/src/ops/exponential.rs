@@ -1,8 +1,7 @@
 //! Exponentials, logarithms, square roots and the error function.
 
-use crate::catalogue::Cases;
-use crate::elementwise::{Map, Unary};
-use crate::{Reads, Var};
+use crate::catalogue::{Cases, Examined};
+use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 use std::f64::consts::{FRAC_2_SQRT_PI, LN_2, LOG2_E};
 
@@ -11,37 +10,34 @@ const INF: f64 = f64::INFINITY;
 /// y = e^x; dx = g y.
 #[derive(Clone, Copy)]
 pub struct Exp;
-impl Unary for Exp {
+impl Formula<1> for Exp {
     const NAME: &'static str = "exp";
-    const READS: Reads = Reads::OUTPUT;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.exp()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
-        g * y
+    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
+        [g * y]
     }
+}
+impl Examined<1> for Exp {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-INF], 0.0, [0.0]).at([-1000.0], 0.0, [0.0]).at([INF], INF, [INF]);
     }
 }
 
-/// y = e^x - 1; dx = g (y + 1).
+/// y = e^x - 1; dx = g e^x.
 #[derive(Clone, Copy)]
 pub struct Expm1;
-impl Unary for Expm1 {
+impl Formula<1> for Expm1 {
     const NAME: &'static str = "expm1";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.expm1()
     }
-    // e^x and not y + 1: the sum would lose every digit where y is near -1.
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        g * x.exp()
-    }
+}
+impl Examined<1> for Expm1 {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([1e-20], 1e-20, [1.0]).at([-INF], -1.0, [0.0]).at([INF], INF, [INF]);
     }
@@ -50,17 +46,14 @@ impl Unary for Expm1 {
 /// y = ln x; dx = g / x.
 #[derive(Clone, Copy)]
 pub struct Ln;
-impl Unary for Ln {
+impl Formula<1> for Ln {
     const NAME: &'static str = "ln";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.ln()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        g / x
-    }
+}
+impl Examined<1> for Ln {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([1.0], 0.0, [1.0]).at([INF], INF, [0.0]);
     }
@@ -69,18 +62,14 @@ impl Unary for Ln {
 /// y = ln(1 + x); dx = g / (1 + x).
 #[derive(Clone, Copy)]
 pub struct Ln1p;
-impl Unary for Ln1p {
+impl Formula<1> for Ln1p {
     const NAME: &'static str = "ln1p";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.ln1p()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let one = x.like(1.0);
-        g / (one + x)
-    }
+}
+impl Examined<1> for Ln1p {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.5..3.0).at([1e-20], 1e-20, [1.0]).at([-1.0], -INF, [INF]).at([INF], INF, [0.0]);
     }
@@ -89,18 +78,19 @@ impl Unary for Ln1p {
 /// y = sqrt x; dx = g / (2 y). The gradient at 0 is infinite.
 #[derive(Clone, Copy)]
 pub struct Sqrt;
-impl Unary for Sqrt {
+impl Formula<1> for Sqrt {
     const NAME: &'static str = "sqrt";
-    const READS: Reads = Reads::OUTPUT;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sqrt()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         let half = g.like(0.5);
-        g * half / y
+        [g * half / y]
     }
+}
+impl Examined<1> for Sqrt {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], 0.0, [INF]).at([4.0], 2.0, [0.25]).at([INF], INF, [0.0]);
     }
@@ -109,18 +99,19 @@ impl Unary for Sqrt {
 /// y = 2^x; dx = g y ln 2.
 #[derive(Clone, Copy)]
 pub struct Exp2;
-impl Unary for Exp2 {
+impl Formula<1> for Exp2 {
     const NAME: &'static str = "exp2";
-    const READS: Reads = Reads::OUTPUT;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.exp2()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         let ln_2 = g.like(LN_2);
-        g * (y * ln_2)
+        [g * (y * ln_2)]
     }
+}
+impl Examined<1> for Exp2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([3.0], 8.0, [8.0 * LN_2]).at([-INF], 0.0, [0.0]).at([INF], INF, [INF]);
     }
@@ -129,18 +120,14 @@ impl Unary for Exp2 {
 /// y = log2 x; dx = g / (x ln 2).
 #[derive(Clone, Copy)]
 pub struct Log2;
-impl Unary for Log2 {
+impl Formula<1> for Log2 {
     const NAME: &'static str = "log2";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.log2()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let log2_e = g.like(LOG2_E);
-        g * log2_e / x
-    }
+}
+impl Examined<1> for Log2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([8.0], 3.0, [0.125 * LOG2_E]).at([INF], INF, [0.0]);
     }
@@ -149,19 +136,20 @@ impl Unary for Log2 {
 /// y = 1 / sqrt x; dx = -g y^3 / 2.
 #[derive(Clone, Copy)]
 pub struct Rsqrt;
-impl Unary for Rsqrt {
+impl Formula<1> for Rsqrt {
     const NAME: &'static str = "rsqrt";
-    const READS: Reads = Reads::OUTPUT;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let one = x.like(1.0);
         one / x.sqrt()
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         let half = g.like(-0.5);
-        g * half * (y.clone() * y.clone() * y)
+        [g * half * (y * y * y)]
     }
+}
+impl Examined<1> for Rsqrt {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], INF, [-INF]).at([4.0], 0.5, [-0.0625]).at([INF], 0.0, [0.0]);
         c.at([-1.0], f64::NAN, [f64::NAN]);
@@ -171,18 +159,14 @@ impl Unary for Rsqrt {
 /// y = erf x; dx = g 2/sqrt(pi) e^(-x^2).
 #[derive(Clone, Copy)]
 pub struct Erf;
-impl Unary for Erf {
+impl Formula<1> for Erf {
     const NAME: &'static str = "erf";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.erf()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let scale = g.like(FRAC_2_SQRT_PI);
-        g * (scale * (-(x.clone() * x)).exp())
-    }
+}
+impl Examined<1> for Erf {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [FRAC_2_SQRT_PI]).at([-INF], -1.0, [0.0]).at([30.0], 1.0, [0.0]);
     }
@@ -192,54 +176,54 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// `e^self`.
     #[track_caller]
     pub fn exp(&self) -> Self {
-        self.tape().apply(Map(Exp), &[self])
+        Exp.on([self])
     }
 
     /// `e^self - 1`, accurate near 0.
     #[track_caller]
     pub fn expm1(&self) -> Self {
-        self.tape().apply(Map(Expm1), &[self])
+        Expm1.on([self])
     }
 
     /// The natural logarithm: -inf at 0, NaN below.
     #[track_caller]
     pub fn ln(&self) -> Self {
-        self.tape().apply(Map(Ln), &[self])
+        Ln.on([self])
     }
 
     /// `ln(1 + self)`, accurate near 0.
     #[track_caller]
     pub fn ln1p(&self) -> Self {
-        self.tape().apply(Map(Ln1p), &[self])
+        Ln1p.on([self])
     }
 
     /// The square root: NaN below 0, infinite gradient at 0.
     #[track_caller]
     pub fn sqrt(&self) -> Self {
-        self.tape().apply(Map(Sqrt), &[self])
+        Sqrt.on([self])
     }
 
     /// `2^self`.
     #[track_caller]
     pub fn exp2(&self) -> Self {
-        self.tape().apply(Map(Exp2), &[self])
+        Exp2.on([self])
     }
 
     /// The logarithm to base 2: -inf at 0, NaN below.
     #[track_caller]
     pub fn log2(&self) -> Self {
-        self.tape().apply(Map(Log2), &[self])
+        Log2.on([self])
     }
 
     /// `1 / sqrt(self)`: inf at 0, where the gradient is -inf; NaN below.
     #[track_caller]
     pub fn rsqrt(&self) -> Self {
-        self.tape().apply(Map(Rsqrt), &[self])
+        Rsqrt.on([self])
     }
 
     /// The error function, `2/sqrt(pi) * integral from 0 to self of e^-t^2 dt`.
     #[track_caller]
     pub fn erf(&self) -> Self {
-        self.tape().apply(Map(Erf), &[self])
+        Erf.on([self])
     }
 }

@@ -1,8 +1,7 @@
 //! Losses: how far predictions are from their targets.
 
-use crate::catalogue::Cases;
-use crate::elementwise::{Binary, Zip};
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::catalogue::{Cases, Examined};
+use crate::{Formula, Grads, Op, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor};
 use std::sync::Arc;
@@ -12,24 +11,15 @@ const INF: f64 = f64::INFINITY;
 /// y = (a - b)^2; da = 2 g (a - b), db = -da.
 #[derive(Clone, Copy)]
 pub struct SquaredError;
-impl Binary for SquaredError {
+impl Formula<2> for SquaredError {
     const NAME: &'static str = "squared_error";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let r = a - b;
-        r.clone() * r
+        r * r
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        let two = g.like(2.0);
-        g * (two * (a - b))
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        let two = g.like(2.0);
-        g * (two * (b - a))
-    }
+}
+impl Examined<2> for SquaredError {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(-3.0..3.0).at([1.0, 1.0], 0.0, [0.0, 0.0]).at([3.0, 1.0], 4.0, [4.0, -4.0]);
     }
@@ -38,33 +28,18 @@ impl Binary for SquaredError {
 /// y = |a - b|; da = g sign(a - b), so 0 at the kink, db = -da.
 #[derive(Clone, Copy)]
 pub struct AbsoluteError;
-impl Binary for AbsoluteError {
+impl Formula<2> for AbsoluteError {
     const NAME: &'static str = "absolute_error";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         (a - b).abs()
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        g * (a - b).sign()
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        g * (b - a).sign()
-    }
+}
+impl Examined<2> for AbsoluteError {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
         c.at([1.0, 1.0], 0.0, [0.0, 0.0]).at([-INF, 1.0], INF, [-1.0, 1.0]);
     }
-}
-
-/// `x` limited to `-most..=most`.
-#[inline(always)]
-fn limited<E: Real>(x: E, most: f64) -> E {
-    let (low, high) = (x.like(-most), x.like(most));
-    let below = (low.clone() - x.clone()).if_positive(low, x.clone());
-    (x - high.clone()).if_positive(high, below)
 }
 
 /// With r = a - b: y = r^2 / 2 for |r| <= delta, else delta (|r| - delta / 2); da = g r limited to +-delta, db = -da.
@@ -73,25 +48,18 @@ pub struct Huber {
     /// Where the parabola goes over into its tangents.
     pub delta: f64,
 }
-impl Binary for Huber {
+impl Formula<2> for Huber {
     const NAME: &'static str = "huber";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let (half, delta) = (a.like(0.5), a.like(self.delta));
-        let r = (a - b).abs();
-        let near = half.clone() * (r.clone() * r.clone());
-        let far = delta.clone() * (r.clone() - half * delta.clone());
-        (r - delta).if_positive(far, near)
+        let r = a - b;
+        let near = half * (r * r);
+        let far = delta * (r.abs() - half * delta);
+        (r.abs() - delta).if_positive(far, near)
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        g * limited(a - b, self.delta)
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        g * limited(b - a, self.delta)
-    }
+}
+impl Examined<2> for Huber {
     fn cases(&self, c: &mut Cases) {
         let d = self.delta;
         c.domain(0.1 * d..0.9 * d).domain_also(2.5 * d..4.0 * d).domain(-0.05 * d..0.05 * d);
@@ -107,30 +75,19 @@ pub struct SmoothL1 {
     /// Where the parabola goes over into its tangents; may be 0.
     pub beta: f64,
 }
-impl Binary for SmoothL1 {
+impl Formula<2> for SmoothL1 {
     const NAME: &'static str = "smooth_l1";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let half = a.like(0.5);
         let (beta, width) = (a.like(self.beta), a.like(self.width()));
-        let r = (a - b).abs();
-        let near = half.clone() * (r.clone() * r.clone()) / width;
-        let far = r.clone() - half * beta.clone();
-        (beta - r).if_positive(near, far)
-    }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
         let r = a - b;
-        let near = limited(r.clone() / r.like(self.width()), 1.0);
-        g * self.slope(r, near)
+        let near = half * (r * r) / width;
+        let far = r.abs() - half * beta;
+        (beta - r.abs()).if_positive(near, far)
     }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        let r = b - a;
-        let near = limited(r.clone() / r.like(self.width()), 1.0);
-        g * self.slope(r, near)
-    }
+}
+impl Examined<2> for SmoothL1 {
     fn cases(&self, c: &mut Cases) {
         let w = self.beta.max(0.1);
         c.domain(0.1 * w..0.9 * w).domain_also(2.5 * w..4.0 * w).domain(-0.05 * w..0.05 * w);
@@ -148,11 +105,6 @@ impl SmoothL1 {
     fn width(&self) -> f64 {
         if self.beta == 0.0 { 1.0 } else { self.beta }
     }
-
-    #[inline(always)]
-    fn slope<E: Real>(&self, r: E, near: E) -> E {
-        if self.beta == 0.0 { r.sign() } else { near }
-    }
 }
 
 /// y = b softplus(-a) + (1 - b) softplus(a): minus the logarithm of the probability that a logit a gives to a target b
@@ -160,29 +112,26 @@ impl SmoothL1 {
 /// so do small gradients at the targets 0 and 1.
 #[derive(Clone, Copy)]
 pub struct BinaryCrossEntropy;
-impl Binary for BinaryCrossEntropy {
+impl Formula<2> for BinaryCrossEntropy {
     const NAME: &'static str = "binary_cross_entropy";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         let (zero, one) = (a.like(0.0), a.like(1.0));
         // softplus(+-a) = softplus(-|a|) + max(+-a, 0).
-        let tail = (-a.clone().abs()).softplus();
-        let against = (one - b.clone()) * a.if_positive(a.clone(), zero.clone());
-        let towards = b * (-a.clone()).if_positive(-a, zero);
+        let tail = (-a.abs()).softplus();
+        let against = (one - b) * a.if_positive(a, zero);
+        let towards = b * (-a).if_positive(-a, zero);
         tail + against + towards
     }
     #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
         // With p = s(-|a|), s(a) is 1 - p or p. At a = 0 it is p, for the sake of the second derivative.
-        let p = a.if_positive(-a.clone(), a.clone()).sigmoid();
-        let towards = b.like(1.0) - b.clone() - p.clone();
-        g * a.if_positive(towards, p - b)
+        let p = a.if_positive(-a, a).sigmoid();
+        let towards = b.like(1.0) - b - p;
+        [g * a.if_positive(towards, p - b), -(g * a)]
     }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, _b: E, _y: E) -> E {
-        -(g * a)
-    }
+}
+impl Examined<2> for BinaryCrossEntropy {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.1..0.9).at([0.0, 1.0], std::f64::consts::LN_2, [-0.5, 0.0]);
         c.at([40.0, 1.0], 4.248_354_255_291_589e-18, [-4.248_354_255_291_589e-18, -40.0]).at(
@@ -253,9 +202,9 @@ impl<T: Scalar> Op<T> for CrossEntropy {
 impl<'t, T: Scalar> Var<'t, T> {
     /// A loss of each element; no broadcasting, which in a loss is a mistake more often than not.
     #[track_caller]
-    fn loss(&self, loss: impl Binary, target: &Self) -> Self {
+    fn loss(&self, loss: impl Formula<2>, target: &Self) -> Self {
         assert_eq!(self.shape(), target.shape(), "a loss of a prediction and a target of different shapes");
-        self.tape().apply(Zip(loss), &[self, target])
+        loss.on([self, target])
     }
 
     /// `(self - target)^2` of each element.

@@ -1,8 +1,7 @@
 //! Functions with kinks and steps: absolute value, sign, extremes, limits, rounding.
 
-use crate::catalogue::Cases;
-use crate::elementwise::{Binary, Map, Unary, Zip};
-use crate::{Reads, Var};
+use crate::catalogue::{Cases, Examined};
+use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 
 const INF: f64 = f64::INFINITY;
@@ -11,17 +10,14 @@ const NAN: f64 = f64::NAN;
 /// y = |x|; dx = g sign(x), so 0 at the kink.
 #[derive(Clone, Copy)]
 pub struct Abs;
-impl Unary for Abs {
+impl Formula<1> for Abs {
     const NAME: &'static str = "abs";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.abs()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        g * x.sign()
-    }
+}
+impl Examined<1> for Abs {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1).at([0.0], 0.0, [0.0]).at([-0.0], 0.0, [0.0]).at([-INF], INF, [-1.0]);
     }
@@ -30,17 +26,14 @@ impl Unary for Abs {
 /// y = 1 for x > 0, -1 for x < 0, else x; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Sign;
-impl Unary for Sign {
+impl Formula<1> for Sign {
     const NAME: &'static str = "sign";
-    const READS: Reads = Reads::NOTHING;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sign()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-        g.like(0.0)
-    }
+}
+impl Examined<1> for Sign {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1).at([0.0], 0.0, [0.0]).at([-INF], -1.0, [0.0]).at([NAN], NAN, [0.0]);
     }
@@ -49,21 +42,14 @@ impl Unary for Sign {
 /// y = the greater of a and b, NaN if one is; its gradient is g, and each has half of it at a tie.
 #[derive(Clone, Copy)]
 pub struct Maximum;
-impl Binary for Maximum {
+impl Formula<2> for Maximum {
     const NAME: &'static str = "maximum";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.maximum(b)
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        share(g, a - b)
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        share(g, b - a)
-    }
+}
+impl Examined<2> for Maximum {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
         c.at([2.0, 2.0], 2.0, [0.5, 0.5]).at([-INF, 1.0], 1.0, [0.0, 1.0]).at([INF, INF], INF, [0.5, 0.5]);
@@ -74,21 +60,14 @@ impl Binary for Maximum {
 /// y = the smaller of a and b, NaN if one is; its gradient is g, and each has half of it at a tie.
 #[derive(Clone, Copy)]
 pub struct Minimum;
-impl Binary for Minimum {
+impl Formula<2> for Minimum {
     const NAME: &'static str = "minimum";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.minimum(b)
     }
-    #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        share(g, b - a)
-    }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        share(g, a - b)
-    }
+}
+impl Examined<2> for Minimum {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
         c.at([2.0, 2.0], 2.0, [0.5, 0.5]).at([-INF, 1.0], -INF, [1.0, 0.0]).at([INF, INF], INF, [0.5, 0.5]);
@@ -98,9 +77,9 @@ impl Binary for Minimum {
 
 /// g where `lead` > 0, 0 where it is negative, half of g at a tie (and where nothing can be said).
 #[inline(always)]
-fn share<E: Real>(g: E, lead: E) -> E {
-    let (zero, half) = (g.like(0.0), g.like(0.5) * g.clone());
-    lead.if_positive(g, (-lead.clone()).if_positive(zero, half))
+pub(crate) fn share<E: Real>(g: E, lead: E) -> E {
+    let (zero, half) = (g.like(0.0), g.like(0.5) * g);
+    lead.if_positive(g, (-lead).if_positive(zero, half))
 }
 
 /// y = x limited to low..=high, NaN for NaN; dx = g inside and on the limits, 0 beyond.
@@ -111,21 +90,16 @@ pub struct Clamp {
     /// The greatest value.
     pub high: f64,
 }
-impl Unary for Clamp {
+impl Formula<1> for Clamp {
     const NAME: &'static str = "clamp";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let (low, high) = (x.like(self.low), x.like(self.high));
-        let below = (low.clone() - x.clone()).if_positive(low, x.clone());
-        (x - high.clone()).if_positive(high, below)
+        let below = (low - x).if_positive(low, x);
+        (x - high).if_positive(high, below)
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        let (zero, low, high) = (g.like(0.0), x.like(self.low), x.like(self.high));
-        let inside = (low - x.clone()).if_positive(zero.clone(), g);
-        (x - high).if_positive(zero, inside)
-    }
+}
+impl Examined<1> for Clamp {
     fn cases(&self, c: &mut Cases) {
         let (low, high) = (self.low, self.high);
         let middle = 0.5 * (low + high);
@@ -141,17 +115,14 @@ impl Unary for Clamp {
 /// y = the greatest whole number that is not above x; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Floor;
-impl Unary for Floor {
+impl Formula<1> for Floor {
     const NAME: &'static str = "floor";
-    const READS: Reads = Reads::NOTHING;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.floor()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-        g.like(0.0)
-    }
+}
+impl Examined<1> for Floor {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.9..-1.1).domain_also(2.1..2.9).at([-0.5], -1.0, [0.0]).at([2.0], 2.0, [0.0]).at([INF], INF, [0.0]);
     }
@@ -160,17 +131,14 @@ impl Unary for Floor {
 /// y = the least whole number that is not below x; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Ceil;
-impl Unary for Ceil {
+impl Formula<1> for Ceil {
     const NAME: &'static str = "ceil";
-    const READS: Reads = Reads::NOTHING;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.ceil()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-        g.like(0.0)
-    }
+}
+impl Examined<1> for Ceil {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.9..-1.1).domain_also(2.1..2.9).at([0.5], 1.0, [0.0]).at([2.0], 2.0, [0.0]).at([-INF], -INF, [0.0]);
     }
@@ -179,17 +147,14 @@ impl Unary for Ceil {
 /// y = the whole number nearest to x, the even one of two; dx = 0.
 #[derive(Clone, Copy)]
 pub struct Round;
-impl Unary for Round {
+impl Formula<1> for Round {
     const NAME: &'static str = "round";
-    const READS: Reads = Reads::NOTHING;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.round()
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, _y: E) -> E {
-        g.like(0.0)
-    }
+}
+impl Examined<1> for Round {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.4..-0.6)
             .domain_also(1.6..2.4)
@@ -204,13 +169,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The absolute value. The gradient at 0 is 0.
     #[track_caller]
     pub fn abs(&self) -> Self {
-        self.tape().apply(Map(Abs), &[self])
+        Abs.on([self])
     }
 
     /// 1 for positive elements, -1 for negative ones, 0 and NaN for 0 and NaN. The gradient is 0.
     #[track_caller]
     pub fn sign(&self) -> Self {
-        self.tape().apply(Map(Sign), &[self])
+        Sign.on([self])
     }
 
     /// The greater of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
@@ -219,7 +184,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn maximum(&self, other: &Self) -> Self {
-        self.tape().apply(Zip(Maximum), &[self, other])
+        Maximum.on([self, other])
     }
 
     /// The smaller of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
@@ -228,7 +193,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn minimum(&self, other: &Self) -> Self {
-        self.tape().apply(Zip(Minimum), &[self, other])
+        Minimum.on([self, other])
     }
 
     /// The elements limited to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is
@@ -239,24 +204,24 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn clamp(&self, low: f64, high: f64) -> Self {
         assert!(low <= high, "clamp between {low} and {high}");
-        self.tape().apply(Map(Clamp { low, high }), &[self])
+        Clamp { low, high }.on([self])
     }
 
     /// The next whole number below. The gradient is 0.
     #[track_caller]
     pub fn floor(&self) -> Self {
-        self.tape().apply(Map(Floor), &[self])
+        Floor.on([self])
     }
 
     /// The next whole number above. The gradient is 0.
     #[track_caller]
     pub fn ceil(&self) -> Self {
-        self.tape().apply(Map(Ceil), &[self])
+        Ceil.on([self])
     }
 
     /// The nearest whole number, the even one of two. The gradient is 0.
     #[track_caller]
     pub fn round(&self) -> Self {
-        self.tape().apply(Map(Round), &[self])
+        Round.on([self])
     }
 }

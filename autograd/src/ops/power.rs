@@ -1,8 +1,7 @@
 //! Powers, reciprocals, and x ln y.
 
-use crate::catalogue::Cases;
-use crate::elementwise::{Binary, Map, Unary, Zip};
-use crate::{Reads, Var};
+use crate::catalogue::{Cases, Examined};
+use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 
 const INF: f64 = f64::INFINITY;
@@ -11,18 +10,19 @@ const NAN: f64 = f64::NAN;
 /// y = 1 / x; dx = -g y^2.
 #[derive(Clone, Copy)]
 pub struct Reciprocal;
-impl Unary for Reciprocal {
+impl Formula<1> for Reciprocal {
     const NAME: &'static str = "reciprocal";
-    const READS: Reads = Reads::OUTPUT;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         let one = x.like(1.0);
         one / x
     }
     #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, _x: E, y: E) -> E {
-        -(g * (y.clone() * y))
+    fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
+        [-(g * (y * y))]
     }
+}
+impl Examined<1> for Reciprocal {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).domain_also(-3.0..-0.5).at([0.0], INF, [-INF]).at([-INF], 0.0, [0.0]).at(
             [-4.0],
@@ -38,21 +38,14 @@ pub struct Powi {
     /// The exponent.
     pub exponent: i32,
 }
-impl Unary for Powi {
+impl Formula<1> for Powi {
     const NAME: &'static str = "powi";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.powi(self.exponent)
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        if self.exponent == 0 {
-            return g.like(0.0);
-        }
-        let factor = g.like(f64::from(self.exponent));
-        g * (factor * x.powi(self.exponent.saturating_sub(1)))
-    }
+}
+impl Examined<1> for Powi {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain_also(-2.0..-0.5);
         match self.exponent {
@@ -69,17 +62,14 @@ impl Unary for Powi {
 /// [`Powi`] with an exponent that the compiler knows: where it is small, a few products that vectorise.
 #[derive(Clone, Copy)]
 pub struct ConstPowi<const N: i32>;
-impl<const N: i32> Unary for ConstPowi<N> {
+impl<const N: i32> Formula<1> for ConstPowi<N> {
     const NAME: &'static str = "powi";
-    const READS: Reads = Powi::READS;
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        Powi { exponent: N }.f(x)
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        Powi { exponent: N }.f([x])
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, y: E) -> E {
-        Powi { exponent: N }.vjp(g, x, y)
-    }
+}
+impl<const N: i32> Examined<1> for ConstPowi<N> {
     fn cases(&self, c: &mut Cases) {
         Powi { exponent: N }.cases(c);
     }
@@ -91,22 +81,14 @@ pub struct Powf {
     /// The exponent.
     pub exponent: f64,
 }
-impl Unary for Powf {
+impl Formula<1> for Powf {
     const NAME: &'static str = "powf";
-    const READS: Reads = Reads::only(&[0]);
     #[inline(always)]
-    fn f<E: Real>(&self, x: E) -> E {
-        let exponent = x.like(self.exponent);
-        x.pow(exponent)
+    fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+        if self.exponent == 0.0 { x.like(1.0) } else { x.pow(x.like(self.exponent)) }
     }
-    #[inline(always)]
-    fn vjp<E: Real>(&self, g: E, x: E, _y: E) -> E {
-        if self.exponent == 0.0 {
-            return g.like(0.0);
-        }
-        let (factor, exponent) = (g.like(self.exponent), g.like(self.exponent - 1.0));
-        g * (factor * x.pow(exponent))
-    }
+}
+impl Examined<1> for Powf {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0);
         match self.exponent {
@@ -123,31 +105,18 @@ impl Unary for Powf {
 /// and a broken b.
 #[derive(Clone, Copy)]
 pub struct Pow;
-impl Binary for Pow {
+impl Formula<2> for Pow {
     const NAME: &'static str = "pow";
-    const READS: Reads = Reads::ALL;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.pow(b)
     }
     #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        let (zero, one) = (g.like(0.0), g.like(1.0));
-        let full = b.clone() * a.clone().pow(b.clone() - one);
-        // 0 where both are 0, and NaN where one is.
-        let origin = (a.clone() + b.clone()) * zero;
-        g * (a.abs() + b.abs()).if_positive(full, origin)
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
+        [g * slope_of_base(a, b), g * slope_of_exponent(a, b, y)]
     }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, y: E) -> E {
-        let (zero, one) = (g.like(0.0), g.like(1.0));
-        let size = a.clone().abs();
-        // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
-        let ln = size.if_positive(a.clone(), one).ln();
-        let full = y.clone() * ln;
-        let at_zero = (-b).if_positive(y.clone() * a.clone().abs().ln(), y * zero.clone() + a * zero);
-        g * size.if_positive(full, at_zero)
-    }
+}
+impl Examined<2> for Pow {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain(-2.0..2.0);
         c.at([0.0, 0.0], 1.0, [0.0, 0.0]).at([0.0, 2.0], 0.0, [0.0, 0.0]).at([0.0, 1.0], 0.0, [1.0, 0.0]);
@@ -156,31 +125,44 @@ impl Binary for Pow {
     }
 }
 
+/// The derivative of y = a^b by a.
+#[inline(always)]
+pub(crate) fn slope_of_base<E: Real>(a: E, b: E) -> E {
+    let full = b * a.pow(b - b.like(1.0));
+    // 0 where both are 0, and NaN where one is.
+    let origin = (a + b) * b.like(0.0);
+    (a.abs() + b.abs()).if_positive(full, origin)
+}
+
+/// The derivative of y = a^b by b.
+#[inline(always)]
+pub(crate) fn slope_of_exponent<E: Real>(a: E, b: E, y: E) -> E {
+    let (zero, one, size) = (a.like(0.0), a.like(1.0), a.abs());
+    // A logarithm that is finite where it is not chosen, or the next derivative would be NaN.
+    let full = y * size.if_positive(a, one).ln();
+    let at_zero = (-b).if_positive(y * size.ln(), y * zero + a * zero);
+    size.if_positive(full, at_zero)
+}
+
 /// y = a ln b, 0 for a = 0 unless b is NaN; da = g ln b, but 0 where a = 0 and b <= 0; db = g a / b, but 0 where a = 0.
 #[derive(Clone, Copy)]
 pub struct Xlogy;
-impl Binary for Xlogy {
+impl Formula<2> for Xlogy {
     const NAME: &'static str = "xlogy";
-    const READS: Reads = Reads::INPUTS;
     #[inline(always)]
-    fn f<E: Real>(&self, a: E, b: E) -> E {
-        let ln = b.clone().ln();
-        let zero = a.like(0.0) * (a.clone() + b.clone().sign());
-        a.clone().abs().if_positive(a * ln, zero)
+    fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
+        let ln = b.ln();
+        let zero = a.like(0.0) * (a + b.sign());
+        a.abs().if_positive(a * ln, zero)
     }
     #[inline(always)]
-    fn vjp_a<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        // The logarithm of 1 where a is 0 and b has none.
-        let divisor = a.abs().if_positive(b.clone(), b.like(1.0));
-        g * b.if_positive(b.clone(), divisor).ln()
+    fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
+        // Where a is 0, the logarithm of 1 if b has none, and a division by 1: the next derivative is not NaN there.
+        let divisor = a.abs().if_positive(b, b.like(1.0));
+        [g * b.if_positive(b, divisor).ln(), g * (a / divisor)]
     }
-    #[inline(always)]
-    fn vjp_b<E: Real>(&self, g: E, a: E, b: E, _y: E) -> E {
-        // Divided by 1 where a is 0, so that the next derivative is not NaN there.
-        let one = b.like(1.0);
-        let divisor = a.clone().abs().if_positive(b, one);
-        g * (a / divisor)
-    }
+}
+impl Examined<2> for Xlogy {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);
         c.at([0.0, 0.0], 0.0, [0.0, 0.0]).at([0.0, 2.0], 0.0, [2.0_f64.ln(), 0.0]).at([0.0, -1.0], 0.0, [0.0, 0.0]);
@@ -193,7 +175,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// `1 / self`.
     #[track_caller]
     pub fn reciprocal(&self) -> Self {
-        self.tape().apply(Map(Reciprocal), &[self])
+        Reciprocal.on([self])
     }
 
     /// `self` to a whole power; exponent 0 gives 1, with gradient 0, whatever the base.
@@ -201,10 +183,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn powi(&self, exponent: i32) -> Self {
         match exponent {
             -1 => self.reciprocal(),
-            2 => self.tape().apply(Map(ConstPowi::<2>), &[self]),
-            3 => self.tape().apply(Map(ConstPowi::<3>), &[self]),
-            4 => self.tape().apply(Map(ConstPowi::<4>), &[self]),
-            _ => self.tape().apply(Map(Powi { exponent }), &[self]),
+            2 => ConstPowi::<2>.on([self]),
+            3 => ConstPowi::<3>.on([self]),
+            4 => ConstPowi::<4>.on([self]),
+            _ => Powi { exponent }.on([self]),
         }
     }
 
@@ -212,7 +194,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// 0.
     #[track_caller]
     pub fn powf(&self, exponent: f64) -> Self {
-        self.tape().apply(Map(Powf { exponent }), &[self])
+        Powf { exponent }.on([self])
     }
 
     /// `self` to the power of `exponent`; broadcasts. At base 0 the gradient of the exponent is 0 unless that is
@@ -222,7 +204,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn pow(&self, exponent: &Self) -> Self {
-        self.tape().apply(Zip(Pow), &[self, exponent])
+        Pow.on([self, exponent])
     }
 
     /// `self * ln(y)`, which is 0 where `self` is 0 even if `y` is 0 or negative; broadcasts. An entropy is
@@ -232,6 +214,6 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn xlogy(&self, y: &Self) -> Self {
-        self.tape().apply(Zip(Xlogy), &[self, y])
+        Xlogy.on([self, y])
     }
 }

@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use super::shade::Material;
 use super::shape::{Axis, Profile, Shape};
 use crate::color_space::SrgbDecode;
-use raygrad_autograd::Unary;
+use raygrad_autograd::Formula;
 
 /// Scene units in a stud pitch.
 const PITCH: f64 = 0.113;
@@ -40,7 +40,7 @@ pub const BROWN: Paint = Paint([112, 66, 36], PLASTIC);
 
 impl Paint {
     fn material(self) -> Material {
-        let albedo = self.0.map(|code| SrgbDecode.f(code as f64 / 255.0));
+        let albedo = self.0.map(|code| SrgbDecode.f([code as f64 / 255.0]));
         Material { albedo: albedo.into(), roughness: self.1 }
     }
 }

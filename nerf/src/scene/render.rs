@@ -7,7 +7,7 @@ use super::{Hit, Scene, shade};
 use crate::camera::Camera;
 use crate::color_space::SrgbEncode;
 use crate::image::Image;
-use raygrad_autograd::Unary;
+use raygrad_autograd::Formula;
 
 /// One image of a scene, with what a camera cannot photograph.
 #[derive(Debug, Clone, PartialEq)]
@@ -82,7 +82,7 @@ impl Scene {
         if covered == 0 {
             return ([0.0; 4], None);
         }
-        let [r, g, b] = (sum / covered as f64).to_array().map(|c| SrgbEncode.f(c) as f32);
+        let [r, g, b] = (sum / covered as f64).to_array().map(|c| SrgbEncode.f([c]) as f32);
         ([r, g, b, covered as f32 / pattern.0.len() as f32], centre)
     }
 }

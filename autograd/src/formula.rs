@@ -1,0 +1,324 @@
+//! Elementwise operations from one formula: its value in one pass, and all its gradients in one more.
+
+use crate::reading::Reading;
+use crate::recorded::{Recorded, Sheet};
+use crate::{Dual, Grads, Op, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, lanes_fused, map_fused, sum_to};
+use smallvec::SmallVec;
+use std::array::from_fn;
+
+/// A function of `N` numbers, applied to each element of `N` tensors with NumPy's broadcasting.
+///
+/// A name and the formula are all it takes. The formula is read in several ways: for numbers, as one vectorised loop
+/// without arrays in between; for [`Dual`] numbers, which gives the gradients of all operands in one more such loop; and
+/// for variables, which records it where a gradient is itself differentiated. [`formula!`](crate::formula) writes one in
+/// a line.
+///
+/// ```
+/// use raygrad_autograd::{Formula, Real, Tape, Tensor};
+///
+/// /// y = 1 / (1 + x^2).
+/// #[derive(Clone, Copy)]
+/// struct Lorentz;
+///
+/// impl Formula<1> for Lorentz {
+///     const NAME: &'static str = "lorentz";
+///     #[inline(always)]
+///     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
+///         let one = x.like(1.0);
+///         one / (one + x * x)
+///     }
+/// }
+///
+/// let tape = Tape::<f64>::new();
+/// let x = tape.leaf(Tensor::scalar(1.0));
+/// let y = Lorentz.on([&x]);
+/// assert_eq!((y.item(), y.grad(&[&x])[0].item()), (0.5, -0.5));
+/// ```
+///
+/// Mark [`f`](Self::f) and [`vjp`](Self::vjp) `#[inline(always)]`: only inlined code is vectorised.
+pub trait Formula<const N: usize>: Copy + Send + Sync + 'static {
+    /// The operation's name.
+    const NAME: &'static str;
+    /// Whether sines and cosines are worth a second reading of the formula: they cost a third then, with the same bits
+    /// (see [`raygrad_tensor::Lane`]), and everything is compiled twice.
+    const ANGLES: bool = false;
+
+    /// The function.
+    fn f<E: Real>(&self, x: [E; N]) -> E;
+
+    /// Its vector-Jacobian product: the gradient of each operand for the gradient `g` of `y = f(x)`. What it reads of `x`
+    /// and `y` the tape keeps.
+    ///
+    /// Unless it is overridden, because another form has more digits or reads a `y` that was dear to compute, it is what
+    /// dual numbers make of [`f`](Self::f).
+    #[inline(always)]
+    fn vjp<E: Real>(&self, g: E, x: [E; N], _y: E) -> [E; N] {
+        derived(self, g, x)
+    }
+
+    /// The function of variables.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[track_caller]
+    fn on<'t, T: Scalar>(self, x: [&Var<'t, T>; N]) -> Var<'t, T> {
+        x[0].tape().apply(Elementwise(self), &x)
+    }
+}
+
+/// The gradients of a formula by dual numbers. Their slopes begin as `g`, since each element of the Jacobian is on its
+/// diagonal.
+#[inline(always)]
+pub(crate) fn derived<F: Formula<N>, E: Real, const N: usize>(formula: &F, g: E, x: [E; N]) -> [E; N] {
+    let mut duals = [Dual { value: g, slopes: [None; N] }; N];
+    let mut k = 0;
+    while k < N {
+        duals[k].value = x[k];
+        duals[k].slopes[k] = Some(g);
+        k += 1;
+    }
+    let y = formula.f(duals);
+    let (mut grads, mut k) = ([g; N], 0);
+    while k < N {
+        grads[k] = match y.slopes[k] {
+            Some(slope) => slope,
+            None => g.like(0.0),
+        };
+        k += 1;
+    }
+    grads
+}
+
+/// A [`Formula`] as an operation.
+#[derive(Clone, Copy)]
+pub struct Elementwise<F, const N: usize>(pub F);
+
+impl<F: Formula<N>, const N: usize> Elementwise<F, N> {
+    /// What each gradient is made of.
+    #[inline(always)]
+    fn readings(&self) -> [Reading; N] {
+        const { assert!(N > 0 && N < 32, "a formula of 1 to 31 operands") };
+        let (mut x, mut k) = ([Reading::of(0); N], 0);
+        while k < N {
+            x[k] = Reading::of(1 << k);
+            k += 1;
+        }
+        self.0.vjp(Reading::gradient(), x, Reading::of(Reading::OUTPUT))
+    }
+
+    /// All gradients of a block: `x` are g, y and the operands.
+    fn gradients<T: Scalar>(&self, x: &[&[T]], out: &mut [&mut [T]]) {
+        if F::ANGLES {
+            let outside = lanes_fused::<T, true, 2, N, N>(
+                x,
+                out,
+                #[inline(always)]
+                |[g, y], x| self.0.vjp(g, x, y),
+            );
+            if !outside {
+                return;
+            }
+        }
+        lanes_fused::<T, false, 2, N, N>(
+            x,
+            out,
+            #[inline(always)]
+            |[g, y], x| self.0.vjp(g, x, y),
+        );
+    }
+
+    /// The values of a block.
+    fn values<T: Scalar>(&self, x: &[&[T]], out: &mut [&mut [T]]) {
+        if F::ANGLES {
+            let outside = lanes_fused::<T, true, 0, N, 1>(
+                x,
+                out,
+                #[inline(always)]
+                |[], x| [self.0.f(x)],
+            );
+            if !outside {
+                return;
+            }
+        }
+        lanes_fused::<T, false, 0, N, 1>(
+            x,
+            out,
+            #[inline(always)]
+            |[], x| [self.0.f(x)],
+        );
+    }
+}
+
+impl<T: Scalar, F: Formula<N>, const N: usize> Op<T> for Elementwise<F, N> {
+    fn name(&self) -> &'static str {
+        F::NAME
+    }
+
+    fn arity(&self) -> Option<usize> {
+        Some(N)
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let [y] = map_fused(x, [true], pool, &|x, out| self.values(x, out));
+        y.unwrap_or_else(|| pool.tensor(&[]))
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::of_bits(self.readings().iter().fold(0, |bits, reading| bits | reading.of))
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        if cx.recording() {
+            let sheet = Sheet::new();
+            let (g, x, y) = given(cx, &sheet, Op::<T>::reads(self));
+            return recorded(cx, &sheet, &self.0.vjp(g, x, y));
+        }
+        let mut wanted = [false; N];
+        let mut reads = 0;
+        let readings = self.readings();
+        for (i, reading) in readings.iter().enumerate() {
+            wanted[i] = cx.needs(i) && !reading.is_gradient;
+            reads |= if wanted[i] { reading.of } else { 0 };
+        }
+        Grads::new(gradients(cx, &readings, wanted, reads, &|x, out| self.gradients(x, out)))
+    }
+}
+
+/// Gradient, operands and result of a pass that is recorded; of what is not read, numbers without a value.
+#[allow(clippy::type_complexity)] // three numbers and their places
+fn given<'s, 't, T: Scalar, const N: usize>(
+    cx: &Vjp<'t, '_, T>,
+    sheet: &'s Sheet<'t, T>,
+    reads: Reads,
+) -> (Recorded<'s, 't, T>, [Recorded<'s, 't, T>; N], Recorded<'s, 't, T>) {
+    let unread = sheet.constant(f64::NAN);
+    let x = from_fn(|i| if reads.input(i) { sheet.given(cx.x(i)) } else { unread });
+    (sheet.given(cx.g().clone()), x, if reads.output() { sheet.given(cx.y()) } else { unread })
+}
+
+/// The gradients that are needed, on the tape.
+fn recorded<'t, T: Scalar>(cx: &Vjp<'t, '_, T>, sheet: &Sheet<'t, T>, grads: &[Recorded<'_, 't, T>]) -> Grads<'t, T> {
+    let needed: SmallVec<[_; 4]> = (0..grads.len()).filter(|&i| cx.needs(i)).map(|i| grads[i]).collect();
+    let mut vars = sheet.vars(cx.g(), &needed).into_iter();
+    // A gradient may be a constant, which has no axes.
+    let stretched = |grad: Var<'t, T>, i| grad.broadcast_to(cx.g().shape()).sum_to(cx.shape(i));
+    Grads::new((0..grads.len()).map(|i| if cx.needs(i) { vars.next().map(|grad| stretched(grad, i)) } else { None }))
+}
+
+/// The gradients that are needed, summed to the shapes of their operands. Apart from the loop, so that it is compiled once
+/// and not for each formula.
+fn gradients<'t, T: Scalar, const N: usize>(
+    cx: &Vjp<'t, '_, T>,
+    readings: &[Reading; N],
+    wanted: [bool; N],
+    reads: u32,
+    block: &raygrad_tensor::Block<'_, T>,
+) -> [Option<Var<'t, T>>; N] {
+    let g = cx.g().value();
+    let mut grads = [const { None }; N];
+    if wanted.contains(&true) {
+        // What no wanted gradient reads costs a register, not a pass over memory: `g` stands in for it.
+        let mut x: SmallVec<[&Tensor<T>; 6]> = SmallVec::new();
+        x.push(g);
+        x.push(if reads & Reading::OUTPUT == 0 { g } else { cx.output() });
+        x.extend((0..N).map(|i| if reads >> i & 1 == 0 { g } else { cx.input(i) }));
+        grads = map_fused(&x, wanted, cx.pool(), block);
+    }
+    let mut i = 0;
+    grads.map(|grad| {
+        let grad = grad.or_else(|| (cx.needs(i) && readings[i].is_gradient).then(|| g.clone()));
+        let shape = cx.shape(i);
+        i += 1;
+        grad.map(|grad| cx.constant(if grad.shape() == shape { grad } else { sum_to(&grad, shape, cx.pool()) }))
+    })
+}
+
+/// A [`Formula`] from a closure-like line: `formula!(|x, a, b| (x * a + b).tanh() * x)`.
+///
+/// The operands are [`Number`](crate::Number)s, so that constants mix with them as `f64`; functions are methods. Numbers
+/// from outside are listed in front, as anything that is `Into<f64>`.
+///
+/// ```
+/// use raygrad_autograd::{Tape, Tensor, formula};
+/// let tape = Tape::<f32>::new();
+/// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
+/// let (scale, shift) = (tape.leaf(Tensor::from_vec(&[2], vec![1.0, -1.0])), tape.leaf(Tensor::scalar(0.5)));
+/// let limit = 3.0;
+/// let y = formula!([limit] |x, a, b| (x * a + b).maximum(-limit) / 2.0).on([&x, &scale, &shift]);
+/// assert_eq!(y.value().as_slice(), [0.75, -0.75, 1.75, -1.5]);
+/// let grads = y.sum().grad(&[&x, &scale, &shift]);
+/// assert_eq!(grads[0].as_slice(), [0.5, -0.5, 0.5, 0.0]);
+/// assert_eq!(grads[1].as_slice(), [2.0, 1.0]);
+/// assert_eq!(grads[2].as_slice(), [1.5]);
+/// ```
+#[macro_export]
+macro_rules! formula {
+    (|$($x:ident),+ $(,)?| $y:expr) => {
+        $crate::formula!([] |$($x),+| $y)
+    };
+    ([$($constant:ident),* $(,)?] |$($x:ident),+ $(,)?| $y:expr) => {{
+        #[derive(Clone, Copy)]
+        struct Written {
+            $($constant: f64,)*
+        }
+        impl $crate::Formula<{ [$(stringify!($x)),+].len() }> for Written {
+            const NAME: &'static str = stringify!($y);
+            const ANGLES: bool = true;
+            #[inline(always)]
+            fn f<E: $crate::Real>(&self, x: [E; [$(stringify!($x)),+].len()]) -> E {
+                let Written { $($constant,)* } = *self;
+                let [$($x),+] = x;
+                $(let $x = $crate::Number($x);)+
+                let y: $crate::Number<E> = $y;
+                y.0
+            }
+        }
+        impl Written {
+            /// [`Formula::on`]($crate::Formula::on), which then need not be in scope.
+            #[allow(dead_code)]
+            #[track_caller]
+            fn on<'t, T: $crate::Scalar>(
+                self,
+                x: [&$crate::Var<'t, T>; [$(stringify!($x)),+].len()],
+            ) -> $crate::Var<'t, T> {
+                $crate::Formula::on(self, x)
+            }
+        }
+        Written { $($constant: f64::from($constant),)* }
+    }};
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ops::{activation, arithmetic, exponential, piecewise, trigonometric};
+
+    #[test]
+    fn an_operation_keeps_what_its_gradients_read() {
+        fn reads<const N: usize>(formula: impl Formula<N>) -> Reads {
+            Op::<f32>::reads(&Elementwise(formula))
+        }
+        assert_eq!(reads(arithmetic::Add), Reads::NOTHING);
+        assert_eq!(reads(arithmetic::Affine { scale: 2.0, shift: 1.0 }), Reads::NOTHING);
+        assert_eq!(reads(piecewise::Floor), Reads::NOTHING);
+        assert_eq!(reads(arithmetic::Mul), Reads::only(&[0, 1]));
+        assert_eq!(reads(trigonometric::Sin), Reads::only(&[0]));
+        assert_eq!(reads(exponential::Exp), Reads::OUTPUT);
+        assert_eq!(reads(activation::Sigmoid), Reads::only(&[0]).and_output());
+        // Of the constant b^0 the gradient of c reads the value, and none reads c.
+        assert_eq!(reads(crate::formula!(|x, a, b, c| a * x + b.powi(0) * c)), Reads::only(&[0, 1, 2]));
+    }
+
+    #[test]
+    fn a_gradient_that_passes_is_not_copied() {
+        let add = Elementwise(arithmetic::Add).readings();
+        assert!(add.iter().all(|reading| reading.is_gradient));
+        let sub = Elementwise(arithmetic::Sub).readings();
+        assert_eq!(sub.map(|reading| reading.is_gradient), [true, false]);
+    }
+}

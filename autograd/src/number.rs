@@ -1,0 +1,105 @@
+//! The numbers of a formula as [`formula!`](crate::formula) writes it, which mix with constants.
+
+use raygrad_tensor::Real;
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+/// A number of a [`formula!`](crate::formula): the functions of [`Real`] as methods, and arithmetic with `f64` on either
+/// side.
+#[derive(Debug, Clone, Copy)]
+pub struct Number<E>(pub E);
+
+/// What a [`Number`] meets: another one, or an `f64`.
+pub trait Term<E> {
+    /// As a number of the kind of `x`.
+    fn term(self, x: E) -> E;
+}
+
+impl<E: Real> Term<E> for Number<E> {
+    #[inline(always)]
+    fn term(self, _x: E) -> E {
+        self.0
+    }
+}
+
+impl<E: Real> Term<E> for f64 {
+    #[inline(always)]
+    fn term(self, x: E) -> E {
+        x.like(self)
+    }
+}
+
+macro_rules! operator {
+    ($($trait:ident $method:ident)*) => {
+        $(
+            impl<E: Real, R: Term<E>> $trait<R> for Number<E> {
+                type Output = Self;
+                #[inline(always)]
+                fn $method(self, other: R) -> Self {
+                    Number(self.0.$method(other.term(self.0)))
+                }
+            }
+
+            impl<E: Real> $trait<Number<E>> for f64 {
+                type Output = Number<E>;
+                #[inline(always)]
+                fn $method(self, other: Number<E>) -> Number<E> {
+                    Number(other.0.like(self).$method(other.0))
+                }
+            }
+        )*
+    };
+}
+
+operator! { Add add Sub sub Mul mul Div div }
+
+impl<E: Real> Neg for Number<E> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Number(-self.0)
+    }
+}
+
+macro_rules! unary {
+    ($($f:ident)*) => {
+        $(
+            #[doc = concat!("See [`Real::", stringify!($f), "`].")]
+            #[inline(always)]
+            pub fn $f(self) -> Self {
+                Number(self.0.$f())
+            }
+        )*
+    };
+}
+
+macro_rules! binary {
+    ($($f:ident)*) => {
+        $(
+            #[doc = concat!("See [`Real::", stringify!($f), "`].")]
+            #[inline(always)]
+            pub fn $f(self, other: impl Term<E>) -> Self {
+                Number(self.0.$f(other.term(self.0)))
+            }
+        )*
+    };
+}
+
+impl<E: Real> Number<E> {
+    unary! {
+        exp expm1 ln ln1p sin cos sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh
+        abs sign floor ceil round
+    }
+    binary! { atan2 pow maximum minimum }
+
+    /// See [`Real::powi`].
+    #[inline(always)]
+    pub fn powi(self, exponent: i32) -> Self {
+        Number(self.0.powi(exponent))
+    }
+
+    /// See [`Real::if_positive`].
+    #[inline(always)]
+    pub fn if_positive(self, yes: impl Term<E>, no: impl Term<E>) -> Self {
+        Number(self.0.if_positive(yes.term(self.0), no.term(self.0)))
+    }
+}

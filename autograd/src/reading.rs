@@ -1,0 +1,97 @@
+//! What a derivative reads, found out by reading the derivative.
+
+use raygrad_tensor::Real;
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+/// A number without a value, which remembers what it was made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Reading {
+    /// A bit for each input, and the highest one for the output.
+    pub(crate) of: u32,
+    /// Whether this is the gradient of the output as it came.
+    pub(crate) is_gradient: bool,
+}
+
+impl Reading {
+    /// The bit of the output.
+    pub(crate) const OUTPUT: u32 = 1 << 31;
+
+    /// A number that is made of these.
+    #[inline(always)]
+    pub(crate) fn of(of: u32) -> Self {
+        Reading { of, is_gradient: false }
+    }
+
+    /// The gradient of the output, which is always there.
+    #[inline(always)]
+    pub(crate) fn gradient() -> Self {
+        Reading { of: 0, is_gradient: true }
+    }
+}
+
+macro_rules! operator {
+    ($($trait:ident $method:ident)*) => {
+        $(
+            impl $trait for Reading {
+                type Output = Self;
+                #[inline(always)]
+                #[allow(clippy::suspicious_arithmetic_impl)] // operands are joined whatever the operator
+                fn $method(self, other: Self) -> Self {
+                    Reading::of(self.of | other.of)
+                }
+            }
+        )*
+    };
+}
+
+operator! { Add add Sub sub Mul mul Div div }
+
+impl Neg for Reading {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Reading::of(self.of)
+    }
+}
+
+macro_rules! unary {
+    ($($f:ident)*) => {
+        $(
+            #[inline(always)]
+            fn $f(self) -> Self {
+                Reading::of(self.of)
+            }
+        )*
+    };
+}
+
+macro_rules! binary {
+    ($($f:ident)*) => {
+        $(
+            #[inline(always)]
+            fn $f(self, other: Self) -> Self {
+                Reading::of(self.of | other.of)
+            }
+        )*
+    };
+}
+
+impl Real for Reading {
+    #[inline(always)]
+    fn like(&self, _value: f64) -> Self {
+        Reading::of(0)
+    }
+    #[inline(always)]
+    fn if_positive(&self, yes: Self, no: Self) -> Self {
+        Reading::of(self.of | yes.of | no.of)
+    }
+    #[inline(always)]
+    fn powi(self, _exponent: i32) -> Self {
+        Reading::of(self.of)
+    }
+    unary! {
+        exp expm1 ln ln1p sin cos sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh
+        abs sign floor ceil round
+    }
+    binary! { atan2 pow maximum minimum }
+}
