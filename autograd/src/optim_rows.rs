@@ -1,6 +1,7 @@
 //! An optimiser for tables of which a step touches few rows: embeddings, hash grids.
 
-use crate::optim::{TINY, TINY_SQUARE, limited};
+use crate::optim::limits::{flushed, limited, tiny_square};
+use crate::optim::settings::or_panic;
 use crate::{AdamConfig, RowSums};
 use raygrad_tensor::{Scalar, simd};
 use rayon::prelude::*;
@@ -91,12 +92,10 @@ impl<T: Scalar> Rule<T> {
     /// The new value and moments of an element with gradient `g`.
     #[inline(always)]
     fn element(&self, [x, g, m, v]: [T; 4], [rate, epsilon]: [T; 2]) -> [T; 3] {
-        let (tiny, tiny_square) = (T::from_f64(TINY), T::from_f64(TINY_SQUARE));
         let g = limited(g);
-        let m = self.beta[0] * m + self.rest[0] * g;
+        let m = flushed(self.beta[0] * m + self.rest[0] * g);
         let v = self.beta[1] * v + self.rest[1] * (g * g);
-        let m = if m > tiny || m < -tiny { m } else { T::ZERO };
-        let v = if v > tiny_square { v } else { T::ZERO };
+        let v = if v > tiny_square() { v } else { T::ZERO };
         [x - rate * m / (v.sqrt() + epsilon), m, v]
     }
 }
@@ -105,10 +104,11 @@ impl<T: Scalar> RowAdam<T> {
     /// An optimiser of `rows` rows of `features` numbers that has seen nothing.
     ///
     /// # Panics
-    /// If `features` is 0.
+    /// If `features` is 0 or [`AdamConfig::check`] finds something.
     #[track_caller]
     pub fn new(config: AdamConfig, rows: usize, features: usize) -> Self {
         assert!(features > 0, "rows without features");
+        or_panic(config.check());
         RowAdam { rule: Arc::new(Rule::new(config)), features, moments: Lines::zeros(0), steps: vec![] }.fresh(rows)
     }
 

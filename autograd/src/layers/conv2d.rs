@@ -114,8 +114,10 @@ mod tests {
             assert!(params.values()[0].as_slice().iter().all(|w| w.abs() <= 0.2_f64.sqrt()));
             let mut inputs = vec![Tensor::from_fn(&[2, 2, 4, 3], |i| (i as f64 * 0.7).sin())];
             inputs.extend(params.values().iter().cloned());
-            check_function(&Check::default(), &inputs, |x| layer.forward(&Bound::from_vars(x[1..].to_vec()), &x[0]))
-                .unwrap();
+            check_function(&Check::default(), &inputs, |x| {
+                layer.forward(&params.layout().bind(x[1..].to_vec()), &x[0])
+            })
+            .unwrap();
         }
     }
 

@@ -74,7 +74,7 @@ mod tests {
         assert_eq!(params.iter().map(|(name, _)| name).collect::<Vec<_>>(), ["words.weight"]);
         let table = params.values()[0].clone();
         check_function(&Check::default(), std::slice::from_ref(&table), |x| {
-            layer.forward(&Bound::from_vars(x.to_vec()), &[4, 1, 4].into()).exp()
+            layer.forward(&params.layout().bind(x.to_vec()), &[4, 1, 4].into()).exp()
         })
         .unwrap();
         let tape = Tape::new();

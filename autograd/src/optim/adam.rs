@@ -1,6 +1,8 @@
 //! Adam and AdamW.
 
-use super::{CHUNK, Move, Optimizer, TINY, TINY_SQUARE, check_shapes, limited, remember, slot};
+use super::limits::{flushed, limited, tiny, tiny_square};
+use super::settings::{check, check_rate, check_share, or_panic};
+use super::{CHUNK, Move, Optimizer, SettingError, check_shapes, remember, slot};
 use raygrad_tensor::{Scalar, Tensor, simd};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -8,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// Adam (Kingma and Ba 2015, algorithm 1).
 ///
 /// Bias corrections are computed in f64 from an integer step count, which each parameter has for itself. First moments
-/// below 1e-30 and second ones below 1e-37 are set to 0, so that long runs without gradient do not fill memory with
+/// below 1e-30 (1e-300 in f64) and second ones below 1e-37 (1e-307) are set to 0, so that long runs without gradient do not fill memory with
 /// denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their squares are finite. Work
 /// is spread over the current rayon pool; the result does not depend on the number of threads.
 #[derive(Debug, Clone)]
@@ -29,12 +31,12 @@ pub struct AdamW<T: Scalar> {
 /// Constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AdamConfig {
-    /// Decay of the first moment, in 0..1.
+    /// Decay of the first moment, at least 0 and less than 1.
     pub beta1: f64,
-    /// Decay of the second moment, in 0..1.
+    /// Decay of the second moment, at least 0 and less than 1.
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
-    /// networks, 1e-15 hash tables.
+    /// networks, 1e-15 hash tables. At least 1e-30.
     pub epsilon: f64,
 }
 
@@ -42,6 +44,18 @@ impl Default for AdamConfig {
     /// 0.9, 0.999, 1e-8.
     fn default() -> Self {
         AdamConfig { beta1: 0.9, beta2: 0.999, epsilon: 1e-8 }
+    }
+}
+
+impl AdamConfig {
+    /// Whether the constants are in their ranges.
+    ///
+    /// # Errors
+    /// If one is not, with its name.
+    pub fn check(&self) -> Result<(), SettingError> {
+        check_share("beta1", self.beta1)?;
+        check_share("beta2", self.beta2)?;
+        check("epsilon", self.epsilon, (1e-30..=1e30).contains(&self.epsilon), "1e-30 to 1e30")
     }
 }
 
@@ -55,7 +69,12 @@ struct Moments<T> {
 
 impl<T: Scalar> Adam<T> {
     /// An optimiser that has seen nothing.
+    ///
+    /// # Panics
+    /// If [`AdamConfig::check`] finds something.
+    #[track_caller]
     pub fn new(config: AdamConfig) -> Self {
+        or_panic(config.check());
         Adam { config, step: 0, moments: vec![] }
     }
 
@@ -113,7 +132,7 @@ impl<T: Scalar> Adam<T> {
                 rate: T::from_f64(part.rate * root / correction(beta1)),
                 epsilon: T::from_f64(epsilon * root),
                 keep: T::from_f64(1.0 - part.rate * decay),
-                tiniest: T::from_f64(if decay == 0.0 { 0.0 } else { TINY }),
+                tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
             };
             let m = remember(&mut moments.first, part.value.len(), first);
             let v = remember(&mut moments.second, part.value.len(), first);
@@ -139,7 +158,12 @@ impl<T: Scalar> AdamW<T> {
     /// An optimiser that has seen nothing. `decay` is the part of a parameter that goes at each step at learning rate 1,
     /// customarily 0.01; parameters can have a factor of their own, such as 0 for biases
     /// ([`Params::set_decay`](crate::Params::set_decay)).
+    ///
+    /// # Panics
+    /// If [`AdamConfig::check`] finds something, or the decay is negative, infinite or NaN.
+    #[track_caller]
     pub fn new(config: AdamConfig, decay: f64) -> Self {
+        or_panic(check_rate("decay", decay));
         AdamW { adam: Adam::new(config), decay }
     }
 
@@ -173,7 +197,6 @@ struct Update<T> {
 
 impl<T: Scalar> Update<T> {
     fn apply(&self, x: &mut [T], g: &[T], m: &mut [T], v: &mut [T]) -> usize {
-        let (tiny, tiny_square) = (T::from_f64(TINY), T::from_f64(TINY_SQUARE));
         let n = x.len();
         let (g, m, v) = (&g[..n], &mut m[..n], &mut v[..n]);
         simd::dispatch(
@@ -183,10 +206,9 @@ impl<T: Scalar> Update<T> {
                 for i in 0..n {
                     let good = g[i].is_finite();
                     let g = limited(g[i]);
-                    let first = self.beta[0] * m[i] + self.rest[0] * g;
+                    let first = flushed(self.beta[0] * m[i] + self.rest[0] * g);
                     let second = self.beta[1] * v[i] + self.rest[1] * (g * g);
-                    let first = if first > tiny || first < -tiny { first } else { T::ZERO };
-                    let second = if second > tiny_square { second } else { T::ZERO };
+                    let second = if second > tiny_square() { second } else { T::ZERO };
                     let kept = x[i] * self.keep;
                     let kept = if kept < self.tiniest && kept > -self.tiniest { T::ZERO } else { kept };
                     let moved = kept - self.rate * first / (second.sqrt() + self.epsilon);

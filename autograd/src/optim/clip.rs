@@ -1,6 +1,6 @@
 //! Bounds on gradients.
 
-use super::TINY;
+use super::limits::flushed;
 use raygrad_tensor::{Scalar, Tensor, simd};
 
 /// What [`clip_norm`] found and did.
@@ -57,7 +57,7 @@ pub fn global_norm<T: Scalar>(grads: &[Tensor<T>]) -> (f64, usize) {
 ///
 /// The norm is that of the finite elements; infinite ones and NaN stay as they are, so that one bad element neither sets
 /// all others to 0 nor goes unnoticed: optimisers leave what has such a gradient alone and count it. Products below 1e-30
-/// become 0.
+/// (1e-300 in f64) become 0.
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, clip_norm};
@@ -142,14 +142,12 @@ fn square<T: Scalar>(x: T, largest: f64) -> f64 {
 }
 
 fn scale<T: Scalar>(x: &mut [T], factor: f64) {
-    let (factor, tiny) = (T::from_f64(factor), T::from_f64(TINY));
+    let factor = T::from_f64(factor);
     simd::dispatch(
         #[inline(always)]
         || {
             for x in x.iter_mut() {
-                let scaled = *x * factor;
-                let scaled = if scaled < tiny && scaled > -tiny { T::ZERO } else { scaled };
-                *x = if x.is_finite() { scaled } else { *x };
+                *x = if x.is_finite() { flushed(*x * factor) } else { *x };
             }
         },
     );
@@ -210,5 +208,9 @@ mod tests {
         let mut uneven = [Tensor::from_vec(&[2], vec![1e10_f32, 1e-25])];
         clip_norm(&mut uneven, 1.0);
         assert_eq!(uneven[0].as_slice(), [1.0, 0.0], "no denormals");
+        let power = |exponent| 2.0_f64.powi(exponent);
+        let mut uneven = [Tensor::from_vec(&[3], [40, -100, -990].map(power).to_vec())];
+        clip_norm(&mut uneven, 1.0);
+        assert_eq!(uneven[0].as_slice(), [1.0, power(-140), 0.0], "f64 holds more");
     }
 }

@@ -1,6 +1,6 @@
 //! Averages of parameters.
 
-use super::TINY;
+use super::limits::flushed;
 use crate::Params;
 use raygrad_tensor::{Scalar, simd};
 
@@ -42,7 +42,7 @@ impl<T: Scalar> Ema<T> {
     }
 
     /// Takes the parameters after a step into account, and returns how many elements were left alone because the
-    /// parameter is infinite or NaN. Averages below 1e-30 become 0.
+    /// parameter is infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
     ///
     /// # Panics
     /// If the number or the size of the parameters has changed.
@@ -74,7 +74,6 @@ impl<T: Scalar> Ema<T> {
 }
 
 fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
-    let tiny = T::from_f64(TINY);
     let n = a.len();
     let x = &x[..n];
     simd::dispatch(
@@ -84,8 +83,7 @@ fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
             for i in 0..n {
                 let good = x[i].is_finite();
                 // With a share of 1 this is exactly x.
-                let blended = (T::ONE - share) * a[i] + share * x[i];
-                let blended = if blended < tiny && blended > -tiny { T::ZERO } else { blended };
+                let blended = flushed((T::ONE - share) * a[i] + share * x[i]);
                 a[i] = if good { blended } else { a[i] };
                 skipped += usize::from(!good);
             }
@@ -139,6 +137,9 @@ mod tests {
             assert!(ema.params().values()[0].as_slice().iter().all(|a| !a.is_subnormal()));
         }
         assert_eq!(ema.into_params().values()[0].as_slice(), [0.0, 0.0]);
+        let mut double = Ema::new(&store(&[1e-40, 1.0]), 0.5);
+        double.update(&store(&[3e-40, 1.0]));
+        assert_eq!(double.params().values()[0].as_slice(), [2e-40, 1.0], "f64 holds more");
         let mut copy = Ema::new(&store(&[1.0, 1.0]), 0.0);
         copy.update(&store(&[0.1, 0.7]));
         assert_eq!(copy.params().values()[0].as_slice(), [0.1, 0.7]);

@@ -3,7 +3,9 @@
 mod adam;
 mod clip;
 mod ema;
+pub(crate) mod limits;
 mod schedule;
+pub(crate) mod settings;
 mod sgd;
 mod table;
 
@@ -11,6 +13,7 @@ pub use adam::{Adam, AdamConfig, AdamW};
 pub use clip::{Clipped, clip_norm, clip_value, global_norm};
 pub use ema::Ema;
 pub use schedule::Schedule;
+pub use settings::SettingError;
 pub use sgd::{Sgd, SgdConfig};
 pub use table::TableAdam;
 
@@ -35,7 +38,7 @@ pub struct Move<'a, T: Scalar> {
 /// Moves parameters against their gradients.
 ///
 /// All optimisers here leave an element alone, and count it, if its gradient is infinite or NaN; set what they remember
-/// to 0 once it is below 1e-30, so that no denormal numbers slow them down; and give the same bits at any number of
+/// to 0 once it is below 1e-30 (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any number of
 /// threads.
 ///
 /// ```
@@ -77,23 +80,6 @@ pub trait Optimizer<T: Scalar> {
 
 /// Elements that one task updates.
 const CHUNK: usize = 1 << 14;
-
-/// What an optimiser remembers is 0 below this.
-pub(crate) const TINY: f64 = 1e-30;
-
-/// A mean of squares is 0 below this: the square of [`TINY`] would be a denormal f32, and this is the square of 3e-19. As
-/// far as epsilon is larger, nobody notices. (A limit of 1e-30 would make 0 of the squares of gradients of 1e-14, whose
-/// own mean is kept, and their step 10 learning rates.)
-pub(crate) const TINY_SQUARE: f64 = 1e-37;
-
-/// The largest gradient that second moments can hold: squared it is still a number, and an element that has met a larger
-/// one moves on. (An infinite second moment would never fade.)
-#[inline(always)]
-pub(crate) fn limited<T: Scalar>(g: T) -> T {
-    let most = T::from_f64(if size_of::<T>() == 4 { 1e19 } else { 1e154 });
-    let g = if g > most { most } else { g };
-    if g < -most { -most } else { g }
-}
 
 /// What an optimiser keeps under a number.
 fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {

@@ -1,6 +1,8 @@
 //! Gradient descent with momentum.
 
-use super::{CHUNK, Move, Optimizer, TINY, check_shapes, remember, slot};
+use super::limits::{flushed, tiny};
+use super::settings::{check, check_rate, check_share, or_panic};
+use super::{CHUNK, Move, Optimizer, SettingError, check_shapes, remember, slot};
 use raygrad_tensor::{Scalar, simd};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -26,9 +28,26 @@ pub struct SgdConfig {
     pub decay: f64,
 }
 
+impl SgdConfig {
+    /// Whether the constants are in their ranges.
+    ///
+    /// # Errors
+    /// If one is not, with its name; also if there is a look-ahead without momentum.
+    pub fn check(&self) -> Result<(), SettingError> {
+        check_share("momentum", self.momentum)?;
+        check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
+        check_rate("decay", self.decay)
+    }
+}
+
 impl<T: Scalar> Sgd<T> {
     /// An optimiser that has seen nothing.
+    ///
+    /// # Panics
+    /// If [`SgdConfig::check`] finds something.
+    #[track_caller]
     pub fn new(config: SgdConfig) -> Self {
+        or_panic(config.check());
         Sgd { config, velocities: vec![] }
     }
 }
@@ -48,7 +67,7 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
                 momentum: T::from_f64(self.config.momentum),
                 nesterov: self.config.nesterov,
                 decay: T::from_f64(decay),
-                tiniest: T::from_f64(if decay == 0.0 { 0.0 } else { TINY }),
+                tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
             };
             let len = part.value.len();
             let values = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(part.grad.as_slice().par_chunks(CHUNK));
@@ -102,7 +121,6 @@ impl<T: Scalar> Update<T> {
     }
 
     fn apply(&self, x: &mut [T], g: &[T], v: &mut [T]) -> usize {
-        let tiny = T::from_f64(TINY);
         let n = x.len();
         let (g, v) = (&g[..n], &mut v[..n]);
         let ahead = if self.nesterov { T::ONE } else { T::ZERO };
@@ -112,8 +130,7 @@ impl<T: Scalar> Update<T> {
                 let mut skipped = 0;
                 for i in 0..n {
                     let h = g[i] + self.decay * x[i];
-                    let velocity = self.momentum * v[i] + h;
-                    let velocity = if velocity > tiny || velocity < -tiny { velocity } else { T::ZERO };
+                    let velocity = flushed(self.momentum * v[i] + h);
                     let direction = if ahead > T::ZERO { h + self.momentum * velocity } else { velocity };
                     let (moved, good) = self.moved(x[i], g[i], direction);
                     v[i] = if good { velocity } else { v[i] };
