@@ -11,7 +11,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Gradient, Pool, Tape, Tensor};
+use raygrad::autograd::{Pool, Tape, Tensor};
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::hash_grid::{HashGrad, HashGrid, TableOptimizer};
 use raygrad::nerf::occupancy::MarchBuffer;
@@ -129,15 +129,15 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
         let marched = composite_visible(field, &params, &samples, sampler.config.termination, false, &tape);
         let loss = model.config.loss.sum(&marched.rendered, &target, &white);
         let middle = start.elapsed().as_secs_f64();
-        let given = loss.grad_sparse(&params.vars());
+        let given = loss.backward(&params.vars());
         whole = whole.min(start.elapsed().as_secs_f64());
         forward = forward.min(middle);
         (asked, kept) = (marched.evaluated, marched.kept);
-        grad = given.into_iter().find(|grad| matches!(grad, Gradient::Sparse(_)));
+        grad = given.into_iter().find(|grad| !grad.is_dense());
         drop((marched, loss, params));
         tape.clear();
     }
-    let parts = grad.ok_or("no gradient of the table")?.parts::<HashGrad<f32>>();
+    let parts = grad.ok_or("no gradient of the table")?.take::<HashGrad<f32>>();
 
     // The densities that decide which samples light reaches, phase by phase.
     let positions = Tensor::from_vec(&[asked, 3], samples.positions.as_slice()[..3 * asked].to_vec());
@@ -157,7 +157,7 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     let mut table = model.params.get(id).clone();
     let mut optimizer = TableOptimizer::new(grid.clone(), model.config.table_adam);
     let mut moved = 0;
-    let update = least(|| moved = optimizer.step(&mut table, &parts, 1e-3).touched);
+    let update = least(|| moved = optimizer.step(&mut table, &parts, None, 1e-3).touched);
 
     let (matrix, line) = (matrix_rate(), line_rate(4 * table.len()));
     let lines_of_state = line_rate(4 * 4 * table.len());

@@ -393,7 +393,7 @@ fn the_nan_finder_checks_recorded_gradients_sums_and_sparse_ones() {
         "gather_rows: the gradient of input 0 is inf at index [0]",
         line,
     );
-    assert!(panic_of(|| sum.grad_sparse(&[&x])).contains("gather_rows: the gradient of input 0 is inf"));
+    assert!(panic_of(|| sum.backward(&[&x])).contains("gather_rows: the gradient of input 0 is inf"));
     // What overflows inside a gradient is not reported if the gradient is finite: softplus of a large number.
     let large = tape.leaf(Tensor::scalar(200.0));
     assert_eq!(large.softplus().grad_graph(&[&large])[0].item(), 1.0);
@@ -464,7 +464,7 @@ fn empty_and_scalar_tensors_pass_through_everything_of_a_tape() {
         let tanh = 0.5_f64.tanh();
         let slope = tanh + 0.5 * (1.0 - tanh * tanh) + 1.0;
         assert!(first.value().as_slice().iter().all(|g| (g - slope).abs() < 1e-15));
-        assert_eq!(total.grad_sparse(&[&x]).len(), 1);
+        assert_eq!(total.backward(&[&x]).len(), 1);
         assert!(tape.to_dot().contains("freed"));
     }
 }

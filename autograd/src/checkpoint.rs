@@ -125,7 +125,7 @@ impl<T: Scalar> Tape<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Activation, Gradient, RowGrad};
+    use crate::{Activation, RowGrad};
 
     fn bits<T: Scalar>(x: &Tensor<T>) -> Vec<u64> {
         x.as_slice().iter().map(|x| x.to_f64().to_bits()).collect()
@@ -230,12 +230,10 @@ mod tests {
         let tape = Tape::<f64>::new();
         let table = tape.leaf(Tensor::from_fn(&[5, 2], |i| i as f64));
         let y = tape.checkpoint(&[&table], |x| x[0].gather_rows(&[3, 1, 3].into()).square());
-        let parts = y.sum().grad_sparse(&[&table]).remove(0);
-        let Gradient::Sparse(parts) = parts else { panic!("a dense gradient") };
-        let mut dense = Tensor::zeros(&[5, 2]);
-        parts.iter().for_each(|part| part.add_to(&mut dense));
+        let gradient = y.sum().backward(&[&table]).remove(0);
+        assert_eq!((gradient.is_rows(), gradient.clone().take::<RowGrad<f64>>().len()), (true, 1));
+        let dense = gradient.into_dense(tape.pool());
         assert_eq!(dense.as_slice(), [0.0, 0.0, 4.0, 6.0, 0.0, 0.0, 24.0, 28.0, 0.0, 0.0]);
-        let _: &RowGrad<f64> = (&*parts[0] as &dyn std::any::Any).downcast_ref().unwrap();
     }
 
     #[test]

@@ -31,6 +31,7 @@ mod dual;
 mod elementwise;
 mod error;
 mod files;
+mod gradient;
 pub mod guide;
 mod hook;
 mod layers;
@@ -54,9 +55,10 @@ pub use dual::Dual;
 pub use elementwise::{Binary, Map, Unary, Zip};
 pub use error::{Error, ShapeError};
 pub use files::write_atomic;
+pub use gradient::{Gradient, RowShare, SparseGrad};
 pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Pass, Sequential};
 pub use npz::NpzError;
-pub use op::{Gradient, Grads, Op, Reads, SparseGrad, Vjp};
+pub use op::{Grads, Op, Reads, Vjp};
 pub use ops::{Activation, Conv2dConfig, INFER, Pool2dConfig, RowGrad, Segments};
 pub use optim::{
     Adam, AdamConfig, AdamW, Clipped, Ema, Move, Optimizer, Schedule, SettingError, Sgd, SgdConfig, TableAdam,

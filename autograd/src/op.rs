@@ -1,9 +1,8 @@
 //! What an operation is: a forward kernel and a vector-Jacobian product.
 
-use crate::{Error, ShapeError, Tape, Var};
+use crate::{Error, ShapeError, SparseGrad, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
-use std::any::Any;
 use std::sync::Arc;
 
 /// An operation of one output. A user's own operation implements this too, and runs with [`Tape::apply`].
@@ -278,30 +277,5 @@ impl<'t, T: Scalar> Grads<'t, T> {
     pub fn with_sparse(mut self, i: usize, grad: Arc<dyn SparseGrad<T>>) -> Self {
         self.0[i] = Some(Given::Sparse(grad));
         self
-    }
-}
-
-/// The gradient of a table of which few rows were used (an embedding, a hash grid), in whatever form the operation finds
-/// cheap. It stays sparse up to [`Var::grad_sparse`](crate::Var::grad_sparse); all other gradients add it up.
-pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
-    /// The shape of the table.
-    fn shape(&self) -> &[usize];
-    /// Adds it to a dense gradient of that shape.
-    fn add_to(&self, dense: &mut Tensor<T>);
-}
-
-/// A gradient as [`Var::grad_sparse`](crate::Var::grad_sparse) gives it.
-pub enum Gradient<T: Scalar> {
-    /// One number for each element.
-    Dense(Tensor<T>),
-    /// Several sparse gradients whose sum it is, in the order of the backward sweep.
-    Sparse(Vec<Arc<dyn SparseGrad<T>>>),
-}
-
-impl<T: Scalar> Gradient<T> {
-    /// The parts of a sparse gradient that are of type `G`; none of a dense one.
-    pub fn parts<G: SparseGrad<T>>(self) -> Vec<Arc<G>> {
-        let Gradient::Sparse(parts) = self else { return vec![] };
-        parts.into_iter().filter_map(|part| (part as Arc<dyn Any + Send + Sync>).downcast().ok()).collect()
     }
 }

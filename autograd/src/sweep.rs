@@ -1,8 +1,8 @@
 //! The backward sweep: from the root down the tape, visiting only what leads to the wanted gradients.
 
-use crate::op::{Given, Gradient, SparseGrad};
+use crate::op::Given;
 use crate::tape::{LEAF, find_non_finite};
-use crate::{Error, Grads, Op, Tape, Var, Vjp};
+use crate::{Error, Gradient, Grads, Op, SparseGrad, Tape, Var, Vjp};
 use raygrad_tensor::{Scalar, Tensor, add_assign};
 use smallvec::SmallVec;
 use std::panic::Location;
@@ -58,19 +58,33 @@ impl<'t, T: Scalar> Var<'t, T> {
         Ok(values(self.tape, sweep(self, self.seed()?, wrt, Keep::Nothing)?))
     }
 
-    /// As [`grad_once`](Self::grad_once), but leaves the gradients of tables sparse where an operation gives them so.
+    /// The gradients of this one-element tensor with respect to `wrt` in the form in which operations give them: sparse
+    /// shares, such as the rows of a table, stay apart. Frees the saved values as the sweep passes, so that their buffers
+    /// serve again at once: what a training step wants.
     ///
     /// # Panics
     /// As [`grad`](Self::grad).
     #[track_caller]
-    pub fn grad_sparse(&self, wrt: &[&Var<'t, T>]) -> Vec<Gradient<T>> {
-        let sums = or_panic(sweep(self, or_panic(self.seed()), wrt, Keep::Nothing));
-        let gradient = |sum| match sum {
-            Sum::Dense(grad) => Gradient::Dense(grad.value),
-            Sum::Sparse(parts) => Gradient::Sparse(parts),
-            Sum::Parts(_) => unreachable!("only `parts` leaves shares apart"),
+    pub fn backward(&self, wrt: &[&Var<'t, T>]) -> Vec<Gradient<T>> {
+        or_panic(self.try_backward(wrt))
+    }
+
+    /// As [`backward`](Self::backward), with an error instead of a panic.
+    ///
+    /// # Errors
+    /// As [`try_grad`](Self::try_grad).
+    #[track_caller]
+    pub fn try_backward(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Gradient<T>>, Error> {
+        let sums = sums(self, self.seed()?, wrt, Keep::Nothing, false)?;
+        let gradient = |(sum, x): (Option<Sum<'t, T>>, &&Var<'t, T>)| {
+            let mut gradient = Gradient::zero(x.shape());
+            if let Some(Sum::Added(dense, sparse)) = sum {
+                dense.into_iter().for_each(|dense| gradient.add_dense(dense.value));
+                sparse.into_iter().for_each(|share| gradient.add_sparse(share));
+            }
+            gradient
         };
-        sums.into_iter().map(gradient).collect()
+        Ok(sums.into_iter().zip(wrt).map(gradient).collect())
     }
 
     /// The gradients as variables on the graph: they can be differentiated again.
@@ -140,8 +154,8 @@ fn values<T: Scalar>(tape: &Tape<T>, sums: Vec<Sum<'_, T>>) -> Vec<Tensor<T>> {
 /// What has arrived at a node so far.
 #[derive(Clone)]
 enum Sum<'t, T: Scalar> {
-    Dense(Var<'t, T>),
-    Sparse(Vec<Arc<dyn SparseGrad<T>>>),
+    /// The sum of the dense shares and the sparse ones, in the order in which they came.
+    Added(Option<Var<'t, T>>, Vec<Arc<dyn SparseGrad<T>>>),
     /// Shares that somebody else is to add, in the order in which they came.
     Parts(Vec<Given<'t, T>>),
 }
@@ -149,12 +163,21 @@ enum Sum<'t, T: Scalar> {
 impl<'t, T: Scalar> Sum<'t, T> {
     /// What is there after `given` has arrived.
     fn gather(sum: Option<Self>, given: Given<'t, T>, tape: &'t Tape<T>) -> Option<Self> {
-        match (sum, given) {
-            (sum, Given::Parts(parts)) => parts.into_iter().fold(sum, |sum, part| Sum::gather(sum, part, tape)),
-            (Some(sum), given) => Some(sum.add(given, tape)),
-            (None, Given::Dense(grad)) => Some(Sum::Dense(grad)),
-            (None, Given::Sparse(part)) => Some(Sum::Sparse(vec![part])),
+        if let Given::Parts(parts) = given {
+            return parts.into_iter().fold(sum, |sum, part| Sum::gather(sum, part, tape));
         }
+        let mut sum = sum.unwrap_or(Sum::Added(None, vec![]));
+        match (&mut sum, given) {
+            (Sum::Parts(parts), given) => parts.push(given),
+            (Sum::Added(_, sparse), Given::Sparse(share)) => sparse.push(share),
+            (Sum::Added(Some(dense), _), Given::Dense(grad)) if tape.is_recording() => *dense = &*dense + grad,
+            (Sum::Added(Some(dense), _), Given::Dense(grad)) => {
+                add_assign(dense.value.as_mut_slice(), grad.value.as_slice());
+            }
+            (Sum::Added(dense, _), Given::Dense(grad)) => *dense = Some(grad),
+            (Sum::Added(..), Given::Parts(_)) => unreachable!("taken apart above"),
+        }
+        Some(sum)
     }
 
     /// The first bad element, if the NaN finder is on.
@@ -167,45 +190,28 @@ impl<'t, T: Scalar> Sum<'t, T> {
     ) -> Result<(), Error> {
         match self {
             _ if !tape.checks_finite() => Ok(()),
-            Sum::Dense(grad) => find_non_finite(op, what, &grad.value, at),
-            Sum::Sparse(_) => find_non_finite(op, what, &self.clone().dense(tape).value, at),
+            Sum::Added(Some(dense), sparse) if sparse.is_empty() => find_non_finite(op, what, &dense.value, at),
+            Sum::Added(..) => find_non_finite(op, what, &self.clone().dense(tape).value, at),
             Sum::Parts(_) => Ok(()),
         }
     }
 
+    /// One variable. In a recorded pass sparse shares become constants, which is what they are.
     fn dense(self, tape: &'t Tape<T>) -> Var<'t, T> {
-        match self {
-            Sum::Dense(grad) => grad,
-            Sum::Sparse(parts) => {
-                let mut sum = tape.pool().full(parts[0].shape(), T::ZERO);
-                parts.iter().for_each(|part| part.add_to(&mut sum));
-                tape.constant(sum)
-            }
-            Sum::Parts(_) => unreachable!("shares are left apart at leaves only"),
+        let Sum::Added(dense, sparse) = self else { unreachable!("shares are left apart at leaves only") };
+        if tape.is_recording()
+            && let Some(dense) = &dense
+            && !sparse.is_empty()
+        {
+            return dense + Sum::Added(None, sparse).dense(tape);
         }
-    }
-
-    fn add(self, given: Given<'t, T>, tape: &'t Tape<T>) -> Self {
-        match (self, given) {
-            (Sum::Dense(sum), Given::Dense(grad)) if tape.is_recording() => Sum::Dense(sum + grad),
-            (Sum::Dense(mut sum), Given::Dense(grad)) => {
-                add_assign(sum.value.as_mut_slice(), grad.value.as_slice());
-                Sum::Dense(sum)
-            }
-            (Sum::Dense(mut sum), Given::Sparse(part)) => {
-                part.add_to(&mut sum.value);
-                Sum::Dense(sum)
-            }
-            (Sum::Sparse(mut parts), Given::Sparse(part)) => {
-                parts.push(part);
-                Sum::Sparse(parts)
-            }
-            (Sum::Parts(mut parts), given) => {
-                parts.push(given);
-                Sum::Parts(parts)
-            }
-            (sparse, dense) => Sum::Dense(sparse.dense(tape)).add(dense, tape),
-        }
+        let mut sum = match (dense, sparse.first()) {
+            (Some(dense), _) => dense,
+            (None, Some(share)) => tape.constant(tape.pool().full(share.shape(), T::ZERO)),
+            (None, None) => unreachable!("a sum has a share"),
+        };
+        sparse.iter().for_each(|share| share.add_to(&mut sum.value));
+        sum
     }
 }
 
@@ -218,7 +224,7 @@ fn sweep<'t, T: Scalar>(
     keep: Keep,
 ) -> Result<Vec<Sum<'t, T>>, Error> {
     let tape = root.tape;
-    let zeros = |x: &Var<'t, T>| Sum::Dense(tape.constant(tape.pool().full(x.shape(), T::ZERO)));
+    let zeros = |x: &Var<'t, T>| Sum::Added(Some(tape.constant(tape.pool().full(x.shape(), T::ZERO))), vec![]);
     let sums = sums(root, seed, wrt, keep, false)?;
     Ok(sums.into_iter().zip(wrt).map(|(sum, x)| sum.unwrap_or_else(|| zeros(x))).collect())
 }

@@ -7,7 +7,7 @@ use crate::model::{Model, Sampler};
 use crate::occupancy::MarchBuffer;
 use crate::sampler::Jitter;
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Gradient, Tape, Tensor, Var};
+use raygrad_autograd::{Tape, Tensor, Var};
 use raygrad_tensor::add_assign;
 use rayon::prelude::*;
 use std::ops::Add;
@@ -67,7 +67,7 @@ impl Scratch {
 pub(crate) struct Slot {
     /// Whether a tile of this step is in the sums.
     started: bool,
-    /// Summed gradient of each dense parameter; None for a table.
+    /// Summed gradient of each parameter; None for a table whose gradient has no dense share.
     pub grads: Vec<Option<Tensor<f32>>>,
     /// The table's gradients, tile by tile.
     pub tables: Vec<Arc<HashGrad<f32>>>,
@@ -122,14 +122,21 @@ impl Slot {
             }
         };
         let loss = loss * (1.0 / (3.0 * total as f64));
-        let given = loss.grad_sparse(&params.vars());
+        let given = loss.backward(&params.vars());
         grads.resize_with(given.len(), || None);
-        for (sum, grad) in grads.iter_mut().zip(given) {
-            match (grad, sum) {
-                (Gradient::Dense(grad), Some(sum)) if *started => add_assign(sum.as_mut_slice(), grad.as_slice()),
-                (Gradient::Dense(grad), Some(sum)) => sum.as_mut_slice().copy_from_slice(grad.as_slice()),
-                (Gradient::Dense(grad), sum) => *sum = Some(grad),
-                (sparse, _) => tables.extend(sparse.parts()),
+        let table = model.field.table().map(|(id, _)| id);
+        for ((id, sum), mut gradient) in model.params.ids().zip(grads).zip(given) {
+            if table == Some(id) {
+                tables.extend(gradient.take());
+                if gradient.is_zero() {
+                    *sum = sum.take().filter(|_| *started);
+                    continue;
+                }
+            }
+            match (gradient.into_dense(tape.pool()), sum) {
+                (grad, Some(sum)) if *started => add_assign(sum.as_mut_slice(), grad.as_slice()),
+                (grad, Some(sum)) => sum.as_mut_slice().copy_from_slice(grad.as_slice()),
+                (grad, sum) => *sum = Some(grad),
             }
         }
         *started = true;
@@ -155,8 +162,10 @@ pub(crate) fn sum_slots(slots: &mut [Slot]) {
     let Some((first, rest)) = slots.split_first_mut() else { return };
     first.grads.par_iter_mut().enumerate().for_each(|(i, sum)| {
         for slot in &*rest {
-            if let (Some(sum), Some(grad)) = (&mut *sum, &slot.grads[i]) {
-                add_assign(sum.as_mut_slice(), grad.as_slice());
+            match (&mut *sum, &slot.grads[i]) {
+                (Some(sum), Some(grad)) => add_assign(sum.as_mut_slice(), grad.as_slice()),
+                (sum @ None, Some(grad)) => *sum = Some(grad.clone()),
+                (_, None) => {}
             }
         }
     });

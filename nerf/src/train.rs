@@ -279,13 +279,17 @@ impl Trainer {
             let parts =
                 (0..turns).flat_map(|turn| self.slots[..used].iter().filter_map(move |slot| slot.tables.get(turn)));
             let parts: Vec<Arc<HashGrad<f32>>> = parts.cloned().collect();
-            let moved = table.step(self.model.params.get_mut(id), &parts, rate);
+            let dense = self.model.params.ids().zip(&self.slots[0].grads).find(|&(other, _)| other == id);
+            let dense = dense.and_then(|(_, sum)| sum.as_ref());
+            let moved = table.step(self.model.params.get_mut(id), &parts, dense, rate);
             self.done.rows += moved.touched as u64;
             skipped += moved.skipped as u64;
             self.slots.iter_mut().for_each(|slot| slot.tables.clear());
         }
         let grads = &self.slots[0].grads;
-        let dense = self.model.params.values_mut().iter_mut().zip(grads).filter_map(|(p, g)| Some((p, g.as_ref()?)));
+        let ids = self.model.params.ids();
+        let pairs = ids.zip(self.model.params.values_mut()).zip(grads);
+        let dense = pairs.filter(|((id, _), _)| Some(*id) != table_id).filter_map(|((_, p), g)| Some((p, g.as_ref()?)));
         skipped + self.adam.step_pairs(dense, rate) as u64
     }
 

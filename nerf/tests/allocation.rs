@@ -43,10 +43,10 @@ fn a_step_of_the_table_optimizer_takes_no_memory() {
         d_out: Tensor::from_fn(&[300, grid.width()], |i| (i as f32 * 0.377).fract() - 0.5),
     });
     let tiles = [tile.clone(), tile];
-    optimizer.step(&mut table, &tiles, 1e-2);
+    optimizer.step(&mut table, &tiles, None, 1e-2);
     let before = BYTES.load(Relaxed);
     for _ in 0..50 {
-        optimizer.step(&mut table, &tiles, 1e-2);
+        optimizer.step(&mut table, &tiles, None, 1e-2);
     }
     // What rayon needs to hand a step over to its workers, and the table's reference count, are all there is: far less
     // than the smallest buffer of a tile, 300 samples of one level.

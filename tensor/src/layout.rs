@@ -1,34 +1,118 @@
-//! Strided layouts: one walk that serves broadcast, permute, slice and flip, and their adjoints.
+//! Strided layouts: which element of a buffer stands at each index.
 
-use crate::parallel::{ELEMENT, PIECE, chunks};
-use crate::{Scalar, Shape};
+use crate::Shape;
+use ndarray::SliceInfoElem;
 use smallvec::SmallVec;
+
+/// The steps in a buffer from an element to its neighbour along each axis.
+pub(crate) type Strides = SmallVec<[isize; 4]>;
 
 /// Which element of a buffer stands at each index of a shape: `offset + sum(index[i] * strides[i])`.
 ///
-/// Stride 0 repeats an element (broadcast), a negative stride walks backwards (flip).
+/// Stride 0 repeats an element (broadcast), a negative stride walks backwards (flip). Every layout that can be made stays
+/// within its buffer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
     shape: Shape,
-    strides: SmallVec<[isize; 4]>,
+    strides: Strides,
     offset: isize,
     /// Number of elements of the buffer that the layout points into.
     source: usize,
 }
 
+/// The number of elements of a shape; `None` if it is beyond `isize::MAX`, which no buffer can hold. Extents of 0 make it 0
+/// whatever the others are, as long as the product of these can be held.
+pub(crate) fn checked_len(shape: &[usize]) -> Option<usize> {
+    let all = shape.iter().filter(|&&extent| extent > 0).try_fold(1_usize, |all, &extent| all.checked_mul(extent))?;
+    (all <= isize::MAX as usize).then(|| if shape.contains(&0) { 0 } else { all })
+}
+
+/// The number of elements of a shape.
+///
+/// # Panics
+/// If it is more than a buffer can hold.
+#[track_caller]
+pub(crate) fn len_of(shape: &[usize]) -> usize {
+    checked_len(shape).unwrap_or_else(|| panic!("a tensor of shape {shape:?} has too many elements"))
+}
+
 impl Layout {
     /// The row-major layout of a whole buffer of this shape.
+    ///
+    /// # Panics
+    /// If it has more elements than a buffer can hold.
+    #[track_caller]
     pub fn contiguous(shape: &[usize]) -> Self {
-        let mut strides = SmallVec::from_elem(1, shape.len());
+        let source = len_of(shape);
+        let mut strides = Strides::from_elem(1, shape.len());
         for i in (1..shape.len()).rev() {
-            strides[i - 1] = strides[i] * shape[i] as isize;
+            strides[i - 1] = strides[i].wrapping_mul(shape[i] as isize);
         }
-        Layout { shape: Shape::from_slice(shape), strides, offset: 0, source: shape.iter().product() }
+        Layout { shape: Shape::from_slice(shape), strides, offset: 0, source }
+    }
+
+    /// A layout of any strides; `None` if it leaves a buffer of `source` elements.
+    pub(crate) fn strided(shape: &[usize], strides: &[isize], offset: isize, source: usize) -> Option<Self> {
+        let layout = Layout { shape: Shape::from_slice(shape), strides: Strides::from_slice(strides), offset, source };
+        layout.is_inside().then_some(layout)
+    }
+
+    /// Whether every index leads to an element of the buffer.
+    fn is_inside(&self) -> bool {
+        if checked_len(&self.shape).is_none() || self.shape.len() != self.strides.len() {
+            return false;
+        }
+        if self.shape.contains(&0) {
+            return true;
+        }
+        let (mut low, mut high) = (self.offset as i128, self.offset as i128);
+        for (&extent, &stride) in self.shape.iter().zip(&self.strides) {
+            let way = (extent as i128 - 1) * stride as i128;
+            if way < 0 { low += way } else { high += way }
+        }
+        low >= 0 && high < self.source as i128
     }
 
     /// The shape that the layout covers.
     pub fn shape(&self) -> &[usize] {
         &self.shape
+    }
+
+    /// The step in the buffer from an element to its neighbour along each axis.
+    pub fn strides(&self) -> &[isize] {
+        &self.strides
+    }
+
+    /// The position in the buffer of the element whose index is 0 along every axis.
+    pub fn offset(&self) -> usize {
+        self.offset as usize
+    }
+
+    /// Number of elements of the buffer that the layout points into.
+    pub fn source(&self) -> usize {
+        self.source
+    }
+
+    /// Number of elements that the layout covers.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether an axis has extent 0.
+    pub fn is_empty(&self) -> bool {
+        self.shape.contains(&0)
+    }
+
+    /// Whether the elements lie one behind the other in row-major order, from [`offset`](Self::offset) on.
+    pub fn is_packed(&self) -> bool {
+        let mut step = 1;
+        for (&extent, &stride) in self.shape.iter().zip(&self.strides).rev() {
+            if extent != 1 && stride != step {
+                return self.is_empty();
+            }
+            step *= extent as isize;
+        }
+        true
     }
 
     /// A buffer of shape `from` stretched to shape `to`, as NumPy broadcasts.
@@ -37,17 +121,28 @@ impl Layout {
     /// If `from` does not broadcast to `to`.
     #[track_caller]
     pub fn broadcast(from: &[usize], to: &[usize]) -> Self {
-        let inner = Layout::contiguous(from);
+        Layout::contiguous(from).stretched(to)
+    }
+
+    /// This layout stretched to shape `to`, as NumPy broadcasts: axes are aligned at the last one, and an axis of extent 1,
+    /// or an absent one, gets stride 0.
+    ///
+    /// # Panics
+    /// If the shape does not broadcast to `to`.
+    #[track_caller]
+    pub fn stretched(&self, to: &[usize]) -> Self {
+        let from = &self.shape;
         assert!(from.len() <= to.len(), "cannot broadcast {from:?} to {to:?}");
+        len_of(to);
         let lead = to.len() - from.len();
-        let mut strides = SmallVec::from_elem(0, to.len());
+        let mut strides = Strides::from_elem(0, to.len());
         for (i, &extent) in from.iter().enumerate() {
             assert!(extent == to[lead + i] || extent == 1, "cannot broadcast {from:?} to {to:?}");
             if extent == to[lead + i] {
-                strides[lead + i] = inner.strides[i];
+                strides[lead + i] = self.strides[i];
             }
         }
-        Layout { shape: Shape::from_slice(to), strides, ..inner }
+        Layout { shape: Shape::from_slice(to), strides, ..*self }
     }
 
     /// Axis `i` of the result is axis `axes[i]` of this layout.
@@ -76,15 +171,16 @@ impl Layout {
     #[track_caller]
     pub fn sliced(&self, axis: usize, start: usize, len: usize, step: isize) -> Self {
         let extent = self.shape[axis];
-        let last = start as isize + step * (len as isize - 1);
-        let inside = |i: isize| (0..extent as isize).contains(&i);
+        let last = start as i128 + step as i128 * (len as i128 - 1);
+        let inside = |i: i128| (0..extent as i128).contains(&i);
         assert!(
-            len == 0 || (inside(start as isize) && inside(last)),
+            len == 0 || (inside(start as i128) && inside(last)),
             "slice of {len} from {start} by {step} leaves the extent {extent} of axis {axis}"
         );
         let mut out = self.clone();
         out.shape[axis] = len;
-        out.strides[axis] *= step;
+        // One entry has no neighbour, however large the step.
+        out.strides[axis] = if len > 1 { self.strides[axis] * step } else { 0 };
         if len > 0 {
             out.offset += start as isize * self.strides[axis];
         }
@@ -111,8 +207,176 @@ impl Layout {
         Layout { shape, strides, offset: self.offset + start, ..*self }
     }
 
+    /// What ndarray's `s![..]` asks for: a slice, one entry or a new axis for each place; axes that are not named stay whole.
+    /// Negative places count from the end, and a negative step walks backwards from the last entry of its range.
+    ///
+    /// # Errors
+    /// If more axes are named than there are, a place lies outside its axis, or a step is 0; in words.
+    pub(crate) fn sliced_by(&self, places: &[SliceInfoElem]) -> Result<Layout, String> {
+        let named = places.iter().filter(|place| !matches!(place, SliceInfoElem::NewAxis)).count();
+        if named > self.shape.len() {
+            return Err(format!("{named} axes are named of a tensor of shape {:?}", self.shape));
+        }
+        let mut out = Layout { shape: Shape::new(), strides: Strides::new(), ..*self };
+        let mut axis = 0;
+        for place in places {
+            if let SliceInfoElem::NewAxis = place {
+                out.shape.push(1);
+                out.strides.push(0);
+                continue;
+            }
+            let (extent, stride) = (self.shape[axis] as isize, self.strides[axis]);
+            let outside = |place: isize| format!("{place} lies outside axis {axis} of a tensor of shape {:?}", self.shape);
+            let from_start = |place: isize| if place < 0 { place + extent } else { place };
+            match *place {
+                SliceInfoElem::Index(place) => {
+                    let index = from_start(place);
+                    if !(0..extent).contains(&index) {
+                        return Err(outside(place));
+                    }
+                    out.offset += index * stride;
+                }
+                SliceInfoElem::Slice { start, end, step } => {
+                    let (first, behind) = (from_start(start), end.map_or(extent, from_start));
+                    if !(0..=extent).contains(&first) {
+                        return Err(outside(start));
+                    }
+                    if !(0..=extent).contains(&behind) {
+                        return Err(outside(end.unwrap_or(extent)));
+                    }
+                    if step == 0 {
+                        return Err(format!("the step along axis {axis} is 0"));
+                    }
+                    let len = (behind - first).max(0).unsigned_abs().div_ceil(step.unsigned_abs());
+                    if len > 0 {
+                        out.offset += stride * if step > 0 { first } else { behind - 1 };
+                    }
+                    out.shape.push(len);
+                    // An axis of one entry has no step, however large the one that was asked for.
+                    out.strides.push(if len > 1 { stride * step } else { 0 });
+                }
+                SliceInfoElem::NewAxis => unreachable!("handled above"),
+            }
+            axis += 1;
+        }
+        out.shape.extend_from_slice(&self.shape[axis..]);
+        out.strides.extend_from_slice(&self.strides[axis..]);
+        Ok(out)
+    }
+
+    /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
+    /// entries in one.
+    ///
+    /// # Panics
+    /// If the axis does not exist, is shorter than a window, or `size` or `step` is 0.
+    #[track_caller]
+    pub fn windows(&self, axis: usize, size: usize, step: usize) -> Self {
+        let (shape, fits) = (&self.shape, self.shape.get(axis).is_some_and(|&extent| 0 < size && size <= extent));
+        assert!(fits && step > 0, "windows of {size} every {step} along axis {axis} of a tensor of shape {shape:?}");
+        let mut out = self.clone();
+        out.shape[axis] = (shape[axis] - size) / step + 1;
+        out.shape.push(size);
+        out.strides.push(self.strides[axis]);
+        // One window has no neighbour, however large the step.
+        out.strides[axis] = if out.shape[axis] > 1 { self.strides[axis] * step as isize } else { 0 };
+        out
+    }
+
+    /// The same elements in the same order under another shape; `None` where strides cannot say that.
+    ///
+    /// # Panics
+    /// If the shapes hold different numbers of elements.
+    #[track_caller]
+    pub fn reshaped(&self, shape: &[usize]) -> Option<Self> {
+        assert_eq!(checked_len(shape), Some(self.len()), "cannot reshape {:?} to {shape:?}", self.shape);
+        if self.is_empty() {
+            return Some(Layout { shape: Shape::from_slice(shape), strides: Strides::from_elem(0, shape.len()), ..*self });
+        }
+        // Runs of axes that are one axis to memory, from the last one on, are cut into new axes.
+        let runs = self.collapsed();
+        let mut runs = runs.iter().rev();
+        let mut strides = Strides::from_elem(0, shape.len());
+        let (mut left, mut step) = (1, 0);
+        for (&extent, new) in shape.iter().zip(&mut strides).rev() {
+            if extent == 1 {
+                continue;
+            }
+            if left == 1 {
+                (left, step) = *runs.next()?;
+            }
+            if left % extent != 0 {
+                return None;
+            }
+            *new = step;
+            left /= extent;
+            step *= extent as isize;
+        }
+        Some(Layout { shape: Shape::from_slice(shape), strides, ..*self })
+    }
+
+    /// The elements that this layout of a row-major buffer of `base`'s shape names, in the buffer of `base`: a view of a
+    /// view. `None` where strides cannot say that.
+    ///
+    /// # Panics
+    /// If this layout was made for another number of elements.
+    #[track_caller]
+    pub fn of(&self, base: &Layout) -> Option<Layout> {
+        assert_eq!(self.source, base.len(), "a layout of {} elements, of a view of {:?}", self.source, base.shape);
+        if self.is_empty() {
+            return Some(Layout { offset: base.offset, source: base.source, ..self.clone() });
+        }
+        if base.is_packed() {
+            return Some(Layout { offset: self.offset + base.offset, source: base.source, ..self.clone() });
+        }
+        // Along each axis of this layout the index of `base` moves by a constant: that between the first two elements.
+        let first = base.index_of(self.offset as usize);
+        let (mut low, mut high) = (first.clone(), first.clone());
+        let mut strides = Strides::with_capacity(self.shape.len());
+        for (&extent, &stride) in self.shape.iter().zip(&self.strides) {
+            if extent == 1 {
+                strides.push(0);
+                continue;
+            }
+            let second = base.index_of((self.offset + stride) as usize);
+            let mut position = 0;
+            for i in 0..first.len() {
+                let way = second[i] - first[i];
+                position += way * base.strides[i];
+                let whole = way * (extent as isize - 1);
+                if whole < 0 { low[i] += whole } else { high[i] += whole }
+            }
+            strides.push(position);
+        }
+        // Where it would leave an axis, it wraps into the next row instead.
+        let inside = (0..first.len()).all(|i| low[i] >= 0 && high[i] < base.shape[i] as isize);
+        let position: isize = first.iter().zip(&base.strides).map(|(&i, &stride)| i * stride).sum();
+        let offset = base.offset + position;
+        inside.then(|| Layout { shape: self.shape.clone(), strides, offset, source: base.source })
+    }
+
+    /// The index of the element that stands at `position` in row-major order.
+    fn index_of(&self, mut position: usize) -> SmallVec<[isize; 4]> {
+        let mut index = SmallVec::from_elem(0, self.shape.len());
+        for (i, &extent) in index.iter_mut().zip(&self.shape).rev() {
+            *i = (position % extent) as isize;
+            position /= extent;
+        }
+        index
+    }
+
+    /// The order of axes in which strides fall: that in which memory is walked from start to end. Axes of stride 0 come
+    /// first.
+    pub(crate) fn order(&self) -> Shape {
+        let mut axes: Shape = (0..self.shape.len()).collect();
+        axes.sort_by_key(|&axis| match self.strides[axis].unsigned_abs() {
+            0 => 0,
+            step => usize::MAX - step,
+        });
+        axes
+    }
+
     /// Axes of extent 1 dropped and neighbours that form one run merged: fewer, longer inner loops.
-    fn collapsed(&self) -> SmallVec<[(usize, isize); 4]> {
+    pub(crate) fn collapsed(&self) -> SmallVec<[(usize, isize); 4]> {
         let mut axes = SmallVec::<[(usize, isize); 4]>::new();
         for (&extent, &stride) in self.shape.iter().zip(&self.strides) {
             match axes.last_mut() {
@@ -125,114 +389,6 @@ impl Layout {
             }
         }
         axes
-    }
-
-    /// Calls `f(first position in the buffer, stride, first position in row-major order, count)` for every run along
-    /// the innermost axis.
-    #[inline(always)]
-    fn runs(&self, mut f: impl FnMut(usize, isize, usize, usize)) {
-        if self.shape.contains(&0) {
-            return;
-        }
-        let mut axes = self.collapsed();
-        let (count, stride) = axes.pop().unwrap_or((1, 1));
-        let mut index = SmallVec::<[usize; 4]>::from_elem(0, axes.len());
-        let (mut position, mut out) = (self.offset, 0);
-        loop {
-            f(position as usize, stride, out, count);
-            out += count;
-            let mut axis = axes.len();
-            loop {
-                if axis == 0 {
-                    return;
-                }
-                axis -= 1;
-                index[axis] += 1;
-                position += axes[axis].1;
-                if index[axis] < axes[axis].0 {
-                    break;
-                }
-                position -= axes[axis].1 * axes[axis].0 as isize;
-                index[axis] = 0;
-            }
-        }
-    }
-
-    /// Copies the elements that the layout names from `source`, in row-major order, to `out`.
-    ///
-    /// # Panics
-    /// If a slice has another length than the layout says.
-    pub fn read<T: Scalar>(&self, source: &[T], out: &mut [T]) {
-        assert_eq!(source.len(), self.source, "source of a layout of {:?}", self.shape);
-        assert_eq!(out.len(), self.shape.iter().product::<usize>(), "output of a layout of {:?}", self.shape);
-        // Cut along the first axis that can be.
-        let axis = self.shape.iter().position(|&extent| extent > 1).unwrap_or(self.shape.len());
-        let inner: usize = self.shape.iter().skip(axis + 1).product();
-        if out.len() <= PIECE || inner == 0 {
-            return self.read_piece(source, out);
-        }
-        let at_once = (PIECE / inner).max(1);
-        let work = ELEMENT * out.len();
-        chunks(out, at_once * inner, work, || (), &|_, i, out| {
-            self.sliced(axis, i * at_once, out.len() / inner, 1).read_piece(source, out);
-        });
-    }
-
-    fn read_piece<T: Scalar>(&self, source: &[T], out: &mut [T]) {
-        self.runs(|position, stride, start, count| {
-            let out = &mut out[start..start + count];
-            match stride {
-                0 => out.fill(source[position]),
-                1 => out.copy_from_slice(&source[position..position + count]),
-                _ => {
-                    for (i, out) in out.iter_mut().enumerate() {
-                        *out = source[(position as isize + i as isize * stride) as usize];
-                    }
-                }
-            }
-        });
-    }
-
-    /// The inverse of [`read`](Self::read): copies `values` to the elements of `target` that the layout names; the
-    /// others stay.
-    ///
-    /// # Panics
-    /// If a slice has another length than the layout says.
-    pub fn write<T: Scalar>(&self, values: &[T], target: &mut [T]) {
-        assert_eq!(target.len(), self.source, "target of a layout of {:?}", self.shape);
-        assert_eq!(values.len(), self.shape.iter().product::<usize>(), "values of a layout of {:?}", self.shape);
-        self.runs(|position, stride, start, count| {
-            let values = &values[start..start + count];
-            if stride == 1 {
-                target[position..position + count].copy_from_slice(values);
-            } else {
-                for (i, &value) in values.iter().enumerate() {
-                    target[(position as isize + i as isize * stride) as usize] = value;
-                }
-            }
-        });
-    }
-
-    /// The adjoint of [`read`](Self::read): adds `values` to the elements of `target` that the layout names. Elements
-    /// that it names more than once receive a pairwise-accurate sum only along the innermost axis.
-    ///
-    /// # Panics
-    /// If a slice has another length than the layout says.
-    pub fn add<T: Scalar>(&self, values: &[T], target: &mut [T]) {
-        assert_eq!(target.len(), self.source, "target of a layout of {:?}", self.shape);
-        assert_eq!(values.len(), self.shape.iter().product::<usize>(), "values of a layout of {:?}", self.shape);
-        self.runs(|position, stride, start, count| {
-            let values = &values[start..start + count];
-            match stride {
-                0 => target[position] += crate::reduce::sum(values),
-                1 => crate::elementwise::add_assign(&mut target[position..position + count], values),
-                _ => {
-                    for (i, &value) in values.iter().enumerate() {
-                        target[(position as isize + i as isize * stride) as usize] += value;
-                    }
-                }
-            }
-        });
     }
 }
 

@@ -1,11 +1,11 @@
 //! Dense tensors of `f32` or `f64` over [`ndarray`], and the kernels that work on them. This crate knows no graph.
 //!
-//! * [`Tensor`]: always contiguous and row-major; a clone is a reference count.
+//! * [`Tensor`]: a shared buffer seen through a shape and strides; clones and views copy nothing.
 //! * [`Pool`]: gives the buffers of dropped tensors to the next ones.
 //! * [`matmul`]: matrix products with transposed operands by stride.
 //! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
-//! * [`Layout`]: broadcast, permute, slice, flip, diagonal, and their adjoints.
+//! * [`Layout`]: the strides of a view: broadcast, permute, slice, flip, diagonal, windows, and their adjoints.
 //! * [`Windows`]: what a convolution or a pooling sees of an image.
 //! * [`Indices`]: integer arrays for sorting, searching and gathering.
 //! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
@@ -14,6 +14,7 @@
 //! Work on large tensors is spread over rayon's threads, unless the caller is one of these; see [`parallel`]. The bits
 //! do not depend on it.
 
+mod convert;
 mod elementwise;
 pub mod extremum;
 mod indices;
@@ -28,8 +29,13 @@ pub mod rows;
 mod scalar;
 pub mod simd;
 mod tensor;
+mod view;
 pub mod vmath;
+mod walk;
 mod windows;
+
+/// Slices for [`Tensor::slice`], as in ndarray: `s![.., -1, 1..3, ..;-1]`.
+pub use ndarray::s;
 
 pub use elementwise::{add_assign, broadcast_shape, broadcast_to, lanes, lanes_either, map, map_either};
 pub use indices::Indices;
@@ -40,4 +46,5 @@ pub use real::Real;
 pub use reduce::{sum, sum_axes, sum_rows, sum_to};
 pub use scalar::Scalar;
 pub use tensor::{Shape, Tensor};
+pub use view::axis_of;
 pub use windows::Windows;

@@ -1,5 +1,6 @@
 //! A pool of buffers: the vectors of dropped tensors, given back to the next tensor of about that size.
 
+use crate::layout::len_of;
 use crate::{Scalar, Shape, Tensor};
 use std::collections::HashMap;
 use std::fmt;
@@ -121,6 +122,7 @@ impl<T: Scalar> Pool<T> {
     }
 
     /// A tensor of this shape with unspecified (old) values, to be overwritten.
+    #[track_caller]
     pub fn tensor(&self, shape: &[usize]) -> Tensor<T> {
         self.filled(shape, |_| ())
     }
@@ -128,15 +130,25 @@ impl<T: Scalar> Pool<T> {
     /// A tensor of this shape whose elements `fill` writes; it finds unspecified (old) values there.
     ///
     /// It costs less than [`tensor`](Self::tensor) and writing to that.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold.
+    #[track_caller]
     pub fn filled(&self, shape: &[usize], fill: impl FnOnce(&mut [T])) -> Tensor<T> {
-        let len = shape.iter().product();
+        let len = len_of(shape);
+        if len == 1 {
+            let mut one = [if cfg!(debug_assertions) { T::from_f64(f64::NAN) } else { T::ZERO }];
+            fill(&mut one);
+            return Tensor::one(Shape::from_slice(shape), one[0]);
+        }
         let small = len <= SMALL;
         let mut values = if small { unspecified(len, len) } else { self.take(len) };
         fill(&mut values);
         Tensor::pooled(Shape::from_slice(shape), values, if small { Pool::none() } else { self.clone() })
     }
 
-    /// A tensor filled with `value`.
+    /// A tensor filled with `value`, every element of which has a place of its own, to be written to.
+    #[track_caller]
     pub fn full(&self, shape: &[usize], value: T) -> Tensor<T> {
         self.filled(shape, |out| out.fill(value))
     }

@@ -1,45 +1,92 @@
-//! The tensor: a contiguous array and the pool it came from.
+//! The tensor: a shared buffer, and which of its elements stands where.
 
-use crate::{Pool, Scalar};
-use ndarray::{ArcArray, Array, ArrayView, Dimension, IxDyn};
+use crate::layout::{checked_len, len_of};
+use crate::{Layout, Pool, Scalar};
 use smallvec::SmallVec;
-use std::fmt;
+use std::slice;
+use std::sync::{Arc, OnceLock};
 
 /// The extents of a tensor's axes; `[]` is a scalar.
 pub type Shape = SmallVec<[usize; 4]>;
 
-/// A dense n-dimensional array of `f32` or `f64`, always contiguous and row-major.
+/// An n-dimensional array of `f32` or `f64`: a shared buffer seen through a shape and strides, as in ndarray.
 ///
-/// It wraps [`ndarray::ArcArray`]: a clone is a reference count, and conversion from and to ndarray is free where the
-/// layout allows. Writing to a shared tensor copies it first.
+/// A clone is a reference count. A view (a slice, a transpose, a broadcast, ..) shares the buffer, and writing to a shared
+/// tensor copies it first, so a view never changes. One number needs no buffer, however far it is broadcast.
+///
+/// Kernels take views as they are where that is faster. Code that asks for a slice ([`as_slice`](Self::as_slice)) of a view
+/// whose elements do not lie one behind the other makes them lie so, once for the view and its clones.
 ///
 /// ```
 /// use raygrad_tensor::Tensor;
 /// let x = Tensor::from_vec(&[2, 3], vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0_f32]);
 /// assert_eq!(x.shape(), [2, 3]);
 /// let y = ndarray::arr2(&[[1.0, 2.0], [3.0, 4.0_f32]]);
-/// assert_eq!(Tensor::from(y.t().to_owned()).as_slice(), [1.0, 3.0, 2.0, 4.0]);
+/// assert_eq!(Tensor::from(y.t()).as_slice(), [1.0, 3.0, 2.0, 4.0]);
 /// ```
+#[derive(Clone)]
 pub struct Tensor<T: Scalar> {
-    /// Some until `drop` takes it apart.
-    array: Option<ArcArray<T, IxDyn>>,
+    shape: Shape,
+    data: Data<T>,
+    /// None where the elements are the whole buffer in row-major order.
+    view: Option<Arc<View<T>>>,
+}
+
+#[derive(Clone)]
+enum Data<T: Scalar> {
+    /// One number, without a buffer.
+    One(T),
+    Shared(Arc<Buffer<T>>),
+}
+
+/// Elements, and the pool that gets them when the last tensor goes.
+struct Buffer<T: Scalar> {
+    values: Vec<T>,
     pool: Pool<T>,
 }
 
+impl<T: Scalar> Drop for Buffer<T> {
+    fn drop(&mut self) {
+        if self.pool.is_some() {
+            self.pool.give(std::mem::take(&mut self.values));
+        }
+    }
+}
+
+struct View<T: Scalar> {
+    layout: Layout,
+    /// The elements in row-major order, if they do not lie so and somebody asked for a slice.
+    packed: OnceLock<Buffer<T>>,
+}
+
 impl<T: Scalar> Tensor<T> {
+    /// A tensor of as many values as the shape holds.
     pub(crate) fn pooled(shape: Shape, values: Vec<T>, pool: Pool<T>) -> Self {
-        let array = match Array::from_shape_vec(IxDyn(&shape), values) {
-            Ok(array) => array.into_shared(),
-            Err(_) => unreachable!("the callers give as many values as the shape holds"),
+        debug_assert_eq!(checked_len(&shape), Some(values.len()));
+        let data = match values[..] {
+            [one] => Data::One(one),
+            _ => Data::Shared(Arc::new(Buffer { values, pool })),
         };
-        Tensor { array: Some(array), pool }
+        Tensor { shape, data, view: None }
     }
 
-    fn inner(&self) -> &ArcArray<T, IxDyn> {
-        match &self.array {
-            Some(array) => array,
-            None => unreachable!("only `drop` and `into_array` take the array"),
-        }
+    /// One number under a shape of one element.
+    pub(crate) fn one(shape: Shape, value: T) -> Self {
+        Tensor { shape, data: Data::One(value), view: None }
+    }
+
+    /// The elements that a layout names of a buffer.
+    pub(crate) fn strided(values: Vec<T>, layout: Layout) -> Self {
+        Tensor::pooled(Shape::from_elem(values.len(), 1), values, Pool::none()).with_layout(layout)
+    }
+
+    /// Other elements of the same buffer.
+    pub(crate) fn with_layout(&self, layout: Layout) -> Self {
+        debug_assert_eq!(layout.source(), self.buffer().len());
+        let shape = Shape::from_slice(layout.shape());
+        let whole = layout.offset() == 0 && layout.len() == layout.source() && layout.is_packed();
+        let view = (!whole).then(|| Arc::new(View { layout, packed: OnceLock::new() }));
+        Tensor { shape, data: self.data.clone(), view }
     }
 
     /// A tensor of this shape from its values in row-major order.
@@ -48,82 +95,181 @@ impl<T: Scalar> Tensor<T> {
     /// If the number of values is not the product of the shape.
     #[track_caller]
     pub fn from_vec(shape: &[usize], values: Vec<T>) -> Self {
-        let len: usize = shape.iter().product();
-        assert_eq!(len, values.len(), "{} values for a tensor of shape {shape:?}", values.len());
+        assert_eq!(checked_len(shape), Some(values.len()), "{} values for a tensor of shape {shape:?}", values.len());
         Tensor::pooled(Shape::from_slice(shape), values, Pool::none())
     }
 
     /// A tensor of this shape whose element number `i` (row-major) is `f(i)`.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold; so for the next ones.
+    #[track_caller]
     pub fn from_fn(shape: &[usize], f: impl FnMut(usize) -> T) -> Self {
-        Tensor::from_vec(shape, (0..shape.iter().product()).map(f).collect())
+        Tensor::from_vec(shape, (0..len_of(shape)).map(f).collect())
     }
 
-    /// A tensor filled with one value.
+    /// A tensor filled with one value, which it holds once.
+    #[track_caller]
     pub fn full(shape: &[usize], value: T) -> Self {
-        Tensor::from_vec(shape, vec![value; shape.iter().product()])
+        Tensor::scalar(value).with_layout(Layout::contiguous(&[]).stretched(shape))
     }
 
     /// A tensor of zeros.
+    #[track_caller]
     pub fn zeros(shape: &[usize]) -> Self {
         Tensor::full(shape, T::ZERO)
     }
 
     /// A tensor of ones.
+    #[track_caller]
     pub fn ones(shape: &[usize]) -> Self {
         Tensor::full(shape, T::ONE)
     }
 
     /// A tensor without axes that holds one value.
     pub fn scalar(value: T) -> Self {
-        Tensor::from_vec(&[], vec![value])
+        Tensor::one(Shape::new(), value)
     }
 
     /// The extent of each axis.
     pub fn shape(&self) -> &[usize] {
-        self.inner().shape()
+        &self.shape
     }
 
     /// Number of axes.
     pub fn ndim(&self) -> usize {
-        self.inner().ndim()
+        self.shape.len()
     }
 
     /// Number of elements.
     pub fn len(&self) -> usize {
-        self.inner().len()
+        self.shape.iter().product()
     }
 
     /// Whether an axis has extent 0.
     pub fn is_empty(&self) -> bool {
-        self.len() == 0
+        self.shape.contains(&0)
     }
 
-    /// The elements in row-major order.
+    /// The buffer that [`layout`](Self::layout) points into: more than the elements of this tensor, or less where it
+    /// repeats some.
+    pub fn buffer(&self) -> &[T] {
+        match &self.data {
+            Data::One(value) => slice::from_ref(value),
+            Data::Shared(buffer) => &buffer.values,
+        }
+    }
+
+    /// Which element of [`buffer`](Self::buffer) stands at each index.
+    pub fn layout(&self) -> Layout {
+        match &self.view {
+            Some(view) => view.layout.clone(),
+            None => Layout::contiguous(&self.shape),
+        }
+    }
+
+    /// Whether the elements lie one behind the other in row-major order, so that [`as_slice`](Self::as_slice) has nothing
+    /// to do.
+    pub fn is_packed(&self) -> bool {
+        self.view.as_ref().is_none_or(|view| view.layout.is_packed())
+    }
+
+    /// The elements in row-major order. Those of a view that lie otherwise are copied the first time: the view and its
+    /// clones keep them.
     pub fn as_slice(&self) -> &[T] {
-        match self.inner().as_slice() {
-            Some(slice) => slice,
-            None => unreachable!("tensors are contiguous by construction"),
+        let Some(view) = &self.view else { return self.buffer() };
+        if view.layout.is_packed() {
+            return &self.buffer()[view.layout.offset()..][..self.len()];
+        }
+        let packed = view.packed.get_or_init(|| {
+            let pool = match &self.data {
+                Data::One(_) => Pool::none(),
+                Data::Shared(buffer) => buffer.pool.clone(),
+            };
+            let mut values = pool.take(self.len());
+            view.layout.read(self.buffer(), &mut values);
+            Buffer { values, pool }
+        });
+        &packed.values
+    }
+
+    /// The elements in row-major order for writing; what another tensor shares, or a view shows out of order, is copied
+    /// first.
+    pub fn as_mut_slice(&mut self) -> &mut [T] {
+        let whole = self.view.is_none();
+        if !(whole && matches!(&self.data, Data::Shared(buffer) if Arc::strong_count(buffer) == 1)) {
+            self.own();
+        }
+        match &mut self.data {
+            Data::One(value) => slice::from_mut(value),
+            Data::Shared(buffer) => match Arc::get_mut(buffer) {
+                Some(buffer) => &mut buffer.values,
+                None => unreachable!("`own` leaves a buffer that nobody shares"),
+            },
         }
     }
 
-    /// The elements for writing; a shared tensor is copied first.
-    pub fn as_mut_slice(&mut self) -> &mut [T] {
-        if let Some(array) = self.array.take() {
-            self.array = Some(match array.try_into_owned_nocopy() {
-                Ok(owned) => owned.into_shared(),
-                Err(shared) => {
-                    let copy = match shared.as_slice() {
-                        Some(values) => self.pool.copy_of(shared.shape(), values),
-                        None => unreachable!("tensors are contiguous by construction"),
-                    };
-                    copy.into_shared()
+    /// Makes the elements the whole of a buffer of this tensor's own.
+    fn own(&mut self) {
+        let pool = match &self.data {
+            Data::One(_) if self.view.is_none() => return,
+            Data::One(_) => Pool::none(),
+            Data::Shared(buffer) => buffer.pool.clone(),
+        };
+        // A packed copy that nobody else sees can be taken.
+        let packed = self.view.take().and_then(|mut view| {
+            let layout = view.layout.clone();
+            match Arc::get_mut(&mut view).and_then(|view| view.packed.take()) {
+                Some(packed) => Some(packed),
+                None => {
+                    let mut values = pool.take(layout.len());
+                    layout.read(self.buffer(), &mut values);
+                    Some(Buffer { values, pool: pool.clone() })
                 }
-            });
+            }
+        });
+        let buffer = packed.unwrap_or_else(|| {
+            let mut values = pool.take(self.len());
+            values.copy_from_slice(self.buffer());
+            Buffer { values, pool }
+        });
+        self.data = match buffer.values[..] {
+            [one] => Data::One(one),
+            _ => Data::Shared(Arc::new(buffer)),
+        };
+    }
+
+    /// The same elements as the whole of a buffer, in row-major order: this tensor if they lie so, else a copy.
+    pub fn packed(&self) -> Self {
+        if self.view.is_none() {
+            return self.clone();
         }
-        match self.array.as_mut().and_then(|array| array.as_slice_mut()) {
-            Some(slice) => slice,
-            None => unreachable!("tensors are contiguous by construction"),
+        let mut copy = self.clone();
+        copy.own();
+        copy
+    }
+
+    /// The elements in row-major order, in a vector of the caller's own.
+    pub fn to_vec(&self) -> Vec<T> {
+        match self.is_packed() {
+            true => self.as_slice().to_vec(),
+            false => {
+                let mut values = vec![T::ZERO; self.len()];
+                self.layout().read(self.buffer(), &mut values);
+                values
+            }
         }
+    }
+
+    /// As [`to_vec`](Self::to_vec), without a copy where the buffer is this tensor's alone.
+    pub fn into_vec(mut self) -> Vec<T> {
+        if self.view.is_none()
+            && let Data::Shared(buffer) = &mut self.data
+            && let Some(buffer) = Arc::get_mut(buffer)
+        {
+            return std::mem::take(&mut buffer.values);
+        }
+        self.to_vec()
     }
 
     /// The one element of a tensor with one element.
@@ -136,96 +282,30 @@ impl<T: Scalar> Tensor<T> {
         self.as_slice()[0]
     }
 
-    /// The same elements under another shape; no copy is made.
-    ///
-    /// # Panics
-    /// If the shapes hold different numbers of elements.
-    #[track_caller]
-    pub fn reshape(&self, shape: &[usize]) -> Self {
-        let len: usize = shape.iter().product();
-        assert_eq!(len, self.len(), "cannot reshape {:?} to {shape:?}", self.shape());
-        match self.inner().clone().into_shape_with_order(IxDyn(shape)) {
-            Ok(array) => Tensor { array: Some(array), pool: self.pool.clone() },
-            Err(_) => unreachable!("contiguous tensors of equal length"),
-        }
-    }
-
-    /// The pool that gave this tensor its buffer.
-    pub fn pool(&self) -> &Pool<T> {
-        &self.pool
-    }
-
-    /// The elements as an ndarray view, for ndarray's own indexing and iteration.
-    pub fn view(&self) -> ArrayView<'_, T, IxDyn> {
-        self.inner().view()
-    }
-
-    fn into_shared(mut self) -> ArcArray<T, IxDyn> {
-        match self.array.take() {
-            Some(array) => array,
-            None => unreachable!("only `drop` and `into_array` take the array"),
-        }
-    }
-
-    /// The elements as an ndarray array; copied only if another tensor shares them.
-    pub fn into_array(self) -> Array<T, IxDyn> {
-        self.into_shared().into_owned()
-    }
-
     /// The elements as another number type, rounded to nearest.
     pub fn cast<U: Scalar>(&self) -> Tensor<U> {
-        Tensor::from_vec(self.shape(), self.as_slice().iter().map(|&x| U::from_f64(x.to_f64())).collect())
+        // A view stays one: what it repeats is converted once.
+        let values = self.buffer().iter().map(|&x| U::from_f64(x.to_f64())).collect();
+        match &self.view {
+            None => Tensor::from_vec(&self.shape, values),
+            Some(view) if view.layout.len() >= self.buffer().len() => Tensor::strided(values, view.layout.clone()),
+            Some(_) => Tensor::from_vec(&self.shape, self.as_slice().iter().map(|&x| U::from_f64(x.to_f64())).collect()),
+        }
     }
 
     /// Whether every element is finite.
     pub fn is_finite(&self) -> bool {
-        self.as_slice().iter().all(|x| x.is_finite())
-    }
-}
-
-impl<T: Scalar> Clone for Tensor<T> {
-    fn clone(&self) -> Self {
-        Tensor { array: self.array.clone(), pool: self.pool.clone() }
-    }
-}
-
-impl<T: Scalar> Drop for Tensor<T> {
-    fn drop(&mut self) {
-        if self.pool.is_some()
-            && let Some(array) = self.array.take()
-            && let Ok(owned) = array.try_into_owned_nocopy()
-        {
-            self.pool.give(owned.into_raw_vec_and_offset().0);
+        match &self.data {
+            Data::One(value) if !self.is_empty() => value.is_finite(),
+            _ => self.as_slice().iter().all(|x| x.is_finite()),
         }
-    }
-}
-
-impl<T: Scalar, D: Dimension> From<Array<T, D>> for Tensor<T> {
-    /// Free for arrays in standard (row-major) layout; others are copied.
-    fn from(array: Array<T, D>) -> Self {
-        let array = array.into_dyn();
-        let array = if array.is_standard_layout() { array } else { array.as_standard_layout().into_owned() };
-        Tensor { array: Some(array.into_shared()), pool: Pool::none() }
-    }
-}
-
-impl<T: Scalar, D: Dimension> From<ArrayView<'_, T, D>> for Tensor<T> {
-    /// A copy of the viewed elements, whatever their strides.
-    fn from(view: ArrayView<'_, T, D>) -> Self {
-        Tensor::from(view.as_standard_layout().into_owned())
     }
 }
 
 impl<T: Scalar> PartialEq for Tensor<T> {
     /// Same shape and equal elements; NaN equals nothing.
     fn eq(&self, other: &Self) -> bool {
-        self.inner() == other.inner()
-    }
-}
-
-impl<T: Scalar> fmt::Debug for Tensor<T> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Tensor<{}>{:?} {}", T::NAME, self.shape(), self.inner())
+        self.shape == other.shape && self.view() == other.view()
     }
 }
 
@@ -240,24 +320,46 @@ mod tests {
         b.as_mut_slice()[0] = 5.0;
         assert_eq!(a.as_slice(), [1.0; 4]);
         assert_eq!(b.as_slice(), [5.0, 1.0, 1.0, 1.0]);
+        let a = Tensor::from_fn(&[2, 3], |i| i as f64);
+        let (column, mut row) = (a.slice_axis(1, 1..2, 1), a.slice_axis(0, 1..2, 1));
+        row.as_mut_slice()[2] = 9.0;
+        assert_eq!((a.as_slice(), column.as_slice()), (&[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..], &[1.0, 4.0][..]));
+        assert_eq!(row.as_slice(), [3.0, 4.0, 9.0]);
+        // The last owner of a part writes without touching what is gone.
+        let mut part = Tensor::from_fn(&[4], |i| i as f64).slice_axis(0, 1..3, 1);
+        part.as_mut_slice()[0] = 7.0;
+        assert_eq!(part.into_vec(), [7.0, 2.0]);
     }
 
     #[test]
-    fn arrays_of_any_layout_become_row_major() {
-        let a = Array::from_shape_vec((2, 3), vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0_f32]).unwrap();
-        let reversed = a.slice(ndarray::s![..;-1, ..]);
-        assert_eq!(Tensor::from(reversed).as_slice(), [3.0, 4.0, 5.0, 0.0, 1.0, 2.0]);
-        let part = a.clone().slice_move(ndarray::s![1.., ..]);
-        let mut part = Tensor::from(part);
-        assert_eq!(part.as_slice(), [3.0, 4.0, 5.0]);
-        part.as_mut_slice()[0] = 9.0;
-        assert_eq!(part.into_array().into_raw_vec_and_offset().0.last(), Some(&5.0));
+    fn a_view_is_packed_once_for_all_its_clones() {
+        let x = Tensor::from_fn(&[2, 3], |i| i as f32).t();
+        let copy = x.clone();
+        assert_eq!(x.as_slice(), [0.0, 3.0, 1.0, 4.0, 2.0, 5.0]);
+        assert!(std::ptr::eq(x.as_slice(), copy.as_slice()));
+        assert!(!x.is_packed() && x.packed().is_packed());
     }
 
     #[test]
     fn scalars_and_empty_tensors() {
         assert_eq!(Tensor::scalar(3.0_f32).item(), 3.0);
-        let empty = Tensor::<f32>::zeros(&[0, 3]);
+        let mut empty = Tensor::<f32>::zeros(&[0, 3]);
         assert!(empty.is_empty() && empty.reshape(&[3, 0]).as_slice().is_empty());
+        assert!(empty.as_mut_slice().is_empty() && empty.into_vec().is_empty());
+        let mut one = Tensor::scalar(1.0_f32);
+        one.as_mut_slice()[0] = 2.0;
+        assert_eq!((one.item(), one.reshape(&[1, 1]).into_vec()), (2.0, vec![2.0]));
+        let mut many = Tensor::scalar(1.0_f32).broadcast_to(&[2, 2]);
+        many.as_mut_slice()[3] = 5.0;
+        assert_eq!(many.as_slice(), [1.0, 1.0, 1.0, 5.0]);
+    }
+
+    #[test]
+    fn sizes_that_no_memory_holds_are_refused() {
+        for shape in [&[1_usize << 63][..], &[1 << 40, 1 << 40], &[0, 1 << 63, 2]] {
+            assert!(std::panic::catch_unwind(|| Tensor::<f32>::zeros(shape)).is_err());
+            assert!(std::panic::catch_unwind(|| Tensor::<f32>::from_vec(shape, vec![])).is_err());
+        }
+        assert!(Tensor::<f32>::zeros(&[0, 1 << 40]).is_empty());
     }
 }

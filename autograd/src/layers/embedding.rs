@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 /// A table with a row of numbers for each of many things: words, images, places.
 ///
-/// The gradient of the table is sparse: [`Var::grad_sparse`] gives [`RowGrad`](crate::RowGrad)s, and
+/// The gradient of the table is sparse: [`Var::backward`] gives [`RowGrad`](crate::RowGrad)s, and
 /// [`TableAdam`](crate::TableAdam) reads and moves only the rows in them. All other gradients and optimisers see a table
 /// that is mostly zeros.
 ///
@@ -24,8 +24,8 @@ use std::sync::Arc;
 /// let bound = params.bind(&tape);
 /// let vectors = words.forward(&bound, &[17, 4, 17].into());
 /// assert_eq!(vectors.shape(), [3, 8]);
-/// let gradient = vectors.square().sum().grad_sparse(&[&bound[words.table()]]).remove(0);
-/// let stats = adam.step(params.get_mut(words.table()), &gradient.parts::<RowGrad<f32>>(), 1e-3);
+/// let mut gradient = vectors.square().sum().backward(&[&bound[words.table()]]).remove(0);
+/// let stats = adam.step(params.get_mut(words.table()), &gradient.take::<RowGrad<f32>>(), 1e-3);
 /// assert_eq!(stats.touched, 2);
 /// ```
 #[derive(Debug, Clone, Copy)]

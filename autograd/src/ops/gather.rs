@@ -1,6 +1,6 @@
 //! Rows of a tensor by number: embeddings and tables.
 
-use crate::{Grads, Op, Reads, RowSums, ShapeError, SparseGrad, Var, Vjp};
+use crate::{Grads, Op, Reads, RowShare, RowSums, ShapeError, SparseGrad, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
@@ -154,19 +154,6 @@ impl<T: Scalar> RowGrad<T> {
         &self.rows
     }
 
-    /// Adds the rows to the sums of their table's rows, in order.
-    ///
-    /// # Panics
-    /// If `sums` belongs to a table of another size.
-    #[track_caller]
-    pub fn scatter(&self, sums: &mut RowSums<T>) {
-        let width: usize = self.shape[1..].iter().product();
-        assert_eq!([sums.table_rows(), sums.features()], [self.shape[0], width], "sums of the table's rows");
-        for (share, &row) in self.rows.as_slice().chunks_exact(width).zip(self.index.iter()) {
-            sums.add(row as usize, share);
-        }
-    }
-
     #[track_caller]
     fn add(&self, dense: &mut [T]) {
         assert_eq!(dense.len(), self.shape.iter().product::<usize>(), "a dense gradient of the table");
@@ -182,6 +169,20 @@ impl<T: Scalar> SparseGrad<T> for RowGrad<T> {
 
     fn add_to(&self, dense: &mut Tensor<T>) {
         self.add(dense.as_mut_slice());
+    }
+
+    fn as_rows(&self) -> Option<&dyn RowShare<T>> {
+        Some(self)
+    }
+}
+
+impl<T: Scalar> RowShare<T> for RowGrad<T> {
+    fn scatter(&self, sums: &mut RowSums<T>) {
+        let width: usize = self.shape[1..].iter().product();
+        assert_eq!([sums.table_rows(), sums.features()], [self.shape[0], width], "sums of the table's rows");
+        for (share, &row) in self.rows.as_slice().chunks_exact(width).zip(self.index.iter()) {
+            sums.add(row as usize, share);
+        }
     }
 }
 
@@ -245,7 +246,7 @@ mod tests {
                 // The recorded gradient is dense.
                 return loss.grad_graph(&[&table])[0].value().as_slice().to_vec();
             }
-            let parts = loss.grad_sparse(&[&table]).remove(0).parts::<RowGrad<f32>>();
+            let parts = loss.backward(&[&table]).remove(0).take::<RowGrad<f32>>();
             let (mut dense, mut sums) = (vec![0.0; 15], RowSums::new(5, 3));
             parts.iter().for_each(|part| part.scatter(&mut sums));
             assert!(parts.len() == 1 && parts[0].rows().shape() == [5, 3] && sums.rows() == [3, 0, 1]);

@@ -1,6 +1,6 @@
 //! Lazy Adam for an embedding's table.
 
-use crate::{AdamConfig, RowAdam, RowGrad, RowStats, RowSums};
+use crate::{AdamConfig, RowAdam, RowGrad, RowShare, RowStats, RowSums};
 use raygrad_tensor::{Scalar, Tensor};
 
 /// [`RowAdam`] for a table whose gradient comes as [`RowGrad`]s: reads and moves only the rows that were gathered.
@@ -38,7 +38,7 @@ impl<T: Scalar> TableAdam<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Adam, Gradient, Tape};
+    use crate::{Adam, Tape};
     use std::sync::Arc;
 
     #[test]
@@ -54,9 +54,9 @@ mod tests {
             let x = tape.leaf(table.clone());
             // Two uses of the table: two parts, whose sum counts.
             let loss = (x.gather_rows(&index).square().sum() + x.gather_rows(&[2].into()).sum()) * 0.5;
-            let gradient = loss.grad_sparse(&[&x]).remove(0);
-            assert!(matches!(&gradient, Gradient::Sparse(parts) if parts.len() == 2));
-            let stats = lazy.step(&mut table, &gradient.parts::<RowGrad<f64>>(), 0.05);
+            let mut gradient = loss.backward(&[&x]).remove(0);
+            assert!(gradient.is_rows() && gradient.sparse().len() == 2);
+            let stats = lazy.step(&mut table, &gradient.take::<RowGrad<f64>>(), 0.05);
             assert_eq!((stats.touched, stats.skipped), (3, 0));
             let x = tape.leaf(dense[0].clone());
             let loss = (x.gather_rows(&index).square().sum() + x.gather_rows(&[2].into()).sum()) * 0.5;

@@ -1,7 +1,7 @@
 //! Training the table: gradients of samples are added level by level, and only rows that got one are updated.
 
 use super::HashGrid;
-use raygrad_autograd::{AdamConfig, RowAdam, RowStats, RowSums, Scalar, SparseGrad, Tensor};
+use raygrad_autograd::{AdamConfig, RowAdam, RowShare, RowStats, RowSums, Scalar, SparseGrad, Tensor};
 use std::sync::Arc;
 
 /// What a tile leaves for the table: where its samples are, and the gradients of their features.
@@ -27,6 +27,24 @@ impl<T: Scalar> SparseGrad<T> for HashGrad<T> {
             let mut sums = RowSums::new(level.rows.len(), features);
             self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut sums);
             sums.add_to(part);
+        }
+    }
+
+    fn as_rows(&self) -> Option<&dyn RowShare<T>> {
+        Some(self)
+    }
+}
+
+impl<T: Scalar> RowShare<T> for HashGrad<T> {
+    fn scatter(&self, sums: &mut RowSums<T>) {
+        let features = self.grid.features();
+        assert_eq!([sums.table_rows(), sums.features()], [self.grid.rows(), features], "sums of the grid's rows");
+        for (number, level) in self.grid.levels().iter().enumerate() {
+            let mut part = RowSums::new(level.rows.len(), features);
+            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut part);
+            for (&row, sum) in part.rows().iter().zip(part.sums().chunks_exact(features)) {
+                sums.add(level.rows.start + row as usize, sum);
+            }
         }
     }
 }
@@ -62,19 +80,30 @@ impl TableOptimizer {
         TableOptimizer { levels: grid.levels().iter().map(|l| level(l.rows.len())).collect(), grid }
     }
 
-    /// Adds up the gradients of all tiles, in their order, and moves the rows that got one with learning rate `rate`.
+    /// Adds up the gradients of all tiles, in their order, and after them a dense one if there is one, and moves the rows
+    /// whose gradient is not zero with learning rate `rate`.
     ///
     /// # Panics
-    /// If the table is not `[rows, features]`, positions are not `[samples, 3]` or gradients not `[samples, width]`.
+    /// If the table or the dense gradient is not `[rows, features]`, positions are not `[samples, 3]` or gradients not
+    /// `[samples, width]`.
     #[track_caller]
-    pub fn step(&mut self, table: &mut Tensor<f32>, grads: &[Arc<HashGrad<f32>>], rate: f64) -> TableStats {
-        assert_eq!(table.shape(), [self.grid.rows(), self.grid.features()], "the table of the grid");
+    pub fn step(
+        &mut self,
+        table: &mut Tensor<f32>,
+        grads: &[Arc<HashGrad<f32>>],
+        dense: Option<&Tensor<f32>>,
+        rate: f64,
+    ) -> TableStats {
+        let shape = [self.grid.rows(), self.grid.features()];
+        assert_eq!(table.shape(), shape, "the table of the grid");
+        assert!(dense.is_none_or(|dense| dense.shape() == shape), "a dense gradient of the table");
         for grad in grads {
             let samples = grad.positions.shape()[0];
             assert_eq!(grad.positions.shape(), [samples, 3], "positions");
             assert_eq!(grad.d_out.shape(), [samples, self.grid.width()], "gradients of {samples} encoded positions");
         }
-        Step { grid: &self.grid, grads, rate }.run(0, &mut self.levels, table.as_mut_slice())
+        let dense = dense.map(Tensor::as_slice);
+        Step { grid: &self.grid, grads, dense, rate }.run(0, &mut self.levels, table.as_mut_slice())
     }
 }
 
@@ -82,6 +111,7 @@ impl TableOptimizer {
 struct Step<'a> {
     grid: &'a HashGrid,
     grads: &'a [Arc<HashGrad<f32>>],
+    dense: Option<&'a [f32]>,
     rate: f64,
 }
 
@@ -92,6 +122,12 @@ impl Step<'_> {
             for grad in self.grads {
                 let (positions, d_out) = (grad.positions.as_slice(), grad.d_out.as_slice());
                 self.grid.scatter_level(first, positions, d_out, &mut level.sums);
+            }
+            if let Some(dense) = self.dense {
+                let (features, rows) = (self.grid.features(), self.grid.levels()[first].rows.clone());
+                let shares = dense[rows.start * features..rows.end * features].chunks_exact(features);
+                let moved = |(_, share): &(usize, &[f32])| share.iter().any(|&x| x != 0.0);
+                shares.enumerate().filter(moved).for_each(|(row, share)| level.sums.add(row, share));
             }
             return level.adam.step(table, &mut level.sums, self.rate);
         }

@@ -2,7 +2,7 @@
 
 use super::*;
 use proptest::prelude::*;
-use raygrad_autograd::{AdamConfig, Op, Pool, RowSums, Scalar, Tape, Tensor};
+use raygrad_autograd::{AdamConfig, Gradient, Op, Pool, RowSums, Scalar, Tape, Tensor};
 use std::sync::Arc;
 
 fn grid(levels: usize, features: usize, log2_table: u32, coarsest: usize, finest: usize) -> HashGrid {
@@ -233,7 +233,7 @@ fn the_optimiser_gives_the_same_bits_on_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let mut optimizer = TableOptimizer::new(grid.clone(), AdamConfig::default());
         let mut table = grid.init::<f32>(1);
-        let stats: Vec<_> = (0..5).map(|_| pool.install(|| optimizer.step(&mut table, &tiles, 1e-2))).collect();
+        let stats: Vec<_> = (0..5).map(|_| pool.install(|| optimizer.step(&mut table, &tiles, None, 1e-2))).collect();
         (table, stats)
     };
     let one = run(1);
@@ -255,7 +255,7 @@ fn the_optimiser_uses_the_gradient_of_the_tape() {
         raygrad_tensor::add_assign(&mut dense, grad.as_slice());
     }
     let mut table = start.clone();
-    let stats = TableOptimizer::new(grid, AdamConfig::default()).step(&mut table, &tiles, 1e-2);
+    let stats = TableOptimizer::new(grid, AdamConfig::default()).step(&mut table, &tiles, None, 1e-2);
     assert_eq!(stats.touched, dense.chunks(2).filter(|row| *row != [0.0; 2]).count());
     // Adam's first step is the learning rate against the gradient's sign.
     for ((after, before), g) in table.as_slice().iter().zip(start.as_slice()).zip(dense) {
@@ -271,9 +271,29 @@ fn a_nan_gradient_is_skipped_and_forgotten() {
     let mut optimizer = TableOptimizer::new(grid.clone(), AdamConfig::default());
     let mut table = grid.init::<f32>(1);
     Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = f32::NAN;
-    let bad = optimizer.step(&mut table, &tiles, 1e-2);
+    let bad = optimizer.step(&mut table, &tiles, None, 1e-2);
     assert!((1..=8).contains(&bad.skipped) && table.is_finite());
     Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = 1.0;
-    assert_eq!(optimizer.step(&mut table, &tiles, 1e-2).skipped, 0);
-    assert_eq!(optimizer.step(&mut table, &[], 1e-2), TableStats::default());
+    assert_eq!(optimizer.step(&mut table, &tiles, None, 1e-2).skipped, 0);
+    assert_eq!(optimizer.step(&mut table, &[], None, 1e-2), TableStats::default());
+}
+
+#[test]
+fn a_dense_share_of_the_tables_gradient_moves_it_like_the_rows_it_sums() {
+    let grid = grid(3, 2, 6, 4, 16);
+    let tiles = tiles(&grid, 1);
+    let mut gradient = Gradient::zero(grid.shape());
+    gradient.add_sparse(tiles[0].clone());
+    let mut sums = RowSums::new(grid.rows(), 2);
+    assert!(gradient.scatter(&mut sums));
+    let dense = gradient.into_dense(&Pool::none());
+    let mut scattered = vec![0.0; dense.len()];
+    sums.add_to(&mut scattered);
+    assert_eq!(scattered, dense.as_slice());
+    let step = |tiles: &[_], dense| {
+        let mut table = grid.init::<f32>(1);
+        let stats = TableOptimizer::new(grid.clone(), AdamConfig::default()).step(&mut table, tiles, dense, 1e-2);
+        (table, stats)
+    };
+    assert_eq!(step(&[], Some(&dense)), step(&tiles, None));
 }
