@@ -1,6 +1,6 @@
 //! Parameters: named tensors outside any tape, so that many tapes share one model.
 
-use crate::{Move, Tape, Var};
+use crate::{Gradient, Move, Tape, Var};
 use raygrad_tensor::{Scalar, Tensor};
 use std::collections::HashMap;
 use std::ops::Index;
@@ -78,6 +78,7 @@ struct Setting {
     frozen: bool,
     rate: f64,
     decay: f64,
+    lazy: bool,
 }
 
 impl<T: Scalar> Params<T> {
@@ -94,7 +95,7 @@ impl<T: Scalar> Params<T> {
     pub fn add(&mut self, name: impl Into<String>, value: Tensor<T>) -> ParamId {
         let id = Arc::make_mut(&mut self.names).add(name.into());
         self.values.push(value);
-        self.settings.push(Setting { frozen: false, rate: 1.0, decay: 1.0 });
+        self.settings.push(Setting { frozen: false, rate: 1.0, decay: 1.0, lazy: false });
         id
     }
 
@@ -131,6 +132,11 @@ impl<T: Scalar> Params<T> {
     #[track_caller]
     pub fn name(&self, id: ParamId) -> &str {
         &self.names.names[self.names.place(id)]
+    }
+
+    /// The handles of the parameters that are not frozen, in order: those that have a gradient.
+    pub fn trainable(&self) -> impl Iterator<Item = ParamId> + '_ {
+        self.ids().zip(&self.settings).filter(|(_, setting)| !setting.frozen).map(|(id, _)| id)
     }
 
     /// The handles in order.
@@ -205,22 +211,46 @@ impl<T: Scalar> Params<T> {
         self.set(which, |setting| setting.decay = factor)
     }
 
-    /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
-    /// not frozen.
+    /// Chooses whether the parameters whose name `which` chooses are lazy, which they are not at first, and returns how
+    /// many these are.
+    ///
+    /// A lazy parameter is a table of which a step uses few rows, along its first axis: an embedding. Optimisers then
+    /// read and move only the rows whose gradient is not zero, and what they remember of others stands still too. That is
+    /// another optimiser: a row that gets one late gradient moves once, where momentum moves it over the following steps
+    /// too ([`RowAdam`](crate::RowAdam)). Choose before the first step.
+    pub fn set_lazy(&mut self, which: impl Fn(&str) -> bool, lazy: bool) -> usize {
+        self.set(which, |setting| setting.lazy = lazy)
+    }
+
+    /// The factor of a parameter's learning rate.
     ///
     /// # Panics
-    /// If there is not one gradient for each parameter, frozen or not.
+    /// If the handle is that of another store.
     #[track_caller]
-    pub fn moves<'a>(&'a mut self, grads: &'a [Tensor<T>], rate: f64) -> impl Iterator<Item = Move<'a, T>> {
-        assert_eq!(self.len(), grads.len(), "as many gradients as parameters");
-        let parts = self.values.iter_mut().zip(grads).zip(&self.settings).enumerate();
-        parts.filter(|(_, (_, setting))| !setting.frozen).map(move |(slot, ((value, grad), setting))| Move {
-            slot,
-            value,
-            grad,
-            rate: rate * setting.rate,
-            decay: setting.decay,
-        })
+    pub fn rate(&self, id: ParamId) -> f64 {
+        self.settings[self.names.place(id)].rate
+    }
+
+    /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
+    /// not frozen and whose gradient has a share.
+    ///
+    /// # Panics
+    /// If there is not one gradient of the same shape for each parameter that is not frozen, or the rate is not within 0
+    /// to 1e30.
+    #[track_caller]
+    pub fn moves<'a>(&'a mut self, grads: &'a [Gradient<T>], rate: f64) -> impl Iterator<Item = Move<'a, T>> {
+        assert!((0.0..=1e30).contains(&rate), "a learning rate of {rate:?}; use 0 to 1e30");
+        let free = self.settings.iter().filter(|setting| !setting.frozen).count();
+        assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
+        let (names, values) = (&self.names.names, self.values.iter_mut());
+        let parts = names.iter().zip(values).zip(&self.settings).enumerate();
+        let free = parts.filter(|(_, (_, setting))| !setting.frozen);
+        let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
+            assert_eq!(value.shape(), grad.shape(), "the gradient of `{name}` has its shape");
+            let lazy = setting.lazy && !value.is_empty();
+            Move { slot, name, value, grad, rate: rate * setting.rate, decay: setting.decay, lazy }
+        });
+        moves.filter(|part| !part.grad.is_zero())
     }
 
     /// Names and values in order.
@@ -256,7 +286,7 @@ impl<T: Scalar> Params<T> {
         &mut self.values[self.names.place(id)]
     }
 
-    /// The parameters as leaves of a tape; frozen ones as constants, whose gradients are 0.
+    /// The parameters as leaves of a tape; frozen ones as constants, which have no gradient.
     #[track_caller]
     pub fn bind<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
         let mut vars = Vec::with_capacity(self.len());
@@ -352,9 +382,50 @@ pub struct Bound<'t, T: Scalar> {
 }
 
 impl<'t, T: Scalar> Bound<'t, T> {
-    /// All parameters in the order of the store, to take gradients with respect to.
+    /// The parameters that gradients can be taken with respect to, in the order of the store: those that are not frozen.
     pub fn vars(&self) -> Vec<&Var<'t, T>> {
-        self.vars.iter().collect()
+        self.vars.iter().filter(|var| var.is_on_graph()).collect()
+    }
+
+    /// The gradients of a one-element tensor, one for each parameter that is not frozen: what
+    /// [`Optimizer::update`](crate::Optimizer::update) takes.
+    ///
+    /// This is the end of a training step. The parameters are given up and everything that the tape has recorded is freed
+    /// with the values that it holds, so that an update moves the parameters where they are; a parameter that something
+    /// still holds is copied first. Values of variables can be read on, but not differentiated. Where more than this is
+    /// to be done with the graph, there is [`Var::backward`](crate::Var::backward) of [`vars`](Self::vars).
+    ///
+    /// ```
+    /// use raygrad_autograd::{Adam, AdamConfig, Optimizer, Params, Tape, Tensor};
+    /// let mut params = Params::<f32>::new();
+    /// let x = params.add("x", Tensor::full(&[2], 3.0));
+    /// let mut adam = Adam::new(AdamConfig::default());
+    /// let tape = Tape::new();
+    /// let bound = params.bind(&tape);
+    /// let loss = bound[x].square().sum();
+    /// let grads = bound.backward(&loss);
+    /// let place = params.get(x).as_slice().as_ptr();
+    /// let moved = adam.update(&mut params, &grads, 0.1).check();
+    /// assert_eq!((moved, params.get(x).as_slice().as_ptr()), (Ok(2), place));
+    /// ```
+    ///
+    /// # Panics
+    /// As [`Var::grad`](crate::Var::grad).
+    #[track_caller]
+    pub fn backward(self, loss: &Var<'t, T>) -> Vec<Gradient<T>> {
+        let grads = loss.backward(&self.vars());
+        loss.tape().free();
+        grads
+    }
+
+    /// The tape that the parameters are on.
+    ///
+    /// # Panics
+    /// If there is no parameter.
+    #[track_caller]
+    pub fn tape(&self) -> &'t Tape<T> {
+        assert!(!self.vars.is_empty(), "the tape of no parameters");
+        self.vars[0].tape()
     }
 }
 
@@ -395,25 +466,23 @@ mod tests {
         let step = |params: &mut Params<f64>, sgd: &mut Sgd<f64>| {
             let tape = Tape::new();
             let bound = params.bind(&tape);
-            let vars = bound.vars();
-            let grads = (vars[0] + vars[1] + vars[2]).sum().grad(&vars);
-            let constant = vars.iter().map(|x| !x.is_on_graph()).collect::<Vec<_>>();
-            sgd.update(params, &grads, 0.1);
-            (constant, grads[2].clone(), params.values().iter().map(|x| x.as_slice()[0]).collect::<Vec<_>>())
+            let sum = params.ids().map(|id| bound[id].sum()).reduce(|a, b| a + b).unwrap();
+            assert_eq!(bound.vars().len(), params.trainable().count());
+            let grads = bound.backward(&sum);
+            let moved = sgd.update(params, &grads, 0.1).check().unwrap();
+            (moved, params.values().iter().map(|x| x.as_slice()[0]).collect::<Vec<_>>())
         };
         // Half the rate; decay adds the parameter, 1, to the gradient, 1, but for the bias.
-        let (constant, grad, values) = step(&mut params, &mut sgd);
-        assert_eq!((constant, grad), (vec![false, false, true], Tensor::zeros(&[2])));
-        assert_eq!(values, [0.9, 0.95, 1.0]);
+        assert_eq!(step(&mut params, &mut sgd), (4, vec![0.9, 0.95, 1.0]));
+        assert_eq!((params.rate(head), params.rate(params.find("trunk.bias").unwrap())), (1.0, 0.5));
         // Settings survive a change of precision and a load.
         let mut copy = params.cast::<f32>().cast::<f64>();
         let bytes = params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap();
         copy.load_safetensors(&bytes).unwrap();
         assert!(copy.is_frozen(head) && copy.trainable_elements() == 4);
         copy.unfreeze(|_| true);
-        let (constant, grad, values) = step(&mut copy, &mut sgd);
-        assert_eq!((constant, grad), (vec![false; 3], Tensor::ones(&[2])));
-        assert_eq!(values[2], 1.0 - 0.1 * 2.0);
+        let (moved, values) = step(&mut copy, &mut sgd);
+        assert_eq!((moved, values[2]), (6, 1.0 - 0.1 * 2.0));
     }
 
     #[test]

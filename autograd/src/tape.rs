@@ -66,6 +66,13 @@ impl<T: Scalar> Tape<T> {
         self.nodes.get_mut().clear();
     }
 
+    /// Frees the operations that are recorded and the values that they hold; their variables stay.
+    pub(crate) fn free(&self) {
+        for node in self.nodes.borrow_mut().iter_mut() {
+            node.take_if(|node| node.op.is_some());
+        }
+    }
+
     /// The pool that the tensors of this tape come from.
     pub fn pool(&self) -> &Pool<T> {
         &self.pool

@@ -3,7 +3,8 @@
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{
-    Activation, Dropout, Init, Linear, Optimizer, Params, Pass, Pool, Sequential, Sgd, SgdConfig, Tape, Tensor, Var,
+    Activation, Dropout, Gradient, Init, Linear, Optimizer, Params, Pass, Pool, Sequential, Sgd, SgdConfig, Tape,
+    Tensor, Var,
 };
 use std::sync::{Arc, Barrier, Mutex};
 
@@ -56,11 +57,10 @@ fn round(
         // The gradient by the input, recorded, is part of the loss.
         let slope = loss.grad_graph(&[&x]).remove(0);
         let total = loss + slope.square().sum();
-        let grads = total.grad_once(&bound.vars());
-        grads.iter().for_each(&mut mix);
+        let grads = bound.backward(&total);
+        grads.iter().filter_map(Gradient::dense).for_each(&mut mix);
         mix(total.value());
-        drop((slope, total, y, x, bound));
-        sgd.update(params, &grads, 0.01);
+        sgd.update(params, &grads, 0.01).check().unwrap();
     }
     tape.clear();
     params.values().iter().for_each(&mut mix);

@@ -105,7 +105,7 @@ impl Hierarchical {
         rays: &Rays<T>,
         jitter: &mut Jitter<'_>,
     ) -> [Samples<T>; 2] {
-        let tape = params.vars()[0].tape();
+        let tape = params.tape();
         let first = stratified(rays, self.config.coarse, jitter, tape.pool());
         let (_, weights) = composite_samples(&self.proposal, params, &first, false, tape);
         let second = self.refine(rays, &first, &weights, jitter, tape.pool());

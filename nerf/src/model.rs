@@ -113,7 +113,7 @@ impl<T: Scalar> Model<T> {
         target: &Tensor<T>,
         background: &Tensor<T>,
     ) -> Var<'t, T> {
-        let tape = params.vars()[0].tape();
+        let tape = params.tape();
         assert_eq!(samples.len(), self.fields().len(), "one set of samples for each field");
         let error = |(field, samples): (&dyn Field<T>, &Samples<T>)| {
             let rendered = match &self.sampler {

@@ -146,7 +146,8 @@ mod tests {
             let y = model.forward(&bound, &x, Pass::Train(0));
             let loss = (y - tape.constant(labels.clone())).square().mean();
             losses.push(loss.item());
-            sgd.update(&mut params, &loss.grad_once(&bound.vars()), 0.01);
+            let grads = bound.backward(&loss);
+            sgd.update(&mut params, &grads, 0.01).check().unwrap();
         }
         assert!(losses[0] > 0.1 && losses[59] < 1e-2, "{} to {}", losses[0], losses[59]);
     }

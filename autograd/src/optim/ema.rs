@@ -1,8 +1,10 @@
 //! Averages of parameters.
 
 use super::limits::flushed;
+use super::state::Reader;
+use super::{OptimizerState, StateError};
 use crate::Params;
-use raygrad_tensor::{Scalar, simd};
+use raygrad_tensor::{Scalar, Tensor, simd};
 
 /// The exponential moving average of parameters: `a = decay a + (1 - decay) x` after each step. It is often a better
 /// model than the parameters themselves, whose last steps are noise (Polyak and Juditsky 1992).
@@ -67,6 +69,32 @@ impl<T: Scalar> Ema<T> {
         &self.average
     }
 
+    /// The averages and how many steps they have taken, so that a run can go on later.
+    pub fn state(&self) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        state.put_counts("", "steps", vec![self.steps]);
+        for (name, value) in self.average.iter() {
+            state.put(name, "average", value.shape(), value.as_slice().to_vec());
+        }
+        state
+    }
+
+    /// Goes on from what [`state`](Self::state) gave.
+    ///
+    /// # Errors
+    /// If the state is that of other parameters; then nothing changes.
+    pub fn load_state(&mut self, state: &OptimizerState<T>) -> Result<(), StateError> {
+        let mut reader = Reader::new(state);
+        let (steps, mut values) = (reader.steps()?, vec![]);
+        for (name, value) in self.average.iter() {
+            values.push(Tensor::from_vec(value.shape(), reader.expect(name, "average", value.shape())?));
+        }
+        reader.finish()?;
+        self.steps = steps;
+        self.average.replace(values);
+        Ok(())
+    }
+
     /// The averages, under the names of the parameters.
     pub fn into_params(self) -> Params<T> {
         self.average
@@ -95,7 +123,6 @@ fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Tensor;
 
     fn store(values: &[f64]) -> Params<f64> {
         let mut params = Params::new();
