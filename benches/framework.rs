@@ -72,7 +72,7 @@ fn scalars() {
     });
     let both = median(100, || {
         let w = tape.leaf(Tensor::scalar(0.999));
-        chain(&w).grad_once(&[&w]);
+        chain(&w).backward(&[&w]);
         drop(w);
         tape.clear();
     });
@@ -194,7 +194,7 @@ fn operation(what: &str, shape: &[usize], f: impl for<'t> Fn(&Var<'t, f32>) -> V
     let mut tape = Tape::new();
     let seconds = median(30, || {
         let x = tape.leaf(values.clone());
-        f(&x).sum().grad_once(&[&x]);
+        f(&x).sum().backward(&[&x]);
         drop(x);
         tape.clear();
     });

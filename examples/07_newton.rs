@@ -45,7 +45,7 @@ fn newton(x: &[f64]) -> (f64, Vec<f64>, Vec<f64>, usize) {
             return (y.item(), g, solution, products);
         }
         let along = Tensor::from_vec(&[g.len()], direction.clone());
-        let image = slope.grad_with(&along, &[&x]).remove(0);
+        let image = tape.no_grad(|| slope.vjp(&tape.constant(along), &[&x])).remove(0).into_value();
         let curvature = dot(&direction, image.as_slice());
         if curvature <= 0.0 {
             // Downhill without end: go along what there is, or straight down.

@@ -1,8 +1,8 @@
 //! What the tape promises: derivatives of any order, threads that never meet, errors that name the line at fault.
 
 use raygrad::autograd::{
-    Activation, Check, Entry, Error, Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tape, Tensor, Var, Vjp,
-    check_op,
+    Activation, Check, Entry, Error, Grads, Map, Op, Pool, Reads, RowGrad, Scalar, Shape, ShapeError, Tape, Tensor,
+    Var, Vjp, check_function, check_op,
 };
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -81,15 +81,13 @@ fn gradients_of_interior_nodes_and_of_what_is_not_reached() {
     let unused = tape.leaf(Tensor::<f64>::ones(&[2, 3]));
     let y = inner.square().sum();
     let later = tape.leaf(vector(&[1.0]));
-    let constant = tape.constant(vector(&[1.0, 2.0, 3.0]));
-    let grads = y.grad(&[&inner, &unused, &x, &later, &constant, &y]);
+    let grads = y.grad(&[&inner, &unused, &x, &later, &y]);
     let [sines, cosines] = [[0.2_f64.sin(), 0.4_f64.sin()], [0.2_f64.cos(), 0.4_f64.cos()]];
     assert_close("the interior node", grads[0].as_slice(), &sines.map(|s| 2.0 * s), 1e-15);
     assert_close("the leaf below it", grads[2].as_slice(), &[0, 1].map(|i| 2.0 * sines[i] * cosines[i]), 1e-15);
     assert_eq!(grads[1], Tensor::zeros(&[2, 3]));
     assert_eq!(grads[3], Tensor::zeros(&[1]));
-    assert_eq!(grads[4], Tensor::zeros(&[3]));
-    assert_eq!(grads[5], Tensor::ones(&[]));
+    assert_eq!(grads[4], Tensor::ones(&[]));
 }
 
 #[test]
@@ -101,7 +99,7 @@ fn detached_values_constants_and_no_grad_stop_gradients() {
     let before = tape.len();
     let silent = tape.no_grad(|| x.exp().square());
     assert!(!silent.is_on_graph() && tape.len() == before && tape.is_recording());
-    assert_eq!(silent.sum().grad(&[&x])[0].as_slice(), [0.0]);
+    assert!(matches!(silent.sum().try_grad(&[&x]), Err(Error::OfConstant { .. })));
     let constants = tape.constant(vector(&[1.0])) + tape.constant(vector(&[2.0]));
     assert!(!constants.is_on_graph() && tape.len() == before, "constants leave no trace");
 }
@@ -123,11 +121,12 @@ fn a_freed_graph_says_so() {
     let x = tape.leaf(vector(&[0.5]));
     let y = x.sin().sum();
     assert_eq!(y.grad(&[&x]), y.grad(&[&x]), "`grad` can be repeated");
-    assert_close("once", y.grad_once(&[&x])[0].as_slice(), &[0.5_f64.cos()], 1e-15);
+    let last = y.backward(&[&x]).remove(0).into_dense(tape.pool());
+    assert_close("once", last.as_slice(), &[0.5_f64.cos()], 1e-15);
     let error = y.try_grad(&[&x]).unwrap_err();
     assert!(matches!(error, Error::Freed { .. }), "{error}");
     assert!(error.to_string().contains(&format!("{}:{}", file!(), line!() - 2)), "{error}");
-    assert!(matches!(y.try_grad_once(&[&x]), Err(Error::Freed { .. })));
+    assert!(matches!(y.try_backward(&[&x]), Err(Error::Freed { .. })));
 }
 
 #[test]
@@ -138,7 +137,7 @@ fn a_cleared_tape_gives_the_same_bits_without_allocating() {
     for round in 0..4 {
         let x = tape.leaf(Tensor::from_fn(&[50, 40], |i| (i as f32 * 0.37).sin()));
         let loss = (x.matmul_t(true, &x, false) * 0.1).tanh().square().sum();
-        let grad = loss.grad_once(&[&x]).remove(0);
+        let grad = loss.backward(&[&x]).remove(0).into_dense(tape.pool());
         let bits: Vec<_> = grad.as_slice().iter().map(|x| x.to_bits()).collect();
         assert_eq!(*first.get_or_insert(bits.clone()), bits, "round {round}");
         drop((x, loss, grad));
@@ -260,7 +259,7 @@ impl<T: Scalar> Op<T> for Replay {
         let tape = Tape::with_pool(cx.pool().clone());
         let (a, b) = (tape.leaf(cx.x(0).into_value()), tape.leaf(cx.x(1).into_value()));
         let y = Self::run(&a, &b) * tape.constant(cx.g().value().clone());
-        Grads::new(y.sum().grad_once(&[&a, &b]).into_iter().map(|grad| Some(cx.constant(grad))))
+        Grads::new(y.sum().grad(&[&a, &b]).into_iter().map(|grad| Some(cx.constant(grad))))
     }
 }
 
@@ -419,13 +418,20 @@ fn one_tape_gives_many_gradients_of_many_results() {
         &a.as_slice().iter().map(|a| 2.0 * a).collect::<Vec<_>>(),
         1e-15,
     );
-    assert_eq!(first.grad_with(&Tensor::scalar(1.0), &[&x, &h])[0], a);
+    let values = tape.no_grad(|| first.vjp(&seed, &[&x, &h]));
+    assert!(values.iter().all(|x| !x.is_on_graph()));
+    assert_close(
+        "vjp values",
+        values[0].value().as_slice(),
+        &a.as_slice().iter().map(|a| 2.0 * a).collect::<Vec<_>>(),
+        1e-15,
+    );
     assert_eq!(second.grad(&[&x])[0], b);
     recorded.sum().grad(&[&x]);
     assert_eq!(first.grad(&[&x])[0], a);
     // The last one frees what it passes, and only that: not the leaf, which other graphs have too.
     let apart = x.cos().sum();
-    assert_eq!(first.grad_once(&[&x])[0], a);
+    assert_eq!(first.backward(&[&x])[0].dense(), Some(&a));
     assert!(second.try_grad(&[&x]).is_err());
     assert_close("apart", apart.grad(&[&x])[0].as_slice(), &[-0.3_f64.sin(), 1.2_f64.sin()], 1e-15);
 }
@@ -437,9 +443,8 @@ fn scopes_without_recording_nest_and_end() {
     let (inner, outer) = tape.no_grad(|| {
         let inner = tape.no_grad(|| x.exp());
         assert!(!tape.is_recording(), "the inner scope gives back what it found");
-        // A derivative inside records what it needs, but its result is not on a graph that the scope could miss.
-        let grads = x.square().sum().grad(&[&x]);
-        assert_eq!(grads[0].as_slice(), [0.0], "nothing was recorded");
+        let error = x.square().sum().try_grad(&[&x]).unwrap_err();
+        assert!(matches!(error, Error::OfConstant { .. }), "nothing was recorded: {error}");
         (inner, x.square())
     });
     assert!(tape.is_recording() && !inner.is_on_graph() && !outer.is_on_graph());
@@ -467,4 +472,390 @@ fn empty_and_scalar_tensors_pass_through_everything_of_a_tape() {
         assert_eq!(total.backward(&[&x]).len(), 1);
         assert!(tape.to_dot().contains("freed"));
     }
+}
+
+/// The slope of x^3 as a model that takes it with a gradient: 3 x^2.
+fn slope<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
+    x[0].powi(3).sum().grad_graph(&[&x[0]]).remove(0)
+}
+
+#[test]
+fn a_gradient_can_be_taken_inside_of_whatever_runs_a_function() {
+    // A checkpoint runs it unrecorded first.
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(Tensor::scalar(3.0));
+    let y = tape.checkpoint(&[&x], slope);
+    assert_eq!((y.item(), y.grad(&[&x])[0].item()), (27.0, 18.0));
+    let second = y.grad_graph(&[&x]).remove(0);
+    assert_eq!((second.item(), second.grad(&[&x])[0].item()), (18.0, 6.0));
+    assert_eq!(tape.no_grad(|| tape.checkpoint(&[&x], slope)).item(), 27.0);
+    assert_eq!(tape.checkpoint(&[&tape.constant(Tensor::scalar(3.0))], slope).item(), 27.0);
+    // With respect to an input whose own gradient nobody wants: a constant, or a variable that was not asked for.
+    let by_second = |x: &[Var<'_, f64>]| (x[0].square() * &x[1]).sum().grad_graph(&[&x[1]]).remove(0).value().clone();
+    let constant = tape.constant(Tensor::scalar(5.0));
+    for other in [&constant, &x.exp()] {
+        let y = tape.checkpoint(&[&x, other], move |x| x[0].tape().constant(by_second(x)) * &x[0]);
+        assert_eq!((y.item(), y.grad(&[&x])[0].item(), y.grad_graph(&[&x])[0].item()), (27.0, 9.0, 9.0));
+    }
+    // Differences of values, and functions of tensors.
+    let at = Tensor::from_vec(&[2], vec![0.4, -1.1]);
+    check_function(&Check::default(), &[at], |x| slope(x) * &x[0]).unwrap();
+    let (y, grads) = raygrad::autograd::derivatives::value_and_grad(slope, &[Tensor::scalar(3.0)]);
+    assert_eq!((y, grads[0].item()), (27.0, 18.0));
+}
+
+#[test]
+fn what_has_no_gradient_is_an_error_and_never_zero() {
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(Tensor::scalar(3.0));
+    let c = tape.constant(Tensor::scalar(2.0));
+    let text = |result: Result<Vec<Tensor<f64>>, Error>| result.unwrap_err().to_string();
+    let message = text(tape.no_grad(|| x.square()).try_grad(&[&x]));
+    assert!(message.starts_with("gradient of a constant") && message.contains("enable_grad"), "{message}");
+    assert!(message.contains(&format!("{}:{}", file!(), line!() - 2)), "{message}");
+    let message = text((&x * &c).try_grad(&[&x, &c]));
+    assert!(message.starts_with("gradient with respect to a constant, number 1"), "{message}");
+    for error in [
+        c.try_backward(&[&x]).err(),
+        c.try_grad_graph(&[&x]).err(),
+        c.try_vjp(&c, &[&x]).err(),
+        c.square().try_grad(&[&x]).err(),
+    ] {
+        assert!(matches!(error, Some(Error::OfConstant { .. })));
+    }
+    assert!(panic_of(|| c.jvp(&[&x], &[&c])).starts_with("gradient of a constant"));
+    assert!(matches!(x.try_vjp(&tape.constant(vector(&[1.0])), &[&x]), Err(Error::Shape { op: "vjp", .. })));
+    // A gradient that is a constant is a function of the variable all the same, whose gradient is zero.
+    let third = (0..3).fold(x.square(), |y, _| y.grad_graph(&[&x]).remove(0));
+    assert_eq!((third.item(), third.grad(&[&x])[0].item()), (0.0, 0.0));
+    assert_eq!(x.affine(3.0, 1.0).hvp(&[&x], &[&c])[0].item(), 0.0);
+    // Nothing to ask for is fine.
+    assert!(x.square().grad(&[]).is_empty());
+}
+
+#[test]
+fn a_scope_with_gradients_works_inside_of_one_without() {
+    let force = |x: &Var<'_, f64>| {
+        let x = x.tracked();
+        let energy = x.tape().enable_grad(|| x.powi(4).sum());
+        (-energy.grad_graph(&[&x]).remove(0)).value().clone()
+    };
+    let tape = Tape::<f64>::new();
+    let (x, c) = (tape.leaf(vector(&[1.0, -2.0])), tape.constant(vector(&[1.0, -2.0])));
+    for force in [force(&x), force(&c), tape.no_grad(|| force(&x)), tape.no_grad(|| force(&c))] {
+        assert_eq!(force.as_slice(), [-4.0, 32.0]);
+    }
+    let inside = tape.no_grad(|| {
+        let y = tape.enable_grad(|| x.exp().sum());
+        assert!(!tape.is_recording() && y.is_on_graph());
+        y.grad_graph(&[&x]).remove(0)
+    });
+    assert!(!inside.is_on_graph() && tape.is_recording());
+    assert_eq!(inside.value(), x.exp().value());
+}
+
+/// A table whose gradient has a form of its own: sums over the rows of `x[0]`, and everything where `x[1]` says.
+struct Total;
+
+/// The same number everywhere.
+struct Everywhere(Shape, f64);
+
+impl raygrad::autograd::SparseGrad<f64> for Everywhere {
+    fn shape(&self) -> &[usize] {
+        &self.0
+    }
+    fn add_to(&self, dense: &mut Tensor<f64>) {
+        dense.as_mut_slice().iter_mut().for_each(|x| *x += self.1);
+    }
+}
+
+impl Op<f64> for Total {
+    fn name(&self) -> &'static str {
+        "total"
+    }
+    fn shape(&self, _x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(Shape::new())
+    }
+    fn forward(&self, x: &[&Tensor<f64>], _pool: &Pool<f64>) -> Tensor<f64> {
+        Tensor::scalar(x[0].as_slice().iter().sum())
+    }
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
+    }
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, f64>) -> Grads<'t, f64> {
+        let share = Everywhere(cx.shape(0).into(), cx.g().item());
+        Grads::new([None]).with_sparse(0, std::sync::Arc::new(share))
+    }
+}
+
+#[test]
+fn shares_of_every_kind_add_up_to_the_dense_gradient() {
+    /// An embedding with a penalty, tied weights, two tables, one of them with a share of an unknown kind.
+    type Model = for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>;
+    let rows = |table: &Var<'_, f64>, index: [u32; 3]| table.value().shape()[0] > index[2] as usize;
+    let models: [(&str, Model, Model); 5] = [
+        (
+            "rows and a penalty",
+            |a, b| a.gather_rows(&[3, 1, 3].into()).exp().sum() + a.square().sum() * 0.5 + b.sum(),
+            |a, b| pick(a, [3, 1, 3]).exp().sum() + a.square().sum() * 0.5 + b.sum(),
+        ),
+        (
+            "tied weights",
+            |a, b| (a.gather_rows(&[0, 2, 1].into()).matmul_t(false, a, true) * 0.1).tanh().sum() * b.sum(),
+            |a, b| (pick(a, [0, 2, 1]).matmul_t(false, a, true) * 0.1).tanh().sum() * b.sum(),
+        ),
+        (
+            "two tables",
+            |a, b| (a.gather_rows(&[3, 3, 0].into()) * b.gather_rows(&[1, 0, 1].into())).exp().sum(),
+            |a, b| (pick(a, [3, 3, 0]) * pick(b, [1, 0, 1])).exp().sum(),
+        ),
+        (
+            "shares of other kinds",
+            |a, b| {
+                let total = a.tape().apply(Total, &[a]);
+                (a.gather_rows(&[1, 1, 2].into()).sum() * total.sin() + a.tape().apply(Total, &[b])) * a.exp().sum()
+            },
+            |a, b| (pick(a, [1, 1, 2]).sum() * a.sum().sin() + b.sum()) * a.exp().sum(),
+        ),
+        (
+            "a table that is computed",
+            |a, b| (a * 2.0).gather_rows(&[3, 1, 3].into()).exp().sum() + a.slice(0, 1, 2).square().sum() * b.sum(),
+            |a, b| {
+                pick(&(a * 2.0), [3, 1, 3]).exp().sum() + pick(a, [1, 2, 2]).square().sum() * b.sum()
+                    - pick(a, [2, 2, 2]).square().sum() * b.sum() / 3.0
+            },
+        ),
+    ];
+    /// Rows by a product with a matrix of ones and zeros: every gradient of it is dense.
+    fn pick<'t>(table: &Var<'t, f64>, index: [u32; 3]) -> Var<'t, f64> {
+        let rows = table.shape()[0];
+        let one = |i: usize| f64::from(u8::from(index[i / rows] as usize == i % rows));
+        table.tape().constant(Tensor::from_fn(&[3, rows], one)).matmul(table)
+    }
+    for (name, sparse, dense) in models {
+        let gradients = |model: Model, backward: bool| {
+            let tape = Tape::<f64>::new();
+            let table = |rows: usize| tape.leaf(Tensor::from_fn(&[rows, 2], |i| (i as f64 * 1.7).sin()));
+            let (a, b) = (table(4), table(2));
+            assert!(rows(&a, [0, 0, 3]));
+            let loss = model(&a, &b);
+            match backward {
+                true => loss.backward(&[&a, &b]).into_iter().map(|grad| grad.into_dense(tape.pool())).collect(),
+                false => loss.grad(&[&a, &b]),
+            }
+        };
+        let expected = gradients(dense, false);
+        for got in [gradients(sparse, true), gradients(sparse, false)] {
+            for (got, expected) in got.iter().zip(&expected) {
+                assert!(expected.as_slice().iter().any(|&g| g != 0.0));
+                assert_close(name, got.as_slice(), expected.as_slice(), 1e-14);
+            }
+        }
+    }
+}
+
+/// Breaks one of the promises of an operation of one input.
+#[derive(Clone, Copy, PartialEq)]
+enum Broken {
+    Output,
+    Gradient,
+    Sparse,
+    Missing,
+    Surplus,
+    Recorded,
+}
+
+impl Op<f64> for Broken {
+    fn name(&self) -> &'static str {
+        "broken"
+    }
+    fn arity(&self) -> Option<usize> {
+        Some(1)
+    }
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        Ok(x[0].into())
+    }
+    fn forward(&self, x: &[&Tensor<f64>], _pool: &Pool<f64>) -> Tensor<f64> {
+        if *self == Broken::Output { Tensor::zeros(&[x[0].len() + 1]) } else { x[0].clone() }
+    }
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, f64>) -> Grads<'t, f64> {
+        let rows = |extent: usize| {
+            let grad = RowGrad::new(&[extent], [0].into(), Tensor::ones(&[1]));
+            Grads::new([None]).with_sparse(0, std::sync::Arc::new(grad))
+        };
+        match self {
+            Broken::Output => Grads::one(cx.g().clone()),
+            Broken::Gradient => Grads::one(cx.g().sum()),
+            Broken::Sparse => rows(5),
+            Broken::Recorded => rows(2),
+            Broken::Missing => Grads::new([]),
+            Broken::Surplus => Grads::new([Some(cx.g().clone()), None]),
+        }
+    }
+}
+
+#[test]
+fn what_an_operation_promises_is_checked_in_every_build() {
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(vector(&[1.0, 2.0]));
+    let run = |op: Broken, recorded: bool| {
+        panic_of(|| {
+            let y = tape.apply(op, &[&x]).sum();
+            if recorded { y.grad_graph(&[&x]).remove(0).into_value() } else { y.grad(&[&x]).remove(0) }
+        })
+    };
+    for (op, recorded, expected) in [
+        (Broken::Output, false, "broken: `forward` and `shape` disagree"),
+        (Broken::Gradient, false, "broken: the gradient of input 0 has another shape"),
+        (Broken::Gradient, true, "broken: the gradient of input 0 has another shape"),
+        (Broken::Sparse, false, "broken: the gradient of input 0 has another shape"),
+        (Broken::Missing, false, "broken: as many gradients as inputs"),
+        (Broken::Surplus, false, "broken: as many gradients as inputs"),
+        (Broken::Recorded, true, "broken: the gradient of input 0 is sparse in a recorded pass"),
+    ] {
+        let message = run(op, recorded);
+        assert!(message.contains(expected), "{message}");
+    }
+    assert_eq!(tape.apply(Broken::Recorded, &[&x]).sum().grad(&[&x])[0].as_slice(), [1.0, 0.0]);
+    assert!(panic_of(|| tape.apply(Broken::Missing, &[&x, &x])).contains("broken: 2 inputs instead of 1"));
+    #[derive(Clone, Copy)]
+    struct Twice;
+    impl raygrad::autograd::Unary for Twice {
+        const NAME: &'static str = "twice";
+        const READS: Reads = Reads::NOTHING;
+        fn f<E: raygrad::autograd::Real>(&self, x: E) -> E {
+            x.clone() + x
+        }
+        fn vjp<E: raygrad::autograd::Real>(&self, g: E, _x: E, _y: E) -> E {
+            g.clone() + g
+        }
+        fn cases(&self, _cases: &mut raygrad::autograd::Cases) {}
+    }
+    assert!(panic_of(|| tape.apply(Map(Twice), &[&x, &x])).contains("twice: 2 inputs instead of 1"));
+}
+
+#[test]
+fn only_what_leads_to_a_wanted_variable_is_passed_and_freed() {
+    // In both orders of the leaves.
+    for late in [false, true] {
+        let tape = Tape::<f64>::new();
+        let leaf = |value| tape.leaf(Tensor::scalar(value));
+        let (x, z) = if late {
+            let z = leaf(0.7);
+            (leaf(0.5), z)
+        } else {
+            (leaf(0.5), leaf(0.7))
+        };
+        let inner = x.sin();
+        let y = &inner * &z;
+        // Asked about an interior variable, a sweep ends there.
+        assert_eq!(y.backward(&[&inner])[0].dense().unwrap().item(), 0.7);
+        assert_eq!(inner.grad(&[&x])[0].item(), 0.5_f64.cos());
+        // What was freed beside the way is none of its business.
+        let y = &inner * &z;
+        inner.backward(&[&x]);
+        assert_eq!(y.grad(&[&z])[0].item(), 0.5_f64.sin());
+        assert!(matches!(y.try_grad(&[&z, &x]), Err(Error::Freed { .. })));
+        assert!(matches!(y.try_grad(&[&x]), Err(Error::Freed { .. })));
+    }
+}
+
+#[test]
+fn a_graph_of_a_million_nodes_is_swept_dropped_and_cleared() {
+    let mut tape = Tape::<f64>::new();
+    for free in [false, true] {
+        let x = tape.leaf(Tensor::scalar(1.0));
+        let aside = x.affine(3.0, 0.0);
+        let y = (0..1_000_000).fold(x.clone(), |y, _| y + &x);
+        let grad = match free {
+            true => y.backward(&[&x]).remove(0).into_dense(tape.pool()),
+            false => y.grad(&[&x]).remove(0),
+        };
+        assert_eq!(grad.item(), 1_000_001.0);
+        assert_eq!(aside.grad(&[&x])[0].item(), 3.0);
+        drop((x, y, aside));
+        tape.clear();
+    }
+    let x = tape.leaf(Tensor::scalar(1.0));
+    assert_eq!((x.square().grad(&[&x])[0].item(), tape.len()), (2.0, 2));
+}
+
+#[test]
+fn many_small_gradients_on_a_long_tape_cost_their_own_nodes_only() {
+    // A gradient of three nodes, again and again: on a tape that is a thousand times longer it is not slower by much.
+    let time = |before: usize| {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::scalar(0.3));
+        let long = (0..before).fold(x.clone(), |y, _| y + &x);
+        let start = std::time::Instant::now();
+        for _ in 0..2000 {
+            assert_eq!((x.sin() * 2.0).grad(&[&x])[0].item(), 2.0 * 0.3_f64.cos());
+        }
+        drop(long);
+        start.elapsed().as_secs_f64()
+    };
+    let short = (0..5).map(|_| time(100)).fold(f64::INFINITY, f64::min);
+    let long = (0..5).map(|_| time(100_000)).fold(f64::INFINITY, f64::min);
+    assert!(long < 8.0 * short, "{long} s after {short} s");
+}
+
+#[test]
+fn the_gradient_of_many_slices_costs_one_sum() {
+    let (count, width) = (512, 2048);
+    let tape = Tape::<f64>::new();
+    let x = tape.leaf(Tensor::from_fn(&[count, width], |i| i as f64));
+    let time = |y: &Var<'_, f64>| {
+        let run = || {
+            let start = std::time::Instant::now();
+            let grad = y.grad(&[&x]).remove(0);
+            (start.elapsed().as_secs_f64(), grad)
+        };
+        (0..3).map(|_| run()).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
+    };
+    let weight = |i: usize| 1.0 + (i % 7) as f64;
+    let sum = (0..count).fold(x.constant(0.0), |sum, i| sum + (x.slice(0, i, 1) * weight(i)).sum());
+    let weights = Tensor::from_fn(&[count, 1], weight);
+    let (whole, expected) = time(&(&x * tape.constant(weights)).sum());
+    let (slices, got) = time(&sum);
+    assert!(got == expected);
+    assert!(slices < 20.0 * whole, "{slices} s for slices, {whole} s for the whole");
+    // Overlapping ones, reversed ones, diagonals.
+    let x = tape.leaf(Tensor::from_fn(&[3, 3], |i| i as f64));
+    let y = x.slice(0, 0, 2).sum()
+        + x.slice(0, 1, 2).square().sum()
+        + (x.flip(1).slice(1, 0, 1) * 10.0).sum()
+        + (x.diagonal(0) * 100.0).sum();
+    let expected = [101.0, 1.0, 11.0, 7.0, 109.0, 21.0, 12.0, 14.0, 126.0];
+    assert_eq!(y.grad(&[&x])[0].as_slice(), expected);
+    assert_eq!(y.grad_graph(&[&x])[0].value().as_slice(), expected);
+}
+
+#[test]
+fn errors_of_chained_methods_can_be_handled() {
+    let tape = Tape::<f64>::new();
+    let (x, w) = (tape.leaf(Tensor::ones(&[2, 3])), tape.leaf(Tensor::ones(&[4, 5])));
+    let (result, line) = (tape.try_run(|| (x.exp().matmul(&w) + 1.0).sum().item()), line!());
+    let error = result.unwrap_err().to_string();
+    assert!(error.starts_with("matmul[[2, 3], [4, 5]]") && error.contains(&format!("{}:{line}:", file!())), "{error}");
+    assert!(matches!(tape.try_run(|| &x + &w), Err(Error::Shape { op: "add", .. })));
+    assert!(matches!(tape.try_run(|| x.grad(&[&x])), Err(Error::NotScalar { .. })));
+    assert!(matches!(tape.try_run(|| tape.no_grad(|| x.sum()).grad(&[&x])), Err(Error::OfConstant { .. })));
+    assert!(tape.is_recording(), "scopes end");
+    // Inside of a checkpoint, forwards and backwards, and from the inner of two scopes.
+    assert!(matches!(
+        tape.try_run(|| tape.checkpoint(&[&x, &w], |x| x[0].matmul(&x[1]))),
+        Err(Error::Shape { op: "matmul", .. })
+    ));
+    assert_eq!(tape.try_run(|| tape.try_run(|| x.matmul(&w)).is_err()).ok(), Some(true));
+    tape.check_finite(true);
+    let y = tape.checkpoint(&[&x], |x| (&x[0] - 1.0).sqrt().sum());
+    let error = tape.try_run(|| y.grad(&[&x])).unwrap_err();
+    assert!(matches!(error, Error::NonFinite { op: "sqrt", .. }), "{error}");
+    assert!(matches!(tape.try_run(|| (&x * 1e308) * 1e308), Err(Error::NonFinite { .. })));
+    assert!(matches!(tape.try_run(|| tape.leaf(vector(&[f64::NAN]))), Err(Error::NonFinite { op: "leaf", .. })));
+    tape.check_finite(false);
+    // Other panics pass through, and outside of a scope an error is a panic as ever.
+    assert_eq!(panic_of(|| tape.try_run(|| panic!("{}", "of another kind"))), "of another kind");
+    assert!(panic_of(|| x.matmul(&w)).starts_with("matmul"));
+    assert_eq!(tape.try_run(|| x.square().sum().grad(&[&x])).unwrap()[0], Tensor::full(&[2, 3], 2.0));
 }

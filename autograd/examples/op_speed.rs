@@ -24,7 +24,7 @@ fn time(shape: &[usize], call: Call) -> [f64; 2] {
         let forward = start.elapsed();
         let sum = y.sum();
         let start = Instant::now();
-        let _grads = sum.grad_once(&[&x, &rest[0], &rest[1]]);
+        let _grads = sum.backward(&[&x, &rest[0], &rest[1]]);
         let backward = start.elapsed();
         for (best, time) in best.iter_mut().zip([forward, backward]) {
             *best = best.min(time.as_nanos() as f64 / value.len() as f64);

@@ -141,12 +141,13 @@ pub fn check_function(
     let tape = Tape::new();
     let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
     let wrt: Vec<_> = leaves.iter().collect();
-    let y = f(&leaves);
+    let y = f(&leaves).tracked();
     let seed = spread(y.shape(), &[0.3..1.3], 3);
     // The function is reduced to one number by a fixed weighting of its outputs.
     let number = |x: &[Tensor<f64>]| -> f64 {
         let tape = Tape::new();
-        let x: Vec<_> = x.iter().map(|x| tape.constant(x.clone())).collect();
+        // Leaves, so that `f` may take gradients.
+        let x: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
         inner(&[f(&x).into_value()], std::slice::from_ref(&seed))
     };
     let grads = (&y * tape.constant(seed.clone())).sum().grad(&wrt);

@@ -19,20 +19,21 @@ where
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
         let tape = Tape::new();
-        let zeros: Vec<_> = x.iter().map(|shape| tape.constant(Tensor::zeros(shape))).collect();
+        let zeros: Vec<_> = x.iter().map(|shape| tape.leaf(Tensor::zeros(shape))).collect();
         Ok((self.f)(&zeros).shape().into())
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let tape = Tape::with_pool(pool.clone());
-        let x: Vec<_> = x.iter().map(|&x| tape.constant(x.clone())).collect();
+        // Leaves, so that `f` may take gradients.
+        let x: Vec<_> = x.iter().map(|&x| tape.leaf(x.clone())).collect();
         (self.f)(&x).into_value()
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let tape = Tape::with_pool(cx.pool().clone());
         let x: Vec<_> = (0..cx.len()).map(|i| tape.leaf(cx.x(i).into_value())).collect();
-        let grads = (self.f)(&x).vjp(&tape.constant(cx.g().value().clone()), &x.iter().collect::<Vec<_>>());
+        let grads = (self.f)(&x).tracked().vjp(&tape.constant(cx.g().value().clone()), &x.iter().collect::<Vec<_>>());
         Grads::new(grads.into_iter().map(|grad| Some(cx.constant(grad.into_value()))))
     }
 
@@ -41,7 +42,7 @@ where
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        Some((self.f)(x))
+        Some((self.f)(&x.iter().map(Var::tracked).collect::<Vec<_>>()))
     }
 }
 

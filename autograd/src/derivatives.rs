@@ -29,7 +29,8 @@ fn at<T: Scalar, R>(
 ) -> R {
     let tape = Tape::new();
     let leaves: Vec<_> = x.iter().map(|x| tape.leaf(x.clone())).collect();
-    let y = f(&leaves);
+    // A function that does not depend on its inputs has derivatives too, all of them 0.
+    let y = f(&leaves).tracked();
     then(y, &leaves.iter().collect::<Vec<_>>())
 }
 
@@ -49,7 +50,7 @@ pub fn value_and_grad<T: Scalar>(
     f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
     x: &[Tensor<T>],
 ) -> (T, Vec<Tensor<T>>) {
-    at(f, x, |y, wrt| (y.item(), y.grad_once(wrt)))
+    at(f, x, |y, wrt| (y.item(), y.grad(wrt)))
 }
 
 /// The value and the vector-Jacobian product (reverse mode): for each input the gradient of `sum(f(x) * seed)`.
@@ -69,7 +70,7 @@ pub fn vjp<T: Scalar>(
     x: &[Tensor<T>],
     seed: &Tensor<T>,
 ) -> (Tensor<T>, Vec<Tensor<T>>) {
-    at(f, x, |y, wrt| (y.value().clone(), y.grad_with(seed, wrt)))
+    at(f, x, |y, wrt| (y.value().clone(), y.vjp_values(seed, wrt)))
 }
 
 /// The value and the Jacobian-vector product (forward mode): the derivative of `f(x + h v)` by `h` at 0, of the shape of
@@ -164,11 +165,12 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// and finds something.
     #[track_caller]
     pub fn jvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Var<'t, T> {
-        self.tape.with_recording(true, || {
+        let slope = self.tape.enable_grad(|| {
             let seed = self.tape.leaf(self.tape.pool().full(self.shape(), T::ZERO));
             let grads = self.vjp(&seed, wrt);
-            inner(self.tape, &grads, tangents).grad_graph(&[&seed]).remove(0)
-        })
+            inner(self.tape, &grads, tangents).tracked().grad_graph(&[&seed]).remove(0)
+        });
+        slope.as_recorded()
     }
 
     /// The product of the Hessian of this one-element tensor with the tangents, recorded: for each of `wrt` the
@@ -178,10 +180,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If this tensor has not exactly one element, and as [`jvp`](Self::jvp).
     #[track_caller]
     pub fn hvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
-        self.tape.with_recording(true, || {
+        let products = self.tape.enable_grad(|| {
             let grads = self.grad_graph(wrt);
-            inner(self.tape, &grads, tangents).grad_graph(wrt)
-        })
+            inner(self.tape, &grads, tangents).tracked().grad_graph(wrt)
+        });
+        products.into_iter().map(Var::as_recorded).collect()
     }
 
     /// The Jacobian with respect to each of `wrt`: tensors of the shape of this one followed by that of the variable.
@@ -199,7 +202,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         if inputs >= outputs {
             // Row by row.
             for row in 0..outputs {
-                for (whole, grad) in all.iter_mut().zip(self.grad_with(&unit(self.shape(), row), wrt)) {
+                for (whole, grad) in all.iter_mut().zip(self.vjp_values(&unit(self.shape(), row), wrt)) {
                     let width = grad.len();
                     whole.as_mut_slice()[row * width..(row + 1) * width].copy_from_slice(grad.as_slice());
                 }
@@ -207,11 +210,11 @@ impl<'t, T: Scalar> Var<'t, T> {
             return all;
         }
         // Column by column: the gradient by the seed of the vector-Jacobian product.
-        let seed = self.tape.with_recording(true, || self.tape.leaf(Tensor::zeros(self.shape())));
-        for (whole, grad) in all.iter_mut().zip(self.vjp(&seed, wrt)) {
+        let seed = self.tape.leaf(Tensor::zeros(self.shape()));
+        for (whole, grad) in all.iter_mut().zip(self.tape.enable_grad(|| self.vjp(&seed, wrt))) {
             let width = grad.value.len();
             for column in 0..width {
-                let values = grad.grad_with(&unit(grad.shape(), column), &[&seed]).remove(0);
+                let values = grad.vjp_values(&unit(grad.shape(), column), &[&seed]).remove(0);
                 for (whole, &value) in whole.as_mut_slice()[column..].iter_mut().step_by(width).zip(values.as_slice()) {
                     *whole = value;
                 }
@@ -229,7 +232,20 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If this tensor has not exactly one element, and as [`jacobian`](Self::jacobian).
     #[track_caller]
     pub fn hessian(&self, wrt: &[&Var<'t, T>]) -> Vec<Vec<Tensor<T>>> {
-        self.grad_graph(wrt).iter().map(|grad| grad.jacobian(wrt)).collect()
+        let grads = self.tape.enable_grad(|| self.grad_graph(wrt));
+        grads.iter().map(|grad| grad.jacobian(wrt)).collect()
+    }
+
+    /// The vector-Jacobian product without a record of it.
+    #[track_caller]
+    fn vjp_values(&self, seed: &Tensor<T>, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
+        let grads = self.tape.no_grad(|| self.vjp(&self.tape.constant(seed.clone()), wrt));
+        grads.into_iter().map(Var::into_value).collect()
+    }
+
+    /// A result of the tape as it records now: a constant in [`Tape::no_grad`].
+    fn as_recorded(self) -> Self {
+        if self.tape.is_recording() { self } else { self.detach() }
     }
 }
 
@@ -387,9 +403,9 @@ mod tests {
         let third = fa.hvp(&[&a, &b], &[&one, &one]);
         // d/da and d/db of f_a along (1, 1): f_aaa + f_aab, f_aab + f_abb.
         assert_close(&[third[0].item(), third[1].item()], &[(-c - s) * e, (-s + c) * e], 1e-14);
-        // A Jacobian of a gradient that is recorded, inside a scope that records nothing.
+        // In a scope that records nothing the result is a constant.
         let inside = tape.no_grad(|| f.jvp(&[&a], &[&one]));
-        assert!(inside.is_on_graph() && inside.item() == fa.item());
+        assert!(!inside.is_on_graph() && inside.item() == fa.item());
         assert_close(fa.jacobian(&[&a, &b])[1].as_slice(), &[c * e], 1e-14);
     }
 

@@ -1,6 +1,7 @@
 //! The graph as a drawing.
 
 use crate::Tape;
+use crate::nodes::CONSTANT;
 use crate::tape::LEAF;
 use raygrad_tensor::Scalar;
 use std::fmt::Write;
@@ -9,7 +10,7 @@ impl<T: Scalar> Tape<T> {
     /// The recorded operations in the DOT language of Graphviz: `dot -Tsvg` draws them.
     ///
     /// A node shows its number, operation, shape and the line of the user's code; leaves are boxes, and what
-    /// `grad_once` has freed is dashed. An edge runs from an input to what is computed from it and shows which input it
+    /// [`Var::backward`](crate::Var::backward) has freed is dashed. An edge runs from an input to what is computed from it and shows which input it
     /// is if there are several. Constants are not on the graph.
     ///
     /// ```
@@ -23,31 +24,34 @@ impl<T: Scalar> Tape<T> {
     pub fn to_dot(&self) -> String {
         let mut out = String::from("digraph tape {\n  node [fontname=\"monospace\"];\n");
         let mut line = |text: String| out.extend(["  ", &text, "\n"]);
-        for (i, node) in self.nodes.borrow().iter().enumerate() {
-            let Some(node) = node else {
-                line(format!("n{i} [label=\"{i} freed\", style=dashed];"));
-                continue;
-            };
-            let (name, form) = match &node.op {
-                Some(op) => (op.name(), ""),
-                None => (LEAF, ", shape=box"),
-            };
-            let place = format!("{}:{}", node.at.file(), node.at.line());
-            let mut label = format!("{i} {name}\n{:?}\n{place}", node.output.shape());
-            // A backslash first, so that those of the other escapes stay.
-            for (plain, escaped) in [("\\", "\\\\"), ("\"", "\\\""), ("\n", "\\n")] {
-                label = label.replace(plain, escaped);
-            }
-            line(format!("n{i} [label=\"{label}\"{form}];"));
-            for (which, (input, _)) in node.inputs.iter().enumerate() {
-                let Some(input) = input else { continue };
-                let mut edge = format!("n{input} -> n{i}");
-                if node.inputs.len() > 1 {
-                    // Writing to a string does not fail.
-                    let _ = write!(edge, " [label=\"{which}\"]");
+        for i in 0..self.len() as u32 {
+            match &*self.nodes.place(i).borrow() {
+                None => line(format!("n{i} [label=\"{i} freed\", style=dashed];")),
+                Some(node) => {
+                    let (name, form) = match &node.op {
+                        Some(op) => (op.name(), ""),
+                        None => (LEAF, ", shape=box"),
+                    };
+                    let place = format!("{}:{}", node.at.file(), node.at.line());
+                    let mut label = format!("{i} {name}\n{:?}\n{place}", node.output.shape());
+                    // A backslash first, so that those of the other escapes stay.
+                    for (plain, escaped) in [("\\", "\\\\"), ("\"", "\\\""), ("\n", "\\n")] {
+                        label = label.replace(plain, escaped);
+                    }
+                    line(format!("n{i} [label=\"{label}\"{form}];"));
                 }
-                line(edge + ";");
             }
+            self.nodes.with_edges(|edges| {
+                let inputs = edges.of(i);
+                for (which, input) in inputs.iter().enumerate().filter(|(_, input)| **input != CONSTANT) {
+                    let mut edge = format!("n{input} -> n{i}");
+                    if inputs.len() > 1 {
+                        // Writing to a string does not fail.
+                        let _ = write!(edge, " [label=\"{which}\"]");
+                    }
+                    line(edge + ";");
+                }
+            });
         }
         out + "}\n"
     }
@@ -82,7 +86,7 @@ mod tests {
         loss.grad_graph(&[&w]);
         let dot = tape.to_dot();
         assert!(tape.len() > before && !dot.contains("src/ops"), "{dot}");
-        loss.grad_once(&[&w]);
+        loss.backward(&[&w]);
         assert!(tape.to_dot().contains("n2 [label=\"2 freed\", style=dashed];"));
         assert_eq!(Tape::<f64>::new().to_dot().lines().count(), 3);
     }

@@ -65,6 +65,10 @@ impl<T: Scalar, U: Unary> Op<T> for Map<U> {
         U::NAME
     }
 
+    fn arity(&self) -> Option<usize> {
+        Some(1)
+    }
+
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
         Ok(Shape::from_slice(x[0]))
     }
@@ -125,6 +129,10 @@ impl<B: Binary> Zip<B> {
 impl<T: Scalar, B: Binary> Op<T> for Zip<B> {
     fn name(&self) -> &'static str {
         B::NAME
+    }
+
+    fn arity(&self) -> Option<usize> {
+        Some(2)
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {

@@ -40,8 +40,28 @@ pub enum Error {
         /// The line of the user's code.
         at: &'static Location<'static>,
     },
-    /// The graph was freed by an earlier [`Var::grad_once`](crate::Var::grad_once).
-    #[error("the graph was freed by an earlier `grad_once`; use `grad` for all gradients but the last (at {at})")]
+    /// A gradient was asked of a constant.
+    #[error(
+        "gradient of a constant: it was computed from constants only, or while nothing was recorded (in `no_grad`); what a \
+         gradient is taken of begins with a leaf (`Tape::leaf`, `Var::tracked`) and is recorded (`Tape::enable_grad`) (at {at})"
+    )]
+    OfConstant {
+        /// The line that asked for the gradient.
+        at: &'static Location<'static>,
+    },
+    /// A gradient was asked with respect to a constant.
+    #[error(
+        "gradient with respect to a constant, number {index} of the variables asked for: make it a leaf (`Tape::leaf`), or \
+         begin with `Var::tracked` where an argument may be a constant (at {at})"
+    )]
+    ByConstant {
+        /// Which of the variables it is, from 0.
+        index: usize,
+        /// The line that asked for the gradient.
+        at: &'static Location<'static>,
+    },
+    /// The graph was freed by an earlier [`Var::backward`](crate::Var::backward).
+    #[error("the graph was freed by an earlier `backward`; use `grad` for all gradients but the last (at {at})")]
     Freed {
         /// The line that asked for the gradient.
         at: &'static Location<'static>,

@@ -22,6 +22,12 @@ pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
     fn as_rows(&self) -> Option<&dyn RowShare<T>> {
         None
     }
+
+    /// Whether it is to be added to a dense gradient as soon as it arrives there, instead of staying as it is: the gradient
+    /// of a slice is the gradient of a whole of which most is zero, and many slices of one tensor are to cost one sum.
+    fn is_passing(&self) -> bool {
+        false
+    }
 }
 
 /// A share of a gradient that consists of rows along the first axis.

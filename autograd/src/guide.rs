@@ -46,8 +46,22 @@
 //!
 //! # What goes wrong, and how one hears of it
 //!
-//! A wrong shape says which operation, which shapes and where it was called, as a panic or, from
-//! [`Tape::try_apply`](crate::Tape::try_apply), as an error. The NaN finder names the operation, the line and the index
+//! A wrong shape says which operation, which shapes and where it was called, as a panic. Where it should be an error
+//! instead, [`Tape::try_run`](crate::Tape::try_run) runs any code out of ordinary methods and operators and gives the first
+//! error, [`Tape::try_apply`](crate::Tape::try_apply) runs a single operation, and every kind of gradient has a form that
+//! begins with `try_`.
+//!
+//! ```
+//! use raygrad_autograd::{Error, Tape, Tensor};
+//! let tape = Tape::<f64>::new();
+//! let (x, w) = (tape.leaf(Tensor::ones(&[4, 3])), tape.leaf(Tensor::ones(&[5, 2])));
+//! let loss = tape.try_run(|| x.matmul(&w).tanh().square().sum());
+//! assert!(matches!(loss, Err(Error::Shape { op: "matmul", .. })));
+//! ```
+//!
+//! A gradient of a constant, or with respect to one, is such an error too, and never a zero: what was computed in
+//! [`Tape::no_grad`](crate::Tape::no_grad) has none. Code that takes a gradient as a part of what it computes, as a force is
+//! the gradient of an energy, says so with [`Tape::enable_grad`](crate::Tape::enable_grad). The NaN finder names the operation, the line and the index
 //! of the first number that is not finite, forwards or backwards. What operations give at kinks, ties and the edges of
 //! their domains is one table: [`conventions`](crate::conventions).
 //!

@@ -1,5 +1,6 @@
 //! What an operation is: a forward kernel and a vector-Jacobian product.
 
+use crate::nodes::CONSTANT;
 use crate::{Error, ShapeError, SparseGrad, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
@@ -34,6 +35,12 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
     /// The operation's name, as errors and the catalogue show it.
     fn name(&self) -> &'static str;
 
+    /// The number of inputs, if it is always the same: the tape then sees to it. With `None` that is up to
+    /// [`shape`](Self::shape).
+    fn arity(&self) -> Option<usize> {
+        None
+    }
+
     /// The shape of the output for inputs of these shapes.
     ///
     /// # Errors
@@ -49,7 +56,7 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
     }
 
     /// The gradient of each input, given the gradient `cx.g()` of the output. Inputs for which `cx.needs(i)` is false
-    /// may be left out.
+    /// may be left out. There is an entry for each input, of its shape, or the sweep panics.
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T>;
 
     /// As [`vjp`](Self::vjp), for an operation that takes gradients itself and hands their errors on. The sweep calls
@@ -142,7 +149,9 @@ pub struct Vjp<'t, 'a, T: Scalar> {
     pub(crate) tape: &'t Tape<T>,
     pub(crate) g: Var<'t, T>,
     pub(crate) op: &'static str,
-    pub(crate) inputs: &'a [(Option<u32>, Kept<T>)],
+    /// For each input its node, or [`CONSTANT`].
+    pub(crate) edges: &'a [u32],
+    pub(crate) inputs: &'a [Kept<T>],
     pub(crate) output: &'a Kept<T>,
     pub(crate) node: u32,
     pub(crate) needs: &'a [bool],
@@ -160,8 +169,8 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
     /// If the operation's [`Reads`] leave it out.
     #[track_caller]
     pub fn x(&self, i: usize) -> Var<'t, T> {
-        let (node, kept) = &self.inputs[i];
-        self.kept(kept, *node, "an input")
+        let node = Some(self.edges[i]).filter(|&node| node != CONSTANT);
+        self.kept(&self.inputs[i], node, "an input")
     }
 
     /// The output, on the graph if this pass is recorded.
@@ -179,7 +188,7 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
     /// As [`x`](Self::x).
     #[track_caller]
     pub fn input(&self, i: usize) -> &Tensor<T> {
-        self.value_of(&self.inputs[i].1, "an input")
+        self.value_of(&self.inputs[i], "an input")
     }
 
     /// The value of the output, for a pass that is not recorded.
@@ -206,7 +215,7 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
 
     /// The shape of input `i`.
     pub fn shape(&self, i: usize) -> &[usize] {
-        self.inputs[i].1.shape()
+        self.inputs[i].shape()
     }
 
     /// Number of inputs.
@@ -246,7 +255,7 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
 }
 
 /// The gradients of an operation's inputs, in their order.
-pub struct Grads<'t, T: Scalar>(pub(crate) SmallVec<[Option<Given<'t, T>>; 3]>);
+pub struct Grads<'t, T: Scalar>(pub(crate) SmallVec<[Option<Given<'t, T>>; 2]>);
 
 /// One gradient that an operation gives.
 #[derive(Clone)]
@@ -255,6 +264,22 @@ pub(crate) enum Given<'t, T: Scalar> {
     Sparse(Arc<dyn SparseGrad<T>>),
     /// Several gradients to add in this order, none of them `Parts`.
     Parts(Vec<Given<'t, T>>),
+}
+
+impl<T: Scalar> Given<'_, T> {
+    /// Panics if it is not what an operation may give for its input `i` of this shape.
+    pub(crate) fn check(&self, op: &str, i: usize, shape: &[usize], recording: bool) {
+        let given = match self {
+            Given::Dense(grad) => grad.shape(),
+            Given::Sparse(_) if recording => panic!(
+                "{op}: the gradient of input {i} is sparse in a recorded pass, but a sparse gradient cannot be \
+                 differentiated: see `Vjp::recording`"
+            ),
+            Given::Sparse(share) => share.shape(),
+            Given::Parts(parts) => return parts.iter().for_each(|part| part.check(op, i, shape, recording)),
+        };
+        assert_eq!(given, shape, "{op}: the gradient of input {i} has another shape than the input");
+    }
 }
 
 impl<'t, T: Scalar> Grads<'t, T> {
@@ -269,7 +294,7 @@ impl<'t, T: Scalar> Grads<'t, T> {
     }
 
     /// The same with a sparse gradient for input `i`. Only where the pass is not recorded: a sparse gradient cannot be
-    /// differentiated.
+    /// differentiated, and a recorded sweep that gets one panics.
     ///
     /// # Panics
     /// If there is no input `i`.

@@ -413,7 +413,8 @@ impl<'t, T: Scalar> Bound<'t, T> {
     /// As [`Var::grad`](crate::Var::grad).
     #[track_caller]
     pub fn backward(self, loss: &Var<'t, T>) -> Vec<Gradient<T>> {
-        let grads = loss.backward(&self.vars());
+        let wanted = self.vars();
+        let grads = if wanted.is_empty() { vec![] } else { loss.backward(&wanted) };
         loss.tape().free();
         grads
     }

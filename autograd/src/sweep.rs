@@ -1,364 +1,197 @@
-//! The backward sweep: from the root down the tape, visiting only what leads to the wanted gradients.
+//! The backward sweep: from the root down the tape, through those nodes alone that lead to a wanted gradient.
 
+use crate::nodes::Node;
 use crate::op::Given;
-use crate::tape::{LEAF, find_non_finite};
-use crate::{Error, Gradient, Grads, Op, SparseGrad, Tape, Var, Vjp};
-use raygrad_tensor::{Scalar, Tensor, add_assign};
+use crate::path::Path;
+use crate::sum::Sum;
+use crate::tape::LEAF;
+use crate::{Error, Grads, Op, Tape, Var, Vjp};
+use raygrad_tensor::Scalar;
 use smallvec::SmallVec;
 use std::panic::Location;
-use std::sync::Arc;
 
 /// What a sweep leaves behind.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Keep {
+pub(crate) enum Keep {
     /// The graph stays as it is.
     Graph,
     /// Saved values are freed as the sweep passes.
     Nothing,
-    /// The graph stays, and the gradients are recorded on it.
+    /// The graph stays, and the gradients are recorded on it if the tape records.
     GraphAndGradients,
 }
 
-impl<'t, T: Scalar> Var<'t, T> {
-    /// The gradients of this one-element tensor with respect to `wrt`; zeros where it does not depend on one. The graph
-    /// stays, so further gradients can be taken.
-    ///
-    /// # Panics
-    /// If this tensor has not exactly one element, the graph was freed, or the NaN finder is on and finds something.
-    #[track_caller]
-    pub fn grad(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
-        or_panic(self.try_grad(wrt))
-    }
-
-    /// As [`grad`](Self::grad), with an error instead of a panic.
-    ///
-    /// # Errors
-    /// If this tensor has not exactly one element, the graph was freed, or the NaN finder is on and finds something.
-    #[track_caller]
-    pub fn try_grad(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
-        Ok(values(self.tape, sweep(self, self.seed()?, wrt, Keep::Graph)?))
-    }
-
-    /// As [`grad`](Self::grad), but frees the saved values as the sweep passes, so that their buffers serve again at
-    /// once: what a training step wants.
-    ///
-    /// # Panics
-    /// As [`grad`](Self::grad).
-    #[track_caller]
-    pub fn grad_once(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
-        or_panic(self.try_grad_once(wrt))
-    }
-
-    /// As [`grad_once`](Self::grad_once), with an error instead of a panic.
-    ///
-    /// # Errors
-    /// As [`try_grad`](Self::try_grad).
-    #[track_caller]
-    pub fn try_grad_once(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Tensor<T>>, Error> {
-        Ok(values(self.tape, sweep(self, self.seed()?, wrt, Keep::Nothing)?))
-    }
-
-    /// The gradients of this one-element tensor with respect to `wrt` in the form in which operations give them: sparse
-    /// shares, such as the rows of a table, stay apart. Frees the saved values as the sweep passes, so that their buffers
-    /// serve again at once: what a training step wants.
-    ///
-    /// # Panics
-    /// As [`grad`](Self::grad).
-    #[track_caller]
-    pub fn backward(&self, wrt: &[&Var<'t, T>]) -> Vec<Gradient<T>> {
-        or_panic(self.try_backward(wrt))
-    }
-
-    /// As [`backward`](Self::backward), with an error instead of a panic.
-    ///
-    /// # Errors
-    /// As [`try_grad`](Self::try_grad).
-    #[track_caller]
-    pub fn try_backward(&self, wrt: &[&Var<'t, T>]) -> Result<Vec<Gradient<T>>, Error> {
-        let sums = sums(self, self.seed()?, wrt, Keep::Nothing, false)?;
-        let gradient = |(sum, x): (Option<Sum<'t, T>>, &&Var<'t, T>)| {
-            let mut gradient = Gradient::zero(x.shape());
-            if let Some(Sum::Added(dense, sparse)) = sum {
-                dense.into_iter().for_each(|dense| gradient.add_dense(dense.value));
-                sparse.into_iter().for_each(|share| gradient.add_sparse(share));
-            }
-            gradient
-        };
-        Ok(sums.into_iter().zip(wrt).map(gradient).collect())
-    }
-
-    /// The gradients as variables on the graph: they can be differentiated again.
-    ///
-    /// ```
-    /// use raygrad_autograd::Tape;
-    /// use raygrad_tensor::Tensor;
-    /// let tape = Tape::<f64>::new();
-    /// let x = tape.leaf(Tensor::scalar(0.5));
-    /// let mut y = x.sin();
-    /// for _ in 0..3 {
-    ///     y = y.grad_graph(&[&x]).remove(0);
-    /// }
-    /// assert!((y.item() + 0.5_f64.cos()).abs() < 1e-15); // the third derivative of sin is -cos
-    /// ```
-    ///
-    /// # Panics
-    /// As [`grad`](Self::grad).
-    #[track_caller]
-    pub fn grad_graph(&self, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
-        let sums = or_panic(sweep(self, or_panic(self.seed()), wrt, Keep::GraphAndGradients));
-        sums.into_iter().map(|sum| sum.dense(self.tape)).collect()
-    }
-
-    /// The vector-Jacobian product: the gradients of `sum(self * seed)` with respect to `wrt`, recorded on the graph.
-    ///
-    /// # Panics
-    /// If `seed` has another shape than this tensor, and as [`grad`](Self::grad).
-    #[track_caller]
-    pub fn vjp(&self, seed: &Var<'t, T>, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
-        assert_eq!(seed.shape(), self.shape(), "the seed of a vector-Jacobian product has the shape of the output");
-        let sums = or_panic(sweep(self, seed.clone(), wrt, Keep::GraphAndGradients));
-        sums.into_iter().map(|sum| sum.dense(self.tape)).collect()
-    }
-
-    /// The vector-Jacobian product without a record of it: the gradients of `sum(self * seed)` with respect to `wrt`.
-    ///
-    /// # Panics
-    /// If `seed` has another shape than this tensor, and as [`grad`](Self::grad).
-    #[track_caller]
-    pub fn grad_with(&self, seed: &Tensor<T>, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
-        assert_eq!(seed.shape(), self.shape(), "the seed of a vector-Jacobian product has the shape of the output");
-        values(self.tape, or_panic(sweep(self, self.tape.constant(seed.clone()), wrt, Keep::Graph)))
-    }
-
-    #[track_caller]
-    fn seed(&self) -> Result<Var<'t, T>, Error> {
-        if self.value.len() != 1 {
-            return Err(Error::NotScalar { shape: self.shape().into(), at: Location::caller() });
-        }
-        Ok(self.tape.constant(self.tape.pool().full(self.shape(), T::ONE)))
-    }
-}
-
-#[track_caller]
-fn or_panic<R>(result: Result<R, Error>) -> R {
-    match result {
-        Ok(value) => value,
-        Err(error) => panic!("{error}"),
-    }
-}
-
-fn values<T: Scalar>(tape: &Tape<T>, sums: Vec<Sum<'_, T>>) -> Vec<Tensor<T>> {
-    sums.into_iter().map(|sum| sum.dense(tape).value).collect()
-}
-
-/// What has arrived at a node so far.
-#[derive(Clone)]
-enum Sum<'t, T: Scalar> {
-    /// The sum of the dense shares and the sparse ones, in the order in which they came.
-    Added(Option<Var<'t, T>>, Vec<Arc<dyn SparseGrad<T>>>),
-    /// Shares that somebody else is to add, in the order in which they came.
-    Parts(Vec<Given<'t, T>>),
-}
-
-impl<'t, T: Scalar> Sum<'t, T> {
-    /// What is there after `given` has arrived.
-    fn gather(sum: Option<Self>, given: Given<'t, T>, tape: &'t Tape<T>) -> Option<Self> {
-        if let Given::Parts(parts) = given {
-            return parts.into_iter().fold(sum, |sum, part| Sum::gather(sum, part, tape));
-        }
-        let mut sum = sum.unwrap_or(Sum::Added(None, vec![]));
-        match (&mut sum, given) {
-            (Sum::Parts(parts), given) => parts.push(given),
-            (Sum::Added(_, sparse), Given::Sparse(share)) => sparse.push(share),
-            (Sum::Added(Some(dense), _), Given::Dense(grad)) if tape.is_recording() => *dense = &*dense + grad,
-            (Sum::Added(Some(dense), _), Given::Dense(grad)) => {
-                add_assign(dense.value.as_mut_slice(), grad.value.as_slice());
-            }
-            (Sum::Added(dense, _), Given::Dense(grad)) => *dense = Some(grad),
-            (Sum::Added(..), Given::Parts(_)) => unreachable!("taken apart above"),
-        }
-        Some(sum)
-    }
-
-    /// The first bad element, if the NaN finder is on.
-    fn check(
-        &self,
-        tape: &'t Tape<T>,
-        what: &str,
-        op: &'static str,
-        at: &'static Location<'static>,
-    ) -> Result<(), Error> {
-        match self {
-            _ if !tape.checks_finite() => Ok(()),
-            Sum::Added(Some(dense), sparse) if sparse.is_empty() => find_non_finite(op, what, &dense.value, at),
-            Sum::Added(..) => find_non_finite(op, what, &self.clone().dense(tape).value, at),
-            Sum::Parts(_) => Ok(()),
-        }
-    }
-
-    /// One variable. In a recorded pass sparse shares become constants, which is what they are.
-    fn dense(self, tape: &'t Tape<T>) -> Var<'t, T> {
-        let Sum::Added(dense, sparse) = self else { unreachable!("shares are left apart at leaves only") };
-        if tape.is_recording()
-            && let Some(dense) = &dense
-            && !sparse.is_empty()
-        {
-            return dense + Sum::Added(None, sparse).dense(tape);
-        }
-        let mut sum = match (dense, sparse.first()) {
-            (Some(dense), _) => dense,
-            (None, Some(share)) => tape.constant(tape.pool().full(share.shape(), T::ZERO)),
-            (None, None) => unreachable!("a sum has a share"),
-        };
-        sparse.iter().for_each(|share| share.add_to(&mut sum.value));
-        sum
-    }
-}
-
-/// The gradients of `sum(root * seed)` with respect to `wrt`.
-#[track_caller]
-fn sweep<'t, T: Scalar>(
+/// What has arrived at each of `wrt`, if anything, as a gradient of `sum(root * seed)`.
+pub(crate) fn sweep<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,
     wrt: &[&Var<'t, T>],
     keep: Keep,
-) -> Result<Vec<Sum<'t, T>>, Error> {
-    let tape = root.tape;
-    let zeros = |x: &Var<'t, T>| Sum::Added(Some(tape.constant(tape.pool().full(x.shape(), T::ZERO))), vec![]);
-    let sums = sums(root, seed, wrt, keep, false)?;
-    Ok(sums.into_iter().zip(wrt).map(|(sum, x)| sum.unwrap_or_else(|| zeros(x))).collect())
+    at: &'static Location<'static>,
+) -> Result<Vec<Option<Sum<'t, T>>>, Error> {
+    sums(root, seed, wrt, keep, false, at)
 }
 
 /// As an unrecorded sweep that frees the graph, but with the shares of each of `leaves` apart, in the order in which they
 /// came. Who adds them to a sum gets the bits of a sweep that had not been interrupted.
-#[track_caller]
 pub(crate) fn parts<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,
     leaves: &[&Var<'t, T>],
+    at: &'static Location<'static>,
 ) -> Result<Vec<Vec<Given<'t, T>>>, Error> {
-    let parts = |sum| if let Some(Sum::Parts(parts)) = sum { parts } else { vec![] };
-    Ok(sums(root, seed, leaves, Keep::Nothing, true)?.into_iter().map(parts).collect())
+    let parts = |sum| if let Some(Sum::Apart(parts)) = sum { parts } else { vec![] };
+    Ok(sums(root, seed, leaves, Keep::Nothing, true, at)?.into_iter().map(parts).collect())
 }
 
-/// What has arrived at each of `wrt`, if anything; with `apart` they are leaves and their shares are not added.
-#[track_caller]
 fn sums<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,
     wrt: &[&Var<'t, T>],
     keep: Keep,
     apart: bool,
+    at: &'static Location<'static>,
 ) -> Result<Vec<Option<Sum<'t, T>>>, Error> {
-    let (tape, at) = (root.tape, Location::caller());
-    for x in wrt {
-        assert!(std::ptr::eq(x.tape, tape), "a gradient with respect to a variable of another tape");
-    }
-    let lowest = wrt.iter().filter_map(|x| x.node).min();
-    let (Some(top), Some(bottom)) = (root.node, lowest) else { return Ok(vec![None; wrt.len()]) };
-    let needed = reach(tape, bottom, top, wrt);
-    // One slot for each node between the lowest variable and the root.
-    let mut grads: Vec<Option<Sum<'t, T>>> = vec![None; needed.len()];
-    let place =
-        |x: &Var<'t, T>| x.node.filter(|&node| node >= bottom && node <= top).map(|node| (node - bottom) as usize);
+    let tape = root.tape;
+    let Some(top) = root.node else { return Ok(vec![None; wrt.len()]) };
+    let scratch = tape.scratch.borrow_mut().pop().unwrap_or_default();
+    let path = Path::new(&tape.nodes, scratch, top, wrt.iter().filter_map(|x| x.node));
+    let places: SmallVec<[Option<usize>; 8]> = wrt.iter().map(|x| x.node.and_then(|node| path.place(node))).collect();
+    let mut sweep = Sweep { tape, keep, at, arrived: Arrived::new(path.nodes().len()), path };
     if apart {
-        wrt.iter().filter_map(|x| place(x)).for_each(|slot| grads[slot] = Some(Sum::Parts(vec![])));
+        places.iter().flatten().for_each(|&place| *sweep.arrived.slot(place) = Some(Sum::Apart(vec![])));
     }
-    if top >= bottom && needed[(top - bottom) as usize] {
-        let slot = &mut grads[(top - bottom) as usize];
-        *slot = Sum::gather(slot.take(), Given::Dense(seed), tape);
+    if sweep.path.needs(top) {
+        sweep.arrive(0, Given::Dense(seed), root.shape());
     }
-    tape.with_recording(keep == Keep::GraphAndGradients, || {
-        for index in (bottom..=top).rev() {
-            let slot = (index - bottom) as usize;
-            if grads[slot].is_none() {
-                continue;
-            }
-            let node = match keep {
-                // A leaf holds no values, and may be one of other graphs too.
-                Keep::Nothing => tape.nodes.borrow_mut()[index as usize].take_if(|node| node.op.is_some()),
-                _ => None,
+    let recording = keep == Keep::GraphAndGradients && tape.is_recording();
+    tape.with_recording(recording, || (0..sweep.path.nodes().len()).try_for_each(|place| sweep.visit(place)))?;
+    let sums = places.iter().map(|place| place.and_then(|place| sweep.arrived.get(place).cloned())).collect();
+    tape.scratch.borrow_mut().push(sweep.path.into_scratch());
+    Ok(sums)
+}
+
+/// A sweep under way.
+struct Sweep<'t, T: Scalar> {
+    tape: &'t Tape<T>,
+    keep: Keep,
+    /// Who asked for it.
+    at: &'static Location<'static>,
+    path: Path,
+    arrived: Arrived<'t, T>,
+}
+
+impl<'t, T: Scalar> Sweep<'t, T> {
+    fn arrive(&mut self, place: usize, given: Given<'t, T>, shape: &[usize]) {
+        Sum::gather(self.arrived.slot(place), given, shape, self.tape);
+    }
+
+    /// Hands the gradient of a node, if one has arrived, on to its inputs.
+    fn visit(&mut self, place: usize) -> Result<(), Error> {
+        let (tape, leads, checks) = (self.tape, self.path.leads(place), self.tape.checks_finite());
+        if !(leads || checks) || self.arrived.get(place).is_none() {
+            return Ok(());
+        }
+        let number = self.path.nodes()[place];
+        let held = tape.nodes.place(number).borrow();
+        let Some(node) = &*held else {
+            return if leads { Err(Error::Freed { at: self.at }) } else { Ok(()) };
+        };
+        if checks && let Some(sum) = self.arrived.get(place) {
+            let (what, name) = match &node.op {
+                Some(op) => ("the gradient of the output", op.name()),
+                None => ("the gradient", LEAF),
             };
-            let node = node.or_else(|| tape.nodes.borrow()[index as usize].clone());
-            let Some(node) = node else { return Err(Error::Freed { at }) };
-            if node.op.is_none() && !tape.checks_finite() {
-                continue;
-            }
-            let wanted = wrt.iter().any(|x| x.node == Some(index));
-            let Some(sum) = (if wanted { grads[slot].clone() } else { grads[slot].take() }) else { continue };
-            let name = node.op.as_ref().map_or(LEAF, |op| op.name());
-            let what = if node.op.is_some() { "the gradient of the output" } else { "the gradient" };
             sum.check(tape, what, name, node.at)?;
-            let Some(op) = &node.op else { continue };
-            let g = sum.dense(tape);
-            let needs: SmallVec<[bool; 4]> =
-                node.inputs.iter().map(|&(input, _)| leads(input, bottom, &needed)).collect();
-            let cx = Vjp { tape, g, op: name, inputs: &node.inputs, output: &node.output, node: index, needs: &needs };
-            tape.differentiating(node.at, || {
-                let given = differentiate(&**op, &cx)?;
-                drop(cx);
-                for (i, grad) in given.0.into_iter().enumerate() {
-                    let (Some(grad), Some(input)) = (grad, node.inputs[i].0) else { continue };
-                    if !needs[i] {
-                        continue;
-                    }
-                    if let Given::Dense(grad) = &grad {
-                        debug_assert_eq!(grad.shape(), node.inputs[i].1.shape(), "gradient of input {i} of {name}");
-                    }
-                    if tape.checks_finite() {
-                        let sum = Sum::gather(None, grad.clone(), tape);
-                        sum.map_or(Ok(()), |sum| {
-                            sum.check(tape, &format!("the gradient of input {i}"), name, node.at)
-                        })?;
-                    }
-                    let slot = &mut grads[(input - bottom) as usize];
-                    *slot = Sum::gather(slot.take(), grad, tape);
-                }
-                Ok(())
-            })?;
+        }
+        let (true, Some(op)) = (leads, &node.op) else { return Ok(()) };
+        let sum = if self.path.wants(place) { self.arrived.get(place).cloned() } else { self.arrived.take(place) };
+        if let Some(sum) = sum {
+            tape.differentiating(node.at, || self.hand_on(number, node, &**op, sum.dense(tape)))?;
+        }
+        drop(held);
+        if self.keep == Keep::Nothing {
+            tape.nodes.free(number);
         }
         Ok(())
-    })?;
-    Ok(wrt.iter().map(|x| place(x).and_then(|slot| grads[slot].clone())).collect())
-}
+    }
 
-/// Whether an input is a node that the sweep passes and that depends on a wanted variable.
-fn leads(input: Option<u32>, bottom: u32, needed: &[bool]) -> bool {
-    input.is_some_and(|i| i >= bottom && needed[(i - bottom) as usize])
-}
-
-/// Which nodes between `bottom` and `top` depend on a wanted variable.
-fn reach<T: Scalar>(tape: &Tape<T>, bottom: u32, top: u32, wrt: &[&Var<'_, T>]) -> Vec<bool> {
-    let nodes = tape.nodes.borrow();
-    let mut needed = vec![false; (top.max(bottom) - bottom) as usize + 1];
-    for x in wrt {
-        if let Some(node) = x.node
-            && let Some(flag) = needed.get_mut((node - bottom) as usize)
-        {
-            *flag = true;
+    fn hand_on(&mut self, number: u32, node: &Node<T>, op: &dyn Op<T>, g: Var<'t, T>) -> Result<(), Error> {
+        let tape = self.tape;
+        let edges: SmallVec<[u32; 4]> = tape.nodes.with_edges(|edges| SmallVec::from_slice(edges.of(number)));
+        let needs: SmallVec<[bool; 4]> = edges.iter().map(|&input| self.path.needs(input)).collect();
+        let Node { inputs, output, at, .. } = node;
+        let cx = Vjp { tape, g, op: op.name(), edges: &edges, inputs, output, node: number, needs: &needs };
+        let given = differentiate(op, &cx, self.at)?.0;
+        drop(cx);
+        assert_eq!(given.len(), inputs.len(), "{}: as many gradients as inputs", op.name());
+        for (i, share) in given.into_iter().enumerate() {
+            let (Some(share), true) = (share, needs[i]) else { continue };
+            let shape = inputs[i].shape();
+            share.check(op.name(), i, shape, tape.is_recording());
+            if tape.checks_finite() {
+                let mut alone = None;
+                Sum::gather(&mut alone, share.clone(), shape, tape);
+                alone.map_or(Ok(()), |sum| sum.check(tape, &format!("the gradient of input {i}"), op.name(), at))?;
+            }
+            if let Some(place) = self.path.place(edges[i]) {
+                self.arrive(place, share, shape);
+            }
         }
+        Ok(())
     }
-    for slot in 0..needed.len() {
-        needed[slot] = needed[slot]
-            || match nodes.get(bottom as usize + slot) {
-                Some(Some(node)) => node.inputs.iter().any(|&(input, _)| leads(input, bottom, &needed)),
-                // A freed node: if the sweep arrives there, it reports it.
-                _ => true,
-            };
+}
+
+/// The sums under way. A sum takes a slot when its first share arrives and gives it back when the sweep has passed, so that
+/// there are as many as are under way at a time, however long the path is.
+struct Arrived<'t, T: Scalar> {
+    /// For each place of the path the slot of its sum, counted from 1; 0 if it has none.
+    slots: Vec<u32>,
+    sums: Vec<Option<Sum<'t, T>>>,
+    free: Vec<u32>,
+}
+
+impl<'t, T: Scalar> Arrived<'t, T> {
+    fn new(len: usize) -> Self {
+        Arrived { slots: vec![0; len], sums: vec![], free: vec![] }
     }
-    needed
+
+    fn get(&self, place: usize) -> Option<&Sum<'t, T>> {
+        self.sums.get((self.slots[place] as usize).checked_sub(1)?)?.as_ref()
+    }
+
+    fn slot(&mut self, place: usize) -> &mut Option<Sum<'t, T>> {
+        if self.slots[place] == 0 {
+            self.slots[place] = self.free.pop().unwrap_or_else(|| {
+                self.sums.push(None);
+                self.sums.len() as u32
+            });
+        }
+        &mut self.sums[self.slots[place] as usize - 1]
+    }
+
+    fn take(&mut self, place: usize) -> Option<Sum<'t, T>> {
+        let slot = std::mem::take(&mut self.slots[place]);
+        let sum = self.sums.get_mut((slot as usize).checked_sub(1)?)?.take();
+        self.free.push(slot);
+        sum
+    }
 }
 
 /// One vector-Jacobian product; through the reference of a fused operation if the result is recorded.
-fn differentiate<'t, T: Scalar>(op: &dyn Op<T>, cx: &Vjp<'t, '_, T>) -> Result<Grads<'t, T>, Error> {
+fn differentiate<'t, T: Scalar>(
+    op: &dyn Op<T>,
+    cx: &Vjp<'t, '_, T>,
+    at: &'static Location<'static>,
+) -> Result<Grads<'t, T>, Error> {
     if cx.recording() && op.is_fused() {
         // Fresh copies on the graph: an input that depends on another one is to get its own share only.
         let inputs: Vec<_> = (0..cx.len()).map(|i| cx.x(i).alias()).collect();
         if let Some(y) = op.reference(&inputs) {
             let wanted: Vec<_> = inputs.iter().zip(cx.needs).filter(|(_, needed)| **needed).map(|(x, _)| x).collect();
-            let sums = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients)?;
-            let mut given = sums.into_iter().map(|sum| sum.dense(cx.tape));
-            return Ok(Grads::new(cx.needs.iter().map(|&needed| if needed { given.next() } else { None })));
+            let mut sums = sweep(&y, cx.g.clone(), &wanted, Keep::GraphAndGradients, at)?.into_iter();
+            let mut given = || sums.next().flatten().map(|sum| sum.dense(cx.tape));
+            return Ok(Grads::new(cx.needs.iter().map(|&needed| if needed { given() } else { None })));
         }
     }
     op.try_vjp(cx)

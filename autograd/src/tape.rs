@@ -1,21 +1,12 @@
 //! The tape: a list of operations in the order in which they ran, which is a topological order.
 
+use crate::nodes::{CONSTANT, Node, Nodes};
 use crate::op::Kept;
 use crate::{Error, Op, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
 use std::cell::{Cell, RefCell};
-use std::panic::Location;
-use std::sync::Arc;
-
-/// One recorded operation.
-pub(crate) struct Node<T: Scalar> {
-    /// None for a leaf.
-    pub op: Option<Box<dyn Op<T>>>,
-    pub inputs: SmallVec<[(Option<u32>, Kept<T>); 2]>,
-    pub output: Kept<T>,
-    pub at: &'static Location<'static>,
-}
+use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
 
 /// Records operations and differentiates them. One tape belongs to one thread at a time; any number of tapes work
 /// side by side, since nothing is global.
@@ -30,10 +21,14 @@ pub(crate) struct Node<T: Scalar> {
 /// assert_eq!(y.grad(&[&x])[0].as_slice(), [2.0, 4.0, 6.0]);
 /// ```
 pub struct Tape<T: Scalar> {
-    pub(crate) nodes: RefCell<Vec<Option<Arc<Node<T>>>>>,
+    pub(crate) nodes: Nodes<T>,
+    /// What sweeps work with, kept from one to the next: as many as there were sweeps inside of each other.
+    pub(crate) scratch: RefCell<Vec<Vec<u32>>>,
     pool: Pool<T>,
     recording: Cell<bool>,
     check_finite: Cell<bool>,
+    /// Whether errors go to a [`Tape::try_run`].
+    trying: Cell<bool>,
     /// While a gradient is worked out: the line of the user's code that recorded what is being differentiated.
     differentiating: Cell<Option<&'static Location<'static>>>,
 }
@@ -53,24 +48,33 @@ impl<T: Scalar> Tape<T> {
     /// An empty tape whose tensors come from `pool`.
     pub fn with_pool(pool: Pool<T>) -> Self {
         Tape {
-            nodes: RefCell::default(),
+            nodes: Nodes::new(),
+            scratch: RefCell::default(),
             pool,
             recording: Cell::new(true),
             check_finite: Cell::new(false),
+            trying: Cell::new(false),
             differentiating: Cell::new(None),
         }
     }
 
+    /// An empty tape for a part of what this one does: with its pool, its NaN finder and the line that it is at.
+    pub(crate) fn nested(&self) -> Self {
+        let tape = Tape::with_pool(self.pool.clone());
+        tape.check_finite.set(self.check_finite.get());
+        tape.trying.set(self.trying.get());
+        tape.differentiating.set(self.differentiating.get());
+        tape
+    }
+
     /// Forgets every operation; the pool stays. The borrow proves that no [`Var`] is left.
     pub fn clear(&mut self) {
-        self.nodes.get_mut().clear();
+        self.nodes.clear();
     }
 
     /// Frees the operations that are recorded and the values that they hold; their variables stay.
     pub(crate) fn free(&self) {
-        for node in self.nodes.borrow_mut().iter_mut() {
-            node.take_if(|node| node.op.is_some());
-        }
+        self.nodes.free_operations();
     }
 
     /// The pool that the tensors of this tape come from.
@@ -80,7 +84,7 @@ impl<T: Scalar> Tape<T> {
 
     /// Number of recorded operations and leaves.
     pub fn len(&self) -> usize {
-        self.nodes.borrow().len()
+        self.nodes.len()
     }
 
     /// Whether nothing is recorded.
@@ -122,8 +126,74 @@ impl<T: Scalar> Tape<T> {
     }
 
     /// Runs `f` without recording: its results are constants.
+    ///
+    /// A gradient of such a constant is an error. Code that takes a gradient inside of a computation, as a force is the
+    /// gradient of an energy, has what it differentiates recorded in any case with [`enable_grad`](Self::enable_grad).
     pub fn no_grad<R>(&self, f: impl FnOnce() -> R) -> R {
         self.with_recording(false, f)
+    }
+
+    /// Runs `f` with recording, also inside of [`no_grad`](Self::no_grad): for a gradient that is part of what is computed.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor, Var};
+    /// /// The force in a field of energy x^4: works with any x, whether anything is recorded or not.
+    /// fn force<'t>(x: &Var<'t, f64>) -> Var<'t, f64> {
+    ///     let x = x.tracked(); // a constant has no gradients
+    ///     let energy = x.tape().enable_grad(|| x.powi(4).sum());
+    ///     -energy.grad_graph(&[&x]).remove(0)
+    /// }
+    /// let tape = Tape::new();
+    /// let x = tape.leaf(Tensor::scalar(2.0));
+    /// assert_eq!(force(&x).grad(&[&x])[0].item(), -48.0); // -12 x^2: the force is recorded
+    /// let value = tape.no_grad(|| force(&x));
+    /// assert!(value.item() == -32.0 && !value.is_on_graph());
+    /// assert_eq!(force(&tape.constant(Tensor::scalar(2.0))).item(), -32.0);
+    /// ```
+    pub fn enable_grad<R>(&self, f: impl FnOnce() -> R) -> R {
+        self.with_recording(true, f)
+    }
+
+    /// Runs `f`, and gives the first [`Error`] of an operation or a gradient of this tape as an error instead of a panic. So
+    /// code out of ordinary methods and operators serves where what it works on is not known to fit: a model that a user
+    /// put together, shapes that come from a file.
+    ///
+    /// The error ends `f` by unwinding, like a panic but without its message, since every operation gives a plain variable
+    /// and there is none to go on with. All other panics pass through: they are no errors of this tape. What `f` recorded
+    /// until then stays. In a program that is built with `panic = "abort"`, errors abort it;
+    /// [`try_apply`](Self::try_apply) and the `try_` gradients do without unwinding.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Error, Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let (x, w) = (tape.leaf(Tensor::ones(&[4, 3])), tape.leaf(Tensor::ones(&[2, 5])));
+    /// let error = tape.try_run(|| (x.exp().matmul(&w) + 1.0).sum()).unwrap_err();
+    /// assert!(matches!(error, Error::Shape { op: "matmul", .. }));
+    /// assert_eq!(tape.try_run(|| x.sum().item()).unwrap(), 12.0);
+    /// ```
+    ///
+    /// # Errors
+    /// The one that would have been the message of a panic: shapes that do not fit, what the NaN finder finds, a gradient
+    /// that does not exist.
+    pub fn try_run<R>(&self, f: impl FnOnce() -> R) -> Result<R, Error> {
+        // Nothing is left half done in the tape: cells get their values back as the stack unwinds, and a node is recorded
+        // after everything that can fail.
+        catch_unwind(AssertUnwindSafe(|| with_cell(&self.trying, true, f))).or_else(|panic| {
+            match panic.downcast::<Raised>() {
+                Ok(raised) => Err(raised.0),
+                Err(other) => resume_unwind(other),
+            }
+        })
+    }
+
+    /// A value, or the error as a panic with its text; in [`try_run`](Self::try_run) as what that waits for.
+    #[track_caller]
+    pub(crate) fn or_raise<R>(&self, result: Result<R, Error>) -> R {
+        match result {
+            Ok(value) => value,
+            Err(error) if self.trying.get() => resume_unwind(Box::new(Raised(error))),
+            Err(error) => panic!("{error}"),
+        }
     }
 
     pub(crate) fn with_recording<R>(&self, on: bool, f: impl FnOnce() -> R) -> R {
@@ -148,14 +218,17 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     pub fn leaf(&self, value: Tensor<T>) -> Var<'_, T> {
         let at = self.line();
-        if self.checks_values()
-            && let Err(error) = find_non_finite(LEAF, "the value", &value, at)
-        {
-            panic!("{error}");
+        if self.checks_values() {
+            self.or_raise(find_non_finite(LEAF, "the value", &value, at));
         }
+        self.unchecked_leaf(value, at)
+    }
+
+    /// A leaf whose value the NaN finder does not look at.
+    pub(crate) fn unchecked_leaf(&self, value: Tensor<T>, at: &'static Location<'static>) -> Var<'_, T> {
         let output = Kept::Shape(Shape::from_slice(value.shape()));
-        let node = Node { op: None, inputs: SmallVec::new(), output, at };
-        Var { tape: self, value, node: Some(self.push(node)) }
+        let node = self.nodes.push(Node { op: None, inputs: SmallVec::new(), output, at }, std::iter::empty());
+        Var { tape: self, value, node: Some(node) }
     }
 
     /// A value that gradients do not flow into.
@@ -163,27 +236,15 @@ impl<T: Scalar> Tape<T> {
         Var { tape: self, value, node: None }
     }
 
-    fn push(&self, node: Node<T>) -> u32 {
-        let mut nodes = self.nodes.borrow_mut();
-        let index = nodes.len();
-        nodes.push(Some(Arc::new(node)));
-        match u32::try_from(index) {
-            Ok(index) => index,
-            Err(_) => panic!("a tape holds at most 2^32 operations: clear it between steps"),
-        }
-    }
-
     /// Runs an operation, and records it if an input is on the graph.
     ///
     /// # Panics
     /// If the shapes do not fit, an input belongs to another tape, or the NaN finder is on and finds something; the
-    /// message names the operation and the caller's line.
+    /// message names the operation and the caller's line. And if the operation does not keep to what it says: the number
+    /// of its inputs, the shape of its output.
     #[track_caller]
     pub fn apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Var<'t, T> {
-        match self.try_apply(op, inputs) {
-            Ok(y) => y,
-            Err(error) => panic!("{error}"),
-        }
+        self.or_raise(self.try_apply(op, inputs))
     }
 
     /// As [`apply`](Self::apply), with an error instead of a panic.
@@ -205,7 +266,7 @@ impl<T: Scalar> Tape<T> {
         let shape = self.check_shapes(op, inputs, at)?;
         let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
         let value = op.forward(&values, &self.pool);
-        debug_assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
+        assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
         self.check_output(op.name(), inputs, &value, at)?;
         Ok(value)
     }
@@ -217,13 +278,9 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     pub fn apply_known<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>], value: Tensor<T>) -> Var<'t, T> {
         let at = self.line();
-        match self.check_shapes(&op, inputs, at) {
-            Ok(shape) => assert_eq!(value.shape(), shape.as_slice(), "{}: a known output of another shape", op.name()),
-            Err(error) => panic!("{error}"),
-        }
-        if let Err(error) = self.check_output(op.name(), inputs, &value, at) {
-            panic!("{error}");
-        }
+        let shape = self.or_raise(self.check_shapes(&op, inputs, at));
+        assert_eq!(value.shape(), shape.as_slice(), "{}: a known output of another shape", op.name());
+        self.or_raise(self.check_output(op.name(), inputs, &value, at));
         self.record(op, inputs, value, at)
     }
 
@@ -258,6 +315,11 @@ impl<T: Scalar> Tape<T> {
         for x in inputs {
             assert!(std::ptr::eq(x.tape, self), "{}: an input belongs to another tape", op.name());
         }
+        if let Some(arity) = op.arity()
+            && arity != inputs.len()
+        {
+            panic!("{}: {} inputs instead of {arity}", op.name(), inputs.len());
+        }
         let shapes: SmallVec<[&[usize]; 4]> = inputs.iter().map(|x| x.shape()).collect();
         op.shape(&shapes).map_err(|what| Error::Shape {
             op: op.name(),
@@ -289,13 +351,16 @@ impl<T: Scalar> Tape<T> {
         at: &'static Location<'static>,
     ) -> Var<'t, T> {
         let reads = op.reads();
-        let kept = |(i, x): (usize, &&Var<'t, T>)| (x.node, Kept::new(&x.value, reads.input(i)));
-        let inputs = inputs.iter().enumerate().map(kept).collect();
+        let edges = inputs.iter().map(|x| x.node.unwrap_or(CONSTANT));
+        let inputs = inputs.iter().enumerate().map(|(i, x)| Kept::new(&x.value, reads.input(i))).collect();
         let output = Kept::new(&value, reads.output());
-        let node = Some(self.push(Node { op: Some(op), inputs, output, at }));
+        let node = Some(self.nodes.push(Node { op: Some(op), inputs, output, at }, edges));
         Var { tape: self, value, node }
     }
 }
+
+/// An error on its way to [`Tape::try_run`].
+struct Raised(Error);
 
 /// What errors and drawings call a node without operation.
 pub(crate) const LEAF: &str = "leaf";

@@ -51,6 +51,16 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape.constant(self.value.clone())
     }
 
+    /// This variable if gradients can flow to it, else a new leaf of the same value: what code begins with that takes
+    /// gradients with respect to an argument which may be a constant ([`Tape::enable_grad`] shows it).
+    #[track_caller]
+    pub fn tracked(&self) -> Self {
+        match self.node {
+            Some(_) => self.clone(),
+            None => self.tape.unchecked_leaf(self.value.clone(), self.tape.line()),
+        }
+    }
+
     /// A scalar constant on the same tape.
     pub fn constant(&self, value: f64) -> Self {
         self.tape.constant(self.tape.pool().full(&[], T::from_f64(value)))

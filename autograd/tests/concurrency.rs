@@ -114,7 +114,7 @@ fn a_tape_moves_between_threads_and_its_values_are_shared() {
         let tape = Tape::new();
         let bound = params.bind(&tape);
         let w = bound.vars()[0];
-        w.matmul(w).tanh().sum().grad_once(&[w]).remove(0)
+        w.matmul(w).tanh().sum().grad(&[w]).remove(0)
     };
     let expected = gradient(&params);
     let handles: Vec<_> = (0..THREADS)

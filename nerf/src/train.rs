@@ -296,7 +296,7 @@ impl Trainer {
             let parts =
                 (0..turns).flat_map(|turn| self.slots[..used].iter().filter_map(move |slot| slot.tables.get(turn)));
             let parts: Vec<Arc<HashGrad<f32>>> = parts.cloned().collect();
-            let dense = params.trainable().zip(&self.slots[0].grads).find(|&(other, _)| other == id);
+            let dense = params.ids().zip(&self.slots[0].grads).find(|&(other, _)| other == id);
             let (dense, rate) = (dense.and_then(|(_, sum)| sum.as_ref()), rate * params.rate(id));
             of_table = table.step(params.get_mut(id), &parts, dense, rate);
             self.done.rows += of_table.touched as u64;
@@ -308,9 +308,11 @@ impl Trainer {
             Some(sum) => Gradient::from(sum),
             None => Gradient::zero(params.get(id).shape()),
         };
-        let grads: Vec<_> = params.trainable().zip(&mut *sums).map(lend).collect();
+        let free = |(id, _): &(ParamId, &mut Option<Tensor<f32>>)| !params.is_frozen(*id);
+        let grads: Vec<_> = params.ids().zip(&mut *sums).filter(free).map(lend).collect();
         let mut report = self.adam.update(params, &grads, rate);
-        for (sum, grad) in sums.iter_mut().zip(grads).filter(|(_, grad)| !grad.is_zero()) {
+        let free = params.ids().zip(sums).filter(|(id, _)| !params.is_frozen(*id));
+        for ((_, sum), grad) in free.zip(grads).filter(|(_, grad)| !grad.is_zero()) {
             *sum = Some(grad.into_dense(&self.pool));
         }
         if let Some(id) = table_id {
@@ -352,5 +354,104 @@ impl Trainer {
         }
         self.carve();
         self.reset_optimisers();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::{Split, embedded};
+    use crate::field::ClassicConfig;
+    use crate::hash_grid::HashGridConfig;
+    use crate::hierarchical::HierarchicalConfig;
+    use crate::{FieldConfig, Preset};
+    use raygrad_autograd::Schedule;
+
+    /// Two tiny networks, and few rays of few samples.
+    fn tiny() -> Config {
+        let paper = ClassicConfig::paper();
+        let field = ClassicConfig { depth: 2, width: 16, skips: vec![], view_width: 8, position_levels: 3, ..paper };
+        let sampler = HierarchicalConfig {
+            proposal: field.clone(),
+            coarse: 6,
+            fine: 4,
+            batch: 16,
+            tile: 8,
+            ..HierarchicalConfig::default()
+        };
+        let (field, sampler) = (FieldConfig::Classic(field), SamplerConfig::Hierarchical(sampler));
+        Config { field, sampler, ..Config::preset(Preset::Small) }
+    }
+
+    /// A small hash grid.
+    fn tiny_table() -> Config {
+        let mut config = Config::preset(Preset::Instant);
+        if let FieldConfig::Instant(field) = &mut config.field {
+            field.grid = HashGridConfig { levels: 3, features: 2, log2_table: 8, coarsest: 4, finest: 16 };
+        }
+        config
+    }
+
+    #[test]
+    fn frozen_parameters_rest_and_others_have_their_own_rates() {
+        let data = Arc::new(embedded(Split::Train, 12));
+        for config in [tiny(), tiny_table()] {
+            for round in 0..3 {
+                let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
+                let params = &mut trainer.model.params;
+                let names: Vec<String> = params.names().map(String::from).collect();
+                let rests = |name: &str| names.iter().position(|other| other == name).is_some_and(|i| i % 3 == round);
+                if round == 1 {
+                    params.set_rate(rests, 0.0)
+                } else {
+                    params.freeze(rests)
+                };
+                let before = params.clone();
+                for _ in 0..2 {
+                    trainer.step(0.1);
+                }
+                assert!(trainer.stats().skipped == 0 && !trainer.stats().has_diverged());
+                for ((name, before), after) in before.iter().zip(trainer.model.params.values()) {
+                    assert_eq!(before == after, rests(name), "{name}, round {round}");
+                }
+                // What was frozen is moved again.
+                trainer.model.params.unfreeze(|_| true);
+                let before = trainer.model.params.clone();
+                trainer.step(0.1);
+                let moved = |(before, after)| before != after;
+                let count =
+                    before.values().iter().zip(trainer.model.params.values()).filter(|&pair| moved(pair)).count();
+                assert_eq!(count == before.len(), round != 1, "round {round}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_run_that_has_diverged_ends() {
+        let data = Arc::new(embedded(Split::Train, 12));
+        for config in [tiny(), tiny_table()] {
+            let mut trainer = Trainer::new(config, data.clone()).unwrap();
+            trainer.step(0.0);
+            trainer.model.params.values_mut().iter_mut().for_each(|x| x.as_mut_slice().fill(f32::NAN));
+            trainer.run(Budget::Steps(1000), |trainer| {
+                assert!(trainer.stats().stuck + 1 == trainer.stats().step && trainer.stats().skipped > 0);
+                ControlFlow::Continue(())
+            });
+            assert!(trainer.stats().has_diverged() && trainer.stats().step == 1 + STUCK);
+        }
+    }
+
+    #[test]
+    fn settings_of_optimisers_are_checked() {
+        let mut config = Config { schedule: Schedule::Constant { rate: 1e300 }, ..tiny() };
+        let message = |config: &Config| config.check().unwrap_err().to_string();
+        assert_eq!(message(&config), "`schedule.rate`: is 1e300; use 0 to 1e30");
+        config.schedule = Schedule::Constant { rate: 0.1 };
+        config.adam.beta1 = 1.0;
+        assert_eq!(message(&config), "`adam.beta1`: is 1.0; use at least 0 and less than 1");
+        config.adam.beta1 = 0.0;
+        config.table_adam.beta2 = 2.0;
+        assert!(message(&config).contains("`table_adam.beta2`: is 2.0"));
+        assert!(Trainer::new(config, Arc::new(embedded(Split::Train, 12))).is_err());
     }
 }

@@ -1,7 +1,8 @@
 //! Operations that move elements: reshape, permute, slice, flip, pad, concat.
 
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Grads, Op, Reads, ShapeError, SparseGrad, Var, Vjp};
 use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor};
+use std::sync::Arc;
 
 /// Stands for the extent that follows from the others, in [`Var::reshape`].
 pub const INFER: usize = usize::MAX;
@@ -38,7 +39,8 @@ impl<T: Scalar> Op<T> for Reshape {
     }
 }
 
-/// y = the elements of x that a layout names: permute, slice and flip. dx = [`Scatter`] of g.
+/// y = the elements of x that a layout names: permute, slice and flip. dx = [`Scatter`] of g, unrecorded a
+/// [`ViewGrad`].
 #[derive(Clone)]
 pub struct View {
     /// The shape of the input.
@@ -77,7 +79,31 @@ impl<T: Scalar> Op<T> for View {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.tape().apply(Scatter(self.clone()), &[cx.g()]))
+        if cx.recording() {
+            return Grads::one(cx.tape().apply(Scatter(self.clone()), &[cx.g()]));
+        }
+        Grads::new([None]).with_sparse(0, Arc::new(ViewGrad { view: self.clone(), g: cx.g().value().clone() }))
+    }
+}
+
+/// The gradient of what a [`View`] looks at: it is added in place, so that many views of one tensor cost one sum.
+struct ViewGrad<T: Scalar> {
+    view: View,
+    /// The gradient of the view.
+    g: Tensor<T>,
+}
+
+impl<T: Scalar> SparseGrad<T> for ViewGrad<T> {
+    fn shape(&self) -> &[usize] {
+        &self.view.from
+    }
+
+    fn add_to(&self, dense: &mut Tensor<T>) {
+        self.view.layout.add(self.g.as_slice(), dense.as_mut_slice());
+    }
+
+    fn is_passing(&self) -> bool {
+        true
     }
 }
 

@@ -1,0 +1,160 @@
+//! The nodes of a tape: a list that grows without moving what is in it, so that a node can be read while others are added.
+
+use crate::Op;
+use crate::op::Kept;
+use raygrad_tensor::Scalar;
+use smallvec::SmallVec;
+use std::cell::{OnceCell, RefCell};
+use std::panic::Location;
+
+/// One recorded operation, or a leaf. Which nodes its inputs are stands in [`Edges`].
+pub(crate) struct Node<T: Scalar> {
+    /// None for a leaf.
+    pub op: Option<Box<dyn Op<T>>>,
+    pub inputs: SmallVec<[Kept<T>; 2]>,
+    pub output: Kept<T>,
+    pub at: &'static Location<'static>,
+}
+
+/// Stands for an input that is no node.
+pub(crate) const CONSTANT: u32 = u32::MAX;
+
+/// Where a node lies; None after it was freed.
+type Place<T> = RefCell<Option<Node<T>>>;
+
+/// Nodes in the first chunk; each further chunk is twice as long.
+const FIRST: usize = 16;
+const CHUNKS: usize = 29;
+
+/// What is recorded on a tape, in the order in which it ran.
+pub(crate) struct Nodes<T: Scalar> {
+    chunks: [OnceCell<Box<[Place<T>]>>; CHUNKS],
+    edges: RefCell<Edges>,
+}
+
+/// For each node the nodes that its inputs are, one after another: compact, since a sweep reads them first to find out
+/// which nodes it has to visit. They stay when a node is freed.
+#[derive(Default)]
+pub(crate) struct Edges {
+    ends: Vec<u32>,
+    inputs: Vec<u32>,
+}
+
+impl Edges {
+    /// Number of nodes.
+    pub fn len(&self) -> usize {
+        self.ends.len()
+    }
+
+    /// The inputs of a node, some of them [`CONSTANT`].
+    #[inline]
+    pub fn of(&self, node: u32) -> &[u32] {
+        let node = node as usize;
+        let start = if node == 0 { 0 } else { self.ends[node - 1] };
+        &self.inputs[start as usize..self.ends[node] as usize]
+    }
+}
+
+impl<T: Scalar> Nodes<T> {
+    pub fn new() -> Self {
+        Nodes { chunks: [const { OnceCell::new() }; CHUNKS], edges: RefCell::default() }
+    }
+
+    /// Number of nodes, freed ones too.
+    pub fn len(&self) -> usize {
+        self.edges.borrow().len()
+    }
+
+    /// Runs `f` on the edges; nothing can be added meanwhile.
+    pub fn with_edges<R>(&self, f: impl FnOnce(&Edges) -> R) -> R {
+        f(&self.edges.borrow())
+    }
+
+    /// The place of a node that was added.
+    #[track_caller]
+    pub fn place(&self, node: u32) -> &Place<T> {
+        let (chunk, offset) = locate(node as usize);
+        match self.chunks[chunk].get() {
+            Some(chunk) => &chunk[offset],
+            None => unreachable!("a node that was never added"),
+        }
+    }
+
+    /// Adds a node whose inputs are these, and returns its number.
+    ///
+    /// # Panics
+    /// If there are 2^32 - 1 nodes or inputs.
+    pub fn push(&self, node: Node<T>, inputs: impl Iterator<Item = u32>) -> u32 {
+        let mut edges = self.edges.borrow_mut();
+        let index = edges.len();
+        let (chunk, offset) = locate(index);
+        edges.inputs.extend(inputs);
+        let (Ok(number), Ok(end)) = (u32::try_from(index), u32::try_from(edges.inputs.len())) else {
+            panic!("a tape holds less than 2^32 operations and inputs: clear it between steps");
+        };
+        assert!(number != CONSTANT, "a tape holds less than 2^32 operations: clear it between steps");
+        edges.ends.push(end);
+        let chunk = self.chunks[chunk].get_or_init(|| (0..FIRST << chunk).map(|_| RefCell::new(None)).collect());
+        *chunk[offset].borrow_mut() = Some(node);
+        number
+    }
+
+    /// Frees what a node holds; its number and its edges stay. Whoever is reading it frees it afterwards.
+    pub fn free(&self, node: u32) {
+        if let Ok(mut place) = self.place(node).try_borrow_mut() {
+            *place = None;
+        }
+    }
+
+    /// Frees what every operation holds, as [`free`](Self::free) does; leaves stay.
+    pub fn free_operations(&self) {
+        for node in 0..self.len() as u32 {
+            if let Ok(mut place) = self.place(node).try_borrow_mut() {
+                place.take_if(|node| node.op.is_some());
+            }
+        }
+    }
+
+    /// Forgets every node, and keeps the memory of as many as there were.
+    pub fn clear(&mut self) {
+        let edges = self.edges.get_mut();
+        let mut left = edges.len();
+        for (i, chunk) in self.chunks.iter_mut().enumerate() {
+            let used = left.min(FIRST << i);
+            left -= used;
+            if used == 0 {
+                chunk.take();
+            } else if let Some(chunk) = chunk.get_mut() {
+                chunk[..used].iter_mut().for_each(|place| *place.get_mut() = None);
+            }
+        }
+        edges.ends.clear();
+        edges.inputs.clear();
+    }
+}
+
+/// The chunk that holds a node, and its place there.
+#[inline]
+fn locate(node: usize) -> (usize, usize) {
+    let chunk = (node / FIRST + 1).ilog2() as usize;
+    (chunk, node + FIRST - (FIRST << chunk))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_node_has_a_place_of_its_own() {
+        let mut expected = (0, 0);
+        for node in 0..100_000 {
+            assert_eq!(locate(node), expected);
+            expected.1 += 1;
+            if expected.1 == FIRST << expected.0 {
+                expected = (expected.0 + 1, 0);
+            }
+        }
+        let (chunk, offset) = locate(CONSTANT as usize);
+        assert!(chunk < CHUNKS && offset < FIRST << chunk);
+    }
+}

@@ -1,0 +1,102 @@
+//! The way of a sweep: the nodes that lead from a root to the variables whose gradients are wanted.
+
+use crate::nodes::{CONSTANT, Nodes};
+use raygrad_tensor::Scalar;
+
+/// The nodes that the root depends on, from the root down to the lowest wanted variable. Finding them takes time in
+/// proportion to their inputs, however long the tape is.
+pub(crate) struct Path {
+    /// Highest first: a node comes before those that it depends on.
+    nodes: Vec<u32>,
+    marks: Vec<Mark>,
+    /// For each of `nodes` its place in it. Entries of other nodes are left from earlier sweeps (a sparse set, Briggs and
+    /// Torczon 1993), so that nothing has to be cleared.
+    places: Vec<u32>,
+}
+
+#[derive(Clone, Copy, Default)]
+struct Mark {
+    /// Whether its own gradient is wanted.
+    wanted: bool,
+    /// Whether an input of it is wanted, or leads to one that is.
+    leads: bool,
+}
+
+impl Path {
+    /// The way from `root` to the nodes `wanted`, which may be anywhere on the tape. `scratch` is what [`into_scratch`]
+    /// gave, of the same tape, or nothing.
+    ///
+    /// [`into_scratch`]: Self::into_scratch
+    pub fn new<T: Scalar>(
+        nodes: &Nodes<T>,
+        scratch: Vec<u32>,
+        root: u32,
+        wanted: impl Iterator<Item = u32> + Clone,
+    ) -> Self {
+        let bottom = wanted.clone().min().unwrap_or(CONSTANT);
+        let mut path = Path { nodes: vec![], marks: vec![], places: scratch };
+        nodes.with_edges(|edges| {
+            path.places.resize(edges.len().max(path.places.len()), 0);
+            path.add(root, bottom);
+            let mut next = 0;
+            while let Some(&node) = path.nodes.get(next) {
+                edges.of(node).iter().for_each(|&input| path.add(input, bottom));
+                next += 1;
+            }
+            path.nodes.sort_unstable_by(|a, b| b.cmp(a));
+            for (place, &node) in path.nodes.iter().enumerate() {
+                path.places[node as usize] = place as u32;
+            }
+            path.marks.resize(path.nodes.len(), Mark::default());
+            for node in wanted {
+                if let Some(place) = path.place(node) {
+                    path.marks[place].wanted = true;
+                }
+            }
+            for place in (0..path.nodes.len()).rev() {
+                path.marks[place].leads = edges.of(path.nodes[place]).iter().any(|&input| path.needs(input));
+            }
+        });
+        path
+    }
+
+    fn add(&mut self, node: u32, bottom: u32) {
+        if node != CONSTANT && node >= bottom && self.place(node).is_none() {
+            self.places[node as usize] = self.nodes.len() as u32;
+            self.nodes.push(node);
+        }
+    }
+
+    /// The nodes, highest first.
+    pub fn nodes(&self) -> &[u32] {
+        &self.nodes
+    }
+
+    /// Where a node stands in [`nodes`](Self::nodes).
+    #[inline]
+    pub fn place(&self, node: u32) -> Option<usize> {
+        let place = *self.places.get(node as usize)? as usize;
+        (self.nodes.get(place) == Some(&node)).then_some(place)
+    }
+
+    /// Whether the gradient of the node at this place is itself wanted.
+    pub fn wants(&self, place: usize) -> bool {
+        self.marks[place].wanted
+    }
+
+    /// Whether the sweep goes on from the node at this place.
+    pub fn leads(&self, place: usize) -> bool {
+        self.marks[place].leads
+    }
+
+    /// Whether the gradient of a node is wanted or leads to one that is.
+    #[inline]
+    pub fn needs(&self, node: u32) -> bool {
+        self.place(node).is_some_and(|place| self.marks[place].wanted || self.marks[place].leads)
+    }
+
+    /// What the next path can be made with.
+    pub fn into_scratch(self) -> Vec<u32> {
+        self.places
+    }
+}
