@@ -106,6 +106,15 @@ impl<T: Scalar> Nodes<T> {
         }
     }
 
+    /// Frees what every operation holds, as [`free`](Self::free) does; leaves stay.
+    pub fn free_operations(&self) {
+        for node in 0..self.len() as u32 {
+            if let Ok(mut place) = self.place(node).try_borrow_mut() {
+                place.take_if(|node| node.op.is_some());
+            }
+        }
+    }
+
     /// Forgets every node, and keeps the memory of as many as there were.
     pub fn clear(&mut self) {
         let edges = self.edges.get_mut();

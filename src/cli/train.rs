@@ -13,7 +13,7 @@ use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
-use super::output::print;
+use super::output::{complain, print};
 use super::preview::Preview;
 use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
@@ -109,6 +109,11 @@ pub fn run(args: &Args) -> Result<Trained> {
     let finished = watch.finish(&trainer, !interrupted);
     watched.and(finished)?;
     summarise(&run, &trainer.stats(), interrupted)?;
+    if trainer.stats().has_diverged() {
+        complain(
+            "training has diverged: no gradient was finite any more; try a lower rate with --set schedule.from=..",
+        );
+    }
     Ok(Trained { folder: run.folder, interrupted })
 }
 

@@ -157,4 +157,66 @@ mod tests {
             assert!(mean(1).abs() < 0.05 && (mean(2) - 1.0 / 3.0).abs() < 0.03, "{place}: {} {}", mean(1), mean(2));
         }
     }
+
+    /// Kolmogorov and Smirnov's statistic: the largest distance between the share of values below x and `cdf(x)`, times
+    /// the root of their number. It is above 1.95 for one sample in a thousand.
+    fn kolmogorov_smirnov(values: &[f64], cdf: impl Fn(f64) -> f64) -> f64 {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let n = sorted.len() as f64;
+        let distance = |(i, &x): (usize, &f64)| (cdf(x) - i as f64 / n).abs().max((cdf(x) - (i + 1) as f64 / n).abs());
+        n.sqrt() * sorted.iter().enumerate().map(distance).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn values_are_distributed_as_their_formula_says() {
+        let (inputs, outputs) = (120, 80);
+        let uniform = |bound: f64| move |x: f64| (0.5 + 0.5 * x / bound).clamp(0.0, 1.0);
+        let normal =
+            |deviation: f64| move |x: f64| 0.5 + 0.5 * raygrad_tensor::Real::erf(x / deviation / 2.0_f64.sqrt());
+        type Cdf = Box<dyn Fn(f64) -> f64>;
+        let cases: [(Init, Cdf); 6] = [
+            (Init::Glorot, Box::new(uniform(0.03_f64.sqrt()))),
+            (Init::He, Box::new(uniform(0.05_f64.sqrt()))),
+            (Init::Uniform(0.3), Box::new(uniform(0.3))),
+            (Init::GlorotNormal, Box::new(normal(0.1))),
+            (Init::HeNormal, Box::new(normal((2.0_f64 / 120.0).sqrt()))),
+            (Init::Normal(0.5), Box::new(normal(0.5))),
+        ];
+        for (init, cdf) in &cases {
+            for seed in 0..5 {
+                let x = init.weight::<f64>(inputs, outputs, &mut Pcg64Mcg::seed_from_u64(seed));
+                let distance = kolmogorov_smirnov(x.as_slice(), cdf);
+                assert!(distance < 2.2, "{init:?}, seed {seed}: {distance}");
+                // The test sees a deviation of a fifth.
+                assert!(kolmogorov_smirnov(x.as_slice(), |x| cdf(1.2 * x)) > 2.2, "{init:?}, seed {seed}");
+            }
+        }
+    }
+
+    #[test]
+    fn layers_and_seeds_are_independent() {
+        let n = 200 * 50;
+        for init in [Init::Glorot, Init::HeNormal, Init::Normal(1.0), Init::Orthogonal(1.0)] {
+            // Two layers of each of three seeds.
+            let seed = |seed| {
+                let mut rng = Pcg64Mcg::seed_from_u64(seed);
+                [(); 2].map(|()| init.weight::<f64>(200, 50, &mut rng))
+            };
+            let all: Vec<_> = (0..3).flat_map(seed).collect();
+            let product = |a: &Tensor<f64>, b: &[f64]| a.as_slice().iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            for (i, a) in all.iter().enumerate() {
+                let square = product(a, a.as_slice());
+                for b in &all[..i] {
+                    let correlation = product(a, b.as_slice()) / (square * product(b, b.as_slice())).sqrt();
+                    assert!(correlation.abs() < 4.5 / f64::from(n).sqrt(), "{init:?}: {correlation}");
+                }
+                // Nor do neighbours within a layer know of each other.
+                let neighbours = product(a, &a.as_slice()[1..]) / square;
+                assert!(neighbours.abs() < 4.5 / f64::from(n).sqrt(), "{init:?}: {neighbours}");
+            }
+        }
+        let again = |seed| Init::He.weight::<f32>(3, 4, &mut Pcg64Mcg::seed_from_u64(seed));
+        assert!(again(7) == again(7) && again(7) != again(8));
+    }
 }

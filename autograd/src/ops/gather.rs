@@ -44,12 +44,26 @@ pub(crate) fn add_up<T: Scalar>(dense: &mut [T], add: impl FnOnce(&mut [f64])) {
     }
 }
 
-/// Adds row `i` of `rows`, of `width` numbers, at row `index[i]` of `sums`.
-fn add_rows<T: Scalar>(rows: &[T], index: &[u32], width: usize, sums: &mut [f64]) {
-    for (row, &place) in rows.chunks_exact(width.max(1)).zip(index) {
-        for (sum, x) in sums[place as usize * width..][..width].iter_mut().zip(row) {
+/// Adds row `i` of `rows`, of `width` numbers, to row `index[i]` of `dense`, with sums in f64 as [`add_up`]. A table that is
+/// larger than what is added to it gets no second one for the sums.
+fn add_rows<T: Scalar>(dense: &mut [T], rows: &[T], index: &[u32], width: usize) {
+    let add = |sums: &mut [f64], row: usize| {
+        for (sum, x) in sums.iter_mut().zip(&rows[row * width..][..width]) {
             *sum += x.to_f64();
         }
+    };
+    if dense.len() <= rows.len() {
+        add_up(dense, |sums| {
+            index.iter().enumerate().for_each(|(row, &place)| add(&mut sums[place as usize * width..][..width], row));
+        });
+        return;
+    }
+    // The shares of a place beside each other, in their order.
+    let mut order: Vec<usize> = (0..index.len()).collect();
+    order.sort_by_key(|&row| index[row]);
+    for shares in order.chunk_by(|&a, &b| index[a] == index[b]) {
+        let place = index[shares[0]] as usize * width;
+        add_up(&mut dense[place..place + width], |sums| shares.iter().for_each(|&row| add(sums, row)));
     }
 }
 
@@ -107,7 +121,7 @@ impl<T: Scalar> Op<T> for ScatterRows {
         shape[0] = self.rows;
         let width: usize = shape[1..].iter().product();
         let mut out = pool.full(&shape, T::ZERO);
-        add_up(out.as_mut_slice(), |sums| add_rows(x[0].as_slice(), &self.index, width, sums));
+        add_rows(out.as_mut_slice(), x[0].as_slice(), &self.index, width);
         out
     }
 
@@ -158,7 +172,7 @@ impl<T: Scalar> RowGrad<T> {
     fn add(&self, dense: &mut [T]) {
         assert_eq!(dense.len(), self.shape.iter().product::<usize>(), "a dense gradient of the table");
         let width: usize = self.shape[1..].iter().product();
-        add_up(dense, |sums| add_rows(self.rows.as_slice(), &self.index, width, sums));
+        add_rows(dense, self.rows.as_slice(), &self.index, width);
     }
 }
 
@@ -262,6 +276,19 @@ mod tests {
     #[should_panic(expected = "index 1 is 4, but there are 4 rows")]
     fn a_row_gradient_beyond_its_table_is_refused() {
         RowGrad::new(&[4, 2], [0, 4].into(), Tensor::<f32>::zeros(&[2, 2]));
+    }
+
+    #[test]
+    fn a_large_table_gets_the_same_sums_as_a_small_one() {
+        let index: Vec<u32> = (0..300).map(|i| (i * i + 3 * i) % 7).collect();
+        let rows: Vec<f32> = (0..600).map(|i| (i as f32 * 0.7).sin() * 10.0_f32.powi(i % 5)).collect();
+        let (mut small, mut large) = (vec![0.25; 14], vec![0.25; 2000]);
+        add_rows(&mut small, &rows, &index, 2);
+        add_rows(&mut large, &rows, &index, 2);
+        assert!(small == large[..14] && large[14..].iter().all(|&x| x == 0.25));
+        assert!(small.iter().filter(|&&x| x == 0.25).count() < 14);
+        add_rows(&mut [] as &mut [f32], &[], &[3, 3], 0);
+        add_rows(&mut large, &[], &[], 2);
     }
 
     #[test]
