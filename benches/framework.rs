@@ -8,10 +8,9 @@
 use rand::rngs::StdRng;
 use rand::{Rng, RngExt, SeedableRng};
 use raygrad::autograd::{
-    Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Init, Linear, Mlp, Params, Pool, Pool2dConfig, Tape,
-    Tensor, Var,
+    Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Gradient, Init, Linear, Mlp, Optimizer, Params, Pool,
+    Pool2dConfig, Tape, Tensor, Var,
 };
-use raygrad::tensor::add_assign;
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -126,18 +125,18 @@ fn train(
             let bound = params.bind(&tape);
             let share = shard.x.shape()[0] as f64 / rows as f64;
             let mean = loss(&bound, &tape.constant(shard.x.clone()), &tape.constant(shard.target.clone())) * share;
-            (mean.item(), mean.grad_once(&bound.vars()))
+            (mean.item(), bound.backward(&mean))
         };
-        let (mut value, mut sum) = (0.0, Vec::<Tensor<f32>>::new());
+        let (mut value, mut sum) = (0.0, Vec::<Gradient<f32>>::new());
         for (part, grads) in shards.par_iter().map(gradient).collect::<Vec<_>>() {
             value += f64::from(part);
             if sum.is_empty() {
                 sum = grads;
             } else {
-                sum.iter_mut().zip(&grads).for_each(|(a, b)| add_assign(a.as_mut_slice(), b.as_slice()));
+                sum.iter_mut().zip(grads).for_each(|(sum, grad)| sum.add(grad));
             }
         }
-        adam.step(params.values_mut(), &sum, 1e-3);
+        adam.update(&mut params, &sum, 1e-3).check().expect("finite gradients");
         last = value;
         first.get_or_insert(value);
     });

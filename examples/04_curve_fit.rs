@@ -71,7 +71,8 @@ fn main() {
         if step % (STEPS / 5) == 0 {
             println!("step {step:4}: off by {:.4} (root mean square)", loss.item().sqrt());
         }
-        adam.update(&mut params, &loss.grad_once(&bound.vars()), schedule.at_step(step, STEPS));
+        let grads = bound.backward(&loss);
+        adam.update(&mut params, &grads, schedule.at_step(step, STEPS)).check().expect("finite gradients");
     }
 
     let found = params.get(id).clone();

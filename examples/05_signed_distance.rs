@@ -102,7 +102,8 @@ fn main() -> raygrad::nerf::Result<()> {
         }
         // With more weight on the curve, slopes fold up inside before they are 1, and the shape gets a hole.
         let loss = on_curve + eikonal;
-        adam.update(&mut params, &loss.grad_once(&bound.vars()), schedule.at_step(step, STEPS));
+        let grads = bound.backward(&loss);
+        adam.update(&mut params, &grads, schedule.at_step(step, STEPS)).check().expect("finite gradients");
     }
 
     let centre = |i: usize| ((2 * i + 1) as f32 / PIXELS as f32 - 1.0) * SIDE;

@@ -103,7 +103,8 @@ fn train(name: &str, params: &mut Params<f32>, model: &Sequential<f32>) -> f64 {
             let right = 100.0 * accuracy(model, params, &test);
             println!("  step {step:3}: loss {:.3}, {right:.1} % of {TESTS} test digits right", loss.item());
         }
-        adam.update(params, &loss.grad_once(&bound.vars()), 5e-3);
+        let grads = bound.backward(&loss);
+        adam.update(params, &grads, 5e-3).check().expect("finite gradients");
     }
     accuracy(model, params, &test)
 }

@@ -10,7 +10,9 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Params, Schedule, Tape, Tensor, Var};
+use raygrad::autograd::{
+    Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Optimizer, Params, Schedule, Tape, Tensor, Var,
+};
 use raygrad::nerf::scene::{Scene, train_cameras};
 use raygrad::nerf::{Image, PositionalEncoding, metrics};
 use std::path::PathBuf;
@@ -62,7 +64,8 @@ fn fit(truth: &Image, levels: usize) -> Image {
         let bound = params.bind(&tape);
         let found = network.color(&bound, &tape.constant(positions(truth, &pixels)));
         let loss = (found - tape.constant(Tensor::from_vec(&[BATCH, 3], colors))).square().mean();
-        adam.step(params.values_mut(), &loss.grad_once(&bound.vars()), schedule.rate(step as f64 / STEPS as f64));
+        let grads = bound.backward(&loss);
+        adam.update(&mut params, &grads, schedule.rate(step as f64 / STEPS as f64)).check().expect("finite gradients");
         if step % (STEPS / 4) == 0 {
             println!("  step {step:4}: {:.2} dB on its pixels", metrics::psnr_from_mse(loss.item().into()));
         }

@@ -13,7 +13,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Adam, AdamConfig, Bound, Params, Schedule, Segments, Tape, Tensor, Var};
+use raygrad::autograd::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::scene::{Scene, train_cameras};
 use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result};
@@ -80,7 +80,8 @@ fn learn(scene: &Scene, sights: &[Sight], seen: bool) -> Result<(Classic, Params
         let bound = params.bind(&tape);
         let error = look(&field, &bound, &tape, &at, seen) - tape.constant(Tensor::from_vec(&[BATCH, 3], colors));
         let loss = error.square().mean();
-        adam.step(params.values_mut(), &loss.grad_once(&bound.vars()), schedule.rate(step as f64 / STEPS as f64));
+        let grads = bound.backward(&loss);
+        adam.update(&mut params, &grads, schedule.rate(step as f64 / STEPS as f64)).check().expect("finite gradients");
         if step % (STEPS / 5) == 0 {
             let name = if seen { "with direction" } else { "without direction" };
             println!("{name}: step {step}, mean squared error {:.5}", loss.item());

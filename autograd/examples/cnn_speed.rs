@@ -10,10 +10,9 @@
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{
-    Activation, Adam, AdamConfig, Bound, Conv2dConfig, INFER, Indices, Init, Linear, ParamId, Params, Pool2dConfig,
-    Tape, Tensor, Var,
+    Activation, Adam, AdamConfig, Bound, Conv2dConfig, Gradient, INFER, Indices, Init, Linear, Optimizer, ParamId,
+    Params, Pool2dConfig, Tape, Tensor, Var,
 };
-use raygrad_tensor::add_assign;
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -51,12 +50,12 @@ impl Network {
 }
 
 /// Loss and gradients of some of the images.
-fn tile(tape: &Tape<f32>, net: &Network, params: &Params<f32>, x: &[f32], labels: &[u32]) -> (f32, Vec<Tensor<f32>>) {
+fn tile(tape: &Tape<f32>, net: &Network, params: &Params<f32>, x: &[f32], labels: &[u32]) -> (f32, Vec<Gradient<f32>>) {
     let bound = params.bind(tape);
     let x = tape.constant(tape.pool().copy_of(&[labels.len(), 1, SIDE, SIDE], x));
     let loss = net.loss(&bound, &x, &Indices::new(&[labels.len(), 1], labels));
     let value = loss.item();
-    (value, loss.grad_once(&bound.vars()))
+    (value, bound.backward(&loss))
 }
 
 fn main() {
@@ -84,9 +83,9 @@ fn main() {
             let (mut loss, mut grads) = tiles.remove(0);
             for (value, others) in tiles {
                 loss += value;
-                grads.iter_mut().zip(others).for_each(|(sum, grad)| add_assign(sum.as_mut_slice(), grad.as_slice()));
+                grads.iter_mut().zip(others).for_each(|(sum, grad)| sum.add(grad));
             }
-            adam.step(params.values_mut(), &grads, 1e-3);
+            adam.update(&mut params, &grads, 1e-3).check().expect("finite gradients");
             times.push(start.elapsed().as_secs_f64());
             losses.push(loss);
         }

@@ -126,7 +126,9 @@
 //!
 //! Parameters live in a store, [`Params`](crate::Params), outside of any tape. A layer is a handle on some of them and a
 //! function of (parameters, input). A training step binds the store to a fresh tape, takes the gradient of a loss, and
-//! hands it to an optimiser.
+//! hands it to an optimiser. [`Bound::backward`](crate::Bound::backward) gives up the bound parameters and frees what the
+//! tape holds, so that the optimiser moves them in place, without a copy. What an update did has to be looked at: elements
+//! whose gradient is infinite or NaN stay where they are, and `check` is an error if there are any.
 //!
 //! ```
 //! use rand::SeedableRng;
@@ -150,12 +152,15 @@
 //!     let y = model.forward(&bound, &tape.constant(x.clone()), Pass::Train(step));
 //!     let loss = y.mse_loss(&tape.constant(wave.clone()));
 //!     last = loss.item();
-//!     adam.update(&mut params, &loss.grad_once(&bound.vars()), schedule.at_step(step, 2000));
+//!     let grads = bound.backward(&loss);
+//!     adam.update(&mut params, &grads, schedule.at_step(step, 2000)).check().unwrap();
 //! }
 //! assert!(last < 2e-3, "{last}");
 //! ```
 //!
-//! `grad_once` frees what it has used as it goes; a tape made with [`Tape::with_pool`](crate::Tape::with_pool) gets its
+//! `backward` frees what it has used as it goes; a tape made with [`Tape::with_pool`](crate::Tape::with_pool) gets its
 //! buffers from the last step, so that a running loop allocates nothing of tensor size. A large model's activations
 //! need not all be kept: [`Tape::checkpoint`](crate::Tape::checkpoint) computes a part again when its gradient is due.
-//! [`Params`](crate::Params) reads and writes safetensors and NumPy's npz.
+//! [`Params`](crate::Params) reads and writes safetensors and NumPy's npz, and chooses by name which parameters are frozen,
+//! have a learning rate or a weight decay of their own, or are tables of which only the rows with a gradient are moved.
+//! [`Optimizer::state`](crate::Optimizer::state) is what a run needs besides to go on later, bit for bit.

@@ -64,10 +64,11 @@ pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp
 pub use npz::NpzError;
 pub use op::{Grads, Op, Reads, Vjp};
 pub use ops::{Activation, Conv2dConfig, INFER, Pool2dConfig, RowGrad, Segments};
-pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, Move, Optimizer, Schedule, Sgd, SgdConfig, TableAdam};
+pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, Move, NonFinite, Optimizer, OptimizerState, Schedule};
+pub use optim::{SettingError, Sgd, SgdConfig, StateError, UpdateReport};
 pub use optim::{clip_norm, clip_value, global_norm};
 pub use optim_rows::{RowAdam, RowStats};
-pub use params::{Bound, ParamId, Params};
+pub use params::{Bound, Layout, ParamId, Params};
 pub use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
 pub use row_sums::{RowAdder, RowSums};
 pub use storage::{ParamsError, Storage};

@@ -1,6 +1,7 @@
 //! An optimiser for tables of which a step touches few rows: embeddings, hash grids.
 
-use crate::optim::{TINY, TINY_SQUARE, limited};
+use crate::optim::limits::{flushed, limited, tiny_square};
+use crate::optim::settings::or_panic;
 use crate::{AdamConfig, RowSums};
 use raygrad_tensor::{Scalar, simd};
 use rayon::prelude::*;
@@ -91,12 +92,10 @@ impl<T: Scalar> Rule<T> {
     /// The new value and moments of an element with gradient `g`.
     #[inline(always)]
     fn element(&self, [x, g, m, v]: [T; 4], [rate, epsilon]: [T; 2]) -> [T; 3] {
-        let (tiny, tiny_square) = (T::from_f64(TINY), T::from_f64(TINY_SQUARE));
         let g = limited(g);
-        let m = self.beta[0] * m + self.rest[0] * g;
+        let m = flushed(self.beta[0] * m + self.rest[0] * g);
         let v = self.beta[1] * v + self.rest[1] * (g * g);
-        let m = if m > tiny || m < -tiny { m } else { T::ZERO };
-        let v = if v > tiny_square { v } else { T::ZERO };
+        let v = if v > tiny_square() { v } else { T::ZERO };
         [x - rate * m / (v.sqrt() + epsilon), m, v]
     }
 }
@@ -105,38 +104,40 @@ impl<T: Scalar> RowAdam<T> {
     /// An optimiser of `rows` rows of `features` numbers that has seen nothing.
     ///
     /// # Panics
-    /// If `features` is 0.
+    /// If `features` is 0 or [`AdamConfig::check`] finds something.
     #[track_caller]
     pub fn new(config: AdamConfig, rows: usize, features: usize) -> Self {
-        assert!(features > 0, "rows without features");
-        RowAdam { rule: Arc::new(Rule::new(config)), features, moments: Lines::zeros(0), steps: vec![] }.fresh(rows)
+        or_panic(config.check());
+        RowAdam { rule: Arc::new(Rule::new(config)), features, moments: Lines::zeros(0), steps: vec![] }
+            .fresh([rows, features])
     }
 
-    /// The same constants, shared, and nothing seen, for another range of `rows` rows.
-    pub fn fresh(&self, rows: usize) -> Self {
-        RowAdam {
-            rule: self.rule.clone(),
-            features: self.features,
-            moments: Lines::zeros(2 * rows * self.features),
-            steps: vec![0; rows],
-        }
+    /// The same constants, shared, and nothing seen, for another range of `rows` rows of `features` numbers.
+    ///
+    /// # Panics
+    /// If `features` is 0.
+    #[track_caller]
+    pub fn fresh(&self, [rows, features]: [usize; 2]) -> Self {
+        assert!(features > 0, "rows without features");
+        RowAdam { rule: self.rule.clone(), features, moments: Lines::zeros(2 * rows * features), steps: vec![0; rows] }
     }
 
     /// Moves the rows of `table` `[rows, features]` that `sums` names against their sum with learning rate `rate`, except
-    /// those whose sum is zero; then nothing is in `sums` any more. Work on many rows is spread over the current rayon
-    /// pool.
+    /// those whose sum is zero; then nothing is in `sums` any more. A row that is moved is multiplied by `1 - rate decay`
+    /// before (as in [`AdamW`](crate::AdamW)). Work on many rows is spread over the current rayon pool.
     ///
     /// # Panics
     /// If a length is not that of this optimiser's rows.
     #[track_caller]
-    pub fn step(&mut self, table: &mut [T], sums: &mut RowSums<T>, rate: f64) -> RowStats {
+    pub fn step(&mut self, table: &mut [T], sums: &mut RowSums<T>, rate: f64, decay: f64) -> RowStats {
         assert_eq!(table.len(), self.steps.len() * self.features, "a table of the optimiser's rows");
         assert_eq!([sums.table_rows(), sums.features()], [self.steps.len(), self.features], "sums of its rows");
-        let (features, rate) = (self.features, T::from_f64(rate));
+        let (features, keep, rate) = (self.features, T::from_f64(1.0 - rate * decay), T::from_f64(rate));
         let update = Update {
             rule: &self.rule,
             features,
             rate,
+            keep,
             table: Rows::new(table),
             moments: Rows::new(self.moments.as_mut_slice()),
             steps: Rows::new(&mut self.steps),
@@ -151,6 +152,37 @@ impl<T: Scalar> RowAdam<T> {
         let stats = stats.reduce(RowStats::default, RowStats::add);
         sums.clear();
         stats
+    }
+
+    /// The first and the second moments, `[rows, features]` each.
+    pub fn moments(&self) -> [Vec<T>; 2] {
+        let features = self.features;
+        let rows = self.moments.as_slice().chunks_exact(2 * features);
+        let half = |which: usize| rows.clone().flat_map(|row| row[which * features..][..features].to_vec()).collect();
+        [half(0), half(1)]
+    }
+
+    /// How many steps each row has taken. Counting ends where the bias is corrected away.
+    pub fn row_steps(&self) -> Vec<u64> {
+        self.steps.iter().map(|&step| step.into()).collect()
+    }
+
+    /// Goes on from what [`moments`](Self::moments) and [`row_steps`](Self::row_steps) gave.
+    ///
+    /// # Panics
+    /// If a length is not that of this optimiser's rows.
+    #[track_caller]
+    pub fn load(&mut self, [first, second]: [&[T]; 2], row_steps: &[u64]) {
+        let features = self.features;
+        assert_eq!([first.len(), second.len()], [self.steps.len() * features; 2], "moments of the optimiser's rows");
+        assert_eq!(row_steps.len(), self.steps.len(), "steps of the optimiser's rows");
+        let moments = first.chunks_exact(features).zip(second.chunks_exact(features));
+        for (row, (first, second)) in self.moments.as_mut_slice().chunks_exact_mut(2 * features).zip(moments) {
+            row[..features].copy_from_slice(first);
+            row[features..].copy_from_slice(second);
+        }
+        let most = self.rule.corrections.len() as u64;
+        self.steps = row_steps.iter().map(|&step| step.min(most) as u32).collect();
     }
 }
 
@@ -169,6 +201,10 @@ impl<T: Scalar> Lines<T> {
         let values = vec![T::ZERO; len + line];
         let start = values.as_ptr().align_offset(LINE).min(line);
         Lines { values, start, len }
+    }
+
+    fn as_slice(&self) -> &[T] {
+        &self.values[self.start..self.start + self.len]
     }
 
     fn as_mut_slice(&mut self) -> &mut [T] {
@@ -229,6 +265,8 @@ struct Update<'a, T> {
     rule: &'a Rule<T>,
     features: usize,
     rate: T,
+    /// What weight decay leaves of a row.
+    keep: T,
     table: Rows<'a, T>,
     moments: Rows<'a, T>,
     steps: Rows<'a, u32>,
@@ -238,20 +276,25 @@ impl<T: Scalar> Update<'_, T> {
     /// Updates some rows.
     #[inline(always)]
     fn visit(&self, rows: &[u32], sums: &[T]) -> RowStats {
+        if self.keep == T::ONE { self.visit_with::<false>(rows, sums) } else { self.visit_with::<true>(rows, sums) }
+    }
+
+    #[inline(always)]
+    fn visit_with<const DECAY: bool>(&self, rows: &[u32], sums: &[T]) -> RowStats {
         // The usual widths as constants: the loops over a row then unroll into one vector.
         match self.features {
-            1 => self.visit_by::<1>(rows, sums),
-            2 => self.visit_by::<2>(rows, sums),
-            4 => self.visit_by::<4>(rows, sums),
-            8 => self.visit_by::<8>(rows, sums),
-            wide if wide % 8 == 0 => self.visit_by::<8>(rows, sums),
-            _ => self.visit_by::<1>(rows, sums),
+            1 => self.visit_by::<1, DECAY>(rows, sums),
+            2 => self.visit_by::<2, DECAY>(rows, sums),
+            4 => self.visit_by::<4, DECAY>(rows, sums),
+            8 => self.visit_by::<8, DECAY>(rows, sums),
+            wide if wide % 8 == 0 => self.visit_by::<8, DECAY>(rows, sums),
+            _ => self.visit_by::<1, DECAY>(rows, sums),
         }
     }
 
     /// Updates each row by itself, in pieces of `W` features, of which a row is a multiple.
     #[inline(always)]
-    fn visit_by<const W: usize>(&self, rows: &[u32], sums: &[T]) -> RowStats {
+    fn visit_by<const W: usize, const DECAY: bool>(&self, rows: &[u32], sums: &[T]) -> RowStats {
         let (rule, features) = (self.rule, if self.features == W { W } else { self.features });
         let mut stats = RowStats::default();
         for (place, (&row, sum)) in rows.iter().zip(sums.chunks_exact(features)).enumerate() {
@@ -285,7 +328,8 @@ impl<T: Scalar> Update<'_, T> {
                 let [mut new_x, g, mut new_m, mut new_v]: [[T; W]; 4] =
                     [load(x, at), load(sum, at), load(m, at), load(v, at)];
                 for i in 0..W {
-                    let old = [new_x[i], g[i], new_m[i], new_v[i]];
+                    let kept = if DECAY { flushed(new_x[i] * self.keep) } else { new_x[i] };
+                    let old = [kept, g[i], new_m[i], new_v[i]];
                     [new_x[i], new_m[i], new_v[i]] = rule.element(old, corrected);
                 }
                 x[at..at + W].copy_from_slice(&new_x);
@@ -308,7 +352,7 @@ fn load<T: Scalar, const W: usize>(from: &[T], at: usize) -> [T; W] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Adam;
+    use crate::{Adam, AdamW, Gradient, Optimizer, Params};
     use raygrad_tensor::Tensor;
 
     /// The sums of a dense gradient, for all rows.
@@ -322,18 +366,24 @@ mod tests {
     fn equals_dense_adam_where_every_row_has_a_gradient() {
         for (rows, features) in [(21, 1), (8, 2), (13, 4), (30, 8), (5, 3), (1, 70), (3, 24)] {
             let config = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
-            let mut dense = Adam::<f32>::new(config);
+            let decay = if rows % 2 == 0 { 0.5 } else { 0.0 };
+            let mut dense: Box<dyn Optimizer<f32>> = match decay {
+                0.0 => Box::new(Adam::new(config)),
+                _ => Box::new(AdamW::new(config, decay)),
+            };
             let mut lazy = RowAdam::<f32>::new(config, rows, features);
             let mut table = vec![0.5; rows * features];
-            let mut expected = [Tensor::full(&[rows, features], 0.5_f32)];
+            let mut expected = Params::new();
+            expected.add("table", Tensor::full(&[rows, features], 0.5_f32));
             for t in 1..=3000 {
                 let grad: Vec<f32> = (0..table.len()).map(|i| ((i * 7 + t * 13) as f32).sin() + 1e-3).collect();
-                dense.step(&mut expected, &[Tensor::from_vec(&[rows, features], grad.clone())], 1e-3);
+                let whole = Gradient::from(Tensor::from_vec(&[rows, features], grad.clone()));
+                dense.update(&mut expected, &[whole], 1e-3).check().unwrap();
                 let mut sums = sums(&grad, features);
-                let stats = lazy.step(&mut table, &mut sums, 1e-3);
+                let stats = lazy.step(&mut table, &mut sums, 1e-3, decay);
                 assert_eq!((stats, sums.rows().is_empty()), (RowStats { touched: rows, skipped: 0 }, true));
             }
-            for (got, expected) in table.iter().zip(expected[0].as_slice()) {
+            for (got, expected) in table.iter().zip(expected.values()[0].as_slice()) {
                 assert!((got - expected).abs() <= 1e-5, "{got} instead of {expected}");
             }
         }
@@ -351,7 +401,7 @@ mod tests {
                 if t % every == 0 {
                     sums.add(8, &[gradient(t / every)]);
                 }
-                adam.step(&mut table, &mut sums, 0.01);
+                adam.step(&mut table, &mut sums, 0.01, 0.0);
             }
             table
         };
@@ -374,11 +424,11 @@ mod tests {
         let mut grad = [0.0; 32];
         (grad[2], grad[7], grad[9]) = (1.0, f32::NAN, f32::INFINITY);
         let mut sums = sums(&grad, 2);
-        let stats = adam.step(&mut table, &mut sums, 0.1);
+        let stats = adam.step(&mut table, &mut sums, 0.1, 0.0);
         assert_eq!(stats, RowStats { touched: 1, skipped: 2 });
         let moved: Vec<_> = (0..32).filter(|&i| table[i] != 1.0).collect();
         assert_eq!(moved, [2], "row 1 moves, and in it the element that has a gradient");
-        assert_eq!(adam.step(&mut table, &mut sums, 0.1), RowStats::default());
+        assert_eq!(adam.step(&mut table, &mut sums, 0.1, 0.0), RowStats::default());
     }
 
     #[test]
@@ -388,7 +438,7 @@ mod tests {
         let gradients = [1e-30, 1e-10, 1e30, -1e30, 1.0, f32::MIN_POSITIVE, 1e-42, 0.0];
         for _ in 0..1000 {
             let before = table;
-            adam.step(&mut table, &mut sums(&gradients, 1), 1.0);
+            adam.step(&mut table, &mut sums(&gradients, 1), 1.0, 0.0);
             assert!(table.iter().zip(before).all(|(x, before)| (x - before).abs() <= 3.2), "{table:?}");
         }
         assert!(adam.moments.as_mut_slice().iter().all(|m| !m.is_subnormal()), "{:?}", adam.moments);
@@ -402,7 +452,7 @@ mod tests {
         (0..rows).rev().for_each(|row| sums.add(row, &[1.0, -1.0]));
         let mut table = vec![0.0; 2 * rows];
         let mut adam = RowAdam::new(AdamConfig::default(), rows, 2);
-        assert_eq!(adam.step(&mut table, &mut sums, 0.5), RowStats { touched: rows, skipped: 0 });
+        assert_eq!(adam.step(&mut table, &mut sums, 0.5, 0.0), RowStats { touched: rows, skipped: 0 });
         assert!(table.chunks(2).all(|row| (row[0] + 0.5).abs() < 1e-6 && (row[1] - 0.5).abs() < 1e-6));
     }
 }

@@ -1,17 +1,25 @@
 //! Parameters: named tensors outside any tape, so that many tapes share one model.
 
-use crate::{Move, Tape, Var};
+use crate::{Gradient, Move, Tape, Var};
 use raygrad_tensor::{Scalar, Tensor};
+use std::collections::HashMap;
 use std::ops::Index;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A handle on a parameter of one [`Params`].
+/// A handle on a parameter of one [`Params`] and of the copies that are made of it; any other store refuses it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct ParamId(usize);
+pub struct ParamId {
+    place: usize,
+    /// No other parameter of this program has it.
+    key: u64,
+}
 
 /// A named store of parameters, in the order in which they were added.
 ///
 /// Layers hold [`ParamId`]s and are pure functions of the bound parameters and their input. A parameter can be frozen,
 /// and can have factors of the learning rate and of the weight decay of its own; parameters are chosen by their names.
+/// The handles of a store fit its clones and casts too, as far as the parameters are the same.
 ///
 /// ```
 /// use raygrad_autograd::{Params, Tape, Tensor};
@@ -24,9 +32,44 @@ pub struct ParamId(usize);
 /// ```
 #[derive(Debug, Clone, Default)]
 pub struct Params<T: Scalar> {
-    names: Vec<String>,
+    /// Shared with what is bound and with copies.
+    names: Arc<Names>,
     values: Vec<Tensor<T>>,
     settings: Vec<Setting>,
+}
+
+/// What the parameters of a store are called.
+#[derive(Debug, Clone, Default)]
+struct Names {
+    names: Vec<String>,
+    places: HashMap<String, usize>,
+    /// For each parameter the number that its handles have.
+    keys: Vec<u64>,
+}
+
+impl Names {
+    #[track_caller]
+    fn add(&mut self, name: String) -> ParamId {
+        static KEYS: AtomicU64 = AtomicU64::new(0);
+        let (place, key) = (self.names.len(), KEYS.fetch_add(1, Ordering::Relaxed));
+        let taken = self.places.insert(name.clone(), place).is_some();
+        assert!(!taken, "there is already a parameter `{name}`");
+        self.names.push(name);
+        self.keys.push(key);
+        ParamId { place, key }
+    }
+
+    /// Where the parameter of a handle stands.
+    #[track_caller]
+    fn place(&self, ParamId { place, key }: ParamId) -> usize {
+        if self.keys.get(place) != Some(&key) {
+            match self.names.get(place) {
+                Some(name) => panic!("a handle of another store: its parameter {place} is not this store's `{name}`"),
+                None => panic!("a handle of another store: its parameter {place}, of {} here", self.names.len()),
+            }
+        }
+        place
+    }
 }
 
 /// How an optimiser treats a parameter.
@@ -35,12 +78,13 @@ struct Setting {
     frozen: bool,
     rate: f64,
     decay: f64,
+    lazy: bool,
 }
 
 impl<T: Scalar> Params<T> {
     /// An empty store.
     pub fn new() -> Self {
-        Params { names: vec![], values: vec![], settings: vec![] }
+        Params { names: Arc::default(), values: vec![], settings: vec![] }
     }
 
     /// Adds a parameter.
@@ -49,12 +93,10 @@ impl<T: Scalar> Params<T> {
     /// If the name is taken.
     #[track_caller]
     pub fn add(&mut self, name: impl Into<String>, value: Tensor<T>) -> ParamId {
-        let name = name.into();
-        assert!(!self.names.contains(&name), "there is already a parameter `{name}`");
-        self.names.push(name);
+        let id = Arc::make_mut(&mut self.names).add(name.into());
         self.values.push(value);
-        self.settings.push(Setting { frozen: false, rate: 1.0, decay: 1.0 });
-        ParamId(self.values.len() - 1)
+        self.settings.push(Setting { frozen: false, rate: 1.0, decay: 1.0, lazy: false });
+        id
     }
 
     /// Number of parameters (tensors).
@@ -80,28 +122,37 @@ impl<T: Scalar> Params<T> {
 
     /// The names in order.
     pub fn names(&self) -> impl ExactSizeIterator<Item = &str> {
-        self.names.iter().map(String::as_str)
+        self.names.names.iter().map(String::as_str)
     }
 
     /// The name of a parameter.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
     pub fn name(&self, id: ParamId) -> &str {
-        &self.names[id.0]
+        &self.names.names[self.names.place(id)]
+    }
+
+    /// The handles of the parameters that are not frozen, in order: those that have a gradient.
+    pub fn trainable(&self) -> impl Iterator<Item = ParamId> + '_ {
+        self.ids().zip(&self.settings).filter(|(_, setting)| !setting.frozen).map(|(id, _)| id)
     }
 
     /// The handles in order.
-    pub fn ids(&self) -> impl ExactSizeIterator<Item = ParamId> + use<T> {
-        (0..self.len()).map(ParamId)
+    pub fn ids(&self) -> impl ExactSizeIterator<Item = ParamId> + '_ {
+        self.names.keys.iter().enumerate().map(|(place, &key)| ParamId { place, key })
     }
 
     /// The parameter of this name.
     pub fn find(&self, name: &str) -> Option<ParamId> {
-        self.names.iter().position(|other| other == name).map(ParamId)
+        self.names.places.get(name).map(|&place| ParamId { place, key: self.names.keys[place] })
     }
 
     /// Changes the settings of the parameters that `which` chooses, and returns how many these are.
     fn set(&mut self, which: impl Fn(&str) -> bool, change: impl Fn(&mut Setting)) -> usize {
         let mut count = 0;
-        for (_, setting) in self.names.iter().zip(&mut self.settings).filter(|(name, _)| which(name)) {
+        for (_, setting) in self.names.names.iter().zip(&mut self.settings).filter(|(name, _)| which(name)) {
             change(setting);
             count += 1;
         }
@@ -130,44 +181,81 @@ impl<T: Scalar> Params<T> {
     }
 
     /// Whether a parameter is frozen.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
     pub fn is_frozen(&self, id: ParamId) -> bool {
-        self.settings[id.0].frozen
+        self.settings[self.names.place(id)].frozen
     }
 
     /// Gives the parameters whose name `which` chooses a factor of the learning rate, instead of 1, and returns how many
     /// these are.
+    ///
+    /// # Panics
+    /// If the factor is negative, infinite or NaN.
+    #[track_caller]
     pub fn set_rate(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
+        assert!(factor >= 0.0 && factor.is_finite(), "a learning rate times {factor}");
         self.set(which, |setting| setting.rate = factor)
     }
 
     /// Gives the parameters whose name `which` chooses a factor of the weight decay, instead of 1, and returns how many
     /// these are. Biases and gains usually have 0.
+    ///
+    /// # Panics
+    /// If the factor is negative, infinite or NaN.
+    #[track_caller]
     pub fn set_decay(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
+        assert!(factor >= 0.0 && factor.is_finite(), "a weight decay times {factor}");
         self.set(which, |setting| setting.decay = factor)
     }
 
-    /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
-    /// not frozen.
+    /// Chooses whether the parameters whose name `which` chooses are lazy, which they are not at first, and returns how
+    /// many these are.
+    ///
+    /// A lazy parameter is a table of which a step uses few rows, along its first axis: an embedding. Optimisers then
+    /// read and move only the rows whose gradient is not zero, and what they remember of others stands still too. That is
+    /// another optimiser: a row that gets one late gradient moves once, where momentum moves it over the following steps
+    /// too ([`RowAdam`](crate::RowAdam)). Choose before the first step.
+    pub fn set_lazy(&mut self, which: impl Fn(&str) -> bool, lazy: bool) -> usize {
+        self.set(which, |setting| setting.lazy = lazy)
+    }
+
+    /// The factor of a parameter's learning rate.
     ///
     /// # Panics
-    /// If there is not one gradient for each parameter that is not frozen.
+    /// If the handle is that of another store.
     #[track_caller]
-    pub fn moves<'a>(&'a mut self, grads: &'a [Tensor<T>], rate: f64) -> impl Iterator<Item = Move<'a, T>> {
+    pub fn rate(&self, id: ParamId) -> f64 {
+        self.settings[self.names.place(id)].rate
+    }
+
+    /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
+    /// not frozen and whose gradient has a share.
+    ///
+    /// # Panics
+    /// If there is not one gradient of the same shape for each parameter that is not frozen, or the rate is not within 0
+    /// to 1e30.
+    #[track_caller]
+    pub fn moves<'a>(&'a mut self, grads: &'a [Gradient<T>], rate: f64) -> impl Iterator<Item = Move<'a, T>> {
+        assert!((0.0..=1e30).contains(&rate), "a learning rate of {rate:?}; use 0 to 1e30");
         let free = self.settings.iter().filter(|setting| !setting.frozen).count();
-        assert_eq!(free, grads.len(), "as many gradients as parameters that are not frozen");
-        let parts = self.values.iter_mut().zip(&self.settings).enumerate().filter(|(_, (_, setting))| !setting.frozen);
-        parts.zip(grads).map(move |((slot, (value, setting)), grad)| Move {
-            slot,
-            value,
-            grad,
-            rate: rate * setting.rate,
-            decay: setting.decay,
-        })
+        assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
+        let (names, values) = (&self.names.names, self.values.iter_mut());
+        let parts = names.iter().zip(values).zip(&self.settings).enumerate();
+        let free = parts.filter(|(_, (_, setting))| !setting.frozen);
+        let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
+            assert_eq!(value.shape(), grad.shape(), "the gradient of `{name}` has its shape");
+            let lazy = setting.lazy && !value.is_empty();
+            Move { slot, name, value, grad, rate: rate * setting.rate, decay: setting.decay, lazy }
+        });
+        moves.filter(|part| !part.grad.is_zero())
     }
 
     /// Names and values in order.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = (&str, &Tensor<T>)> {
-        self.names.iter().map(String::as_str).zip(&self.values)
+        self.names().zip(&self.values)
     }
 
     /// The values in order.
@@ -181,28 +269,66 @@ impl<T: Scalar> Params<T> {
     }
 
     /// One value.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
     pub fn get(&self, id: ParamId) -> &Tensor<T> {
-        &self.values[id.0]
+        &self.values[self.names.place(id)]
     }
 
     /// One value, for an optimiser.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
     pub fn get_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
-        &mut self.values[id.0]
+        &mut self.values[self.names.place(id)]
     }
 
-    /// The parameters as leaves of a tape; frozen ones as constants, which have no gradients.
+    /// The parameters as leaves of a tape; frozen ones as constants, which have no gradient.
     #[track_caller]
     pub fn bind<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
         let mut vars = Vec::with_capacity(self.len());
         for (value, setting) in self.values.iter().zip(&self.settings) {
             vars.push(if setting.frozen { tape.constant(value.clone()) } else { tape.leaf(value.clone()) });
         }
-        Bound(vars)
+        Bound { names: self.names.clone(), vars }
     }
 
     /// The parameters as constants of a tape, for evaluation.
     pub fn bind_constant<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
-        Bound(self.values.iter().map(|value| tape.constant(value.clone())).collect())
+        let vars = self.values.iter().map(|value| tape.constant(value.clone())).collect();
+        Bound { names: self.names.clone(), vars }
+    }
+
+    /// What the handles of this store fit, without its values.
+    pub fn layout(&self) -> Layout {
+        Layout(self.names.clone())
+    }
+
+    /// Takes values and settings from a store of the same names and shapes, which may have another precision: the
+    /// handles of a model that was made anew then fit the parameters of an old one.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Params, Tensor};
+    /// let (mut old, mut new) = (Params::<f64>::new(), Params::<f32>::new());
+    /// old.add("x", Tensor::scalar(0.5));
+    /// let x = new.add("x", Tensor::scalar(9.0));
+    /// new.assign(&old);
+    /// assert_eq!(new.get(x).item(), 0.5);
+    /// ```
+    ///
+    /// # Panics
+    /// If names, their order or shapes differ.
+    #[track_caller]
+    pub fn assign<U: Scalar>(&mut self, other: &Params<U>) {
+        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
+        for ((name, value), theirs) in self.iter().zip(&other.values) {
+            assert_eq!(value.shape(), theirs.shape(), "two parameters `{name}`");
+        }
+        self.values = other.values.iter().map(Tensor::cast).collect();
+        self.settings.clone_from(&other.settings);
     }
 
     /// The same parameters in another precision.
@@ -220,37 +346,99 @@ impl<T: Scalar> Params<T> {
     }
 }
 
-/// Parameters on a tape; index it with a [`ParamId`].
-#[derive(Debug)]
-pub struct Bound<'t, T: Scalar>(Vec<Var<'t, T>>);
+/// The names of a store's parameters and the handles that fit them, without values: it puts variables in the place of
+/// parameters, in a check of a whole model or inside a checkpoint. A clone is a reference count.
+///
+/// ```
+/// use raygrad_autograd::{Params, Tape, Tensor};
+/// let mut params = Params::<f64>::new();
+/// let weight = params.add("weight", Tensor::full(&[2], 3.0));
+/// let layout = params.layout();
+/// let tape = Tape::new();
+/// let x = tape.leaf(Tensor::full(&[2], 0.5));
+/// let y = tape.checkpoint(&[&x], move |x| layout.bind(x.to_vec())[weight].square().sum());
+/// assert_eq!(y.item(), 0.5);
+/// ```
+#[derive(Debug, Clone)]
+pub struct Layout(Arc<Names>);
 
-impl<'t, T: Scalar> Bound<'t, T> {
-    /// Variables in place of parameters, in the order of the store: what a check of a whole model differentiates.
-    pub fn from_vars(vars: Vec<Var<'t, T>>) -> Self {
-        Bound(vars)
-    }
-
-    /// The tape that the parameters are bound to.
+impl Layout {
+    /// Variables in place of the parameters, in the order of the store.
     ///
     /// # Panics
-    /// If there is none.
+    /// If there is not one for each parameter.
     #[track_caller]
-    pub fn tape(&self) -> &'t Tape<T> {
-        assert!(!self.0.is_empty(), "the tape of no parameters");
-        self.0[0].tape()
+    pub fn bind<'t, T: Scalar>(&self, vars: Vec<Var<'t, T>>) -> Bound<'t, T> {
+        assert_eq!(vars.len(), self.0.names.len(), "one variable for each parameter");
+        Bound { names: self.0.clone(), vars }
+    }
+}
+
+/// Parameters on a tape; index it with a [`ParamId`].
+#[derive(Debug)]
+pub struct Bound<'t, T: Scalar> {
+    names: Arc<Names>,
+    vars: Vec<Var<'t, T>>,
+}
+
+impl<'t, T: Scalar> Bound<'t, T> {
+    /// The parameters that gradients can be taken with respect to, in the order of the store: those that are not frozen.
+    pub fn vars(&self) -> Vec<&Var<'t, T>> {
+        self.vars.iter().filter(|var| var.is_on_graph()).collect()
     }
 
-    /// The parameters to take gradients with respect to, in the order of the store: all but the frozen ones, which are
-    /// constants.
-    pub fn vars(&self) -> Vec<&Var<'t, T>> {
-        self.0.iter().filter(|x| x.is_on_graph()).collect()
+    /// The gradients of a one-element tensor, one for each parameter that is not frozen: what
+    /// [`Optimizer::update`](crate::Optimizer::update) takes.
+    ///
+    /// This is the end of a training step. The parameters are given up and everything that the tape has recorded is freed
+    /// with the values that it holds, so that an update moves the parameters where they are; a parameter that something
+    /// still holds is copied first. Values of variables can be read on, but not differentiated. Where more than this is
+    /// to be done with the graph, there is [`Var::backward`](crate::Var::backward) of [`vars`](Self::vars).
+    ///
+    /// ```
+    /// use raygrad_autograd::{Adam, AdamConfig, Optimizer, Params, Tape, Tensor};
+    /// let mut params = Params::<f32>::new();
+    /// let x = params.add("x", Tensor::full(&[2], 3.0));
+    /// let mut adam = Adam::new(AdamConfig::default());
+    /// let tape = Tape::new();
+    /// let bound = params.bind(&tape);
+    /// let loss = bound[x].square().sum();
+    /// let grads = bound.backward(&loss);
+    /// let place = params.get(x).as_slice().as_ptr();
+    /// let moved = adam.update(&mut params, &grads, 0.1).check();
+    /// assert_eq!((moved, params.get(x).as_slice().as_ptr()), (Ok(2), place));
+    /// ```
+    ///
+    /// # Panics
+    /// As [`Var::grad`](crate::Var::grad).
+    #[track_caller]
+    pub fn backward(self, loss: &Var<'t, T>) -> Vec<Gradient<T>> {
+        let grads = loss.backward(&self.vars());
+        loss.tape().free();
+        grads
+    }
+
+    /// The tape that the parameters are on.
+    ///
+    /// # Panics
+    /// If there is no parameter.
+    #[track_caller]
+    pub fn tape(&self) -> &'t Tape<T> {
+        assert!(!self.vars.is_empty(), "the tape of no parameters");
+        self.vars[0].tape()
     }
 }
 
 impl<'t, T: Scalar> Index<ParamId> for Bound<'t, T> {
     type Output = Var<'t, T>;
+
+    /// The parameter of a handle.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
     fn index(&self, id: ParamId) -> &Var<'t, T> {
-        &self.0[id.0]
+        &self.vars[self.names.place(id)]
     }
 }
 
@@ -278,24 +466,75 @@ mod tests {
         let step = |params: &mut Params<f64>, sgd: &mut Sgd<f64>| {
             let tape = Tape::new();
             let bound = params.bind(&tape);
-            let all: Vec<_> = params.ids().map(|id| &bound[id]).collect();
-            let grads = (all[0] + all[1] + all[2]).sum().grad(&bound.vars());
-            let constant = all.iter().map(|x| !x.is_on_graph()).collect::<Vec<_>>();
-            sgd.update(params, &grads, 0.1);
-            (constant, grads.len(), params.values().iter().map(|x| x.as_slice()[0]).collect::<Vec<_>>())
+            let sum = params.ids().map(|id| bound[id].sum()).reduce(|a, b| a + b).unwrap();
+            assert_eq!(bound.vars().len(), params.trainable().count());
+            let grads = bound.backward(&sum);
+            let moved = sgd.update(params, &grads, 0.1).check().unwrap();
+            (moved, params.values().iter().map(|x| x.as_slice()[0]).collect::<Vec<_>>())
         };
         // Half the rate; decay adds the parameter, 1, to the gradient, 1, but for the bias.
-        let (constant, grad, values) = step(&mut params, &mut sgd);
-        assert_eq!((constant, grad), (vec![false, false, true], 2));
-        assert_eq!(values, [0.9, 0.95, 1.0]);
+        assert_eq!(step(&mut params, &mut sgd), (4, vec![0.9, 0.95, 1.0]));
+        assert_eq!((params.rate(head), params.rate(params.find("trunk.bias").unwrap())), (1.0, 0.5));
         // Settings survive a change of precision and a load.
         let mut copy = params.cast::<f32>().cast::<f64>();
         let bytes = params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap();
         copy.load_safetensors(&bytes).unwrap();
         assert!(copy.is_frozen(head) && copy.trainable_elements() == 4);
         copy.unfreeze(|_| true);
-        let (constant, grad, values) = step(&mut copy, &mut sgd);
-        assert_eq!((constant, grad), (vec![false; 3], 3));
-        assert_eq!(values[2], 1.0 - 0.1 * 2.0);
+        let (moved, values) = step(&mut copy, &mut sgd);
+        assert_eq!((moved, values[2]), (6, 1.0 - 0.1 * 2.0));
+    }
+
+    #[test]
+    fn handles_fit_copies_and_no_other_store() {
+        let mut params = Params::<f64>::new();
+        let x = params.add("x", Tensor::scalar(1.0));
+        let (single, mut copy) = (params.cast::<f32>(), params.clone());
+        let y = copy.add("y", Tensor::scalar(2.0));
+        assert_eq!((single.get(x).item(), copy.get(x).item(), copy.get(y).item()), (1.0, 1.0, 2.0));
+        assert_eq!(params.find("x"), Some(x));
+        assert_eq!(copy.ids().collect::<Vec<_>>(), [x, y]);
+        // Both stores have a second parameter, but not the same one.
+        let z = params.add("z", Tensor::scalar(3.0));
+        let mut other = Params::<f64>::new();
+        let stranger = other.add("x", Tensor::scalar(4.0));
+        let tape = Tape::new();
+        let bound = params.bind(&tape);
+        let message = |f: &dyn Fn()| {
+            let error = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).expect_err("refused");
+            error.downcast_ref::<String>().cloned().unwrap_or_default()
+        };
+        for (f, expected) in [
+            (&(|| drop(params.get(y).clone())) as &dyn Fn(), "its parameter 1 is not this store's `z`"),
+            (&|| drop(copy.name(z).to_owned()), "its parameter 1 is not this store's `y`"),
+            (&|| drop(bound[stranger].clone()), "its parameter 0 is not this store's `x`"),
+            (&|| assert!(single.is_frozen(y)), "its parameter 1, of 1 here"),
+        ] {
+            assert!(message(f).contains(expected), "{} and {expected}", message(f));
+        }
+        other.add("z", Tensor::scalar(5.0));
+        other.freeze(|name| name == "z");
+        params.assign(&other.cast::<f32>());
+        assert_eq!((params.get(x).item(), params.get(z).item(), params.is_frozen(z)), (4.0, 5.0, true));
+    }
+
+    #[test]
+    fn many_parameters_are_added_and_found_in_linear_time() {
+        let mut params = Params::<f32>::new();
+        let start = std::time::Instant::now();
+        for i in 0..100_000 {
+            let id = params.add(format!("layer{i}.weight"), Tensor::zeros(&[0]));
+            assert_eq!(params.find(&format!("layer{i}.weight")), Some(id));
+        }
+        // A search through all names takes minutes.
+        assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());
+    }
+
+    #[test]
+    #[should_panic(expected = "there is already a parameter `x`")]
+    fn a_name_is_taken_once() {
+        let mut params = Params::<f32>::new();
+        params.add("x", Tensor::zeros(&[1]));
+        params.add("x", Tensor::zeros(&[2]));
     }
 }

@@ -37,7 +37,7 @@ impl Storage {
         if values.iter().all(fits) { self } else { Storage::Full }
     }
 
-    fn dtype<T: Scalar>(self) -> Dtype {
+    pub(crate) fn dtype<T: Scalar>(self) -> Dtype {
         match self {
             Storage::Full if size_of::<T>() == 4 => Dtype::F32,
             Storage::Full => Dtype::F64,

@@ -72,6 +72,11 @@ impl<T: Scalar> Tape<T> {
         self.nodes.clear();
     }
 
+    /// Frees the operations that are recorded and the values that they hold; their variables stay.
+    pub(crate) fn free(&self) {
+        (0..self.len() as u32).filter(|&node| self.nodes.is_operation(node)).for_each(|node| self.nodes.free(node));
+    }
+
     /// The pool that the tensors of this tape come from.
     pub fn pool(&self) -> &Pool<T> {
         &self.pool

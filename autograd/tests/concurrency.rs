@@ -3,8 +3,8 @@
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{
-    Activation, Bound, Dropout, Init, Linear, Optimizer, Params, Pass, Pool, Sequential, Sgd, SgdConfig, Tape, Tensor,
-    Var,
+    Activation, Dropout, Gradient, Init, Linear, Optimizer, Params, Pass, Pool, Sequential, Sgd, SgdConfig, Tape,
+    Tensor, Var,
 };
 use std::sync::{Arc, Barrier, Mutex};
 
@@ -48,20 +48,19 @@ fn round(
         let x = tape.leaf(Tensor::from_fn(&[7, 5], |i| ((i as u64 * 31 + seed) as f32 * 0.17).sin()));
         let mut inputs = vec![&x];
         inputs.extend(bound.vars());
-        let network = model.clone();
+        let (network, layout) = (model.clone(), params.layout());
         let y = tape.checkpoint(&inputs, move |x: &[Var<'_, f32>]| {
-            network.forward(&Bound::from_vars(x[1..].to_vec()), &x[0], Pass::Train(seed))
+            network.forward(&layout.bind(x[1..].to_vec()), &x[0], Pass::Train(seed))
         });
         let y = y.map_grad(|g| g * (1.0 + 1e-3 * f64::from(inner_gradient(g.value().as_slice()[0]))));
         let loss = y.square().mean();
         // The gradient by the input, recorded, is part of the loss.
         let slope = loss.grad_graph(&[&x]).remove(0);
         let total = loss + slope.square().sum();
-        let grads = total.grad_once(&bound.vars());
-        grads.iter().for_each(&mut mix);
+        let grads = bound.backward(&total);
+        grads.iter().filter_map(Gradient::dense).for_each(&mut mix);
         mix(total.value());
-        drop((slope, total, y, x, bound));
-        sgd.update(params, &grads, 0.01);
+        sgd.update(params, &grads, 0.01).check().unwrap();
     }
     tape.clear();
     params.values().iter().for_each(&mut mix);

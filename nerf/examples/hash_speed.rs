@@ -78,7 +78,7 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
                 grid.scatter_level(l, positions.as_slice(), d_out.as_slice(), &mut sums);
             }
             let middle = Instant::now();
-            let stats = optimizer.step(values, &mut sums, 1e-2);
+            let stats = optimizer.step(values, &mut sums, 1e-2, 0.0);
             let times = [middle.duration_since(start), middle.elapsed()];
             for (least, time) in least.iter_mut().zip(times) {
                 *least = least.min(time.as_secs_f64());

@@ -184,6 +184,11 @@ impl Config {
     /// If one is out of range.
     pub fn check(&self) -> Result<()> {
         self.loss.check()?;
+        let checked =
+            [("schedule", self.schedule.check()), ("adam", self.adam.check()), ("table_adam", self.table_adam.check())];
+        for (part, checked) in checked {
+            checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
+        }
         match &self.sampler {
             SamplerConfig::Hierarchical(config) => config.check(),
             SamplerConfig::Marching(config) => config.check(),

@@ -147,7 +147,7 @@ impl<T: Scalar> Model<T> {
     /// If the configuration is out of range, which that of a model in use is not.
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::new(self.config.clone(), self.extent, 0)?;
-        model.params = self.params.cast();
+        model.params.assign(&self.params);
         model.sampler = self.sampler.clone();
         Ok(model)
     }

@@ -67,7 +67,7 @@ impl Scratch {
 pub(crate) struct Slot {
     /// Whether a tile of this step is in the sums.
     started: bool,
-    /// Summed gradient of each parameter; None for a table whose gradient has no dense share.
+    /// Summed gradient of each parameter that is not frozen; None for a table whose gradient has no dense share.
     pub grads: Vec<Option<Tensor<f32>>>,
     /// The table's gradients, tile by tile.
     pub tables: Vec<Arc<HashGrad<f32>>>,
@@ -123,16 +123,10 @@ impl Slot {
         };
         let loss = loss * (1.0 / (3.0 * total as f64));
         // Where rays meet nothing, the loss may be a constant: its gradients are zero.
-        let mut given = loss.tracked().backward(&params.vars()).into_iter();
-        grads.resize_with(model.params.len(), || None);
+        let given = loss.tracked().backward(&params.vars());
+        grads.resize_with(given.len(), || None);
         let table = model.field.table().map(|(id, _)| id);
-        for (id, sum) in model.params.ids().zip(grads) {
-            // A frozen parameter has no gradient.
-            let gradient = if model.params.is_frozen(id) { None } else { given.next() };
-            let Some(mut gradient) = gradient else {
-                *sum = None;
-                continue;
-            };
+        for ((id, sum), mut gradient) in model.params.trainable().zip(grads).zip(given) {
             if table == Some(id) {
                 tables.extend(gradient.take());
                 if gradient.is_zero() {
@@ -142,7 +136,8 @@ impl Slot {
             }
             match (gradient.into_dense(tape.pool()), sum) {
                 (grad, Some(sum)) if *started => add_assign(sum.as_mut_slice(), grad.as_slice()),
-                (grad, Some(sum)) => sum.as_mut_slice().copy_from_slice(grad.as_slice()),
+                // Another one than before, if other parameters are frozen now.
+                (grad, Some(sum)) if sum.shape() == grad.shape() => sum.as_mut_slice().copy_from_slice(grad.as_slice()),
                 (grad, sum) => *sum = Some(grad),
             }
         }

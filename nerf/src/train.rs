@@ -11,7 +11,7 @@ use crate::{Error, Result};
 use crate::{silhouette, startup};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Adam, Pool};
+use raygrad_autograd::{Adam, Gradient, Optimizer, ParamId, Pool, RowStats, Tensor, UpdateReport};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::ops::ControlFlow;
@@ -28,6 +28,9 @@ const RAYS: [usize; 2] = [256, 1 << 16];
 const GRID_EVERY: u64 = 16;
 /// Steps between the times when memory that they did not need is freed: the number of samples changes as training goes on.
 const TRIM_EVERY: u64 = 256;
+
+/// Steps in a row without a finite gradient after which a run has diverged: an overflow of one batch passes.
+const STUCK: u64 = 100;
 
 /// How long to train.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -67,10 +70,21 @@ pub struct StepStats {
     pub occupied: f64,
     /// The learning rate.
     pub rate: f64,
-    /// Elements whose gradient was not finite, so far; they were left alone.
+    /// Elements, of the table rows, whose gradient was not finite, so far; they were left alone.
     pub skipped: u64,
+    /// Steps in a row, up to this one, that moved nothing because no gradient was finite: the run has diverged if they
+    /// go on.
+    pub stuck: u64,
     /// How often the start-up detector began again with another seed.
     pub restarts: u32,
+}
+
+impl StepStats {
+    /// Whether the run has diverged: for 100 steps in a row no gradient was finite, so that nothing moves any more. Its
+    /// model is of no use.
+    pub fn has_diverged(&self) -> bool {
+        self.stuck >= STUCK
+    }
 }
 
 /// A model in training.
@@ -142,6 +156,7 @@ impl Trainer {
             occupied: 1.0,
             rate: 0.0,
             skipped: 0,
+            stuck: 0,
             restarts,
         };
         let mut trainer = Trainer {
@@ -184,8 +199,8 @@ impl Trainer {
         self.done
     }
 
-    /// Trains until the budget is used up or `observe`, which is called after every step, breaks. The time that
-    /// `observe` takes does not count.
+    /// Trains until the budget is used up or `observe`, which is called after every step, breaks, or until the run has
+    /// [diverged](StepStats::has_diverged). The time that `observe` takes does not count.
     pub fn run(&mut self, budget: Budget, mut observe: impl FnMut(&Trainer) -> ControlFlow<()>) {
         loop {
             let fraction = match budget {
@@ -196,7 +211,7 @@ impl Trainer {
                 break;
             }
             self.step(fraction);
-            if observe(self).is_break() {
+            if observe(self).is_break() || self.done.has_diverged() {
                 break;
             }
         }
@@ -225,7 +240,7 @@ impl Trainer {
             self.pool.trim();
         }
         let rate = self.model.config.schedule.rate(fraction);
-        let skipped = self.descend(rate, tile);
+        let report = self.descend(rate, tile);
         let values = 3.0 * self.batch as f64;
         self.elapsed += start.elapsed();
         self.done = StepStats {
@@ -242,7 +257,8 @@ impl Trainer {
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,
             rate,
-            skipped: self.done.skipped + skipped,
+            skipped: self.done.skipped + report.skipped as u64,
+            stuck: if report.is_stuck() { self.done.stuck + 1 } else { 0 },
             restarts: self.done.restarts,
         };
         self.adapt_batch(&work);
@@ -267,30 +283,40 @@ impl Trainer {
         self.slots.iter().fold(Work::default(), |sum, slot| sum + slot.work)
     }
 
-    /// Moves the parameters; returns how many elements were left alone.
-    fn descend(&mut self, rate: f64, tile: usize) -> u64 {
+    /// Moves the parameters.
+    fn descend(&mut self, rate: f64, tile: usize) -> UpdateReport {
         let used = self.batch.div_ceil(tile).min(SLOTS);
         sum_slots(&mut self.slots[..used]);
+        let params = &mut self.model.params;
         let table_id = self.model.field.table().map(|(id, _)| id);
-        let mut skipped = 0;
-        if let (Some(id), Some(table)) = (table_id, &mut self.table) {
+        let mut of_table = RowStats::default();
+        if let (Some(id), Some(table)) = (table_id.filter(|&id| !params.is_frozen(id)), &mut self.table) {
             // Tiles in their order, whatever slot they fell to.
             let turns = self.slots[..used].iter().map(|slot| slot.tables.len()).max().unwrap_or(0);
             let parts =
                 (0..turns).flat_map(|turn| self.slots[..used].iter().filter_map(move |slot| slot.tables.get(turn)));
             let parts: Vec<Arc<HashGrad<f32>>> = parts.cloned().collect();
-            let dense = self.model.params.ids().zip(&self.slots[0].grads).find(|&(other, _)| other == id);
-            let dense = dense.and_then(|(_, sum)| sum.as_ref());
-            let moved = table.step(self.model.params.get_mut(id), &parts, dense, rate);
-            self.done.rows += moved.touched as u64;
-            skipped += moved.skipped as u64;
+            let dense = params.trainable().zip(&self.slots[0].grads).find(|&(other, _)| other == id);
+            let (dense, rate) = (dense.and_then(|(_, sum)| sum.as_ref()), rate * params.rate(id));
+            of_table = table.step(params.get_mut(id), &parts, dense, rate);
+            self.done.rows += of_table.touched as u64;
             self.slots.iter_mut().for_each(|slot| slot.tables.clear());
         }
-        let grads = &self.slots[0].grads;
-        let ids = self.model.params.ids();
-        let pairs = ids.zip(self.model.params.values_mut()).zip(grads);
-        let dense = pairs.filter(|((id, _), _)| Some(*id) != table_id).filter_map(|((_, p), g)| Some((p, g.as_ref()?)));
-        skipped + self.adam.step_pairs(dense, rate) as u64
+        // The sums are lent to the optimiser. A gradient without a share stands for the table, which has its own.
+        let sums = &mut self.slots[0].grads;
+        let lend = |(id, sum): (ParamId, &mut Option<Tensor<f32>>)| match sum.take_if(|_| Some(id) != table_id) {
+            Some(sum) => Gradient::from(sum),
+            None => Gradient::zero(params.get(id).shape()),
+        };
+        let grads: Vec<_> = params.trainable().zip(&mut *sums).map(lend).collect();
+        let mut report = self.adam.update(params, &grads, rate);
+        for (sum, grad) in sums.iter_mut().zip(grads).filter(|(_, grad)| !grad.is_zero()) {
+            *sum = Some(grad.into_dense(&self.pool));
+        }
+        if let Some(id) = table_id {
+            report.count(params.name(id), of_table.touched, of_table.skipped);
+        }
+        report
     }
 
     /// Chooses the number of rays so that the next step has as many samples as it should.

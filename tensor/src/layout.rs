@@ -226,7 +226,8 @@ impl Layout {
                 continue;
             }
             let (extent, stride) = (self.shape[axis] as isize, self.strides[axis]);
-            let outside = |place: isize| format!("{place} lies outside axis {axis} of a tensor of shape {:?}", self.shape);
+            let outside =
+                |place: isize| format!("{place} lies outside axis {axis} of a tensor of shape {:?}", self.shape);
             let from_start = |place: isize| if place < 0 { place + extent } else { place };
             match *place {
                 SliceInfoElem::Index(place) => {
@@ -290,7 +291,11 @@ impl Layout {
     pub fn reshaped(&self, shape: &[usize]) -> Option<Self> {
         assert_eq!(checked_len(shape), Some(self.len()), "cannot reshape {:?} to {shape:?}", self.shape);
         if self.is_empty() {
-            return Some(Layout { shape: Shape::from_slice(shape), strides: Strides::from_elem(0, shape.len()), ..*self });
+            return Some(Layout {
+                shape: Shape::from_slice(shape),
+                strides: Strides::from_elem(0, shape.len()),
+                ..*self
+            });
         }
         // Runs of axes that are one axis to memory, from the last one on, are cut into new axes.
         let runs = self.collapsed();

@@ -289,7 +289,9 @@ impl<T: Scalar> Tensor<T> {
         match &self.view {
             None => Tensor::from_vec(&self.shape, values),
             Some(view) if view.layout.len() >= self.buffer().len() => Tensor::strided(values, view.layout.clone()),
-            Some(_) => Tensor::from_vec(&self.shape, self.as_slice().iter().map(|&x| U::from_f64(x.to_f64())).collect()),
+            Some(_) => {
+                Tensor::from_vec(&self.shape, self.as_slice().iter().map(|&x| U::from_f64(x.to_f64())).collect())
+            }
         }
     }
 

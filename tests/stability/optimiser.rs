@@ -1,7 +1,9 @@
 //! Adam, dense and lazy.
 
 use crate::support::*;
-use raygrad::autograd::{Adam, AdamConfig, AdamW, Optimizer, Params, RowAdam, RowSums, Scalar, Sgd, SgdConfig, Tensor};
+use raygrad::autograd::{
+    Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, RowAdam, RowSums, Scalar, Sgd, SgdConfig, Tensor,
+};
 
 const TABLE: AdamConfig = AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 };
 
@@ -20,16 +22,28 @@ pub fn bound(config: &AdamConfig) -> f64 {
     (1..100_000).step_by(7).map(at).fold(1.0, f64::max)
 }
 
+/// A store of one parameter.
+fn store<T: Scalar>(value: Tensor<T>) -> Params<T> {
+    let mut params = Params::new();
+    params.add("x", value);
+    params
+}
+
+/// A step of that parameter; returns how many elements were left alone.
+fn step<T: Scalar>(adam: &mut dyn Optimizer<T>, params: &mut Params<T>, gradient: Tensor<T>, rate: f64) -> usize {
+    adam.update(params, &[Gradient::from(gradient)], rate).skipped
+}
+
 /// The way of each element in each of the steps with these gradients.
 fn ways<T: Scalar>(config: AdamConfig, gradients: &[Vec<f64>], rate: f64) -> Vec<Vec<f64>> {
     let n = gradients[0].len();
     let mut adam = Adam::<T>::new(config);
-    let mut x = [Tensor::zeros(&[n])];
+    let mut x = store(Tensor::zeros(&[n]));
     let way = |gradient: &Vec<f64>| {
         // From 0 each time, so that small steps keep their digits.
-        x[0].as_mut_slice().fill(T::ZERO);
-        adam.step(&mut x, &[vector(gradient)], rate);
-        numbers(&x[0])
+        x.values_mut()[0].as_mut_slice().fill(T::ZERO);
+        step(&mut adam, &mut x, vector(gradient), rate);
+        numbers(&x.values()[0])
     };
     gradients.iter().map(way).collect()
 }
@@ -109,14 +123,14 @@ fn a_huge_gradient_does_not_stop_an_element_for_ever<T: Scalar>() {
 /// Matrix: NaN is skipped and counted. Catalogue: lazy and dense.
 fn bad_gradients_are_skipped_and_counted<T: Scalar>() {
     let mut adam = Adam::<T>::new(AdamConfig::default());
-    let mut x = [vector::<T>(&[1.0; 4])];
-    let skipped = adam.step(&mut x, &[vector(&[f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1.0])], 0.1);
+    let mut x = store(vector::<T>(&[1.0; 4]));
+    let skipped = step(&mut adam, &mut x, vector(&[f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1.0]), 0.1);
     assert_eq!(skipped, 3);
-    let moved = numbers(&x[0]);
+    let moved = numbers(&x.values()[0]);
     assert!(moved[..3] == [1.0; 3] && (moved[3] - 0.9).abs() < 1e-6, "{moved:?}");
     // Nothing of them is remembered.
-    adam.step(&mut x, &[vector(&[0.0; 4])], 0.1);
-    assert_eq!(numbers(&x[0])[..3], [1.0; 3]);
+    step(&mut adam, &mut x, vector(&[0.0; 4]), 0.1);
+    assert_eq!(numbers(&x.values()[0])[..3], [1.0; 3]);
 }
 
 /// Matrix: 10^4 steps without gradient. Long run: 1e5 of them. Catalogue: denormal moments.
@@ -129,13 +143,13 @@ fn a_hundred_thousand_steps_without_gradient<T: Scalar>() {
         Box::new(AdamW::new(AdamConfig::default(), 0.01)),
         Box::new(Sgd::new(SgdConfig { momentum: 0.9, ..SgdConfig::default() })),
     ];
-    let zeros = [Tensor::zeros(&[4])];
+    let zeros = [Gradient::from(Tensor::zeros(&[4]))];
     for (k, optimizer) in optimisers.iter_mut().enumerate() {
-        optimizer.update(&mut params, &[vector(&[1.0, -1.0, 1e-12, 1e-30])], 1e-3);
+        step(&mut **optimizer, &mut params, vector(&[1.0, -1.0, 1e-12, 1e-30]), 1e-3);
         let mut last = numbers(params.get(id));
         let mut rest = None;
         for step in 0..100_000_u32 {
-            optimizer.update(&mut params, &zeros, 1e-3);
+            optimizer.update(&mut params, &zeros, 1e-3).check().unwrap();
             let now = numbers(params.get(id));
             let denormal = |x: &f64| *x != 0.0 && x.abs() < by_type::<T>(f32::MIN_POSITIVE.into(), f64::MIN_POSITIVE);
             assert!(now.iter().all(|x| x.is_finite() && !denormal(x)), "optimiser {k}, step {step}: {now:?}");
@@ -155,17 +169,17 @@ fn a_hundred_thousand_steps_without_gradient<T: Scalar>() {
 #[test]
 fn ten_million_steps() {
     let mut adam = Adam::<f32>::new(AdamConfig::default());
-    let mut x = [Tensor::<f32>::zeros(&[3])];
-    let gradient = [vector::<f32>(&[1.0, -1e-3, 0.0])];
+    let mut x = store(Tensor::<f32>::zeros(&[3]));
+    let gradient = [Gradient::from(vector::<f32>(&[1.0, -1e-3, 0.0]))];
     for step in 1..=10_000_000_u32 {
         if step % 1000 == 1 || step == 10_000_000 {
-            x[0].as_mut_slice().fill(0.0);
-            adam.step(&mut x, &gradient, 1.0);
-            let way = numbers(&x[0]);
+            x.values_mut()[0].as_mut_slice().fill(0.0);
+            adam.update(&mut x, &gradient, 1.0).check().unwrap();
+            let way = numbers(&x.values()[0]);
             let exact = [-1.0, 1.0, 0.0];
             (0..3).for_each(|i| within(&format!("step {step}"), way[i], exact[i], 3e-5));
         } else {
-            adam.step(&mut x, &gradient, 1.0);
+            adam.update(&mut x, &gradient, 1.0).check().unwrap();
         }
     }
     assert_eq!(adam.steps(), 10_000_000);
@@ -189,7 +203,7 @@ fn lazy_adam_with_pauses<T: Scalar>() {
                     let (m, v) = (m / (1.0 - config.beta1.powi(t)), v / (1.0 - config.beta2.powi(t)));
                     x -= 0.01 * m / (v.sqrt() + config.epsilon);
                 }
-                adam.step(&mut table, &mut sums, 0.01);
+                adam.step(&mut table, &mut sums, 0.01, 0.0);
                 within(&format!("every {every}, step {step}"), table[9].to_f64(), x, by_type::<T>(2e-6, 1e-13));
             }
             assert!(table.iter().enumerate().all(|(i, x)| i == 9 || *x == T::ZERO));
@@ -205,7 +219,7 @@ fn lazy_adam_with_pauses<T: Scalar>() {
     let mut adam = RowAdam::<T>::new(TABLE, 8, 1);
     let (mut table, mut sums) = (vec![T::ZERO; 8], RowSums::new(8, 1));
     sums.add(0, &[T::ONE]);
-    adam.step(&mut table, &mut sums, 1.0);
+    adam.step(&mut table, &mut sums, 1.0, 0.0);
     near::<T>("lazy", -table[0].to_f64(), 1.0, 1e-6);
 }
 
@@ -219,7 +233,7 @@ fn no_lazy_step_is_longer_than_the_bound<T: Scalar>() {
                 let sign = if step % 5 == 0 { -1.0 } else { 1.0 };
                 let mut sums = RowSums::new(8, 2);
                 sums.add(3, &[T::from_f64(sign * size); 2]);
-                adam.step(&mut table, &mut sums, 1.0);
+                adam.step(&mut table, &mut sums, 1.0, 0.0);
                 let way = table[7].to_f64().abs();
                 assert!(way <= bound(&config) * (1.0 + 1e-5), "|g| {size:e}, step {step}: {way:e}");
             }

@@ -1,7 +1,7 @@
 //! What is left out: empty cells, and what lies behind opaque samples.
 
 use crate::support::*;
-use raygrad::autograd::{Bound, Scalar, Segments, Tape, Tensor, Var};
+use raygrad::autograd::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
 use raygrad::nerf::sampler::Jitter;
@@ -45,7 +45,7 @@ fn training_ends_rays_within_the_bound<T: Scalar>() {
             let t = vector::<T>(&(0..n).map(|i| 2.0 * i as f64 / n as f64).collect::<Vec<_>>());
             let tape = Tape::new();
             let samples = Samples::new(&rays, Segments::uniform(1, n), t, vector(&vec![delta; n]), tape.pool());
-            let params = Bound::from_vars(vec![]);
+            let params = Params::new().bind(&tape);
             let fog = Fog { sigma: 1.0, white_behind };
             let all = composite_visible(&fog, &params, &samples, 0.0, false, &tape);
             let some = composite_visible(&fog, &params, &samples, eps, false, &tape);

@@ -114,8 +114,10 @@ mod tests {
             assert!(params.values()[0].as_slice().iter().all(|w| w.abs() <= 0.2_f64.sqrt()));
             let mut inputs = vec![Tensor::from_fn(&[2, 2, 4, 3], |i| (i as f64 * 0.7).sin())];
             inputs.extend(params.values().iter().cloned());
-            check_function(&Check::default(), &inputs, |x| layer.forward(&Bound::from_vars(x[1..].to_vec()), &x[0]))
-                .unwrap();
+            check_function(&Check::default(), &inputs, |x| {
+                layer.forward(&params.layout().bind(x[1..].to_vec()), &x[0])
+            })
+            .unwrap();
         }
     }
 
@@ -144,7 +146,8 @@ mod tests {
             let y = model.forward(&bound, &x, Pass::Train(0));
             let loss = (y - tape.constant(labels.clone())).square().mean();
             losses.push(loss.item());
-            sgd.update(&mut params, &loss.grad_once(&bound.vars()), 0.01);
+            let grads = bound.backward(&loss);
+            sgd.update(&mut params, &grads, 0.01).check().unwrap();
         }
         assert!(losses[0] > 0.1 && losses[59] < 1e-2, "{} to {}", losses[0], losses[59]);
     }

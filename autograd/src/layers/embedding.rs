@@ -8,25 +8,26 @@ use std::sync::Arc;
 
 /// A table with a row of numbers for each of many things: words, images, places.
 ///
-/// The gradient of the table is sparse: [`Var::backward`] gives [`RowGrad`](crate::RowGrad)s, and
-/// [`TableAdam`](crate::TableAdam) reads and moves only the rows in them. All other gradients and optimisers see a table
-/// that is mostly zeros.
+/// The gradient of the table consists of the rows that were used ([`RowGrad`](crate::RowGrad)s), from the tape to the
+/// optimiser. With [`Params::set_lazy`] only these rows are read and moved; without, the optimiser treats the table as it
+/// treats any parameter, whose gradient is mostly 0.
 ///
 /// ```
-/// use raygrad_autograd::{AdamConfig, Embedding, Init, Params, RowGrad, TableAdam, Tape};
+/// use raygrad_autograd::{Adam, AdamConfig, Embedding, Init, Optimizer, Params, Tape};
 /// use rand::SeedableRng;
 /// let mut rng = rand::rngs::StdRng::seed_from_u64(1);
 /// let mut params = Params::<f32>::new();
 /// let words = Embedding::new(&mut params, "words", [1000, 8], Init::Normal(0.1), &mut rng);
-/// let mut adam = TableAdam::new(AdamConfig::default(), [1000, 8]);
+/// params.set_lazy(|name| name == "words.weight", true);
+/// let mut adam = Adam::new(AdamConfig::default());
 ///
 /// let tape = Tape::new();
 /// let bound = params.bind(&tape);
 /// let vectors = words.forward(&bound, &[17, 4, 17].into());
 /// assert_eq!(vectors.shape(), [3, 8]);
-/// let mut gradient = vectors.square().sum().backward(&[&bound[words.table()]]).remove(0);
-/// let stats = adam.step(params.get_mut(words.table()), &gradient.take::<RowGrad<f32>>(), 1e-3);
-/// assert_eq!(stats.touched, 2);
+/// let grads = bound.backward(&vectors.square().sum());
+/// let report = adam.update(&mut params, &grads, 1e-3);
+/// assert_eq!(report.moved, 2 * 8);
 /// ```
 #[derive(Debug, Clone, Copy)]
 pub struct Embedding {
@@ -74,7 +75,7 @@ mod tests {
         assert_eq!(params.iter().map(|(name, _)| name).collect::<Vec<_>>(), ["words.weight"]);
         let table = params.values()[0].clone();
         check_function(&Check::default(), std::slice::from_ref(&table), |x| {
-            layer.forward(&Bound::from_vars(x.to_vec()), &[4, 1, 4].into()).exp()
+            layer.forward(&params.layout().bind(x.to_vec()), &[4, 1, 4].into()).exp()
         })
         .unwrap();
         let tape = Tape::new();

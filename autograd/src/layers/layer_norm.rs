@@ -71,7 +71,7 @@ mod tests {
         let forward = |x: &[Tensor<f64>]| {
             let tape = Tape::new();
             let vars: Vec<_> = x[1..].iter().map(|x| tape.constant(x.clone())).collect();
-            norm.forward(&Bound::from_vars(vars), &tape.constant(x[0].clone())).into_value()
+            norm.forward(&params.layout().bind(vars), &tape.constant(x[0].clone())).into_value()
         };
         let got = forward(&inputs);
         for (row, got) in inputs[0].as_slice().chunks(4).zip(got.as_slice().chunks(4)) {
@@ -83,7 +83,7 @@ mod tests {
                 assert!((got[k] - expected).abs() < 1e-13, "{} instead of {expected}", got[k]);
             }
         }
-        check_function(&Check::default(), &inputs, |x| norm.forward(&Bound::from_vars(x[1..].to_vec()), &x[0]))
+        check_function(&Check::default(), &inputs, |x| norm.forward(&params.layout().bind(x[1..].to_vec()), &x[0]))
             .unwrap();
     }
 }

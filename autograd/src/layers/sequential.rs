@@ -178,11 +178,10 @@ mod tests {
             let x = tape.leaf(Tensor::from_fn(&[6, 2], |i| (i as f64 * 0.7).sin()));
             let mut inputs = vec![&x];
             inputs.extend(bound.vars());
-            let whole = model.clone();
+            let (whole, layout) = (model.clone(), params.layout());
             let y = match checked {
-                true => tape.checkpoint(&inputs, move |x| {
-                    whole.forward(&Bound::from_vars(x[1..].to_vec()), &x[0], Pass::Train(9))
-                }),
+                true => tape
+                    .checkpoint(&inputs, move |x| whole.forward(&layout.bind(x[1..].to_vec()), &x[0], Pass::Train(9))),
                 false => model.forward(&bound, &x, Pass::Train(9)),
             };
             y.square().sum().grad(&inputs)
@@ -197,7 +196,7 @@ mod tests {
         let mut inputs = vec![Tensor::from_fn(&[3, 2], |i| (i as f64 + 0.5).cos())];
         inputs.extend(params.values().iter().cloned());
         check_function(&Check::default(), &inputs, |x| {
-            model.forward(&Bound::from_vars(x[1..].to_vec()), &x[0], Pass::Train(5)).square()
+            model.forward(&params.layout().bind(x[1..].to_vec()), &x[0], Pass::Train(5)).square()
         })
         .unwrap();
     }

@@ -1,25 +1,38 @@
 //! Adam and AdamW.
 
-use super::{CHUNK, Move, Optimizer, TINY, TINY_SQUARE, check_shapes, limited, remember, slot};
-use raygrad_tensor::{Scalar, Tensor, simd};
+use super::limits::{flushed, limited, tiny, tiny_square};
+use super::settings::{check, check_rate, check_share, or_panic};
+use super::state::{Reader, memories};
+use super::{CHUNK, Move, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, remember, slot};
+use crate::{Gradient, Params, RowAdam, RowSums};
+use raygrad_tensor::{Pool, Scalar, simd};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Adam (Kingma and Ba 2015, algorithm 1).
 ///
 /// Bias corrections are computed in f64 from an integer step count, which each parameter has for itself. First moments
-/// below 1e-30 and second ones below 1e-37 are set to 0, so that long runs without gradient do not fill memory with
+/// below 1e-30 (1e-300 in f64) and second ones below 1e-37 (1e-307) are set to 0, so that long runs without gradient do not fill memory with
 /// denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their squares are finite. Work
 /// is spread over the current rayon pool; the result does not depend on the number of threads.
+///
+/// A lazy parameter ([`Params::set_lazy`]) is moved by [`RowAdam`]: rows without gradient are not read, and each counts
+/// its own steps. A step whose gradient does not consist of rows alone, because a penalty on the whole table is part of
+/// the loss, visits every row whose gradient is not zero.
 #[derive(Debug, Clone)]
 pub struct Adam<T: Scalar> {
     config: AdamConfig,
     step: u64,
-    moments: Vec<Moments<T>>,
+    memory: Vec<Memory<T>>,
+    /// Made for the first lazy parameter: its constants are for all.
+    rows: Option<RowAdam<T>>,
+    /// For gradients that have to be added up.
+    pool: Pool<T>,
 }
 
 /// Adam with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2): before each step a parameter is
-/// multiplied by `1 - rate decay`. An element whose gradient is infinite or NaN does not decay either.
+/// multiplied by `1 - rate decay`. An element whose gradient is infinite or NaN does not decay either, nor does a row of
+/// a lazy parameter without gradient.
 #[derive(Debug, Clone)]
 pub struct AdamW<T: Scalar> {
     adam: Adam<T>,
@@ -29,12 +42,12 @@ pub struct AdamW<T: Scalar> {
 /// Constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AdamConfig {
-    /// Decay of the first moment, in 0..1.
+    /// Decay of the first moment, at least 0 and less than 1.
     pub beta1: f64,
-    /// Decay of the second moment, in 0..1.
+    /// Decay of the second moment, at least 0 and less than 1.
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
-    /// networks, 1e-15 hash tables.
+    /// networks, 1e-15 hash tables. At least 1e-30.
     pub epsilon: f64,
 }
 
@@ -45,7 +58,29 @@ impl Default for AdamConfig {
     }
 }
 
+impl AdamConfig {
+    /// Whether the constants are in their ranges.
+    ///
+    /// # Errors
+    /// If one is not, with its name.
+    pub fn check(&self) -> Result<(), SettingError> {
+        check_share("beta1", self.beta1)?;
+        check_share("beta2", self.beta2)?;
+        check("epsilon", self.epsilon, (1e-30..=1e30).contains(&self.epsilon), "1e-30 to 1e30")
+    }
+}
+
 /// What Adam knows of one parameter.
+#[derive(Debug, Clone, Default)]
+enum Memory<T> {
+    /// Not moved so far.
+    #[default]
+    Nothing,
+    Dense(Moments<T>),
+    Rows(Box<Table<T>>),
+}
+
+/// Moments of a parameter that is moved as a whole.
 #[derive(Debug, Clone, Default)]
 struct Moments<T> {
     step: u64,
@@ -53,10 +88,23 @@ struct Moments<T> {
     second: Vec<T>,
 }
 
+/// A parameter of which only rows are moved.
+#[derive(Debug, Clone)]
+struct Table<T> {
+    adam: RowAdam<T>,
+    /// Nothing between steps.
+    sums: Option<RowSums<T>>,
+}
+
 impl<T: Scalar> Adam<T> {
     /// An optimiser that has seen nothing.
+    ///
+    /// # Panics
+    /// If [`AdamConfig::check`] finds something.
+    #[track_caller]
     pub fn new(config: AdamConfig) -> Self {
-        Adam { config, step: 0, moments: vec![] }
+        or_panic(config.check());
+        Adam { config, step: 0, memory: vec![], rows: None, pool: Pool::new() }
     }
 
     /// Number of steps taken.
@@ -64,74 +112,115 @@ impl<T: Scalar> Adam<T> {
         self.step
     }
 
-    /// Moves each parameter against its gradient with learning rate `rate`, and returns how many elements were left
-    /// alone because their gradient was infinite or NaN.
-    ///
-    /// # Panics
-    /// If the number or a shape of the gradients is not that of the parameters, or of the parameters of the last step.
+    /// A step with decoupled weight decay.
     #[track_caller]
-    pub fn step(&mut self, params: &mut [Tensor<T>], grads: &[Tensor<T>], rate: f64) -> usize {
-        assert_eq!(params.len(), grads.len(), "as many gradients as parameters");
-        self.step_pairs(params.iter_mut().zip(grads), rate)
-    }
-
-    /// As [`step`](Self::step), for parameters that come with their gradients: always the same ones, in the same order.
-    ///
-    /// # Panics
-    /// As [`step`](Self::step).
-    #[track_caller]
-    pub fn step_pairs<'a>(
-        &mut self,
-        pairs: impl Iterator<Item = (&'a mut Tensor<T>, &'a Tensor<T>)>,
-        rate: f64,
-    ) -> usize {
-        let known = (self.step > 0).then_some(self.moments.len());
-        let mut count = 0;
-        let moves = pairs.enumerate().map(|(slot, (value, grad))| Move { slot, value, grad, rate, decay: 1.0 });
-        let skipped = self.advance_with(moves.inspect(|_| count += 1), 0.0);
-        assert!(known.is_none_or(|known| known == count), "as many parameters as in the first step");
-        skipped
-    }
-
-    #[track_caller]
-    fn advance_with<'a>(&mut self, moves: impl Iterator<Item = Move<'a, T>>, decay: f64) -> usize {
+    fn decayed(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64, decay: f64) -> UpdateReport {
         self.step += 1;
-        let AdamConfig { beta1, beta2, epsilon } = self.config;
-        let mut skipped = 0;
-        for part in moves {
-            check_shapes(&part);
-            let moments = slot(&mut self.moments, part.slot);
-            let first = moments.step == 0;
-            moments.step += 1;
-            // 1 - beta^t without cancellation.
-            let correction = |beta: f64| -(moments.step as f64 * beta.ln()).exp_m1();
-            let root = correction(beta2).sqrt();
+        let mut report = UpdateReport::default();
+        for part in params.moves(grads, rate) {
             let decay = decay * part.decay;
-            let update = Update {
-                beta: [beta1, beta2].map(T::from_f64),
-                rest: [1.0 - beta1, 1.0 - beta2].map(T::from_f64),
-                rate: T::from_f64(part.rate * root / correction(beta1)),
-                epsilon: T::from_f64(epsilon * root),
-                keep: T::from_f64(1.0 - part.rate * decay),
-                tiniest: T::from_f64(if decay == 0.0 { 0.0 } else { TINY }),
-            };
-            let m = remember(&mut moments.first, part.value.len(), first);
-            let v = remember(&mut moments.second, part.value.len(), first);
-            let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
-            let values = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(part.grad.as_slice().par_chunks(CHUNK));
-            skipped += values.zip(moments).map(|((x, g), (m, v))| update.apply(x, g, m, v)).sum::<usize>();
+            let (name, moved, skipped) = if part.lazy { self.rows(part, decay) } else { self.dense(part, decay) };
+            report.count(name, moved, skipped);
         }
-        skipped
+        report
+    }
+
+    /// Moves a parameter as a whole; returns its name and how many elements were moved and left alone.
+    #[track_caller]
+    fn dense<'a>(&mut self, part: Move<'a, T>, decay: f64) -> (&'a str, usize, usize) {
+        let memory = slot(&mut self.memory, part.slot);
+        if let Memory::Nothing = memory {
+            *memory = Memory::Dense(Moments::default());
+        }
+        let Memory::Dense(moments) = memory else { panic!("`{}` was lazy until now", part.name) };
+        moments.step += 1;
+        let AdamConfig { beta1, beta2, epsilon } = self.config;
+        // 1 - beta^t without cancellation.
+        let correction = |beta: f64| -(moments.step as f64 * beta.ln()).exp_m1();
+        let root = correction(beta2).sqrt();
+        let update = Update {
+            beta: [beta1, beta2].map(T::from_f64),
+            rest: [1.0 - beta1, 1.0 - beta2].map(T::from_f64),
+            rate: T::from_f64(part.rate * root / correction(beta1)),
+            epsilon: T::from_f64(epsilon * root),
+            keep: T::from_f64(1.0 - part.rate * decay),
+            tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
+        };
+        let m = remember(&mut moments.first, &part);
+        let v = remember(&mut moments.second, &part);
+        let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
+        let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
+        let values = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(grad.as_slice().par_chunks(CHUNK));
+        let skipped = values.zip(moments).map(|((x, g), (m, v))| update.apply(x, g, m, v)).sum::<usize>();
+        (part.name, len - skipped, skipped)
+    }
+
+    /// Moves the rows of a table whose gradient is not zero; returns the same.
+    #[track_caller]
+    fn rows<'a>(&mut self, part: Move<'a, T>, decay: f64) -> (&'a str, usize, usize) {
+        let [rows, features] = part.table();
+        let memory = slot(&mut self.memory, part.slot);
+        if let Memory::Nothing = memory {
+            let config = self.config;
+            let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1)).fresh([rows, features]);
+            *memory = Memory::Rows(Box::new(Table { adam, sums: None }));
+        }
+        let Memory::Rows(table) = memory else { panic!("`{}` was not lazy until now", part.name) };
+        let sums = part.row_sums(&mut table.sums, &self.pool);
+        let stats = table.adam.step(part.value.as_mut_slice(), sums, part.rate, decay);
+        (part.name, stats.touched * features, stats.skipped * features)
     }
 }
 
 impl<T: Scalar> Optimizer<T> for Adam<T> {
     #[track_caller]
-    fn advance<'a>(&mut self, moves: &mut dyn Iterator<Item = Move<'a, T>>) -> usize
-    where
-        T: 'a,
-    {
-        self.advance_with(moves, 0.0)
+    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
+        self.decayed(params, grads, rate, 0.0)
+    }
+
+    fn state(&self, params: &Params<T>) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        state.put_counts("", "steps", vec![self.step]);
+        for (name, shape, memory) in memories(params, &self.memory) {
+            let [first, second] = match memory {
+                Memory::Nothing => continue,
+                Memory::Dense(Moments { step, first, second }) => {
+                    state.put_counts(name, "step", vec![*step]);
+                    [first.clone(), second.clone()]
+                }
+                Memory::Rows(table) => {
+                    state.put_counts(name, "row_steps", table.adam.row_steps());
+                    table.adam.moments()
+                }
+            };
+            state.put(name, "first", shape, first);
+            state.put(name, "second", shape, second);
+        }
+        state
+    }
+
+    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
+        let mut reader = Reader::new(state);
+        let (step, mut memory) = (reader.steps()?, vec![]);
+        for (name, value) in params.iter() {
+            let (shape, config) = (value.shape(), self.config);
+            let rows = shape.first().copied().unwrap_or(1);
+            memory.push(if let Some(steps) = reader.counts(name, "row_steps", rows)? {
+                let moments = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
+                let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1));
+                let mut adam = adam.fresh([rows, value.len() / rows.max(1)]);
+                adam.load(moments.each_ref().map(Vec::as_slice), steps);
+                Memory::Rows(Box::new(Table { adam, sums: None }))
+            } else if let Some(steps) = reader.counts(name, "step", 1)? {
+                let [first, second] = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
+                Memory::Dense(Moments { step: steps[0], first, second })
+            } else {
+                Memory::Nothing
+            });
+        }
+        reader.finish()?;
+        (self.step, self.memory) = (step, memory);
+        Ok(())
     }
 }
 
@@ -139,7 +228,12 @@ impl<T: Scalar> AdamW<T> {
     /// An optimiser that has seen nothing. `decay` is the part of a parameter that goes at each step at learning rate 1,
     /// customarily 0.01; parameters can have a factor of their own, such as 0 for biases
     /// ([`Params::set_decay`](crate::Params::set_decay)).
+    ///
+    /// # Panics
+    /// If [`AdamConfig::check`] finds something, or the decay is not within 0 to 1e30.
+    #[track_caller]
     pub fn new(config: AdamConfig, decay: f64) -> Self {
+        or_panic(check_rate("decay", decay));
         AdamW { adam: Adam::new(config), decay }
     }
 
@@ -151,11 +245,16 @@ impl<T: Scalar> AdamW<T> {
 
 impl<T: Scalar> Optimizer<T> for AdamW<T> {
     #[track_caller]
-    fn advance<'a>(&mut self, moves: &mut dyn Iterator<Item = Move<'a, T>>) -> usize
-    where
-        T: 'a,
-    {
-        self.adam.advance_with(moves, self.decay)
+    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
+        self.adam.decayed(params, grads, rate, self.decay)
+    }
+
+    fn state(&self, params: &Params<T>) -> OptimizerState<T> {
+        self.adam.state(params)
+    }
+
+    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
+        self.adam.load_state(params, state)
     }
 }
 
@@ -173,7 +272,6 @@ struct Update<T> {
 
 impl<T: Scalar> Update<T> {
     fn apply(&self, x: &mut [T], g: &[T], m: &mut [T], v: &mut [T]) -> usize {
-        let (tiny, tiny_square) = (T::from_f64(TINY), T::from_f64(TINY_SQUARE));
         let n = x.len();
         let (g, m, v) = (&g[..n], &mut m[..n], &mut v[..n]);
         simd::dispatch(
@@ -181,15 +279,14 @@ impl<T: Scalar> Update<T> {
             || {
                 let mut skipped = 0;
                 for i in 0..n {
-                    let good = g[i].is_finite();
-                    let g = limited(g[i]);
-                    let first = self.beta[0] * m[i] + self.rest[0] * g;
+                    let (finite, g) = (g[i].is_finite(), limited(g[i]));
+                    let first = flushed(self.beta[0] * m[i] + self.rest[0] * g);
                     let second = self.beta[1] * v[i] + self.rest[1] * (g * g);
-                    let first = if first > tiny || first < -tiny { first } else { T::ZERO };
-                    let second = if second > tiny_square { second } else { T::ZERO };
+                    let second = if second > tiny_square() { second } else { T::ZERO };
                     let kept = x[i] * self.keep;
                     let kept = if kept < self.tiniest && kept > -self.tiniest { T::ZERO } else { kept };
                     let moved = kept - self.rate * first / (second.sqrt() + self.epsilon);
+                    let good = finite && moved.is_finite();
                     m[i] = if good { first } else { m[i] };
                     v[i] = if good { second } else { v[i] };
                     x[i] = if good { moved } else { x[i] };
@@ -204,12 +301,24 @@ impl<T: Scalar> Update<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use raygrad_tensor::Tensor;
+
+    fn store<T: Scalar>(value: Tensor<T>) -> Params<T> {
+        let mut params = Params::new();
+        params.add("x", value);
+        params
+    }
+
+    /// One step of a single parameter; returns how many elements were left alone.
+    fn step<T: Scalar>(adam: &mut impl Optimizer<T>, params: &mut Params<T>, grad: Tensor<T>, rate: f64) -> usize {
+        adam.update(params, &[grad.into()], rate).skipped
+    }
 
     fn one_step(g: f64, epsilon: f64) -> f64 {
-        let mut adam = Adam::<f32>::new(AdamConfig { epsilon, ..AdamConfig::default() });
-        let mut x = [Tensor::scalar(0.0_f32)];
-        adam.step(&mut x, &[Tensor::scalar(g as f32)], 1.0);
-        f64::from(x[0].item())
+        let mut params = store(Tensor::scalar(0.0_f32));
+        let mut adam = Adam::new(AdamConfig { epsilon, ..AdamConfig::default() });
+        step(&mut adam, &mut params, Tensor::scalar(g as f32), 1.0);
+        f64::from(params.values()[0].item())
     }
 
     #[test]
@@ -224,109 +333,101 @@ mod tests {
     }
 
     #[test]
-    fn follows_the_algorithm_in_f64() {
+    fn follows_the_algorithm_in_f64_with_and_without_decay() {
         let gradient = |t: usize| (t as f64 * 0.7).sin();
-        let mut adam = Adam::<f64>::new(AdamConfig::default());
-        let mut x = [Tensor::scalar(0.5)];
-        let (mut m, mut v, mut expected) = (0.0, 0.0, 0.5);
-        for t in 1..=500 {
-            let g = gradient(t);
-            adam.step(&mut x, &[Tensor::scalar(g)], 0.01);
-            m = 0.9 * m + 0.1 * g;
-            v = 0.999 * v + 0.001 * g * g;
-            let (mh, vh) = (m / (1.0 - 0.9_f64.powi(t as i32)), v / (1.0 - 0.999_f64.powi(t as i32)));
-            expected -= 0.01 * mh / (vh.sqrt() + 1e-8);
-            assert!((x[0].item() - expected).abs() < 1e-10, "step {t}");
+        for (factor, decay) in [(1.0, 0.1), (0.0, 0.1), (3.0, 0.02)] {
+            let (mut adam, mut params) = (AdamW::new(AdamConfig::default(), decay), store(Tensor::scalar(0.5)));
+            let (mut plain, mut free) = (Adam::new(AdamConfig::default()), store(Tensor::scalar(0.5)));
+            params.set_decay(|_| true, factor);
+            let (mut m, mut v, mut expected, mut undecayed) = (0.0, 0.0, 0.5, 0.5);
+            for t in 1..=500 {
+                let (g, rate) = (gradient(t), 0.01 * (1.0 + (t as f64).cos().abs()));
+                assert_eq!(step(&mut adam, &mut params, Tensor::scalar(g), rate), 0);
+                assert_eq!(step(&mut plain, &mut free, Tensor::scalar(g), rate), 0);
+                m = 0.9 * m + 0.1 * g;
+                v = 0.999 * v + 0.001 * g * g;
+                let (mh, vh): (f64, f64) = (m / (1.0 - 0.9_f64.powi(t as i32)), v / (1.0 - 0.999_f64.powi(t as i32)));
+                let way = rate * mh / (vh.sqrt() + 1e-8);
+                expected = expected - rate * factor * decay * expected - way;
+                undecayed -= way;
+                assert!((params.values()[0].item() - expected).abs() < 1e-10, "step {t}");
+                assert!((free.values()[0].item() - undecayed).abs() < 1e-10, "step {t}");
+            }
         }
     }
 
     #[test]
     fn nan_is_skipped_and_counted_and_nothing_goes_denormal() {
         let mut adam = Adam::<f32>::new(AdamConfig::default());
-        let mut x = [Tensor::from_vec(&[3], vec![1.0, 2.0, 3.0_f32])];
-        let skipped = adam.step(&mut x, &[Tensor::from_vec(&[3], vec![1.0, f32::NAN, f32::INFINITY])], 0.1);
-        assert_eq!(skipped, 2);
-        assert_eq!(&x[0].as_slice()[1..], [2.0, 3.0]);
+        let mut params = store(Tensor::from_vec(&[4], vec![1.0, 2.0, 3.0, f32::MAX]));
+        params.set_rate(|_| true, 1e3);
+        let grad = Tensor::from_vec(&[4], vec![1.0, f32::NAN, f32::INFINITY, -1.0]);
+        let report = adam.update(&mut params, &[grad.into()], 1e30);
+        assert_eq!((report.moved, report.skipped, report.is_stuck()), (1, 3, false), "the last step overflows");
+        assert_eq!(report.bad, [("x".to_owned(), 3)]);
+        let message = report.check().unwrap_err().to_string();
+        assert_eq!(message, "3 of 4 elements stay where they are, for their gradient is not finite: 3 of `x`");
+        assert_eq!(&params.values()[0].as_slice()[1..], [2.0, 3.0, f32::MAX]);
         for _ in 0..10_000 {
-            adam.step(&mut x, &[Tensor::zeros(&[3])], 0.1);
+            step(&mut adam, &mut params, Tensor::zeros(&[4]), 0.1);
         }
-        let Moments { first, second, .. } = &adam.moments[0];
+        let Memory::Dense(Moments { first, second, .. }) = &adam.memory[0] else { panic!("no moments") };
         assert!(first.iter().chain(second).all(|x| *x == 0.0 || x.is_normal()), "{first:?} {second:?}");
-        assert!(x[0].is_finite());
-    }
-
-    #[test]
-    fn decoupled_decay_follows_the_algorithm_in_f64() {
-        let gradient = |t: usize| (t as f64 * 0.7).sin();
-        for (factor, decay) in [(1.0, 0.1), (0.0, 0.1), (3.0, 0.02)] {
-            let mut adam = AdamW::<f64>::new(AdamConfig::default(), decay);
-            let mut value = Tensor::scalar(0.5);
-            let (mut m, mut v, mut expected) = (0.0, 0.0, 0.5);
-            for t in 1..=500 {
-                let (grad, rate) = (Tensor::scalar(gradient(t)), 0.01 * (1.0 + (t as f64).cos().abs()));
-                let part = Move { slot: 4, value: &mut value, grad: &grad, rate, decay: factor };
-                assert_eq!(adam.advance(&mut [part].into_iter()), 0);
-                let g = gradient(t);
-                m = 0.9 * m + 0.1 * g;
-                v = 0.999 * v + 0.001 * g * g;
-                let (mh, vh) = (m / (1.0 - 0.9_f64.powi(t as i32)), v / (1.0 - 0.999_f64.powi(t as i32)));
-                expected = expected - rate * factor * decay * expected - rate * mh / (vh.sqrt() + 1e-8);
-                assert!((value.item() - expected).abs() < 1e-10, "step {t}");
-            }
-        }
+        assert!(params.values()[0].is_finite());
+        assert!(adam.update(&mut params, &[Tensor::full(&[4], f32::NAN).into()], 0.1).is_stuck());
+        assert!(!adam.update(&mut params, &[Tensor::zeros(&[4]).into()], 0.1).is_stuck());
     }
 
     #[test]
     fn a_decaying_parameter_ends_at_zero_and_a_bad_gradient_stops_it() {
         let mut adam = AdamW::<f32>::new(AdamConfig::default(), 1.0);
-        let mut value = Tensor::from_vec(&[2], vec![1e-25_f32, 1e-25]);
-        let grad = Tensor::from_vec(&[2], vec![0.0, f32::NAN]);
+        let mut params = store(Tensor::from_vec(&[2], vec![1e-25_f32, 1e-25]));
         let mut skipped = 0;
         for _ in 0..300 {
-            let part = Move { slot: 0, value: &mut value, grad: &grad, rate: 0.1, decay: 1.0 };
-            skipped += adam.advance(&mut [part].into_iter());
-            assert!(value.as_slice().iter().all(|x| !x.is_subnormal()));
+            skipped += step(&mut adam, &mut params, Tensor::from_vec(&[2], vec![0.0, f32::NAN]), 0.1);
+            assert!(params.values()[0].as_slice().iter().all(|x| !x.is_subnormal()));
         }
-        assert_eq!((value.as_slice(), skipped), (&[0.0, 1e-25][..], 300));
+        assert_eq!((params.values()[0].as_slice(), skipped), (&[0.0, 1e-25][..], 300));
         // Without decay a tiny parameter stays as it is.
-        let mut adam = Adam::<f32>::new(AdamConfig::default());
-        let mut x = [Tensor::scalar(1e-40_f32)];
-        adam.step(&mut x, &[Tensor::scalar(0.0)], 0.1);
-        assert_eq!(x[0].item(), 1e-40);
+        let mut params = store(Tensor::scalar(1e-40_f32));
+        step(&mut Adam::new(AdamConfig::default()), &mut params, Tensor::scalar(0.0), 0.1);
+        assert_eq!(params.values()[0].item(), 1e-40);
     }
 
     #[test]
-    fn a_parameter_that_comes_later_has_its_own_count() {
+    fn a_parameter_that_rests_at_first_has_its_own_count() {
         let mut adam = Adam::<f64>::new(AdamConfig::default());
-        let (mut a, mut b) = (Tensor::scalar(0.0), Tensor::scalar(0.0));
-        let grad = Tensor::scalar(1.0);
+        let mut params = Params::new();
+        let [a, b, c] = ["a", "b", "c"].map(|name| params.add(name, Tensor::scalar(0.0)));
+        let one = || Gradient::from(Tensor::scalar(1.0));
         for step in 0..50 {
-            let first = Move { slot: 0, value: &mut a, grad: &grad, rate: 0.1, decay: 1.0 };
-            let second = Move { slot: 7, value: &mut b, grad: &grad, rate: 0.1, decay: 1.0 };
-            adam.advance(&mut [Some(first), (step >= 40).then_some(second)].into_iter().flatten());
+            // One is frozen, of the other one nothing depends.
+            let late = step >= 40;
+            params.freeze(|name| name == "c");
+            params.unfreeze(|name| late && name == "c");
+            let mut grads = vec![one(), if late { one() } else { Gradient::zero(&[]) }];
+            grads.extend(late.then(one));
+            assert_eq!(adam.update(&mut params, &grads, 0.1).check(), Ok(if late { 3 } else { 1 }));
         }
         // With a constant gradient every step is one learning rate, from the first one on.
-        assert!((a.item() + 5.0).abs() < 1e-6 && (b.item() + 1.0).abs() < 1e-6, "{a:?} {b:?}");
+        let way = |id| -params.get(id).item();
+        assert!((way(a) - 5.0).abs() < 1e-6 && (way(b) - 1.0).abs() < 1e-6 && (way(c) - 1.0).abs() < 1e-6);
         assert_eq!(adam.steps(), 50);
     }
 
     #[test]
     fn empty_parameters_and_long_ones_take_the_same_step() {
-        let mut adam = Adam::<f32>::new(AdamConfig::default());
-        let len = 2 * CHUNK + 3;
-        let mut x = [Tensor::zeros(&[0, 3]), Tensor::zeros(&[len])];
-        let grads = [Tensor::zeros(&[0, 3]), Tensor::from_fn(&[len], |i| 1.0 + (i % 7) as f32)];
-        assert_eq!(adam.step(&mut x, &grads, 0.5), 0);
-        assert!(x[1].as_slice().iter().all(|x| (x + 0.5).abs() < 1e-6));
-    }
-
-    #[test]
-    #[should_panic(expected = "as many parameters as in the first step")]
-    fn a_parameter_cannot_be_left_out_of_a_step() {
-        let mut adam = Adam::<f32>::new(AdamConfig::default());
-        let mut x = [Tensor::scalar(0.0), Tensor::scalar(0.0)];
-        let grads = [Tensor::scalar(1.0), Tensor::scalar(1.0)];
-        adam.step(&mut x, &grads, 0.1);
-        adam.step(&mut x[..1], &grads[..1], 0.1);
+        for lazy in [false, true] {
+            let mut params = Params::<f32>::new();
+            let len = 2 * CHUNK + 3;
+            let shapes = [&[0, 3][..], &[3, 0], &[len], &[]];
+            for (i, shape) in shapes.iter().enumerate() {
+                params.add(i.to_string(), Tensor::zeros(shape));
+            }
+            params.set_lazy(|_| true, lazy);
+            let grads = shapes.map(|shape| Tensor::from_fn(shape, |i| 1.0 + (i % 7) as f32).into());
+            assert_eq!(Adam::new(AdamConfig::default()).update(&mut params, &grads, 0.5).check(), Ok(len + 1));
+            assert!(params.values().iter().flat_map(Tensor::as_slice).all(|x| (x + 0.5).abs() < 1e-6));
+        }
     }
 }

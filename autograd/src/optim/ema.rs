@@ -1,8 +1,10 @@
 //! Averages of parameters.
 
-use super::TINY;
+use super::limits::flushed;
+use super::state::Reader;
+use super::{OptimizerState, StateError};
 use crate::Params;
-use raygrad_tensor::{Scalar, simd};
+use raygrad_tensor::{Scalar, Tensor, simd};
 
 /// The exponential moving average of parameters: `a = decay a + (1 - decay) x` after each step. It is often a better
 /// model than the parameters themselves, whose last steps are noise (Polyak and Juditsky 1992).
@@ -42,7 +44,7 @@ impl<T: Scalar> Ema<T> {
     }
 
     /// Takes the parameters after a step into account, and returns how many elements were left alone because the
-    /// parameter is infinite or NaN. Averages below 1e-30 become 0.
+    /// parameter is infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
     ///
     /// # Panics
     /// If the number or the size of the parameters has changed.
@@ -67,6 +69,32 @@ impl<T: Scalar> Ema<T> {
         &self.average
     }
 
+    /// The averages and how many steps they have taken, so that a run can go on later.
+    pub fn state(&self) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        state.put_counts("", "steps", vec![self.steps]);
+        for (name, value) in self.average.iter() {
+            state.put(name, "average", value.shape(), value.as_slice().to_vec());
+        }
+        state
+    }
+
+    /// Goes on from what [`state`](Self::state) gave.
+    ///
+    /// # Errors
+    /// If the state is that of other parameters; then nothing changes.
+    pub fn load_state(&mut self, state: &OptimizerState<T>) -> Result<(), StateError> {
+        let mut reader = Reader::new(state);
+        let (steps, mut values) = (reader.steps()?, vec![]);
+        for (name, value) in self.average.iter() {
+            values.push(Tensor::from_vec(value.shape(), reader.expect(name, "average", value.shape())?));
+        }
+        reader.finish()?;
+        self.steps = steps;
+        self.average.replace(values);
+        Ok(())
+    }
+
     /// The averages, under the names of the parameters.
     pub fn into_params(self) -> Params<T> {
         self.average
@@ -74,7 +102,6 @@ impl<T: Scalar> Ema<T> {
 }
 
 fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
-    let tiny = T::from_f64(TINY);
     let n = a.len();
     let x = &x[..n];
     simd::dispatch(
@@ -84,8 +111,7 @@ fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
             for i in 0..n {
                 let good = x[i].is_finite();
                 // With a share of 1 this is exactly x.
-                let blended = (T::ONE - share) * a[i] + share * x[i];
-                let blended = if blended < tiny && blended > -tiny { T::ZERO } else { blended };
+                let blended = flushed((T::ONE - share) * a[i] + share * x[i]);
                 a[i] = if good { blended } else { a[i] };
                 skipped += usize::from(!good);
             }
@@ -97,7 +123,6 @@ fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Tensor;
 
     fn store(values: &[f64]) -> Params<f64> {
         let mut params = Params::new();
@@ -139,6 +164,9 @@ mod tests {
             assert!(ema.params().values()[0].as_slice().iter().all(|a| !a.is_subnormal()));
         }
         assert_eq!(ema.into_params().values()[0].as_slice(), [0.0, 0.0]);
+        let mut double = Ema::new(&store(&[1e-40, 1.0]), 0.5);
+        double.update(&store(&[3e-40, 1.0]));
+        assert_eq!(double.params().values()[0].as_slice(), [2e-40, 1.0], "f64 holds more");
         let mut copy = Ema::new(&store(&[1.0, 1.0]), 0.0);
         copy.update(&store(&[0.1, 0.7]));
         assert_eq!(copy.params().values()[0].as_slice(), [0.1, 0.7]);

@@ -3,40 +3,86 @@
 mod adam;
 mod clip;
 mod ema;
+pub(crate) mod limits;
+mod report;
 mod schedule;
+pub(crate) mod settings;
 mod sgd;
-mod table;
+mod state;
 
 pub use adam::{Adam, AdamConfig, AdamW};
 pub use clip::{Clipped, clip_norm, clip_value, global_norm};
 pub use ema::Ema;
+pub use report::{NonFinite, UpdateReport};
 pub use schedule::Schedule;
+pub use settings::SettingError;
 pub use sgd::{Sgd, SgdConfig};
-pub use table::TableAdam;
+pub use state::{OptimizerState, StateError};
 
-use crate::Params;
-use raygrad_tensor::{Scalar, Tensor};
+use crate::{Gradient, Params, RowSums};
+use raygrad_tensor::{Pool, Scalar, Tensor};
+use std::borrow::Cow;
 
 /// One parameter that an optimiser is to move.
 #[derive(Debug)]
 pub struct Move<'a, T: Scalar> {
-    /// Which parameter it is: what the optimiser remembers of it is kept under this number.
+    /// Which parameter of its store it is.
     pub slot: usize,
+    /// Its name.
+    pub name: &'a str,
     /// Its value.
     pub value: &'a mut Tensor<T>,
-    /// Its gradient.
-    pub grad: &'a Tensor<T>,
+    /// Its gradient, of the same shape and not without a share.
+    pub grad: &'a Gradient<T>,
     /// Its learning rate.
     pub rate: f64,
     /// A factor of the optimiser's weight decay.
     pub decay: f64,
+    /// Whether only the rows whose gradient is not zero are to be visited ([`Params::set_lazy`]).
+    pub lazy: bool,
+}
+
+impl<'a, T: Scalar> Move<'a, T> {
+    /// The gradient as one tensor, from `pool` if it is not one already.
+    pub fn dense_grad(&self, pool: &Pool<T>) -> Cow<'a, Tensor<T>> {
+        match self.grad.dense() {
+            Some(dense) if self.grad.is_dense() => Cow::Borrowed(dense),
+            _ => Cow::Owned(self.grad.clone().into_dense(pool)),
+        }
+    }
+
+    /// The parameter as a table `[rows, features]`, whose rows lie along the first axis.
+    fn table(&self) -> [usize; 2] {
+        let shape = self.value.shape();
+        [shape.first().copied().unwrap_or(1), shape.iter().skip(1).product()]
+    }
+
+    /// The sums of the gradient's rows, which are made at the first step. A gradient that does not consist of rows is
+    /// added up first: then all its rows are there.
+    fn row_sums<'s>(&self, sums: &'s mut Option<RowSums<T>>, pool: &Pool<T>) -> &'s mut RowSums<T> {
+        let [rows, features] = self.table();
+        let sums = sums.get_or_insert_with(|| RowSums::new(rows, features));
+        if !self.grad.scatter(sums) {
+            let dense = self.dense_grad(pool);
+            dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
+        }
+        sums
+    }
 }
 
 /// Moves parameters against their gradients.
 ///
+/// Every optimiser takes every gradient ([`Gradient`]): dense ones, rows of a table, and both. What it does depends on
+/// the gradient's value alone, unless a parameter is lazy ([`Params::set_lazy`]). Frozen parameters rest, and so does one
+/// whose gradient has no share because nothing depends on it; others move with the learning rate and the weight decay
+/// of their own ([`Params::set_rate`], [`Params::set_decay`]).
+///
 /// All optimisers here leave an element alone, and count it, if its gradient is infinite or NaN; set what they remember
-/// to 0 once it is below 1e-30, so that no denormal numbers slow them down; and give the same bits at any number of
-/// threads.
+/// to 0 once it is below 1e-30 (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any
+/// number of threads.
+///
+/// [`Bound::backward`](crate::Bound::backward) gives the gradients and lets go of the parameters, which can then be
+/// moved in place. While a tape or a variable still holds one, an update copies it first.
 ///
 /// ```
 /// use raygrad_autograd::{Optimizer, Params, Schedule, Sgd, SgdConfig, Tape, Tensor};
@@ -48,52 +94,33 @@ pub struct Move<'a, T: Scalar> {
 ///     let tape = Tape::new();
 ///     let bound = params.bind(&tape);
 ///     let loss = (&bound[x] - 2.0).square();
-///     let grads = loss.grad_once(&bound.vars());
-///     optimizer.update(&mut params, &grads, schedule.at_step(step, 200));
+///     let grads = bound.backward(&loss);
+///     optimizer.update(&mut params, &grads, schedule.at_step(step, 200)).check().unwrap();
 /// }
 /// assert!((params.get(x).item() - 2.0).abs() < 1e-3);
 /// ```
 pub trait Optimizer<T: Scalar> {
-    /// Moves these parameters, each of them once, and returns how many elements were left alone because their gradient
-    /// was infinite or NaN.
+    /// Moves the parameters of a store at learning rate `rate`. An implementation goes through [`Params::moves`].
     ///
     /// # Panics
-    /// If a gradient has another shape than its parameter, or a parameter another size than the last one of its slot.
+    /// If there is not one gradient of the same shape for each parameter that is not frozen, the rate is not within 0 to
+    /// 1e30, or a parameter has another size than at its first step.
     #[track_caller]
-    fn advance<'a>(&mut self, moves: &mut dyn Iterator<Item = Move<'a, T>>) -> usize
-    where
-        T: 'a;
+    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport;
 
-    /// Moves all parameters of a store that are not frozen, with the learning rate and the weight decay of each
-    /// ([`Params::set_rate`], [`Params::set_decay`]), and returns how many elements were left alone.
+    /// What the optimiser remembers of the parameters of this store, so that a run can go on later.
+    fn state(&self, params: &Params<T>) -> OptimizerState<T>;
+
+    /// Remembers what [`state`](Self::state) gave, in place of everything else: the next steps then are, bit for bit,
+    /// what they would have been.
     ///
-    /// # Panics
-    /// If there is not one gradient of the same shape for each parameter that is not frozen.
-    #[track_caller]
-    fn update(&mut self, params: &mut Params<T>, grads: &[Tensor<T>], rate: f64) -> usize {
-        self.advance(&mut params.moves(grads, rate))
-    }
+    /// # Errors
+    /// If the state is that of another kind of optimiser or of other parameters; then nothing changes.
+    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError>;
 }
 
 /// Elements that one task updates.
 const CHUNK: usize = 1 << 14;
-
-/// What an optimiser remembers is 0 below this.
-pub(crate) const TINY: f64 = 1e-30;
-
-/// A mean of squares is 0 below this: the square of [`TINY`] would be a denormal f32, and this is the square of 3e-19. As
-/// far as epsilon is larger, nobody notices. (A limit of 1e-30 would make 0 of the squares of gradients of 1e-14, whose
-/// own mean is kept, and their step 10 learning rates.)
-pub(crate) const TINY_SQUARE: f64 = 1e-37;
-
-/// The largest gradient that second moments can hold: squared it is still a number, and an element that has met a larger
-/// one moves on. (An infinite second moment would never fade.)
-#[inline(always)]
-pub(crate) fn limited<T: Scalar>(g: T) -> T {
-    let most = T::from_f64(if size_of::<T>() == 4 { 1e19 } else { 1e154 });
-    let g = if g > most { most } else { g };
-    if g < -most { -most } else { g }
-}
 
 /// What an optimiser keeps under a number.
 fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {
@@ -103,17 +130,12 @@ fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {
     &mut states[slot]
 }
 
-#[track_caller]
-fn check_shapes<T: Scalar>(part: &Move<'_, T>) {
-    assert_eq!(part.value.shape(), part.grad.shape(), "a gradient has the shape of its parameter");
-}
-
 /// The memory of a parameter, made at its first step.
 #[track_caller]
-fn remember<T: Scalar>(memory: &mut Vec<T>, len: usize, first: bool) -> &mut [T] {
-    if first {
-        *memory = vec![T::ZERO; len];
+fn remember<'m, T: Scalar>(memory: &'m mut Vec<T>, part: &Move<'_, T>) -> &'m mut [T] {
+    if memory.is_empty() {
+        memory.resize(part.value.len(), T::ZERO);
     }
-    assert_eq!(memory.len(), len, "the same parameters as in the first step");
+    assert_eq!(memory.len(), part.value.len(), "elements of `{}`, as at its first step", part.name);
     memory
 }

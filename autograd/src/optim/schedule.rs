@@ -1,5 +1,7 @@
 //! Learning rates over the course of a run.
 
+use super::SettingError;
+use super::settings::{check, check_rate};
 use serde::{Deserialize, Serialize};
 
 /// A learning rate over the course of a run, as a function of the fraction of the budget (steps, time, samples) that is
@@ -75,6 +77,35 @@ impl Schedule {
         }
     }
 
+    /// Whether the numbers are in their ranges: rates of 0 to 1e30, of which f32 still has multiples, and more than 0
+    /// where they are a ratio; fractions of the run of 0 to 1, a stair's of more than 0.
+    ///
+    /// # Errors
+    /// If one is not, with its name.
+    pub fn check(&self) -> Result<(), SettingError> {
+        let check_warmup = |warmup| check("warmup", warmup, (0.0..=1.0).contains(&warmup), "0 to 1");
+        let check_ratio = |name, rate| check(name, rate, rate > 0.0, "more than 0");
+        match *self {
+            Schedule::Constant { rate } => check_rate("rate", rate),
+            Schedule::Linear { from, to, warmup } | Schedule::Cosine { from, to, warmup } => {
+                check_rate("from", from)?;
+                check_rate("to", to)?;
+                check_warmup(warmup)
+            }
+            Schedule::Step { from, factor, every, warmup } => {
+                check_rate("from", from)?;
+                check("factor", factor, (0.0..=1.0).contains(&factor), "0 to 1")?;
+                check("every", every, every > 0.0 && every <= 1.0, "more than 0, to 1")?;
+                check_warmup(warmup)
+            }
+            Schedule::Exponential { from, to, warmup } => {
+                check_rate("from", from).and(check_ratio("from", from))?;
+                check_rate("to", to).and(check_ratio("to", to))?;
+                check_warmup(warmup)
+            }
+        }
+    }
+
     /// The learning rate of step number `step`, counted from 0, of `steps`: the fraction in the middle of the step, so
     /// that a warm-up does not begin with a step of rate 0.
     pub fn at_step(&self, step: u64, steps: u64) -> f64 {
@@ -117,6 +148,35 @@ mod tests {
             let rate = 0.5_f64.powi(stair);
             assert_rates(step, &[(f64::from(stair) / 10.0, rate), (0.1 * f64::from(stair), rate)]);
             assert_rates(step, &[(0.0999 + 0.1 * f64::from(stair), rate)]);
+        }
+    }
+
+    #[test]
+    fn numbers_out_of_range_are_named() {
+        let good = [
+            Schedule::Constant { rate: 0.0 },
+            Schedule::Linear { from: 1.0, to: 0.0, warmup: 1.0 },
+            Schedule::Cosine { from: 0.0, to: 2.0, warmup: 0.0 },
+            Schedule::Step { from: 1.0, factor: 1.0, every: 1.0, warmup: 0.5 },
+            Schedule::Exponential { from: 1e-3, to: 1e-30, warmup: 0.0 },
+        ];
+        assert!(good.iter().all(|schedule| schedule.check().is_ok()));
+        for (schedule, expected) in [
+            (Schedule::Constant { rate: 1e300 }, "`rate` is 1e300; use 0 to 1e30"),
+            (Schedule::Constant { rate: f64::NAN }, "`rate` is NaN; use 0 to 1e30"),
+            (Schedule::Linear { from: -1.0, to: 0.0, warmup: 0.0 }, "`from` is -1.0; use 0 to 1e30"),
+            (Schedule::Cosine { from: 1.0, to: f64::INFINITY, warmup: 0.0 }, "`to` is inf; use 0 to 1e30"),
+            (Schedule::Linear { from: 1.0, to: 0.0, warmup: 1.5 }, "`warmup` is 1.5; use 0 to 1"),
+            (Schedule::Exponential { from: 1.0, to: 0.0, warmup: 0.0 }, "`to` is 0.0; use more than 0"),
+            (Schedule::Exponential { from: 0.0, to: 1.0, warmup: 0.0 }, "`from` is 0.0; use more than 0"),
+            (Schedule::Step { from: 1.0, factor: 2.0, every: 0.1, warmup: 0.0 }, "`factor` is 2.0; use 0 to 1"),
+            (
+                Schedule::Step { from: 1.0, factor: 0.5, every: 0.0, warmup: 0.0 },
+                "`every` is 0.0; use more than 0, to 1",
+            ),
+        ] {
+            let message = schedule.check().map_err(|error| error.to_string());
+            assert!(message.as_ref().is_err_and(|message| message.contains(expected)), "{message:?} and {expected}");
         }
     }
 

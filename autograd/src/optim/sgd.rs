@@ -1,24 +1,42 @@
 //! Gradient descent with momentum.
 
-use super::{CHUNK, Move, Optimizer, TINY, check_shapes, remember, slot};
-use raygrad_tensor::{Scalar, simd};
+use super::limits::{flushed, tiny};
+use super::settings::{check, check_rate, check_share, or_panic};
+use super::state::{Reader, memories};
+use super::{CHUNK, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, remember, slot};
+use crate::{Gradient, Params, RowSums};
+use raygrad_tensor::{Pool, Scalar, simd};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Gradient descent: `h = g + decay x`, `v = momentum v + h`, `x = x - rate d`, where the direction `d` is `v`, or
 /// `h + momentum v` with Nesterov's look-ahead (Sutskever et al. 2013, in the form that PyTorch has).
 ///
-/// An element is left alone, and counted, if its gradient or what would come of it is infinite or NaN.
+/// An element is left alone, and counted, if its gradient or what would come of it is infinite or NaN. Of a lazy
+/// parameter the rows without gradient stay, whatever their velocity and decay; without either, lazy or not is the same.
+/// Velocities below 1e-30 (1e-300 in f64) are set to 0.
 #[derive(Debug, Clone)]
 pub struct Sgd<T: Scalar> {
     config: SgdConfig,
-    velocities: Vec<Option<Vec<T>>>,
+    memory: Vec<Memory<T>>,
+    /// For gradients that have to be added up.
+    pool: Pool<T>,
+}
+
+/// What it knows of one parameter.
+#[derive(Debug, Clone, Default)]
+struct Memory<T> {
+    /// Empty without momentum and before the first step.
+    velocity: Vec<T>,
+    /// Nothing between steps.
+    sums: Option<RowSums<T>>,
 }
 
 /// Constants of [`Sgd`].
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct SgdConfig {
-    /// How much of the last step's velocity stays, in 0..1; 0 is plain gradient descent, which remembers nothing.
+    /// How much of the last step's velocity stays, at least 0 and less than 1; 0 is plain gradient descent, which
+    /// remembers nothing.
     pub momentum: f64,
     /// Look ahead along the velocity.
     pub nesterov: bool,
@@ -26,42 +44,83 @@ pub struct SgdConfig {
     pub decay: f64,
 }
 
+impl SgdConfig {
+    /// Whether the constants are in their ranges.
+    ///
+    /// # Errors
+    /// If one is not, with its name; also if there is a look-ahead without momentum.
+    pub fn check(&self) -> Result<(), SettingError> {
+        check_share("momentum", self.momentum)?;
+        check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
+        check_rate("decay", self.decay)
+    }
+}
+
 impl<T: Scalar> Sgd<T> {
     /// An optimiser that has seen nothing.
+    ///
+    /// # Panics
+    /// If [`SgdConfig::check`] finds something.
+    #[track_caller]
     pub fn new(config: SgdConfig) -> Self {
-        Sgd { config, velocities: vec![] }
+        or_panic(config.check());
+        Sgd { config, memory: vec![], pool: Pool::new() }
     }
 }
 
 impl<T: Scalar> Optimizer<T> for Sgd<T> {
     #[track_caller]
-    fn advance<'a>(&mut self, moves: &mut dyn Iterator<Item = Move<'a, T>>) -> usize
-    where
-        T: 'a,
-    {
-        let mut skipped = 0;
-        for part in moves {
-            check_shapes(&part);
+    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
+        let mut report = UpdateReport::default();
+        for part in params.moves(grads, rate) {
             let decay = self.config.decay * part.decay;
             let update = Update {
                 rate: T::from_f64(part.rate),
                 momentum: T::from_f64(self.config.momentum),
                 nesterov: self.config.nesterov,
                 decay: T::from_f64(decay),
-                tiniest: T::from_f64(if decay == 0.0 { 0.0 } else { TINY }),
+                tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
             };
-            let len = part.value.len();
-            let values = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(part.grad.as_slice().par_chunks(CHUNK));
-            skipped += if self.config.momentum == 0.0 {
-                values.map(|(x, g)| update.plain(x, g)).sum::<usize>()
+            let Memory { velocity, sums } = slot(&mut self.memory, part.slot);
+            let velocity: &mut [T] = if self.config.momentum == 0.0 { &mut [] } else { remember(velocity, &part) };
+            let (moved, skipped) = if part.lazy {
+                let sums = part.row_sums(sums, &self.pool);
+                let counts = update.rows(part.value.as_mut_slice(), sums, velocity);
+                sums.clear();
+                counts
             } else {
-                let velocity = slot(&mut self.velocities, part.slot);
-                let first = velocity.is_none();
-                let velocity = remember(velocity.get_or_insert_default(), len, first);
-                values.zip(velocity.par_chunks_mut(CHUNK)).map(|((x, g), v)| update.apply(x, g, v)).sum::<usize>()
+                let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
+                let pairs = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(grad.as_slice().par_chunks(CHUNK));
+                let skipped = if velocity.is_empty() {
+                    pairs.map(|(x, g)| update.plain(x, g)).sum()
+                } else {
+                    pairs.zip(velocity.par_chunks_mut(CHUNK)).map(|((x, g), v)| update.apply(x, g, v)).sum::<usize>()
+                };
+                (len - skipped, skipped)
             };
+            report.count(part.name, moved, skipped);
         }
-        skipped
+        report
+    }
+
+    fn state(&self, params: &Params<T>) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        for (name, shape, memory) in memories(params, &self.memory).filter(|(.., memory)| !memory.velocity.is_empty()) {
+            state.put(name, "velocity", shape, memory.velocity.clone());
+        }
+        state
+    }
+
+    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
+        let mut reader = Reader::new(state);
+        let mut memory = vec![];
+        for (name, value) in params.iter() {
+            let velocity = reader.tensor(name, "velocity", value.shape())?.unwrap_or_default();
+            memory.push(Memory { velocity, sums: None });
+        }
+        reader.finish()?;
+        self.memory = memory;
+        Ok(())
     }
 }
 
@@ -76,6 +135,24 @@ struct Update<T> {
 }
 
 impl<T: Scalar> Update<T> {
+    /// Moves the rows whose sum is not zero; returns how many of their elements were moved and left alone.
+    fn rows(&self, x: &mut [T], sums: &RowSums<T>, velocity: &mut [T]) -> (usize, usize) {
+        let features = sums.features();
+        let (mut visited, mut skipped) = (0, 0);
+        for (&row, sum) in sums.rows().iter().zip(sums.sums().chunks_exact(features)) {
+            if sum.iter().all(|&g| g == T::ZERO) {
+                continue;
+            }
+            let place = row as usize * features..(row as usize + 1) * features;
+            visited += features;
+            skipped += match velocity {
+                [] => self.plain(&mut x[place], sum),
+                _ => self.apply(&mut x[place.clone()], sum, &mut velocity[place]),
+            };
+        }
+        (visited - skipped, skipped)
+    }
+
     /// The parameter after a step along `direction`, and whether all went well.
     #[inline(always)]
     fn moved(&self, x: T, g: T, direction: T) -> (T, bool) {
@@ -102,7 +179,6 @@ impl<T: Scalar> Update<T> {
     }
 
     fn apply(&self, x: &mut [T], g: &[T], v: &mut [T]) -> usize {
-        let tiny = T::from_f64(TINY);
         let n = x.len();
         let (g, v) = (&g[..n], &mut v[..n]);
         let ahead = if self.nesterov { T::ONE } else { T::ZERO };
@@ -112,8 +188,7 @@ impl<T: Scalar> Update<T> {
                 let mut skipped = 0;
                 for i in 0..n {
                     let h = g[i] + self.decay * x[i];
-                    let velocity = self.momentum * v[i] + h;
-                    let velocity = if velocity > tiny || velocity < -tiny { velocity } else { T::ZERO };
+                    let velocity = flushed(self.momentum * v[i] + h);
                     let direction = if ahead > T::ZERO { h + self.momentum * velocity } else { velocity };
                     let (moved, good) = self.moved(x[i], g[i], direction);
                     v[i] = if good { velocity } else { v[i] };
@@ -131,8 +206,15 @@ mod tests {
     use super::*;
     use raygrad_tensor::Tensor;
 
-    fn step<T: Scalar>(sgd: &mut Sgd<T>, value: &mut Tensor<T>, grad: &Tensor<T>, rate: f64) -> usize {
-        sgd.advance(&mut [Move { slot: 0, value, grad, rate, decay: 1.0 }].into_iter())
+    /// One step of a single parameter.
+    fn step<T: Scalar>(sgd: &mut Sgd<T>, params: &mut Params<T>, grad: &Tensor<T>, rate: f64) -> usize {
+        sgd.update(params, &[grad.clone().into()], rate).skipped
+    }
+
+    fn store<T: Scalar>(value: Tensor<T>) -> Params<T> {
+        let mut params = Params::new();
+        params.add("x", value);
+        params
     }
 
     #[test]
@@ -141,17 +223,18 @@ mod tests {
             [(0.0, false, 0.0), (0.0, false, 0.1), (0.9, false, 0.0), (0.9, true, 0.0), (0.7, true, 0.05)]
         {
             let mut sgd = Sgd::<f64>::new(SgdConfig { momentum, nesterov, decay });
-            let mut value = Tensor::from_vec(&[2], vec![0.5, -1.5]);
+            let mut params = store(Tensor::from_vec(&[2], vec![0.5, -1.5]));
             let (mut x, mut v) = ([0.5, -1.5], [0.0; 2]);
             for t in 0..300 {
                 let grad = Tensor::from_fn(&[2], |i| ((t + i) as f64 * 0.31).cos());
                 let rate = 0.02 + 0.01 * (t as f64).sin();
-                assert_eq!(step(&mut sgd, &mut value, &grad, rate), 0);
+                assert_eq!(step(&mut sgd, &mut params, &grad, rate), 0);
                 for i in 0..2 {
                     let h = grad.as_slice()[i] + decay * x[i];
                     v[i] = momentum * v[i] + h;
                     x[i] -= rate * if nesterov { h + momentum * v[i] } else { v[i] };
-                    assert!((value.as_slice()[i] - x[i]).abs() < 1e-12, "{momentum} {nesterov} {decay}: step {t}");
+                    let got = params.values()[0].as_slice()[i];
+                    assert!((got - x[i]).abs() < 1e-12, "{momentum} {nesterov} {decay}: step {t}");
                 }
             }
         }
@@ -162,17 +245,17 @@ mod tests {
         // x'' = -c x in discrete time: x_{t+1} = (1 + mu - c rate) x_t - mu x_{t-1}, whose roots solve a quadratic.
         let (mu, rate, curvature) = (0.25, 0.1, 1.0);
         let mut sgd = Sgd::<f64>::new(SgdConfig { momentum: mu, ..SgdConfig::default() });
-        let mut value = Tensor::scalar(1.0);
+        let mut params = store(Tensor::scalar(1.0));
         let b: f64 = 1.0 + mu - curvature * rate;
         let root = (b * b - 4.0 * mu).sqrt();
         let (r1, r2) = (0.5 * (b + root), 0.5 * (b - root));
         // x_0 = 1 and x_1 = 1 - c rate.
         let c1 = (1.0 - curvature * rate - r2) / (r1 - r2);
         for t in 1..100 {
-            let grad = Tensor::scalar(curvature * value.item());
-            step(&mut sgd, &mut value, &grad, rate);
-            let expected = c1 * r1.powi(t) + (1.0 - c1) * r2.powi(t);
-            assert!((value.item() - expected).abs() < 1e-13, "step {t}: {} instead of {expected}", value.item());
+            let grad = Tensor::scalar(curvature * params.values()[0].item());
+            step(&mut sgd, &mut params, &grad, rate);
+            let (got, expected) = (params.values()[0].item(), c1 * r1.powi(t) + (1.0 - c1) * r2.powi(t));
+            assert!((got - expected).abs() < 1e-13, "step {t}: {got} instead of {expected}");
         }
     }
 
@@ -181,18 +264,18 @@ mod tests {
         for momentum in [0.0, 0.9] {
             let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, decay: 0.5, ..SgdConfig::default() });
             let start = [1.0, 2.0, 3.0, -3e38, 1e-25];
-            let mut value = Tensor::from_vec(&[5], start.to_vec());
+            let mut params = store(Tensor::from_vec(&[5], start.to_vec()));
             let grad = Tensor::from_vec(&[5], vec![f32::NAN, f32::NEG_INFINITY, 1.0, 3e38, 0.0]);
             // The step of element 3 would overflow.
-            assert_eq!(step(&mut sgd, &mut value, &grad, 1.0), 3, "momentum {momentum}");
-            assert_eq!([0, 1, 3].map(|i| value.as_slice()[i]), [1.0, 2.0, -3e38]);
+            assert_eq!(step(&mut sgd, &mut params, &grad, 1.0), 3, "momentum {momentum}");
+            assert_eq!([0, 1, 3].map(|i| params.values()[0].as_slice()[i]), [1.0, 2.0, -3e38]);
             for _ in 0..5000 {
-                step(&mut sgd, &mut value, &Tensor::zeros(&[5]), 0.1);
-                assert!(value.as_slice().iter().all(|x| !x.is_subnormal()));
+                step(&mut sgd, &mut params, &Tensor::zeros(&[5]), 0.1);
+                assert!(params.values()[0].as_slice().iter().all(|x| !x.is_subnormal()));
             }
-            assert!(value.as_slice()[4].abs() < 4e-30, "where velocity ends, so does decay");
-            assert!(sgd.velocities.iter().flatten().flatten().all(|v| !v.is_subnormal()));
-            assert_eq!(sgd.velocities.is_empty(), momentum == 0.0);
+            assert!(params.values()[0].as_slice()[4].abs() < 4e-30, "where velocity ends, so does decay");
+            let velocity = &sgd.memory[0].velocity;
+            assert!(velocity.iter().all(|v| !v.is_subnormal()) && velocity.is_empty() == (momentum == 0.0));
         }
     }
 
@@ -200,13 +283,18 @@ mod tests {
     fn empty_parameters_and_long_ones_take_the_same_step() {
         for momentum in [0.0, 0.5] {
             let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, ..SgdConfig::default() });
-            for shape in [&[0, 3][..], &[2 * CHUNK + 3], &[]] {
-                let mut value = Tensor::ones(shape);
-                let grad = Tensor::ones(shape);
-                let part = Move { slot: shape.len(), value: &mut value, grad: &grad, rate: 0.5, decay: 1.0 };
-                assert_eq!(sgd.advance(&mut [part].into_iter()), 0);
-                assert!(value.as_slice().iter().all(|&x| x == 0.5));
+            let mut params = Params::new();
+            for (i, shape) in [&[0, 3][..], &[2 * CHUNK + 3], &[]].into_iter().enumerate() {
+                params.add(i.to_string(), Tensor::ones(shape));
             }
+            params.set_lazy(|_| true, true);
+            for lazy in [true, false] {
+                params.set_lazy(|_| true, lazy);
+                let grads: Vec<_> = params.values().iter().map(|x| Gradient::from(Tensor::ones(x.shape()))).collect();
+                assert_eq!(sgd.update(&mut params, &grads, 0.5).check(), Ok(2 * CHUNK + 4));
+            }
+            let expected = if momentum == 0.0 { 0.0 } else { -0.25 };
+            assert!(params.values().iter().flat_map(Tensor::as_slice).all(|&x| x == expected));
         }
     }
 }

@@ -74,9 +74,14 @@ struct Level {
 impl TableOptimizer {
     /// An optimiser that has seen nothing. The paper's constants are 0.9, 0.99 and 1e-15 (section 4): a large epsilon
     /// would stall rows that are seldom visited.
+    ///
+    /// # Panics
+    /// If [`AdamConfig::check`] finds something.
+    #[track_caller]
     pub fn new(grid: HashGrid, config: AdamConfig) -> Self {
         let adam = RowAdam::new(config, 0, grid.features());
-        let level = |rows| Level { adam: adam.fresh(rows), sums: RowSums::new(rows, grid.features()) };
+        let level =
+            |rows| Level { adam: adam.fresh([rows, grid.features()]), sums: RowSums::new(rows, grid.features()) };
         TableOptimizer { levels: grid.levels().iter().map(|l| level(l.rows.len())).collect(), grid }
     }
 
@@ -129,7 +134,7 @@ impl Step<'_> {
                 let moved = |(_, share): &(usize, &[f32])| share.iter().any(|&x| x != 0.0);
                 shares.enumerate().filter(moved).for_each(|(row, share)| level.sums.add(row, share));
             }
-            return level.adam.step(table, &mut level.sums, self.rate);
+            return level.adam.step(table, &mut level.sums, self.rate, 0.0);
         }
         let half = levels.len() / 2;
         let (coarse, fine) = levels.split_at_mut(half);
