@@ -32,16 +32,6 @@ impl<'t, T: Scalar> Var<'t, T> {
         Ok(sums.into_iter().zip(wrt).map(value).collect())
     }
 
-    /// As [`grad`](Self::grad), but frees the saved values as the sweep passes, so that their buffers serve again at once.
-    ///
-    /// # Panics
-    /// As [`grad`](Self::grad).
-    #[track_caller]
-    pub fn grad_once(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
-        let pool = self.tape.pool();
-        self.backward(wrt).into_iter().map(|gradient| gradient.into_dense(pool)).collect()
-    }
-
     /// The gradients of this one-element tensor with respect to `wrt` in the form in which operations give them: sparse
     /// shares, such as the rows of a table, stay apart. Saved values are freed as the sweep passes, so that their buffers
     /// serve again at once. That is what a training step wants; [`grad`](Self::grad) is for everything else.
