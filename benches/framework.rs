@@ -11,7 +11,7 @@ use raygrad::autograd::{
     Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Gradient, Init, Linear, Mlp, Optimizer, Params, Pool,
     Pool2dConfig, Tape, Tensor, Var, formula,
 };
-use raygrad::tensor::parallel;
+use raygrad::tensor::{map, parallel};
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -221,4 +221,37 @@ fn operations() {
         let (gain, bias) = (x.tape().leaf(gain.clone()), x.tape().leaf(bias.clone()));
         x.layer_norm(&gain, &bias, 1e-5) * x.tape().constant(weight.clone())
     });
+    views();
+    let rng = &mut StdRng::seed_from_u64(1);
+    let mut noise = |shape: &[usize]| Tensor::from_fn(shape, |_| rng.random::<f32>() - 0.5);
+    let (kernel, right) = (noise(&[32, 16, 3, 3]), noise(&[512, 32, 32]));
+    let padded = Conv2dConfig { padding: [1, 1], ..Conv2dConfig::default() };
+    operation("convolution of one image 16x128x128 to 32", &[1, 16, 128, 128], |x| {
+        x.conv2d(&x.tape().leaf(kernel.clone()), &padded)
+    });
+    operation("512 products of 32x32 matrices", &[512, 32, 32], |x| x.matmul(&x.tape().constant(right.clone())));
+}
+
+/// What views cost where their elements have to be written in order, against a copy; many slices, against the whole.
+fn views() {
+    let pool = Pool::new();
+    let x = Tensor::<f32>::from_fn(&[4096, 4096], |i| i as f32);
+    let copy = median(20, || drop(map([&x], &pool, |[x]| x)));
+    let mut out = vec![0.0; x.len()];
+    let transpose = median(20, || x.t().layout().read(x.buffer(), &mut out));
+    report("transpose 4096x4096, written", &[("seconds", transpose), ("seconds_copy", copy)]);
+    let values = Tensor::<f32>::from_fn(&[512, 4096], |i| (i % 97) as f32);
+    let mut tape = Tape::new();
+    let mut timed = |parts: usize| {
+        median(20, || {
+            let x = tape.leaf(values.clone());
+            let part = |i| x.slice(0, i * 512 / parts, 512 / parts).square().sum();
+            let sum = (1..parts).map(part).fold(part(0), |sum, part| sum + part);
+            sum.backward(&[&x]);
+            drop((sum, x));
+            tape.clear();
+        })
+    };
+    let (whole, slices) = (timed(1), timed(512));
+    report("squares of 512 slices of 8 MB, with gradient", &[("seconds", slices), ("seconds_whole", whole)]);
 }

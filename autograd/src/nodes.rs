@@ -99,11 +99,6 @@ impl<T: Scalar> Nodes<T> {
         number
     }
 
-    /// Whether a node is an operation that was not freed.
-    pub fn is_operation(&self, node: u32) -> bool {
-        self.place(node).borrow().as_ref().is_some_and(|node| node.op.is_some())
-    }
-
     /// Frees what a node holds; its number and its edges stay. Whoever is reading it frees it afterwards.
     pub fn free(&self, node: u32) {
         if let Ok(mut place) = self.place(node).try_borrow_mut() {

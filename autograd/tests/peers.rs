@@ -22,8 +22,12 @@ macro_rules! cases {
 }
 
 /// Operations of the catalogue without a reference, and why.
-const WITHOUT: [(&str, &str); 1] =
-    [("alias", "the tape's own copy of an input, not callable from outside; it is the identity")];
+const WITHOUT: [(&str, &str); 4] = [
+    ("alias", "the tape's own copy of an input, not callable from outside; it is the identity"),
+    ("matmul_left_transposed", "compared as matmul.tn"),
+    ("matmul_right_transposed", "compared as matmul.nt"),
+    ("matmul_both_transposed", "compared as matmul.tt"),
+];
 
 fn elementwise() -> Vec<Case> {
     cases! {

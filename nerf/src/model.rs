@@ -148,7 +148,10 @@ impl<T: Scalar> Model<T> {
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::new(self.config.clone(), self.extent, 0)?;
         model.params.assign(&self.params);
-        model.sampler = self.sampler.clone();
+        // The other sampler has nothing but its configuration and handles of the new store.
+        if let Sampler::Marching(_) = &self.sampler {
+            model.sampler = self.sampler.clone();
+        }
         Ok(model)
     }
 }

@@ -1,8 +1,12 @@
 //! Arithmetic and functions of tensors without a tape, with NumPy's broadcasting.
 
-use crate::{Real, Scalar, Tensor, map, map_real};
+use crate::parallel::{ELEMENT, chunks};
+use crate::{Real, Scalar, Tensor, map, map_real, simd};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, DivAssign, Index, Mul, MulAssign, Neg, Sub, SubAssign};
+
+/// Elements of a tensor that are changed in place by one task.
+const STRETCH: usize = 1 << 14;
 
 macro_rules! operator {
     ($trait:ident $method:ident, $assign:ident $assign_method:ident, $op:tt) => {
@@ -62,7 +66,8 @@ macro_rules! operator {
         impl<T: Scalar> $assign<T> for Tensor<T> {
             /// In place where nobody shares the elements.
             fn $assign_method(&mut self, other: T) {
-                self.as_mut_slice().iter_mut().for_each(|a| *a = *a $op other);
+                let other = Tensor::scalar(other).broadcast_to(self.shape());
+                self.update(&other, |a, b| a $op b);
             }
         }
     };
@@ -201,9 +206,24 @@ impl<T: Scalar> Tensor<T> {
     }
 
     /// `a = f(a, b)` for the elements `b` of a tensor of the same shape.
-    fn update(&mut self, other: &Self, f: impl Fn(T, T) -> T) {
-        let other = other.as_slice();
-        self.as_mut_slice().iter_mut().zip(other).for_each(|(a, &b)| *a = f(*a, b));
+    fn update(&mut self, other: &Self, f: impl Fn(T, T) -> T + Sync) {
+        let (layout, work) = (other.layout(), ELEMENT * self.len());
+        let one = if let [one] = *other.buffer() { Some(one) } else { None };
+        let scratch = || vec![one.unwrap_or(T::ZERO); STRETCH];
+        chunks(self.as_mut_slice(), STRETCH, work, scratch, &|scratch: &mut Vec<T>, i, a| {
+            let b = &mut scratch[..a.len()];
+            if one.is_none() {
+                layout.read_range(other.buffer(), i * STRETCH, b);
+            }
+            simd::dispatch(
+                #[inline(always)]
+                || {
+                    for (a, &b) in a.iter_mut().zip(&*b) {
+                        *a = f(*a, b);
+                    }
+                },
+            );
+        });
     }
 
     /// Each element to the power of a number.
@@ -256,7 +276,7 @@ impl<T: Scalar> Tensor<T> {
     /// Whether the shapes are the same and every element of this tensor is within `absolute + relative * |y|` of the
     /// element `y` of the other, or equal to it. A NaN is close to nothing.
     pub fn is_close(&self, other: &Self, relative: f64, absolute: f64) -> bool {
-        let close = |a: f64, b: f64| a == b || (a - b).abs() <= absolute + relative * b.abs();
+        let close = |a: f64, b: f64| a == b || (b.is_finite() && (a - b).abs() <= absolute + relative * b.abs());
         self.shape() == other.shape() && self.iter().zip(other.iter()).all(|(a, b)| close(a.to_f64(), b.to_f64()))
     }
 
@@ -288,6 +308,14 @@ mod tests {
         y *= &Tensor::from([[2.0], [0.0]]);
         y /= 2.0;
         assert_eq!((y.to_vec(), x[[0, 0]]), (vec![10.0, 21.0, 0.0, 0.0], 1.0));
+        // In pieces, of views, where they are.
+        let mut large = Tensor::from_fn(&[300, 200], |i| i as f64);
+        let (place, turned) = (large.as_slice().as_ptr(), Tensor::from_fn(&[200, 300], |i| i as f64).t());
+        large += &turned;
+        large *= 2.0;
+        large -= &Tensor::arange(0.0, 200.0, 1.0);
+        assert_eq!(large[[299, 7]], 2.0 * (299.0 * 200.0 + 7.0 + 7.0 * 300.0 + 299.0) - 7.0);
+        assert!(std::ptr::eq(large.as_slice().as_ptr(), place));
         assert_eq!([x.clone(), x.t(), x.clone()].into_iter().sum::<Tensor<f64>>(), &x * 2.0 + x.t());
         assert_eq!(std::iter::empty::<Tensor<f32>>().sum::<Tensor<f32>>().item(), 0.0);
         assert!(std::panic::catch_unwind(|| &x + &Tensor::zeros(&[3])).is_err());
@@ -326,6 +354,10 @@ mod tests {
         let nan = Tensor::from([f64::NAN]);
         assert!(nan.clamp(0.0, 1.0)[[0]].is_nan() && nan.maximum(3.0)[[0]].is_nan() && !nan.is_close(&nan, 1.0, 1.0));
         assert!(!x.is_close(&x.reshape(&[4, 1]), 1.0, 1.0));
+        let [one, near] = [1.0, 1.1].map(|x| Tensor::<f64>::from([2.0, x]));
+        assert!(one.is_close(&near, 0.1, 0.0) && !one.is_close(&near, 0.09, 0.0));
+        assert!(one.is_close(&near, 0.0, 0.11) && !one.is_close(&near, 0.0, 0.09));
+        assert!(!Tensor::from([1.0]).is_close(&Tensor::from([f64::INFINITY]), 1.0, 1.0));
     }
 
     #[test]

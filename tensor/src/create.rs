@@ -8,11 +8,13 @@ use crate::{Indices, Pool, Scalar, Shape, Tensor};
 /// If there is none, the axis does not exist, or other extents differ.
 #[track_caller]
 pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> Tensor<T> {
-    let mut shape = Shape::from_slice(parts[0].shape());
+    let Some(first) = parts.first() else { panic!("concat of no tensors") };
+    let mut shape = Shape::from_slice(first.shape());
+    assert!(axis < shape.len(), "concat along axis {axis} of a tensor of shape {shape:?}");
     for part in &parts[1..] {
         let same = |i: usize| i == axis || part.shape()[i] == shape[i];
         let fits = part.ndim() == shape.len() && (0..shape.len()).all(same);
-        assert!(fits, "concat of shapes {:?} and {:?} along axis {axis}", parts[0].shape(), part.shape());
+        assert!(fits, "concat of shapes {:?} and {:?} along axis {axis}", first.shape(), part.shape());
     }
     shape[axis] = parts.iter().map(|part| part.shape()[axis]).sum();
     pool.filled(&shape, |out| {

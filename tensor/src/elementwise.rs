@@ -78,7 +78,11 @@ macro_rules! map_real {
 
 /// One result of a pass over `N` tensors: see [`map_fused`].
 #[track_caller]
-fn map_block<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, block: impl Fn([&[T]; N], &mut [T]) + Sync) -> Tensor<T> {
+fn map_block<T: Scalar, const N: usize>(
+    x: [&Tensor<T>; N],
+    pool: &Pool<T>,
+    block: impl Fn([&[T]; N], &mut [T]) + Sync,
+) -> Tensor<T> {
     let [result] = map_fused(&x, [true], pool, &|x, out| block(std::array::from_fn(|k| x[k]), out[0]));
     match result {
         Some(result) => result,

@@ -6,6 +6,7 @@ use crate::{Lane, Layout, Pool, Scalar, Shape, Tensor, broadcast_shape, simd};
 use rayon::prelude::*;
 use smallvec::SmallVec;
 use std::array::from_fn;
+use std::ops::Range;
 use std::slice;
 
 /// What is computed of a block of elements: from slices of the operands to slices of the results, all of one length.
@@ -59,7 +60,8 @@ fn map_views<T: Scalar, const M: usize>(
     let layouts: SmallVec<[Layout; 6]> = x.iter().map(|x| x.layout().stretched(shape)).collect();
     // The same for other views of the operands.
     let of = |turn: &dyn Fn(&Layout) -> Layout| {
-        let x: SmallVec<[Tensor<T>; 6]> = x.iter().zip(&layouts).map(|(x, layout)| x.with_layout(turn(layout))).collect();
+        let x: SmallVec<[Tensor<T>; 6]> =
+            x.iter().zip(&layouts).map(|(x, layout)| x.with_layout(turn(layout))).collect();
         map_fused(&x.iter().collect::<SmallVec<[_; 6]>>(), wanted, pool, block)
     };
     let is_repeated = |&axis: &usize| shape[axis] > 1 && layouts.iter().all(|layout| layout.strides()[axis] == 0);
@@ -68,7 +70,8 @@ fn map_views<T: Scalar, const M: usize>(
         let once = |layout: &Layout| repeated.iter().fold(layout.clone(), |layout, &axis| layout.sliced(axis, 0, 1, 1));
         return of(&once).map(|result| result.map(|result| result.broadcast_to(shape)));
     }
-    let is_whole = |layout: &&Layout| !layout.strides().iter().zip(shape).any(|(&stride, &extent)| stride == 0 && extent > 1);
+    let is_whole =
+        |layout: &&Layout| !layout.strides().iter().zip(shape).any(|(&stride, &extent)| stride == 0 && extent > 1);
     if !layouts.iter().any(Layout::is_packed)
         && let Some(order) = layouts.iter().filter(is_whole).find_map(Layout::memory_order)
     {
@@ -76,7 +79,8 @@ fn map_views<T: Scalar, const M: usize>(
         let back = |result: Tensor<T>| result.with_layout(result.layout().permuted(&inverse(&order)));
         return turned.map(|result| result.map(back));
     }
-    let parts: SmallVec<[Part<'_, T>; 6]> = x.iter().zip(&layouts).map(|(x, layout)| Part::of(x.buffer(), layout)).collect();
+    let parts: SmallVec<[Part<'_, T>; 6]> =
+        x.iter().zip(&layouts).map(|(x, layout)| Part::of(x.buffer(), layout)).collect();
     map_parts(&parts, shape, wanted, pool, block)
 }
 
@@ -99,12 +103,16 @@ impl<'a, T: Scalar> Part<'a, T> {
         }
     }
 
-    /// Space for `width` elements, if they are not in order.
-    fn scratch(&self, width: usize) -> Vec<T> {
+    /// Space for `width` elements, if they are not in order; to be given back.
+    fn scratch(&self, width: usize, pool: &Pool<T>) -> Vec<T> {
         match *self {
             Part::Packed(_) => vec![],
-            Part::One(value) => vec![value; width],
-            Part::Strided(..) => vec![T::ZERO; width],
+            Part::One(value) => {
+                let mut values = pool.take(width);
+                values.fill(value);
+                values
+            }
+            Part::Strided(..) => pool.take(width),
         }
     }
 
@@ -131,7 +139,7 @@ fn map_parts<T: Scalar, const M: usize>(
 ) -> [Option<Tensor<T>>; M] {
     let len = len_of(shape);
     let mut results = wanted.map(|wanted| wanted.then(|| pool.buffer(len)));
-    run(x, len, &mut results.each_mut().map(|result| result.as_deref_mut()), block);
+    run(x, len, &mut results.each_mut().map(|result| result.as_deref_mut()), pool, block);
     results.map(|result| result.map(|values| pool.wrap(shape, values)))
 }
 
@@ -139,9 +147,9 @@ fn map_parts<T: Scalar, const M: usize>(
 type Results<'a, T> = [Option<&'a mut [T]>];
 
 /// All blocks, on all threads if that is worth it.
-fn run<T: Scalar>(x: &[Part<'_, T>], len: usize, out: &mut Results<'_, T>, block: &Block<'_, T>) {
+fn run<T: Scalar>(x: &[Part<'_, T>], len: usize, out: &mut Results<'_, T>, pool: &Pool<T>, block: &Block<'_, T>) {
     if len <= PIECE || !is_worthwhile(len * ELEMENT * out.len()) {
-        return piece(x, 0, len, out, block);
+        return piece(x, 0..len, out, pool, block);
     }
     let mut rest: SmallVec<[Option<&mut [T]>; 4]> = out.iter_mut().map(|out| out.as_deref_mut()).collect();
     let pieces: Vec<(usize, usize, SmallVec<[_; 4]>)> = (0..len)
@@ -151,15 +159,22 @@ fn run<T: Scalar>(x: &[Part<'_, T>], len: usize, out: &mut Results<'_, T>, block
             (start, n, rest.iter_mut().map(|rest| rest.as_mut().and_then(|rest| rest.split_off_mut(..n))).collect())
         })
         .collect();
-    pieces.into_par_iter().for_each(|(start, n, mut out)| piece(x, start, n, &mut out, block));
+    pieces.into_par_iter().for_each(|(start, n, mut out)| piece(x, start..start + n, &mut out, pool, block));
 }
 
-/// The blocks of one thread: `out` begins at element `start` of `x` and is `len` long.
-fn piece<T: Scalar>(x: &[Part<'_, T>], start: usize, len: usize, out: &mut Results<'_, T>, block: &Block<'_, T>) {
+/// The blocks of one thread: `out` is for the elements in `range`.
+fn piece<T: Scalar>(
+    x: &[Part<'_, T>],
+    range: Range<usize>,
+    out: &mut Results<'_, T>,
+    pool: &Pool<T>,
+    block: &Block<'_, T>,
+) {
+    let (start, len) = (range.start, range.len());
     let width = len.min(BLOCK);
     let spare = out.iter().filter(|out| out.is_none()).count();
     let mut unwanted: SmallVec<[T; 16]> = SmallVec::from_elem(T::ZERO, spare * width);
-    let mut scratch: SmallVec<[Vec<T>; 6]> = x.iter().map(|x| x.scratch(width)).collect();
+    let mut scratch: SmallVec<[Vec<T>; 6]> = x.iter().map(|x| x.scratch(width, pool)).collect();
     for first in (0..len).step_by(BLOCK) {
         let n = BLOCK.min(len - first);
         let x: SmallVec<[&[T]; 6]> =
@@ -174,6 +189,7 @@ fn piece<T: Scalar>(x: &[Part<'_, T>], start: usize, len: usize, out: &mut Resul
         }
         block(&x, &mut blocks);
     }
+    scratch.into_iter().filter(|scratch| scratch.capacity() > 0).for_each(|scratch| pool.give(scratch));
 }
 
 /// Elements of which [`lanes_fused`] holds several results before it writes them: results in slices that might overlap

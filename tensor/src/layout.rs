@@ -22,7 +22,7 @@ pub struct Layout {
 
 /// The number of elements of a shape; `None` if it is beyond `isize::MAX`, which no buffer can hold. Extents of 0 make it 0
 /// whatever the others are, as long as the product of these can be held.
-pub(crate) fn checked_len(shape: &[usize]) -> Option<usize> {
+pub fn checked_len(shape: &[usize]) -> Option<usize> {
     let all = shape.iter().filter(|&&extent| extent > 0).try_fold(1_usize, |all, &extent| all.checked_mul(extent))?;
     (all <= isize::MAX as usize).then(|| if shape.contains(&0) { 0 } else { all })
 }
@@ -374,6 +374,23 @@ impl Layout {
             position /= extent;
         }
         index
+    }
+
+    /// For a layout that names every element of a row-major buffer once, such as a permutation or a flip: the layout of its
+    /// elements that names them in the order of that buffer.
+    pub fn inverted(&self) -> Option<Layout> {
+        let mut order: Shape = (0..self.shape.len()).collect();
+        order.sort_by_key(|&axis| std::cmp::Reverse(self.strides[axis].unsigned_abs()));
+        let (mut forward, mut back) = (self.permuted(&order), Layout::contiguous(&self.shape).permuted(&order));
+        for axis in 0..order.len() {
+            if forward.strides[axis] < 0 && forward.shape[axis] > 1 {
+                let extent = forward.shape[axis];
+                forward = forward.sliced(axis, extent - 1, extent, -1);
+                back = back.sliced(axis, extent - 1, extent, -1);
+            }
+        }
+        let whole = forward.len() == self.source && forward.offset == 0 && forward.is_packed();
+        (whole && !self.is_empty()).then_some(back)
     }
 
     /// Where what lies behind the first `lead` axes begins in the buffer, for every index of these, in row-major order.

@@ -12,8 +12,8 @@
 //! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
-//! Work on large tensors is spread over rayon's threads, unless the caller is one of these; see [`parallel`]. The bits
-//! do not depend on it.
+//! Work on large tensors is spread over the threads of the caller's rayon pool; see [`parallel`]. The bits do not depend on
+//! it.
 
 mod arithmetic;
 mod axes;
@@ -50,7 +50,7 @@ pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map
 pub use fused::{Block, lanes_fused, map_fused};
 pub use indices::Indices;
 pub use lane::Lane;
-pub use layout::Layout;
+pub use layout::{Layout, checked_len};
 pub use mask::Mask;
 pub use pool::Pool;
 pub use real::Real;

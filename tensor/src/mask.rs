@@ -144,6 +144,9 @@ impl<T: Scalar> Tensor<T> {
         let Some(shape) = crate::broadcast_shape(&[self.shape(), other.shape()]) else {
             panic!("shapes {:?} and {:?} do not broadcast", self.shape(), other.shape())
         };
+        if let ([b], true) = (other.buffer(), self.shape() == shape.as_slice()) {
+            return Mask::new(&shape, self.iter().map(|a| f(a, *b)).collect::<Vec<_>>());
+        }
         let (a, b) = (self.broadcast_to(&shape), other.broadcast_to(&shape));
         Mask::new(&shape, a.iter().zip(b.iter()).map(|(a, b)| f(a, b)).collect::<Vec<_>>())
     }

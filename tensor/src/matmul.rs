@@ -120,7 +120,8 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
         let rows = m.div_ceil((m / ROWS).min(PIECES));
         chunks(c, rows * n, work, || (), &|_, i, c| {
             let rows = i * rows..i * rows + c.len() / n;
-            gemm(a.some_rows(rows), b, c, accumulate);
+            // SAFETY: `c` has as many rows of n elements.
+            unsafe { product(a.some_rows(rows), b, c.as_mut_ptr(), n, accumulate) }
         });
     } else if m > 2 && n >= 2 * ROWS && is_worthwhile(work) {
         let columns = n.div_ceil((n / ROWS).min(PIECES));
@@ -175,7 +176,8 @@ pub fn matmul<T: Scalar>(a: &Tensor<T>, b: &Tensor<T>, pool: &Pool<T>) -> Tensor
     let with = |last: [usize; 2]| lead.iter().copied().chain(last).collect::<Shape>();
     let layouts = [a.layout().stretched(&with([m, k])), b.layout().stretched(&with([k, n]))];
     pool.filled(&with([m, n]), |c| {
-        let ([a_at, b_at], work) = (layouts.each_ref().map(|x| x.offsets(lead.len())), m.saturating_mul(k) * n);
+        let ([a_at, b_at], work) =
+            (layouts.each_ref().map(|x| x.offsets(lead.len())), m.saturating_mul(k).saturating_mul(n));
         let one = |i: usize, c: &mut [T]| {
             let left = Matrix::of(a.buffer(), &layouts[0], a_at[i]);
             gemm(left, Matrix::of(b.buffer(), &layouts[1], b_at[i]), c, false);
@@ -249,6 +251,35 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn large_products_of_views_and_of_batches_are_those_of_copies() {
+        let pool = Pool::new();
+        let value = |i: usize| ((i * 7919) % 1009) as f64 / 500.0 - 1.0;
+        // Cut by rows, by columns, by depth, and not at all; one large product of a batch, many small ones.
+        for [batch, m, k, n] in [
+            [1, 517, 130, 131],
+            [1, 3, 64, 20_003],
+            [1, 7, 16_385, 11],
+            [1, 40, 30, 20],
+            [3, 256, 130, 140],
+            [90, 20, 31, 33],
+        ] {
+            let a = Tensor::from_fn(&[batch, k, m], value).t().flip(-1);
+            let b = Tensor::from_fn(&[n, k], value).t().flip(0);
+            let (a_copy, b_copy) = (a.packed(), b.packed());
+            let got = matmul(&a, &b, &pool);
+            assert_eq!(got.shape(), [batch, m, n]);
+            for (i, got) in got.as_slice().chunks(m * n).enumerate() {
+                let expected = naive(&a_copy.as_slice()[i * m * k..][..m * k], b_copy.as_slice(), [m, k, n]);
+                let close = got.iter().zip(&expected).all(|(got, expected)| (got - expected).abs() <= 1e-10);
+                assert!(close, "{batch} of {m}x{k} by {k}x{n}");
+            }
+        }
+        // One factor repeated, and rows that are all the same.
+        let (a, b) = (Tensor::from_fn(&[1, 40], value).broadcast_to(&[300, 40]), Tensor::from_fn(&[2, 40, 5], value));
+        assert!(matmul(&a, &b, &pool).is_close(&matmul(&a.packed(), &b, &pool), 1e-13, 1e-13));
     }
 
     #[test]

@@ -4,7 +4,6 @@
 //! threads of the caller's rayon pool work on the pieces. Who has cut the work already, further outside, says so with
 //! [`serial`]: an operation that waited for others there would only delay it.
 
-use crate::Scalar;
 use rayon::prelude::*;
 use std::cell::Cell;
 
@@ -71,13 +70,6 @@ pub fn chunks<T: Send, S>(
     }
 }
 
-/// Calls `f(start, piece)` for pieces of `out` that begin at element `start`: on all threads if that is worth it, at
-/// `work` operations an element.
-pub(crate) fn pieces<T: Scalar>(out: &mut [T], work: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
-    let work = work * out.len();
-    chunks(out, PIECE, work, || (), &|_, i, piece| f(i * PIECE, piece));
-}
-
 #[cfg(test)]
 mod tests {
     use super::{is_worthwhile, serial};
@@ -140,6 +132,8 @@ mod tests {
                 .into_iter()
                 // Cut by columns, by depth, by neither.
                 .chain([
+                    (256, 8192, 64),
+                    (700, 9001, 100),
                     (24, 517, 2111),
                     (3, 64, 100_003),
                     (7, 60_001, 11),

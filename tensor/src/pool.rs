@@ -45,6 +45,9 @@ impl<T> Shelf<T> {
 /// Tensors of at most this many elements, scalars above all, do without the pool: an allocator is quicker with them.
 const SMALL: usize = 64;
 
+/// Elements from which new memory is left to the system to clear.
+const LARGE: usize = 1 << 18;
+
 /// Buffers are rounded up to a quarter of a power of two, so that sizes that vary from step to step share them; at
 /// most 25 % of a buffer is unused.
 fn class(len: usize) -> usize {
@@ -54,8 +57,14 @@ fn class(len: usize) -> usize {
 
 /// A new buffer that is to be overwritten; where assertions are on, what is forgotten shows as NaN.
 ///
-/// Unlike `vec!`, which asks the allocator for cleared memory; that is the slow way to get a little of it.
+/// A little is cleared here: it is the slow way to ask the allocator for it. What is large is only promised by the system,
+/// and comes to be where it is written to, on all threads that write.
 fn unspecified<T: Scalar>(len: usize, capacity: usize) -> Vec<T> {
+    if capacity >= LARGE && !cfg!(debug_assertions) {
+        let mut values = vec![T::ZERO; capacity];
+        values.truncate(len);
+        return values;
+    }
     let mut values = Vec::with_capacity(capacity);
     values.resize(len, if cfg!(debug_assertions) { T::from_f64(f64::NAN) } else { T::ZERO });
     values
@@ -102,7 +111,8 @@ impl<T: Scalar> Pool<T> {
     /// Puts a vector that [`take`](Self::take) gave out back on its shelf; others are freed.
     pub fn give(&self, buffer: Vec<T>) {
         let capacity = buffer.capacity();
-        if capacity == class(capacity)
+        if capacity > 0
+            && capacity == class(capacity)
             && let Some(mut shelves) = self.shelves()
         {
             shelves.free.entry(capacity).or_default().buffers.push(buffer);
@@ -208,6 +218,13 @@ mod tests {
         drop(alias);
         assert_eq!(pool.tensor(&[998]).as_slice().as_ptr(), address);
         assert_eq!(pool.allocated(), 2 * class(1000));
+    }
+
+    #[test]
+    fn a_vector_that_was_taken_out_leaves_nothing_behind() {
+        let pool = Pool::<f32>::new();
+        drop(pool.full(&[100], 1.0).into_vec());
+        assert!(pool.shelves().unwrap().free.is_empty());
     }
 
     #[test]

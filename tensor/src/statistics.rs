@@ -212,10 +212,11 @@ mod tests {
             assert_eq!((x.sum(), x.max(), x.min()), (array.sum(), 12.5, -9.5));
             assert_eq!(x.mean(), array.sum() / 60.0);
             assert!((x.norm() - array.mapv(|x| x * x).sum().sqrt()).abs() < 1e-12);
-            assert!(
-                (x.var_over([0, -1], 1).shape(), x.max_over(Axes::from(1).keepdims()).ndim())
-                    == (&[x.shape()[1]][..], 3)
-            );
+            // Several axes are one.
+            let middle = x.permute(&[1, 0, 2]).reshape(&[x.shape()[1], x.len() / x.shape()[1]]);
+            assert!(x.var_over([0, -1], 1).is_close(&middle.var_over(1, 1), 1e-13, 0.0));
+            assert_eq!(x.max_over(Axes::from([2, 0]).keepdims()).to_vec(), middle.max_over(1).to_vec());
+            assert!(x.sum_over([0, -1]).is_close(&middle.sum_over(1), 1e-13, 1e-13));
         }
     }
 
@@ -229,6 +230,8 @@ mod tests {
         assert!(none.mean().is_nan() && none.var_over(0, 0)[[1]].is_nan() && none.max_over(1).is_empty());
         assert!(std::panic::catch_unwind(|| none.max_over(0)).is_err());
         assert_eq!((huge.distance(&huge), none.distance(&none)), (0.0, 0.0));
+        let (zero, far) = (Tensor::from([0.0, 0.0]), Tensor::from([1.0_f32, -3.0]));
+        assert_eq!((zero.distance(&far), far.distance(&zero)), (3.0, 3.0));
         assert!(Tensor::from([f32::NAN, 0.0]).distance(&Tensor::from([0.0, 1.0])).is_nan());
     }
 }

@@ -84,6 +84,9 @@ impl<T: Scalar> Tensor<T> {
     pub(crate) fn with_layout(&self, layout: Layout) -> Self {
         debug_assert_eq!(layout.source(), self.buffer().len());
         let shape = Shape::from_slice(layout.shape());
+        if layout.is_empty() {
+            return Tensor::pooled(shape, vec![], Pool::none());
+        }
         let whole = layout.offset() == 0 && layout.len() == layout.source() && layout.is_packed();
         let view = (!whole).then(|| Arc::new(View { layout, packed: OnceLock::new() }));
         Tensor { shape, data: self.data.clone(), view }
@@ -189,13 +192,15 @@ impl<T: Scalar> Tensor<T> {
         if view.layout.is_packed() {
             return &self.buffer()[view.layout.offset()..][..self.len()];
         }
-        let packed = view.packed.get_or_init(|| {
-            let pool = self.pool();
-            let mut values = pool.take(self.len());
-            view.layout.read(self.buffer(), &mut values);
-            Buffer { values, pool }
-        });
-        &packed.values
+        if let Some(packed) = view.packed.get() {
+            return &packed.values;
+        }
+        // Not while others wait for it: a thread that waits for its helpers may take up one of them. Who comes second throws
+        // its copy away.
+        let pool = self.pool();
+        let mut values = pool.take(self.len());
+        view.layout.read(self.buffer(), &mut values);
+        &view.packed.get_or_init(|| Buffer { values, pool }).values
     }
 
     /// The elements in row-major order for writing; what another tensor shares, or a view shows out of order, is copied
@@ -342,6 +347,21 @@ mod tests {
         let mut empty = Tensor::<f32>::zeros(&[0, 3]);
         assert!(empty.is_empty() && empty.reshape(&[3, 0]).as_slice().is_empty());
         assert!(empty.as_mut_slice().is_empty() && empty.into_vec().is_empty());
+        // Steps along other axes lead out of a buffer that holds nothing.
+        let empty = Tensor::<f32>::from_vec(&[0, 3], vec![]);
+        for view in
+            [empty.slice(crate::s![.., 1..]), empty.flip(1), empty.t().diagonal(1), empty.slice(crate::s![.., 2])]
+        {
+            assert!(view.to_vec().is_empty() && view.as_slice().is_empty() && (&view + 1.0).is_empty());
+            assert_eq!(view.sum(), 0.0);
+        }
+        let repeated = Tensor::full(&[3], f32::NAN);
+        assert!(
+            !repeated.is_finite()
+                && Tensor::full(&[0], f32::NAN).is_finite()
+                && !repeated.slice(crate::s![1..]).is_finite()
+        );
+        assert!(Tensor::from([1.0, f32::INFINITY, 2.0]).slice(crate::s![..;2]).is_finite());
         let mut one = Tensor::scalar(1.0_f32);
         one.as_mut_slice()[0] = 2.0;
         assert_eq!((one.item(), one.reshape(&[1, 1]).into_vec()), (2.0, vec![2.0]));

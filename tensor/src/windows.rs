@@ -1,5 +1,6 @@
 //! The windows that a 2-D convolution or pooling sees of an image. One image at a time: a batch is the caller's loop.
 
+use crate::parallel::{ELEMENT, chunks};
 use crate::{Scalar, simd};
 use std::ops::Range;
 
@@ -120,12 +121,15 @@ impl Windows {
     pub fn unfold<T: Scalar>(&self, image: &[T], out: &mut [T]) {
         let (count, per_channel) = (self.count(), self.kernel_len() * self.count());
         self.check(image.len(), out.len(), per_channel);
-        if self.padding != [0, 0] {
-            out.fill(T::ZERO);
+        if out.is_empty() {
+            return;
         }
-        let step = self.stride[1];
-        let images = image.chunks_exact(self.pixels().max(1));
-        for (image, out) in images.zip(out.chunks_exact_mut(per_channel)) {
+        let (step, work, pixels) = (self.stride[1], ELEMENT * out.len(), self.pixels());
+        chunks(out, per_channel, work, || (), &|_, channel, out| {
+            if self.padding != [0, 0] {
+                out.fill(T::ZERO);
+            }
+            let image = &image[channel * pixels..][..pixels];
             self.runs(|k, windows, first| {
                 let out = &mut out[k * count..][windows];
                 if step == 1 {
@@ -136,7 +140,7 @@ impl Windows {
                     }
                 }
             });
-        }
+        });
     }
 
     /// The adjoint of [`unfold`](Self::unfold): adds each column to the pixels that its window sees ("col2im").
@@ -147,13 +151,15 @@ impl Windows {
     pub fn fold<T: Scalar>(&self, columns: &[T], image: &mut [T]) {
         let (count, per_channel) = (self.count(), self.kernel_len() * self.count());
         self.check(image.len(), columns.len(), per_channel);
-        for (image, columns) in image.chunks_exact_mut(self.pixels().max(1)).zip(columns.chunks_exact(per_channel)) {
+        let work = ELEMENT * columns.len();
+        chunks(image, self.pixels().max(1), work, || (), &|_, channel, image| {
+            let columns = &columns[channel * per_channel..][..per_channel];
             self.add_runs(
                 image,
                 #[inline(always)]
                 |k, windows| &columns[k * count..][windows],
             );
-        }
+        });
     }
 
     /// Adds `values(k, windows)` to the pixels that are element `k` of these windows.

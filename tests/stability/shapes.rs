@@ -177,7 +177,7 @@ proptest! {
             let mut leaf = |shape: &[usize]| tape.leaf(Tensor::from_fn(shape, |_| { value += 0.37; 0.1 + value % 1.0 }));
             let [a, b, c] = [&a, &b, &c].map(|shape| leaf(shape));
             let Some(y) = apply(op, &a, &b, &c, k) else { return };
-            let first = y.sum().grad_graph(&[&a, &b, &c]);
+            let first = y.tracked().sum().grad_graph(&[&a, &b, &c]);
             let again = first.iter().fold(tape.constant(Tensor::scalar(0.0)), |sum, grad| sum + grad.square().sum());
             again.grad(&[&a, &b, &c]);
         }));

@@ -1,7 +1,7 @@
 //! Operations that move elements: reshape, permute, slice, flip, pad, concat.
 
 use crate::{Grads, Op, Reads, ShapeError, SparseGrad, Var, Vjp};
-use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor, concat};
+use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor, checked_len, concat};
 use std::sync::Arc;
 
 /// Stands for the extent that follows from the others, in [`Var::reshape`].
@@ -20,7 +20,7 @@ impl<T: Scalar> Op<T> for Reshape {
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        if x[0].iter().product::<usize>() != self.shape.iter().product::<usize>() {
+        if checked_len(x[0]) != checked_len(&self.shape) {
             return Err(format!("{:?} holds another number of elements", self.shape));
         }
         Ok(self.shape.clone())
@@ -79,6 +79,10 @@ impl<T: Scalar> Op<T> for View {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         if cx.recording() {
             return Grads::one(cx.tape().apply(Scatter(self.clone()), &[cx.g()]));
+        }
+        // What shows every element once leads back without a copy.
+        if let Some(back) = self.layout.inverted() {
+            return Grads::one(cx.constant(cx.g().value().seen_through(&back).reshape(cx.shape(0))));
         }
         Grads::new([None]).with_sparse(0, Arc::new(ViewGrad { view: self.clone(), g: cx.g().value().clone() }))
     }

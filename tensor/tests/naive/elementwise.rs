@@ -1,9 +1,7 @@
 //! Maps with every kind of broadcast, sines in blocks of quick and other ones, lanes.
 
 use crate::support::{around, close, in_both, same, values, wide};
-use raygrad_tensor::{
-    Pool, Real, Scalar, Tensor, add_assign, broadcast_shape, broadcast_to, lanes, lanes_either, map, map_real,
-};
+use raygrad_tensor::{Pool, Real, Scalar, Tensor, add_assign, broadcast_shape, lanes, lanes_either, map, map_real};
 
 fn tensor<T: Scalar>(shape: &[usize], seed: usize) -> Tensor<T> {
     Tensor::from_vec(shape, values(shape.iter().product(), seed))
@@ -57,7 +55,7 @@ fn broadcasts<T: Scalar>() {
             assert_eq!(y.shape(), &shape[..]);
             same(&what, y.as_slice(), exact());
             for x in [x, a, b] {
-                let y = broadcast_to(&x, &shape, &pool);
+                let y = x.broadcast_to(&shape);
                 assert_eq!(y.shape(), &shape[..]);
                 same(&what, y.as_slice(), (0..count).map(|i| at(&x, i)));
             }
