@@ -209,6 +209,16 @@ pub fn lanes_fused<T: Scalar, const QUICK: bool, const K: usize, const N: usize,
 ) -> bool {
     assert!(x.len() == K + N && out.len() == M, "{} operands and {} results of a formula", x.len(), out.len());
     let n = out.first().map_or(0, |out| out.len());
+    if M > 1 && n == 1 {
+        // Numbers do without what holds the results of a stretch.
+        let (first, second) = (cut::<T, K>(x, 0, 1), cut::<T, N>(x, K, 1));
+        let results = f(gather(&first, 0), gather(&second, 0));
+        let mut outside = T::Flags::default();
+        for (out, result) in out.iter_mut().zip(results) {
+            (out[0], outside) = (result.parts().0, outside | result.parts().1);
+        }
+        return T::is_set(outside);
+    }
     simd::dispatch(
         #[inline(always)]
         || {

@@ -3,10 +3,44 @@
 use crate::parallel::{ELEMENT, PIECE, chunks};
 use crate::{Layout, Scalar};
 use smallvec::SmallVec;
+use std::array::from_fn;
 use std::ops::Range;
 
 /// Rows and columns of a tile of a transpose: a cache line of f32 each way.
 const TILE: usize = 16;
+
+/// Rows and columns of a block of tiles.
+const BLOCK: usize = 64;
+
+/// The parts of a range, `len` long but for the last.
+fn starts(range: Range<usize>, len: usize) -> impl Iterator<Item = Range<usize>> {
+    range.clone().step_by(len).map(move |start| start..range.end.min(start + len))
+}
+
+/// `out[i * row_step + j] = source[start + j * step + i]` for a tile of `height x width`.
+fn transpose<T: Scalar>(
+    source: &[T],
+    start: usize,
+    step: isize,
+    out: &mut [T],
+    row_step: usize,
+    [height, width]: [usize; 2],
+) {
+    let line = |j: usize| &source[(start as isize + j as isize * step) as usize..];
+    if [height, width] == [TILE; 2] {
+        let tile: [[T; TILE]; TILE] = from_fn(|j| from_fn(|i| line(j)[..TILE][i]));
+        for i in 0..TILE {
+            let row: [T; TILE] = from_fn(|j| tile[j][i]);
+            out[i * row_step..][..TILE].copy_from_slice(&row);
+        }
+        return;
+    }
+    for j in 0..width {
+        for (i, &x) in line(j)[..height].iter().enumerate() {
+            out[i * row_step + j] = x;
+        }
+    }
+}
 
 /// A run of a walk: elements at equal steps in the buffer.
 struct Run {
@@ -81,17 +115,30 @@ impl Layout {
     pub fn read<T: Scalar>(&self, source: &[T], out: &mut [T]) {
         assert_eq!(source.len(), self.source(), "source of a layout of {:?}", self.shape());
         assert_eq!(out.len(), self.len(), "output of a layout of {:?}", self.shape());
-        // Cut along the first axis that can be, at whole tiles.
-        let axis = self.shape().iter().position(|&extent| extent > 1).unwrap_or(self.shape().len());
-        let inner: usize = self.shape().iter().skip(axis + 1).product();
-        if out.len() <= PIECE || inner == 0 {
-            return self.read_piece(source, out);
-        }
-        let at_once = (PIECE / inner).next_multiple_of(TILE).max(TILE);
         let work = ELEMENT * out.len();
+        if out.len() <= PIECE || self.rows_in_memory().is_none() {
+            return chunks(out, PIECE, work, || (), &|_, i, out| self.read_range(source, i * PIECE, out));
+        }
+        // Cut along the first axis that can be: at whole blocks, or between matrices.
+        let axis = self.shape().iter().position(|&extent| extent > 1).unwrap_or(0);
+        let inner: usize = self.shape()[axis + 1..].iter().product();
+        let whole = if self.strides()[axis] == 1 { BLOCK } else { 1 };
+        let at_once = (PIECE / inner).next_multiple_of(whole).max(whole);
         chunks(out, at_once * inner, work, || (), &|_, i, out| {
-            self.sliced(axis, i * at_once, out.len() / inner, 1).read_piece(source, out);
+            let part = self.sliced(axis, i * at_once, out.len() / inner, 1);
+            match part.rows_in_memory() {
+                Some(axis) => part.read_transposed(&part.collapsed(), axis, source, out),
+                None => part.read_range(source, 0, out),
+            }
         });
+    }
+
+    /// For a layout that turns matrices: the collapsed axis along which neighbours lie in memory, which is not the last.
+    fn rows_in_memory(&self) -> Option<usize> {
+        let axes = self.collapsed();
+        let &(columns, step) = axes.last()?;
+        let turned = step.unsigned_abs() > 1 && columns >= TILE && !self.is_empty();
+        turned.then(|| axes.iter().rposition(|&(extent, stride)| stride == 1 && extent >= TILE)).flatten()
     }
 
     /// Copies a range of the elements, counted in row-major order, to `out`.
@@ -104,18 +151,6 @@ impl Layout {
                 None => out.iter_mut().zip(run.positions()).for_each(|(out, position)| *out = source[position]),
             }
         });
-    }
-
-    fn read_piece<T: Scalar>(&self, source: &[T], out: &mut [T]) {
-        let axes = self.collapsed();
-        if let Some(&(columns, step)) = axes.last()
-            && step.unsigned_abs() > 1
-            && columns >= TILE
-            && let Some(axis) = axes.iter().rposition(|&(extent, stride)| stride == 1 && extent >= TILE)
-        {
-            return self.read_transposed(&axes, axis, source, out);
-        }
-        self.read_range(source, 0, out);
     }
 
     /// As [`read`](Self::read), where neighbours in memory lie along `axis` of the collapsed `axes` and not along the last.
@@ -134,19 +169,14 @@ impl Layout {
                 to += index * axes[other + 1..].iter().map(|&(extent, _)| extent).product::<usize>();
             }
             let out = &mut out[to..];
-            for row in (0..rows).step_by(TILE) {
-                let height = TILE.min(rows - row);
-                for column in (0..columns).step_by(TILE) {
-                    let width = TILE.min(columns - column);
-                    let mut tile = [[T::ZERO; TILE]; TILE];
-                    for (j, line) in tile[..width].iter_mut().enumerate() {
-                        let start = (from + (column + j) as isize * step) as usize + row;
-                        line[..height].copy_from_slice(&source[start..][..height]);
-                    }
-                    for i in 0..height {
-                        let out = &mut out[(row + i) * row_step + column..][..width];
-                        for (j, out) in out.iter_mut().enumerate() {
-                            *out = tile[j][i];
+            // Blocks of tiles, so that few pages of memory are in use at a time.
+            for rows in starts(0..rows, BLOCK) {
+                for columns in starts(0..columns, BLOCK) {
+                    for row in starts(rows.clone(), TILE) {
+                        for column in starts(columns.clone(), TILE) {
+                            let start = (from + column.start as isize * step) as usize + row.start;
+                            let out = &mut out[row.start * row_step + column.start..];
+                            transpose(&source[..], start, step, out, row_step, [row.len(), column.len()]);
                         }
                     }
                 }
