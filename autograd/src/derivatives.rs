@@ -170,7 +170,7 @@ impl<'t, T: Scalar> Var<'t, T> {
             let grads = self.vjp(&seed, wrt);
             inner(self.tape, &grads, tangents).tracked().grad_graph(&[&seed]).remove(0)
         });
-        slope.as_recorded()
+        slope.recorded_or_constant()
     }
 
     /// The product of the Hessian of this one-element tensor with the tangents, recorded: for each of `wrt` the
@@ -184,7 +184,7 @@ impl<'t, T: Scalar> Var<'t, T> {
             let grads = self.grad_graph(wrt);
             inner(self.tape, &grads, tangents).tracked().grad_graph(wrt)
         });
-        products.into_iter().map(Var::as_recorded).collect()
+        products.into_iter().map(Var::recorded_or_constant).collect()
     }
 
     /// The Jacobian with respect to each of `wrt`: tensors of the shape of this one followed by that of the variable.
@@ -244,7 +244,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// A result of the tape as it records now: a constant in [`Tape::no_grad`].
-    fn as_recorded(self) -> Self {
+    fn recorded_or_constant(self) -> Self {
         if self.tape.is_recording() { self } else { self.detach() }
     }
 }

@@ -176,7 +176,7 @@ impl Layout {
                         for column in starts(columns.clone(), TILE) {
                             let start = (from + column.start as isize * step) as usize + row.start;
                             let out = &mut out[row.start * row_step + column.start..];
-                            transpose(&source[..], start, step, out, row_step, [row.len(), column.len()]);
+                            transpose(source, start, step, out, row_step, [row.len(), column.len()]);
                         }
                     }
                 }
