@@ -130,6 +130,23 @@ fn a_penalty_on_a_lazy_table_visits_every_row() {
     }
 }
 
+#[test]
+fn a_lazy_table_moves_as_an_eager_one_where_every_row_has_a_gradient() {
+    for (name, make) in optimisers::<f64>() {
+        let (mut lazy, ids) = model::<f64>(true);
+        let mut eager = lazy.clone();
+        eager.set_lazy(|_| true, false);
+        let [mut one, mut other] = [make(), make()];
+        for step in 0..30 {
+            train(&mut *one, &mut lazy, ids, step, true).unwrap();
+            train(&mut *other, &mut eager, ids, step, true).unwrap();
+        }
+        for (a, b) in lazy.values().iter().zip(eager.values()) {
+            assert!(a.is_close(b, 1e-11, 1e-12), "{name}: {a} and {b}");
+        }
+    }
+}
+
 /// A state survives its file.
 fn stored<T: Scalar>(state: &OptimizerState<T>) -> OptimizerState<T> {
     let read = OptimizerState::from_safetensors(&state.to_safetensors().unwrap()).unwrap();

@@ -4,15 +4,25 @@ use crate::layout::len_of;
 use crate::{Scalar, Shape, Tensor};
 use std::collections::HashMap;
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 /// Gives out the buffers of tensors that were dropped before.
 ///
 /// A clone is another handle on the same pool. Tensors made by a pool remember it and give their buffer back when the
-/// last reference goes, on whatever thread; so a loop that builds and drops the same graph allocates nothing of tensor
+/// last reference goes, on whatever thread, as long as a handle on the pool is left; so a loop that builds and drops the same graph allocates nothing of tensor
 /// size after its first round. [`Pool::none`] makes plain tensors that free their memory.
 #[derive(Clone)]
 pub struct Pool<T: Scalar>(Option<Arc<Mutex<Shelves<T>>>>);
+
+/// A pool as the buffers remember it that it gave out: they do not keep it, and what lies in it, alive.
+pub(crate) struct Home<T>(Weak<Mutex<Shelves<T>>>);
+
+impl<T: Scalar> Home<T> {
+    /// The pool, if anybody still has it; else none.
+    pub fn pool(&self) -> Pool<T> {
+        Pool(self.0.upgrade())
+    }
+}
 
 /// Free buffers by capacity class.
 struct Shelves<T> {
@@ -185,8 +195,9 @@ impl<T: Scalar> Pool<T> {
         })
     }
 
-    pub(crate) fn is_some(&self) -> bool {
-        self.0.is_some()
+    /// Where buffers of this pool go back to.
+    pub(crate) fn home(&self) -> Home<T> {
+        Home(self.0.as_ref().map_or_else(Weak::new, Arc::downgrade))
     }
 }
 
@@ -218,6 +229,18 @@ mod tests {
         drop(alias);
         assert_eq!(pool.tensor(&[998]).as_slice().as_ptr(), address);
         assert_eq!(pool.allocated(), 2 * class(1000));
+    }
+
+    #[test]
+    fn a_tensor_that_outlives_its_pool_does_not_keep_it() {
+        let pool = Pool::<f32>::new();
+        drop(pool.full(&[1000], 1.0));
+        let survivor = pool.full(&[2000], 2.0);
+        let Home(shelves) = pool.home();
+        drop(pool);
+        assert!(shelves.upgrade().is_none());
+        assert_eq!((&survivor + 1.0).as_slice(), [3.0; 2000]);
+        assert_eq!(survivor.reshape(&[40, 50]).t().into_vec(), [2.0; 2000]);
     }
 
     #[test]

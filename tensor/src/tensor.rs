@@ -1,6 +1,7 @@
 //! The tensor: a shared buffer, and which of its elements stands where.
 
 use crate::layout::{checked_len, len_of};
+use crate::pool::Home;
 use crate::{Layout, Pool, Scalar};
 use smallvec::SmallVec;
 use std::slice;
@@ -42,14 +43,12 @@ enum Data<T: Scalar> {
 /// Elements, and the pool that gets them when the last tensor goes.
 struct Buffer<T: Scalar> {
     values: Vec<T>,
-    pool: Pool<T>,
+    home: Home<T>,
 }
 
 impl<T: Scalar> Drop for Buffer<T> {
     fn drop(&mut self) {
-        if self.pool.is_some() {
-            self.pool.give(std::mem::take(&mut self.values));
-        }
+        self.home.pool().give(std::mem::take(&mut self.values));
     }
 }
 
@@ -65,7 +64,7 @@ impl<T: Scalar> Tensor<T> {
         debug_assert_eq!(checked_len(&shape), Some(values.len()));
         let data = match values[..] {
             [one] => Data::One(one),
-            _ => Data::Shared(Arc::new(Buffer { values, pool })),
+            _ => Data::Shared(Arc::new(Buffer { values, home: pool.home() })),
         };
         Tensor { shape, data, view: None }
     }
@@ -96,7 +95,7 @@ impl<T: Scalar> Tensor<T> {
     pub(crate) fn pool(&self) -> Pool<T> {
         match &self.data {
             Data::One(_) => Pool::none(),
-            Data::Shared(buffer) => buffer.pool.clone(),
+            Data::Shared(buffer) => buffer.home.pool(),
         }
     }
 
@@ -200,7 +199,7 @@ impl<T: Scalar> Tensor<T> {
         let pool = self.pool();
         let mut values = pool.take(self.len());
         view.layout.read(self.buffer(), &mut values);
-        &view.packed.get_or_init(|| Buffer { values, pool }).values
+        &view.packed.get_or_init(|| Buffer { values, home: pool.home() }).values
     }
 
     /// The elements in row-major order for writing; what another tensor shares, or a view shows out of order, is copied
@@ -230,7 +229,7 @@ impl<T: Scalar> Tensor<T> {
         let buffer = packed.unwrap_or_else(|| {
             let mut values = pool.take(layout.len());
             layout.read(self.buffer(), &mut values);
-            Buffer { values, pool }
+            Buffer { values, home: pool.home() }
         });
         self.data = match buffer.values[..] {
             [one] => Data::One(one),

@@ -126,6 +126,12 @@ mod tests {
     }
 
     #[test]
+    fn a_stair_rises_first() {
+        let stair = Schedule::Step { from: 0.8, factor: 0.5, every: 0.25, warmup: 0.5 };
+        assert_rates(stair, &[(0.0, 0.0), (0.125, 0.2), (0.25, 0.2), (0.5, 0.2), (0.75, 0.1)]);
+    }
+
+    #[test]
     fn schedules_hit_their_ends() {
         let decay = Schedule::Exponential { from: 1e-2, to: 1e-4, warmup: 0.1 };
         assert_eq!(decay.rate(0.0), 0.0);
