@@ -7,11 +7,11 @@
 
 use rand::rngs::StdRng;
 use rand::{Rng, RngExt, SeedableRng};
-use raygrad::autograd::{
+use raygrad::tensor::{map, parallel};
+use raygrad::{
     Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Gradient, Init, Linear, Mlp, Optimizer, Params, Pool,
     Pool2dConfig, Tape, Tensor, Var, formula,
 };
-use raygrad::tensor::{map, parallel};
 use rayon::prelude::*;
 use std::time::Instant;
 

@@ -5,7 +5,7 @@
 //! cargo run --release --example 01_tensors
 //! ```
 
-use raygrad::autograd::{Axes, Tape, Tensor, Var};
+use raygrad::{Axes, Tape, Tensor, Var};
 
 fn print(what: &str, x: &Var<'_, f64>) {
     println!("{what} {:?}\n{:.3}\n", x.shape(), x.value().view());

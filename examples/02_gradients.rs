@@ -4,8 +4,9 @@
 //! cargo run --release --example 02_gradients
 //! ```
 
-use raygrad::autograd::{
-    Check, Tape, Tensor, Var, check_function,
+use raygrad::check::{Check, check_function};
+use raygrad::{
+    Tape, Tensor, Var,
     derivatives::{hessian, hvp, jacobian},
 };
 

@@ -4,7 +4,8 @@
 //! cargo run --release --example 03_custom_op
 //! ```
 
-use raygrad::autograd::{Cases, Check, Entry, Formula, Real, Tape, Tensor, check_op, formula};
+use raygrad::check::{Cases, Check, Entry, check_op};
+use raygrad::{Formula, Real, Tape, Tensor, formula};
 
 /// The soft sign, y = x / (1 + |x|), with a gradient by hand that may have a mistake in it; dx = g / (1 + |x|)^2.
 ///

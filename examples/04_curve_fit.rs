@@ -7,7 +7,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Adam, AdamConfig, Optimizer, Params, Schedule, Tape, Tensor, Var, derivatives::hvp};
+use raygrad::{Adam, AdamConfig, Optimizer, Params, Schedule, Tape, Tensor, Var, derivatives::hvp};
 
 const POINTS: usize = 200;
 const STEPS: u64 = 3000;

@@ -10,11 +10,11 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{
+use raygrad::nerf::Image;
+use raygrad::{
     Activation, Adam, AdamConfig, Bound, Init, Linear, Optimizer, Params, Pass, Pool, Schedule, Sequential, Tape,
     Tensor, Var,
 };
-use raygrad::nerf::Image;
 use std::f32::consts::TAU;
 use std::path::PathBuf;
 
@@ -34,7 +34,7 @@ fn curve(angle: f32) -> [f32; 2] {
 /// The distance that the network is to find without having been told, from many points of the border.
 fn exact_distance(border: &[[f32; 2]], at: [f32; 2]) -> f32 {
     let square = |p: &[f32; 2]| (p[0] - at[0]).powi(2) + (p[1] - at[1]).powi(2);
-    let nearest = border.iter().map(square).fold(f32::INFINITY, raygrad::autograd::Real::minimum).sqrt();
+    let nearest = border.iter().map(square).fold(f32::INFINITY, raygrad::Real::minimum).sqrt();
     let edge = curve(at[1].atan2(at[0]));
     if at[0].hypot(at[1]) < edge[0].hypot(edge[1]) { -nearest } else { nearest }
 }

@@ -11,7 +11,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{
+use raygrad::{
     Activation, Adam, AdamConfig, Conv2d, Conv2dConfig, INFER, Init, Linear, Optimizer, Params, Pass, Pool2dConfig,
     Sequential, Tape, Tensor,
 };

@@ -5,7 +5,7 @@
 //! cargo run --release --example 07_newton
 //! ```
 
-use raygrad::autograd::{Tape, Tensor, Var, derivatives::value_and_grad};
+use raygrad::{Tape, Tensor, Var, derivatives::value_and_grad};
 
 const DIMENSIONS: usize = 100;
 
@@ -89,7 +89,7 @@ fn main() {
         }
         x = moved(&x, h, &direction);
     }
-    let farthest = x.iter().map(|x| (x - 1.0).abs()).fold(0.0, raygrad::autograd::Real::maximum);
+    let farthest = x.iter().map(|x| (x - 1.0).abs()).fold(0.0, raygrad::Real::maximum);
     println!("  all variables are 1 within {farthest:.0e}");
     assert!(farthest < 1e-6, "another minimum, or none");
 

@@ -10,11 +10,9 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{
-    Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Optimizer, Params, Schedule, Tape, Tensor, Var,
-};
 use raygrad::nerf::scene::{Scene, train_cameras};
 use raygrad::nerf::{Image, PositionalEncoding, metrics};
+use raygrad::{Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Optimizer, Params, Schedule, Tape, Tensor, Var};
 use std::path::PathBuf;
 
 const STEPS: usize = 3000;

@@ -44,7 +44,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let pairs = || images.iter().zip(&unskipped);
         let mean = pairs().map(|(a, b)| psnr(a, b)).sum::<f64>() / images.len() as f64;
         let errors = pairs().flat_map(|(a, b)| a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs()));
-        let largest = errors.fold(0.0, raygrad::autograd::Real::maximum);
+        let largest = errors.fold(0.0, raygrad::Real::maximum);
         let fewer = 2.0 * counts.unskipped as f64 / (counts.density + counts.color) as f64;
         let [density, color] = [counts.density, counts.color].map(per_pixel);
         println!("{name:9} {density:8.1}{color:8.1}{fewer:21.1}{mean:10.1}{largest:15.1e}{seconds:9.2}");

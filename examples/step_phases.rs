@@ -11,7 +11,6 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Pool, Tape, Tensor};
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::hash_grid::{HashGrad, HashGrid, TableOptimizer};
 use raygrad::nerf::occupancy::MarchBuffer;
@@ -20,6 +19,7 @@ use raygrad::nerf::visible::composite_visible;
 use raygrad::nerf::{Config, Extent, FieldConfig, InstantConfig, Model, Rays, Sampler, clip_span};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::simd;
+use raygrad::{Pool, Tape, Tensor};
 use serde_json::Value;
 use std::error::Error;
 use std::hint::black_box;

@@ -13,10 +13,10 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::scene::{Scene, train_cameras};
 use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result};
+use raygrad::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
 use std::path::PathBuf;
 
 const STEPS: usize = 6000;

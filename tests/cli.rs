@@ -148,7 +148,7 @@ fn pictures_and_animations() {
     place.succeeds("render run --size 20x10 --out double.png --precision f64");
     let [single, double] = ["single.png", "double.png"].map(|name| png(&place.path(name)));
     let differences = single.data.iter().zip(&double.data).map(|(a, b)| (a - b).abs());
-    assert!(differences.fold(0.0, raygrad::autograd::Real::maximum) <= 1.5 / 255.0, "both precisions show the same");
+    assert!(differences.fold(0.0, raygrad::Real::maximum) <= 1.5 / 255.0, "both precisions show the same");
     let wide = png(&place.path("wide.PNG"));
     assert_eq!([wide.width, wide.height], [20, 10]);
     place.succeeds("render run --path test --out test.gif");

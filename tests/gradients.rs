@@ -2,9 +2,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{
-    Activation, Bound, Check, Op, Real, Scalar, Segments, Tape, Tensor, Var, check_function, check_op,
-};
+use raygrad::check::{Check, check_function, check_op};
 use raygrad::nerf::hash_grid::HashGridConfig;
 use raygrad::nerf::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampler::Jitter;
@@ -13,6 +11,7 @@ use raygrad::nerf::{
     ClassicConfig, Composite, Config, Extent, FieldConfig, Loss as LossKind, Model, PositionalEncoding, Preset, Rays,
     SamplerConfig, Samples, VoxelConfig, catalogue, clip_span,
 };
+use raygrad::{Activation, Bound, Op, Real, Scalar, Segments, Tape, Tensor, Var};
 use std::collections::BTreeSet;
 use std::path::Path;
 

@@ -2,10 +2,10 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::autograd::{Tape, Tensor};
 use raygrad::nerf::dataset::{Dataset, Split, embedded};
 use raygrad::nerf::hierarchical::HierarchicalConfig;
 use raygrad::nerf::{ClassicConfig, Config, Extent, Field, FieldConfig, Model, Preset, SamplerConfig, Trainer};
+use raygrad::{Tape, Tensor};
 use std::sync::Arc;
 
 /// Networks as deep as the paper's and so narrow that many seeds are dead.
@@ -38,7 +38,7 @@ fn density_share(model: &Model<f32>) -> f64 {
         let density = field.density(&params, &field.encode(&params, &tape.constant(points.clone()))).sigma();
         density.value().as_slice().iter().filter(|&&sigma| sigma > 0.0).count() as f64 / 400.0
     };
-    model.fields().into_iter().map(share).fold(1.0, raygrad::autograd::Real::minimum)
+    model.fields().into_iter().map(share).fold(1.0, raygrad::Real::minimum)
 }
 
 #[test]

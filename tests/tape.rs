@@ -1,9 +1,7 @@
 //! What the tape promises: derivatives of any order, threads that never meet, errors that name the line at fault.
 
-use raygrad::autograd::{
-    Activation, Check, Entry, Error, Grads, Op, Pool, Reads, RowGrad, Scalar, Shape, ShapeError, Tape, Tensor, Var,
-    Vjp, check_function, check_op,
-};
+use raygrad::check::{Check, Entry, check_function, check_op};
+use raygrad::{Activation, Error, Grads, Op, Pool, Reads, RowGrad, Scalar, Shape, ShapeError, Tape, Tensor, Var, Vjp};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 fn vector(values: &[f64]) -> Tensor<f64> {
@@ -500,7 +498,7 @@ fn a_gradient_can_be_taken_inside_of_whatever_runs_a_function() {
     // Differences of values, and functions of tensors.
     let at = Tensor::from_vec(&[2], vec![0.4, -1.1]);
     check_function(&Check::default(), &[at], |x| slope(x) * &x[0]).unwrap();
-    let (y, grads) = raygrad::autograd::derivatives::value_and_grad(slope, &[Tensor::scalar(3.0)]);
+    let (y, grads) = raygrad::derivatives::value_and_grad(slope, &[Tensor::scalar(3.0)]);
     assert_eq!((y, grads[0].item()), (27.0, 18.0));
 }
 
@@ -560,7 +558,7 @@ struct Total;
 /// The same number everywhere.
 struct Everywhere(Shape, f64);
 
-impl raygrad::autograd::SparseGrad<f64> for Everywhere {
+impl raygrad::SparseGrad<f64> for Everywhere {
     fn shape(&self) -> &[usize] {
         &self.0
     }
@@ -718,11 +716,8 @@ fn what_an_operation_promises_is_checked_in_every_build() {
     }
     assert_eq!(tape.apply(Broken::Recorded, &[&x]).sum().grad(&[&x])[0].as_slice(), [1.0, 0.0]);
     assert!(panic_of(|| tape.apply(Broken::Missing, &[&x, &x])).contains("broken: 2 inputs instead of 1"));
-    let twice = raygrad::autograd::formula!(|x| x + x);
-    assert!(
-        panic_of(|| tape.apply(raygrad::autograd::Elementwise::<_, 1>(twice), &[&x, &x]))
-            .contains("2 inputs instead of 1")
-    );
+    let twice = raygrad::formula!(|x| x + x);
+    assert!(panic_of(|| tape.apply(raygrad::Elementwise::<_, 1>(twice), &[&x, &x])).contains("2 inputs instead of 1"));
 }
 
 #[test]

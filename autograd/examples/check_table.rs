@@ -4,14 +4,15 @@
 //! cargo run --release -p raygrad-autograd --example check_table
 //! ```
 
-use raygrad_autograd::{Check, Report, catalogue, check_op, write_atomic};
+use raygrad_autograd::check::{Check, Report, catalogue, check_op};
+use raygrad_nn::write_atomic;
 use std::fmt::Write;
 use std::path::Path;
 
 const HEAD: &str = "# Operations and their errors
 
 Written by `cargo run --release -p raygrad-autograd --example check_table`. Every operation of the catalogue
-(`autograd/src/catalogue.rs`) is examined on several inputs: scalars, no elements, broadcast shapes, rows short and long.
+(`autograd/src/check/catalogue.rs`) is examined on several inputs: scalars, no elements, broadcast shapes, rows short and long.
 
 - **entries**: how often the operation is in the catalogue, with different settings; **checks**: comparisons made.
 - **first**, **second**: derivatives against central differences in f64, with a step scaled to the input and Richardson's

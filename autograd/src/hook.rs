@@ -79,7 +79,8 @@ impl<'t, T: Scalar> Var<'t, T> {
 
 #[cfg(test)]
 mod tests {
-    use crate::{Check, Tape, Tensor, check_function};
+    use crate::check::{Check, check_function};
+    use crate::{Tape, Tensor};
     use std::sync::{Arc, Mutex};
 
     #[test]

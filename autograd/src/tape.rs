@@ -72,8 +72,9 @@ impl<T: Scalar> Tape<T> {
         self.nodes.clear();
     }
 
-    /// Frees the operations that are recorded and the values that they hold; their variables stay.
-    pub(crate) fn free(&self) {
+    /// Frees the operations that are recorded and the values that only they hold; variables keep their values, but have no
+    /// gradient any more.
+    pub fn free(&self) {
         self.nodes.free_operations();
     }
 

@@ -1,6 +1,6 @@
 //! Every operation in the catalogue is examined, and every operation in the sources is in the catalogue.
 
-use raygrad_autograd::{Check, catalogue, check_op};
+use raygrad_autograd::check::{Check, catalogue, check_op};
 use std::collections::BTreeSet;
 
 #[test]

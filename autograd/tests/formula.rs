@@ -1,6 +1,7 @@
 //! Formulas: fused operations against what they are made of, and the whole crate imported at once.
 
 // Everything, as a user may: nothing of it may shadow the methods of `Var`.
+use raygrad_autograd::check::*;
 use raygrad_autograd::*;
 
 #[test]

@@ -1,10 +1,8 @@
 //! The gradient checker is checked: each way in which an operation can be wrong is caught, by the check that is meant
 //! to catch it.
 
-use raygrad_autograd::{
-    Cases, Check, Elementwise, Entry, Examined, Extreme, Formula, Grads, Op, Pool, Real, Scalar, Shape, ShapeError,
-    Tensor, Var, Vjp, check_op,
-};
+use raygrad_autograd::check::{Cases, Check, Entry, Examined, Extreme, check_op};
+use raygrad_autograd::{Elementwise, Formula, Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::{broadcast_shape, map};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;

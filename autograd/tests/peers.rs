@@ -1,10 +1,11 @@
 //! Every operation of the catalogue against PyTorch in f64: value, gradient, and the gradient of a contraction of the
 //! gradient. `reference/make.py` says what the reference holds and writes it.
 
+use raygrad_autograd::check::catalogue;
 use raygrad_autograd::{
-    Activation, Axes, Conv2dConfig, INFER, Indices, Params, Pool2dConfig, Scalar, Segments, Tape, Tensor, Var,
-    catalogue,
+    Activation, Axes, Conv2dConfig, INFER, Indices, Pool2dConfig, Scalar, Segments, Tape, Tensor, Var,
 };
+use raygrad_nn::Params;
 use std::collections::BTreeSet;
 use std::path::Path;
 

@@ -1,7 +1,8 @@
 //! Random expressions: first and second derivatives against finite differences, whatever is combined with whatever.
 
 use proptest::prelude::*;
-use raygrad_autograd::{Activation, Check, Tensor, Var, check_function};
+use raygrad_autograd::check::{Check, check_function};
+use raygrad_autograd::{Activation, Tensor, Var};
 
 /// One step of a random program: an operation on two of the values so far.
 type Step = (u8, u8, u8);

@@ -1,7 +1,8 @@
 //! Reductions and scans over every set of axes, against plain loops and finite differences, down to no elements and no
 //! axes.
 
-use raygrad_autograd::{Axes, Check, Scalar, Tape, Tensor, Var, check_function};
+use raygrad_autograd::check::{Check, check_function};
+use raygrad_autograd::{Axes, Scalar, Tape, Tensor, Var};
 
 type Reduce = for<'t> fn(&Var<'t, f64>, Axes) -> Var<'t, f64>;
 type Plain = fn(&[f64]) -> f64;

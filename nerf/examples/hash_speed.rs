@@ -5,8 +5,9 @@
 //! cargo run --release -p raygrad-nerf --example hash_speed [levels features log2_table]
 //! ```
 
-use raygrad_autograd::{AdamConfig, Op, Pool, RowAdam, RowSums, Tensor};
+use raygrad_autograd::{Op, Pool, RowSums, Tensor};
 use raygrad_nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use raygrad_nn::{AdamConfig, RowAdam};
 use std::time::Instant;
 
 /// Samples of a tile, and tiles of a step.

@@ -1,6 +1,7 @@
 //! This crate's operations, for the checks.
 
-use raygrad_autograd::Entry;
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
 
 /// Every operation of this crate, with the inputs it is checked on.
 pub fn catalogue() -> Vec<Entry> {

@@ -3,7 +3,9 @@
 //! NeRF is trained, and its images are blended, in code values as they stand in files: half of white over black is .5
 //! there, where half of the light would be .735. Use these operations for a model whose colours are light.
 
-use raygrad_autograd::{Cases, Entry, Examined, Formula, Real, Scalar, Var};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::{Cases, Entry, Examined};
+use raygrad_autograd::{Formula, Real, Scalar, Var};
 
 /// Linear light and code value where the line ends and the power begins (IEC 61966-2-1).
 const KNEE: [f64; 2] = [0.003_130_8, 0.040_45];
@@ -44,6 +46,7 @@ impl Formula<1> for SrgbEncode {
     }
 }
 
+#[cfg(feature = "check")]
 impl Examined<1> for SrgbEncode {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..1.5).domain_also(-0.5..0.001);
@@ -64,6 +67,7 @@ impl Formula<1> for SrgbDecode {
     }
 }
 
+#[cfg(feature = "check")]
 impl Examined<1> for SrgbDecode {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..1.5).domain_also(-0.5..0.03);
@@ -95,6 +99,7 @@ pub fn srgb_decode<'t, T: Scalar>(codes: &Var<'t, T>) -> Var<'t, T> {
 }
 
 /// The catalogue entries of this file.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     vec![Entry::examined(SrgbEncode), Entry::examined(SrgbDecode)]
 }

@@ -1,7 +1,9 @@
 //! Volume rendering: what arrives at the eye from the samples along a ray.
 
 use crate::{Error, Result};
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
 
 /// Composites the features of packed samples, front to back (Mildenhall et al. 2020, equation 3; Max 1995).
@@ -298,6 +300,7 @@ impl<T: Scalar> Op<T> for Composite<T> {
 }
 
 /// The catalogue entries of this file. [`Composite`] holds a tensor of its own number type, so each precision has its own.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     let delta = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.5, 0.125, 0.5, 1.0, 0.0, 0.375]);
     let segments = || Segments::new([0, 3, 3, 4, 7]);

@@ -8,7 +8,7 @@ use crate::loss::Loss;
 use crate::marching::MarchingConfig;
 use crate::occupancy::Skip;
 use crate::{Error, Result};
-use raygrad_autograd::{AdamConfig, Schedule, Storage};
+use raygrad_nn::{AdamConfig, Schedule, Storage};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;

@@ -1,6 +1,8 @@
 //! Scene contraction: all of space in a ball of radius 2, for scenes without bounds.
 
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 
 /// y = x inside the unit ball, else (2 - 1/r) x / r with r = |x|: space outside is squeezed between radius 1 and 2, evenly
 /// in disparity (Barron et al. 2022, mip-NeRF 360, equation 10). Rows of the last axis are points.
@@ -140,6 +142,7 @@ pub fn contract<'t, T: Scalar>(points: &Var<'t, T>) -> Var<'t, T> {
 }
 
 /// The catalogue entries of this file.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     let points = |scale: f64| Tensor::from_fn(&[5, 3], |i| scale * (((i * 7) % 11) as f64 / 5.0 - 1.0));
     vec![

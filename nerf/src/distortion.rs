@@ -1,6 +1,8 @@
 //! The distortion loss: pulls the weights along a ray together.
 
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 
 /// For each ray, `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` of the weights `w` of samples with midpoints `m` and
 /// intervals of length `d` (Barron et al. 2022, mip-NeRF 360, equation 15): `[samples]` to `[rays]`.
@@ -127,6 +129,7 @@ impl<T: Scalar> Op<T> for Distortion<T> {
 }
 
 /// The catalogue entries of this file. [`Distortion`] holds tensors of its own number type, so each precision has its own.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     let midpoints = || Tensor::<f64>::from_vec(&[7], vec![0.125, 0.25, 0.75, 0.5, 0.0, 0.0, 0.875]);
     let lengths = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.125, 0.5, 0.5, 1.0, 0.0, 0.375]);

@@ -1,6 +1,8 @@
 //! Positional encoding: sinusoids of rising frequency let a network hold fine detail.
 
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
 
 /// y = (x, sin(pi x), cos(pi x), sin(2 pi x), cos(2 pi x), .. cos(2^(levels-1) pi x)), each for all channels of x in turn
@@ -148,6 +150,7 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
 }
 
 /// The catalogue entries of this file.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     vec![
         Entry::new(PositionalEncoding { levels: 4, input: true })

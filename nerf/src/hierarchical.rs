@@ -6,7 +6,8 @@ use crate::field::{Classic, ClassicConfig, Field};
 use crate::pass::composite_samples;
 use crate::rays::{Rays, Samples};
 use crate::sampler::{Jitter, importance, stratified};
-use raygrad_autograd::{Bound, Pool, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Pool, Scalar, Tape, Tensor, Var};
+use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
 
 /// Numbers of a [`Hierarchical`] sampler.

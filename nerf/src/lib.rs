@@ -9,6 +9,7 @@ pub mod background;
 mod batch;
 mod bounds;
 mod camera;
+#[cfg(feature = "check")]
 mod catalogue;
 mod color_space;
 pub mod colormap;
@@ -53,6 +54,7 @@ pub use self::image::Image;
 pub use background::Background;
 pub use bounds::{clip_span, intersect_box};
 pub use camera::{Camera, Ray};
+#[cfg(feature = "check")]
 pub use catalogue::catalogue;
 pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use composite::Composite;

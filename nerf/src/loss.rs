@@ -65,7 +65,8 @@ impl Loss {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use raygrad_autograd::{Check, Tape, check_function};
+    use raygrad_autograd::Tape;
+    use raygrad_autograd::check::{Check, check_function};
 
     /// Colours of opaque rays, and what they should be.
     fn pixels() -> [Tensor<f64>; 2] {

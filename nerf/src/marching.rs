@@ -7,7 +7,8 @@ use crate::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, 
 use crate::quadrature::Quadrature;
 use crate::rays::{Rays, Samples};
 use crate::sampler::Jitter;
-use raygrad_autograd::{Params, Pool, Scalar, Segments, Tape};
+use raygrad_autograd::{Pool, Scalar, Segments, Tape};
+use raygrad_nn::Params;
 use serde::{Deserialize, Serialize};
 
 /// Numbers of a [`Marching`] sampler.

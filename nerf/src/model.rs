@@ -12,7 +12,8 @@ use crate::{Error, Result};
 use glam::DVec3;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Bound, Params, Pool, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Pool, Scalar, Tape, Tensor, Var};
+use raygrad_nn::{Bound, Params};
 use std::sync::Arc;
 
 /// The scene's extent, stored with the model.

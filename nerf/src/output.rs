@@ -51,13 +51,13 @@ impl Image {
 }
 
 /// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched: see
-/// [`raygrad_autograd::write_atomic`].
+/// [`raygrad_nn::write_atomic`].
 ///
 /// # Errors
 /// If the folder does not exist or the file cannot be written; the error names `path`.
 pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     let path = path.as_ref();
-    raygrad_autograd::write_atomic(path, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
+    raygrad_nn::write_atomic(path, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
 }
 
 #[cfg(test)]

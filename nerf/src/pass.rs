@@ -2,7 +2,8 @@
 
 use crate::field::{Density, Field};
 use crate::rays::Samples;
-use raygrad_autograd::{Bound, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Scalar, Tape, Tensor, Var};
+use raygrad_nn::Bound;
 
 /// Colour (and distance, if `with_depth`) of samples, composited along their rays: `[rays, 4 or 5]`, the last channel
 /// being the transmittance that is left. Also the weight of each sample, as a constant.

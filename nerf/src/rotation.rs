@@ -1,6 +1,8 @@
 //! Rotations for poses that are optimised: from and to rotation vectors, with gradients at every angle.
 
-use raygrad_autograd::{Entry, Real, Scalar, Shape, Tensor, Var, record};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Real, Scalar, Shape, Tensor, Var, record};
 
 /// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
 ///
@@ -177,6 +179,7 @@ pub fn rotation_log<'t, T: Scalar>(matrices: &Var<'t, T>) -> Var<'t, T> {
 }
 
 /// The catalogue entries of this file.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     let angles = |scale: f64| Tensor::from_fn(&[6, 3], |i| scale * (((i * 7) % 13) as f64 / 6.0 - 1.0));
     let matrices = |scale: f64| {

@@ -6,7 +6,8 @@ use crate::field::Field;
 use crate::model::{Extent, Model};
 use crate::train::stream;
 use rand::RngExt;
-use raygrad_autograd::{Bound, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Scalar, Tape, Tensor, Var};
+use raygrad_nn::Bound;
 
 /// Points at which a new field is probed.
 const PROBES: usize = 512;

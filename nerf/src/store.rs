@@ -57,7 +57,7 @@ mod tests {
     use crate::field::{FieldConfig, VoxelConfig};
     use crate::scene::train_cameras;
     use glam::DVec3;
-    use raygrad_autograd::Storage;
+    use raygrad_nn::Storage;
 
     fn voxel(direction_degree: usize) -> Config {
         let mut config = Config::preset(Preset::Voxel);

@@ -11,7 +11,8 @@ use crate::{Error, Result};
 use crate::{silhouette, startup};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Adam, Gradient, Optimizer, ParamId, Pool, RowStats, Tensor, UpdateReport};
+use raygrad_autograd::{Gradient, Pool, Tensor};
+use raygrad_nn::{Adam, Optimizer, ParamId, RowStats, UpdateReport};
 use raygrad_tensor::parallel;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -367,7 +368,7 @@ mod tests {
     use crate::hash_grid::HashGridConfig;
     use crate::hierarchical::HierarchicalConfig;
     use crate::{FieldConfig, Preset};
-    use raygrad_autograd::Schedule;
+    use raygrad_nn::Schedule;
 
     /// Two tiny networks, and few rays of few samples.
     fn tiny() -> Config {

@@ -3,7 +3,8 @@
 use crate::field::Field;
 use crate::pass::composite_density;
 use crate::rays::Samples;
-use raygrad_autograd::{Bound, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Scalar, Tape, Tensor, Var};
+use raygrad_nn::Bound;
 
 /// Marched samples, composited.
 pub struct Marched<'t, T: Scalar> {

@@ -1,7 +1,7 @@
 //! Activations and logarithms at their ends.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Tape, Var};
+use raygrad::{Scalar, Tape, Var};
 
 /// The value and the gradient of a function of one number.
 fn at<T: Scalar>(x: f64, f: impl for<'t> Fn(&Var<'t, T>) -> Var<'t, T>) -> [f64; 2] {

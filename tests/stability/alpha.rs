@@ -1,8 +1,8 @@
 //! Alpha of one interval: `1 - e^(-sigma delta)`.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Segments, Tape, Tensor};
 use raygrad::nerf::Composite;
+use raygrad::{Scalar, Segments, Tape, Tensor};
 
 /// What one sample of colour 1 gives: alpha, what is left of the light, and the gradient of alpha by the density.
 fn one_sample<T: Scalar>(sigma: f64, delta: f64) -> [f64; 3] {

@@ -1,8 +1,8 @@
 //! The sRGB transfer curve, and the space in which blending happens.
 
 use crate::support::*;
-use raygrad::autograd::{Formula, Scalar, Tape};
 use raygrad::nerf::{Image, SrgbDecode, SrgbEncode, background, quantise, srgb_decode, srgb_encode};
+use raygrad::{Formula, Scalar, Tape};
 
 /// Matrix: sRGB at -.1, 0, 1e-8, knee +- ulp, 1, 2. Catalogue: `where` + pow.
 fn the_curve_and_its_slope_are_finite_everywhere<T: Scalar>() {

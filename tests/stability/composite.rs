@@ -1,9 +1,9 @@
 //! Compositing along a ray.
 
 use crate::support::*;
-use raygrad::autograd::{Pool, Real, Scalar, Segments, Tape, Tensor, Var};
 use raygrad::nerf::Composite;
 use raygrad::nerf::sampler::{Jitter, importance, stratified};
+use raygrad::{Pool, Real, Scalar, Segments, Tape, Tensor, Var};
 
 /// Colour and remaining light of one ray of optical depths `x`, and the gradients of the colour by densities and colours.
 fn ray<T: Scalar>(x: &[f64], colour: &[f64]) -> ([f64; 2], Vec<f64>, Vec<f64>) {

@@ -1,8 +1,8 @@
 //! The distortion loss.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Segments, Tape};
 use raygrad::nerf::{Composite, Distortion};
+use raygrad::{Scalar, Segments, Tape};
 
 /// Loss and gradients of one ray of samples of this width, starting at `start`, and the same by definition in f64.
 fn both_ways<T: Scalar>(weights: &[f64], width: f64, start: f64) -> [(f64, Vec<f64>); 2] {

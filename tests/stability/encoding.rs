@@ -1,8 +1,8 @@
 //! Positional encoding.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Tape};
 use raygrad::nerf::PositionalEncoding;
+use raygrad::{Scalar, Tape};
 use std::f64::consts::PI;
 
 /// Matrix: positional encoding of 0, +-1, +-4, +-1e3, +-1e6 with L = 10, 12, 16. Catalogue: pi rounded to f32.

@@ -2,12 +2,12 @@
 
 use crate::damage::{clear, damage, damaged};
 use proptest::prelude::*;
-use raygrad::autograd::{Params, Scalar, Storage, Tensor};
 use raygrad::nerf::dataset::{Split, load, load_views};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::hash_grid::HashGridConfig;
 use raygrad::nerf::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
 use raygrad::nerf::{Background, Config, Extent, FieldConfig, Image, Model, Preset, SamplerConfig};
+use raygrad::{Params, Scalar, Storage, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::LazyLock;

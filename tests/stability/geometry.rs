@@ -1,9 +1,9 @@
 //! Boxes, directions, contraction, normalised device coordinates, lenses.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Tape};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Ndc, RadialLens, Ray, clip_span, contract, intersect_box};
+use raygrad::{Scalar, Tape};
 
 const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
 

@@ -1,8 +1,8 @@
 //! The cells of a hash grid.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Tape, Tensor};
 use raygrad::nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use raygrad::{Scalar, Tape, Tensor};
 
 const SIZES: [usize; 5] = [16, 255, 2048, 30_000, 65_536];
 

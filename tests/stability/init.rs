@@ -1,9 +1,9 @@
 //! New fields: whether there is anything to learn from.
 
 use crate::support::noise;
-use raygrad::autograd::{Tape, Tensor};
 use raygrad::nerf::dataset::{Split, embedded};
 use raygrad::nerf::{Config, Extent, Field, Model, Preset, Trainer};
+use raygrad::{Tape, Tensor};
 use std::sync::Arc;
 
 /// The least share, over the fields of a model, of random points whose density has a gradient.
@@ -23,7 +23,7 @@ fn alive_share(model: &Model<f32>) -> f64 {
         let moved = slopes.as_slice().chunks_exact(3).filter(|slope| slope.iter().any(|x| *x != 0.0)).count();
         moved as f64 / points.shape()[0] as f64
     };
-    model.fields().into_iter().map(share).fold(1.0, raygrad::autograd::Real::minimum)
+    model.fields().into_iter().map(share).fold(1.0, raygrad::Real::minimum)
 }
 
 /// Matrix: of 100 seeds, all have a density gradient at more than 1 % of random points. Catalogue: ReLU density.

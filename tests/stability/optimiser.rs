@@ -1,9 +1,7 @@
 //! Adam, dense and lazy.
 
 use crate::support::*;
-use raygrad::autograd::{
-    Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, RowAdam, RowSums, Scalar, Sgd, SgdConfig, Tensor,
-};
+use raygrad::{Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, RowAdam, RowSums, Scalar, Sgd, SgdConfig, Tensor};
 
 const TABLE: AdamConfig = AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 };
 
@@ -19,7 +17,7 @@ pub fn bound(config: &AdamConfig) -> f64 {
         let correction = (1.0 - beta2.powi(t)).sqrt() / (1.0 - beta1.powi(t));
         (1.0 - beta1) / (1.0 - beta2).sqrt() * sum.sqrt() * correction
     };
-    (1..100_000).step_by(7).map(at).fold(1.0, raygrad::autograd::Real::maximum)
+    (1..100_000).step_by(7).map(at).fold(1.0, raygrad::Real::maximum)
 }
 
 /// A store of one parameter.
@@ -102,10 +100,7 @@ fn growing_gradients_reach_the_bound<T: Scalar>() {
         let warm = (0..4000).map(|_| vec![1e-10]);
         let gradients: Vec<_> = warm.chain((0..160).map(|k| vec![1e-10 * growth.powi(k)])).collect();
         let config = AdamConfig { epsilon: 1e-20, ..config };
-        let most = ways::<T>(config, &gradients, 1.0)
-            .iter()
-            .map(|way| way[0].abs())
-            .fold(0.0, raygrad::autograd::Real::maximum);
+        let most = ways::<T>(config, &gradients, 1.0).iter().map(|way| way[0].abs()).fold(0.0, raygrad::Real::maximum);
         let customary = constant(&format!("bound of Adam's step / lr for the {name} betas"));
         let expected = constant(&format!("bound of Adam's step / lr for the {name} betas, by Cauchy and Schwarz"));
         assert!(most > 1.5 * customary, "{name}: {most} and {customary}");

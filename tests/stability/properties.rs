@@ -2,7 +2,6 @@
 
 use crate::support::*;
 use proptest::prelude::*;
-use raygrad::autograd::{Adam, AdamConfig, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
 use raygrad::nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use raygrad::nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 use raygrad::nerf::sampler::{Jitter, invert_cdf};
@@ -10,6 +9,7 @@ use raygrad::nerf::{
     Composite, Distortion, Ndc, Pose, PositionalEncoding, RadialLens, Ray, Rays, contract, glam::DVec3, intersect_box,
     rotation_exp, srgb_decode, srgb_encode,
 };
+use raygrad::{Adam, AdamConfig, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
 
 /// A finite number of any magnitude that f32 has, evenly over the exponents, or a zero of either sign.
 fn any_finite() -> impl Strategy<Value = f64> {

@@ -1,8 +1,8 @@
 //! Rotations and poses.
 
 use crate::support::*;
-use raygrad::autograd::{Scalar, Tape};
 use raygrad::nerf::{Pose, rotation_exp, rotation_log};
+use raygrad::{Scalar, Tape};
 use std::f64::consts::PI;
 
 const ANGLES: [f64; 12] = [0.0, 1e-30, 1e-8, 1e-4, 1e-2, 0.5, 1.0, 2.0, 3.0, PI - 1e-6, PI, PI - 1e-3];
@@ -95,10 +95,10 @@ fn a_million_compositions_stay_a_rotation<T: Scalar>() {
     for i in 0..1_000_000 {
         pose = step.after(&pose);
         if i % 4096 == 0 {
-            worst = raygrad::autograd::Real::maximum(worst, pose.skewness());
+            worst = raygrad::Real::maximum(worst, pose.skewness());
         }
     }
-    worst = raygrad::autograd::Real::maximum(worst, pose.skewness());
+    worst = raygrad::Real::maximum(worst, pose.skewness());
     assert!(worst <= by_type::<T>(1e-6, 2e-15), "{worst:e}");
     assert!(pose.translation.iter().all(|x| x.to_f64().abs() < 2.0));
     // There and back.

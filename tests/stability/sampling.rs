@@ -1,8 +1,8 @@
 //! Inverse-CDF sampling.
 
 use crate::support::*;
-use raygrad::autograd::{Pool, Scalar};
 use raygrad::nerf::sampler::{Jitter, importance, invert_cdf, stratified};
+use raygrad::{Pool, Scalar};
 
 fn inverted<T: Scalar>(weights: &[f64], share: f64, u: &[f64]) -> Vec<f64> {
     let weights: Vec<T> = weights.iter().map(|&w| T::from_f64(w)).collect();

@@ -3,8 +3,8 @@
 
 use ndarray::{ArrayD, Axis, IxDyn, Slice, concatenate, stack};
 use proptest::prelude::*;
-use raygrad::autograd::{Activation, Conv2dConfig, Indices, Pool2dConfig, Segments, Tape, Tensor, Var};
 use raygrad::nerf::{Composite, Contraction, PositionalEncoding, SphericalHarmonics, rotation_exp, rotation_log};
+use raygrad::{Activation, Conv2dConfig, Indices, Pool2dConfig, Segments, Tape, Tensor, Var};
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;

@@ -1,12 +1,12 @@
 //! What is left out: empty cells, and what lies behind opaque samples.
 
 use crate::support::*;
-use raygrad::autograd::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
 use raygrad::nerf::sampler::Jitter;
 use raygrad::nerf::visible::composite_visible;
 use raygrad::nerf::{Camera, Config, Density, Extent, Field, Model, Preset, SamplerConfig, Samples};
+use raygrad::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use std::sync::Arc;
 
 /// A fog of one density in a cube of +-1, black in the half in front (z < 0) and white behind, or all of one colour.

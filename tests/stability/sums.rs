@@ -1,7 +1,7 @@
 //! Long sums, and sums in which many threads or places take part.
 
 use crate::support::*;
-use raygrad::autograd::{RowSums, Scalar, Segments, Tape, Tensor};
+use raygrad::{RowSums, Scalar, Segments, Tape, Tensor};
 use std::sync::Arc;
 
 /// Matrix: reduce 2^24 x 1e-4, and alternating +-1e8 + 1. Catalogue: long f32 sums.

@@ -1,7 +1,7 @@
 //! What the tests share: both precisions, comparisons that NaN fails, and the constants.
 
-use raygrad::autograd::{Scalar, Tensor};
 use raygrad::nerf::{Ray, Rays, glam::DVec3};
+use raygrad::{Scalar, Tensor};
 use serde_json::Value;
 
 /// Makes a test in each precision of functions that are generic over the number type.

@@ -1,11 +1,10 @@
 //! Activation functions.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined, INF};
 use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI};
-
-const INF: f64 = f64::INFINITY;
 
 /// y = max(x, 0), NaN for NaN; dx = g where x > 0, else 0 (also at the kink).
 #[derive(Clone, Copy)]
@@ -25,6 +24,7 @@ impl Formula<1> for Relu {
         [y.if_positive(g, zero)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Relu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -46,6 +46,7 @@ impl Formula<1> for Sigmoid {
         [g * (y * (-x).sigmoid())]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Sigmoid {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.5, [0.25]).at([-INF], 0.0, [0.0]).at([INF], 1.0, [0.0]);
@@ -63,6 +64,7 @@ impl Formula<1> for Softplus {
         x.softplus()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Softplus {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-20.0], 2.061_153_620e-9, [2.061_153_618e-9]).at([89.0], 89.0, [1.0]);
@@ -80,6 +82,7 @@ impl Formula<1> for LogSigmoid {
         -(-x).softplus()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for LogSigmoid {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], -std::f64::consts::LN_2, [0.5]).at([20.0], -2.061_153_620e-9, [2.061_153_618e-9]);
@@ -101,6 +104,7 @@ impl Formula<1> for LeakyRelu {
         x.if_positive(x, scaled)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for LeakyRelu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -124,6 +128,7 @@ impl Formula<1> for Elu {
         x.if_positive(x, below)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Elu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
@@ -155,6 +160,7 @@ impl Formula<1> for Gelu {
         [g * (share + scaled(x, density))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Gelu {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at(
@@ -186,6 +192,7 @@ impl Formula<1> for GeluTanh {
         [g * (share + scaled(x * slope, density))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for GeluTanh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([1e30], 1e30, [1.0]);
@@ -210,6 +217,7 @@ impl Formula<1> for Silu {
         [g * (share + scaled(x, density))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Silu {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);

@@ -1,6 +1,7 @@
 //! The four operations, and multiplication and addition of constants.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined};
 use crate::{Formula, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, map};
 
@@ -14,6 +15,7 @@ impl Formula<2> for Add {
         a + b
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Add {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
@@ -31,6 +33,7 @@ impl Formula<2> for Sub {
         a - b
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Sub {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
@@ -48,6 +51,7 @@ impl Formula<2> for Mul {
         a * b
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Mul {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(-3.0..3.0);
@@ -66,6 +70,7 @@ impl Formula<2> for Div {
         a / b
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Div {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);
@@ -90,6 +95,7 @@ impl Formula<1> for Affine {
         x * scale + shift
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Affine {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], self.shift, [self.scale]);
@@ -107,6 +113,7 @@ impl Formula<1> for Alias {
         x
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Alias {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).at([f64::INFINITY], f64::INFINITY, [1.0]);

@@ -313,7 +313,7 @@ impl<'t, T: Scalar> Var<'t, T> {
 mod tests {
     use super::*;
     use crate::Tape;
-    use crate::catalogue::spread;
+    use crate::check::spread;
     use proptest::prelude::*;
 
     proptest! {

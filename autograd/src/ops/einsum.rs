@@ -184,8 +184,9 @@ impl<'t, T: Scalar> Var<'t, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::catalogue::spread;
-    use crate::{Check, Tape, check_function};
+    use crate::Tape;
+    use crate::check::spread;
+    use crate::check::{Check, check_function};
     use raygrad_tensor::Tensor;
 
     /// The definition: a sum over all values of all letters.

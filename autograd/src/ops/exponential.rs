@@ -1,11 +1,12 @@
 //! Exponentials, logarithms, square roots and the error function.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined, INF};
 use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
-use std::f64::consts::{FRAC_2_SQRT_PI, LN_2, LOG2_E};
-
-const INF: f64 = f64::INFINITY;
+use std::f64::consts::LN_2;
+#[cfg(feature = "check")]
+use std::f64::consts::{FRAC_2_SQRT_PI, LOG2_E};
 
 /// y = e^x; dx = g y.
 #[derive(Clone, Copy)]
@@ -21,6 +22,7 @@ impl Formula<1> for Exp {
         [g * y]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Exp {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-INF], 0.0, [0.0]).at([-1000.0], 0.0, [0.0]).at([INF], INF, [INF]);
@@ -37,6 +39,7 @@ impl Formula<1> for Expm1 {
         x.expm1()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Expm1 {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([1e-20], 1e-20, [1.0]).at([-INF], -1.0, [0.0]).at([INF], INF, [INF]);
@@ -53,6 +56,7 @@ impl Formula<1> for Ln {
         x.ln()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Ln {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([1.0], 0.0, [1.0]).at([INF], INF, [0.0]);
@@ -69,6 +73,7 @@ impl Formula<1> for Ln1p {
         x.ln1p()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Ln1p {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.5..3.0).at([1e-20], 1e-20, [1.0]).at([-1.0], -INF, [INF]).at([INF], INF, [0.0]);
@@ -90,6 +95,7 @@ impl Formula<1> for Sqrt {
         [g * half / y]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Sqrt {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], 0.0, [INF]).at([4.0], 2.0, [0.25]).at([INF], INF, [0.0]);
@@ -111,6 +117,7 @@ impl Formula<1> for Exp2 {
         [g * (y * ln_2)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Exp2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([3.0], 8.0, [8.0 * LN_2]).at([-INF], 0.0, [0.0]).at([INF], INF, [INF]);
@@ -127,6 +134,7 @@ impl Formula<1> for Log2 {
         x.log2()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Log2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([8.0], 3.0, [0.125 * LOG2_E]).at([INF], INF, [0.0]);
@@ -149,6 +157,7 @@ impl Formula<1> for Rsqrt {
         [g * half * (y * y * y)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Rsqrt {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], INF, [-INF]).at([4.0], 0.5, [-0.0625]).at([INF], 0.0, [0.0]);
@@ -166,6 +175,7 @@ impl Formula<1> for Erf {
         x.erf()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Erf {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [FRAC_2_SQRT_PI]).at([-INF], -1.0, [0.0]).at([30.0], 1.0, [0.0]);

@@ -1,12 +1,11 @@
 //! Losses: how far predictions are from their targets.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined, INF};
 use crate::{Formula, Grads, Op, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor};
 use std::sync::Arc;
-
-const INF: f64 = f64::INFINITY;
 
 /// y = (a - b)^2; da = 2 g (a - b), db = -da.
 #[derive(Clone, Copy)]
@@ -19,6 +18,7 @@ impl Formula<2> for SquaredError {
         r * r
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for SquaredError {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(-3.0..3.0).at([1.0, 1.0], 0.0, [0.0, 0.0]).at([3.0, 1.0], 4.0, [4.0, -4.0]);
@@ -35,6 +35,7 @@ impl Formula<2> for AbsoluteError {
         (a - b).abs()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for AbsoluteError {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
@@ -59,6 +60,7 @@ impl Formula<2> for Huber {
         (r.abs() - delta).if_positive(far, near)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Huber {
     fn cases(&self, c: &mut Cases) {
         let d = self.delta;
@@ -87,6 +89,7 @@ impl Formula<2> for SmoothL1 {
         (beta - r.abs()).if_positive(near, far)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for SmoothL1 {
     fn cases(&self, c: &mut Cases) {
         let w = self.beta.max(0.1);
@@ -131,6 +134,7 @@ impl Formula<2> for BinaryCrossEntropy {
         [g * a.if_positive(towards, p - b), -(g * a)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for BinaryCrossEntropy {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.1..0.9).at([0.0, 1.0], std::f64::consts::LN_2, [-0.5, 0.0]);

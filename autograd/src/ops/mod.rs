@@ -1,5 +1,5 @@
 //! The operations, each in one place: formula, derivative, documentation, sample inputs and extreme values. An
-//! operation is added by writing it in the file of its kind and listing it in [`catalogue`](crate::catalogue).
+//! operation is added by writing it in the file of its kind and listing it in `check/catalogue.rs`.
 
 pub(crate) mod activation;
 pub(crate) mod arithmetic;

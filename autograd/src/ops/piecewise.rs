@@ -1,11 +1,9 @@
 //! Functions with kinks and steps: absolute value, sign, extremes, limits, rounding.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined, INF, NAN};
 use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
-
-const INF: f64 = f64::INFINITY;
-const NAN: f64 = f64::NAN;
 
 /// y = |x|; dx = g sign(x), so 0 at the kink.
 #[derive(Clone, Copy)]
@@ -17,6 +15,7 @@ impl Formula<1> for Abs {
         x.abs()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Abs {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1).at([0.0], 0.0, [0.0]).at([-0.0], 0.0, [0.0]).at([-INF], INF, [-1.0]);
@@ -33,6 +32,7 @@ impl Formula<1> for Sign {
         x.sign()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Sign {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1).at([0.0], 0.0, [0.0]).at([-INF], -1.0, [0.0]).at([NAN], NAN, [0.0]);
@@ -49,6 +49,7 @@ impl Formula<2> for Maximum {
         a.maximum(b)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Maximum {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
@@ -67,6 +68,7 @@ impl Formula<2> for Minimum {
         a.minimum(b)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Minimum {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
@@ -99,6 +101,7 @@ impl Formula<1> for Clamp {
         (x - high).if_positive(high, below)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Clamp {
     fn cases(&self, c: &mut Cases) {
         let (low, high) = (self.low, self.high);
@@ -122,6 +125,7 @@ impl Formula<1> for Floor {
         x.floor()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Floor {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.9..-1.1).domain_also(2.1..2.9).at([-0.5], -1.0, [0.0]).at([2.0], 2.0, [0.0]).at([INF], INF, [0.0]);
@@ -138,6 +142,7 @@ impl Formula<1> for Ceil {
         x.ceil()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Ceil {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.9..-1.1).domain_also(2.1..2.9).at([0.5], 1.0, [0.0]).at([2.0], 2.0, [0.0]).at([-INF], -INF, [0.0]);
@@ -154,6 +159,7 @@ impl Formula<1> for Round {
         x.round()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Round {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.4..-0.6)

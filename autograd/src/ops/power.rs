@@ -1,11 +1,9 @@
 //! Powers, reciprocals, and x ln y.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined, INF, NAN};
 use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
-
-const INF: f64 = f64::INFINITY;
-const NAN: f64 = f64::NAN;
 
 /// y = 1 / x; dx = -g y^2.
 #[derive(Clone, Copy)]
@@ -22,6 +20,7 @@ impl Formula<1> for Reciprocal {
         [-(g * (y * y))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Reciprocal {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).domain_also(-3.0..-0.5).at([0.0], INF, [-INF]).at([-INF], 0.0, [0.0]).at(
@@ -45,6 +44,7 @@ impl Formula<1> for Powi {
         x.powi(self.exponent)
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Powi {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain_also(-2.0..-0.5);
@@ -69,6 +69,7 @@ impl<const N: i32> Formula<1> for ConstPowi<N> {
         Powi { exponent: N }.f([x])
     }
 }
+#[cfg(feature = "check")]
 impl<const N: i32> Examined<1> for ConstPowi<N> {
     fn cases(&self, c: &mut Cases) {
         Powi { exponent: N }.cases(c);
@@ -88,6 +89,7 @@ impl Formula<1> for Powf {
         if self.exponent == 0.0 { x.like(1.0) } else { x.pow(x.like(self.exponent)) }
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Powf {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0);
@@ -116,6 +118,7 @@ impl Formula<2> for Pow {
         [g * slope_of_base(a, b), g * slope_of_exponent(a, b, y)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Pow {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain(-2.0..2.0);
@@ -162,6 +165,7 @@ impl Formula<2> for Xlogy {
         [g * b.if_positive(b, divisor).ln(), g * (a / divisor)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Xlogy {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);

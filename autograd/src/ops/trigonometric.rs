@@ -1,11 +1,9 @@
 //! Trigonometric and hyperbolic functions, and the inverse ones.
 
-use crate::catalogue::{Cases, Examined};
+#[cfg(feature = "check")]
+use crate::check::{Cases, Examined, INF, PI};
 use crate::{Formula, Var};
 use raygrad_tensor::{Real, Scalar};
-
-const INF: f64 = f64::INFINITY;
-const PI: f64 = std::f64::consts::PI;
 
 /// y = sin x; dx = g cos x.
 #[derive(Clone, Copy)]
@@ -18,6 +16,7 @@ impl Formula<1> for Sin {
         x.sin()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Sin {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [1.0]).at([INF], f64::NAN, [f64::NAN]);
@@ -35,6 +34,7 @@ impl Formula<1> for Cos {
         x.cos()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Cos {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([INF], f64::NAN, [f64::NAN]);
@@ -51,6 +51,7 @@ impl Formula<1> for SinPi {
         x.sin_pi()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for SinPi {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [PI]).at([0.5], 1.0, [0.0]).at([-1e6], 0.0, [PI]);
@@ -68,6 +69,7 @@ impl Formula<1> for CosPi {
         x.cos_pi()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for CosPi {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([0.5], 0.0, [-PI]).at([1e6 + 1.0], -1.0, [0.0]);
@@ -91,6 +93,7 @@ impl Formula<1> for Tanh {
         [g * ((one - y) * (one + y))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Tanh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([INF], 1.0, [0.0]).at([-INF], -1.0, [0.0]).at([300.0], 1.0, [0.0]).at([0.0], 0.0, [1.0]);
@@ -112,6 +115,7 @@ impl Formula<1> for Tan {
         [g * (one + y * y)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Tan {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.2..1.2).at([0.0], 0.0, [1.0]).at([INF], f64::NAN, [f64::NAN]);
@@ -132,6 +136,7 @@ impl Formula<1> for Asin {
         [g / complement(x)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Asin {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.8..0.8).at([0.0], 0.0, [1.0]).at([1.0], 0.5 * PI, [INF]).at([-1.0], -0.5 * PI, [INF]);
@@ -153,6 +158,7 @@ impl Formula<1> for Acos {
         [-(g / complement(x))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Acos {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.8..0.8).at([0.0], 0.5 * PI, [-1.0]).at([1.0], 0.0, [-INF]).at([-1.0], PI, [-INF]);
@@ -175,6 +181,7 @@ impl Formula<1> for Atan {
         [g / (one + x * x)]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Atan {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [1.0]).at([INF], 0.5 * PI, [0.0]).at([-INF], -0.5 * PI, [0.0]);
@@ -195,6 +202,7 @@ impl Formula<2> for Atan2 {
         [g * turn(b, a, b), -(g * turn(a, a, b))]
     }
 }
+#[cfg(feature = "check")]
 impl Examined<2> for Atan2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.3..3.0).domain_also(-3.0..-0.3).domain(-3.0..3.0);
@@ -237,6 +245,7 @@ impl Formula<1> for Sinh {
         x.sinh()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Sinh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([1e-20], 1e-20, [1.0]).at([-INF], -INF, [INF]).at([-0.0], 0.0, [1.0]);
@@ -253,6 +262,7 @@ impl Formula<1> for Cosh {
         x.cosh()
     }
 }
+#[cfg(feature = "check")]
 impl Examined<1> for Cosh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([-INF], INF, [-INF]);

@@ -2,7 +2,8 @@
 
 use super::Medium;
 use crate::field::{Density, Field};
-use raygrad_autograd::{Bound, ParamId, Params, Scalar, Segments, Tensor, Var};
+use raygrad_autograd::{Scalar, Segments, Tensor, Var};
+use raygrad_nn::{Bound, ParamId, Params};
 use std::sync::Arc;
 
 /// A medium that is rendered like any field. Its amplitudes are a parameter, so they have gradients and can be trained;

@@ -4,7 +4,8 @@ use super::*;
 use crate::pass::composite_samples;
 use crate::rays::{Rays, Samples};
 use crate::sampler::{Jitter, stratified};
-use raygrad_autograd::{Params, Pool, Tape};
+use raygrad_autograd::{Pool, Tape};
+use raygrad_nn::Params;
 
 /// The lines of `tests/reference/analytic.py`: colour, depth, transmittance, and the derivatives of these by each
 /// amplitude in turn.

@@ -4,7 +4,8 @@ use crate::Result;
 use crate::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use glam::DVec3;
 use rand::{Rng, RngExt};
-use raygrad_autograd::{Bound, ParamId, Params, Scalar, Tensor, Var};
+use raygrad_autograd::{Scalar, Tensor, Var};
+use raygrad_nn::{Bound, ParamId, Params};
 
 /// What fields that look positions up in a table have in common.
 #[derive(Debug, Clone)]

@@ -6,7 +6,8 @@ use crate::encoding::PositionalEncoding;
 use crate::{Error, Result};
 use glam::DVec3;
 use rand::Rng;
-use raygrad_autograd::{Activation, Bound, Init, Linear, Mlp, Params, Scalar, Segments, Tensor, Var};
+use raygrad_autograd::{Activation, Scalar, Segments, Tensor, Var};
+use raygrad_nn::{Bound, Init, Linear, Mlp, Params};
 use serde::{Deserialize, Serialize};
 
 /// Size and shape of a [`Classic`] field.

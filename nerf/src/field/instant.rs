@@ -8,7 +8,8 @@ use crate::hash_grid::{HashGrid, HashGridConfig};
 use crate::spherical::SphericalHarmonics;
 use glam::DVec3;
 use rand::Rng;
-use raygrad_autograd::{Activation, Bound, Init, Linear, ParamId, Params, Scalar, Segments, Tensor, Var};
+use raygrad_autograd::{Activation, Scalar, Segments, Tensor, Var};
+use raygrad_nn::{Bound, Init, Linear, ParamId, Params};
 use serde::{Deserialize, Serialize};
 
 /// Size of an [`Instant`] field.

@@ -14,7 +14,8 @@ use crate::composite::Composite;
 use crate::hash_grid::HashGrid;
 use glam::DVec3;
 use rand::Rng;
-use raygrad_autograd::{Bound, ParamId, Params, Scalar, Segments, Tensor, Var};
+use raygrad_autograd::{Scalar, Segments, Tensor, Var};
+use raygrad_nn::{Bound, ParamId, Params};
 use serde::{Deserialize, Serialize};
 
 /// What a field says of positions alone.

@@ -8,7 +8,8 @@ use crate::hash_grid::{HashGrid, HashGridConfig};
 use crate::spherical::SphericalHarmonics;
 use glam::DVec3;
 use rand::Rng;
-use raygrad_autograd::{Bound, ParamId, Params, Scalar, Segments, Tensor, Var};
+use raygrad_autograd::{Scalar, Segments, Tensor, Var};
+use raygrad_nn::{Bound, ParamId, Params};
 use serde::{Deserialize, Serialize};
 
 /// Size of a [`Voxel`] field.

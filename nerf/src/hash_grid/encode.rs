@@ -1,8 +1,10 @@
 //! The encoding as an operation.
 
 use super::kernel::{BLOCK, Cells, Points};
-use super::{HashGrad, HashGrid, HashGridConfig, HashLevel};
-use raygrad_autograd::{Entry, Grads, Op, Pool, RowSums, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+use super::{HashGrad, HashGrid, HashLevel};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, RowSums, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::simd;
 use std::mem::swap;
 use std::sync::Arc;
@@ -224,9 +226,10 @@ fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var
 }
 
 /// The catalogue entries of this file: dense and hashed levels, with positions that no check moves across a border.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     let entry = |levels, features, log2_table, coarsest, finest| {
-        let config = HashGridConfig { levels, features, log2_table, coarsest, finest };
+        let config = super::HashGridConfig { levels, features, log2_table, coarsest, finest };
         HashGrid::new(&config).ok().map(|grid| {
             let table = |seed: u64| {
                 let tiny = grid.init::<f64>(seed);

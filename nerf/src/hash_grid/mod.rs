@@ -11,6 +11,7 @@ mod kernel;
 mod optimizer;
 
 pub use encode::HashEncoding;
+#[cfg(feature = "check")]
 pub(crate) use encode::entries;
 pub use grid::{HashGrid, HashGridConfig, HashLevel};
 pub use optimizer::{HashGrad, TableOptimizer, TableStats};

@@ -1,7 +1,8 @@
 //! Training the table: gradients of samples are added level by level, and only rows that got one are updated.
 
 use super::HashGrid;
-use raygrad_autograd::{AdamConfig, RowAdam, RowShare, RowStats, RowSums, Scalar, SparseGrad, Tensor};
+use raygrad_autograd::{RowShare, RowSums, Scalar, SparseGrad, Tensor};
+use raygrad_nn::{AdamConfig, RowAdam, RowStats};
 use std::sync::Arc;
 
 /// What a tile leaves for the table: where its samples are, and the gradients of their features.

@@ -2,7 +2,8 @@
 
 use super::*;
 use proptest::prelude::*;
-use raygrad_autograd::{AdamConfig, Gradient, Op, Pool, RowSums, Scalar, Tape, Tensor};
+use raygrad_autograd::{Gradient, Op, Pool, RowSums, Scalar, Tape, Tensor};
+use raygrad_nn::AdamConfig;
 use std::sync::Arc;
 
 fn grid(levels: usize, features: usize, log2_table: u32, coarsest: usize, finest: usize) -> HashGrid {

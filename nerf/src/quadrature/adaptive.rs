@@ -3,7 +3,8 @@
 use super::{Intervals, Plan, Quadrature, Share};
 use crate::field::Field;
 use crate::rays::Samples;
-use raygrad_autograd::{Bound, Real, Scalar, Segments, Tape, Tensor};
+use raygrad_autograd::{Real, Scalar, Segments, Tape, Tensor};
+use raygrad_nn::Bound;
 
 /// No interval is halved more often.
 const MOST_HALVINGS: usize = 24;

@@ -4,7 +4,8 @@ use super::{Quadrature, refine};
 use crate::analytic::{AnalyticField, AnalyticScene};
 use crate::rays::Rays;
 use crate::sampler::{Jitter, stratified};
-use raygrad_autograd::{Params, Scalar, Tape, Var};
+use raygrad_autograd::{Scalar, Tape, Var};
+use raygrad_nn::Params;
 
 /// An approximation of [`Exact`](crate::analytic::Exact), and what it took.
 #[derive(Debug, Clone, PartialEq)]

@@ -24,6 +24,7 @@ mod tests;
 
 pub use adaptive::{Refined, refine};
 pub use measure::{Integral, integrate};
+#[cfg(feature = "check")]
 pub(crate) use op::entries;
 pub use op::{CompositeIntervals, Intervals, Share, gauss_share};
 pub use plan::{Composited, Plan};

@@ -1,7 +1,9 @@
 //! Compositing of intervals between two nodes.
 
 use crate::composite::Composite;
-use raygrad_autograd::{Entry, Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
 use std::sync::Arc;
 
@@ -255,6 +257,7 @@ impl<T: Scalar> Op<T> for CompositeIntervals<T> {
 }
 
 /// The catalogue entries of this file.
+#[cfg(feature = "check")]
 pub(crate) fn entries() -> Vec<Entry> {
     fn op<T: Scalar>(share: Share, log_density: bool) -> CompositeIntervals<T> {
         // Nodes that two intervals share, one that stands alone, one that is not used, and a ray without intervals.

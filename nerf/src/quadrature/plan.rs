@@ -6,7 +6,8 @@ use crate::pass::features;
 use crate::rays::{Rays, Samples};
 use crate::sampler::{Jitter, stratified};
 use crate::visible::{Marched, composite_visible};
-use raygrad_autograd::{Bound, Pool, Scalar, Segments, Tape, Tensor, Var};
+use raygrad_autograd::{Pool, Scalar, Segments, Tape, Tensor, Var};
+use raygrad_nn::Bound;
 use std::sync::Arc;
 
 /// Places along rays where a field is asked, and the intervals that the answers stand for.

@@ -11,7 +11,8 @@ use crate::rays::Rays;
 use crate::sampler::{Jitter, stratified};
 use crate::train::Trainer;
 use glam::DVec3;
-use raygrad_autograd::{Params, Tape};
+use raygrad_autograd::Tape;
+use raygrad_nn::Params;
 use std::sync::Arc;
 
 fn find(name: &str) -> AnalyticScene {

@@ -4,12 +4,12 @@ use std::hint::black_box;
 use std::path::Path;
 use std::time::Instant;
 
-use raygrad::autograd::{Op, Pool, Tensor};
 use raygrad::nerf::Result;
 use raygrad::nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::vmath::survey::{Function, doubles, singles, ulp_error};
 use raygrad::tensor::{Scalar, simd};
+use raygrad::{Op, Pool, Tensor};
 
 use super::Results;
 use super::figure::{Axis, Figure, Panel, Series};

@@ -2,11 +2,11 @@
 
 use std::hint::black_box;
 
-use raygrad::autograd::{Pool, Real, Tape, Tensor};
 use raygrad::nerf::Density;
 use raygrad::nerf::Rays;
 use raygrad::nerf::analytic::{AnalyticScene, scenes};
 use raygrad::nerf::quadrature::{Integral, Quadrature, integrate};
+use raygrad::{Pool, Real, Tape, Tensor};
 
 use super::Results;
 use super::figure::{Axis, Figure, Panel, Series};

@@ -5,7 +5,7 @@ mod setting;
 use std::path::Path;
 use std::sync::Arc;
 
-use raygrad::autograd::Real;
+use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced};
 use raygrad::nerf::metrics::{psnr, psnr_from_mse};
 use raygrad::nerf::{Config, Error, Evaluations, Image, Model, Preset, Result, Sampler, Trainer};

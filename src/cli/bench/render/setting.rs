@@ -1,6 +1,6 @@
 //! Ways to render one model.
 
-use raygrad::autograd::Storage;
+use raygrad::Storage;
 use raygrad::nerf::marching::Marching;
 use raygrad::nerf::occupancy::{Skip, Threshold, Update};
 use raygrad::nerf::quadrature::Quadrature;

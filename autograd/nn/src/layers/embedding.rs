@@ -1,0 +1,91 @@
+//! Embeddings.
+
+use super::Init;
+use crate::{Bound, ParamId, Params};
+use rand::Rng;
+use raygrad_autograd::Var;
+use raygrad_tensor::Scalar;
+use std::sync::Arc;
+
+/// A table with a row of numbers for each of many things: words, images, places.
+///
+/// The gradient of the table consists of the rows that were used ([`RowGrad`](raygrad_autograd::RowGrad)s), from the tape to the
+/// optimiser. With [`Params::set_lazy`] only these rows are read and moved; without, the optimiser treats the table as it
+/// treats any parameter, whose gradient is mostly 0.
+///
+/// ```
+/// use raygrad_autograd::Tape;
+/// use raygrad_nn::{Adam, AdamConfig, Embedding, Init, Optimizer, Params};
+/// use rand::SeedableRng;
+/// let mut rng = rand::rngs::StdRng::seed_from_u64(1);
+/// let mut params = Params::<f32>::new();
+/// let words = Embedding::new(&mut params, "words", [1000, 8], Init::Normal(0.1), &mut rng);
+/// params.set_lazy(|name| name == "words.weight", true);
+/// let mut adam = Adam::new(AdamConfig::default());
+///
+/// let tape = Tape::new();
+/// let bound = params.bind(&tape);
+/// let vectors = words.forward(&bound, &[17, 4, 17].into());
+/// assert_eq!(vectors.shape(), [3, 8]);
+/// let grads = bound.backward(&vectors.square().sum());
+/// let report = adam.update(&mut params, &grads, 1e-3);
+/// assert_eq!(report.moved, 2 * 8);
+/// ```
+#[derive(Debug, Clone, Copy)]
+pub struct Embedding {
+    table: ParamId,
+}
+
+impl Embedding {
+    /// A table of `rows` rows of `width` numbers, the parameter `<name>.weight`.
+    pub fn new<T: Scalar>(
+        params: &mut Params<T>,
+        name: &str,
+        [rows, width]: [usize; 2],
+        init: Init,
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Self {
+        Embedding { table: params.add(format!("{name}.weight"), init.weight(rows, width, rng)) }
+    }
+
+    /// The table's parameter.
+    pub fn table(&self) -> ParamId {
+        self.table
+    }
+
+    /// The rows of these numbers: `[index.len(), width]`.
+    ///
+    /// # Panics
+    /// If a number is not below that of the rows.
+    #[track_caller]
+    pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, index: &Arc<[u32]>) -> Var<'t, T> {
+        params[self.table].gather_rows(index)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use raygrad_autograd::check::{Check, check_function};
+    use raygrad_autograd::{Tape, Tensor};
+
+    #[test]
+    fn a_table_is_learned_through_dense_gradients_too() {
+        let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(1);
+        let mut params = Params::<f64>::new();
+        let layer = Embedding::new(&mut params, "words", [5, 3], Init::Uniform(1.0), &mut rng);
+        assert_eq!(params.iter().map(|(name, _)| name).collect::<Vec<_>>(), ["words.weight"]);
+        let table = params.values()[0].clone();
+        check_function(&Check::default(), std::slice::from_ref(&table), |x| {
+            layer.forward(&params.layout().bind(x.to_vec()), &[4, 1, 4].into()).exp()
+        })
+        .unwrap();
+        let tape = Tape::new();
+        let bound = params.bind(&tape);
+        let y = layer.forward(&bound, &[4, 1].into());
+        assert_eq!(y.value().as_slice(), [&table.as_slice()[12..15], &table.as_slice()[3..6]].concat());
+        assert_eq!(layer.forward(&bound, &[].into()).shape(), [0, 3]);
+        assert_eq!(layer.forward(&bound, &[].into()).sum().grad(&bound.vars())[0], Tensor::zeros(&[5, 3]));
+    }
+}

@@ -1,0 +1,62 @@
+//! The dense layer.
+
+use super::{Init, Layer, Pass};
+use crate::{Bound, ParamId, Params};
+use rand::Rng;
+use raygrad_autograd::{Activation, Var};
+use raygrad_tensor::{Scalar, Tensor};
+
+/// A dense layer: `activation(x weight + bias)`, or without the bias.
+#[derive(Debug, Clone)]
+pub struct Linear {
+    weight: ParamId,
+    bias: Option<ParamId>,
+    activation: Activation,
+}
+
+impl Linear {
+    /// A layer `[.., inputs] -> [.., outputs]` whose parameters are `<name>.weight` and `<name>.bias`; the bias is 0.
+    pub fn new<T: Scalar>(
+        params: &mut Params<T>,
+        name: &str,
+        sizes: [usize; 2],
+        activation: Activation,
+        init: Init,
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Self {
+        let layer = Linear::without_bias(params, name, sizes, activation, init, rng);
+        Linear { bias: Some(params.add(format!("{name}.bias"), Tensor::zeros(&sizes[1..]))), ..layer }
+    }
+
+    /// As [`new`](Self::new), with a weight only.
+    pub fn without_bias<T: Scalar>(
+        params: &mut Params<T>,
+        name: &str,
+        [inputs, outputs]: [usize; 2],
+        activation: Activation,
+        init: Init,
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Self {
+        Linear {
+            weight: params.add(format!("{name}.weight"), init.weight(inputs, outputs, rng)),
+            bias: None,
+            activation,
+        }
+    }
+
+    /// The layer's output.
+    ///
+    /// # Panics
+    /// If the last extent of `x` is not the number of inputs.
+    #[track_caller]
+    pub fn forward<'t, T: Scalar>(&self, params: &Bound<'t, T>, x: &Var<'t, T>) -> Var<'t, T> {
+        x.linear(&params[self.weight], self.bias.map(|bias| &params[bias]), self.activation)
+    }
+}
+
+impl<T: Scalar> Layer<T> for Linear {
+    #[track_caller]
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Pass) -> Var<'t, T> {
+        self.forward(params, x)
+    }
+}

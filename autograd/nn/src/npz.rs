@@ -1,0 +1,456 @@
+//! Parameters as NumPy's `.npz`: a zip archive with a `.npy` file for each array.
+//!
+//! The crate `ndarray-npy` (0.10) is not used: it allocates what a header announces before it looks how much there is, so
+//! a file of a hundred bytes that claims 2^60 elements ends the process.
+
+use crate::{Params, write_atomic};
+use rawzip::{CompressionMethod, ZipArchive, ZipArchiveWriter};
+use raygrad_tensor::{Scalar, Shape, Tensor};
+use std::collections::HashSet;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+/// Why parameters could not be written to or read from a `.npz` file.
+#[derive(Debug, thiserror::Error)]
+pub enum NpzError {
+    /// The file cannot be read or written.
+    #[error("{}: {error}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        error: std::io::Error,
+    },
+    /// The file is not a zip archive or is damaged.
+    #[error("{} is not a whole npz file: {what}", path.display())]
+    Archive {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// An array of the file is damaged or does not fit the parameter of its name.
+    #[error("{}: array `{name}`: {what}", path.display())]
+    Array {
+        /// The file.
+        path: PathBuf,
+        /// The array.
+        name: String,
+        /// What is wrong.
+        what: String,
+    },
+}
+
+/// What is wrong with an array, for [`NpzError::Array`].
+type What = String;
+
+impl<T: Scalar> Params<T> {
+    /// Writes the parameters to a `.npz` file, uncompressed as `numpy.savez` does it: `numpy.load(path)[name]` is the
+    /// parameter `name`. The bytes go to a temporary file beside it, which then takes its name: the file is whole or
+    /// untouched.
+    ///
+    /// ```
+    /// use raygrad_autograd::Tensor;
+    /// use raygrad_nn::Params;
+    /// let mut params = Params::<f32>::new();
+    /// params.add("layer.weight", Tensor::from_vec(&[1, 2], vec![0.5, -1.0]));
+    /// let folder = tempfile::tempdir().unwrap();
+    /// let path = folder.path().join("model.npz");
+    /// params.save_npz(&path).unwrap();
+    /// let copy = Params::<f32>::read_npz(&path).unwrap();
+    /// assert_eq!(copy.values(), params.values());
+    /// ```
+    ///
+    /// # Errors
+    /// If the file cannot be written, or a name cannot be that of a file in an archive.
+    pub fn save_npz(&self, path: impl AsRef<Path>) -> Result<(), NpzError> {
+        let path = path.as_ref();
+        let mut bytes = vec![];
+        let mut archive = ZipArchiveWriter::new(&mut bytes);
+        for (name, value) in self.iter() {
+            add(&mut archive, name, value).map_err(|what| array(path, name, what))?;
+        }
+        archive.finish().map_err(|error| damaged(path, error))?;
+        write_atomic(path, &bytes).map_err(|error| NpzError::File { path: path.into(), error })
+    }
+
+    /// Replaces every value by the array of the same name in a `.npz` file, compressed or not, in either order of
+    /// elements. Nothing changes if an array does not fit.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is damaged, or names, shapes or number types differ from those of this store; the
+    /// error names the file and the array.
+    pub fn load_npz(&mut self, path: impl AsRef<Path>) -> Result<(), NpzError> {
+        let path = path.as_ref();
+        let mut arrays: Vec<(String, Option<Tensor<T>>)> =
+            read(path)?.into_iter().map(|(name, value)| (name, Some(value))).collect();
+        let mut values = Vec::with_capacity(self.len());
+        for (name, value) in self.iter() {
+            let found = arrays.iter_mut().find(|(other, _)| other == name).and_then(|(_, value)| value.take());
+            let Some(found) = found else {
+                return Err(array(path, name, "is missing: the file belongs to another model".into()));
+            };
+            if found.shape() != value.shape() {
+                let what = format!("has shape {:?}, the parameter {:?}", found.shape(), value.shape());
+                return Err(array(path, name, what));
+            }
+            values.push(found);
+        }
+        if let Some((name, _)) = arrays.iter().find(|(_, value)| value.is_some()) {
+            return Err(array(path, name, "is not a parameter of this model".into()));
+        }
+        self.replace(values);
+        Ok(())
+    }
+
+    /// A new store with the arrays of a `.npz` file, in the order of the file.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is damaged, or an array has another number type; the error names the file and the
+    /// array.
+    pub fn read_npz(path: impl AsRef<Path>) -> Result<Self, NpzError> {
+        let mut params = Params::new();
+        for (name, value) in read(path.as_ref())? {
+            params.add(name, value);
+        }
+        Ok(params)
+    }
+}
+
+fn array(path: &Path, name: &str, what: What) -> NpzError {
+    NpzError::Array { path: path.into(), name: name.into(), what }
+}
+
+fn damaged(path: &Path, error: rawzip::Error) -> NpzError {
+    NpzError::Archive { path: path.into(), what: error.to_string() }
+}
+
+/// NumPy's name of the number type, little-endian.
+fn descr<T: Scalar>() -> &'static str {
+    if size_of::<T>() == 4 { "<f4" } else { "<f8" }
+}
+
+/// Adds one array to an archive.
+fn add<T: Scalar>(archive: &mut ZipArchiveWriter<&mut Vec<u8>>, name: &str, value: &Tensor<T>) -> Result<(), What> {
+    let file = format!("{name}.npy");
+    if rawzip::path::ZipFilePath::from_str(&file).as_str() != file {
+        return Err("its name cannot be that of a file in an archive".into());
+    }
+    let mut bytes = header::<T>(value.shape());
+    value.as_slice().iter().for_each(|x| x.write_le(&mut bytes));
+    store(archive, &file, &bytes).map_err(|error| error.to_string())
+}
+
+fn store(archive: &mut ZipArchiveWriter<&mut Vec<u8>>, file: &str, bytes: &[u8]) -> Result<(), rawzip::Error> {
+    let (mut entry, config) = archive.new_file(file).compression_method(CompressionMethod::STORE).start()?;
+    let mut writer = config.wrap(&mut entry);
+    writer.write_all(bytes)?;
+    let (_, descriptor) = writer.finish()?;
+    entry.finish(descriptor)?;
+    Ok(())
+}
+
+/// The start of a `.npy` file of version 1, or of version 2 for very many axes.
+fn header<T: Scalar>(shape: &[usize]) -> Vec<u8> {
+    // A tuple of one element has a comma, and a list of several may end in one.
+    let extents: String = shape.iter().map(|extent| format!("{extent}, ")).collect();
+    let mut text =
+        format!("{{'descr': '{}', 'fortran_order': False, 'shape': ({}), }}", descr::<T>(), extents.trim_end());
+    let long = text.len() > usize::from(u16::MAX) - 128;
+    let prefix = if long { 12 } else { 10 };
+    // The elements start at a multiple of 64 bytes.
+    let padding = (prefix + text.len() + 1).next_multiple_of(64) - prefix - text.len() - 1;
+    text.extend(std::iter::repeat_n(' ', padding));
+    text.push('\n');
+    let mut bytes = b"\x93NUMPY".to_vec();
+    if long {
+        bytes.extend([2, 0]);
+        bytes.extend((text.len() as u32).to_le_bytes());
+    } else {
+        bytes.extend([1, 0]);
+        bytes.extend((text.len() as u16).to_le_bytes());
+    }
+    bytes.extend(text.as_bytes());
+    bytes
+}
+
+/// The arrays of a file, in its order.
+fn read<T: Scalar>(path: &Path) -> Result<Vec<(String, Tensor<T>)>, NpzError> {
+    let bytes = std::fs::read(path).map_err(|error| NpzError::File { path: path.into(), error })?;
+    let archive = ZipArchive::from_slice(&bytes).map_err(|error| damaged(path, error))?;
+    let mut entries = archive.entries();
+    let (mut arrays, mut seen, mut count) = (vec![], HashSet::new(), 0);
+    while let Some(entry) = entries.next_entry().map_err(|error| damaged(path, error))? {
+        count += 1;
+        if entry.is_dir() {
+            continue;
+        }
+        let file = String::from_utf8_lossy(entry.file_path().as_bytes()).into_owned();
+        let name = file.strip_suffix(".npy").unwrap_or(&file).to_owned();
+        if !seen.insert(name.clone()) {
+            return Err(array(path, &name, "is there twice".into()));
+        }
+        let content = archive
+            .get_entry(entry.wayfinder())
+            .map_err(|error| error.to_string())
+            .and_then(|content| unpack(&content, entry.compression_method(), entry.uncompressed_size_hint()));
+        let value = content.and_then(|content| parse(&content)).map_err(|what| array(path, &name, what))?;
+        arrays.push((name, value));
+    }
+    if count != archive.entries_hint() {
+        let what = format!("{count} entries instead of {}", archive.entries_hint());
+        return Err(NpzError::Archive { path: path.into(), what });
+    }
+    Ok(arrays)
+}
+
+/// The bytes of a file in an archive, checked against its checksum.
+fn unpack(entry: &rawzip::ZipSliceEntry<'_>, method: CompressionMethod, size: u64) -> Result<Vec<u8>, What> {
+    let mut content = vec![];
+    let result = if method == CompressionMethod::STORE {
+        entry.verifying_reader(entry.data()).read_to_end(&mut content)
+    } else if method == CompressionMethod::DEFLATE {
+        // No more than the archive announces, whatever comes out.
+        let reader = flate2::read::DeflateDecoder::new(entry.data()).take(size.saturating_add(1));
+        entry.verifying_reader(reader).read_to_end(&mut content)
+    } else {
+        return Err(format!("is compressed by a method that is not supported ({method:?})"));
+    };
+    result.map_err(|error| format!("cannot be unpacked: {error}"))?;
+    Ok(content)
+}
+
+/// The array of a `.npy` file.
+fn parse<T: Scalar>(bytes: &[u8]) -> Result<Tensor<T>, What> {
+    let broken = || -> What { "is not a whole npy file".into() };
+    let version = bytes.get(..8).filter(|start| start.starts_with(b"\x93NUMPY")).ok_or_else(broken)?[6];
+    let number = |bytes: &[u8]| bytes.iter().rev().fold(0, |sum, &byte| sum << 8 | usize::from(byte));
+    let start = if version == 1 { 10 } else { 12 };
+    let length = bytes.get(8..start).map(number).ok_or_else(broken)?;
+    let end = start.checked_add(length).ok_or_else(broken)?;
+    let text = bytes.get(start..end).and_then(|text| std::str::from_utf8(text).ok()).ok_or_else(broken)?;
+    let found = field(text, "descr").unwrap_or_default().trim_start_matches(['\'', '"']);
+    let found = found.split(['\'', '"']).next().unwrap_or_default();
+    if found != descr::<T>() {
+        return Err(format!("holds numbers of type `{found}`, the parameters are of `{}`", descr::<T>()));
+    }
+    let extents = field(text, "shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(broken)?.0;
+    let extents = extents.split(',').map(str::trim).filter(|extent| !extent.is_empty());
+    let shape = extents.map(|extent| extent.parse().map_err(|_| broken())).collect::<Result<Shape, What>>()?;
+    // Without its empty axes, too, a shape must be of a size that memory could hold: an array library may multiply these.
+    let mut size = shape.iter().filter(|&&extent| extent > 0);
+    let size = size.try_fold(size_of::<T>(), |size, &extent| size.checked_mul(extent));
+    let Some(size) = size.filter(|&size| isize::try_from(size).is_ok()) else {
+        return Err(format!("has shape {shape:?}, which is too large"));
+    };
+    let data = &bytes[end..];
+    if data.len() != if shape.contains(&0) { 0 } else { size } {
+        return Err(format!("holds {} bytes of elements, which is not what shape {shape:?} needs", data.len()));
+    }
+    let values: Vec<T> = data.chunks_exact(size_of::<T>()).map(T::read_le).collect();
+    let fortran = field(text, "fortran_order").ok_or_else(broken)?.starts_with("True");
+    Ok(if fortran { from_columns(&shape, &values) } else { Tensor::from_vec(&shape, values) })
+}
+
+/// What follows a key of the header.
+fn field<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+    let (_, rest) = text.split_once(&format!("'{key}'")).or_else(|| text.split_once(&format!("\"{key}\"")))?;
+    Some(rest.trim_start().strip_prefix(':')?.trim_start())
+}
+
+/// A tensor from its elements with the first index running fastest.
+fn from_columns<T: Scalar>(shape: &[usize], values: &[T]) -> Tensor<T> {
+    Tensor::from_fn(shape, |mut i| {
+        let (mut place, mut stride) = (0, values.len());
+        for &extent in shape.iter().rev() {
+            stride /= extent;
+            place += i % extent * stride;
+            i /= extent;
+        }
+        values[place]
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Written by NumPy: see `tests/data/README.md`.
+    fn fixture(name: &str) -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+    }
+
+    fn store<T: Scalar>() -> Params<T> {
+        let mut params = Params::new();
+        let value = |i: usize| T::from_f64((i as f64 * 0.7).sin());
+        params.add("net.0.weight", Tensor::from_fn(&[3, 4, 2], value));
+        params.add("scalar", Tensor::scalar(T::from_f64(-0.0)));
+        params.add("empty", Tensor::zeros(&[0, 5]));
+        params.add("größe", Tensor::from_vec(&[3], [f64::NAN, f64::INFINITY, 1e-40].map(T::from_f64).to_vec()));
+        params
+    }
+
+    fn bits<T: Scalar>(params: &Params<T>) -> Vec<(String, Vec<usize>, Vec<u64>)> {
+        let bits = |x: &Tensor<T>| x.as_slice().iter().map(|x| x.to_f64().to_bits()).collect();
+        params.iter().map(|(name, x)| (name.into(), x.shape().to_vec(), bits(x))).collect()
+    }
+
+    fn round_trip<T: Scalar>() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.npz");
+        let params = store::<T>();
+        params.save_npz(&path).unwrap();
+        assert_eq!(bits(&Params::<T>::read_npz(&path).unwrap()), bits(&params));
+        let mut other = params.clone();
+        other.values_mut().iter_mut().for_each(|x| x.as_mut_slice().fill(T::from_f64(9.0)));
+        other.load_npz(&path).unwrap();
+        assert_eq!(bits(&other), bits(&params));
+        // Written again over itself, and nothing else is left in the folder.
+        other.save_npz(&path).unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_stored_model_comes_back_bit_for_bit() {
+        round_trip::<f32>();
+        round_trip::<f64>();
+    }
+
+    #[test]
+    fn files_of_numpy_are_understood() {
+        for name in ["stored.npz", "compressed.npz"] {
+            let params = Params::<f32>::read_npz(fixture(name)).unwrap();
+            let get = |name| params.get(params.find(name).unwrap());
+            assert_eq!(*get("matrix"), Tensor::from_vec(&[2, 3], vec![0.0, 0.5, 1.0, 1.5, 2.0, 2.5]), "{name}");
+            // Stored with the first index running fastest.
+            assert_eq!(*get("columns"), Tensor::from_fn(&[2, 3, 4], |i| i as f32), "{name}");
+            assert_eq!((get("scalar").shape(), get("scalar").item()), (&[][..], -3.25));
+            assert_eq!((get("empty").shape(), params.len()), (&[0, 2][..], 4));
+        }
+        let doubles = Params::<f64>::read_npz(fixture("doubles.npz")).unwrap();
+        assert_eq!(doubles.values()[0].as_slice(), [0.1, -1e300]);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_named_and_changes_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.npz");
+        let write = |arrays: &[(&str, &[usize])]| {
+            let mut params = Params::<f32>::new();
+            for (name, shape) in arrays {
+                params.add(*name, Tensor::ones(shape));
+            }
+            params.save_npz(&path).unwrap();
+        };
+        let mut params = Params::<f32>::new();
+        params.add("a", Tensor::zeros(&[2]));
+        params.add("b", Tensor::zeros(&[2, 2]));
+        let mut refused = |part: &str| {
+            let message = params.load_npz(&path).unwrap_err().to_string();
+            assert!(message.starts_with(&path.display().to_string()) && message.contains(part), "{message}");
+            assert!(params.values().iter().all(|x| x.as_slice().iter().all(|&x| x == 0.0)));
+        };
+        write(&[("a", &[2]), ("b", &[4])]);
+        refused("array `b`: has shape [4], the parameter [2, 2]");
+        write(&[("a", &[2])]);
+        refused("array `b`: is missing");
+        write(&[("b", &[2, 2]), ("a", &[2]), ("c", &[1])]);
+        refused("array `c`: is not a parameter of this model");
+        let mut doubles = Params::<f64>::new();
+        doubles.add("a", Tensor::zeros(&[2]));
+        doubles.save_npz(&path).unwrap();
+        refused("array `a`: holds numbers of type `<f8`, the parameters are of `<f4`");
+        std::fs::write(&path, b"not an archive").unwrap();
+        refused("is not a whole npz file");
+        std::fs::remove_file(&path).unwrap();
+        refused("No such file");
+        let missing = folder.path().join("nowhere/model.npz");
+        let message = params.save_npz(&missing).unwrap_err().to_string();
+        assert!(message.starts_with(&missing.display().to_string()), "{message}");
+        let mut odd = Params::<f32>::new();
+        odd.add("../up", Tensor::zeros(&[1]));
+        assert!(odd.save_npz(&path).unwrap_err().to_string().contains("array `../up`: its name cannot be"));
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn damage_anywhere_is_an_error_or_changes_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.npz");
+        let params = store::<f32>();
+        params.save_npz(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        let expected = bits(&params);
+        for at in 0..whole.len() {
+            // Cut short: never accepted.
+            std::fs::write(&path, &whole[..at]).unwrap();
+            assert!(Params::<f32>::read_npz(&path).is_err(), "cut at {at}");
+            // One byte changed: noticed, or in a part that says nothing of the arrays.
+            let mut changed = whole.clone();
+            changed[at] ^= 0x55;
+            std::fs::write(&path, &changed).unwrap();
+            if let Ok(read) = Params::<f32>::read_npz(&path) {
+                let names =
+                    |bits: &[(String, Vec<usize>, Vec<u64>)]| bits.iter().map(|x| x.2.clone()).collect::<Vec<_>>();
+                assert_eq!(names(&bits(&read)), names(&expected), "byte {at}");
+            }
+        }
+    }
+
+    /// A `.npy` file of version 2.
+    fn npy(header: &str, data: &[u8]) -> Vec<u8> {
+        let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
+        bytes.extend((header.len() as u32).to_le_bytes());
+        bytes.extend(header.as_bytes());
+        bytes.extend(data);
+        bytes
+    }
+
+    #[test]
+    fn a_shape_beyond_all_memory_is_an_error_and_takes_none() {
+        let whole = format!("{}", u64::MAX);
+        for shape in [
+            "(0, 9223372036854775808)",
+            "(9223372036854775808, 0)",
+            "(9223372036854775808, 2, 0)",
+            "(0, 4294967296, 4294967296)",
+            "(0, 1152921504606846976, 8)",
+            "(4294967296, 4294967296)",
+            "(9223372036854775808, 2)",
+            "(1152921504606846976,)",
+            &format!("({whole}, {whole})"),
+            "(36893488147419103232,)",
+            "(-1,)",
+        ] {
+            for order in ["False", "True"] {
+                let header = format!("{{'descr': '<f4', 'fortran_order': {order}, 'shape': {shape}, }}");
+                for data in [&[][..], &[0; 8]] {
+                    let error = parse::<f32>(&npy(&header, data)).expect_err(shape);
+                    let words = ["which is too large", "is not a whole npy file", "which is not what shape"];
+                    assert!(words.iter().any(|words| error.contains(words)), "{shape}: {error}");
+                }
+            }
+        }
+        // As large as an empty array may be.
+        let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 1152921504606846976), }";
+        assert_eq!(parse::<f32>(&npy(header, &[])).unwrap().shape(), [0, 1 << 60]);
+    }
+
+    #[test]
+    fn headers_are_those_of_numpy() {
+        assert_eq!(header::<f32>(&[3, 4]).len(), 128);
+        assert!(
+            header::<f32>(&[])
+                .starts_with(b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f4', 'fortran_order': False, 'shape': (), }")
+        );
+        assert!(header::<f64>(&[7]).ends_with(b" \n"));
+        for text in [
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }",
+            "{\"shape\" : (3 ,) , \"fortran_order\":False,\"descr\":\"<f4\"}\n",
+        ] {
+            let bytes = npy(text, &[0; 12]);
+            assert_eq!(parse::<f32>(&bytes).unwrap(), Tensor::zeros(&[3]));
+            assert!(parse::<f32>(&bytes[..bytes.len() - 1]).unwrap_err().contains("11 bytes"));
+        }
+    }
+}

@@ -1,0 +1,175 @@
+//! Averages of parameters.
+
+use super::limits::flushed;
+use super::state::Reader;
+use super::{OptimizerState, StateError};
+use crate::Params;
+use raygrad_tensor::{Scalar, Tensor, simd};
+
+/// The exponential moving average of parameters: `a = decay a + (1 - decay) x` after each step. It is often a better
+/// model than the parameters themselves, whose last steps are noise (Polyak and Juditsky 1992).
+///
+/// ```
+/// use raygrad_autograd::Tensor;
+/// use raygrad_nn::{Ema, Params};
+/// let mut params = Params::<f64>::new();
+/// let x = params.add("x", Tensor::scalar(0.0));
+/// let mut ema = Ema::new(&params, 0.9);
+/// params.get_mut(x).as_mut_slice()[0] = 1.0;
+/// ema.update(&params);
+/// assert!((ema.params().get(x).item() - 0.1).abs() < 1e-15);
+/// ```
+#[derive(Debug, Clone)]
+pub struct Ema<T: Scalar> {
+    average: Params<T>,
+    decay: f64,
+    warmup: bool,
+    steps: u64,
+}
+
+impl<T: Scalar> Ema<T> {
+    /// An average that starts at these parameters.
+    ///
+    /// # Panics
+    /// If `decay` is not in 0..=1.
+    #[track_caller]
+    pub fn new(params: &Params<T>, decay: f64) -> Self {
+        assert!((0.0..=1.0).contains(&decay), "an average with decay {decay}");
+        Ema { average: params.clone(), decay, warmup: false, steps: 0 }
+    }
+
+    /// The same with a shorter memory at first, so that the random start is soon forgotten: the decay of step `t`, from
+    /// 0, is at most `(1 + t) / (10 + t)`.
+    pub fn with_warmup(self) -> Self {
+        Ema { warmup: true, ..self }
+    }
+
+    /// Takes the parameters after a step into account, and returns how many elements were left alone because the
+    /// parameter is infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
+    ///
+    /// # Panics
+    /// If the number or the size of the parameters has changed.
+    #[track_caller]
+    pub fn update(&mut self, params: &Params<T>) -> usize {
+        assert_eq!(self.average.len(), params.len(), "the parameters that the average started with");
+        let t = self.steps as f64;
+        let decay = if self.warmup { self.decay.min((1.0 + t) / (10.0 + t)) } else { self.decay };
+        self.steps += 1;
+        let share = T::from_f64(1.0 - decay);
+        let pairs = self.average.values_mut().iter_mut().zip(params.values());
+        pairs
+            .map(|(a, x)| {
+                assert_eq!(a.shape(), x.shape(), "the parameters that the average started with");
+                blend(a.as_mut_slice(), x.as_slice(), share)
+            })
+            .sum()
+    }
+
+    /// The averages, under the names of the parameters.
+    pub fn params(&self) -> &Params<T> {
+        &self.average
+    }
+
+    /// The averages and how many steps they have taken, so that a run can go on later.
+    pub fn state(&self) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        state.put_counts("", "steps", vec![self.steps]);
+        for (name, value) in self.average.iter() {
+            state.put(name, "average", value.shape(), value.as_slice().to_vec());
+        }
+        state
+    }
+
+    /// Goes on from what [`state`](Self::state) gave.
+    ///
+    /// # Errors
+    /// If the state is that of other parameters; then nothing changes.
+    pub fn load_state(&mut self, state: &OptimizerState<T>) -> Result<(), StateError> {
+        let mut reader = Reader::new(state);
+        let (steps, mut values) = (reader.steps()?, vec![]);
+        for (name, value) in self.average.iter() {
+            values.push(Tensor::from_vec(value.shape(), reader.expect(name, "average", value.shape())?));
+        }
+        reader.finish()?;
+        self.steps = steps;
+        self.average.replace(values);
+        Ok(())
+    }
+
+    /// The averages, under the names of the parameters.
+    pub fn into_params(self) -> Params<T> {
+        self.average
+    }
+}
+
+fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
+    let n = a.len();
+    let x = &x[..n];
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let mut skipped = 0;
+            for i in 0..n {
+                let good = x[i].is_finite();
+                // With a share of 1 this is exactly x.
+                let blended = flushed((T::ONE - share) * a[i] + share * x[i]);
+                a[i] = if good { blended } else { a[i] };
+                skipped += usize::from(!good);
+            }
+            skipped
+        },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn store(values: &[f64]) -> Params<f64> {
+        let mut params = Params::new();
+        params.add("x", Tensor::from_vec(&[values.len()], values.to_vec()));
+        params.add("empty", Tensor::zeros(&[0, 2]));
+        params
+    }
+
+    #[test]
+    fn follows_its_recurrence_with_and_without_warmup() {
+        for warmup in [false, true] {
+            let mut ema = Ema::new(&store(&[2.0, -1.0]), 0.95);
+            if warmup {
+                ema = ema.with_warmup();
+            }
+            // The weights of the values so far, as the definition unrolled gives them.
+            let (mut values, mut weights) = (vec![2.0], vec![1.0]);
+            for t in 0..100 {
+                let decay = if warmup { 0.95_f64.min((1.0 + f64::from(t)) / (10.0 + f64::from(t))) } else { 0.95 };
+                let x = (f64::from(t) * 0.3).sin();
+                assert_eq!(ema.update(&store(&[x, -1.0])), 0);
+                weights.iter_mut().for_each(|w| *w *= decay);
+                weights.push(1.0 - decay);
+                values.push(x);
+                let expected: f64 = values.iter().zip(&weights).map(|(x, w)| x * w).sum();
+                let got = ema.params().values()[0].as_slice();
+                assert!((got[0] - expected).abs() < 1e-14 && (got[1] + 1.0).abs() < 1e-14, "step {t}");
+            }
+        }
+    }
+
+    #[test]
+    fn bad_parameters_do_not_enter_and_nothing_goes_denormal() {
+        let mut ema = Ema::new(&store(&[1.0, 1.0]).cast::<f32>(), 0.5);
+        assert_eq!(ema.update(&store(&[f64::NAN, 0.0]).cast()), 1);
+        assert_eq!(ema.params().values()[0].as_slice(), [1.0, 0.5]);
+        for _ in 0..300 {
+            ema.update(&store(&[0.0, 0.0]).cast());
+            assert!(ema.params().values()[0].as_slice().iter().all(|a| !a.is_subnormal()));
+        }
+        assert_eq!(ema.into_params().values()[0].as_slice(), [0.0, 0.0]);
+        let mut double = Ema::new(&store(&[1e-40, 1.0]), 0.5);
+        double.update(&store(&[3e-40, 1.0]));
+        assert_eq!(double.params().values()[0].as_slice(), [2e-40, 1.0], "f64 holds more");
+        let mut copy = Ema::new(&store(&[1.0, 1.0]), 0.0);
+        copy.update(&store(&[0.1, 0.7]));
+        assert_eq!(copy.params().values()[0].as_slice(), [0.1, 0.7]);
+    }
+}

@@ -1,0 +1,145 @@
+//! Optimisers and what belongs to them: schedules, clipping, averages.
+
+mod adam;
+mod clip;
+mod ema;
+mod limits;
+mod report;
+mod rows;
+mod schedule;
+mod settings;
+mod sgd;
+mod state;
+
+pub use adam::{Adam, AdamConfig, AdamW};
+pub use clip::{Clipped, clip_norm, clip_value, global_norm};
+pub use ema::Ema;
+pub use report::{NonFinite, UpdateReport};
+pub use rows::{RowAdam, RowStats};
+pub use schedule::Schedule;
+pub use settings::SettingError;
+pub use sgd::{Sgd, SgdConfig};
+pub use state::{OptimizerState, StateError};
+
+use crate::Params;
+use raygrad_autograd::{Gradient, RowSums};
+use raygrad_tensor::{Pool, Scalar, Tensor};
+use std::borrow::Cow;
+
+/// One parameter that an optimiser is to move.
+#[derive(Debug)]
+pub struct Move<'a, T: Scalar> {
+    /// Which parameter of its store it is.
+    pub slot: usize,
+    /// Its name.
+    pub name: &'a str,
+    /// Its value.
+    pub value: &'a mut Tensor<T>,
+    /// Its gradient, of the same shape and not without a share.
+    pub grad: &'a Gradient<T>,
+    /// Its learning rate.
+    pub rate: f64,
+    /// A factor of the optimiser's weight decay.
+    pub decay: f64,
+    /// Whether only the rows whose gradient is not zero are to be visited ([`Params::set_lazy`]).
+    pub lazy: bool,
+}
+
+impl<'a, T: Scalar> Move<'a, T> {
+    /// The gradient as one tensor, from `pool` if it is not one already.
+    pub fn dense_grad(&self, pool: &Pool<T>) -> Cow<'a, Tensor<T>> {
+        match self.grad.dense() {
+            Some(dense) if self.grad.is_dense() => Cow::Borrowed(dense),
+            _ => Cow::Owned(self.grad.clone().into_dense(pool)),
+        }
+    }
+
+    /// The parameter as a table `[rows, features]`, whose rows lie along the first axis.
+    fn table(&self) -> [usize; 2] {
+        let shape = self.value.shape();
+        [shape.first().copied().unwrap_or(1), shape.iter().skip(1).product()]
+    }
+
+    /// The sums of the gradient's rows, which are made at the first step. A gradient that does not consist of rows is
+    /// added up first: then all its rows are there.
+    fn row_sums<'s>(&self, sums: &'s mut Option<RowSums<T>>, pool: &Pool<T>) -> &'s mut RowSums<T> {
+        let [rows, features] = self.table();
+        let sums = sums.get_or_insert_with(|| RowSums::new(rows, features));
+        if !self.grad.scatter(sums) {
+            let dense = self.dense_grad(pool);
+            dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
+        }
+        sums
+    }
+}
+
+/// Moves parameters against their gradients.
+///
+/// Every optimiser takes every gradient ([`Gradient`]): dense ones, rows of a table, and both. What it does depends on
+/// the gradient's value alone, unless a parameter is lazy ([`Params::set_lazy`]). Frozen parameters rest, and so does one
+/// whose gradient has no share because nothing depends on it; others move with the learning rate and the weight decay
+/// of their own ([`Params::set_rate`], [`Params::set_decay`]).
+///
+/// All optimisers here leave an element alone, and count it, if its gradient is infinite or NaN; set what they remember
+/// to 0 once it is below 1e-30 (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any
+/// number of threads.
+///
+/// [`Bound::backward`](crate::Bound::backward) gives the gradients and lets go of the parameters, which can then be
+/// moved in place. While a tape or a variable still holds one, an update copies it first.
+///
+/// ```
+/// use raygrad_autograd::{Tape, Tensor};
+/// use raygrad_nn::{Optimizer, Params, Schedule, Sgd, SgdConfig};
+/// let mut params = Params::<f64>::new();
+/// let x = params.add("x", Tensor::scalar(5.0));
+/// let mut optimizer = Sgd::new(SgdConfig { momentum: 0.9, ..SgdConfig::default() });
+/// let schedule = Schedule::Cosine { from: 0.1, to: 0.0, warmup: 0.1 };
+/// for step in 0..200 {
+///     let tape = Tape::new();
+///     let bound = params.bind(&tape);
+///     let loss = (&bound[x] - 2.0).square();
+///     let grads = bound.backward(&loss);
+///     optimizer.update(&mut params, &grads, schedule.at_step(step, 200)).check().unwrap();
+/// }
+/// assert!((params.get(x).item() - 2.0).abs() < 1e-3);
+/// ```
+pub trait Optimizer<T: Scalar> {
+    /// Moves the parameters of a store at learning rate `rate`. An implementation goes through [`Params::moves`].
+    ///
+    /// # Panics
+    /// If there is not one gradient of the same shape for each parameter that is not frozen, the rate is not within 0 to
+    /// 1e30, or a parameter has another size than at its first step.
+    #[track_caller]
+    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport;
+
+    /// What the optimiser remembers of the parameters of this store, so that a run can go on later.
+    fn state(&self, params: &Params<T>) -> OptimizerState<T>;
+
+    /// Remembers what [`state`](Self::state) gave, in place of everything else: the next steps then are, bit for bit,
+    /// what they would have been.
+    ///
+    /// # Errors
+    /// If the state is that of another kind of optimiser or of other parameters; then nothing changes.
+    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError>;
+}
+
+/// Elements that one task updates.
+const CHUNK: usize = 1 << 14;
+
+/// What an optimiser keeps under a number.
+fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {
+    if states.len() <= slot {
+        states.resize_with(slot + 1, S::default);
+    }
+    &mut states[slot]
+}
+
+/// The memory of a parameter, made at its first step.
+#[track_caller]
+fn remember<'m, T: Scalar>(memory: &'m mut Vec<T>, part: &Move<'_, T>) -> &'m mut [T] {
+    if memory.is_empty() {
+        memory.resize(part.value.len(), T::ZERO);
+    }
+    assert_eq!(memory.len(), part.value.len(), "elements of `{}`, as at its first step", part.name);
+    memory
+}

@@ -1,0 +1,301 @@
+//! Gradient descent with momentum.
+
+use super::limits::{flushed, tiny};
+use super::settings::{check, check_rate, check_share, or_panic};
+use super::state::{Reader, memories};
+use super::{CHUNK, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, remember, slot};
+use crate::Params;
+use raygrad_autograd::{Gradient, RowSums};
+use raygrad_tensor::{Pool, Scalar, simd};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Gradient descent: `h = g + decay x`, `v = momentum v + h`, `x = x - rate d`, where the direction `d` is `v`, or
+/// `h + momentum v` with Nesterov's look-ahead (Sutskever et al. 2013, in the form that PyTorch has).
+///
+/// An element is left alone, and counted, if its gradient or what would come of it is infinite or NaN. Of a lazy
+/// parameter the rows without gradient stay, whatever their velocity and decay; without either, lazy or not is the same.
+/// Velocities below 1e-30 (1e-300 in f64) are set to 0.
+#[derive(Debug, Clone)]
+pub struct Sgd<T: Scalar> {
+    config: SgdConfig,
+    memory: Vec<Memory<T>>,
+    /// For gradients that have to be added up.
+    pool: Pool<T>,
+}
+
+/// What it knows of one parameter.
+#[derive(Debug, Clone, Default)]
+struct Memory<T> {
+    /// Empty without momentum and before the first step.
+    velocity: Vec<T>,
+    /// Nothing between steps.
+    sums: Option<RowSums<T>>,
+}
+
+/// Constants of [`Sgd`].
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct SgdConfig {
+    /// How much of the last step's velocity stays, at least 0 and less than 1; 0 is plain gradient descent, which
+    /// remembers nothing.
+    pub momentum: f64,
+    /// Look ahead along the velocity.
+    pub nesterov: bool,
+    /// Weight decay: this times the parameter is added to the gradient.
+    pub decay: f64,
+}
+
+impl SgdConfig {
+    /// Whether the constants are in their ranges.
+    ///
+    /// # Errors
+    /// If one is not, with its name; also if there is a look-ahead without momentum.
+    pub fn check(&self) -> Result<(), SettingError> {
+        check_share("momentum", self.momentum)?;
+        check("momentum", self.momentum, !self.nesterov || self.momentum > 0.0, "more than 0 to look ahead")?;
+        check_rate("decay", self.decay)
+    }
+}
+
+impl<T: Scalar> Sgd<T> {
+    /// An optimiser that has seen nothing.
+    ///
+    /// # Panics
+    /// If [`SgdConfig::check`] finds something.
+    #[track_caller]
+    pub fn new(config: SgdConfig) -> Self {
+        or_panic(config.check());
+        Sgd { config, memory: vec![], pool: Pool::new() }
+    }
+}
+
+impl<T: Scalar> Optimizer<T> for Sgd<T> {
+    #[track_caller]
+    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
+        let mut report = UpdateReport::default();
+        for part in params.moves(grads, rate) {
+            let decay = self.config.decay * part.decay;
+            let update = Update {
+                rate: T::from_f64(part.rate),
+                momentum: T::from_f64(self.config.momentum),
+                nesterov: self.config.nesterov,
+                decay: T::from_f64(decay),
+                tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
+            };
+            let Memory { velocity, sums } = slot(&mut self.memory, part.slot);
+            let velocity: &mut [T] = if self.config.momentum == 0.0 { &mut [] } else { remember(velocity, &part) };
+            let (moved, skipped) = if part.lazy {
+                let sums = part.row_sums(sums, &self.pool);
+                let counts = update.rows(part.value.as_mut_slice(), sums, velocity);
+                sums.clear();
+                counts
+            } else {
+                let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
+                let pairs = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(grad.as_slice().par_chunks(CHUNK));
+                let skipped = if velocity.is_empty() {
+                    pairs.map(|(x, g)| update.plain(x, g)).sum()
+                } else {
+                    pairs.zip(velocity.par_chunks_mut(CHUNK)).map(|((x, g), v)| update.apply(x, g, v)).sum::<usize>()
+                };
+                (len - skipped, skipped)
+            };
+            report.count(part.name, moved, skipped);
+        }
+        report
+    }
+
+    fn state(&self, params: &Params<T>) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        for (name, shape, memory) in memories(params, &self.memory).filter(|(.., memory)| !memory.velocity.is_empty()) {
+            state.put(name, "velocity", shape, memory.velocity.clone());
+        }
+        state
+    }
+
+    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
+        let mut reader = Reader::new(state);
+        let mut memory = vec![];
+        for (name, value) in params.iter() {
+            let velocity = reader.tensor(name, "velocity", value.shape())?.unwrap_or_default();
+            memory.push(Memory { velocity, sums: None });
+        }
+        reader.finish()?;
+        self.memory = memory;
+        Ok(())
+    }
+}
+
+/// One step's constants.
+struct Update<T> {
+    rate: T,
+    momentum: T,
+    nesterov: bool,
+    decay: T,
+    /// A decaying parameter is 0 below this.
+    tiniest: T,
+}
+
+impl<T: Scalar> Update<T> {
+    /// Moves the rows whose sum is not zero; returns how many of their elements were moved and left alone.
+    fn rows(&self, x: &mut [T], sums: &RowSums<T>, velocity: &mut [T]) -> (usize, usize) {
+        let features = sums.features();
+        let (mut visited, mut skipped) = (0, 0);
+        for (&row, sum) in sums.rows().iter().zip(sums.sums().chunks_exact(features)) {
+            if sum.iter().all(|&g| g == T::ZERO) {
+                continue;
+            }
+            let place = row as usize * features..(row as usize + 1) * features;
+            visited += features;
+            skipped += match velocity {
+                [] => self.plain(&mut x[place], sum),
+                _ => self.apply(&mut x[place.clone()], sum, &mut velocity[place]),
+            };
+        }
+        (visited - skipped, skipped)
+    }
+
+    /// The parameter after a step along `direction`, and whether all went well.
+    #[inline(always)]
+    fn moved(&self, x: T, g: T, direction: T) -> (T, bool) {
+        let moved = x - self.rate * direction;
+        let moved = if moved < self.tiniest && moved > -self.tiniest { T::ZERO } else { moved };
+        (moved, g.is_finite() && moved.is_finite())
+    }
+
+    fn plain(&self, x: &mut [T], g: &[T]) -> usize {
+        let n = x.len();
+        let g = &g[..n];
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let mut skipped = 0;
+                for i in 0..n {
+                    let (moved, good) = self.moved(x[i], g[i], g[i] + self.decay * x[i]);
+                    x[i] = if good { moved } else { x[i] };
+                    skipped += usize::from(!good);
+                }
+                skipped
+            },
+        )
+    }
+
+    fn apply(&self, x: &mut [T], g: &[T], v: &mut [T]) -> usize {
+        let n = x.len();
+        let (g, v) = (&g[..n], &mut v[..n]);
+        let ahead = if self.nesterov { T::ONE } else { T::ZERO };
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                let mut skipped = 0;
+                for i in 0..n {
+                    let h = g[i] + self.decay * x[i];
+                    let velocity = flushed(self.momentum * v[i] + h);
+                    let direction = if ahead > T::ZERO { h + self.momentum * velocity } else { velocity };
+                    let (moved, good) = self.moved(x[i], g[i], direction);
+                    v[i] = if good { velocity } else { v[i] };
+                    x[i] = if good { moved } else { x[i] };
+                    skipped += usize::from(!good);
+                }
+                skipped
+            },
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_tensor::Tensor;
+
+    /// One step of a single parameter.
+    fn step<T: Scalar>(sgd: &mut Sgd<T>, params: &mut Params<T>, grad: &Tensor<T>, rate: f64) -> usize {
+        sgd.update(params, &[grad.clone().into()], rate).skipped
+    }
+
+    fn store<T: Scalar>(value: Tensor<T>) -> Params<T> {
+        let mut params = Params::new();
+        params.add("x", value);
+        params
+    }
+
+    #[test]
+    fn follows_its_recurrences_in_f64() {
+        for (momentum, nesterov, decay) in
+            [(0.0, false, 0.0), (0.0, false, 0.1), (0.9, false, 0.0), (0.9, true, 0.0), (0.7, true, 0.05)]
+        {
+            let mut sgd = Sgd::<f64>::new(SgdConfig { momentum, nesterov, decay });
+            let mut params = store(Tensor::from_vec(&[2], vec![0.5, -1.5]));
+            let (mut x, mut v) = ([0.5, -1.5], [0.0; 2]);
+            for t in 0..300 {
+                let grad = Tensor::from_fn(&[2], |i| ((t + i) as f64 * 0.31).cos());
+                let rate = 0.02 + 0.01 * (t as f64).sin();
+                assert_eq!(step(&mut sgd, &mut params, &grad, rate), 0);
+                for i in 0..2 {
+                    let h = grad.as_slice()[i] + decay * x[i];
+                    v[i] = momentum * v[i] + h;
+                    x[i] -= rate * if nesterov { h + momentum * v[i] } else { v[i] };
+                    let got = params.values()[0].as_slice()[i];
+                    assert!((got - x[i]).abs() < 1e-12, "{momentum} {nesterov} {decay}: step {t}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn momentum_on_a_quadratic_is_the_closed_form() {
+        // x'' = -c x in discrete time: x_{t+1} = (1 + mu - c rate) x_t - mu x_{t-1}, whose roots solve a quadratic.
+        let (mu, rate, curvature) = (0.25, 0.1, 1.0);
+        let mut sgd = Sgd::<f64>::new(SgdConfig { momentum: mu, ..SgdConfig::default() });
+        let mut params = store(Tensor::scalar(1.0));
+        let b: f64 = 1.0 + mu - curvature * rate;
+        let root = (b * b - 4.0 * mu).sqrt();
+        let (r1, r2) = (0.5 * (b + root), 0.5 * (b - root));
+        // x_0 = 1 and x_1 = 1 - c rate.
+        let c1 = (1.0 - curvature * rate - r2) / (r1 - r2);
+        for t in 1..100 {
+            let grad = Tensor::scalar(curvature * params.values()[0].item());
+            step(&mut sgd, &mut params, &grad, rate);
+            let (got, expected) = (params.values()[0].item(), c1 * r1.powi(t) + (1.0 - c1) * r2.powi(t));
+            assert!((got - expected).abs() < 1e-13, "step {t}: {got} instead of {expected}");
+        }
+    }
+
+    #[test]
+    fn bad_gradients_are_skipped_and_counted_and_nothing_goes_denormal() {
+        for momentum in [0.0, 0.9] {
+            let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, decay: 0.5, ..SgdConfig::default() });
+            let start = [1.0, 2.0, 3.0, -3e38, 1e-25];
+            let mut params = store(Tensor::from_vec(&[5], start.to_vec()));
+            let grad = Tensor::from_vec(&[5], vec![f32::NAN, f32::NEG_INFINITY, 1.0, 3e38, 0.0]);
+            // The step of element 3 would overflow.
+            assert_eq!(step(&mut sgd, &mut params, &grad, 1.0), 3, "momentum {momentum}");
+            assert_eq!([0, 1, 3].map(|i| params.values()[0].as_slice()[i]), [1.0, 2.0, -3e38]);
+            for _ in 0..5000 {
+                step(&mut sgd, &mut params, &Tensor::zeros(&[5]), 0.1);
+                assert!(params.values()[0].as_slice().iter().all(|x| !x.is_subnormal()));
+            }
+            assert!(params.values()[0].as_slice()[4].abs() < 4e-30, "where velocity ends, so does decay");
+            let velocity = &sgd.memory[0].velocity;
+            assert!(velocity.iter().all(|v| !v.is_subnormal()) && velocity.is_empty() == (momentum == 0.0));
+        }
+    }
+
+    #[test]
+    fn empty_parameters_and_long_ones_take_the_same_step() {
+        for momentum in [0.0, 0.5] {
+            let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, ..SgdConfig::default() });
+            let mut params = Params::new();
+            for (i, shape) in [&[0, 3][..], &[2 * CHUNK + 3], &[]].into_iter().enumerate() {
+                params.add(i.to_string(), Tensor::ones(shape));
+            }
+            params.set_lazy(|_| true, true);
+            for lazy in [true, false] {
+                params.set_lazy(|_| true, lazy);
+                let grads: Vec<_> = params.values().iter().map(|x| Gradient::from(Tensor::ones(x.shape()))).collect();
+                assert_eq!(sgd.update(&mut params, &grads, 0.5).check(), Ok(2 * CHUNK + 4));
+            }
+            let expected = if momentum == 0.0 { 0.0 } else { -0.25 };
+            assert!(params.values().iter().flat_map(Tensor::as_slice).all(|&x| x == expected));
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! What an optimiser remembers, by the names of the parameters.
+
+use crate::Params;
+#[cfg(feature = "files")]
+use crate::Storage;
+use raygrad_tensor::{Scalar, Tensor};
+#[cfg(feature = "files")]
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// What an optimiser remembers, so that a run can go on where it stopped, bit for bit.
+///
+/// An entry is named after its parameter and what it is: `layer.weight.first`. Constants, such as those of
+/// [`AdamConfig`](crate::AdamConfig), are not part of it, and neither are the parameters.
+///
+/// ```
+/// use raygrad_autograd::{Gradient, Tensor};
+/// use raygrad_nn::{Adam, AdamConfig, Optimizer, OptimizerState, Params};
+/// let mut params = Params::<f32>::new();
+/// params.add("x", Tensor::scalar(5.0));
+/// let mut adam = Adam::new(AdamConfig::default());
+/// adam.update(&mut params, &[Gradient::from(Tensor::scalar(1.0))], 0.1).check().unwrap();
+/// let bytes = adam.state(&params).to_safetensors().unwrap();
+///
+/// let mut later = Adam::new(AdamConfig::default());
+/// later.load_state(&params, &OptimizerState::from_safetensors(&bytes).unwrap()).unwrap();
+/// assert_eq!(later.steps(), 1);
+/// ```
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct OptimizerState<T: Scalar> {
+    /// Numbers of the parameters' type: moments, velocities, averages.
+    pub tensors: BTreeMap<String, Tensor<T>>,
+    /// Counts of steps: of the optimiser, of a parameter, or of each row of a table.
+    pub counts: BTreeMap<String, Vec<u64>>,
+}
+
+/// Why a state does not fit an optimiser and its parameters.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    /// The bytes are not a safetensors file.
+    #[cfg(feature = "files")]
+    #[error("not a safetensors file: {0}")]
+    Format(#[from] safetensors::SafeTensorError),
+    /// An entry is missing, unknown or of another shape or type.
+    #[error("`{name}` {what}")]
+    Entry {
+        /// The entry.
+        name: String,
+        /// What is wrong with it.
+        what: String,
+    },
+}
+
+impl StateError {
+    fn entry(name: &str, what: impl Into<String>) -> Self {
+        StateError::Entry { name: name.to_owned(), what: what.into() }
+    }
+}
+
+/// The name of an entry; without a parameter it is one of the optimiser itself.
+fn key(name: &str, what: &str) -> String {
+    if name.is_empty() { what.to_owned() } else { format!("{name}.{what}") }
+}
+
+impl<T: Scalar> OptimizerState<T> {
+    /// Adds numbers of a parameter.
+    pub(crate) fn put(&mut self, name: &str, what: &str, shape: &[usize], values: Vec<T>) {
+        self.tensors.insert(key(name, what), Tensor::from_vec(shape, values));
+    }
+
+    /// Adds counts of a parameter.
+    pub(crate) fn put_counts(&mut self, name: &str, what: &str, counts: Vec<u64>) {
+        self.counts.insert(key(name, what), counts);
+    }
+}
+
+#[cfg(feature = "files")]
+impl<T: Scalar> OptimizerState<T> {
+    /// The state as a safetensors file: tensors in their own type, counts as `U64`.
+    ///
+    /// # Errors
+    /// If the format cannot hold it.
+    pub fn to_safetensors(&self) -> Result<Vec<u8>, StateError> {
+        let mut parts = vec![];
+        for (name, value) in &self.tensors {
+            let mut bytes = Vec::with_capacity(size_of_val(value.as_slice()));
+            value.as_slice().iter().for_each(|x| x.write_le(&mut bytes));
+            parts.push((name, Storage::Full.dtype::<T>(), value.shape().to_vec(), bytes));
+        }
+        for (name, counts) in &self.counts {
+            let bytes = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
+            parts.push((name, Dtype::U64, vec![counts.len()], bytes));
+        }
+        let mut views = Vec::with_capacity(parts.len());
+        for (name, dtype, shape, bytes) in &parts {
+            views.push((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?));
+        }
+        Ok(safetensors::serialize(views, None)?)
+    }
+
+    /// The state that such a file holds.
+    ///
+    /// # Errors
+    /// If the bytes are no safetensors file or a number type is neither that of the parameters nor `U64`.
+    pub fn from_safetensors(bytes: &[u8]) -> Result<Self, StateError> {
+        let mut state = OptimizerState { tensors: BTreeMap::new(), counts: BTreeMap::new() };
+        for (name, view) in SafeTensors::deserialize(bytes)?.tensors() {
+            if view.dtype() == Storage::Full.dtype::<T>() {
+                let values = view.data().chunks_exact(size_of::<T>()).map(T::read_le).collect();
+                state.tensors.insert(name, Tensor::from_vec(view.shape(), values));
+            } else if view.dtype() == Dtype::U64 {
+                let counts = view.data().as_chunks().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect();
+                state.counts.insert(name, counts);
+            } else {
+                return Err(StateError::entry(&name, format!("is of type {:?}, and not {}", view.dtype(), T::NAME)));
+            }
+        }
+        Ok(state)
+    }
+}
+
+/// A state that is being read: what has not been asked for is left over.
+pub(crate) struct Reader<'a, T: Scalar> {
+    state: &'a OptimizerState<T>,
+    left: BTreeSet<&'a str>,
+}
+
+impl<'a, T: Scalar> Reader<'a, T> {
+    pub fn new(state: &'a OptimizerState<T>) -> Self {
+        Reader { state, left: state.tensors.keys().chain(state.counts.keys()).map(String::as_str).collect() }
+    }
+
+    /// The numbers of a parameter, if there are any.
+    pub fn tensor(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<Option<Vec<T>>, StateError> {
+        let key = key(name, what);
+        let Some(tensor) = self.state.tensors.get(&key) else { return Ok(None) };
+        self.left.remove(key.as_str());
+        if tensor.shape() != shape {
+            return Err(StateError::entry(&key, format!("has the shape {:?}, and not {shape:?}", tensor.shape())));
+        }
+        Ok(Some(tensor.as_slice().to_vec()))
+    }
+
+    /// As [`tensor`](Self::tensor), where there must be one.
+    pub fn expect(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<Vec<T>, StateError> {
+        self.tensor(name, what, shape)?.ok_or_else(|| StateError::entry(&key(name, what), "is missing"))
+    }
+
+    /// Counts of a parameter, if there are any.
+    pub fn counts(&mut self, name: &str, what: &str, len: usize) -> Result<Option<&'a [u64]>, StateError> {
+        let key = key(name, what);
+        let Some(counts) = self.state.counts.get(&key) else { return Ok(None) };
+        self.left.remove(key.as_str());
+        if counts.len() != len {
+            return Err(StateError::entry(&key, format!("has {} counts, and not {len}", counts.len())));
+        }
+        Ok(Some(counts))
+    }
+
+    /// The optimiser's own number of steps.
+    pub fn steps(&mut self) -> Result<u64, StateError> {
+        self.counts("", "steps", 1)?.map(|steps| steps[0]).ok_or_else(|| StateError::entry("steps", "is missing"))
+    }
+
+    /// An error if anything has not been asked for.
+    pub fn finish(self) -> Result<(), StateError> {
+        let what = "is unknown: the state belongs to another optimiser or other parameters";
+        self.left.first().map_or(Ok(()), |name| Err(StateError::entry(name, what)))
+    }
+}
+
+/// For each parameter of a store what an optimiser remembers of it, if anything.
+pub(crate) fn memories<'a, T: Scalar, M>(
+    params: &'a Params<T>,
+    memories: &'a [M],
+) -> impl Iterator<Item = (&'a str, &'a [usize], &'a M)> {
+    params.iter().zip(memories).map(|((name, value), memory)| (name, value.shape(), memory))
+}

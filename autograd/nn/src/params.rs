@@ -1,0 +1,547 @@
+//! Parameters: named tensors outside any tape, so that many tapes share one model.
+
+use crate::Move;
+use raygrad_autograd::{Gradient, Tape, Var};
+use raygrad_tensor::{Scalar, Tensor};
+use std::collections::HashMap;
+use std::ops::Index;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A handle on a parameter of one [`Params`] and of the copies that are made of it; any other store refuses it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct ParamId {
+    place: usize,
+    /// No other parameter of this program has it.
+    key: u64,
+}
+
+/// A named store of parameters, in the order in which they were added.
+///
+/// Layers hold [`ParamId`]s and are pure functions of the bound parameters and their input. A parameter can be frozen,
+/// and can have factors of the learning rate and of the weight decay of its own; parameters are chosen by their names.
+/// The handles of a store fit its clones and casts too, as far as the parameters are the same.
+///
+/// ```
+/// use raygrad_autograd::{Tape, Tensor};
+/// use raygrad_nn::Params;
+/// let mut params = Params::<f32>::new();
+/// let weight = params.add("weight", Tensor::full(&[2], 3.0));
+/// let tape = Tape::new();
+/// let bound = params.bind(&tape);
+/// let loss = bound[weight].square().sum();
+/// assert_eq!(loss.grad(&bound.vars())[0].as_slice(), [6.0, 6.0]);
+/// ```
+#[derive(Debug, Clone, Default)]
+pub struct Params<T: Scalar> {
+    /// Shared with what is bound and with copies.
+    names: Arc<Names>,
+    values: Vec<Tensor<T>>,
+    settings: Vec<Setting>,
+}
+
+/// What the parameters of a store are called.
+#[derive(Debug, Clone, Default)]
+struct Names {
+    names: Vec<String>,
+    places: HashMap<String, usize>,
+    /// For each parameter the number that its handles have.
+    keys: Vec<u64>,
+}
+
+impl Names {
+    #[track_caller]
+    fn add(&mut self, name: String) -> ParamId {
+        static KEYS: AtomicU64 = AtomicU64::new(0);
+        let (place, key) = (self.names.len(), KEYS.fetch_add(1, Ordering::Relaxed));
+        let taken = self.places.insert(name.clone(), place).is_some();
+        assert!(!taken, "there is already a parameter `{name}`");
+        self.names.push(name);
+        self.keys.push(key);
+        ParamId { place, key }
+    }
+
+    /// Where the parameter of a handle stands.
+    #[track_caller]
+    fn place(&self, ParamId { place, key }: ParamId) -> usize {
+        if self.keys.get(place) != Some(&key) {
+            match self.names.get(place) {
+                Some(name) => panic!("a handle of another store: its parameter {place} is not this store's `{name}`"),
+                None => panic!("a handle of another store: its parameter {place}, of {} here", self.names.len()),
+            }
+        }
+        place
+    }
+}
+
+/// How an optimiser treats a parameter.
+#[derive(Debug, Clone, Copy)]
+struct Setting {
+    frozen: bool,
+    rate: f64,
+    decay: f64,
+    lazy: bool,
+}
+
+impl<T: Scalar> Params<T> {
+    /// An empty store.
+    pub fn new() -> Self {
+        Params { names: Arc::default(), values: vec![], settings: vec![] }
+    }
+
+    /// Adds a parameter.
+    ///
+    /// # Panics
+    /// If the name is taken.
+    #[track_caller]
+    pub fn add(&mut self, name: impl Into<String>, value: Tensor<T>) -> ParamId {
+        let id = Arc::make_mut(&mut self.names).add(name.into());
+        self.values.push(value);
+        self.settings.push(Setting { frozen: false, rate: 1.0, decay: 1.0, lazy: false });
+        id
+    }
+
+    /// Number of parameters (tensors).
+    pub fn len(&self) -> usize {
+        self.values.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.values.is_empty()
+    }
+
+    /// Number of elements of all parameters together.
+    pub fn elements(&self) -> usize {
+        self.values.iter().map(Tensor::len).sum()
+    }
+
+    /// Number of elements of the parameters that are not frozen.
+    pub fn trainable_elements(&self) -> usize {
+        let free = self.values.iter().zip(&self.settings).filter(|(_, setting)| !setting.frozen);
+        free.map(|(value, _)| value.len()).sum()
+    }
+
+    /// The names in order.
+    pub fn names(&self) -> impl ExactSizeIterator<Item = &str> {
+        self.names.names.iter().map(String::as_str)
+    }
+
+    /// The name of a parameter.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn name(&self, id: ParamId) -> &str {
+        &self.names.names[self.names.place(id)]
+    }
+
+    /// The handles of the parameters that are not frozen, in order: those that have a gradient.
+    pub fn trainable(&self) -> impl Iterator<Item = ParamId> + '_ {
+        self.ids().zip(&self.settings).filter(|(_, setting)| !setting.frozen).map(|(id, _)| id)
+    }
+
+    /// The handles in order.
+    pub fn ids(&self) -> impl ExactSizeIterator<Item = ParamId> + '_ {
+        self.names.keys.iter().enumerate().map(|(place, &key)| ParamId { place, key })
+    }
+
+    /// The parameter of this name.
+    pub fn find(&self, name: &str) -> Option<ParamId> {
+        self.names.places.get(name).map(|&place| ParamId { place, key: self.names.keys[place] })
+    }
+
+    /// Changes the settings of the parameters that `which` chooses, and returns how many these are.
+    fn set(&mut self, which: impl Fn(&str) -> bool, change: impl Fn(&mut Setting)) -> usize {
+        let mut count = 0;
+        for (_, setting) in self.names.names.iter().zip(&mut self.settings).filter(|(name, _)| which(name)) {
+            change(setting);
+            count += 1;
+        }
+        count
+    }
+
+    /// Freezes the parameters whose name `which` chooses, and returns how many these are. A frozen parameter is a
+    /// constant on a tape, so that nothing is computed for its gradient, and optimisers leave it alone.
+    ///
+    /// ```
+    /// use raygrad_autograd::Tensor;
+    /// use raygrad_nn::Params;
+    /// let mut params = Params::<f32>::new();
+    /// let trunk = params.add("trunk.weight", Tensor::zeros(&[3, 2]));
+    /// params.add("head.weight", Tensor::zeros(&[2, 1]));
+    /// assert_eq!(params.freeze(|name| name.starts_with("trunk.")), 1);
+    /// assert!(params.is_frozen(trunk));
+    /// assert_eq!((params.elements(), params.trainable_elements()), (8, 2));
+    /// ```
+    pub fn freeze(&mut self, which: impl Fn(&str) -> bool) -> usize {
+        self.set(which, |setting| setting.frozen = true)
+    }
+
+    /// The opposite of [`freeze`](Self::freeze).
+    pub fn unfreeze(&mut self, which: impl Fn(&str) -> bool) -> usize {
+        self.set(which, |setting| setting.frozen = false)
+    }
+
+    /// Whether a parameter is frozen.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn is_frozen(&self, id: ParamId) -> bool {
+        self.settings[self.names.place(id)].frozen
+    }
+
+    /// Gives the parameters whose name `which` chooses a factor of the learning rate, instead of 1, and returns how many
+    /// these are.
+    ///
+    /// # Panics
+    /// If the factor is negative, infinite or NaN.
+    #[track_caller]
+    pub fn set_rate(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
+        assert!(factor >= 0.0 && factor.is_finite(), "a learning rate times {factor}");
+        self.set(which, |setting| setting.rate = factor)
+    }
+
+    /// Gives the parameters whose name `which` chooses a factor of the weight decay, instead of 1, and returns how many
+    /// these are. Biases and gains usually have 0.
+    ///
+    /// # Panics
+    /// If the factor is negative, infinite or NaN.
+    #[track_caller]
+    pub fn set_decay(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
+        assert!(factor >= 0.0 && factor.is_finite(), "a weight decay times {factor}");
+        self.set(which, |setting| setting.decay = factor)
+    }
+
+    /// Chooses whether the parameters whose name `which` chooses are lazy, which they are not at first, and returns how
+    /// many these are.
+    ///
+    /// A lazy parameter is a table of which a step uses few rows, along its first axis: an embedding. Optimisers then
+    /// read and move only the rows whose gradient is not zero, and what they remember of others stands still too. That is
+    /// another optimiser: a row that gets one late gradient moves once, where momentum moves it over the following steps
+    /// too ([`RowAdam`](crate::RowAdam)). Choose before the first step.
+    pub fn set_lazy(&mut self, which: impl Fn(&str) -> bool, lazy: bool) -> usize {
+        self.set(which, |setting| setting.lazy = lazy)
+    }
+
+    /// The factor of a parameter's learning rate.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn rate(&self, id: ParamId) -> f64 {
+        self.settings[self.names.place(id)].rate
+    }
+
+    /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
+    /// not frozen and whose gradient has a share.
+    ///
+    /// # Panics
+    /// If there is not one gradient of the same shape for each parameter that is not frozen, or the rate is not within 0
+    /// to 1e30.
+    #[track_caller]
+    pub fn moves<'a>(&'a mut self, grads: &'a [Gradient<T>], rate: f64) -> impl Iterator<Item = Move<'a, T>> {
+        assert!((0.0..=1e30).contains(&rate), "a learning rate of {rate:?}; use 0 to 1e30");
+        let free = self.settings.iter().filter(|setting| !setting.frozen).count();
+        assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
+        let (names, values) = (&self.names.names, self.values.iter_mut());
+        let parts = names.iter().zip(values).zip(&self.settings).enumerate();
+        let free = parts.filter(|(_, (_, setting))| !setting.frozen);
+        let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
+            assert_eq!(value.shape(), grad.shape(), "the gradient of `{name}` has its shape");
+            let lazy = setting.lazy && !value.is_empty();
+            Move { slot, name, value, grad, rate: rate * setting.rate, decay: setting.decay, lazy }
+        });
+        moves.filter(|part| !part.grad.is_zero())
+    }
+
+    /// Names and values in order.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = (&str, &Tensor<T>)> {
+        self.names().zip(&self.values)
+    }
+
+    /// The values in order.
+    pub fn values(&self) -> &[Tensor<T>] {
+        &self.values
+    }
+
+    /// The values in order, for an optimiser.
+    pub fn values_mut(&mut self) -> &mut [Tensor<T>] {
+        &mut self.values
+    }
+
+    /// One value.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn get(&self, id: ParamId) -> &Tensor<T> {
+        &self.values[self.names.place(id)]
+    }
+
+    /// One value, for an optimiser.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn get_mut(&mut self, id: ParamId) -> &mut Tensor<T> {
+        &mut self.values[self.names.place(id)]
+    }
+
+    /// The parameters as leaves of a tape; frozen ones as constants, which have no gradient.
+    #[track_caller]
+    pub fn bind<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
+        let mut vars = Vec::with_capacity(self.len());
+        for (value, setting) in self.values.iter().zip(&self.settings) {
+            vars.push(if setting.frozen { tape.constant(value.clone()) } else { tape.leaf(value.clone()) });
+        }
+        Bound { names: self.names.clone(), vars }
+    }
+
+    /// The parameters as constants of a tape, for evaluation.
+    pub fn bind_constant<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
+        let vars = self.values.iter().map(|value| tape.constant(value.clone())).collect();
+        Bound { names: self.names.clone(), vars }
+    }
+
+    /// What the handles of this store fit, without its values.
+    pub fn layout(&self) -> ParamLayout {
+        ParamLayout(self.names.clone())
+    }
+
+    /// Takes values and settings from a store of the same names and shapes, which may have another precision: the
+    /// handles of a model that was made anew then fit the parameters of an old one.
+    ///
+    /// ```
+    /// use raygrad_autograd::Tensor;
+    /// use raygrad_nn::Params;
+    /// let (mut old, mut new) = (Params::<f64>::new(), Params::<f32>::new());
+    /// old.add("x", Tensor::scalar(0.5));
+    /// let x = new.add("x", Tensor::scalar(9.0));
+    /// new.assign(&old);
+    /// assert_eq!(new.get(x).item(), 0.5);
+    /// ```
+    ///
+    /// # Panics
+    /// If names, their order or shapes differ.
+    #[track_caller]
+    pub fn assign<U: Scalar>(&mut self, other: &Params<U>) {
+        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
+        for ((name, value), theirs) in self.iter().zip(&other.values) {
+            assert_eq!(value.shape(), theirs.shape(), "two parameters `{name}`");
+        }
+        self.values = other.values.iter().map(Tensor::cast).collect();
+        self.settings.clone_from(&other.settings);
+    }
+
+    /// The same parameters in another precision.
+    pub fn cast<U: Scalar>(&self) -> Params<U> {
+        Params {
+            names: self.names.clone(),
+            values: self.values.iter().map(Tensor::cast).collect(),
+            settings: self.settings.clone(),
+        }
+    }
+
+    /// Other values of the same shapes.
+    pub(crate) fn replace(&mut self, values: Vec<Tensor<T>>) {
+        self.values = values;
+    }
+}
+
+/// The names of a store's parameters and the handles that fit them, without values: it puts variables in the place of
+/// parameters, in a check of a whole model or inside a checkpoint. A clone is a reference count.
+///
+/// ```
+/// use raygrad_autograd::{Tape, Tensor};
+/// use raygrad_nn::Params;
+/// let mut params = Params::<f64>::new();
+/// let weight = params.add("weight", Tensor::full(&[2], 3.0));
+/// let layout = params.layout();
+/// let tape = Tape::new();
+/// let x = tape.leaf(Tensor::full(&[2], 0.5));
+/// let y = tape.checkpoint(&[&x], move |x| layout.bind(x.to_vec())[weight].square().sum());
+/// assert_eq!(y.item(), 0.5);
+/// ```
+#[derive(Debug, Clone)]
+pub struct ParamLayout(Arc<Names>);
+
+impl ParamLayout {
+    /// Variables in place of the parameters, in the order of the store.
+    ///
+    /// # Panics
+    /// If there is not one for each parameter.
+    #[track_caller]
+    pub fn bind<'t, T: Scalar>(&self, vars: Vec<Var<'t, T>>) -> Bound<'t, T> {
+        assert_eq!(vars.len(), self.0.names.len(), "one variable for each parameter");
+        Bound { names: self.0.clone(), vars }
+    }
+}
+
+/// Parameters on a tape; index it with a [`ParamId`].
+#[derive(Debug)]
+pub struct Bound<'t, T: Scalar> {
+    names: Arc<Names>,
+    vars: Vec<Var<'t, T>>,
+}
+
+impl<'t, T: Scalar> Bound<'t, T> {
+    /// The parameters that gradients can be taken with respect to, in the order of the store: those that are not frozen.
+    pub fn vars(&self) -> Vec<&Var<'t, T>> {
+        self.vars.iter().filter(|var| var.is_on_graph()).collect()
+    }
+
+    /// The gradients of a one-element tensor, one for each parameter that is not frozen: what
+    /// [`Optimizer::update`](crate::Optimizer::update) takes.
+    ///
+    /// This is the end of a training step. The parameters are given up and everything that the tape has recorded is freed
+    /// with the values that it holds, so that an update moves the parameters where they are; a parameter that something
+    /// still holds is copied first. Values of variables can be read on, but not differentiated. Where more than this is
+    /// to be done with the graph, there is [`Var::backward`](raygrad_autograd::Var::backward) of [`vars`](Self::vars).
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor};
+    /// use raygrad_nn::{Adam, AdamConfig, Optimizer, Params};
+    /// let mut params = Params::<f32>::new();
+    /// let x = params.add("x", Tensor::full(&[2], 3.0));
+    /// let mut adam = Adam::new(AdamConfig::default());
+    /// let tape = Tape::new();
+    /// let bound = params.bind(&tape);
+    /// let loss = bound[x].square().sum();
+    /// let grads = bound.backward(&loss);
+    /// let place = params.get(x).as_slice().as_ptr();
+    /// let moved = adam.update(&mut params, &grads, 0.1).check();
+    /// assert_eq!((moved, params.get(x).as_slice().as_ptr()), (Ok(2), place));
+    /// ```
+    ///
+    /// # Panics
+    /// As [`Var::grad`](raygrad_autograd::Var::grad).
+    #[track_caller]
+    pub fn backward(self, loss: &Var<'t, T>) -> Vec<Gradient<T>> {
+        let wanted = self.vars();
+        let grads = if wanted.is_empty() { vec![] } else { loss.backward(&wanted) };
+        loss.tape().free();
+        grads
+    }
+
+    /// The tape that the parameters are on.
+    ///
+    /// # Panics
+    /// If there is no parameter.
+    #[track_caller]
+    pub fn tape(&self) -> &'t Tape<T> {
+        assert!(!self.vars.is_empty(), "the tape of no parameters");
+        self.vars[0].tape()
+    }
+}
+
+impl<'t, T: Scalar> Index<ParamId> for Bound<'t, T> {
+    type Output = Var<'t, T>;
+
+    /// The parameter of a handle.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    fn index(&self, id: ParamId) -> &Var<'t, T> {
+        &self.vars[self.names.place(id)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Optimizer, Sgd, SgdConfig, Storage};
+    use std::collections::HashMap;
+
+    #[test]
+    fn frozen_parameters_rest_and_others_have_their_own_rates() {
+        let mut params = Params::<f64>::new();
+        for name in ["trunk.weight", "trunk.bias", "head.weight"] {
+            params.add(name, Tensor::ones(&[2]));
+        }
+        assert_eq!(params.set_rate(|name| name.starts_with("trunk."), 0.5), 2);
+        assert_eq!(params.set_decay(|name| name.ends_with("bias"), 0.0), 1);
+        assert_eq!(params.freeze(|name| name == "head.weight"), 1);
+        let head = params.find("head.weight").unwrap();
+        assert!(params.is_frozen(head) && params.name(head) == "head.weight" && params.find("body").is_none());
+        assert_eq!((params.elements(), params.trainable_elements(), params.ids().count()), (6, 4, 3));
+        assert_eq!(params.names().collect::<Vec<_>>(), ["trunk.weight", "trunk.bias", "head.weight"]);
+
+        let mut sgd = Sgd::new(SgdConfig { decay: 1.0, ..SgdConfig::default() });
+        let step = |params: &mut Params<f64>, sgd: &mut Sgd<f64>| {
+            let tape = Tape::new();
+            let bound = params.bind(&tape);
+            let sum = params.ids().map(|id| bound[id].sum()).reduce(|a, b| a + b).unwrap();
+            assert_eq!(bound.vars().len(), params.trainable().count());
+            let grads = bound.backward(&sum);
+            let moved = sgd.update(params, &grads, 0.1).check().unwrap();
+            (moved, params.values().iter().map(|x| x.as_slice()[0]).collect::<Vec<_>>())
+        };
+        // Half the rate; decay adds the parameter, 1, to the gradient, 1, but for the bias.
+        assert_eq!(step(&mut params, &mut sgd), (4, vec![0.9, 0.95, 1.0]));
+        assert_eq!((params.rate(head), params.rate(params.find("trunk.bias").unwrap())), (1.0, 0.5));
+        // Settings survive a change of precision and a load.
+        let mut copy = params.cast::<f32>().cast::<f64>();
+        let bytes = params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap();
+        copy.load_safetensors(&bytes).unwrap();
+        assert!(copy.is_frozen(head) && copy.trainable_elements() == 4);
+        copy.unfreeze(|_| true);
+        let (moved, values) = step(&mut copy, &mut sgd);
+        assert_eq!((moved, values[2]), (6, 1.0 - 0.1 * 2.0));
+    }
+
+    #[test]
+    fn handles_fit_copies_and_no_other_store() {
+        let mut params = Params::<f64>::new();
+        let x = params.add("x", Tensor::scalar(1.0));
+        let (single, mut copy) = (params.cast::<f32>(), params.clone());
+        let y = copy.add("y", Tensor::scalar(2.0));
+        assert_eq!((single.get(x).item(), copy.get(x).item(), copy.get(y).item()), (1.0, 1.0, 2.0));
+        assert_eq!(params.find("x"), Some(x));
+        assert_eq!(copy.ids().collect::<Vec<_>>(), [x, y]);
+        // Both stores have a second parameter, but not the same one.
+        let z = params.add("z", Tensor::scalar(3.0));
+        let mut other = Params::<f64>::new();
+        let stranger = other.add("x", Tensor::scalar(4.0));
+        let tape = Tape::new();
+        let bound = params.bind(&tape);
+        let message = |f: &dyn Fn()| {
+            let error = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).expect_err("refused");
+            error.downcast_ref::<String>().cloned().unwrap_or_default()
+        };
+        for (f, expected) in [
+            (&(|| drop(params.get(y).clone())) as &dyn Fn(), "its parameter 1 is not this store's `z`"),
+            (&|| drop(copy.name(z).to_owned()), "its parameter 1 is not this store's `y`"),
+            (&|| drop(bound[stranger].clone()), "its parameter 0 is not this store's `x`"),
+            (&|| assert!(single.is_frozen(y)), "its parameter 1, of 1 here"),
+        ] {
+            assert!(message(f).contains(expected), "{} and {expected}", message(f));
+        }
+        other.add("z", Tensor::scalar(5.0));
+        other.freeze(|name| name == "z");
+        params.assign(&other.cast::<f32>());
+        assert_eq!((params.get(x).item(), params.get(z).item(), params.is_frozen(z)), (4.0, 5.0, true));
+    }
+
+    #[test]
+    fn many_parameters_are_added_and_found_in_linear_time() {
+        let mut params = Params::<f32>::new();
+        let start = std::time::Instant::now();
+        for i in 0..100_000 {
+            let id = params.add(format!("layer{i}.weight"), Tensor::zeros(&[0]));
+            assert_eq!(params.find(&format!("layer{i}.weight")), Some(id));
+        }
+        // A search through all names takes minutes.
+        assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());
+    }
+
+    #[test]
+    #[should_panic(expected = "there is already a parameter `x`")]
+    fn a_name_is_taken_once() {
+        let mut params = Params::<f32>::new();
+        params.add("x", Tensor::zeros(&[1]));
+        params.add("x", Tensor::zeros(&[2]));
+    }
+}

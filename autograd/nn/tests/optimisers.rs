@@ -1,0 +1,394 @@
+//! What all optimisers have in common: forms of gradients, frozen and lazy parameters, states, limits, ranges.
+
+use rand::{Rng, RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use raygrad_autograd::{Gradient, Pool, RowGrad, RowSums, Scalar, Tape, Tensor, Var};
+use raygrad_nn::{
+    Adam, AdamConfig, AdamW, Bound, Ema, NonFinite, Optimizer, OptimizerState, ParamId, Params, RowAdam, Sgd, SgdConfig,
+};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+
+type Make<T> = fn() -> Box<dyn Optimizer<T>>;
+
+/// All optimisers, under names for messages.
+fn optimisers<T: Scalar>() -> [(&'static str, Make<T>); 6] {
+    const NESTEROV: SgdConfig = SgdConfig { momentum: 0.75, nesterov: true, decay: 0.01 };
+    [
+        ("plain", || Box::new(Sgd::new(SgdConfig::default()))),
+        ("momentum", || Box::new(Sgd::new(SgdConfig { nesterov: false, ..NESTEROV }))),
+        ("nesterov", || Box::new(Sgd::new(NESTEROV))),
+        ("adam", || Box::new(Adam::new(AdamConfig::default()))),
+        ("table", || Box::new(Adam::new(AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() }))),
+        ("adamw", || Box::new(AdamW::new(AdamConfig::default(), 0.1))),
+    ]
+}
+
+fn random<T: Scalar>(shape: &[usize], rng: &mut impl Rng) -> Tensor<T> {
+    Tensor::from_fn(shape, |_| T::from_f64(rng.random::<f64>() - 0.5))
+}
+
+fn bits<T: Scalar>(params: &Params<T>) -> Vec<u64> {
+    params.values().iter().flat_map(Tensor::as_slice).map(|x| x.to_f64().to_bits()).collect()
+}
+
+/// A table, a vector and a number.
+fn model<T: Scalar>(lazy: bool) -> (Params<T>, [ParamId; 3]) {
+    let mut rng = Pcg64Mcg::seed_from_u64(3);
+    let mut params = Params::new();
+    let ids = [("table", &[40, 3][..]), ("vector", &[3]), ("number", &[])]
+        .map(|(name, shape)| params.add(name, random(shape, &mut rng)));
+    params.set_lazy(|name| name == "table", lazy);
+    (params, ids)
+}
+
+/// A loss of a few rows of the table, some of them twice; with `dense`, of its other elements too.
+fn loss<'t, T: Scalar>(bound: &Bound<'t, T>, ids: [ParamId; 3], step: usize, dense: bool) -> Var<'t, T> {
+    let [table, vector, number] = ids.map(|id| &bound[id]);
+    let rows: Arc<[u32]> = [step % 40, (step * 7 + 3) % 40, step % 40, 11].map(|row| row as u32).into();
+    let used = (table.gather_rows(&rows) * vector).sin().sum() + table.gather_rows(&[11].into()).square().sum();
+    let sum = used * number + number.square();
+    if dense { sum + table.square().sum() * 0.01 } else { sum }
+}
+
+/// The gradients of that loss.
+fn gradients<T: Scalar>(params: &Params<T>, ids: [ParamId; 3], step: usize, dense: bool) -> Vec<Gradient<T>> {
+    let tape = Tape::new();
+    let bound = params.bind(&tape);
+    let loss = loss(&bound, ids, step, dense);
+    bound.backward(&loss)
+}
+
+/// A step of training; returns how many elements were moved.
+fn train<T: Scalar>(
+    optimizer: &mut dyn Optimizer<T>,
+    params: &mut Params<T>,
+    ids: [ParamId; 3],
+    step: usize,
+    dense: bool,
+) -> Result<usize, NonFinite> {
+    let grads = gradients(params, ids, step, dense);
+    optimizer.update(params, &grads, 0.05).check()
+}
+
+#[test]
+fn a_sparse_gradient_gives_exactly_the_dense_result() {
+    for (name, make) in optimisers::<f32>() {
+        let (mut sparse, ids) = model::<f32>(false);
+        let mut dense = sparse.clone();
+        let (mut one, mut other) = (make(), make());
+        for step in 0..30 {
+            let with_penalty = step % 4 == 3;
+            let grads = gradients(&sparse, ids, step, with_penalty);
+            assert!(grads[0].sparse().len() == 2 && grads[0].dense().is_some() == with_penalty);
+            let added: Vec<_> = grads.iter().map(|grad| grad.clone().into_dense(&Pool::none()).into()).collect();
+            let moved = one.update(&mut sparse, &grads, 0.05).check();
+            assert_eq!(moved, Ok(124));
+            assert_eq!(moved, other.update(&mut dense, &added, 0.05).check());
+            assert_eq!(bits(&sparse), bits(&dense), "{name}: step {step}");
+        }
+    }
+}
+
+#[test]
+fn a_lazy_table_moves_the_rows_with_a_gradient_in_whatever_form_it_comes() {
+    for (name, make) in optimisers::<f64>() {
+        let (mut rows, ids) = model::<f64>(true);
+        let (mut whole, mut eager) = (rows.clone(), rows.clone());
+        eager.set_lazy(|_| true, false);
+        let [mut one, mut other, mut third] = [make(), make(), make()];
+        for step in 0..30 {
+            let before = rows.get(ids[0]).clone();
+            let grads = gradients(&rows, ids, step, false);
+            let dense: Vec<_> = grads.iter().map(|grad| grad.clone().into_dense(&Pool::none()).into()).collect();
+            let used = 3 - usize::from(step % 40 == 11 || (step * 7 + 3) % 40 == 11 || step == (step * 7 + 3) % 40);
+            assert_eq!(one.update(&mut rows, &grads, 0.05).check(), Ok(3 * used + 4), "{name}: step {step}");
+            assert_eq!(other.update(&mut whole, &dense, 0.05).check(), Ok(3 * used + 4), "{name}: step {step}");
+            let moved = |row: usize| rows.get(ids[0]).as_slice()[3 * row..][..3] != before.as_slice()[3 * row..][..3];
+            assert_eq!((0..40).filter(|&row| moved(row)).count(), used, "{name}: step {step}");
+            train(&mut *third, &mut eager, ids, step, false).unwrap();
+        }
+        let close = |a: &Params<f64>, b: &Params<f64>| {
+            let pairs = a.values().iter().flat_map(Tensor::as_slice).zip(b.values().iter().flat_map(Tensor::as_slice));
+            pairs.map(|(a, b)| (a - b).abs()).all(|error| error <= 1e-12)
+        };
+        assert!(close(&rows, &whole), "{name}");
+        // What rests without momentum and decay rests lazily too.
+        assert_eq!(close(&rows, &eager), name == "plain", "{name}");
+    }
+}
+
+#[test]
+fn a_penalty_on_a_lazy_table_visits_every_row() {
+    for (name, make) in optimisers::<f64>() {
+        let (mut params, ids) = model::<f64>(true);
+        let mut optimizer = make();
+        for step in 0..10 {
+            let moved = train(&mut *optimizer, &mut params, ids, step, step == 4).unwrap();
+            assert_eq!(moved == 124, step == 4, "{name}: {moved} at step {step}");
+        }
+    }
+}
+
+#[test]
+fn a_lazy_table_moves_as_an_eager_one_where_every_row_has_a_gradient() {
+    for (name, make) in optimisers::<f64>() {
+        let (mut lazy, ids) = model::<f64>(true);
+        let mut eager = lazy.clone();
+        eager.set_lazy(|_| true, false);
+        let [mut one, mut other] = [make(), make()];
+        for step in 0..30 {
+            train(&mut *one, &mut lazy, ids, step, true).unwrap();
+            train(&mut *other, &mut eager, ids, step, true).unwrap();
+        }
+        for (a, b) in lazy.values().iter().zip(eager.values()) {
+            assert!(a.is_close(b, 1e-11, 1e-12), "{name}: {a} and {b}");
+        }
+    }
+}
+
+/// A state survives its file.
+fn stored<T: Scalar>(state: &OptimizerState<T>) -> OptimizerState<T> {
+    let read = OptimizerState::from_safetensors(&state.to_safetensors().unwrap()).unwrap();
+    assert_eq!(read, *state);
+    read
+}
+
+fn a_run_goes_on_from_its_state_bit_for_bit<T: Scalar>() {
+    for (name, make) in optimisers::<T>() {
+        for lazy in [false, true] {
+            let (mut through, ids) = model::<T>(lazy);
+            let mut halted = through.clone();
+            // One of them is not moved before the pause.
+            let step = |params: &mut Params<T>, optimizer: &mut dyn Optimizer<T>, step: usize| {
+                params.freeze(|name| name == "vector");
+                params.unfreeze(|_| step >= 8);
+                let grads = gradients(params, ids, step, step % 5 == 2);
+                optimizer.update(params, &grads, 0.05).check().unwrap();
+            };
+            let mut whole = make();
+            (0..20).for_each(|t| step(&mut through, &mut *whole, t));
+            let mut first = make();
+            (0..10).for_each(|t| step(&mut halted, &mut *first, t));
+            let state = stored(&first.state(&halted));
+            let mut second = make();
+            second.load_state(&halted, &state).unwrap();
+            assert_eq!(second.state(&halted), state, "{name}, lazy: {lazy}");
+            (10..20).for_each(|t| step(&mut halted, &mut *second, t));
+            assert_eq!(bits(&halted), bits(&through), "{name}, lazy: {lazy}");
+            assert_eq!(second.state(&halted), whole.state(&through), "{name}, lazy: {lazy}");
+            // A fresh optimiser would have done something else, if there is anything to remember.
+            assert_eq!(state.tensors.is_empty(), name == "plain");
+        }
+    }
+}
+
+#[test]
+fn runs_in_f32_go_on_bit_for_bit() {
+    a_run_goes_on_from_its_state_bit_for_bit::<f32>();
+}
+
+#[test]
+fn runs_in_f64_go_on_bit_for_bit() {
+    a_run_goes_on_from_its_state_bit_for_bit::<f64>();
+}
+
+#[test]
+fn rows_and_averages_go_on_bit_for_bit() {
+    let config = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
+    let step = |adam: &mut RowAdam<f32>, table: &mut [f32], t: usize| {
+        let mut sums = RowSums::new(9, 2);
+        [t % 9, (3 * t) % 9].iter().for_each(|&row| sums.add(row, &[(t as f32).sin(), 0.5]));
+        adam.step(table, &mut sums, 0.1, 0.01);
+    };
+    let (mut through, mut halted) = (vec![1.0; 18], vec![1.0; 18]);
+    let [mut whole, mut first, mut second] = [(); 3].map(|()| RowAdam::new(config, 9, 2));
+    (0..20).for_each(|t| step(&mut whole, &mut through, t));
+    (0..10).for_each(|t| step(&mut first, &mut halted, t));
+    second.load(first.moments().each_ref().map(Vec::as_slice), &first.row_steps());
+    (10..20).for_each(|t| step(&mut second, &mut halted, t));
+    assert_eq!(halted, through);
+    assert!(halted.iter().all(|x| *x != 1.0));
+
+    let (mut params, _) = model::<f32>(false);
+    let mut whole = Ema::new(&params, 0.99).with_warmup();
+    let mut second = whole.clone();
+    let mut next = |ema: &mut Ema<f32>, t: i32| {
+        params.values_mut().iter_mut().for_each(|x| x.as_mut_slice().fill(t as f32));
+        assert_eq!(ema.update(&params), 0);
+    };
+    (0..10).for_each(|t| next(&mut whole, t));
+    second.load_state(&stored(&whole.state())).unwrap();
+    (10..20).for_each(|t| [&mut whole, &mut second].into_iter().for_each(|ema| next(ema, t)));
+    assert_eq!(bits(whole.params()), bits(second.params()));
+}
+
+#[test]
+fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
+    let (mut params, ids) = model::<f32>(true);
+    let mut adam = Adam::new(AdamConfig::default());
+    for step in 0..3 {
+        train(&mut adam, &mut params, ids, step, false).unwrap();
+    }
+    let good = adam.state(&params);
+    type Change = fn(&mut OptimizerState<f32>);
+    let changes: [(Change, &str); 6] = [
+        (|s| drop(s.tensors.remove("vector.first")), "`vector.first` is missing"),
+        (|s| drop(s.counts.remove("steps")), "`steps` is missing"),
+        (|s| drop(s.counts.remove("vector.step")), "`vector.first` is unknown"),
+        (|s| drop(s.counts.insert("table.row_steps".into(), vec![1; 3])), "`table.row_steps` has 3 counts, and not 40"),
+        (|s| drop(s.tensors.insert("number.second".into(), Tensor::zeros(&[1]))), "has the shape [1], and not []"),
+        (|s| drop(s.tensors.insert("stranger.first".into(), Tensor::zeros(&[1]))), "`stranger.first` is unknown"),
+    ];
+    for (change, expected) in changes {
+        let mut state = good.clone();
+        change(&mut state);
+        let message = adam.load_state(&params, &state).unwrap_err().to_string();
+        assert!(message.contains(expected), "{message} and {expected}");
+        assert_eq!(adam.state(&params), good);
+    }
+    let error = Sgd::new(SgdConfig::default()).load_state(&params, &good).unwrap_err().to_string();
+    assert!(error.contains("the state belongs to another optimiser"), "{error}");
+    assert!(OptimizerState::<f64>::from_safetensors(&good.to_safetensors().unwrap()).is_err());
+}
+
+#[test]
+fn frozen_parameters_rest_and_others_have_their_own_rates() {
+    for (name, make) in optimisers::<f64>() {
+        let (mut params, ids) = model::<f64>(false);
+        params.set_rate(|name| name == "vector", 0.5);
+        params.set_decay(|_| true, 0.0);
+        let mut other = params.clone();
+        other.freeze(|name| name == "table");
+        let start = params.clone();
+        let (mut one, mut two) = (make(), make());
+        assert_eq!(train(&mut *one, &mut params, ids, 0, true), Ok(124));
+        assert_eq!(train(&mut *two, &mut other, ids, 0, true), Ok(4));
+        assert_eq!(start.get(ids[0]), other.get(ids[0]), "{name}");
+        assert_ne!(start.get(ids[0]), params.get(ids[0]), "{name}");
+        // Half of the rate is half of the way, of the first step.
+        let way = |params: &Params<f64>| params.get(ids[1]).as_slice()[0] - start.get(ids[1]).as_slice()[0];
+        other.assign(&start);
+        other.set_rate(|_| true, 1.0);
+        train(&mut *make(), &mut other, ids, 0, true).unwrap();
+        assert!((way(&params) / way(&other) - 0.5).abs() < 1e-12, "{name}");
+    }
+}
+
+/// Numbers that f32 cannot hold are nothing special in f64.
+#[test]
+fn small_numbers_of_f64_are_kept() {
+    let once = |optimizer: &mut dyn Optimizer<f64>, x: f64, g: f64| {
+        let mut params = Params::new();
+        let id = params.add("x", Tensor::scalar(x));
+        optimizer.update(&mut params, &[Tensor::scalar(g).into()], 1.0).check().unwrap();
+        params.get(id).item()
+    };
+    let momentum = SgdConfig { momentum: 0.9, ..SgdConfig::default() };
+    assert_eq!(once(&mut Sgd::new(momentum), 0.0, 1e-40), -1e-40);
+    assert_eq!(once(&mut Sgd::new(SgdConfig { decay: 0.5, ..SgdConfig::default() }), 1e-40, 0.0), 0.5e-40);
+    assert_eq!(once(&mut AdamW::new(AdamConfig::default(), 0.5), 1e-40, 0.0), 0.5e-40);
+    let config = AdamConfig { epsilon: 1e-30, ..AdamConfig::default() };
+    let expected = -1e-35 / (1e-35 + 1e-30);
+    assert!((once(&mut Adam::new(config), 0.0, 1e-35) / expected - 1.0).abs() < 1e-12);
+    let (mut table, mut sums) = ([0.0; 2], RowSums::new(2, 1));
+    sums.add(1, &[1e-35]);
+    RowAdam::new(config, 2, 1).step(&mut table, &mut sums, 1.0, 0.0);
+    assert!(table[0] == 0.0 && (table[1] / expected - 1.0).abs() < 1e-12);
+}
+
+fn message(f: impl FnOnce()) -> String {
+    let error = catch_unwind(AssertUnwindSafe(f)).expect_err("refused");
+    error.downcast::<String>().map_or_else(|_| "no words".into(), |message| *message)
+}
+
+#[test]
+fn settings_out_of_their_range_are_refused_by_name() {
+    let adam = AdamConfig::default();
+    for (config, expected) in [
+        (AdamConfig { beta1: 1.0, ..adam }, "`beta1` is 1.0; use at least 0 and less than 1"),
+        (AdamConfig { beta2: 2.0, ..adam }, "`beta2` is 2.0;"),
+        (AdamConfig { beta2: f64::NAN, ..adam }, "`beta2` is NaN;"),
+        (AdamConfig { epsilon: 0.0, ..adam }, "`epsilon` is 0.0; use 1e-30 to 1e30"),
+    ] {
+        for message in [
+            message(|| drop(Adam::<f32>::new(config))),
+            message(|| drop(AdamW::<f64>::new(config, 0.0))),
+            message(|| drop(RowAdam::<f32>::new(config, 1, 1))),
+            config.check().unwrap_err().to_string(),
+        ] {
+            assert!(message.contains(expected), "{message} and {expected}");
+        }
+    }
+    assert!(message(|| drop(AdamW::<f32>::new(adam, -1.0))).contains("`decay` is -1.0; use 0 to 1e30"));
+    let sgd = SgdConfig::default();
+    for (config, expected) in [
+        (SgdConfig { momentum: 1.0, ..sgd }, "`momentum` is 1.0; use at least 0 and less than 1"),
+        (SgdConfig { nesterov: true, ..sgd }, "`momentum` is 0.0; use more than 0 to look ahead"),
+        (SgdConfig { decay: f64::INFINITY, ..sgd }, "`decay` is inf;"),
+    ] {
+        assert!(message(|| drop(Sgd::<f32>::new(config))).contains(expected), "{config:?}");
+    }
+    let (mut params, ids) = model::<f32>(false);
+    let grads = gradients(&params, ids, 0, false);
+    let mut update = |grads: &[Gradient<f32>], rate| {
+        message(|| drop(Adam::new(AdamConfig::default()).update(&mut params, grads, rate)))
+    };
+    for rate in [1e300, -1e-3, f64::NAN] {
+        assert!(update(&grads, rate).contains(&format!("a learning rate of {rate:?}; use 0 to 1e30")));
+    }
+    assert!(update(&grads[1..], 0.1).contains("one gradient for each parameter that is not frozen"));
+    let swapped = [grads[1].clone(), grads[0].clone(), grads[2].clone()];
+    assert!(update(&swapped, 0.1).contains("the gradient of `table` has its shape"));
+    assert!(message(|| assert_eq!(params.set_rate(|_| true, -1.0), 0)).contains("a learning rate times -1"));
+}
+
+#[test]
+fn a_lazy_parameter_stays_so() {
+    let (mut params, ids) = model::<f32>(true);
+    let mut adam = Adam::new(AdamConfig::default());
+    train(&mut adam, &mut params, ids, 0, false).unwrap();
+    params.set_lazy(|_| true, false);
+    let grads = gradients(&params, ids, 1, false);
+    assert!(message(|| drop(adam.update(&mut params, &grads, 0.1))).contains("`table` was lazy until now"));
+}
+
+#[test]
+fn a_bad_row_of_a_lazy_table_rests_as_a_whole() {
+    let (mut params, ids) = model::<f32>(true);
+    let before = params.get(ids[0]).clone();
+    let rows = Tensor::from_vec(&[2, 3], vec![1.0, f32::NAN, 1.0, 1.0, 2.0, 3.0]);
+    let mut table = Gradient::zero(&[40, 3]);
+    table.add_sparse(Arc::new(RowGrad::new(&[40, 3], [5, 6].into(), rows)));
+    let grads = [table, Gradient::zero(&[3]), Gradient::zero(&[])];
+    let report = Adam::new(AdamConfig::default()).update(&mut params, &grads, 0.1);
+    assert_eq!((report.moved, report.skipped, report.bad), (3, 3, vec![("table".to_owned(), 3)]));
+    let moved = |row: usize| params.get(ids[0]).as_slice()[3 * row..][..3] != before.as_slice()[3 * row..][..3];
+    assert_eq!((0..40).filter(|&row| moved(row)).collect::<Vec<_>>(), [6]);
+}
+
+/// A step of training leaves every parameter where it is in memory; with something that holds one, it is copied.
+#[test]
+fn a_step_copies_no_parameter() {
+    for (name, make) in optimisers::<f32>() {
+        let (mut params, ids) = model::<f32>(false);
+        let mut optimizer = make();
+        let places = |params: &Params<f32>| params.values().iter().map(|x| x.as_slice().as_ptr()).collect::<Vec<_>>();
+        let start = places(&params);
+        for step in 0..3 {
+            let tape = Tape::new();
+            let bound = params.bind(&tape);
+            let loss = loss(&bound, ids, step, true);
+            // A second use of the parameters that has no part in the loss is recorded too.
+            let metric = (&bound[ids[0]] * &bound[ids[1]]).exp().sum();
+            let grads = bound.backward(&loss);
+            optimizer.update(&mut params, &grads, 0.05).check().unwrap();
+            assert!(metric.item().is_finite() && loss.item().is_finite());
+            assert_eq!(places(&params)[..2], start[..2], "{name}: step {step}");
+        }
+        let held = params.get(ids[0]).clone();
+        train(&mut *optimizer, &mut params, ids, 3, true).unwrap();
+        assert_ne!(places(&params)[0], start[0], "{name}");
+        assert_ne!(held, *params.get(ids[0]));
+    }
+}

@@ -1,0 +1,395 @@
+//! The catalogue: every operation with the inputs it is checked on and its values at extremes.
+
+use crate::formula::derived;
+use crate::ops::trigonometric;
+use crate::ops::{
+    Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
+};
+use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
+use crate::{Elementwise, Formula, Op};
+use raygrad_tensor::{Layout, Shape, Tensor};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Where an elementwise formula is sampled, and what it gives at extremes.
+#[derive(Debug, Clone, Default)]
+pub struct Cases {
+    linear: bool,
+    /// For each input the ranges that samples are drawn from.
+    domains: Vec<Vec<Range<f64>>>,
+    extremes: Vec<Extreme>,
+}
+
+/// The exact value and gradients at one point, chosen because naive formulas fail there.
+#[derive(Debug, Clone)]
+pub struct Extreme {
+    /// The inputs.
+    pub x: Vec<f64>,
+    /// The value; NaN if it is to be NaN.
+    pub y: f64,
+    /// The gradient of each input for a gradient of 1.
+    pub grads: Vec<f64>,
+}
+
+impl Cases {
+    /// The function is linear, which is checked too.
+    pub fn linear(&mut self) -> &mut Self {
+        self.linear = true;
+        self
+    }
+
+    /// The range of the next input.
+    pub fn domain(&mut self, range: Range<f64>) -> &mut Self {
+        self.domains.push(vec![range]);
+        self
+    }
+
+    /// A further range of the last input, for a function with a gap: samples alternate between the ranges.
+    pub fn domain_also(&mut self, range: Range<f64>) -> &mut Self {
+        if let Some(last) = self.domains.last_mut() {
+            last.push(range);
+        }
+        self
+    }
+
+    /// Sets of operands.
+    fn samples(&self) -> Vec<Vec<Tensor<f64>>> {
+        // The shapes of one operand, and of several: taken over and over where there are more.
+        let shapes: &[&[&[usize]]] = match self.domains.len() {
+            1 => &[&[&[2, 3]], &[&[]], &[&[0, 3]], &[&[37]]],
+            _ => &[&[&[2, 3]], &[&[4, 1], &[3]], &[&[], &[2]], &[&[0, 1], &[3]], &[&[2, 1, 2], &[1]], &[&[]]],
+        };
+        let set = |(k, shapes): (usize, &&[&[usize]])| {
+            let operands = self.domains.iter().zip(shapes.iter().cycle()).enumerate();
+            operands.map(|(i, (domain, shape))| spread(shape, domain, i + 7 * k)).collect()
+        };
+        shapes.iter().enumerate().map(set).collect()
+    }
+
+    /// The value `y` and the gradients at `x`.
+    pub fn at<const N: usize>(&mut self, x: [f64; N], y: f64, grads: [f64; N]) -> &mut Self {
+        self.extremes.push(Extreme { x: x.into(), y, grads: grads.into() });
+        self
+    }
+}
+
+/// A formula that has its cases with it, as all of the catalogue's have.
+pub trait Examined<const N: usize>: Formula<N> {
+    /// Where it is sampled in checks, and exact values at extremes.
+    fn cases(&self, cases: &mut Cases);
+}
+
+/// An elementwise formula and its derivatives by dual numbers, of the operands and the gradient of the result.
+pub(crate) type DualFormula = dyn Fn(&[f64], f64) -> (f64, Vec<f64>);
+
+/// One operation as the checks see it: for f64, for f32, and what to feed it.
+pub struct Entry {
+    /// The operation's name.
+    pub name: &'static str,
+    /// Whether it is linear in all inputs together.
+    pub linear: bool,
+    /// Sets of inputs.
+    pub samples: Vec<Vec<Tensor<f64>>>,
+    /// Exact values.
+    pub extremes: Vec<Extreme>,
+    pub(crate) f64: Arc<dyn Op<f64>>,
+    pub(crate) f32: Arc<dyn Op<f32>>,
+    pub(crate) dual: Option<Box<DualFormula>>,
+}
+
+impl Entry {
+    /// An operation without samples.
+    pub fn new<O: Op<f64> + Op<f32> + Clone>(op: O) -> Self {
+        Entry::of(op.clone(), op)
+    }
+
+    /// As [`new`](Self::new), for an operation that holds tensors and so has a value of its own in each precision.
+    pub fn of(f64: impl Op<f64>, f32: impl Op<f32>) -> Self {
+        let name = f64.name();
+        let (f64, f32) = (Arc::new(f64), Arc::new(f32));
+        Entry { name, linear: false, samples: vec![], extremes: vec![], f64, f32, dual: None }
+    }
+
+    /// A further set of inputs, of these shapes, with values in -1..1.
+    pub fn sample(mut self, shapes: &[&[usize]]) -> Self {
+        let inputs =
+            shapes.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 7 * self.samples.len()));
+        let inputs = inputs.collect();
+        self.samples.push(inputs);
+        self
+    }
+
+    /// A further set of inputs.
+    pub fn sample_of(mut self, inputs: Vec<Tensor<f64>>) -> Self {
+        self.samples.push(inputs);
+        self
+    }
+
+    /// The operation is linear, which is checked too.
+    pub fn linear(self) -> Self {
+        Entry { linear: true, ..self }
+    }
+
+    /// A formula, with its cases.
+    pub fn examined<const N: usize>(formula: impl Examined<N>) -> Self {
+        let mut cases = Cases::default();
+        formula.cases(&mut cases);
+        Entry::formula(formula, &cases)
+    }
+
+    /// A formula, sampled in as many domains as it has operands.
+    ///
+    /// ```
+    /// use raygrad_autograd::check::{Cases, Check, Entry, check_op};
+    /// use raygrad_autograd::formula;
+    /// let swish = formula!(|x, beta| x * (beta * x).sigmoid());
+    /// let mut cases = Cases::default();
+    /// cases.domain(-3.0..3.0).domain(0.5..2.0).at([0.0, 1.0], 0.0, [0.5, 0.0]);
+    /// check_op(&Check::default(), &Entry::formula(swish, &cases)).unwrap();
+    /// ```
+    ///
+    /// # Panics
+    /// If there is not one domain for each operand.
+    pub fn formula<F: Formula<N>, const N: usize>(formula: F, cases: &Cases) -> Self {
+        assert_eq!(cases.domains.len(), N, "{}: one domain for each operand", F::NAME);
+        let dual = move |x: &[f64], g: f64| {
+            let x = std::array::from_fn(|i| x[i]);
+            (formula.f(x), derived(&formula, g, x).to_vec())
+        };
+        Entry {
+            samples: cases.samples(),
+            linear: cases.linear,
+            extremes: cases.extremes.clone(),
+            dual: Some(Box::new(dual)),
+            ..Entry::new(Elementwise(formula))
+        }
+    }
+}
+
+/// Reproducible values that fill the ranges evenly and follow no pattern that an error could hide in.
+pub(crate) fn spread(shape: &[usize], ranges: &[Range<f64>], salt: usize) -> Tensor<f64> {
+    const GOLDEN: f64 = 0.618_033_988_749_894_9;
+    Tensor::from_fn(shape, |i| {
+        let range = &ranges[i % ranges.len()];
+        let unit = ((i + 1) as f64 * GOLDEN + salt as f64 * 0.377).fract();
+        range.start + unit * (range.end - range.start)
+    })
+}
+
+/// Every operation of this crate.
+pub fn catalogue() -> Vec<Entry> {
+    [core(), elementwise(), reductions(), losses()].into_iter().flatten().collect()
+}
+
+/// Functions of one, two and three numbers.
+fn elementwise() -> Vec<Entry> {
+    use select::Compare::{Equal, Greater, GreaterEqual, Less, LessEqual, NotEqual};
+    // Powers of both signs, of 0 and of 1 have conventions of their own.
+    let powi = [0, 1, 5, -4].map(|exponent| Entry::examined(power::Powi { exponent }));
+    let powers = [
+        Entry::examined(power::ConstPowi::<2>),
+        Entry::examined(power::ConstPowi::<3>),
+        Entry::examined(power::ConstPowi::<4>),
+    ];
+    let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::examined(power::Powf { exponent }));
+    // Values that are equal in places, and that no step of a difference takes past each other.
+    let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
+    let compare = [Greater, GreaterEqual, Less, LessEqual].map(|comparison| {
+        let apart = |i: usize| Tensor::from_fn(&[2, 3], |k| (k + i * (2 * k % 3)) as f64 + 0.5 * i as f64);
+        let apart = vec![apart(0), apart(1)];
+        Entry::new(comparison).sample_of(apart).sample(&[&[0, 1], &[3]]).sample(&[&[], &[]])
+    });
+    let equal = [Equal, NotEqual].map(|comparison| {
+        Entry::new(comparison).sample(&[&[2, 3], &[3]]).sample(&[&[0, 1], &[3]]).sample(&[&[], &[2]])
+    });
+    let mask = |shape: &[usize]| ranks(shape, 3);
+    let choice = |shape: &[usize], others: [&[usize]; 2]| {
+        let others = others.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 3));
+        std::iter::once(mask(shape)).chain(others).collect::<Vec<_>>()
+    };
+    let rest = vec![
+        Entry::examined(exponential::Exp2),
+        Entry::examined(exponential::Log2),
+        Entry::examined(exponential::Rsqrt),
+        Entry::examined(exponential::Erf),
+        Entry::examined(trigonometric::Tan),
+        Entry::examined(trigonometric::Asin),
+        Entry::examined(trigonometric::Acos),
+        Entry::examined(trigonometric::Atan),
+        Entry::examined(trigonometric::Atan2),
+        Entry::examined(trigonometric::Sinh),
+        Entry::examined(trigonometric::Cosh),
+        Entry::examined(activation::LogSigmoid),
+        Entry::examined(activation::LeakyRelu { slope: 0.125 }),
+        Entry::examined(activation::Elu { alpha: 1.5 }),
+        Entry::examined(activation::Gelu),
+        Entry::examined(activation::GeluTanh),
+        Entry::examined(activation::Silu),
+        Entry::examined(piecewise::Abs),
+        Entry::examined(piecewise::Sign),
+        Entry::examined(piecewise::Maximum),
+        Entry::examined(piecewise::Minimum),
+        Entry::examined(piecewise::Clamp { low: -1.0, high: 2.0 }),
+        Entry::examined(piecewise::Floor),
+        Entry::examined(piecewise::Ceil),
+        Entry::examined(piecewise::Round),
+        Entry::examined(power::Reciprocal),
+        Entry::examined(power::Pow),
+        Entry::examined(power::Xlogy),
+        Entry::new(select::Where)
+            .sample_of(choice(&[2, 3], [&[2, 3], &[3]]))
+            .sample_of(choice(&[3], [&[2, 1], &[]]))
+            .sample_of(choice(&[0, 3], [&[3], &[1]]))
+            .sample_of(choice(&[], [&[], &[]])),
+        Entry::new(select::Lerp).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[3], &[2, 1], &[]]).sample(&[
+            &[0, 3],
+            &[3],
+            &[1],
+        ]),
+    ];
+    powi.into_iter().chain(powers).chain(powf).chain(compare).chain(equal).chain(rest).collect()
+}
+
+/// What makes fewer numbers out of many, and what runs along an axis.
+fn reductions() -> Vec<Entry> {
+    let shape = |extents: &[usize]| Shape::from_slice(extents);
+    let variance = |extents: &[usize], correction| moments::Variance { shape: shape(extents), correction };
+    let extremum = |from, behind, greatest| {
+        // Far enough apart for the steps of differences.
+        let apart = |extents: &[usize]| Tensor::from_fn(extents, |i| ((i * 7 + 3) % 24) as f64 * 0.1 - 1.0);
+        let entry = Entry::new(extremum::Extremum { from, behind, greatest });
+        let empty: &[usize] = if from == 0 { &[2, 3, 0] } else { &[0, 2, 3] };
+        entry.sample_of(vec![apart(&[2, 3, 4])]).sample(&[empty])
+    };
+    let zeros = |extents: &[usize], every: usize| {
+        let values = spread(extents, &[-1.5..1.5], 2);
+        vec![Tensor::from_fn(extents, |i| if i % every == 1 { 0.0 } else { values.as_slice()[i] })]
+    };
+    let walk = |axis, reverse| scan::Walk { axis, reverse };
+    let wide: &[&[usize]] = &[&[3, 40]];
+    vec![
+        extremum(1, 3, true),
+        extremum(0, 2, false),
+        extremum(1, 1, true),
+        Entry::new(moments::Variance { correction: 1.0, ..variance(&[2, 1], 0.0) })
+            .sample(&[&[2, 5]])
+            .sample(&[&[2, 40]]),
+        Entry::new(variance(&[1, 3, 1], 0.0)).sample(&[&[2, 3, 4]]).sample(&[&[5, 3, 1]]),
+        Entry::new(variance(&[], 0.0)).sample(&[&[]]),
+        Entry::new(variance(&[0, 1], 0.0)).sample(&[&[0, 4]]),
+        Entry::new(moments::Deviation(variance(&[2, 1], 1.0))).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
+        Entry::new(moments::Deviation(variance(&[1, 3, 1], 0.0))).sample(&[&[2, 3, 4]]),
+        Entry::new(moments::Norm { shape: shape(&[2, 1]) }).sample(&[&[2, 5]]).sample(&[&[2, 40]]),
+        Entry::new(moments::Norm { shape: shape(&[1, 3]) }).sample(&[&[4, 3]]),
+        Entry::new(moments::Norm { shape: shape(&[]) }).sample(&[&[]]),
+        Entry::new(moments::Norm { shape: shape(&[1, 1]) }).sample(&[&[2, 3]]),
+        Entry::new(scan::Cumsum(walk(1, false))).linear().sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]).sample(&[&[2, 0]]),
+        Entry::new(scan::Cumsum(walk(0, true))).linear().sample(&[&[5]]).sample(&[&[3, 2]]).sample(&[&[0]]),
+        Entry::new(scan::Cumprod(walk(1, false)))
+            .sample(&[&[2, 4]])
+            .sample_of(zeros(&[3, 4], 2))
+            .sample_of(zeros(&[3, 4, 2], 5))
+            .sample(&[&[2, 0]]),
+        Entry::new(scan::Cumprod(walk(0, true))).sample(&[&[4]]).sample_of(zeros(&[5], 3)),
+        Entry::new(scan::Recurrence(walk(0, false))).sample(&[&[5], &[5]]).sample(&[&[4, 2], &[4, 2]]),
+        Entry::new(scan::Recurrence(walk(1, true))).sample(&[&[2, 4], &[2, 4]]).sample(&[&[2, 0], &[2, 0]]),
+        Entry::new(product::Product)
+            .sample(&[&[2, 4]])
+            .sample_of(zeros(&[3, 4], 5))
+            .sample_of(zeros(&[2, 5], 2))
+            .sample(&[&[2, 0]])
+            .sample(&[&[1]]),
+        Entry::new(softmax::Softmax)
+            .sample(&[&[2, 5]])
+            .sample(wide)
+            .sample(&[&[0, 3]])
+            .sample(&[&[2, 0]])
+            .sample(&[&[1]]),
+        Entry::new(softmax::LogSoftmax).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[2, 0]]),
+        Entry::new(softmax::LogSumExp).sample(&[&[2, 5]]).sample(wide).sample(&[&[0, 3]]).sample(&[&[3]]),
+        Entry::new(layer_norm::LayerNorm { eps: 1e-3 })
+            .sample(&[&[3, 5], &[5], &[5]])
+            .sample(&[&[2, 20, 3], &[3], &[3]])
+            .sample(&[&[2, 40], &[40], &[40]])
+            .sample(&[&[0, 3], &[3], &[3]])
+            .sample(&[&[2, 0], &[0], &[0]]),
+    ]
+}
+
+/// Losses.
+fn losses() -> Vec<Entry> {
+    let cross_entropy = |classes: &[u32]| Entry::new(loss::CrossEntropy { classes: classes.into() });
+    vec![
+        Entry::examined(loss::SquaredError),
+        Entry::examined(loss::AbsoluteError),
+        Entry::examined(loss::Huber { delta: 0.5 }),
+        Entry::examined(loss::SmoothL1 { beta: 0.5 }),
+        Entry::examined(loss::SmoothL1 { beta: 0.0 }),
+        Entry::examined(loss::BinaryCrossEntropy),
+        cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
+        cross_entropy(&[1]).sample(&[&[2]]),
+        cross_entropy(&[]).sample(&[&[0, 3]]),
+    ]
+}
+
+/// Arithmetic, products, shapes, tables and segments.
+fn core() -> Vec<Entry> {
+    let shape = |extents: &[usize]| Shape::from_slice(extents);
+    let segments = || Segments::new([0, 3, 3, 4, 7]);
+    let view = |from: &[usize], layout: fn(Layout) -> Layout| shape::View {
+        from: Shape::from_slice(from),
+        layout: layout(Layout::contiguous(from)),
+    };
+    let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
+    let mut entries = vec![
+        Entry::examined(arithmetic::Add),
+        Entry::examined(arithmetic::Sub),
+        Entry::examined(arithmetic::Mul),
+        Entry::examined(arithmetic::Div),
+        Entry::examined(arithmetic::Affine { scale: -2.5, shift: 0.75 }),
+        Entry::examined(arithmetic::Alias),
+        Entry::new(arithmetic::IfPositive).sample(&[&[2, 3], &[2, 3], &[3]]).sample(&[&[4], &[], &[4]]),
+        Entry::examined(exponential::Exp),
+        Entry::examined(exponential::Expm1),
+        Entry::examined(exponential::Ln),
+        Entry::examined(exponential::Ln1p),
+        Entry::examined(exponential::Sqrt),
+        Entry::examined(trigonometric::Sin),
+        Entry::examined(trigonometric::Cos),
+        Entry::examined(trigonometric::SinPi),
+        Entry::examined(trigonometric::CosPi),
+        Entry::examined(trigonometric::Tanh),
+        Entry::examined(activation::Relu),
+        Entry::examined(activation::Sigmoid),
+        Entry::examined(activation::Softplus),
+        Entry::new(matmul::Matmul).sample(&[&[3, 4], &[4, 2]]).sample(&[&[0, 4], &[4, 2]]).sample(&[&[3, 0], &[0, 2]]),
+        Entry::new(linear::LinearOp(Activation::Identity))
+            .sample(&[&[5, 3], &[3, 4], &[4]])
+            .sample(&[&[5, 3], &[3, 4]]),
+        Entry::new(linear::LinearOp(Activation::Relu))
+            .sample(&[&[5, 3], &[3, 4], &[4]])
+            .sample(&[&[2, 5, 3], &[3, 4]])
+            .sample(&[&[0, 3], &[3, 4], &[4]]),
+        Entry::new(reduce::SumTo { shape: shape(&[]) }).linear().sample(&[&[2, 3]]).sample(&[&[]]).sample(&[&[0, 2]]),
+        Entry::new(reduce::SumTo { shape: shape(&[3, 1]) }).linear().sample(&[&[2, 3, 4]]).sample(&[&[3, 1]]),
+        Entry::new(reduce::BroadcastTo { shape: shape(&[2, 3, 4]) }).linear().sample(&[&[3, 1]]).sample(&[&[]]),
+        Entry::new(shape::Reshape { shape: shape(&[3, 2]) }).linear().sample(&[&[2, 3]]).sample(&[&[6]]),
+        Entry::new(view(&[2, 3, 4], |layout| layout.permuted(&[2, 0, 1]))).linear().sample(&[&[2, 3, 4]]),
+        Entry::new(view(&[4, 5], |layout| layout.sliced(1, 4, 2, -3))).linear().sample(&[&[4, 5]]),
+        Entry::new(shape::Scatter(view(&[4, 5], |layout| layout.sliced(1, 1, 3, 1)))).linear().sample(&[&[4, 3]]),
+        Entry::new(shape::Concat { axis: 1 }).linear().sample(&[&[2, 3], &[2, 1], &[2, 0]]).sample(&[&[2, 3]]),
+        Entry::new(gather::GatherRows { index: [2, 0, 2, 3].into() }).linear().sample(&[&[4]]).sample(&[&[5, 3]]),
+        Entry::new(gather::GatherRows { index: [].into() }).linear().sample(&[&[4]]).sample(&[&[0, 3]]),
+        Entry::new(gather::ScatterRows { index: [2, 0, 2].into(), rows: 4 })
+            .linear()
+            .sample(&[&[3]])
+            .sample(&[&[3, 2]]),
+        Entry::new(segment::SegmentSum(segments())).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
+        Entry::new(segment::SegmentExpand(segments())).linear().sample(&[&[4]]).sample(&[&[4, 2]]),
+        Entry::new(cumsum(false, false)).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
+        Entry::new(cumsum(true, false)).linear().sample(&[&[7]]),
+        Entry::new(cumsum(true, true)).linear().sample(&[&[7, 3]]),
+    ];
+    entries.extend(super::arrays::entries());
+    entries
+}

@@ -1,0 +1,65 @@
+//! A function made of operations, seen as one operation: so that the checks examine it as hard.
+
+use super::Entry;
+use crate::{Grads, Op, ShapeError, Tape, Var, Vjp};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+
+/// A function of variables that may be called on any tape.
+struct Composed<F> {
+    name: &'static str,
+    f: F,
+}
+
+impl<T: Scalar, F> Op<T> for Composed<F>
+where
+    F: for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T> + Send + Sync + 'static,
+{
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+        let tape = Tape::new();
+        let zeros: Vec<_> = x.iter().map(|shape| tape.leaf(Tensor::zeros(shape))).collect();
+        Ok((self.f)(&zeros).shape().into())
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        let tape = Tape::with_pool(pool.clone());
+        // Leaves, so that `f` may take gradients.
+        let x: Vec<_> = x.iter().map(|&x| tape.leaf(x.clone())).collect();
+        (self.f)(&x).into_value()
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let tape = Tape::with_pool(cx.pool().clone());
+        let x: Vec<_> = (0..cx.len()).map(|i| tape.leaf(cx.x(i).into_value())).collect();
+        let grads = (self.f)(&x).tracked().vjp(&tape.constant(cx.g().value().clone()), &x.iter().collect::<Vec<_>>());
+        Grads::new(grads.into_iter().map(|grad| Some(cx.constant(grad.into_value()))))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        Some((self.f)(&x.iter().map(Var::tracked).collect::<Vec<_>>()))
+    }
+}
+
+impl Entry {
+    /// A function made of operations, given once for each precision, which the checks then examine as if it were one.
+    ///
+    /// ```
+    /// use raygrad_autograd::check::{Check, Entry, check_op};
+    /// let entry = Entry::function("swish", |x| &x[0] * x[0].sigmoid(), |x| &x[0] * x[0].sigmoid());
+    /// check_op(&Check::default(), &entry.sample(&[&[2, 3]])).unwrap();
+    /// ```
+    pub fn function(
+        name: &'static str,
+        f64: impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64> + Send + Sync + 'static,
+        f32: impl for<'t> Fn(&[Var<'t, f32>]) -> Var<'t, f32> + Send + Sync + 'static,
+    ) -> Self {
+        Entry::of(Composed { name, f: f64 }, Composed { name, f: f32 })
+    }
+}
