@@ -9,8 +9,8 @@ use rand::rngs::StdRng;
 use rand::{Rng, RngExt, SeedableRng};
 use raygrad::tensor::{map, parallel};
 use raygrad::{
-    Activation, Adam, AdamConfig, Bound, Conv2d, Conv2dConfig, Gradient, Init, Linear, Mlp, Optimizer, Params, Pool,
-    Pool2dConfig, Tape, Tensor, Var, formula,
+    Activation, Adam, AdamConfig, Axes, Bound, Conv2d, Conv2dConfig, Gradient, Init, Linear, Mlp, Optimizer, Params,
+    Pool, Pool2dConfig, Tape, Tensor, Var, formula,
 };
 use rayon::prelude::*;
 use std::time::Instant;
@@ -210,8 +210,8 @@ fn operations() {
     operation("elementwise chain, 1M, fused", &[1_000_000], |x| {
         formula!(|x| (x * 1.5 + 0.5).tanh() * x + (x * x * -0.5).exp() - x).on([x])
     });
-    operation("sum over axis 0, 4096x1024", &[4096, 1024], |x| x.sum_axes(&[0]));
-    operation("sum over axis 1, 4096x1024", &[4096, 1024], |x| x.sum_axes(&[1]));
+    operation("sum over axis 0, 4096x1024", &[4096, 1024], |x| x.sum_over(Axes::from(0).keepdims()));
+    operation("sum over axis 1, 4096x1024", &[4096, 1024], |x| x.sum_over(Axes::from(1).keepdims()));
     operation("sum, 4096x1024", &[4096, 1024], |x| x.sum());
     // Weighted, since the sum of a softmax is constant.
     let weight = Tensor::from_fn(&[1024, 512], |i| (i as f32 * 0.7).sin());
@@ -245,7 +245,7 @@ fn views() {
     let mut timed = |parts: usize| {
         median(20, || {
             let x = tape.leaf(values.clone());
-            let part = |i| x.slice(0, i * 512 / parts, 512 / parts).square().sum();
+            let part = |i| x.slice_axis(0, i * 512 / parts..i * 512 / parts + 512 / parts).square().sum();
             let sum = (1..parts).map(part).fold(part(0), |sum, part| sum + part);
             sum.backward(&[&x]);
             drop((sum, x));

@@ -30,7 +30,7 @@ fn main() {
     print("Weighted marks", &marks.matmul(&weights));
 
     // Slices, permutations and joins make new tensors.
-    let last_two = marks.slice(1, 2, 2).t();
+    let last_two = marks.slice_axis(1, 2..4).t();
     print("The last two subjects, a row each", &last_two);
     let (sorted, index) = marks.sort(1, true);
     print("Sorted, best mark first", &sorted);

@@ -12,7 +12,7 @@ use raygrad::{
 
 /// From polar coordinates `[r, phi]` to `[x, y]`.
 fn cartesian<'t>(polar: &[Var<'t, f64>]) -> Var<'t, f64> {
-    let (r, phi) = (polar[0].slice(0, 0, 1), polar[0].slice(0, 1, 1));
+    let (r, phi) = (polar[0].slice_axis(0, ..1), polar[0].slice_axis(0, 1..2));
     Var::concat(&[&(&r * phi.cos()), &(&r * phi.sin())], 0)
 }
 

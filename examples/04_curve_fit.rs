@@ -18,7 +18,7 @@ const NOISE: f64 = 0.05;
 
 /// `a e^(-d t) cos(f t + p)` for parameters `[a, d, f, p]`.
 fn oscillation<'t>(parameters: &Var<'t, f64>, t: &Var<'t, f64>) -> Var<'t, f64> {
-    let part = |i| parameters.slice(0, i, 1);
+    let part = |i| parameters.slice_axis(0, i..i + 1);
     part(0) * (-(part(1) * t)).exp() * (part(2) * t + part(3)).cos()
 }
 

@@ -12,7 +12,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::Image;
 use raygrad::{
-    Activation, Adam, AdamConfig, Bound, Init, Linear, Optimizer, Params, Pass, Pool, Schedule, Sequential, Tape,
+    Activation, Adam, AdamConfig, Axes, Bound, Init, Linear, Optimizer, Params, Pass, Pool, Schedule, Sequential, Tape,
     Tensor, Var,
 };
 use std::f32::consts::TAU;
@@ -42,7 +42,7 @@ fn exact_distance(border: &[[f32; 2]], at: [f32; 2]) -> f32 {
 /// The distances `[n, 1]` of positions `[n, 2]`: those from a circle, which settles what is inside, and what the network
 /// adds to them.
 fn distance<'t>(network: &Sequential<f32>, params: &Bound<'t, f32>, x: &Var<'t, f32>) -> Var<'t, f32> {
-    let circle = (x.square().sum_axes(&[1]) + 1e-4).sqrt() - 0.6;
+    let circle = (x.square().sum_over(Axes::from(1).keepdims()) + 1e-4).sqrt() - 0.6;
     circle + network.forward(params, x, Pass::Evaluate)
 }
 
@@ -94,7 +94,7 @@ fn main() -> raygrad::nerf::Result<()> {
         let tape = Tape::with_pool(pool.clone());
         let bound = params.bind(&tape);
         let (d, slope) = distance_and_slope(&network, &bound, &tape.leaf(points));
-        let on_curve = d.slice(0, 0, BATCH).abs().mean();
+        let on_curve = d.slice_axis(0, 0..BATCH).abs().mean();
         let eikonal = (slope - 1.0).square().mean();
         if step % (STEPS / 6) == 0 {
             let (off, bend) = (on_curve.item(), eikonal.item().sqrt());

@@ -39,7 +39,7 @@ const FONT: [[u8; 7]; 10] = [
 ];
 
 /// Pictures `[count, 1, SIDE, SIDE]` of random digits, and which digits they are.
-fn pictures(count: usize, rng: &mut StdRng) -> (Tensor<f32>, Vec<usize>) {
+fn pictures(count: usize, rng: &mut StdRng) -> (Tensor<f32>, Vec<u32>) {
     let mut pixels = Vec::with_capacity(count * SIDE * SIDE);
     let mut labels = Vec::with_capacity(count);
     for _ in 0..count {
@@ -51,7 +51,7 @@ fn pictures(count: usize, rng: &mut StdRng) -> (Tensor<f32>, Vec<usize>) {
             let ink = i < GLYPH[0] && j < GLYPH[1] && FONT[label][i] >> (GLYPH[1] - 1 - j) & 1 == 1;
             pixels.push(rng.random_range(-0.3..0.3) + if ink { contrast } else { 0.0 });
         }
-        labels.push(label);
+        labels.push(label as u32);
     }
     (Tensor::from_vec(&[count, 1, SIDE, SIDE], pixels), labels)
 }
@@ -79,11 +79,11 @@ fn strokes(channels: &[usize], params: &mut Params<f32>, rng: &mut StdRng) -> Se
 }
 
 /// The share of pictures whose highest score is that of the right digit.
-fn accuracy(model: &Sequential<f32>, params: &Params<f32>, (x, labels): &(Tensor<f32>, Vec<usize>)) -> f64 {
+fn accuracy(model: &Sequential<f32>, params: &Params<f32>, (x, labels): &(Tensor<f32>, Vec<u32>)) -> f64 {
     let tape = Tape::new();
     let scores = model.forward(&params.bind_constant(&tape), &tape.constant(x.clone()), Pass::Evaluate);
     let best = scores.argmax(-1);
-    let right = best.as_slice().iter().zip(labels).filter(|&(&best, &label)| best as usize == label).count();
+    let right = best.as_slice().iter().zip(labels).filter(|(best, label)| best == label).count();
     right as f64 / labels.len() as f64
 }
 

@@ -11,7 +11,7 @@ const DIMENSIONS: usize = 100;
 
 /// The sum of `100 (x[i + 1] - x[i]^2)^2 + (1 - x[i])^2`; 0 where all are 1.
 fn rosenbrock<'t>(x: &Var<'t, f64>) -> Var<'t, f64> {
-    let (head, tail) = (x.slice(0, 0, DIMENSIONS - 1), x.slice(0, 1, DIMENSIONS - 1));
+    let (head, tail) = (x.slice_axis(0, 0..DIMENSIONS - 1), x.slice_axis(0, 1..1 + DIMENSIONS - 1));
     (100.0 * (tail - head.square()).square() + (1.0 - head).square()).sum()
 }
 

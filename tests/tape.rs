@@ -1,7 +1,9 @@
 //! What the tape promises: derivatives of any order, threads that never meet, errors that name the line at fault.
 
 use raygrad::check::{Check, Entry, check_function, check_op};
-use raygrad::{Activation, Error, Grads, Op, Pool, Reads, RowGrad, Scalar, Shape, ShapeError, Tape, Tensor, Var, Vjp};
+use raygrad::{
+    Activation, Axes, Error, Grads, Op, Pool, Reads, RowGrad, Scalar, Shape, ShapeError, Tape, Tensor, Var, Vjp,
+};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 fn vector(values: &[f64]) -> Tensor<f64> {
@@ -155,7 +157,7 @@ fn gradient_bits(salt: usize) -> Vec<u32> {
     for round in 0..5 {
         let value = |i: usize| ((i * (salt + 3) + round) as f32 * 0.61).sin();
         let (x, w) = (tape.leaf(Tensor::from_fn(&[33, 17], value)), tape.leaf(Tensor::from_fn(&[17, 9], value)));
-        let loss = (x.matmul(&w).softplus() / (1.0 + w.square().sum_axes(&[0]))).exp().mean();
+        let loss = (x.matmul(&w).softplus() / (1.0 + w.square().sum_over(Axes::from(0).keepdims()))).exp().mean();
         for grad in loss.grad(&[&x, &w]) {
             bits.extend(grad.as_slice().iter().map(|x| x.to_bits()));
         }
@@ -371,18 +373,18 @@ fn the_nan_finder_checks_recorded_gradients_sums_and_sparse_ones() {
     // Two finite shares whose sum overflows: at a leaf, and before an operation.
     let x = tape.leaf(Tensor::from_vec(&[2], vec![1e-3, 1e-3]));
     let line = line!() - 1;
-    let sum = (&x * 3e38 + &x * 3e38).slice(0, 0, 1).sum();
+    let sum = (&x * 3e38 + &x * 3e38).slice_axis(0, ..1).sum();
     starts(sum.try_grad(&[&x]).unwrap_err().to_string(), "leaf: the gradient is inf at index [0]", line);
     let h = x.affine(0.5, 0.0);
     let line = line!() - 1;
-    let sum = (&h * 3e38 + &h * 3e38).slice(0, 0, 1).sum();
+    let sum = (&h * 3e38 + &h * 3e38).slice_axis(0, ..1).sum();
     starts(
         sum.try_grad(&[&x]).unwrap_err().to_string(),
         "affine: the gradient of the output is inf at index [0]",
         line,
     );
     // A sparse gradient with two rows in one place.
-    let rows = x.gather_rows(&[0, 0].into());
+    let rows = x.gather_rows([0, 0]);
     let line = line!() - 1;
     let sum = (rows * 3e38).sum();
     starts(
@@ -594,30 +596,30 @@ fn shares_of_every_kind_add_up_to_the_dense_gradient() {
     let models: [(&str, Model, Model); 5] = [
         (
             "rows and a penalty",
-            |a, b| a.gather_rows(&[3, 1, 3].into()).exp().sum() + a.square().sum() * 0.5 + b.sum(),
+            |a, b| a.gather_rows([3, 1, 3]).exp().sum() + a.square().sum() * 0.5 + b.sum(),
             |a, b| pick(a, [3, 1, 3]).exp().sum() + a.square().sum() * 0.5 + b.sum(),
         ),
         (
             "tied weights",
-            |a, b| (a.gather_rows(&[0, 2, 1].into()).matmul(&a.t()) * 0.1).tanh().sum() * b.sum(),
+            |a, b| (a.gather_rows([0, 2, 1]).matmul(&a.t()) * 0.1).tanh().sum() * b.sum(),
             |a, b| (pick(a, [0, 2, 1]).matmul(&a.t()) * 0.1).tanh().sum() * b.sum(),
         ),
         (
             "two tables",
-            |a, b| (a.gather_rows(&[3, 3, 0].into()) * b.gather_rows(&[1, 0, 1].into())).exp().sum(),
+            |a, b| (a.gather_rows([3, 3, 0]) * b.gather_rows([1, 0, 1])).exp().sum(),
             |a, b| (pick(a, [3, 3, 0]) * pick(b, [1, 0, 1])).exp().sum(),
         ),
         (
             "shares of other kinds",
             |a, b| {
                 let total = a.tape().apply(Total, &[a]);
-                (a.gather_rows(&[1, 1, 2].into()).sum() * total.sin() + a.tape().apply(Total, &[b])) * a.exp().sum()
+                (a.gather_rows([1, 1, 2]).sum() * total.sin() + a.tape().apply(Total, &[b])) * a.exp().sum()
             },
             |a, b| (pick(a, [1, 1, 2]).sum() * a.sum().sin() + b.sum()) * a.exp().sum(),
         ),
         (
             "a table that is computed",
-            |a, b| (a * 2.0).gather_rows(&[3, 1, 3].into()).exp().sum() + a.slice(0, 1, 2).square().sum() * b.sum(),
+            |a, b| (a * 2.0).gather_rows([3, 1, 3]).exp().sum() + a.slice_axis(0, 1..3).square().sum() * b.sum(),
             |a, b| {
                 pick(&(a * 2.0), [3, 1, 3]).exp().sum() + pick(a, [1, 2, 2]).square().sum() * b.sum()
                     - pick(a, [2, 2, 2]).square().sum() * b.sum() / 3.0
@@ -799,7 +801,7 @@ fn the_gradient_of_many_slices_costs_one_sum() {
         (0..3).map(|_| run()).min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
     };
     let weight = |i: usize| 1.0 + (i % 7) as f64;
-    let sum = (0..count).fold(x.constant(0.0), |sum, i| sum + (x.slice(0, i, 1).square() * weight(i)).sum());
+    let sum = (0..count).fold(x.constant(0.0), |sum, i| sum + (x.slice_axis(0, i..i + 1).square() * weight(i)).sum());
     let weights = Tensor::from_fn(&[count, 1], weight);
     let (whole, expected) = time(&(x.square() * tape.constant(weights)).sum());
     let (slices, got) = time(&sum);
@@ -807,9 +809,9 @@ fn the_gradient_of_many_slices_costs_one_sum() {
     assert!(slices < 20.0 * whole, "{slices} s for slices, {whole} s for the whole");
     // Overlapping ones, reversed ones, diagonals.
     let x = tape.leaf(Tensor::from_fn(&[3, 3], |i| i as f64));
-    let y = x.slice(0, 0, 2).sum()
-        + x.slice(0, 1, 2).square().sum()
-        + (x.flip(1).slice(1, 0, 1) * 10.0).sum()
+    let y = x.slice_axis(0, ..2).sum()
+        + x.slice_axis(0, 1..3).square().sum()
+        + (x.flip(1).slice_axis(1, ..1) * 10.0).sum()
         + (x.diagonal(0) * 100.0).sum();
     let expected = [101.0, 1.0, 11.0, 7.0, 109.0, 21.0, 12.0, 14.0, 126.0];
     assert_eq!(y.grad(&[&x])[0].as_slice(), expected);

@@ -42,7 +42,7 @@ fn main() -> Result<(), rayon::ThreadPoolBuildError> {
         ("log_softmax", |x, _| x.log_softmax(-1)),
         ("logsumexp", |x, _| x.logsumexp_over(-1)),
         ("layer_norm", |x, rest| x.layer_norm(&rest[0], &rest[1], 1e-5)),
-        ("cross_entropy", |x, _| x.cross_entropy(&vec![1; x.value().len() / x.shape()[1]])),
+        ("cross_entropy", |x, _| x.cross_entropy(vec![1; x.value().len() / x.shape()[1]])),
         ("binary_cross_entropy", |x, rest| x.binary_cross_entropy(&rest[2])),
         ("mse_loss", |x, rest| x.mse_loss(&rest[2])),
         ("sum", |x, _| x.sum()),

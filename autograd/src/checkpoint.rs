@@ -229,7 +229,7 @@ mod tests {
     fn a_sparse_gradient_stays_sparse() {
         let tape = Tape::<f64>::new();
         let table = tape.leaf(Tensor::from_fn(&[5, 2], |i| i as f64));
-        let y = tape.checkpoint(&[&table], |x| x[0].gather_rows(&[3, 1, 3].into()).square());
+        let y = tape.checkpoint(&[&table], |x| x[0].gather_rows([3, 1, 3]).square());
         let gradient = y.sum().backward(&[&table]).remove(0);
         assert_eq!((gradient.is_rows(), gradient.clone().take::<RowGrad<f64>>().len()), (true, 1));
         let dense = gradient.into_dense(tape.pool());

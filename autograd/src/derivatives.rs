@@ -293,7 +293,7 @@ mod tests {
 
     /// `[a^2 b, sin a, e^b]` from `[a, b]`.
     fn curve<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
-        let (a, b) = (x[0].slice(0, 0, 1), x[0].slice(0, 1, 1));
+        let (a, b) = (x[0].slice_axis(0, ..1), x[0].slice_axis(0, 1..2));
         Var::concat(&[&(a.square() * &b), &a.sin(), &b.exp()], 0)
     }
 
@@ -311,7 +311,7 @@ mod tests {
         let tall = jacobian(curve, &[vector(&AT)]).remove(0);
         assert_eq!(tall.shape(), [3, 2]);
         assert_close(tall.as_slice(), &slopes(), 1e-14);
-        let wide = jacobian(|x| curve(x).slice(0, 0, 2), &[vector(&AT)]).remove(0);
+        let wide = jacobian(|x| curve(x).slice_axis(0, ..2), &[vector(&AT)]).remove(0);
         assert_eq!(wide.shape(), [2, 2]);
         assert_close(wide.as_slice(), &slopes()[..4], 1e-14);
         // Two inputs, of which one has no influence, and shapes of several axes.

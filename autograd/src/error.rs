@@ -70,3 +70,8 @@ pub enum Error {
 
 /// What an operation says of shapes that do not fit it.
 pub type ShapeError = String;
+
+/// Nothing, or what does not fit.
+pub(crate) fn ensure(holds: bool, what: impl FnOnce() -> String) -> Result<(), ShapeError> {
+    if holds { Ok(()) } else { Err(what()) }
+}

@@ -47,7 +47,7 @@ pub trait RowShare<T: Scalar> {
 /// use raygrad_autograd::{Pool, RowSums, Tape, Tensor};
 /// let tape = Tape::<f64>::new();
 /// let table = tape.leaf(Tensor::ones(&[4, 2]));
-/// let used = table.gather_rows(&[3, 1, 3].into()).sum();
+/// let used = table.gather_rows([3, 1, 3]).sum();
 /// let gradient = used.backward(&[&table]).remove(0);
 /// let mut sums = RowSums::new(4, 2);
 /// assert!(gradient.scatter(&mut sums)); // it consists of rows
@@ -223,7 +223,7 @@ mod tests {
     fn sparse_and_dense_shares_of_one_table_come_together() {
         let tape = Tape::<f64>::new();
         let table = tape.leaf(Tensor::from_fn(&[3, 2], |i| i as f64));
-        let used = || table.gather_rows(&[2, 0, 2].into()).square().sum();
+        let used = || table.gather_rows([2, 0, 2]).square().sum();
         let loss = used() + table.square().sum() * 0.5 + used();
         let expected = loss.grad(&[&table]).remove(0);
         let gradient = loss.backward(&[&table]).remove(0);

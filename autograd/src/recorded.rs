@@ -160,7 +160,7 @@ macro_rules! binary {
     ($($f:ident)*) => {
         $(
             fn $f(self, other: Self) -> Self {
-                self.binary(other, Var::$f)
+                self.binary(other, |a, b| a.$f(b))
             }
         )*
     };

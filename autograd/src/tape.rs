@@ -2,7 +2,7 @@
 
 use crate::nodes::{CONSTANT, Node, Nodes};
 use crate::op::Kept;
-use crate::{Error, Op, Var};
+use crate::{Error, Op, ShapeError, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
 use std::cell::{Cell, RefCell};
@@ -195,6 +195,14 @@ impl<T: Scalar> Tape<T> {
             Err(error) if self.trying.get() => resume_unwind(Box::new(Raised(error))),
             Err(error) => panic!("{error}"),
         }
+    }
+
+    /// A value, or what is wrong with the inputs of operation `op`, as [`or_raise`](Self::or_raise) has it.
+    #[track_caller]
+    pub(crate) fn fits<R>(&self, op: &'static str, inputs: &[&Var<'_, T>], result: Result<R, ShapeError>) -> R {
+        let at = self.line();
+        let shapes = || inputs.iter().map(|x| Shape::from_slice(x.shape())).collect();
+        self.or_raise(result.map_err(|what| Error::Shape { op, shapes: shapes(), what, at }))
     }
 
     pub(crate) fn with_recording<R>(&self, on: bool, f: impl FnOnce() -> R) -> R {

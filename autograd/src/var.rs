@@ -1,13 +1,13 @@
 //! A variable: a value and its place on the tape.
 
-use crate::{Tape, ops};
-use raygrad_tensor::{Scalar, Tensor};
+use crate::{ShapeError, Tape};
+use raygrad_tensor::{Axes, Reduction, Scalar, Tensor, find_axis};
 use std::fmt;
-use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// A tensor on a tape. A clone is a reference count.
 ///
-/// Arithmetic works on references and values, between variables (with NumPy's broadcasting) and with `f64` constants.
+/// Arithmetic works on references and values, between variables, tensors (with NumPy's broadcasting) and numbers; tensors and
+/// numbers are constants ([`Operand`](crate::Operand)).
 #[derive(Clone)]
 pub struct Var<'t, T: Scalar> {
     pub(crate) tape: &'t Tape<T>,
@@ -66,6 +66,24 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape.constant(self.tape.pool().full(&[], T::from_f64(value)))
     }
 
+    /// A value, or what is wrong with this input of operation `op`, as an error of the tape.
+    #[track_caller]
+    pub(crate) fn fits<R>(&self, op: &'static str, result: Result<R, ShapeError>) -> R {
+        self.tape.fits(op, &[self], result)
+    }
+
+    /// The number of an axis that may be counted from the last one.
+    #[track_caller]
+    pub(crate) fn axis(&self, op: &'static str, axis: isize) -> usize {
+        self.fits(op, find_axis(axis, self.shape()))
+    }
+
+    /// The axes of a reduction.
+    #[track_caller]
+    pub(crate) fn axes(&self, op: &'static str, axes: impl Into<Axes>) -> Reduction {
+        self.fits(op, axes.into().find(self.shape()))
+    }
+
     /// Whether gradients can flow to this variable.
     pub fn is_on_graph(&self) -> bool {
         self.node.is_some()
@@ -78,102 +96,5 @@ impl<T: Scalar> fmt::Debug for Var<'_, T> {
             Some(node) => write!(f, "Var #{node} {:?}", self.value),
             None => write!(f, "Var constant {:?}", self.value),
         }
-    }
-}
-
-macro_rules! operator {
-    ($trait:ident, $method:ident, $op:expr) => {
-        impl<'t, T: Scalar> $trait<&Var<'t, T>> for &Var<'t, T> {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, other: &Var<'t, T>) -> Var<'t, T> {
-                $op(self, other)
-            }
-        }
-        impl<'t, T: Scalar> $trait<Var<'t, T>> for &Var<'t, T> {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, other: Var<'t, T>) -> Var<'t, T> {
-                $op(self, &other)
-            }
-        }
-        impl<'t, T: Scalar> $trait<&Var<'t, T>> for Var<'t, T> {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, other: &Var<'t, T>) -> Var<'t, T> {
-                $op(&self, other)
-            }
-        }
-        impl<'t, T: Scalar> $trait<Var<'t, T>> for Var<'t, T> {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, other: Var<'t, T>) -> Var<'t, T> {
-                $op(&self, &other)
-            }
-        }
-    };
-}
-
-operator!(Add, add, ops::add);
-operator!(Sub, sub, ops::sub);
-operator!(Mul, mul, ops::mul);
-operator!(Div, div, ops::div);
-
-/// An operator with an `f64` on either side. A product adds -0, which changes no number: +0 would turn -0 into +0.
-macro_rules! constant_operator {
-    ($trait:ident, $method:ident, |$x:ident, $c:ident| $right:expr, $left:expr) => {
-        impl<'t, T: Scalar> $trait<f64> for &Var<'t, T> {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, $c: f64) -> Var<'t, T> {
-                let $x = self;
-                $right
-            }
-        }
-        impl<'t, T: Scalar> $trait<f64> for Var<'t, T> {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, $c: f64) -> Var<'t, T> {
-                let $x = &self;
-                $right
-            }
-        }
-        impl<'t, T: Scalar> $trait<&Var<'t, T>> for f64 {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, $x: &Var<'t, T>) -> Var<'t, T> {
-                let $c = self;
-                $left
-            }
-        }
-        impl<'t, T: Scalar> $trait<Var<'t, T>> for f64 {
-            type Output = Var<'t, T>;
-            #[track_caller]
-            fn $method(self, $x: Var<'t, T>) -> Var<'t, T> {
-                let ($x, $c) = (&$x, self);
-                $left
-            }
-        }
-    };
-}
-
-constant_operator!(Add, add, |x, c| x.affine(1.0, c), x.affine(1.0, c));
-constant_operator!(Sub, sub, |x, c| x.affine(1.0, -c), x.affine(-1.0, c));
-constant_operator!(Mul, mul, |x, c| x.affine(c, -0.0), x.affine(c, -0.0));
-constant_operator!(Div, div, |x, c| x / x.constant(c), x.constant(c) / x);
-
-impl<'t, T: Scalar> Neg for &Var<'t, T> {
-    type Output = Var<'t, T>;
-    #[track_caller]
-    fn neg(self) -> Var<'t, T> {
-        self.affine(-1.0, -0.0)
-    }
-}
-
-impl<'t, T: Scalar> Neg for Var<'t, T> {
-    type Output = Var<'t, T>;
-    #[track_caller]
-    fn neg(self) -> Var<'t, T> {
-        -&self
     }
 }

@@ -2,7 +2,7 @@
 
 use proptest::prelude::*;
 use raygrad_autograd::check::{Check, check_function};
-use raygrad_autograd::{Activation, Tensor, Var};
+use raygrad_autograd::{Activation, Axes, Tensor, Var};
 
 /// One step of a random program: an operation on two of the values so far.
 type Step = (u8, u8, u8);
@@ -47,12 +47,14 @@ fn step<'t>(op: u8, a: &Var<'t, f64>, b: &Var<'t, f64>) -> Var<'t, f64> {
         8 => a.softplus() * 0.5,
         9 => (a.square() + 0.5).sqrt() * 0.5,
         10 => (a.square() + 1.0).ln(),
-        11 if axes > 0 => a.sum_axes(&[axes - 1]) * 0.3,
+        11 if axes > 0 => a.sum_over(Axes::from(-1).keepdims()) * 0.3,
         12 => product(a, b, false).unwrap_or_else(|| number(a)),
         13 if axes == 2 => a.permute(&[1, 0]),
-        14 if axes > 0 => Var::concat(&[a, &a.sin()], 0).slice(0, a.shape()[0] / 2, a.shape()[0]),
+        14 if axes > 0 => {
+            Var::concat(&[a, &a.sin()], 0).slice_axis(0, a.shape()[0] / 2..a.shape()[0] / 2 + a.shape()[0])
+        }
         15 => (a.reshape(&[a.value().len()]) * 0.9).reshape(a.shape()),
-        16 if axes > 0 && a.shape()[0] > 0 => a.gather_rows(&[a.shape()[0] as u32 - 1, 0, 0].into()),
+        16 if axes > 0 && a.shape()[0] > 0 => a.gather_rows([a.shape()[0] as u32 - 1, 0, 0]),
         17 if axes > 0 => a.flip(0) * 0.7,
         // A variable that is used in and beside a segment that runs again.
         18 => a.tape().checkpoint(&[a, &beside(a, b)], |x| (&x[0] * &x[1]).sin()) + a * 0.1,

@@ -334,7 +334,7 @@ mod tests {
         let s = tape.leaf(tensor(sigma, &[n]));
         let c = tape.leaf(tensor(colour, &[n, 1]));
         let out = tape.apply(Composite::new(tensor(delta, &[n]), Segments::uniform(1, n)), &[&s, &c]);
-        let grads = out.slice(1, 0, 1).sum().grad(&[&s, &c]);
+        let grads = out.slice_axis(1, ..1).sum().grad(&[&s, &c]);
         [out.value(), &grads[0], &grads[1]].map(|x| x.as_slice().iter().map(|x| x.to_f64()).collect())
     }
 
@@ -347,7 +347,7 @@ mod tests {
                 let density = tape.leaf(Tensor::from_vec(&[1], vec![z as f32]));
                 let feature = tape.constant(Tensor::ones(&[1, 1]));
                 let op = Composite::of_log_density(Tensor::from_vec(&[1], vec![delta]), Segments::uniform(1, 1));
-                let color = tape.apply(op, &[&density, &feature]).slice(1, 0, 1).sum();
+                let color = tape.apply(op, &[&density, &feature]).slice_axis(1, ..1).sum();
                 let x = z.exp() * f64::from(delta);
                 let (value, slope) = (f64::from(color.item()), f64::from(color.grad(&[&density])[0].item()));
                 let expected = if x > 700.0 { 0.0 } else { x * (-x).exp() };

@@ -118,8 +118,8 @@ impl<T: Scalar> Op<T> for Contraction {
         let (scale, least) = (constant(scales), constant(least));
         let unit = x / &scale;
         // max(1, |x|) / scale, inside both branches: with it as radius the formula is the identity in the ball.
-        let norm = unit.square().sum_axes(&[axis]).reshape(&column).maximum(&least).sqrt();
-        let radius = (&norm * scale).minimum(&x.constant(FARTHEST));
+        let norm = unit.square().sum_over(-1).reshape(&column).maximum(least).sqrt();
+        let radius = (&norm * scale).minimum(FARTHEST);
         Some(unit * ((2.0 - radius.reciprocal()) / norm))
     }
 }

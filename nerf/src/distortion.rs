@@ -111,7 +111,7 @@ impl<T: Scalar> Op<T> for Distortion<T> {
         let m = self.midpoints.as_slice();
         let loss = |rows: std::ops::Range<usize>| {
             let (n, start) = (rows.len(), rows.start);
-            let w = x[0].slice(0, start, n);
+            let w = x[0].slice_axis(0, start..start + n);
             let distances = Tensor::from_fn(&[n, n], |k| {
                 let (i, j) = (start + k / n.max(1), start + k % n.max(1));
                 T::from_f64((m[i].to_f64() - m[j].to_f64()).abs())
@@ -122,7 +122,7 @@ impl<T: Scalar> Op<T> for Distortion<T> {
         };
         let losses: Vec<_> = self.segments.ranges().map(loss).collect();
         if losses.is_empty() {
-            return Some(x[0].slice(0, 0, 0));
+            return Some(x[0].slice_axis(0, ..0));
         }
         Some(Var::concat(&losses.iter().collect::<Vec<_>>(), 0))
     }

@@ -143,9 +143,9 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
             parts.extend([Var::sin_pi(&y), Var::cos_pi(&y)]);
         }
         if parts.is_empty() {
-            return Some(x.slice(x.shape().len() - 1, 0, 0));
+            return Some(x.slice_axis(-1, ..0));
         }
-        Some(Var::concat(&parts.iter().collect::<Vec<_>>(), x.shape().len() - 1))
+        Some(Var::concat(&parts.iter().collect::<Vec<_>>(), -1))
     }
 }
 

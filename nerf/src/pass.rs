@@ -55,8 +55,8 @@ pub(crate) fn features<'t, T: Scalar>(
 /// The colour of composited features `[rays, 3 or more, + 1]` over a background `[rays, 3]`.
 pub fn over_background<'t, T: Scalar>(rendered: &Var<'t, T>, background: &Tensor<T>) -> Var<'t, T> {
     let channels = rendered.shape()[1];
-    let left = rendered.slice(1, channels - 1, 1);
-    rendered.slice(1, 0, 3) + left * rendered.tape().constant(background.clone())
+    let left = rendered.slice_axis(1, channels - 1..channels - 1 + 1);
+    rendered.slice_axis(1, ..3) + left * rendered.tape().constant(background.clone())
 }
 
 /// The sum of squared differences between composited colours and `target` `[rays, 3]`.

@@ -2,7 +2,7 @@
 
 #[cfg(feature = "check")]
 use raygrad_autograd::check::Entry;
-use raygrad_autograd::{Real, Scalar, Shape, Tensor, Var, record};
+use raygrad_autograd::{Mask, Real, Scalar, Shape, Tensor, Var, record};
 
 /// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
 ///
@@ -108,7 +108,7 @@ pub(crate) fn largest<T: Scalar>(m: &[T; 9]) -> usize {
 /// is finite at every angle, 0 and pi included.
 ///
 /// ```
-/// use raygrad_autograd::{Tape, Tensor};
+/// use raygrad_autograd::{Mask, Tape, Tensor};
 /// use raygrad_nerf::{rotation_exp, rotation_log};
 /// let tape = Tape::<f64>::new();
 /// let vector = tape.leaf(Tensor::from_vec(&[2, 3], vec![0.0, 0.0, 0.0, 1e-8, 0.3, -2.0]));
@@ -122,12 +122,11 @@ pub(crate) fn largest<T: Scalar>(m: &[T; 9]) -> usize {
 /// If the last extent is not 3.
 #[track_caller]
 pub fn rotation_exp<'t, T: Scalar>(vectors: &Var<'t, T>) -> Var<'t, T> {
-    let axis = vectors.shape().len().saturating_sub(1);
     assert_eq!(vectors.shape().last(), Some(&3), "rotation vectors of three elements");
-    let [x, y, z] = [0, 1, 2].map(|i| vectors.slice(axis, i, 1));
+    let [x, y, z] = [0, 1, 2].map(|i| vectors.slice_axis(-1, i..i + 1));
     let parts = record([&x, &y, &z], |vector| exp(vector));
     let shape: Shape = vectors.shape().iter().copied().chain([3]).collect();
-    Var::concat(&parts.iter().collect::<Vec<_>>(), axis).reshape(&shape)
+    Var::concat(&parts.iter().collect::<Vec<_>>(), -1).reshape(&shape)
 }
 
 /// Rotation vectors `[.., 3]`, of length 0 to pi, for rotation matrices `[.., 3, 3]`: the inverse of [`rotation_exp`].
@@ -164,10 +163,9 @@ pub fn rotation_log<'t, T: Scalar>(matrices: &Var<'t, T>) -> Var<'t, T> {
             }
         };
         let stand_in = Tensor::from_fn(&[1, 9], |k| T::from_f64(turn(k)));
-        let mask = Tensor::from_fn(&[count, 1], |i| if pivots[i] == pivot { T::ONE } else { T::ZERO });
-        let mask = flat.tape().constant(mask);
-        let seen = flat.where_(&mask, &flat.tape().constant(stand_in));
-        let elements: [_; 9] = std::array::from_fn(|k| seen.slice(1, k, 1));
+        let mask = Mask::new(&[count, 1], pivots.iter().map(|&other| other == pivot).collect::<Vec<_>>());
+        let seen = flat.where_(&mask, &stand_in);
+        let elements: [_; 9] = std::array::from_fn(|k| seen.slice_axis(1, k..k + 1));
         let vector = record(elements.each_ref(), |matrix| log_from(&matrix, pivot));
         let vector = Var::concat(&vector.iter().collect::<Vec<_>>(), 1);
         out = Some(match out {
@@ -175,7 +173,7 @@ pub fn rotation_log<'t, T: Scalar>(matrices: &Var<'t, T>) -> Var<'t, T> {
             None => vector,
         });
     }
-    out.unwrap_or_else(|| flat.slice(1, 0, 3)).reshape(&shape)
+    out.unwrap_or_else(|| flat.slice_axis(1, ..3)).reshape(&shape)
 }
 
 /// The catalogue entries of this file.

@@ -164,7 +164,7 @@ impl<T: Scalar> Op<T> for SphericalHarmonics {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let [x, y, z] = [0, 1, 2].map(|axis| x[0].slice(1, axis, 1));
+        let [x, y, z] = [0, 1, 2].map(|axis| x[0].slice_axis(1, axis..axis + 1));
         let all = record([&x, &y, &z], |direction| values(direction));
         let columns = all[..self.width()].iter().map(|value| value.broadcast_to(x.shape()));
         Some(Var::concat(&columns.collect::<Vec<_>>().iter().collect::<Vec<_>>(), 1))

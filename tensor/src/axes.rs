@@ -32,29 +32,55 @@ impl Axes {
 
     /// For a tensor of this shape: which axes are reduced.
     ///
+    /// # Errors
+    /// If an axis does not exist or is named twice; in words.
+    pub fn find(&self, shape: &[usize]) -> Result<Reduction, String> {
+        let mut reduced: SmallVec<[bool; 4]> = SmallVec::from_elem(self.axes.is_none(), shape.len());
+        for &axis in self.axes.iter().flatten() {
+            let i = find_axis(axis, shape)?;
+            if reduced[i] {
+                return Err(format!("axis {axis} of a tensor of shape {shape:?} is named twice"));
+            }
+            reduced[i] = true;
+        }
+        Ok(Reduction { shape: Shape::from_slice(shape), reduced, keepdims: self.keepdims })
+    }
+
+    /// As [`find`](Self::find).
+    ///
     /// # Panics
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn resolve(&self, shape: &[usize]) -> Reduction {
-        let mut reduced: SmallVec<[bool; 4]> = SmallVec::from_elem(self.axes.is_none(), shape.len());
-        for &axis in self.axes.iter().flatten() {
-            let i = axis_of(axis, shape);
-            assert!(!reduced[i], "axis {axis} of a tensor of shape {shape:?} is named twice");
-            reduced[i] = true;
+        match self.find(shape) {
+            Ok(reduction) => reduction,
+            Err(what) => panic!("{what}"),
         }
-        Reduction { shape: Shape::from_slice(shape), reduced, keepdims: self.keepdims }
     }
 }
 
 /// The number of an axis that may be counted from the last one: -1 is the last.
 ///
+/// # Errors
+/// If it does not exist; in words.
+pub fn find_axis(axis: isize, shape: &[usize]) -> Result<usize, String> {
+    let from_start = if axis < 0 { axis.wrapping_add(shape.len() as isize) } else { axis };
+    if (0..shape.len() as isize).contains(&from_start) {
+        return Ok(from_start as usize);
+    }
+    Err(format!("there is no axis {axis} in a tensor of shape {shape:?}"))
+}
+
+/// As [`find_axis`].
+///
 /// # Panics
 /// If it does not exist.
 #[track_caller]
 pub fn axis_of(axis: isize, shape: &[usize]) -> usize {
-    let from_start = if axis < 0 { axis + shape.len() as isize } else { axis };
-    assert!((0..shape.len() as isize).contains(&from_start), "axis {axis} of a tensor of shape {shape:?}");
-    from_start as usize
+    match find_axis(axis, shape) {
+        Ok(axis) => axis,
+        Err(what) => panic!("{what}"),
+    }
 }
 
 impl From<isize> for Axes {
@@ -143,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "axis 3 of a tensor of shape [2, 3, 4]")]
+    #[should_panic(expected = "no axis 3 in a tensor of shape [2, 3, 4]")]
     fn an_axis_that_does_not_exist_panics() {
         Axes::from(3).resolve(&[2, 3, 4]);
     }

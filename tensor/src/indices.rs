@@ -1,6 +1,6 @@
 //! Integer arrays: what sorting and searching give, and what gathering takes.
 
-use crate::{Scalar, Shape, Tensor};
+use crate::{Scalar, Shape, Tensor, axis_of};
 use std::cmp::Ordering;
 use std::fmt;
 use std::sync::Arc;
@@ -10,6 +10,54 @@ use std::sync::Arc;
 pub struct Indices {
     shape: Shape,
     values: Arc<[u32]>,
+}
+
+impl From<Arc<[u32]>> for Indices {
+    fn from(values: Arc<[u32]>) -> Self {
+        Indices { shape: Shape::from_slice(&[values.len()]), values }
+    }
+}
+
+macro_rules! from {
+    ($(<$(const $n:ident: usize)?> $list:ty;)+) => {
+        $(
+            impl<$(const $n: usize)?> From<$list> for Indices {
+                /// One axis.
+                fn from(values: $list) -> Self {
+                    Indices::from(Arc::<[u32]>::from(values))
+                }
+            }
+        )+
+    };
+}
+
+from! { <> Vec<u32>; <> &[u32]; <const N: usize> [u32; N]; }
+
+impl<const N: usize> From<&[u32; N]> for Indices {
+    /// One axis.
+    fn from(values: &[u32; N]) -> Self {
+        Indices::from(&values[..])
+    }
+}
+
+impl From<&Vec<u32>> for Indices {
+    /// One axis.
+    fn from(values: &Vec<u32>) -> Self {
+        Indices::from(&values[..])
+    }
+}
+
+impl From<&Arc<[u32]>> for Indices {
+    /// One axis; nothing is copied.
+    fn from(values: &Arc<[u32]>) -> Self {
+        Indices::from(values.clone())
+    }
+}
+
+impl From<&Indices> for Indices {
+    fn from(indices: &Indices) -> Self {
+        indices.clone()
+    }
 }
 
 impl Indices {
@@ -98,8 +146,8 @@ impl<T: Scalar> Tensor<T> {
     /// # Panics
     /// If the axis does not exist.
     #[track_caller]
-    pub fn argsort(&self, axis: usize, descending: bool) -> Indices {
-        assert!(axis < self.ndim(), "argsort along axis {axis} of a tensor of shape {:?}", self.shape());
+    pub fn argsort(&self, axis: isize, descending: bool) -> Indices {
+        let axis = axis_of(axis, self.shape());
         let extent = self.shape()[axis];
         let inner: usize = self.shape()[axis + 1..].iter().product();
         let mut values = vec![0; self.len()];
@@ -165,7 +213,7 @@ mod tests {
         ) {
             let axis = axis % shape.len();
             let x = Tensor::<f32>::from_fn(&shape, |i| match (i * 7) % 5 { 4 => f32::NAN, k => k as f32 });
-            let got = x.argsort(axis, descending);
+            let got = x.argsort(axis as isize, descending);
             prop_assert_eq!(got.shape(), &shape[..]);
             let inner: usize = shape[axis + 1..].iter().product();
             let rank = |i: usize| if x.as_slice()[i].is_nan() { 9 } else { x.as_slice()[i] as i32 };

@@ -1,8 +1,9 @@
 //! Strided layouts: which element of a buffer stands at each index.
 
 use crate::Shape;
-use ndarray::SliceInfoElem;
 use smallvec::SmallVec;
+
+mod views;
 
 /// The steps in a buffer from an element to its neighbour along each axis.
 pub(crate) type Strides = SmallVec<[isize; 4]>;
@@ -25,6 +26,32 @@ pub struct Layout {
 pub fn checked_len(shape: &[usize]) -> Option<usize> {
     let all = shape.iter().filter(|&&extent| extent > 0).try_fold(1_usize, |all, &extent| all.checked_mul(extent))?;
     (all <= isize::MAX as usize).then(|| if shape.contains(&0) { 0 } else { all })
+}
+
+/// Stands for the extent that follows from the others, in a reshape.
+pub const INFER: usize = usize::MAX;
+
+/// A shape for `len` elements in which one extent may be [`INFER`].
+///
+/// # Errors
+/// If it holds another number of elements, more than one extent is to be inferred, or the one does not follow from the
+/// others because they do not divide the number of elements or one of them is 0; in words.
+pub fn inferred(shape: &[usize], len: usize) -> Result<Shape, String> {
+    let mut known = Shape::from_slice(shape);
+    if let Some(axis) = shape.iter().position(|&extent| extent == INFER) {
+        known[axis] = 1;
+        if known.contains(&INFER) {
+            return Err("only one extent can be inferred".into());
+        }
+        match checked_len(&known) {
+            Some(others) if others > 0 && len.is_multiple_of(others) => known[axis] = len / others,
+            _ => return Err(format!("no extent of {len} elements follows from {known:?}")),
+        }
+    }
+    if checked_len(&known) != Some(len) {
+        return Err(format!("{known:?} holds another number of elements than {len}"));
+    }
+    Ok(known)
 }
 
 /// The number of elements of a shape.
@@ -120,174 +147,6 @@ impl Layout {
             step *= extent as isize;
         }
         true
-    }
-
-    /// A buffer of shape `from` stretched to shape `to`, as NumPy broadcasts.
-    ///
-    /// # Panics
-    /// If `from` does not broadcast to `to`.
-    #[track_caller]
-    pub fn broadcast(from: &[usize], to: &[usize]) -> Self {
-        Layout::contiguous(from).stretched(to)
-    }
-
-    /// This layout stretched to shape `to`, as NumPy broadcasts: axes are aligned at the last one, and an axis of extent 1,
-    /// or an absent one, gets stride 0.
-    ///
-    /// # Panics
-    /// If the shape does not broadcast to `to`.
-    #[track_caller]
-    pub fn stretched(&self, to: &[usize]) -> Self {
-        let from = &self.shape;
-        assert!(from.len() <= to.len(), "cannot broadcast {from:?} to {to:?}");
-        len_of(to);
-        let lead = to.len() - from.len();
-        let mut strides = Strides::from_elem(0, to.len());
-        for (i, &extent) in from.iter().enumerate() {
-            assert!(extent == to[lead + i] || extent == 1, "cannot broadcast {from:?} to {to:?}");
-            if extent == to[lead + i] {
-                strides[lead + i] = self.strides[i];
-            }
-        }
-        Layout { shape: Shape::from_slice(to), strides, ..*self }
-    }
-
-    /// Axis `i` of the result is axis `axes[i]` of this layout.
-    ///
-    /// # Panics
-    /// If `axes` is not a permutation of the axes.
-    #[track_caller]
-    pub fn permuted(&self, axes: &[usize]) -> Self {
-        let mut seen = SmallVec::<[bool; 8]>::from_elem(false, self.shape.len());
-        assert_eq!(axes.len(), self.shape.len(), "{axes:?} does not name every axis of {:?} once", self.shape);
-        for &axis in axes {
-            assert!(axis < seen.len() && !seen[axis], "{axes:?} does not name every axis of {:?} once", self.shape);
-            seen[axis] = true;
-        }
-        Layout {
-            shape: axes.iter().map(|&axis| self.shape[axis]).collect(),
-            strides: axes.iter().map(|&axis| self.strides[axis]).collect(),
-            ..*self
-        }
-    }
-
-    /// `len` elements along `axis`, from `start` on, every `step`-th; a negative step walks backwards.
-    ///
-    /// # Panics
-    /// If an element lies outside the axis.
-    #[track_caller]
-    pub fn sliced(&self, axis: usize, start: usize, len: usize, step: isize) -> Self {
-        let extent = self.shape[axis];
-        let last = start as i128 + step as i128 * (len as i128 - 1);
-        let inside = |i: i128| (0..extent as i128).contains(&i);
-        assert!(
-            len == 0 || (inside(start as i128) && inside(last)),
-            "slice of {len} from {start} by {step} leaves the extent {extent} of axis {axis}"
-        );
-        let mut out = self.clone();
-        out.shape[axis] = len;
-        // One entry has no neighbour, however large the step.
-        out.strides[axis] = if len > 1 { self.strides[axis] * step } else { 0 };
-        if len > 0 {
-            out.offset += start as isize * self.strides[axis];
-        }
-        out
-    }
-
-    /// The diagonal through axes `a` and `b`, which becomes the last axis: the elements whose index along `b` is that
-    /// along `a` plus `offset`. It is empty if the offset leaves the matrix.
-    ///
-    /// # Panics
-    /// If an axis does not exist or both are the same.
-    #[track_caller]
-    pub fn diagonal(&self, a: usize, b: usize, offset: isize) -> Self {
-        let ndim = self.shape.len();
-        assert!(a < ndim && b < ndim && a != b, "the diagonal through axes {a} and {b} of {:?}", self.shape);
-        let (row, column) = (offset.min(0).unsigned_abs(), offset.max(0).unsigned_abs());
-        let len = self.shape[a].saturating_sub(row).min(self.shape[b].saturating_sub(column));
-        let others = (0..ndim).filter(|&axis| axis != a && axis != b);
-        let mut shape: Shape = others.clone().map(|axis| self.shape[axis]).collect();
-        let mut strides: SmallVec<[isize; 4]> = others.map(|axis| self.strides[axis]).collect();
-        shape.push(len);
-        strides.push(self.strides[a] + self.strides[b]);
-        let start = if len == 0 { 0 } else { row as isize * self.strides[a] + column as isize * self.strides[b] };
-        Layout { shape, strides, offset: self.offset + start, ..*self }
-    }
-
-    /// What ndarray's `s![..]` asks for: a slice, one entry or a new axis for each place; axes that are not named stay whole.
-    /// Negative places count from the end, and a negative step walks backwards from the last entry of its range.
-    ///
-    /// # Errors
-    /// If more axes are named than there are, a place lies outside its axis, or a step is 0; in words.
-    pub(crate) fn sliced_by(&self, places: &[SliceInfoElem]) -> Result<Layout, String> {
-        let named = places.iter().filter(|place| !matches!(place, SliceInfoElem::NewAxis)).count();
-        if named > self.shape.len() {
-            return Err(format!("{named} axes are named of a tensor of shape {:?}", self.shape));
-        }
-        let mut out = Layout { shape: Shape::new(), strides: Strides::new(), ..*self };
-        let mut axis = 0;
-        for place in places {
-            if let SliceInfoElem::NewAxis = place {
-                out.shape.push(1);
-                out.strides.push(0);
-                continue;
-            }
-            let (extent, stride) = (self.shape[axis] as isize, self.strides[axis]);
-            let outside =
-                |place: isize| format!("{place} lies outside axis {axis} of a tensor of shape {:?}", self.shape);
-            let from_start = |place: isize| if place < 0 { place + extent } else { place };
-            match *place {
-                SliceInfoElem::Index(place) => {
-                    let index = from_start(place);
-                    if !(0..extent).contains(&index) {
-                        return Err(outside(place));
-                    }
-                    out.offset += index * stride;
-                }
-                SliceInfoElem::Slice { start, end, step } => {
-                    let (first, behind) = (from_start(start), end.map_or(extent, from_start));
-                    if !(0..=extent).contains(&first) {
-                        return Err(outside(start));
-                    }
-                    if !(0..=extent).contains(&behind) {
-                        return Err(outside(end.unwrap_or(extent)));
-                    }
-                    if step == 0 {
-                        return Err(format!("the step along axis {axis} is 0"));
-                    }
-                    let len = (behind - first).max(0).unsigned_abs().div_ceil(step.unsigned_abs());
-                    if len > 0 {
-                        out.offset += stride * if step > 0 { first } else { behind - 1 };
-                    }
-                    out.shape.push(len);
-                    // An axis of one entry has no step, however large the one that was asked for.
-                    out.strides.push(if len > 1 { stride * step } else { 0 });
-                }
-                SliceInfoElem::NewAxis => unreachable!("handled above"),
-            }
-            axis += 1;
-        }
-        out.shape.extend_from_slice(&self.shape[axis..]);
-        out.strides.extend_from_slice(&self.strides[axis..]);
-        Ok(out)
-    }
-
-    /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
-    /// entries in one.
-    ///
-    /// # Panics
-    /// If the axis does not exist, is shorter than a window, or `size` or `step` is 0.
-    #[track_caller]
-    pub fn windows(&self, axis: usize, size: usize, step: usize) -> Self {
-        let (shape, fits) = (&self.shape, self.shape.get(axis).is_some_and(|&extent| 0 < size && size <= extent));
-        assert!(fits && step > 0, "windows of {size} every {step} along axis {axis} of a tensor of shape {shape:?}");
-        let mut out = self.clone();
-        out.shape[axis] = (shape[axis] - size) / step + 1;
-        out.shape.push(size);
-        out.strides.push(self.strides[axis]);
-        // One window has no neighbour, however large the step.
-        out.strides[axis] = if out.shape[axis] > 1 { self.strides[axis] * step as isize } else { 0 };
-        out
     }
 
     /// The same elements in the same order under another shape; `None` where strides cannot say that.
@@ -487,7 +346,7 @@ mod tests {
             }
             let mut wide = vec![2; lead];
             wide.extend(shape.iter().map(|&extent| if extent == 1 { 3 } else { extent }));
-            layouts.push(Layout::broadcast(&shape, &wide));
+            layouts.push(Layout::contiguous(&shape).stretched(&wide));
             for layout in layouts {
                 let expected = naive(&layout, &source);
                 let mut out = vec![f64::NAN; expected.len()];

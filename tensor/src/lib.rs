@@ -9,6 +9,7 @@
 //! * [`Layout`]: the strides of a view: broadcast, permute, slice, flip, diagonal, windows, and their adjoints.
 //! * [`Windows`]: what a convolution or a pooling sees of an image.
 //! * [`Indices`], [`Mask`]: integer and boolean arrays, for sorting, searching, gathering, comparing and picking.
+//! * `random` (with the feature `rand`): uniform and normal numbers, permutations.
 //! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
 //! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
 //!
@@ -29,6 +30,8 @@ mod mask;
 pub mod matmul;
 pub mod parallel;
 mod pool;
+#[cfg(feature = "rand")]
+pub mod random;
 mod real;
 mod reduce;
 pub mod rows;
@@ -41,16 +44,16 @@ pub mod vmath;
 mod walk;
 mod windows;
 
-/// Slices for [`Tensor::slice`], as in ndarray: `s![.., -1, 1..3, ..;-1]`.
-pub use ndarray::s;
+/// Slices for [`Tensor::slice`] and [`Tensor::slice_axis`], as in ndarray: `s![.., -1, 1..3, ..;-1]`.
+pub use ndarray::{Slice, SliceInfoElem, s};
 
-pub use axes::{Axes, Reduction, axis_of};
+pub use axes::{Axes, Reduction, axis_of, find_axis};
 pub use create::concat;
 pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map_either};
 pub use fused::{Block, lanes_fused, map_fused};
 pub use indices::Indices;
 pub use lane::Lane;
-pub use layout::{Layout, checked_len};
+pub use layout::{INFER, Layout, checked_len, inferred};
 pub use mask::Mask;
 pub use pool::Pool;
 pub use real::Real;

@@ -1,7 +1,8 @@
 //! Boolean arrays: what comparisons give, and what picks elements.
 
 use crate::layout::checked_len;
-use crate::{Indices, Scalar, Shape, Tensor, axis_of};
+use crate::parallel::{ELEMENT, PIECE, chunks};
+use crate::{Indices, Scalar, Shape, Tensor, axis_of, map};
 use std::fmt;
 use std::ops::{BitAnd, BitOr, BitXor, Not};
 use std::sync::Arc;
@@ -13,7 +14,7 @@ use std::sync::Arc;
 /// let x = Tensor::from([3.0, -1.0, 0.5]);
 /// let inside = x.gt(0.0) & x.lt(2.0);
 /// assert_eq!((inside.as_slice(), inside.count()), (&[false, false, true][..], 1));
-/// assert_eq!(inside.pick(&x, 9.0), Tensor::from([9.0, 9.0, 0.5]));
+/// assert_eq!(x.where_(&inside, 9.0), Tensor::from([9.0, 9.0, 0.5]));
 /// assert_eq!(x.masked(&!inside), Tensor::from([3.0, -1.0]));
 /// ```
 #[derive(Clone, PartialEq, Eq)]
@@ -74,17 +75,6 @@ impl Mask {
         Tensor::from_vec(&self.shape, self.values.iter().map(|&x| if x { T::ONE } else { T::ZERO }).collect())
     }
 
-    /// The elements of `yes` where it is true, those of `no` elsewhere (`numpy.where`, `torch.where`).
-    ///
-    /// # Panics
-    /// If `yes` or `no` does not broadcast to the shape of the mask.
-    #[track_caller]
-    pub fn pick<T: Scalar>(&self, yes: impl Into<Tensor<T>>, no: impl Into<Tensor<T>>) -> Tensor<T> {
-        let [yes, no] = [yes.into(), no.into()].map(|x| x.broadcast_to(&self.shape));
-        let pairs = self.values.iter().zip(yes.iter().zip(no.iter()));
-        Tensor::from_vec(&self.shape, pairs.map(|(&x, (yes, no))| if x { yes } else { no }).collect())
-    }
-
     fn join(&self, other: &Mask, f: impl Fn(bool, bool) -> bool) -> Mask {
         assert_eq!(self.shape, other.shape, "masks of different shapes");
         Mask::new(&self.shape, self.values.iter().zip(&*other.values).map(|(&a, &b)| f(a, b)).collect::<Vec<_>>())
@@ -140,15 +130,28 @@ impl fmt::Debug for Mask {
 
 impl<T: Scalar> Tensor<T> {
     #[track_caller]
-    fn compare(&self, other: &Self, f: impl Fn(T, T) -> bool) -> Mask {
+    fn compare(&self, other: &Self, f: impl Fn(T, T) -> bool + Sync) -> Mask {
         let Some(shape) = crate::broadcast_shape(&[self.shape(), other.shape()]) else {
             panic!("shapes {:?} and {:?} do not broadcast", self.shape(), other.shape())
         };
-        if let ([b], true) = (other.buffer(), self.shape() == shape.as_slice()) {
-            return Mask::new(&shape, self.iter().map(|a| f(a, *b)).collect::<Vec<_>>());
+        let mut holds = vec![false; crate::layout::len_of(&shape)];
+        let work = holds.len() * ELEMENT;
+        let a = self.broadcast_to(&shape);
+        let a = a.as_slice();
+        // A number is not spread out first.
+        if let [b] = *other.buffer() {
+            chunks(&mut holds, PIECE, work, || (), &|(), i, holds| {
+                holds.iter_mut().zip(&a[i * PIECE..]).for_each(|(holds, &a)| *holds = f(a, b));
+            });
+            return Mask::new(&shape, holds);
         }
-        let (a, b) = (self.broadcast_to(&shape), other.broadcast_to(&shape));
-        Mask::new(&shape, a.iter().zip(b.iter()).map(|(a, b)| f(a, b)).collect::<Vec<_>>())
+        let b = other.broadcast_to(&shape);
+        let b = b.as_slice();
+        chunks(&mut holds, PIECE, work, || (), &|(), i, holds| {
+            let pairs = a[i * PIECE..].iter().zip(&b[i * PIECE..]);
+            holds.iter_mut().zip(pairs).for_each(|(holds, (&a, &b))| *holds = f(a, b));
+        });
+        Mask::new(&shape, holds)
     }
 
     /// Where elements are less than those of another tensor or than a number.
@@ -187,6 +190,22 @@ impl<T: Scalar> Tensor<T> {
     /// Where elements are NaN.
     pub fn is_nan(&self) -> Mask {
         !self.equals(self)
+    }
+
+    /// The elements where `mask` is true, and those of `other` elsewhere; all three broadcast together (`numpy.where`,
+    /// `torch.where`, with the underscore because Rust keeps that word to itself).
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    #[track_caller]
+    pub fn where_(&self, mask: &Mask, other: impl Into<Tensor<T>>) -> Self {
+        let (mask, other) = (mask.cast(), other.into());
+        map(
+            [&mask, self, &other],
+            &self.pool(),
+            #[inline(always)]
+            |[mask, yes, no]| if mask == T::ZERO { no } else { yes },
+        )
     }
 
     /// The elements where a mask is true, in row-major order: `[count]`.
@@ -268,7 +287,7 @@ mod tests {
         assert!(x.is_nan().any() && !x.is_nan().all() && Mask::new(&[0], []).all() && !Mask::new(&[0], []).any());
         assert_eq!((x.gt(1.5).count(), x.gt(1.5).nonzero().as_slice()), (2, &[1, 2][..]));
         assert_eq!(x.gt(1.5).cast::<f32>(), Tensor::from([[0.0, 1.0], [1.0, 0.0]]));
-        assert_eq!(x.is_nan().pick(&row, &x), Tensor::from([[1.0, 2.0], [3.0, 2.0]]));
+        assert_eq!(row.where_(&x.is_nan(), &x), Tensor::from([[1.0, 2.0], [3.0, 2.0]]));
         assert_eq!(x.t().masked(&x.t().gt(0.0)), Tensor::from([1.0, 3.0, 2.0]));
     }
 

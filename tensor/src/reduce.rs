@@ -318,7 +318,7 @@ mod tests {
             let mut small = shape.clone();
             axes.iter().for_each(|&axis| small[axis] = 1);
             let mut expected = vec![0.0; small.iter().product()];
-            crate::Layout::broadcast(&small, &shape).add(x.as_slice(), &mut expected);
+            crate::Layout::contiguous(&small).stretched(&shape).add(x.as_slice(), &mut expected);
             prop_assert_eq!(got.shape(), &small[..]);
             prop_assert_eq!(got.as_slice(), &expected[..]);
             if drop_lead && small.first() == Some(&1) {

@@ -321,12 +321,12 @@ mod tests {
         assert_eq!(a.as_slice(), [1.0; 4]);
         assert_eq!(b.as_slice(), [5.0, 1.0, 1.0, 1.0]);
         let a = Tensor::from_fn(&[2, 3], |i| i as f64);
-        let (column, mut row) = (a.slice_axis(1, 1..2, 1), a.slice_axis(0, 1..2, 1));
+        let (column, mut row) = (a.slice_axis(1, 1..2), a.slice_axis(0, 1..2));
         row.as_mut_slice()[2] = 9.0;
         assert_eq!((a.as_slice(), column.as_slice()), (&[0.0, 1.0, 2.0, 3.0, 4.0, 5.0][..], &[1.0, 4.0][..]));
         assert_eq!(row.as_slice(), [3.0, 4.0, 9.0]);
         // The last owner of a part writes without touching what is gone.
-        let mut part = Tensor::from_fn(&[4], |i| i as f64).slice_axis(0, 1..3, 1);
+        let mut part = Tensor::from_fn(&[4], |i| i as f64).slice_axis(0, 1..3);
         part.as_mut_slice()[0] = 7.0;
         assert_eq!(part.into_vec(), [7.0, 2.0]);
     }

@@ -1,8 +1,8 @@
 //! Views of a tensor: other elements, or another order of them, without a copy.
 
-use crate::{Layout, Scalar, Shape, Tensor, axis_of};
-use ndarray::SliceInfoElem;
-use std::ops::Range;
+use crate::layout::inferred;
+use crate::{Layout, Scalar, Tensor};
+use ndarray::{Slice, SliceInfoElem};
 
 impl<T: Scalar> Tensor<T> {
     /// The elements that a layout of a row-major tensor of this shape names. Without a copy, unless the layout steps over
@@ -18,15 +18,29 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// The same elements under another shape; copied only where strides cannot say that.
+    /// A view that a user asked for, or what is wrong with it as a panic.
+    #[track_caller]
+    fn seen_as(&self, name: &str, layout: Result<Layout, String>) -> Self {
+        match layout {
+            Ok(layout) => self.with_layout(layout),
+            Err(what) => panic!("{name}: {what}"),
+        }
+    }
+
+    /// The same elements under another shape, in which one extent may be [`INFER`](crate::INFER): it follows from the
+    /// others. Copied only where strides cannot say that.
     ///
     /// # Panics
-    /// If the shapes hold different numbers of elements.
+    /// If the shape holds another number of elements, or no extent follows.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
-        match self.layout().reshaped(shape) {
+        let shape = match inferred(shape, self.len()) {
+            Ok(shape) => shape,
+            Err(what) => panic!("reshape of {:?}: {what}", self.shape()),
+        };
+        match self.layout().reshaped(&shape) {
             Some(layout) => self.with_layout(layout),
-            None => self.packed().reshape(shape),
+            None => self.packed().reshape(&shape),
         }
     }
 
@@ -45,25 +59,24 @@ impl<T: Scalar> Tensor<T> {
     /// If more axes are named than there are, a place lies outside its axis, or a step is 0.
     #[track_caller]
     pub fn slice(&self, places: impl AsRef<[SliceInfoElem]>) -> Self {
-        match self.layout().sliced_by(places.as_ref()) {
-            Ok(layout) => self.with_layout(layout),
-            Err(what) => panic!("slice: {what}"),
-        }
+        self.seen_as("slice", self.layout().sliced_by(places.as_ref()))
     }
 
-    /// The entries `range` along one axis, every `step`-th of them; a negative step starts at the last one and walks
-    /// backwards. For an axis whose number is known only when the program runs.
+    /// The entries of a range along one axis, whose number may be known only when the program runs: `1..3`, `..-1`, or
+    /// with a step `Slice::from(..).step_by(-2)`.
+    ///
+    /// ```
+    /// use raygrad_tensor::{Slice, Tensor};
+    /// let x = Tensor::from_fn(&[6], |i| i as f32);
+    /// assert_eq!(x.slice_axis(-1, 1..3).as_slice(), [1.0, 2.0]);
+    /// assert_eq!(x.slice_axis(0, Slice::from(..-1).step_by(-3)).as_slice(), [4.0, 1.0]);
+    /// ```
     ///
     /// # Panics
-    /// If the axis does not exist, the range leaves it or is reversed, or the step is 0.
+    /// If the axis does not exist, the range leaves it, or the step is 0.
     #[track_caller]
-    pub fn slice_axis(&self, axis: isize, range: Range<usize>, step: isize) -> Self {
-        let (shape, axis) = (self.shape(), axis_of(axis, self.shape()));
-        let fits = range.start <= range.end && range.end <= shape[axis] && step != 0;
-        assert!(fits, "slice {range:?} by {step} along axis {axis} of a tensor of shape {shape:?}");
-        let start = if step > 0 { range.start } else { range.end.saturating_sub(1) };
-        let len = range.len().div_ceil(step.unsigned_abs());
-        self.with_layout(self.layout().sliced(axis, start, len, step))
+    pub fn slice_axis(&self, axis: isize, range: impl Into<Slice>) -> Self {
+        self.seen_as("slice_axis", self.layout().sliced_axis(axis, range))
     }
 
     /// Axis `i` of the result is axis `axes[i]` of this tensor.
@@ -72,8 +85,7 @@ impl<T: Scalar> Tensor<T> {
     /// If `axes` does not name every axis once.
     #[track_caller]
     pub fn permute(&self, axes: &[isize]) -> Self {
-        let axes: Shape = axes.iter().map(|&axis| axis_of(axis, self.shape())).collect();
-        self.with_layout(self.layout().permuted(&axes))
+        self.seen_as("permute", self.layout().permuted_by(axes))
     }
 
     /// Two axes exchanged.
@@ -82,9 +94,7 @@ impl<T: Scalar> Tensor<T> {
     /// If an axis does not exist.
     #[track_caller]
     pub fn transpose(&self, a: isize, b: isize) -> Self {
-        let mut axes: Shape = (0..self.ndim()).collect();
-        axes.swap(axis_of(a, self.shape()), axis_of(b, self.shape()));
-        self.with_layout(self.layout().permuted(&axes))
+        self.seen_as("transpose", self.layout().transposed(a, b))
     }
 
     /// The last two axes exchanged: the transpose of a matrix, or of each matrix of a batch.
@@ -93,7 +103,7 @@ impl<T: Scalar> Tensor<T> {
     /// If there are less than two axes.
     #[track_caller]
     pub fn t(&self) -> Self {
-        self.transpose(-1, -2)
+        self.seen_as("t", self.layout().transposed(-1, -2))
     }
 
     /// The entries along `axis` in reverse order.
@@ -102,9 +112,7 @@ impl<T: Scalar> Tensor<T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn flip(&self, axis: isize) -> Self {
-        let axis = axis_of(axis, self.shape());
-        let len = self.shape()[axis];
-        self.with_layout(self.layout().sliced(axis, len.saturating_sub(1), len, -1))
+        self.seen_as("flip", self.layout().flipped(axis))
     }
 
     /// This tensor stretched to `shape`, as NumPy broadcasts: axes are aligned at the last one, and an axis of extent 1, or
@@ -114,7 +122,10 @@ impl<T: Scalar> Tensor<T> {
     /// If the shape does not broadcast to `shape`.
     #[track_caller]
     pub fn broadcast_to(&self, shape: &[usize]) -> Self {
-        if self.shape() == shape { self.clone() } else { self.with_layout(self.layout().stretched(shape)) }
+        if self.shape() == shape {
+            return self.clone();
+        }
+        self.seen_as("broadcast_to", self.layout().broadcast_to(shape))
     }
 
     /// The diagonal through the last two axes, which becomes the last one. Number `diagonal` counts from the main one
@@ -124,8 +135,7 @@ impl<T: Scalar> Tensor<T> {
     /// If there are less than two axes.
     #[track_caller]
     pub fn diagonal(&self, diagonal: isize) -> Self {
-        let (row, column) = (axis_of(-2, self.shape()), axis_of(-1, self.shape()));
-        self.with_layout(self.layout().diagonal(row, column, diagonal))
+        self.seen_as("diagonal", self.layout().last_diagonal(diagonal))
     }
 
     /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
@@ -142,7 +152,7 @@ impl<T: Scalar> Tensor<T> {
     /// If the axis does not exist or is shorter than a window, or `size` or `step` is 0.
     #[track_caller]
     pub fn windows(&self, axis: isize, size: usize, step: usize) -> Self {
-        self.with_layout(self.layout().windows(axis_of(axis, self.shape()), size, step))
+        self.seen_as("windows", self.layout().windows(axis, size, step))
     }
 
     /// This tensor without `axis`, which has extent 1.
@@ -151,11 +161,7 @@ impl<T: Scalar> Tensor<T> {
     /// If the axis does not exist or has another extent.
     #[track_caller]
     pub fn squeeze(&self, axis: isize) -> Self {
-        let axis = axis_of(axis, self.shape());
-        assert!(self.shape()[axis] == 1, "squeeze of axis {axis} of a tensor of shape {:?}", self.shape());
-        let mut shape = Shape::from_slice(self.shape());
-        shape.remove(axis);
-        self.reshape(&shape)
+        self.seen_as("squeeze", self.layout().squeezed(axis))
     }
 
     /// This tensor with a new axis of extent 1 that stands at place `axis`, which may be counted from behind the last one.
@@ -164,11 +170,6 @@ impl<T: Scalar> Tensor<T> {
     /// If there is no such place.
     #[track_caller]
     pub fn unsqueeze(&self, axis: isize) -> Self {
-        let mut shape = Shape::from_slice(self.shape());
-        shape.push(1);
-        let axis = axis_of(axis, &shape);
-        shape.pop();
-        shape.insert(axis, 1);
-        self.reshape(&shape)
+        self.seen_as("unsqueeze", self.layout().unsqueezed(axis))
     }
 }

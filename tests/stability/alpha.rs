@@ -10,7 +10,7 @@ fn one_sample<T: Scalar>(sigma: f64, delta: f64) -> [f64; 3] {
     let density = tape.leaf(vector::<T>(&[sigma]));
     let op = Composite::new(vector::<T>(&[delta]), Segments::uniform(1, 1));
     let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]);
-    let slope = out.slice(1, 0, 1).sum().grad(&[&density]).remove(0).item().to_f64();
+    let slope = out.slice_axis(1, ..1).sum().grad(&[&density]).remove(0).item().to_f64();
     let [alpha, left] = [0, 1].map(|i| out.value().as_slice()[i].to_f64());
     [alpha, left, slope]
 }

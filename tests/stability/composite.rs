@@ -12,7 +12,7 @@ fn ray<T: Scalar>(x: &[f64], colour: &[f64]) -> ([f64; 2], Vec<f64>, Vec<f64>) {
     let (density, features) = (tape.leaf(vector::<T>(x)), tape.leaf(tensor::<T>(&[n, 1], colour)));
     let op = Composite::new(Tensor::ones(&[n]), Segments::uniform(1, n));
     let out = tape.apply(op, &[&density, &features]);
-    let grads = out.slice(1, 0, 1).sum().grad(&[&density, &features]);
+    let grads = out.slice_axis(1, ..1).sum().grad(&[&density, &features]);
     let both = [0, 1].map(|i| out.value().as_slice()[i].to_f64());
     (both, numbers(&grads[0]), numbers(&grads[1]))
 }
@@ -62,7 +62,7 @@ fn gradient_behind_opaque_samples<T: Scalar>() {
     let tape = Tape::new();
     let alpha = tape.leaf(vector::<T>(&[0.3, 1.0, 0.5]));
     let left = (1.0 - &alpha).cumprod(0);
-    let before = Var::concat(&[&tape.constant(Tensor::ones(&[1])), &left.slice(0, 0, 2)], 0);
+    let before = Var::concat(&[&tape.constant(Tensor::ones(&[1])), &left.slice_axis(0, ..2)], 0);
     let colour = tape.constant(vector(&[0.2, 0.9, 0.4]));
     let slopes = (before * &alpha * colour).sum().grad(&[&alpha]).remove(0);
     for (i, slope) in numbers(&slopes).into_iter().enumerate() {
@@ -140,7 +140,7 @@ fn no_interval_is_longer_than_the_ray<T: Scalar>() {
         let tape = Tape::new();
         let density = tape.leaf(Tensor::full(&[n], T::from_f64(1e-10)));
         let op = Composite::new(samples.delta, samples.segments);
-        let alpha = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[n, 1]))]).slice(1, 0, 1).sum();
+        let alpha = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[n, 1]))]).slice_axis(1, ..1).sum();
         near::<T>("alpha", alpha.item().to_f64(), 4e-10, 1e-6);
         assert!(numbers(&alpha.grad(&[&density])[0]).iter().all(|&slope| (0.0..=4.0).contains(&slope)));
     }
@@ -153,7 +153,7 @@ fn exponential_density<T: Scalar>() {
             let tape = Tape::new();
             let density = tape.leaf(vector::<T>(&[z]));
             let op = Composite::of_log_density(vector(&[delta]), Segments::uniform(1, 1));
-            let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice(1, 0, 1).sum();
+            let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
             let u = z.exp() * round::<T>(delta);
             let tolerance = by_type::<T>(2e-7, 1e-15);
             near::<T>(&format!("alpha, z {z}, interval {delta}"), out.item().to_f64(), -(-u).exp_m1(), tolerance);
@@ -166,7 +166,7 @@ fn exponential_density<T: Scalar>() {
         let tape = Tape::new();
         let density = tape.leaf(vector::<T>(&[z]));
         let op = Composite::of_log_density(vector(&[1e-6]), Segments::uniform(1, 1));
-        let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice(1, 0, 1).sum();
+        let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
         out.grad(&[&density])[0].item().to_f64()
     };
     // Not the gradient that is clamped at 15, and not the one that is clamped at -15.

@@ -18,7 +18,8 @@ fn exact_at_every_level_and_size<T: Scalar>() {
         let y = tape.apply(PositionalEncoding { levels, input: false }, &[&input]);
         let values = numbers(y.value());
         for level in 0..levels {
-            let slopes = [0, 1].map(|k| numbers(&y.slice(1, 2 * level + k, 1).sum().grad(&[&input])[0]));
+            let slopes =
+                [0, 1].map(|k| numbers(&y.slice_axis(1, 2 * level + k..2 * level + k + 1).sum().grad(&[&input])[0]));
             for (i, &x) in x.iter().enumerate() {
                 // 2^k x is exact, and so is its remainder by 2.
                 let frequency = (level as f64).exp2();

@@ -100,7 +100,7 @@ fn directions_of_vectors_of_every_size<T: Scalar>() {
             for (got, x) in numbers(unit.value()).into_iter().zip(scaled) {
                 near::<T>(&format!("{shape:?} times {scale:e}"), got, x / length, 2.0 * T::EPSILON);
             }
-            finite("gradient", &unit.slice(1, 0, 1).sum().grad(&[&x])[0]);
+            finite("gradient", &unit.slice_axis(1, ..1).sum().grad(&[&x])[0]);
         }
     }
     let top = greatest::<T>();
@@ -119,7 +119,7 @@ fn contraction_is_smooth_and_bounded<T: Scalar>() {
         let tape = Tape::new();
         let x = tape.leaf(tensor::<T>(&[1, 3], &point));
         let y = contract(&x);
-        let rows: Vec<f64> = (0..3).flat_map(|i| numbers(&y.slice(1, i, 1).sum().grad(&[&x])[0])).collect();
+        let rows: Vec<f64> = (0..3).flat_map(|i| numbers(&y.slice_axis(1, i..i + 1).sum().grad(&[&x])[0])).collect();
         (numbers(y.value()), rows)
     };
     let identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];

@@ -64,7 +64,7 @@ fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: boo
         "{weights:?} {values:?}"
     );
     prop_assert!((-1e-7..=1.0 + 1e-6).contains(&values[0]), "{values:?}");
-    let grads = out.slice(1, 0, 1).sum().grad(&[&density, &features]);
+    let grads = out.slice_axis(1, ..1).sum().grad(&[&density, &features]);
     prop_assert!(grads.iter().all(Tensor::is_finite), "{grads:?}");
     // And by way of plain operations, once more differentiated, where nothing overflows in truth.
     if delta.iter().all(|&d| d < 1e3) && sigma.iter().all(|&s| s < 20.0) {

@@ -4,7 +4,7 @@
 use ndarray::{ArrayD, Axis, IxDyn, Slice, concatenate, stack};
 use proptest::prelude::*;
 use raygrad::nerf::{Composite, Contraction, PositionalEncoding, SphericalHarmonics, rotation_exp, rotation_log};
-use raygrad::{Activation, Conv2dConfig, Indices, Pool2dConfig, Segments, Tape, Tensor, Var};
+use raygrad::{Activation, Axes, Conv2dConfig, Indices, Pool2dConfig, Segments, Tape, Tensor, Var};
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -14,7 +14,8 @@ type V<'t> = Var<'t, f64>;
 /// Operation number `op` of values and small numbers, some of them out of range.
 fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) -> Option<V<'t>> {
     let tape = a.tape();
-    let axis = i as isize - 2;
+    // Places that may be counted from the end, and places from the start.
+    let (axis, at) = (i as isize - 2, i as isize);
     let index: Arc<[u32]> = (0..j).map(|n| ((n * 3 + k) % 5) as u32).collect();
     let indices = || Indices::new(&[j], index.clone());
     let along = || {
@@ -34,7 +35,7 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
         6 => a.outer(b),
         7 => a.cross(b),
         8 => a.normalize(),
-        9 => a.sum_axes(&[i]),
+        9 => a.sum_over(Axes::from(at).keepdims()),
         10 => a.mean_over(axis),
         11 => a.max_over(axis),
         12 => a.min_over([axis, j as isize - 2]),
@@ -48,33 +49,33 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
         20 => a.cumsum(axis),
         21 => a.cumprod(axis),
         22 => a.recurrence(b, axis),
-        23 => a.permute(&[i, j]),
-        24 => a.transpose(i, j),
+        23 => a.permute(&[at, j as isize]),
+        24 => a.transpose(at, j as isize),
         25 => a.t(),
         26 => a.reshape(&[i, j]),
-        27 => a.slice(i, j, k),
-        28 => a.slice_step(i, j..k, 2),
-        29 => a.flip(i),
-        30 => a.squeeze(i),
-        31 => a.unsqueeze(i),
-        32 => a.roll(i, k as isize - 2),
-        33 => a.repeat(i, j),
+        27 => a.slice_axis(at, j..j + k),
+        28 => a.slice_axis(at, Slice::from(j..k).step_by(2)),
+        29 => a.flip(at),
+        30 => a.squeeze(at),
+        31 => a.unsqueeze(at),
+        32 => a.roll(at, k as isize - 2),
+        33 => a.repeat(at, j),
         34 => a.tile(&[i, j]),
         35 => a.pad(&[[i, j], [k, 0]], 0.5),
         36 => a.broadcast_to(&[i, j]),
         37 => a.sum_to(&[i, j]),
-        38 => Var::concat(&[a, b, c], i),
-        39 => Var::stack(&[a, b], i),
-        40 => a.split(i, &[j, k]).pop()?,
+        38 => Var::concat(&[a, b, c], at),
+        39 => Var::stack(&[a, b], at),
+        40 => a.split(at, &[j, k]).pop()?,
         41 => a.gather_rows(&index),
         42 => a.scatter_rows(&index, i),
-        43 => a.gather(i, &along()),
-        44 => a.scatter_add(i, &along(), b),
-        45 => a.index_select(i, &index),
-        46 => a.index_add(i, &index, b),
-        47 => a.sort(i, j % 2 == 0).0,
+        43 => a.gather(at, &along()),
+        44 => a.scatter_add(at, &along(), b),
+        45 => a.index_select(at, &index),
+        46 => a.index_add(at, &index, b),
+        47 => a.sort(at, j % 2 == 0).0,
         48 => tape.one_hot(&indices(), k),
-        49 => a.where_(b, c),
+        49 => a.where_(&b.gt(0.5), c),
         50 => a.lerp(b, c),
         51 => a.tril(axis),
         52 => a.diagonal(axis),
@@ -89,7 +90,7 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
         61 => a.segment_sum(&segments()),
         62 => a.segment_expand(&segments()),
         63 => a.segment_cumsum(&segments(), k % 2 == 0),
-        64 => a.cross_entropy(&[i, j, k]),
+        64 => a.cross_entropy([i, j, k].map(|class| class as u32)),
         65 => a.mse_loss(b),
         66 => a.huber(b, 0.5),
         67 => a.conv2d_transpose(b, &conv, [i, k]),
@@ -120,30 +121,16 @@ impl Einsum for V<'_> {
     }
 }
 
-/// Words of the messages that are written for users. A panic with none of them is an accident: an index out of bounds, an
-/// overflow, an `unwrap`.
-const MESSAGES: [&str; 20] = [
-    // What an operation says of the shapes that it is given, with the place of the call.
-    "(recorded at tests/stability/shapes.rs:",
-    "a tensor of shape",
-    "a loss of a prediction and a target of different shapes",
-    "a scalar is no matrix",
-    "does not name every axis of",
-    "dot of shapes",
-    "einsum \"",
-    "index_add of",
-    "leaves the extent",
-    "no elements to choose from along axis",
+/// What is not the tape's to refuse: inputs that constructors and plain tensors check. Any other panic is an accident: an
+/// index out of bounds, an overflow, an `unwrap`.
+const MESSAGES: [&str; 7] = [
     "one_hot: index",
-    "outer of shapes",
     "rotation matrices are",
     "rotation vectors of three elements",
     "searchsorted in a scalar",
     "searchsorted of shapes",
+    "segment offsets do not fall",
     "spherical harmonics of degree",
-    "split into",
-    "stack of tensors of different shapes",
-    "the diagonal of a matrix from a scalar",
 ];
 
 /// Whether a panic is one that was written for a user.
@@ -176,7 +163,9 @@ proptest! {
             let mut value = 0.0;
             let mut leaf = |shape: &[usize]| tape.leaf(Tensor::from_fn(shape, |_| { value += 0.37; 0.1 + value % 1.0 }));
             let [a, b, c] = [&a, &b, &c].map(|shape| leaf(shape));
-            let Some(y) = apply(op, &a, &b, &c, k) else { return };
+            // What does not fit is an error; what fits has gradients of any order.
+            let Ok(y) = tape.try_run(|| apply(op, &a, &b, &c, k)) else { return };
+            let Some(y) = y else { return };
             let first = y.tracked().sum().grad_graph(&[&a, &b, &c]);
             let again = first.iter().fold(tape.constant(Tensor::scalar(0.0)), |sum, grad| sum + grad.square().sum());
             again.grad(&[&a, &b, &c]);
@@ -242,12 +231,10 @@ fn by_ndarray(op: usize, x: [&ArrayD<f64>; 3], [i, j, k]: [usize; 3]) -> Option<
             a
         }),
         26 => a.to_shape(IxDyn(&[i, j])).ok().map(|y| y.to_owned()),
-        // No entries leave no axis, wherever they start.
-        27 if k == 0 => extent.map(|_| a.slice_axis(Axis(i), (0..0).into()).to_owned()),
         27 => extent.filter(|&n| j + k <= n).map(|_| a.slice_axis(Axis(i), (j..j + k).into()).to_owned()),
         28 => extent
-            .filter(|&n| j <= k && k <= n)
-            .map(|_| a.slice_axis(Axis(i), Slice::new(j as isize, Some(k as isize), 2)).to_owned()),
+            .filter(|&n| j <= n && k <= n)
+            .map(|_| a.slice_axis(Axis(i), Slice::new(j as isize, Some(k.max(j) as isize), 2)).to_owned()),
         29 => extent.map(|_| {
             let mut a = a.clone();
             a.invert_axis(Axis(i));
@@ -286,7 +273,7 @@ proptest! {
         let got = catch_unwind(AssertUnwindSafe(|| {
             let tape = Tape::<f64>::new();
             let [a, b, c] = [&a, &b, &c].map(|x| tape.leaf(x.clone()));
-            apply(op, &a, &b, &c, k).map(Var::into_value)
+            tape.try_run(|| apply(op, &a, &b, &c, k)).ok().flatten().map(Var::into_value)
         }));
         match (got, expected) {
             (Ok(Some(got)), Some(expected)) => {
@@ -295,12 +282,9 @@ proptest! {
                     prop_assert!((got - expected).abs() <= 1e-14 * expected.abs() || got.is_nan() && expected.is_nan());
                 }
             }
-            (Err(panic), None) => {
-                let text = words(panic);
-                prop_assert!(is_a_message(&text), "{}", text);
-            }
+            (Ok(None), None) => {}
             (Ok(got), expected) => prop_assert!(false, "{:?} where ndarray has {:?}", got, expected),
-            (Err(panic), Some(expected)) => prop_assert!(false, "{} where ndarray has {:?}", words(panic), expected),
+            (Err(panic), expected) => prop_assert!(false, "{} where ndarray has {:?}", words(panic), expected),
         }
     }
 }

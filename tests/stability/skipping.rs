@@ -27,9 +27,9 @@ impl<T: Scalar> Field<T> for Fog {
         Density { value: encoding.tape().constant(sigma), log: false, features: encoding.clone() }
     }
     fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Var<'t, T>, _: &Segments) -> Var<'t, T> {
-        let z = features.slice(1, 2, 1);
-        let white = if self.white_behind { z.gt(&z.constant(0.0)) } else { z.gt(&z.constant(-5.0)) };
-        white.broadcast_to(&[features.shape()[0], 3])
+        let z = features.slice_axis(1, 2..3);
+        let white = z.gt(if self.white_behind { 0.0 } else { -5.0 });
+        z.tape().constant(white.cast()).broadcast_to(&[features.shape()[0], 3])
     }
 }
 

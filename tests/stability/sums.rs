@@ -1,7 +1,7 @@
 //! Long sums, and sums in which many threads or places take part.
 
 use crate::support::*;
-use raygrad::{RowSums, Scalar, Segments, Tape, Tensor};
+use raygrad::{Axes, RowSums, Scalar, Segments, Tape, Tensor};
 use std::sync::Arc;
 
 /// Matrix: reduce 2^24 x 1e-4, and alternating +-1e8 + 1. Catalogue: long f32 sums.
@@ -12,7 +12,7 @@ fn long_sums<T: Scalar>() {
     let expected = n as f64 * round::<T>(1e-4);
     near::<T>("2^24 x 1e-4", x.sum().item().to_f64(), expected, by_type::<T>(1e-6, 1e-14));
     near::<T>("their mean", x.mean().item().to_f64(), round::<T>(1e-4), by_type::<T>(1e-6, 1e-14));
-    let rows = x.reshape(&[n / 16, 16]).sum_axes(&[0]);
+    let rows = x.reshape(&[n / 16, 16]).sum_over(Axes::from(0).keepdims());
     numbers(rows.value()).iter().for_each(|sum| near::<T>("columns", *sum, expected / 16.0, by_type::<T>(1e-6, 1e-14)));
     drop((x, rows));
     let n = 1 << 20;

@@ -9,7 +9,7 @@
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Activation, Conv2dConfig, Gradient, INFER, Indices, Pool2dConfig, Tape, Tensor, Var};
+use raygrad_autograd::{Activation, Axes, Conv2dConfig, Gradient, INFER, Indices, Pool2dConfig, Tape, Tensor, Var};
 use raygrad_nn::{Adam, AdamConfig, Bound, Init, Linear, Optimizer, ParamId, Params};
 use rayon::prelude::*;
 use std::time::Instant;
@@ -43,7 +43,7 @@ impl Network {
             h = h.conv2d_bias(&params[weight], &params[bias], &same).relu().max_pool2d(&Pool2dConfig::new([2, 2]));
         }
         let scores = self.head.forward(params, &h.reshape(&[x.shape()[0], INFER]));
-        (scores.exp().sum_axes(&[1]).ln() - scores.gather(1, labels)).sum() * (1.0 / IMAGES as f64)
+        (scores.exp().sum_over(Axes::from(1).keepdims()).ln() - scores.gather(1, labels)).sum() * (1.0 / IMAGES as f64)
     }
 }
 

@@ -46,7 +46,7 @@ fn model<T: Scalar>(lazy: bool) -> (Params<T>, [ParamId; 3]) {
 fn loss<'t, T: Scalar>(bound: &Bound<'t, T>, ids: [ParamId; 3], step: usize, dense: bool) -> Var<'t, T> {
     let [table, vector, number] = ids.map(|id| &bound[id]);
     let rows: Arc<[u32]> = [step % 40, (step * 7 + 3) % 40, step % 40, 11].map(|row| row as u32).into();
-    let used = (table.gather_rows(&rows) * vector).sin().sum() + table.gather_rows(&[11].into()).square().sum();
+    let used = (table.gather_rows(&rows) * vector).sin().sum() + table.gather_rows([11]).square().sum();
     let sum = used * number + number.square();
     if dense { sum + table.square().sum() * 0.01 } else { sum }
 }

@@ -2,7 +2,8 @@
 
 use super::Entry;
 use super::spread;
-use crate::ops::{Conv2dConfig, INFER, Pool2dConfig, convolution, index, matmul, matrix, pooling, shape, vector};
+use crate::ops::{Conv2dConfig, Pool2dConfig, convolution, index, matmul, matrix, pooling, shape, vector};
+use crate::{INFER, Slice};
 use crate::{Indices, Var};
 use raygrad_tensor::{Layout, Shape};
 
@@ -39,7 +40,10 @@ fn shapes() -> Vec<Entry> {
         function!("reshape", |x| x[0].reshape(&[INFER, 2])).linear().sample(&[&[2, 3]]).sample(&[&[0]]).sample(&[&[2]]),
         function!("transpose", |x| x[0].transpose(0, 2)).linear().sample(&[&[2, 3, 4]]).sample(&[&[2, 0, 1]]),
         function!("squeeze", |x| x[0].squeeze(1).unsqueeze(0)).linear().sample(&[&[2, 1, 3]]).sample(&[&[0, 1]]),
-        function!("slice_step", |x| x[0].slice_step(0, 1..6, -2)).linear().sample(&[&[7]]).sample(&[&[6, 2]]),
+        function!("slice_step", |x| x[0].slice_axis(0, Slice::from(1..6).step_by(-2)))
+            .linear()
+            .sample(&[&[7]])
+            .sample(&[&[6, 2]]),
         function!("stack", |x| Var::stack(&[&x[0], &x[1], &x[0]], 0))
             .linear()
             .sample(&[&[], &[]])
@@ -98,7 +102,7 @@ fn indexing() -> Vec<Entry> {
         function!("scatter_add", |x| x[0].scatter_add(0, &Indices::new(&[3, 2], [1, 0, 1, 1, 0, 0]), &x[1]))
             .linear()
             .sample(&[&[2, 2], &[3, 2]]),
-        function!("index_add", |x| x[0].index_add(1, &[1, 1].into(), &x[1])).linear().sample(&[&[2, 3], &[2, 2]]),
+        function!("index_add", |x| x[0].index_add(1, [1, 1], &x[1])).linear().sample(&[&[2, 3], &[2, 2]]),
         function!("sort", |x| x[0].sort(0, false).0).sample(&[&[7]]).sample(&[&[4, 3]]).sample(&[&[0]]),
         function!("sort_descending", |x| x[0].sort(1, true).0).sample(&[&[2, 5]]).sample(&[&[3, 1, 2]]),
     ]

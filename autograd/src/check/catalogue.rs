@@ -183,7 +183,6 @@ pub fn catalogue() -> Vec<Entry> {
 
 /// Functions of one, two and three numbers.
 fn elementwise() -> Vec<Entry> {
-    use select::Compare::{Equal, Greater, GreaterEqual, Less, LessEqual, NotEqual};
     // Powers of both signs, of 0 and of 1 have conventions of their own.
     let powi = [0, 1, 5, -4].map(|exponent| Entry::examined(power::Powi { exponent }));
     let powers = [
@@ -194,14 +193,6 @@ fn elementwise() -> Vec<Entry> {
     let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::examined(power::Powf { exponent }));
     // Values that are equal in places, and that no step of a difference takes past each other.
     let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
-    let compare = [Greater, GreaterEqual, Less, LessEqual].map(|comparison| {
-        let apart = |i: usize| Tensor::from_fn(&[2, 3], |k| (k + i * (2 * k % 3)) as f64 + 0.5 * i as f64);
-        let apart = vec![apart(0), apart(1)];
-        Entry::new(comparison).sample_of(apart).sample(&[&[0, 1], &[3]]).sample(&[&[], &[]])
-    });
-    let equal = [Equal, NotEqual].map(|comparison| {
-        Entry::new(comparison).sample(&[&[2, 3], &[3]]).sample(&[&[0, 1], &[3]]).sample(&[&[], &[2]])
-    });
     let mask = |shape: &[usize]| ranks(shape, 3);
     let choice = |shape: &[usize], others: [&[usize]; 2]| {
         let others = others.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 3));
@@ -247,7 +238,7 @@ fn elementwise() -> Vec<Entry> {
             &[1],
         ]),
     ];
-    powi.into_iter().chain(powers).chain(powf).chain(compare).chain(equal).chain(rest).collect()
+    powi.into_iter().chain(powers).chain(powf).chain(rest).collect()
 }
 
 /// What makes fewer numbers out of many, and what runs along an axis.

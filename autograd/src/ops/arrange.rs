@@ -1,8 +1,8 @@
 //! Rearrangements that are made of other operations: axes added and dropped, tensors stacked, split, tiled and rolled.
 
 use crate::Var;
-use raygrad_tensor::{Layout, Scalar, Shape};
-use std::ops::Range;
+use crate::error::ensure;
+use raygrad_tensor::{Layout, Scalar, Shape, checked_len};
 
 impl<'t, T: Scalar> Var<'t, T> {
     /// Two axes exchanged.
@@ -10,12 +10,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If an axis does not exist.
     #[track_caller]
-    pub fn transpose(&self, a: usize, b: usize) -> Self {
-        let ndim = self.shape().len();
-        assert!(a < ndim && b < ndim, "transpose of axes {a} and {b} of a tensor of shape {:?}", self.shape());
-        let mut axes: Shape = (0..ndim).collect();
-        axes.swap(a, b);
-        self.permute(&axes)
+    pub fn transpose(&self, a: isize, b: isize) -> Self {
+        self.view("transpose", |layout| layout.transposed(a, b))
     }
 
     /// The last two axes exchanged: the transpose of a matrix, or of each matrix of a batch; nothing is copied.
@@ -24,9 +20,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If there are less than two axes.
     #[track_caller]
     pub fn t(&self) -> Self {
-        let ndim = self.shape().len();
-        assert!(ndim >= 2, "transpose of a tensor of shape {:?}", self.shape());
-        self.transpose(ndim - 2, ndim - 1)
+        self.view("t", |layout| layout.transposed(-1, -2))
     }
 
     /// This tensor without `axis`, which has extent 1; nothing is copied.
@@ -34,59 +28,31 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist or has another extent.
     #[track_caller]
-    pub fn squeeze(&self, axis: usize) -> Self {
-        assert!(self.shape().get(axis) == Some(&1), "squeeze of axis {axis} of a tensor of shape {:?}", self.shape());
-        let mut shape = Shape::from_slice(self.shape());
-        shape.remove(axis);
-        self.reshape(&shape)
+    pub fn squeeze(&self, axis: isize) -> Self {
+        self.reshape(self.fits("squeeze", Layout::contiguous(self.shape()).squeezed(axis)).shape())
     }
 
-    /// This tensor with a new axis of extent 1 that stands at place `axis`; nothing is copied.
+    /// This tensor with a new axis of extent 1 that stands at place `axis`, which may be counted from behind the last one;
+    /// nothing is copied.
     ///
     /// # Panics
-    /// If `axis` is larger than the number of axes.
+    /// If there is no such place.
     #[track_caller]
-    pub fn unsqueeze(&self, axis: usize) -> Self {
-        let mut shape = Shape::from_slice(self.shape());
-        assert!(axis <= shape.len(), "unsqueeze at axis {axis} of a tensor of shape {shape:?}");
-        shape.insert(axis, 1);
-        self.reshape(&shape)
-    }
-
-    /// The entries `range` along `axis`, every `step`-th of them. A negative step starts at the last entry of the range
-    /// and walks backwards, as in ndarray.
-    ///
-    /// ```
-    /// use raygrad_autograd::{Tape, Tensor};
-    /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from_fn(&[6], |i| i as f32));
-    /// assert_eq!(x.slice_step(0, 1..6, 2).value().as_slice(), [1.0, 3.0, 5.0]);
-    /// assert_eq!(x.slice_step(0, 0..5, -3).value().as_slice(), [4.0, 1.0]);
-    /// ```
-    ///
-    /// # Panics
-    /// If the axis does not exist, the range leaves it or is reversed, or the step is 0.
-    #[track_caller]
-    pub fn slice_step(&self, axis: usize, range: Range<usize>, step: isize) -> Self {
-        let shape = self.shape();
-        let fits = axis < shape.len() && range.start <= range.end && range.end <= shape[axis];
-        assert!(fits && step != 0, "slice {range:?} by {step} along axis {axis} of a tensor of shape {shape:?}");
-        let start = if step > 0 { range.start } else { range.end.saturating_sub(1) };
-        let len = range.len().div_ceil(step.unsigned_abs());
-        self.view(Layout::contiguous(shape).sliced(axis, start, len, step))
+    pub fn unsqueeze(&self, axis: isize) -> Self {
+        self.reshape(self.fits("unsqueeze", Layout::contiguous(self.shape()).unsqueezed(axis)).shape())
     }
 
     /// Tensors of one shape along a new axis, which stands at place `axis`.
     ///
     /// # Panics
-    /// If there is none, their shapes differ, or `axis` is larger than their number of axes.
+    /// If there is none, their shapes differ, or there is no place `axis`.
     #[track_caller]
-    pub fn stack(parts: &[&Self], axis: usize) -> Self {
+    pub fn stack(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("stack of no tensors") };
-        for part in parts {
-            assert_eq!(part.shape(), first.shape(), "stack of tensors of different shapes");
-        }
+        let same = parts.iter().all(|part| part.shape() == first.shape());
+        first.tape().fits("stack", parts, ensure(same, || "the shapes differ".into()));
         let parts: Vec<_> = parts.iter().map(|part| part.unsqueeze(axis)).collect();
+        // Of negative places those of the axes that are there now.
         Var::concat(&parts.iter().collect::<Vec<_>>(), axis)
     }
 
@@ -95,14 +61,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist or the extents do not sum up to its extent.
     #[track_caller]
-    pub fn split(&self, axis: usize, extents: &[usize]) -> Vec<Self> {
-        let total = Some(extents.iter().sum());
-        let shape = self.shape();
-        assert!(shape.get(axis).copied() == total, "split into {extents:?} along axis {axis} of shape {shape:?}");
+    pub fn split(&self, axis: isize, extents: &[usize]) -> Vec<Self> {
+        let extent = self.shape()[self.axis("split", axis)];
+        let total = extents.iter().try_fold(0_usize, |total, &len| total.checked_add(len));
+        self.fits("split", ensure(total == Some(extent), || format!("{extents:?} are not {extent} together")));
         let mut start = 0;
         let mut parts = Vec::with_capacity(extents.len());
         for &len in extents {
-            parts.push(self.slice(axis, start, len));
+            parts.push(self.slice_axis(axis, start..start + len));
             start += len;
         }
         parts
@@ -124,11 +90,12 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn tile(&self, counts: &[usize]) -> Self {
         let shape = self.shape();
-        let lead = counts.len().checked_sub(shape.len());
-        let Some(lead) = lead else { panic!("{} counts to tile a tensor of shape {shape:?}", counts.len()) };
+        let lead = counts.len().checked_sub(shape.len()).ok_or_else(|| format!("{counts:?} names less axes"));
+        let lead = self.fits("tile", lead);
         let extent = |i: usize| if i < lead { 1 } else { shape[i - lead] };
         let narrow: Shape = (0..counts.len()).flat_map(|i| [1, extent(i)]).collect();
         let wide: Shape = (0..counts.len()).flat_map(|i| [counts[i], extent(i)]).collect();
+        self.fits("tile", ensure(checked_len(&wide).is_some(), || format!("{counts:?} times is too much")));
         let out: Shape = (0..counts.len()).map(|i| counts[i] * extent(i)).collect();
         self.reshape(&narrow).broadcast_to(&wide).reshape(&out)
     }
@@ -138,13 +105,16 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist.
     #[track_caller]
-    pub fn repeat(&self, axis: usize, count: usize) -> Self {
+    pub fn repeat(&self, axis: isize, count: usize) -> Self {
+        let axis = self.axis("repeat", axis);
         let mut shape = Shape::from_slice(self.shape());
-        assert!(axis < shape.len(), "repeat along axis {axis} of a tensor of shape {shape:?}");
+        let mut narrow = shape.clone();
+        narrow.insert(axis + 1, 1);
         let mut wide = shape.clone();
         wide.insert(axis + 1, count);
+        self.fits("repeat", ensure(checked_len(&wide).is_some(), || format!("{count} times is too much")));
         shape[axis] *= count;
-        self.unsqueeze(axis + 1).broadcast_to(&wide).reshape(&shape)
+        self.reshape(&narrow).broadcast_to(&wide).reshape(&shape)
     }
 
     /// The entries along `axis` moved `shift` places towards the end; what leaves there comes in at the start. A
@@ -153,14 +123,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist.
     #[track_caller]
-    pub fn roll(&self, axis: usize, shift: isize) -> Self {
-        assert!(axis < self.shape().len(), "roll along axis {axis} of a tensor of shape {:?}", self.shape());
-        let extent = self.shape()[axis];
+    pub fn roll(&self, axis: isize, shift: isize) -> Self {
+        let extent = self.shape()[self.axis("roll", axis)];
         let shift = shift.rem_euclid(extent.max(1) as isize) as usize;
         if shift == 0 {
             return self.clone();
         }
-        let (head, tail) = (self.slice(axis, 0, extent - shift), self.slice(axis, extent - shift, shift));
+        let (head, tail) =
+            (self.slice_axis(axis, ..(extent - shift) as isize), self.slice_axis(axis, -(shift as isize)..));
         Var::concat(&[&tail, &head], axis)
     }
 
@@ -171,9 +141,9 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If one is not a vector.
     #[track_caller]
     pub fn meshgrid(axes: &[&Self]) -> Vec<Self> {
-        let extent = |x: &&Self| match *x.shape() {
-            [extent] => extent,
-            _ => panic!("meshgrid of a tensor of shape {:?}", x.shape()),
+        let extent = |x: &&Self| {
+            x.fits("meshgrid", ensure(x.shape().len() == 1, || "not a vector".into()));
+            x.shape()[0]
         };
         let shape: Shape = axes.iter().map(extent).collect();
         let mut grids = Vec::with_capacity(axes.len());
@@ -188,7 +158,7 @@ impl<'t, T: Scalar> Var<'t, T> {
 
 #[cfg(test)]
 mod tests {
-    use crate::{INFER, Tape, Tensor, Var};
+    use crate::{INFER, Slice, Tape, Tensor, Var};
     use std::panic::{AssertUnwindSafe, catch_unwind};
 
     /// 0, 1, 2, .. in this shape.
@@ -206,17 +176,17 @@ mod tests {
         is(&x.t(), &[3, 2], &[0.0, 3.0, 1.0, 4.0, 2.0, 5.0]);
         is(&x.roll(1, 1), &[2, 3], &[2.0, 0.0, 1.0, 5.0, 3.0, 4.0]);
         is(&x.roll(1, -4), &[2, 3], &[1.0, 2.0, 0.0, 4.0, 5.0, 3.0]);
-        is(&x.slice_step(1, 0..3, -2), &[2, 2], &[2.0, 0.0, 5.0, 3.0]);
-        is(&x.slice_step(1, 1..1, -2), &[2, 0], &[]);
+        is(&x.slice_axis(1, Slice::from(0..3).step_by(-2)), &[2, 2], &[2.0, 0.0, 5.0, 3.0]);
+        is(&x.slice_axis(1, Slice::from(1..1).step_by(-2)), &[2, 0], &[]);
         is(
-            &x.tile(&[2, 1, 2]).slice(0, 1, 1),
+            &x.tile(&[2, 1, 2]).slice_axis(0, 1..2),
             &[1, 2, 6],
             &[0.0, 1.0, 2.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 3.0, 4.0, 5.0],
         );
-        is(&x.repeat(0, 2).slice(1, 0, 1), &[4, 1], &[0.0, 0.0, 3.0, 3.0]);
+        is(&x.repeat(0, 2).slice_axis(1, ..1), &[4, 1], &[0.0, 0.0, 3.0, 3.0]);
         is(&x.repeat(1, 0), &[2, 0], &[]);
-        is(&x.reshape(&[3, INFER]).slice(0, 1, 1), &[1, 2], &[2.0, 3.0]);
-        is(&Var::stack(&[&x, &x.flip(1)], 1).slice(0, 1, 1), &[1, 2, 3], &[3.0, 4.0, 5.0, 5.0, 4.0, 3.0]);
+        is(&x.reshape(&[3, INFER]).slice_axis(0, 1..2), &[1, 2], &[2.0, 3.0]);
+        is(&Var::stack(&[&x, &x.flip(1)], 1).slice_axis(0, 1..2), &[1, 2, 3], &[3.0, 4.0, 5.0, 5.0, 4.0, 3.0]);
         is(&Var::stack(&[&x.sum(), &x.mean()], 0), &[2], &[15.0, 2.5]);
         let parts = x.split(1, &[1, 0, 2]);
         is(&parts[0], &[2, 1], &[0.0, 3.0]);
@@ -246,8 +216,7 @@ mod tests {
             &(|| drop(x.transpose(0, 2))) as &dyn Fn(),
             &|| drop(x.squeeze(0)),
             &|| drop(x.unsqueeze(3)),
-            &|| drop(x.slice_step(1, 0..4, 1)),
-            &|| drop(x.slice_step(1, 0..2, 0)),
+            &|| drop(x.slice_axis(1, 0..4)),
             &|| drop(x.split(1, &[1, 1])),
             &|| drop(x.tile(&[2])),
             &|| drop(x.repeat(2, 2)),
@@ -255,10 +224,11 @@ mod tests {
             &|| drop(x.reshape(&[4, INFER])),
             &|| drop(x.pad(&[[1, 0]], 0.0)),
         ] {
-            assert!(panics(f).contains("[2, 3]"), "{}", panics(f));
+            let text = panics(f);
+            assert!(text.contains("[2, 3]") && text.contains("arrange.rs"), "{text}");
         }
         assert!(panics(&|| drop(x.reshape(&[INFER, INFER]))).contains("one extent"));
         assert!(panics(&|| drop(Var::<f64>::stack(&[], 0))).contains("no tensors"));
-        assert!(panics(&|| drop(Var::stack(&[&x, &x.t()], 0))).contains("different shapes"));
+        assert!(panics(&|| drop(Var::stack(&[&x, &x.t()], 0))).contains("the shapes differ"));
     }
 }

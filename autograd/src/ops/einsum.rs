@@ -1,7 +1,8 @@
 //! Einstein summation of one or two tensors: diagonals and sums of each, then one batched matrix product.
 
+use crate::error::ensure;
 use crate::{ShapeError, Var};
-use raygrad_tensor::{Layout, Scalar, Shape};
+use raygrad_tensor::{Scalar, Shape};
 
 /// A tensor whose axes have letters.
 struct Labelled<'t, T: Scalar> {
@@ -70,7 +71,7 @@ impl<'t, T: Scalar> Labelled<'t, T> {
     /// Each letter once: the diagonal of the axes that share one.
     fn diagonals(mut self) -> Self {
         while let Some((a, b)) = self.repeated() {
-            let x = self.x.view(Layout::contiguous(self.x.shape()).diagonal(a, b, 0));
+            let x = self.x.view("einsum", |layout| Ok(layout.diagonal(a, b, 0)));
             let label = self.labels.remove(b);
             self.labels.remove(a);
             self.labels.push(label);
@@ -86,17 +87,14 @@ impl<'t, T: Scalar> Labelled<'t, T> {
 
     /// Summed over the axes whose letters nobody else has.
     fn summed(self, wanted: impl Fn(char) -> bool) -> Self {
-        let alone: Vec<usize> = (0..self.labels.len()).filter(|&axis| !wanted(self.labels[axis])).collect();
+        let alone: Vec<_> = (0..self.labels.len()).filter(|&axis| !wanted(self.labels[axis])).collect();
         if alone.is_empty() {
             return self;
         }
         let keep = |axis: &usize| !alone.contains(axis);
         let axes: Vec<usize> = (0..self.labels.len()).filter(keep).collect();
-        let shape: Shape = axes.iter().map(|&axis| self.x.shape()[axis]).collect();
-        Labelled {
-            x: self.x.sum_axes(&alone).reshape(&shape),
-            labels: axes.iter().map(|&axis| self.labels[axis]).collect(),
-        }
+        let alone: Vec<_> = alone.iter().map(|&axis| axis as isize).collect();
+        Labelled { x: self.x.sum_over(&alone[..]), labels: axes.iter().map(|&axis| self.labels[axis]).collect() }
     }
 
     /// The axes in the order of these letters.
@@ -106,7 +104,7 @@ impl<'t, T: Scalar> Labelled<'t, T> {
         }
         let place = |label: &char| self.labels.iter().position(|other| other == label);
         let axes: Shape = labels.iter().filter_map(place).collect();
-        self.x.permute(&axes)
+        self.x.reordered(&axes)
     }
 
     /// As matrices `[batch.., rows, columns]`; whatever order the tensor has already is not copied.
@@ -169,10 +167,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// the result repeats a letter or has one that no operand has.
     #[track_caller]
     pub fn einsum(equation: &str, operands: &[&Self]) -> Self {
-        assert!(matches!(operands.len(), 1 | 2), "einsum {equation:?}: {} operands instead of 1 or 2", operands.len());
+        let Some(first) = operands.first() else { panic!("einsum {equation:?} of no tensors") };
+        let one_or_two =
+            ensure(operands.len() < 3, || format!("{equation:?}: {} operands instead of 1 or 2", operands.len()));
+        first.tape().fits("einsum", operands, one_or_two);
         let shapes: Vec<&[usize]> = operands.iter().map(|x| x.shape()).collect();
         match parse(equation, &shapes) {
-            Err(what) => panic!("einsum {equation:?}: {what}"),
+            Err(what) => first.tape().fits("einsum", operands, Err(format!("{equation:?}: {what}"))),
             Ok((labels, result)) => {
                 let labelled = operands.iter().zip(labels).map(|(&x, labels)| Labelled { x: x.clone(), labels });
                 contract(labelled.collect(), &result)

@@ -1,8 +1,8 @@
 //! The greatest and smallest elements along axes, and where they are.
 
+use crate::error::ensure;
 use crate::{Axes, Grads, Indices, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::axis_of;
-use raygrad_tensor::extremum::{Middle, arg_extremum, extremum, extremum_grad};
+use raygrad_tensor::extremum::{Middle, extremum, extremum_grad};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// y = the greatest (or smallest) element over axes `from..behind`, which stay with extent 1; dx = g, shared evenly
@@ -56,9 +56,9 @@ impl<T: Scalar> Op<T> for Extremum {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (x, y, g) = (cx.x(0), cx.y(), cx.g());
         if cx.recording() {
-            let equal = x.eq(&y);
-            let share = g / equal.sum_to(y.shape());
-            return Grads::one(share.where_(&equal, &share.constant(0.0)));
+            let equal = x.equals(&y);
+            let share = g / cx.constant(equal.cast()).sum_to(y.shape());
+            return Grads::one(share.where_(&equal, 0.0));
         }
         let mut out = cx.pool().tensor(x.shape());
         let [x_, y, g] = [x.value(), y.value(), g.value()].map(Tensor::as_slice);
@@ -70,7 +70,7 @@ impl<T: Scalar> Op<T> for Extremum {
 impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     fn extremum(&self, axes: Axes, greatest: bool) -> Self {
-        let axes = axes.resolve(self.shape());
+        let axes = self.axes(if greatest { "max_over" } else { "min_over" }, axes);
         let y = match axes.run() {
             Some((from, behind)) => self.tape().apply(Extremum { from, behind, greatest }, &[self]),
             None => self.tape().apply(Extremum { from: 1, behind: 2, greatest }, &[&self.rows_over(&axes)]),
@@ -125,21 +125,17 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     #[track_caller]
-    fn arg_extremum(&self, axis: isize, greatest: bool) -> Indices {
-        let (x, shape) = (self.value().as_slice(), self.shape());
-        if shape.is_empty() {
-            axis_of(axis, &[1]);
-            return Indices::new(&[], [0]);
+    fn chosen(&self, op: &'static str, axis: isize) -> Tensor<T> {
+        if self.shape().is_empty() {
+            return self.reshape(&[1]).chosen(op, axis);
         }
-        let axis = axis_of(axis, shape);
-        let middle = [shape[..axis].iter().product(), shape[axis], shape[axis + 1..].iter().product()];
-        assert!(
-            middle[1] > 0 || middle[0] * middle[2] == 0,
-            "no elements to choose from along axis {axis} of {shape:?}"
+        let axis = self.axis(op, axis);
+        let others = self.shape().iter().enumerate().all(|(i, &extent)| i == axis || extent > 0);
+        self.fits(
+            op,
+            ensure(self.shape()[axis] > 0 || !others, || format!("nothing to choose from along axis {axis}")),
         );
-        let mut rest = Shape::from_slice(shape);
-        rest.remove(axis);
-        Indices::new(&rest, arg_extremum(x, middle, greatest))
+        self.value().clone()
     }
 
     /// Where the greatest elements along `axis` are: an index for each element of the shape that remains without that
@@ -157,7 +153,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist, or there are no elements to choose from.
     #[track_caller]
     pub fn argmax(&self, axis: isize) -> Indices {
-        self.arg_extremum(axis, true)
+        self.chosen("argmax", axis).argmax(axis)
     }
 
     /// Where the smallest elements along `axis` are; see [`argmax`](Self::argmax).
@@ -166,7 +162,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`argmax`](Self::argmax).
     #[track_caller]
     pub fn argmin(&self, axis: isize) -> Indices {
-        self.arg_extremum(axis, false)
+        self.chosen("argmin", axis).argmin(axis)
     }
 }
 

@@ -1,7 +1,7 @@
 //! Rows of a tensor by number: embeddings and tables.
 
 use crate::{Grads, Op, Reads, RowShare, RowSums, ShapeError, SparseGrad, Var, Vjp};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
 /// y[i] = x[index[i]] along the first axis; dx = [`ScatterRows`] of g, unrecorded as a sparse [`RowGrad`].
@@ -207,7 +207,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
     /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
-    /// let y = x.gather_rows(&[1, 0, 1].into());
+    /// let y = x.gather_rows([1, 0, 1]);
     /// assert_eq!(y.value().as_slice(), [3.0, 4.0, 1.0, 2.0, 3.0, 4.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [1.0, 1.0, 2.0, 2.0]);
     /// ```
@@ -215,8 +215,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If this is a scalar or an index is not below the number of rows.
     #[track_caller]
-    pub fn gather_rows(&self, index: &Arc<[u32]>) -> Self {
-        self.tape().apply(GatherRows { index: index.clone() }, &[self])
+    pub fn gather_rows(&self, index: impl Into<Indices>) -> Self {
+        self.tape().apply(GatherRows { index: self.line("gather_rows", index) }, &[self])
     }
 
     /// The adjoint of [`gather_rows`](Self::gather_rows): `[index.len(), ..]` to `[rows, ..]`, zeros to which row `i` of
@@ -225,8 +225,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If there is not one index for each row, or one is not below `rows`.
     #[track_caller]
-    pub fn scatter_rows(&self, index: &Arc<[u32]>, rows: usize) -> Self {
-        self.tape().apply(ScatterRows { index: index.clone(), rows }, &[self])
+    pub fn scatter_rows(&self, index: impl Into<Indices>, rows: usize) -> Self {
+        self.tape().apply(ScatterRows { index: self.line("scatter_rows", index), rows }, &[self])
     }
 }
 
@@ -295,7 +295,7 @@ mod tests {
     fn sums_into_one_row_keep_their_digits() {
         let tape = Tape::<f32>::new();
         let x = tape.constant(Tensor::from_vec(&[3], vec![1e8, 1.0, -1e8]));
-        assert_eq!(x.scatter_rows(&[1, 1, 1].into(), 2).value().as_slice(), [0.0, 1.0]);
-        assert_eq!(x.scatter_rows(&[1, 0, 1].into(), 2).value().as_slice(), [1.0, 0.0]);
+        assert_eq!(x.scatter_rows([1, 1, 1], 2).value().as_slice(), [0.0, 1.0]);
+        assert_eq!(x.scatter_rows([1, 0, 1], 2).value().as_slice(), [1.0, 0.0]);
     }
 }

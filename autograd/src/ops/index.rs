@@ -2,6 +2,7 @@
 //! graph; gradients flow through what is picked.
 
 use super::gather::add_up;
+use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
@@ -150,7 +151,7 @@ impl<T: Scalar> Op<T> for ScatterAlong {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.g().gather(self.axis, &self.index))
+        Grads::one(cx.g().gather(self.axis as isize, &self.index))
     }
 }
 
@@ -218,7 +219,7 @@ impl<T: Scalar> Op<T> for IndexAdd {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::one(cx.g().index_select(self.axis, &self.index))
+        Grads::one(cx.g().index_select(self.axis as isize, &self.index))
     }
 }
 
@@ -239,8 +240,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist, other extents differ, or an index is not below the extent of the axis.
     #[doc(alias = "take_along_axis")]
     #[track_caller]
-    pub fn gather(&self, axis: usize, index: &Indices) -> Self {
-        self.tape().apply(GatherAlong { axis, index: index.clone() }, &[self])
+    pub fn gather(&self, axis: isize, index: &Indices) -> Self {
+        self.tape().apply(GatherAlong { axis: self.axis("gather", axis), index: index.clone() }, &[self])
     }
 
     /// This tensor with the elements of `source` added at the positions that `index` names along `axis`:
@@ -250,11 +251,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist, the shapes do not fit, or an index is not below the extent of the axis.
     #[track_caller]
-    pub fn scatter_add(&self, axis: usize, index: &Indices, source: &Self) -> Self {
-        let extent = *self.shape().get(axis).unwrap_or(&0);
-        let sum = self.tape().apply(ScatterAlong { axis, index: index.clone(), extent }, &[source]);
-        assert_eq!(sum.shape(), self.shape(), "scatter_add of {:?}: other extents differ", source.shape());
-        self + sum
+    pub fn scatter_add(&self, axis: isize, index: &Indices, source: &Self) -> Self {
+        let axis = self.axis("scatter_add", axis);
+        let op = ScatterAlong { axis, index: index.clone(), extent: self.shape()[axis] };
+        self.plus("scatter_add", self.tape().apply(op, &[source]), source)
     }
 
     /// Entries along `axis` by number: `[.., n, ..]` to `[.., index.len(), ..]`. The gradient is
@@ -263,8 +263,9 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist, or an index is not below its extent.
     #[track_caller]
-    pub fn index_select(&self, axis: usize, index: &Arc<[u32]>) -> Self {
-        self.tape().apply(IndexSelect { axis, index: index.clone() }, &[self])
+    pub fn index_select(&self, axis: isize, index: impl Into<Indices>) -> Self {
+        let (axis, index) = (self.axis("index_select", axis), self.line("index_select", index));
+        self.tape().apply(IndexSelect { axis, index }, &[self])
     }
 
     /// This tensor with entry `i` of `source` along `axis` added to entry `index[i]`, in the order of `i`.
@@ -272,11 +273,26 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist, the shapes do not fit, or an index is not below the extent of the axis.
     #[track_caller]
-    pub fn index_add(&self, axis: usize, index: &Arc<[u32]>, source: &Self) -> Self {
-        let extent = *self.shape().get(axis).unwrap_or(&0);
-        let sum = self.tape().apply(IndexAdd { axis, index: index.clone(), extent }, &[source]);
-        assert_eq!(sum.shape(), self.shape(), "index_add of {:?}: other extents differ", source.shape());
+    pub fn index_add(&self, axis: isize, index: impl Into<Indices>, source: &Self) -> Self {
+        let (axis, index) = (self.axis("index_add", axis), self.line("index_add", index));
+        let op = IndexAdd { axis, index, extent: self.shape()[axis] };
+        self.plus("index_add", self.tape().apply(op, &[source]), source)
+    }
+
+    /// The sum with what was made of `source`.
+    #[track_caller]
+    fn plus(&self, op: &'static str, sum: Self, source: &Self) -> Self {
+        let same = ensure(sum.shape() == self.shape(), || "other extents differ".into());
+        self.tape().fits(op, &[self, source], same);
         self + sum
+    }
+
+    /// Indices along one axis.
+    #[track_caller]
+    pub(crate) fn line(&self, op: &'static str, index: impl Into<Indices>) -> Arc<[u32]> {
+        let index = index.into();
+        self.fits(op, ensure(index.shape().len() == 1, || format!("indices of shape {:?} are no list", index.shape())));
+        index.values().clone()
     }
 
     /// The elements sorted along `axis`, and where each stood: `y = x.gather(axis, &index)`. Equal elements keep their
@@ -289,14 +305,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let x = tape.leaf(Tensor::from_vec(&[3], vec![5.0, 1.0, 3.0]));
     /// let (sorted, index) = x.sort(0, false);
     /// assert_eq!((sorted.value().as_slice(), index.as_slice()), (&[1.0, 3.0, 5.0][..], &[1, 2, 0][..]));
-    /// assert_eq!(sorted.slice(0, 0, 1).sum().grad(&[&x])[0].as_slice(), [0.0, 1.0, 0.0]);
+    /// assert_eq!(sorted.slice_axis(0, ..1).sum().grad(&[&x])[0].as_slice(), [0.0, 1.0, 0.0]);
     /// ```
     ///
     /// # Panics
     /// If the axis does not exist.
     #[track_caller]
-    pub fn sort(&self, axis: usize, descending: bool) -> (Self, Indices) {
-        let index = self.value().argsort(axis, descending);
+    pub fn sort(&self, axis: isize, descending: bool) -> (Self, Indices) {
+        let index = self.argsort(axis, descending);
         (self.gather(axis, &index), index)
     }
 
@@ -305,7 +321,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist.
     #[track_caller]
-    pub fn argsort(&self, axis: usize, descending: bool) -> Indices {
+    pub fn argsort(&self, axis: isize, descending: bool) -> Indices {
+        self.axis("argsort", axis);
         self.value().argsort(axis, descending)
     }
 
@@ -358,7 +375,7 @@ mod tests {
     fn a_source_of_another_width_is_not_broadcast() {
         let tape = Tape::<f32>::new();
         let x = tape.constant(Tensor::zeros(&[2, 3]));
-        x.index_add(0, &[1].into(), &tape.constant(Tensor::ones(&[1, 1])));
+        x.index_add(0, [1], &tape.constant(Tensor::ones(&[1, 1])));
     }
 
     #[test]
@@ -366,7 +383,7 @@ mod tests {
         let tape = Tape::<f32>::new();
         let zero = tape.constant(Tensor::zeros(&[1, 2]));
         let source = tape.constant(Tensor::from_vec(&[1, 3], vec![1e8, 1.0, -1e8]));
-        assert_eq!(zero.index_add(1, &[1, 1, 1].into(), &source).value().as_slice(), [0.0, 1.0]);
+        assert_eq!(zero.index_add(1, [1, 1, 1], &source).value().as_slice(), [0.0, 1.0]);
         assert_eq!(zero.scatter_add(1, &Indices::new(&[1, 3], [1, 0, 1]), &source).value().as_slice(), [1.0, 0.0]);
     }
     /// An axis with entries before and behind it, and fewer or more indices than entries.

@@ -2,9 +2,10 @@
 
 #[cfg(feature = "check")]
 use crate::check::{Cases, Examined, INF};
-use crate::{Formula, Grads, Op, ShapeError, Var, Vjp};
+use crate::error::ensure;
+use crate::{Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
-use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor};
+use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
 /// y = (a - b)^2; da = 2 g (a - b), db = -da.
@@ -198,17 +199,19 @@ impl<T: Scalar> Op<T> for CrossEntropy {
         let axes = x[0].shape().len() - 1;
         let n = x[0].shape()[axes];
         let logs = x[0].log_softmax(-1);
-        let index = self.classes.iter().enumerate().map(|(row, &class)| (row * n) as u32 + class).collect();
-        Some(-logs.reshape(&[logs.value().len()]).gather_rows(&index).reshape(&x[0].shape()[..axes]))
+        let index = self.classes.iter().enumerate().map(|(row, &class)| (row * n) as u32 + class);
+        Some(-logs.reshape(&[logs.value().len()]).gather_rows(index.collect::<Vec<_>>()).reshape(&x[0].shape()[..axes]))
     }
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
     /// A loss of each element; no broadcasting, which in a loss is a mistake more often than not.
     #[track_caller]
-    fn loss(&self, loss: impl Formula<2>, target: &Self) -> Self {
-        assert_eq!(self.shape(), target.shape(), "a loss of a prediction and a target of different shapes");
-        loss.on([self, target])
+    fn loss<F: Formula<2>>(&self, loss: F, target: impl Operand<'t, T>) -> Self {
+        let target = target.on(self.tape());
+        let same = ensure(self.shape() == target.shape(), || "prediction and target have different shapes".into());
+        self.tape().fits(F::NAME, &[self, &target], same);
+        loss.on([self, &target])
     }
 
     /// `(self - target)^2` of each element.
@@ -216,7 +219,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn squared_error(&self, target: &Self) -> Self {
+    pub fn squared_error(&self, target: impl Operand<'t, T>) -> Self {
         self.loss(SquaredError, target)
     }
 
@@ -225,7 +228,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn mse_loss(&self, target: &Self) -> Self {
+    pub fn mse_loss(&self, target: impl Operand<'t, T>) -> Self {
         self.squared_error(target).mean()
     }
 
@@ -234,7 +237,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn absolute_error(&self, target: &Self) -> Self {
+    pub fn absolute_error(&self, target: impl Operand<'t, T>) -> Self {
         self.loss(AbsoluteError, target)
     }
 
@@ -243,7 +246,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn l1_loss(&self, target: &Self) -> Self {
+    pub fn l1_loss(&self, target: impl Operand<'t, T>) -> Self {
         self.absolute_error(target).mean()
     }
 
@@ -253,8 +256,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ or `delta` is not positive.
     #[track_caller]
-    pub fn huber(&self, target: &Self, delta: f64) -> Self {
-        assert!(delta > 0.0, "the width of Huber's loss is {delta}");
+    pub fn huber(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
+        self.fits("huber", ensure(delta > 0.0, || format!("the width is {delta}")));
         self.loss(Huber { delta }, target)
     }
 
@@ -263,7 +266,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// As [`huber`](Self::huber).
     #[track_caller]
-    pub fn huber_loss(&self, target: &Self, delta: f64) -> Self {
+    pub fn huber_loss(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
         self.huber(target, delta).mean()
     }
 
@@ -272,8 +275,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ or `beta` is negative.
     #[track_caller]
-    pub fn smooth_l1(&self, target: &Self, beta: f64) -> Self {
-        assert!(beta >= 0.0, "the width of the smooth L1 loss is {beta}");
+    pub fn smooth_l1(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
+        self.fits("smooth_l1", ensure(beta >= 0.0, || format!("the width is {beta}")));
         self.loss(SmoothL1 { beta }, target)
     }
 
@@ -282,7 +285,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// As [`smooth_l1`](Self::smooth_l1).
     #[track_caller]
-    pub fn smooth_l1_loss(&self, target: &Self, beta: f64) -> Self {
+    pub fn smooth_l1_loss(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
         self.smooth_l1(target, beta).mean()
     }
 
@@ -292,7 +295,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn binary_cross_entropy(&self, target: &Self) -> Self {
+    pub fn binary_cross_entropy(&self, target: impl Operand<'t, T>) -> Self {
         self.loss(BinaryCrossEntropy, target)
     }
 
@@ -301,7 +304,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes differ.
     #[track_caller]
-    pub fn binary_cross_entropy_loss(&self, target: &Self) -> Self {
+    pub fn binary_cross_entropy_loss(&self, target: impl Operand<'t, T>) -> Self {
         self.binary_cross_entropy(target).mean()
     }
 
@@ -320,9 +323,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If there is not one class for each row, or one is not below `n`.
     #[track_caller]
-    pub fn cross_entropy(&self, classes: &[usize]) -> Self {
-        let class = |&class: &usize| u32::try_from(class).unwrap_or(u32::MAX);
-        self.tape().apply(CrossEntropy { classes: classes.iter().map(class).collect() }, &[self])
+    pub fn cross_entropy(&self, classes: impl Into<Indices>) -> Self {
+        self.tape().apply(CrossEntropy { classes: classes.into().values().clone() }, &[self])
     }
 
     /// The mean of [`cross_entropy`](Self::cross_entropy) over the rows, as a scalar; NaN for no rows.
@@ -330,7 +332,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// As [`cross_entropy`](Self::cross_entropy).
     #[track_caller]
-    pub fn cross_entropy_loss(&self, classes: &[usize]) -> Self {
+    pub fn cross_entropy_loss(&self, classes: impl Into<Indices>) -> Self {
         self.cross_entropy(classes).mean()
     }
 }

@@ -1,5 +1,6 @@
 //! Matrix products: of two matrices, of batches of them, and of vectors.
 
+use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::matmul::matmul;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
@@ -68,7 +69,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn matmul(&self, other: &Self) -> Self {
         let (a, b) = (self.shape(), other.shape());
-        assert!(!a.is_empty() && !b.is_empty(), "matmul of shapes {a:?} and {b:?}: a scalar is no matrix");
+        let matrices = ensure(!a.is_empty() && !b.is_empty(), || "a scalar is no matrix".into());
+        self.tape().fits("matmul", &[self, other], matrices);
         let (mut left, mut right) = (Cow::Borrowed(self), Cow::Borrowed(other));
         if a.len() == 1 {
             left = Cow::Owned(self.unsqueeze(0));
@@ -88,11 +90,11 @@ impl<'t, T: Scalar> Var<'t, T> {
                 self.tape().apply(Matmul, &[&left, &right])
             };
         if b.len() == 1 {
-            y = y.squeeze(y.shape().len() - 1);
+            y = y.squeeze(-1);
         }
         if a.len() == 1 {
             // The row's axis stands before the columns, if these are still there.
-            y = y.squeeze(y.shape().len() - if b.len() == 1 { 1 } else { 2 });
+            y = y.squeeze(if b.len() == 1 { -1 } else { -2 });
         }
         y
     }
@@ -103,8 +105,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the operands are not vectors of one length.
     #[track_caller]
     pub fn dot(&self, other: &Self) -> Self {
-        let shapes = (self.shape(), other.shape());
-        assert!(shapes.0.len() == 1 && shapes.0 == shapes.1, "dot of shapes {shapes:?}");
+        let vectors = self.shape().len() == 1 && self.shape() == other.shape();
+        self.tape().fits("dot", &[self, other], ensure(vectors, || "not two vectors of one length".into()));
         (self * other).sum()
     }
 
@@ -114,9 +116,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an operand is not a vector.
     #[track_caller]
     pub fn outer(&self, other: &Self) -> Self {
-        let (&[_], &[_]) = (self.shape(), other.shape()) else {
-            panic!("outer of shapes {:?} and {:?}", self.shape(), other.shape())
-        };
+        let vectors = self.shape().len() == 1 && other.shape().len() == 1;
+        self.tape().fits("outer", &[self, other], ensure(vectors, || "not two vectors".into()));
         self.unsqueeze(1) * other
     }
 }

@@ -1,7 +1,8 @@
 //! Parts of matrices: triangles and diagonals of the last two axes.
 
+use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor, checked_len};
 
 /// y = x where column - row is at least (upper) or at most (lower) a number, else 0; dx is the same of g.
 #[derive(Clone, Copy)]
@@ -72,9 +73,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If there are less than two axes.
     #[track_caller]
     pub fn diagonal(&self, diagonal: isize) -> Self {
-        let ndim = self.shape().len();
-        assert!(ndim >= 2, "diagonal of a tensor of shape {:?}", self.shape());
-        self.view(Layout::contiguous(self.shape()).diagonal(ndim - 2, ndim - 1, diagonal))
+        self.view("diagonal", |layout| layout.last_diagonal(diagonal))
     }
 
     /// Matrices with the rows of this tensor on a diagonal and zeros elsewhere, `[.., k]` to `[.., n, n]` with
@@ -84,9 +83,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If this is a scalar.
     #[track_caller]
     pub fn diag_embed(&self, diagonal: isize) -> Self {
-        let Some((&len, lead)) = self.shape().split_last() else { panic!("the diagonal of a matrix from a scalar") };
-        let n = len + diagonal.unsigned_abs();
+        let (&len, lead) =
+            self.fits("diag_embed", self.shape().split_last().ok_or_else(|| "a scalar has no rows".into()));
+        let n = len.saturating_add(diagonal.unsigned_abs());
         let shape: Shape = lead.iter().copied().chain([n, n]).collect();
+        self.fits("diag_embed", ensure(checked_len(&shape).is_some(), || format!("{shape:?} is too large")));
         let layout = Layout::contiguous(&shape).diagonal(shape.len() - 2, shape.len() - 1, diagonal);
         self.scatter_view(&shape, layout)
     }
@@ -100,7 +101,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         match self.shape().len() {
             1 => self.diag_embed(diagonal),
             2 => self.diagonal(diagonal),
-            _ => panic!("diag of a tensor of shape {:?}: use diagonal or diag_embed", self.shape()),
+            _ => self.fits("diag", Err("use `diagonal` or `diag_embed`".into())),
         }
     }
 }

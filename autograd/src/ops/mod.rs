@@ -35,4 +35,3 @@ pub use gather::RowGrad;
 pub use linear::Activation;
 pub use pooling::Pool2dConfig;
 pub use segment::Segments;
-pub use shape::INFER;

@@ -140,7 +140,7 @@ impl<T: Scalar> Op<T> for Deviation {
 /// `g / y`, and 0 where `y` is 0.
 fn over_unless_zero<'t, T: Scalar>(g: &Var<'t, T>, y: &Var<'t, T>) -> Var<'t, T> {
     let (zero, one) = (y.constant(0.0), y.constant(1.0));
-    let is_zero = y.eq(&zero);
+    let is_zero = y.equals(0.0);
     // Divided by 1 where it is not chosen, so that the next derivative is not NaN.
     zero.where_(&is_zero, &(g / one.where_(&is_zero, y)))
 }
@@ -252,7 +252,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn var_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("var_over", axes);
         let op = Variance { shape: axes.kept(), correction: correction as f64 };
         self.tape().apply(op, &[self]).reshape(&axes.result())
     }
@@ -270,7 +270,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn std_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("std_over", axes);
         let op = Deviation(Variance { shape: axes.kept(), correction: correction as f64 });
         self.tape().apply(op, &[self]).reshape(&axes.result())
     }
@@ -298,7 +298,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn norm_over(&self, axes: impl Into<Axes>) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("norm_over", axes);
         self.tape().apply(Norm { shape: axes.kept() }, &[self]).reshape(&axes.result())
     }
 

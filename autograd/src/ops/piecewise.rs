@@ -2,7 +2,8 @@
 
 #[cfg(feature = "check")]
 use crate::check::{Cases, Examined, INF, NAN};
-use crate::{Formula, Var};
+use crate::error::ensure;
+use crate::{Formula, Operand, Var};
 use raygrad_tensor::{Real, Scalar};
 
 /// y = |x|; dx = g sign(x), so 0 at the kink.
@@ -189,8 +190,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn maximum(&self, other: &Self) -> Self {
-        Maximum.on([self, other])
+    pub fn maximum(&self, other: impl Operand<'t, T>) -> Self {
+        Maximum.on([self, &other.on(self.tape())])
     }
 
     /// The smaller of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
@@ -198,8 +199,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn minimum(&self, other: &Self) -> Self {
-        Minimum.on([self, other])
+    pub fn minimum(&self, other: impl Operand<'t, T>) -> Self {
+        Minimum.on([self, &other.on(self.tape())])
     }
 
     /// The elements limited to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is
@@ -209,7 +210,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If `low` is not at most `high`.
     #[track_caller]
     pub fn clamp(&self, low: f64, high: f64) -> Self {
-        assert!(low <= high, "clamp between {low} and {high}");
+        self.fits("clamp", ensure(low <= high, || format!("between {low} and {high} is nothing")));
         Clamp { low, high }.on([self])
     }
 

@@ -187,7 +187,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn prod_over(&self, axes: impl Into<Axes>) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("prod_over", axes);
         self.tape().apply(Product, &[&self.rows_over(&axes)]).reshape(&axes.result())
     }
 }

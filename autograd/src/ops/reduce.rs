@@ -95,7 +95,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn sum_over(&self, axes: impl Into<Axes>) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("sum_over", axes);
         self.sum_to(&axes.kept()).reshape(&axes.result())
     }
 
@@ -105,7 +105,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn mean_over(&self, axes: impl Into<Axes>) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("mean_over", axes);
         (self.sum_to(&axes.kept()) / axes.count() as f64).reshape(&axes.result())
     }
 
@@ -115,21 +115,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         let order = axes.reduced_last();
         let sorted = order.is_sorted();
         let rows = axes.kept().iter().product();
-        if sorted { self.clone() } else { self.permute(&order) }.reshape(&[rows, axes.count()])
-    }
-
-    /// The sum over `axes`, which stay as axes of extent 1.
-    ///
-    /// # Panics
-    /// If an axis does not exist.
-    #[track_caller]
-    pub fn sum_axes(&self, axes: &[usize]) -> Self {
-        let mut shape = Shape::from_slice(self.shape());
-        for &axis in axes {
-            assert!(axis < shape.len(), "sum over axis {axis} of a tensor of shape {shape:?}");
-            shape[axis] = 1;
-        }
-        self.sum_to(&shape)
+        if sorted { self.clone() } else { self.reordered(&order) }.reshape(&[rows, axes.count()])
     }
 
     /// The sum over the axes along which `shape` would have to be stretched to become the shape of this tensor.

@@ -1,7 +1,7 @@
 //! Cumulative sums and products, and the recurrence that their derivatives lead to.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, axis_of};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// The order in which a scan walks an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,17 +58,17 @@ impl Walk {
     /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the
     /// end.
     pub(super) fn neighbour<'t, T: Scalar>(self, x: &Var<'t, T>, next: bool, fill: f64) -> Var<'t, T> {
-        let n = x.shape()[self.axis];
-        if n == 0 {
+        let axis = self.axis as isize;
+        if x.shape()[self.axis] == 0 {
             return x.clone();
         }
         let mut shape = Shape::from_slice(x.shape());
         shape[self.axis] = 1;
         let end = x.tape().constant(x.tape().pool().full(&shape, T::from_f64(fill)));
         if self.reverse == next {
-            Var::concat(&[&end, &x.slice(self.axis, 0, n - 1)], self.axis)
+            Var::concat(&[&end, &x.slice_axis(axis, ..-1)], axis)
         } else {
-            Var::concat(&[&x.slice(self.axis, 1, n - 1), &end], self.axis)
+            Var::concat(&[&x.slice_axis(axis, 1..), &end], axis)
         }
     }
 }
@@ -191,11 +191,11 @@ impl<T: Scalar> Op<T> for Recurrence {
 impl<'t, T: Scalar> Var<'t, T> {
     /// A scan along an axis that may be counted from the last one; a scalar counts as one entry.
     #[track_caller]
-    fn walk(&self, axis: isize, reverse: bool, scan: impl Fn(Walk, &Self) -> Self) -> Self {
+    fn walk(&self, op: &'static str, axis: isize, reverse: bool, scan: impl Fn(Walk, &Self) -> Self) -> Self {
         if self.shape().is_empty() {
-            return scan(Walk { axis: axis_of(axis, &[1]), reverse }, &self.reshape(&[1])).reshape(&[]);
+            return self.reshape(&[1]).walk(op, axis, reverse, scan).reshape(&[]);
         }
-        scan(Walk { axis: axis_of(axis, self.shape()), reverse }, self)
+        scan(Walk { axis: self.axis(op, axis), reverse }, self)
     }
 
     /// The sums of the entries along `axis` up to each one and with it, carried in f64.
@@ -204,7 +204,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn cumsum(&self, axis: isize) -> Self {
-        self.walk(axis, false, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
+        self.walk("cumsum", axis, false, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
     /// The sums of the entries along `axis` from each one (with it) to the last, carried in f64.
@@ -213,7 +213,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn reverse_cumsum(&self, axis: isize) -> Self {
-        self.walk(axis, true, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
+        self.walk("reverse_cumsum", axis, true, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
     /// The products of the entries along `axis` up to each one and with it, carried in f64. The gradient is right
@@ -223,7 +223,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn cumprod(&self, axis: isize) -> Self {
-        self.walk(axis, false, |walk, x| x.tape().apply(Cumprod(walk), &[x]))
+        self.walk("cumprod", axis, false, |walk, x| x.tape().apply(Cumprod(walk), &[x]))
     }
 
     /// `y[i] = self[i] y[i - 1] + summand[i]` along `axis`, with 0 before the first entry: a first-order linear
@@ -233,7 +233,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ or the axis does not exist.
     #[track_caller]
     pub fn recurrence(&self, summand: &Self, axis: isize) -> Self {
-        let walk = Walk { axis: axis_of(axis, self.shape()), reverse: false };
+        let walk = Walk { axis: self.axis("recurrence", axis), reverse: false };
         self.tape().apply(Recurrence(walk), &[self, summand])
     }
 }

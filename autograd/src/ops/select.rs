@@ -1,93 +1,8 @@
 //! Choices: comparisons, selection by a mask, and interpolation.
 
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, map};
-
-/// y = 1 where the comparison holds, else 0. No gradient.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Compare {
-    /// a > b.
-    Greater,
-    /// a >= b.
-    GreaterEqual,
-    /// a < b.
-    Less,
-    /// a <= b.
-    LessEqual,
-    /// a = b.
-    Equal,
-    /// a != b.
-    NotEqual,
-}
-
-fn compared<T: Scalar>(x: &[&Tensor<T>], pool: &Pool<T>, holds: impl Fn(T, T) -> bool + Sync) -> Tensor<T> {
-    map(
-        [x[0], x[1]],
-        pool,
-        #[inline(always)]
-        |[a, b]| if holds(a, b) { T::ONE } else { T::ZERO },
-    )
-}
-
-impl<T: Scalar> Op<T> for Compare {
-    fn name(&self) -> &'static str {
-        "compare"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        // A loop for each: inside one, the choice would be made for every element.
-        match self {
-            Compare::Greater => compared(
-                x,
-                pool,
-                #[inline(always)]
-                |a, b| a > b,
-            ),
-            Compare::GreaterEqual => compared(
-                x,
-                pool,
-                #[inline(always)]
-                |a, b| a >= b,
-            ),
-            Compare::Less => compared(
-                x,
-                pool,
-                #[inline(always)]
-                |a, b| a < b,
-            ),
-            Compare::LessEqual => compared(
-                x,
-                pool,
-                #[inline(always)]
-                |a, b| a <= b,
-            ),
-            Compare::Equal => compared(
-                x,
-                pool,
-                #[inline(always)]
-                |a, b| a == b,
-            ),
-            Compare::NotEqual => compared(
-                x,
-                pool,
-                #[inline(always)]
-                |a, b| a != b,
-            ),
-        }
-    }
-
-    fn reads(&self) -> Reads {
-        Reads::NOTHING
-    }
-
-    fn vjp<'t>(&self, _cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        Grads::new([None, None])
-    }
-}
+use crate::error::ensure;
+use crate::{Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
+use raygrad_tensor::{Mask, Pool, Scalar, Shape, Tensor, broadcast_shape, map};
 
 /// y = yes where the mask is not 0, else no. The mask has no gradient.
 #[derive(Clone, Copy)]
@@ -118,8 +33,8 @@ impl<T: Scalar> Op<T> for Where {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         // Chosen and not multiplied: an infinite gradient on one side leaves no NaN on the other.
         let (mask, g, zero) = (cx.x(0), cx.g(), cx.g().constant(0.0));
-        let yes = cx.needs(1).then(|| g.where_(&mask, &zero).sum_to(cx.shape(1)));
-        let no = cx.needs(2).then(|| zero.where_(&mask, g).sum_to(cx.shape(2)));
+        let yes = cx.needs(1).then(|| cx.tape().apply(Where, &[&mask, g, &zero]).sum_to(cx.shape(1)));
+        let no = cx.needs(2).then(|| cx.tape().apply(Where, &[&mask, &zero, g]).sum_to(cx.shape(2)));
         Grads::new([None, yes, no])
     }
 }
@@ -157,81 +72,76 @@ impl<T: Scalar> Op<T> for Lerp {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// Comparisons give constants: they are not on the graph.
+    /// A comparison of values that broadcast together.
     #[track_caller]
-    fn compare(&self, comparison: Compare, other: &Self) -> Self {
-        self.tape().apply(comparison, &[&self.detach(), &other.detach()])
+    fn compare(&self, op: &'static str, other: impl Operand<'t, T>, holds: fn(&Tensor<T>, &Tensor<T>) -> Mask) -> Mask {
+        let other = other.on(self.tape());
+        let fits = broadcast_shape(&[self.shape(), other.shape()]).is_some();
+        self.tape().fits(op, &[self, &other], ensure(fits, || "the shapes do not broadcast".into()));
+        holds(self.value(), other.value())
     }
 
-    /// 1 where `self > other`, else 0, as a constant; broadcasts. A NaN compares as in Rust: it equals nothing.
+    /// Where `self > other`; broadcasts. A NaN compares as in Rust: it equals nothing. There is nothing to differentiate:
+    /// the result is a [`Mask`], for [`where_`](Self::where_), [`masked`](Self::masked), and as numbers by [`Mask::cast`].
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[3], vec![-2.0, 0.0, 3.0]));
-    /// assert_eq!(x.gt(&x.constant(-1.0)).value().as_slice(), [0.0, 1.0, 1.0]);
+    /// let x = tape.leaf(Tensor::from([-2.0, 0.0, 3.0]));
+    /// assert_eq!((x.gt(-1.0) & x.lt(1.0)).as_slice(), [false, true, false]);
     /// ```
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn gt(&self, other: &Self) -> Self {
-        self.compare(Compare::Greater, other)
+    pub fn gt(&self, other: impl Operand<'t, T>) -> Mask {
+        self.compare("gt", other, |a, b| a.gt(b))
     }
 
-    /// 1 where `self >= other`, else 0; see [`gt`](Self::gt).
+    /// Where `self >= other`; see [`gt`](Self::gt).
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn ge(&self, other: &Self) -> Self {
-        self.compare(Compare::GreaterEqual, other)
+    pub fn ge(&self, other: impl Operand<'t, T>) -> Mask {
+        self.compare("ge", other, |a, b| a.ge(b))
     }
 
-    /// 1 where `self < other`, else 0; see [`gt`](Self::gt).
+    /// Where `self < other`; see [`gt`](Self::gt).
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn lt(&self, other: &Self) -> Self {
-        self.compare(Compare::Less, other)
+    pub fn lt(&self, other: impl Operand<'t, T>) -> Mask {
+        self.compare("lt", other, |a, b| a.lt(b))
     }
 
-    /// 1 where `self <= other`, else 0; see [`gt`](Self::gt).
+    /// Where `self <= other`; see [`gt`](Self::gt).
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn le(&self, other: &Self) -> Self {
-        self.compare(Compare::LessEqual, other)
+    pub fn le(&self, other: impl Operand<'t, T>) -> Mask {
+        self.compare("le", other, |a, b| a.le(b))
     }
 
-    /// 1 where `self == other`, else 0; see [`gt`](Self::gt).
+    /// Where both are equal; see [`gt`](Self::gt).
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn eq(&self, other: &Self) -> Self {
-        self.compare(Compare::Equal, other)
+    pub fn equals(&self, other: impl Operand<'t, T>) -> Mask {
+        self.compare("equals", other, |a, b| a.equals(b))
     }
 
-    /// 1 where `self != other`, else 0; see [`gt`](Self::gt).
-    ///
-    /// # Panics
-    /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn ne(&self, other: &Self) -> Self {
-        self.compare(Compare::NotEqual, other)
-    }
-
-    /// `self` where `mask` is not 0, else `other`: PyTorch's `where`, with the underscore because Rust keeps that word
-    /// to itself. All three broadcast together. The gradient goes to whichever was chosen, and none to the mask.
+    /// `self` where `mask` holds, else `other`: PyTorch's `where`, with the underscore because Rust keeps that word to
+    /// itself. All three broadcast together. The gradient goes to whichever was chosen.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[3], vec![-2.0, 0.0, 3.0]));
-    /// let y = x.square().where_(&x.lt(&x.constant(1.0)), &x);
+    /// let x = tape.leaf(Tensor::from([-2.0, 0.0, 3.0]));
+    /// let y = x.square().where_(&x.lt(1.0), &x);
     /// assert_eq!(y.value().as_slice(), [4.0, 0.0, 3.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [-4.0, 0.0, 1.0]);
     /// ```
@@ -239,8 +149,20 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn where_(&self, mask: &Self, other: &Self) -> Self {
-        self.tape().apply(Where, &[mask, self, other])
+    pub fn where_(&self, mask: &Mask, other: impl Operand<'t, T>) -> Self {
+        let mask = self.tape().constant(mask.cast());
+        self.tape().apply(Where, &[&mask, self, &other.on(self.tape())])
+    }
+
+    /// The elements where `mask` holds, as a vector in row-major order: NumPy's `x[mask]`, PyTorch's `masked_select`.
+    ///
+    /// # Panics
+    /// If the mask has another shape.
+    #[track_caller]
+    pub fn masked(&self, mask: &Mask) -> Self {
+        let same = ensure(mask.shape() == self.shape(), || format!("the mask has the shape {:?}", mask.shape()));
+        self.fits("masked", same);
+        self.reshape(&[self.value().len()]).gather_rows(mask.nonzero())
     }
 
     /// `self + weight * (end - self)`: linear interpolation, exact at weights 0 and 1; broadcasts.
@@ -248,8 +170,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn lerp(&self, end: &Self, weight: &Self) -> Self {
-        self.tape().apply(Lerp, &[self, end, weight])
+    pub fn lerp(&self, end: impl Operand<'t, T>, weight: impl Operand<'t, T>) -> Self {
+        self.tape().apply(Lerp, &[self, &end.on(self.tape()), &weight.on(self.tape())])
     }
 }
 
@@ -258,26 +180,35 @@ mod tests {
     use crate::{Tape, Tensor};
 
     #[test]
-    fn comparisons_are_constants_and_nan_equals_nothing() {
+    fn comparisons_broadcast_and_nan_equals_nothing() {
         let tape = Tape::<f64>::new();
-        let a = tape.leaf(Tensor::from_vec(&[4], vec![1.0, 2.0, f64::INFINITY, f64::NAN]));
-        let b = tape.leaf(Tensor::from_vec(&[4], vec![2.0, 2.0, f64::INFINITY, f64::NAN]));
-        let all = [a.gt(&b), a.ge(&b), a.lt(&b), a.le(&b), a.eq(&b), a.ne(&b)];
-        let expected = [[0, 0, 0, 0], [0, 1, 1, 0], [1, 0, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]];
+        let a = tape.leaf(Tensor::from([1.0, 2.0, f64::INFINITY, f64::NAN]));
+        let b = Tensor::from([2.0, 2.0, f64::INFINITY, f64::NAN]);
+        let all = [a.gt(&b), a.ge(&b), a.lt(&b), a.le(&b), a.equals(&b)];
+        let expected = [[0, 0, 0, 0], [0, 1, 1, 0], [1, 0, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0]];
         for (got, expected) in all.iter().zip(expected) {
-            assert!(!got.is_on_graph());
-            assert_eq!(got.value().as_slice(), expected.map(f64::from));
+            assert_eq!(got.as_slice(), expected.map(|x| x == 1));
         }
-        assert_eq!(a.gt(&tape.constant(Tensor::zeros(&[0, 1]))).shape(), [0, 4]);
+        assert_eq!(a.gt(Tensor::zeros(&[0, 1])).shape(), [0, 4]);
+    }
+
+    #[test]
+    fn what_a_mask_picks_gets_the_gradient() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from([[1.0, -2.0], [3.0, 4.0]]));
+        let y = x.square().masked(&x.gt(0.0));
+        assert_eq!(y.value(), &Tensor::from([1.0, 9.0, 16.0]));
+        assert_eq!(y.sum().grad(&[&x])[0], Tensor::from([[2.0, 0.0], [6.0, 8.0]]));
+        assert!(tape.try_run(|| x.masked(&x.slice_axis(0, ..1).gt(0.0))).is_err());
     }
 
     #[test]
     fn an_infinite_gradient_on_one_side_of_a_choice_leaves_the_other_alone() {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from_vec(&[2], vec![0.0, 4.0]));
-        let y = x.sqrt().where_(&x.gt(&x.constant(1.0)), &x).sum();
+        let y = x.sqrt().where_(&x.gt(1.0), &x).sum();
         // The root's own slope at 0 is infinite, and 0 times it is NaN: the user must keep the root away from 0.
-        let safe = x.maximum(&x.constant(1.0)).sqrt().where_(&x.gt(&x.constant(1.0)), &x).sum();
+        let safe = x.maximum(1.0).sqrt().where_(&x.gt(1.0), &x).sum();
         assert!(y.grad(&[&x])[0].as_slice()[0].is_nan());
         assert_eq!(safe.grad(&[&x])[0].as_slice(), [1.0, 0.25]);
     }
@@ -286,7 +217,7 @@ mod tests {
     fn interpolation_meets_its_ends_exactly() {
         let tape = Tape::<f32>::new();
         let (a, b) = (tape.leaf(Tensor::scalar(1e8)), tape.leaf(Tensor::scalar(0.1)));
-        assert_eq!(a.lerp(&b, &a.constant(1.0)).item(), 0.1);
-        assert_eq!(a.lerp(&b, &a.constant(0.0)).item(), 1e8);
+        assert_eq!(a.lerp(&b, 1.0).item(), 0.1);
+        assert_eq!(a.lerp(&b, 0.0).item(), 1e8);
     }
 }

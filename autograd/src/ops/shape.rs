@@ -1,11 +1,9 @@
 //! Operations that move elements: reshape, permute, slice, flip, pad, concat.
 
+use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, SparseGrad, Var, Vjp};
-use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor, checked_len, concat};
+use raygrad_tensor::{Layout, Pool, Scalar, Shape, Slice, SliceInfoElem, Tensor, checked_len, concat, inferred};
 use std::sync::Arc;
-
-/// Stands for the extent that follows from the others, in [`Var::reshape`].
-pub const INFER: usize = usize::MAX;
 
 /// y = x under another shape.
 #[derive(Clone)]
@@ -212,14 +210,14 @@ impl<T: Scalar> Op<T> for Concat {
         Grads::new((0..cx.len()).map(|i| {
             let len = cx.shape(i)[self.axis];
             start += len;
-            cx.needs(i).then(|| cx.g().slice(self.axis, start - len, len))
+            cx.needs(i).then(|| cx.g().slice_axis(self.axis as isize, start - len..start))
         }))
     }
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The same elements under another shape; nothing is copied. One extent may be [`INFER`]: it follows from the
-    /// others.
+    /// The same elements under another shape; nothing is copied. One extent may be [`INFER`](crate::INFER): it follows from
+    /// the others.
     ///
     /// ```
     /// use raygrad_autograd::{INFER, Tape, Tensor};
@@ -233,25 +231,24 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// follow from the others because they do not divide the number of elements or one of them is 0.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
-        if let Some(axis) = shape.iter().position(|&extent| extent == INFER) {
-            let mut known = Shape::from_slice(shape);
-            known[axis] = 1;
-            assert!(!known.contains(&INFER), "reshape: only one extent can be inferred");
-            let (len, product) = (self.value().len(), known.iter().product::<usize>());
-            let divides = product > 0 && len.is_multiple_of(product);
-            assert!(divides, "reshape of {:?}: no extent follows from the others, {known:?}", self.shape());
-            known[axis] = len / product;
-            return self.reshape(&known);
-        }
         if self.shape() == shape {
             return self.clone();
         }
-        self.tape().apply(Reshape { shape: shape.into() }, &[self])
+        let shape = self.fits("reshape", inferred(shape, self.value().len()));
+        if self.shape() == shape.as_slice() {
+            return self.clone();
+        }
+        self.tape().apply(Reshape { shape }, &[self])
     }
 
-    /// The elements that a layout of this tensor's shape names.
+    /// The elements that a layout of this tensor's shape names; what is wrong with it is an error of operation `op`.
     #[track_caller]
-    pub(crate) fn view(&self, layout: Layout) -> Self {
+    pub(crate) fn view(&self, op: &'static str, layout: impl FnOnce(&Layout) -> Result<Layout, ShapeError>) -> Self {
+        let whole = Layout::contiguous(self.shape());
+        let layout = self.fits(op, layout(&whole));
+        if layout == whole {
+            return self.clone();
+        }
         self.tape().apply(View { from: self.shape().into(), layout }, &[self])
     }
 
@@ -261,14 +258,24 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Scatter(View { from: shape.into(), layout }), &[self])
     }
 
+    /// Axis `i` of the result is axis `order[i]` of this tensor, for an order that is known to fit.
+    #[track_caller]
+    pub(crate) fn reordered(&self, order: &[usize]) -> Self {
+        self.view("permute", |layout| Ok(layout.permuted(order)))
+    }
+
     /// This tensor with `padding[i]` entries of `value` before and behind along each axis `i`.
     ///
     /// # Panics
-    /// If there is not one pair for each axis.
+    /// If there is not one pair for each axis, or the result is too large.
     #[track_caller]
     pub fn pad(&self, padding: &[[usize; 2]], value: f64) -> Self {
-        assert_eq!(padding.len(), self.shape().len(), "pad by {padding:?} a tensor of shape {:?}", self.shape());
-        let from: Shape = self.shape().iter().zip(padding).map(|(&extent, [a, b])| a + extent + b).collect();
+        let one_each = ensure(padding.len() == self.shape().len(), || format!("{padding:?} names other axes"));
+        self.fits("pad", one_each);
+        let wide = |(&extent, [a, b]): (&usize, &[usize; 2])| a.checked_add(extent)?.checked_add(*b);
+        let from: Option<Shape> = self.shape().iter().zip(padding).map(wide).collect();
+        let from = from.filter(|from| checked_len(from).is_some()).ok_or_else(|| format!("{padding:?} is too much"));
+        let from = self.fits("pad", from);
         let mut layout = Layout::contiguous(&from);
         for (axis, (&extent, pad)) in self.shape().iter().zip(padding).enumerate() {
             layout = layout.sliced(axis, pad[0], extent, 1);
@@ -276,37 +283,69 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Pad { view: View { from, layout }, value }, &[self])
     }
 
-    /// Axis `i` of the result is axis `axes[i]` of this tensor.
+    /// Axis `i` of the result is axis `axes[i]` of this tensor; nothing is copied.
     ///
     /// # Panics
     /// If `axes` does not name every axis once.
     #[track_caller]
-    pub fn permute(&self, axes: &[usize]) -> Self {
-        self.view(Layout::contiguous(self.shape()).permuted(axes))
+    pub fn permute(&self, axes: &[isize]) -> Self {
+        self.view("permute", |layout| layout.permuted_by(axes))
     }
 
-    /// `len` entries along `axis`, from `start` on.
+    /// Slices, single entries and new axes, as ndarray's `s![]` names them; nothing is copied. Negative places count from
+    /// the end, a negative step walks backwards from the last entry of its range, and axes that are not named stay whole.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Tape, Tensor, s};
+    /// let tape = Tape::<f64>::new();
+    /// let x = tape.leaf(Tensor::from_fn(&[2, 3], |i| i as f64));
+    /// let y = x.slice(s![-1, ..;2]);
+    /// assert_eq!(y.value().as_slice(), [3.0, 5.0]);
+    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [0.0, 0.0, 0.0, 1.0, 0.0, 1.0]);
+    /// ```
     ///
     /// # Panics
-    /// If the axis does not exist or the entries leave it.
+    /// If more axes are named than there are, a place lies outside its axis, or a step is 0.
     #[track_caller]
-    pub fn slice(&self, axis: usize, start: usize, len: usize) -> Self {
-        assert!(axis < self.shape().len(), "slice along axis {axis} of a tensor of shape {:?}", self.shape());
-        if start == 0 && len == self.shape()[axis] {
-            return self.clone();
-        }
-        self.view(Layout::contiguous(self.shape()).sliced(axis, start, len, 1))
+    pub fn slice(&self, places: impl AsRef<[SliceInfoElem]>) -> Self {
+        self.view("slice", |layout| layout.sliced_by(places.as_ref()))
     }
 
-    /// The entries along `axis` in reverse order.
+    /// The entries of a range along one axis, whose number may be known only when the program runs: `1..3`, `..-1`, or
+    /// with a step `Slice::from(..).step_by(-2)`; nothing is copied.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Slice, Tape, Tensor};
+    /// let tape = Tape::<f32>::new();
+    /// let x = tape.leaf(Tensor::from_fn(&[6], |i| i as f32));
+    /// assert_eq!(x.slice_axis(-1, 1..3).value().as_slice(), [1.0, 2.0]);
+    /// assert_eq!(x.slice_axis(0, Slice::from(..-1).step_by(-3)).value().as_slice(), [4.0, 1.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist, the range leaves it, or the step is 0.
+    #[track_caller]
+    pub fn slice_axis(&self, axis: isize, range: impl Into<Slice>) -> Self {
+        self.view("slice_axis", |layout| layout.sliced_axis(axis, range))
+    }
+
+    /// The entries along `axis` in reverse order; nothing is copied.
     ///
     /// # Panics
     /// If the axis does not exist.
     #[track_caller]
-    pub fn flip(&self, axis: usize) -> Self {
-        assert!(axis < self.shape().len(), "flip along axis {axis} of a tensor of shape {:?}", self.shape());
-        let len = self.shape()[axis];
-        self.view(Layout::contiguous(self.shape()).sliced(axis, len.saturating_sub(1), len, -1))
+    pub fn flip(&self, axis: isize) -> Self {
+        self.view("flip", |layout| layout.flipped(axis))
+    }
+
+    /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
+    /// entries in one; nothing is copied.
+    ///
+    /// # Panics
+    /// If the axis does not exist or is shorter than a window, or `size` or `step` is 0.
+    #[track_caller]
+    pub fn windows(&self, axis: isize, size: usize, step: usize) -> Self {
+        self.view("windows", |layout| layout.windows(axis, size, step))
     }
 
     /// Tensors one after another along `axis`.
@@ -314,8 +353,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If there is none, the axis does not exist, or other extents differ.
     #[track_caller]
-    pub fn concat(parts: &[&Self], axis: usize) -> Self {
+    pub fn concat(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("concat of no tensors") };
-        first.tape().apply(Concat { axis }, parts)
+        first.tape().apply(Concat { axis: first.axis("concat", axis) }, parts)
     }
 }

@@ -1,7 +1,6 @@
 //! Softmax, its logarithm, and the logarithm of a sum of exponentials.
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::axis_of;
 use raygrad_tensor::rows;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
@@ -127,7 +126,7 @@ impl<T: Scalar> Op<T> for LogSumExp {
         let mut column = Shape::from_slice(y.shape());
         column.push(1);
         // x - y would be NaN where both are -inf; there e^x is the 0 that is wanted.
-        let nothing = y.eq(&y.constant(f64::NEG_INFINITY));
+        let nothing = y.equals(f64::NEG_INFINITY);
         let y = y.constant(0.0).where_(&nothing, &y).reshape(&column);
         Grads::one((x - y).exp() * cx.g().reshape(&column))
     }
@@ -143,16 +142,15 @@ impl<'t, T: Scalar> Var<'t, T> {
     fn along(&self, axis: isize, op: impl Op<T>) -> Self {
         let ndim = self.shape().len();
         if ndim == 0 {
-            axis_of(axis, &[1]);
-            return self.tape().apply(op, &[&self.reshape(&[1])]).reshape(&[]);
+            return self.reshape(&[1]).along(axis, op).reshape(&[]);
         }
-        let axis = axis_of(axis, self.shape());
+        let axis = self.axis(op.name(), axis);
         if axis == ndim - 1 {
             return self.tape().apply(op, &[self]);
         }
         let mut order: Shape = (0..ndim).collect();
         order.swap(axis, ndim - 1);
-        self.tape().apply(op, &[&self.permute(&order)]).permute(&order)
+        self.tape().apply(op, &[&self.reordered(&order)]).reordered(&order)
     }
 
     /// Softmax along `axis`: `e^self` divided by its sum, without overflow. Entries of -inf get probability 0; a row of
@@ -196,7 +194,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If an axis does not exist or is named twice.
     #[track_caller]
     pub fn logsumexp_over(&self, axes: impl Into<Axes>) -> Self {
-        let axes = axes.into().resolve(self.shape());
+        let axes = self.axes("logsumexp_over", axes);
         self.tape().apply(LogSumExp, &[&self.rows_over(&axes)]).reshape(&axes.result())
     }
 }

@@ -1,6 +1,6 @@
 //! Vectors along the last axis: cross product and direction.
 
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
 
 /// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
@@ -155,7 +155,7 @@ impl<T: Scalar> Op<T> for Normalize {
         let one = |scale| if zero(scale) { T::ONE } else { T::ZERO };
         let one = tape.constant(Tensor::from_vec(&column, scales.iter().map(one).collect()));
         let unit = &x[0] / scale;
-        let square = unit.square().sum_axes(&[shape.len() - 1]);
+        let square = unit.square().sum_over(Axes::from(-1).keepdims());
         Some(unit / (square + one).sqrt())
     }
 }
@@ -206,7 +206,7 @@ mod tests {
                 assert!((f64::from(y) - f64::from(x) / length).abs() <= 1.2e-7, "{scale:e}: {y}");
             }
             // Across the row the gradient is 1 / length; along it, 0.
-            let across = y.slice(0, 2, 1).sum().grad(&[&x]).remove(0);
+            let across = y.slice_axis(0, 2..3).sum().grad(&[&x]).remove(0);
             let expected = (1.0 / length).min(f32::MAX.into());
             assert!((f64::from(across.as_slice()[2]) / expected - 1.0).abs() < 1e-6, "{scale:e}: {across:?}");
             let along = (&y * &y).sum().grad(&[&x]).remove(0);
@@ -219,7 +219,7 @@ mod tests {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 0.0, 3.0, 4.0]));
         let y = x.normalize();
-        let first = y.slice(1, 0, 1).sum().grad_graph(&[&x]).remove(0);
+        let first = y.slice_axis(1, ..1).sum().grad_graph(&[&x]).remove(0);
         assert_eq!(first.value().as_slice()[..2], [0.0, 0.0]);
         assert!((first.value().as_slice()[2] - 0.128).abs() < 1e-15, "{first:?}");
         let second = first.square().sum().grad(&[&x]).remove(0);

@@ -45,7 +45,7 @@ impl<T: Scalar> Field<T> for AnalyticField {
             self.medium.shapes(position, out);
         }
         let shapes = Tensor::from_vec(&[samples, count], shapes.into_iter().map(T::from_f64).collect());
-        let value = (amplitudes * encoding.tape().constant(shapes)).sum_axes(&[1]).reshape(&[samples]);
+        let value = (amplitudes * shapes).sum_over(1);
         Density { value, log: false, features: encoding.clone() }
     }
 

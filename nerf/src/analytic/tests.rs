@@ -93,7 +93,7 @@ fn as_fields_they_are_rendered_and_differentiated_like_any_other() {
         let tape = Tape::new();
         let bound = params.bind(&tape);
         let (rendered, _) = composite_samples(&field, &bound, &samples, true, &tape);
-        let pick = |channel| rendered.slice(1, channel, 1).sum();
+        let pick = |channel| rendered.slice_axis(1, channel..channel + 1).sum();
         let (color, left) = (pick(1) + pick(4) * scene.background, pick(4));
         let near = |what: &str, got: f64, expected: f64| {
             assert!(

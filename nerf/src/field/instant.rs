@@ -100,7 +100,7 @@ impl<T: Scalar> Field<T> for Instant {
     fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
         let hidden = self.density[0].forward(params, encoding);
         let features = self.density[1].forward(params, &hidden);
-        let raw = features.slice(1, 0, 1).reshape(&[encoding.shape()[0]]);
+        let raw = features.slice_axis(1, ..1).reshape(&[encoding.shape()[0]]);
         Density { value: raw - LOG_DENSITY_SHIFT, log: true, features }
     }
 

@@ -86,7 +86,7 @@ impl<T: Scalar> Field<T> for Voxel {
     }
 
     fn density<'t>(&self, _params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
-        let raw = encoding.slice(1, 0, 1).reshape(&[encoding.shape()[0]]);
+        let raw = encoding.slice_axis(1, ..1).reshape(&[encoding.shape()[0]]);
         Density { value: raw * LOG_DENSITY_GAIN - LOG_DENSITY_SHIFT, log: true, features: encoding.clone() }
     }
 
@@ -99,9 +99,8 @@ impl<T: Scalar> Field<T> for Voxel {
     ) -> Var<'t, T> {
         let (samples, width) = (features.shape()[0], self.direction.width());
         let seen = directions.tape().apply(self.direction, &[directions]).segment_expand(segments);
-        let coefficients = features.slice(1, 1, 3 * width).reshape(&[samples, 3, width]);
-        let sum = (coefficients * seen.reshape(&[samples, 1, width])).sum_axes(&[2]);
-        sum.reshape(&[samples, 3]).sigmoid()
+        let coefficients = features.slice_axis(1, 1..1 + 3 * width).reshape(&[samples, 3, width]);
+        (coefficients * seen.reshape(&[samples, 1, width])).sum_over(-1).sigmoid()
     }
 
     fn table(&self) -> Option<(ParamId, &HashGrid)> {

@@ -212,15 +212,16 @@ fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var
     let cell = |x: T| ((clamp(x) * T::from_f64(scale)).to_f64() as u32).min(level.resolution - 1);
     let place: [Var<'t, T>; 3] = std::array::from_fn(|axis| {
         let inside = column(&|x| if x < T::ZERO || x > T::ONE { T::ZERO } else { T::ONE }, axis);
-        let clamped = x.slice(1, axis, 1) * inside + column(&|x| if x > T::ONE { T::ONE } else { T::ZERO }, axis);
+        let clamped =
+            x.slice_axis(1, axis..axis + 1) * inside + column(&|x| if x > T::ONE { T::ONE } else { T::ZERO }, axis);
         clamped * scale - column(&|x| T::from_f64(cell(x).into()), axis)
     });
     let corner = |corner: u32| {
         let side = |axis: usize| corner >> axis & 1;
         let row = |x: &[T]| level.row(std::array::from_fn(|axis| cell(x[axis]) + side(axis)));
-        let rows = values.as_slice().chunks_exact(3).map(|x| level.rows.start as u32 + row(x)).collect();
+        let rows = values.as_slice().chunks_exact(3).map(|x| level.rows.start as u32 + row(x));
         let weight = |axis: usize| if side(axis) == 1 { place[axis].clone() } else { 1.0 - &place[axis] };
-        table.gather_rows(&rows) * (weight(0) * (weight(1) * weight(2)))
+        table.gather_rows(rows.collect::<Vec<_>>()) * (weight(0) * (weight(1) * weight(2)))
     };
     (1..8).fold(corner(0), |sum, k| sum + corner(k))
 }

@@ -46,7 +46,7 @@ pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations
         }
     };
     let rendered = plan.render(&field, &bound, true, &tape);
-    let pick = |channel| rendered.slice(1, channel, 1).sum();
+    let pick = |channel| rendered.slice_axis(1, channel..channel + 1).sum();
     let (color, depth) = (pick(1) + pick(4) * scene.background, pick(3));
     let gradient = |value: &Var<'_, T>| value.grad(&bound.vars())[0].as_slice().iter().map(|x| x.to_f64()).collect();
     Integral {

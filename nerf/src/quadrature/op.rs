@@ -169,12 +169,12 @@ impl<T: Scalar> CompositeIntervals<T> {
             return x * 0.0 + 0.5;
         }
         let sum = a + b;
-        let ratio = (b / &sum.maximum(&constant(1e-37))).where_(&sum.gt(&constant(0.0)), &constant(0.5));
-        let (near, far) = (x.minimum(&constant(SERIES_BELOW)), x.maximum(&constant(SERIES_BELOW)));
+        let ratio = (b / sum.maximum(1e-37)).where_(&sum.gt(0.0), 0.5);
+        let (near, far) = (x.minimum(SERIES_BELOW), x.maximum(SERIES_BELOW));
         let square = near.square();
         let series = LEAD_SERIES.iter().rev().fold(constant(0.0), |sum, &c| sum * &square + c) * near;
         let closed = far.expm1().reciprocal() - far.reciprocal() + 0.5;
-        let lead = series.where_(&x.lt(&constant(SERIES_BELOW)), &closed);
+        let lead = series.where_(&x.lt(SERIES_BELOW), &closed);
         (ratio - lead * SQRT_3).clamp(0.0, 1.0)
     }
 }

@@ -213,7 +213,8 @@ fn what_no_light_reaches_is_left_out_within_the_bound() {
         for (a, b) in all.rendered.value().as_slice().iter().zip(lit.rendered.value().as_slice()) {
             assert!((a - b).abs() <= 4.0 * 1e-4, "{rule}: {a} {b}");
         }
-        let gradient = |seen: &Composited<'_, f64>| seen.rendered.slice(1, 0, 1).sum().grad(&bound.vars()).remove(0);
+        let gradient =
+            |seen: &Composited<'_, f64>| seen.rendered.slice_axis(1, ..1).sum().grad(&bound.vars()).remove(0);
         for (a, b) in gradient(&all).as_slice().iter().zip(gradient(&lit).as_slice()) {
             assert!((a - b).abs() <= 1e-3, "{rule}: {a} {b}");
         }

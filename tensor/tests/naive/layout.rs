@@ -38,7 +38,7 @@ fn cases(a: usize, b: usize, c: usize) -> Vec<Case> {
 /// Layouts that stretch a buffer.
 fn stretched(a: usize, b: usize, c: usize) -> Vec<Case> {
     let case = |from: &[usize], position: Position| Case {
-        layout: Layout::broadcast(from, &[a, b, c]),
+        layout: Layout::contiguous(from).stretched(&[a, b, c]),
         source: from.iter().product(),
         position,
     };

@@ -1,8 +1,8 @@
 //! How weights start.
 
 use rand::{Rng, RngExt};
+use raygrad_tensor::random::standard_normal;
 use raygrad_tensor::{Scalar, Tensor};
-use std::f64::consts::TAU;
 
 /// How the weights of a layer start.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,9 +46,9 @@ impl Init {
             Init::Glorot => uniform((6.0 / both).sqrt(), shape, rng),
             Init::He => uniform((6.0 / inputs).sqrt(), shape, rng),
             Init::Uniform(bound) => uniform(bound, shape, rng),
-            Init::GlorotNormal => Tensor::from_fn(shape, |_| T::from_f64((2.0 / both).sqrt() * normal(rng))),
-            Init::HeNormal => Tensor::from_fn(shape, |_| T::from_f64((2.0 / inputs).sqrt() * normal(rng))),
-            Init::Normal(deviation) => Tensor::from_fn(shape, |_| T::from_f64(deviation * normal(rng))),
+            Init::GlorotNormal => Tensor::normal(shape, 0.0, (2.0 / both).sqrt(), rng),
+            Init::HeNormal => Tensor::normal(shape, 0.0, (2.0 / inputs).sqrt(), rng),
+            Init::Normal(deviation) => Tensor::normal(shape, 0.0, deviation, rng),
             Init::Orthogonal(gain) => orthogonal(gain, shape, rng),
             Init::Zeros => Tensor::zeros(shape),
         }
@@ -59,12 +59,6 @@ fn uniform<T: Scalar>(bound: f64, shape: &[usize], rng: &mut (impl Rng + ?Sized)
     Tensor::from_fn(shape, |_| T::from_f64(bound * (2.0 * rng.random::<f64>() - 1.0)))
 }
 
-/// A normal variable of variance 1 (Box and Muller 1958).
-fn normal(rng: &mut (impl Rng + ?Sized)) -> f64 {
-    // 1 - u is in (0, 1], so that the logarithm is finite.
-    (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt() * (TAU * rng.random::<f64>()).cos()
-}
-
 /// The orthogonal factor of a matrix of normal variables, whose triangular factor has a positive diagonal: so every
 /// orthogonal matrix is equally likely (Mezzadri 2007).
 fn orthogonal<T: Scalar>(gain: f64, shape: &[usize], rng: &mut (impl Rng + ?Sized)) -> Tensor<T> {
@@ -73,7 +67,7 @@ fn orthogonal<T: Scalar>(gain: f64, shape: &[usize], rng: &mut (impl Rng + ?Size
     let (count, length) = (rows.min(columns), rows.max(columns));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
     while basis.len() < count {
-        let mut v: Vec<f64> = (0..length).map(|_| normal(rng)).collect();
+        let mut v: Vec<f64> = (0..length).map(|_| standard_normal(rng)).collect();
         // Gram-Schmidt twice is orthogonal to the last digits (Giraud et al. 2005).
         for _ in 0..2 {
             for unit in &basis {

@@ -52,7 +52,7 @@ impl Mlp {
         let mut h = x.clone();
         for (i, layer) in self.layers.iter().enumerate() {
             if self.skips.contains(&i) {
-                h = Var::concat(&[x, &h], h.shape().len() - 1);
+                h = Var::concat(&[x, &h], -1);
             }
             h = layer.forward(params, &h);
         }
