@@ -120,7 +120,7 @@ fn train(
     let mut adam = Adam::new(AdamConfig::default());
     let rows: usize = shards.iter().map(|shard| shard.x.shape()[0]).sum();
     let (mut first, mut last) = (None, 0.0);
-    let seconds = median(60, || {
+    let seconds = median(if rows * params.elements() < 1 << 23 { 3000 } else { 60 }, || {
         let gradient = |shard: &Shard| {
             let tape = Tape::with_pool(shard.pool.clone());
             let bound = params.bind(&tape);

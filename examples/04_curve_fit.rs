@@ -67,7 +67,7 @@ fn main() {
         let tape = Tape::new();
         let bound = params.bind(&tape);
         let curve = oscillation(&bound[id], &tape.constant(t.clone()));
-        let loss = curve.mse_loss(&tape.constant(data.clone()));
+        let loss = curve.mse_loss(tape.constant(data.clone()));
         if step % (STEPS / 5) == 0 {
             println!("step {step:4}: off by {:.4} (root mean square)", loss.item().sqrt());
         }
@@ -79,7 +79,7 @@ fn main() {
     let errors = deviations(
         |x| {
             let tape = x[0].tape();
-            oscillation(&x[0], &tape.constant(t.clone())).squared_error(&tape.constant(data.clone())).sum()
+            oscillation(&x[0], &tape.constant(t.clone())).squared_error(tape.constant(data.clone())).sum()
         },
         &found,
     );

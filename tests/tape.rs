@@ -63,7 +63,7 @@ fn a_variable_used_often_gathers_every_share() {
     // Small integers: the sum 1 + 2 + .. + 100 is exact.
     let mut sum = &x * 1.0;
     for k in 2..=100 {
-        sum = sum + &x * f64::from(k);
+        sum += &x * f64::from(k);
     }
     assert_eq!(sum.sum().grad(&[&x])[0].as_slice(), [5050.0; 2]);
     // Both factors, a broadcast operand, and the same variable asked for twice.

@@ -93,13 +93,13 @@ impl<T: Scalar> Op<T> for Wave {
         }
         match self.fault {
             WrongSign => db = -db,
-            TwiceTheGradient => da = da * 2.0,
-            NanGradient => db = db * f64::NAN,
+            TwiceTheGradient => da *= 2.0,
+            NanGradient => db *= f64::NAN,
             GradientToTheWrongInput => (da, db) = (db.sum_to(cx.shape(0)), da.sum_to(cx.shape(1))),
             ForgottenInput => return Grads::new([Some(da), None]),
-            ConfusedByAliases if aliased => da = da * 2.0,
+            ConfusedByAliases if aliased => da *= 2.0,
             WrongWhereSmall => (da, db) = (da * 1e-9, db * 1.02e-9),
-            AnotherGradientWhenRecorded if cx.recording() => da = da * (1.0 + 1e-8),
+            AnotherGradientWhenRecorded if cx.recording() => da *= 1.0 + 1e-8,
             _ => {}
         }
         Grads::new([Some(da), Some(db)])

@@ -130,9 +130,9 @@ fn losses() -> Vec<Case> {
         "smooth_l1.smooth_l1_loss": |x| x[0].smooth_l1_loss(&x[1], 0.25);
         "binary_cross_entropy": |x| x[0].binary_cross_entropy(&x[1]);
         "binary_cross_entropy.loss": |x| x[0].binary_cross_entropy_loss(&x[1]);
-        "cross_entropy": |x| x[0].cross_entropy(&[2, 0, 2]);
-        "cross_entropy.wide": |x| x[0].cross_entropy(&[34, 0, 34]);
-        "cross_entropy.loss": |x| x[0].cross_entropy_loss(&[2, 0, 2]);
+        "cross_entropy": |x| x[0].cross_entropy([2, 0, 2]);
+        "cross_entropy.wide": |x| x[0].cross_entropy([34, 0, 34]);
+        "cross_entropy.loss": |x| x[0].cross_entropy_loss([2, 0, 2]);
     }
 }
 
@@ -337,7 +337,7 @@ fn errors<T: Scalar>(
     for grad in &recorded {
         let w = Tensor::from_fn(grad.shape(), |i| T::from_f64(w.as_slice()[start + i]));
         start += w.len();
-        total = total + (grad * tape.constant(w)).sum();
+        total += (grad * tape.constant(w)).sum();
     }
     let second = total.grad(&x.iter().chain([&u]).collect::<Vec<_>>());
     let recorded: Vec<_> = recorded.into_iter().map(Var::into_value).collect();

@@ -121,6 +121,9 @@ impl<T: Scalar> Tensor<T> {
     /// A tensor filled with one value, which it holds once.
     #[track_caller]
     pub fn full(shape: &[usize], value: T) -> Self {
+        if shape.iter().all(|&extent| extent == 1) {
+            return Tensor::one(Shape::from_slice(shape), value);
+        }
         Tensor::scalar(value).with_layout(Layout::contiguous(&[]).stretched(shape))
     }
 

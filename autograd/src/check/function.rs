@@ -194,7 +194,7 @@ pub fn check_function(
     }
     let mut total = tape.constant(Tensor::scalar(0.0));
     for (grad, weight) in recorded.iter().zip(&weights) {
-        total = total + (grad * tape.constant(weight.clone())).sum();
+        total += (grad * tape.constant(weight.clone())).sum();
     }
     let wrt: Vec<_> = leaves.iter().chain([&seed]).collect();
     let second = total.grad(&wrt);

@@ -230,7 +230,7 @@ fn twice(
     let grads = joined((&y * tape.constant(seed(y.shape()))).sum().grad_graph(&wrt), join);
     let mut total = tape.constant(Tensor::scalar(0.0));
     for (k, grad) in grads.iter().enumerate() {
-        total = total + (grad * tape.constant(spread(grad.shape(), &[-1.0..1.0], 29 + k))).sum();
+        total += (grad * tape.constant(spread(grad.shape(), &[-1.0..1.0], 29 + k))).sum();
     }
     let second = joined(total.grad_graph(&wrt), join);
     grads.into_iter().chain(second).chain([y]).map(Var::into_value).collect()

@@ -126,7 +126,7 @@ impl<T: Scalar> Op<T> for LinearOp {
         shape[x[0].shape().len() - 1] = outputs;
         let mut y = x[0].reshape(&[rows, inputs]).matmul(&x[1]);
         if let Some(bias) = x.get(2) {
-            y = y + bias;
+            y += bias;
         }
         if self.0 == Activation::Relu {
             y = y.relu();

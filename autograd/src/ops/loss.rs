@@ -345,14 +345,14 @@ mod tests {
     #[should_panic(expected = "different shapes")]
     fn a_loss_does_not_broadcast() {
         let tape = Tape::<f32>::new();
-        let _ = tape.constant(Tensor::zeros(&[4, 1])).mse_loss(&tape.constant(Tensor::zeros(&[4])));
+        let _ = tape.constant(Tensor::zeros(&[4, 1])).mse_loss(tape.constant(Tensor::zeros(&[4])));
     }
 
     #[test]
     #[should_panic(expected = "row 1 has class 3, but there are 3 classes")]
     fn a_class_that_does_not_exist_is_reported() {
         let tape = Tape::<f32>::new();
-        let _ = tape.constant(Tensor::zeros(&[2, 3])).cross_entropy_loss(&[0, 3]);
+        let _ = tape.constant(Tensor::zeros(&[2, 3])).cross_entropy_loss([0, 3]);
     }
 
     #[test]
