@@ -128,7 +128,7 @@
 //! assert!(report.first_order < 1e-9 && report.second_order < 1e-9);
 //! ```
 //!
-//! [`check_op`](crate::autograd::check::check_op) is the examination that every operation of this crate has to pass: finite differences of
+//! With the feature `check`, [`check_op`](crate::autograd::check::check_op) is the examination that every operation of this crate has to pass: finite differences of
 //! first and second order, dual numbers, f32 against f64, extremes, inputs of any origin, the same bits twice. A wrong
 //! sign, a forgotten factor or a missing sum does not get through. What is not elementwise is an [`Op`](crate::Op), whose
 //! derivative is written with variables. An operation may be *fused*: then it carries a `reference` made of plain

@@ -60,8 +60,10 @@ pub enum Error {
         /// The line that asked for the gradient.
         at: &'static Location<'static>,
     },
-    /// The graph was freed by an earlier [`Var::backward`](crate::Var::backward).
-    #[error("the graph was freed by an earlier `backward`; use `grad` for all gradients but the last (at {at})")]
+    /// The graph was freed by an earlier [`Var::backward`](crate::Var::backward) or [`Tape::free`](crate::Tape::free).
+    #[error(
+        "the graph was freed by an earlier `backward` or `Tape::free`; use `grad` for all gradients but the last (at {at})"
+    )]
     Freed {
         /// The line that asked for the gradient.
         at: &'static Location<'static>,

@@ -51,7 +51,7 @@ pub use number::{Number, Term};
 pub use op::{Grads, Op, Reads, Vjp};
 pub use operand::{Constant, Operand};
 pub use ops::{Activation, Conv2dConfig, Pool2dConfig, RowGrad, Segments};
-pub use raygrad_tensor::{Axes, INFER, Indices, Mask, Pool, Real, Scalar, Shape, Slice, Tensor, s};
+pub use raygrad_tensor::{Axes, INFER, Indices, Mask, Pool, Real, Scalar, Shape, Slice, SliceInfoElem, Tensor, s};
 pub use recorded::{Recorded, record};
 pub use row_sums::{RowAdder, RowSums};
 pub use tape::Tape;

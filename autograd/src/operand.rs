@@ -154,10 +154,16 @@ impl<'t, T: Scalar> Sum for Var<'t, T> {
     /// The sum of variables that broadcast together, in their order.
     ///
     /// # Panics
-    /// If there is none: there would be no tape for a 0. Or if the shapes do not broadcast.
+    /// If there is none: there would be no tape for a 0. Or if the shapes do not broadcast; the line that the message names is
+    /// then that of `Iterator::sum`.
     #[track_caller]
     fn sum<I: Iterator<Item = Var<'t, T>>>(vars: I) -> Self {
-        vars.reduce(|a, b| a + b).expect("the sum of no variables belongs to no tape")
+        let mut vars = vars;
+        let mut sum = vars.next().expect("the sum of no variables belongs to no tape");
+        for x in vars {
+            sum += x;
+        }
+        sum
     }
 }
 

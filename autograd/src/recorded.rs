@@ -69,17 +69,19 @@ impl<'t, T: Scalar> Sheet<'t, T> {
             }
         }
         let mut vars: Vec<Var<'t, T>> = Vec::with_capacity(steps.len());
-        for (step, needed) in steps.iter().zip(needed) {
-            vars.push(match step {
-                _ if !needed => any.clone(),
-                Step::Given(x) => x.clone(),
-                Step::Constant(value) => any.constant(*value),
-                Step::Unary(f, x) => f(&vars[*x]),
-                Step::Binary(f, [a, b]) => f(&vars[*a], &vars[*b]),
-                Step::Powi(exponent, x) => vars[*x].powi(*exponent),
-                Step::IfPositive([x, yes, no]) => vars[*x].if_positive(&vars[*yes], &vars[*no]),
-            });
-        }
+        any.tape().as_one(|| {
+            for (step, needed) in steps.iter().zip(needed) {
+                vars.push(match step {
+                    _ if !needed => any.clone(),
+                    Step::Given(x) => x.clone(),
+                    Step::Constant(value) => any.constant(*value),
+                    Step::Unary(f, x) => f(&vars[*x]),
+                    Step::Binary(f, [a, b]) => f(&vars[*a], &vars[*b]),
+                    Step::Powi(exponent, x) => vars[*x].powi(*exponent),
+                    Step::IfPositive([x, yes, no]) => vars[*x].if_positive(&vars[*yes], &vars[*no]),
+                });
+            }
+        });
         results.iter().map(|result| vars[result.index].clone()).collect()
     }
 }

@@ -3,7 +3,7 @@
 use crate::nodes::{CONSTANT, Node, Nodes};
 use crate::op::Kept;
 use crate::{Error, Op, ShapeError, Var};
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, checked_len};
 use smallvec::SmallVec;
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
@@ -31,6 +31,8 @@ pub struct Tape<T: Scalar> {
     trying: Cell<bool>,
     /// While a gradient is worked out: the line of the user's code that recorded what is being differentiated.
     differentiating: Cell<Option<&'static Location<'static>>>,
+    /// While a method that is made of operations runs: the line of the user's code that called it.
+    within: Cell<Option<&'static Location<'static>>>,
 }
 
 impl<T: Scalar> Default for Tape<T> {
@@ -55,6 +57,7 @@ impl<T: Scalar> Tape<T> {
             check_finite: Cell::new(false),
             trying: Cell::new(false),
             differentiating: Cell::new(None),
+            within: Cell::new(None),
         }
     }
 
@@ -217,7 +220,13 @@ impl<T: Scalar> Tape<T> {
     /// The line of the user's code that an operation belongs to.
     #[track_caller]
     pub(crate) fn line(&self) -> &'static Location<'static> {
-        self.differentiating.get().unwrap_or(Location::caller())
+        self.differentiating.get().or(self.within.get()).unwrap_or(Location::caller())
+    }
+
+    /// Runs operations that belong to the caller's line, also where closures hide it.
+    #[track_caller]
+    pub(crate) fn as_one<R>(&self, f: impl FnOnce() -> R) -> R {
+        with_cell(&self.within, Some(self.line()), f)
     }
 
     /// A variable that gradients can be taken with respect to.
@@ -330,7 +339,11 @@ impl<T: Scalar> Tape<T> {
             panic!("{}: {} inputs instead of {arity}", op.name(), inputs.len());
         }
         let shapes: SmallVec<[&[usize]; 4]> = inputs.iter().map(|x| x.shape()).collect();
-        op.shape(&shapes).map_err(|what| Error::Shape {
+        let shape = op.shape(&shapes).and_then(|shape| match checked_len(&shape) {
+            Some(_) => Ok(shape),
+            None => Err(format!("a result of shape {shape:?} has too many elements")),
+        });
+        shape.map_err(|what| Error::Shape {
             op: op.name(),
             shapes: shapes.iter().map(|shape| Shape::from_slice(shape)).collect(),
             what,

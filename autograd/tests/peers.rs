@@ -198,6 +198,7 @@ fn shapes() -> Vec<Case> {
         "view.diagonal": |x| x[0].diagonal(1);
         "scatter_view": |x| x[0].diag_embed(-1);
         "slice_step": |x| x[0].slice_axis(0, Slice::from(1..6).step_by(-2));
+        "windows": |x| x[0].windows(0, 3, 2);
         "transpose": |x| x[0].transpose(0, 2);
         "squeeze": |x| x[0].squeeze(1).unsqueeze(0);
         "concat": |x| Var::concat(&[&x[0], &x[1]], 1);

@@ -184,8 +184,12 @@ impl Config {
     /// If one is out of range.
     pub fn check(&self) -> Result<()> {
         self.loss.check()?;
-        let checked =
-            [("schedule", self.schedule.check()), ("adam", self.adam.check()), ("table_adam", self.table_adam.check())];
+        let schedule = format!("schedule.{}", self.schedule.name());
+        let checked = [
+            (schedule.as_str(), self.schedule.check()),
+            ("adam", self.adam.check()),
+            ("table_adam", self.table_adam.check()),
+        ];
         for (part, checked) in checked {
             checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
         }

@@ -135,10 +135,11 @@ impl Slot {
             };
             if table == Some(id) {
                 tables.extend(gradient.take());
-                if gradient.is_zero() {
-                    *sum = sum.take().filter(|_| *started);
-                    continue;
-                }
+            }
+            // What no ray reached has no share and rests.
+            if gradient.is_zero() {
+                *sum = sum.take().filter(|_| *started);
+                continue;
             }
             match (gradient.into_dense(tape.pool()), sum) {
                 (grad, Some(sum)) if *started => add_assign(sum.as_mut_slice(), grad.as_slice()),

@@ -260,7 +260,8 @@ impl Trainer {
             occupied: self.done.occupied,
             rate,
             skipped: self.done.skipped + report.skipped as u64,
-            stuck: if report.is_stuck() { self.done.stuck + 1 } else { 0 },
+            // A network may turn NaN into gradients of 0, with which parameters do move.
+            stuck: if report.is_stuck() || !work.loss.is_finite() { self.done.stuck + 1 } else { 0 },
             restarts: self.done.restarts,
         };
         self.adapt_batch(&work);
@@ -430,6 +431,22 @@ mod tests {
     }
 
     #[test]
+    fn a_run_whose_networks_overflow_ends_although_parameters_move() {
+        let data = Arc::new(embedded(Split::Train, 12));
+        let mut trainer = Trainer::new(tiny_table(), data).unwrap();
+        trainer.step(0.0);
+        let ids: Vec<_> = trainer.model.params.ids().collect();
+        for id in ids {
+            if trainer.model.params.name(id).contains("color.0") {
+                let weights = trainer.model.params.get_mut(id).as_mut_slice();
+                weights.iter_mut().enumerate().for_each(|(i, x)| *x = if i % 2 == 0 { 3e38 } else { -3e38 });
+            }
+        }
+        trainer.run(Budget::Steps(1000), |_| ControlFlow::Continue(()));
+        assert!(trainer.stats().has_diverged() && trainer.stats().step < 200, "{:?}", trainer.stats());
+    }
+
+    #[test]
     fn a_run_that_has_diverged_ends() {
         let data = Arc::new(embedded(Split::Train, 12));
         for config in [tiny(), tiny_table()] {
@@ -448,7 +465,7 @@ mod tests {
     fn settings_of_optimisers_are_checked() {
         let mut config = Config { schedule: Schedule::Constant { rate: 1e300 }, ..tiny() };
         let message = |config: &Config| config.check().unwrap_err().to_string();
-        assert_eq!(message(&config), "`schedule.rate`: is 1e300; use 0 to 1e30");
+        assert_eq!(message(&config), "`schedule.constant.rate`: is 1e300; use 0 to 1e30");
         config.schedule = Schedule::Constant { rate: 0.1 };
         config.adam.beta1 = 1.0;
         assert_eq!(message(&config), "`adam.beta1`: is 1.0; use at least 0 and less than 1");

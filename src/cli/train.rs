@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Parser;
+use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
@@ -110,9 +111,12 @@ pub fn run(args: &Args) -> Result<Trained> {
     watched.and(finished)?;
     summarise(&run, &trainer.stats(), interrupted)?;
     if trainer.stats().has_diverged() {
-        complain(
-            "training has diverged: no gradient was finite any more; try a lower rate with --set schedule.from=..",
-        );
+        let schedule = trainer.model.config.schedule;
+        let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
+        complain(&format!(
+            "training has diverged: its numbers are no longer finite; try a lower rate with --set schedule.{}.{rate}=..",
+            schedule.name()
+        ));
     }
     Ok(Trained { folder: run.folder, interrupted })
 }

@@ -163,8 +163,30 @@ function! {
     sin;
     /// The cosine of each element, an angle in radians.
     cos;
+    /// The tangent of each element, an angle in radians.
+    tan;
+    /// The angle in radians, -pi/2 to pi/2, whose sine each element is; NaN beyond -1 and 1.
+    asin;
+    /// The angle in radians, 0 to pi, whose cosine each element is; NaN beyond -1 and 1.
+    acos;
+    /// The angle in radians, -pi/2 to pi/2, whose tangent each element is.
+    atan;
+    /// The hyperbolic sine of each element.
+    sinh;
+    /// The hyperbolic cosine of each element.
+    cosh;
     /// The hyperbolic tangent of each element.
     tanh;
+    /// The error function of each element.
+    erf;
+    /// `2^x` of each element.
+    exp2;
+    /// The logarithm to base 2 of each element; NaN below 0.
+    log2;
+    /// `ln(1 + e^x)` of each element, without overflow.
+    softplus;
+    /// 1 for positive elements, -1 for negative ones, 0 and NaN for 0 and NaN.
+    sign;
     /// `1 / (1 + e^-x)` of each element.
     sigmoid;
     /// Each element rounded down to a whole number.

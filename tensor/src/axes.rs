@@ -89,6 +89,25 @@ impl From<isize> for Axes {
     }
 }
 
+// A number in the code is one of these.
+impl From<i32> for Axes {
+    fn from(axis: i32) -> Self {
+        Axes::from([axis as isize])
+    }
+}
+
+impl From<usize> for Axes {
+    fn from(axis: usize) -> Self {
+        Axes::from([axis as isize])
+    }
+}
+
+impl<const N: usize> From<&[isize; N]> for Axes {
+    fn from(axes: &[isize; N]) -> Self {
+        Axes::from(&axes[..])
+    }
+}
+
 impl<const N: usize> From<[isize; N]> for Axes {
     fn from(axes: [isize; N]) -> Self {
         Axes::from(&axes[..])

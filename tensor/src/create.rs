@@ -56,13 +56,15 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     /// use raygrad_tensor::Tensor;
     /// assert_eq!(Tensor::linspace(0.0_f32, 1.0, 3), Tensor::from([0.0, 0.5, 1.0]));
+    /// assert_eq!(Tensor::linspace(-1e308_f64, 1e308, 3), Tensor::from([-1e308, 0.0, 1e308]));
     /// ```
     pub fn linspace(start: T, end: T, count: usize) -> Self {
         let (first, last, most) = (start.to_f64(), end.to_f64(), count.saturating_sub(1).max(1) as f64);
         // From the nearer end, so that both are exact.
         let at = |i: usize| {
             let (part, rest) = (i as f64 / most, (most - i as f64) / most);
-            if part <= 0.5 { first + (last - first) * part } else { last - (last - first) * rest }
+            // Of both ends, so that no difference overflows.
+            if part <= 0.5 { first * (1.0 - part) + last * part } else { last * (1.0 - rest) + first * rest }
         };
         Tensor::from_fn(&[count], |i| T::from_f64(at(i)))
     }

@@ -1,6 +1,6 @@
 //! Integer arrays: what sorting and searching give, and what gathering takes.
 
-use crate::{Scalar, Shape, Tensor, axis_of};
+use crate::{Scalar, Shape, Tensor, axis_of, checked_len};
 use std::cmp::Ordering;
 use std::fmt;
 use std::sync::Arc;
@@ -68,8 +68,8 @@ impl Indices {
     #[track_caller]
     pub fn new(shape: &[usize], values: impl Into<Arc<[u32]>>) -> Self {
         let values = values.into();
-        let len: usize = shape.iter().product();
-        assert_eq!(len, values.len(), "{} values for indices of shape {shape:?}", values.len());
+        let fits = checked_len(shape) == Some(values.len());
+        assert!(fits, "{} values for indices of shape {shape:?}", values.len());
         Indices { shape: Shape::from_slice(shape), values }
     }
 
@@ -204,6 +204,18 @@ impl<T: Scalar> Tensor<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_number_for_each_place_and_no_more() {
+        for shape in [&[3][..], &[1 << 32, 1 << 32], &[0, 2]] {
+            assert!(std::panic::catch_unwind(|| Indices::new(shape, [0, 1])).is_err(), "{shape:?}");
+        }
+        let list: Arc<[u32]> = [4, 5].into();
+        let all =
+            [Indices::from(&list), Indices::from(&vec![4, 5]), Indices::from(&[4, 5]), Indices::from(&[4, 5][..])];
+        assert!(all.iter().all(|x| x == &Indices::new(&[2], [4, 5])));
+    }
+
     use proptest::prelude::*;
 
     proptest! {

@@ -20,7 +20,7 @@ use std::sync::Arc;
 #[derive(Clone, PartialEq, Eq)]
 pub struct Mask {
     shape: Shape,
-    values: Arc<[bool]>,
+    values: Arc<Vec<bool>>,
 }
 
 impl Mask {
@@ -29,8 +29,8 @@ impl Mask {
     /// # Panics
     /// If the number of values is not the product of the shape.
     #[track_caller]
-    pub fn new(shape: &[usize], values: impl Into<Arc<[bool]>>) -> Self {
-        let values = values.into();
+    pub fn new(shape: &[usize], values: impl Into<Vec<bool>>) -> Self {
+        let values = Arc::new(values.into());
         assert_eq!(checked_len(shape), Some(values.len()), "{} values for a mask of shape {shape:?}", values.len());
         Mask { shape: Shape::from_slice(shape), values }
     }
@@ -72,9 +72,15 @@ impl Mask {
 
     /// 1 where it is true, 0 elsewhere.
     pub fn cast<T: Scalar>(&self) -> Tensor<T> {
-        Tensor::from_vec(&self.shape, self.values.iter().map(|&x| if x { T::ONE } else { T::ZERO }).collect())
+        let mut numbers = vec![T::ZERO; self.values.len()];
+        chunks(&mut numbers, PIECE, self.values.len() * ELEMENT, || (), &|(), i, numbers| {
+            let pairs = numbers.iter_mut().zip(&self.values[i * PIECE..]);
+            pairs.for_each(|(number, &x)| *number = if x { T::ONE } else { T::ZERO });
+        });
+        Tensor::from_vec(&self.shape, numbers)
     }
 
+    #[track_caller]
     fn join(&self, other: &Mask, f: impl Fn(bool, bool) -> bool) -> Mask {
         assert_eq!(self.shape, other.shape, "masks of different shapes");
         Mask::new(&self.shape, self.values.iter().zip(&*other.values).map(|(&a, &b)| f(a, b)).collect::<Vec<_>>())
@@ -215,7 +221,9 @@ impl<T: Scalar> Tensor<T> {
     #[track_caller]
     pub fn masked(&self, mask: &Mask) -> Self {
         assert_eq!(self.shape(), mask.shape(), "a mask of another shape");
-        self.iter().zip(mask.as_slice()).filter(|(_, keep)| **keep).map(|(x, _)| x).collect()
+        let mut kept = Vec::with_capacity(mask.count());
+        kept.extend(self.iter().zip(mask.as_slice()).filter(|(_, keep)| **keep).map(|(x, _)| x));
+        Tensor::from_vec(&[kept.len()], kept)
     }
 
     /// The entries with these numbers along `axis` (`numpy.take`): the axis becomes those of `index`.
@@ -229,7 +237,8 @@ impl<T: Scalar> Tensor<T> {
     /// # Panics
     /// If the axis does not exist or a number is not below its extent.
     #[track_caller]
-    pub fn take(&self, axis: isize, index: &Indices) -> Self {
+    pub fn take(&self, axis: isize, index: impl Into<Indices>) -> Self {
+        let index = index.into();
         let axis = axis_of(axis, self.shape());
         let (extent, inner) = (self.shape()[axis], self.shape()[axis + 1..].iter().product::<usize>());
         if let Some(place) = index.as_slice().iter().position(|&i| i as usize >= extent) {
@@ -289,6 +298,41 @@ mod tests {
         assert_eq!(x.gt(1.5).cast::<f32>(), Tensor::from([[0.0, 1.0], [1.0, 0.0]]));
         assert_eq!(row.where_(&x.is_nan(), &x), Tensor::from([[1.0, 2.0], [3.0, 2.0]]));
         assert_eq!(x.t().masked(&x.t().gt(0.0)), Tensor::from([1.0, 3.0, 2.0]));
+    }
+
+    #[test]
+    fn large_comparisons_are_those_of_their_elements() {
+        let n = 100_003;
+        let a = Tensor::<f32>::from_fn(&[n], |i| ((i * 7919) % n) as f32);
+        let b = Tensor::<f32>::from_fn(&[n], |i| ((i * 104_729) % n) as f32);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        let same = |mask: Mask, expected: &dyn Fn(usize) -> bool| {
+            assert!(mask.as_slice().iter().enumerate().all(|(i, &holds)| holds == expected(i)));
+            let numbers = pool.install(|| mask.cast::<f64>());
+            assert!(numbers.iter().enumerate().all(|(i, x)| x == f64::from(u8::from(expected(i)))));
+        };
+        pool.install(|| {
+            same(a.lt(&b), &|i| a[[i]] < b[[i]]);
+            same(a.ge(50_000.0), &|i| a[[i]] >= 50_000.0);
+            let (column, row) =
+                (Tensor::<f32>::arange(0.0, 401.0, 1.0).reshape(&[401, 1]), Tensor::arange(0.0, 307.0, 2.0));
+            same(column.gt(&row), &|i| (i / 154) as f32 > 2.0 * (i % 154) as f32);
+            same(a.flip(0).le(&b), &|i| a[[n - 1 - i]] <= b[[i]]);
+        });
+        let chosen = a.where_(&a.lt(&b), &b);
+        assert!((0..n).all(|i| chosen[[i]] == a[[i]].min(b[[i]])));
+    }
+
+    #[test]
+    #[should_panic(expected = "masks of different shapes")]
+    fn masks_of_different_shapes_do_not_join() {
+        let _ = Mask::new(&[2, 1], [true, false]) & Mask::new(&[2], [true, false]);
+    }
+
+    #[test]
+    #[should_panic(expected = "values for a mask of shape")]
+    fn a_mask_has_a_value_for_each_place() {
+        Mask::new(&[3], [true, false]);
     }
 
     #[test]

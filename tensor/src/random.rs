@@ -54,10 +54,10 @@ impl<T: Scalar> Tensor<T> {
     /// Normal numbers of this mean and standard deviation.
     ///
     /// # Panics
-    /// If the deviation is negative or NaN.
+    /// If the deviation is negative, infinite or NaN.
     #[track_caller]
     pub fn normal(shape: &[usize], mean: f64, deviation: f64, rng: &mut (impl Rng + ?Sized)) -> Self {
-        assert!(deviation >= 0.0, "normal numbers of standard deviation {deviation}");
+        assert!((0.0..f64::INFINITY).contains(&deviation), "normal numbers of standard deviation {deviation}");
         Tensor::from_fn(shape, |_| T::from_f64(mean + deviation * standard_normal(rng)))
     }
 
@@ -79,7 +79,7 @@ impl Indices {
     /// If the range is empty and the shape is not.
     #[track_caller]
     pub fn random(shape: &[usize], range: Range<u32>, rng: &mut (impl Rng + ?Sized)) -> Self {
-        let len: usize = shape.iter().product();
+        let len = crate::layout::len_of(shape);
         Indices::new(shape, (0..len).map(|_| rng.random_range(range.clone())).collect::<Vec<_>>())
     }
 
@@ -159,6 +159,21 @@ mod tests {
         }
         assert_eq!(Tensor::<f32>::rand(&[1], &mut Ones).item(), 1.0 - f32::EPSILON / 2.0);
         assert_eq!(Tensor::<f64>::rand(&[1], &mut Ones).item(), 1.0 - f64::EPSILON / 2.0);
+    }
+
+    #[test]
+    fn what_is_no_distribution_is_refused() {
+        let refused = |f: fn(&mut StdRng) -> Tensor<f32>| {
+            std::panic::catch_unwind(|| f(&mut StdRng::seed_from_u64(1))).unwrap_err();
+        };
+        refused(|rng| Tensor::normal(&[1], 0.0, -1.0, rng));
+        refused(|rng| Tensor::normal(&[1], 0.0, f64::INFINITY, rng));
+        refused(|rng| Tensor::uniform(&[1], 0.0..f64::INFINITY, rng));
+        refused(|rng| Tensor::bernoulli(&[1], 1.5, rng));
+        refused(|rng| Tensor::bernoulli(&[1], f64::NAN, rng));
+        let mut rng = StdRng::seed_from_u64(1);
+        assert!(Tensor::<f64>::uniform(&[99], -1e308..1.5e308, &mut rng).is_finite());
+        assert_eq!(Tensor::<f64>::bernoulli(&[99], 0.0, &mut rng).sum(), 0.0);
     }
 
     #[test]

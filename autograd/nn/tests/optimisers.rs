@@ -392,3 +392,43 @@ fn a_step_copies_no_parameter() {
         assert_ne!(held, *params.get(ids[0]));
     }
 }
+
+#[test]
+fn what_a_store_or_an_optimiser_cannot_take_is_refused() {
+    let panics = |f: &dyn Fn()| assert!(catch_unwind(AssertUnwindSafe(f)).is_err());
+    let store = |name: &str, shape: &[usize]| {
+        let mut params = Params::<f32>::new();
+        params.add(name, Tensor::zeros(shape));
+        params
+    };
+    panics(&|| store("x", &[2]).assign(&store("y", &[2])));
+    panics(&|| store("x", &[2]).assign(&store("x", &[3])));
+    panics(&|| assert_eq!(store("x", &[2]).set_decay(|_| true, -1.0), 1));
+    panics(&|| drop(store("x", &[2]).layout().bind(Vec::<Var<'_, f32>>::new())));
+    let grads = || [Gradient::from(Tensor::<f32>::zeros(&[1]))];
+    panics(&|| assert_eq!(raygrad_nn::clip_value(&mut grads(), f64::NAN), 0));
+    panics(&|| assert!(raygrad_nn::clip_norm(&mut grads(), -1.0).norm >= 0.0));
+    // A frozen store has no gradients, a bound constant none either.
+    let mut params = store("x", &[2]);
+    params.freeze(|_| true);
+    let tape = Tape::new();
+    let bound = params.bind(&tape);
+    let loss = tape.leaf(Tensor::scalar(1.0)).square();
+    assert!(bound.backward(&loss).is_empty());
+    assert!(params.bind_constant(&tape).vars().is_empty());
+}
+
+#[test]
+fn averages_that_cannot_go_on_stay_as_they_are() {
+    let mut params = Params::<f64>::new();
+    params.add("x", Tensor::from([1.0, 2.0]));
+    let mut ema = Ema::new(&params, 0.5);
+    params.values_mut()[0] = Tensor::from([3.0, 4.0]);
+    ema.update(&params);
+    let state = ema.state();
+    let mut stranger = state.clone();
+    stranger.counts.insert("steps".into(), vec![77]);
+    stranger.tensors.insert("y.average".into(), Tensor::zeros(&[1]));
+    assert!(ema.load_state(&stranger).is_err());
+    assert_eq!(ema.state(), state);
+}

@@ -32,6 +32,7 @@ fn shapes() -> Vec<Entry> {
     let triangle = |upper, diagonal| Entry::new(matrix::Triangle { upper, diagonal }).linear();
     vec![
         Entry::new(view(&[3, 4], |layout| layout.diagonal(0, 1, 1))).linear().sample(&[&[3, 4]]),
+        function!("windows", |x| x[0].windows(0, 3, 2)).linear().sample(&[&[7]]).sample(&[&[4, 2]]),
         Entry::new(shape::Scatter(view(&[3, 2, 4], |layout| layout.diagonal(0, 2, -1)))).linear().sample(&[&[2, 2]]),
         Entry::new(pad(0.0)).linear().sample(&[&[2, 5]]),
         Entry::new(pad(-1.5)).sample(&[&[2, 5]]),

@@ -47,7 +47,7 @@ impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
 /// Examines an operation as the catalogue describes it. On every sample:
 ///
 /// - first and second derivatives against finite differences in f64 ([`check_function`]);
-/// - the same bits when run again, on buffers that hold NaN from before, and on inputs that come from transposed and
+/// - the same bits when run again, on buffers that hold other numbers from before, and on inputs that come from transposed and
 ///   reversed arrays;
 /// - the same value and derivatives where one variable is passed for two inputs as where two equal ones are;
 /// - f32 against f64, by norm and by units in the last place;

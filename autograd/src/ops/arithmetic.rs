@@ -1,8 +1,9 @@
 //! The four operations, and multiplication and addition of constants.
 
+use super::power::ConstPowi;
 #[cfg(feature = "check")]
 use crate::check::{Cases, Examined};
-use crate::{Formula, Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, map};
 
 /// y = a + b.
@@ -184,7 +185,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// `self * self`.
     #[track_caller]
     pub fn square(&self) -> Self {
-        self * self
+        ConstPowi::<2>.on([self])
     }
 
     /// The same value as a new node.
@@ -207,7 +208,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn if_positive(&self, yes: &Self, no: &Self) -> Self {
-        self.tape().apply(IfPositive, &[self, yes, no])
+    pub fn if_positive(&self, yes: impl Operand<'t, T>, no: impl Operand<'t, T>) -> Self {
+        let (yes, no) = (yes.on(self.tape()), no.on(self.tape()));
+        self.tape().apply(IfPositive, &[self, &yes, &no])
     }
 }

@@ -51,9 +51,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         let Some(first) = parts.first() else { panic!("stack of no tensors") };
         let same = parts.iter().all(|part| part.shape() == first.shape());
         first.tape().fits("stack", parts, ensure(same, || "the shapes differ".into()));
-        let parts: Vec<_> = parts.iter().map(|part| part.unsqueeze(axis)).collect();
-        // Of negative places those of the axes that are there now.
-        Var::concat(&parts.iter().collect::<Vec<_>>(), axis)
+        first.tape().as_one(|| {
+            let parts: Vec<_> = parts.iter().map(|part| part.unsqueeze(axis)).collect();
+            // Of negative places those of the axes that are there now.
+            Var::concat(&parts.iter().collect::<Vec<_>>(), axis)
+        })
     }
 
     /// Consecutive parts along `axis`, of these extents: the inverse of [`concat`](Self::concat).
@@ -141,11 +143,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If one is not a vector.
     #[track_caller]
     pub fn meshgrid(axes: &[&Self]) -> Vec<Self> {
-        let extent = |x: &&Self| {
+        for x in axes {
             x.fits("meshgrid", ensure(x.shape().len() == 1, || "not a vector".into()));
-            x.shape()[0]
-        };
-        let shape: Shape = axes.iter().map(extent).collect();
+        }
+        let shape: Shape = axes.iter().map(|x| x.shape()[0]).collect();
         let mut grids = Vec::with_capacity(axes.len());
         for (i, x) in axes.iter().enumerate() {
             let mut own = Shape::from_elem(1, shape.len());

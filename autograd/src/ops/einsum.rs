@@ -176,7 +176,7 @@ impl<'t, T: Scalar> Var<'t, T> {
             Err(what) => first.tape().fits("einsum", operands, Err(format!("{equation:?}: {what}"))),
             Ok((labels, result)) => {
                 let labelled = operands.iter().zip(labels).map(|(&x, labels)| Labelled { x: x.clone(), labels });
-                contract(labelled.collect(), &result)
+                first.tape().as_one(|| contract(labelled.collect(), &result))
             }
         }
     }

@@ -61,9 +61,12 @@ fn add_rows<T: Scalar>(dense: &mut [T], rows: &[T], index: &[u32], width: usize)
     // The shares of a place beside each other, in their order.
     let mut order: Vec<usize> = (0..index.len()).collect();
     order.sort_by_key(|&row| index[row]);
+    let mut sums = vec![0.0; width];
     for shares in order.chunk_by(|&a, &b| index[a] == index[b]) {
         let place = index[shares[0]] as usize * width;
-        add_up(&mut dense[place..place + width], |sums| shares.iter().for_each(|&row| add(sums, row)));
+        sums.fill(0.0);
+        shares.iter().for_each(|&row| add(&mut sums, row));
+        dense[place..place + width].iter_mut().zip(&sums).for_each(|(dense, &sum)| *dense += T::from_f64(sum));
     }
 }
 
@@ -82,9 +85,9 @@ impl<T: Scalar> Op<T> for GatherRows {
         let mut shape = Shape::from_slice(x[0].shape());
         shape[0] = self.index.len();
         let width: usize = shape[1..].iter().product();
-        let mut out = pool.tensor(&shape);
+        let (mut out, x) = (pool.tensor(&shape), x[0].as_slice());
         for (out, &row) in out.as_mut_slice().chunks_exact_mut(width.max(1)).zip(self.index.iter()) {
-            out.copy_from_slice(&x[0].as_slice()[row as usize * width..][..width]);
+            out.copy_from_slice(&x[row as usize * width..][..width]);
         }
         out
     }

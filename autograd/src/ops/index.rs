@@ -3,7 +3,7 @@
 
 use super::gather::add_up;
 use crate::error::ensure;
-use crate::{Grads, Op, Reads, ShapeError, Tape, Var, Vjp};
+use crate::{Grads, Op, Operand, Reads, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
@@ -240,8 +240,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist, other extents differ, or an index is not below the extent of the axis.
     #[doc(alias = "take_along_axis")]
     #[track_caller]
-    pub fn gather(&self, axis: isize, index: &Indices) -> Self {
-        self.tape().apply(GatherAlong { axis: self.axis("gather", axis), index: index.clone() }, &[self])
+    pub fn gather(&self, axis: isize, index: impl Into<Indices>) -> Self {
+        self.tape().apply(GatherAlong { axis: self.axis("gather", axis), index: index.into() }, &[self])
     }
 
     /// This tensor with the elements of `source` added at the positions that `index` names along `axis`:
@@ -251,9 +251,9 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the axis does not exist, the shapes do not fit, or an index is not below the extent of the axis.
     #[track_caller]
-    pub fn scatter_add(&self, axis: isize, index: &Indices, source: &Self) -> Self {
+    pub fn scatter_add(&self, axis: isize, index: impl Into<Indices>, source: &Self) -> Self {
         let axis = self.axis("scatter_add", axis);
-        let op = ScatterAlong { axis, index: index.clone(), extent: self.shape()[axis] };
+        let op = ScatterAlong { axis, index: index.into(), extent: self.shape()[axis] };
         self.plus("scatter_add", self.tape().apply(op, &[source]), source)
     }
 
@@ -332,7 +332,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not fit.
     #[track_caller]
-    pub fn searchsorted(&self, values: &Self, right: bool) -> Indices {
+    pub fn searchsorted(&self, values: impl Operand<'t, T>, right: bool) -> Indices {
+        let values = values.on(self.tape());
+        let lead = self.shape().split_last().map(|(_, lead)| lead);
+        let same = values.shape().split_last().map(|(_, lead)| lead) == lead;
+        let what = || "the leading extents differ, or there is no axis to search in".into();
+        let fits = ensure(lead.is_some_and(|lead| lead.is_empty() || same), what);
+        self.tape().fits("searchsorted", &[self, &values], fits);
         self.value().searchsorted(values.value(), right)
     }
 }
@@ -343,7 +349,9 @@ impl<T: Scalar> Tape<T> {
     /// # Panics
     /// If an index is not below `classes`.
     #[track_caller]
-    pub fn one_hot(&self, index: &Indices, classes: usize) -> Var<'_, T> {
+    pub fn one_hot(&self, index: impl Into<Indices>, classes: usize) -> Var<'_, T> {
+        let index = index.into();
+        self.fits("one_hot", &[], check_index(index.as_slice(), classes, 0));
         self.constant(index.one_hot(classes))
     }
 }

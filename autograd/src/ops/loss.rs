@@ -197,10 +197,10 @@ impl<T: Scalar> Op<T> for CrossEntropy {
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         let axes = x[0].shape().len() - 1;
-        let n = x[0].shape()[axes];
-        let logs = x[0].log_softmax(-1);
-        let index = self.classes.iter().enumerate().map(|(row, &class)| (row * n) as u32 + class);
-        Some(-logs.reshape(&[logs.value().len()]).gather_rows(index.collect::<Vec<_>>()).reshape(&x[0].shape()[..axes]))
+        let mut column = Shape::from_slice(x[0].shape());
+        column[axes] = 1;
+        let logs = x[0].log_softmax(-1).gather(-1, Indices::new(&column, self.classes.clone()));
+        Some(-logs.reshape(&x[0].shape()[..axes]))
     }
 }
 
@@ -309,7 +309,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` with a class below `n` for each
-    /// row, to `[..]`.
+    /// row, in a list or an array `[..]`, to `[..]`.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -324,7 +324,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If there is not one class for each row, or one is not below `n`.
     #[track_caller]
     pub fn cross_entropy(&self, classes: impl Into<Indices>) -> Self {
-        self.tape().apply(CrossEntropy { classes: classes.into().values().clone() }, &[self])
+        let classes = classes.into();
+        // One list, or an array of the rows' shape.
+        let rows = self.shape().split_last().map_or(&[][..], |(_, rows)| rows);
+        let fits = classes.shape().len() == 1 || classes.shape() == rows;
+        let what = || format!("classes of shape {:?} for rows of shape {rows:?}", classes.shape());
+        self.fits("cross_entropy", ensure(fits, what));
+        self.tape().apply(CrossEntropy { classes: classes.values().clone() }, &[self])
     }
 
     /// The mean of [`cross_entropy`](Self::cross_entropy) over the rows, as a scalar; NaN for no rows.

@@ -1,7 +1,7 @@
 //! Matrix products: of two matrices, of batches of them, and of vectors.
 
 use crate::error::ensure;
-use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::matmul::matmul;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
 use std::borrow::Cow;
@@ -67,7 +67,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If a factor is a scalar, the inner extents differ or the leading axes do not broadcast.
     #[track_caller]
-    pub fn matmul(&self, other: &Self) -> Self {
+    pub fn matmul(&self, other: impl Operand<'t, T>) -> Self {
+        let other = &other.on(self.tape());
         let (a, b) = (self.shape(), other.shape());
         let matrices = ensure(!a.is_empty() && !b.is_empty(), || "a scalar is no matrix".into());
         self.tape().fits("matmul", &[self, other], matrices);
@@ -104,7 +105,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the operands are not vectors of one length.
     #[track_caller]
-    pub fn dot(&self, other: &Self) -> Self {
+    pub fn dot(&self, other: impl Operand<'t, T>) -> Self {
+        let other = &other.on(self.tape());
         let vectors = self.shape().len() == 1 && self.shape() == other.shape();
         self.tape().fits("dot", &[self, other], ensure(vectors, || "not two vectors of one length".into()));
         (self * other).sum()
@@ -115,7 +117,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If an operand is not a vector.
     #[track_caller]
-    pub fn outer(&self, other: &Self) -> Self {
+    pub fn outer(&self, other: impl Operand<'t, T>) -> Self {
+        let other = &other.on(self.tape());
         let vectors = self.shape().len() == 1 && other.shape().len() == 1;
         self.tape().fits("outer", &[self, other], ensure(vectors, || "not two vectors".into()));
         self.unsqueeze(1) * other

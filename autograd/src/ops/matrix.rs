@@ -26,11 +26,11 @@ impl<T: Scalar> Op<T> for Triangle {
         let mut out = pool.copy_of(x[0].shape(), x[0].as_slice());
         let [.., rows, columns] = *x[0].shape() else { unreachable!("`shape` wants two axes") };
         for (row, out) in out.as_mut_slice().chunks_exact_mut(columns.max(1)).enumerate() {
-            let diagonal = (row % rows) as isize + self.diagonal;
+            let diagonal = ((row % rows) as isize).saturating_add(self.diagonal);
             if self.upper {
                 out[..diagonal.clamp(0, columns as isize) as usize].fill(T::ZERO);
             } else {
-                out[(diagonal + 1).clamp(0, columns as isize) as usize..].fill(T::ZERO);
+                out[diagonal.saturating_add(1).clamp(0, columns as isize) as usize..].fill(T::ZERO);
             }
         }
         out

@@ -2,7 +2,7 @@
 
 #[cfg(feature = "check")]
 use crate::check::{Cases, Examined, INF, NAN};
-use crate::{Formula, Var};
+use crate::{Formula, Operand, Var};
 use raygrad_tensor::{Real, Scalar};
 
 /// y = 1 / x; dx = -g y^2.
@@ -207,8 +207,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn pow(&self, exponent: &Self) -> Self {
-        Pow.on([self, exponent])
+    pub fn pow(&self, exponent: impl Operand<'t, T>) -> Self {
+        Pow.on([self, &exponent.on(self.tape())])
     }
 
     /// `self * ln(y)`, which is 0 where `self` is 0 even if `y` is 0 or negative; broadcasts. An entropy is
@@ -217,7 +217,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn xlogy(&self, y: &Self) -> Self {
-        Xlogy.on([self, y])
+    pub fn xlogy(&self, y: impl Operand<'t, T>) -> Self {
+        Xlogy.on([self, &y.on(self.tape())])
     }
 }

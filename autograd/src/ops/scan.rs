@@ -195,7 +195,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         if self.shape().is_empty() {
             return self.reshape(&[1]).walk(op, axis, reverse, scan).reshape(&[]);
         }
-        scan(Walk { axis: self.axis(op, axis), reverse }, self)
+        let walk = Walk { axis: self.axis(op, axis), reverse };
+        self.tape().as_one(|| scan(walk, self))
     }
 
     /// The sums of the entries along `axis` up to each one and with it, carried in f64.

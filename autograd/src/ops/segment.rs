@@ -28,7 +28,10 @@ impl Segments {
     /// If there are 2^32 rows or more.
     #[track_caller]
     pub fn uniform(count: usize, len: usize) -> Self {
-        let at = |i: usize| u32::try_from(i * len).unwrap_or_else(|_| panic!("{count} segments of {len} rows"));
+        let at = |i: usize| match i.checked_mul(len).map(u32::try_from) {
+            Some(Ok(row)) => row,
+            _ => panic!("{count} segments of {len} rows are 2^32 rows or more"),
+        };
         Segments((0..=count).map(at).collect())
     }
 

@@ -75,12 +75,13 @@ impl<T: Scalar> Op<T> for View {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        // What shows every element once leads back without a copy.
+        if let Some(layout) = self.layout.inverted() {
+            let back = View { from: Shape::from_slice(self.layout.shape()), layout };
+            return Grads::one(cx.tape().apply(back, &[cx.g()]).reshape(cx.shape(0)));
+        }
         if cx.recording() {
             return Grads::one(cx.tape().apply(Scatter(self.clone()), &[cx.g()]));
-        }
-        // What shows every element once leads back without a copy.
-        if let Some(back) = self.layout.inverted() {
-            return Grads::one(cx.constant(cx.g().value().seen_through(&back).reshape(cx.shape(0))));
         }
         Grads::new([None]).with_sparse(0, Arc::new(ViewGrad { view: self.clone(), g: cx.g().value().clone() }))
     }

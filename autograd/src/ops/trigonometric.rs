@@ -2,7 +2,7 @@
 
 #[cfg(feature = "check")]
 use crate::check::{Cases, Examined, INF, PI};
-use crate::{Formula, Var};
+use crate::{Formula, Operand, Var};
 use raygrad_tensor::{Real, Scalar};
 
 /// y = sin x; dx = g cos x.
@@ -329,8 +329,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn atan2(&self, x: &Self) -> Self {
-        Atan2.on([self, x])
+    pub fn atan2(&self, x: impl Operand<'t, T>) -> Self {
+        Atan2.on([self, &x.on(self.tape())])
     }
 
     /// Hyperbolic sine, accurate near 0.

@@ -1,6 +1,6 @@
 //! Vectors along the last axis: cross product and direction.
 
-use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
 
 /// y = a x b along the last axis of extent 3, with broadcasting; da = b x g, db = g x a.
@@ -166,8 +166,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If a last axis has not three entries or the shapes do not broadcast.
     #[track_caller]
-    pub fn cross(&self, other: &Self) -> Self {
-        self.tape().apply(Cross, &[self, other])
+    pub fn cross(&self, other: impl Operand<'t, T>) -> Self {
+        self.tape().apply(Cross, &[self, &other.on(self.tape())])
     }
 
     /// The rows of the last axis divided by their length. Rows of any size keep their digits (1e-40 and 1e30 alike). A

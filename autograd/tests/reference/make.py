@@ -227,6 +227,7 @@ def shapes():
     case("view.diagonal", lambda x: x.diagonal(1), (3, 4))
     case("scatter_view", lambda x: torch.diag_embed(x, -1), (2, 2))
     case("slice_step", lambda x: x[1:6].flip(0)[::2], (7, 2))
+    case("windows", lambda x: x.unfold(0, 3, 2), (7, 2))
     case("transpose", lambda x: x.transpose(0, 2), (2, 3, 4))
     case("squeeze", lambda x: x.squeeze(1).unsqueeze(0), (2, 1, 3))
     case("concat", lambda a, b: torch.cat((a, b), 1), (2, 3), (2, 1))

@@ -3,7 +3,7 @@
 //! The forms that take what a user writes, axes from either end and places as of `s![..]`, say what is wrong with it in
 //! words; [`Tensor`](crate::Tensor) shows them as a panic, a graph as an error.
 
-use super::{Layout, Strides, len_of};
+use super::{Layout, Strides, checked_len, len_of};
 use crate::{Shape, find_axis};
 use ndarray::{Slice, SliceInfoElem};
 use smallvec::SmallVec;
@@ -166,6 +166,9 @@ impl Layout {
         out.strides.push(self.strides[axis]);
         // One window has no neighbour, however large the step.
         out.strides[axis] = if out.shape[axis] > 1 { self.strides[axis] * step as isize } else { 0 };
+        if checked_len(&out.shape).is_none() {
+            return Err(format!("windows of shape {:?} have too many elements", out.shape));
+        }
         Ok(out)
     }
 
@@ -227,7 +230,7 @@ impl Layout {
     /// If the shape does not broadcast to `to`; in words.
     pub fn broadcast_to(&self, to: &[usize]) -> Result<Self, String> {
         let fits = crate::broadcast_shape(&[&self.shape, to]).is_some_and(|wide| wide.as_slice() == to);
-        match crate::checked_len(to) {
+        match checked_len(to) {
             _ if !fits => Err(format!("cannot broadcast {:?} to {to:?}", self.shape)),
             None => Err(format!("a tensor of shape {to:?} has too many elements")),
             Some(_) => Ok(self.stretched(to)),

@@ -133,6 +133,8 @@ impl<T: Scalar> RowAdam<T> {
     pub fn step(&mut self, table: &mut [T], sums: &mut RowSums<T>, rate: f64, decay: f64) -> RowStats {
         assert_eq!(table.len(), self.steps.len() * self.features, "a table of the optimiser's rows");
         assert_eq!([sums.table_rows(), sums.features()], [self.steps.len(), self.features], "sums of its rows");
+        // A factor of a parameter may take the rate where `f32` ends; a row is not to become infinite there.
+        let rate = rate.min(1e30);
         let (features, keep, rate) = (self.features, T::from_f64(1.0 - rate * decay), T::from_f64(rate));
         let update = Update {
             rule: &self.rule,

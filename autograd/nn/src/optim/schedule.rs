@@ -56,6 +56,17 @@ pub enum Schedule {
 }
 
 impl Schedule {
+    /// The name of the kind, under which its numbers are written in a file.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Schedule::Constant { .. } => "constant",
+            Schedule::Linear { .. } => "linear",
+            Schedule::Step { .. } => "step",
+            Schedule::Exponential { .. } => "exponential",
+            Schedule::Cosine { .. } => "cosine",
+        }
+    }
+
     /// The learning rate when `fraction` (0 to 1) of the run is done. The warm-up multiplies the rate, so it does not
     /// delay what follows.
     pub fn rate(&self, fraction: f64) -> f64 {
