@@ -229,7 +229,7 @@ fn operations() {
     operation("convolution of one image 16x128x128 to 32", &[1, 16, 128, 128], |x| {
         x.conv2d(&x.tape().leaf(kernel.clone()), &padded)
     });
-    operation("512 products of 32x32 matrices", &[512, 32, 32], |x| x.matmul(&x.tape().constant(right.clone())));
+    operation("512 products of 32x32 matrices", &[512, 32, 32], |x| x.matmul(x.tape().constant(right.clone())));
 }
 
 /// What views cost where their elements have to be written in order, against a copy; many slices, against the whole.

@@ -601,8 +601,8 @@ fn shares_of_every_kind_add_up_to_the_dense_gradient() {
         ),
         (
             "tied weights",
-            |a, b| (a.gather_rows([0, 2, 1]).matmul(&a.t()) * 0.1).tanh().sum() * b.sum(),
-            |a, b| (pick(a, [0, 2, 1]).matmul(&a.t()) * 0.1).tanh().sum() * b.sum(),
+            |a, b| (a.gather_rows([0, 2, 1]).matmul(a.t()) * 0.1).tanh().sum() * b.sum(),
+            |a, b| (pick(a, [0, 2, 1]).matmul(a.t()) * 0.1).tanh().sum() * b.sum(),
         ),
         (
             "two tables",

@@ -115,7 +115,7 @@ fn the_functions_of_a_formula_are_the_operations<T: Scalar>() {
     }
     two! { atan2 pow maximum minimum }
     let fused = formula!(|x, y| x.if_positive(y, 1.0)).on([&x, &y]);
-    agree("if_positive", &results(&fused, &[&x, &y]), &results(&x.if_positive(&y, &x.constant(1.0)), &[&x, &y]));
+    agree("if_positive", &results(&fused, &[&x, &y]), &results(&x.if_positive(&y, x.constant(1.0)), &[&x, &y]));
     agree("powi", &results(&formula!(|x| x.powi(-3)).on([&x]), &[&x]), &results(&x.powi(-3), &[&x]));
     agree("powi", &results(&formula!(|x| x.powi(0)).on([&x]), &[&x]), &results(&x.powi(0), &[&x]));
 }

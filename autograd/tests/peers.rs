@@ -220,8 +220,8 @@ fn shapes() -> Vec<Case> {
             let grids = Var::meshgrid(&[&x[0], &x[1]]);
             &grids[0] * grids[1].square()
         };
-        "gather": |x| x[0].gather(1, &along());
-        "scatter_add": |x| x[0].scatter_add(1, &along(), &x[1]);
+        "gather": |x| x[0].gather(1, along());
+        "scatter_add": |x| x[0].scatter_add(1, along(), &x[1]);
         "index_select": |x| x[0].index_select(1, [2, 0, 2]);
         "index_add": |x| x[0].index_add(1, [2, 0, 2], &x[1]);
         "gather_rows": |x| x[0].gather_rows([2, 0, 2]);
@@ -244,8 +244,8 @@ fn algebra() -> Vec<Case> {
         "matmul.batch": |x| x[0].matmul(&x[1]);
         "matmul.batch_matrix": |x| x[0].matmul(&x[1]);
         "matmul.tn": |x| x[0].t().matmul(&x[1]);
-        "matmul.nt": |x| x[0].matmul(&x[1].t());
-        "matmul.tt": |x| x[0].t().matmul(&x[1].t());
+        "matmul.nt": |x| x[0].matmul(x[1].t());
+        "matmul.tt": |x| x[0].t().matmul(x[1].t());
         "dot": |x| x[0].dot(&x[1]);
         "outer": |x| x[0].outer(&x[1]);
         "einsum": |x| Var::einsum("bij,bjk->bik", &[&x[0], &x[1]]);

@@ -29,7 +29,7 @@ fn product<'t>(a: &Var<'t, f64>, b: &Var<'t, f64>, fused: bool) -> Option<Var<'t
         last == first
     })?;
     let turned = |x: &Var<'t, f64>, turn: bool| if turn { x.t() } else { x.clone() };
-    Some(turned(a, ta).matmul(&turned(b, tb)) * scale)
+    Some(turned(a, ta).matmul(turned(b, tb)) * scale)
 }
 
 /// Every operation keeps its values within about -3..3, so that no depth of nesting makes differences useless.

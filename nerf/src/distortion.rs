@@ -117,7 +117,7 @@ impl<T: Scalar> Op<T> for Distortion<T> {
                 T::from_f64((m[i].to_f64() - m[j].to_f64()).abs())
             });
             let lengths = Tensor::from_vec(&[n], self.lengths.as_slice()[rows].to_vec());
-            let apart = (w.reshape(&[1, n]).matmul(&tape.constant(distances)).reshape(&[n]) * &w).sum();
+            let apart = (w.reshape(&[1, n]).matmul(tape.constant(distances)).reshape(&[n]) * &w).sum();
             (apart + (w.square() * tape.constant(lengths)).sum() * (1.0 / 3.0)).reshape(&[1])
         };
         let losses: Vec<_> = self.segments.ranges().map(loss).collect();

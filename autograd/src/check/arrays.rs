@@ -100,7 +100,7 @@ fn indexing() -> Vec<Entry> {
         select(0, &[]).sample(&[&[3]]).sample(&[&[0, 2]]),
         add(1, &[2, 0, 2], 4).sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]),
         add(0, &[], 2).sample(&[&[0]]).sample(&[&[0, 3]]),
-        function!("scatter_add", |x| x[0].scatter_add(0, &Indices::new(&[3, 2], [1, 0, 1, 1, 0, 0]), &x[1]))
+        function!("scatter_add", |x| x[0].scatter_add(0, Indices::new(&[3, 2], [1, 0, 1, 1, 0, 0]), &x[1]))
             .linear()
             .sample(&[&[2, 2], &[3, 2]]),
         function!("index_add", |x| x[0].index_add(1, [1, 1], &x[1])).linear().sample(&[&[2, 3], &[2, 2]]),
@@ -120,11 +120,11 @@ fn algebra() -> Vec<Entry> {
             .sample(&[&[2, 4, 3], &[4, 2]])
             .sample(&[&[4, 3], &[2, 4, 2]])
             .sample(&[&[4, 3], &[4, 2]]),
-        function!("matmul_right_transposed", |x| x[0].matmul(&x[1].t()))
+        function!("matmul_right_transposed", |x| x[0].matmul(x[1].t()))
             .sample(&[&[1, 3, 4], &[2, 2, 4]])
             .sample(&[&[0, 2, 3], &[1, 2, 3]])
             .sample(&[&[3, 4], &[2, 4]]),
-        function!("matmul_both_transposed", |x| x[0].t().matmul(&x[1].t()))
+        function!("matmul_both_transposed", |x| x[0].t().matmul(x[1].t()))
             .sample(&[&[2, 4, 3], &[2, 2, 4]])
             .sample(&[&[2, 0, 3], &[2, 2, 0]])
             .sample(&[&[4, 3], &[2, 4]]),

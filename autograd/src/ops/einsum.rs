@@ -139,7 +139,7 @@ fn contract<'t, T: Scalar>(operands: Vec<Labelled<'t, T>>, result: &[char]) -> V
     let labels = [&batch[..], &left, &right].concat();
     let extent = |label: &char| if in_b(label) { b.extent(*label) } else { a.extent(*label) };
     let shape: Shape = labels.iter().map(extent).collect();
-    let x = a.matrices(&batch, &left, &inner).matmul(&b.matrices(&batch, &inner, &right)).reshape(&shape);
+    let x = a.matrices(&batch, &left, &inner).matmul(b.matrices(&batch, &inner, &right)).reshape(&shape);
     Labelled { x, labels }.ordered(result)
 }
 

@@ -392,7 +392,7 @@ mod tests {
         let zero = tape.constant(Tensor::zeros(&[1, 2]));
         let source = tape.constant(Tensor::from_vec(&[1, 3], vec![1e8, 1.0, -1e8]));
         assert_eq!(zero.index_add(1, [1, 1, 1], &source).value().as_slice(), [0.0, 1.0]);
-        assert_eq!(zero.scatter_add(1, &Indices::new(&[1, 3], [1, 0, 1]), &source).value().as_slice(), [1.0, 0.0]);
+        assert_eq!(zero.scatter_add(1, Indices::new(&[1, 3], [1, 0, 1]), &source).value().as_slice(), [1.0, 0.0]);
     }
     /// An axis with entries before and behind it, and fewer or more indices than entries.
     #[test]

@@ -153,7 +153,7 @@ mod tests {
             let (m, n) = (if row { 1 } else { m }, if column { 1 } else { n });
             let tape = Tape::<f64>::new();
             let (x, y) = (spread(&a, &[-1.0..1.0], 1), spread(&b, &[-1.0..1.0], 2));
-            let got = tape.constant(x.clone()).matmul(&tape.constant(y.clone()));
+            let got = tape.constant(x.clone()).matmul(tape.constant(y.clone()));
             prop_assert_eq!(got.shape(), &expected_shape[..]);
             let full = |x: &Tensor<f64>, axes: [usize; 2]| {
                 let mut wide = wide.to_vec();

@@ -36,7 +36,7 @@ impl<T: Scalar> Op<T> for Cross {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let da = cx.needs(0).then(|| cx.x(1).cross(cx.g()).sum_to(cx.shape(0)));
-        let db = cx.needs(1).then(|| cx.g().cross(&cx.x(0)).sum_to(cx.shape(1)));
+        let db = cx.needs(1).then(|| cx.g().cross(cx.x(0)).sum_to(cx.shape(1)));
         Grads::new([da, db])
     }
 }
