@@ -432,3 +432,17 @@ fn averages_that_cannot_go_on_stay_as_they_are() {
     assert!(ema.load_state(&stranger).is_err());
     assert_eq!(ema.state(), state);
 }
+
+#[test]
+fn a_dense_gradient_reaches_the_optimiser_without_a_copy() {
+    let mut params = Params::<f32>::new();
+    params.add("x", Tensor::from([1.0, 2.0]));
+    let dense = [Gradient::from(Tensor::from([3.0, 4.0]))];
+    let part = params.moves(&dense, 0.1).next().unwrap();
+    assert!(matches!(part.dense_grad(&Pool::none()), std::borrow::Cow::Borrowed(_)));
+    let mut rows = Gradient::zero(&[2]);
+    rows.add_sparse(Arc::new(RowGrad::new(&[2], [1].into(), Tensor::from([5.0]))));
+    let rows = [rows];
+    let part = params.moves(&rows, 0.1).next().unwrap();
+    assert_eq!(part.dense_grad(&Pool::none()).into_owned(), Tensor::from([0.0, 5.0]));
+}
