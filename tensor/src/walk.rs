@@ -12,9 +12,45 @@ const TILE: usize = 16;
 /// Rows and columns of a block of tiles.
 const BLOCK: usize = 64;
 
+/// Elements of a transpose that are written past the caches, at least: nobody finds them there again.
+const STREAMED: usize = 1 << 20;
+/// Bytes of a cache line.
+const LINE: usize = 64;
+
 /// The parts of a range, `len` long but for the last.
 fn starts(range: Range<usize>, len: usize) -> impl Iterator<Item = Range<usize>> {
     range.clone().step_by(len).map(move |start| start..range.end.min(start + len))
+}
+
+/// Copies a row of a tile to memory without reading the cache line that it fills.
+///
+/// # Panics
+/// If `out` is shorter or not aligned to 16 bytes.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn stream<T: Scalar>(row: &[T; TILE], out: &mut [T]) {
+    use std::arch::x86_64::{__m128i, _mm_loadu_si128, _mm_stream_si128};
+    let out = out[..TILE].as_mut_ptr().cast::<__m128i>();
+    assert!(out.addr().is_multiple_of(16), "a row that is not aligned");
+    for k in 0..size_of::<[T; TILE]>() / 16 {
+        // SAFETY: the processor has SSE2, `row` and `out` are as long, and `out` is aligned. Run by `streamed_rows_arrive`.
+        unsafe { _mm_stream_si128(out.add(k), _mm_loadu_si128(row.as_ptr().cast::<__m128i>().add(k))) };
+    }
+}
+
+/// Where there is no such instruction: a copy.
+#[cfg(not(target_arch = "x86_64"))]
+fn stream<T: Scalar>(row: &[T; TILE], out: &mut [T]) {
+    out[..TILE].copy_from_slice(row);
+}
+
+/// Has everything that was [`stream`]ed written before anything else is.
+fn finish_streams() {
+    // SAFETY: the processor has SSE. Run by `streamed_rows_arrive`.
+    #[cfg(target_arch = "x86_64")]
+    unsafe {
+        std::arch::x86_64::_mm_sfence();
+    }
 }
 
 /// `out[i * row_step + j] = source[start + j * step + i]` for a tile of `height x width`.
@@ -25,13 +61,28 @@ fn transpose<T: Scalar>(
     out: &mut [T],
     row_step: usize,
     [height, width]: [usize; 2],
+    streamed: bool,
 ) {
     let line = |j: usize| &source[(start as isize + j as isize * step) as usize..];
     if [height, width] == [TILE; 2] {
-        let tile: [[T; TILE]; TILE] = from_fn(|j| from_fn(|i| line(j)[..TILE][i]));
-        for i in 0..TILE {
-            let row: [T; TILE] = from_fn(|j| tile[j][i]);
-            out[i * row_step..][..TILE].copy_from_slice(&row);
+        let lines: [&[T]; TILE] = from_fn(|j| &line(j)[..TILE]);
+        // Squares of four, which the compiler turns in registers.
+        for i in (0..TILE).step_by(4) {
+            let mut rows = [[T::ZERO; TILE]; 4];
+            for j in (0..TILE).step_by(4) {
+                let square: [[T; 4]; 4] = from_fn(|k| from_fn(|l| lines[j + k][i + l]));
+                for (l, row) in rows.iter_mut().enumerate() {
+                    row[j..j + 4].copy_from_slice(&square.map(|line| line[l]));
+                }
+            }
+            for (l, row) in rows.iter().enumerate() {
+                let out = &mut out[(i + l) * row_step..][..TILE];
+                if streamed {
+                    stream(row, out);
+                } else {
+                    out.copy_from_slice(row);
+                }
+            }
         }
         return;
     }
@@ -124,10 +175,11 @@ impl Layout {
         let inner: usize = self.shape()[axis + 1..].iter().product();
         let whole = if self.strides()[axis] == 1 { BLOCK } else { 1 };
         let at_once = (PIECE / inner).next_multiple_of(whole).max(whole);
+        let streamed = out.len() >= STREAMED;
         chunks(out, at_once * inner, work, || (), &|_, i, out| {
             let part = self.sliced(axis, i * at_once, out.len() / inner, 1);
             match part.rows_in_memory() {
-                Some(axis) => part.read_transposed(&part.collapsed(), axis, source, out),
+                Some(axis) => part.read_transposed(&part.collapsed(), axis, source, out, streamed),
                 None => part.read_range(source, 0, out),
             }
         });
@@ -142,7 +194,7 @@ impl Layout {
     }
 
     /// Copies a range of the elements, counted in row-major order, to `out`.
-    pub(crate) fn read_range<T: Scalar>(&self, source: &[T], start: usize, out: &mut [T]) {
+    pub(crate) fn read_range<T: Copy>(&self, source: &[T], start: usize, out: &mut [T]) {
         self.runs(start..start + out.len(), |run| {
             let out = &mut out[run.start - start..][..run.count];
             match run.neighbours() {
@@ -154,7 +206,14 @@ impl Layout {
     }
 
     /// As [`read`](Self::read), where neighbours in memory lie along `axis` of the collapsed `axes` and not along the last.
-    fn read_transposed<T: Scalar>(&self, axes: &[(usize, isize)], axis: usize, source: &[T], out: &mut [T]) {
+    fn read_transposed<T: Scalar>(
+        &self,
+        axes: &[(usize, isize)],
+        axis: usize,
+        source: &[T],
+        out: &mut [T],
+        streamed: bool,
+    ) {
         let (rows, (columns, step)) = (axes[axis].0, axes[axes.len() - 1]);
         // Steps of the output along the axes, and the matrices that the other axes count.
         let row_step: usize = axes[axis + 1..].iter().map(|&(extent, _)| extent).product();
@@ -169,19 +228,23 @@ impl Layout {
                 to += index * axes[other + 1..].iter().map(|&(extent, _)| extent).product::<usize>();
             }
             let out = &mut out[to..];
+            // Rows are streamed if all begin at the same place of a cache line: from the first whole line on.
+            let streamed = streamed && (row_step * size_of::<T>()).is_multiple_of(LINE);
+            let lead = if streamed { out.as_ptr().align_offset(LINE).min(columns) } else { 0 };
             // Blocks of tiles, so that few pages of memory are in use at a time.
             for rows in starts(0..rows, BLOCK) {
-                for columns in starts(0..columns, BLOCK) {
+                for columns in starts(0..lead, BLOCK).chain(starts(lead..columns, BLOCK)) {
                     for row in starts(rows.clone(), TILE) {
                         for column in starts(columns.clone(), TILE) {
                             let start = (from + column.start as isize * step) as usize + row.start;
                             let out = &mut out[row.start * row_step + column.start..];
-                            transpose(source, start, step, out, row_step, [row.len(), column.len()]);
+                            transpose(source, start, step, out, row_step, [row.len(), column.len()], streamed);
                         }
                     }
                 }
             }
         }
+        finish_streams();
     }
 
     /// The inverse of [`read`](Self::read): copies `values` to the elements of `target` that the layout names; the
@@ -217,5 +280,36 @@ impl Layout {
                 None => run.positions().zip(values).for_each(|(position, &value)| target[position] += value),
             }
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Transposes that are streamed: of whole matrices and of parts, to places at any distance from a cache line.
+    fn large_transposes<T: Scalar>(per_line: usize) {
+        // Rows of the result that all begin at one place of a line, and rows that do not.
+        for (matrices, rows, columns) in [(1, 1440, 1536), (2, 1057, 1072), (1, 1441, 1537)] {
+            let source = Vec::from_iter((0..matrices * rows * columns).map(|i| T::from_f64((i % 65_521) as f64)));
+            let whole = Layout::contiguous(&[matrices, columns, rows]);
+            assert!(whole.len() >= STREAMED);
+            for layout in [whole.permuted(&[0, 2, 1]), whole.sliced(2, rows - 1, rows, -1).permuted(&[0, 2, 1])] {
+                for lead in [0, 1, per_line - 1] {
+                    let mut out = vec![T::from_f64(-1.0); layout.len() + lead];
+                    layout.read(&source, &mut out[lead..]);
+                    assert!(out[..lead].iter().all(|x| x.to_f64() == -1.0));
+                    let mut expected = vec![T::ZERO; layout.len()];
+                    layout.read_range(&source, 0, &mut expected);
+                    assert!(out[lead..] == expected, "{matrices} of {rows}x{columns}, {lead} places into a line");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn streamed_rows_arrive() {
+        large_transposes::<f32>(16);
+        large_transposes::<f64>(8);
     }
 }
