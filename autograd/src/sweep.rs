@@ -34,6 +34,7 @@ pub(crate) fn sweep<'t, T: Scalar>(
 
 /// As an unrecorded sweep that frees the graph, but with the shares of each of `leaves` apart, in the order in which they
 /// came. Who adds them to a sum gets the bits of a sweep that had not been interrupted.
+#[inline(never)]
 pub(crate) fn parts<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,
@@ -44,6 +45,7 @@ pub(crate) fn parts<'t, T: Scalar>(
     Ok(sums(root, seed, leaves, Keep::Nothing, true, at)?.into_iter().map(parts).collect())
 }
 
+#[inline(never)]
 fn sums<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,

@@ -38,6 +38,7 @@ impl<T: Scalar> Model<T> {
     ///
     /// # Panics
     /// If `finer` is 0.
+    #[inline(never)]
     pub fn dense_view(&self, camera: &Camera, background: [f64; 3], finer: usize) -> DenseView {
         assert!(finer > 0, "steps that are 0 times smaller");
         let mut pixels = vec![[0.0; 5]; camera.width * camera.height];

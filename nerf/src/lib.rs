@@ -13,6 +13,8 @@ mod camera;
 mod catalogue;
 mod color_space;
 pub mod colormap;
+#[doc(hidden)]
+pub mod compiled;
 mod composite;
 mod config;
 mod contraction;

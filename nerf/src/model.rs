@@ -54,6 +54,7 @@ impl<T: Scalar> Model<T> {
     ///
     /// # Errors
     /// If the configuration is out of range.
+    #[inline(never)]
     pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
         config.check()?;
         let [low, high] = extent.bounds;
@@ -146,6 +147,7 @@ impl<T: Scalar> Model<T> {
     ///
     /// # Errors
     /// If the configuration is out of range, which that of a model in use is not.
+    #[inline(never)]
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::new(self.config.clone(), self.extent, 0)?;
         model.params.assign(&self.params);

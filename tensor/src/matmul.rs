@@ -102,6 +102,7 @@ const PER_OPERATION: usize = 8;
 /// # Panics
 /// If the sizes do not fit together.
 #[track_caller]
+#[inline(never)]
 pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumulate: bool) {
     let (m, k, n) = (a.rows, a.columns, b.columns);
     assert_eq!(b.rows, k, "inner dimensions of {m}x{k} times {}x{n}", b.rows);

@@ -27,6 +27,7 @@ const CACHE: usize = 1 << 20;
 /// let sum = raygrad_tensor::sum(&x);
 /// assert!((sum / 1677.7216 - 1.0).abs() < 1e-6); // a plain loop is 14 % off
 /// ```
+#[inline(never)]
 pub fn sum<T: Scalar>(x: &[T]) -> T {
     if x.len() <= LANES * BLOCK {
         return simd::dispatch(
@@ -226,6 +227,7 @@ pub fn sum_to<T: Scalar>(x: &Tensor<T>, shape: &[usize], pool: &Pool<T>) -> Tens
 }
 
 /// The sum over the axes whose extent is 1 in `kept`.
+#[inline(never)]
 fn sum_kept<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tensor<T> {
     if x.is_packed() {
         return sum_packed(x, kept, pool);

@@ -86,7 +86,7 @@ pub trait Scalar:
 }
 
 macro_rules! scalar {
-    ($t:ident, $bits:ident, $matrixmultiply:path) => {
+    ($t:ident, $bits:ident, $gemm:ident, $matrixmultiply:path) => {
         impl Scalar for $t {
             const NAME: &'static str = stringify!($t);
             const ZERO: Self = 0.0;
@@ -143,23 +143,25 @@ macro_rules! scalar {
                 c_row: usize,
                 accumulate: bool,
             ) {
-                let (one, serial) = (1.0, gemm::Parallelism::None);
-                // SAFETY: the caller's promise, with the strides in the order that `gemm` asks for (column, row).
+                // The kernels want columns in order, so this is c^T = b^T a^T; strides are (column, row).
+                let product = $gemm::gemm::$t::get_gemm_fn();
+                let (one, serial) = (1.0, gemm_common::Parallelism::None);
+                // SAFETY: the caller's promise.
                 unsafe {
-                    gemm::gemm(
-                        m,
+                    product(
                         n,
+                        m,
                         k,
                         c,
-                        1,
                         c_row as isize,
+                        1,
                         accumulate,
-                        a,
-                        a_col,
-                        a_row,
                         b,
-                        b_col,
                         b_row,
+                        b_col,
+                        a,
+                        a_row,
+                        a_col,
                         one,
                         one,
                         false,
@@ -188,5 +190,5 @@ macro_rules! scalar {
     };
 }
 
-scalar!(f32, u32, matrixmultiply::sgemm);
-scalar!(f64, u64, matrixmultiply::dgemm);
+scalar!(f32, u32, gemm_f32, matrixmultiply::sgemm);
+scalar!(f64, u64, gemm_f64, matrixmultiply::dgemm);

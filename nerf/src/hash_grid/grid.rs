@@ -153,6 +153,7 @@ impl HashGrid {
 
     /// A table `[rows, features]` to start from, uniform in -1e-4..1e-4 (section 4): near zero, so that the first steps
     /// see no random colours, and not zero, so that features differ.
+    #[inline(never)]
     pub fn init<T: Scalar>(&self, seed: u64) -> Tensor<T> {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         Tensor::from_fn(&[self.rows(), self.features], |_| T::from_f64(1e-4 * (2.0 * rng.random::<f64>() - 1.0)))

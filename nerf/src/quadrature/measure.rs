@@ -26,6 +26,7 @@ pub struct Integral {
 
 /// Renders a scene and differentiates what is seen, in the precision `T`, with at most `evaluations` evaluations; an
 /// adaptive rule begins with as many intervals and asks as often as it needs.
+#[inline(never)]
 pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations: usize) -> Integral {
     let mut params = Params::<T>::new();
     let field = AnalyticField::new(scene.medium.clone(), &mut params);

@@ -159,6 +159,7 @@ impl Quadrature {
 
     /// The plan for equal intervals over the spans of rays, with at most `evaluations` evaluations a ray and with at least
     /// one interval.
+    #[inline(never)]
     pub fn even<T: Scalar>(self, rays: &Rays<T>, evaluations: usize, pool: &Pool<T>) -> Plan<T> {
         let intervals = match self {
             Quadrature::Left | Quadrature::Midpoint => evaluations,
@@ -183,6 +184,7 @@ impl<T: Scalar> Plan<T> {
     /// The features of the plan's samples, composited along their rays: `[rays, channels + 1]` as
     /// [`Composite`](crate::Composite) gives it.
     #[track_caller]
+    #[inline(never)]
     pub fn composite<'t>(&self, density: &Density<'t, T>, features: &Var<'t, T>) -> Var<'t, T> {
         let tape = features.tape();
         let inputs = [&density.value, features];
