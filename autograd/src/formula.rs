@@ -186,19 +186,26 @@ impl<T: Scalar, F: Formula<N>, const N: usize> Op<T> for Elementwise<F, N> {
         broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
     }
 
+    #[inline(never)]
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
         let [y] = map_fused(x, [true], pool, &|x, out| self.values(x, out));
         y.unwrap_or_else(|| pool.tensor(&[]))
     }
 
     fn reads(&self) -> Reads {
-        Reads::of_bits(self.readings().iter().fold(0, |bits, reading| bits | reading.of))
+        Op::<T>::reads_for(self, &|_| true)
     }
 
+    fn reads_for(&self, has_gradient: &dyn Fn(usize) -> bool) -> Reads {
+        let readings = self.readings().into_iter().enumerate();
+        Reads::of_bits(readings.fold(0, |bits, (i, reading)| bits | if has_gradient(i) { reading.of } else { 0 }))
+    }
+
+    #[inline(never)]
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         if cx.recording() {
             let sheet = Sheet::new();
-            let (g, x, y) = given(cx, &sheet, Op::<T>::reads(self));
+            let (g, x, y) = given(cx, &sheet, Op::<T>::reads_for(self, &|i| cx.needs(i)));
             return recorded(cx, &sheet, &self.0.vjp(g, x, y));
         }
         let mut wanted = [false; N];

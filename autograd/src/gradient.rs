@@ -1,7 +1,7 @@
 //! A gradient: a sum of shares, dense or in whatever form an operation finds cheap.
 
 use crate::RowSums;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, add_assign};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::any::Any;
 use std::fmt;
 use std::sync::Arc;
@@ -150,7 +150,7 @@ impl<T: Scalar> Gradient<T> {
     pub fn add_dense(&mut self, share: Tensor<T>) {
         assert_eq!(share.shape(), self.shape(), "a share of a gradient has the shape of the whole");
         match &mut self.dense {
-            Some(sum) => add_assign(sum.as_mut_slice(), share.as_slice()),
+            Some(sum) => *sum += &share,
             None => self.dense = Some(share),
         }
     }

@@ -56,6 +56,12 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
         Reads::INPUTS
     }
 
+    /// As [`reads`](Self::reads), where `has_gradient` says which inputs are on the graph: the others need no gradient, so
+    /// that what only theirs would read is not kept. The tape calls this one.
+    fn reads_for(&self, _has_gradient: &dyn Fn(usize) -> bool) -> Reads {
+        self.reads()
+    }
+
     /// The gradient of each input, given the gradient `cx.g()` of the output. Inputs for which `cx.needs(i)` is false
     /// may be left out. There is an entry for each input, of its shape, or the sweep panics.
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T>;
@@ -118,6 +124,11 @@ impl Reads {
     /// These and the output.
     pub const fn and_output(self) -> Reads {
         Reads { output: true, ..self }
+    }
+
+    /// These, and `more` where that is so.
+    pub const fn and_if(self, so: bool, more: Reads) -> Reads {
+        if so { Reads { inputs: self.inputs | more.inputs, output: self.output || more.output } } else { self }
     }
 
     /// Whether input `i` is read. Operations of more than 32 inputs read all or none of the rest, as input 31.

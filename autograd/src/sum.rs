@@ -3,7 +3,7 @@
 use crate::op::Given;
 use crate::tape::find_non_finite;
 use crate::{Error, Gradient, SparseGrad, Tape, Var};
-use raygrad_tensor::{Scalar, Tensor, add_assign};
+use raygrad_tensor::{Scalar, Tensor};
 use std::panic::Location;
 use std::sync::Arc;
 
@@ -101,9 +101,10 @@ fn add<'t, T: Scalar>(sum: &mut Var<'t, T>, share: Var<'t, T>) {
 
 /// Adds a dense share to a sum of the same shape.
 pub(crate) fn add_share<T: Scalar>(sum: &mut Tensor<T>, share: &Tensor<T>) {
-    match (sum.as_mut_slice(), share.as_slice()) {
+    if share.len() == 1 {
         // The loop is not worth its start.
-        ([sum], [share]) => *sum += *share,
-        (sum, share) => add_assign(sum, share),
+        sum.as_mut_slice()[0] += share.item();
+    } else {
+        *sum += share;
     }
 }

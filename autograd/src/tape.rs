@@ -372,7 +372,7 @@ impl<T: Scalar> Tape<T> {
         value: Tensor<T>,
         at: &'static Location<'static>,
     ) -> Var<'t, T> {
-        let reads = op.reads();
+        let reads = op.reads_for(&|i| inputs[i].node.is_some());
         let edges = inputs.iter().map(|x| x.node.unwrap_or(CONSTANT));
         let inputs = inputs.iter().enumerate().map(|(i, x)| Kept::new(&x.value, reads.input(i))).collect();
         let output = Kept::new(&value, reads.output());
@@ -414,4 +414,31 @@ pub(crate) fn find_non_finite<T: Scalar>(
         rest /= extent;
     }
     Err(Error::NonFinite { op, what: what.into(), value: value.as_slice()[position].to_f64(), index, at })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_only_constants_would_read_is_not_kept() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::full(&[3, 3], 2.0));
+        let (c, tall) = (tape.constant(Tensor::full(&[3, 3], 3.0)), tape.constant(Tensor::full(&[1, 1, 3, 3], 1.0)));
+        let kept = |y: Var<'_, f64>| {
+            let node = tape.nodes.place(y.node.unwrap()).borrow();
+            let inputs = &node.as_ref().unwrap().inputs;
+            inputs.iter().map(|kept| matches!(kept, Kept::Value(_))).collect::<Vec<_>>()
+        };
+        assert_eq!(kept(&x * &c), [false, true]);
+        assert_eq!(kept(&c * &x), [true, false]);
+        assert_eq!(kept(&x / 8.0), [false, true]);
+        assert_eq!(kept(&x * &x), [true, true]);
+        assert_eq!(kept(x.matmul(&c)), [false, true]);
+        assert_eq!(kept(c.matmul(&x)), [true, false]);
+        assert_eq!(kept(x.where_(&c.gt(1.0), &c)), [false, false]);
+        let image = x.reshape(&[1, 1, 3, 3]);
+        assert_eq!(kept(image.conv2d(&tall, &Default::default())), [false, true]);
+        assert_eq!(kept(tall.conv2d(&image, &Default::default())), [true, false]);
+    }
 }

@@ -229,22 +229,31 @@ impl<T: Scalar> Tensor<T> {
 
     /// `a = f(a, b)` for the elements `b` of a tensor of the same shape.
     fn update(&mut self, other: &Self, f: impl Fn(T, T) -> T + Sync) {
-        let (layout, work) = (other.layout(), ELEMENT * self.len());
+        let work = ELEMENT * self.len();
+        let stretch = |a: &mut [T], b: &[T]| {
+            simd::dispatch(
+                #[inline(always)]
+                || {
+                    for (a, &b) in a.iter_mut().zip(b) {
+                        *a = f(*a, b);
+                    }
+                },
+            );
+        };
+        if other.is_packed() {
+            let b = other.as_slice();
+            chunks(self.as_mut_slice(), STRETCH, work, || (), &|(), i, a| stretch(a, &b[i * STRETCH..][..a.len()]));
+            return;
+        }
+        let layout = other.layout();
         let one = if let [one] = *other.buffer() { Some(one) } else { None };
-        let scratch = || vec![one.unwrap_or(T::ZERO); STRETCH];
+        let scratch = || vec![one.unwrap_or(T::ZERO); STRETCH.min(other.len())];
         chunks(self.as_mut_slice(), STRETCH, work, scratch, &|scratch: &mut Vec<T>, i, a| {
             let b = &mut scratch[..a.len()];
             if one.is_none() {
                 layout.read_range(other.buffer(), i * STRETCH, b);
             }
-            simd::dispatch(
-                #[inline(always)]
-                || {
-                    for (a, &b) in a.iter_mut().zip(&*b) {
-                        *a = f(*a, b);
-                    }
-                },
-            );
+            stretch(a, b);
         });
     }
 

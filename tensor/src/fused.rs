@@ -27,6 +27,7 @@ const BLOCK: usize = 4096;
 /// # Panics
 /// If the shapes do not broadcast.
 #[track_caller]
+#[inline(never)]
 pub fn map_fused<T: Scalar, const M: usize>(
     x: &[&Tensor<T>],
     wanted: [bool; M],
@@ -85,7 +86,7 @@ fn map_views<T: Scalar, const M: usize>(
 }
 
 /// An operand of a loop over a common shape.
-enum Part<'a, T: Scalar> {
+pub(crate) enum Part<'a, T: Scalar> {
     /// Its elements are in order.
     Packed(&'a [T]),
     /// One number.
@@ -95,7 +96,7 @@ enum Part<'a, T: Scalar> {
 }
 
 impl<'a, T: Scalar> Part<'a, T> {
-    fn of(buffer: &'a [T], layout: &'a Layout) -> Self {
+    pub(crate) fn of(buffer: &'a [T], layout: &'a Layout) -> Self {
         match buffer {
             &[one] => Part::One(one),
             _ if layout.is_packed() => Part::Packed(&buffer[layout.offset()..]),
@@ -104,7 +105,7 @@ impl<'a, T: Scalar> Part<'a, T> {
     }
 
     /// Space for `width` elements, if they are not in order; to be given back.
-    fn scratch(&self, width: usize, pool: &Pool<T>) -> Vec<T> {
+    pub(crate) fn scratch(&self, width: usize, pool: &Pool<T>) -> Vec<T> {
         match *self {
             Part::Packed(_) => vec![],
             Part::One(value) => {
@@ -117,7 +118,7 @@ impl<'a, T: Scalar> Part<'a, T> {
     }
 
     /// `n` elements from `start` on.
-    fn cut<'s>(&'s self, start: usize, n: usize, scratch: &'s mut [T]) -> &'s [T] {
+    pub(crate) fn cut<'s>(&'s self, start: usize, n: usize, scratch: &'s mut [T]) -> &'s [T] {
         match self {
             Part::Packed(x) => &x[start..][..n],
             Part::One(_) => &scratch[..n],

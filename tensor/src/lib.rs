@@ -54,7 +54,7 @@ pub use fused::{Block, lanes_fused, map_fused};
 pub use indices::Indices;
 pub use lane::Lane;
 pub use layout::{INFER, Layout, checked_len, inferred};
-pub use mask::Mask;
+pub use mask::{Mask, choose};
 pub use pool::Pool;
 pub use real::Real;
 pub use reduce::{sum, sum_axes, sum_rows, sum_to};

@@ -1,8 +1,9 @@
 //! Boolean arrays: what comparisons give, and what picks elements.
 
+use crate::fused::Part;
 use crate::layout::checked_len;
 use crate::parallel::{ELEMENT, PIECE, chunks};
-use crate::{Indices, Scalar, Shape, Tensor, axis_of, map};
+use crate::{Indices, Layout, Pool, Scalar, Shape, Tensor, axis_of, broadcast_shape, simd};
 use std::fmt;
 use std::ops::{BitAnd, BitOr, BitXor, Not};
 use std::sync::Arc;
@@ -80,10 +81,28 @@ impl Mask {
         Tensor::from_vec(&self.shape, numbers)
     }
 
+    /// The mask stretched to another shape, as NumPy broadcasts.
+    ///
+    /// # Panics
+    /// If the shape does not broadcast to `shape`.
+    #[track_caller]
+    pub fn broadcast_to(&self, shape: &[usize]) -> Mask {
+        if self.shape() == shape {
+            return self.clone();
+        }
+        let layout = Layout::contiguous(&self.shape).stretched(shape);
+        let mut values = vec![false; layout.len()];
+        layout.read_range(&self.values, 0, &mut values);
+        Mask::new(shape, values)
+    }
+
     #[track_caller]
     fn join(&self, other: &Mask, f: impl Fn(bool, bool) -> bool) -> Mask {
-        assert_eq!(self.shape, other.shape, "masks of different shapes");
-        Mask::new(&self.shape, self.values.iter().zip(&*other.values).map(|(&a, &b)| f(a, b)).collect::<Vec<_>>())
+        let Some(shape) = broadcast_shape(&[self.shape(), other.shape()]) else {
+            panic!("masks of shapes {:?} and {:?} do not broadcast", self.shape, other.shape)
+        };
+        let (a, b) = (self.broadcast_to(&shape), other.broadcast_to(&shape));
+        Mask::new(&shape, a.values.iter().zip(&*b.values).map(|(&a, &b)| f(a, b)).collect::<Vec<_>>())
     }
 }
 
@@ -92,7 +111,7 @@ macro_rules! operator {
         impl $trait for &Mask {
             type Output = Mask;
             /// # Panics
-            /// If the shapes differ.
+            /// If the shapes do not broadcast.
             #[track_caller]
             fn $method(self, other: &Mask) -> Mask {
                 self.join(other, |a, b| a $op b)
@@ -101,7 +120,7 @@ macro_rules! operator {
         impl $trait for Mask {
             type Output = Mask;
             /// # Panics
-            /// If the shapes differ.
+            /// If the shapes do not broadcast.
             #[track_caller]
             fn $method(self, other: Mask) -> Mask {
                 &self $op &other
@@ -134,10 +153,39 @@ impl fmt::Debug for Mask {
     }
 }
 
+/// The elements of `yes` where `mask` is true, and those of `no` elsewhere; see [`Tensor::where_`].
+///
+/// # Panics
+/// If the shapes do not broadcast.
+#[track_caller]
+pub fn choose<T: Scalar>(mask: &Mask, yes: &Tensor<T>, no: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
+    let shapes = [mask.shape(), yes.shape(), no.shape()];
+    let Some(shape) = broadcast_shape(&shapes) else { panic!("shapes {shapes:?} do not broadcast") };
+    let mask = mask.broadcast_to(&shape);
+    let layouts = [yes, no].map(|x| x.layout().stretched(&shape));
+    let [yes, no] = [Part::of(yes.buffer(), &layouts[0]), Part::of(no.buffer(), &layouts[1])];
+    pool.filled(&shape, |out| {
+        let width = PIECE.min(out.len());
+        let scratch = || [&yes, &no].map(|part| part.scratch(width, &Pool::none()));
+        chunks(out, PIECE, mask.values.len() * ELEMENT, scratch, &|[first, second]: &mut [Vec<T>; 2], i, out| {
+            let (start, n) = (i * PIECE, out.len());
+            let (mask, yes, no) = (&mask.values[start..][..n], yes.cut(start, n, first), no.cut(start, n, second));
+            simd::dispatch(
+                #[inline(always)]
+                || {
+                    for ((out, &mask), (&yes, &no)) in out.iter_mut().zip(mask).zip(yes.iter().zip(no)) {
+                        *out = if mask { yes } else { no };
+                    }
+                },
+            );
+        });
+    })
+}
+
 impl<T: Scalar> Tensor<T> {
     #[track_caller]
     fn compare(&self, other: &Self, f: impl Fn(T, T) -> bool + Sync) -> Mask {
-        let Some(shape) = crate::broadcast_shape(&[self.shape(), other.shape()]) else {
+        let Some(shape) = broadcast_shape(&[self.shape(), other.shape()]) else {
             panic!("shapes {:?} and {:?} do not broadcast", self.shape(), other.shape())
         };
         let mut holds = vec![false; crate::layout::len_of(&shape)];
@@ -205,13 +253,7 @@ impl<T: Scalar> Tensor<T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn where_(&self, mask: &Mask, other: impl Into<Tensor<T>>) -> Self {
-        let (mask, other) = (mask.cast(), other.into());
-        map(
-            [&mask, self, &other],
-            &self.pool(),
-            #[inline(always)]
-            |[mask, yes, no]| if mask == T::ZERO { no } else { yes },
-        )
+        choose(mask, self, &other.into(), &self.pool())
     }
 
     /// The elements where a mask is true, in row-major order: `[count]`.
@@ -324,9 +366,34 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "masks of different shapes")]
-    fn masks_of_different_shapes_do_not_join() {
-        let _ = Mask::new(&[2, 1], [true, false]) & Mask::new(&[2], [true, false]);
+    fn masks_broadcast() {
+        let (column, row) = (Mask::new(&[2, 1], [true, false]), Mask::new(&[3], [true, false, true]));
+        assert_eq!(&column & &row, Mask::new(&[2, 3], [true, false, true, false, false, false]));
+        assert_eq!(column.broadcast_to(&[2, 2, 2]).as_slice(), [true, true, false, false].repeat(2));
+        let refused = std::panic::catch_unwind(|| column | Mask::new(&[3, 2], [true; 6]));
+        let message = *refused.unwrap_err().downcast::<String>().unwrap();
+        assert_eq!(message, "masks of shapes [2, 1] and [3, 2] do not broadcast");
+    }
+
+    #[test]
+    fn large_choices_among_views_are_those_of_their_elements() {
+        let shape = [301, 403];
+        let at = |i: usize| [i / 403, i % 403];
+        let x = Tensor::<f64>::from_fn(&[403, 301], |i| i as f64);
+        let (yes, no) = (x.t(), Tensor::<f64>::from_fn(&[301, 1], |i| -(i as f64)));
+        let (whole, row) = (yes.gt(60_000.0), Mask::new(&[403], (0..403).map(|j| j % 3 == 0).collect::<Vec<_>>()));
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        for mask in [&whole, &row] {
+            for (yes, no) in [(&yes, &no), (&no, &yes), (&yes, &Tensor::scalar(0.5))] {
+                let chosen = pool.install(|| yes.where_(mask, no));
+                assert_eq!(chosen.shape(), shape);
+                let [mask, yes, no] = [mask.cast(), yes.clone(), no.clone()].map(|x| x.broadcast_to(&shape));
+                for (i, value) in chosen.iter().enumerate() {
+                    assert_eq!(value, if mask[at(i)] == 1.0 { yes[at(i)] } else { no[at(i)] });
+                }
+            }
+        }
+        assert_eq!(yes.where_(&Mask::new(&[0, 1, 403], []), &no).shape(), [0, 301, 403]);
     }
 
     #[test]

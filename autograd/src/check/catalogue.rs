@@ -193,11 +193,7 @@ fn elementwise() -> Vec<Entry> {
     let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::examined(power::Powf { exponent }));
     // Values that are equal in places, and that no step of a difference takes past each other.
     let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
-    let mask = |shape: &[usize]| ranks(shape, 3);
-    let choice = |shape: &[usize], others: [&[usize]; 2]| {
-        let others = others.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 3));
-        std::iter::once(mask(shape)).chain(others).collect::<Vec<_>>()
-    };
+    let choice = |shape: &[usize]| Entry::new(select::Where(ranks(shape, 3).gt(0.0)));
     let rest = vec![
         Entry::examined(exponential::Exp2),
         Entry::examined(exponential::Log2),
@@ -227,11 +223,10 @@ fn elementwise() -> Vec<Entry> {
         Entry::examined(power::Reciprocal),
         Entry::examined(power::Pow),
         Entry::examined(power::Xlogy),
-        Entry::new(select::Where)
-            .sample_of(choice(&[2, 3], [&[2, 3], &[3]]))
-            .sample_of(choice(&[3], [&[2, 1], &[]]))
-            .sample_of(choice(&[0, 3], [&[3], &[1]]))
-            .sample_of(choice(&[], [&[], &[]])),
+        choice(&[2, 3]).sample(&[&[2, 3], &[3]]),
+        choice(&[3]).sample(&[&[2, 1], &[]]).sample(&[&[0, 3], &[1]]),
+        choice(&[2, 1]).sample(&[&[1, 3], &[]]),
+        choice(&[]).sample(&[&[], &[]]),
         Entry::new(select::Lerp).sample(&[&[2, 3], &[2, 3], &[2, 3]]).sample(&[&[3], &[2, 1], &[]]).sample(&[
             &[0, 3],
             &[3],

@@ -166,6 +166,10 @@ impl<T: Scalar> Op<T> for Conv2d {
         Reads::only(&[0, 1])
     }
 
+    fn reads_for(&self, has_gradient: &dyn Fn(usize) -> bool) -> Reads {
+        Reads::NOTHING.and_if(has_gradient(0), Reads::only(&[1])).and_if(has_gradient(1), Reads::only(&[0]))
+    }
+
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (g, tape) = (cx.g(), cx.tape());
         let (image, kernel) = ([cx.shape(0)[2], cx.shape(0)[3]], [cx.shape(1)[2], cx.shape(1)[3]]);

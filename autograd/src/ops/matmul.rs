@@ -38,6 +38,10 @@ impl<T: Scalar> Op<T> for Matmul {
         Reads::INPUTS
     }
 
+    fn reads_for(&self, has_gradient: &dyn Fn(usize) -> bool) -> Reads {
+        Reads::NOTHING.and_if(has_gradient(0), Reads::only(&[1])).and_if(has_gradient(1), Reads::only(&[0]))
+    }
+
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let product = |a: &Var<'t, T>, b: &Var<'t, T>| cx.tape().apply(Matmul, &[a, b]);
         let a = cx.needs(0).then(|| product(cx.g(), &cx.x(1).t()).sum_to(cx.shape(0)));

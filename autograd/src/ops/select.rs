@@ -2,11 +2,11 @@
 
 use crate::error::ensure;
 use crate::{Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
-use raygrad_tensor::{Mask, Pool, Scalar, Shape, Tensor, broadcast_shape, map};
+use raygrad_tensor::{Mask, Pool, Scalar, Shape, Tensor, broadcast_shape, choose, map};
 
-/// y = yes where the mask is not 0, else no. The mask has no gradient.
-#[derive(Clone, Copy)]
-pub struct Where;
+/// y = yes where the mask holds, else no.
+#[derive(Clone)]
+pub struct Where(pub Mask);
 
 impl<T: Scalar> Op<T> for Where {
     fn name(&self) -> &'static str {
@@ -14,28 +14,25 @@ impl<T: Scalar> Op<T> for Where {
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        broadcast_shape(x).ok_or_else(|| "the shapes do not broadcast".into())
+        let [yes, no] = x else { return Err("two choices, and the mask between them".into()) };
+        broadcast_shape(&[self.0.shape(), yes, no])
+            .ok_or_else(|| format!("they do not broadcast with a mask of shape {:?}", self.0.shape()))
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        map(
-            [x[0], x[1], x[2]],
-            pool,
-            #[inline(always)]
-            |[mask, yes, no]| if mask == T::ZERO { no } else { yes },
-        )
+        choose(&self.0, x[0], x[1], pool)
     }
 
     fn reads(&self) -> Reads {
-        Reads::only(&[0])
+        Reads::NOTHING
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         // Chosen and not multiplied: an infinite gradient on one side leaves no NaN on the other.
-        let (mask, g, zero) = (cx.x(0), cx.g(), cx.g().constant(0.0));
-        let yes = cx.needs(1).then(|| cx.tape().apply(Where, &[&mask, g, &zero]).sum_to(cx.shape(1)));
-        let no = cx.needs(2).then(|| cx.tape().apply(Where, &[&mask, &zero, g]).sum_to(cx.shape(2)));
-        Grads::new([None, yes, no])
+        let (g, zero) = (cx.g(), cx.g().constant(0.0));
+        let yes = cx.needs(0).then(|| cx.tape().apply(self.clone(), &[g, &zero]).sum_to(cx.shape(0)));
+        let no = cx.needs(1).then(|| cx.tape().apply(self.clone(), &[&zero, g]).sum_to(cx.shape(1)));
+        Grads::new([yes, no])
     }
 }
 
@@ -150,8 +147,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn where_(&self, mask: &Mask, other: impl Operand<'t, T>) -> Self {
-        let mask = self.tape().constant(mask.cast());
-        self.tape().apply(Where, &[&mask, self, &other.on(self.tape())])
+        self.tape().apply(Where(mask.clone()), &[self, &other.on(self.tape())])
     }
 
     /// The elements where `mask` holds, as a vector in row-major order: NumPy's `x[mask]`, PyTorch's `masked_select`.
