@@ -1,6 +1,7 @@
 //! Walks along layouts: reading the elements that a layout names, writing them, and adding to them.
 
 use crate::parallel::{ELEMENT, PIECE, chunks};
+use crate::simd::prefetch;
 use crate::{Layout, Scalar};
 use smallvec::SmallVec;
 use std::array::from_fn;
@@ -11,9 +12,10 @@ const TILE: usize = 16;
 
 /// Rows and columns of a block of tiles.
 const BLOCK: usize = 64;
+const COLUMNS: usize = 32;
 
-/// Elements of a transpose that are written past the caches, at least: nobody finds them there again.
-const STREAMED: usize = 1 << 20;
+/// Elements of a transpose that is written past the caches, at least: nobody finds them there again.
+const LARGE: usize = 1 << 20;
 /// Bytes of a cache line.
 const LINE: usize = 64;
 
@@ -53,6 +55,24 @@ fn finish_streams() {
     }
 }
 
+/// The transpose of a square, in registers. The compiler alone would load element by element.
+#[inline(always)]
+fn turn<T: Scalar>(square: [[T; 4]; 4]) -> [[T; 4]; 4] {
+    #[cfg(target_arch = "x86_64")]
+    if size_of::<T>() == size_of::<f32>() {
+        use std::arch::x86_64::{_mm_loadu_ps, _mm_movehl_ps, _mm_movelh_ps, _mm_unpackhi_ps, _mm_unpacklo_ps};
+        // SAFETY: the processor has SSE, and a line is as long as what is made of it. Run by `streamed_rows_arrive`.
+        return unsafe {
+            let [a, b, c, d] = square.each_ref().map(|line| _mm_loadu_ps(line.as_ptr().cast()));
+            let (low, high) =
+                ([_mm_unpacklo_ps(a, b), _mm_unpacklo_ps(c, d)], [_mm_unpackhi_ps(a, b), _mm_unpackhi_ps(c, d)]);
+            let pairs = |[x, y]: [_; 2]| [_mm_movelh_ps(x, y), _mm_movehl_ps(y, x)];
+            std::mem::transmute_copy(&[pairs(low), pairs(high)])
+        };
+    }
+    from_fn(|l| square.map(|line| line[l]))
+}
+
 /// `out[i * row_step + j] = source[start + j * step + i]` for a tile of `height x width`.
 fn transpose<T: Scalar>(
     source: &[T],
@@ -65,15 +85,16 @@ fn transpose<T: Scalar>(
 ) {
     let line = |j: usize| &source[(start as isize + j as isize * step) as usize..];
     if [height, width] == [TILE; 2] {
-        let lines: [&[T]; TILE] = from_fn(|j| &line(j)[..TILE]);
-        // Squares of four, which the compiler turns in registers.
+        // Lines at a step of a power of two would evict each other before they are used up.
+        let mut lines = [[T::ZERO; TILE]; TILE];
+        for (j, copy) in lines.iter_mut().enumerate() {
+            copy.copy_from_slice(&line(j)[..TILE]);
+        }
         for i in (0..TILE).step_by(4) {
             let mut rows = [[T::ZERO; TILE]; 4];
             for j in (0..TILE).step_by(4) {
-                let square: [[T; 4]; 4] = from_fn(|k| from_fn(|l| lines[j + k][i + l]));
-                for (l, row) in rows.iter_mut().enumerate() {
-                    row[j..j + 4].copy_from_slice(&square.map(|line| line[l]));
-                }
+                let square = turn(from_fn(|k| from_fn(|l| lines[j + k][i + l])));
+                rows.iter_mut().zip(&square).for_each(|(row, part)| row[j..j + 4].copy_from_slice(part));
             }
             for (l, row) in rows.iter().enumerate() {
                 let out = &mut out[(i + l) * row_step..][..TILE];
@@ -175,11 +196,11 @@ impl Layout {
         let inner: usize = self.shape()[axis + 1..].iter().product();
         let whole = if self.strides()[axis] == 1 { BLOCK } else { 1 };
         let at_once = (PIECE / inner).next_multiple_of(whole).max(whole);
-        let streamed = out.len() >= STREAMED;
+        let large = out.len() >= LARGE;
         chunks(out, at_once * inner, work, || (), &|_, i, out| {
             let part = self.sliced(axis, i * at_once, out.len() / inner, 1);
             match part.rows_in_memory() {
-                Some(axis) => part.read_transposed(&part.collapsed(), axis, source, out, streamed),
+                Some(axis) => part.read_transposed(&part.collapsed(), axis, source, out, large),
                 None => part.read_range(source, 0, out),
             }
         });
@@ -212,9 +233,9 @@ impl Layout {
         axis: usize,
         source: &[T],
         out: &mut [T],
-        streamed: bool,
+        large: bool,
     ) {
-        let (rows, (columns, step)) = (axes[axis].0, axes[axes.len() - 1]);
+        let (height, (width, step)) = (axes[axis].0, axes[axes.len() - 1]);
         // Steps of the output along the axes, and the matrices that the other axes count.
         let row_step: usize = axes[axis + 1..].iter().map(|&(extent, _)| extent).product();
         let others: SmallVec<[usize; 4]> = (0..axes.len() - 1).filter(|&other| other != axis).collect();
@@ -229,11 +250,18 @@ impl Layout {
             }
             let out = &mut out[to..];
             // Rows are streamed if all begin at the same place of a cache line: from the first whole line on.
-            let streamed = streamed && (row_step * size_of::<T>()).is_multiple_of(LINE);
-            let lead = if streamed { out.as_ptr().align_offset(LINE).min(columns) } else { 0 };
+            let streamed = large && (row_step * size_of::<T>()).is_multiple_of(LINE);
+            let lead = if streamed { out.as_ptr().align_offset(LINE).min(width) } else { 0 };
             // Blocks of tiles, so that few pages of memory are in use at a time.
-            for rows in starts(0..rows, BLOCK) {
-                for columns in starts(0..lead, BLOCK).chain(starts(lead..columns, BLOCK)) {
+            for rows in starts(0..height, BLOCK) {
+                for columns in starts(0..lead, COLUMNS).chain(starts(lead..width, COLUMNS)) {
+                    if large {
+                        // What the next block reads, while this one is written.
+                        for column in columns.end..width.min(columns.end + COLUMNS) {
+                            let line = (from + column as isize * step) as usize;
+                            rows.clone().step_by(LINE / size_of::<T>()).for_each(|row| prefetch(&source[line + row]));
+                        }
+                    }
                     for row in starts(rows.clone(), TILE) {
                         for column in starts(columns.clone(), TILE) {
                             let start = (from + column.start as isize * step) as usize + row.start;
@@ -293,7 +321,7 @@ mod tests {
         for (matrices, rows, columns) in [(1, 1440, 1536), (2, 1057, 1072), (1, 1441, 1537)] {
             let source = Vec::from_iter((0..matrices * rows * columns).map(|i| T::from_f64((i % 65_521) as f64)));
             let whole = Layout::contiguous(&[matrices, columns, rows]);
-            assert!(whole.len() >= STREAMED);
+            assert!(whole.len() >= LARGE);
             for layout in [whole.permuted(&[0, 2, 1]), whole.sliced(2, rows - 1, rows, -1).permuted(&[0, 2, 1])] {
                 for lead in [0, 1, per_line - 1] {
                     let mut out = vec![T::from_f64(-1.0); layout.len() + lead];
