@@ -26,7 +26,7 @@ fn main() {
     print("How far each mark is from the student's mean", &(&marks - &means));
 
     // Weights of subjects: a matrix times a vector.
-    let weights = tape.constant(Tensor::from_vec(&[4], vec![0.4, 0.3, 0.2, 0.1]));
+    let weights = tape.constant(Tensor::from([0.4, 0.3, 0.2, 0.1]));
     print("Weighted marks", &marks.matmul(&weights));
 
     // Slices, permutations and joins make new tensors.

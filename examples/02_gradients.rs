@@ -19,38 +19,34 @@ fn cartesian<'t>(polar: &[Var<'t, f64>]) -> Var<'t, f64> {
 fn main() {
     // One gradient: d/dx of x sin x is sin x + x cos x.
     let tape = Tape::<f64>::new();
-    let x = tape.leaf(Tensor::from_vec(&[3], vec![0.5, 1.0, 2.0]));
+    let x = tape.leaf(Tensor::from([0.5, 1.0, 2.0]));
     let y = &x * x.sin();
     let slope = y.sum().grad_graph(&[&x]).remove(0);
-    println!("x          {:?}", x.value().as_slice());
-    println!("y'         {:.12?}", slope.value().as_slice());
-    println!("expected   {:.12?}", x.value().as_slice().iter().map(|x| x.sin() + x * x.cos()).collect::<Vec<_>>());
+    println!("x          {}", x.value());
+    println!("y'         {:.12}", slope.value());
+    println!("expected   {:.12}", x.value().map(|x| x.sin() + x * x.cos()));
 
     // The gradient is on the tape like anything else, so it has a gradient; and so on.
     let mut derivative = slope;
     for order in 2..=4 {
         derivative = derivative.sum().grad_graph(&[&x]).remove(0);
-        println!("order {order}    {:.12?}", derivative.value().as_slice());
+        println!("order {order}    {:.12}", derivative.value());
     }
-    println!(
-        "expected   {:.12?}",
-        x.value().as_slice().iter().map(|x| x * x.sin() - 4.0 * x.cos()).collect::<Vec<_>>()
-    );
+    println!("expected   {:.12}", x.value().map(|x| x * x.sin() - 4.0 * x.cos()));
 
     // Derivatives of functions. The Jacobian of polar coordinates has the determinant r.
-    let polar = Tensor::from_vec(&[2], vec![3.0, 0.7]);
+    let polar = Tensor::from([3.0, 0.7]);
     let j = jacobian(cartesian, std::slice::from_ref(&polar)).remove(0);
-    let j = j.as_slice();
-    println!("\nJacobian   {j:.6?}");
-    println!("determinant {:.12} for r = 3", j[0] * j[3] - j[1] * j[2]);
+    println!("\nJacobian\n{j:.6}");
+    println!("determinant {:.12} for r = 3", j[[0, 0]] * j[[1, 1]] - j[[0, 1]] * j[[1, 0]]);
 
     // A Hessian, and its product with a vector, which costs no more for a million inputs than a few gradients.
-    let point = Tensor::from_vec(&[2], vec![1.0, 2.0]);
+    let point = Tensor::from([1.0, 2.0]);
     let h = hessian(|x| x[0].square().sum().square(), std::slice::from_ref(&point)).remove(0).remove(0);
-    println!("\nHessian of |x|^4 at (1, 2)   {:?}", h.as_slice());
-    let v = Tensor::from_vec(&[2], vec![1.0, -1.0]);
+    println!("\nHessian of |x|^4 at (1, 2)\n{h}");
+    let v = Tensor::from([1.0, -1.0]);
     let product = hvp(|x| x[0].square().sum().square(), &[point], &[v]).remove(0);
-    println!("times (1, -1)                {:?}", product.as_slice());
+    println!("times (1, -1)                {product}");
 
     // And the check that all of this is right: finite differences of first and second order.
     let report = check_function(&Check::default(), &[polar], cartesian).expect("the derivatives are right");

@@ -47,17 +47,17 @@ impl Formula<1> for SoftSign {
 fn main() {
     // It runs as any other operation does, and has derivatives of every order.
     let tape = Tape::<f32>::new();
-    let x = tape.leaf(Tensor::from_vec(&[3], vec![-1.0, 0.5, 3.0]));
+    let x = tape.leaf(Tensor::from([-1.0, 0.5, 3.0]));
     let y = SoftSign { mistake: Mistake::None }.on([&x]);
     let slope = y.sum().grad_graph(&[&x]).remove(0);
-    println!("y      {:?}", y.value().as_slice());
-    println!("slope  {:?}", slope.value().as_slice());
-    println!("bend   {:?}", slope.sum().grad(&[&x])[0].as_slice());
+    println!("y      {}", y.value());
+    println!("slope  {}", slope.value());
+    println!("bend   {}", slope.sum().grad(&[&x])[0]);
 
     // In a line, of several operands that broadcast: one pass forward, and one that gives both gradients.
     let width = tape.leaf(Tensor::scalar(2.0));
     let grads = formula!(|x, w| x / (w + x.abs())).on([&x, &width]).sum().grad(&[&x, &width]);
-    println!("by x   {:?}\nby w   {:?}\n", grads[0].as_slice(), grads[1].as_slice());
+    println!("by x   {}\nby w   {}\n", grads[0], grads[1]);
 
     // Sampled on both sides of its kink, and at extremes: there is no tolerance for a NaN.
     let mut cases = Cases::default();

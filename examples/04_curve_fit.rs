@@ -25,27 +25,24 @@ fn oscillation<'t>(parameters: &Var<'t, f64>, t: &Var<'t, f64>) -> Var<'t, f64> 
 /// The standard deviation of each parameter: the roots of the diagonal of `2 NOISE^2 H^-1`, with the Hessian of the sum of
 /// squares. Each column of the inverse is found by conjugate gradients, which need only products with the Hessian.
 fn deviations(loss: impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f64>, at: &Tensor<f64>) -> Vec<f64> {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let column = |i: usize| {
-        let mut solution = vec![0.0; at.len()];
-        let mut residual: Vec<f64> = (0..at.len()).map(|k| if k == i { 1.0 } else { 0.0 }).collect();
+        let mut solution = Tensor::zeros(at.shape());
+        let mut residual = Tensor::zeros(at.shape());
+        residual[[i]] = 1.0;
         let mut direction = residual.clone();
         for _ in 0..2 * at.len() {
-            let along = Tensor::from_vec(at.shape(), direction.clone());
-            let image = hvp(&loss, std::slice::from_ref(at), &[along]).remove(0);
-            let square = dot(&residual, &residual);
-            let step = square / dot(&direction, image.as_slice());
-            for k in 0..at.len() {
-                solution[k] += step * direction[k];
-                residual[k] -= step * image.as_slice()[k];
-            }
-            let left = dot(&residual, &residual);
+            let image = hvp(&loss, std::slice::from_ref(at), std::slice::from_ref(&direction)).remove(0);
+            let square = residual.dot(&residual);
+            let step = square / direction.dot(&image);
+            solution += &(step * &direction);
+            residual -= &(step * &image);
+            let left = residual.dot(&residual);
             if left < 1e-24 {
                 break;
             }
-            direction = residual.iter().zip(&direction).map(|(r, d)| r + left / square * d).collect();
+            direction = &residual + left / square * direction;
         }
-        (2.0 * NOISE * NOISE * solution[i]).sqrt()
+        (2.0 * NOISE * NOISE * solution[[i]]).sqrt()
     };
     (0..at.len()).map(column).collect()
 }
@@ -56,18 +53,18 @@ fn main() {
     let mut normal = || (0..12).map(|_| rng.random_range(-0.5..0.5)).sum::<f64>();
     let t = Tensor::from_fn(&[POINTS], |i| i as f64 * 8.0 / POINTS as f64);
     let tape = Tape::new();
-    let exact = oscillation(&tape.constant(Tensor::from_vec(&[4], TRUTH.to_vec())), &tape.constant(t.clone()));
-    let data = Tensor::from_fn(&[POINTS], |i| exact.value().as_slice()[i] + NOISE * normal());
+    let exact = oscillation(&tape.constant(Tensor::from(TRUTH)), &tape.constant(t.clone()));
+    let data = Tensor::from_fn(&[POINTS], |i| exact.value()[[i]] + NOISE * normal());
 
     let mut params = Params::<f64>::new();
-    let id = params.add("oscillation", Tensor::from_vec(&[4], vec![1.0, 0.1, 2.0, 0.0]));
+    let id = params.add("oscillation", Tensor::from([1.0, 0.1, 2.0, 0.0]));
     let mut adam = Adam::new(AdamConfig::default());
     let schedule = Schedule::Cosine { from: 2e-2, to: 0.0, warmup: 0.0 };
     for step in 0..STEPS {
         let tape = Tape::new();
         let bound = params.bind(&tape);
         let curve = oscillation(&bound[id], &tape.constant(t.clone()));
-        let loss = curve.mse_loss(tape.constant(data.clone()));
+        let loss = curve.mse_loss(&data);
         if step % (STEPS / 5) == 0 {
             println!("step {step:4}: off by {:.4} (root mean square)", loss.item().sqrt());
         }
@@ -79,12 +76,12 @@ fn main() {
     let errors = deviations(
         |x| {
             let tape = x[0].tape();
-            oscillation(&x[0], &tape.constant(t.clone())).squared_error(tape.constant(data.clone())).sum()
+            oscillation(&x[0], &tape.constant(t.clone())).squared_error(&data).sum()
         },
         &found,
     );
     println!("\n{:<10} {:>8} {:>19}", "", "truth", "found");
     for i in 0..4 {
-        println!("{:<10} {:>8.4} {:>9.4} +- {:.4}", NAMES[i], TRUTH[i], found.as_slice()[i], errors[i]);
+        println!("{:<10} {:>8.4} {:>9.4} +- {:.4}", NAMES[i], TRUTH[i], found[[i]], errors[i]);
     }
 }

@@ -8,10 +8,10 @@
 //! ```
 //! use raygrad::{Tape, Tensor};
 //! let tape = Tape::<f64>::new();
-//! let x = tape.leaf(Tensor::from_vec(&[3], vec![1.0, 2.0, 3.0]));
+//! let x = tape.leaf(Tensor::from([1.0, 2.0, 3.0]));
 //! let y = (0.5 * x.square()).sum();
 //! assert_eq!(y.item(), 7.0);
-//! assert_eq!(y.grad(&[&x])[0].as_slice(), [1.0, 2.0, 3.0]);
+//! assert_eq!(y.grad(&[&x])[0], [1.0, 2.0, 3.0]);
 //! ```
 //!
 //! Tapes share no state: any number of them run on any threads, and a tape's memory goes with it. An operation on large
@@ -38,10 +38,10 @@
 //!
 //! ```
 //! use raygrad::{Tensor, derivatives::hvp};
-//! let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
-//! let v = Tensor::from_vec(&[2], vec![1.0, 0.0]);
+//! let x = Tensor::from([3.0, -1.0]);
+//! let v = Tensor::from([1.0, 0.0]);
 //! let product = hvp(|x| x[0].powi(3).sum(), &[x], &[v]); // the Hessian is diag(6 x)
-//! assert_eq!(product[0].as_slice(), [18.0, 0.0]);
+//! assert_eq!(product[0], [18.0, 0.0]);
 //! ```
 //!
 //! # What goes wrong, and how one hears of it
@@ -69,7 +69,7 @@
 //! use raygrad::{Tape, Tensor};
 //! let tape = Tape::<f64>::new();
 //! tape.check_finite(true);
-//! let x = tape.leaf(Tensor::from_vec(&[2], vec![4.0, 0.0]));
+//! let x = tape.leaf(Tensor::from([4.0, 0.0]));
 //! let error = x.sqrt().sum().try_grad(&[&x]).unwrap_err();
 //! assert!(error.to_string().starts_with("sqrt: the gradient of input 0 is inf at index [1]"));
 //! ```
@@ -84,12 +84,12 @@
 //! ```
 //! use raygrad::{Tape, Tensor, formula};
 //! let tape = Tape::<f64>::new();
-//! let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 1.0, 2.0, 3.0]));
-//! let shift = tape.leaf(Tensor::from_vec(&[2], vec![0.5, -0.5]));
+//! let x = tape.leaf(Tensor::from([[0.0, 1.0], [2.0, 3.0]]));
+//! let shift = tape.leaf(Tensor::from([0.5, -0.5]));
 //! let (steepness, limit) = (2.0, 6.0); // constants from outside are listed
 //! let y = formula!([steepness, limit] |x, b| (steepness * (x - b)).minimum(limit).exp() / 2.0).on([&x, &shift]);
 //! let grads = y.sum().grad(&[&x, &shift]);
-//! assert_eq!(grads[1].as_slice(), [-((-1.0_f64).exp() + 3.0_f64.exp()), -3.0_f64.exp()]); // 3.5 is beyond the limit
+//! assert_eq!(grads[1], [-((-1.0_f64).exp() + 3.0_f64.exp()), -3.0_f64.exp()]); // 3.5 is beyond the limit
 //! ```
 //!
 //! An operation with a name is a [`Formula`](crate::Formula): a function written once for every kind of number. Its
@@ -155,7 +155,7 @@
 //! let model = Sequential::new().then(hidden).map(|x| x.tanh()).then(out);
 //!
 //! let x = Tensor::from_fn(&[64, 1], |i| i as f32 / 16.0 - 2.0);
-//! let wave = Tensor::from_fn(&[64, 1], |i| (1.5 * x.as_slice()[i]).sin());
+//! let wave = (&x * 1.5).sin();
 //! let mut adam = Adam::new(AdamConfig::default());
 //! let schedule = Schedule::Cosine { from: 3e-2, to: 0.0, warmup: 0.1 };
 //! let mut last = f32::NAN;

@@ -38,7 +38,7 @@ fn at<T: Scalar, R>(
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::value_and_grad};
-/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let x = Tensor::from([3.0, -1.0]);
 /// let (y, grads) = value_and_grad(|x| x[0].square().sum(), &[x]);
 /// assert_eq!((y, grads[0].as_slice()), (10.0, &[6.0, -2.0][..]));
 /// ```
@@ -57,8 +57,8 @@ pub fn value_and_grad<T: Scalar>(
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::vjp};
-/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
-/// let (y, grads) = vjp(|x| x[0].square(), &[x], &Tensor::from_vec(&[2], vec![1.0, 10.0]));
+/// let x = Tensor::from([3.0, -1.0]);
+/// let (y, grads) = vjp(|x| x[0].square(), &[x], &Tensor::from([1.0, 10.0]));
 /// assert_eq!((y.as_slice(), grads[0].as_slice()), (&[9.0, 1.0][..], &[6.0, -20.0][..]));
 /// ```
 ///
@@ -102,7 +102,7 @@ pub fn jvp<T: Scalar>(
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::jacobian};
-/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let x = Tensor::from([3.0, -1.0]);
 /// let j = jacobian(|x| x[0].square(), &[x]);
 /// assert_eq!((j[0].shape(), j[0].as_slice()), (&[2, 2][..], &[6.0, 0.0, 0.0, -2.0][..]));
 /// ```
@@ -115,11 +115,11 @@ pub fn jacobian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::hessian};
-/// let x = Tensor::from_vec(&[2], vec![3.0, -1.0]);
+/// let x = Tensor::from([3.0, -1.0]);
 /// let h = hessian(|x| x[0].square().sum() * &x[1], &[x, Tensor::scalar(0.5)]);
-/// assert_eq!(h[0][0].as_slice(), [1.0, 0.0, 0.0, 1.0]);
+/// assert_eq!(h[0][0], [[1.0, 0.0], [0.0, 1.0]]);
 /// assert_eq!((h[0][1].as_slice(), h[1][0].as_slice()), (&[6.0, -2.0][..], &[6.0, -2.0][..]));
-/// assert_eq!(h[1][1].as_slice(), [0.0]);
+/// assert_eq!(h[1][1].item(), 0.0);
 /// ```
 ///
 /// # Panics
@@ -136,7 +136,7 @@ pub fn hessian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &[
 /// use raygrad_autograd::{Tensor, derivatives::hvp};
 /// let vector = |values: [f64; 2]| Tensor::from_vec(&[2], values.to_vec());
 /// let product = hvp(|x| (x[0].square() * &x[0]).sum(), &[vector([3.0, -1.0])], &[vector([1.0, 10.0])]);
-/// assert_eq!(product[0].as_slice(), [18.0, -60.0]);
+/// assert_eq!(product[0], [18.0, -60.0]);
 /// ```
 ///
 /// # Panics

@@ -279,15 +279,15 @@ fn gradients<'t, T: Scalar, const N: usize>(
 /// ```
 /// use raygrad_autograd::{Tape, Tensor, formula};
 /// let tape = Tape::<f32>::new();
-/// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
-/// let (scale, shift) = (tape.leaf(Tensor::from_vec(&[2], vec![1.0, -1.0])), tape.leaf(Tensor::scalar(0.5)));
+/// let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
+/// let (scale, shift) = (tape.leaf(Tensor::from([1.0, -1.0])), tape.leaf(Tensor::scalar(0.5)));
 /// let limit = 3.0;
 /// let y = formula!([limit] |x, a, b| (x * a + b).maximum(-limit) / 2.0).on([&x, &scale, &shift]);
-/// assert_eq!(y.value().as_slice(), [0.75, -0.75, 1.75, -1.5]);
+/// assert_eq!(*y.value(), [[0.75, -0.75], [1.75, -1.5]]);
 /// let grads = y.sum().grad(&[&x, &scale, &shift]);
-/// assert_eq!(grads[0].as_slice(), [0.5, -0.5, 0.5, 0.0]);
-/// assert_eq!(grads[1].as_slice(), [2.0, 1.0]);
-/// assert_eq!(grads[2].as_slice(), [1.5]);
+/// assert_eq!(grads[0], [[0.5, -0.5], [0.5, 0.0]]);
+/// assert_eq!(grads[1], [2.0, 1.0]);
+/// assert_eq!(grads[2].item(), 1.5);
 /// ```
 #[macro_export]
 macro_rules! formula {

@@ -52,7 +52,7 @@ pub trait RowShare<T: Scalar> {
 /// let mut sums = RowSums::new(4, 2);
 /// assert!(gradient.scatter(&mut sums)); // it consists of rows
 /// assert_eq!(sums.rows(), [3, 1]);
-/// assert_eq!(gradient.into_dense(&Pool::none()).as_slice(), [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0]);
+/// assert_eq!(gradient.into_dense(&Pool::none()), [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0], [2.0, 2.0]]);
 /// ```
 #[derive(Clone)]
 pub struct Gradient<T: Scalar> {

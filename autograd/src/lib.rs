@@ -4,9 +4,9 @@
 //! ```
 //! use raygrad_autograd::{Tape, Tensor};
 //! let tape = Tape::<f64>::new();
-//! let x = tape.leaf(Tensor::from_vec(&[2], vec![3.0, -1.0]));
+//! let x = tape.leaf(Tensor::from([3.0, -1.0]));
 //! let y = (x.square() * &x).sum();
-//! assert_eq!(y.grad(&[&x])[0].as_slice(), [27.0, 3.0]); // 3 x^2
+//! assert_eq!(y.grad(&[&x])[0], [27.0, 3.0]); // 3 x^2
 //! ```
 //!
 //! * [`Tape`], [`Var`]: what is recorded; every operation is a method of [`Var`].

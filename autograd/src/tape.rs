@@ -15,10 +15,10 @@ use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
 /// use raygrad_autograd::Tape;
 /// use raygrad_tensor::Tensor;
 /// let tape = Tape::<f64>::new();
-/// let x = tape.leaf(Tensor::from_vec(&[3], vec![1.0, 2.0, 3.0]));
+/// let x = tape.leaf(Tensor::from([1.0, 2.0, 3.0]));
 /// let y = (&x * &x).sum();
 /// assert_eq!(y.item(), 14.0);
-/// assert_eq!(y.grad(&[&x])[0].as_slice(), [2.0, 4.0, 6.0]);
+/// assert_eq!(y.grad(&[&x])[0], [2.0, 4.0, 6.0]);
 /// ```
 pub struct Tape<T: Scalar> {
     pub(crate) nodes: Nodes<T>,
@@ -107,7 +107,7 @@ impl<T: Scalar> Tape<T> {
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
     /// tape.check_finite(true);
-    /// let x = tape.leaf(Tensor::from_vec(&[2], vec![4.0, 0.0]));
+    /// let x = tape.leaf(Tensor::from([4.0, 0.0]));
     /// let error = x.sqrt().sum().try_grad(&[&x]).unwrap_err();
     /// assert!(error.to_string().starts_with("sqrt: the gradient of input 0 is inf at index [1]"));
     /// ```

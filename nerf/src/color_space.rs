@@ -82,7 +82,7 @@ impl Examined<1> for SrgbDecode {
 /// use raygrad_autograd::{Tape, Tensor};
 /// use raygrad_nerf::srgb_encode;
 /// let tape = Tape::<f64>::new();
-/// let light = tape.leaf(Tensor::from_vec(&[3], vec![-0.1, 0.0, 0.5]));
+/// let light = tape.leaf(Tensor::from([-0.1, 0.0, 0.5]));
 /// let codes = srgb_encode(&light);
 /// assert!((codes.value().as_slice()[2] - 0.735357).abs() < 1e-6);
 /// assert!(codes.sum().grad(&[&light])[0].as_slice().iter().all(|slope| slope.is_finite()));

@@ -295,13 +295,27 @@ impl<T: Scalar> Tensor<T> {
         self.map(|x| Real::minimum(Real::maximum(x, low), high))
     }
 
-    /// The product of matrices in the last two axes; see [`matmul`](crate::matmul::matmul).
+    /// The product of matrices in the last two axes, as [`matmul`](crate::matmul::matmul) forms it. A vector on the left is
+    /// a row, on the right a column, and that axis is missing from the result.
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// let (a, x) = (Tensor::from([[1.0, 2.0], [3.0, 4.0]]), Tensor::from([1.0, 10.0]));
+    /// assert_eq!((a.matmul(&x), x.matmul(&a)), (Tensor::from([21.0, 43.0]), Tensor::from([31.0, 42.0])));
+    /// ```
     ///
     /// # Panics
-    /// If a factor has less than two axes, the inner extents differ or the leading axes do not broadcast.
+    /// If a factor is a scalar, the inner extents differ or the leading axes do not broadcast.
     #[track_caller]
     pub fn matmul(&self, other: &Self) -> Self {
-        crate::matmul::matmul(self, other, &self.pool())
+        let (row, column) = (self.ndim() == 1, other.ndim() == 1);
+        let left = if row { self.unsqueeze(0) } else { self.clone() };
+        let right = if column { other.unsqueeze(1) } else { other.clone() };
+        let mut y = crate::matmul::matmul(&left, &right, &self.pool());
+        if column {
+            y = y.squeeze(-1);
+        }
+        if row { y.squeeze(if column { -1 } else { -2 }) } else { y }
     }
 
     /// Whether the shapes are the same and every element of this tensor is within `absolute + relative * |y|` of the

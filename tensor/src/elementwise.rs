@@ -58,9 +58,9 @@ pub fn map_either<T: Scalar, const N: usize>(
 ///
 /// ```
 /// use raygrad_tensor::{Pool, Real, Tensor, map_real};
-/// let (x, amplitude) = (Tensor::from_vec(&[2], vec![0.0, 1e30]), Tensor::scalar(2.0));
+/// let (x, amplitude) = (Tensor::from([0.0, 1e30]), Tensor::scalar(2.0));
 /// let y = map_real!([&x, &amplitude], &Pool::none(), |[x, a]| a * x.sin());
-/// assert_eq!(y.as_slice(), [0.0, 0.01866293786235165]);
+/// assert_eq!(y, [0.0, 0.01866293786235165]);
 /// ```
 #[macro_export]
 macro_rules! map_real {

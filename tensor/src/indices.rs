@@ -112,6 +112,13 @@ impl Indices {
     }
 }
 
+impl<const N: usize> PartialEq<[u32; N]> for Indices {
+    /// Whether this is a vector of these numbers.
+    fn eq(&self, other: &[u32; N]) -> bool {
+        self.shape() == [N] && self.as_slice() == other
+    }
+}
+
 impl fmt::Debug for Indices {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Indices{:?} {:?}", self.shape, self.values)
@@ -138,9 +145,9 @@ impl<T: Scalar> Tensor<T> {
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
-    /// let x = Tensor::from_vec(&[4], vec![3.0, 1.0, 3.0, 2.0_f32]);
-    /// assert_eq!(x.argsort(0, false).as_slice(), [1, 3, 0, 2]);
-    /// assert_eq!(x.argsort(0, true).as_slice(), [0, 2, 3, 1]);
+    /// let x = Tensor::from([3.0, 1.0, 3.0, 2.0_f32]);
+    /// assert_eq!(x.argsort(0, false), [1, 3, 0, 2]);
+    /// assert_eq!(x.argsort(0, true), [0, 2, 3, 1]);
     /// ```
     ///
     /// # Panics
@@ -172,8 +179,8 @@ impl<T: Scalar> Tensor<T> {
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
-    /// let edges = Tensor::from_vec(&[3], vec![0.0, 0.5, 1.0_f32]);
-    /// let x = Tensor::from_vec(&[2, 2], vec![-1.0, 0.5, 0.7, 2.0]);
+    /// let edges = Tensor::from([0.0, 0.5, 1.0_f32]);
+    /// let x = Tensor::from([[-1.0, 0.5], [0.7, 2.0]]);
     /// assert_eq!(edges.searchsorted(&x, false).as_slice(), [0, 1, 2, 3]);
     /// assert_eq!(edges.searchsorted(&x, true).as_slice(), [0, 2, 2, 3]);
     /// ```

@@ -17,6 +17,7 @@
 //! it.
 
 mod arithmetic;
+mod arrange;
 mod axes;
 mod convert;
 mod create;

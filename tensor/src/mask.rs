@@ -147,6 +147,13 @@ impl Not for Mask {
     }
 }
 
+impl<const N: usize> PartialEq<[bool; N]> for Mask {
+    /// Whether this is a vector of these values.
+    fn eq(&self, other: &[bool; N]) -> bool {
+        self.shape() == [N] && self.as_slice() == other
+    }
+}
+
 impl fmt::Debug for Mask {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Mask{:?} {:?}", self.shape, self.values)

@@ -161,8 +161,8 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
 ///
 /// ```
 /// use raygrad_tensor::{Pool, Tensor, matmul::matmul};
-/// let a = Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0_f32]);
-/// assert_eq!(matmul(&a, &a.t(), &Pool::none()).as_slice(), [5.0, 11.0, 11.0, 25.0]);
+/// let a = Tensor::from([[1.0, 2.0], [3.0, 4.0_f32]]);
+/// assert_eq!(matmul(&a, &a.t(), &Pool::none()), [[5.0, 11.0], [11.0, 25.0]]);
 /// ```
 ///
 /// # Panics

@@ -3,6 +3,7 @@
 use crate::extremum::{arg_extremum, extremum};
 use crate::rows::variance_rows;
 use crate::{Axes, Indices, Real, Reduction, Scalar, Shape, Tensor, axis_of, sum_to};
+use std::ops::Range;
 
 impl<T: Scalar> Tensor<T> {
     /// The sum of all elements, pairwise.
@@ -56,6 +57,16 @@ impl<T: Scalar> Tensor<T> {
         out * scale
     }
 
+    /// The mean squared deviation of all elements from their mean; see [`var_over`](Self::var_over).
+    pub fn var(&self, correction: usize) -> T {
+        self.var_over(.., correction).item()
+    }
+
+    /// The root of [`var`](Self::var).
+    pub fn std(&self, correction: usize) -> T {
+        self.std_over(.., correction).item()
+    }
+
     /// The root of [`var_over`](Self::var_over).
     #[track_caller]
     pub fn std_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
@@ -68,9 +79,18 @@ impl<T: Scalar> Tensor<T> {
         let result = axes.result();
         let none = axes.count() == 0 && !result.contains(&0);
         assert!(!none, "the extremum of no elements of a tensor of shape {:?}", self.shape());
-        let rows = self.rows(&axes);
-        let middle = [rows.shape()[0], rows.shape()[1], 1];
-        self.pool().filled(&result, |out| extremum(rows.as_slice(), middle, greatest, out))
+        let (x, middle) = match axes.run() {
+            Some((first, behind)) => {
+                let extent = |axes: Range<usize>| self.shape()[axes].iter().product();
+                (self.clone(), [extent(0..first), extent(first..behind), extent(behind..self.ndim())])
+            }
+            None => {
+                let rows = self.rows(&axes);
+                let [outer, count] = [0, 1].map(|axis| rows.shape()[axis]);
+                (rows, [outer, count, 1])
+            }
+        };
+        self.pool().filled(&result, |out| extremum(x.as_slice(), middle, greatest, out))
     }
 
     /// The greatest elements over any axes; NaN where one is.
@@ -122,7 +142,7 @@ impl<T: Scalar> Tensor<T> {
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
-    /// assert_eq!(Tensor::from([[1.0, 5.0, 5.0], [9.0, 0.0, 3.0]]).argmax(-1).as_slice(), [1, 0]);
+    /// assert_eq!(Tensor::from([[1.0, 5.0, 5.0], [9.0, 0.0, 3.0]]).argmax(-1), [1, 0]);
     /// ```
     ///
     /// # Panics
@@ -141,13 +161,14 @@ impl<T: Scalar> Tensor<T> {
         self.arg_over(axis, false)
     }
 
-    /// The inner product of two tensors of one shape, pairwise.
+    /// The inner product of two vectors, pairwise.
     ///
     /// # Panics
-    /// If the shapes differ.
+    /// If they are not vectors of one length.
     #[track_caller]
     pub fn dot(&self, other: &Self) -> T {
-        assert_eq!(self.shape(), other.shape(), "the inner product of tensors of different shapes");
+        let vectors = self.ndim() == 1 && self.shape() == other.shape();
+        assert!(vectors, "dot of shapes {:?} and {:?}: not two vectors of one length", self.shape(), other.shape());
         (self * other).sum()
     }
 
@@ -161,7 +182,7 @@ impl<T: Scalar> Tensor<T> {
             return largest;
         }
         let scaled = self / largest;
-        scaled.dot(&scaled).sqrt() * largest
+        scaled.square().sum().sqrt() * largest
     }
 
     /// The largest absolute difference of two tensors of one shape: 0 of no elements, NaN if there is one.
@@ -193,8 +214,8 @@ mod tests {
                     assert!(x.std_over(signed, 1).is_close(&array.std_axis(Axis(axis), 1.0).into(), 1e-13, 0.0));
                     let fold =
                         |start: f64, f: fn(f64, f64) -> f64| array.fold_axis(Axis(axis), start, |&a, &b| f(a, b));
-                    assert_eq!(x.max_over(signed), fold(f64::MIN, f64::max).into());
-                    assert_eq!(x.min_over(signed), fold(f64::MAX, f64::min).into());
+                    assert_eq!(x.max_over(signed), Tensor::from(fold(f64::MIN, f64::max)));
+                    assert_eq!(x.min_over(signed), Tensor::from(fold(f64::MAX, f64::min)));
                     let (most, least) = (x.argmax(signed), x.argmin(signed));
                     let lanes = array.lanes(Axis(axis)).into_iter().map(|lane| lane.to_vec());
                     for ((lane, &most), &least) in lanes.zip(most.as_slice()).zip(least.as_slice()) {

@@ -23,7 +23,7 @@ pub type Shape = SmallVec<[usize; 4]>;
 /// let x = Tensor::from_vec(&[2, 3], vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0_f32]);
 /// assert_eq!(x.shape(), [2, 3]);
 /// let y = ndarray::arr2(&[[1.0, 2.0], [3.0, 4.0_f32]]);
-/// assert_eq!(Tensor::from(y.t()).as_slice(), [1.0, 3.0, 2.0, 4.0]);
+/// assert_eq!(Tensor::from(y.t()), [[1.0, 3.0], [2.0, 4.0]]);
 /// ```
 #[derive(Clone)]
 pub struct Tensor<T: Scalar> {

@@ -50,8 +50,8 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     /// use raygrad_tensor::{Tensor, s};
     /// let x = Tensor::from_fn(&[2, 3, 4], |i| i as f32);
-    /// assert_eq!(x.slice(s![.., -1, 1..3]).as_slice(), [9.0, 10.0, 21.0, 22.0]);
-    /// assert_eq!(x.slice(s![0, 0, ..;-2]).as_slice(), [3.0, 1.0]);
+    /// assert_eq!(x.slice(s![.., -1, 1..3]), [[9.0, 10.0], [21.0, 22.0]]);
+    /// assert_eq!(x.slice(s![0, 0, ..;-2]), [3.0, 1.0]);
     /// assert_eq!(x.slice(s![1]).shape(), [3, 4]);
     /// ```
     ///
@@ -68,8 +68,8 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     /// use raygrad_tensor::{Slice, Tensor};
     /// let x = Tensor::from_fn(&[6], |i| i as f32);
-    /// assert_eq!(x.slice_axis(-1, 1..3).as_slice(), [1.0, 2.0]);
-    /// assert_eq!(x.slice_axis(0, Slice::from(..-1).step_by(-3)).as_slice(), [4.0, 1.0]);
+    /// assert_eq!(x.slice_axis(-1, 1..3), [1.0, 2.0]);
+    /// assert_eq!(x.slice_axis(0, Slice::from(..-1).step_by(-3)), [4.0, 1.0]);
     /// ```
     ///
     /// # Panics

@@ -30,7 +30,7 @@ pub struct ParamId {
 /// let tape = Tape::new();
 /// let bound = params.bind(&tape);
 /// let loss = bound[weight].square().sum();
-/// assert_eq!(loss.grad(&bound.vars())[0].as_slice(), [6.0, 6.0]);
+/// assert_eq!(loss.grad(&bound.vars())[0], [6.0, 6.0]);
 /// ```
 #[derive(Debug, Clone, Default)]
 pub struct Params<T: Scalar> {

@@ -143,7 +143,7 @@ fn against_differences(
 /// ```
 /// use raygrad_autograd::check::{Check, check_function};
 /// use raygrad_tensor::Tensor;
-/// let x = Tensor::from_vec(&[2], vec![0.3, 1.2]);
+/// let x = Tensor::from([0.3, 1.2]);
 /// check_function(&Check::default(), &[x], |x| (x[0].sin() * &x[0]).exp()).unwrap();
 /// ```
 ///

@@ -82,9 +82,9 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[2], vec![1.0, 2.0]));
-    /// assert_eq!(x.tile(&[2]).value().as_slice(), [1.0, 2.0, 1.0, 2.0]);
-    /// assert_eq!(x.repeat(0, 2).value().as_slice(), [1.0, 1.0, 2.0, 2.0]);
+    /// let x = tape.leaf(Tensor::from([1.0, 2.0]));
+    /// assert_eq!(*x.tile(&[2]).value(), [1.0, 2.0, 1.0, 2.0]);
+    /// assert_eq!(*x.repeat(0, 2).value(), [1.0, 1.0, 2.0, 2.0]);
     /// ```
     ///
     /// # Panics

@@ -155,10 +155,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let b = tape.leaf(Tensor::from_fn(&[2, 4, 5], |i| i as f64));
     /// assert_eq!(Var::einsum("bij,bjk->bik", &[&a, &b]).value(), a.matmul(&b).value());
     /// assert_eq!(Var::einsum("bij->", &[&a]).item(), a.sum().item());
-    /// let square = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
+    /// let square = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
     /// let trace = Var::einsum("ii", &[&square]);
     /// assert_eq!(trace.item(), 5.0);
-    /// assert_eq!(trace.grad(&[&square])[0].as_slice(), [1.0, 0.0, 0.0, 1.0]);
+    /// assert_eq!(trace.grad(&[&square])[0], [[1.0, 0.0], [0.0, 1.0]]);
     /// ```
     ///
     /// # Panics

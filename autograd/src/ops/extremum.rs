@@ -93,10 +93,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 5.0, 3.0, 3.0]));
+    /// let x = tape.leaf(Tensor::from([[1.0, 5.0], [3.0, 3.0]]));
     /// let y = x.max_over(-1);
-    /// assert_eq!(y.value().as_slice(), [5.0, 3.0]);
-    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [0.0, 1.0, 0.5, 0.5]);
+    /// assert_eq!(*y.value(), [5.0, 3.0]);
+    /// assert_eq!(y.sum().grad(&[&x])[0], [[0.0, 1.0], [0.5, 0.5]]);
     /// ```
     ///
     /// # Panics
@@ -145,8 +145,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from_vec(&[2, 3], vec![1.0, 5.0, 2.0, 3.0, 0.0, 3.0]));
-    /// assert_eq!(x.argmax(-1).as_slice(), [1, 0]);
-    /// assert_eq!(x.argmax(0).as_slice(), [1, 0, 1]);
+    /// assert_eq!(x.argmax(-1), [1, 0]);
+    /// assert_eq!(x.argmax(0), [1, 0, 1]);
     /// ```
     ///
     /// # Panics

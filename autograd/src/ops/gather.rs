@@ -209,10 +209,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
+    /// let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
     /// let y = x.gather_rows([1, 0, 1]);
-    /// assert_eq!(y.value().as_slice(), [3.0, 4.0, 1.0, 2.0, 3.0, 4.0]);
-    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [1.0, 1.0, 2.0, 2.0]);
+    /// assert_eq!(*y.value(), [[3.0, 4.0], [1.0, 2.0], [3.0, 4.0]]);
+    /// assert_eq!(y.sum().grad(&[&x])[0], [[1.0, 1.0], [2.0, 2.0]]);
     /// ```
     ///
     /// # Panics

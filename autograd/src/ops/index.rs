@@ -233,7 +233,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f64>::new();
     /// let logits = tape.leaf(Tensor::from_vec(&[2, 3], vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.6]));
     /// let labels = Indices::new(&[2, 1], [2, 0]);
-    /// assert_eq!(logits.gather(1, &labels).value().as_slice(), [0.3, 0.4]);
+    /// assert_eq!(*logits.gather(1, &labels).value(), [[0.3], [0.4]]);
     /// ```
     ///
     /// # Panics
@@ -258,13 +258,18 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// Entries along `axis` by number: `[.., n, ..]` to `[.., index.len(), ..]`. The gradient is
-    /// [added](Self::index_add) back to the entries that were picked.
+    /// [added](Self::index_add) back to the entries that were picked; along the first axis it is sparse, as that of
+    /// [`gather_rows`](Self::gather_rows).
     ///
     /// # Panics
     /// If the axis does not exist, or an index is not below its extent.
     #[track_caller]
     pub fn index_select(&self, axis: isize, index: impl Into<Indices>) -> Self {
         let (axis, index) = (self.axis("index_select", axis), self.line("index_select", index));
+        if axis == 0 {
+            // Rows have a sparse gradient.
+            return self.gather_rows(index);
+        }
         self.tape().apply(IndexSelect { axis, index }, &[self])
     }
 
@@ -302,10 +307,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[3], vec![5.0, 1.0, 3.0]));
+    /// let x = tape.leaf(Tensor::from([5.0, 1.0, 3.0]));
     /// let (sorted, index) = x.sort(0, false);
     /// assert_eq!((sorted.value().as_slice(), index.as_slice()), (&[1.0, 3.0, 5.0][..], &[1, 2, 0][..]));
-    /// assert_eq!(sorted.slice_axis(0, ..1).sum().grad(&[&x])[0].as_slice(), [0.0, 1.0, 0.0]);
+    /// assert_eq!(sorted.slice_axis(0, ..1).sum().grad(&[&x])[0], [0.0, 1.0, 0.0]);
     /// ```
     ///
     /// # Panics

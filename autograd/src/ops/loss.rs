@@ -314,7 +314,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
-    /// let logits = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 0.0, 3.0_f64.ln(), 0.0]));
+    /// let logits = tape.leaf(Tensor::from([[0.0, 0.0], [3.0_f64.ln(), 0.0]]));
     /// let loss = logits.cross_entropy(&[1, 0]);
     /// assert!((loss.value().as_slice()[0] - 2.0_f64.ln()).abs() < 1e-15); // 1/2 for the right class
     /// assert!((loss.value().as_slice()[1] - (4.0_f64 / 3.0).ln()).abs() < 1e-15); // 3/4

@@ -61,11 +61,11 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
-    /// let a = tape.leaf(Tensor::from_vec(&[2, 2], vec![1.0, 2.0, 3.0, 4.0]));
-    /// let x = tape.leaf(Tensor::from_vec(&[2], vec![1.0, 10.0]));
+    /// let a = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
+    /// let x = tape.leaf(Tensor::from([1.0, 10.0]));
     /// let y = a.matmul(&x);
-    /// assert_eq!(y.value().as_slice(), [21.0, 43.0]);
-    /// assert_eq!(x.matmul(&y).grad(&[&a])[0].as_slice(), [1.0, 10.0, 10.0, 100.0]);
+    /// assert_eq!(*y.value(), [21.0, 43.0]);
+    /// assert_eq!(x.matmul(&y).grad(&[&a])[0], [[1.0, 10.0], [10.0, 100.0]]);
     /// ```
     ///
     /// # Panics

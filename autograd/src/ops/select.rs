@@ -139,8 +139,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([-2.0, 0.0, 3.0]));
     /// let y = x.square().where_(&x.lt(1.0), &x);
-    /// assert_eq!(y.value().as_slice(), [4.0, 0.0, 3.0]);
-    /// assert_eq!(y.sum().grad(&[&x])[0].as_slice(), [-4.0, 0.0, 1.0]);
+    /// assert_eq!(*y.value(), [4.0, 0.0, 3.0]);
+    /// assert_eq!(y.sum().grad(&[&x])[0], [-4.0, 0.0, 1.0]);
     /// ```
     ///
     /// # Panics

@@ -159,7 +159,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f64>::new();
-    /// let x = tape.leaf(Tensor::from_vec(&[2, 2], vec![0.0, 3.0_f64.ln(), 1000.0, 1000.0]));
+    /// let x = tape.leaf(Tensor::from([[0.0, 3.0_f64.ln()], [1000.0, 1000.0]]));
     /// let y = x.softmax(-1);
     /// assert!((y.value().as_slice()[1] - 0.75).abs() < 1e-15);
     /// assert_eq!(y.value().as_slice()[2..], [0.5, 0.5]);

@@ -51,7 +51,7 @@ pub fn global_norm<T: Scalar>(grads: &[Gradient<T>]) -> (f64, usize) {
 /// ```
 /// use raygrad_autograd::{Gradient, Tensor};
 /// use raygrad_nn::clip_norm;
-/// let values = [Tensor::from_vec(&[2], vec![3.0, f64::NAN]), Tensor::scalar(4.0)];
+/// let values = [Tensor::from([3.0, f64::NAN]), Tensor::scalar(4.0)];
 /// let mut grads = values.map(Gradient::from);
 /// let clipped = clip_norm(&mut grads, 1.0);
 /// assert_eq!((clipped.norm, clipped.factor, clipped.bad), (5.0, 0.2, 1));

@@ -1,0 +1,258 @@
+//! Tensors out of the elements of others, in another arrangement, and elements put in place.
+
+use crate::layout::checked_len;
+use crate::{Indices, Layout, Scalar, Shape, SliceInfoElem, Tensor, axis_of, concat};
+use std::ops::IndexMut;
+
+impl<T: Scalar> Tensor<T> {
+    /// Parts along `axis` with these extents, as views (`torch.split`).
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// let [a, b] = Tensor::from([1.0, 2.0, 3.0]).split(0, &[2, 1]).try_into().unwrap();
+    /// assert_eq!((a, b), (Tensor::from([1.0, 2.0]), Tensor::from([3.0])));
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist or the extents do not add up to its own.
+    #[track_caller]
+    pub fn split(&self, axis: isize, extents: &[usize]) -> Vec<Self> {
+        let extent = self.shape()[axis_of(axis, self.shape())];
+        let total = extents.iter().try_fold(0_usize, |total, &len| total.checked_add(len));
+        assert_eq!(total, Some(extent), "split: {extents:?} are not {extent} together");
+        let mut start = 0;
+        let part = |&len: &usize| {
+            start += len;
+            self.slice_axis(axis, start - len..start)
+        };
+        extents.iter().map(part).collect()
+    }
+
+    /// The whole tensor, so many times along each axis; further axes stand in front (`numpy.tile`).
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::from([1.0, 2.0]).tile(&[2, 2]), Tensor::from([[1.0, 2.0, 1.0, 2.0], [1.0, 2.0, 1.0, 2.0]]));
+    /// ```
+    ///
+    /// # Panics
+    /// If there are fewer counts than axes, or more elements than memory can hold.
+    #[track_caller]
+    pub fn tile(&self, counts: &[usize]) -> Self {
+        let Some(lead) = counts.len().checked_sub(self.ndim()) else {
+            panic!("tile: {counts:?} names less axes than {:?}", self.shape())
+        };
+        let extent = |i: usize| if i < lead { 1 } else { self.shape()[i - lead] };
+        let of = |f: &dyn Fn(usize) -> [usize; 2]| (0..counts.len()).flat_map(f).collect::<Shape>();
+        let (narrow, wide) = (of(&|i| [1, extent(i)]), of(&|i| [counts[i], extent(i)]));
+        let shape: Shape = (0..counts.len()).map(|i| counts[i].saturating_mul(extent(i))).collect();
+        self.spread("tile", &narrow, &wide, &shape)
+    }
+
+    /// Each entry along `axis`, `count` times (`numpy.repeat`, `torch.repeat_interleave`).
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::from([1.0, 2.0]).repeat(0, 2), Tensor::from([1.0, 1.0, 2.0, 2.0]));
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist, or there would be more elements than memory can hold.
+    #[track_caller]
+    pub fn repeat(&self, axis: isize, count: usize) -> Self {
+        let axis = axis_of(axis, self.shape());
+        let [mut narrow, mut wide, mut shape] = [(); 3].map(|()| Shape::from_slice(self.shape()));
+        narrow.insert(axis + 1, 1);
+        wide.insert(axis + 1, count);
+        shape[axis] = shape[axis].saturating_mul(count);
+        self.spread("repeat", &narrow, &wide, &shape)
+    }
+
+    /// A `narrow` view of the elements, stretched to `wide`, in a final shape.
+    #[track_caller]
+    fn spread(&self, what: &str, narrow: &[usize], wide: &[usize], shape: &[usize]) -> Self {
+        assert!(checked_len(wide).is_some(), "{what}: a tensor of shape {shape:?} is more than memory holds");
+        self.reshape(narrow).broadcast_to(wide).reshape(shape)
+    }
+
+    /// Entries along `axis` moved on by `shift`, those that leave at the end coming in at the start (`numpy.roll`).
+    ///
+    /// ```
+    /// use raygrad_tensor::Tensor;
+    /// assert_eq!(Tensor::from([1.0, 2.0, 3.0]).roll(0, 1), Tensor::from([3.0, 1.0, 2.0]));
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist.
+    #[track_caller]
+    pub fn roll(&self, axis: isize, shift: isize) -> Self {
+        let axis = axis_of(axis, self.shape());
+        let extent = self.shape()[axis].max(1) as isize;
+        let shift = shift.rem_euclid(extent);
+        if shift == 0 {
+            return self.clone();
+        }
+        let [head, tail] = [(0, extent - shift), (extent - shift, extent)];
+        let part = |(start, end)| self.slice_axis(axis as isize, start..end);
+        concat(&[&part(tail), &part(head)], axis, &self.pool())
+    }
+
+    /// The elements that `index` names along `axis`: `y[i][j] = x[index[i][j]][j]` for axis 0 of two
+    /// (`numpy.take_along_axis`, `torch.gather`). `index` has the extents of this tensor in all other axes.
+    ///
+    /// ```
+    /// use raygrad_tensor::{Indices, Tensor};
+    /// let x = Tensor::from([[3.0, 1.0, 2.0], [4.0, 6.0, 5.0]]);
+    /// assert_eq!(x.gather(1, x.argsort(-1, false)), Tensor::from([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]));
+    /// ```
+    ///
+    /// # Panics
+    /// If the axis does not exist, other extents differ, or an index is not below the extent of the axis.
+    #[track_caller]
+    pub fn gather(&self, axis: isize, index: impl Into<Indices>) -> Self {
+        let (axis, index) = (axis_of(axis, self.shape()), index.into());
+        let same = |i: usize| i == axis || index.shape()[i] == self.shape()[i];
+        let fits = index.shape().len() == self.ndim() && (0..self.ndim()).all(same);
+        assert!(fits, "gather along axis {axis} of {:?} by indices of {:?}", self.shape(), index.shape());
+        let (extent, count) = (self.shape()[axis], index.shape()[axis]);
+        let inner: usize = self.shape()[axis + 1..].iter().product();
+        let x = self.as_slice();
+        let element = |(place, &entry): (usize, &u32)| {
+            assert!((entry as usize) < extent, "gather: index {place} is {entry}, but axis {axis} ends at {extent}");
+            x[(place / (count * inner) * extent + entry as usize) * inner + place % inner]
+        };
+        Tensor::from_vec(index.shape(), index.as_slice().iter().enumerate().map(element).collect())
+    }
+
+    /// Writes `values`, which broadcast, to the elements that a slice names: `x[:, 1:3] = values` of NumPy.
+    ///
+    /// ```
+    /// use raygrad_tensor::{Tensor, s};
+    /// let mut x = Tensor::zeros(&[2, 3]);
+    /// x.assign(s![.., 1..], &Tensor::from([1.0, 2.0]));
+    /// x.assign(s![1, ..;2], 9.0);
+    /// assert_eq!(x, Tensor::from([[0.0, 1.0, 2.0], [9.0, 1.0, 9.0]]));
+    /// ```
+    ///
+    /// # Panics
+    /// If the slice leaves the tensor, or the values do not broadcast to its shape.
+    #[track_caller]
+    pub fn assign(&mut self, places: impl AsRef<[SliceInfoElem]>, values: impl Into<Tensor<T>>) {
+        let layout = match Layout::contiguous(self.shape()).sliced_by(places.as_ref()) {
+            Ok(layout) => layout,
+            Err(what) => panic!("assign to a tensor of shape {:?}: {what}", self.shape()),
+        };
+        let values = values.into().broadcast_to(layout.shape());
+        layout.write(values.as_slice(), self.as_mut_slice());
+    }
+}
+
+impl<T: Scalar, const N: usize> IndexMut<[usize; N]> for Tensor<T> {
+    /// One element for writing: `x[[i, j]] = 1.0`. What another tensor shares is copied first.
+    ///
+    /// # Panics
+    /// If there are not as many axes as places, or a place lies outside its axis.
+    #[track_caller]
+    fn index_mut(&mut self, index: [usize; N]) -> &mut T {
+        let inside = N == self.ndim() && index.iter().zip(self.shape()).all(|(i, extent)| i < extent);
+        assert!(inside, "no element {index:?} in a tensor of shape {:?}", self.shape());
+        let place = index.iter().zip(self.shape()).fold(0, |place, (i, extent)| place * extent + i);
+        &mut self.as_mut_slice()[place]
+    }
+}
+
+impl<T: Scalar, const N: usize> PartialEq<[T; N]> for Tensor<T> {
+    /// Whether this is a vector of these elements.
+    fn eq(&self, other: &[T; N]) -> bool {
+        self.shape() == [N] && self.as_slice() == other
+    }
+}
+
+impl<T: Scalar, const N: usize, const M: usize> PartialEq<[[T; M]; N]> for Tensor<T> {
+    /// Whether this is a matrix of these rows.
+    fn eq(&self, other: &[[T; M]; N]) -> bool {
+        self.shape() == [N, M] && self.as_slice() == other.as_flattened()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::s;
+    use ndarray::{Array3, Axis};
+    use std::panic::catch_unwind;
+
+    fn counted(shape: &[usize]) -> Tensor<f64> {
+        Tensor::from_fn(shape, |i| i as f64)
+    }
+
+    #[test]
+    fn rearranged_elements_are_those_of_their_places() {
+        let x = counted(&[3, 4, 2]).permute(&[2, 0, 1]);
+        let tiled = x.tile(&[2, 1, 2, 3]);
+        assert_eq!(tiled.shape(), [2, 2, 6, 12]);
+        for (i, value) in tiled.iter().enumerate() {
+            assert_eq!(value, x[[i / 72 % 2, i / 12 % 6 % 3, i % 12 % 4]]);
+        }
+        let repeated = x.repeat(-1, 3);
+        assert_eq!(repeated.shape(), [2, 3, 12]);
+        for (i, value) in repeated.iter().enumerate() {
+            assert_eq!(value, x[[i / 36, i / 12 % 3, i % 12 / 3]]);
+        }
+        for shift in [-5, -1, 0, 1, 3, 7] {
+            for (i, value) in x.roll(1, shift).iter().enumerate() {
+                assert_eq!(value, x[[i / 12, (i as isize / 4 % 3 - shift).rem_euclid(3) as usize, i % 4]]);
+            }
+        }
+        let parts = x.split(2, &[1, 0, 3]);
+        assert_eq!(parts.iter().map(|part| part.shape()[2]).collect::<Vec<_>>(), [1, 0, 3]);
+        assert_eq!(parts[2], x.slice(s![.., .., 1..]));
+        assert_eq!(parts[2].buffer().as_ptr(), x.buffer().as_ptr());
+        assert_eq!((x.tile(&[1, 0, 1]).shape(), x.repeat(0, 0).shape()), (&[2, 0, 4][..], &[0, 3, 4][..]));
+        assert_eq!(counted(&[0]).roll(0, 3).shape(), [0]);
+    }
+
+    #[test]
+    fn gathered_elements_are_those_of_their_index() {
+        let x = counted(&[4, 3, 2]).permute(&[1, 0, 2]);
+        let index = Indices::new(&[3, 5, 2], (0..30).map(|i| i * 7 % 4).collect::<Vec<u32>>());
+        for (i, value) in x.gather(1, &index).iter().enumerate() {
+            assert_eq!(value, x[[i / 10, i * 7 % 4, i % 2]]);
+        }
+        assert_eq!(counted(&[2, 0]).gather(1, Indices::new(&[2, 0], [])).shape(), [2, 0]);
+        assert!(catch_unwind(|| x.gather(1, Indices::new(&[3, 1, 2], [0, 1, 2, 3, 4, 0]))).is_err());
+        assert!(catch_unwind(|| x.gather(1, Indices::new(&[3, 1, 1], [0, 1, 2]))).is_err());
+    }
+
+    #[test]
+    fn elements_are_put_in_place_and_only_there() {
+        let mut x = counted(&[2, 3, 4]).permute(&[1, 0, 2]);
+        let shared = x.clone();
+        let mut array = Array3::from_shape_fn((3, 2, 4), |(i, j, k)| shared[[i, j, k]]);
+        x.assign(s![..;-2, 1, 1..3], Tensor::from([[-1.0, -2.0], [-3.0, -4.0]]));
+        array.slice_mut(s![..;-2, 1, 1..3]).assign(&ndarray::arr2(&[[-1.0, -2.0], [-3.0, -4.0]]));
+        x.assign(s![1..2, .., 3], 7.0);
+        array.slice_mut(s![1..2, .., 3]).fill(7.0);
+        x[[2, 0, 0]] = 0.5;
+        array[[2, 0, 0]] = 0.5;
+        assert_eq!(x, Tensor::from(array.clone()));
+        assert_eq!(shared, counted(&[2, 3, 4]).permute(&[1, 0, 2]));
+        assert_eq!(array.index_axis(Axis(0), 2)[[0, 0]], 0.5);
+        for refused in [s![4, .., ..].as_ref(), s![.., .., .., 0].as_ref()] {
+            let mut x = x.clone();
+            assert!(catch_unwind(move || x.assign(refused, 0.0)).is_err());
+        }
+        let mut narrow = x.clone();
+        assert!(catch_unwind(move || narrow.assign(s![.., .., ..2], Tensor::zeros(&[3]))).is_err());
+        assert!(catch_unwind(move || x[[0, 2, 0]] = 1.0).is_err());
+    }
+
+    #[test]
+    fn a_tensor_equals_a_list_of_its_shape() {
+        let x = counted(&[2, 2]);
+        assert!(x == [[0.0, 1.0], [2.0, 3.0]] && x.t() == [[0.0, 2.0], [1.0, 3.0]]);
+        assert!(x != [[0.0, 1.0], [2.0, 4.0]] && x != [0.0, 1.0, 2.0, 3.0] && x.reshape(&[4]) == [0.0, 1.0, 2.0, 3.0]);
+        let [one, nan] = [Tensor::scalar(1.0), Tensor::from([f64::NAN])];
+        assert!(one != [1.0] && nan != [f64::NAN]);
+    }
+}
