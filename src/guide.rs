@@ -15,8 +15,8 @@
 //! ```
 //!
 //! Tapes share no state: any number of them run on any threads, and a tape's memory goes with it. An operation on large
-//! tensors uses all of rayon's threads (`RAYON_NUM_THREADS` sets how many), unless it runs on one of them already, as in
-//! `ThreadPool::install`: there it keeps to its thread.
+//! tensors uses all of rayon's threads (`RAYON_NUM_THREADS` sets how many), or those of the caller's own pool in
+//! `ThreadPool::install`; inside [`parallel::serial`](crate::tensor::parallel::serial) it keeps to its thread.
 //!
 //! # Gradients of gradients
 //!

@@ -283,7 +283,7 @@ fn gradients<'t, T: Scalar, const N: usize>(
 /// let (scale, shift) = (tape.leaf(Tensor::from([1.0, -1.0])), tape.leaf(Tensor::scalar(0.5)));
 /// let limit = 3.0;
 /// let y = formula!([limit] |x, a, b| (x * a + b).maximum(-limit) / 2.0).on([&x, &scale, &shift]);
-/// assert_eq!(*y.value(), [[0.75, -0.75], [1.75, -1.5]]);
+/// assert_eq!(y.value(), [[0.75, -0.75], [1.75, -1.5]]);
 /// let grads = y.sum().grad(&[&x, &scale, &shift]);
 /// assert_eq!(grads[0], [[0.5, -0.5], [0.5, 0.0]]);
 /// assert_eq!(grads[1], [2.0, 1.0]);

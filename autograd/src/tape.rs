@@ -372,7 +372,8 @@ impl<T: Scalar> Tape<T> {
         value: Tensor<T>,
         at: &'static Location<'static>,
     ) -> Var<'t, T> {
-        let reads = op.reads_for(&|i| inputs[i].node.is_some());
+        // Where a gradient is differentiated, the reference of a fused operation takes all inputs.
+        let reads = if op.is_fused() { op.reads() } else { op.reads_for(&|i| inputs[i].node.is_some()) };
         let edges = inputs.iter().map(|x| x.node.unwrap_or(CONSTANT));
         let inputs = inputs.iter().enumerate().map(|(i, x)| Kept::new(&x.value, reads.input(i))).collect();
         let output = Kept::new(&value, reads.output());

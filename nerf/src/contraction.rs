@@ -131,7 +131,7 @@ impl<T: Scalar> Op<T> for Contraction {
 /// use raygrad_nerf::contract;
 /// let tape = Tape::<f32>::new();
 /// let x = tape.leaf(Tensor::from_vec(&[2, 3], vec![0.5, 0.0, 0.0, 0.0, 4.0, 0.0]));
-/// assert_eq!(*contract(&x).value(), [[0.5, 0.0, 0.0], [0.0, 1.75, 0.0]]);
+/// assert_eq!(contract(&x).value(), [[0.5, 0.0, 0.0], [0.0, 1.75, 0.0]]);
 /// ```
 ///
 /// # Panics

@@ -63,6 +63,17 @@ macro_rules! operator {
                 self.update(&other, |a, b| a $op b);
             }
         }
+        impl<T: Scalar> $assign<Tensor<T>> for Tensor<T> {
+            /// In place where nobody shares the elements.
+            ///
+            /// # Panics
+            /// If `other` does not broadcast to the shape of this tensor.
+            #[track_caller]
+            fn $assign_method(&mut self, other: Tensor<T>) {
+                let other = other.broadcast_to(self.shape());
+                self.update(&other, |a, b| a $op b);
+            }
+        }
         impl<T: Scalar> $assign<T> for Tensor<T> {
             /// In place where nobody shares the elements.
             fn $assign_method(&mut self, other: T) {
@@ -240,7 +251,8 @@ impl<T: Scalar> Tensor<T> {
                 },
             );
         };
-        if other.is_packed() {
+        // A transpose is brought into order tile by tile first.
+        if other.is_packed() || other.layout().rows_in_memory().is_some() {
             let b = other.as_slice();
             chunks(self.as_mut_slice(), STRETCH, work, || (), &|(), i, a| stretch(a, &b[i * STRETCH..][..a.len()]));
             return;
@@ -309,6 +321,13 @@ impl<T: Scalar> Tensor<T> {
     #[track_caller]
     pub fn matmul(&self, other: &Self) -> Self {
         let (row, column) = (self.ndim() == 1, other.ndim() == 1);
+        let [inner, lines] = [self.shape().last(), other.shape().iter().nth_back(if column { 0 } else { 1 })];
+        assert!(
+            inner.is_some() && inner == lines,
+            "matmul of shapes {:?} and {:?}: the inner extents differ",
+            self.shape(),
+            other.shape()
+        );
         let left = if row { self.unsqueeze(0) } else { self.clone() };
         let right = if column { other.unsqueeze(1) } else { other.clone() };
         let mut y = crate::matmul::matmul(&left, &right, &self.pool());
@@ -354,12 +373,23 @@ mod tests {
         y /= 2.0;
         assert_eq!((y.to_vec(), x[[0, 0]]), (vec![10.0, 21.0, 0.0, 0.0], 1.0));
         // In pieces, of views, where they are.
-        let mut large = Tensor::from_fn(&[300, 200], |i| i as f64);
-        let (place, turned) = (large.as_slice().as_ptr(), Tensor::from_fn(&[200, 300], |i| i as f64).t());
-        large += &turned;
-        large *= 2.0;
-        large -= &Tensor::arange(0.0, 200.0, 1.0);
-        assert_eq!(large[[299, 7]], 2.0 * (299.0 * 200.0 + 7.0 + 7.0 * 300.0 + 299.0) - 7.0);
+        let (rows, columns) = (700, 300);
+        let counted = Tensor::from_fn(&[rows, columns], |i| i as f64);
+        let (turned, packed) = (counted.reshape(&[columns, rows]).t(), counted.flip(0).packed());
+        let mut large = Tensor::from_vec(&[rows, columns], counted.to_vec());
+        let place = large.as_slice().as_ptr();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        pool.install(|| {
+            large += &turned;
+            large *= 2.0;
+            large -= Tensor::arange(0.0, columns as f64, 1.0);
+            large += &packed;
+        });
+        for (i, value) in large.iter().enumerate() {
+            let (row, column) = (i / columns, i % columns);
+            let sum = 2.0 * (i + column * rows + row) as f64 - column as f64;
+            assert_eq!(value, sum + ((rows - 1 - row) * columns + column) as f64);
+        }
         assert!(std::ptr::eq(large.as_slice().as_ptr(), place));
         assert_eq!([x.clone(), x.t(), x.clone()].into_iter().sum::<Tensor<f64>>(), &x * 2.0 + x.t());
         assert_eq!(std::iter::empty::<Tensor<f32>>().sum::<Tensor<f32>>().item(), 0.0);
@@ -413,5 +443,20 @@ mod tests {
         assert_eq!(view.iter().nth(1), Some(7.0));
         assert!(std::panic::catch_unwind(|| view[[4, 0]]).is_err() && std::panic::catch_unwind(|| view[[0]]).is_err());
         assert_eq!(x.matmul(&x.t()).shape(), [3, 3]);
+    }
+
+    #[test]
+    fn vectors_are_rows_and_columns_of_products() {
+        let (a, b) =
+            (Tensor::from_fn(&[2, 3, 4], |i| (i * 5 % 7) as f64), Tensor::from_fn(&[2, 4, 3], |i| (i * 3 % 5) as f64));
+        let (three, four) = (Tensor::from([1.0, -2.0, 3.0]), Tensor::from([2.0, 1.0, 0.5, -1.0]));
+        let sum = |n: usize, f: &dyn Fn(usize) -> f64| (0..n).map(f).sum::<f64>();
+        let expected = Tensor::from_fn(&[2, 3], |i| sum(4, &|k| a[[i / 3, i % 3, k]] * four[[k]]));
+        assert_eq!(a.matmul(&four), expected);
+        let expected = Tensor::from_fn(&[2, 4], |i| sum(3, &|k| three[[k]] * a[[i / 4, k, i % 4]]));
+        assert_eq!(three.matmul(&a), expected);
+        let expected = Tensor::from_fn(&[2, 3, 3], |i| sum(4, &|k| a[[i / 9, i / 3 % 3, k]] * b[[i / 9, k, i % 3]]));
+        assert_eq!(a.matmul(&b), expected);
+        assert_eq!(four.matmul(&four), Tensor::scalar(6.25));
     }
 }

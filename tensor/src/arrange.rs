@@ -1,8 +1,65 @@
 //! Tensors out of the elements of others, in another arrangement, and elements put in place.
 
 use crate::layout::checked_len;
-use crate::{Indices, Layout, Scalar, Shape, SliceInfoElem, Tensor, axis_of, concat};
-use std::ops::IndexMut;
+use crate::{Indices, Layout, Scalar, Shape, SliceInfoElem, Tensor, axis_of, concat, find_axis};
+use std::ops::{IndexMut, Range};
+
+/// The shapes that lead to a tensor which is `counts[i]` times the whole along axis `i`: that in which it is seen, that to
+/// which it is stretched, and the result's. Missing counts in front are 1, and further axes stand in front.
+///
+/// # Errors
+/// If there would be more elements than memory can hold.
+pub fn tiled(shape: &[usize], counts: &[usize]) -> Result<[Shape; 3], String> {
+    let ndim = shape.len().max(counts.len());
+    let padded =
+        |list: &[usize]| std::iter::repeat_n(1, ndim - list.len()).chain(list.iter().copied()).collect::<Shape>();
+    let (extents, counts) = (padded(shape), padded(counts));
+    let of = |f: &dyn Fn(usize) -> [usize; 2]| (0..ndim).flat_map(f).collect::<Shape>();
+    within_memory(of(&|i| [1, extents[i]]), of(&|i| [counts[i], extents[i]]), |wide| {
+        wide.chunks_exact(2).map(|pair| pair[0] * pair[1]).collect()
+    })
+}
+
+/// As [`tiled`], for each entry along an axis `count` times.
+///
+/// # Errors
+/// If the axis does not exist, or there would be more elements than memory can hold.
+pub fn repeated(shape: &[usize], axis: isize, count: usize) -> Result<[Shape; 3], String> {
+    let axis = find_axis(axis, shape)?;
+    let [mut narrow, mut wide] = [(); 2].map(|()| Shape::from_slice(shape));
+    narrow.insert(axis + 1, 1);
+    wide.insert(axis + 1, count);
+    within_memory(narrow, wide, |wide| {
+        let mut out = Shape::from_slice(shape);
+        out[axis] *= wide[axis + 1];
+        out
+    })
+}
+
+fn within_memory(narrow: Shape, wide: Shape, out: impl FnOnce(&[usize]) -> Shape) -> Result<[Shape; 3], String> {
+    if checked_len(&wide).is_none() {
+        return Err(format!("{:?} times {:?} is more than memory holds", &wide[..], &narrow[..]));
+    }
+    let out = out(&wide);
+    Ok([narrow, wide, out])
+}
+
+/// The ranges of consecutive parts of an axis.
+///
+/// # Errors
+/// If the axis does not exist or the extents do not add up to its own.
+pub fn split_places(shape: &[usize], axis: isize, extents: &[usize]) -> Result<Vec<Range<usize>>, String> {
+    let extent = shape[find_axis(axis, shape)?];
+    if extents.iter().try_fold(0_usize, |total, &len| total.checked_add(len)) != Some(extent) {
+        return Err(format!("{extents:?} are not {extent} together"));
+    }
+    let mut end = 0;
+    let part = |&len: &usize| {
+        end += len;
+        end - len..end
+    };
+    Ok(extents.iter().map(part).collect())
+}
 
 impl<T: Scalar> Tensor<T> {
     /// Parts along `axis` with these extents, as views (`torch.split`).
@@ -17,18 +74,14 @@ impl<T: Scalar> Tensor<T> {
     /// If the axis does not exist or the extents do not add up to its own.
     #[track_caller]
     pub fn split(&self, axis: isize, extents: &[usize]) -> Vec<Self> {
-        let extent = self.shape()[axis_of(axis, self.shape())];
-        let total = extents.iter().try_fold(0_usize, |total, &len| total.checked_add(len));
-        assert_eq!(total, Some(extent), "split: {extents:?} are not {extent} together");
-        let mut start = 0;
-        let part = |&len: &usize| {
-            start += len;
-            self.slice_axis(axis, start - len..start)
-        };
-        extents.iter().map(part).collect()
+        match split_places(self.shape(), axis, extents) {
+            Ok(places) => places.into_iter().map(|place| self.slice_axis(axis, place)).collect(),
+            Err(what) => panic!("split of a tensor of shape {:?}: {what}", self.shape()),
+        }
     }
 
-    /// The whole tensor, so many times along each axis; further axes stand in front (`numpy.tile`).
+    /// The whole tensor `counts[i]` times along each axis `i` (`numpy.tile`, `torch.repeat`). More counts than axes add
+    /// leading axes, fewer leave the leading axes as they are.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -36,17 +89,10 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If there are fewer counts than axes, or more elements than memory can hold.
+    /// If there would be more elements than memory can hold.
     #[track_caller]
     pub fn tile(&self, counts: &[usize]) -> Self {
-        let Some(lead) = counts.len().checked_sub(self.ndim()) else {
-            panic!("tile: {counts:?} names less axes than {:?}", self.shape())
-        };
-        let extent = |i: usize| if i < lead { 1 } else { self.shape()[i - lead] };
-        let of = |f: &dyn Fn(usize) -> [usize; 2]| (0..counts.len()).flat_map(f).collect::<Shape>();
-        let (narrow, wide) = (of(&|i| [1, extent(i)]), of(&|i| [counts[i], extent(i)]));
-        let shape: Shape = (0..counts.len()).map(|i| counts[i].saturating_mul(extent(i))).collect();
-        self.spread("tile", &narrow, &wide, &shape)
+        self.spread("tile", tiled(self.shape(), counts))
     }
 
     /// Each entry along `axis`, `count` times (`numpy.repeat`, `torch.repeat_interleave`).
@@ -60,22 +106,19 @@ impl<T: Scalar> Tensor<T> {
     /// If the axis does not exist, or there would be more elements than memory can hold.
     #[track_caller]
     pub fn repeat(&self, axis: isize, count: usize) -> Self {
-        let axis = axis_of(axis, self.shape());
-        let [mut narrow, mut wide, mut shape] = [(); 3].map(|()| Shape::from_slice(self.shape()));
-        narrow.insert(axis + 1, 1);
-        wide.insert(axis + 1, count);
-        shape[axis] = shape[axis].saturating_mul(count);
-        self.spread("repeat", &narrow, &wide, &shape)
+        self.spread("repeat", repeated(self.shape(), axis, count))
     }
 
-    /// A `narrow` view of the elements, stretched to `wide`, in a final shape.
     #[track_caller]
-    fn spread(&self, what: &str, narrow: &[usize], wide: &[usize], shape: &[usize]) -> Self {
-        assert!(checked_len(wide).is_some(), "{what}: a tensor of shape {shape:?} is more than memory holds");
-        self.reshape(narrow).broadcast_to(wide).reshape(shape)
+    fn spread(&self, what: &str, shapes: Result<[Shape; 3], String>) -> Self {
+        match shapes {
+            Ok([narrow, wide, shape]) => self.reshape(&narrow).broadcast_to(&wide).reshape(&shape),
+            Err(error) => panic!("{what} of a tensor of shape {:?}: {error}", self.shape()),
+        }
     }
 
-    /// Entries along `axis` moved on by `shift`, those that leave at the end coming in at the start (`numpy.roll`).
+    /// Entries along `axis` moved on by `shift`, those that leave at the end coming in at the start. (`numpy.roll` and
+    /// `torch.roll` take the shift first.)
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -117,8 +160,10 @@ impl<T: Scalar> Tensor<T> {
         let (extent, count) = (self.shape()[axis], index.shape()[axis]);
         let inner: usize = self.shape()[axis + 1..].iter().product();
         let x = self.as_slice();
+        if let Some(place) = index.as_slice().iter().position(|&entry| entry as usize >= extent) {
+            panic!("gather: index {place} is {}, but axis {axis} ends at {extent}", index.as_slice()[place])
+        }
         let element = |(place, &entry): (usize, &u32)| {
-            assert!((entry as usize) < extent, "gather: index {place} is {entry}, but axis {axis} ends at {extent}");
             x[(place / (count * inner) * extent + entry as usize) * inner + place % inner]
         };
         Tensor::from_vec(index.shape(), index.as_slice().iter().enumerate().map(element).collect())
@@ -168,6 +213,18 @@ impl<T: Scalar, const N: usize> PartialEq<[T; N]> for Tensor<T> {
     }
 }
 
+impl<T: Scalar, const N: usize> PartialEq<[T; N]> for &Tensor<T> {
+    fn eq(&self, other: &[T; N]) -> bool {
+        **self == *other
+    }
+}
+
+impl<T: Scalar, const N: usize, const M: usize> PartialEq<[[T; M]; N]> for &Tensor<T> {
+    fn eq(&self, other: &[[T; M]; N]) -> bool {
+        **self == *other
+    }
+}
+
 impl<T: Scalar, const N: usize, const M: usize> PartialEq<[[T; M]; N]> for Tensor<T> {
     /// Whether this is a matrix of these rows.
     fn eq(&self, other: &[[T; M]; N]) -> bool {
@@ -210,6 +267,34 @@ mod tests {
         assert_eq!(parts[2].buffer().as_ptr(), x.buffer().as_ptr());
         assert_eq!((x.tile(&[1, 0, 1]).shape(), x.repeat(0, 0).shape()), (&[2, 0, 4][..], &[0, 3, 4][..]));
         assert_eq!(counted(&[0]).roll(0, 3).shape(), [0]);
+        assert_eq!(x.tile(&[3]), x.tile(&[1, 1, 3]));
+    }
+
+    fn said(f: impl FnOnce()) -> String {
+        *catch_unwind(std::panic::AssertUnwindSafe(f)).unwrap_err().downcast::<String>().unwrap()
+    }
+
+    #[test]
+    fn what_does_not_fit_is_said() {
+        let x = counted(&[2, 3]);
+        let expect = |f: &dyn Fn(), words: &str| assert!(said(f).contains(words), "{}", said(f));
+        expect(&|| drop(x.split(1, &[1, 1])), "split of a tensor of shape [2, 3]: [1, 1] are not 3 together");
+        expect(&|| drop(x.split(1, &[usize::MAX, 4])), "are not 3 together");
+        expect(&|| drop(x.split(2, &[3])), "there is no axis 2");
+        expect(&|| drop(x.tile(&[usize::MAX / 2, 1])), "more than memory holds");
+        expect(&|| drop(x.repeat(0, usize::MAX / 2)), "more than memory holds");
+        expect(&|| drop(x.repeat(-3, 2)), "there is no axis -3");
+        expect(&|| drop(x.gather(0, Indices::new(&[1, 3], [0, 2, 1]))), "gather: index 1 is 2, but axis 0 ends at 2");
+        expect(
+            &|| drop(x.gather(0, Indices::new(&[1, 2], [0, 0]))),
+            "gather along axis 0 of [2, 3] by indices of [1, 2]",
+        );
+        expect(&|| x.clone().assign(s![2, ..], 0.0), "assign to a tensor of shape [2, 3]");
+        expect(&|| drop(x.matmul(&Tensor::from([1.0, 2.0]))), "matmul of shapes [2, 3] and [2]");
+        expect(&|| drop(x.matmul(&Tensor::scalar(1.0))), "matmul of shapes [2, 3] and []");
+        expect(&|| assert!(x.dot(&x) > 0.0), "not two vectors of one length");
+        let (short, long) = (Tensor::from([1.0]), Tensor::from([1.0, 2.0]));
+        expect(&|| assert!(short.dot(&long) > 0.0), "not two vectors of one length");
     }
 
     #[test]
@@ -238,19 +323,35 @@ mod tests {
         assert_eq!(x, Tensor::from(array.clone()));
         assert_eq!(shared, counted(&[2, 3, 4]).permute(&[1, 0, 2]));
         assert_eq!(array.index_axis(Axis(0), 2)[[0, 0]], 0.5);
+        let other = x.clone();
+        x.assign(s![..;-1], other.clone());
+        assert_eq!(x, other.flip(0));
         for refused in [s![4, .., ..].as_ref(), s![.., .., .., 0].as_ref()] {
             let mut x = x.clone();
             assert!(catch_unwind(move || x.assign(refused, 0.0)).is_err());
         }
         let mut narrow = x.clone();
         assert!(catch_unwind(move || narrow.assign(s![.., .., ..2], Tensor::zeros(&[3]))).is_err());
-        assert!(catch_unwind(move || x[[0, 2, 0]] = 1.0).is_err());
+        for place in [&[0_usize, 2, 0][..], &[2], &[0, 0, 0, 0]] {
+            let mut x = x.clone();
+            let message = said(move || match *place {
+                [i] => x[[i]] = 1.0,
+                [i, j, k] => x[[i, j, k]] = 1.0,
+                _ => x[[0; 4]] = 1.0,
+            });
+            assert!(message.starts_with("no element"), "{message}");
+        }
     }
 
     #[test]
     fn a_tensor_equals_a_list_of_its_shape() {
         let x = counted(&[2, 2]);
         assert!(x == [[0.0, 1.0], [2.0, 3.0]] && x.t() == [[0.0, 2.0], [1.0, 3.0]]);
+        assert!(
+            x != [[0.0, 1.0, 2.0, 3.0]]
+                && x != [[0.0], [1.0], [2.0], [3.0]]
+                && x.reshape(&[4]) != [[0.0, 1.0], [2.0, 3.0]]
+        );
         assert!(x != [[0.0, 1.0], [2.0, 4.0]] && x != [0.0, 1.0, 2.0, 3.0] && x.reshape(&[4]) == [0.0, 1.0, 2.0, 3.0]);
         let [one, nan] = [Tensor::scalar(1.0), Tensor::from([f64::NAN])];
         assert!(one != [1.0] && nan != [f64::NAN]);

@@ -1,6 +1,7 @@
 //! The greatest or smallest elements along an axis, and where they are.
 
 use crate::indices::index;
+use crate::parallel::{ELEMENT, PIECE, chunks};
 use crate::reduce::chunk;
 use crate::rows::fold_lanes;
 use crate::{Scalar, simd};
@@ -14,30 +15,35 @@ pub type Middle = [usize; 3];
 /// # Panics
 /// If the lengths do not fit, or `count` is 0 and `out` is not empty.
 pub fn extremum<T: Scalar>(x: &[T], middle: Middle, greatest: bool, out: &mut [T]) {
-    if greatest {
-        along(
-            x,
-            middle,
-            out,
-            #[inline(always)]
-            |a, b| a.maximum(b),
-        );
-    } else {
-        along(
-            x,
-            middle,
-            out,
-            #[inline(always)]
-            |a, b| a.minimum(b),
-        );
-    }
+    let [outer, count, inner] = middle;
+    assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner), "extremum of {middle:?}");
+    // Groups of about a piece for each task.
+    let (group, at_once) = (count * inner, (PIECE / (count * inner).max(1)).max(1));
+    chunks(out, (at_once * inner).max(1), ELEMENT * x.len(), || (), &|(), i, out| {
+        let groups = out.len() / inner;
+        let (x, middle) = (&x[i * at_once * group..][..groups * group], [groups, count, inner]);
+        if greatest {
+            along(
+                x,
+                middle,
+                out,
+                #[inline(always)]
+                |a, b| a.maximum(b),
+            );
+        } else {
+            along(
+                x,
+                middle,
+                out,
+                #[inline(always)]
+                |a, b| a.minimum(b),
+            );
+        }
+    });
 }
 
 fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, out: &mut [T], pick: impl Fn(T, T) -> T) {
-    assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner), "extremum of {:?}", [outer, count, inner]);
-    if out.is_empty() {
-        return;
-    }
+    debug_assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner));
     assert!(count > 0, "extremum of no elements");
     simd::dispatch(
         #[inline(always)]

@@ -48,6 +48,7 @@ mod windows;
 /// Slices for [`Tensor::slice`] and [`Tensor::slice_axis`], as in ndarray: `s![.., -1, 1..3, ..;-1]`.
 pub use ndarray::{Slice, SliceInfoElem, s};
 
+pub use arrange::{repeated, split_places, tiled};
 pub use axes::{Axes, Reduction, axis_of, find_axis};
 pub use create::concat;
 pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map_either};

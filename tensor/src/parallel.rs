@@ -73,8 +73,9 @@ pub fn chunks<T: Send, S>(
 #[cfg(test)]
 mod tests {
     use super::{is_worthwhile, serial};
+    use crate::extremum::extremum;
     use crate::matmul::{Matrix, gemm};
-    use crate::{Layout, Pool, Real, Scalar, Tensor, map_real, rows, sum, sum_axes};
+    use crate::{Layout, Mask, Pool, Real, Scalar, Tensor, map_real, rows, sum, sum_axes};
 
     /// Of many magnitudes, so that the order of additions shows.
     fn values<T: Scalar>(shape: &[usize], seed: usize) -> Tensor<T> {
@@ -100,6 +101,13 @@ mod tests {
             sum_axes(&x.reshape(&[1, 1031, 517]), &[1], &pool),
             Tensor::from_fn(&[20], |i| sum(&x.as_slice()[i..])),
         ];
+        let mut sum = x.clone();
+        sum += &values(&[1031, 517], 4);
+        sum += &row;
+        out.push(sum);
+        let mask = Mask::new(&[517], (0..517).map(|i| i % 3 == 0).collect::<Vec<_>>());
+        out.push(x.where_(&mask, &column));
+        out.push(x.where_(&x.lt(T::from_f64(0.25)), &row));
         let mut write = |shape: &[usize], f: &dyn Fn(&mut [T])| {
             let mut y = Tensor::full(shape, T::from_f64(f64::NAN));
             f(y.as_mut_slice());
@@ -109,6 +117,9 @@ mod tests {
         write(&tall, &|y| {
             Layout::contiguous(&[517, 1031]).permuted(&[1, 0]).sliced(1, 516, 517, -1).read(wide, y);
         });
+        for middle @ [outer, _, inner] in [[1031, 517, 1], [1031, 47, 11], [1, 1031, 517]] {
+            write(&[outer * inner], &|y| extremum(wide, middle, true, y));
+        }
         write(&tall, &|y| rows::softmax_rows(wide, 517, y, &pool));
         write(&tall, &|y| rows::softmax_rows_grad(wide, wide, 517, y));
         write(&tall, &|y| rows::log_softmax_rows(wide, 517, y, &pool));

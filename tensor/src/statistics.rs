@@ -82,7 +82,11 @@ impl<T: Scalar> Tensor<T> {
         let (x, middle) = match axes.run() {
             Some((first, behind)) => {
                 let extent = |axes: Range<usize>| self.shape()[axes].iter().product();
-                (self.clone(), [extent(0..first), extent(first..behind), extent(behind..self.ndim())])
+                // A view of its own: what is packed for this goes with it.
+                (
+                    self.with_layout(self.layout().clone()),
+                    [extent(0..first), extent(first..behind), extent(behind..self.ndim())],
+                )
             }
             None => {
                 let rows = self.rows(&axes);
@@ -254,5 +258,31 @@ mod tests {
         let (zero, far) = (Tensor::from([0.0, 0.0]), Tensor::from([1.0_f32, -3.0]));
         assert_eq!((zero.distance(&far), far.distance(&zero)), (3.0, 3.0));
         assert!(Tensor::from([f32::NAN, 0.0]).distance(&Tensor::from([0.0, 1.0])).is_nan());
+    }
+
+    #[test]
+    fn numbers_of_all_elements() {
+        let x = Tensor::from([[1.0, 4.0], [2.0, 9.0_f64]]);
+        assert_eq!((x.var(0), x.var(1)), (9.5, 38.0 / 3.0));
+        assert_eq!((x.std(0), x.std(1)), (9.5_f64.sqrt(), (38.0_f64 / 3.0).sqrt()));
+        assert_eq!(Tensor::from([1.0, 2.0, 3.0]).dot(&Tensor::from([4.0, -5.0, 6.0])), 12.0);
+        assert_eq!((x.max_over(..), x.flip(0).t().max_over(0)), (Tensor::scalar(9.0), Tensor::from([9.0, 4.0])));
+        assert!(Tensor::<f32>::zeros(&[0]).var(0).is_nan());
+    }
+
+    #[test]
+    fn extremes_over_neighbouring_axes() {
+        let x = Tensor::from_fn(&[2, 3, 1, 4], |i| ((i * 7) % 24) as f64);
+        let of = |keep: &dyn Fn(usize) -> usize, n: usize| {
+            let mut greatest = vec![f64::MIN; n];
+            x.iter().enumerate().for_each(|(i, x)| greatest[keep(i)] = greatest[keep(i)].max(x));
+            greatest
+        };
+        assert_eq!(x.max_over([0, 1]).to_vec(), of(&|i| i % 4, 4));
+        assert_eq!(x.max_over([1, 3]).to_vec(), of(&|i| i / 12, 2));
+        assert_eq!(x.max_over([1, 2]).to_vec(), of(&|i| i / 12 * 4 + i % 4, 8));
+        assert_eq!(x.max_over([0, 3]).to_vec(), of(&|i| i / 4 % 3, 3));
+        let none: [isize; 0] = [];
+        assert_eq!(x.max_over(none), x);
     }
 }

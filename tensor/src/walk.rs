@@ -35,7 +35,8 @@ fn stream<T: Scalar>(row: &[T; TILE], out: &mut [T]) {
     let out = out[..TILE].as_mut_ptr().cast::<__m128i>();
     assert!(out.addr().is_multiple_of(16), "a row that is not aligned");
     for k in 0..size_of::<[T; TILE]>() / 16 {
-        // SAFETY: the processor has SSE2, `row` and `out` are as long, and `out` is aligned. Run by `streamed_rows_arrive`.
+        // SAFETY: the processor has SSE2, `row` and `out` are as long, `out` is aligned, and a fence follows before the slice
+        // that `out` is of is given back ([`Streams`]). Run by `streamed_rows_arrive`.
         unsafe { _mm_stream_si128(out.add(k), _mm_loadu_si128(row.as_ptr().cast::<__m128i>().add(k))) };
     }
 }
@@ -46,12 +47,16 @@ fn stream<T: Scalar>(row: &[T; TILE], out: &mut [T]) {
     out[..TILE].copy_from_slice(row);
 }
 
-/// Has everything that was [`stream`]ed written before anything else is.
-fn finish_streams() {
-    // SAFETY: the processor has SSE. Run by `streamed_rows_arrive`.
-    #[cfg(target_arch = "x86_64")]
-    unsafe {
-        std::arch::x86_64::_mm_sfence();
+/// While it lives rows may be [`stream`]ed; when it goes, they have been written before anything that follows.
+struct Streams;
+
+impl Drop for Streams {
+    fn drop(&mut self) {
+        // SAFETY: the processor has SSE. Run by `streamed_rows_arrive`.
+        #[cfg(target_arch = "x86_64")]
+        unsafe {
+            std::arch::x86_64::_mm_sfence();
+        }
     }
 }
 
@@ -207,7 +212,7 @@ impl Layout {
     }
 
     /// For a layout that turns matrices: the collapsed axis along which neighbours lie in memory, which is not the last.
-    fn rows_in_memory(&self) -> Option<usize> {
+    pub(crate) fn rows_in_memory(&self) -> Option<usize> {
         let axes = self.collapsed();
         let &(columns, step) = axes.last()?;
         let turned = step.unsigned_abs() > 1 && columns >= TILE && !self.is_empty();
@@ -235,6 +240,7 @@ impl Layout {
         out: &mut [T],
         large: bool,
     ) {
+        let _streams = Streams;
         let (height, (width, step)) = (axes[axis].0, axes[axes.len() - 1]);
         // Steps of the output along the axes, and the matrices that the other axes count.
         let row_step: usize = axes[axis + 1..].iter().map(|&(extent, _)| extent).product();
@@ -272,7 +278,6 @@ impl Layout {
                 }
             }
         }
-        finish_streams();
     }
 
     /// The inverse of [`read`](Self::read): copies `values` to the elements of `target` that the layout names; the
@@ -317,12 +322,24 @@ mod tests {
 
     /// Transposes that are streamed: of whole matrices and of parts, to places at any distance from a cache line.
     fn large_transposes<T: Scalar>(per_line: usize) {
-        // Rows of the result that all begin at one place of a line, and rows that do not.
-        for (matrices, rows, columns) in [(1, 1440, 1536), (2, 1057, 1072), (1, 1441, 1537)] {
+        // Rows of the result that all begin at one place of a line, and rows that do not; matrices that are small.
+        for (matrices, rows, columns) in [(1, 1440, 1536), (2, 1057, 1072), (1, 1441, 1537), (70, 200, 160)] {
             let source = Vec::from_iter((0..matrices * rows * columns).map(|i| T::from_f64((i % 65_521) as f64)));
             let whole = Layout::contiguous(&[matrices, columns, rows]);
-            assert!(whole.len() >= LARGE);
-            for layout in [whole.permuted(&[0, 2, 1]), whole.sliced(2, rows - 1, rows, -1).permuted(&[0, 2, 1])] {
+            let part = whole.sliced(2, 3, rows - 20, 1).sliced(1, 5, columns - 16, 1);
+            let four = Layout::contiguous(&[2, matrices / 2, columns, rows]).permuted(&[1, 0, 3, 2]);
+            let [turned, nested] = if matrices > 2 {
+                [whole.permuted(&[2, 1, 0]), four]
+            } else {
+                [1, 2].map(|_| whole.permuted(&[0, 2, 1]))
+            };
+            for layout in [
+                turned,
+                nested,
+                whole.sliced(1, columns - 1, columns, -1).permuted(&[0, 2, 1]),
+                part.permuted(&[0, 2, 1]),
+            ] {
+                assert!(layout.len() >= LARGE && layout.rows_in_memory().is_some(), "{layout:?}");
                 for lead in [0, 1, per_line - 1] {
                     let mut out = vec![T::from_f64(-1.0); layout.len() + lead];
                     layout.read(&source, &mut out[lead..]);

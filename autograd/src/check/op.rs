@@ -30,6 +30,9 @@ impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
     fn reads(&self) -> crate::Reads {
         (**self).reads()
     }
+    fn reads_for(&self, has_gradient: &dyn Fn(usize) -> bool) -> crate::Reads {
+        (**self).reads_for(has_gradient)
+    }
     fn vjp<'t>(&self, cx: &crate::Vjp<'t, '_, T>) -> crate::Grads<'t, T> {
         (**self).vjp(cx)
     }
@@ -50,6 +53,7 @@ impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
 /// - the same bits when run again, on buffers that hold other numbers from before, and on inputs that come from transposed and
 ///   reversed arrays;
 /// - the same value and derivatives where one variable is passed for two inputs as where two equal ones are;
+/// - the same derivatives by the other inputs where one is a constant, of which the tape then keeps less;
 /// - f32 against f64, by norm and by units in the last place;
 /// - a fused operation against its reference, an elementwise formula against dual numbers;
 /// - a linear operation for linearity, and its gradient for being the adjoint: `<J x, u> = <x, J' u>`.
@@ -85,6 +89,11 @@ fn check_sample(check: &Check, entry: &Entry, x: &[Tensor<f64>]) -> Result<Repor
         let [shared, apart] = [true, false].map(|shared| twice(&entry.f64, x, [i, j], values, shared));
         // Two derivatives may cancel: what rounding leaves is no error.
         compare_all(&what, &shared, &apart, 1e-12, 1e-3)?;
+        report.comparisons += 1;
+    }
+    for held in 0..if x.len() > 1 { x.len() } else { 0 } {
+        let [constant, leaf] = [true, false].map(|constant| by_others(&entry.f64, x, held, constant));
+        compare_all(&format!("input {held} as a constant against a variable"), &constant, &leaf, 1e-12, 1e-3)?;
         report.comparisons += 1;
     }
     let singles: Vec<Tensor<f32>> = x.iter().map(Tensor::cast).collect();
@@ -227,13 +236,31 @@ fn twice(
         wrt.remove(j);
     }
     let join = if shared { None } else { Some((i, j)) };
-    let grads = joined((&y * tape.constant(seed(y.shape()))).sum().grad_graph(&wrt), join);
-    let mut total = tape.constant(Tensor::scalar(0.0));
-    for (k, grad) in grads.iter().enumerate() {
-        total += (grad * tape.constant(spread(grad.shape(), &[-1.0..1.0], 29 + k))).sum();
-    }
-    let second = joined(total.grad_graph(&wrt), join);
+    let grads = joined((&y * seed(y.shape())).sum().grad_graph(&wrt), join);
+    let second = joined(weighted(&grads).grad_graph(&wrt), join);
     grads.into_iter().chain(second).chain([y]).map(Var::into_value).collect()
+}
+
+/// A weighting of gradients.
+fn weighted<'t>(grads: &[Var<'t, f64>]) -> Var<'t, f64> {
+    let part = |(k, grad): (usize, &Var<'t, f64>)| (grad * spread(grad.shape(), &[-1.0..1.0], 29 + k)).sum();
+    grads.iter().enumerate().map(part).sum::<Var<'t, f64>>().tracked()
+}
+
+/// Gradients, recorded gradients and gradients of a weighting of these, by all inputs but the one that is `held`.
+fn by_others(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], held: usize, constant: bool) -> Vec<Tensor<f64>> {
+    let tape = Tape::new();
+    let input = |(i, x): (usize, &Tensor<f64>)| {
+        if constant && i == held { tape.constant(x.clone()) } else { tape.leaf(x.clone()) }
+    };
+    let inputs: Vec<_> = x.iter().enumerate().map(input).collect();
+    let y = tape.apply(op.clone(), &inputs.iter().collect::<Vec<_>>()).tracked();
+    let loss = (&y * seed(y.shape())).sum();
+    let wrt: Vec<_> = inputs.iter().enumerate().filter(|(i, _)| *i != held).map(|(_, x)| x).collect();
+    let grads = loss.grad_graph(&wrt);
+    let second = weighted(&grads).grad_graph(&wrt);
+    let all = grads.into_iter().chain(second).map(Var::into_value);
+    loss.grad(&wrt).into_iter().chain(all).collect()
 }
 
 /// Element `j` added to element `i`, of a pair `(i, j)`, and removed; `j` is behind `i`.

@@ -202,7 +202,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # use raygrad_tensor::Tensor;
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([-2.0, 0.0, 3.0]));
-    /// assert_eq!(*x.if_positive(&x, &x.constant(9.0)).value(), [9.0, 9.0, 3.0]);
+    /// assert_eq!(x.if_positive(&x, &x.constant(9.0)).value(), [9.0, 9.0, 3.0]);
     /// ```
     ///
     /// # Panics

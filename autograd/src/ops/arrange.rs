@@ -2,7 +2,7 @@
 
 use crate::Var;
 use crate::error::ensure;
-use raygrad_tensor::{Layout, Scalar, Shape, checked_len};
+use raygrad_tensor::{Layout, Scalar, Shape, repeated, split_places, tiled};
 
 impl<'t, T: Scalar> Var<'t, T> {
     /// Two axes exchanged.
@@ -64,42 +64,27 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist or the extents do not sum up to its extent.
     #[track_caller]
     pub fn split(&self, axis: isize, extents: &[usize]) -> Vec<Self> {
-        let extent = self.shape()[self.axis("split", axis)];
-        let total = extents.iter().try_fold(0_usize, |total, &len| total.checked_add(len));
-        self.fits("split", ensure(total == Some(extent), || format!("{extents:?} are not {extent} together")));
-        let mut start = 0;
-        let mut parts = Vec::with_capacity(extents.len());
-        for &len in extents {
-            parts.push(self.slice_axis(axis, start..start + len));
-            start += len;
-        }
-        parts
+        let places = self.fits("split", split_places(self.shape(), axis, extents));
+        places.into_iter().map(|place| self.slice_axis(axis, place)).collect()
     }
 
     /// The whole tensor `counts[i]` times along each axis `i` (`numpy.tile`, `torch.repeat`). More counts than axes add
-    /// leading axes.
+    /// leading axes, fewer leave the leading axes as they are.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([1.0, 2.0]));
-    /// assert_eq!(*x.tile(&[2]).value(), [1.0, 2.0, 1.0, 2.0]);
-    /// assert_eq!(*x.repeat(0, 2).value(), [1.0, 1.0, 2.0, 2.0]);
+    /// assert_eq!(x.tile(&[2]).value(), [1.0, 2.0, 1.0, 2.0]);
+    /// assert_eq!(x.repeat(0, 2).value(), [1.0, 1.0, 2.0, 2.0]);
     /// ```
     ///
     /// # Panics
-    /// If there are less counts than axes.
+    /// If there would be more elements than memory can hold.
     #[track_caller]
     pub fn tile(&self, counts: &[usize]) -> Self {
-        let shape = self.shape();
-        let lead = counts.len().checked_sub(shape.len()).ok_or_else(|| format!("{counts:?} names less axes"));
-        let lead = self.fits("tile", lead);
-        let extent = |i: usize| if i < lead { 1 } else { shape[i - lead] };
-        let narrow: Shape = (0..counts.len()).flat_map(|i| [1, extent(i)]).collect();
-        let wide: Shape = (0..counts.len()).flat_map(|i| [counts[i], extent(i)]).collect();
-        self.fits("tile", ensure(checked_len(&wide).is_some(), || format!("{counts:?} times is too much")));
-        let out: Shape = (0..counts.len()).map(|i| counts[i] * extent(i)).collect();
-        self.reshape(&narrow).broadcast_to(&wide).reshape(&out)
+        let [narrow, wide, shape] = self.fits("tile", tiled(self.shape(), counts));
+        self.reshape(&narrow).broadcast_to(&wide).reshape(&shape)
     }
 
     /// Each entry along `axis`, `count` times (`numpy.repeat`, `torch.repeat_interleave`).
@@ -108,19 +93,12 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the axis does not exist.
     #[track_caller]
     pub fn repeat(&self, axis: isize, count: usize) -> Self {
-        let axis = self.axis("repeat", axis);
-        let mut shape = Shape::from_slice(self.shape());
-        let mut narrow = shape.clone();
-        narrow.insert(axis + 1, 1);
-        let mut wide = shape.clone();
-        wide.insert(axis + 1, count);
-        self.fits("repeat", ensure(checked_len(&wide).is_some(), || format!("{count} times is too much")));
-        shape[axis] *= count;
+        let [narrow, wide, shape] = self.fits("repeat", repeated(self.shape(), axis, count));
         self.reshape(&narrow).broadcast_to(&wide).reshape(&shape)
     }
 
     /// The entries along `axis` moved `shift` places towards the end; what leaves there comes in at the start. A
-    /// negative shift moves towards the start.
+    /// negative shift moves towards the start. (`numpy.roll` and `torch.roll` take the shift first.)
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -219,7 +197,7 @@ mod tests {
             &|| drop(x.unsqueeze(3)),
             &|| drop(x.slice_axis(1, 0..4)),
             &|| drop(x.split(1, &[1, 1])),
-            &|| drop(x.tile(&[2])),
+            &|| drop(x.tile(&[2, usize::MAX])),
             &|| drop(x.repeat(2, 2)),
             &|| drop(x.roll(2, 1)),
             &|| drop(x.reshape(&[4, INFER])),

@@ -95,7 +95,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([[1.0, 5.0], [3.0, 3.0]]));
     /// let y = x.max_over(-1);
-    /// assert_eq!(*y.value(), [5.0, 3.0]);
+    /// assert_eq!(y.value(), [5.0, 3.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0], [[0.0, 1.0], [0.5, 0.5]]);
     /// ```
     ///

@@ -97,12 +97,17 @@ impl<T: Scalar> Op<T> for GatherRows {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        if cx.recording() {
-            return Grads::one(cx.g().scatter_rows(&self.index, cx.shape(0)[0]));
-        }
-        let grad = RowGrad::new(cx.shape(0), self.index.clone(), cx.g().value().clone());
-        Grads::new([None]).with_sparse(0, Arc::new(grad))
+        rows_gradient(cx, &self.index)
     }
+}
+
+/// The gradient of a table of which rows were picked: sparse, unless it is recorded.
+pub(super) fn rows_gradient<'t, T: Scalar>(cx: &Vjp<'t, '_, T>, index: &Arc<[u32]>) -> Grads<'t, T> {
+    if cx.recording() {
+        return Grads::one(cx.g().scatter_rows(index, cx.shape(0)[0]));
+    }
+    let grad = RowGrad::new(cx.shape(0), index.clone(), cx.g().value().clone());
+    Grads::new([None]).with_sparse(0, Arc::new(grad))
 }
 
 impl<T: Scalar> Op<T> for ScatterRows {
@@ -211,7 +216,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f64>::new();
     /// let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
     /// let y = x.gather_rows([1, 0, 1]);
-    /// assert_eq!(*y.value(), [[3.0, 4.0], [1.0, 2.0], [3.0, 4.0]]);
+    /// assert_eq!(y.value(), [[3.0, 4.0], [1.0, 2.0], [3.0, 4.0]]);
     /// assert_eq!(y.sum().grad(&[&x])[0], [[1.0, 1.0], [2.0, 2.0]]);
     /// ```
     ///

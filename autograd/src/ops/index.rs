@@ -1,7 +1,7 @@
 //! Elements along an axis by number: gather, select, sort, and their adjoints. Indices are whole numbers outside the
 //! graph; gradients flow through what is picked.
 
-use super::gather::add_up;
+use super::gather::{add_up, rows_gradient};
 use crate::error::ensure;
 use crate::{Grads, Op, Operand, Reads, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
@@ -182,6 +182,9 @@ impl<T: Scalar> Op<T> for IndexSelect {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        if self.axis == 0 {
+            return rows_gradient(cx, &self.index);
+        }
         let op = IndexAdd { axis: self.axis, index: self.index.clone(), extent: cx.shape(0)[self.axis] };
         Grads::one(cx.tape().apply(op, &[cx.g()]))
     }
@@ -233,7 +236,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f64>::new();
     /// let logits = tape.leaf(Tensor::from_vec(&[2, 3], vec![0.1, 0.2, 0.3, 0.4, 0.5, 0.6]));
     /// let labels = Indices::new(&[2, 1], [2, 0]);
-    /// assert_eq!(*logits.gather(1, &labels).value(), [[0.3], [0.4]]);
+    /// assert_eq!(logits.gather(1, &labels).value(), [[0.3], [0.4]]);
     /// ```
     ///
     /// # Panics
@@ -266,10 +269,6 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn index_select(&self, axis: isize, index: impl Into<Indices>) -> Self {
         let (axis, index) = (self.axis("index_select", axis), self.line("index_select", index));
-        if axis == 0 {
-            // Rows have a sparse gradient.
-            return self.gather_rows(index);
-        }
         self.tape().apply(IndexSelect { axis, index }, &[self])
     }
 
@@ -399,6 +398,19 @@ mod tests {
         assert_eq!(zero.index_add(1, [1, 1, 1], &source).value().as_slice(), [0.0, 1.0]);
         assert_eq!(zero.scatter_add(1, Indices::new(&[1, 3], [1, 0, 1]), &source).value().as_slice(), [1.0, 0.0]);
     }
+    #[test]
+    fn rows_that_are_selected_have_a_sparse_gradient() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from_fn(&[3, 2], |i| i as f64));
+        let rows = x.index_select(0, [1, 0, 1]).square().sum().backward(&[&x]).remove(0);
+        assert!(rows.is_rows());
+        assert_eq!(rows.into_dense(tape.pool()), [[0.0, 2.0], [8.0, 12.0], [0.0, 0.0]]);
+        let x = tape.leaf(Tensor::from_fn(&[3, 2], |i| i as f64));
+        let columns = x.index_select(1, [1, 0, 1]).square().sum().backward(&[&x]).remove(0);
+        assert!(columns.is_dense());
+        assert_eq!(columns.into_dense(tape.pool()), [[0.0, 4.0], [4.0, 12.0], [8.0, 20.0]]);
+    }
+
     /// An axis with entries before and behind it, and fewer or more indices than entries.
     #[test]
     fn gathering_along_an_axis_in_the_middle_is_what_its_definition_says() {

@@ -71,7 +71,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f64>::new();
     /// let x = tape.leaf(Tensor::from_vec(&[1, 2], vec![10.0, 14.0]));
     /// let (gain, bias) = (tape.leaf(Tensor::ones(&[2])), tape.leaf(Tensor::full(&[2], 0.5)));
-    /// assert_eq!(*x.layer_norm(&gain, &bias, 0.0).value(), [[-0.5, 1.5]]);
+    /// assert_eq!(x.layer_norm(&gain, &bias, 0.0).value(), [[-0.5, 1.5]]);
     /// ```
     ///
     /// # Panics

@@ -290,7 +290,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let large = 2.0_f32.powi(100); // its square is infinite
     /// let x = tape.leaf(Tensor::from([[3.0 * large, 4.0 * large], [0.0, 0.0]]));
     /// let y = x.norm_over(-1);
-    /// assert_eq!(*y.value(), [5.0 * large, 0.0]);
+    /// assert_eq!(y.value(), [5.0 * large, 0.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0], [[0.6, 0.8], [0.0, 0.0]]);
     /// ```
     ///

@@ -179,7 +179,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from_vec(&[3, 3], vec![2.0, 3.0, 4.0, 2.0, 0.0, 4.0, 0.0, 3.0, 0.0]));
     /// let y = x.prod_over(-1);
-    /// assert_eq!(*y.value(), [24.0, 0.0, 0.0]);
+    /// assert_eq!(y.value(), [24.0, 0.0, 0.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0], [[12.0, 8.0, 6.0], [0.0, 8.0, 0.0], [0.0, 0.0, 0.0]]);
     /// ```
     ///

@@ -87,7 +87,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// use raygrad_autograd::{Axes, Tape, Tensor};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0]]));
-    /// assert_eq!(*x.sum_over(-1).value(), [3.0, 7.0]);
+    /// assert_eq!(x.sum_over(-1).value(), [3.0, 7.0]);
     /// assert_eq!(x.sum_over(Axes::from(0).keepdims()).shape(), [1, 2]);
     /// ```
     ///

@@ -139,7 +139,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([-2.0, 0.0, 3.0]));
     /// let y = x.square().where_(&x.lt(1.0), &x);
-    /// assert_eq!(*y.value(), [4.0, 0.0, 3.0]);
+    /// assert_eq!(y.value(), [4.0, 0.0, 3.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0], [-4.0, 0.0, 1.0]);
     /// ```
     ///
@@ -206,7 +206,12 @@ mod tests {
         // The root's own slope at 0 is infinite, and 0 times it is NaN: the user must keep the root away from 0.
         let safe = x.maximum(1.0).sqrt().where_(&x.gt(1.0), &x).sum();
         assert!(y.grad(&[&x])[0].as_slice()[0].is_nan());
-        assert_eq!(safe.grad(&[&x])[0].as_slice(), [1.0, 0.25]);
+        assert_eq!(safe.grad(&[&x])[0], [1.0, 0.25]);
+        // One that comes from behind: the side that was not chosen gets 0 and not infinity times 0.
+        let (a, b) = (tape.leaf(Tensor::from([1.0, 2.0])), tape.leaf(Tensor::from([3.0, 4.0])));
+        let chosen = a.where_(&a.gt(1.5), &b);
+        let grads = (chosen * Tensor::from([f64::INFINITY, f64::INFINITY])).sum().grad(&[&a, &b]);
+        assert_eq!((grads[0].to_vec(), grads[1].to_vec()), (vec![0.0, f64::INFINITY], vec![f64::INFINITY, 0.0]));
     }
 
     #[test]

@@ -301,7 +301,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// let tape = Tape::<f64>::new();
     /// let x = tape.leaf(Tensor::from_fn(&[2, 3], |i| i as f64));
     /// let y = x.slice(s![-1, ..;2]);
-    /// assert_eq!(*y.value(), [3.0, 5.0]);
+    /// assert_eq!(y.value(), [3.0, 5.0]);
     /// assert_eq!(y.sum().grad(&[&x])[0], [[0.0, 0.0, 0.0], [1.0, 0.0, 1.0]]);
     /// ```
     ///
@@ -319,8 +319,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// use raygrad_autograd::{Slice, Tape, Tensor};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from_fn(&[6], |i| i as f32));
-    /// assert_eq!(*x.slice_axis(-1, 1..3).value(), [1.0, 2.0]);
-    /// assert_eq!(*x.slice_axis(0, Slice::from(..-1).step_by(-3)).value(), [4.0, 1.0]);
+    /// assert_eq!(x.slice_axis(-1, 1..3).value(), [1.0, 2.0]);
+    /// assert_eq!(x.slice_axis(0, Slice::from(..-1).step_by(-3)).value(), [4.0, 1.0]);
     /// ```
     ///
     /// # Panics

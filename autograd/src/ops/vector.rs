@@ -178,7 +178,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// use raygrad_autograd::{Tape, Tensor};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::from([[3e-23, 4e-23], [0.0, 0.0]]));
-    /// assert_eq!(*x.normalize().value(), [[0.6, 0.8], [0.0, 0.0]]);
+    /// assert_eq!(x.normalize().value(), [[0.6, 0.8], [0.0, 0.0]]);
     /// ```
     ///
     /// # Panics

@@ -40,7 +40,7 @@ impl LayerNorm {
     /// let tape = Tape::new();
     /// let x = tape.constant(Tensor::from_vec(&[1, 2], vec![10.0, 14.0]));
     /// let y = norm.with_eps(0.0).forward(&params.bind(&tape), &x);
-    /// assert_eq!(*y.value(), [[-1.0, 1.0]]);
+    /// assert_eq!(y.value(), [[-1.0, 1.0]]);
     /// ```
     ///
     /// # Panics
