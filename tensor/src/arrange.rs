@@ -353,6 +353,9 @@ mod tests {
                 && x.reshape(&[4]) != [[0.0, 1.0], [2.0, 3.0]]
         );
         assert!(x != [[0.0, 1.0], [2.0, 4.0]] && x != [0.0, 1.0, 2.0, 3.0] && x.reshape(&[4]) == [0.0, 1.0, 2.0, 3.0]);
+        let (matrix, vector) = (&x, &x.reshape(&[4]));
+        assert!(matrix == [[0.0, 1.0], [2.0, 3.0]] && matrix != [[0.0, 1.0], [2.0, 4.0]]);
+        assert!(vector == [0.0, 1.0, 2.0, 3.0] && vector != [0.0; 4]);
         let [one, nan] = [Tensor::scalar(1.0), Tensor::from([f64::NAN])];
         assert!(one != [1.0] && nan != [f64::NAN]);
     }

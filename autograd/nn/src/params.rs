@@ -335,6 +335,23 @@ impl<T: Scalar> Params<T> {
         self.settings.clone_from(&other.settings);
     }
 
+    /// Takes over what was said of the parameters of another store with the same names: which are frozen, with their values,
+    /// and what rates, decay and laziness they have. All others keep their values.
+    ///
+    /// # Panics
+    /// If names or shapes differ.
+    #[track_caller]
+    pub fn inherit(&mut self, other: &Params<T>) {
+        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
+        for (i, (value, theirs)) in self.values.iter_mut().zip(&other.values).enumerate() {
+            assert_eq!(value.shape(), theirs.shape(), "two parameters `{}`", self.names.names[i]);
+            if other.settings[i].frozen {
+                value.clone_from(theirs);
+            }
+        }
+        self.settings.clone_from(&other.settings);
+    }
+
     /// The same parameters in another precision.
     pub fn cast<U: Scalar>(&self) -> Params<U> {
         Params {
