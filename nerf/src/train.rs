@@ -132,11 +132,13 @@ impl Trainer {
     /// A new model for a dataset.
     ///
     /// # Errors
-    /// If the configuration is out of range or the dataset has no frame.
+    /// If the configuration is out of range, the dataset has no frame, or no ray of it
+    /// [meets the scene's box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
+        data.check_reach()?;
         let extent = Extent { bounds: data.bounds, span: [data.near, data.far] };
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
         let batch = match &config.sampler {
@@ -353,7 +355,9 @@ impl Trainer {
         self.done.restarts += 1;
         self.collapses += 1;
         let seed = config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
-        if let Ok((model, _)) = startup::living_model(&config, self.model.extent, seed) {
+        if let Ok((mut model, _)) = startup::living_model(&config, self.model.extent, seed) {
+            // What was loaded and frozen is not thrown away, and rates are not forgotten.
+            model.params.inherit(&self.model.params);
             self.model = model;
         }
         self.carve();
@@ -370,6 +374,45 @@ mod tests {
     use crate::hierarchical::HierarchicalConfig;
     use crate::{FieldConfig, Preset};
     use raygrad_nn::Schedule;
+
+    #[test]
+    fn cameras_from_which_nothing_of_the_box_is_seen_are_an_error() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(3);
+        for frame in &mut data.frames {
+            frame.camera.pose.translation *= 3.0;
+        }
+        let message = Trainer::new(tiny(), Arc::new(data.clone())).err().unwrap().to_string();
+        let expected = "no ray of the 3 photographs meets the box";
+        assert!(message.contains(expected) && message.contains("on average"), "{message}");
+        // One that sees a part is enough.
+        data.frames[2].camera.pose.translation /= 3.0;
+        Trainer::new(tiny(), Arc::new(data.clone())).unwrap();
+        // Near enough, and looking away.
+        data.frames.drain(..2);
+        data.frames[0].camera.pose.matrix3 = -data.frames[0].camera.pose.matrix3;
+        assert!(data.check_reach().is_err());
+    }
+
+    #[test]
+    fn a_restart_keeps_what_was_said_of_parameters() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(2);
+        let mut trainer = Trainer::new(tiny(), Arc::new(data)).unwrap();
+        let params = &mut trainer.model.params;
+        let ids: Vec<_> = params.ids().collect();
+        let frozen = params.name(ids[0]).to_owned();
+        params.get_mut(ids[0]).as_mut_slice().fill(0.25);
+        params.freeze(|name| name == frozen);
+        params.set_rate(|name| name != frozen, 0.5);
+        let before: Vec<_> = params.values().to_vec();
+        trainer.restart();
+        let params = &trainer.model.params;
+        let ids: Vec<_> = params.ids().collect();
+        assert!(params.is_frozen(ids[0]) && params.rate(ids[1]) == 0.5 && !params.is_frozen(ids[1]));
+        assert_eq!(params.values()[0], before[0]);
+        assert!(params.values().iter().zip(&before).skip(1).any(|(new, old)| new != old), "other numbers");
+    }
 
     /// Two tiny networks, and few rays of few samples.
     fn tiny() -> Config {

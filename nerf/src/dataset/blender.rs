@@ -46,6 +46,10 @@ pub(super) fn load(folder: &Path, split: Split, downscale: usize, views: usize) 
     }
     let present = evenly_spaced(present, views);
     let [width, height] = common_size(&file, &present)?;
+    transforms.lens.check(&file, None, transforms.camera_angle_x, [width, height])?;
+    for (entry, _) in &present {
+        entry.lens.check(&file, entry.index, transforms.camera_angle_x, [width, height])?;
+    }
     if !width.is_multiple_of(downscale) || !height.is_multiple_of(downscale) {
         let what = format!("{downscale} does not divide the image size {width}x{height}");
         return Err(Error::setting("downscale", what));
@@ -92,6 +96,7 @@ fn common_size(file: &Path, frames: &[(Entry, PathBuf)]) -> Result<[usize; 2]> {
 /// The contents of a transforms file, checked.
 struct Transforms {
     camera_angle_x: f64,
+    lens: Lens,
     entries: Vec<Entry>,
 }
 
@@ -100,6 +105,92 @@ struct Entry {
     index: usize,
     file_path: String,
     pose: DAffine3,
+    lens: Lens,
+}
+
+/// What an object says of its camera in the fields that other programs write beside those of the format. Dropped without a
+/// word they would change every picture, so they must say what the format says without them: a camera whose image is
+/// centred and not distorted.
+struct Lens(Vec<(&'static str, Value)>);
+
+impl Lens {
+    const FIELDS: [&str; 22] = [
+        "camera_angle_x",
+        "camera_angle_y",
+        "fl_x",
+        "fl_y",
+        "cx",
+        "cy",
+        "w",
+        "h",
+        "k1",
+        "k2",
+        "k3",
+        "k4",
+        "k5",
+        "k6",
+        "p1",
+        "p2",
+        "camera_model",
+        "is_fisheye",
+        "aabb_scale",
+        "scale",
+        "offset",
+        "rolling_shutter",
+    ];
+
+    fn read(object: &Value) -> Self {
+        Lens(Self::FIELDS.into_iter().filter_map(|name| Some((name, object.get(name)?.clone()))).collect())
+    }
+
+    /// The first field that says something else than a camera of this horizontal angle and this many pixels.
+    fn other(&self, angle: f64, [width, height]: [usize; 2]) -> Option<(&'static str, String)> {
+        let [w, h] = [width, height].map(|n| n as f64);
+        let focal = 0.5 * w / (0.5 * angle).tan();
+        let number = |expected: f64, value: &Value, places: usize| {
+            let close = value.as_f64().is_some_and(|x| (x - expected).abs() <= 1e-3 * expected.abs());
+            (!close).then(|| format!("{expected:.places$}"))
+        };
+        self.0.iter().find_map(|(name, value)| {
+            let expected = match *name {
+                "camera_angle_x" => number(angle, value, 6),
+                "camera_angle_y" => number(2.0 * (0.5 * h / focal).atan(), value, 6),
+                "fl_x" | "fl_y" => number(focal, value, 3),
+                "cx" => number(0.5 * w, value, 1),
+                "cy" => number(0.5 * h, value, 1),
+                "w" => number(w, value, 0),
+                "h" => number(h, value, 0),
+                "aabb_scale" | "scale" => number(1.0, value, 0),
+                "camera_model" => {
+                    let is_known = matches!(value.as_str(), Some("SIMPLE_PINHOLE" | "PINHOLE" | "OPENCV"));
+                    (!is_known).then(|| "PINHOLE".to_owned())
+                }
+                "is_fisheye" => (value.as_bool() != Some(false)).then(|| "false".to_owned()),
+                "offset" | "rolling_shutter" => {
+                    let zeros = |list: &Vec<Value>| list.iter().all(|x| x.as_f64() == Some(0.0));
+                    (!value.as_array().is_some_and(zeros)).then(|| "zeros".to_owned())
+                }
+                _ => number(0.0, value, 0),
+            };
+            Some((*name, format!("is {value}, and must be {}", expected?)))
+        })
+    }
+
+    /// # Errors
+    /// If a field says something else, by its path.
+    fn check(&self, file: &Path, index: impl Into<Option<usize>>, angle: f64, size: [usize; 2]) -> Result<()> {
+        let Some((name, what)) = self.other(angle, size) else { return Ok(()) };
+        let path = index.into().map_or(name.to_owned(), |index| field(index, name));
+        let [width, height] = size;
+        Err(Error::field(
+            file,
+            path,
+            format!(
+                "{what} for images of {width}x{height} and camera_angle_x {angle:.6}: cameras of a focal length of their own, \
+                 off centre, distorted or in a box of their own are not supported"
+            ),
+        ))
+    }
 }
 
 impl Transforms {
@@ -120,7 +211,7 @@ impl Transforms {
             return Err(Error::field(file, "frames", "is empty: there is nothing to load"));
         }
         let entries = frames.iter().enumerate().map(|(index, frame)| Entry::read(file, index, frame));
-        Ok(Transforms { camera_angle_x, entries: entries.collect::<Result<_>>()? })
+        Ok(Transforms { camera_angle_x, lens: Lens::read(&root), entries: entries.collect::<Result<_>>()? })
     }
 }
 
@@ -132,7 +223,7 @@ impl Entry {
         let field = self::field(index, "transform_matrix");
         let matrix = member(file, frame, "transform_matrix", &field)?;
         let pose = rigid_pose(matrix).map_err(|what| Error::field(file, field, what))?;
-        Ok(Entry { index, file_path, pose })
+        Ok(Entry { index, file_path, pose, lens: Lens::read(frame) })
     }
 
     fn field(&self, name: &str) -> String {

@@ -14,6 +14,7 @@ use std::str::FromStr;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::bounds::clip_span;
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::image::Image;
@@ -91,6 +92,38 @@ impl Dataset {
     pub fn has_alpha(&self) -> bool {
         self.frames.iter().any(|frame| frame.image.channels == 4)
     }
+
+    /// Whether the photographs show anything of the scene's box at all.
+    ///
+    /// # Errors
+    /// If no ray of any photograph meets the box between `near` and `far`: nothing could ever be learned.
+    pub fn check_reach(&self) -> Result<()> {
+        /// Rays that are tried along each side of an image.
+        const RAYS: usize = 32;
+        let meets = |camera: &Camera| {
+            let place = |i: usize, n: usize| (i as f64 + 0.5) / RAYS as f64 * n as f64;
+            let ray = |i: usize| camera.ray(place(i % RAYS, camera.width), place(i / RAYS, camera.height));
+            (0..RAYS * RAYS).any(|i| {
+                let [enter, leave] = clip_span(&ray(i), self.bounds, [self.near, self.far]);
+                enter < leave
+            })
+        };
+        if self.frames.iter().any(|frame| meets(&frame.camera)) {
+            return Ok(());
+        }
+        let [low, high] = self.bounds;
+        let distances = self.frames.iter().map(|frame| frame.camera.pose.translation.distance(0.5 * (low + high)));
+        let mean = distances.sum::<f64>() / self.frames.len().max(1) as f64;
+        let what = format!(
+            "no ray of the {} photographs meets the box from {low} to {high} between the distances {} and {} from its \
+             camera; the cameras are {mean:.3} from its middle on average: scale and move their positions to where the \
+             scene lies in the box",
+            self.frames.len(),
+            self.near,
+            self.far
+        );
+        Err(Error::setting("dataset", what))
+    }
 }
 
 /// Reads one split of the dataset in `folder`, its images [averaged](Image::downscaled) down by the integer factor
@@ -128,9 +161,7 @@ pub fn load_views(folder: impl AsRef<Path>, split: Split, downscale: usize, view
         return blender::load(folder, split, downscale, views);
     }
     let what = match folder.join("transforms.json").is_file() {
-        true => {
-            "is in instant-ngp's format (transforms.json), which is not supported: convert it to transforms_train.json"
-        }
+        true => "is in the format of instant-ngp and nerfstudio (transforms.json), whose cameras are not supported yet",
         false => "is not a dataset: expected a file transforms_train.json, transforms_val.json or transforms_test.json",
     };
     Err(Error::file(folder, what))

@@ -222,3 +222,58 @@ fn the_lego_scene_loads() {
         assert!(ray.at(-ray.origin.dot(ray.direction)).length() < 0.5);
     }
 }
+
+#[test]
+fn fields_that_would_change_the_picture_are_no_surprise() {
+    let focal = 4.0 / 0.4_f64.tan();
+    let neutral = [
+        ("fl_x", json!(focal)),
+        ("fl_y", json!(focal * 1.0005)),
+        ("cx", json!(4)),
+        ("cy", json!(3.0)),
+        ("w", json!(8)),
+        ("h", json!(6.0)),
+        ("k1", json!(0)),
+        ("p2", json!(0.0)),
+        ("camera_angle_y", json!(2.0 * (3.0 / focal).atan())),
+        ("camera_model", json!("OPENCV")),
+        ("is_fisheye", json!(false)),
+        ("aabb_scale", json!(1)),
+        ("offset", json!([0, 0, 0])),
+    ];
+    let mut document = document(&["./train/r_0", "./train/r_1"]);
+    for (name, value) in &neutral {
+        document[name] = value.clone();
+        document["frames"][1][name] = value.clone();
+    }
+    document["frames"][1]["camera_angle_x"] = json!(0.8);
+    assert_eq!(
+        load(folder(&document.to_string()).path(), Split::Train, 1).unwrap(),
+        load(good().path(), Split::Train, 1).unwrap()
+    );
+    let others = [
+        ("fl_x", json!(1.02 * focal), "must be 9.461"),
+        ("fl_y", json!(0.98 * focal), "must be 9.461"),
+        ("cx", json!(4.5), "must be 4.0"),
+        ("cy", json!(4.0), "must be 3.0"),
+        ("w", json!(16), "must be 8"),
+        ("h", json!("6"), "must be 6"),
+        ("k1", json!(1e-4), "must be 0"),
+        ("k4", json!(-0.1), "must be 0"),
+        ("p1", json!(0.01), "must be 0"),
+        ("camera_angle_y", json!(0.8), "must be 0.614"),
+        ("camera_model", json!("OPENCV_FISHEYE"), "must be PINHOLE"),
+        ("is_fisheye", json!(true), "must be false"),
+        ("aabb_scale", json!(4), "must be 1"),
+        ("scale", json!(0.33), "must be 1"),
+        ("offset", json!([0.5, 0.5, 0.5]), "must be zeros"),
+    ];
+    for (name, value, expected) in others {
+        let message = failure_after(|document| document[name] = value.clone());
+        says(&message, &[&format!("`{name}`"), expected, "images of 8x6", "not supported"]);
+        let message = failure_after(|document| document["frames"][1][name] = value);
+        says(&message, &[&format!("frames[1].{name}"), expected]);
+    }
+    let message = failure_after(|document| document["frames"][0]["camera_angle_x"] = json!(0.9));
+    says(&message, &["frames[0].camera_angle_x", "must be 0.8"]);
+}
