@@ -12,8 +12,8 @@ use std::path::Path;
 const GRID: &str = "occupancy";
 
 impl Model<f32> {
-    /// Writes the parameters in the number type of the configuration, and the occupancy grid if there is one, as safetensors: beside the file first and then over
-    /// it.
+    /// Writes the parameters in the number type of the configuration and, if there is an occupancy grid, which of its cells
+    /// are occupied, as safetensors: beside the file first and then over it.
     ///
     /// # Errors
     /// If the file cannot be written.
@@ -21,7 +21,7 @@ impl Model<f32> {
         let metadata = HashMap::from([("format".into(), "raygrad".into())]);
         let blobs = match &self.sampler {
             Sampler::Hierarchical(_) => vec![],
-            Sampler::Marching(sampler) => vec![(GRID, sampler.grid.to_bytes())],
+            Sampler::Marching(sampler) => vec![(GRID, sampler.grid.occupied_to_bytes())],
         };
         let bytes = self
             .params
@@ -83,7 +83,7 @@ mod tests {
         let read = Model::load(&path, voxel(2), extent).unwrap();
         assert_eq!(read.params.values(), model.params.values());
         let (Sampler::Marching(old), Sampler::Marching(new)) = (&model.sampler, &read.sampler) else { panic!() };
-        assert!(new.grid.occupied_share() < 0.5 && new.grid.to_bytes() == old.grid.to_bytes());
+        assert!(new.grid.occupied_share() < 0.5 && new.grid.occupied_to_bytes() == old.grid.occupied_to_bytes());
         let camera = &train_cameras(4, 24)[1];
         let [seen, again] = [&model, &read].map(|model| model.view(camera, [1.0; 3]));
         assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));

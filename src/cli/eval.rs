@@ -6,10 +6,10 @@ use std::time::Instant;
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
 use raygrad::nerf::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::occupancy::Skip;
-use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, colormap};
+use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, Sampler, colormap};
 use serde::Serialize;
 
-use super::output::{depth_colors, make_folder, print};
+use super::output::{depth_colors, make_folder, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
@@ -21,7 +21,8 @@ const PICTURES: usize = 10;
 
 /// Compare a model with photographs: PSNR and SSIM
 ///
-/// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth.
+/// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth. Another split, number of
+/// views, --skip or --precision stands in the name, as in RUN/eval-val-10-off.json, so that no result replaces another's.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -41,9 +42,20 @@ pub struct Args {
     /// Arithmetic of the pictures
     #[arg(long, value_enum, default_value_t)]
     precision: Precision,
-    /// Print what eval.json holds in place of a table
+    /// Print what the file holds in place of a table
     #[arg(long)]
     json: bool,
+}
+
+impl Args {
+    /// The name of the result: `eval`, and what differs from the ordinary.
+    fn name(&self) -> String {
+        let split = (self.split != Split::Test).then(|| self.split.to_string());
+        let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
+        let [views, skip] = [self.views.map(|n| n.to_string()), self.skip.map(|skip| skip.to_string())];
+        let parts = ["eval".to_owned()].into_iter().chain([split, views, skip, precision].into_iter().flatten());
+        parts.collect::<Vec<_>>().join("-")
+    }
 }
 
 /// The result: `eval.json`.
@@ -59,6 +71,8 @@ struct Report {
     downscale: usize,
     /// What photographs with transparency are composited over.
     background: Background,
+    /// What was left out; null where there is no occupancy grid.
+    skip: Option<Skip>,
     /// `f32`, or `f64` with nothing left out but empty cells.
     precision: Precision,
     /// Where in a pixel its ray passes: 0.5 is the centre.
@@ -95,9 +109,14 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let scene = run.scene(args.scene.as_ref())?;
     let data = scene.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
-    let pictures = run.file("eval");
+    let name = args.name();
+    let pictures = run.file(&name);
     make_folder(&pictures)?;
     let (background, span) = (model.config.background, model.extent.span);
+    let skip = match &model.sampler {
+        Sampler::Marching(marching) => Some(marching.config.occupancy.skip),
+        Sampler::Hierarchical(_) => None,
+    };
     let renderer = Renderer::new(model, args.precision)?;
     let (per_view, seconds_per_view, evaluations) = compare(&renderer, background, span, &data, &pictures)?;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
@@ -111,6 +130,7 @@ pub fn run(args: &Args) -> Result<()> {
         height: data.frames[0].image.height,
         downscale: run.config.downscale,
         background: shown_background(background),
+        skip,
         precision: args.precision,
         pixel_offset: 0.5,
         quantisation: "none",
@@ -122,7 +142,7 @@ pub fn run(args: &Args) -> Result<()> {
         unskipped_per_pixel: per_pixel(evaluations.unskipped),
         per_view,
     };
-    let file = run.file("eval.json");
+    let file = run.file(&format!("{name}.json"));
     write_json(&file, &report)?;
     if args.json {
         let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(&file, e))?;
@@ -168,7 +188,7 @@ fn compare(
         let truth = frame.image.over(background);
         let score = score(frame.name.clone(), &picture.color, &truth);
         if drawn.contains(&i) {
-            draw(&picture, &truth, span).save_png(pictures.join(format!("{i:03}.png")))?;
+            draw(&picture, &truth, span).save_png(pictures.join(picture_name(&i)))?;
         }
         let done = i + 1;
         progress.set(done as f64 / data.frames.len() as f64, || {
@@ -176,7 +196,14 @@ fn compare(
         });
         scores.push(score);
     }
+    let written: Vec<_> = drawn.iter().map(picture_name).collect();
+    remove(&other_numbered(pictures, &written)?)?;
     Ok((scores, seconds / data.frames.len() as f64, evaluations))
+}
+
+/// The file of the picture of a view.
+fn picture_name(view: &usize) -> String {
+    format!("{view:03}.png")
 }
 
 fn score(name: String, render: &Image, truth: &Image) -> Score {

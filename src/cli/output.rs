@@ -1,7 +1,7 @@
 //! Words to the terminal, and folders to write to.
 
 use std::io::{ErrorKind, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Image, Picture, Result, colormap};
 
@@ -34,6 +34,28 @@ pub fn check_writable(folder: &Path) -> Result<()> {
 pub fn make_folder(folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(|e| Error::file(folder, format!("cannot be created: {e}")))?;
     check_writable(folder)
+}
+
+/// The pictures in a folder whose names are numbers, other than those that are `written`: what a longer row of pictures has
+/// left there.
+pub fn other_numbered(folder: &Path, written: &[String]) -> Result<Vec<PathBuf>> {
+    let error = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
+    let mut others = vec![];
+    for entry in std::fs::read_dir(folder).map_err(error)? {
+        let name = entry.map_err(error)?.file_name().to_string_lossy().into_owned();
+        let stem = name.strip_suffix(".png").unwrap_or_default();
+        if !stem.is_empty() && stem.bytes().all(|b| b.is_ascii_digit()) && !written.contains(&name) {
+            others.push(folder.join(name));
+        }
+    }
+    Ok(others)
+}
+
+/// Removes files that are of no more use.
+pub fn remove(files: &[PathBuf]) -> Result<()> {
+    files.iter().try_for_each(|file| {
+        std::fs::remove_file(file).map_err(|e| Error::file(file, format!("cannot be removed: {e}")))
+    })
 }
 
 /// The depth of a picture in false colour: yellow near, violet far, black where there is nothing to see.

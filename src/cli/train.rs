@@ -77,12 +77,18 @@ pub struct Trained {
     pub folder: PathBuf,
     /// Whether Ctrl-C ended it.
     pub interrupted: bool,
+    /// Whether its numbers are no longer finite.
+    pub diverged: bool,
 }
 
 impl Trained {
     /// With which code the program should exit.
     pub fn exit_code(&self) -> ExitCode {
-        if self.interrupted { interrupt::EXIT_CODE.into() } else { ExitCode::SUCCESS }
+        match self {
+            Trained { diverged: true, .. } => ExitCode::FAILURE,
+            Trained { interrupted: true, .. } => interrupt::EXIT_CODE.into(),
+            _ => ExitCode::SUCCESS,
+        }
     }
 }
 
@@ -110,7 +116,8 @@ pub fn run(args: &Args) -> Result<Trained> {
     let finished = watch.finish(&trainer, !interrupted);
     watched.and(finished)?;
     summarise(&run, &trainer.stats(), interrupted)?;
-    if trainer.stats().has_diverged() {
+    let diverged = trainer.stats().has_diverged();
+    if diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
         complain(&format!(
@@ -118,7 +125,7 @@ pub fn run(args: &Args) -> Result<Trained> {
             schedule.name()
         ));
     }
-    Ok(Trained { folder: run.folder, interrupted })
+    Ok(Trained { folder: run.folder, interrupted, diverged })
 }
 
 impl Args {

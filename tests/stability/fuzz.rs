@@ -167,16 +167,18 @@ proptest! {
     #[test]
     fn occupancy_grids(damage in damage(), noise in prop::collection::vec(any::<u8>(), 0..200)) {
         let grid = OccupancyGrid::new(EXTENT.bounds, &OccupancyConfig { resolution: 8, ..OccupancyConfig::default() });
-        let bytes = grid.unwrap().to_bytes();
+        let grid = grid.unwrap();
+        for bytes in [grid.to_bytes(), grid.occupied_to_bytes()] {
         let mut headed = bytes[..8].to_vec();
         headed.extend(&noise);
         // Its header alone, where damage to so many bytes rarely falls.
         let mut header = damaged(&bytes[..64], &damage);
         header.extend(&bytes[64..]);
-        for bytes in [damaged(&bytes, &damage), noise, headed, header] {
+        for bytes in [damaged(&bytes, &damage), noise.clone(), headed, header] {
             if let Err(error) = OccupancyGrid::from_bytes(&bytes) {
                 clear(error, "`");
             }
+        }
         }
     }
 

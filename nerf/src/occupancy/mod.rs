@@ -68,6 +68,11 @@ pub use march::{MAX_STEPS, MarchBuffer, Step};
 pub use skip::Skip;
 pub use update::{DensityFn, POINTS, Update};
 
+/// Cells of a grid, at most.
+const MOST_CELLS: usize = 1 << 28;
+/// A density, and a bit.
+const BYTES_PER_CELL: f64 = 4.125;
+
 /// Words that one task works on.
 const TASK: usize = 256;
 
@@ -75,7 +80,8 @@ const TASK: usize = 256;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OccupancyConfig {
-    /// Cells along each axis: a multiple of 4, of 16 if there are several cascades; at most 1024.
+    /// Cells along each axis: a multiple of 4, of 16 if there are several cascades; at most 1024, and with all cascades at
+    /// most 2^28 cells (1.1 GB).
     pub resolution: usize,
     /// Number of nested boxes, 1 to 8: the scene's own, and each further one twice as large around the same centre.
     pub cascades: usize,
@@ -105,6 +111,17 @@ impl OccupancyConfig {
         let unit = if self.cascades > 1 { 16 } else { 4 };
         if !self.resolution.is_multiple_of(unit) || !(unit..=1024).contains(&self.resolution) {
             let what = format!("is {}; use a multiple of {unit} up to 1024", self.resolution);
+            return Err(Error::setting("occupancy.resolution", what));
+        }
+        let cells = self.resolution.pow(3) * self.cascades;
+        if cells > MOST_CELLS {
+            let what = format!(
+                "{} with {} cascades takes {:.1} GB; use at most {:.1} GB",
+                self.resolution,
+                self.cascades,
+                BYTES_PER_CELL * cells as f64 / 1e9,
+                BYTES_PER_CELL * MOST_CELLS as f64 / 1e9
+            );
             return Err(Error::setting("occupancy.resolution", what));
         }
         Ok(())

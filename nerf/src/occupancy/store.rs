@@ -6,16 +6,31 @@ use super::{OccupancyConfig, OccupancyGrid};
 use crate::{Error, Result};
 use glam::DVec3;
 
-/// What a stored grid begins with: a name and a version.
-const MAGIC: [u8; 8] = *b"raygocc1";
+/// What a stored grid begins with, a name and a version: with the densities of its cells, and without.
+const WHOLE: [u8; 8] = *b"raygocc1";
+const OCCUPIED: [u8; 8] = *b"raygocb1";
 /// Bytes before the words: magic, resolution and cascades (u32), lower and upper corner (f64).
 const HEADER: usize = 8 + 2 * 4 + 6 * 8;
 
 impl OccupancyGrid {
-    /// The whole grid: a header, one word for each block, one `f32` for each cell; little-endian. 8.6 MB at 128^3.
+    /// The whole grid, to go on training with: a header, one word for each block, one `f32` for each cell; little-endian.
+    /// 8.7 MB at 128^3.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(HEADER + 8 * self.words.len() + 4 * self.densities.len());
-        bytes.extend(MAGIC);
+        let mut bytes = self.header_and_words(WHOLE);
+        bytes.reserve(4 * self.densities.len());
+        self.densities.iter().for_each(|density| bytes.extend(density.to_le_bytes()));
+        bytes
+    }
+
+    /// Which cells are occupied, all that rendering reads: [`to_bytes`](Self::to_bytes) without the densities. 0.26 MB at
+    /// 128^3.
+    pub fn occupied_to_bytes(&self) -> Vec<u8> {
+        self.header_and_words(OCCUPIED)
+    }
+
+    fn header_and_words(&self, magic: [u8; 8]) -> Vec<u8> {
+        let mut bytes = Vec::with_capacity(HEADER + 8 * self.words.len());
+        bytes.extend(magic);
         for number in [self.resolution(), self.cascades()] {
             bytes.extend((number as u32).to_le_bytes());
         }
@@ -23,33 +38,44 @@ impl OccupancyGrid {
             bytes.extend(number.to_le_bytes());
         }
         self.words.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
-        self.densities.iter().for_each(|density| bytes.extend(density.to_le_bytes()));
         bytes
     }
 
-    /// The grid that [`to_bytes`](Self::to_bytes) wrote.
+    /// The grid that [`to_bytes`](Self::to_bytes) or [`occupied_to_bytes`](Self::occupied_to_bytes) wrote. Of the latter an
+    /// occupied cell counts as never looked at, and any other as empty.
     ///
     /// # Errors
     /// If the bytes are cut short, too long or no grid.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let error = |what: String| Error::setting("occupancy grid", what);
-        if bytes.len() < HEADER || bytes[..MAGIC.len()] != MAGIC {
+        let magic = bytes.first_chunk().filter(|magic| [WHOLE, OCCUPIED].contains(magic));
+        if bytes.len() < HEADER || magic.is_none() {
             return Err(error("is not an occupancy grid of this version".into()));
         }
-        let mut rest = &bytes[MAGIC.len()..];
+        let is_whole = magic == Some(&WHOLE);
+        let mut rest = &bytes[WHOLE.len()..];
         let [resolution, cascades] = [0; 2].map(|_| u32::from_le_bytes(take(&mut rest)) as usize);
         let corners = [[0; 3]; 2].map(|corner| DVec3::from(corner.map(|_| f64::from_le_bytes(take(&mut rest)))));
         let config = OccupancyConfig { resolution, cascades, ..OccupancyConfig::default() };
         // Before anything is allocated for it.
         config.check()?;
         let cells = resolution.pow(3) * cascades;
-        let needed = HEADER + cells / CELLS * 8 + cells * 4;
+        let needed = HEADER + cells / CELLS * 8 + if is_whole { cells * 4 } else { 0 };
         if bytes.len() != needed {
             return Err(error(format!("has {} bytes where {needed} belong; write it again", bytes.len())));
         }
         let mut grid = OccupancyGrid::new(corners, &config)?;
         grid.words.iter_mut().for_each(|word| *word = u64::from_le_bytes(take(&mut rest)));
-        grid.densities.iter_mut().for_each(|density| *density = f32::from_le_bytes(take(&mut rest)));
+        if is_whole {
+            grid.densities.iter_mut().for_each(|density| *density = f32::from_le_bytes(take(&mut rest)));
+        } else {
+            for (cells, word) in grid.densities.chunks_exact_mut(CELLS).zip(&grid.words) {
+                cells
+                    .iter_mut()
+                    .enumerate()
+                    .for_each(|(bit, x)| *x = if word >> bit & 1 == 1 { f32::NAN } else { 0.0 });
+            }
+        }
         grid.leaps = Leaps::new(&grid.words, &grid.lattice);
         Ok(grid)
     }
