@@ -147,13 +147,20 @@ fn pictures_and_animations() {
     assert_eq!([first.width, first.height], [SIZE, SIZE]);
     assert_ne!(first, second);
     assert!(!place.path("run/orbit/0002.png").exists());
-    // Frames of a longer path go, where they can be nobody else's.
-    std::fs::write(place.path("run/orbit/notes.txt"), "mine").unwrap();
-    place.succeeds("render run --frames 1");
-    assert!(!place.path("run/orbit/0001.png").exists() && place.path("run/orbit/notes.txt").exists());
-    place.succeeds("render run --frames 2 --out mine");
-    place.succeeds("render run --frames 1 --out mine");
-    assert!(place.path("mine/0001.png").exists());
+    // Frames of a longer path stay, and that is said.
+    let output = place.command("render run --frames 1").output().unwrap();
+    assert!(output.status.success() && place.path("run/orbit/0001.png").exists());
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("orbit holds 1 more numbered pictures, from a longer path"), "{said}");
+    // Pictures of an evaluation that is replaced go; nothing else does.
+    std::fs::create_dir(place.path("run/eval")).unwrap();
+    for name in ["007.png", "0007.png", "7.png", "notes.txt"] {
+        std::fs::write(place.path(&format!("run/eval/{name}")), "old").unwrap();
+    }
+    place.succeeds("eval run");
+    let left =
+        ["007.png", "0007.png", "7.png", "notes.txt"].map(|name| place.path(&format!("run/eval/{name}")).exists());
+    assert_eq!(left, [false, true, true, true]);
     place.succeeds("render run --size 20x10 --out wide.PNG --depth");
     place.succeeds("render run --size 20x10 --out single.png");
     place.succeeds("render run --size 20x10 --out double.png --precision f64");

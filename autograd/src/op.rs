@@ -57,7 +57,8 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
     }
 
     /// As [`reads`](Self::reads), where `has_gradient` says which inputs are on the graph: the others need no gradient, so
-    /// that what only theirs would read is not kept. The tape calls this one.
+    /// that what only theirs would read is not kept. The tape calls this one, unless the operation
+    /// [is fused](Self::is_fused).
     fn reads_for(&self, _has_gradient: &dyn Fn(usize) -> bool) -> Reads {
         self.reads()
     }

@@ -9,20 +9,23 @@ use raygrad::nerf::occupancy::Skip;
 use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, Sampler, colormap};
 use serde::Serialize;
 
-use super::output::{depth_colors, make_folder, other_numbered, print, remove};
+use super::output::{depth_colors, make_folder, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::{Run, write_json};
 use super::scene::Scene;
 
+/// Digits of the number of a picture.
+const DIGITS: usize = 3;
 /// Views of which a picture is written.
 const PICTURES: usize = 10;
 
 /// Compare a model with photographs: PSNR and SSIM
 ///
 /// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth. Another split, number of
-/// views, --skip or --precision stands in the name, as in RUN/eval-val-10-off.json, so that no result replaces another's.
+/// views, --skip or --precision stands in the name, as in RUN/eval-val-10-off.json, so that none replaces another's result; that
+/// of another --scene does.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -144,6 +147,8 @@ pub fn run(args: &Args) -> Result<()> {
     };
     let file = run.file(&format!("{name}.json"));
     write_json(&file, &report)?;
+    // Pictures of an evaluation of other photographs under the same name would belong to no result.
+    remove(&other_numbered(&pictures, DIGITS, &drawn(report.views)));
     if args.json {
         let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(&file, e))?;
         return print(&format!("{text}\n"));
@@ -166,6 +171,11 @@ fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     sum.filter(|_| count > 0).map(|sum| sum / count as f64)
 }
 
+/// The numbers of the views of which a picture is written.
+fn drawn(views: usize) -> Vec<usize> {
+    evenly_spaced((0..views).collect(), PICTURES)
+}
+
 /// Scores all views and draws some; also the mean time of rendering one, in seconds, and what was evaluated for all.
 fn compare(
     renderer: &Renderer,
@@ -175,7 +185,7 @@ fn compare(
     pictures: &Path,
 ) -> Result<(Vec<Score>, f64, Evaluations)> {
     let background = background.shown();
-    let drawn = evenly_spaced((0..data.frames.len()).collect(), PICTURES);
+    let drawn = drawn(data.frames.len());
     let mut scores = Vec::with_capacity(data.frames.len());
     let (mut seconds, mut evaluations) = (0.0, Evaluations::default());
     let mut progress = Progress::new();
@@ -188,7 +198,7 @@ fn compare(
         let truth = frame.image.over(background);
         let score = score(frame.name.clone(), &picture.color, &truth);
         if drawn.contains(&i) {
-            draw(&picture, &truth, span).save_png(pictures.join(picture_name(&i)))?;
+            draw(&picture, &truth, span).save_png(pictures.join(numbered(i, DIGITS)))?;
         }
         let done = i + 1;
         progress.set(done as f64 / data.frames.len() as f64, || {
@@ -196,14 +206,7 @@ fn compare(
         });
         scores.push(score);
     }
-    let written: Vec<_> = drawn.iter().map(picture_name).collect();
-    remove(&other_numbered(pictures, &written)?)?;
     Ok((scores, seconds / data.frames.len() as f64, evaluations))
-}
-
-/// The file of the picture of a view.
-fn picture_name(view: &usize) -> String {
-    format!("{view:03}.png")
 }
 
 fn score(name: String, render: &Image, truth: &Image) -> Score {

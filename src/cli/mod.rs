@@ -69,7 +69,9 @@ fn run(cli: Cli) -> Result<ExitCode> {
         None => first_run(),
         Some(Command::Train(args)) => {
             let trained = train::run(&args)?;
-            suggest(&trained.folder)?;
+            if !trained.diverged {
+                suggest(&trained.folder)?;
+            }
             Ok(trained.exit_code())
         }
         Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
@@ -81,10 +83,12 @@ fn run(cli: Cli) -> Result<ExitCode> {
 /// What the bare program does: trains with all defaults and renders a picture.
 fn first_run() -> Result<ExitCode> {
     let trained = train::run(&train::Args::default())?;
-    if !trained.interrupted {
+    if !trained.interrupted && !trained.diverged {
         render::run(&render::Args::picture(&trained.folder))?;
     }
-    suggest(&trained.folder)?;
+    if !trained.diverged {
+        suggest(&trained.folder)?;
+    }
     Ok(trained.exit_code())
 }
 

@@ -36,26 +36,31 @@ pub fn make_folder(folder: &Path) -> Result<()> {
     check_writable(folder)
 }
 
-/// The pictures in a folder whose names are numbers, other than those that are `written`: what a longer row of pictures has
-/// left there.
-pub fn other_numbered(folder: &Path, written: &[String]) -> Result<Vec<PathBuf>> {
-    let error = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
-    let mut others = vec![];
-    for entry in std::fs::read_dir(folder).map_err(error)? {
-        let name = entry.map_err(error)?.file_name().to_string_lossy().into_owned();
-        let stem = name.strip_suffix(".png").unwrap_or_default();
-        if !stem.is_empty() && stem.bytes().all(|b| b.is_ascii_digit()) && !written.contains(&name) {
-            others.push(folder.join(name));
-        }
-    }
-    Ok(others)
+/// The files in a folder named as pictures by number, `digits` long at least, other than those of the numbers in `written`:
+/// what a longer row of pictures has left there.
+pub fn other_numbered(folder: &Path, digits: usize, written: &[usize]) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let other = |entry: &std::fs::DirEntry| {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let number = name.strip_suffix(".png").and_then(|stem| stem.parse::<usize>().ok());
+        number.is_some_and(|n| name == numbered(n, digits) && !written.contains(&n))
+            && entry.file_type().is_ok_and(|kind| kind.is_file())
+    };
+    entries.filter(other).map(|entry| entry.path()).collect()
 }
 
-/// Removes files that are of no more use.
-pub fn remove(files: &[PathBuf]) -> Result<()> {
-    files.iter().try_for_each(|file| {
-        std::fs::remove_file(file).map_err(|e| Error::file(file, format!("cannot be removed: {e}")))
-    })
+/// The name of a picture by its number.
+pub fn numbered(number: usize, digits: usize) -> String {
+    format!("{number:0digits$}.png")
+}
+
+/// Removes pictures of an earlier, longer row. One that stays is no error: what was asked for is written.
+pub fn remove(files: &[PathBuf]) {
+    for file in files {
+        if let Err(e) = std::fs::remove_file(file) {
+            complain(&format!("{}: cannot be removed: {e}", file.display()));
+        }
+    }
 }
 
 /// The depth of a picture in false colour: yellow near, violet far, black where there is nothing to see.

@@ -10,7 +10,7 @@ use raygrad::nerf::{Camera, Error, Image, Result, write_atomic};
 
 use super::animation::Animation;
 use super::cameras::fitted;
-use super::output::{check_writable, depth_colors, make_folder, note, other_numbered, print, remove};
+use super::output::{check_writable, depth_colors, make_folder, note, numbered, other_numbered, print};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
@@ -116,17 +116,10 @@ pub fn run(args: &Args) -> Result<()> {
     drop(progress);
     sink.finish()?;
     if kind == Kind::Folder {
-        let written: Vec<_> = (0..cameras.len()).map(frame_name).collect();
-        let older = other_numbered(&out, &written)?;
-        // In a folder of the run's own there is nothing else; in another one they may be anybody's.
-        if args.out.is_none() {
-            remove(&older)?;
-        } else if !older.is_empty() {
-            note(&format!(
-                "{} holds {} more numbered pictures, which are not of this path",
-                out.display(),
-                older.len()
-            ));
+        let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
+        if !older.is_empty() {
+            // They may be what somebody wants to keep.
+            note(&format!("{} holds {} more numbered pictures, from a longer path", out.display(), older.len()));
         }
     }
     let [width, height] = [cameras[0].width, cameras[0].height];
@@ -134,10 +127,8 @@ pub fn run(args: &Args) -> Result<()> {
     print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))
 }
 
-/// The file of a frame in a folder.
-fn frame_name(index: usize) -> String {
-    format!("{index:04}.png")
-}
+/// Digits of the number of a frame in a folder.
+const DIGITS: usize = 4;
 
 /// The cameras along the path; at least one.
 fn cameras(args: &Args, run: &Run) -> Result<Vec<Camera>> {
@@ -203,7 +194,7 @@ impl<'a> Sink<'a> {
 
     fn push(&mut self, index: usize, image: &Image) -> Result<()> {
         match self {
-            Sink::Folder(folder) => image.save_png(folder.join(frame_name(index))),
+            Sink::Folder(folder) => image.save_png(folder.join(numbered(index, DIGITS))),
             Sink::Png(path) => image.save_png(path),
             Sink::Gif(path, animation) => animation.push(image).map_err(|e| Error::file(path, e)),
         }

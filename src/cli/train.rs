@@ -85,8 +85,8 @@ impl Trained {
     /// With which code the program should exit.
     pub fn exit_code(&self) -> ExitCode {
         match self {
-            Trained { diverged: true, .. } => ExitCode::FAILURE,
             Trained { interrupted: true, .. } => interrupt::EXIT_CODE.into(),
+            Trained { diverged: true, .. } => ExitCode::FAILURE,
             _ => ExitCode::SUCCESS,
         }
     }

@@ -9,6 +9,9 @@ use crate::{Scalar, simd};
 /// A tensor as the kernels see it: `[outer, count, inner]`, reduced along the axis in the middle.
 pub type Middle = [usize; 3];
 
+/// Columns that one task reduces, at least: some cache lines of each row.
+const LEAST: usize = 64;
+
 /// The greatest elements (the smallest ones without `greatest`) along the middle axis: `[outer, count, inner]` to
 /// `[outer, inner]`. A NaN among them is the result.
 ///
@@ -17,33 +20,46 @@ pub type Middle = [usize; 3];
 pub fn extremum<T: Scalar>(x: &[T], middle: Middle, greatest: bool, out: &mut [T]) {
     let [outer, count, inner] = middle;
     assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner), "extremum of {middle:?}");
+    if outer == 1 && inner > 1 {
+        // One group: columns of it for each task.
+        let at_once = (PIECE / count.max(1)).max(LEAST);
+        chunks(out, at_once, ELEMENT * x.len(), || (), &|(), i, out| columns(x, middle, i * at_once, greatest, out));
+        return;
+    }
     // Groups of about a piece for each task.
     let (group, at_once) = (count * inner, (PIECE / (count * inner).max(1)).max(1));
     chunks(out, (at_once * inner).max(1), ELEMENT * x.len(), || (), &|(), i, out| {
         let groups = out.len() / inner;
         let (x, middle) = (&x[i * at_once * group..][..groups * group], [groups, count, inner]);
-        if greatest {
-            along(
-                x,
-                middle,
-                out,
-                #[inline(always)]
-                |a, b| a.maximum(b),
-            );
-        } else {
-            along(
-                x,
-                middle,
-                out,
-                #[inline(always)]
-                |a, b| a.minimum(b),
-            );
-        }
+        columns(x, middle, 0, greatest, out);
     });
 }
 
-fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, out: &mut [T], pick: impl Fn(T, T) -> T) {
-    debug_assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner));
+/// [`extremum`] of the columns from `first` on: all, or some of one group.
+fn columns<T: Scalar>(x: &[T], middle: Middle, first: usize, greatest: bool, out: &mut [T]) {
+    if greatest {
+        along(
+            x,
+            middle,
+            first,
+            out,
+            #[inline(always)]
+            |a, b| a.maximum(b),
+        );
+    } else {
+        along(
+            x,
+            middle,
+            first,
+            out,
+            #[inline(always)]
+            |a, b| a.minimum(b),
+        );
+    }
+}
+
+fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, first: usize, out: &mut [T], pick: impl Fn(T, T) -> T) {
+    debug_assert!(x.len() == outer * count * inner && (out.len() == outer * inner || outer == 1));
     assert!(count > 0, "extremum of no elements");
     simd::dispatch(
         #[inline(always)]
@@ -54,10 +70,12 @@ fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, out: &mut [T], pick:
                 }
                 return;
             }
-            for (x, out) in x.chunks_exact(count * inner).zip(out.chunks_exact_mut(inner)) {
-                out.copy_from_slice(&x[..inner]);
+            let width = if outer == 1 { out.len() } else { inner };
+            for (x, out) in x.chunks_exact(count * inner).zip(out.chunks_exact_mut(width)) {
+                out.copy_from_slice(&x[first..][..width]);
                 for row in x.chunks_exact(inner) {
-                    for i in 0..inner {
+                    let row = &row[first..][..width];
+                    for i in 0..width {
                         out[i] = pick(out[i], row[i]);
                     }
                 }

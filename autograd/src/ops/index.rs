@@ -27,7 +27,7 @@ pub struct ScatterAlong {
     pub extent: usize,
 }
 
-/// y[.., i, ..] = x[.., index[i], ..] along an axis; dx = [`IndexAdd`] of g.
+/// y[.., i, ..] = x[.., index[i], ..] along an axis; dx = [`IndexAdd`] of g, along the first axis as rows.
 #[derive(Clone)]
 pub struct IndexSelect {
     /// The axis.

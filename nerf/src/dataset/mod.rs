@@ -12,6 +12,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 use glam::DVec3;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::bounds::clip_span;
@@ -98,17 +99,19 @@ impl Dataset {
     /// # Errors
     /// If no ray of any photograph meets the box between `near` and `far`: nothing could ever be learned.
     pub fn check_reach(&self) -> Result<()> {
-        /// Rays that are tried along each side of an image.
+        /// Rays that are tried along each side of an image, before all.
         const RAYS: usize = 32;
-        let meets = |camera: &Camera| {
-            let place = |i: usize, n: usize| (i as f64 + 0.5) / RAYS as f64 * n as f64;
-            let ray = |i: usize| camera.ray(place(i % RAYS, camera.width), place(i / RAYS, camera.height));
-            (0..RAYS * RAYS).any(|i| {
-                let [enter, leave] = clip_span(&ray(i), self.bounds, [self.near, self.far]);
+        let meets = |camera: &Camera, [columns, rows]: [usize; 2]| {
+            let place = |i: usize, n: usize, size: usize| (i as f64 + 0.5) / n as f64 * size as f64;
+            (0..columns * rows).any(|i| {
+                let [x, y] = [place(i % columns, columns, camera.width), place(i / columns, rows, camera.height)];
+                let [enter, leave] = clip_span(&camera.ray(x, y), self.bounds, [self.near, self.far]);
                 enter < leave
             })
         };
-        if self.frames.iter().any(|frame| meets(&frame.camera)) {
+        let some = self.frames.iter().any(|frame| meets(&frame.camera, [RAYS; 2]));
+        // A small box may lie between the rays.
+        if some || self.frames.par_iter().any(|Frame { camera, .. }| meets(camera, [camera.width, camera.height])) {
             return Ok(());
         }
         let [low, high] = self.bounds;

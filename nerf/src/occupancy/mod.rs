@@ -69,7 +69,7 @@ pub use skip::Skip;
 pub use update::{DensityFn, POINTS, Update};
 
 /// Cells of a grid, at most.
-const MOST_CELLS: usize = 1 << 28;
+const MOST_CELLS: usize = 1 << 30;
 /// A density, and a bit.
 const BYTES_PER_CELL: f64 = 4.125;
 
@@ -81,7 +81,7 @@ const TASK: usize = 256;
 #[serde(deny_unknown_fields, default)]
 pub struct OccupancyConfig {
     /// Cells along each axis: a multiple of 4, of 16 if there are several cascades; at most 1024, and with all cascades at
-    /// most 2^28 cells (1.1 GB).
+    /// most 2^30 cells (4.4 GB).
     pub resolution: usize,
     /// Number of nested boxes, 1 to 8: the scene's own, and each further one twice as large around the same centre.
     pub cascades: usize,
@@ -116,7 +116,7 @@ impl OccupancyConfig {
         let cells = self.resolution.pow(3) * self.cascades;
         if cells > MOST_CELLS {
             let what = format!(
-                "{} with {} cascades takes {:.1} GB; use at most {:.1} GB",
+                "{} with {} cascades takes {:.1} GB; use at most 2^30 cells ({:.1} GB)",
                 self.resolution,
                 self.cascades,
                 BYTES_PER_CELL * cells as f64 / 1e9,

@@ -336,9 +336,9 @@ fn grids_survive_being_stored() {
 fn settings_out_of_range_are_refused() {
     let check =
         |resolution, cascades| OccupancyConfig { resolution, cascades, skip: Skip::Off, silhouettes: true }.check();
-    assert!(check(4, 1).is_ok() && check(12, 1).is_ok() && check(640, 1).is_ok() && check(320, 8).is_ok());
+    assert!(check(4, 1).is_ok() && check(12, 1).is_ok() && check(1024, 1).is_ok() && check(512, 8).is_ok());
     for (resolution, cascades) in
-        [(0, 1), (6, 1), (1028, 1), (12, 2), (0, 2), (16, 0), (16, 9), (648, 1), (336, 8), (1024, 8)]
+        [(0, 1), (6, 1), (1028, 1), (12, 2), (0, 2), (16, 0), (16, 9), (528, 8), (1024, 2), (1024, 8)]
     {
         assert!(check(resolution, cascades).is_err(), "{resolution}, {cascades}");
     }

@@ -230,16 +230,19 @@ fn fields_that_would_change_the_picture_are_no_surprise() {
         ("fl_x", json!(focal)),
         ("fl_y", json!(focal * 1.0005)),
         ("cx", json!(4)),
-        ("cy", json!(3.0)),
+        ("cy", json!(2.5)),
         ("w", json!(8)),
         ("h", json!(6.0)),
         ("k1", json!(0)),
-        ("p2", json!(0.0)),
-        ("camera_angle_y", json!(2.0 * (3.0 / focal).atan())),
-        ("camera_model", json!("OPENCV")),
-        ("is_fisheye", json!(false)),
-        ("aabb_scale", json!(1)),
-        ("offset", json!([0, 0, 0])),
+        ("k2", json!(null)),
+        ("p2", json!(1e-17)),
+        ("camera_model", json!("SIMPLE_RADIAL")),
+        ("is_fisheye", json!(0)),
+        // What sizes the boxes of other programs, and what Blender says of its sensor.
+        ("aabb_scale", json!(4)),
+        ("scale", json!(0.33)),
+        ("offset", json!([0.5, 0.5, 0.5])),
+        ("camera_angle_y", json!(0.4711)),
     ];
     let mut document = document(&["./train/r_0", "./train/r_1"]);
     for (name, value) in &neutral {
@@ -247,26 +250,29 @@ fn fields_that_would_change_the_picture_are_no_surprise() {
         document["frames"][1][name] = value.clone();
     }
     document["frames"][1]["camera_angle_x"] = json!(0.8);
-    assert_eq!(
-        load(folder(&document.to_string()).path(), Split::Train, 1).unwrap(),
-        load(good().path(), Split::Train, 1).unwrap()
-    );
+    let plain = load(good().path(), Split::Train, 1).unwrap();
+    assert_eq!(load(folder(&document.to_string()).path(), Split::Train, 1).unwrap(), plain);
+    // Of images that were four times as large.
+    for object in ["w", "h", "cx", "cy", "fl_x", "fl_y"] {
+        document[object] = json!(4.0 * document[object].as_f64().unwrap());
+    }
+    document["cy"] = json!(11.5);
+    assert_eq!(load(folder(&document.to_string()).path(), Split::Train, 1).unwrap(), plain);
     let others = [
-        ("fl_x", json!(1.02 * focal), "must be 9.461"),
-        ("fl_y", json!(0.98 * focal), "must be 9.461"),
-        ("cx", json!(4.5), "must be 4.0"),
-        ("cy", json!(4.0), "must be 3.0"),
+        ("fl_x", json!(1.02 * focal), "must be 9.46089"),
+        ("fl_y", json!(0.98 * focal), "must be 9.46089"),
+        ("cx", json!(4.6), "must be 4"),
+        ("cy", json!(3.6), "must be 3"),
         ("w", json!(16), "must be 8"),
         ("h", json!("6"), "must be 6"),
         ("k1", json!(1e-4), "must be 0"),
         ("k4", json!(-0.1), "must be 0"),
         ("p1", json!(0.01), "must be 0"),
-        ("camera_angle_y", json!(0.8), "must be 0.614"),
         ("camera_model", json!("OPENCV_FISHEYE"), "must be PINHOLE"),
         ("is_fisheye", json!(true), "must be false"),
-        ("aabb_scale", json!(4), "must be 1"),
-        ("scale", json!(0.33), "must be 1"),
-        ("offset", json!([0.5, 0.5, 0.5]), "must be zeros"),
+        ("latlong", json!(true), "must be false"),
+        ("x_fov", json!(45.8), "must be absent"),
+        ("rolling_shutter", json!([0, 0, 0, 1]), "must be zeros"),
     ];
     for (name, value, expected) in others {
         let message = failure_after(|document| document[name] = value.clone());
