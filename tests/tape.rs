@@ -252,8 +252,8 @@ impl<T: Scalar> Op<T> for Replay {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         if cx.recording() {
-            // New nodes, so that an input which depends on the other keeps to its own share.
-            let (a, b) = (cx.x(0) * 1.0, cx.x(1) * 1.0);
+            // New nodes, so that an input which depends on the other keeps to its own share, and a constant has a gradient.
+            let (a, b) = ((cx.x(0) * 1.0).tracked(), (cx.x(1) * 1.0).tracked());
             return Grads::new(Self::run(&a, &b).vjp(cx.g(), &[&a, &b]).into_iter().map(Some));
         }
         let tape = Tape::with_pool(cx.pool().clone());
