@@ -284,5 +284,17 @@ mod tests {
         assert_eq!(x.max_over([0, 3]).to_vec(), of(&|i| i / 4 % 3, 3));
         let none: [isize; 0] = [];
         assert_eq!(x.max_over(none), x);
+        // Enough columns, groups and elements for several tasks.
+        for shape in [[1, 700, 330], [900, 30, 11], [4000, 60, 1]] {
+            let x = Tensor::<f32>::from_fn(&shape, |i| ((i * 7919) % 230_003) as f32);
+            let [outer, count, inner] = shape;
+            let least = x.min_over(1);
+            for (i, value) in x.max_over(1).iter().enumerate() {
+                let column = (0..count).map(|k| x[[i / inner, k, i % inner]]);
+                assert_eq!(value, column.clone().fold(f32::MIN, f32::max), "{shape:?} {i}");
+                assert_eq!(least[[i / inner, i % inner]], column.fold(f32::MAX, f32::min));
+            }
+            assert_eq!(least.len(), outer * inner);
+        }
     }
 }
