@@ -70,8 +70,7 @@ macro_rules! operator {
             /// If `other` does not broadcast to the shape of this tensor.
             #[track_caller]
             fn $assign_method(&mut self, other: Tensor<T>) {
-                let other = other.broadcast_to(self.shape());
-                self.update(&other, |a, b| a $op b);
+                self.$assign_method(&other);
             }
         }
         impl<T: Scalar> $assign<T> for Tensor<T> {

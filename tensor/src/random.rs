@@ -110,7 +110,7 @@ mod tests {
             assert!(below.is_finite());
             (below - i as f64 / n).abs().max(((i + 1) as f64 / n - below).abs())
         };
-        x.iter().enumerate().map(apart).fold(0.0, f64::max) * n.sqrt()
+        x.iter().enumerate().map(apart).fold(0.0, crate::Real::maximum) * n.sqrt()
     }
 
     #[test]

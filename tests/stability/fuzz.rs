@@ -56,8 +56,8 @@ fn is_small(config: &Config) -> bool {
     fn most(value: &serde_json::Value) -> f64 {
         match value {
             serde_json::Value::Number(number) => number.as_f64().unwrap_or(f64::INFINITY),
-            serde_json::Value::Array(values) => values.iter().map(most).fold(0.0, f64::max),
-            serde_json::Value::Object(values) => values.values().map(most).fold(0.0, f64::max),
+            serde_json::Value::Array(values) => values.iter().map(most).fold(0.0, raygrad::Real::maximum),
+            serde_json::Value::Object(values) => values.values().map(most).fold(0.0, raygrad::Real::maximum),
             _ => 0.0,
         }
     }

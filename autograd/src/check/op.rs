@@ -91,7 +91,7 @@ fn check_sample(check: &Check, entry: &Entry, x: &[Tensor<f64>]) -> Result<Repor
         compare_all(&what, &shared, &apart, 1e-12, 1e-3)?;
         report.comparisons += 1;
     }
-    for held in 0..if x.len() > 1 { x.len() } else { 0 } {
+    for held in (0..x.len()).filter(|_| x.len() > 1) {
         let [constant, leaf] = [true, false].map(|constant| by_others(&entry.f64, x, held, constant));
         compare_all(&format!("input {held} as a constant against a variable"), &constant, &leaf, 1e-12, 1e-3)?;
         report.comparisons += 1;

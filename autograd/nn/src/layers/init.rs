@@ -159,7 +159,7 @@ mod tests {
         sorted.sort_by(f64::total_cmp);
         let n = sorted.len() as f64;
         let distance = |(i, &x): (usize, &f64)| (cdf(x) - i as f64 / n).abs().max((cdf(x) - (i + 1) as f64 / n).abs());
-        n.sqrt() * sorted.iter().enumerate().map(distance).fold(0.0, f64::max)
+        n.sqrt() * sorted.iter().enumerate().map(distance).fold(0.0, raygrad_tensor::Real::maximum)
     }
 
     #[test]
