@@ -10,8 +10,9 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::nerf::scene::{Scene, train_cameras};
-use raygrad::nerf::{Image, PositionalEncoding, metrics};
+use raygrad::nerf::dataset::scene::{Scene, train_cameras};
+use raygrad::nerf::pictures::metrics;
+use raygrad::nerf::{Image, PositionalEncoding};
 use raygrad::{Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Optimizer, Params, Schedule, Tape, Tensor, Var};
 use std::path::PathBuf;
 

@@ -10,8 +10,8 @@
 //! cells as well, where no photograph ever judged it.
 
 use raygrad::nerf::dataset::{Split, load_views};
-use raygrad::nerf::metrics::psnr;
-use raygrad::nerf::occupancy::{OccupancyGrid, Skip};
+use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::space::occupancy::{OccupancyGrid, Skip};
 use raygrad::nerf::{Camera, Config, Evaluations, Extent, Image, Model, Sampler};
 use serde_json::Value;
 use std::error::Error;

@@ -11,11 +11,11 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
+use raygrad::nerf::Jitter;
 use raygrad::nerf::dataset::{Dataset, Split, load};
-use raygrad::nerf::hash_grid::{HashGrad, HashGrid, TableOptimizer};
-use raygrad::nerf::occupancy::MarchBuffer;
-use raygrad::nerf::sampler::Jitter;
-use raygrad::nerf::visible::composite_visible;
+use raygrad::nerf::encoding::hash_grid::{HashGrad, HashGrid, TableOptimizer};
+use raygrad::nerf::space::occupancy::MarchBuffer;
+use raygrad::nerf::volume::visible::composite_visible;
 use raygrad::nerf::{Config, Extent, FieldConfig, InstantConfig, Model, Rays, Sampler, clip_span};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::simd;

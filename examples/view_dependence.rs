@@ -13,8 +13,8 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
+use raygrad::nerf::dataset::scene::{Scene, train_cameras};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::scene::{Scene, train_cameras};
 use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result};
 use raygrad::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
 use std::path::PathBuf;

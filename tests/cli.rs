@@ -5,8 +5,8 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use raygrad::nerf::Image;
+use raygrad::nerf::dataset::scene::ANGLE_X;
 use raygrad::nerf::dataset::{Split, embedded, evenly_spaced};
-use raygrad::nerf::scene::ANGLE_X;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 

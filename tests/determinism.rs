@@ -1,8 +1,8 @@
 //! The same seed gives the same bits, on any number of threads.
 
 use raygrad::nerf::dataset::{Dataset, Split, embedded};
-use raygrad::nerf::hash_grid::HashGridConfig;
-use raygrad::nerf::hierarchical::HierarchicalConfig;
+use raygrad::nerf::encoding::hash_grid::HashGridConfig;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, SamplerConfig, StepStats, Trainer, VoxelConfig};
 use std::sync::Arc;
 

@@ -3,10 +3,10 @@
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::check::{Check, check_function, check_op};
-use raygrad::nerf::hash_grid::HashGridConfig;
-use raygrad::nerf::hierarchical::HierarchicalConfig;
-use raygrad::nerf::sampler::Jitter;
-use raygrad::nerf::scene::{Scene, train_cameras};
+use raygrad::nerf::Jitter;
+use raygrad::nerf::dataset::scene::{Scene, train_cameras};
+use raygrad::nerf::encoding::hash_grid::HashGridConfig;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::{
     ClassicConfig, Composite, Config, Extent, FieldConfig, Loss as LossKind, Model, PositionalEncoding, Preset, Rays,
     SamplerConfig, Samples, VoxelConfig, catalogue, clip_span,

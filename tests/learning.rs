@@ -1,11 +1,12 @@
 //! End to end: photographs and cameras go in, and views that were held out come out.
 
 use raygrad::nerf::dataset::{Dataset, Split, embedded, load};
-use raygrad::nerf::hash_grid::HashGridConfig;
-use raygrad::nerf::hierarchical::HierarchicalConfig;
-use raygrad::nerf::occupancy::Skip;
+use raygrad::nerf::encoding::hash_grid::HashGridConfig;
+use raygrad::nerf::pictures::metrics;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
+use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{
-    Budget, ClassicConfig, Config, FieldConfig, Image, Loss, Preset, SamplerConfig, Trainer, VoxelConfig, metrics,
+    Budget, ClassicConfig, Config, FieldConfig, Image, Loss, Preset, SamplerConfig, Trainer, VoxelConfig,
 };
 use std::ops::ControlFlow;
 use std::path::Path;

@@ -3,7 +3,7 @@
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::dataset::{Dataset, Split, embedded};
-use raygrad::nerf::hierarchical::HierarchicalConfig;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::{ClassicConfig, Config, Extent, Field, FieldConfig, Model, Preset, SamplerConfig, Trainer};
 use raygrad::{Tape, Tensor};
 use std::sync::Arc;

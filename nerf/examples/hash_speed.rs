@@ -6,7 +6,7 @@
 //! ```
 
 use raygrad_autograd::{Op, Pool, RowSums, Tensor};
-use raygrad_nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use raygrad_nerf::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use raygrad_nn::{AdamConfig, RowAdam};
 use std::time::Instant;
 

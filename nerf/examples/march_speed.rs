@@ -10,9 +10,9 @@
 use glam::DVec3;
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_pcg::Pcg64Mcg;
-use raygrad_nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step, Threshold, Update};
-use raygrad_nerf::sampler::Jitter;
-use raygrad_nerf::scene::{Scene, test_cameras, train_cameras};
+use raygrad_nerf::Jitter;
+use raygrad_nerf::dataset::scene::{Scene, test_cameras, train_cameras};
+use raygrad_nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step, Threshold, Update};
 use raygrad_nerf::{Ray, Rays, Result, clip_span};
 use std::time::Instant;
 

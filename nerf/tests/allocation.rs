@@ -3,7 +3,7 @@
 //! The test has a binary of its own, because it counts what the whole process allocates.
 
 use raygrad_autograd::Tensor;
-use raygrad_nerf::hash_grid::{HashGrad, HashGrid, HashGridConfig, TableOptimizer};
+use raygrad_nerf::encoding::hash_grid::{HashGrad, HashGrid, HashGridConfig, TableOptimizer};
 use raygrad_nn::AdamConfig;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;

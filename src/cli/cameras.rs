@@ -106,7 +106,7 @@ mod tests {
             assert!((offset.z - view.distance * view.elevation.sin()).abs() < 1e-12);
             assert!(camera.ray(4.0, 4.0).at(view.distance).distance(centre) < 1e-12);
         }
-        assert!((view.angle_x - raygrad::nerf::scene::ANGLE_X).abs() < 1e-12);
+        assert!((view.angle_x - raygrad::nerf::dataset::scene::ANGLE_X).abs() < 1e-12);
         view.check().unwrap();
     }
 

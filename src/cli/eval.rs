@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
-use raygrad::nerf::metrics::{SSIM_WINDOW, psnr, ssim};
-use raygrad::nerf::occupancy::Skip;
-use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, Sampler, colormap};
+use raygrad::nerf::pictures::colormap;
+use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
+use raygrad::nerf::space::occupancy::Skip;
+use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, Sampler};
 use serde::Serialize;
 
 use super::output::{depth_colors, make_folder, numbered, other_numbered, print, remove};

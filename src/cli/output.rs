@@ -3,7 +3,8 @@
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::{Error, Image, Picture, Result, colormap};
+use raygrad::nerf::pictures::colormap;
+use raygrad::nerf::{Error, Image, Picture, Result};
 
 /// Writes to standard output. A reader that has gone away, as in `raygrad eval run | head -1`, is no error.
 pub fn print(text: &str) -> Result<()> {

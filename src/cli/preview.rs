@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use raygrad::nerf::dataset::{Dataset, Frame, Split};
-use raygrad::nerf::metrics::psnr;
+use raygrad::nerf::pictures::metrics::psnr;
 use raygrad::nerf::{Camera, Image, Model, Result};
 
 use super::output::complain;

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use raygrad::nerf::dataset::Split;
-use raygrad::nerf::occupancy::Skip;
-use raygrad::nerf::scene::test_cameras;
+use raygrad::nerf::dataset::scene::test_cameras;
+use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Camera, Error, Image, Result, write_atomic};
 
 use super::animation::Animation;

@@ -9,7 +9,7 @@ use std::time::Duration;
 use clap::Parser;
 use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, Split};
-use raygrad::nerf::occupancy::Skip;
+use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
 use serde_json::Value;
 

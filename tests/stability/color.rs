@@ -1,7 +1,7 @@
 //! The sRGB transfer curve, and the space in which blending happens.
 
 use crate::support::*;
-use raygrad::nerf::{Image, SrgbDecode, SrgbEncode, background, quantise, srgb_decode, srgb_encode};
+use raygrad::nerf::{Image, SrgbDecode, SrgbEncode, dataset::background, quantise, srgb_decode, srgb_encode};
 use raygrad::{Formula, Scalar, Tape};
 
 /// Matrix: sRGB at -.1, 0, 1e-8, knee +- ulp, 1, 2. Catalogue: `where` + pow.

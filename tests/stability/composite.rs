@@ -2,7 +2,9 @@
 
 use crate::support::*;
 use raygrad::nerf::Composite;
-use raygrad::nerf::sampler::{Jitter, importance, stratified};
+use raygrad::nerf::Jitter;
+use raygrad::nerf::camera::stratified;
+use raygrad::nerf::sampling::steps::importance;
 use raygrad::{Pool, Real, Scalar, Segments, Tape, Tensor, Var};
 
 /// Colour and remaining light of one ray of optical depths `x`, and the gradients of the colour by densities and colours.

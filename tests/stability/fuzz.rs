@@ -3,9 +3,9 @@
 use crate::damage::{clear, damage, damaged};
 use proptest::prelude::*;
 use raygrad::nerf::dataset::{Split, load, load_views};
+use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::hash_grid::HashGridConfig;
-use raygrad::nerf::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
+use raygrad::nerf::space::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
 use raygrad::nerf::{Background, Config, Extent, FieldConfig, Image, Model, Preset, SamplerConfig};
 use raygrad::{Params, Scalar, Storage, Tensor};
 use std::collections::HashMap;

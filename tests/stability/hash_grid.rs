@@ -1,7 +1,7 @@
 //! The cells of a hash grid.
 
 use crate::support::*;
-use raygrad::nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use raygrad::nerf::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use raygrad::{Scalar, Tape, Tensor};
 
 const SIZES: [usize; 5] = [16, 255, 2048, 30_000, 65_536];

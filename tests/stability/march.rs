@@ -1,9 +1,9 @@
 //! Marching: equal steps and cones. Marching is f32 alone; the rays come in either precision.
 
 use crate::support::*;
+use raygrad::nerf::Jitter;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::occupancy::{MAX_STEPS, MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
-use raygrad::nerf::sampler::Jitter;
+use raygrad::nerf::space::occupancy::{MAX_STEPS, MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 
 /// The samples of a ray from the origin along z in a box around it that is wide enough, all of it occupied.
 fn march(span: [f64; 2], step: Step) -> MarchBuffer {

@@ -2,9 +2,10 @@
 
 use crate::support::*;
 use proptest::prelude::*;
-use raygrad::nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
-use raygrad::nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
-use raygrad::nerf::sampler::{Jitter, invert_cdf};
+use raygrad::nerf::Jitter;
+use raygrad::nerf::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use raygrad::nerf::sampling::steps::invert_cdf;
+use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 use raygrad::nerf::{
     Composite, Distortion, Ndc, Pose, PositionalEncoding, RadialLens, Ray, Rays, contract, glam::DVec3, intersect_box,
     rotation_exp, srgb_decode, srgb_encode,

@@ -1,7 +1,9 @@
 //! Inverse-CDF sampling.
 
 use crate::support::*;
-use raygrad::nerf::sampler::{Jitter, importance, invert_cdf, stratified};
+use raygrad::nerf::Jitter;
+use raygrad::nerf::camera::stratified;
+use raygrad::nerf::sampling::steps::{importance, invert_cdf};
 use raygrad::{Pool, Scalar};
 
 fn inverted<T: Scalar>(weights: &[f64], share: f64, u: &[f64]) -> Vec<f64> {

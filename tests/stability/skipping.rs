@@ -1,10 +1,10 @@
 //! What is left out: empty cells, and what lies behind opaque samples.
 
 use crate::support::*;
+use raygrad::nerf::Jitter;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
-use raygrad::nerf::sampler::Jitter;
-use raygrad::nerf::visible::composite_visible;
+use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
+use raygrad::nerf::volume::visible::composite_visible;
 use raygrad::nerf::{Camera, Config, Density, Extent, Field, Model, Preset, SamplerConfig, Samples};
 use raygrad::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use std::sync::Arc;

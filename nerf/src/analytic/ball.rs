@@ -1,7 +1,7 @@
 //! A ball of constant density.
 
 use super::{Layer, Layers, Medium};
-use crate::camera::Ray;
+use crate::camera::pinhole::Ray;
 use glam::DVec3;
 use std::f64::consts::PI;
 

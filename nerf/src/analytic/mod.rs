@@ -13,6 +13,7 @@
 mod ball;
 mod field;
 mod layers;
+mod measure;
 mod smooth;
 #[cfg(test)]
 mod tests;
@@ -20,9 +21,10 @@ mod tests;
 pub use ball::Ball;
 pub use field::AnalyticField;
 pub use layers::{Layer, Layers};
+pub use measure::{Integral, integrate};
 pub use smooth::{Exponential, Gaussian};
 
-use crate::camera::Ray;
+use crate::camera::pinhole::Ray;
 use glam::DVec3;
 use std::fmt::Debug;
 use std::sync::Arc;

@@ -1,9 +1,10 @@
 //! The closed forms against integrals taken numerically in 25 digits, and against what a renderer makes of them.
 
 use super::*;
-use crate::pass::composite_samples;
-use crate::rays::{Rays, Samples};
-use crate::sampler::{Jitter, stratified};
+use crate::camera::rays::stratified;
+use crate::camera::rays::{Rays, Samples};
+use crate::random::Jitter;
+use crate::volume::pass::composite_samples;
 use raygrad_autograd::{Pool, Tape};
 use raygrad_nn::Params;
 

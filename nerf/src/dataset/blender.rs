@@ -11,9 +11,9 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::{Dataset, Frame, Split, evenly_spaced};
-use crate::camera::Camera;
+use crate::camera::pinhole::Camera;
+use crate::dataset::image::Image;
 use crate::error::{Error, Result};
-use crate::image::Image;
 use intrinsics::Intrinsics;
 
 /// The format does not say where the scene lies: these are the values that all work on it uses.

@@ -1,8 +1,8 @@
 //! The embedded scene as a dataset: needs no files.
 
 use super::{Dataset, Frame, Split};
-use crate::camera::Camera;
-use crate::scene::{DISTANCE, Scene, test_cameras, train_cameras, val_cameras};
+use crate::camera::pinhole::Camera;
+use crate::dataset::scene::{DISTANCE, Scene, test_cameras, train_cameras, val_cameras};
 
 /// Rays a pixel, for anti-aliasing.
 const SAMPLES: usize = 5;

@@ -2,9 +2,17 @@
 //!
 //! Each format has a file of its own here, and [`load`] recognises which one a folder holds.
 
+pub mod background;
+pub(crate) mod batch;
 mod blender;
+pub(crate) mod color_space;
 mod embedded;
+pub(crate) mod image;
+pub mod scene;
 
+pub use self::image::Image;
+pub use background::Background;
+pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use embedded::embedded;
 
 use std::fmt;
@@ -15,10 +23,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::bounds::clip_span;
-use crate::camera::Camera;
+use crate::camera::bounds::clip_span;
+use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
-use crate::image::Image;
 
 /// What the images of a part of a dataset are for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -89,7 +96,7 @@ pub struct Dataset {
 }
 
 impl Dataset {
-    /// Whether some image has transparency and so needs a [background](crate::background).
+    /// Whether some image has transparency and so needs a [background](crate::dataset::background).
     pub fn has_alpha(&self) -> bool {
         self.frames.iter().any(|frame| frame.image.channels == 4)
     }

@@ -1,7 +1,7 @@
 //! A hash grid over a box of scene units, with its table among the parameters.
 
 use crate::Result;
-use crate::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use crate::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use glam::DVec3;
 use rand::{Rng, RngExt};
 use raygrad_autograd::{Scalar, Tensor, Var};

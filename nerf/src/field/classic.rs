@@ -1,8 +1,8 @@
 //! The network of the NeRF paper.
 
 use super::{Density, DensityActivation, Field};
-use crate::config::{check_parameters, check_range};
-use crate::encoding::PositionalEncoding;
+use crate::encoding::sinusoids::PositionalEncoding;
+use crate::range::{check_parameters, check_range};
 use crate::{Error, Result};
 use glam::DVec3;
 use rand::Rng;

@@ -10,8 +10,8 @@ pub use instant::{Instant, InstantConfig};
 pub use voxel::{Voxel, VoxelConfig};
 
 use crate::Result;
-use crate::composite::Composite;
-use crate::hash_grid::HashGrid;
+use crate::encoding::hash_grid::HashGrid;
+use crate::volume::composite::Composite;
 use glam::DVec3;
 use rand::Rng;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};

@@ -3,9 +3,9 @@
 use super::boxed_grid::BoxedGrid;
 use super::{Density, Field};
 use crate::Result;
-use crate::config::check_range;
-use crate::hash_grid::{HashGrid, HashGridConfig};
-use crate::spherical::SphericalHarmonics;
+use crate::encoding::hash_grid::{HashGrid, HashGridConfig};
+use crate::encoding::spherical::SphericalHarmonics;
+use crate::range::check_range;
 use glam::DVec3;
 use rand::Rng;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use raygrad::nerf::Result;
-use raygrad::nerf::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use raygrad::nerf::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::vmath::survey::{Function, doubles, singles, ulp_error};
 use raygrad::tensor::{Scalar, simd};

@@ -5,7 +5,8 @@ use std::hint::black_box;
 use raygrad::nerf::Density;
 use raygrad::nerf::Rays;
 use raygrad::nerf::analytic::{AnalyticScene, scenes};
-use raygrad::nerf::quadrature::{Integral, Quadrature, integrate};
+use raygrad::nerf::analytic::{Integral, integrate};
+use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::{Pool, Real, Tape, Tensor};
 
 use super::Results;
@@ -100,7 +101,7 @@ struct Cost {
 
 /// Compositing of rays with a rule: densities, colours, and what to do with them.
 struct Work {
-    plan: raygrad::nerf::quadrature::Plan<f32>,
+    plan: raygrad::nerf::volume::quadrature::Plan<f32>,
     density: Tensor<f32>,
     color: Tensor<f32>,
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced};
-use raygrad::nerf::metrics::{psnr, psnr_from_mse};
+use raygrad::nerf::pictures::metrics::{psnr, psnr_from_mse};
 use raygrad::nerf::{Config, Error, Evaluations, Image, Model, Preset, Result, Sampler, Trainer};
 
 use super::super::output::note;
@@ -116,7 +116,7 @@ fn measure(
     for (frame, reference) in views.frames.iter().zip(reference) {
         let (image, count) = setting.render(&own, &frame.camera)?;
         evaluations = evaluations + count;
-        error += raygrad::nerf::metrics::mse(&image, reference);
+        error += raygrad::nerf::pictures::metrics::mse(&image, reference);
         let differences = image.data.iter().zip(&reference.data).map(|(a, b)| f64::from((a - b).abs()));
         largest = differences.fold(largest, Real::maximum);
         truth += psnr(&image, &frame.image.over([1.0; 3]));
@@ -285,7 +285,7 @@ fn findings(outcomes: &[Outcome], pixels: f64) -> Vec<String> {
 mod tests {
     use super::*;
     use raygrad::nerf::Limits;
-    use raygrad::nerf::occupancy::Skip;
+    use raygrad::nerf::space::occupancy::Skip;
 
     #[test]
     fn what_another_beats_is_dominated() {

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced};
-use raygrad::nerf::metrics::psnr;
-use raygrad::nerf::occupancy::Skip;
+use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Budget, Config, Preset, Result, StepStats, Trainer};
 use serde_json::Value;
 

@@ -1,9 +1,9 @@
 //! Ways to render one model.
 
 use raygrad::Storage;
-use raygrad::nerf::marching::Marching;
-use raygrad::nerf::occupancy::{Skip, Threshold, Update};
-use raygrad::nerf::quadrature::Quadrature;
+use raygrad::nerf::sampling::marching::Marching;
+use raygrad::nerf::space::occupancy::{Skip, Threshold, Update};
+use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Camera, Evaluations, Image, Limits, Model, Result, Sampler};
 
 /// The background of all pictures.

@@ -1,0 +1,62 @@
+//! What a rule makes of a scene that is known exactly.
+
+use super::{AnalyticField, AnalyticScene};
+use crate::camera::rays::Rays;
+use crate::camera::rays::stratified;
+use crate::random::Jitter;
+use crate::volume::quadrature::{Quadrature, refine};
+use raygrad_autograd::{Scalar, Tape, Var};
+use raygrad_nn::Params;
+
+/// An approximation of [`Exact`](crate::analytic::Exact), and what it took.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Integral {
+    /// Colour over the background.
+    pub color: f64,
+    /// Distance times weight.
+    pub depth: f64,
+    /// Light that is left.
+    pub transmittance: f64,
+    /// The derivative of the colour by each amplitude.
+    pub d_color: Vec<f64>,
+    /// That of the depth.
+    pub d_depth: Vec<f64>,
+    /// How often density and colour were asked for.
+    pub evaluations: usize,
+}
+
+/// Renders a scene and differentiates what is seen, in the precision `T`, with at most `evaluations` evaluations; an
+/// adaptive rule begins with as many intervals and asks as often as it needs.
+#[inline(never)]
+pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations: usize) -> Integral {
+    let mut params = Params::<T>::new();
+    let field = AnalyticField::new(scene.medium.clone(), &mut params);
+    let mut rays = Rays::new();
+    rays.push(&scene.ray, [0.0, scene.length]);
+    let tape = Tape::new();
+    let bound = params.bind(&tape);
+    let (plan, evaluations) = match rule {
+        Quadrature::Adaptive { tolerance } => {
+            let steps = stratified(&rays, evaluations.max(1), &mut Jitter::Middle, tape.pool());
+            let refined = refine(&field, &bound, &steps, tolerance, 0.0, &tape);
+            (refined.plan, refined.evaluations)
+        }
+        _ => {
+            let plan = rule.even(&rays, evaluations, tape.pool());
+            let evaluations = plan.len();
+            (plan, evaluations)
+        }
+    };
+    let rendered = plan.render(&field, &bound, true, &tape);
+    let pick = |channel| rendered.slice_axis(1, channel..channel + 1).sum();
+    let (color, depth) = (pick(1) + pick(4) * scene.background, pick(3));
+    let gradient = |value: &Var<'_, T>| value.grad(&bound.vars())[0].as_slice().iter().map(|x| x.to_f64()).collect();
+    Integral {
+        color: color.item().to_f64(),
+        depth: depth.item().to_f64(),
+        transmittance: pick(4).item().to_f64(),
+        d_color: gradient(&color),
+        d_depth: gradient(&depth),
+        evaluations,
+    }
+}

@@ -1,0 +1,17 @@
+//! Cameras, their lenses and poses, and the rays through their pixels.
+
+pub(crate) mod bounds;
+pub(crate) mod lens;
+pub(crate) mod ndc;
+pub(crate) mod pinhole;
+pub(crate) mod pose;
+pub(crate) mod rays;
+pub(crate) mod rotation;
+
+pub use bounds::{clip_span, intersect_box};
+pub use lens::RadialLens;
+pub use ndc::{Ndc, NdcRay};
+pub use pinhole::{Camera, Ray};
+pub use pose::Pose;
+pub use rays::{Rays, Samples, stratified};
+pub use rotation::{rotation_exp, rotation_log};

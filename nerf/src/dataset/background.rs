@@ -1,0 +1,155 @@
+//! What lies behind a scene, and compositing over it.
+
+use std::fmt;
+use std::str::FromStr;
+
+use rand::{Rng, RngExt};
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::image::Image;
+use crate::error::{Error, Result};
+
+/// The background in front of which images with transparency are trained and shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Background {
+    /// White: the convention under which results on the synthetic scenes are published.
+    #[default]
+    White,
+    /// Black.
+    Black,
+    /// While training, a colour drawn anew for each ray, so that no density can pose as background; it needs images
+    /// with alpha. White when images are shown or measured.
+    Random,
+}
+
+impl Background {
+    /// The colour behind a training ray. Only [`Random`](Self::Random) draws from `rng`: three uniform values in 0..1.
+    pub fn draw(self, rng: &mut (impl Rng + ?Sized)) -> [f32; 3] {
+        match self {
+            Background::Random => rng.random(),
+            fixed => fixed.shown(),
+        }
+    }
+
+    /// The colour behind images that are shown or measured.
+    pub fn shown(self) -> [f32; 3] {
+        match self {
+            Background::White | Background::Random => [1.0; 3],
+            Background::Black => [0.0; 3],
+        }
+    }
+}
+
+impl fmt::Display for Background {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Background::White => "white",
+            Background::Black => "black",
+            Background::Random => "random",
+        })
+    }
+}
+
+impl FromStr for Background {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "white" => Ok(Background::White),
+            "black" => Ok(Background::Black),
+            "random" => Ok(Background::Random),
+            _ => Err(Error::setting("background", format!("must be white, black or random, is `{text}`"))),
+        }
+    }
+}
+
+/// One pixel over a background colour: `alpha c + (1 - alpha) background` for RGBA, where alpha is not premultiplied;
+/// RGB passes through.
+///
+/// # Panics
+/// If the pixel has neither 3 nor 4 channels.
+#[track_caller]
+pub fn over(pixel: &[f32], background: [f32; 3]) -> [f32; 3] {
+    match *pixel {
+        [r, g, b] => [r, g, b],
+        [r, g, b, alpha] => {
+            let [below_r, below_g, below_b] = background.map(|value| (1.0 - alpha) * value);
+            [alpha * r + below_r, alpha * g + below_g, alpha * b + below_b]
+        }
+        _ => panic!("a pixel over a background has 3 or 4 channels, not {}", pixel.len()),
+    }
+}
+
+impl Image {
+    /// The image [over](over()) a background colour: RGB, of the same size.
+    ///
+    /// # Panics
+    /// If the image has neither 3 nor 4 channels.
+    #[track_caller]
+    pub fn over(&self, background: [f32; 3]) -> Image {
+        let data = self.data.chunks_exact(self.channels).flat_map(|pixel| over(pixel, background)).collect();
+        Image { width: self.width, height: self.height, channels: 3, data }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+    use rand::rngs::StdRng;
+
+    #[test]
+    fn over_mixes_by_alpha() {
+        let background = [1.0, 0.5, 0.0];
+        assert_eq!(over(&[0.5, 0.5, 0.5, 1.0], background), [0.5; 3]);
+        assert_eq!(over(&[0.5, 0.5, 0.5, 0.0], background), background);
+        assert_eq!(over(&[0.5, 0.0, 1.0, 0.25], background), [0.875, 0.375, 0.25]);
+        assert_eq!(over(&[0.1, 0.2, 0.3], background), [0.1, 0.2, 0.3]);
+    }
+
+    #[test]
+    fn an_image_over_a_colour_is_rgb() {
+        let image = Image { width: 2, height: 1, channels: 4, data: vec![0.5, 0.5, 0.5, 1.0, 0.5, 0.5, 0.5, 0.0] };
+        let flat = image.over([0.0, 0.25, 1.0]);
+        assert_eq!((flat.width, flat.height, flat.channels), (2, 1, 3));
+        assert_eq!(flat.data, [0.5, 0.5, 0.5, 0.0, 0.25, 1.0]);
+        assert_eq!(flat.over([0.0; 3]), flat);
+    }
+
+    #[test]
+    #[should_panic(expected = "3 or 4 channels, not 1")]
+    fn grey_has_no_place_over_a_colour() {
+        Image::new(1, 1, 1).over([0.0; 3]);
+    }
+
+    #[test]
+    fn only_random_draws() {
+        let (mut rng, mut untouched) = (StdRng::seed_from_u64(3), StdRng::seed_from_u64(3));
+        assert_eq!(Background::White.draw(&mut rng), [1.0; 3]);
+        assert_eq!(Background::Black.draw(&mut rng), [0.0; 3]);
+        let colour = Background::Random.draw(&mut rng);
+        assert_eq!(colour, untouched.random::<[f32; 3]>());
+        assert_ne!(colour, Background::Random.draw(&mut rng));
+        assert_eq!(Background::Random.shown(), [1.0; 3]);
+    }
+
+    #[test]
+    fn names_round_trip() {
+        for background in [Background::White, Background::Black, Background::Random] {
+            assert_eq!(background.to_string().parse::<Background>().unwrap(), background);
+            assert_eq!(serde_json::to_string(&background).unwrap(), format!("\"{background}\""));
+        }
+        let message = "grey".parse::<Background>().unwrap_err().to_string();
+        assert_eq!(message, "`background`: must be white, black or random, is `grey`");
+    }
+
+    proptest! {
+        #[test]
+        fn over_stays_between_its_two_colours(c in 0.0f32..=1.0, alpha in 0.0f32..=1.0, below in 0.0f32..=1.0) {
+            let [mixed, ..] = over(&[c, c, c, alpha], [below; 3]);
+            prop_assert!(mixed >= c.min(below) - 1e-6 && mixed <= c.max(below) + 1e-6);
+        }
+    }
+}

@@ -1,0 +1,161 @@
+//! The geometry of a hash grid: levels, resolutions and rows.
+
+use crate::range::{check_parameters, check_range};
+use crate::{Error, Result};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use raygrad_autograd::{Scalar, Tensor};
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// The numbers behind a [`HashGrid`] (Müller et al. 2022, table 1).
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HashGridConfig {
+    /// Number of resolutions, 1 to 32.
+    pub levels: usize,
+    /// Features in a row of the table: 1, 2, 4, 8, 16 or 32.
+    pub features: usize,
+    /// Binary logarithm of the most rows that a level may have, 4 to 28.
+    pub log2_table: u32,
+    /// Cells along an axis of the coarsest level, at least 1.
+    pub coarsest: usize,
+    /// Cells along an axis of the finest level, at most 65536: finer cells would leave f32 too few digits for the place
+    /// within a cell.
+    pub finest: usize,
+}
+
+impl HashGridConfig {
+    /// The largest `log2_table`: a grid of 512 cells along an axis then still has a row for each corner.
+    pub(crate) const MOST_LOG2_TABLE: u32 = 28;
+
+    /// The paper's: 16 levels of 2 features from 16 to 2048, tables of 2^19 rows.
+    pub fn paper() -> Self {
+        HashGridConfig { levels: 16, features: 2, log2_table: 19, coarsest: 16, finest: 2048 }
+    }
+
+    /// Rows of more features on fewer levels, so fewer places of memory to visit, up to about the resolution of the
+    /// photographs; and as many of both as pay within `seconds` of training on two cores: more of them hold more detail,
+    /// but take longer, the more so if they do not fit the caches.
+    pub fn cpu(seconds: f64) -> Self {
+        let (log2_table, finest) = match seconds {
+            ..=100.0 => (17, 512),
+            ..=300.0 => (18, 512),
+            _ => (19, 768),
+        };
+        HashGridConfig { levels: 8, features: 4, log2_table, coarsest: 16, finest }
+    }
+
+    fn check(&self) -> Result<()> {
+        check_range("levels", self.levels, 1, 32)?;
+        check_range("log2_table", self.log2_table, 4, Self::MOST_LOG2_TABLE)?;
+        check_range("coarsest", self.coarsest, 1, self.finest)?;
+        check_range("finest", self.finest, self.coarsest, 1 << 16)?;
+        if ![1, 2, 4, 8, 16, 32].contains(&self.features) {
+            return Err(Error::setting("features", format!("is {}; use 1, 2, 4, 8, 16 or 32", self.features)));
+        }
+        Ok(())
+    }
+}
+
+/// One resolution of a [`HashGrid`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HashLevel {
+    /// Cells along an axis.
+    pub resolution: u32,
+    /// Whether corners share rows by their hash; if not, each corner has a row of its own.
+    pub hashed: bool,
+    /// This level's rows of the table.
+    pub rows: Range<usize>,
+}
+
+impl HashLevel {
+    /// Row, counted from the level's first, of the corner `[x, y, z]`; each coordinate is at most the resolution.
+    ///
+    /// Either `x + (N+1) (y + (N+1) z)`, or the paper's hash (equation 4):
+    /// `(x xor 2654435761 y xor 805459861 z) mod rows`, in 32 bits.
+    #[inline(always)]
+    pub(super) fn row(&self, [x, y, z]: [u32; 3]) -> u32 {
+        if self.hashed {
+            (x ^ y.wrapping_mul(PRIMES[0]) ^ z.wrapping_mul(PRIMES[1])) & (self.rows.len() as u32 - 1)
+        } else {
+            let side = self.resolution + 1;
+            x + side * (y + side * z)
+        }
+    }
+}
+
+/// Multipliers of the hash.
+pub(super) const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
+
+/// Levels of rising resolution over the unit cube, and the rows of one table that they take their features from. A clone
+/// is a reference count.
+///
+/// Level `l` has `N_l = floor(coarsest b^l)` cells along an axis, `b = (finest / coarsest)^(1 / (levels - 1))`
+/// (equations 2 and 3), so `N_l + 1` corners. A level with few enough corners has a row for each; a finer one hashes its
+/// corners to `2^log2_table` rows. Rows are rounded up to a multiple of 16, so that
+/// each level begins with a line of the caches.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HashGrid {
+    levels: Arc<[HashLevel]>,
+    features: usize,
+    shape: [usize; 2],
+}
+
+impl HashGrid {
+    /// The grid of these numbers.
+    ///
+    /// # Errors
+    /// If one is out of the range that its field states.
+    pub fn new(config: &HashGridConfig) -> Result<Self> {
+        config.check()?;
+        let growth = (config.finest as f64 / config.coarsest as f64).ln() / (config.levels - 1).max(1) as f64;
+        let most = 1_usize << config.log2_table;
+        let mut first = 0;
+        let level = |l: usize| {
+            // The tiny excess makes the last level the finest in spite of rounding.
+            let resolution = config.coarsest as f64 * (l as f64 * growth).exp() * (1.0 + 1e-12);
+            let corners = (resolution as usize + 1).pow(3);
+            let count = corners.min(most).next_multiple_of(16);
+            first += count;
+            HashLevel { resolution: resolution as u32, hashed: corners > most, rows: first - count..first }
+        };
+        let levels: Arc<[HashLevel]> = (0..config.levels).map(level).collect();
+        check_parameters(first * config.features)?;
+        Ok(HashGrid { levels, features: config.features, shape: [first, config.features] })
+    }
+
+    /// The levels, coarsest first.
+    pub fn levels(&self) -> &[HashLevel] {
+        &self.levels
+    }
+
+    /// Features in a row of the table.
+    pub fn features(&self) -> usize {
+        self.features
+    }
+
+    /// Rows of the table.
+    pub fn rows(&self) -> usize {
+        self.levels.last().map_or(0, |level| level.rows.end)
+    }
+
+    /// Features of a sample: levels times features.
+    pub fn width(&self) -> usize {
+        self.levels.len() * self.features
+    }
+
+    /// The shape of the table, `[rows, features]`.
+    pub fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// A table `[rows, features]` to start from, uniform in -1e-4..1e-4 (section 4): near zero, so that the first steps
+    /// see no random colours, and not zero, so that features differ.
+    #[inline(never)]
+    pub fn init<T: Scalar>(&self, seed: u64) -> Tensor<T> {
+        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        Tensor::from_fn(&[self.rows(), self.features], |_| T::from_f64(1e-4 * (2.0 * rng.random::<f64>() - 1.0)))
+    }
+}

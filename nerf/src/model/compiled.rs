@@ -1,0 +1,20 @@
+//! What is compiled here, for f64 as for f32, so that no crate that calls it compiles it again.
+//!
+//! A generic function is compiled in every crate that uses it, unless it is marked `#[inline(never)]` and a crate below has
+//! used it for the same types. So marked are the entries that stand for much code (of this crate and of those below).
+
+use crate::analytic::{Integral, integrate};
+use crate::volume::quadrature::Quadrature;
+use crate::{DenseView, Model, Result, analytic};
+
+/// The entries in f64; those in f32 are used by training and views.
+#[allow(clippy::type_complexity)] // the types of the entries
+#[doc(hidden)]
+#[inline(never)]
+pub fn in_double() -> (
+    fn(&Model<f32>) -> Result<Model<f64>>,
+    fn(&Model<f64>, &crate::Camera, [f64; 3], usize) -> DenseView,
+    fn(&analytic::AnalyticScene, Quadrature, usize) -> Integral,
+) {
+    (Model::cast, Model::dense_view, integrate::<f64>)
+}

@@ -1,0 +1,229 @@
+//! What to train and how: the presets and every number behind them.
+
+use crate::dataset::background::Background;
+use crate::encoding::hash_grid::HashGridConfig;
+use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
+use crate::sampling::hierarchical::HierarchicalConfig;
+use crate::sampling::marching::MarchingConfig;
+use crate::space::occupancy::Skip;
+use crate::volume::loss::Loss;
+use crate::{Error, Result};
+use raygrad_nn::{AdamConfig, Schedule, Storage};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// A named configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// The paper's networks and numbers: 64 + 128 samples, two networks of 8 layers of 256.
+    Classic,
+    /// The same idea with half of the depth and of the width: a recognisable scene in minutes.
+    Small,
+    /// A hash grid marched through an occupancy grid: a good scene in a minute.
+    #[default]
+    Instant,
+    /// A grid of voxels, marched in the same way: no network, and five times the parameters.
+    Voxel,
+}
+
+impl FromStr for Preset {
+    type Err = Error;
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "classic" => Ok(Preset::Classic),
+            "small" => Ok(Preset::Small),
+            "instant" => Ok(Preset::Instant),
+            "voxel" => Ok(Preset::Voxel),
+            _ => Err(Error::setting("preset", format!("there is no `{name}`; use classic, small, instant or voxel"))),
+        }
+    }
+}
+
+impl fmt::Display for Preset {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Preset::Classic => "classic",
+            Preset::Small => "small",
+            Preset::Instant => "instant",
+            Preset::Voxel => "voxel",
+        })
+    }
+}
+
+/// Where rays are sampled. Any field can be sampled either way.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum SamplerConfig {
+    /// Stratified samples through a network of their own, then more where it found something.
+    Hierarchical(HierarchicalConfig),
+    /// Even steps through the occupied cells of a grid.
+    Marching(MarchingConfig),
+}
+
+/// A model and how it is trained. It is stored with the model, so that a run can be read back.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// What is fitted.
+    pub field: FieldConfig,
+    /// Where it is sampled.
+    pub sampler: SamplerConfig,
+    /// What is minimised.
+    #[serde(default)]
+    pub loss: Loss,
+    /// Learning rate over the run.
+    pub schedule: Schedule,
+    /// The optimiser's constants, for networks.
+    pub adam: AdamConfig,
+    /// The optimiser's constants for the rows of a table.
+    pub table_adam: AdamConfig,
+    /// What photographs with alpha are composited over.
+    pub background: Background,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// The number type of parameters in the file that a model is saved to.
+    #[serde(default)]
+    pub storage: Storage,
+}
+
+impl Config {
+    /// The numbers of a preset.
+    pub fn preset(preset: Preset) -> Self {
+        let paper = ClassicConfig::paper();
+        let small = ClassicConfig { depth: 4, width: 128, skips: vec![], view_width: 64, ..paper.clone() };
+        let proposal =
+            ClassicConfig { depth: 2, width: 64, skips: vec![], view_width: 32, position_levels: 6, ..paper.clone() };
+        let classic = Config {
+            field: FieldConfig::Classic(paper.clone()),
+            sampler: SamplerConfig::Hierarchical(HierarchicalConfig::default()),
+            loss: Loss::Mse,
+            schedule: Schedule::Exponential { from: 5e-4, to: 5e-6, warmup: 0.0 },
+            adam: AdamConfig::default(),
+            table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
+            background: Background::White,
+            seed: 0,
+            storage: Storage::Full,
+        };
+        match preset {
+            Preset::Classic => classic,
+            Preset::Small => Config {
+                field: FieldConfig::Classic(small),
+                sampler: SamplerConfig::Hierarchical(HierarchicalConfig {
+                    proposal,
+                    coarse: 48,
+                    fine: 32,
+                    batch: 256,
+                    tile: 16,
+                    ..HierarchicalConfig::default()
+                }),
+                schedule: Schedule::Exponential { from: 4e-3, to: 1e-4, warmup: 0.005 },
+                ..classic
+            },
+            Preset::Instant => Config {
+                field: FieldConfig::Instant(InstantConfig {
+                    grid: HashGridConfig::cpu(60.0),
+                    density_width: 64,
+                    features: 16,
+                    color_width: 64,
+                    color_depth: 2,
+                    direction_degree: 4,
+                }),
+                sampler: SamplerConfig::Marching(MarchingConfig::default()),
+                schedule: Schedule::Linear { from: 2e-2, to: 0.0, warmup: 0.005 },
+                adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
+                background: Background::Random,
+                ..classic
+            },
+            Preset::Voxel => Config {
+                field: FieldConfig::Voxel(VoxelConfig { resolution: 128, direction_degree: 2 }),
+                sampler: SamplerConfig::Marching(MarchingConfig::default()),
+                schedule: Schedule::Exponential { from: 5e-2, to: 5e-3, warmup: 0.0 },
+                background: Background::Random,
+                ..classic
+            },
+        }
+    }
+
+    /// The same for a training time: the table of a hash grid is as large as pays within it, see [`HashGridConfig::cpu`],
+    /// beyond 100 seconds the steps along a ray grow shorter as training goes on, and beyond 300 a training step has twice
+    /// as many samples.
+    pub fn with_budget(mut self, seconds: f64) -> Self {
+        if let FieldConfig::Instant(field) = &mut self.field {
+            field.grid = HashGridConfig::cpu(seconds);
+            if let SamplerConfig::Marching(marching) = &mut self.sampler
+                && seconds > 100.0
+            {
+                (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / 450.0));
+                marching.samples *= if seconds > 300.0 { 2 } else { 1 };
+            }
+        }
+        self
+    }
+
+    /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves the sampler alone).
+    pub fn with_skip(mut self, skip: Skip) -> Self {
+        match &mut self.sampler {
+            SamplerConfig::Marching(marching) => marching.occupancy.skip = skip,
+            SamplerConfig::Hierarchical(_) if skip == Skip::Off => {}
+            SamplerConfig::Hierarchical(hierarchical) => {
+                // As many rays as before, once a few samples are left of each.
+                let samples = 16 * hierarchical.batch;
+                let mut marching = MarchingConfig { samples, ..MarchingConfig::default() };
+                marching.occupancy.skip = skip;
+                self.sampler = SamplerConfig::Marching(marching);
+            }
+        }
+        self
+    }
+
+    /// Whether the numbers make sense together.
+    ///
+    /// # Errors
+    /// If one is out of range.
+    pub fn check(&self) -> Result<()> {
+        self.loss.check()?;
+        let schedule = format!("schedule.{}", self.schedule.name());
+        let checked = [
+            (schedule.as_str(), self.schedule.check()),
+            ("adam", self.adam.check()),
+            ("table_adam", self.table_adam.check()),
+        ];
+        for (part, checked) in checked {
+            checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
+        }
+        match &self.sampler {
+            SamplerConfig::Hierarchical(config) => config.check(),
+            SamplerConfig::Marching(config) => config.check(),
+        }
+    }
+
+    fn classic_fields(&mut self) -> impl Iterator<Item = &mut ClassicConfig> {
+        let field = match &mut self.field {
+            FieldConfig::Classic(config) => Some(config),
+            FieldConfig::Instant(_) | FieldConfig::Voxel(_) => None,
+        };
+        let proposal = match &mut self.sampler {
+            SamplerConfig::Hierarchical(config) => Some(&mut config.proposal),
+            SamplerConfig::Marching(_) => None,
+        };
+        field.into_iter().chain(proposal)
+    }
+
+    /// The same without positional encoding: classic networks see bare coordinates.
+    pub fn without_encoding(mut self) -> Self {
+        for field in self.classic_fields() {
+            (field.position_levels, field.direction_levels) = (0, 0);
+        }
+        self
+    }
+
+    /// The same with the paper's ReLU density in classic networks.
+    pub fn with_relu_density(mut self) -> Self {
+        for field in self.classic_fields() {
+            field.density = DensityActivation::Relu;
+        }
+        self
+    }
+}

@@ -1,0 +1,270 @@
+//! How alike two images are: mean squared error, PSNR, SSIM.
+//!
+//! All take images of one shape with values in 0..=1, sum in f64, and give NaN when a value is NaN.
+
+use rayon::prelude::*;
+
+use crate::dataset::image::Image;
+
+/// Mean squared error over all pixels and channels; NaN for images without pixels.
+///
+/// # Panics
+/// If the images differ in size or channels.
+#[track_caller]
+pub fn mse(a: &Image, b: &Image) -> f64 {
+    a.assert_same_shape(b);
+    let squares = a.data.iter().zip(&b.data).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
+    squares.sum::<f64>() / a.data.len() as f64
+}
+
+/// Peak signal-to-noise ratio in decibels for a peak of 1: `-10 log10(mse)`. Identical images give +infinity.
+///
+/// The published figure of a test set is the mean of the images' PSNR, not the PSNR of their mean error.
+///
+/// # Panics
+/// If the images differ in size or channels.
+#[track_caller]
+pub fn psnr(a: &Image, b: &Image) -> f64 {
+    psnr_from_mse(mse(a, b))
+}
+
+/// Peak signal-to-noise ratio in decibels of a mean squared error, for a peak of 1: 0 gives +infinity.
+pub fn psnr_from_mse(mse: f64) -> f64 {
+    // The reciprocal rather than a minus sign: an error of 1 is 0 dB, not -0.
+    10.0 * mse.recip().log10()
+}
+
+/// Side of the window of [`ssim`] in pixels: the smallest image it can measure.
+pub const SSIM_WINDOW: usize = 11;
+
+/// Structural similarity (Wang, Bovik, Sheikh and Simoncelli 2004), at most 1, and 1 for identical images.
+///
+/// An 11x11 Gaussian window with standard deviation 1.5 pixels moves over all places where it lies inside the image.
+/// With the window's means `mu`, variances and covariance (weights that sum to 1, no sample correction), C1 = 0.01^2
+/// and C2 = 0.03^2 for a range of 1,
+///
+/// ```text
+/// ssim = (2 mu_a mu_b + C1) (2 cov_ab + C2) / ((mu_a^2 + mu_b^2 + C1) (var_a + var_b + C2))
+/// ```
+///
+/// and the result is its mean over places and channels.
+///
+/// # Panics
+/// If the images differ in size or channels, or are smaller than the window.
+#[track_caller]
+pub fn ssim(a: &Image, b: &Image) -> f64 {
+    const C1: f64 = 0.01 * 0.01;
+    const C2: f64 = 0.03 * 0.03;
+    a.assert_same_shape(b);
+    let fits = a.width >= SSIM_WINDOW && a.height >= SSIM_WINDOW;
+    assert!(fits, "SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW} pixels, the images have {}x{}", a.width, a.height);
+
+    // In terms of s = a + b and d = a - b,
+    //     2 mu_a mu_b = (mu_s^2 - mu_d^2) / 2   and   mu_a^2 + mu_b^2 = (mu_s^2 + mu_d^2) / 2,
+    // and likewise for the variances. Two moments are needed in place of five, and as none of these terms is negative,
+    // no rounding can lift the quotient above 1.
+    let weights = gaussian();
+    let sums = row_moments(a, b, &weights, |a, b| a + b);
+    let differences = row_moments(a, b, &weights, |a, b| a - b);
+    let row_total = |y: usize| {
+        let window = |rows: &[Moments]| combine(&weights, std::array::from_fn(|k| rows[y + k].as_slices()));
+        let (s, d) = (window(&sums), window(&differences));
+        let similarity = |i: usize| {
+            let (mu_s, mu_d) = (s.mean[i].powi(2), d.mean[i].powi(2));
+            let (var_s, var_d) = (s.variance[i], d.variance[i]);
+            let numerator = (mu_s - mu_d + 2.0 * C1) * (var_s - var_d + 2.0 * C2);
+            numerator / ((mu_s + mu_d + 2.0 * C1) * (var_s + var_d + 2.0 * C2))
+        };
+        (0..s.mean.len()).map(similarity).sum::<f64>()
+    };
+    // Rows are added in order, so that the result does not depend on the number of threads.
+    let places = [a.width + 1 - SSIM_WINDOW, a.height + 1 - SSIM_WINDOW];
+    let totals: Vec<f64> = (0..places[1]).into_par_iter().map(row_total).collect();
+    totals.iter().sum::<f64>() / (places[0] * places[1] * a.channels) as f64
+}
+
+/// Weighted means and variances, one for each place and channel of a row.
+struct Moments {
+    mean: Vec<f64>,
+    variance: Vec<f64>,
+}
+
+impl Moments {
+    fn as_slices(&self) -> (&[f64], &[f64]) {
+        (&self.mean, &self.variance)
+    }
+}
+
+/// The moments of `f(a, b)` in windows of one row, for every row.
+///
+/// The Gaussian window is a product, so it is taken along rows, and then [`combine`] takes it down the columns.
+fn row_moments(a: &Image, b: &Image, weights: &Weights, f: fn(f64, f64) -> f64) -> Vec<Moments> {
+    let row_length = a.width * a.channels;
+    let out_length = row_length - (SSIM_WINDOW - 1) * a.channels;
+    let zeros = vec![0.0; out_length];
+    let moments = |(a_row, b_row): (&[f32], &[f32])| {
+        let row: Vec<f64> = a_row.iter().zip(b_row).map(|(&a, &b)| f(a.into(), b.into())).collect();
+        combine(weights, std::array::from_fn(|k| (&row[k * a.channels..][..out_length], &zeros[..])))
+    };
+    a.data.par_chunks_exact(row_length).zip(b.data.par_chunks_exact(row_length)).map(moments).collect()
+}
+
+/// Weights of the window along one axis; they sum to 1.
+type Weights = [f64; SSIM_WINDOW];
+
+/// The Gaussian window of standard deviation 1.5.
+fn gaussian() -> Weights {
+    const SIGMA: f64 = 1.5;
+    let centre = (SSIM_WINDOW / 2) as f64;
+    let weights: Weights = std::array::from_fn(|k| (-0.5 * ((k as f64 - centre) / SIGMA).powi(2)).exp());
+    let total: f64 = weights.iter().sum();
+    weights.map(|w| w / total)
+}
+
+/// Moments of a whole from the means and variances of its parts, element by element.
+///
+/// The variance of a whole is the mean of the variances of its parts plus the variance of their means: centred, where
+/// the textbook's E[x^2] - mu^2 cancels and comes out negative in flat regions.
+fn combine(weights: &Weights, parts: [(&[f64], &[f64]); SSIM_WINDOW]) -> Moments {
+    let length = parts[0].0.len();
+    let (mut mean, mut variance) = (vec![0.0; length], vec![0.0; length]);
+    for (&weight, (part_mean, _)) in weights.iter().zip(parts) {
+        for (mean, part_mean) in mean.iter_mut().zip(part_mean) {
+            *mean += weight * part_mean;
+        }
+    }
+    for (&weight, (part_mean, part_variance)) in weights.iter().zip(parts) {
+        let part = part_mean.iter().zip(part_variance);
+        for ((variance, mean), (part_mean, part_variance)) in variance.iter_mut().zip(&mean).zip(part) {
+            *variance += weight * (part_variance + (part_mean - mean) * (part_mean - mean));
+        }
+    }
+    Moments { mean, variance }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rand::rngs::StdRng;
+    use rand::{RngExt, SeedableRng};
+
+    fn constant(value: f32) -> Image {
+        Image { width: 16, height: 13, channels: 3, data: vec![value; 16 * 13 * 3] }
+    }
+
+    fn noise(seed: u64, base: &Image, scale: f32) -> Image {
+        let mut rng = StdRng::seed_from_u64(seed);
+        let data = base.data.iter().map(|v| v + scale * (rng.random::<f32>() - 0.5)).collect();
+        Image { data, ..*base }
+    }
+
+    /// The definition, window by window in two dimensions.
+    fn ssim_by_definition(a: &Image, b: &Image) -> f64 {
+        let weight = |dx: usize, dy: usize| {
+            let squared = (dx as f64 - 5.0).powi(2) + (dy as f64 - 5.0).powi(2);
+            (-squared / (2.0 * 1.5 * 1.5)).exp()
+        };
+        let window: Vec<(usize, usize)> = (0..121).map(|i| (i % 11, i / 11)).collect();
+        let total: f64 = window.iter().map(|&(dx, dy)| weight(dx, dy)).sum();
+        let mut all = Vec::new();
+        for y in 0..=a.height - 11 {
+            for x in 0..=a.width - 11 {
+                for c in 0..a.channels {
+                    let mean = |f: &dyn Fn(f64, f64) -> f64| {
+                        let value = |i: &Image, dx, dy| f64::from(i.pixel(x + dx, y + dy)[c]);
+                        let term = |&(dx, dy): &_| weight(dx, dy) / total * f(value(a, dx, dy), value(b, dx, dy));
+                        window.iter().map(term).sum::<f64>()
+                    };
+                    let (mu_a, mu_b) = (mean(&|a, _| a), mean(&|_, b| b));
+                    let var_a = mean(&|a, _| (a - mu_a).powi(2));
+                    let var_b = mean(&|_, b| (b - mu_b).powi(2));
+                    let cov = mean(&|a, b| (a - mu_a) * (b - mu_b));
+                    let luminance = (2.0 * mu_a * mu_b + 1e-4) / (mu_a * mu_a + mu_b * mu_b + 1e-4);
+                    all.push(luminance * (2.0 * cov + 9e-4) / (var_a + var_b + 9e-4));
+                }
+            }
+        }
+        all.iter().sum::<f64>() / all.len() as f64
+    }
+
+    #[test]
+    fn psnr_of_known_errors() {
+        let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-5, "{a} for {b}");
+        close(psnr(&constant(0.5), &constant(0.6)), 20.0);
+        close(psnr(&constant(0.25), &constant(0.26)), 40.0);
+        assert_eq!(psnr(&constant(0.0), &constant(1.0)).to_bits(), 0.0f64.to_bits());
+        assert_eq!(psnr(&constant(0.3), &constant(0.3)), f64::INFINITY);
+        assert_eq!(mse(&constant(0.25), &constant(0.75)), 0.25);
+        assert_eq!(psnr_from_mse(0.01), 20.0);
+        assert_eq!(psnr_from_mse(0.0), f64::INFINITY);
+    }
+
+    #[test]
+    fn ssim_of_identical_images_is_one() {
+        let image = noise(1, &constant(0.5), 1.0);
+        assert_eq!(ssim(&image, &image), 1.0);
+        assert_eq!(ssim(&constant(0.0), &constant(0.0)), 1.0);
+    }
+
+    #[test]
+    fn ssim_of_constants() {
+        // Variances vanish: what is left is the luminance term.
+        let got = ssim(&constant(0.25), &constant(0.75));
+        assert!((got - (2.0 * 0.25 * 0.75 + 1e-4) / (0.0625 + 0.5625 + 1e-4)).abs() < 1e-12, "{got}");
+    }
+
+    #[test]
+    fn ssim_never_exceeds_one() {
+        let base = constant(0.6);
+        let nearly = ssim(&base, &constant(0.6 + 1e-7));
+        assert!(nearly <= 1.0 && nearly > 1.0 - 1e-9, "{nearly}");
+        for scale in [1e-7, 1e-6, 1e-5, 1e-4, 1e-3] {
+            let noisy = ssim(&base, &noise(7, &base, scale));
+            assert!(noisy <= 1.0 && noisy > 0.9, "{scale}: {noisy}");
+        }
+    }
+
+    #[test]
+    fn ssim_agrees_with_its_definition() {
+        for (seed, scale) in [(1, 1.0), (2, 0.3), (3, 1e-2), (4, 1e-5)] {
+            let a = noise(seed, &constant(0.5), 1.0);
+            let b = noise(seed + 100, &a, scale);
+            let (fast, slow) = (ssim(&a, &b), ssim_by_definition(&a, &b));
+            assert!((fast - slow).abs() < 1e-12, "{scale}: {fast} for {slow}");
+        }
+    }
+
+    #[test]
+    fn nan_is_no_good_score() {
+        let (good, mut bad) = (constant(0.5), constant(0.5));
+        bad.data[100] = f32::NAN;
+        for metric in [mse, psnr, ssim] {
+            assert!(metric(&good, &bad).is_nan() && metric(&bad, &bad).is_nan());
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "differ in height, width or channels")]
+    fn other_shapes_are_refused() {
+        psnr(&Image::new(2, 3, 3), &Image::new(3, 2, 3));
+    }
+
+    #[test]
+    #[should_panic(expected = "SSIM needs 11x11 pixels, the images have 12x10")]
+    fn ssim_needs_a_window() {
+        ssim(&Image::new(12, 10, 1), &Image::new(12, 10, 1));
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(32))]
+        #[test]
+        fn ssim_is_symmetric_and_bounded(seed: u64, scale in 0.0f32..1.0) {
+            let a = noise(seed, &constant(0.5), 1.0);
+            let b = noise(!seed, &a, scale);
+            let forward = ssim(&a, &b);
+            prop_assert_eq!(forward, ssim(&b, &a));
+            prop_assert!((-1.0..=1.0).contains(&forward));
+        }
+    }
+}

@@ -1,0 +1,7 @@
+//! Pictures: how far apart two are, maps in colour, and files.
+
+pub mod colormap;
+pub mod metrics;
+pub(crate) mod output;
+
+pub use output::{quantise, write_atomic};

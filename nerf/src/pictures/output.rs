@@ -1,0 +1,114 @@
+//! Images to files: 8-bit quantisation, PNG, and writing that leaves no half-written file.
+
+use std::path::Path;
+
+use image::codecs::png::PngEncoder;
+use image::{ExtendedColorType, ImageEncoder};
+
+use crate::dataset::image::Image;
+use crate::error::{Error, Result};
+
+/// A value of 0..=1 as a byte: `round(255 clamp(x, 0, 1))`. NaN becomes 0.
+pub fn quantise(value: f32) -> u8 {
+    // A float cast to an integer turns NaN into 0.
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+impl Image {
+    /// The image as an 8-bit PNG file in memory: grey, RGB or RGBA by its channels, each value [quantised](quantise).
+    ///
+    /// # Panics
+    /// If the image has no pixels, has another number of channels than 1, 3 or 4, or holds another number of values
+    /// than its size says.
+    #[track_caller]
+    pub fn to_png(&self) -> Vec<u8> {
+        let colour = match self.channels {
+            1 => ExtendedColorType::L8,
+            3 => ExtendedColorType::Rgb8,
+            4 => ExtendedColorType::Rgba8,
+            other => panic!("a PNG has 1, 3 or 4 channels, not {other}"),
+        };
+        assert!(self.width > 0 && self.height > 0, "a {}x{} image has no pixels", self.width, self.height);
+        let bytes: Vec<u8> = self.data.iter().map(|&value| quantise(value)).collect();
+        let mut png = Vec::new();
+        PngEncoder::new(&mut png)
+            .write_image(&bytes, self.width as u32, self.height as u32, colour)
+            .expect("the shape is checked above, and writing to memory does not fail");
+        png
+    }
+
+    /// Writes the image to the file `path` as [PNG](Self::to_png), replacing it [as a whole](write_atomic).
+    ///
+    /// # Errors
+    /// If the file cannot be written; the error names it.
+    ///
+    /// # Panics
+    /// As [`to_png`](Self::to_png).
+    #[track_caller]
+    pub fn save_png(&self, path: impl AsRef<Path>) -> Result<()> {
+        write_atomic(path, &self.to_png())
+    }
+}
+
+/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched: see
+/// [`raygrad_nn::write_atomic`].
+///
+/// # Errors
+/// If the folder does not exist or the file cannot be written; the error names `path`.
+pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
+    let path = path.as_ref();
+    raygrad_nn::write_atomic(path, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantises_to_the_nearest_byte() {
+        let cases = [(0.0, 0), (1.0, 255), (-0.5, 0), (7.0, 255), (0.5, 128), (0.499 / 255.0, 0), (0.501 / 255.0, 1)];
+        for (value, byte) in cases {
+            assert_eq!(quantise(value), byte, "{value}");
+        }
+        assert_eq!([f32::NAN, f32::INFINITY, f32::NEG_INFINITY].map(quantise), [0, 255, 0]);
+        assert!((0..=255).all(|byte| quantise(f32::from(byte) / 255.0) == byte));
+    }
+
+    #[test]
+    fn png_round_trip_is_exact_for_bytes() {
+        let folder = tempfile::tempdir().unwrap();
+        for channels in [3, 4] {
+            let data = (0..5 * 3 * channels).map(|i| (i * 4 % 256) as f32 / 255.0).collect();
+            let image = Image { width: 5, height: 3, channels, data };
+            let path = folder.path().join("image.png");
+            image.save_png(&path).unwrap();
+            assert_eq!(Image::open(&path).unwrap(), image);
+        }
+        // Grey is read back as RGB.
+        let path = folder.path().join("grey.png");
+        Image { width: 2, height: 1, channels: 1, data: vec![0.0, 1.0] }.save_png(&path).unwrap();
+        assert_eq!(Image::open(&path).unwrap().data, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2, "no temporary file stays behind");
+    }
+
+    #[test]
+    fn a_failed_write_names_the_file_and_harms_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let absent = folder.path().join("absent/image.png");
+        let message = write_atomic(&absent, b"x").unwrap_err().to_string();
+        assert!(message.contains("absent/image.png: cannot be written"), "{message}");
+        // A folder in the place of the file: the rename fails, and the temporary file goes.
+        let taken = folder.path().join("taken");
+        std::fs::create_dir(&taken).unwrap();
+        std::fs::write(taken.join("inside"), b"kept").unwrap();
+        assert!(write_atomic(&taken, b"x").is_err());
+        assert_eq!(std::fs::read(taken.join("inside")).unwrap(), b"kept");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    #[should_panic(expected = "1, 3 or 4 channels, not 2")]
+    fn two_channels_are_not_a_png() {
+        Image::new(1, 1, 2).to_png();
+    }
+}

@@ -1,0 +1,5 @@
+//! Where rays are sampled.
+
+pub mod hierarchical;
+pub mod marching;
+pub mod steps;

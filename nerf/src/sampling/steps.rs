@@ -1,0 +1,218 @@
+//! Where to sample a ray: stratified bins, and more samples where a first pass found something.
+
+use crate::camera::rays::{Rays, Samples};
+use crate::random::Jitter;
+use crate::{Error, Result};
+use raygrad_autograd::{Pool, Scalar, Segments};
+
+/// `count` further samples a ray, drawn from the density that `weights` (one for each of the stratified samples
+/// `coarse`) describes over the bins, merged with the coarse ones in order (Mildenhall et al. 2020, section 5.2).
+///
+/// The density is an explicit mixture, `1 - uniform_share` of it from the weights: a ray whose weights are all zero is
+/// sampled evenly, and no region is starved. So is a ray with a weight that is negative, infinite or NaN: what made it
+/// shows in the colours. Each sample stands for the interval up to half way to its neighbours, the
+/// outermost up to near and far.
+///
+/// # Panics
+/// If there is not one weight for each sample.
+pub fn importance<T: Scalar>(
+    rays: &Rays<T>,
+    coarse: &Samples<T>,
+    weights: &[T],
+    count: usize,
+    uniform_share: f64,
+    jitter: &mut Jitter<'_>,
+    pool: &Pool<T>,
+) -> Samples<T> {
+    assert_eq!(weights.len(), coarse.len(), "one weight for each coarse sample");
+    let bins = if rays.is_empty() { 0 } else { coarse.len() / rays.len() };
+    let segments = Segments::uniform(rays.len(), bins + count);
+    let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
+    let mut u = vec![0.0; count];
+    let mut drawn = vec![0.0; count];
+    for (ray, rows) in segments.ranges().enumerate() {
+        let own = coarse.segments.range(ray);
+        let [near, far] = rays.spans[ray].map(T::to_f64);
+        for (i, u) in u.iter_mut().enumerate() {
+            *u = (i as f64 + jitter.draw()) / count as f64;
+        }
+        if invert_cdf(&weights[own.clone()], uniform_share, &u, &mut drawn).is_err() {
+            drawn.copy_from_slice(&u);
+        }
+        let (t, delta) = (&mut t.as_mut_slice()[rows.clone()], &mut delta.as_mut_slice()[rows]);
+        // Both lists rise, so a merge keeps the order.
+        let (known, mut a, mut b) = (&coarse.t.as_slice()[own], 0, 0);
+        for t in t.iter_mut() {
+            let fresh = drawn.get(b).map(|x| T::from_f64(near + (far - near) * x));
+            *t = match (known.get(a), fresh) {
+                (Some(&known), Some(fresh)) if fresh < known => {
+                    b += 1;
+                    fresh
+                }
+                (Some(&known), _) => {
+                    a += 1;
+                    known
+                }
+                (None, Some(fresh)) => {
+                    b += 1;
+                    fresh
+                }
+                (None, None) => unreachable!("as many places as both lists hold"),
+            };
+        }
+        voronoi(t, [T::from_f64(near), T::from_f64(far)], delta);
+    }
+    Samples::new(rays, segments, t, delta, pool)
+}
+
+/// The length of the part of `[near, far]` that is nearest to each of the rising distances `t`.
+fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
+    let half = T::from_f64(0.5);
+    let mut edge = near;
+    for i in 0..t.len() {
+        let next = match t.get(i + 1) {
+            Some(&next) => half * (t[i] + next),
+            None => far,
+        };
+        let width = next - edge;
+        delta[i] = if width > T::ZERO { width } else { T::ZERO };
+        edge = next;
+    }
+}
+
+/// Inverts the cumulative distribution of a histogram of equal bins over `[0, 1]` at the rising numbers `u` in
+/// `[0, 1)`: `out[i]` rises with `u[i]` and lies in `[0, 1]`.
+///
+/// The density is `(1 - uniform_share) weights / sum + uniform_share`, uniform where the sum is 0. Only the proportions of
+/// the weights matter, whatever their size.
+///
+/// # Errors
+/// If a weight is negative, infinite or NaN; `out` is then as it was.
+///
+/// # Panics
+/// If there is no bin.
+pub fn invert_cdf<T: Scalar>(weights: &[T], uniform_share: f64, u: &[f64], out: &mut [f64]) -> Result<()> {
+    assert!(!weights.is_empty(), "a distribution over no bins");
+    let mut largest = 0.0_f64;
+    for (bin, weight) in weights.iter().enumerate() {
+        if !(weight.is_finite() && *weight >= T::ZERO) {
+            return Err(Error::setting(format!("weights[{bin}]"), format!("is {weight}; use 0 or more")));
+        }
+        largest = largest.max(weight.to_f64());
+    }
+    // In units of the largest, so that no sum overflows.
+    let weight = |i: usize| if largest > 0.0 { weights[i].to_f64() / largest } else { 0.0 };
+    let n = weights.len() as f64;
+    let total: f64 = (0..weights.len()).map(weight).sum();
+    let share = if total > 0.0 { uniform_share } else { 1.0 };
+    let mass = |i: usize| share / n + if share < 1.0 { (1.0 - share) * (weight(i) / total) } else { 0.0 };
+    let (mut bin, mut below) = (0, 0.0);
+    for (&u, out) in u.iter().zip(out) {
+        // The last bin takes what rounding leaves over, and bins without mass are passed.
+        while bin + 1 < weights.len() && below + mass(bin) <= u {
+            below += mass(bin);
+            bin += 1;
+        }
+        let mass = mass(bin);
+        let inside = if mass > 0.0 { ((u - below) / mass).clamp(0.0, 1.0) } else { 0.5 };
+        *out = (bin as f64 + inside) / n;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::pinhole::Ray;
+    use crate::camera::rays::stratified;
+    use glam::DVec3;
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
+
+    fn rays(count: usize) -> Rays<f64> {
+        let mut rays = Rays::new();
+        for i in 0..count {
+            rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [2.0, 6.0 + i as f64]);
+        }
+        rays
+    }
+
+    #[test]
+    fn stratified_samples_stay_in_their_bins_and_cover_the_span() {
+        let rays = rays(3);
+        let samples = stratified(&rays, 8, &mut Jitter::Random(&mut Pcg64Mcg::seed_from_u64(1)), &Pool::new());
+        for (ray, rows) in samples.segments.ranges().enumerate() {
+            let [near, far] = rays.spans[ray];
+            let width = (far - near) / 8.0;
+            for (i, &t) in samples.t.as_slice()[rows.clone()].iter().enumerate() {
+                assert!((near + i as f64 * width..near + (i + 1) as f64 * width).contains(&t));
+            }
+            let total: f64 = samples.delta.as_slice()[rows].iter().sum();
+            assert!((total - (far - near)).abs() < 1e-12);
+        }
+        let middle = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
+        assert_eq!(&middle.t.as_slice()[..4], [2.5, 3.5, 4.5, 5.5]);
+        assert_eq!(&middle.positions.as_slice()[..3], [0.0, 0.0, 2.5]);
+    }
+
+    #[test]
+    fn zero_weights_are_uniform_and_one_hot_stays_in_its_bin() {
+        let u: Vec<f64> = (0..100).map(|i| (i as f64 + 0.5) / 100.0).collect();
+        let mut out = vec![0.0; 100];
+        invert_cdf(&[0.0_f32; 7], 0.01, &u, &mut out).unwrap();
+        assert!(out.iter().zip(&u).all(|(x, u)| (x - u).abs() < 1e-12));
+        for scale in [1.0, 1e-30_f32] {
+            let mut weights = [0.0; 10];
+            weights[3] = scale;
+            invert_cdf(&weights, 0.0, &u, &mut out).unwrap();
+            assert!(out.iter().all(|x| (0.3..=0.4).contains(x)), "{out:?}");
+            invert_cdf(&weights, 0.1, &u, &mut out).unwrap();
+            let outside = out.iter().filter(|x| !(0.3..=0.4).contains(*x)).count();
+            assert!((8..=10).contains(&outside), "a tenth, less the bin's own share: {outside}");
+        }
+        for bad in [f32::NAN, -1.0, f32::INFINITY] {
+            let error = invert_cdf(&[1.0, bad], 0.1, &u, &mut out).unwrap_err().to_string();
+            assert!(error.starts_with("`weights[1]`: is "), "{error}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn inversion_is_monotone_and_matches_the_histogram(
+            weights in prop::collection::vec(0.0f32..1.0, 1..20), zeroed in 0usize..20
+        ) {
+            let mut weights = weights;
+            if let Some(weight) = weights.get_mut(zeroed) { *weight = 0.0; }
+            let n = 20_000;
+            let u: Vec<f64> = (0..n).map(|i| (i as f64 + 0.5) / n as f64).collect();
+            let mut out = vec![0.0; n];
+            invert_cdf(&weights, 0.05, &u, &mut out).unwrap();
+            prop_assert!(out.windows(2).all(|pair| pair[0] <= pair[1]));
+            prop_assert!(out.iter().all(|x| (0.0..=1.0).contains(x)));
+            let total: f32 = weights.iter().sum();
+            for (i, &weight) in weights.iter().enumerate() {
+                let bins = weights.len() as f64;
+                let count = out.iter().filter(|x| (**x * bins) as usize == i).count() as f64 / n as f64;
+                let share = if total > 0.0 { 0.95 * f64::from(weight / total) + 0.05 / bins } else { 1.0 / bins };
+                prop_assert!((count - share).abs() < 3.0 / n as f64 + 1e-4, "bin {i}: {count} against {share}");
+            }
+        }
+
+        #[test]
+        fn importance_samples_are_sorted_and_cover_the_span(seed in 0u64..1000) {
+            let rays = rays(2);
+            let mut rng = Pcg64Mcg::seed_from_u64(seed);
+            let coarse = stratified(&rays, 6, &mut Jitter::Random(&mut rng), &Pool::new());
+            let weights: Vec<f64> = (0..12).map(|i| if i % 5 == 0 { 1.0 } else { 0.0 }).collect();
+            let fine = importance(&rays, &coarse, &weights, 9, 0.01, &mut Jitter::Random(&mut rng), &Pool::new());
+            for (ray, rows) in fine.segments.ranges().enumerate() {
+                let t = &fine.t.as_slice()[rows.clone()];
+                prop_assert!(t.windows(2).all(|pair| pair[0] <= pair[1]));
+                let [near, far] = rays.spans[ray];
+                prop_assert!(t[0] >= near && t[14] <= far);
+                prop_assert!((fine.delta.as_slice()[rows].iter().sum::<f64>() - (far - near)).abs() < 1e-9);
+            }
+        }
+    }
+}

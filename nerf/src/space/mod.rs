@@ -1,0 +1,7 @@
+//! The region of a scene: which parts of it hold something, and all of space in a ball.
+
+pub(crate) mod contraction;
+pub mod occupancy;
+pub(crate) mod silhouette;
+
+pub use contraction::{Contraction, contract};

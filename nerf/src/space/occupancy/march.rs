@@ -1,0 +1,253 @@
+//! Marching rays through the occupied cells of a grid.
+
+use super::OccupancyGrid;
+use crate::camera::rays::{Rays, Samples};
+use crate::random::Jitter;
+use raygrad_autograd::{Pool, Segments};
+use raygrad_tensor::simd;
+
+mod frame;
+mod spacing;
+#[cfg(test)]
+mod tests;
+
+use frame::{Frame, LatticeRay, Numbering};
+use spacing::{Cone, LANES, Spacing, Uniform};
+pub use spacing::{MAX_STEPS, Step};
+
+/// The samples that rays have in occupied cells, packed. Kept from call to call, so that nothing is allocated.
+#[derive(Debug, Clone, Default)]
+pub struct MarchBuffer {
+    /// Distances along the rays in scene units, those of all rays one after another, never falling within a ray.
+    pub t: Vec<f32>,
+    /// For each sample the length of the interval that it stands for, in scene units.
+    pub delta: Vec<f32>,
+    /// The samples of ray `r` are `offsets[r]..offsets[r + 1]`.
+    pub offsets: Vec<u32>,
+    /// How many samples there would be if every cell were occupied: what skipping is measured against.
+    pub steps: u64,
+    /// `growth[i] = ((1 + c)^i - 1) / c` for the cone `c` of the last call that had one.
+    growth: Vec<f32>,
+    cone: f32,
+}
+
+impl MarchBuffer {
+    /// The samples with positions and directions.
+    ///
+    /// # Panics
+    /// If these are not the rays that were marched.
+    pub fn samples(&self, rays: &Rays<f32>, pool: &Pool<f32>) -> Samples<f32> {
+        let copy = |values: &[f32]| pool.copy_of(&[values.len()], values);
+        Samples::new(rays, Segments::new(&self.offsets[..]), copy(&self.t), copy(&self.delta), pool)
+    }
+}
+
+impl OccupancyGrid {
+    /// The samples of rays that lie in occupied cells.
+    ///
+    /// A ray's samples lie `step` apart from where it enters the outermost box (or from the near end of its span, or 0)
+    /// up to where it leaves it (or the far end), as [`Step`] describes; the first after `jitter` of a step, drawn once
+    /// for each ray. Exactly those are returned that lie in occupied cells, up to the step's `max_samples` a ray. Sample
+    /// `i` is at the same distance whatever is occupied, and stands for the interval between `i` and `i + 1` whole steps
+    /// from the entry: the last one may stick out of the box, and with a random jitter the integral has no bias. A
+    /// sample that rounding puts outside of the box is dropped. A ray with a number that is not finite has no samples.
+    ///
+    /// # Panics
+    /// If the step is out of range, or there are 2^32 samples or more.
+    pub fn march(&self, rays: &Rays<f32>, step: &Step, jitter: &mut Jitter<'_>, out: &mut MarchBuffer) {
+        if let Err(error) = step.check() {
+            panic!("{error}");
+        }
+        let frame = Frame::new(&self.lattice);
+        out.steps = 0;
+        out.offsets.clear();
+        out.offsets.reserve(rays.len() + 1);
+        out.offsets.push(0);
+        if step.cone > 0.0 && step.cone != out.cone {
+            out.growth.clear();
+            out.cone = step.cone;
+        }
+        let mut found = Found { t: std::mem::take(&mut out.t), delta: std::mem::take(&mut out.delta), len: 0 };
+        // As long as each other, should the caller have changed one.
+        found.delta.resize(found.t.len(), 0.0);
+        simd::dispatch(
+            #[inline(always)]
+            || {
+                for i in 0..rays.len() {
+                    let jitter = jitter.draw() as f32;
+                    let ray = LatticeRay::new(rays.origins[i], rays.directions[i], rays.spans[i], &frame);
+                    if let Some(ray) = ray {
+                        let growth = &mut out.growth;
+                        out.steps += if frame.cascades > 1 {
+                            self.march_ray::<true>(&frame, &ray, step, jitter, growth, &mut found)
+                        } else {
+                            self.march_ray::<false>(&frame, &ray, step, jitter, growth, &mut found)
+                        };
+                    }
+                    // 2^32 samples are 16 GiB of distances.
+                    out.offsets.push(u32::try_from(found.len).unwrap_or_else(|_| panic!("2^32 samples or more")));
+                }
+            },
+        );
+        found.t.truncate(found.len);
+        if step.cone > 0.0 {
+            found.delta.truncate(found.len);
+        } else {
+            found.delta.clear();
+            found.delta.resize(found.len, step.length);
+        }
+        (out.t, out.delta) = (found.t, found.delta);
+    }
+
+    /// Adds one ray's samples and returns how many it would have if every cell were occupied.
+    #[inline(always)]
+    fn march_ray<const NESTED: bool>(
+        &self,
+        frame: &Frame,
+        ray: &LatticeRay,
+        step: &Step,
+        jitter: f32,
+        growth: &mut Vec<f32>,
+        found: &mut Found,
+    ) -> u64 {
+        if step.cone > 0.0 {
+            let spacing = Cone::new(step, ray.span, jitter, growth);
+            self.walk::<_, true, NESTED>(frame, ray, &spacing, step.max_samples, found)
+        } else {
+            let spacing = Uniform::new(step, ray.span, jitter);
+            self.walk::<_, false, NESTED>(frame, ray, &spacing, step.max_samples, found)
+        }
+    }
+
+    /// Leaps over empty blocks, and tests samples in groups from those on that are not empty.
+    #[inline(always)]
+    fn walk<S: Spacing, const DELTA: bool, const NESTED: bool>(
+        &self,
+        frame: &Frame,
+        ray: &LatticeRay,
+        spacing: &S,
+        max_samples: usize,
+        found: &mut Found,
+    ) -> u64 {
+        let (first, end) = inside(frame, ray, spacing);
+        let limit = found.len.saturating_add(max_samples);
+        let leaps = self.leaps.octant(ray.octant);
+        let numbering = Numbering::new(frame, ray.octant);
+        let mut i = first;
+        while i < end && found.len < limit {
+            let (cascade, block, _) = frame.locate::<NESTED>(ray.at(spacing.at(i)));
+            let leap = leaps[numbering.word(cascade, block)];
+            if leap == 0 {
+                let occupied = self.test::<NESTED>(frame, &numbering, ray, &spacing.group(i)) & first_lanes(end - i);
+                found.add::<_, DELTA>(spacing, i, occupied);
+                found.len = found.len.min(limit);
+                i += LANES;
+            } else {
+                let faces = block.map(
+                    #[inline(always)]
+                    |b| frame.face(cascade, b + i32::from(leap)),
+                );
+                i = first_beyond(ray, spacing, faces, i, end);
+            }
+        }
+        (end - first) as u64
+    }
+
+    /// Which of the samples at these distances lie in occupied cells, one bit for each; any, beyond the box.
+    #[inline(always)]
+    fn test<const NESTED: bool>(
+        &self,
+        frame: &Frame,
+        numbering: &Numbering,
+        ray: &LatticeRay,
+        t: &[f32; LANES],
+    ) -> u32 {
+        let (mut words, mut bits) = ([0; LANES], [0; LANES]);
+        for lane in 0..LANES {
+            let (cascade, block, cell) = frame.locate::<NESTED>(ray.at(t[lane]));
+            words[lane] = numbering.word(cascade, block) as u32;
+            bits[lane] = numbering.bit(cell);
+        }
+        let mut occupied = 0;
+        for lane in 0..LANES {
+            occupied |= ((self.words[words[lane] as usize] >> bits[lane]) as u32 & 1) << lane;
+        }
+        occupied
+    }
+}
+
+/// A bit for each of the first `count` lanes, or for all.
+#[inline(always)]
+fn first_lanes(count: usize) -> u32 {
+    (1 << count.min(LANES)) - 1
+}
+
+/// The first sample and the one after the last that are before `far` and in the box.
+#[inline(always)]
+fn inside<S: Spacing>(frame: &Frame, ray: &LatticeRay, spacing: &S) -> (usize, usize) {
+    let far = ray.span[1];
+    let mut end = spacing.steps_to(far);
+    while end > 0 && spacing.at(end - 1) >= far {
+        end -= 1;
+    }
+    while end < spacing.max_steps() && spacing.at(end) < far {
+        end += 1;
+    }
+    let mut first = 0;
+    while first < end && ray.at(spacing.at(first)).iter().any(|x| *x < 0.0) {
+        first += 1;
+    }
+    while end > first && ray.at(spacing.at(end - 1)).iter().any(|x| *x >= frame.size as f32) {
+        end -= 1;
+    }
+    (first, end)
+}
+
+/// The first sample after sample `i` that is beyond one of the upper `faces` of a box that holds sample `i`; at most
+/// `end`. In rare cases of rounding an earlier one, which is in the box too.
+#[inline(always)]
+fn first_beyond<S: Spacing>(ray: &LatticeRay, spacing: &S, faces: [f32; 3], i: usize, end: usize) -> usize {
+    let leave = ray.reaches(faces);
+    let mut next = (spacing.steps_to(leave[0].min(leave[1]).min(leave[2]))).clamp(i + 1, end);
+    // No coordinate falls along the ray: if the last sample before `next` is in the box, then all between are.
+    loop {
+        let last = ray.at(spacing.at(next - 1));
+        if next == i + 1 || last[0] < faces[0] && last[1] < faces[1] && last[2] < faces[2] {
+            return next;
+        }
+        next -= (next - i) / 2;
+    }
+}
+
+/// Samples so far: the first `len` elements, of more that are there to be overwritten.
+struct Found {
+    t: Vec<f32>,
+    delta: Vec<f32>,
+    len: usize,
+}
+
+impl Found {
+    /// Adds those of a group of samples that have their bit set.
+    #[inline(always)]
+    fn add<S: Spacing, const DELTA: bool>(&mut self, spacing: &S, group: usize, mut set: u32) {
+        if self.t.len() < self.len + 2 * LANES {
+            let room = 2 * self.len + 4 * LANES;
+            self.t.resize(room, 0.0);
+            if DELTA {
+                self.delta.resize(room, 0.0);
+            }
+        }
+        // Samples in a row, of which there are few in a group, are written as a whole group from the first one on: what
+        // follows them is overwritten by the next ones.
+        while set != 0 {
+            let (skipped, count) = (set.trailing_zeros(), (set >> set.trailing_zeros()).trailing_ones());
+            let first = group + skipped as usize;
+            self.t[self.len..][..LANES].copy_from_slice(&spacing.group(first));
+            if DELTA {
+                self.delta[self.len..][..LANES].copy_from_slice(&spacing.widths(first));
+            }
+            self.len += count as usize;
+            set &= !(((1 << count) - 1) << skipped);
+        }
+    }
+}

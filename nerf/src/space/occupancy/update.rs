@@ -1,0 +1,223 @@
+//! Looking at a field: a few cells at a time in training, all that matter before rendering.
+
+use super::carve::uncarved;
+use super::lattice::{CELLS, cell};
+use super::{OccupancyGrid, TASK, bits, exceeding};
+use crate::random::stream;
+use rand::RngExt;
+use rand_pcg::Pcg64Mcg;
+use raygrad_tensor::parallel;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// A field's density: writes that of each position (scene units) into the slot of the same number (1 / scene unit).
+/// It is called from several threads at a time, with [`POINTS`] positions or fewer that lie close together.
+pub type DensityFn<'a> = dyn Fn(&[[f32; 3]], &mut [f32]) + Sync + 'a;
+
+/// The most positions in one call of a [`DensityFn`].
+pub const POINTS: usize = 4096;
+/// Samples along each edge of a cell in [`OccupancyGrid::rebuild`].
+const REBUILD: usize = 2;
+
+/// Which cells an update looks at, and how.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Update {
+    /// Every cell is looked at once in so many updates, at least 1.
+    pub every: u32,
+    /// Every occupied cell is looked at once in so many updates, at least 1.
+    pub occupied_every: u32,
+    /// Samples along each edge of a cell, 1 to 4: 2 means 2 x 2 x 2 samples, one at a random place in each octant.
+    pub samples: u32,
+    /// What is left of a cell's old density when it is looked at, 0 to 1; the larger of that and the new is kept.
+    pub decay: f32,
+}
+
+impl Update {
+    /// All cells: the customary choice for the first 256 steps of training.
+    pub const ALL: Update = Update { every: 1, occupied_every: 1, samples: 1, decay: 0.95 };
+    /// Occupied cells and one in sixteen of the others, for later: as good as one in four, which is customary, on scenes
+    /// of solid objects, at half of the cost.
+    pub const PARTIAL: Update = Update { every: 16, ..Update::ALL };
+}
+
+/// Where the samples of a cell lie, as shares of its edges: in each of the boxes with these lower corners and of this
+/// size, at a random place; a size of 0 is a fixed place.
+struct Places {
+    corners: Vec<[f64; 3]>,
+    size: f64,
+}
+
+impl Places {
+    /// One in each of `n` x `n` x `n` parts.
+    fn random(n: usize) -> Self {
+        Places { corners: parts(n, 0.0), size: 1.0 / n as f64 }
+    }
+
+    /// The middle of each of `n` x `n` x `n` parts.
+    fn middles(n: usize) -> Self {
+        Places { corners: parts(n, 0.5), size: 0.0 }
+    }
+}
+
+/// The points `shift` behind the lower corners of `n` x `n` x `n` parts, in parts.
+fn parts(n: usize, shift: f64) -> Vec<[f64; 3]> {
+    (0..n * n * n).map(|i| [i % n, i / n % n, i / (n * n)].map(|k| (k as f64 + shift) / n as f64)).collect()
+}
+
+/// Positions that wait to be looked at, and the cells that they belong to.
+#[derive(Default)]
+struct Waiting {
+    cells: Vec<usize>,
+    points: Vec<[f32; 3]>,
+    densities: Vec<f32>,
+}
+
+impl Waiting {
+    /// Looks at what waits; `keep` makes a cell's density of its old one and the largest new one.
+    fn flush(&mut self, density: &DensityFn<'_>, samples: usize, out: &mut [f32], keep: impl Fn(f32, f32) -> f32) {
+        if self.points.is_empty() {
+            return;
+        }
+        self.densities.clear();
+        self.densities.resize(self.points.len(), f32::NAN);
+        density(&self.points, &mut self.densities);
+        for (&cell, found) in self.cells.iter().zip(self.densities.chunks_exact(samples)) {
+            out[cell] = keep(out[cell], found.iter().fold(f32::NEG_INFINITY, |a, &b| larger(a, b)));
+        }
+        self.cells.clear();
+        self.points.clear();
+    }
+}
+
+/// The larger of two densities; NaN if the field gave NaN, so that the cell stays occupied.
+fn larger(old: f32, new: f32) -> f32 {
+    if new <= old || old.is_nan() { old } else { new }
+}
+
+/// The cells of word `word` whose turn it is if every cell has one turn in `every` steps.
+fn turn(word: usize, step: u64, every: u32) -> u64 {
+    // Neighbouring words begin their rounds at unrelated cells (multiples of the golden ratio).
+    let start = (word as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
+    let every = u64::from(every.max(1));
+    let first = (start + step) % every;
+    (first..CELLS as u64).step_by(every as usize).fold(0, |cells, bit| cells | 1 << bit)
+}
+
+impl OccupancyGrid {
+    /// Looks at some cells and returns the number of densities that were asked for. What is occupied changes only with
+    /// the next [`threshold`](Self::threshold).
+    ///
+    /// `step` counts the updates: with it and `seed` the same cells and places are chosen at any number of threads.
+    /// Each density becomes `max(decay * old, largest new)`.
+    ///
+    /// # Panics
+    /// If a number of the plan is out of range.
+    pub fn update(&mut self, plan: &Update, seed: u64, step: u64, density: &DensityFn<'_>) -> u64 {
+        assert!(plan.every > 0 && plan.occupied_every > 0, "every cell has its turn: {plan:?}");
+        assert!((1..=4).contains(&plan.samples), "1 to 4 samples along each edge: {plan:?}");
+        assert!((0.0..=1.0).contains(&plan.decay), "a share is left: {plan:?}");
+        let words = std::mem::take(&mut self.words);
+        let chosen = |word: usize| turn(word, step, plan.every) | words[word] & turn(word, step, plan.occupied_every);
+        let rng = |task: usize| stream(seed, [step, task as u64]);
+        // The field's NaN replaces what was known.
+        let keep = |old: f32, new: f32| if new <= plan.decay * old { plan.decay * old } else { new };
+        let count = self.look(&Places::random(plan.samples as usize), chosen, rng, keep, density);
+        self.words = words;
+        count
+    }
+
+    /// Forgets what was known and finds out which cells a finished field occupies, for rendering. Returns the number of
+    /// densities that were asked for.
+    ///
+    /// Samples are the middles of the eight octants of each cell. First one of them is looked at in each cell, then all
+    /// eight in each empty cell that touches an occupied one, until none is left. So the occupied cells are those that
+    /// eight samples in every cell would find, except for groups of touching cells of which none shows in its first
+    /// sample. Whatever contains a box of one cell's size with more than `min_sigma` everywhere is not missed; of what
+    /// is found, each cell is that contains such a box of half that edge.
+    ///
+    /// With `dilate`, the 26 cells around each of them are occupied too.
+    pub fn rebuild(&mut self, min_sigma: f32, dilate: bool, density: &DensityFn<'_>) -> u64 {
+        let all = Places::middles(REBUILD);
+        let one = Places { corners: all.corners[..1].to_vec(), ..all };
+        // Fixed places draw nothing.
+        let rng = |_| stream(0, [0, 0]);
+        let mut count = self.look(&one, |_| u64::MAX, rng, |_, new| new, density);
+        let mut occupied = self.exceeding(min_sigma);
+        let mut seen = occupied.clone();
+        loop {
+            let mut front = occupied.clone();
+            bits::dilate(&mut front, &self.lattice);
+            for (i, (front, seen)) in front.iter_mut().zip(&mut seen).enumerate() {
+                *front = if self.lattice.is_used(i) { *front & !*seen } else { 0 };
+                *seen |= *front;
+            }
+            if front.iter().all(|word| *word == 0) {
+                break;
+            }
+            count += self.look(&all, |word| front[word], rng, larger, density);
+            for (word, densities) in self.densities.chunks_exact(CELLS).enumerate().filter(|(i, _)| front[*i] != 0) {
+                occupied[word] |= exceeding(densities, min_sigma) & front[word];
+            }
+        }
+        self.occupy(occupied, dilate);
+        count
+    }
+
+    /// Looks at the occupied cells of a finished field, at the middles of their eight octants, and empties those where
+    /// none has more than `min_sigma`. Returns the number of densities that were asked for.
+    pub fn prune(&mut self, min_sigma: f32, density: &DensityFn<'_>) -> u64 {
+        let mut occupied = self.words.clone();
+        let rng = |_| stream(0, [0, 0]);
+        let count = self.look(&Places::middles(REBUILD), |word| occupied[word], rng, |_, new| new, density);
+        for (word, exceeding) in occupied.iter_mut().zip(self.exceeding(min_sigma)) {
+            *word &= exceeding;
+        }
+        self.occupy(occupied, false);
+        count
+    }
+
+    /// Looks at the chosen cells of each word.
+    fn look(
+        &mut self,
+        places: &Places,
+        chosen: impl Fn(usize) -> u64 + Sync,
+        rng: impl Fn(usize) -> Pcg64Mcg + Sync,
+        keep: impl Fn(f32, f32) -> f32 + Sync,
+        density: &DensityFn<'_>,
+    ) -> u64 {
+        let lattice = &self.lattice;
+        let samples = places.corners.len();
+        let look = |waiting: &mut Waiting, (task, densities): (usize, &mut [f32])| {
+            let mut rng = rng(task);
+            let mut count = 0;
+            for word in 0..densities.len() / CELLS {
+                let mut cells = if lattice.is_used(task * TASK + word) { chosen(task * TASK + word) } else { 0 };
+                if cells != 0 {
+                    cells &= uncarved(&densities[word * CELLS..(word + 1) * CELLS]);
+                }
+                let [corner, size] = lattice.block(task * TASK + word).map(|x| x.to_array());
+                count += samples * cells.count_ones() as usize;
+                while cells != 0 {
+                    let bit = cells.trailing_zeros() as usize;
+                    cells &= cells - 1;
+                    if waiting.points.len() + samples > POINTS {
+                        waiting.flush(density, samples, densities, &keep);
+                    }
+                    waiting.cells.push(word * CELLS + bit);
+                    let cell = cell(bit);
+                    for part in &places.corners {
+                        waiting.points.push(std::array::from_fn(|axis| {
+                            let inside = if places.size > 0.0 { places.size * rng.random::<f64>() } else { 0.0 };
+                            (corner[axis] + size[axis] * (cell[axis] as f64 + part[axis] + inside)) as f32
+                        }));
+                    }
+                }
+            }
+            waiting.flush(density, samples, densities, &keep);
+            count as u64
+        };
+        let tasks = self.densities.par_chunks_mut(CELLS * TASK).enumerate();
+        tasks.map_init(Waiting::default, |waiting, task| parallel::serial(|| look(waiting, task))).sum()
+    }
+}

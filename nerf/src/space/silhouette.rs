@@ -1,0 +1,126 @@
+//! Carving with silhouettes: where a photograph is fully transparent, nothing lies between its camera and infinity.
+
+use crate::camera::pinhole::Camera;
+use crate::dataset::Dataset;
+use crate::dataset::image::Image;
+use crate::space::occupancy::OccupancyGrid;
+use glam::{DAffine3, DVec3};
+
+/// Pixels around a place that must be transparent too: the footprint of the filter that the photograph was made with.
+const MARGIN: f64 = 1.5;
+
+/// Where one photograph shows something.
+struct Silhouette<'a> {
+    camera: &'a Camera,
+    world_to_camera: DAffine3,
+    /// For each corner between pixels, row by row, how many pixels above it and to its left are not fully transparent.
+    sums: Vec<u32>,
+}
+
+impl<'a> Silhouette<'a> {
+    /// `None` if the image has no transparency.
+    fn new(camera: &'a Camera, image: &Image) -> Option<Self> {
+        if image.channels != 4 {
+            return None;
+        }
+        let stride = image.width + 1;
+        let mut sums = vec![0; stride * (image.height + 1)];
+        for y in 0..image.height {
+            let mut row = 0;
+            for x in 0..image.width {
+                row += u32::from(image.pixel(x, y)[3] > 0.0);
+                sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row;
+            }
+        }
+        Some(Silhouette { camera, world_to_camera: camera.pose.inverse(), sums })
+    }
+
+    /// Whether all of a ball is in the picture and every pixel that it could be seen in is fully transparent.
+    fn is_clear(&self, centre: DVec3, radius: f64) -> bool {
+        let local = self.world_to_camera.transform_point3(centre);
+        let depth = -local.z;
+        if depth <= 1.01 * radius {
+            return false;
+        }
+        let mut window = [[0; 2]; 2];
+        let sizes = [self.camera.width, self.camera.height];
+        for (axis, tangent) in [local.x / depth, -local.y / depth].into_iter().enumerate() {
+            // |(x + dx) / (z + dz) - x / z| = |dx - (x / z) dz| / (z + dz) for a point of the ball.
+            let reach = radius * (1.0 + tangent.abs()) / (depth - radius);
+            let [low, high] = [tangent - reach, tangent + reach];
+            let place = |tangent: f64| self.camera.centre[axis] + self.camera.focal[axis] * tangent;
+            let (low, high) = ((place(low) - MARGIN).floor(), (place(high) + MARGIN).ceil());
+            if !(low >= 0.0 && high <= sizes[axis] as f64) {
+                return false;
+            }
+            window[axis] = [low as usize, high as usize];
+        }
+        let [[left, right], [top, bottom]] = window;
+        let at = |x: usize, y: usize| self.sums[y * (self.camera.width + 1) + x];
+        at(right, bottom) + at(left, top) == at(left, bottom) + at(right, top)
+    }
+}
+
+/// Empties for good the cells of a grid that some photograph of the dataset sees through. What is left is the visual hull
+/// (Laurentini 1994). Photographs without transparency say nothing.
+pub(crate) fn carve(grid: &mut OccupancyGrid, data: &Dataset) {
+    for frame in &data.frames {
+        if let Some(silhouette) = Silhouette::new(&frame.camera, &frame.image) {
+            grid.carve(&|centre, radius| silhouette.is_clear(centre, radius));
+        }
+    }
+    grid.occupy_all_but_carved();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::space::occupancy::OccupancyConfig;
+
+    /// Looks along -z at a picture whose middle third is opaque.
+    fn view(eye: DVec3, up: DVec3) -> (Camera, Image) {
+        let mut image = Image::new(60, 60, 4);
+        for y in 20..40 {
+            for x in 20..40 {
+                image.pixel_mut(x, y)[3] = 0.01;
+            }
+        }
+        (Camera::from_angle(60, 60, 0.5, Camera::look_at(eye, DVec3::ZERO, up)), image)
+    }
+
+    #[test]
+    fn a_ball_is_clear_only_where_every_pixel_that_could_show_it_is() {
+        let (camera, image) = view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y);
+        let silhouette = Silhouette::new(&camera, &image).unwrap();
+        // At distance 10 the picture is 5.1 wide, a pixel .085.
+        assert!(!silhouette.is_clear(DVec3::ZERO, 0.01), "in the middle");
+        assert!(silhouette.is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
+        assert!(!silhouette.is_clear(DVec3::new(1.7, 0.0, 0.0), 0.9), "reaches into the silhouette");
+        assert!(!silhouette.is_clear(DVec3::new(0.0, 2.5, 0.0), 0.3), "reaches out of the picture");
+        assert!(!silhouette.is_clear(DVec3::new(0.0, 0.0, 12.0), 0.3), "behind the camera");
+        assert!(!silhouette.is_clear(DVec3::new(1.0, 0.0, 9.9), 0.3), "around the camera");
+        let (right, up) = (DVec3::new(1.0, 0.0, 0.0), DVec3::new(0.0, 1.0, 0.0));
+        assert!(
+            silhouette.is_clear(1.1 * right + 1.1 * up, 0.02) && !silhouette.is_clear(0.8 * right + 0.8 * up, 0.02)
+        );
+        assert!(Silhouette::new(&camera, &Image::new(60, 60, 3)).is_none());
+    }
+
+    #[test]
+    fn two_views_leave_the_box_that_both_see() {
+        let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
+        let mut grid =
+            OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
+        for (camera, image) in &views {
+            let silhouette = Silhouette::new(camera, image).unwrap();
+            grid.carve(&|centre, radius| silhouette.is_clear(centre, radius));
+        }
+        grid.occupy_all_but_carved();
+        let [low, high] = grid.occupied_bounds().unwrap();
+        // A third of 5.1, seen in perspective, with two pixels and a cell of margin.
+        assert!(low.max_element() < -0.85 && low.min_element() > -1.35, "{low}");
+        assert!(high.min_element() > 0.85 && high.max_element() < 1.35, "{high}");
+        let share = grid.occupied_share();
+        assert!((0.2..0.4).contains(&share), "{share}");
+    }
+}

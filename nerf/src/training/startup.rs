@@ -1,0 +1,56 @@
+//! The start-up detector: a network can begin, or soon end, without density anywhere, and then never learns.
+
+use crate::Result;
+use crate::field::Field;
+use crate::model::config::Config;
+use crate::model::{Extent, Model};
+use crate::random::stream;
+use rand::RngExt;
+use raygrad_autograd::{Scalar, Tape, Tensor, Var};
+use raygrad_nn::Bound;
+
+/// Points at which a new field is probed.
+const PROBES: usize = 512;
+/// Share of the points that must have a density gradient.
+const ALIVE: f64 = 0.01;
+/// Seeds to try before the last one is taken as it is.
+const ATTEMPTS: u32 = 32;
+/// Steps of a model after which its opacity is judged, and until which it may end a run.
+const JUDGED: std::ops::Range<u64> = 100..1000;
+/// Collapses that end a run: a scene that is empty in truth must not restart for ever.
+const COLLAPSES: u32 = 3;
+
+/// The first of the models with seeds `seed`, `seed + 1`, .. whose fields have a gradient to learn from, and how many
+/// were passed over.
+pub(crate) fn living_model(config: &Config, extent: Extent, seed: u64) -> Result<(Model<f32>, u32)> {
+    let mut attempt = 0;
+    loop {
+        let model = Model::new(config.clone(), extent, seed.wrapping_add(attempt.into()))?;
+        let alive = model.fields().iter().all(|field| alive_share(&model, *field) > ALIVE);
+        if alive || attempt + 1 == ATTEMPTS {
+            return Ok((model, attempt));
+        }
+        attempt += 1;
+    }
+}
+
+/// The share of random points in the box where the density has a gradient with respect to the network's output.
+fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
+    let mut rng = stream(0, [0, 0]);
+    let [low, high] = model.extent.bounds.map(|corner| corner.to_array());
+    let at = |i: usize, u: f64| (low[i % 3] + u * (high[i % 3] - low[i % 3])) as f32;
+    let points = Tensor::from_fn(&[PROBES, 3], |i| at(i, rng.random()));
+    let tape = Tape::new();
+    let params: Bound<'_, f32> = model.params.bind_constant(&tape);
+    let positions: Var<'_, f32> = tape.leaf(points);
+    let density = field.density(&params, &field.encode(&params, &positions)).sigma();
+    let slopes = density.sum().grad(&[&positions]);
+    let moved = slopes[0].as_slice().chunks_exact(3).filter(|slope| slope.iter().any(|x| *x != f32::ZERO)).count();
+    moved as f64 / PROBES as f64
+}
+
+/// Whether a model in its first steps shows nothing at all: the collapse to an all-background image. `steps` is how many
+/// it has taken, and `collapses` how many models of the run have collapsed before it.
+pub(crate) fn has_collapsed(steps: u64, opacity: f64, collapses: u32) -> bool {
+    JUDGED.contains(&steps) && opacity < 1e-3 && collapses < COLLAPSES
+}
