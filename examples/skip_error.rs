@@ -12,7 +12,7 @@
 use raygrad::nerf::dataset::{Split, load_views};
 use raygrad::nerf::pictures::metrics::psnr;
 use raygrad::nerf::space::occupancy::{OccupancyGrid, Skip};
-use raygrad::nerf::{Camera, Config, Evaluations, Extent, Image, Model, Sampler};
+use raygrad::nerf::{Camera, Config, Evaluations, Extent, Image, Model};
 use serde_json::Value;
 use std::error::Error;
 use std::path::Path;
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let (images, counts, seconds) = render(&model, &cameras);
         row(&skip.to_string(), &images, counts, seconds);
     }
-    if let Sampler::Marching(marching) = &mut model.sampler {
+    if let Some(marching) = model.marching_mut() {
         marching.grid = OccupancyGrid::new(extent.bounds, &marching.config.occupancy)?;
     }
     model.set_skip(Skip::Off);

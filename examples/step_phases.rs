@@ -13,18 +13,18 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::Jitter;
 use raygrad::nerf::dataset::{Dataset, Split, load};
-use raygrad::nerf::encoding::hash_grid::{HashGrad, HashGrid, TableOptimizer};
-use raygrad::nerf::space::occupancy::MarchBuffer;
-use raygrad::nerf::volume::visible::composite_visible;
-use raygrad::nerf::{Config, Extent, FieldConfig, InstantConfig, Model, Rays, Sampler, clip_span};
+use raygrad::nerf::encoding::hash_grid::HashGrid;
+use raygrad::nerf::space::occupancy::Step;
+use raygrad::nerf::{Config, Extent, Instant, InstantConfig, Model, Query, Rays};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::simd;
-use raygrad::{Pool, Tape, Tensor};
+use raygrad::{Adam, Optimizer, Params, Pool, Tape, Tensor};
 use serde_json::Value;
+use std::any::Any;
 use std::error::Error;
 use std::hint::black_box;
 use std::path::Path;
-use std::time::Instant;
+use std::time;
 
 /// Times that each phase is run; the least counts.
 const RUNS: usize = 20;
@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 /// The least time of several runs, in seconds.
 fn least(mut f: impl FnMut()) -> f64 {
     let time = |_| {
-        let start = Instant::now();
+        let start = time::Instant::now();
         f();
         start.elapsed().as_secs_f64()
     };
@@ -86,8 +86,7 @@ fn batch(model: &Model<f32>, data: &Dataset, count: usize) -> (Rays<f32>, Vec<f3
     for _ in 0..count {
         let frame = &data.frames[rng.random_range(0..data.frames.len())];
         let (x, y) = (rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height));
-        let ray = frame.camera.pixel_ray(x, y);
-        rays.push(&ray, clip_span(&ray, model.extent.bounds, model.extent.span));
+        rays.push_pixel(&frame.camera, [x, y], model.extent.bounds, model.extent.span);
         target.extend_from_slice(&frame.image.pixel(x, y)[..3]);
     }
     (rays, target)
@@ -103,20 +102,24 @@ fn network(config: &InstantConfig, grid: &HashGrid) -> [f64; 2] {
 }
 
 fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
-    let (Sampler::Marching(sampler), FieldConfig::Instant(config)) = (&model.sampler, &model.config.field) else {
+    let (Some(sampler), Some(config)) = (model.marching(), model.config.field.get::<InstantConfig>()) else {
         return Err("step_phases looks at instant models".into());
     };
-    let (id, grid) = model.field.table().ok_or("a field without a table")?;
-    let (grid, field) = (grid.clone(), &*model.field);
+    let any: &dyn Any = &*model.field;
+    let table = any.downcast_ref::<Instant>().ok_or("a field that is not instant")?.grid();
+    let (id, grid, field) = (table.table(), table.grid(), &*model.field);
     // A tile is an eighth of a step.
     let wanted = sampler.config.samples / 8;
     let (probe, _) = batch(model, data, 256);
-    let (mut buffer, pool) = (MarchBuffer::default(), Pool::new());
-    let jitter = || StdRng::seed_from_u64(3);
-    let each = sampler.samples(&probe, &mut Jitter::Random(&mut jitter()), &mut buffer, &pool).len() as f64 / 256.0;
+    let (step, pool) = (Step::uniform(sampler.step()), Pool::new());
+    let marched = |rays: &Rays<f32>| {
+        let mut random = StdRng::seed_from_u64(3);
+        sampler.march(&sampler.grid, rays, &step, &mut Jitter::Random(&mut random), &pool).0
+    };
+    let each = marched(&probe).len() as f64 / 256.0;
     let (rays, target) = batch(model, data, (wanted as f64 / each.max(0.5)) as usize);
-    let march = least(|| drop(sampler.samples(&rays, &mut Jitter::Random(&mut jitter()), &mut buffer, &pool)));
-    let samples = sampler.samples(&rays, &mut Jitter::Random(&mut jitter()), &mut buffer, &pool);
+    let march = least(|| drop(marched(&rays)));
+    let samples = marched(&rays);
 
     let mut tape = Tape::new();
     let target = Tensor::from_vec(&[rays.len(), 3], target);
@@ -125,43 +128,46 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
     let (mut asked, mut kept, mut grad) = (0, 0, None);
     for _ in 0..RUNS {
         let params = model.params.bind(&tape);
-        let start = Instant::now();
-        let marched = composite_visible(field, &params, &samples, sampler.config.termination, false, &tape);
-        let loss = model.config.loss.sum(&marched.rendered, &target, &white);
+        let start = time::Instant::now();
+        let query = Query::new(field, &params);
+        let lit = sampler.config.quadrature.render(&query, &samples, sampler.config.termination);
+        let loss = model.config.loss.sum(&lit.rendered.over(&white), &target);
         let middle = start.elapsed().as_secs_f64();
         let given = loss.backward(&params.vars());
         whole = whole.min(start.elapsed().as_secs_f64());
         forward = forward.min(middle);
-        (asked, kept) = (marched.evaluated, marched.kept);
+        (asked, kept) = (lit.asked, lit.kept);
         grad = given.into_iter().find(|grad| !grad.is_dense());
-        drop((marched, loss, params));
+        drop((lit, loss, params));
         tape.clear();
     }
-    let parts = grad.ok_or("no gradient of the table")?.take::<HashGrad<f32>>();
+    let grad = grad.ok_or("no gradient of the table")?;
 
     // The densities that decide which samples light reaches, phase by phase.
-    let positions = Tensor::from_vec(&[asked, 3], samples.positions.as_slice()[..3 * asked].to_vec());
+    let positions = Tensor::from_vec(&[asked, 3], samples.positions(&pool).as_slice()[..3 * asked].to_vec());
     let (mut encode, mut density) = (f64::INFINITY, f64::INFINITY);
     for _ in 0..RUNS {
         let params = model.params.bind_constant(&tape);
         let x = tape.constant(positions.clone());
-        let start = Instant::now();
-        let encoding = field.encode(&params, &x);
-        encode = encode.min(start.elapsed().as_secs_f64());
-        let start = Instant::now();
-        drop(field.density(&params, &encoding));
-        density = density.min(start.elapsed().as_secs_f64());
-        drop((encoding, x, params));
+        let start = time::Instant::now();
+        drop(table.encode(&params, &x));
+        let looked_up = start.elapsed().as_secs_f64();
+        drop(field.density(&params, &x));
+        encode = encode.min(looked_up);
+        density = density.min(start.elapsed().as_secs_f64() - 2.0 * looked_up);
+        drop((x, params));
         tape.clear();
     }
-    let mut table = model.params.get(id).clone();
-    let mut optimizer = TableOptimizer::new(grid.clone(), model.config.table_adam);
-    let mut moved = 0;
-    let update = least(|| moved = optimizer.step(&mut table, &parts, None, 1e-3).touched);
+    let mut alone = Params::new();
+    alone.add("table", model.params.get(id).clone());
+    alone.set_lazy(|_| true, true);
+    let (mut adam, mut moved) = (Adam::new(model.config.table_adam), 0);
+    let update = least(|| moved = adam.update(&mut alone, std::slice::from_ref(&grad), 1e-3).moved / grid.features());
+    let size = 4 * model.params.get(id).len();
 
-    let (matrix, line) = (matrix_rate(), line_rate(4 * table.len()));
-    let lines_of_state = line_rate(4 * 4 * table.len());
-    let [density_work, color_work] = network(config, &grid).map(|work| 2.0 * work);
+    let (matrix, line) = (matrix_rate(), line_rate(size));
+    let lines_of_state = line_rate(4 * size);
+    let [density_work, color_work] = network(config, grid).map(|work| 2.0 * work);
     let lookups = (asked * grid.levels().len() * 8) as f64;
     println!(
         "a tile of {} rays: {} samples marched, {asked} asked for a density, {kept} lit",

@@ -15,7 +15,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::dataset::scene::{Scene, train_cameras};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result};
+use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result, Seen, Site, Space};
 use raygrad::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
 use std::path::PathBuf;
 
@@ -58,10 +58,11 @@ fn look<'t>(
         let values = at.iter().flat_map(|pair| f(pair).as_vec3().to_array()).collect();
         tape.constant(Tensor::from_vec(&[at.len(), 3], values))
     };
-    let density = field.density(params, &field.encode(params, &rows(&|pair| pair[0])));
-    let directions = rows(&|pair| if seen { -pair[1] } else { DVec3::NEG_Z });
+    let density = field.density(params, &rows(&|pair| pair[0]));
+    let directions = &rows(&|pair| if seen { -pair[1] } else { DVec3::NEG_Z });
     // A ray for each point, with the point as its only sample.
-    field.color(params, &density.features, &directions, &Segments::uniform(at.len(), 1))
+    let segments = &Segments::uniform(at.len(), 1);
+    field.color(params, &density.features, &Seen { directions, segments, frames: None })
 }
 
 /// Teaches a field the colours of the surface.
@@ -69,7 +70,10 @@ fn learn(scene: &Scene, sights: &[Sight], seen: bool) -> Result<(Classic, Params
     let mut rng = StdRng::seed_from_u64(0);
     let mut params = Params::new();
     let config = ClassicConfig { depth: 4, width: 96, skips: vec![], view_width: 64, ..ClassicConfig::paper() };
-    let field = Classic::new(&config, scene.bounds(), &mut params, "field", &mut rng)?;
+    let field = {
+        let space = Space::within(scene.bounds());
+        Classic::new(&config, Site { space, params: &mut params, name: "field", rng: &mut rng })?
+    };
     let mut adam = Adam::new(AdamConfig::default());
     let schedule = Schedule::Exponential { from: 3e-3, to: 1e-4, warmup: 0.02 };
     for step in 0..STEPS {

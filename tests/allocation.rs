@@ -3,7 +3,8 @@
 //! The test has a binary of its own, because it counts what the whole process allocates.
 
 use raygrad::nerf::dataset::{Split, embedded};
-use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, SamplerConfig, Trainer};
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
+use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, Trainer};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -56,16 +57,16 @@ fn a_step_allocates_nothing_of_tensor_size() {
     let data = Arc::new(embedded(Split::Val, 32));
     let mut small = Config::preset(Preset::Small);
     let quarter = ClassicConfig { width: 64, view_width: 32, ..ClassicConfig::paper() };
-    let mut classic = Config { field: FieldConfig::Classic(quarter.clone()), ..Config::preset(Preset::Classic) };
+    let mut classic = Config { field: FieldConfig::new(quarter.clone()), ..Config::preset(Preset::Classic) };
     for config in [&mut small, &mut classic] {
-        let SamplerConfig::Hierarchical(sampler) = &mut config.sampler else { panic!("not hierarchical") };
+        let Some(sampler) = config.sampler.get_mut::<HierarchicalConfig>() else { panic!("not hierarchical") };
         sampler.batch = BATCH;
     }
-    if let SamplerConfig::Hierarchical(sampler) = &mut classic.sampler {
+    if let Some(sampler) = classic.sampler.get_mut::<HierarchicalConfig>() {
         sampler.proposal = quarter;
     }
     for (name, config) in [("small", small), ("classic at a quarter of its width", classic)] {
-        let SamplerConfig::Hierarchical(sampler) = &config.sampler else { panic!("not hierarchical") };
+        let Some(sampler) = config.sampler.get::<HierarchicalConfig>() else { panic!("not hierarchical") };
         assert!(4 * sampler.tile * sampler.coarse >= SIZE, "{name}");
         for threads in [1, 2] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

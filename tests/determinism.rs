@@ -3,7 +3,10 @@
 use raygrad::nerf::dataset::{Dataset, Split, embedded};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
-use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, SamplerConfig, StepStats, Trainer, VoxelConfig};
+use raygrad::nerf::sampling::marching::MarchingConfig;
+use raygrad::nerf::{
+    ClassicConfig, Config, FieldConfig, InstantConfig, Preset, SamplerConfig, StepStats, Trainer, VoxelConfig,
+};
 use std::sync::Arc;
 
 /// Small networks, with more tiles than there are slots that sum gradients, and a last tile that is not full.
@@ -17,17 +20,17 @@ fn config(seed: u64) -> Config {
         tile: 4,
         ..HierarchicalConfig::default()
     };
-    let (field, sampler) = (FieldConfig::Classic(field), SamplerConfig::Hierarchical(sampler));
+    let (field, sampler) = (FieldConfig::new(field), SamplerConfig::new(sampler));
     Config { field, sampler, seed, ..Config::preset(Preset::Small) }
 }
 
 /// A hash grid small enough to be hashed, marched.
 fn instant(seed: u64) -> Config {
     let mut config = Config { seed, ..Config::preset(Preset::Instant) };
-    if let FieldConfig::Instant(field) = &mut config.field {
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 3, log2_table: 10, finest: 64, ..field.grid };
     }
-    if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         sampler.samples = 4096;
         sampler.occupancy.resolution = 32;
     }
@@ -36,7 +39,7 @@ fn instant(seed: u64) -> Config {
 
 /// A grid of voxels with enough rows for several tasks of the optimiser, marched.
 fn voxel(seed: u64) -> Config {
-    let field = FieldConfig::Voxel(VoxelConfig { resolution: 48, direction_degree: 2 });
+    let field = FieldConfig::new(VoxelConfig { resolution: 48, direction_degree: 2 });
     Config { field, sampler: instant(seed).sampler, seed, ..Config::preset(Preset::Voxel) }
 }
 
@@ -54,7 +57,7 @@ fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: Option<usiz
     let run = || {
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
         let done: Vec<StepStats> = (0..steps).map(|step| trainer.step(f64::from(step) / f64::from(steps))).collect();
-        trainer.model.finish_grid();
+        trainer.model.finish();
         let view = trainer.model.view(&data.frames[0].camera, [1.0; 3]);
         Outcome {
             params: trainer.model.params.values().iter().flat_map(|x| bits(x.as_slice())).collect(),

@@ -7,9 +7,11 @@ use raygrad::nerf::Jitter;
 use raygrad::nerf::dataset::scene::{Scene, train_cameras};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
+use raygrad::nerf::sampling::marching::MarchingConfig;
+use raygrad::nerf::volume::Weights;
 use raygrad::nerf::{
-    ClassicConfig, Composite, Config, Extent, FieldConfig, Loss as LossKind, Model, PositionalEncoding, Preset, Rays,
-    SamplerConfig, Samples, VoxelConfig, catalogue, clip_span,
+    ClassicConfig, Config, Extent, FieldConfig, InstantConfig, Loss as LossKind, Model, PositionalEncoding, Preset,
+    Rays, SamplerConfig, Samples, VoxelConfig, catalogue, clip_span,
 };
 use raygrad::{Activation, Bound, Op, Real, Scalar, Segments, Tape, Tensor, Var};
 use std::collections::BTreeSet;
@@ -41,7 +43,7 @@ fn no_operation_of_nerf_is_missing() {
     let known: BTreeSet<_> = catalogue().iter().map(|entry| entry.name.to_string()).collect();
     let mut written = BTreeSet::new();
     operations_in(&Path::new(env!("CARGO_MANIFEST_DIR")).join("nerf/src"), &mut written);
-    assert!(written.contains("composite") && written.contains("positional_encoding"), "found only {written:?}");
+    assert!(written.contains("weights") && written.contains("positional_encoding"), "found only {written:?}");
     assert_eq!(written, known, "operations in the sources and in the catalogue");
 }
 
@@ -59,7 +61,7 @@ impl Loss<f32> {
         // A cube of +-1: positions then need no scaling, and both precisions encode the very same numbers. The highest
         // frequency would amplify the rounding of a scaled position 1600 times.
         let [low, high] = Scene::bulldozer().bounds().map(|corner| corner.signum());
-        let extent = Extent { bounds: [low, high], span: [2.0, 6.0] };
+        let extent = Extent::new([low, high], [2.0, 6.0]);
         let mut rng = StdRng::seed_from_u64(seed);
         let mut batch = Rays::new();
         let cameras = train_cameras(5, 16);
@@ -69,7 +71,15 @@ impl Loss<f32> {
             batch.push(&ray, clip_span(&ray, extent.bounds, extent.span));
         }
         let model = Model::new(config, extent, seed).unwrap();
-        let samples = model.samples(&batch, &mut Jitter::Random(&mut rng));
+        // So many binary digits that positions are the same in both precisions.
+        let short = |x: &Tensor<f32>| Tensor::from_fn(x.shape(), |i| (x.as_slice()[i] * 512.0).round() / 512.0);
+        let shorten = |samples: Samples<f32>| Samples {
+            origins: short(&samples.origins),
+            directions: short(&samples.directions),
+            t: short(&samples.t),
+            ..samples
+        };
+        let samples = model.samples(&batch, &mut Jitter::Random(&mut rng)).into_iter().map(shorten).collect();
         let mut colors = || Tensor::from_fn(&[rays, 3], |_| rng.random());
         Loss { target: colors(), background: colors(), samples, model }
     }
@@ -78,14 +88,7 @@ impl Loss<f32> {
     fn double(&self) -> Loss<f64> {
         let mut model = Model::new(self.model.config.clone(), self.model.extent, 0).unwrap();
         model.params.assign(&self.model.params);
-        let cast = |samples: &Samples<f32>| Samples {
-            positions: samples.positions.cast(),
-            directions: samples.directions.cast(),
-            t: samples.t.cast(),
-            delta: samples.delta.cast(),
-            segments: samples.segments.clone(),
-        };
-        let samples = self.samples.iter().map(cast).collect();
+        let samples = self.samples.iter().map(Samples::cast).collect();
         Loss { model, samples, target: self.target.cast(), background: self.background.cast() }
     }
 }
@@ -129,7 +132,7 @@ fn tiny() -> Config {
 /// A field that is also its own proposal, with few samples.
 fn hierarchical(field: ClassicConfig, coarse: usize, fine: usize) -> Config {
     let sampler = HierarchicalConfig { proposal: field.clone(), coarse, fine, ..HierarchicalConfig::default() };
-    let (field, sampler) = (FieldConfig::Classic(field), SamplerConfig::Hierarchical(sampler));
+    let (field, sampler) = (FieldConfig::new(field), SamplerConfig::new(sampler));
     Config { field, sampler, ..Config::preset(Preset::Classic) }
 }
 
@@ -148,16 +151,16 @@ fn the_training_loss_has_the_first_and_second_derivatives_that_differences_show(
 #[test]
 fn so_has_the_loss_of_the_instant_field() {
     let mut config = Config::preset(Preset::Instant);
-    if let FieldConfig::Instant(field) = &mut config.field {
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 2, features: 2, log2_table: 6, coarsest: 3, finest: 8 };
         (field.density_width, field.features, field.color_width, field.direction_degree) = (6, 4, 5, 2);
     }
-    if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         sampler.step = 0.1;
     }
     let mut loss = Loss::new(config, 3, 1).double();
     // Features of the size that training gives them, so that every gradient is well above rounding.
-    let (table, _) = loss.model.field.table().unwrap();
+    let table = loss.model.params.find("field.table").unwrap();
     loss.model.params.get_mut(table).as_mut_slice().iter_mut().for_each(|x| *x *= 1e4);
     let check = Check { step: 1e-6, tolerance: 1e-8, ..Check::default() };
     let report = check_function(&check, loss.model.params.values(), |vars| loss.at_vars(vars));
@@ -169,13 +172,13 @@ fn so_has_the_loss_of_the_instant_field() {
 fn so_has_the_loss_of_the_voxel_field() {
     for loss in [LossKind::Mse, LossKind::Huber { delta: 0.2 }] {
         let mut config = Config { loss, ..Config::preset(Preset::Voxel) };
-        config.field = FieldConfig::Voxel(VoxelConfig { resolution: 3, direction_degree: 2 });
-        if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+        config.field = FieldConfig::new(VoxelConfig { resolution: 3, direction_degree: 2 });
+        if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
             sampler.step = 0.1;
         }
         let mut loss = Loss::new(config, 3, 1).double();
         // Coefficients of the size that training gives them.
-        let (table, _) = loss.model.field.table().unwrap();
+        let table = loss.model.params.find("field.table").unwrap();
         loss.model.params.get_mut(table).as_mut_slice().iter_mut().for_each(|x| *x *= 1e4);
         let check = Check { step: 1e-5, tolerance: 1e-8, ..Check::default() };
         let params = loss.model.params.values();
@@ -286,16 +289,15 @@ fn fused_operations_agree<T: Scalar>(tolerance: f64) {
         Tensor::from_fn(shape, |_| f64::from(rng.random_range(from..to) as f32))
     };
     let segments = Segments::new([0, 40, 40, 41, 150]);
-    let delta = random(&[150], 0.0, 0.3).cast::<T>();
-    let composite = || Composite::new(delta.clone(), segments.clone());
+    let weights = || Weights::new(segments.clone());
     let encoding = PositionalEncoding { levels: 10, input: true };
     let cases = [
         (
-            "composite",
+            "weights",
             both_routes::<T>(
-                &[random(&[150], 0.0, 5.0), random(&[150, 4], 0.0, 1.0)],
-                |x| x[0].tape().apply(composite(), &[&x[0], &x[1]]),
-                |x| composite().reference(x).unwrap(),
+                &[random(&[150], 0.0, 1.0)],
+                |x| x[0].tape().apply(weights(), &[&x[0]]),
+                |x| weights().reference(x).unwrap(),
             ),
         ),
         (

@@ -4,9 +4,10 @@ use raygrad::nerf::dataset::{Dataset, Split, embedded, load};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::pictures::metrics;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
+use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{
-    Budget, ClassicConfig, Config, FieldConfig, Image, Loss, Preset, SamplerConfig, Trainer, VoxelConfig,
+    Budget, ClassicConfig, Config, FieldConfig, Image, InstantConfig, Loss, Preset, SamplerConfig, Trainer, VoxelConfig,
 };
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -25,17 +26,17 @@ fn config() -> Config {
         tile: 16,
         ..HierarchicalConfig::default()
     };
-    let (field, sampler) = (FieldConfig::Classic(fine), SamplerConfig::Hierarchical(sampler));
+    let (field, sampler) = (FieldConfig::new(fine), SamplerConfig::new(sampler));
     Config { field, sampler, ..Config::preset(Preset::Small) }
 }
 
 /// A small hash grid, marched with few samples.
 fn instant() -> Config {
     let mut config = Config::preset(Preset::Instant);
-    if let FieldConfig::Instant(field) = &mut config.field {
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 4, log2_table: 14, finest: 128, ..field.grid };
     }
-    if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         sampler.samples = 1 << 13;
         sampler.step = 1.0 / 100.0;
         sampler.occupancy.resolution = 32;
@@ -45,7 +46,7 @@ fn instant() -> Config {
 
 /// A coarse grid of voxels, marched with few samples.
 fn voxel() -> Config {
-    let field = FieldConfig::Voxel(VoxelConfig { resolution: 32, direction_degree: 2 });
+    let field = FieldConfig::new(VoxelConfig { resolution: 32, direction_degree: 2 });
     Config { field, sampler: instant().sampler, ..Config::preset(Preset::Voxel) }
 }
 

@@ -19,7 +19,7 @@ fn narrow(seed: u64) -> Config {
         tile: 16,
         ..HierarchicalConfig::default()
     };
-    let (field, sampler) = (FieldConfig::Classic(field), SamplerConfig::Hierarchical(sampler));
+    let (field, sampler) = (FieldConfig::new(field), SamplerConfig::new(sampler));
     Config { field, sampler, seed, ..Config::preset(Preset::Small) }.with_relu_density()
 }
 
@@ -35,7 +35,7 @@ fn density_share(model: &Model<f32>) -> f64 {
     let share = |field: &dyn Field<f32>| {
         let tape = Tape::new();
         let params = model.params.bind_constant(&tape);
-        let density = field.density(&params, &field.encode(&params, &tape.constant(points.clone()))).sigma();
+        let density = field.density(&params, &tape.constant(points.clone())).sigma();
         density.value().as_slice().iter().filter(|&&sigma| sigma > 0.0).count() as f64 / 400.0
     };
     model.fields().into_iter().map(share).fold(1.0, raygrad::Real::minimum)
@@ -44,7 +44,7 @@ fn density_share(model: &Model<f32>) -> f64 {
 #[test]
 fn of_a_hundred_seeds_none_starts_dead() {
     let data = data();
-    let extent = Extent { bounds: data.bounds, span: [data.near, data.far] };
+    let extent = Extent::new(data.bounds, [data.near, data.far]);
     let (mut dead, mut passed_over) = (0, 0);
     for seed in 0..100 {
         let bare = density_share(&Model::new(narrow(seed), extent, seed).unwrap());
@@ -107,7 +107,7 @@ fn a_scene_that_stays_empty_does_not_restart_for_ever() {
 #[test]
 fn a_run_that_learns_is_left_alone() {
     let mut config = Config::preset(Preset::Small);
-    if let SamplerConfig::Hierarchical(sampler) = &mut config.sampler {
+    if let Some(sampler) = config.sampler.get_mut::<HierarchicalConfig>() {
         sampler.batch = 32;
     }
     let mut trainer = Trainer::new(config, data()).unwrap();

@@ -31,13 +31,28 @@ pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
 }
 
 /// A share of a gradient that consists of rows along the first axis.
-pub trait RowShare<T: Scalar> {
+pub trait RowShare<T: Scalar>: Send + Sync {
     /// Adds the rows to the sums of their table's rows, in a fixed order.
     ///
     /// # Panics
     /// If `sums` belongs to a table of another size.
     #[track_caller]
     fn scatter(&self, sums: &mut RowSums<T>);
+
+    /// The rows of each part of the table, one part after another, that [`scatter_part`](Self::scatter_part) can add up by
+    /// itself, at the same time as others: the levels of a hash grid. Empty for a table without parts.
+    fn parts(&self) -> Vec<usize> {
+        vec![]
+    }
+
+    /// As [`scatter`](Self::scatter) for the rows of one part, whose first row is row 0 of `sums`.
+    ///
+    /// # Panics
+    /// If `sums` belongs to a table of another size.
+    #[track_caller]
+    fn scatter_part(&self, _part: usize, sums: &mut RowSums<T>) {
+        self.scatter(sums);
+    }
 }
 
 /// The gradient of one variable, as [`Var::backward`](crate::Var::backward) gives it: the sum of a dense tensor and of
@@ -115,6 +130,11 @@ impl<T: Scalar> Gradient<T> {
             self.sparse.iter().filter_map(|share| share.as_rows()).for_each(|rows| rows.scatter(sums));
         }
         is_rows
+    }
+
+    /// Takes all sparse shares out, in their order.
+    pub fn take_sparse(&mut self) -> Vec<Arc<dyn SparseGrad<T>>> {
+        std::mem::take(&mut self.sparse)
     }
 
     /// Takes the sparse shares of type `G` out, in their order. All others stay.

@@ -76,6 +76,13 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
         Ok(self.vjp(cx))
     }
 
+    /// Whether [`Tape::remember`] keeps the output, for [`Tape::recall`] to take it from there: worth it for an operation
+    /// that costs far more than a copy of its output. Each row of the output along the first axis must follow from the
+    /// same row of the first input and from inputs that no row is special in (parameters).
+    fn is_kept(&self) -> bool {
+        false
+    }
+
     /// Whether the tape goes through [`reference`](Self::reference), which then gives a value, where a gradient is itself
     /// differentiated. The operation then reads all its inputs. An operation whose [`vjp`](Self::vjp) can be recorded
     /// leaves this false, and may still have a reference as an oracle.

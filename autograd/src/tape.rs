@@ -1,11 +1,13 @@
 //! The tape: a list of operations in the order in which they ran, which is a topological order.
 
+use crate::memo::Memory;
 use crate::nodes::{CONSTANT, Node, Nodes};
 use crate::op::Kept;
 use crate::{Error, Op, ShapeError, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, checked_len};
 use smallvec::SmallVec;
 use std::cell::{Cell, RefCell};
+use std::fmt;
 use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
 
 /// Records operations and differentiates them. One tape belongs to one thread at a time; any number of tapes work
@@ -33,6 +35,14 @@ pub struct Tape<T: Scalar> {
     differentiating: Cell<Option<&'static Location<'static>>>,
     /// While a method that is made of operations runs: the line of the user's code that called it.
     within: Cell<Option<&'static Location<'static>>>,
+    /// Outputs that are remembered or recalled.
+    pub(crate) memory: Cell<Memory<T>>,
+}
+
+impl<T: Scalar> fmt::Debug for Tape<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Tape<{}> of {} operations", T::NAME, self.len())
+    }
 }
 
 impl<T: Scalar> Default for Tape<T> {
@@ -58,6 +68,7 @@ impl<T: Scalar> Tape<T> {
             trying: Cell::new(false),
             differentiating: Cell::new(None),
             within: Cell::new(None),
+            memory: Cell::default(),
         }
     }
 
@@ -275,7 +286,7 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     pub fn try_apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Result<Var<'t, T>, Error> {
         let at = self.line();
-        let value = self.run(&op, inputs, at)?;
+        let value = if op.is_kept() { self.run_kept(&op, inputs, at)? } else { self.run(&op, inputs, at)? };
         Ok(self.record(op, inputs, value, at))
     }
 
@@ -289,17 +300,20 @@ impl<T: Scalar> Tape<T> {
         Ok(value)
     }
 
-    /// Records an operation whose output is known already, from an earlier unrecorded run on the same inputs.
-    ///
-    /// # Panics
-    /// If the shapes do not fit, `value` has not the shape of the output, or the NaN finder is on and finds something.
+    /// As [`run`](Self::run), with the memory of the tape.
     #[track_caller]
-    pub fn apply_known<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>], value: Tensor<T>) -> Var<'t, T> {
-        let at = self.line();
-        let shape = self.or_raise(self.check_shapes(&op, inputs, at));
-        assert_eq!(value.shape(), shape.as_slice(), "{}: a known output of another shape", op.name());
-        self.or_raise(self.check_output(op.name(), inputs, &value, at));
-        self.record(op, inputs, value, at)
+    fn run_kept(
+        &self,
+        op: &dyn Op<T>,
+        inputs: &[&Var<'_, T>],
+        at: &'static Location<'static>,
+    ) -> Result<Tensor<T>, Error> {
+        let value = match self.recalled(op, inputs) {
+            Some(value) => value,
+            None => self.run(op, inputs, at)?,
+        };
+        self.keep(&value);
+        Ok(value)
     }
 
     /// If the NaN finder is on and the output is not finite: an error that also says which input was so before.

@@ -6,8 +6,9 @@ use raygrad_autograd::check::Entry;
 /// Every operation of this crate, with the inputs it is checked on.
 pub fn catalogue() -> Vec<Entry> {
     let mut entries = crate::encoding::sinusoids::entries();
-    entries.extend(crate::volume::composite::entries());
-    entries.extend(crate::volume::quadrature::entries());
+    entries.extend(crate::volume::depth::entries());
+    entries.extend(crate::volume::weights::entries());
+    entries.extend(crate::volume::accumulate::entries());
     entries.extend(crate::encoding::hash_grid::entries());
     entries.extend(crate::encoding::spherical::entries());
     entries.extend(crate::dataset::color_space::entries());

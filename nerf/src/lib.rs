@@ -8,10 +8,14 @@ pub mod analytic;
 pub mod camera;
 #[cfg(feature = "check")]
 mod catalogue;
+#[doc(hidden)]
+pub mod compiled;
 pub mod dataset;
 pub mod encoding;
 mod error;
 pub mod field;
+pub mod kind;
+pub mod losses;
 pub mod model;
 pub mod pictures;
 pub(crate) mod random;
@@ -29,13 +33,18 @@ pub use catalogue::catalogue;
 pub use dataset::{Background, Image, SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use encoding::{PositionalEncoding, SphericalHarmonics};
 pub use error::{Error, Result};
-pub use field::{Classic, ClassicConfig, Density, DensityActivation, Field, FieldConfig, Instant, InstantConfig};
-pub use field::{Voxel, VoxelConfig};
+pub use field::{
+    Classic, ClassicConfig, Density, DensityActivation, Field, FieldConfig, Fields, Instant, InstantConfig,
+};
+pub use field::{Seen, Voxel, VoxelConfig};
 pub use glam;
-pub use model::{Config, Extent, Model, Preset, Sampler, SamplerConfig};
+pub use kind::{Family, Kind, Part, Site, register};
+pub use losses::Loss;
+pub use model::{Config, Extent, Model, Preset};
 pub use pictures::{quantise, write_atomic};
 pub use random::Jitter;
-pub use rendering::{DenseView, Evaluations, Limits, Picture};
-pub use space::{Contraction, contract};
+pub use rendering::{DenseView, Picture};
+pub use sampling::{Limits, Load, Progress, Purpose, Sampled, Sampler, SamplerConfig, Samplers};
+pub use space::{Contraction, Space, contract};
 pub use training::{Budget, StepStats, Trainer};
-pub use volume::{Composite, Distortion, Loss};
+pub use volume::{Distortion, Evaluations, Query, Rendered};

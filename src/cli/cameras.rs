@@ -93,7 +93,7 @@ mod tests {
 
     fn viewpoint() -> (Viewpoint, Extent) {
         let data = embedded(Split::Test, 8);
-        (Viewpoint::of(&data), Extent { bounds: data.bounds, span: [data.near, data.far] })
+        (Viewpoint::of(&data), Extent::new(data.bounds, [data.near, data.far]))
     }
 
     #[test]

@@ -6,8 +6,8 @@ use std::time::Instant;
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
-use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, Sampler};
+use raygrad::nerf::space::occupancy::{Skip, Skipping};
+use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result};
 use serde::Serialize;
 
 use super::output::{depth_colors, make_folder, numbered, other_numbered, print, remove};
@@ -76,7 +76,7 @@ struct Report {
     /// What photographs with transparency are composited over.
     background: Background,
     /// What was left out; null where there is no occupancy grid.
-    skip: Option<Skip>,
+    skip: Option<Skipping>,
     /// `f32`, or `f64` with nothing left out but empty cells.
     precision: Precision,
     /// Where in a pixel its ray passes: 0.5 is the centre.
@@ -117,10 +117,7 @@ pub fn run(args: &Args) -> Result<()> {
     let pictures = run.file(&name);
     make_folder(&pictures)?;
     let (background, span) = (model.config.background, model.extent.span);
-    let skip = match &model.sampler {
-        Sampler::Marching(marching) => Some(marching.config.occupancy.skip),
-        Sampler::Hierarchical(_) => None,
-    };
+    let skip = model.marching().map(|marching| marching.config.occupancy.skip);
     let renderer = Renderer::new(model, args.precision)?;
     let (per_view, seconds_per_view, evaluations) = compare(&renderer, background, span, &data, &pictures)?;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();

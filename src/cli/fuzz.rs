@@ -19,7 +19,7 @@ fn run_config() -> RunConfig {
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
         downscale: 1,
-        extent: Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] },
+        extent: Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]),
         viewpoint: Viewpoint { width: 8, height: 6, angle_x: 0.7, distance: 4.0, elevation: 0.5 },
         config: Config::preset(Preset::Instant),
     }

@@ -1,15 +1,15 @@
 //! Alpha of one interval: `1 - e^(-sigma delta)`.
 
 use crate::support::*;
-use raygrad::nerf::Composite;
+use raygrad::nerf::volume::{OpticalDepth, weights};
 use raygrad::{Scalar, Segments, Tape, Tensor};
 
 /// What one sample of colour 1 gives: alpha, what is left of the light, and the gradient of alpha by the density.
 fn one_sample<T: Scalar>(sigma: f64, delta: f64) -> [f64; 3] {
     let tape = Tape::new();
     let density = tape.leaf(vector::<T>(&[sigma]));
-    let op = Composite::new(vector::<T>(&[delta]), Segments::uniform(1, 1));
-    let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]);
+    let (op, segments) = (OpticalDepth::new(vector::<T>(&[delta])), Segments::uniform(1, 1));
+    let out = composite(op, &segments, [&density, &tape.constant(Tensor::ones(&[1, 1]))]);
     let slope = out.slice_axis(1, ..1).sum().grad(&[&density]).remove(0).item().to_f64();
     let [alpha, left] = [0, 1].map(|i| out.value().as_slice()[i].to_f64());
     [alpha, left, slope]
@@ -42,8 +42,11 @@ fn many_small_steps_add_up<T: Scalar>() {
     let tape = Tape::new();
     let delta = vector::<T>(&vec![1.0 / n as f64; n]);
     let density = tape.leaf(vector::<T>(&vec![1e-3; n]));
-    let out =
-        tape.apply(Composite::new(delta, Segments::uniform(1, n)), &[&density, &tape.constant(Tensor::ones(&[n, 1]))]);
+    let out = composite(
+        OpticalDepth::new(delta),
+        &Segments::uniform(1, n),
+        [&density, &tape.constant(Tensor::ones(&[n, 1]))],
+    );
     let expected = constant("alpha of 1024 steps of depth 1e-3 in all");
     near::<T>("accumulated alpha", out.value().as_slice()[0].to_f64(), expected, by_type::<T>(2e-7, 1e-14));
 }
@@ -64,8 +67,8 @@ fn no_density_or_no_length_is_nothing<T: Scalar>() {
     // The same by way of plain operations, which is where second derivatives come from.
     let tape = Tape::new();
     let density = tape.leaf(vector::<T>(&[0.5, 0.0, 0.25]));
-    let op = Composite::new(vector::<T>(&[1.0, f64::INFINITY, 1.0]), Segments::uniform(1, 3));
-    let first = op.weights(&density).sum().grad_graph(&[&density]).remove(0);
+    let (op, segments) = (OpticalDepth::new(vector::<T>(&[1.0, f64::INFINITY, 1.0])), Segments::uniform(1, 3));
+    let first = weights(&tape.apply(op, &[&density]), &segments).sum().grad_graph(&[&density]).remove(0);
     finite("first derivative", first.value());
     finite("second derivative", &first.sum().grad(&[&density])[0]);
 }
@@ -73,20 +76,20 @@ fn no_density_or_no_length_is_nothing<T: Scalar>() {
 /// Matrix: a negative density and a negative interval are errors.
 fn negative_densities_and_intervals_are_errors<T: Scalar>() {
     for bad in [-1e-30, -1.0, f64::NEG_INFINITY, f64::NAN] {
-        let error = Composite::try_new(vector::<T>(&[1.0, bad]), Segments::uniform(1, 2)).unwrap_err().to_string();
+        let error = OpticalDepth::try_new(vector::<T>(&[1.0, bad])).unwrap_err().to_string();
         assert!(error.starts_with("`delta[1]`: is "), "{error}");
     }
-    let op = || Composite::new(Tensor::<T>::ones(&[2]), Segments::uniform(1, 2));
+    let op = || OpticalDepth::new(Tensor::<T>::ones(&[2]));
     let error = op().check(&vector(&[1.0, -0.5])).unwrap_err().to_string();
     assert!(error.starts_with("`density[1]`: is -0.5"), "{error}");
     assert!(op().check(&vector(&[0.0, -0.0])).is_ok() && op().check(&vector(&[f64::NAN, 1.0])).is_ok());
     let text = panic_of(|| {
         let tape = Tape::new();
-        tape.apply(op(), &[&tape.leaf(vector(&[1.0, -0.5])), &tape.constant(Tensor::ones(&[2, 1]))]).into_value()
+        tape.apply(op(), &[&tape.leaf(vector(&[1.0, -0.5]))]).into_value()
     });
     assert!(text.contains("density[1]"), "{text}");
     // A logarithm may be anything.
-    let log = Composite::of_log_density(Tensor::<T>::ones(&[2]), Segments::uniform(1, 2));
+    let log = OpticalDepth::of_log_density(Tensor::<T>::ones(&[2]));
     assert!(log.check(&vector(&[-5.0, -0.5])).is_ok());
 }
 

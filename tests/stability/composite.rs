@@ -1,19 +1,19 @@
 //! Compositing along a ray.
 
 use crate::support::*;
-use raygrad::nerf::Composite;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::camera::stratified;
 use raygrad::nerf::sampling::steps::importance;
-use raygrad::{Pool, Real, Scalar, Segments, Tape, Tensor, Var};
+use raygrad::nerf::volume::{OpticalDepth, Weights};
+use raygrad::{Op, Pool, Real, Scalar, Segments, Tape, Tensor, Var};
 
 /// Colour and remaining light of one ray of optical depths `x`, and the gradients of the colour by densities and colours.
 fn ray<T: Scalar>(x: &[f64], colour: &[f64]) -> ([f64; 2], Vec<f64>, Vec<f64>) {
     let n = x.len();
     let tape = Tape::new();
     let (density, features) = (tape.leaf(vector::<T>(x)), tape.leaf(tensor::<T>(&[n, 1], colour)));
-    let op = Composite::new(Tensor::ones(&[n]), Segments::uniform(1, n));
-    let out = tape.apply(op, &[&density, &features]);
+    let (op, segments) = (OpticalDepth::new(Tensor::ones(&[n])), Segments::uniform(1, n));
+    let out = composite(op, &segments, [&density, &features]);
     let grads = out.slice_axis(1, ..1).sum().grad(&[&density, &features]);
     let both = [0, 1].map(|i| out.value().as_slice()[i].to_f64());
     (both, numbers(&grads[0]), numbers(&grads[1]))
@@ -74,9 +74,9 @@ fn gradient_behind_opaque_samples<T: Scalar>() {
 
 /// Matrix: optical depths (.1, 20, .5, .5, 30, .2). Catalogue: T = prod(1 - alpha + 1e-10).
 fn transmittance_far_behind<T: Scalar>() {
-    let op = Composite::new(Tensor::<T>::ones(&[6]), Segments::uniform(1, 6));
-    let [transmittance, weights] =
-        op.transmittance_and_weights(&vector(&[0.1, 20.0, 0.5, 0.5, 30.0, 0.2]), &Pool::new());
+    let (op, x) = (Weights::new(Segments::uniform(1, 6)), vector::<T>(&[0.1, 20.0, 0.5, 0.5, 30.0, 0.2]));
+    let transmittance = op.transmittance(&x, &Pool::new());
+    let weights = op.forward(&[&x], &Pool::new());
     // The depth .1 is rounded, and T falls by the error of the sum: half an ULP of 20.6 in f32.
     for i in 2..6 {
         let expected = constant(&format!("T[{i}]"));
@@ -86,10 +86,13 @@ fn transmittance_far_behind<T: Scalar>() {
     within("weights", total + constant("T[5]") * (-0.2_f64).exp(), 1.0, by_type::<T>(1e-6, 1e-15));
     // 192 steps to a depth of 40.
     let n = 192;
-    let op = Composite::new(vector::<T>(&vec![4.0 / n as f64; n]), Segments::uniform(1, n));
+    let (op, segments) = (OpticalDepth::new(vector::<T>(&vec![4.0 / n as f64; n])), Segments::uniform(1, n));
     let tape = Tape::new();
-    let out =
-        tape.apply(op, &[&tape.constant(Tensor::full(&[n], T::from_f64(10.0))), &tape.constant(Tensor::ones(&[n, 1]))]);
+    let out = composite(
+        op,
+        &segments,
+        [&tape.constant(Tensor::full(&[n], T::from_f64(10.0))), &tape.constant(Tensor::ones(&[n, 1]))],
+    );
     let left = out.value().as_slice()[1].to_f64();
     near::<T>("192 steps", left, constant("transmittance(40)"), by_type::<T>(7e-6, 1e-13));
 }
@@ -141,8 +144,9 @@ fn no_interval_is_longer_than_the_ray<T: Scalar>() {
         within("intervals", numbers(&samples.delta).iter().sum(), 4.0, 1e-5);
         let tape = Tape::new();
         let density = tape.leaf(Tensor::full(&[n], T::from_f64(1e-10)));
-        let op = Composite::new(samples.delta, samples.segments);
-        let alpha = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[n, 1]))]).slice_axis(1, ..1).sum();
+        let (op, segments) = (OpticalDepth::new(samples.delta), samples.segments);
+        let alpha =
+            composite(op, &segments, [&density, &tape.constant(Tensor::ones(&[n, 1]))]).slice_axis(1, ..1).sum();
         near::<T>("alpha", alpha.item().to_f64(), 4e-10, 1e-6);
         assert!(numbers(&alpha.grad(&[&density])[0]).iter().all(|&slope| (0.0..=4.0).contains(&slope)));
     }
@@ -154,8 +158,9 @@ fn exponential_density<T: Scalar>() {
         for delta in [1e-6, 1e-3, 1.0] {
             let tape = Tape::new();
             let density = tape.leaf(vector::<T>(&[z]));
-            let op = Composite::of_log_density(vector(&[delta]), Segments::uniform(1, 1));
-            let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
+            let (op, segments) = (OpticalDepth::of_log_density(vector(&[delta])), Segments::uniform(1, 1));
+            let out =
+                composite(op, &segments, [&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
             let u = z.exp() * round::<T>(delta);
             let tolerance = by_type::<T>(2e-7, 1e-15);
             near::<T>(&format!("alpha, z {z}, interval {delta}"), out.item().to_f64(), -(-u).exp_m1(), tolerance);
@@ -167,8 +172,8 @@ fn exponential_density<T: Scalar>() {
     let slope = |z: f64| {
         let tape = Tape::new();
         let density = tape.leaf(vector::<T>(&[z]));
-        let op = Composite::of_log_density(vector(&[1e-6]), Segments::uniform(1, 1));
-        let out = tape.apply(op, &[&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
+        let (op, segments) = (OpticalDepth::of_log_density(vector(&[1e-6])), Segments::uniform(1, 1));
+        let out = composite(op, &segments, [&density, &tape.constant(Tensor::ones(&[1, 1]))]).slice_axis(1, ..1).sum();
         out.grad(&[&density])[0].item().to_f64()
     };
     // Not the gradient that is clamped at 15, and not the one that is clamped at -15.

@@ -1,7 +1,8 @@
 //! The distortion loss.
 
 use crate::support::*;
-use raygrad::nerf::{Composite, Distortion};
+use raygrad::nerf::Distortion;
+use raygrad::nerf::volume::{OpticalDepth, weights};
 use raygrad::{Scalar, Segments, Tape};
 
 /// Loss and gradients of one ray of samples of this width, starting at `start`, and the same by definition in f64.
@@ -53,7 +54,7 @@ fn of_densities<T: Scalar>() {
     for density in [0.0, 1e-30, 1.0, 1e30] {
         let tape = Tape::new();
         let sigma = tape.leaf(vector::<T>(&vec![density; n]));
-        let weights = Composite::new(d.clone(), segments()).weights(&sigma);
+        let weights = weights(&tape.apply(OpticalDepth::new(d.clone()), &[&sigma]), &segments());
         let loss = tape.apply(Distortion::new(m.clone(), d.clone(), segments()), &[&weights]).sum();
         assert!(loss.item().to_f64() >= 0.0);
         finite("gradient", &loss.grad(&[&sigma])[0]);

@@ -5,8 +5,9 @@ use proptest::prelude::*;
 use raygrad::nerf::dataset::{Split, load, load_views};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
-use raygrad::nerf::{Background, Config, Extent, FieldConfig, Image, Model, Preset, SamplerConfig};
+use raygrad::nerf::{Background, ClassicConfig, Config, Extent, Image, InstantConfig, Model, Preset};
 use raygrad::{Params, Scalar, Storage, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
@@ -30,17 +31,17 @@ fn scene(folder: &Path) -> Vec<u8> {
 
 fn config() -> Config {
     let mut config = Config::preset(Preset::Instant);
-    if let FieldConfig::Instant(field) = &mut config.field {
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 2, features: 2, log2_table: 6, coarsest: 3, finest: 8 };
         (field.density_width, field.features, field.color_width, field.direction_degree) = (6, 4, 5, 2);
     }
-    if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         sampler.occupancy = OccupancyConfig { resolution: 4, ..sampler.occupancy };
     }
     config
 }
 
-const EXTENT: Extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] };
+const EXTENT: Extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0], unit: 1.0 };
 
 fn params<T: Scalar>() -> Params<T> {
     let mut params = Params::new();
@@ -215,11 +216,11 @@ proptest! {
 #[test]
 fn models_that_no_memory_holds_are_refused() {
     let mut classic = Config::preset(Preset::Classic);
-    if let FieldConfig::Classic(field) = &mut classic.field {
+    if let Some(field) = classic.field.get_mut::<ClassicConfig>() {
         (field.depth, field.width) = (1 << 14, 1 << 14);
     }
     let mut instant = Config::preset(Preset::Instant);
-    if let FieldConfig::Instant(field) = &mut instant.field {
+    if let Some(field) = instant.field.get_mut::<InstantConfig>() {
         field.grid = HashGridConfig { levels: 32, features: 32, log2_table: 28, coarsest: 512, finest: 65_536 };
     }
     for config in [classic, instant] {
@@ -232,7 +233,7 @@ fn models_that_no_memory_holds_are_refused() {
 #[test]
 fn extents_are_checked() {
     for bad in [f64::NAN, f64::INFINITY, 2.0] {
-        let extent = Extent { bounds: [DVec3::splat(bad), DVec3::ONE], span: [2.0, 6.0] };
+        let extent = Extent::new([DVec3::splat(bad), DVec3::ONE], [2.0, 6.0]);
         clear(Model::<f32>::new(config(), extent, 0).err().expect("an error"), "bounds");
     }
 }

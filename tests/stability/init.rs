@@ -1,6 +1,7 @@
 //! New fields: whether there is anything to learn from.
 
 use crate::support::noise;
+use raygrad::nerf::InstantConfig;
 use raygrad::nerf::dataset::{Split, embedded};
 use raygrad::nerf::{Config, Extent, Field, Model, Preset, Trainer};
 use raygrad::{Tape, Tensor};
@@ -16,7 +17,7 @@ fn alive_share(model: &Model<f32>) -> f64 {
         let tape = Tape::new();
         let params = model.params.bind_constant(&tape);
         let positions = tape.leaf(points.clone());
-        let sigma = field.density(&params, &field.encode(&params, &positions)).sigma();
+        let sigma = field.density(&params, &positions).sigma();
         assert!(sigma.value().is_finite());
         let slopes = sigma.sum().grad(&[&positions]).remove(0);
         assert!(slopes.is_finite());
@@ -30,7 +31,7 @@ fn alive_share(model: &Model<f32>) -> f64 {
 #[test]
 fn a_hundred_seeds_of_every_preset_are_alive() {
     let data = embedded(Split::Val, 8);
-    let extent = Extent { bounds: data.bounds, span: [data.near, data.far] };
+    let extent = Extent::new(data.bounds, [data.near, data.far]);
     for preset in [Preset::Small, Preset::Classic, Preset::Instant] {
         let mut least = 1.0_f64;
         // The paper's network is large: fewer of them take as long.
@@ -48,7 +49,7 @@ fn a_hundred_seeds_of_every_preset_are_alive() {
 
 /// A table that is quick to fill.
 fn small_table(mut config: Config) -> Config {
-    if let raygrad::nerf::FieldConfig::Instant(field) = &mut config.field {
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
         (field.grid.log2_table, field.grid.levels) = (10, 4);
     }
     config

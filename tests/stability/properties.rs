@@ -4,13 +4,14 @@ use crate::support::*;
 use proptest::prelude::*;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
-use raygrad::nerf::sampling::steps::invert_cdf;
+use raygrad::nerf::sampling::steps::{even_edges, invert_cdf};
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
+use raygrad::nerf::volume::{self, OpticalDepth, Weights};
 use raygrad::nerf::{
-    Composite, Distortion, Ndc, Pose, PositionalEncoding, RadialLens, Ray, Rays, contract, glam::DVec3, intersect_box,
+    Distortion, Ndc, Pose, PositionalEncoding, RadialLens, Ray, Rays, contract, glam::DVec3, intersect_box,
     rotation_exp, srgb_decode, srgb_encode,
 };
-use raygrad::{Adam, AdamConfig, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
+use raygrad::{Adam, AdamConfig, Op, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
 
 /// A finite number of any magnitude that f32 has, evenly over the exponents, or a zero of either sign.
 fn any_finite() -> impl Strategy<Value = f64> {
@@ -50,15 +51,15 @@ fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: boo
     let n = sigma.len();
     let tape = Tape::new();
     let (density, features) = (tape.leaf(vector::<T>(sigma)), tape.leaf(tensor::<T>(&[n, 1], colour)));
-    let op = || {
-        let (delta, segments) = (vector::<T>(delta), Segments::uniform(1, n));
-        if log { Composite::of_log_density(delta, segments) } else { Composite::new(delta, segments) }
-    };
-    let [transmittance, weights] = op().transmittance_and_weights(density.value(), tape.pool());
+    let (lengths, segments) = (vector::<T>(delta), Segments::uniform(1, n));
+    let op = || if log { OpticalDepth::of_log_density(lengths.clone()) } else { OpticalDepth::new(lengths.clone()) };
+    let scan = Weights::new(segments.clone());
+    let x = op().forward(&[density.value()], tape.pool());
+    let (transmittance, weights) = (scan.transmittance(&x, tape.pool()), scan.forward(&[&x], tape.pool()));
     let (transmittance, weights) = (numbers(&transmittance), numbers(&weights));
     prop_assert!(transmittance.iter().chain(&weights).all(|x| (0.0..=1.0).contains(x)));
     prop_assert!(transmittance.windows(2).all(|pair| pair[1] <= pair[0]));
-    let out = tape.apply(op(), &[&density, &features]);
+    let out = composite(op(), &segments, [&density, &features]);
     let values = numbers(out.value());
     prop_assert!(
         (weights.iter().sum::<f64>() + values[1] - 1.0).abs() <= by_type::<T>(1e-6, 1e-14),
@@ -69,7 +70,7 @@ fn compositing<T: Scalar>(sigma: &[f64], delta: &[f64], colour: &[f64], log: boo
     prop_assert!(grads.iter().all(Tensor::is_finite), "{grads:?}");
     // And by way of plain operations, once more differentiated, where nothing overflows in truth.
     if delta.iter().all(|&d| d < 1e3) && sigma.iter().all(|&s| s < 20.0) {
-        let first = op().weights(&density).sum().grad_graph(&[&density]).remove(0);
+        let first = volume::weights(&tape.apply(op(), &[&density]), &segments).sum().grad_graph(&[&density]).remove(0);
         prop_assert!(first.value().is_finite());
         prop_assert!(first.sum().grad(&[&density])[0].is_finite());
     }
@@ -137,7 +138,7 @@ fn histogram<T: Scalar>(weights: &[f64], share: f64, u: &[f64]) -> Outcome {
     let weights: Vec<T> = weights.iter().map(|&w| T::from_f64(w)).collect();
     let good = weights.iter().all(|w| Scalar::is_finite(*w) && *w >= T::ZERO);
     let mut out = vec![0.5; u.len()];
-    prop_assert_eq!(invert_cdf(&weights, share, u, &mut out).is_ok(), good);
+    prop_assert_eq!(invert_cdf(&even_edges(weights.len()), &weights, share, u, &mut out).is_ok(), good);
     prop_assert!(out.is_sorted() && out.iter().all(|x| (0.0..=1.0).contains(x)), "{:?}", out);
     Ok(())
 }

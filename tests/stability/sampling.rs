@@ -3,13 +3,13 @@
 use crate::support::*;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::camera::stratified;
-use raygrad::nerf::sampling::steps::{importance, invert_cdf};
+use raygrad::nerf::sampling::steps::{even_edges, importance, invert_cdf};
 use raygrad::{Pool, Scalar};
 
 fn inverted<T: Scalar>(weights: &[f64], share: f64, u: &[f64]) -> Vec<f64> {
     let weights: Vec<T> = weights.iter().map(|&w| T::from_f64(w)).collect();
     let mut out = vec![f64::NAN; u.len()];
-    invert_cdf(&weights, share, u, &mut out).unwrap();
+    invert_cdf(&even_edges(weights.len()), &weights, share, u, &mut out).unwrap();
     out
 }
 
@@ -41,7 +41,7 @@ fn weights_of_every_size<T: Scalar>() {
     }
     for bad in [f64::NAN, f64::INFINITY, -1.0] {
         let mut out = [0.5];
-        let error = invert_cdf(&[T::ONE, T::from_f64(bad)], 0.01, &[0.9], &mut out).unwrap_err();
+        let error = invert_cdf(&even_edges(2), &[T::ONE, T::from_f64(bad)], 0.01, &[0.9], &mut out).unwrap_err();
         assert!(error.to_string().starts_with("`weights[1]`"), "{error}");
         assert_eq!(out, [0.5]);
     }

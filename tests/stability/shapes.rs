@@ -3,7 +3,8 @@
 
 use ndarray::{ArrayD, Axis, IxDyn, Slice, concatenate, stack};
 use proptest::prelude::*;
-use raygrad::nerf::{Composite, Contraction, PositionalEncoding, SphericalHarmonics, rotation_exp, rotation_log};
+use raygrad::nerf::volume::{Accumulate, OpticalDepth, Weights};
+use raygrad::nerf::{Contraction, PositionalEncoding, SphericalHarmonics, rotation_exp, rotation_log};
 use raygrad::{Activation, Axes, Conv2dConfig, Indices, Pool2dConfig, Segments, Tape, Tensor, Var};
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -99,7 +100,9 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
         70 => tape.apply(SphericalHarmonics::new(i), &[a]),
         71 => rotation_exp(a),
         72 => rotation_log(a),
-        73 => tape.apply(Composite::new(Tensor::ones(&[i + j]), segments()), &[&a.square(), b]),
+        73 => tape.apply(OpticalDepth::new(Tensor::ones(&[i + j])), &[&a.square()]),
+        78 => tape.apply(Weights::new(segments()), &[&a.square()]),
+        79 => tape.apply(Accumulate(segments()), &[&a.square(), b]),
         74 => tape.constant(Tensor::scalar(a.searchsorted(b, false).as_slice().len() as f64)),
         75 => tape.constant(Tensor::scalar(a.argmax(axis).as_slice().len() as f64)),
         76 => Var::meshgrid(&[a, b]).pop()?,
@@ -108,7 +111,7 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
     })
 }
 
-const OPERATIONS: usize = 78;
+const OPERATIONS: usize = 80;
 
 trait Einsum {
     fn einsum_with(&self, other: &Self, which: usize) -> Self;

@@ -3,9 +3,11 @@
 use crate::support::*;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
-use raygrad::nerf::volume::visible::composite_visible;
-use raygrad::nerf::{Camera, Config, Density, Extent, Field, Model, Preset, SamplerConfig, Samples};
+use raygrad::nerf::volume::Lit;
+use raygrad::nerf::volume::quadrature::Quadrature;
+use raygrad::nerf::{Camera, Config, Density, Extent, Field, Model, Preset, Query, Samples, Seen, VoxelConfig};
 use raygrad::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use std::sync::Arc;
 
@@ -16,17 +18,11 @@ struct Fog {
 }
 
 impl<T: Scalar> Field<T> for Fog {
-    fn encode<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        positions.clone()
+    fn density<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
+        let sigma = Tensor::full(&[positions.shape()[0]], T::from_f64(self.sigma));
+        Density { value: positions.tape().constant(sigma), log: false, features: positions.clone() }
     }
-    fn encode_known<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        positions.tape().constant(known)
-    }
-    fn density<'t>(&self, _: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
-        let sigma = Tensor::full(&[encoding.shape()[0]], T::from_f64(self.sigma));
-        Density { value: encoding.tape().constant(sigma), log: false, features: encoding.clone() }
-    }
-    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Var<'t, T>, _: &Segments) -> Var<'t, T> {
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
         let z = features.slice_axis(1, 2..3);
         let white = z.gt(if self.white_behind { 0.0 } else { -5.0 });
         z.tape().constant(white.cast()).broadcast_to(&[features.shape()[0], 3])
@@ -47,16 +43,17 @@ fn training_ends_rays_within_the_bound<T: Scalar>() {
             let samples = Samples::new(&rays, Segments::uniform(1, n), t, vector(&vec![delta; n]), tape.pool());
             let params = Params::new().bind(&tape);
             let fog = Fog { sigma: 1.0, white_behind };
-            let all = composite_visible(&fog, &params, &samples, 0.0, false, &tape);
-            let some = composite_visible(&fog, &params, &samples, eps, false, &tape);
+            let query = Query::new(&fog, &params);
+            let [all, some] = [0.0, eps].map(|least| Quadrature::Midpoint.render(&query, &samples, least));
             assert_eq!(all.kept, n);
             assert!(some.kept <= n && (eps == 0.0 || some.kept.abs_diff(steps) <= 1), "{eps}: {} kept", some.kept);
             for background in [0.0, 1.0] {
-                let pixel = |x: &Var<'_, T>| {
-                    let x = numbers(x.value());
-                    x[0] + background * x[3]
+                let pixel = |seen: &Lit<'_, T>| {
+                    let [color, left] =
+                        [&seen.rendered.color, &seen.rendered.transmittance()].map(|x| numbers(x.value()));
+                    color[0] + background * left[0]
                 };
-                let [whole, part] = [&all, &some].map(|marched| pixel(&marched.rendered));
+                let [whole, part] = [&all, &some].map(pixel);
                 within(
                     &format!("threshold {eps}, background {background}"),
                     part,
@@ -73,13 +70,13 @@ both!(training_ends_rays_within_the_bound);
 /// A model that is this fog, and a camera in front of it.
 fn fog_model(fog: Fog, skip: Skip) -> (Model<f32>, Camera) {
     let mut config = Config::preset(Preset::Voxel);
-    if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         sampler.occupancy.resolution = 16;
-        sampler.occupancy.skip = skip;
+        sampler.occupancy.skip = skip.into();
         sampler.step = 1.0 / 128.0;
     }
-    let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [0.0, 10.0] };
-    if let raygrad::nerf::FieldConfig::Voxel(voxel) = &mut config.field {
+    let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
+    if let Some(voxel) = config.field.get_mut::<VoxelConfig>() {
         voxel.resolution = 4;
     }
     let mut model = Model::new(config, extent, 0).unwrap();
@@ -98,7 +95,7 @@ fn rendering_ends_rays_within_the_bound() {
                 for background in [0.0, 1.0] {
                     let view = |skip| {
                         let (mut model, camera) = fog_model(Fog { sigma, white_behind }, skip);
-                        model.finish_grid();
+                        model.finish();
                         model.view(&camera, [background; 3])
                     };
                     let (whole, part) = (view(Skip::Off), view(skip));
@@ -119,7 +116,7 @@ fn rendering_ends_rays_within_the_bound() {
 fn a_ray_that_ends_early_has_the_whole_colour() {
     for skip in [Skip::Lossless, Skip::Fast] {
         let (mut model, camera) = fog_model(Fog { sigma: 10.0, white_behind: false }, skip);
-        model.finish_grid();
+        model.finish();
         let view = model.view(&camera, [0.0; 3]);
         let brightest = view.color.data.iter().fold(0.0_f32, |a, &b| a.max(b));
         within("brightest", brightest.into(), 1.0, 1e-6);

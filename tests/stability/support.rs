@@ -1,7 +1,8 @@
 //! What the tests share: both precisions, comparisons that NaN fails, and the constants.
 
+use raygrad::nerf::volume::{OpticalDepth, accumulate, weights};
 use raygrad::nerf::{Ray, Rays, glam::DVec3};
-use raygrad::{Scalar, Tensor};
+use raygrad::{Scalar, Segments, Tensor, Var};
 use serde_json::Value;
 
 /// Makes a test in each precision of functions that are generic over the number type.
@@ -127,4 +128,15 @@ pub fn noise(seed: u64) -> impl FnMut() -> f64 {
         state ^= state << 17;
         (state >> 11) as f64 / (1_u64 << 53) as f64
     }
+}
+
+/// Composited features and the light that is left, `[rays, channels + 1]`: the operations of volume rendering in a row.
+pub fn composite<'t, T: Scalar>(
+    depth: OpticalDepth<T>,
+    segments: &Segments,
+    [density, features]: [&Var<'t, T>; 2],
+) -> Var<'t, T> {
+    let x = density.tape().apply(depth, &[density]);
+    let left = (-x.segment_sum(segments)).exp().reshape(&[segments.len(), 1]);
+    Var::concat(&[&accumulate(&weights(&x, segments), features, segments), &left], 1)
 }

@@ -14,6 +14,7 @@ mod optim;
 mod params;
 #[cfg(feature = "files")]
 mod storage;
+mod tiles;
 
 #[cfg(feature = "files")]
 pub use files::write_atomic;
@@ -26,3 +27,4 @@ pub use optim::{clip_norm, clip_value, global_norm};
 pub use params::{Bound, ParamId, ParamLayout, Params};
 #[cfg(feature = "files")]
 pub use storage::{ParamsError, Storage};
+pub use tiles::{SLOTS, TileSums, Tiles};

@@ -225,6 +225,15 @@ impl<T: Scalar> Params<T> {
         self.set(which, |setting| setting.lazy = lazy)
     }
 
+    /// Whether only rows of a parameter are moved: see [`set_lazy`](Self::set_lazy).
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn is_lazy(&self, id: ParamId) -> bool {
+        self.settings[self.names.place(id)].lazy
+    }
+
     /// The factor of a parameter's learning rate.
     ///
     /// # Panics
@@ -296,13 +305,13 @@ impl<T: Scalar> Params<T> {
         for (value, setting) in self.values.iter().zip(&self.settings) {
             vars.push(if setting.frozen { tape.constant(value.clone()) } else { tape.leaf(value.clone()) });
         }
-        Bound { names: self.names.clone(), vars }
+        Bound { names: self.names.clone(), vars, tape: Some(tape) }
     }
 
     /// The parameters as constants of a tape, for evaluation.
     pub fn bind_constant<'t>(&self, tape: &'t Tape<T>) -> Bound<'t, T> {
         let vars = self.values.iter().map(|value| tape.constant(value.clone())).collect();
-        Bound { names: self.names.clone(), vars }
+        Bound { names: self.names.clone(), vars, tape: Some(tape) }
     }
 
     /// What the handles of this store fit, without its values.
@@ -392,7 +401,7 @@ impl ParamLayout {
     #[track_caller]
     pub fn bind<'t, T: Scalar>(&self, vars: Vec<Var<'t, T>>) -> Bound<'t, T> {
         assert_eq!(vars.len(), self.0.names.len(), "one variable for each parameter");
-        Bound { names: self.0.clone(), vars }
+        Bound { names: self.0.clone(), tape: vars.first().map(|var| var.tape()), vars }
     }
 }
 
@@ -401,6 +410,8 @@ impl ParamLayout {
 pub struct Bound<'t, T: Scalar> {
     names: Arc<Names>,
     vars: Vec<Var<'t, T>>,
+    /// None where nothing tells.
+    tape: Option<&'t Tape<T>>,
 }
 
 impl<'t, T: Scalar> Bound<'t, T> {
@@ -445,11 +456,10 @@ impl<'t, T: Scalar> Bound<'t, T> {
     /// The tape that the parameters are on.
     ///
     /// # Panics
-    /// If there is no parameter.
+    /// If there is no parameter to tell, in what [`ParamLayout::bind`] gave.
     #[track_caller]
     pub fn tape(&self) -> &'t Tape<T> {
-        assert!(!self.vars.is_empty(), "the tape of no parameters");
-        self.vars[0].tape()
+        self.tape.unwrap_or_else(|| panic!("the tape of no parameters"))
     }
 }
 

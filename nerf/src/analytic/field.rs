@@ -1,8 +1,8 @@
 //! A medium as a field.
 
 use super::Medium;
-use crate::field::{Density, Field};
-use raygrad_autograd::{Scalar, Segments, Tensor, Var};
+use crate::field::{Density, Field, Seen};
+use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params};
 use std::sync::Arc;
 
@@ -24,33 +24,25 @@ impl AnalyticField {
 }
 
 /// The positions in the rows of a tensor.
-fn positions<T: Scalar>(x: &Tensor<T>) -> impl Iterator<Item = [f64; 3]> + '_ {
+fn rows<T: Scalar>(x: &Tensor<T>) -> impl Iterator<Item = [f64; 3]> + '_ {
     x.as_slice().chunks_exact(3).map(|x| [x[0], x[1], x[2]].map(T::to_f64))
 }
 
 impl<T: Scalar> Field<T> for AnalyticField {
-    fn encode<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        positions.tape().constant(positions.value().clone())
-    }
-
-    fn encode_known<'t>(&self, _: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        positions.tape().constant(known)
-    }
-
-    fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
+    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
         let amplitudes = &params[self.amplitudes];
-        let (samples, count) = (encoding.shape()[0], amplitudes.shape()[0]);
+        let (samples, count) = (positions.shape()[0], amplitudes.shape()[0]);
         let mut shapes = vec![0.0; samples * count];
-        for (position, out) in positions(encoding.value()).zip(shapes.chunks_exact_mut(count)) {
+        for (position, out) in rows(positions.value()).zip(shapes.chunks_exact_mut(count)) {
             self.medium.shapes(position, out);
         }
         let shapes = Tensor::from_vec(&[samples, count], shapes.into_iter().map(T::from_f64).collect());
         let value = (amplitudes * shapes).sum_over(1);
-        Density { value, log: false, features: encoding.clone() }
+        Density { value, log: false, features: positions.clone() }
     }
 
-    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Var<'t, T>, _: &Segments) -> Var<'t, T> {
-        let colors = positions(features.value()).flat_map(|position| [T::from_f64(self.medium.color(position)); 3]);
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+        let colors = rows(features.value()).flat_map(|position| [T::from_f64(self.medium.color(position)); 3]);
         features.tape().constant(Tensor::from_vec(features.shape(), colors.collect()))
     }
 }

@@ -5,6 +5,7 @@ use crate::camera::rays::Rays;
 use crate::camera::rays::stratified;
 use crate::random::Jitter;
 use crate::volume::quadrature::{Quadrature, refine};
+use crate::volume::query::Query;
 use raygrad_autograd::{Scalar, Tape, Var};
 use raygrad_nn::Params;
 
@@ -35,10 +36,11 @@ pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations
     rays.push(&scene.ray, [0.0, scene.length]);
     let tape = Tape::new();
     let bound = params.bind(&tape);
+    let query = Query::new(&field, &bound);
     let (plan, evaluations) = match rule {
         Quadrature::Adaptive { tolerance } => {
             let steps = stratified(&rays, evaluations.max(1), &mut Jitter::Middle, tape.pool());
-            let refined = refine(&field, &bound, &steps, tolerance, 0.0, &tape);
+            let refined = refine(&query, &steps, tolerance, 0.0);
             (refined.plan, refined.evaluations)
         }
         _ => {
@@ -47,14 +49,14 @@ pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations
             (plan, evaluations)
         }
     };
-    let rendered = plan.render(&field, &bound, true, &tape);
-    let pick = |channel| rendered.slice_axis(1, channel..channel + 1).sum();
-    let (color, depth) = (pick(1) + pick(4) * scene.background, pick(3));
+    let seen = plan.render(&query);
+    let color = seen.color.slice_axis(1, 1..2).sum() + seen.transmittance().sum() * scene.background;
+    let depth = seen.depth().sum();
     let gradient = |value: &Var<'_, T>| value.grad(&bound.vars())[0].as_slice().iter().map(|x| x.to_f64()).collect();
     Integral {
         color: color.item().to_f64(),
         depth: depth.item().to_f64(),
-        transmittance: pick(4).item().to_f64(),
+        transmittance: seen.transmittance().item().to_f64(),
         d_color: gradient(&color),
         d_depth: gradient(&depth),
         evaluations,

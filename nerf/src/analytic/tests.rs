@@ -4,7 +4,8 @@ use super::*;
 use crate::camera::rays::stratified;
 use crate::camera::rays::{Rays, Samples};
 use crate::random::Jitter;
-use crate::volume::pass::composite_samples;
+use crate::volume::quadrature::Plan;
+use crate::volume::query::Query;
 use raygrad_autograd::{Pool, Tape};
 use raygrad_nn::Params;
 
@@ -93,9 +94,11 @@ fn as_fields_they_are_rendered_and_differentiated_like_any_other() {
         let samples: Samples<f64> = stratified(&rays, 1 << 15, &mut Jitter::Middle, &Pool::new());
         let tape = Tape::new();
         let bound = params.bind(&tape);
-        let (rendered, _) = composite_samples(&field, &bound, &samples, true, &tape);
-        let pick = |channel| rendered.slice_axis(1, channel..channel + 1).sum();
-        let (color, left) = (pick(1) + pick(4) * scene.background, pick(4));
+        let seen = Plan { samples, intervals: None }.render(&Query::new(&field, &bound));
+        let (left, depth) = (seen.transmittance().sum(), seen.depth().sum());
+        let color = seen.color.slice_axis(1, 1..2).sum() + &left * scene.background;
+        let opacity = seen.opacity().item();
+        assert!((opacity + left.item() - 1.0).abs() < 1e-14 && (seen.weights.sum().item() - opacity).abs() < 1e-12);
         let near = |what: &str, got: f64, expected: f64| {
             assert!(
                 (got - expected).abs() <= 4e-4 * expected.abs().max(0.1),
@@ -104,11 +107,11 @@ fn as_fields_they_are_rendered_and_differentiated_like_any_other() {
             );
         };
         near("colour", color.item(), scene.exact.color);
-        near("depth", pick(3).item(), scene.exact.depth);
+        near("depth", depth.item(), scene.exact.depth);
         near("transmittance", left.item(), scene.exact.transmittance);
         for (value, d, what) in [
             (&color, &scene.exact.d_color, "d colour"),
-            (&pick(3), &scene.exact.d_depth, "d depth"),
+            (&depth, &scene.exact.d_depth, "d depth"),
             (&left, &scene.exact.d_transmittance, "d transmittance"),
         ] {
             let got = &value.grad(&bound.vars())[0];

@@ -1,8 +1,11 @@
 //! Rays and the samples along them, packed: the samples of all rays stand one after another.
 
-use crate::camera::pinhole::Ray;
+use super::bounds::clip_span;
+use super::pinhole::{Camera, Ray};
 use crate::random::Jitter;
+use glam::DVec3;
 use raygrad_autograd::{Pool, Scalar, Segments, Tensor};
+use std::ops::Range;
 
 /// A batch of rays.
 #[derive(Debug, Clone, Default)]
@@ -28,6 +31,13 @@ impl<T: Scalar> Rays<T> {
         self.spans.push(span.map(T::from_f64));
     }
 
+    /// Adds the ray through the centre of a camera's pixel, column and row, with the part of `span` (near and far distance)
+    /// that lies in the box `bounds` (lower and upper corner).
+    pub fn push_pixel(&mut self, camera: &Camera, [column, row]: [usize; 2], bounds: [DVec3; 2], span: [f64; 2]) {
+        let ray = camera.pixel_ray(column, row);
+        self.push(&ray, clip_span(&ray, bounds, span));
+    }
+
     /// Number of rays.
     pub fn len(&self) -> usize {
         self.origins.len()
@@ -50,7 +60,7 @@ impl<T: Scalar> Rays<T> {
     ///
     /// # Panics
     /// If the range leaves the batch.
-    pub fn slice(&self, range: std::ops::Range<usize>) -> Self {
+    pub fn slice(&self, range: Range<usize>) -> Self {
         Rays {
             origins: self.origins[range.clone()].to_vec(),
             directions: self.directions[range.clone()].to_vec(),
@@ -62,8 +72,8 @@ impl<T: Scalar> Rays<T> {
 /// Where rays are sampled: `segments` says which rows belong to which ray.
 #[derive(Debug, Clone)]
 pub struct Samples<T: Scalar> {
-    /// Positions, `[samples, 3]`, in scene units.
-    pub positions: Tensor<T>,
+    /// Where the rays start, `[rays, 3]`, in scene units.
+    pub origins: Tensor<T>,
     /// Unit viewing directions, `[rays, 3]`.
     pub directions: Tensor<T>,
     /// Distances along the rays, `[samples]`, rising within a ray.
@@ -81,19 +91,40 @@ impl<T: Scalar> Samples<T> {
     /// If there are not as many distances and intervals as rows, or not as many segments as rays.
     pub fn new(rays: &Rays<T>, segments: Segments, t: Tensor<T>, delta: Tensor<T>, pool: &Pool<T>) -> Self {
         assert_eq!(segments.len(), rays.len(), "one segment for each ray");
+        let rows = |values: &[[T; 3]]| pool.copy_of(&[rays.len(), 3], values.as_flattened());
+        let rays = [rows(&rays.origins), rows(&rays.directions)];
+        Samples::along(rays, segments, t, delta)
+    }
+
+    /// Other samples of the same rays.
+    ///
+    /// # Panics
+    /// If there are not as many distances and intervals as rows, or not as many segments as rays.
+    pub fn at(&self, segments: Segments, t: Tensor<T>, delta: Tensor<T>) -> Self {
+        assert_eq!(segments.len(), self.segments.len(), "one segment for each ray");
+        Samples::along([self.origins.clone(), self.directions.clone()], segments, t, delta)
+    }
+
+    fn along([origins, directions]: [Tensor<T>; 2], segments: Segments, t: Tensor<T>, delta: Tensor<T>) -> Self {
         assert_eq!([t.len(), delta.len()], [segments.rows(); 2], "one distance and one interval for each sample");
-        let mut positions = pool.tensor(&[segments.rows(), 3]);
+        Samples { origins, directions, t, delta, segments }
+    }
+
+    /// Positions `origin + t direction`, `[samples, 3]`, in scene units.
+    pub fn positions(&self, pool: &Pool<T>) -> Tensor<T> {
+        let mut positions = pool.tensor(&[self.len(), 3]);
         let out = positions.as_mut_slice();
-        for (ray, rows) in segments.ranges().enumerate() {
-            let (origin, direction) = (rays.origins[ray], rays.directions[ray]);
-            for (position, &t) in out[3 * rows.start..3 * rows.end].chunks_exact_mut(3).zip(&t.as_slice()[rows]) {
+        let rays = self.origins.as_slice().chunks_exact(3).zip(self.directions.as_slice().chunks_exact(3));
+        for (rows, (origin, direction)) in self.segments.ranges().zip(rays) {
+            let (origin, direction) = ([origin[0], origin[1], origin[2]], [direction[0], direction[1], direction[2]]);
+            let places = out[3 * rows.start..3 * rows.end].chunks_exact_mut(3);
+            for (position, &t) in places.zip(&self.t.as_slice()[rows]) {
                 for axis in 0..3 {
                     position[axis] = origin[axis] + t * direction[axis];
                 }
             }
         }
-        let directions = pool.copy_of(&[rays.len(), 3], rays.directions.as_flattened());
-        Samples { positions, directions, t, delta, segments }
+        positions
     }
 
     /// The samples with these rising numbers; rays keep their number, some without samples.
@@ -105,20 +136,51 @@ impl<T: Scalar> Samples<T> {
         offsets.push(0);
         let mut taken = 0;
         for range in self.segments.ranges() {
-            taken += rows[taken..].partition_point(|&row| (row as usize) < range.end);
+            taken += rows[taken..].iter().take_while(|&&row| (row as usize) < range.end).count();
             offsets.push(taken as u32);
         }
-        let (mut positions, mut t, mut delta) =
-            (pool.tensor(&[rows.len(), 3]), pool.tensor(&[rows.len()]), pool.tensor(&[rows.len()]));
-        let all = (self.positions.as_slice(), self.t.as_slice(), self.delta.as_slice());
-        let out = (positions.as_mut_slice(), t.as_mut_slice(), delta.as_mut_slice());
-        for (i, &row) in rows.iter().enumerate() {
-            let row = row as usize;
-            out.0[3 * i..3 * i + 3].copy_from_slice(&all.0[3 * row..3 * row + 3]);
-            out.1[i] = all.1[row];
-            out.2[i] = all.2[row];
+        let (mut t, mut delta) = (pool.tensor(&[rows.len()]), pool.tensor(&[rows.len()]));
+        let (all_t, all_delta) = (self.t.as_slice(), self.delta.as_slice());
+        let out = t.as_mut_slice().iter_mut().zip(delta.as_mut_slice());
+        for ((t, delta), &row) in out.zip(rows) {
+            (*t, *delta) = (all_t[row as usize], all_delta[row as usize]);
         }
-        Samples { positions, directions: self.directions.clone(), t, delta, segments: Segments::new(offsets) }
+        self.at(Segments::new(offsets), t, delta)
+    }
+
+    /// Pieces of some rays, each with the number of its ray and of its samples: a ray for each piece.
+    ///
+    /// # Panics
+    /// If a number is out of range.
+    pub fn pieces(&self, pieces: &[(usize, Range<usize>)], pool: &Pool<T>) -> Self {
+        let ends = pieces.iter().scan(0, |end, (_, rows)| {
+            *end += rows.len() as u32;
+            Some(*end)
+        });
+        let segments = Segments::new([0].into_iter().chain(ends).collect::<Vec<_>>());
+        let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
+        let mut rays = [pool.tensor(&[pieces.len(), 3]), pool.tensor(&[pieces.len(), 3])];
+        let [origins, directions] = &mut rays;
+        let lines = origins.as_mut_slice().chunks_exact_mut(3).zip(directions.as_mut_slice().chunks_exact_mut(3));
+        let (out_t, out_delta) = (t.as_mut_slice(), delta.as_mut_slice());
+        for (((ray, rows), to), (origin, direction)) in pieces.iter().zip(segments.ranges()).zip(lines) {
+            out_t[to.clone()].copy_from_slice(&self.t.as_slice()[rows.clone()]);
+            out_delta[to].copy_from_slice(&self.delta.as_slice()[rows.clone()]);
+            origin.copy_from_slice(&self.origins.as_slice()[3 * ray..3 * ray + 3]);
+            direction.copy_from_slice(&self.directions.as_slice()[3 * ray..3 * ray + 3]);
+        }
+        Samples::along(rays, segments, t, delta)
+    }
+
+    /// The same samples in another precision.
+    pub fn cast<U: Scalar>(&self) -> Samples<U> {
+        Samples {
+            origins: self.origins.cast(),
+            directions: self.directions.cast(),
+            t: self.t.cast(),
+            delta: self.delta.cast(),
+            segments: self.segments.clone(),
+        }
     }
 
     /// Number of samples.

@@ -1,34 +1,43 @@
 //! Training rays and what they should show.
 
-use crate::camera::bounds::clip_span;
+use super::Dataset;
+use super::background::{Background, over};
 use crate::camera::rays::Rays;
-use crate::dataset::Dataset;
-use crate::dataset::background::{Background, over};
-use rand::RngExt;
-use rand_pcg::Pcg64Mcg;
+use rand::{Rng, RngExt};
 
-/// Rays with the colours that photographs show along them.
+/// Rays with what photographs show along them.
+#[derive(Debug, Clone, Default)]
 pub struct Batch {
     /// The rays.
     pub rays: Rays<f32>,
+    /// For each ray the number of its photograph in the dataset.
+    pub frames: Vec<u32>,
+    /// For each ray the column and the row of its pixel.
+    pub pixels: Vec<[u32; 2]>,
     /// The photographs' colours, over the background where they have alpha.
     pub target: Vec<[f32; 3]>,
     /// The background that each ray is composited over.
     pub background: Vec<[f32; 3]>,
 }
 
-/// Random pixels of random photographs.
-pub fn draw(data: &Dataset, count: usize, background: Background, rng: &mut Pcg64Mcg) -> Batch {
-    let mut batch =
-        Batch { rays: Rays::new(), target: Vec::with_capacity(count), background: Vec::with_capacity(count) };
-    for _ in 0..count {
-        let frame = &data.frames[rng.random_range(0..data.frames.len())];
-        let (x, y) = (rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height));
-        let ray = frame.camera.pixel_ray(x, y);
-        let color = background.draw(rng);
-        batch.rays.push(&ray, clip_span(&ray, data.bounds, [data.near, data.far]));
-        batch.target.push(over(frame.image.pixel(x, y), color));
-        batch.background.push(color);
+impl Batch {
+    /// Random pixels of random photographs.
+    ///
+    /// # Panics
+    /// If the dataset has no frames.
+    pub fn draw(data: &Dataset, count: usize, background: Background, rng: &mut (impl Rng + ?Sized)) -> Self {
+        let mut batch = Batch::default();
+        for _ in 0..count {
+            let number = rng.random_range(0..data.frames.len());
+            let frame = &data.frames[number];
+            let pixel = [rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height)];
+            let color = background.draw(rng);
+            batch.rays.push_pixel(&frame.camera, pixel, data.bounds, [data.near, data.far]);
+            batch.frames.push(number as u32);
+            batch.pixels.push(pixel.map(|x| x as u32));
+            batch.target.push(over(frame.image.pixel(pixel[0], pixel[1]), color));
+            batch.background.push(color);
+        }
+        batch
     }
-    batch
 }

@@ -14,7 +14,7 @@ use super::{Dataset, Frame, Split, evenly_spaced};
 use crate::camera::pinhole::Camera;
 use crate::dataset::image::Image;
 use crate::error::{Error, Result};
-use intrinsics::Intrinsics;
+use intrinsics::{Intrinsics, field};
 
 /// The format does not say where the scene lies: these are the values that all work on it uses.
 const HALF_BOX: f64 = 1.5;
@@ -151,10 +151,6 @@ impl Entry {
     fn name(&self) -> &str {
         self.file_path.strip_prefix("./").unwrap_or(&self.file_path)
     }
-}
-
-fn field(index: usize, name: &str) -> String {
-    format!("frames[{index}].{name}")
 }
 
 /// The member `name` of a JSON object; `field` is its path in the document.

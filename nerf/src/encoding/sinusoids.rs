@@ -109,6 +109,10 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
         Reads::ALL
     }
 
+    fn is_kept(&self) -> bool {
+        true
+    }
+
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let mut dx = cx.pool().full(cx.shape(0), T::ZERO);
         let channels = cx.shape(0)[cx.shape(0).len() - 1];

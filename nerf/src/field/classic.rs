@@ -1,14 +1,15 @@
 //! The network of the NeRF paper.
 
-use super::{Density, DensityActivation, Field};
+use super::{Density, DensityActivation, Field, Fields, Seen};
 use crate::encoding::sinusoids::PositionalEncoding;
+use crate::kind::{Kind, Site};
 use crate::range::{check_parameters, check_range};
+use crate::space::cube::Space;
 use crate::{Error, Result};
-use glam::DVec3;
-use rand::Rng;
-use raygrad_autograd::{Activation, Scalar, Segments, Tensor, Var};
-use raygrad_nn::{Bound, Init, Linear, Mlp, Params};
+use raygrad_autograd::{Activation, Scalar, Var};
+use raygrad_nn::{Bound, Init, Linear, Mlp};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Size and shape of a [`Classic`] field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -44,6 +45,10 @@ impl ClassicConfig {
             density: DensityActivation::Softplus,
         }
     }
+}
+
+impl Kind<Fields> for ClassicConfig {
+    const KIND: &'static str = "classic";
 
     fn check(&self) -> Result<()> {
         let positive = [("depth", self.depth), ("width", self.width), ("view_width", self.view_width)];
@@ -61,6 +66,10 @@ impl ClassicConfig {
             None => Ok(()),
         }
     }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
+        Ok(Arc::new(Classic::new(self, site)?))
+    }
 }
 
 /// The NeRF paper's field (Mildenhall et al. 2020, figure 7): positions through a deep stack to density and a feature
@@ -68,9 +77,7 @@ impl ClassicConfig {
 #[derive(Debug, Clone)]
 pub struct Classic {
     config: ClassicConfig,
-    /// `(x - centre) * scale` lies in -1..1 within the box.
-    centre: DVec3,
-    scale: f64,
+    space: Space,
     trunk: Mlp,
     density: Linear,
     feature: Linear,
@@ -79,17 +86,12 @@ pub struct Classic {
 }
 
 impl Classic {
-    /// A field for the box `bounds` (lower and upper corner) with new parameters `<name>...` in `params`.
+    /// A field with new parameters `<name>...`.
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new<T: Scalar>(
-        config: &ClassicConfig,
-        bounds: [DVec3; 2],
-        params: &mut Params<T>,
-        name: &str,
-        rng: &mut (impl Rng + ?Sized),
-    ) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &ClassicConfig, site: Site<'_, T>) -> Result<Self> {
+        let Site { space, params, name, rng } = site;
         config.check()?;
         let ClassicConfig { width, view_width, .. } = *config;
         let positions = PositionalEncoding { levels: config.position_levels, input: true }.width(3);
@@ -100,8 +102,7 @@ impl Classic {
         };
         Ok(Classic {
             config: config.clone(),
-            centre: 0.5 * (bounds[0] + bounds[1]),
-            scale: 2.0 / (bounds[1] - bounds[0]).max_element(),
+            space,
             trunk,
             density: layer("density", [width, 1], Activation::Identity, Init::Glorot),
             feature: layer("feature", [width, width], Activation::Identity, Init::Glorot),
@@ -117,33 +118,19 @@ impl Classic {
 }
 
 impl<T: Scalar> Field<T> for Classic {
-    fn encode<'t>(&self, _params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        let centre = self.centre.to_array().map(T::from_f64);
-        let centre = positions.tape().constant(Tensor::from_vec(&[3], centre.to_vec()));
-        self.sinusoids(&((positions - centre) * self.scale), self.config.position_levels)
+    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
+        let encoding = self.sinusoids(&self.space.centred(positions), self.config.position_levels);
+        let features = self.trunk.forward(params, &encoding);
+        let raw = self.density.forward(params, &features).reshape(&[positions.shape()[0]]);
+        let value = self.config.density.apply(&raw);
+        let value = if self.space.unit == 1.0 { value } else { value * (1.0 / self.space.unit) };
+        Density { value, log: false, features }
     }
 
-    fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        // Nothing to learn from: without a gradient of the positions the encoding is a constant.
-        if positions.is_on_graph() { self.encode(params, positions) } else { positions.tape().constant(known) }
-    }
-
-    fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
-        let features = self.trunk.forward(params, encoding);
-        let raw = self.density.forward(params, &features).reshape(&[encoding.shape()[0]]);
-        Density { value: self.config.density.apply(&raw), log: false, features }
-    }
-
-    fn color<'t>(
-        &self,
-        params: &Bound<'t, T>,
-        features: &Var<'t, T>,
-        directions: &Var<'t, T>,
-        segments: &Segments,
-    ) -> Var<'t, T> {
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
         let feature = self.feature.forward(params, features);
-        let seen = self.sinusoids(directions, self.config.direction_levels).segment_expand(segments);
-        let hidden = self.view.forward(params, &Var::concat(&[&feature, &seen], 1));
+        let directions = self.sinusoids(seen.directions, self.config.direction_levels).segment_expand(seen.segments);
+        let hidden = self.view.forward(params, &Var::concat(&[&feature, &directions], 1));
         self.color.forward(params, &hidden).sigmoid()
     }
 }

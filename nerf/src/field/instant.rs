@@ -1,16 +1,16 @@
 //! A hash grid and two small networks.
 
-use super::boxed_grid::BoxedGrid;
-use super::{Density, Field};
+use super::grid::Grid;
+use super::{Density, Field, Fields, Seen};
 use crate::Result;
-use crate::encoding::hash_grid::{HashGrid, HashGridConfig};
+use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
+use crate::kind::{Kind, Site};
 use crate::range::check_range;
-use glam::DVec3;
-use rand::Rng;
-use raygrad_autograd::{Activation, Scalar, Segments, Tensor, Var};
-use raygrad_nn::{Bound, Init, Linear, ParamId, Params};
+use raygrad_autograd::{Activation, Scalar, Var};
+use raygrad_nn::{Bound, Init, Linear};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Size of an [`Instant`] field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -30,7 +30,9 @@ pub struct InstantConfig {
     pub direction_degree: usize,
 }
 
-impl InstantConfig {
+impl Kind<Fields> for InstantConfig {
+    const KIND: &'static str = "instant";
+
     fn check(&self) -> Result<()> {
         check_range("density_width", self.density_width, 1, 1 << 12)?;
         check_range("features", self.features, 1, 1 << 12)?;
@@ -38,9 +40,13 @@ impl InstantConfig {
         check_range("color_depth", self.color_depth, 1, 64)?;
         check_range("direction_degree", self.direction_degree, 1, 4)
     }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
+        Ok(Arc::new(Instant::new(self, site)?))
+    }
 }
 
-/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in a box of side 1.
+/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in its own unit.
 const LOG_DENSITY_SHIFT: f64 = 1.0;
 
 /// A field as in Mueller et al. 2022, section 5.4: a multiresolution hash grid, a density network of one hidden layer,
@@ -48,26 +54,24 @@ const LOG_DENSITY_SHIFT: f64 = 1.0;
 /// the first output.
 #[derive(Debug, Clone)]
 pub struct Instant {
-    grid: BoxedGrid,
+    grid: Grid,
     direction: SphericalHarmonics,
+    /// Subtracted from the logarithm of the density.
+    shift: f64,
     density: [Linear; 2],
     color: Vec<Linear>,
 }
 
 impl Instant {
-    /// A field for the box `bounds` (lower and upper corner) with new parameters `<name>...` in `params`.
+    /// A field with new parameters `<name>...`.
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new<T: Scalar>(
-        config: &InstantConfig,
-        bounds: [DVec3; 2],
-        params: &mut Params<T>,
-        name: &str,
-        rng: &mut impl Rng,
-    ) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &InstantConfig, site: Site<'_, T>) -> Result<Self> {
         config.check()?;
-        let grid = BoxedGrid::new(&config.grid, bounds, params, name, rng)?;
+        let shift = LOG_DENSITY_SHIFT + site.space.unit.ln();
+        let Site { space, params, name, rng } = site;
+        let grid = Grid::new(&config.grid, Site { space, params, name, rng })?;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let mut layer = |part: String, sizes, activation| {
             Linear::without_bias(params, &format!("{name}.{part}"), sizes, activation, Init::He, &mut *rng)
@@ -84,42 +88,29 @@ impl Instant {
             let (outputs, activation) = if last { (3, Activation::Identity) } else { (color_width, Activation::Relu) };
             color.push(layer(format!("color.{i}"), [inputs, outputs], activation));
         }
-        Ok(Instant { grid, direction, density, color })
+        Ok(Instant { grid, direction, shift, density, color })
+    }
+
+    /// The grid that positions are looked up in.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
     }
 }
 
 impl<T: Scalar> Field<T> for Instant {
-    fn encode<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        self.grid.encode(params, positions)
-    }
-
-    fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        self.grid.encode_known(params, positions, known)
-    }
-
-    fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
-        let hidden = self.density[0].forward(params, encoding);
+    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
+        let hidden = self.density[0].forward(params, &self.grid.encode(params, positions));
         let features = self.density[1].forward(params, &hidden);
-        let raw = features.slice_axis(1, ..1).reshape(&[encoding.shape()[0]]);
-        Density { value: raw - LOG_DENSITY_SHIFT, log: true, features }
+        let raw = features.slice_axis(1, ..1).reshape(&[positions.shape()[0]]);
+        Density { value: raw - self.shift, log: true, features }
     }
 
-    fn color<'t>(
-        &self,
-        params: &Bound<'t, T>,
-        features: &Var<'t, T>,
-        directions: &Var<'t, T>,
-        segments: &Segments,
-    ) -> Var<'t, T> {
-        let seen = directions.tape().apply(self.direction, &[directions]).segment_expand(segments);
-        let mut hidden = Var::concat(&[features, &seen], 1);
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+        let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
+        let mut hidden = Var::concat(&[features, &directions], 1);
         for layer in &self.color {
             hidden = layer.forward(params, &hidden);
         }
         hidden.sigmoid()
-    }
-
-    fn table(&self) -> Option<(ParamId, &HashGrid)> {
-        Some(self.grid.table())
     }
 }

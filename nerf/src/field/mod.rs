@@ -1,22 +1,21 @@
 //! Fields: functions of position and direction that give density and colour.
 
-mod boxed_grid;
 mod classic;
+mod grid;
 mod instant;
 mod voxel;
 
 pub use classic::{Classic, ClassicConfig};
+pub use grid::Grid;
 pub use instant::{Instant, InstantConfig};
 pub use voxel::{Voxel, VoxelConfig};
 
-use crate::Result;
-use crate::encoding::hash_grid::HashGrid;
-use crate::volume::composite::Composite;
-use glam::DVec3;
-use rand::Rng;
-use raygrad_autograd::{Scalar, Segments, Tensor, Var};
-use raygrad_nn::{Bound, ParamId, Params};
+use crate::kind::{Family, Part, Registered};
+use raygrad_autograd::{Scalar, Segments, Var};
+use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
+use std::any::Any;
+use std::sync::{Arc, RwLock};
 
 /// What a field says of positions alone.
 pub struct Density<'t, T: Scalar> {
@@ -34,76 +33,47 @@ impl<'t, T: Scalar> Density<'t, T> {
     pub fn sigma(&self) -> Var<'t, T> {
         if self.log { self.value.exp() } else { self.value.clone() }
     }
+}
 
-    /// The operation that composites samples of this density over intervals `delta` `[samples]`.
-    ///
-    /// # Panics
-    /// As [`Composite::new`].
-    #[track_caller]
-    pub fn composite(&self, delta: Tensor<T>, segments: Segments) -> Composite<T> {
-        if self.log { Composite::of_log_density(delta, segments) } else { Composite::new(delta, segments) }
-    }
+/// From where samples are seen.
+#[derive(Clone, Copy)]
+pub struct Seen<'a, 't, T: Scalar> {
+    /// Unit directions of the rays, `[rays, 3]`.
+    pub directions: &'a Var<'t, T>,
+    /// Which samples belong to which ray.
+    pub segments: &'a Segments,
+    /// The number of the photograph that each ray belongs to, `[rays]`: for a field with a code for each photograph. There
+    /// is none in new views.
+    pub frames: Option<&'a [u32]>,
 }
 
 /// A radiance field. Density depends on position alone, so that surfaces stay where they are from every side; colour
 /// depends on the viewing direction too.
-pub trait Field<T: Scalar>: Send + Sync {
-    /// The encoding of `positions` `[samples, 3]`, in scene units, that the network sees: `[samples, channels]`.
-    fn encode<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T>;
+///
+/// A field of one's own implements this and, for its configuration, [`Kind<Fields>`](crate::Kind); with
+/// [`register`](crate::kind::register) it is trained, rendered, saved and loaded like those of this crate.
+pub trait Field<T: Scalar>: Any + Send + Sync {
+    /// The density at `positions` `[samples, 3]`, in scene units.
+    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T>;
 
-    /// As [`encode`](Self::encode), for an encoding that is known from an unrecorded pass.
-    fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T>;
+    /// Colour `[samples, 3]` in 0..=1, for the features that [`density`](Self::density) gave, some rows of them or all.
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T>;
+}
 
-    /// Density for an encoding.
-    fn density<'t>(&self, params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T>;
+/// The family of fields.
+pub struct Fields;
 
-    /// Colour `[samples, 3]` in 0..=1, seen along the unit `directions` `[rays, 3]`; `segments` says which samples
-    /// belong to which ray.
-    fn color<'t>(
-        &self,
-        params: &Bound<'t, T>,
-        features: &Var<'t, T>,
-        directions: &Var<'t, T>,
-        segments: &Segments,
-    ) -> Var<'t, T>;
-
-    /// The parameter that is a table with sparse gradients, and the grid that it belongs to.
-    fn table(&self) -> Option<(ParamId, &HashGrid)> {
-        None
+impl Family for Fields {
+    const WHAT: &'static str = "field";
+    type Built<T: Scalar> = Arc<dyn Field<T>>;
+    fn registered() -> &'static RwLock<Vec<Registered<Self>>> {
+        static OTHERS: RwLock<Vec<Registered<Fields>>> = RwLock::new(vec![]);
+        &OTHERS
     }
 }
 
 /// Which field, and its size.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "lowercase")]
-pub enum FieldConfig {
-    /// The network of the NeRF paper.
-    Classic(ClassicConfig),
-    /// A hash grid with two small networks.
-    Instant(InstantConfig),
-    /// A grid of voxels without a network.
-    Voxel(VoxelConfig),
-}
-
-impl FieldConfig {
-    /// A field for the box `bounds` with new parameters `<name>...` in `params`.
-    ///
-    /// # Errors
-    /// If the configuration is out of range.
-    pub fn build<T: Scalar>(
-        &self,
-        bounds: [DVec3; 2],
-        params: &mut Params<T>,
-        name: &str,
-        rng: &mut impl Rng,
-    ) -> Result<std::sync::Arc<dyn Field<T>>> {
-        Ok(match self {
-            FieldConfig::Classic(config) => std::sync::Arc::new(Classic::new(config, bounds, params, name, rng)?),
-            FieldConfig::Instant(config) => std::sync::Arc::new(Instant::new(config, bounds, params, name, rng)?),
-            FieldConfig::Voxel(config) => std::sync::Arc::new(Voxel::new(config, bounds, params, name, rng)?),
-        })
-    }
-}
+pub type FieldConfig = Part<Fields>;
 
 /// How a network's raw output becomes a density.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,16 +1,16 @@
 //! A grid of voxels and no network.
 
-use super::boxed_grid::BoxedGrid;
-use super::{Density, Field};
+use super::grid::Grid;
+use super::{Density, Field, Fields, Seen};
 use crate::Result;
-use crate::encoding::hash_grid::{HashGrid, HashGridConfig};
+use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
+use crate::kind::{Kind, Site};
 use crate::range::check_range;
-use glam::DVec3;
-use rand::Rng;
-use raygrad_autograd::{Scalar, Segments, Tensor, Var};
-use raygrad_nn::{Bound, ParamId, Params};
+use raygrad_autograd::{Scalar, Var};
+use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Size of a [`Voxel`] field.
 ///
@@ -25,14 +25,20 @@ pub struct VoxelConfig {
     pub direction_degree: usize,
 }
 
-impl VoxelConfig {
+impl Kind<Fields> for VoxelConfig {
+    const KIND: &'static str = "voxel";
+
     fn check(&self) -> Result<()> {
         check_range("resolution", self.resolution, 1, 512)?;
         check_range("direction_degree", self.direction_degree, 1, 3)
     }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
+        Ok(Arc::new(Voxel::new(self, site)?))
+    }
 }
 
-/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in a box of side 1.
+/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in its own unit.
 const LOG_DENSITY_SHIFT: f64 = 1.0;
 /// What the logarithm of the density is multiplied by: without a network before it, it moves by little more than the
 /// learning rate in a step, and has further to go than a colour.
@@ -46,22 +52,18 @@ const LOG_DENSITY_GAIN: f64 = 10.0;
 /// A row of the table is the logarithm of the density, then the coefficients of red, green and blue, then padding.
 #[derive(Debug, Clone)]
 pub struct Voxel {
-    grid: BoxedGrid,
+    grid: Grid,
     direction: SphericalHarmonics,
+    /// Subtracted from the logarithm of the density.
+    shift: f64,
 }
 
 impl Voxel {
-    /// A field for the box `bounds` (lower and upper corner) with one new parameter, `<name>.table`, in `params`.
+    /// A field with one new parameter, `<name>.table`.
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new<T: Scalar>(
-        config: &VoxelConfig,
-        bounds: [DVec3; 2],
-        params: &mut Params<T>,
-        name: &str,
-        rng: &mut impl Rng,
-    ) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &VoxelConfig, site: Site<'_, T>) -> Result<Self> {
         config.check()?;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let grid = HashGridConfig {
@@ -71,39 +73,27 @@ impl Voxel {
             coarsest: config.resolution,
             finest: config.resolution,
         };
-        let grid = BoxedGrid::new(&grid, bounds, params, name, rng)?;
-        Ok(Voxel { grid, direction })
+        let shift = LOG_DENSITY_SHIFT + site.space.unit.ln();
+        Ok(Voxel { grid: Grid::new(&grid, site)?, direction, shift })
+    }
+
+    /// The grid that positions are looked up in.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
     }
 }
 
 impl<T: Scalar> Field<T> for Voxel {
-    fn encode<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        self.grid.encode(params, positions)
+    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
+        let features = self.grid.encode(params, positions);
+        let raw = features.slice_axis(1, ..1).reshape(&[positions.shape()[0]]);
+        Density { value: raw * LOG_DENSITY_GAIN - self.shift, log: true, features }
     }
 
-    fn encode_known<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>, known: Tensor<T>) -> Var<'t, T> {
-        self.grid.encode_known(params, positions, known)
-    }
-
-    fn density<'t>(&self, _params: &Bound<'t, T>, encoding: &Var<'t, T>) -> Density<'t, T> {
-        let raw = encoding.slice_axis(1, ..1).reshape(&[encoding.shape()[0]]);
-        Density { value: raw * LOG_DENSITY_GAIN - LOG_DENSITY_SHIFT, log: true, features: encoding.clone() }
-    }
-
-    fn color<'t>(
-        &self,
-        _params: &Bound<'t, T>,
-        features: &Var<'t, T>,
-        directions: &Var<'t, T>,
-        segments: &Segments,
-    ) -> Var<'t, T> {
+    fn color<'t>(&self, _params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
         let (samples, width) = (features.shape()[0], self.direction.width());
-        let seen = directions.tape().apply(self.direction, &[directions]).segment_expand(segments);
+        let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
         let coefficients = features.slice_axis(1, 1..1 + 3 * width).reshape(&[samples, 3, width]);
-        (coefficients * seen.reshape(&[samples, 1, width])).sum_over(-1).sigmoid()
-    }
-
-    fn table(&self) -> Option<(ParamId, &HashGrid)> {
-        Some(self.grid.table())
+        (coefficients * directions.reshape(&[samples, 1, width])).sum_over(-1).sigmoid()
     }
 }

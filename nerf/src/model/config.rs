@@ -3,10 +3,11 @@
 use crate::dataset::background::Background;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
+use crate::losses::photometric::Loss;
+use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
 use crate::space::occupancy::Skip;
-use crate::volume::loss::Loss;
 use crate::{Error, Result};
 use raygrad_nn::{AdamConfig, Schedule, Storage};
 use serde::{Deserialize, Serialize};
@@ -52,14 +53,19 @@ impl fmt::Display for Preset {
     }
 }
 
-/// Where rays are sampled. Any field can be sampled either way.
+/// Parameters that are moved in a way of their own.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "lowercase")]
-pub enum SamplerConfig {
-    /// Stratified samples through a network of their own, then more where it found something.
-    Hierarchical(HierarchicalConfig),
-    /// Even steps through the occupied cells of a grid.
-    Marching(MarchingConfig),
+#[serde(deny_unknown_fields)]
+pub struct GroupConfig {
+    /// What their names begin with: `field.color`. A parameter belongs to the first group that it fits.
+    pub params: String,
+    /// The optimiser's constants.
+    pub adam: AdamConfig,
+    /// Learning rate over the run.
+    pub schedule: Schedule,
+    /// Decoupled weight decay, as of [`AdamW`](raygrad_nn::AdamW).
+    #[serde(default)]
+    pub decay: f64,
 }
 
 /// A model and how it is trained. It is stored with the model, so that a run can be read back.
@@ -67,8 +73,10 @@ pub enum SamplerConfig {
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// What is fitted.
+    #[serde(deserialize_with = "super::known::read")]
     pub field: FieldConfig,
     /// Where it is sampled.
+    #[serde(deserialize_with = "super::known::read")]
     pub sampler: SamplerConfig,
     /// What is minimised.
     #[serde(default)]
@@ -79,6 +87,9 @@ pub struct Config {
     pub adam: AdamConfig,
     /// The optimiser's constants for the rows of a table.
     pub table_adam: AdamConfig,
+    /// Parameters that are moved in a way of their own; all others as the fields above say.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub groups: Vec<GroupConfig>,
     /// What photographs with alpha are composited over.
     pub background: Background,
     /// Seed of everything random.
@@ -96,12 +107,13 @@ impl Config {
         let proposal =
             ClassicConfig { depth: 2, width: 64, skips: vec![], view_width: 32, position_levels: 6, ..paper.clone() };
         let classic = Config {
-            field: FieldConfig::Classic(paper.clone()),
-            sampler: SamplerConfig::Hierarchical(HierarchicalConfig::default()),
+            field: FieldConfig::new(paper.clone()),
+            sampler: SamplerConfig::new(HierarchicalConfig::default()),
             loss: Loss::Mse,
             schedule: Schedule::Exponential { from: 5e-4, to: 5e-6, warmup: 0.0 },
             adam: AdamConfig::default(),
             table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
+            groups: vec![],
             background: Background::White,
             seed: 0,
             storage: Storage::Full,
@@ -109,8 +121,8 @@ impl Config {
         match preset {
             Preset::Classic => classic,
             Preset::Small => Config {
-                field: FieldConfig::Classic(small),
-                sampler: SamplerConfig::Hierarchical(HierarchicalConfig {
+                field: FieldConfig::new(small),
+                sampler: SamplerConfig::new(HierarchicalConfig {
                     proposal,
                     coarse: 48,
                     fine: 32,
@@ -122,7 +134,7 @@ impl Config {
                 ..classic
             },
             Preset::Instant => Config {
-                field: FieldConfig::Instant(InstantConfig {
+                field: FieldConfig::new(InstantConfig {
                     grid: HashGridConfig::cpu(60.0),
                     density_width: 64,
                     features: 16,
@@ -130,15 +142,15 @@ impl Config {
                     color_depth: 2,
                     direction_degree: 4,
                 }),
-                sampler: SamplerConfig::Marching(MarchingConfig::default()),
+                sampler: SamplerConfig::new(MarchingConfig::default()),
                 schedule: Schedule::Linear { from: 2e-2, to: 0.0, warmup: 0.005 },
                 adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
                 background: Background::Random,
                 ..classic
             },
             Preset::Voxel => Config {
-                field: FieldConfig::Voxel(VoxelConfig { resolution: 128, direction_degree: 2 }),
-                sampler: SamplerConfig::Marching(MarchingConfig::default()),
+                field: FieldConfig::new(VoxelConfig { resolution: 128, direction_degree: 2 }),
+                sampler: SamplerConfig::new(MarchingConfig::default()),
                 schedule: Schedule::Exponential { from: 5e-2, to: 5e-3, warmup: 0.0 },
                 background: Background::Random,
                 ..classic
@@ -150,9 +162,9 @@ impl Config {
     /// beyond 100 seconds the steps along a ray grow shorter as training goes on, and beyond 300 a training step has twice
     /// as many samples.
     pub fn with_budget(mut self, seconds: f64) -> Self {
-        if let FieldConfig::Instant(field) = &mut self.field {
+        if let Some(field) = self.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig::cpu(seconds);
-            if let SamplerConfig::Marching(marching) = &mut self.sampler
+            if let Some(marching) = self.sampler.get_mut::<MarchingConfig>()
                 && seconds > 100.0
             {
                 (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / 450.0));
@@ -162,18 +174,17 @@ impl Config {
         self
     }
 
-    /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves the sampler alone).
+    /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves another sampler alone).
     pub fn with_skip(mut self, skip: Skip) -> Self {
-        match &mut self.sampler {
-            SamplerConfig::Marching(marching) => marching.occupancy.skip = skip,
-            SamplerConfig::Hierarchical(_) if skip == Skip::Off => {}
-            SamplerConfig::Hierarchical(hierarchical) => {
-                // As many rays as before, once a few samples are left of each.
-                let samples = 16 * hierarchical.batch;
-                let mut marching = MarchingConfig { samples, ..MarchingConfig::default() };
-                marching.occupancy.skip = skip;
-                self.sampler = SamplerConfig::Marching(marching);
-            }
+        if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
+            marching.occupancy.skip = skip.into();
+        } else if skip != Skip::Off {
+            // As many rays as before, once a few samples are left of each.
+            let batch = self.sampler.get::<HierarchicalConfig>().map(|hierarchical| hierarchical.batch);
+            let usual = MarchingConfig::default();
+            let mut marching = MarchingConfig { samples: batch.map_or(usual.samples, |batch| 16 * batch), ..usual };
+            marching.occupancy.skip = skip.into();
+            self.sampler = SamplerConfig::new(marching);
         }
         self
     }
@@ -193,22 +204,13 @@ impl Config {
         for (part, checked) in checked {
             checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
         }
-        match &self.sampler {
-            SamplerConfig::Hierarchical(config) => config.check(),
-            SamplerConfig::Marching(config) => config.check(),
-        }
+        self.field.check()?;
+        self.sampler.check()
     }
 
     fn classic_fields(&mut self) -> impl Iterator<Item = &mut ClassicConfig> {
-        let field = match &mut self.field {
-            FieldConfig::Classic(config) => Some(config),
-            FieldConfig::Instant(_) | FieldConfig::Voxel(_) => None,
-        };
-        let proposal = match &mut self.sampler {
-            SamplerConfig::Hierarchical(config) => Some(&mut config.proposal),
-            SamplerConfig::Marching(_) => None,
-        };
-        field.into_iter().chain(proposal)
+        let proposal = self.sampler.get_mut::<HierarchicalConfig>().map(|config| &mut config.proposal);
+        self.field.get_mut::<ClassicConfig>().into_iter().chain(proposal)
     }
 
     /// The same without positional encoding: classic networks see bare coordinates.

@@ -1,47 +1,60 @@
 //! A model: a field, where it is sampled, and its parameters.
 
-#[doc(hidden)]
-pub mod compiled;
 pub(crate) mod config;
+mod known;
 mod store;
 
-pub use config::{Config, Preset, SamplerConfig};
+pub use config::{Config, Preset};
 
+use crate::Result;
 use crate::camera::rays::{Rays, Samples};
 use crate::field::Field;
+use crate::kind::Site;
 use crate::random::Jitter;
-use crate::sampling::hierarchical::Hierarchical;
-use crate::sampling::marching::{Marching, densities};
-use crate::space::occupancy::{MarchBuffer, OccupancyGrid, Skip};
-use crate::volume::pass::composite_samples;
-use crate::{Error, Result};
+use crate::sampling::marching::Marching;
+use crate::sampling::{Purpose, Sampler};
+use crate::space::cube::Space;
+use crate::space::occupancy::Skipping;
+use crate::volume::query::Query;
 use glam::DVec3;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Pool, Scalar, Tape, Tensor, Var};
 use raygrad_nn::{Bound, Params};
+use serde::{Deserialize, Serialize};
+use std::any::Any;
 use std::sync::Arc;
 
 /// The scene's extent, stored with the model.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Extent {
     /// Lower and upper corner of the box that holds the scene.
     pub bounds: [DVec3; 2],
     /// Distances along a ray between which it is sampled.
     pub span: [f64; 2],
+    /// The length that the field measures its densities by, in scene units: see [`Space::unit`].
+    #[serde(default = "one")]
+    pub unit: f64,
 }
 
-/// Where rays are sampled, with what it takes.
-#[derive(Debug, Clone)]
-pub enum Sampler {
-    /// A coarse field, then importance sampling.
-    Hierarchical(Hierarchical),
-    /// An occupancy grid.
-    Marching(Marching),
+fn one() -> f64 {
+    1.0
+}
+
+impl Extent {
+    /// Of a new model.
+    pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
+        Extent { bounds, span, unit: Space::within(bounds).unit }
+    }
+
+    /// The map to the unit cube.
+    pub fn space(&self) -> Space {
+        Space { unit: self.unit, ..Space::within(self.bounds) }
+    }
 }
 
 /// A field with its sampler and parameters.
-#[derive(Clone)]
 pub struct Model<T: Scalar> {
     /// How it was made.
     pub config: Config,
@@ -52,7 +65,19 @@ pub struct Model<T: Scalar> {
     /// What is rendered.
     pub field: Arc<dyn Field<T>>,
     /// Where it is sampled.
-    pub sampler: Sampler,
+    pub sampler: Box<dyn Sampler<T>>,
+}
+
+impl<T: Scalar> Clone for Model<T> {
+    fn clone(&self) -> Self {
+        Model {
+            config: self.config.clone(),
+            extent: self.extent,
+            params: self.params.clone(),
+            field: self.field.clone(),
+            sampler: self.sampler.boxed(),
+        }
+    }
 }
 
 impl<T: Scalar> Model<T> {
@@ -63,57 +88,44 @@ impl<T: Scalar> Model<T> {
     #[inline(never)]
     pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
         config.check()?;
-        let [low, high] = extent.bounds;
-        if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
-            return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
-        }
-        let mut rng = Pcg64Mcg::seed_from_u64(seed);
+        let space = extent.space();
+        space.check()?;
         let mut params = Params::new();
-        let sampler = match &config.sampler {
-            SamplerConfig::Hierarchical(config) => Sampler::Hierarchical(Hierarchical {
-                config: config.clone(),
-                proposal: crate::field::Classic::new(
-                    &config.proposal,
-                    extent.bounds,
-                    &mut params,
-                    "proposal",
-                    &mut rng,
-                )?,
-            }),
-            SamplerConfig::Marching(config) => Sampler::Marching(Marching {
-                config: config.clone(),
-                grid: OccupancyGrid::new(extent.bounds, &config.occupancy)?,
-                progress: 0.0,
-            }),
-        };
-        let field = config.field.build(extent.bounds, &mut params, "field", &mut rng)?;
+        let rng = &mut Pcg64Mcg::seed_from_u64(seed);
+        let sampler = config.sampler.build(Site { space, params: &mut params, name: "sampler", rng })?;
+        let field = config.field.build(Site { space, params: &mut params, name: "field", rng })?;
         Ok(Model { config, extent, params, field, sampler })
     }
 
-    /// All fields: that of the sampler, if it has one, and the one that is rendered.
+    /// All fields: those of the sampler, if it has any, and the one that is rendered.
     pub fn fields(&self) -> Vec<&dyn Field<T>> {
-        let proposal = match &self.sampler {
-            Sampler::Hierarchical(sampler) => Some(&sampler.proposal as &dyn Field<T>),
-            Sampler::Marching(_) => None,
-        };
-        proposal.into_iter().chain([&*self.field]).collect()
+        self.sampler.fields().into_iter().chain([&*self.field]).collect()
     }
 
-    /// For each of [`fields`](Self::fields) where it is sampled along `rays`, as the parameters are now.
+    /// The sampler, if it marches through an occupancy grid.
+    pub fn marching(&self) -> Option<&Marching> {
+        (&*self.sampler as &dyn Any).downcast_ref()
+    }
+
+    /// The sampler, to be changed, if it marches through an occupancy grid.
+    pub fn marching_mut(&mut self) -> Option<&mut Marching> {
+        (&mut *self.sampler as &mut dyn Any).downcast_mut()
+    }
+
+    /// Where fields are sampled along `rays` by the sampler as it is in training, with the parameters as they are now:
+    /// first what each [coarse](crate::sampling::Sampled::coarse) picture is made of, and last the steps of the field.
     pub fn samples(&self, rays: &Rays<T>, jitter: &mut Jitter<'_>) -> Vec<Samples<T>> {
         let tape = Tape::new();
         let params = self.params.bind_constant(&tape);
-        match &self.sampler {
-            Sampler::Hierarchical(sampler) => sampler.samples(&params, rays, jitter).into(),
-            Sampler::Marching(sampler) => vec![sampler.samples(rays, jitter, &mut MarchBuffer::default(), tape.pool())],
-        }
+        let sampled = self.sampler.sample(&Query::new(&*self.field, &params), rays, Purpose::Training, jitter);
+        sampled.coarse.into_iter().map(|seen| seen.samples).chain([sampled.steps]).collect()
     }
 
-    /// The training loss at given samples, a differentiable function of the parameters alone: the sum over fields, rays
+    /// The photometric loss at given samples, a differentiable function of the parameters alone: the sum over fields, rays
     /// and channels of the configured loss against `target` `[rays, 3]` over `background` `[rays, 3]`.
     ///
     /// # Panics
-    /// If there is not one set of samples for each of [`fields`](Self::fields).
+    /// If there are more sets of samples than [`fields`](Self::fields).
     pub fn loss_at<'t>(
         &self,
         params: &Bound<'t, T>,
@@ -121,33 +133,17 @@ impl<T: Scalar> Model<T> {
         target: &Tensor<T>,
         background: &Tensor<T>,
     ) -> Var<'t, T> {
-        let tape = params.tape();
-        assert_eq!(samples.len(), self.fields().len(), "one set of samples for each field");
+        let fields = self.fields();
+        assert!(samples.len() <= fields.len(), "one set of samples for each field");
         let error = |(field, samples): (&dyn Field<T>, &Samples<T>)| {
-            let rendered = match &self.sampler {
-                Sampler::Hierarchical(_) => composite_samples(field, params, samples, false, tape).0,
-                Sampler::Marching(sampler) => {
-                    let rule = sampler.config.quadrature;
-                    rule.plan_for(field, params, samples, 0.0, tape).plan.render(field, params, false, tape)
-                }
-            };
-            self.config.loss.sum(&rendered, target, background)
+            let plan = self.sampler.quadrature().plan_for(&Query::new(field, params), samples, 0.0).plan;
+            let seen = plan.render(&Query::new(field, params));
+            self.config.loss.sum(&seen.over(background), target)
         };
-        let errors = self.fields().into_iter().zip(samples).map(error);
-        errors.reduce(|sum, error| sum + error).unwrap_or_else(|| tape.constant(Tensor::scalar(T::ZERO)))
+        let errors = fields[fields.len() - samples.len()..].iter().copied().zip(samples).map(error);
+        errors.reduce(|sum, error| sum + error).unwrap_or_else(|| params.tape().constant(Tensor::scalar(T::ZERO)))
     }
-}
 
-impl<T: Scalar> Model<T> {
-    /// Chooses what [`view`](Model::view) may leave out from now on. A model without an occupancy grid leaves out nothing.
-    pub fn set_skip(&mut self, skip: Skip) {
-        if let Sampler::Marching(marching) = &mut self.sampler {
-            marching.config.occupancy.skip = skip;
-        }
-    }
-}
-
-impl<T: Scalar> Model<T> {
     /// The same model in another precision: the same samples, occupied cells and parameters, the latter rounded if need
     /// be.
     ///
@@ -157,9 +153,10 @@ impl<T: Scalar> Model<T> {
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::new(self.config.clone(), self.extent, 0)?;
         model.params.assign(&self.params);
-        // The other sampler has nothing but its configuration and handles of the new store.
-        if let Sampler::Marching(_) = &self.sampler {
-            model.sampler = self.sampler.clone();
+        let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
+        model.sampler.load_state(&state)?;
+        if let (Some(old), Some(new)) = (self.marching(), model.marching_mut()) {
+            *new = old.clone();
         }
         Ok(model)
     }
@@ -167,7 +164,7 @@ impl<T: Scalar> Model<T> {
 
 impl Model<f32> {
     /// The field's density at each of these positions (scene units), in 1 / scene unit, into the slot of the same number:
-    /// what an [`OccupancyGrid`] asks for.
+    /// what an [`OccupancyGrid`](crate::space::occupancy::OccupancyGrid) asks for.
     ///
     /// # Panics
     /// If there are not as many slots as positions.
@@ -175,11 +172,33 @@ impl Model<f32> {
         densities(&*self.field, &self.params, &Pool::new(), points, out);
     }
 
-    /// Looks closely at everything that the occupancy grid, if there is one, may hold: for rendering within the error
-    /// bound of the configuration. [`Trainer::run`](crate::Trainer::run) ends with it.
-    pub fn finish_grid(&mut self) {
-        if let Sampler::Marching(marching) = &mut self.sampler {
-            marching.finish(&*self.field, &self.params, &Pool::new());
+    /// Chooses what views leave out from now on. A model without an occupancy grid leaves out what it has to.
+    pub fn set_skip(&mut self, skip: impl Into<Skipping>) {
+        if let Some(marching) = self.marching_mut() {
+            marching.config.occupancy.skip = skip.into();
+            self.finish();
         }
     }
+
+    /// Looks closely at everything that the sampler may look at: for rendering within the error bound of the
+    /// configuration. [`Trainer::run`](crate::Trainer::run) and [`load`](Self::load) end with it.
+    pub fn finish(&mut self) {
+        let Model { sampler, field, params, .. } = self;
+        let pool = Pool::new();
+        sampler.finish(&|points, out| densities(&**field, params, &pool, points, out));
+    }
+}
+
+/// A field's densities, for samplers.
+pub(crate) fn densities(
+    field: &dyn Field<f32>,
+    params: &Params<f32>,
+    pool: &Pool<f32>,
+    points: &[[f32; 3]],
+    out: &mut [f32],
+) {
+    let tape = Tape::with_pool(pool.clone());
+    let params = params.bind_constant(&tape);
+    let positions = tape.constant(pool.copy_of(&[points.len(), 3], points.as_flattened()));
+    out.copy_from_slice(field.density(&params, &positions).sigma().value().as_slice());
 }

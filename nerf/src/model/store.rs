@@ -1,31 +1,23 @@
 //! Models on disk.
 
-use crate::model::config::Config;
-use crate::model::{Extent, Model, Sampler};
+use super::config::Config;
+use super::{Extent, Model};
 use crate::pictures::output::write_atomic;
-use crate::space::occupancy::OccupancyGrid;
 use crate::{Error, Result};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// The name of the occupancy grid's bytes in a file.
-const GRID: &str = "occupancy";
-
 impl Model<f32> {
-    /// Writes the parameters in the number type of the configuration and, if there is an occupancy grid, which of its cells
-    /// are occupied, as safetensors: beside the file first and then over it.
+    /// Writes the parameters in the number type of the configuration and what the sampler knows (such as which cells of an
+    /// occupancy grid are occupied) as safetensors: beside the file first and then over it.
     ///
     /// # Errors
     /// If the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let metadata = HashMap::from([("format".into(), "raygrad".into())]);
-        let blobs = match &self.sampler {
-            Sampler::Hierarchical(_) => vec![],
-            Sampler::Marching(sampler) => vec![(GRID, sampler.grid.occupied_to_bytes())],
-        };
         let bytes = self
             .params
-            .to_safetensors(self.config.storage, metadata, &blobs)
+            .to_safetensors(self.config.storage, metadata, &self.sampler.state())
             .map_err(|error| Error::file(&path, error))?;
         write_atomic(path, &bytes)
     }
@@ -37,15 +29,9 @@ impl Model<f32> {
     pub fn load(path: impl AsRef<Path>, config: Config, extent: Extent) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
         let mut model = Model::new(config, extent, 0)?;
-        let blobs = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
-        if let Sampler::Marching(sampler) = &mut model.sampler {
-            let Some(bytes) = blobs.get(GRID) else { return Err(Error::file(&path, "holds no occupancy grid")) };
-            let grid = OccupancyGrid::from_bytes(bytes).map_err(|error| Error::file(&path, error))?;
-            if grid.bounds() != sampler.grid.bounds() || grid.cells() != sampler.grid.cells() {
-                return Err(Error::file(&path, "its occupancy grid belongs to a model of another configuration"));
-            }
-            sampler.grid = grid;
-        }
+        let state = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
+        model.sampler.load_state(&state).map_err(|error| Error::file(&path, error))?;
+        model.finish();
         Ok(model)
     }
 }
@@ -55,14 +41,16 @@ mod tests {
     use super::*;
     use crate::dataset::scene::train_cameras;
     use crate::field::{FieldConfig, VoxelConfig};
-    use crate::model::config::{Preset, SamplerConfig};
+    use crate::model::config::Preset;
+    use crate::sampling::marching::MarchingConfig;
+    use crate::space::occupancy::OccupancyGrid;
     use glam::DVec3;
     use raygrad_nn::Storage;
 
     fn voxel(direction_degree: usize) -> Config {
         let mut config = Config::preset(Preset::Voxel);
-        config.field = FieldConfig::Voxel(VoxelConfig { resolution: 20, direction_degree });
-        if let SamplerConfig::Marching(sampler) = &mut config.sampler {
+        config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree });
+        if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
             sampler.occupancy.resolution = 16;
         }
         config
@@ -70,20 +58,23 @@ mod tests {
 
     #[test]
     fn a_voxel_model_comes_back_as_it_was() {
-        let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] };
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let mut model = Model::new(voxel(2), extent, 3).unwrap();
         // A ball in one corner, so that the occupancy grid has something to remember.
-        let (table, _) = model.field.table().unwrap();
+        let table = model.params.find("field.table").unwrap();
         let rows = model.params.get_mut(table).as_mut_slice().chunks_exact_mut(16).enumerate();
         rows.for_each(|(i, row)| row[0] = if i % 21 < 9 && i / 441 < 9 { 4.0 } else { -20.0 });
-        model.finish_grid();
+        model.finish();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         model.save(&path).unwrap();
         let read = Model::load(&path, voxel(2), extent).unwrap();
         assert_eq!(read.params.values(), model.params.values());
-        let (Sampler::Marching(old), Sampler::Marching(new)) = (&model.sampler, &read.sampler) else { panic!() };
-        assert!(new.grid.occupied_share() < 0.5 && new.grid.occupied_to_bytes() == old.grid.occupied_to_bytes());
+        let (Some(old), Some(new)) = (model.marching(), read.marching()) else { panic!() };
+        let bytes = |grid: [&OccupancyGrid; 2]| grid.map(OccupancyGrid::occupied_to_bytes);
+        assert_eq!(bytes([&new.grid, new.view_grid()]), bytes([&old.grid, old.view_grid()]));
+        assert!(new.view_grid().occupied_share() < 0.5, "what views look at is pruned");
+        assert_eq!(new.grid.occupied_share(), 1.0, "what is stored is not");
         let camera = &train_cameras(4, 24)[1];
         let [seen, again] = [&model, &read].map(|model| model.view(camera, [1.0; 3]));
         assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));
@@ -93,7 +84,7 @@ mod tests {
 
     #[test]
     fn sixteen_bits_take_half_of_the_file() {
-        let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] };
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         let sizes = [Storage::Full, Storage::F16, Storage::Bf16].map(|storage| {

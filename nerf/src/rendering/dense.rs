@@ -1,17 +1,15 @@
 //! Views in which nothing is left out, in any precision: what others are measured against.
 
-use crate::camera::bounds::clip_span;
+use super::picture::Picture;
+use super::pixel::Pixel;
 use crate::camera::pinhole::Camera;
-use crate::camera::rays::{Rays, Samples};
-use crate::dataset::image::Image;
-use crate::model::{Model, Sampler};
+use crate::camera::rays::Rays;
+use crate::model::Model;
 use crate::random::Jitter;
-use crate::rendering::picture::{Evaluations, Picture, VISIBLE};
-use crate::sampling::marching::Marching;
-use crate::space::occupancy::{MarchBuffer, Step};
-use raygrad_autograd::{Scalar, Segments, Tape, Tensor};
-use raygrad_tensor::parallel;
-use rayon::prelude::*;
+use crate::sampling::Purpose;
+use crate::volume::query::Query;
+use crate::volume::render::Evaluations;
+use raygrad_autograd::{Scalar, Tape, Var};
 
 /// A view in double precision.
 #[derive(Debug, Clone)]
@@ -20,8 +18,8 @@ pub struct DenseView {
     pub width: usize,
     /// Number of rows.
     pub height: usize,
-    /// For each pixel the colour over the background, the distance times the weight, and the transmittance.
-    pub pixels: Vec<[f64; 5]>,
+    /// What is seen over the background, row by row.
+    pub pixels: Vec<Pixel>,
     /// How often fields were asked.
     pub evaluations: Evaluations,
 }
@@ -34,85 +32,47 @@ impl<T: Scalar> Model<T> {
     /// the configured ones. Nothing is left out but the cells that the occupancy grid holds to be empty.
     ///
     /// In f64 at several times the steps it is a reference for faster ways: `model.cast::<f64>()?.dense_view(..)`. A
-    /// hierarchical sampler has as many samples whatever `finer` is.
+    /// sampler without steps has as many samples whatever `finer` is.
     ///
     /// # Panics
     /// If `finer` is 0.
     #[inline(never)]
     pub fn dense_view(&self, camera: &Camera, background: [f64; 3], finer: usize) -> DenseView {
         assert!(finer > 0, "steps that are 0 times smaller");
-        let mut pixels = vec![[0.0; 5]; camera.width * camera.height];
-        let tiles = pixels.par_chunks_mut(TILE).enumerate();
-        let evaluations = tiles.map(|(tile, out)| {
-            let mut rays = Rays::<T>::new();
-            for pixel in tile * TILE..tile * TILE + out.len() {
-                let ray = camera.pixel_ray(pixel % camera.width, pixel / camera.width);
-                rays.push(&ray, clip_span(&ray, self.extent.bounds, self.extent.span));
-            }
-            parallel::serial(|| self.dense_rays(&rays, finer, out))
-        });
-        let evaluations = evaluations.reduce(Evaluations::default, |a, b| a + b);
-        for pixel in &mut pixels {
-            let left = pixel[4];
-            pixel.iter_mut().zip(background).for_each(|(value, background)| *value += left * background);
-        }
+        let see = |_: &mut (), rays: &Rays<T>, out: &mut [Pixel]| self.dense_rays(rays, finer, out);
+        let (pixels, evaluations) = self.pixels(camera, TILE, see);
+        let pixels = pixels.into_iter().map(|pixel| pixel.over(background)).collect();
         DenseView { width: camera.width, height: camera.height, pixels, evaluations }
     }
 
-    fn dense_rays(&self, rays: &Rays<T>, finer: usize, out: &mut [[f64; 5]]) -> Evaluations {
+    fn dense_rays(&self, rays: &Rays<T>, finer: usize, out: &mut [Pixel]) -> Evaluations {
         let tape = Tape::new();
         let params = self.params.bind_constant(&tape);
-        let (rendered, evaluations) = match &self.sampler {
-            Sampler::Hierarchical(sampler) => {
-                let rendered = sampler.render(&*self.field, &params, rays, &mut Jitter::Middle, true, &tape).fine;
-                let each = (rays.len() * sampler.config.evaluations()) as u64;
-                (rendered, Evaluations { density: each, color: each, unskipped: each })
-            }
-            Sampler::Marching(sampler) => {
-                let (steps, unskipped) = even_steps(sampler, rays, finer, &tape);
-                let rule = sampler.config.quadrature;
-                let seen = rule.plan_for(&*self.field, &params, &steps, 0.0, &tape);
-                let rendered = seen.plan.render(&*self.field, &params, true, &tape);
-                let asked = seen.evaluations as u64;
-                (rendered, Evaluations { density: asked, color: asked, unskipped })
-            }
-        };
-        for (out, values) in out.iter_mut().zip(rendered.value().as_slice().chunks_exact(5)) {
-            out.iter_mut().zip(values).for_each(|(out, value)| *out = value.to_f64());
+        let query = &Query::new(&*self.field, &params);
+        let sampled = self.sampler.sample(query, rays, Purpose::View { finer }, &mut Jitter::Middle);
+        let seen = self.sampler.quadrature().plan_for(query, &sampled.steps, 0.0);
+        let rendered = seen.plan.render(query);
+        let [color, depth, left] = [&rendered.color, &rendered.depth(), &rendered.transmittance()].map(numbers);
+        for (i, out) in out.iter_mut().enumerate() {
+            *out = Pixel {
+                color: [color[3 * i], color[3 * i + 1], color[3 * i + 2]],
+                depth: depth[i],
+                transmittance: left[i],
+            };
         }
-        evaluations
+        let asked = seen.evaluations as u64;
+        sampled.evaluations + Evaluations { density: asked, color: asked, unskipped: 0 }
     }
 }
 
-/// Samples in occupied cells, and how many there would be if all were. Where they lie is worked out in f32, so they are the
-/// same in every precision.
-fn even_steps<T: Scalar>(sampler: &Marching, rays: &Rays<T>, finer: usize, tape: &Tape<T>) -> (Samples<T>, u64) {
-    let mut buffer = MarchBuffer::default();
-    let step = Step::uniform(sampler.view_step() / finer as f32);
-    sampler.grid.march(&rays.cast(), &step, &mut Jitter::Middle, &mut buffer);
-    let tensor =
-        |values: &[f32]| Tensor::from_vec(&[values.len()], values.iter().map(|&x| T::from_f64(x.into())).collect());
-    let segments = Segments::new(&buffer.offsets[..]);
-    (Samples::new(rays, segments, tensor(&buffer.t), tensor(&buffer.delta), tape.pool()), buffer.steps)
+fn numbers<T: Scalar>(values: &Var<'_, T>) -> Vec<f64> {
+    values.value().as_slice().iter().map(|x| x.to_f64()).collect()
 }
 
 impl DenseView {
     /// The view rounded to single precision.
     pub fn picture(&self) -> Picture {
-        let image = |channels: usize, value: &dyn Fn(&[f64; 5], usize) -> f64| {
-            let data = self.pixels.iter().flat_map(|pixel| (0..channels).map(move |c| value(pixel, c) as f32));
-            Image { width: self.width, height: self.height, channels, data: data.collect() }
-        };
-        let depth = |pixel: &[f64; 5]| {
-            let opacity = 1.0 - pixel[4];
-            if opacity > f64::from(VISIBLE) { pixel[3] / opacity } else { 0.0 }
-        };
-        Picture {
-            color: image(3, &|pixel, c| pixel[c]),
-            depth: image(1, &|pixel, _| depth(pixel)),
-            opacity: image(1, &|pixel, _| 1.0 - pixel[4]),
-            evaluations: self.evaluations,
-        }
+        Picture::new([self.width, self.height], &self.pixels, self.evaluations)
     }
 }
 
@@ -130,10 +90,9 @@ mod tests {
     /// A voxel model with a ball in one corner.
     fn ball() -> Model<f32> {
         let mut config = Config::preset(Preset::Voxel).with_skip(Skip::Off);
-        config.field = FieldConfig::Voxel(VoxelConfig { resolution: 20, direction_degree: 2 });
-        let mut model =
-            Model::new(config, Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0] }, 3).unwrap();
-        let (table, _) = model.field.table().unwrap();
+        config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 2 });
+        let mut model = Model::new(config, Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]), 3).unwrap();
+        let table = model.params.find("field.table").unwrap();
         let rows = model.params.get_mut(table).as_mut_slice().chunks_exact_mut(16).enumerate();
         rows.for_each(|(i, row)| row[0] = if i % 21 < 9 && i / 441 < 9 { 0.3 } else { -2.0 });
         model
@@ -147,13 +106,17 @@ mod tests {
         let [background, black] = [[0.2, 0.5, 1.0], [0.0; 3]];
         let [exact, single] = [double.dense_view(camera, background, 1), model.dense_view(camera, background, 1)];
         assert_eq!(exact.evaluations, single.evaluations);
-        let worst = |values: std::ops::Range<usize>| {
-            let pairs = exact.pixels.iter().zip(&single.pixels);
-            let errors = pairs.flat_map(|(a, b)| values.clone().map(|i| (a[i] - b[i]).abs()));
+        let values = |pixel: &Pixel| {
+            let [r, g, b] = pixel.color;
+            [r, g, b, pixel.depth, pixel.transmittance]
+        };
+        let worst = |one: &DenseView, which: std::ops::Range<usize>| {
+            let pairs = exact.pixels.iter().map(values).zip(one.pixels.iter().map(values));
+            let errors = pairs.flat_map(|(a, b)| which.clone().map(move |i| (a[i] - b[i]).abs()));
             errors.fold(0.0_f64, Real::maximum)
         };
         // Densities are up to e^2, distances around 4.
-        let (colour, all) = (worst(0..3), worst(0..exact.pixels[0].len()));
+        let (colour, all) = (worst(&single, 0..3), worst(&single, 0..5));
         println!("f32 against f64 at the same samples: colours {colour:.1e}, with distances {all:.1e}");
         assert!(colour > 0.0 && colour <= 1e-6 && all <= 1e-5, "{colour:e}, {all:e}");
         let view = model.view(camera, background.map(|x| x as f32));
@@ -164,11 +127,7 @@ mod tests {
             picture.opacity.data.iter().any(|&x| x > 0.5) && exact.pixels != double.dense_view(camera, black, 1).pixels
         );
         let finer = double.dense_view(camera, background, 3);
-        let difference = |view: &DenseView| {
-            let pairs = view.pixels.iter().flatten().zip(exact.pixels.iter().flatten());
-            pairs.map(|(a, b)| (a - b).abs()).fold(0.0, Real::maximum)
-        };
-        assert!((1e-9..0.2).contains(&difference(&finer)), "{}", difference(&finer));
+        assert!((1e-9..0.2).contains(&worst(&finer, 0..5)), "{}", worst(&finer, 0..5));
         assert!(finer.evaluations.density > 2 * exact.evaluations.density);
     }
 
@@ -180,7 +139,7 @@ mod tests {
         use crate::volume::quadrature::Quadrature::*;
         // The voxels' edges are steep at the scale of a step.
         for rule in [Left, Midpoint, PiecewiseLinear, Gauss2, Adaptive { tolerance: 1e-4 }] {
-            let Sampler::Marching(sampler) = &mut model.sampler else { panic!() };
+            let Some(sampler) = model.marching_mut() else { panic!() };
             sampler.config.quadrature = rule;
             let seen = model.view(camera, [1.0; 3]);
             let differences = seen.color.data.iter().zip(&reference.color.data).map(|(a, b)| (a - b).abs());

@@ -2,8 +2,9 @@
 
 pub(crate) mod dense;
 pub(crate) mod picture;
+pub(crate) mod pixel;
 pub(crate) mod view;
 
 pub use dense::DenseView;
-pub use picture::{Evaluations, Picture};
-pub use view::Limits;
+pub use picture::Picture;
+pub use pixel::Pixel;

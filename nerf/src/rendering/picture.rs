@@ -1,17 +1,16 @@
 //! Rendering whole images, tile by tile on all cores.
 
-use crate::camera::bounds::clip_span;
+use super::pixel::Pixel;
+use super::view::Viewer;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::dataset::image::Image;
-use crate::model::{Model, Sampler};
-use crate::random::Jitter;
-use crate::rendering::view::{Limits, Viewer};
-use crate::space::occupancy::Skip;
-use raygrad_autograd::Tape;
+use crate::model::Model;
+use crate::sampling::Limits;
+use crate::volume::render::Evaluations;
+use raygrad_autograd::Scalar;
 use raygrad_tensor::parallel;
 use rayon::prelude::*;
-use std::ops::Add;
 
 /// What a model sees from a camera.
 #[derive(Debug, Clone)]
@@ -26,76 +25,64 @@ pub struct Picture {
     pub evaluations: Evaluations,
 }
 
-/// How often fields were asked.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Evaluations {
-    /// For a density.
-    pub density: u64,
-    /// For a colour.
-    pub color: u64,
-    /// How often it would have been for each if nothing but the outside of the box were left out.
-    pub unskipped: u64,
-}
+/// Below this opacity a pixel has no depth.
+const VISIBLE: f64 = 1e-3;
 
-impl Add for Evaluations {
-    type Output = Evaluations;
-    fn add(self, other: Evaluations) -> Evaluations {
-        Evaluations {
-            density: self.density + other.density,
-            color: self.color + other.color,
-            unskipped: self.unskipped + other.unskipped,
+impl Picture {
+    /// A picture of these pixels, row by row, in single precision.
+    pub(crate) fn new(camera: [usize; 2], pixels: &[Pixel], evaluations: Evaluations) -> Self {
+        let [width, height] = camera;
+        let image = |channels: usize, values: &dyn Fn(&Pixel, usize) -> f64| {
+            let data = pixels.iter().flat_map(|pixel| (0..channels).map(move |c| values(pixel, c) as f32));
+            Image { width, height, channels, data: data.collect() }
+        };
+        let opacity = |pixel: &Pixel| 1.0 - pixel.transmittance;
+        let depth = |pixel: &Pixel| if opacity(pixel) > VISIBLE { pixel.depth / opacity(pixel) } else { 0.0 };
+        Picture {
+            color: image(3, &|pixel, c| pixel.color[c]),
+            depth: image(1, &|pixel, _| depth(pixel)),
+            opacity: image(1, &|pixel, _| opacity(pixel)),
+            evaluations,
         }
     }
 }
 
-/// Colour `[3]`, distance and transmittance of a ray, each times the light that the samples block.
-pub(crate) type RayValues = [f32; 5];
-
-/// Rays that are evaluated together: hierarchical, and marching.
-const TILE: [usize; 2] = [32, 512];
-/// Below this opacity a pixel has no depth.
-pub(crate) const VISIBLE: f32 = 1e-3;
+impl<T: Scalar> Model<T> {
+    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays.
+    pub(crate) fn pixels<S: Default>(
+        &self,
+        camera: &Camera,
+        tile: usize,
+        see: impl Fn(&mut S, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
+    ) -> (Vec<Pixel>, Evaluations) {
+        let mut pixels = vec![Pixel::default(); camera.width * camera.height];
+        let tiles = pixels.par_chunks_mut(tile).enumerate();
+        let evaluations = tiles.map_init(S::default, |scratch, (which, out)| {
+            let mut rays = Rays::new();
+            for pixel in which * tile..which * tile + out.len() {
+                let place = [pixel % camera.width, pixel / camera.width];
+                rays.push_pixel(camera, place, self.extent.bounds, self.extent.span);
+            }
+            parallel::serial(|| see(scratch, &rays, out))
+        });
+        let evaluations = evaluations.reduce(Evaluations::default, |a, b| a + b);
+        (pixels, evaluations)
+    }
+}
 
 impl Model<f32> {
     /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
     /// time, on any number of threads.
     pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
-        let skip = match &self.sampler {
-            Sampler::Marching(sampler) => sampler.config.occupancy.skip,
-            Sampler::Hierarchical(_) => Skip::Off,
-        };
-        self.view_within(camera, background, &Limits::of(skip))
+        self.view_within(camera, background, &self.sampler.limits())
     }
 
-    /// As [`view`](Self::view), with these limits in place of those that go with the configuration. A hierarchical
-    /// sampler leaves out nothing and pays no heed to them.
+    /// As [`view`](Self::view), with these limits in place of those that go with the configuration.
     pub fn view_within(&self, camera: &Camera, background: [f32; 3], limits: &Limits) -> Picture {
-        let pixels = camera.width * camera.height;
-        let image = |channels| Image::new(camera.width, camera.height, channels);
-        let (mut color, mut depth, mut opacity) = (image(3), image(1), image(1));
-        let tile = TILE[usize::from(matches!(self.sampler, Sampler::Marching(_)))];
-        let parts = color.data.par_chunks_mut(3 * tile).zip(depth.data.par_chunks_mut(tile));
-        let parts = parts.zip(opacity.data.par_chunks_mut(tile)).enumerate();
-        let evaluations = parts
-            .map_init(Viewer::default, |viewer, (part, ((color, depth), opacity))| {
-                let mut rays = Rays::new();
-                for pixel in part * tile..((part + 1) * tile).min(pixels) {
-                    let ray = camera.pixel_ray(pixel % camera.width, pixel / camera.width);
-                    rays.push(&ray, clip_span(&ray, self.extent.bounds, self.extent.span));
-                }
-                let mut values = vec![[0.0; 5]; rays.len()];
-                let evaluations = parallel::serial(|| self.view_rays(viewer, &rays, limits, &mut values));
-                for (i, [r, g, b, distance, left]) in values.into_iter().enumerate() {
-                    for (channel, value) in [r, g, b].into_iter().enumerate() {
-                        color[3 * i + channel] = value + left * background[channel];
-                    }
-                    opacity[i] = 1.0 - left;
-                    depth[i] = if opacity[i] > VISIBLE { distance / opacity[i] } else { 0.0 };
-                }
-                evaluations
-            })
-            .reduce(Evaluations::default, |a, b| a + b);
-        Picture { color, depth, opacity, evaluations }
+        let see = |viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [Pixel]| viewer.see(self, rays, limits, out);
+        let (pixels, evaluations) = self.pixels(camera, self.sampler.view_tile(), see);
+        let pixels: Vec<_> = pixels.into_iter().map(|pixel| pixel.over(background.map(f64::from))).collect();
+        Picture::new([camera.width, camera.height], &pixels, evaluations)
     }
 
     /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole: something
@@ -117,22 +104,6 @@ impl Model<f32> {
             self.view(&camera.resized(width, height), background)
         })
     }
-
-    fn view_rays(&self, viewer: &mut Viewer, rays: &Rays<f32>, limits: &Limits, out: &mut [RayValues]) -> Evaluations {
-        match &self.sampler {
-            Sampler::Hierarchical(sampler) => {
-                let tape = Tape::with_pool(viewer.pool.clone());
-                let params = self.params.bind_constant(&tape);
-                let rendered = sampler.render(&*self.field, &params, rays, &mut Jitter::Middle, true, &tape).fine;
-                for (out, values) in out.iter_mut().zip(rendered.value().as_slice().chunks_exact(5)) {
-                    out.copy_from_slice(values);
-                }
-                let each = (rays.len() * sampler.config.evaluations()) as u64;
-                Evaluations { density: each, color: each, unskipped: each }
-            }
-            Sampler::Marching(sampler) => viewer.march(self, sampler, rays, limits, out),
-        }
-    }
 }
 
 #[cfg(test)]
@@ -144,7 +115,7 @@ mod tests {
 
     #[test]
     fn a_progressive_view_ends_with_the_view_itself() {
-        let extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [0.0, 10.0] };
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
         let model = Model::new(Config::preset(Preset::Small), extent, 0).unwrap();
         let pose = Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y);
         let camera = Camera::from_angle(13, 9, 0.6, pose);

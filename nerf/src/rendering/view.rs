@@ -1,50 +1,27 @@
-//! Rendering by marching: densities front to back in rounds until the light is used up, colours where they matter.
+//! Views: densities front to back in rounds until the light is used up, colours where they matter.
 
-use crate::camera::rays::Rays;
+use super::pixel::Pixel;
+use crate::camera::rays::{Rays, Samples};
 use crate::model::Model;
 use crate::random::Jitter;
-use crate::rendering::picture::{Evaluations, RayValues};
-use crate::sampling::marching::Marching;
-use crate::space::occupancy::{MarchBuffer, Skip, Step};
+use crate::sampling::{Limits, Purpose};
 use crate::volume::quadrature::Quadrature;
-use raygrad_autograd::{Pool, Segments, Tape};
-use std::sync::Arc;
+use crate::volume::query::Query;
+use crate::volume::render::{Evaluations, accumulate};
+use crate::volume::weights::Weights;
+use raygrad_autograd::{Pool, Tape};
 
-/// Samples that a ray takes in a round: few while most rays end early.
-const ROUND: usize = 8;
-/// Steps that a ray takes at a time where rules composite intervals themselves: the nodes at their ends are asked twice.
+/// Samples that are asked together, about.
+const ROUND: usize = 4096;
+/// Samples that a ray takes in a round, at least: few while most rays end early.
+const LEAST: usize = 8;
+/// Steps that a ray takes at a time where rules weight intervals themselves: the nodes at their ends are asked twice.
 const CHUNK: usize = 16;
 
-/// What may be left out along one ray when rendering with an occupancy grid.
-///
-/// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling the
-/// rest.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Limits {
-    /// A ray ends where less light than this is left, 0 to 1.
-    pub termination: f32,
-    /// Samples whose weights add up to at most this have no colour of their own, 0 to 1. Quadratures of two nodes an
-    /// interval colour every sample.
-    pub color_budget: f32,
-}
-
-impl Limits {
-    /// What goes with skipping that much empty space.
-    pub fn of(skip: Skip) -> Self {
-        match skip {
-            Skip::Off => Limits { termination: 0.0, color_budget: 0.0 },
-            Skip::Lossless => Limits { termination: 1e-4, color_budget: 1e-4 },
-            Skip::Fast => Limits { termination: 1e-3, color_budget: 2e-3 },
-        }
-    }
-}
-
-/// Buffers of one worker.
+/// What one worker keeps.
 #[derive(Default)]
 pub(crate) struct Viewer {
-    pub pool: Pool<f32>,
-    marched: MarchBuffer,
-    rays: Vec<RayState>,
+    pool: Pool<f32>,
 }
 
 /// How far a ray has come.
@@ -57,177 +34,145 @@ struct RayState {
     weight: f32,
 }
 
-/// A sample of a round that gets a colour.
-struct Shaded {
-    row: u32,
-    weight: f32,
+impl Viewer {
+    /// What is seen along rays without a background.
+    pub fn see(&mut self, model: &Model<f32>, rays: &Rays<f32>, limits: &Limits, out: &mut [Pixel]) -> Evaluations {
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = model.params.bind_constant(&tape);
+        let query = &Query::new(&*model.field, &params);
+        let sampled = model.sampler.sample(query, rays, Purpose::View { finer: 1 }, &mut Jitter::Middle);
+        let rule = model.sampler.quadrature();
+        let asked = match rule {
+            Quadrature::Midpoint | Quadrature::Left => {
+                in_rounds(query, &rule.plan(&sampled.steps, tape.pool()).samples, limits, out)
+            }
+            _ => in_chunks(query, rule, &sampled.steps, limits, out),
+        };
+        asked + sampled.evaluations
+    }
 }
 
-impl Viewer {
-    /// Colour, distance and remaining transmittance of each ray.
-    pub fn march(
-        &mut self,
-        model: &Model<f32>,
-        sampler: &Marching,
-        rays: &Rays<f32>,
-        limits: &Limits,
-        out: &mut [RayValues],
-    ) -> Evaluations {
-        let step = Step::uniform(sampler.view_step());
-        sampler.grid.march(rays, &step, &mut Jitter::Middle, &mut self.marched);
-        match sampler.config.quadrature {
-            Quadrature::Midpoint => {}
-            Quadrature::Left => {
-                let MarchBuffer { t, delta, .. } = &mut self.marched;
-                t.iter_mut().zip(delta).for_each(|(t, delta)| *t -= 0.5 * *delta);
-            }
-            rule => return self.composite(model, rule, rays, limits, out),
-        }
-        self.rays.clear();
-        self.rays.resize(rays.len(), RayState::default());
-        let range = |ray: usize| self.marched.offsets[ray] as usize..self.marched.offsets[ray + 1] as usize;
-        let mut alive: Vec<u32> = (0..rays.len() as u32).filter(|&ray| !range(ray as usize).is_empty()).collect();
-        let mut evaluations = Evaluations { unskipped: self.marched.steps, ..Evaluations::default() };
-        let mut round = 0;
-        while !alive.is_empty() {
-            evaluations = evaluations + self.round(model, rays, &alive, round, limits, out);
-            round += 1;
-            let most = f64::from(limits.termination);
-            alive.retain(|&ray| {
-                let samples = self.marched.offsets[ray as usize + 1] - self.marched.offsets[ray as usize];
-                (samples as usize) > round * ROUND && (-self.rays[ray as usize].depth).exp() > most
-            });
-        }
-        for (out, state) in out.iter_mut().zip(&self.rays) {
-            finish(out, state, limits);
-        }
-        evaluations
+/// The view of samples that stand for an interval each.
+fn in_rounds(query: &Query<'_, '_, f32>, samples: &Samples<f32>, limits: &Limits, out: &mut [Pixel]) -> Evaluations {
+    let mut states = vec![RayState::default(); out.len()];
+    let each = (ROUND / out.len().max(1)).max(LEAST);
+    let range = |ray: usize| samples.segments.range(ray);
+    out.fill(Pixel::default());
+    let mut alive: Vec<usize> = (0..out.len()).filter(|&ray| !range(ray).is_empty()).collect();
+    let (mut evaluations, mut done) = (Evaluations::default(), 0);
+    while !alive.is_empty() {
+        let piece = |&ray: &usize| (ray, range(ray).start + done..(range(ray).start + done + each).min(range(ray).end));
+        let pieces: Vec<_> = alive.iter().map(piece).collect();
+        let part = samples.pieces(&pieces, query.tape().pool());
+        evaluations = evaluations + round(query, &part, &alive, limits, &mut states, out);
+        done += each;
+        let most = f64::from(limits.termination);
+        alive.retain(|&ray| range(ray).len() > done && (-states[ray].depth).exp() > most);
     }
+    for (out, state) in out.iter_mut().zip(&states) {
+        finish(out, state, limits);
+    }
+    evaluations
+}
 
-    /// The view by a rule that composites intervals itself, front to back in chunks of steps.
-    fn composite(
-        &mut self,
-        model: &Model<f32>,
-        rule: Quadrature,
-        rays: &Rays<f32>,
-        limits: &Limits,
-        out: &mut [RayValues],
-    ) -> Evaluations {
-        let steps = self.marched.samples(rays, &self.pool);
-        let tape = Tape::with_pool(self.pool.clone());
-        let params = model.params.bind_constant(&tape);
-        let mut evaluations = Evaluations { unskipped: self.marched.steps, ..Evaluations::default() };
-        let mut left = vec![1.0_f32; rays.len()];
-        for chunk in (0..).step_by(CHUNK) {
-            let ranges = steps.segments.ranges().enumerate().filter(|(ray, _)| left[*ray] > limits.termination);
-            let rows: Vec<u32> = ranges
-                .flat_map(|(_, rows)| (rows.start + chunk).min(rows.end)..(rows.start + chunk + CHUNK).min(rows.end))
-                .map(|row| row as u32)
-                .collect();
-            if rows.is_empty() {
-                break;
-            }
-            let seen = rule.render(&*model.field, &params, &steps.select(&rows, &self.pool), 0.0, true, &tape);
-            evaluations.density += seen.asked as u64;
-            evaluations.color += if let Quadrature::Adaptive { .. } = rule { seen.asked } else { seen.kept } as u64;
-            let values = seen.rendered.value().as_slice().chunks_exact(5);
-            for ((out, left), values) in out.iter_mut().zip(&mut left).zip(values) {
-                out[..4].iter_mut().zip(values).for_each(|(out, value)| *out += *left * value);
-                *left *= values[4];
+/// The next samples of the rays that are alive.
+fn round(
+    query: &Query<'_, '_, f32>,
+    part: &Samples<f32>,
+    alive: &[usize],
+    limits: &Limits,
+    states: &mut [RayState],
+    out: &mut [Pixel],
+) -> Evaluations {
+    let pool = query.tape().pool();
+    let density = query.density(part);
+    let depth = density.optical_depth(&part.delta);
+    let before: Vec<f64> = alive.iter().map(|&ray| states[ray].depth).collect();
+    let weights = query.tape().apply(Weights::behind(part.segments.clone(), before), &[&depth]);
+    let (x, w, t) = (depth.value().as_slice(), weights.value().as_slice(), part.t.as_slice());
+    let mut shaded: Vec<u32> = Vec::with_capacity(part.len());
+    for (rows, &ray) in part.segments.ranges().zip(alive) {
+        let (state, out) = (&mut states[ray], &mut out[ray]);
+        for row in rows {
+            let weight = w[row];
+            state.depth += f64::from(x[row]);
+            state.weight += weight;
+            out.depth += f64::from(weight * t[row]);
+            // Small weights first come first served, within the budget.
+            let small = state.uncolored + weight <= limits.color_budget && 4.0 * weight <= limits.color_budget;
+            if small || weight == 0.0 {
+                state.uncolored += weight;
+            } else {
+                shaded.push(row as u32);
             }
         }
-        for (out, left) in out.iter_mut().zip(left) {
-            let state = RayState { depth: -f64::from(left).ln(), weight: 1.0 - left, uncolored: 0.0 };
-            finish(out, &state, limits);
-        }
-        evaluations
     }
+    let count = Evaluations { density: part.len() as u64, color: shaded.len() as u64, unskipped: 0 };
+    if shaded.is_empty() {
+        return count;
+    }
+    let seen = part.select(&shaded, pool);
+    let color = query.color(&density.features.gather_rows(&shaded[..]), &seen);
+    let color = accumulate(&weights.gather_rows(&shaded[..]), &color, &seen.segments);
+    for (&ray, color) in alive.iter().zip(color.value().as_slice().chunks_exact(3)) {
+        out[ray].color.iter_mut().zip(color).for_each(|(out, &color)| *out += f64::from(color));
+    }
+    count
+}
 
-    /// The next samples of all rays that are alive.
-    fn round(
-        &mut self,
-        model: &Model<f32>,
-        rays: &Rays<f32>,
-        alive: &[u32],
-        round: usize,
-        limits: &Limits,
-        out: &mut [RayValues],
-    ) -> Evaluations {
-        let MarchBuffer { t, delta, offsets, .. } = &self.marched;
-        let tape = Tape::with_pool(self.pool.clone());
-        let params = model.params.bind_constant(&tape);
-        let mut rows = Vec::with_capacity(alive.len() * ROUND);
-        let mut ends = Vec::with_capacity(alive.len());
-        let mut positions = Vec::with_capacity(3 * alive.len() * ROUND);
-        for &ray in alive {
-            let ray = ray as usize;
-            let start = offsets[ray] as usize + round * ROUND;
-            for row in start..(start + ROUND).min(offsets[ray + 1] as usize) {
-                rows.push(row);
-                positions.extend((0..3).map(|axis| rays.origins[ray][axis] + t[row] * rays.directions[ray][axis]));
-            }
-            ends.push(rows.len());
+/// The view by a rule that weights intervals itself, front to back in chunks of steps.
+fn in_chunks(
+    query: &Query<'_, '_, f32>,
+    rule: Quadrature,
+    steps: &Samples<f32>,
+    limits: &Limits,
+    out: &mut [Pixel],
+) -> Evaluations {
+    let mut evaluations = Evaluations::default();
+    let mut depths = vec![0.0; out.len()];
+    out.fill(Pixel::default());
+    for chunk in (0..).step_by(CHUNK) {
+        let left = |ray: usize| f64::exp(-depths[ray]);
+        let ranges = steps.segments.ranges().enumerate().filter(|(ray, _)| left(*ray) > f64::from(limits.termination));
+        let rows: Vec<u32> = ranges
+            .flat_map(|(_, rows)| (rows.start + chunk).min(rows.end)..(rows.start + chunk + CHUNK).min(rows.end))
+            .map(|row| row as u32)
+            .collect();
+        if rows.is_empty() {
+            break;
         }
-        let positions = tape.constant(tape.pool().copy_of(&[rows.len(), 3], &positions));
-        let density = model.field.density(&params, &model.field.encode(&params, &positions));
-        let sigma = density.sigma();
-        let sigma = sigma.value().as_slice();
-        let (mut shaded, mut shaded_ends) = (Vec::with_capacity(rows.len()), vec![0_u32]);
-        let mut start = 0;
-        for (&ray, &end) in alive.iter().zip(&ends) {
-            let state = &mut self.rays[ray as usize];
-            for row in start..end {
-                let depth = f64::from(sigma[row]) * f64::from(delta[rows[row]]);
-                let weight = ((-state.depth).exp() * -(-depth).exp_m1()) as f32;
-                state.depth += depth;
-                state.weight += weight;
-                out[ray as usize][3] += weight * t[rows[row]];
-                // Small weights first come first served, within the budget.
-                if state.uncolored + weight <= limits.color_budget && 4.0 * weight <= limits.color_budget
-                    || weight == 0.0
-                {
-                    state.uncolored += weight;
-                } else {
-                    shaded.push(Shaded { row: row as u32, weight });
-                }
-            }
-            start = end;
-            shaded_ends.push(shaded.len() as u32);
+        let seen = rule.render(query, &steps.select(&rows, query.tape().pool()), 0.0);
+        evaluations.density += seen.asked as u64;
+        evaluations.color += if let Quadrature::Adaptive { .. } = rule { seen.asked } else { seen.kept } as u64;
+        let rendered = &seen.rendered;
+        let (depth, color) = (rendered.depth(), rendered.color.value().as_slice().chunks_exact(3));
+        let values = color.zip(depth.value().as_slice()).zip(rendered.optical_depth.value().as_slice());
+        for ((out, tau), ((color, &depth), &x)) in out.iter_mut().zip(&mut depths).zip(values) {
+            let left = f64::exp(-*tau);
+            out.color.iter_mut().zip(color).for_each(|(out, &color)| *out += left * f64::from(color));
+            out.depth += left * f64::from(depth);
+            *tau += f64::from(x);
         }
-        let count = Evaluations { density: rows.len() as u64, color: shaded.len() as u64, unskipped: 0 };
-        if shaded.is_empty() {
-            return count;
-        }
-        let index: Arc<[u32]> = shaded.iter().map(|shaded| shaded.row).collect();
-        let directions: Vec<[f32; 3]> = alive.iter().map(|&ray| rays.directions[ray as usize]).collect();
-        let directions = tape.constant(tape.pool().copy_of(&[alive.len(), 3], directions.as_flattened()));
-        let segments = Segments::new(shaded_ends);
-        let color = model.field.color(&params, &density.features.gather_rows(&index), &directions, &segments);
-        for (&ray, range) in alive.iter().zip(segments.ranges()) {
-            for i in range {
-                for channel in 0..3 {
-                    out[ray as usize][channel] += shaded[i].weight * color.value().as_slice()[3 * i + channel];
-                }
-            }
-        }
-        count
     }
+    for (out, depth) in out.iter_mut().zip(depths) {
+        finish(out, &RayState { depth, weight: -(-depth).exp_m1() as f32, uncolored: 0.0 }, limits);
+    }
+    evaluations
 }
 
 /// Makes up for what was left out.
-fn finish(out: &mut RayValues, state: &RayState, limits: &Limits) {
-    let left = (-state.depth).exp() as f32;
-    let colored = state.weight - state.uncolored;
+fn finish(out: &mut Pixel, state: &RayState, limits: &Limits) {
+    let left = (-state.depth).exp();
+    let colored = f64::from(state.weight - state.uncolored);
+    out.transmittance = left;
     if colored > 0.0 {
         // The light that would have gone on stays with what is in front.
-        let ended = left <= limits.termination;
-        let total = if ended { 1.0 } else { state.weight };
-        out[..3].iter_mut().for_each(|value| *value *= total / colored);
+        let ended = left <= f64::from(limits.termination);
+        let total = if ended { 1.0 } else { f64::from(state.weight) };
+        out.color.iter_mut().for_each(|value| *value *= total / colored);
         if ended {
-            out[3] *= total / state.weight;
+            out.depth *= total / f64::from(state.weight);
+            out.transmittance = 0.0;
         }
-        out[4] = if ended { 0.0 } else { left };
-    } else {
-        out[4] = left;
     }
 }

@@ -1,15 +1,17 @@
 //! Hierarchical sampling: a coarse field finds where to look, and the field proper is sampled there.
 
+use super::steps::importance;
+use super::{Load, Purpose, Sampled, Sampler, Samplers};
 use crate::Result;
-use crate::camera::rays::stratified;
-use crate::camera::rays::{Rays, Samples};
+use crate::camera::rays::{Rays, stratified};
 use crate::field::{Classic, ClassicConfig, Field};
+use crate::kind::{Kind, Site};
 use crate::random::Jitter;
 use crate::range::check_range;
-use crate::sampling::steps::importance;
-use crate::volume::pass::composite_samples;
-use raygrad_autograd::{Pool, Scalar, Tape, Tensor, Var};
-use raygrad_nn::Bound;
+use crate::volume::quadrature::Plan;
+use crate::volume::query::Query;
+use crate::volume::render::Evaluations;
+use raygrad_autograd::Scalar;
 use serde::{Deserialize, Serialize};
 
 /// Numbers of a [`Hierarchical`] sampler.
@@ -38,8 +40,10 @@ impl Default for HierarchicalConfig {
     }
 }
 
-impl HierarchicalConfig {
-    pub(crate) fn check(&self) -> Result<()> {
+impl Kind<Samplers> for HierarchicalConfig {
+    const KIND: &'static str = "hierarchical";
+
+    fn check(&self) -> Result<()> {
         check_range("coarse", self.coarse, 1, 1 << 12)?;
         check_range("fine", self.fine, 0, 1 << 12)?;
         check_range("batch", self.batch, 1, 1 << 20)?;
@@ -47,13 +51,14 @@ impl HierarchicalConfig {
         check_range("uniform_share", self.uniform_share, 0.0, 1.0)
     }
 
-    /// Evaluations of both networks for a ray.
-    pub fn evaluations(&self) -> usize {
-        2 * self.coarse + self.fine
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
+        let proposal = Classic::new(&self.proposal, Site { name: "proposal", ..site })?;
+        Ok(Box::new(Hierarchical { config: self.clone(), proposal }))
     }
 }
 
-/// The coarse field and the numbers (Mildenhall et al. 2020, section 5.2).
+/// The coarse field and the numbers (Mildenhall et al. 2020, section 5.2). The coarse field is fitted to the photographs as
+/// well.
 #[derive(Debug, Clone)]
 pub struct Hierarchical {
     /// The numbers.
@@ -62,56 +67,34 @@ pub struct Hierarchical {
     pub proposal: Classic,
 }
 
-/// What a forward pass gives for each ray: features and the transmittance that is left, `[rays, features + 1]`.
-pub struct Rendered<'t, T: Scalar> {
-    /// From the coarse field.
-    pub coarse: Var<'t, T>,
-    /// From the field proper.
-    pub fine: Var<'t, T>,
-}
-
-impl Hierarchical {
-    /// The whole forward pass of `field` and the coarse field. With `with_depth` there is a fourth feature, the distance.
-    pub fn render<'t, T: Scalar>(
+impl<T: Scalar> Sampler<T> for Hierarchical {
+    fn sample<'t>(
         &self,
-        field: &dyn Field<T>,
-        params: &Bound<'t, T>,
+        query: &Query<'_, 't, T>,
         rays: &Rays<T>,
+        _: Purpose,
         jitter: &mut Jitter<'_>,
-        with_depth: bool,
-        tape: &'t Tape<T>,
-    ) -> Rendered<'t, T> {
-        let first = stratified(rays, self.config.coarse, jitter, tape.pool());
-        let (coarse, weights) = composite_samples(&self.proposal, params, &first, with_depth, tape);
-        // No gradient flows through the choice of places.
-        let second = self.refine(rays, &first, &weights, jitter, tape.pool());
-        let (fine, _) = composite_samples(field, params, &second, with_depth, tape);
-        Rendered { coarse, fine }
+    ) -> Sampled<'t, T> {
+        let HierarchicalConfig { coarse, fine, uniform_share, .. } = self.config;
+        let pool = query.tape().pool();
+        let first = Plan { samples: stratified(rays, coarse, jitter, pool), intervals: None };
+        let seen = first.render(&query.of(&self.proposal));
+        let weights = seen.weights.value().as_slice();
+        let steps = importance(rays, &first.samples, weights, fine, uniform_share, jitter, pool);
+        let asked = first.len() as u64;
+        let evaluations = Evaluations { density: asked, color: asked, unskipped: asked + steps.len() as u64 };
+        Sampled { steps, coarse: vec![seen], levels: vec![], evaluations }
     }
 
-    fn refine<T: Scalar>(
-        &self,
-        rays: &Rays<T>,
-        first: &Samples<T>,
-        weights: &Tensor<T>,
-        jitter: &mut Jitter<'_>,
-        pool: &Pool<T>,
-    ) -> Samples<T> {
-        let HierarchicalConfig { fine, uniform_share, .. } = self.config;
-        importance(rays, first, weights.as_slice(), fine, uniform_share, jitter, pool)
+    fn load(&self) -> Load {
+        Load::Rays { step: self.config.batch, tile: self.config.tile }
     }
 
-    /// The samples of [`render`](Self::render) for the coarse field and for the field proper.
-    pub fn samples<T: Scalar>(
-        &self,
-        params: &Bound<'_, T>,
-        rays: &Rays<T>,
-        jitter: &mut Jitter<'_>,
-    ) -> [Samples<T>; 2] {
-        let tape = params.tape();
-        let first = stratified(rays, self.config.coarse, jitter, tape.pool());
-        let (_, weights) = composite_samples(&self.proposal, params, &first, false, tape);
-        let second = self.refine(rays, &first, &weights, jitter, tape.pool());
-        [first, second]
+    fn boxed(&self) -> Box<dyn Sampler<T>> {
+        Box::new(self.clone())
+    }
+
+    fn fields(&self) -> Vec<&dyn Field<T>> {
+        vec![&self.proposal]
     }
 }

@@ -1,15 +1,23 @@
-//! Marching: even steps through the occupied cells of a grid, and as little work as possible on each.
+//! Marching: even steps through the occupied cells of a grid.
 
-use crate::Result;
+use super::{Limits, Load, Progress, Purpose, Sampled, Sampler, Samplers};
 use crate::camera::rays::{Rays, Samples};
-use crate::field::Field;
+use crate::dataset::Dataset;
+use crate::kind::{Kind, Site};
 use crate::random::Jitter;
 use crate::range::check_range;
-use crate::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
+use crate::space::occupancy::{
+    DensityFn, MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Skipping, Step, Threshold, Update,
+};
+use crate::space::silhouette;
 use crate::volume::quadrature::Quadrature;
-use raygrad_autograd::{Pool, Scalar, Segments, Tape};
-use raygrad_nn::Params;
+use crate::volume::query::Query;
+use crate::volume::render::Evaluations;
+use crate::{Error, Result};
+use raygrad_autograd::{Pool, Scalar, Segments};
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
 
 /// Numbers of a [`Marching`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -43,7 +51,7 @@ const fn view_step() -> f64 {
 
 impl Default for MarchingConfig {
     fn default() -> Self {
-        let occupancy = OccupancyConfig { skip: Skip::Fast, ..OccupancyConfig::default() };
+        let occupancy = OccupancyConfig { skip: Skip::Fast.into(), ..OccupancyConfig::default() };
         MarchingConfig {
             occupancy,
             step: 1.0 / 200.0,
@@ -56,8 +64,10 @@ impl Default for MarchingConfig {
     }
 }
 
-impl MarchingConfig {
-    pub(crate) fn check(&self) -> Result<()> {
+impl Kind<Samplers> for MarchingConfig {
+    const KIND: &'static str = "marching";
+
+    fn check(&self) -> Result<()> {
         self.occupancy.check()?;
         check_range("step", self.step, 1e-5, 1.0)?;
         self.last_step.map_or(Ok(()), |step| check_range("last_step", step, 1e-5, 1.0))?;
@@ -66,25 +76,50 @@ impl MarchingConfig {
         self.quadrature.check()?;
         check_range("termination", self.termination, 0.0, 1.0)
     }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
+        let grid = OccupancyGrid::new(site.space.bounds, &self.occupancy)?;
+        Ok(Box::new(Marching::new(self.clone(), grid)))
+    }
 }
 
 /// In training, cells whose optical depth a step is below this (or below the mean) are passed over.
 const TRAINING_DEPTH: f32 = 0.01;
 /// Training steps in which all cells are looked at.
 const WARM_UP: u64 = 256;
+/// Steps between updates of the occupancy grid.
+const GRID_EVERY: u64 = 16;
+/// The name of the occupancy grid in a file.
+const GRID: &str = "occupancy";
 
 /// The occupancy grid and the numbers.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Marching {
     /// The numbers.
     pub config: MarchingConfig,
-    /// Which cells hold something.
+    /// Which cells hold something that training works on: a part of the model.
     pub grid: OccupancyGrid,
+    /// Which of these views look at, if fewer: see [`Sampler::finish`].
+    pruned: Option<OccupancyGrid>,
     /// How much of training is done, 0 to 1.
     pub progress: f64,
+    /// What nobody marches with at the moment.
+    buffers: Mutex<Vec<MarchBuffer>>,
+}
+
+impl Clone for Marching {
+    fn clone(&self) -> Self {
+        let (progress, pruned) = (self.progress, self.pruned.clone());
+        Marching { progress, pruned, ..Marching::new(self.config.clone(), self.grid.clone()) }
+    }
 }
 
 impl Marching {
+    /// Marching through a grid, before training.
+    pub fn new(config: MarchingConfig, grid: OccupancyGrid) -> Self {
+        Marching { config, grid, pruned: None, progress: 0.0, buffers: Mutex::default() }
+    }
+
     /// The length of a training step in scene units, now.
     pub fn step(&self) -> f32 {
         let first = self.config.step;
@@ -102,67 +137,134 @@ impl Marching {
         (share * (high - low).max_element()) as f32
     }
 
-    /// Samples in occupied cells, at even steps from a random start in each ray's span.
-    pub fn samples<T: Scalar>(
+    /// The cells that views look at.
+    pub fn view_grid(&self) -> &OccupancyGrid {
+        self.pruned.as_ref().unwrap_or(&self.grid)
+    }
+
+    /// Samples in occupied cells of a grid at even steps of this length from each ray's near end, and how many there would be if all
+    /// cells were occupied. Where they lie is worked out in f32, so they are the same in every precision.
+    pub fn march<T: Scalar>(
         &self,
+        grid: &OccupancyGrid,
         rays: &Rays<T>,
+        step: &Step,
         jitter: &mut Jitter<'_>,
-        buffer: &mut MarchBuffer,
         pool: &Pool<T>,
-    ) -> Samples<T> {
-        self.grid.march(&rays.cast(), &Step::uniform(self.step()), jitter, buffer);
+    ) -> (Samples<T>, u64) {
+        let buffers = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut buffer = buffers().pop().unwrap_or_default();
+        grid.march(&rays.cast(), step, jitter, &mut buffer);
         let tensor = |values: &[f32]| {
             let mut out = pool.tensor(&[values.len()]);
             out.as_mut_slice().iter_mut().zip(values).for_each(|(out, &x)| *out = T::from_f64(x.into()));
             out
         };
-        Samples::new(rays, Segments::new(&buffer.offsets[..]), tensor(&buffer.t), tensor(&buffer.delta), pool)
-    }
-
-    /// Looks at some cells of a field in training and passes over those that hold little. `step` counts training steps.
-    pub(crate) fn update(
-        &mut self,
-        field: &dyn Field<f32>,
-        params: &Params<f32>,
-        pool: &Pool<f32>,
-        step: u64,
-        seed: u64,
-    ) {
-        if self.config.occupancy.skip == Skip::Off {
-            return;
-        }
-        let plan = if step < WARM_UP { Update::ALL } else { Update::PARTIAL };
-        self.grid.update(&plan, seed, step, &|points, out| densities(field, params, pool, points, out));
-        let min_sigma = TRAINING_DEPTH / self.step();
-        self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
-    }
-
-    /// Looks closely at what is occupied, and leaves out what rendering may leave out by the configuration's error bound.
-    ///
-    /// What training passed over stays empty: the field was never asked there, and what it would say is not part of the
-    /// scene that was fitted.
-    pub(crate) fn finish(&mut self, field: &dyn Field<f32>, params: &Params<f32>, pool: &Pool<f32>) {
-        let skip = self.config.occupancy.skip;
-        if skip != Skip::Off {
-            let min_sigma = skip.min_sigma(self.grid.diagonal());
-            self.grid.prune(min_sigma, &|points, out| densities(field, params, pool, points, out));
-        }
+        let segments = Segments::new(&buffer.offsets[..]);
+        let samples = Samples::new(rays, segments, tensor(&buffer.t), tensor(&buffer.delta), pool);
+        let steps = buffer.steps;
+        buffers().push(buffer);
+        (samples, steps)
     }
 }
 
-/// A field's densities, for the occupancy grid.
-pub(crate) fn densities(
-    field: &dyn Field<f32>,
-    params: &Params<f32>,
-    pool: &Pool<f32>,
-    points: &[[f32; 3]],
-    out: &mut [f32],
-) {
-    let tape = Tape::with_pool(pool.clone());
-    let params = params.bind_constant(&tape);
-    let positions = tape.constant(pool.copy_of(&[points.len(), 3], points.as_flattened()));
-    let density = field.density(&params, &field.encode(&params, &positions));
-    out.copy_from_slice(density.sigma().value().as_slice());
+impl<T: Scalar> Sampler<T> for Marching {
+    fn sample<'t>(
+        &self,
+        query: &Query<'_, 't, T>,
+        rays: &Rays<T>,
+        purpose: Purpose,
+        jitter: &mut Jitter<'_>,
+    ) -> Sampled<'t, T> {
+        let (grid, length) = match purpose {
+            Purpose::Training => (&self.grid, self.step()),
+            Purpose::View { finer } => (self.view_grid(), self.view_step() / finer as f32),
+        };
+        let (steps, unskipped) = self.march(grid, rays, &Step::uniform(length), jitter, query.tape().pool());
+        Sampled { evaluations: Evaluations { unskipped, ..Evaluations::default() }, ..Sampled::new(steps) }
+    }
+
+    fn load(&self) -> Load {
+        Load::Samples(self.config.samples)
+    }
+
+    fn boxed(&self) -> Box<dyn Sampler<T>> {
+        Box::new(self.clone())
+    }
+
+    fn quadrature(&self) -> Quadrature {
+        self.config.quadrature
+    }
+
+    fn termination(&self) -> f64 {
+        self.config.termination
+    }
+
+    fn limits(&self) -> Limits {
+        Limits::of(&self.config.occupancy.skip)
+    }
+
+    fn view_tile(&self) -> usize {
+        512
+    }
+
+    /// Leaves out what the silhouettes of the photographs show to be empty.
+    fn prepare(&mut self, data: &Dataset) {
+        silhouette::carve(&mut self.grid, data, self.config.occupancy.skip.carving);
+    }
+
+    /// Looks at some cells and passes over those that hold little.
+    fn update(&mut self, progress: &Progress, densities: &DensityFn<'_>) -> bool {
+        let Progress { step, fraction, seed } = *progress;
+        self.progress = fraction;
+        if step % GRID_EVERY != 1 || step == 1 || !self.config.occupancy.skip.grid {
+            return false;
+        }
+        let plan = if step < WARM_UP { Update::ALL } else { Update::PARTIAL };
+        self.grid.update(&plan, seed, step, densities);
+        let min_sigma = TRAINING_DEPTH / self.step();
+        self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
+        true
+    }
+
+    /// Looks closely at what is occupied, and finds out what views may leave out by the configuration's error bound. The
+    /// grid of training, which is stored with the model, stays as it is.
+    ///
+    /// What training passed over stays empty: the field was never asked there, and what it would say is not part of the
+    /// scene that was fitted.
+    fn finish(&mut self, densities: &DensityFn<'_>) {
+        let pruning = self.config.occupancy.skip.pruning;
+        self.pruned = (pruning > 0.0).then(|| {
+            let mut grid = self.grid.clone();
+            grid.prune((pruning / grid.diagonal()) as f32, densities);
+            grid
+        });
+    }
+
+    fn grid(&self) -> Option<&OccupancyGrid> {
+        Some(&self.grid)
+    }
+
+    fn state(&self) -> Vec<(&'static str, Vec<u8>)> {
+        vec![(GRID, self.grid.occupied_to_bytes())]
+    }
+
+    fn load_state(&mut self, state: &HashMap<String, Vec<u8>>) -> Result<()> {
+        let Some(bytes) = state.get(GRID) else { return Err(Error::setting(GRID, "holds no occupancy grid")) };
+        let grid = OccupancyGrid::from_bytes(bytes)?;
+        if grid.bounds() != self.grid.bounds() || grid.cells() != self.grid.cells() {
+            return Err(Error::setting(GRID, "belongs to a model of another configuration"));
+        }
+        (self.grid, self.pruned) = (grid, None);
+        Ok(())
+    }
+}
+
+impl Limits {
+    /// What these switches say of views.
+    pub fn of(skip: &Skipping) -> Self {
+        Limits { termination: skip.termination as f32, color_budget: skip.colors as f32 }
+    }
 }
 
 #[cfg(test)]
@@ -174,7 +276,7 @@ mod tests {
     fn steps_shrink_evenly_from_the_first_to_the_last() {
         let config = MarchingConfig { step: 0.01, last_step: Some(0.0025), ..MarchingConfig::default() };
         let grid = OccupancyGrid::new([DVec3::ZERO, DVec3::new(1.0, 4.0, 2.0)], &config.occupancy).unwrap();
-        let mut marching = Marching { config, grid, progress: 0.0 };
+        let mut marching = Marching::new(config, grid);
         let mut at = |progress: f64| {
             marching.progress = progress;
             [marching.step(), marching.view_step()]
@@ -185,6 +287,6 @@ mod tests {
             assert_eq!(view, 4.0 / 600.0);
         }
         let wrong = MarchingConfig { last_step: Some(0.0), ..MarchingConfig::default() };
-        assert!(wrong.check().unwrap_err().to_string().starts_with("`last_step`"));
+        assert!(Kind::check(&wrong).unwrap_err().to_string().starts_with("`last_step`"));
     }
 }

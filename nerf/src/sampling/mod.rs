@@ -1,5 +1,202 @@
 //! Where rays are sampled.
+//!
+//! A [`Sampler`] gives steps along rays, and may ask the field, or fields of its own, where to look:
+//! [`Marching`](marching::Marching) takes even steps through the occupied cells of a grid,
+//! [`Hierarchical`](hierarchical::Hierarchical) more samples where a coarse field of its own found something, and
+//! [`Proposal`](proposal::Proposal) resamples what small density fields of its own propose.
 
 pub mod hierarchical;
 pub mod marching;
+pub mod proposal;
 pub mod steps;
+
+use crate::Result;
+use crate::camera::rays::{Rays, Samples};
+use crate::dataset::Dataset;
+use crate::field::Field;
+use crate::kind::{Family, Part, Registered};
+use crate::random::Jitter;
+use crate::space::occupancy::{DensityFn, OccupancyGrid};
+use crate::volume::quadrature::Quadrature;
+use crate::volume::query::Query;
+use crate::volume::render::{Evaluations, Rendered};
+use raygrad_autograd::{Scalar, Segments, Var};
+use std::any::Any;
+use std::collections::HashMap;
+use std::sync::RwLock;
+
+/// What samples are for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// A training step.
+    Training,
+    /// A view, with steps so many times smaller than the configured ones, at least 1: where a sampler has steps.
+    View {
+        /// How many times.
+        finer: usize,
+    },
+}
+
+/// Where the field is sampled, and what else was found out on the way.
+pub struct Sampled<'t, T: Scalar> {
+    /// The steps: each sample is the middle of an interval, or stands for it.
+    pub steps: Samples<T>,
+    /// What fields of the sampler's own showed: pictures of the same rays, to be fitted as well.
+    pub coarse: Vec<Rendered<'t, T>>,
+    /// Histograms that density fields of the sampler's own proposed, to be pulled towards the weights of the field.
+    pub levels: Vec<Level<'t, T>>,
+    /// How often the sampler asked, and how many steps there would be if nothing in the box were skipped.
+    pub evaluations: Evaluations,
+}
+
+impl<'t, T: Scalar> Sampled<'t, T> {
+    /// Steps that nobody was asked for.
+    pub fn new(steps: Samples<T>) -> Self {
+        let evaluations = Evaluations { unskipped: steps.len() as u64, ..Evaluations::default() };
+        Sampled { steps, coarse: vec![], levels: vec![], evaluations }
+    }
+}
+
+/// A histogram along rays that a density field proposed.
+pub struct Level<'t, T: Scalar> {
+    /// The edges of the bins of all rays, in scene units, rising along each ray: one more than bins a ray.
+    pub edges: Vec<f64>,
+    /// The weight of each bin, `[rays * bins]`.
+    pub weights: Var<'t, T>,
+    /// The bins of each ray.
+    pub segments: Segments,
+}
+
+/// What may be left out along one ray of a view.
+///
+/// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling the
+/// rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// A ray ends where less light than this is left, 0 to 1.
+    pub termination: f32,
+    /// Samples whose weights add up to at most this have no colour of their own, 0 to 1. Quadratures of two nodes an
+    /// interval colour every sample.
+    pub color_budget: f32,
+}
+
+impl Limits {
+    /// Nothing is left out.
+    pub const NONE: Limits = Limits { termination: 0.0, color_budget: 0.0 };
+}
+
+/// How much a training step works on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Load {
+    /// So many rays, in tiles of so many.
+    Rays {
+        /// Rays of a step.
+        step: usize,
+        /// Rays of a tile: one tape, on one core.
+        tile: usize,
+    },
+    /// So many rays that about so many samples lie on them.
+    Samples(usize),
+}
+
+/// How far training is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Progress {
+    /// The number of the step that comes next, from 1.
+    pub step: u64,
+    /// How much of the run is done, 0 to 1.
+    pub fraction: f64,
+    /// The run's seed.
+    pub seed: u64,
+}
+
+/// Chooses where rays are sampled. Only [`sample`](Self::sample), [`load`](Self::load) and [`boxed`](Self::boxed) are
+/// needed; the rest is for samplers that learn, leave out, or remember.
+///
+/// A sampler of one's own implements this and, for its configuration, [`Kind<Samplers>`](crate::Kind); with
+/// [`register`](crate::kind::register) it is trained, rendered, saved and loaded like those of this crate.
+pub trait Sampler<T: Scalar>: Any + Send + Sync {
+    /// Where the field of `query` is sampled along `rays`. No gradient flows through the choice of places.
+    fn sample<'t>(
+        &self,
+        query: &Query<'_, 't, T>,
+        rays: &Rays<T>,
+        purpose: Purpose,
+        jitter: &mut Jitter<'_>,
+    ) -> Sampled<'t, T>;
+
+    /// How much a training step works on.
+    fn load(&self) -> Load;
+
+    /// A copy.
+    fn boxed(&self) -> Box<dyn Sampler<T>>;
+
+    /// How the integral over the steps is approximated.
+    fn quadrature(&self) -> Quadrature {
+        Quadrature::Midpoint
+    }
+
+    /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as much.
+    fn termination(&self) -> f64 {
+        0.0
+    }
+
+    /// What views leave out.
+    fn limits(&self) -> Limits {
+        Limits::NONE
+    }
+
+    /// Rays of a view that are worked out together.
+    fn view_tile(&self) -> usize {
+        32
+    }
+
+    /// Fields of the sampler's own.
+    fn fields(&self) -> Vec<&dyn Field<T>> {
+        vec![]
+    }
+
+    /// Learns from the photographs what can be known before the first step.
+    fn prepare(&mut self, _data: &Dataset) {}
+
+    /// Learns from the field's densities, before a training step; says whether the [grid](Self::grid) has changed.
+    fn update(&mut self, _progress: &Progress, _densities: &DensityFn<'_>) -> bool {
+        false
+    }
+
+    /// Looks closely at a field that is finished, before it is rendered.
+    fn finish(&mut self, _densities: &DensityFn<'_>) {}
+
+    /// The occupancy grid, if there is one.
+    fn grid(&self) -> Option<&OccupancyGrid> {
+        None
+    }
+
+    /// What is stored with a model, beside the parameters, under names.
+    fn state(&self) -> Vec<(&'static str, Vec<u8>)> {
+        vec![]
+    }
+
+    /// Takes back what [`state`](Self::state) gave.
+    ///
+    /// # Errors
+    /// If something is absent, or of a sampler of another configuration.
+    fn load_state(&mut self, _state: &HashMap<String, Vec<u8>>) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// The family of samplers.
+pub struct Samplers;
+
+impl Family for Samplers {
+    const WHAT: &'static str = "sampler";
+    type Built<T: Scalar> = Box<dyn Sampler<T>>;
+    fn registered() -> &'static RwLock<Vec<Registered<Self>>> {
+        static OTHERS: RwLock<Vec<Registered<Samplers>>> = RwLock::new(vec![]);
+        &OTHERS
+    }
+}
+
+/// Which sampler, and its numbers.
+pub type SamplerConfig = Part<Samplers>;

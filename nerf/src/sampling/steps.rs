@@ -28,6 +28,7 @@ pub fn importance<T: Scalar>(
     let bins = if rays.is_empty() { 0 } else { coarse.len() / rays.len() };
     let segments = Segments::uniform(rays.len(), bins + count);
     let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
+    let edges = even_edges(bins);
     let mut u = vec![0.0; count];
     let mut drawn = vec![0.0; count];
     for (ray, rows) in segments.ranges().enumerate() {
@@ -36,7 +37,7 @@ pub fn importance<T: Scalar>(
         for (i, u) in u.iter_mut().enumerate() {
             *u = (i as f64 + jitter.draw()) / count as f64;
         }
-        if invert_cdf(&weights[own.clone()], uniform_share, &u, &mut drawn).is_err() {
+        if invert_cdf(&edges, &weights[own.clone()], uniform_share, &u, &mut drawn).is_err() {
             drawn.copy_from_slice(&u);
         }
         let (t, delta) = (&mut t.as_mut_slice()[rows.clone()], &mut delta.as_mut_slice()[rows]);
@@ -80,19 +81,28 @@ fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
     }
 }
 
-/// Inverts the cumulative distribution of a histogram of equal bins over `[0, 1]` at the rising numbers `u` in
-/// `[0, 1)`: `out[i]` rises with `u[i]` and lies in `[0, 1]`.
+/// Inverts the cumulative distribution of a histogram between rising `edges` (one more than weights; two may be equal) at
+/// the rising numbers `u` in `[0, 1)`: `out[i]` rises with `u[i]` and lies between the first and the last edge.
 ///
-/// The density is `(1 - uniform_share) weights / sum + uniform_share`, uniform where the sum is 0. Only the proportions of
-/// the weights matter, whatever their size.
+/// The density is `1 - uniform_share` times that of the weights, which are spread evenly within their bins, and
+/// `uniform_share` times an even one; it is even where the sum of the weights is 0. Only the proportions of the weights
+/// matter, whatever their size.
 ///
 /// # Errors
 /// If a weight is negative, infinite or NaN; `out` is then as it was.
 ///
 /// # Panics
-/// If there is no bin.
-pub fn invert_cdf<T: Scalar>(weights: &[T], uniform_share: f64, u: &[f64], out: &mut [f64]) -> Result<()> {
-    assert!(!weights.is_empty(), "a distribution over no bins");
+/// If there is no bin, or not one more edge than weights.
+pub fn invert_cdf<T: Scalar>(
+    edges: &[f64],
+    weights: &[T],
+    uniform_share: f64,
+    u: &[f64],
+    out: &mut [f64],
+) -> Result<()> {
+    let bins = weights.len();
+    assert!(bins > 0, "a distribution over no bins");
+    assert_eq!(edges.len(), bins + 1, "one more edge than weights");
     let mut largest = 0.0_f64;
     for (bin, weight) in weights.iter().enumerate() {
         if !(weight.is_finite() && *weight >= T::ZERO) {
@@ -102,22 +112,27 @@ pub fn invert_cdf<T: Scalar>(weights: &[T], uniform_share: f64, u: &[f64], out: 
     }
     // In units of the largest, so that no sum overflows.
     let weight = |i: usize| if largest > 0.0 { weights[i].to_f64() / largest } else { 0.0 };
-    let n = weights.len() as f64;
-    let total: f64 = (0..weights.len()).map(weight).sum();
+    let (total, length): (f64, f64) = ((0..bins).map(weight).sum(), edges[bins] - edges[0]);
     let share = if total > 0.0 { uniform_share } else { 1.0 };
-    let mass = |i: usize| share / n + if share < 1.0 { (1.0 - share) * (weight(i) / total) } else { 0.0 };
+    let width = |i: usize| if length > 0.0 { (edges[i + 1] - edges[i]) / length } else { 1.0 / bins as f64 };
+    let mass = |i: usize| share * width(i) + if share < 1.0 { (1.0 - share) * (weight(i) / total) } else { 0.0 };
     let (mut bin, mut below) = (0, 0.0);
     for (&u, out) in u.iter().zip(out) {
         // The last bin takes what rounding leaves over, and bins without mass are passed.
-        while bin + 1 < weights.len() && below + mass(bin) <= u {
+        while bin + 1 < bins && below + mass(bin) <= u {
             below += mass(bin);
             bin += 1;
         }
         let mass = mass(bin);
         let inside = if mass > 0.0 { ((u - below) / mass).clamp(0.0, 1.0) } else { 0.5 };
-        *out = (bin as f64 + inside) / n;
+        *out = edges[bin] + inside * (edges[bin + 1] - edges[bin]);
     }
     Ok(())
+}
+
+/// `bins + 1` edges of equal bins over `[0, 1]`.
+pub fn even_edges(bins: usize) -> Vec<f64> {
+    (0..=bins).map(|i| i as f64 / bins.max(1) as f64).collect()
 }
 
 #[cfg(test)]
@@ -153,26 +168,26 @@ mod tests {
         }
         let middle = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
         assert_eq!(&middle.t.as_slice()[..4], [2.5, 3.5, 4.5, 5.5]);
-        assert_eq!(&middle.positions.as_slice()[..3], [0.0, 0.0, 2.5]);
+        assert_eq!(&middle.positions(&Pool::new()).as_slice()[..3], [0.0, 0.0, 2.5]);
     }
 
     #[test]
     fn zero_weights_are_uniform_and_one_hot_stays_in_its_bin() {
         let u: Vec<f64> = (0..100).map(|i| (i as f64 + 0.5) / 100.0).collect();
         let mut out = vec![0.0; 100];
-        invert_cdf(&[0.0_f32; 7], 0.01, &u, &mut out).unwrap();
+        invert_cdf(&even_edges(7), &[0.0_f32; 7], 0.01, &u, &mut out).unwrap();
         assert!(out.iter().zip(&u).all(|(x, u)| (x - u).abs() < 1e-12));
         for scale in [1.0, 1e-30_f32] {
             let mut weights = [0.0; 10];
             weights[3] = scale;
-            invert_cdf(&weights, 0.0, &u, &mut out).unwrap();
+            invert_cdf(&even_edges(10), &weights, 0.0, &u, &mut out).unwrap();
             assert!(out.iter().all(|x| (0.3..=0.4).contains(x)), "{out:?}");
-            invert_cdf(&weights, 0.1, &u, &mut out).unwrap();
+            invert_cdf(&even_edges(10), &weights, 0.1, &u, &mut out).unwrap();
             let outside = out.iter().filter(|x| !(0.3..=0.4).contains(*x)).count();
             assert!((8..=10).contains(&outside), "a tenth, less the bin's own share: {outside}");
         }
         for bad in [f32::NAN, -1.0, f32::INFINITY] {
-            let error = invert_cdf(&[1.0, bad], 0.1, &u, &mut out).unwrap_err().to_string();
+            let error = invert_cdf(&even_edges(2), &[1.0, bad], 0.1, &u, &mut out).unwrap_err().to_string();
             assert!(error.starts_with("`weights[1]`: is "), "{error}");
         }
     }
@@ -187,7 +202,7 @@ mod tests {
             let n = 20_000;
             let u: Vec<f64> = (0..n).map(|i| (i as f64 + 0.5) / n as f64).collect();
             let mut out = vec![0.0; n];
-            invert_cdf(&weights, 0.05, &u, &mut out).unwrap();
+            invert_cdf(&even_edges(weights.len()), &weights, 0.05, &u, &mut out).unwrap();
             prop_assert!(out.windows(2).all(|pair| pair[0] <= pair[1]));
             prop_assert!(out.iter().all(|x| (0.0..=1.0).contains(x)));
             let total: f32 = weights.iter().sum();

@@ -61,14 +61,25 @@ impl<'a> Silhouette<'a> {
     }
 }
 
-/// Empties for good the cells of a grid that some photograph of the dataset sees through. What is left is the visual hull
-/// (Laurentini 1994). Photographs without transparency say nothing.
-pub(crate) fn carve(grid: &mut OccupancyGrid, data: &Dataset) {
-    for frame in &data.frames {
-        if let Some(silhouette) = Silhouette::new(&frame.camera, &frame.image) {
-            grid.carve(&|centre, radius| silhouette.is_clear(centre, radius));
-        }
+/// Photographs of which one is asked to see through a cell, at least.
+const EACH: usize = 8;
+
+/// Empties for good the cells of a grid that `votes` photographs of the dataset see through, or one of eight if they are
+/// few. What is left is the visual hull (Laurentini 1994), up to wrong masks in fewer photographs. Photographs without
+/// transparency say nothing; 0 votes empty nothing.
+pub(crate) fn carve(grid: &mut OccupancyGrid, data: &Dataset, votes: u32) {
+    let views = data.frames.iter().filter_map(|frame| Silhouette::new(&frame.camera, &frame.image));
+    carve_views(grid, &views.collect::<Vec<_>>(), votes);
+}
+
+fn carve_views(grid: &mut OccupancyGrid, views: &[Silhouette<'_>], votes: u32) {
+    let votes = (votes as usize).min(views.len().div_ceil(EACH));
+    if votes == 0 {
+        return;
     }
+    grid.carve(&|centre, radius| {
+        views.iter().filter(|view| view.is_clear(centre, radius)).take(votes).count() == votes
+    });
     grid.occupy_all_but_carved();
 }
 
@@ -111,16 +122,38 @@ mod tests {
         let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
         let mut grid =
             OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
-        for (camera, image) in &views {
-            let silhouette = Silhouette::new(camera, image).unwrap();
-            grid.carve(&|centre, radius| silhouette.is_clear(centre, radius));
-        }
-        grid.occupy_all_but_carved();
+        let views: Vec<_> = views.iter().map(|(camera, image)| Silhouette::new(camera, image).unwrap()).collect();
+        carve_views(&mut grid, &views, 1);
         let [low, high] = grid.occupied_bounds().unwrap();
         // A third of 5.1, seen in perspective, with two pixels and a cell of margin.
         assert!(low.max_element() < -0.85 && low.min_element() > -1.35, "{low}");
         assert!(high.min_element() > 0.85 && high.max_element() < 1.35, "{high}");
         let share = grid.occupied_share();
         assert!((0.2..0.4).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn one_wrong_mask_empties_nothing_where_two_have_to_agree() {
+        // Sixteen cameras around the box, one of which has a picture that is transparent throughout.
+        let around = |i: usize| {
+            let angle = i as f64 * std::f64::consts::TAU / 16.0;
+            view(DVec3::new(10.0 * angle.cos(), 0.0, 10.0 * angle.sin()), DVec3::Y)
+        };
+        let left = |wrong: Option<usize>, votes: u32| {
+            let mut views: Vec<_> = (0..16).map(around).collect();
+            if let Some(wrong) = wrong {
+                views[wrong].1 = Image::new(60, 60, 4);
+            }
+            let config = OccupancyConfig { resolution: 32, ..OccupancyConfig::default() };
+            let mut grid = OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &config).unwrap();
+            let views: Vec<_> = views.iter().map(|(camera, image)| Silhouette::new(camera, image).unwrap()).collect();
+            carve_views(&mut grid, &views, votes);
+            grid.occupied_share()
+        };
+        let [right, two] = [1, 2].map(|votes| left(None, votes));
+        assert!(right > 0.1 && (right..1.3 * right).contains(&two), "{right} {two}");
+        assert!(left(Some(5), 1) < 0.3 * right, "one mask takes what it sees");
+        assert!(left(Some(5), 2) >= right);
+        assert_eq!((left(Some(5), 0), left(None, 99)), (1.0, two), "of sixteen two are asked for, at most");
     }
 }

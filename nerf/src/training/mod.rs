@@ -1,7 +1,10 @@
 //! Fitting a model to photographs.
 
-pub(crate) mod slot;
+pub(crate) mod groups;
+pub(crate) mod pass;
 pub(crate) mod startup;
+pub(crate) mod stats;
 pub(crate) mod trainer;
 
-pub use trainer::{Budget, StepStats, Trainer};
+pub use stats::{Budget, StepStats};
+pub use trainer::Trainer;

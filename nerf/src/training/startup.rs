@@ -6,8 +6,7 @@ use crate::model::config::Config;
 use crate::model::{Extent, Model};
 use crate::random::stream;
 use rand::RngExt;
-use raygrad_autograd::{Scalar, Tape, Tensor, Var};
-use raygrad_nn::Bound;
+use raygrad_autograd::{Gradient, Tape, Tensor};
 
 /// Points at which a new field is probed.
 const PROBES: usize = 512;
@@ -34,18 +33,27 @@ pub(crate) fn living_model(config: &Config, extent: Extent, seed: u64) -> Result
     }
 }
 
-/// The share of random points in the box where the density has a gradient with respect to the network's output.
+/// The share of random points in the box where the density has a slope; 1 if it has none anywhere but parameters have a
+/// gradient.
 fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     let mut rng = stream(0, [0, 0]);
     let [low, high] = model.extent.bounds.map(|corner| corner.to_array());
     let at = |i: usize, u: f64| (low[i % 3] + u * (high[i % 3] - low[i % 3])) as f32;
     let points = Tensor::from_fn(&[PROBES, 3], |i| at(i, rng.random()));
     let tape = Tape::new();
-    let params: Bound<'_, f32> = model.params.bind_constant(&tape);
-    let positions: Var<'_, f32> = tape.leaf(points);
-    let density = field.density(&params, &field.encode(&params, &positions)).sigma();
-    let slopes = density.sum().grad(&[&positions]);
-    let moved = slopes[0].as_slice().chunks_exact(3).filter(|slope| slope.iter().any(|x| *x != f32::ZERO)).count();
+    let params = model.params.bind(&tape);
+    let positions = tape.leaf(points);
+    let density = field.density(&params, &positions).sigma().sum().tracked();
+    let slopes = density.grad(&[&positions]);
+    let moved = slopes[0].as_slice().chunks_exact(3).filter(|slope| slope.iter().any(|x| *x != 0.0)).count();
+    if moved == 0 {
+        // A field may be the same everywhere, or have no slopes, and yet learn.
+        let learns = |grad: &Gradient<f32>| {
+            !grad.is_dense() || grad.dense().is_some_and(|grad| grad.as_slice().iter().any(|x| *x != 0.0))
+        };
+        let vars = params.vars();
+        return if !vars.is_empty() && density.backward(&vars).iter().any(learns) { 1.0 } else { 0.0 };
+    }
     moved as f64 / PROBES as f64
 }
 

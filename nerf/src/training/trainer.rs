@@ -1,118 +1,45 @@
 //! Training: tiles of rays on as many cores as there are, and the same bits on any number of them.
 
+use super::groups::Groups;
+use super::pass::{Work, rays_loss};
+use super::startup;
+use super::stats::{Budget, StepStats};
 use crate::dataset::Dataset;
-use crate::encoding::hash_grid::{HashGrad, TableOptimizer};
-use crate::model::config::{Config, SamplerConfig};
-use crate::model::{Extent, Model, Sampler};
+use crate::dataset::batch::Batch;
+use crate::model::config::Config;
+use crate::model::{Extent, Model, densities};
 use crate::pictures::metrics::psnr_from_mse;
-use crate::random::stream;
-use crate::space::occupancy::Skip;
-use crate::space::silhouette;
-use crate::training::slot::{Scratch, Slot, Work, sum_slots};
-use crate::training::startup;
+use crate::random::{Jitter, stream};
+use crate::sampling::{Load, Progress};
 use crate::{Error, Result};
-use raygrad_autograd::{Gradient, Pool, Tensor};
-use raygrad_nn::{Adam, Optimizer, ParamId, RowStats, UpdateReport};
-use raygrad_tensor::parallel;
-use rayon::prelude::*;
-use serde::Serialize;
-use std::ops::ControlFlow;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use raygrad_autograd::Pool;
+use raygrad_nn::{SLOTS, Tiles};
+use std::ops::{Add, ControlFlow};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
-/// number of threads, and as many as threads can work at a time. A marching step has one tile for each: with more, smaller
-/// ones, recording them would cost a two-core machine an eighth of its time.
-const SLOTS: usize = 8;
-/// Rays of a marching step: the least, and the most.
+/// Rays of a step that is to have a number of samples: the least, and the most.
 const RAYS: [usize; 2] = [256, 1 << 16];
-/// Steps between updates of the occupancy grid.
-const GRID_EVERY: u64 = 16;
 /// Steps between the times when memory that they did not need is freed: the number of samples changes as training goes on.
 const TRIM_EVERY: u64 = 256;
-
-/// Steps in a row without a finite gradient after which a run has diverged: an overflow of one batch passes.
-const STUCK: u64 = 100;
-
-/// How long to train.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Budget {
-    /// A number of steps.
-    Steps(u64),
-    /// Training time; what happens between steps does not count. The schedule stretches to it.
-    Time(Duration),
-}
-
-/// What one step did, and the run so far.
-#[derive(Debug, Clone, Copy, Serialize)]
-pub struct StepStats {
-    /// Number of the step, from 1.
-    pub step: u64,
-    /// Training time so far.
-    pub train_seconds: f64,
-    /// Rays so far.
-    pub rays: u64,
-    /// Samples placed on rays so far: without a grid all, with one those in occupied cells.
-    pub marched: u64,
-    /// Evaluations of a density so far.
-    pub samples: u64,
-    /// Evaluations of a colour, and of all gradients, so far.
-    pub shaded: u64,
-    /// Evaluations of each that there would have been so far if nothing in the box were skipped.
-    pub unskipped: u64,
-    /// Rows of the field's table that were moved so far.
-    pub rows: u64,
-    /// The mean loss, of a hierarchical model that of the coarse field plus that of the fine one.
-    pub loss: f64,
-    /// PSNR on this step's rays, in dB.
-    pub psnr: f64,
-    /// Mean opacity of this step's rays, 0 to 1.
-    pub opacity: f64,
-    /// Share of the occupancy grid that is occupied; 1 without a grid.
-    pub occupied: f64,
-    /// The learning rate.
-    pub rate: f64,
-    /// Elements, of the table rows, whose gradient was not finite, so far; they were left alone.
-    pub skipped: u64,
-    /// Steps in a row, up to this one, that moved nothing because no gradient was finite: the run has diverged if they
-    /// go on.
-    pub stuck: u64,
-    /// How often the start-up detector began again with another seed.
-    pub restarts: u32,
-}
-
-impl StepStats {
-    /// Whether the run has diverged: for 100 steps in a row no gradient was finite, so that nothing moves any more. Its
-    /// model is of no use.
-    pub fn has_diverged(&self) -> bool {
-        self.stuck >= STUCK
-    }
-}
 
 /// A model in training.
 pub struct Trainer {
     /// The model as it is now.
     pub model: Model<f32>,
     data: Arc<Dataset>,
-    adam: Adam<f32>,
-    /// For the table of the field, if it has one.
-    table: Option<TableOptimizer>,
-    slots: Vec<Slot>,
-    /// What no thread is working with.
-    scratch: Mutex<Vec<Scratch>>,
-    /// For what happens outside of the slots.
+    groups: Groups,
+    tiles: Tiles<f32>,
+    /// For what happens outside of the tiles.
     pool: Pool<f32>,
     /// Rays of the next step.
     batch: usize,
+    /// What time it is.
+    clock: Box<dyn Fn() -> Duration + Send + Sync>,
     elapsed: Duration,
     /// How many models of this run have collapsed.
     collapses: u32,
     done: StepStats,
-}
-
-/// The list; it is whole at every point where a panic could strike.
-fn locked(scratch: &Mutex<Vec<Scratch>>) -> MutexGuard<'_, Vec<Scratch>> {
-    scratch.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Trainer {
@@ -122,67 +49,54 @@ impl Trainer {
     /// If the configuration is out of range, the dataset has no frame, or no ray of it
     /// [meets the scene's box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
+        let start = Instant::now();
+        Trainer::with_clock(config, data, move || start.elapsed())
+    }
+
+    /// As [`new`](Self::new), with a clock of one's own: the time since some moment, which training time is measured by.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn with_clock(
+        config: Config,
+        data: Arc<Dataset>,
+        clock: impl Fn() -> Duration + Send + Sync + 'static,
+    ) -> Result<Self> {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
         data.check_reach()?;
-        let extent = Extent { bounds: data.bounds, span: [data.near, data.far] };
+        let extent = Extent::new(data.bounds, [data.near, data.far]);
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
-        let batch = match &config.sampler {
-            SamplerConfig::Hierarchical(config) => config.batch,
-            SamplerConfig::Marching(_) => RAYS[0],
-        };
-        let done = StepStats {
-            step: 0,
-            train_seconds: 0.0,
-            rays: 0,
-            marched: 0,
-            samples: 0,
-            shaded: 0,
-            unskipped: 0,
-            rows: 0,
-            loss: f64::NAN,
-            psnr: f64::NAN,
-            opacity: f64::NAN,
-            occupied: 1.0,
-            rate: 0.0,
-            skipped: 0,
-            stuck: 0,
-            restarts,
-        };
         let mut trainer = Trainer {
-            adam: Adam::new(config.adam),
-            table: None,
-            slots: (0..SLOTS).map(|_| Slot::default()).collect(),
-            scratch: Mutex::default(),
+            groups: Groups::new(&model.config, &model.params),
+            tiles: Tiles::new(),
             pool: Pool::new(),
+            batch: match model.sampler.load() {
+                Load::Rays { step, .. } => step,
+                Load::Samples(_) => RAYS[0],
+            },
             model,
             data,
-            batch,
+            clock: Box::new(clock),
             elapsed: Duration::ZERO,
             collapses: 0,
-            done,
+            done: StepStats { restarts, ..StepStats::default() },
         };
-        trainer.reset_optimisers();
-        trainer.carve();
+        trainer.prepare();
         Ok(trainer)
     }
 
-    fn reset_optimisers(&mut self) {
-        let config = &self.model.config;
-        self.adam = Adam::new(config.adam);
-        self.table = self.model.field.table().map(|(_, grid)| TableOptimizer::new(grid.clone(), config.table_adam));
+    /// Lets the sampler learn from the photographs. That is training too.
+    fn prepare(&mut self) {
+        let start = (self.clock)();
+        self.model.sampler.prepare(&self.data);
+        self.count_occupied();
+        self.elapsed += (self.clock)().saturating_sub(start);
     }
 
-    /// Leaves out what the silhouettes of the photographs show to be empty.
-    fn carve(&mut self) {
-        if let Sampler::Marching(marching) = &mut self.model.sampler {
-            let config = marching.config.occupancy;
-            if config.silhouettes && config.skip != Skip::Off {
-                silhouette::carve(&mut marching.grid, &self.data);
-                self.done.occupied = marching.grid.occupied_share();
-            }
-        }
+    fn count_occupied(&mut self) {
+        self.done.occupied = self.model.sampler.grid().map_or(1.0, |grid| grid.occupied_share());
     }
 
     /// What the last step did.
@@ -206,34 +120,40 @@ impl Trainer {
                 break;
             }
         }
-        let start = Instant::now();
-        self.model.finish_grid();
-        self.elapsed += start.elapsed();
+        let start = (self.clock)();
+        self.model.finish();
+        self.count_occupied();
+        self.elapsed += (self.clock)().saturating_sub(start);
     }
 
     /// One training step; `fraction` says how much of the run is done, for the schedule.
     pub fn step(&mut self, fraction: f64) -> StepStats {
-        let start = Instant::now();
+        let start = (self.clock)();
         let number = self.done.step + 1;
         // A restart draws other rays too.
         let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
-        if let Sampler::Marching(marching) = &mut self.model.sampler {
-            marching.progress = fraction;
-        }
-        self.update_grid(number, seed);
-        let tile = match &self.model.config.sampler {
-            SamplerConfig::Hierarchical(config) => config.tile,
-            SamplerConfig::Marching(_) => self.batch.div_ceil(SLOTS),
+        self.update_sampler(&Progress { step: number, fraction, seed });
+        let tile = match self.model.sampler.load() {
+            Load::Rays { tile, .. } => tile,
+            // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
+            Load::Samples(_) => self.batch.div_ceil(SLOTS),
         };
-        let work = self.differentiate(tile, seed, number);
+        let (model, data, total) = (&self.model, &*self.data, self.batch);
+        let step = self.tiles.differentiate(&model.params, total.div_ceil(tile), |which, params, ()| {
+            let rng = &mut stream(seed, [number, which as u64]);
+            let batch = Batch::draw(data, tile.min(total - which * tile), model.config.background, rng);
+            let (loss, work) = rays_loss(model, params, &batch, &mut Jitter::Random(rng));
+            (loss * (1.0 / (3.0 * total as f64)), work)
+        });
+        let report = self.groups.update(&mut self.model.params, &step.grads, fraction);
+        self.tiles.take_back(step.grads);
         if number.is_multiple_of(TRIM_EVERY) {
-            locked(&self.scratch).iter().for_each(Scratch::trim);
+            self.tiles.trim();
             self.pool.trim();
         }
-        let rate = self.model.config.schedule.rate(fraction);
-        let report = self.descend(rate, tile);
+        let work = step.results.into_iter().fold(Work::default(), Work::add);
         let values = 3.0 * self.batch as f64;
-        self.elapsed += start.elapsed();
+        self.elapsed += (self.clock)().saturating_sub(start);
         self.done = StepStats {
             step: number,
             train_seconds: self.elapsed.as_secs_f64(),
@@ -242,97 +162,40 @@ impl Trainer {
             samples: self.done.samples + work.samples,
             shaded: self.done.shaded + work.shaded,
             unskipped: self.done.unskipped + work.unskipped,
-            rows: self.done.rows,
+            moved: self.done.moved + report.moved as u64,
             loss: work.loss / values,
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,
-            rate,
+            rate: self.model.config.schedule.rate(fraction),
             skipped: self.done.skipped + report.skipped as u64,
             // A network may turn NaN into gradients of 0, with which parameters do move.
             stuck: if report.is_stuck() || !work.loss.is_finite() { self.done.stuck + 1 } else { 0 },
             restarts: self.done.restarts,
         };
         self.adapt_batch(&work);
-        if startup::has_collapsed(self.adam.steps(), self.done.opacity, self.collapses) {
+        if startup::has_collapsed(self.groups.steps(), self.done.opacity, self.collapses) {
             self.restart();
         }
         self.done
     }
 
-    /// All tiles' gradients, left in the slots.
-    fn differentiate(&mut self, tile: usize, seed: u64, number: u64) -> Work {
-        let (model, data, total, free) = (&self.model, &*self.data, self.batch, &self.scratch);
-        self.slots.par_iter_mut().enumerate().for_each(|(index, slot)| {
-            slot.begin();
-            let mut scratch = locked(free).pop().unwrap_or_default();
-            for which in (index..total.div_ceil(tile)).step_by(SLOTS) {
-                let count = tile.min(total - which * tile);
-                let rng = &mut stream(seed, [number, which as u64]);
-                parallel::serial(|| slot.tile(&mut scratch, model, data, [count, total], rng));
-            }
-            locked(free).push(scratch);
-        });
-        self.slots.iter().fold(Work::default(), |sum, slot| sum + slot.work)
-    }
-
-    /// Moves the parameters.
-    fn descend(&mut self, rate: f64, tile: usize) -> UpdateReport {
-        let used = self.batch.div_ceil(tile).min(SLOTS);
-        sum_slots(&mut self.slots[..used]);
-        let params = &mut self.model.params;
-        let table_id = self.model.field.table().map(|(id, _)| id);
-        let mut of_table = RowStats::default();
-        if let (Some(id), Some(table)) = (table_id.filter(|&id| !params.is_frozen(id)), &mut self.table) {
-            // Tiles in their order, whatever slot they fell to.
-            let turns = self.slots[..used].iter().map(|slot| slot.tables.len()).max().unwrap_or(0);
-            let parts =
-                (0..turns).flat_map(|turn| self.slots[..used].iter().filter_map(move |slot| slot.tables.get(turn)));
-            let parts: Vec<Arc<HashGrad<f32>>> = parts.cloned().collect();
-            let dense = params.ids().zip(&self.slots[0].grads).find(|&(other, _)| other == id);
-            let (dense, rate) = (dense.and_then(|(_, sum)| sum.as_ref()), rate * params.rate(id));
-            of_table = table.step(params.get_mut(id), &parts, dense, rate);
-            self.done.rows += of_table.touched as u64;
-            self.slots.iter_mut().for_each(|slot| slot.tables.clear());
-        }
-        // The sums are lent to the optimiser. A gradient without a share stands for the table, which has its own.
-        let sums = &mut self.slots[0].grads;
-        let lend = |(id, sum): (ParamId, &mut Option<Tensor<f32>>)| match sum.take_if(|_| Some(id) != table_id) {
-            Some(sum) => Gradient::from(sum),
-            None => Gradient::zero(params.get(id).shape()),
-        };
-        let free = |(id, _): &(ParamId, &mut Option<Tensor<f32>>)| !params.is_frozen(*id);
-        let grads: Vec<_> = params.ids().zip(&mut *sums).filter(free).map(lend).collect();
-        let mut report = self.adam.update(params, &grads, rate);
-        let free = params.ids().zip(sums).filter(|(id, _)| !params.is_frozen(*id));
-        for ((_, sum), grad) in free.zip(grads).filter(|(_, grad)| !grad.is_zero()) {
-            *sum = Some(grad.into_dense(&self.pool));
-        }
-        if let Some(id) = table_id {
-            report.count(params.name(id), of_table.touched, of_table.skipped);
-        }
-        report
-    }
-
     /// Chooses the number of rays so that the next step has as many samples as it should.
     fn adapt_batch(&mut self, work: &Work) {
-        if let Sampler::Marching(marching) = &self.model.sampler {
+        if let Load::Samples(samples) = self.model.sampler.load() {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
-            let rays = marching.config.samples as f64 / each;
+            let rays = samples as f64 / each;
             // Not at once: the number of samples a ray is noisy.
             let rays = (0.5 * (rays + self.batch as f64)).min(2.0 * self.batch as f64) as usize;
             self.batch = rays.next_multiple_of(SLOTS).clamp(RAYS[0], RAYS[1]);
         }
     }
 
-    fn update_grid(&mut self, number: u64, seed: u64) {
-        if number % GRID_EVERY != 1 || number == 1 {
-            return;
-        }
+    fn update_sampler(&mut self, progress: &Progress) {
         let Model { sampler, field, params, .. } = &mut self.model;
-        if let Sampler::Marching(marching) = sampler {
-            marching.update(&**field, params, &self.pool, number, seed);
-            self.done.occupied = marching.grid.occupied_share();
+        let pool = &self.pool;
+        if sampler.update(progress, &|points, out| densities(&**field, params, pool, points, out)) {
+            self.count_occupied();
         }
     }
 
@@ -347,8 +210,8 @@ impl Trainer {
             model.params.inherit(&self.model.params);
             self.model = model;
         }
-        self.carve();
-        self.reset_optimisers();
+        self.prepare();
+        self.groups = Groups::new(&self.model.config, &self.model.params);
     }
 }
 
@@ -357,8 +220,10 @@ mod tests {
     use super::*;
     use crate::dataset::{Split, embedded};
     use crate::encoding::hash_grid::HashGridConfig;
-    use crate::field::ClassicConfig;
+    use crate::field::{ClassicConfig, InstantConfig};
+    use crate::sampling::SamplerConfig;
     use crate::sampling::hierarchical::HierarchicalConfig;
+    use crate::training::stats::STUCK;
     use crate::{FieldConfig, Preset};
     use raygrad_nn::Schedule;
 
@@ -413,14 +278,14 @@ mod tests {
             tile: 8,
             ..HierarchicalConfig::default()
         };
-        let (field, sampler) = (FieldConfig::Classic(field), SamplerConfig::Hierarchical(sampler));
+        let (field, sampler) = (FieldConfig::new(field), SamplerConfig::new(sampler));
         Config { field, sampler, ..Config::preset(Preset::Small) }
     }
 
     /// A small hash grid.
     fn tiny_table() -> Config {
         let mut config = Config::preset(Preset::Instant);
-        if let FieldConfig::Instant(field) = &mut config.field {
+        if let Some(field) = config.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig { levels: 3, features: 2, log2_table: 8, coarsest: 4, finest: 16 };
         }
         config

@@ -6,8 +6,9 @@ use raygrad::nerf::Density;
 use raygrad::nerf::Rays;
 use raygrad::nerf::analytic::{AnalyticScene, scenes};
 use raygrad::nerf::analytic::{Integral, integrate};
+use raygrad::nerf::volume::accumulate;
 use raygrad::nerf::volume::quadrature::Quadrature;
-use raygrad::{Pool, Real, Tape, Tensor};
+use raygrad::{Pool, Real, Tape, Tensor, Var};
 
 use super::Results;
 use super::figure::{Axis, Figure, Panel, Series};
@@ -117,17 +118,21 @@ impl Work {
         Work { plan, density, color }
     }
 
+    fn color<'t>(&self, value: Var<'t, f32>, features: &Var<'t, f32>) -> Var<'t, f32> {
+        let weights = self.plan.weighted(&Density { value, log: false, features: features.clone() }).weights;
+        accumulate(&weights, features, &self.plan.samples.segments)
+    }
+
     fn forward(&self, tape: &Tape<f32>) {
         let [value, features] = [&self.density, &self.color].map(|x| tape.constant(x.clone()));
-        black_box(self.plan.composite(&Density { value, log: false, features: features.clone() }, &features));
+        black_box(self.color(value, &features));
     }
 
     fn both(&self, tape: &mut Tape<f32>) {
         let [value, features] = [&self.density, &self.color].map(|x| tape.leaf(x.clone()));
-        let density = Density { value: value.clone(), log: false, features: features.clone() };
-        let rendered = self.plan.composite(&density, &features);
-        black_box(rendered.sum().grad(&[&value, &features]));
-        drop((value, features, density, rendered));
+        let color = self.color(value.clone(), &features);
+        black_box(color.sum().grad(&[&value, &features]));
+        drop((value, features, color));
         tape.clear();
     }
 }

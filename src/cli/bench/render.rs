@@ -2,13 +2,14 @@
 
 mod setting;
 
+use std::any::Any;
 use std::path::Path;
 use std::sync::Arc;
 
 use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced};
 use raygrad::nerf::pictures::metrics::{psnr, psnr_from_mse};
-use raygrad::nerf::{Config, Error, Evaluations, Image, Model, Preset, Result, Sampler, Trainer};
+use raygrad::nerf::{Config, Error, Evaluations, Image, Instant, Model, Preset, Result, Trainer, Voxel};
 
 use super::super::output::note;
 use super::super::run::Run;
@@ -53,7 +54,7 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
         Some(folder) => stored(folder, &scale)?,
         None => trained(&scale)?,
     };
-    let Sampler::Marching(sampler) = &model.sampler else {
+    let Some(sampler) = model.marching() else {
         return Err(Error::setting("run", "samples hierarchically; choose one that marches, such as preset instant"));
     };
     let step = sampler.config.view_step;
@@ -150,8 +151,10 @@ fn mark_dominated(outcomes: &mut [Outcome]) {
 /// Numbers that one evaluation of the density and one of the colour takes: look-ups of table rows, bytes of them, and
 /// floating-point operations of matrix products.
 fn cost(model: &Model<f32>) -> [[u64; 3]; 2] {
-    let table = model.field.table().map(|(_, grid)| (8 * grid.levels().len() as u64, grid.features() as u64));
-    let (lookups, features) = table.unwrap_or((0, 0));
+    let field: &dyn Any = &*model.field;
+    let grid = field.downcast_ref::<Instant>().map(Instant::grid).or(field.downcast_ref::<Voxel>().map(Voxel::grid));
+    let (lookups, features) =
+        grid.map_or((0, 0), |grid| (8 * grid.grid().levels().len() as u64, grid.grid().features() as u64));
     let flops = |of_color: bool| -> u64 {
         let matrices = model.params.iter().filter(|(name, x)| {
             let is_color = name.contains(".color") || name.contains(".view");
@@ -323,7 +326,7 @@ mod tests {
         assert!(off.psnr >= lossless.psnr - 0.01 && lossless.psnr >= 40.0, "{} {}", off.psnr, lossless.psnr);
         // The bound is that of a fog at the threshold all along a ray, of ending early and of the colour budget.
         let bound = |skip: Skip| {
-            let limits = Limits::of(skip);
+            let limits = Limits::of(&skip.into());
             skip.error_bound() + f64::from(limits.termination + limits.color_budget)
         };
         assert!(lossless.largest <= off.largest + bound(Skip::Lossless), "{}", lossless.largest);

@@ -156,13 +156,13 @@ fn table(courses: &[Course], curves: &[Vec<Point>]) -> Table {
         "densities",
         "colours and gradients",
         "if nothing were skipped",
-        "table rows moved",
+        "parameters moved",
         "PSNR, dB",
     ];
     let mut table = Table::new("train", &columns);
     for (course, curve) in courses.iter().zip(curves) {
         for Point { stats, psnr } in curve {
-            let counts = [stats.step, stats.rays, stats.samples, stats.shaded, stats.unskipped, stats.rows];
+            let counts = [stats.step, stats.rays, stats.samples, stats.shaded, stats.unskipped, stats.moved];
             let names = [course.preset.to_string(), course.skip.to_string(), course.seed.to_string()];
             let row = names.into_iter().chain([digits(stats.train_seconds)]);
             table.push(row.chain(counts.map(|n| n.to_string())).chain([digits(*psnr)]).collect());

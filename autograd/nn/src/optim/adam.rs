@@ -93,8 +93,8 @@ struct Moments<T> {
 #[derive(Debug, Clone)]
 struct Table<T> {
     adam: RowAdam<T>,
-    /// Nothing between steps.
-    sums: Option<RowSums<T>>,
+    /// For each part that is summed by itself; nothing between steps.
+    sums: Vec<RowSums<T>>,
 }
 
 impl<T: Scalar> Adam<T> {
@@ -164,11 +164,22 @@ impl<T: Scalar> Adam<T> {
         if let Memory::Nothing = memory {
             let config = self.config;
             let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1)).fresh([rows, features]);
-            *memory = Memory::Rows(Box::new(Table { adam, sums: None }));
+            *memory = Memory::Rows(Box::new(Table { adam, sums: vec![] }));
         }
         let Memory::Rows(table) = memory else { panic!("`{}` was not lazy until now", part.name) };
-        let sums = part.row_sums(&mut table.sums, &self.pool);
-        let stats = table.adam.step(part.value.as_mut_slice(), sums, part.rate, decay);
+        let (shares, sizes) = part.row_parts();
+        if !table.sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
+            table.sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
+        }
+        // A gradient that does not consist of rows is added up first: then all its rows are there.
+        let dense = shares.is_none().then(|| part.dense_grad(&self.pool));
+        let fill = |i: usize, sums: &mut RowSums<T>| {
+            shares.iter().flatten().for_each(|share| share.scatter_part(i, sums));
+            if let Some(dense) = &dense {
+                dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
+            }
+        };
+        let stats = table.adam.step_parts(part.value.as_mut_slice(), &mut table.sums, fill, part.rate, decay);
         (part.name, stats.touched * features, stats.skipped * features)
     }
 }
@@ -211,7 +222,7 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
                 let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1));
                 let mut adam = adam.fresh([rows, value.len() / rows.max(1)]);
                 adam.load(moments.each_ref().map(Vec::as_slice), steps);
-                Memory::Rows(Box::new(Table { adam, sums: None }))
+                Memory::Rows(Box::new(Table { adam, sums: vec![] }))
             } else if let Some(steps) = reader.counts(name, "step", 1)? {
                 let [first, second] = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
                 Memory::Dense(Moments { step: steps[0], first, second })

@@ -22,7 +22,7 @@ pub use sgd::{Sgd, SgdConfig};
 pub use state::{OptimizerState, StateError};
 
 use crate::Params;
-use raygrad_autograd::{Gradient, RowSums};
+use raygrad_autograd::{Gradient, RowShare, RowSums};
 use raygrad_tensor::{Pool, Scalar, Tensor};
 use std::borrow::Cow;
 
@@ -58,6 +58,18 @@ impl<'a, T: Scalar> Move<'a, T> {
     fn table(&self) -> [usize; 2] {
         let shape = self.value.shape();
         [shape.first().copied().unwrap_or(1), shape.iter().skip(1).product()]
+    }
+
+    /// The shares of a gradient that consists of rows, and the parts in which its rows can be added up by themselves. All
+    /// rows are one part where shares disagree, or where there are others.
+    fn row_parts(&self) -> (Option<Vec<&'a dyn RowShare<T>>>, Vec<usize>) {
+        let [rows, _] = self.table();
+        let shares: Option<Vec<_>> = self.grad.sparse().iter().map(|share| share.as_rows()).collect();
+        let shares = shares.filter(|_| self.grad.dense().is_none());
+        let mut parts = shares.iter().flatten().map(|share| share.parts());
+        let first = parts.next().unwrap_or_default();
+        let agreed = first.iter().sum::<usize>() == rows && parts.all(|other| other == first);
+        (shares, if agreed { first } else { vec![rows] })
     }
 
     /// The sums of the gradient's rows, which are made at the first step. A gradient that does not consist of rows is

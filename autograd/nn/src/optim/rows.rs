@@ -131,8 +131,30 @@ impl<T: Scalar> RowAdam<T> {
     /// If a length is not that of this optimiser's rows.
     #[track_caller]
     pub fn step(&mut self, table: &mut [T], sums: &mut RowSums<T>, rate: f64, decay: f64) -> RowStats {
+        self.step_parts(table, std::slice::from_mut(sums), |_, _| {}, rate, decay)
+    }
+
+    /// As [`step`](Self::step) for a table in parts, one after another, each with its own sums: `fill` adds to the sums of
+    /// the part of that number what it has to, and the part's rows are moved while the sums are in the caches. Parts are
+    /// worked on side by side.
+    ///
+    /// # Panics
+    /// If a length is not that of this optimiser's rows.
+    #[track_caller]
+    pub fn step_parts(
+        &mut self,
+        table: &mut [T],
+        parts: &mut [RowSums<T>],
+        fill: impl Fn(usize, &mut RowSums<T>) + Sync,
+        rate: f64,
+        decay: f64,
+    ) -> RowStats {
         assert_eq!(table.len(), self.steps.len() * self.features, "a table of the optimiser's rows");
-        assert_eq!([sums.table_rows(), sums.features()], [self.steps.len(), self.features], "sums of its rows");
+        let rows: usize = parts.iter().map(RowSums::table_rows).sum();
+        assert!(
+            rows == self.steps.len() && parts.iter().all(|sums| sums.features() == self.features),
+            "sums of its rows"
+        );
         // A factor of a parameter may take the rate where `f32` ends; a row is not to become infinite there.
         let rate = rate.min(1e30);
         let (features, keep, rate) = (self.features, T::from_f64(1.0 - rate * decay), T::from_f64(rate));
@@ -145,16 +167,28 @@ impl<T: Scalar> RowAdam<T> {
             moments: Rows::new(self.moments.as_mut_slice()),
             steps: Rows::new(&mut self.steps),
         };
-        let chunks = sums.rows().par_chunks(CHUNK).zip(sums.sums().par_chunks(CHUNK * features));
-        let stats = chunks.map(|(rows, sums)| {
-            simd::dispatch(
-                #[inline(always)]
-                || update.visit(rows, sums),
-            )
+        let firsts = parts.iter().scan(0, |end, part| {
+            *end += part.table_rows();
+            Some(*end - part.table_rows())
         });
-        let stats = stats.reduce(RowStats::default, RowStats::add);
-        sums.clear();
-        stats
+        let firsts: Vec<usize> = firsts.collect();
+        let step = |(part, sums): (usize, &mut RowSums<T>)| {
+            fill(part, sums);
+            let chunks = sums.rows().par_chunks(CHUNK).zip(sums.sums().par_chunks(CHUNK * features));
+            let stats = chunks.map(|(rows, sums)| {
+                simd::dispatch(
+                    #[inline(always)]
+                    || update.visit(firsts[part], rows, sums),
+                )
+            });
+            let stats = stats.reduce(RowStats::default, RowStats::add);
+            sums.clear();
+            stats
+        };
+        match parts {
+            [sums] => step((0, sums)),
+            parts => parts.par_iter_mut().enumerate().map(step).reduce(RowStats::default, RowStats::add),
+        }
     }
 
     /// The first and the second moments, `[rows, features]` each.
@@ -278,33 +312,37 @@ struct Update<'a, T> {
 impl<T: Scalar> Update<'_, T> {
     /// Updates some rows.
     #[inline(always)]
-    fn visit(&self, rows: &[u32], sums: &[T]) -> RowStats {
-        if self.keep == T::ONE { self.visit_with::<false>(rows, sums) } else { self.visit_with::<true>(rows, sums) }
+    fn visit(&self, first: usize, rows: &[u32], sums: &[T]) -> RowStats {
+        match self.keep == T::ONE {
+            true => self.visit_with::<false>(first, rows, sums),
+            false => self.visit_with::<true>(first, rows, sums),
+        }
     }
 
     #[inline(always)]
-    fn visit_with<const DECAY: bool>(&self, rows: &[u32], sums: &[T]) -> RowStats {
+    fn visit_with<const DECAY: bool>(&self, first: usize, rows: &[u32], sums: &[T]) -> RowStats {
         // The usual widths as constants: the loops over a row then unroll into one vector.
         match self.features {
-            1 => self.visit_by::<1, DECAY>(rows, sums),
-            2 => self.visit_by::<2, DECAY>(rows, sums),
-            4 => self.visit_by::<4, DECAY>(rows, sums),
-            8 => self.visit_by::<8, DECAY>(rows, sums),
-            wide if wide % 8 == 0 => self.visit_by::<8, DECAY>(rows, sums),
-            _ => self.visit_by::<1, DECAY>(rows, sums),
+            1 => self.visit_by::<1, DECAY>(first, rows, sums),
+            2 => self.visit_by::<2, DECAY>(first, rows, sums),
+            4 => self.visit_by::<4, DECAY>(first, rows, sums),
+            8 => self.visit_by::<8, DECAY>(first, rows, sums),
+            wide if wide % 8 == 0 => self.visit_by::<8, DECAY>(first, rows, sums),
+            _ => self.visit_by::<1, DECAY>(first, rows, sums),
         }
     }
 
     /// Updates each row by itself, in pieces of `W` features, of which a row is a multiple.
     #[inline(always)]
-    fn visit_by<const W: usize, const DECAY: bool>(&self, rows: &[u32], sums: &[T]) -> RowStats {
+    fn visit_by<const W: usize, const DECAY: bool>(&self, first: usize, rows: &[u32], sums: &[T]) -> RowStats {
         let (rule, features) = (self.rule, if self.features == W { W } else { self.features });
         let mut stats = RowStats::default();
         for (place, (&row, sum)) in rows.iter().zip(sums.chunks_exact(features)).enumerate() {
             if let Some(&later) = rows.get(place + AHEAD) {
-                self.table.prefetch(later as usize * features, features);
-                self.moments.prefetch(2 * later as usize * features, 2 * features);
-                self.steps.prefetch(later as usize, 1);
+                let later = first + later as usize;
+                self.table.prefetch(later * features, features);
+                self.moments.prefetch(2 * later * features, 2 * features);
+                self.steps.prefetch(later, 1);
             }
             let (mut any, mut finite) = (false, true);
             for i in 0..features {
@@ -316,9 +354,10 @@ impl<T: Scalar> Update<'_, T> {
             if !(any & finite) {
                 continue;
             }
-            let row = row as usize;
-            // SAFETY: `RowSums` names each row once, so no other task and no other turn of this loop has this one.
-            // `tasks_share_a_table` runs it.
+            let row = first + row as usize;
+            // SAFETY: `RowSums` names each row once and below the number of its rows, and the rows of one part end where
+            // those of the next begin: so no other task and no other turn of this loop has this one.
+            // `tasks_share_a_table` and `parts_share_a_table` run it.
             let (x, moments, step) = unsafe {
                 let x = self.table.get(row * features, features);
                 (x, self.moments.get(2 * row * features, 2 * features), self.steps.get(row, 1))
@@ -446,6 +485,38 @@ mod tests {
             assert!(table.iter().zip(before).all(|(x, before)| (x - before).abs() <= 3.2), "{table:?}");
         }
         assert!(adam.moments.as_mut_slice().iter().all(|m| !m.is_subnormal()), "{:?}", adam.moments);
+    }
+
+    #[test]
+    fn parts_share_a_table() {
+        // Three parts, filled in the step itself, against the whole.
+        let sizes = [5, 300, 4];
+        let run = |in_parts: bool| {
+            let rows: usize = sizes.iter().sum();
+            let (mut adam, mut table) = (RowAdam::<f32>::new(AdamConfig::default(), rows, 2), vec![0.25; 2 * rows]);
+            let mut parts: Vec<_> = sizes.iter().map(|&rows| RowSums::new(rows, 2)).collect();
+            let share = |row: usize, step: usize| [(row * 7 + step) as f32 % 5.0 - 2.0, 1.0 + row as f32];
+            for step in 0..3 {
+                let stats = if in_parts {
+                    let fill = |part: usize, sums: &mut RowSums<f32>| {
+                        let first: usize = sizes[..part].iter().sum();
+                        (0..sizes[part]).step_by(2).for_each(|row| sums.add(row, &share(first + row, step)));
+                    };
+                    adam.step_parts(&mut table, &mut parts, fill, 0.1, 0.0)
+                } else {
+                    let mut sums = RowSums::new(rows, 2);
+                    let firsts = [0, 5, 305];
+                    for (first, size) in firsts.into_iter().zip(sizes) {
+                        (first..first + size).step_by(2).for_each(|row| sums.add(row, &share(row, step)));
+                    }
+                    adam.step(&mut table, &mut sums, 0.1, 0.0)
+                };
+                assert_eq!(stats, RowStats { touched: 3 + 150 + 2, skipped: 0 });
+                assert!(parts.iter().all(|sums| sums.rows().is_empty()));
+            }
+            (table, adam.row_steps())
+        };
+        assert_eq!(run(true), run(false));
     }
 
     #[test]

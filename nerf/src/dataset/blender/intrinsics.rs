@@ -1,6 +1,5 @@
 //! What files say of their cameras beside the fields of the format.
 
-use super::field;
 use crate::error::{Error, Result};
 use serde_json::Value;
 use std::path::Path;
@@ -109,4 +108,9 @@ impl Intrinsics {
             ),
         ))
     }
+}
+
+/// The path of a field of a frame in the document.
+pub(super) fn field(index: usize, name: &str) -> String {
+    format!("frames[{index}].{name}")
 }

@@ -27,6 +27,7 @@
 
 mod bulldozer;
 mod bvh;
+mod golden;
 mod kit;
 mod render;
 mod shade;
@@ -42,9 +43,6 @@ pub use views::{ANGLE_X, DISTANCE, test_cameras, train_cameras, val_cameras};
 use crate::camera::pinhole::Ray;
 use bvh::Bvh;
 use shade::Material;
-
-/// The golden angle in radians: points a golden angle apart on a circle never bunch up, however many they are.
-const GOLDEN_ANGLE: f64 = 2.399963229728653;
 
 /// Solids under a fixed sun and sky.
 #[derive(Debug, Clone)]

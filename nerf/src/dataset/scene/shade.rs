@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use glam::{DVec2, DVec3};
 
-use super::GOLDEN_ANGLE;
 use super::bvh::{Bvh, Hit};
+use super::golden::GOLDEN_ANGLE;
 use crate::camera::pinhole::Ray;
 
 /// A diffuse body under a clear, more or less smooth surface.

@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use glam::DVec3;
 
-use super::GOLDEN_ANGLE;
+use super::golden::GOLDEN_ANGLE;
 use crate::camera::pinhole::Camera;
 
 /// Distance from the origin to every camera, in scene units.

@@ -167,6 +167,10 @@ impl<T: Scalar> Op<T> for HashEncoding {
         out
     }
 
+    fn is_kept(&self) -> bool {
+        true
+    }
+
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (positions, table) = (cx.x(0).into_value(), cx.x(1).into_value());
         let d_out = cx.g().value().clone();

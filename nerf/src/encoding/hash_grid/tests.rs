@@ -3,7 +3,7 @@
 use super::*;
 use proptest::prelude::*;
 use raygrad_autograd::{Gradient, Op, Pool, RowSums, Scalar, Tape, Tensor};
-use raygrad_nn::AdamConfig;
+use raygrad_nn::{Adam, AdamConfig, Optimizer, Params};
 use std::sync::Arc;
 
 fn grid(levels: usize, features: usize, log2_table: u32, coarsest: usize, finest: usize) -> HashGrid {
@@ -226,24 +226,35 @@ fn tiles(grid: &HashGrid, count: usize) -> Vec<Arc<HashGrad<f32>>> {
         .collect()
 }
 
+/// A store that holds a grid's table as it is at the start, and its gradient on these tiles.
+fn store(grid: &HashGrid, tiles: &[Arc<HashGrad<f32>>]) -> (Params<f32>, Gradient<f32>) {
+    let mut params = Params::new();
+    params.add("table", grid.init::<f32>(1));
+    params.set_lazy(|_| true, true);
+    let mut gradient = Gradient::zero(grid.shape());
+    tiles.iter().for_each(|tile| gradient.add_sparse(tile.clone()));
+    (params, gradient)
+}
+
 #[test]
-fn the_optimiser_gives_the_same_bits_on_any_number_of_threads() {
+fn a_table_moves_by_the_same_bits_on_any_number_of_threads() {
     let grid = grid(5, 2, 10, 4, 64);
     let tiles = tiles(&grid, 3);
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let mut optimizer = TableOptimizer::new(grid.clone(), AdamConfig::default());
-        let mut table = grid.init::<f32>(1);
-        let stats: Vec<_> = (0..5).map(|_| pool.install(|| optimizer.step(&mut table, &tiles, None, 1e-2))).collect();
-        (table, stats)
+        let (mut params, gradient) = store(&grid, &tiles);
+        let mut adam = Adam::new(AdamConfig::default());
+        let step = |_| pool.install(|| adam.update(&mut params, std::slice::from_ref(&gradient), 1e-2));
+        let reports: Vec<_> = (0..5).map(step).collect();
+        (params.values()[0].clone(), reports)
     };
     let one = run(1);
-    assert!(one.1.iter().all(|stats| stats.touched > 1000 && stats.skipped == 0));
+    assert!(one.1.iter().all(|report| report.moved > 2000 && report.skipped == 0));
     assert!(one == run(2) && one == run(4));
 }
 
 #[test]
-fn the_optimiser_uses_the_gradient_of_the_tape() {
+fn a_table_moves_level_by_level_as_its_dense_gradient_says() {
     let grid = grid(3, 2, 6, 4, 16);
     let tiles = tiles(&grid, 2);
     let start = grid.init::<f32>(1);
@@ -255,46 +266,41 @@ fn the_optimiser_uses_the_gradient_of_the_tape() {
         let grad = (out * tape.constant(tile.d_out.clone())).sum().grad(&[&table]).remove(0);
         raygrad_tensor::add_assign(&mut dense, grad.as_slice());
     }
-    let mut table = start.clone();
-    let stats = TableOptimizer::new(grid, AdamConfig::default()).step(&mut table, &tiles, None, 1e-2);
-    assert_eq!(stats.touched, dense.chunks(2).filter(|row| *row != [0.0; 2]).count());
+    let (mut params, gradient) = store(&grid, &tiles);
+    let report = Adam::new(AdamConfig::default()).update(&mut params, &[gradient], 1e-2);
+    assert_eq!(report.moved, 2 * dense.chunks(2).filter(|row| *row != [0.0; 2]).count());
     // Adam's first step is the learning rate against the gradient's sign.
-    for ((after, before), g) in table.as_slice().iter().zip(start.as_slice()).zip(dense) {
-        let expected = if g == 0.0 { 0.0 } else { -1e-2 * g.signum() };
+    for ((after, before), g) in params.values()[0].as_slice().iter().zip(start.as_slice()).zip(&dense) {
+        let expected = if *g == 0.0 { 0.0 } else { -1e-2 * g.signum() };
         assert!((after - before - expected).abs() <= 1e-5, "{before} to {after}, gradient {g}");
     }
+    // The same from the sums of all rows at once, and from a dense gradient: of one tile, which is added up in one way.
+    let (mut params, gradient) = store(&grid, &tiles[..1]);
+    let report = Adam::new(AdamConfig::default()).update(&mut params, &[gradient], 1e-2);
+    let mut sums = RowSums::new(grid.rows(), 2);
+    let (mut other, gradient) = store(&grid, &tiles[..1]);
+    assert!(gradient.scatter(&mut sums));
+    let mut scattered = vec![0.0; start.len()];
+    sums.add_to(&mut scattered);
+    assert_eq!(scattered, gradient.clone().into_dense(&Pool::none()).as_slice());
+    let dense = Gradient::from(gradient.into_dense(&Pool::none()));
+    let again = Adam::new(AdamConfig::default()).update(&mut other, &[dense], 1e-2);
+    assert_eq!((again.moved, other.values()), (report.moved, params.values()));
 }
 
 #[test]
 fn a_nan_gradient_is_skipped_and_forgotten() {
     let grid = grid(2, 2, 6, 4, 16);
     let mut tiles = tiles(&grid, 1);
-    let mut optimizer = TableOptimizer::new(grid.clone(), AdamConfig::default());
-    let mut table = grid.init::<f32>(1);
-    Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = f32::NAN;
-    let bad = optimizer.step(&mut table, &tiles, None, 1e-2);
-    assert!((1..=8).contains(&bad.skipped) && table.is_finite());
-    Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = 1.0;
-    assert_eq!(optimizer.step(&mut table, &tiles, None, 1e-2).skipped, 0);
-    assert_eq!(optimizer.step(&mut table, &[], None, 1e-2), TableStats::default());
-}
-
-#[test]
-fn a_dense_share_of_the_tables_gradient_moves_it_like_the_rows_it_sums() {
-    let grid = grid(3, 2, 6, 4, 16);
-    let tiles = tiles(&grid, 1);
-    let mut gradient = Gradient::zero(grid.shape());
-    gradient.add_sparse(tiles[0].clone());
-    let mut sums = RowSums::new(grid.rows(), 2);
-    assert!(gradient.scatter(&mut sums));
-    let dense = gradient.into_dense(&Pool::none());
-    let mut scattered = vec![0.0; dense.len()];
-    sums.add_to(&mut scattered);
-    assert_eq!(scattered, dense.as_slice());
-    let step = |tiles: &[_], dense| {
-        let mut table = grid.init::<f32>(1);
-        let stats = TableOptimizer::new(grid.clone(), AdamConfig::default()).step(&mut table, tiles, dense, 1e-2);
-        (table, stats)
+    let (mut params, _) = store(&grid, &tiles);
+    let mut adam = Adam::new(AdamConfig::default());
+    let mut step = |value: f32| {
+        Arc::get_mut(&mut tiles[0]).unwrap().d_out.as_mut_slice()[0] = value;
+        let (_, gradient) = store(&grid, &tiles);
+        let report = adam.update(&mut params, &[gradient], 1e-2);
+        assert!(params.values()[0].is_finite());
+        report.skipped
     };
-    assert_eq!(step(&[], Some(&dense)), step(&tiles, None));
+    assert!((2..=16).contains(&step(f32::NAN)));
+    assert_eq!(step(1.0), 0);
 }

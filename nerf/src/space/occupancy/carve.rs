@@ -1,17 +1,9 @@
 //! Cells that are known to be empty before anything is learned, and stay so.
 
-use super::lattice::{CELLS, cell};
+use super::lattice::{CARVED, CELLS, cell, uncarved};
 use super::{OccupancyGrid, TASK};
 use glam::DVec3;
 use rayon::prelude::*;
-
-/// The density of a cell that is empty for good: below any threshold, and never looked at.
-pub(super) const CARVED: f32 = f32::NEG_INFINITY;
-
-/// The cells of a block that are not carved.
-pub(super) fn uncarved(densities: &[f32]) -> u64 {
-    densities.iter().enumerate().fold(0, |word, (bit, &x)| word | u64::from(x != CARVED) << bit)
-}
 
 impl OccupancyGrid {
     /// Marks as empty for good the cells for which `is_empty(centre, radius)` holds, a ball around the cell in scene

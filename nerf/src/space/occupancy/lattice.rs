@@ -81,3 +81,11 @@ impl Lattice {
 pub(super) fn cell(bit: usize) -> [usize; 3] {
     [bit % EDGE, bit / EDGE % EDGE, bit / (EDGE * EDGE)]
 }
+
+/// The density of a cell that is empty for good: below any threshold, and never looked at.
+pub(super) const CARVED: f32 = f32::NEG_INFINITY;
+
+/// The cells of a block that are not carved.
+pub(super) fn uncarved(densities: &[f32]) -> u64 {
+    densities.iter().enumerate().fold(0, |word, (bit, &x)| word | u64::from(x != CARVED) << bit)
+}

@@ -59,13 +59,13 @@ mod update;
 
 use crate::{Error, Result};
 use glam::DVec3;
-use lattice::{CELLS, Lattice};
+use lattice::{CARVED, CELLS, Lattice};
 use leaps::Leaps;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use march::{MAX_STEPS, MarchBuffer, Step};
-pub use skip::Skip;
+pub use skip::{Skip, Skipping};
 pub use update::{DensityFn, POINTS, Update};
 
 /// Cells of a grid, at most.
@@ -77,24 +77,48 @@ const BYTES_PER_CELL: f64 = 4.125;
 const TASK: usize = 256;
 
 /// How fine a grid is, and what it may cost.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(from = "Stored")]
 pub struct OccupancyConfig {
     /// Cells along each axis: a multiple of 4, of 16 if there are several cascades; at most 1024, and with all cascades at
     /// most 2^30 cells (4.4 GB).
     pub resolution: usize,
     /// Number of nested boxes, 1 to 8: the scene's own, and each further one twice as large around the same centre.
     pub cascades: usize,
-    /// What may be skipped when rendering.
-    pub skip: Skip,
-    /// Whether training carves the grid with the silhouettes of photographs that have transparency, at the start: a cell
-    /// that a fully transparent part of a photograph shows stays empty. No error, if transparent pixels are right.
-    pub silhouettes: bool,
+    /// What may be left out.
+    pub skip: Skipping,
 }
 
 impl Default for OccupancyConfig {
     fn default() -> Self {
-        OccupancyConfig { resolution: 128, cascades: 1, skip: Skip::Lossless, silhouettes: true }
+        OccupancyConfig { resolution: 128, cascades: 1, skip: Skip::Lossless.into() }
+    }
+}
+
+/// What a file may say.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Stored {
+    resolution: usize,
+    cascades: usize,
+    skip: Skipping,
+    /// The first edition's switch for carving, for which one photograph was enough.
+    silhouettes: Option<bool>,
+}
+
+impl Default for Stored {
+    fn default() -> Self {
+        let OccupancyConfig { resolution, cascades, skip } = OccupancyConfig::default();
+        Stored { resolution, cascades, skip, silhouettes: None }
+    }
+}
+
+impl From<Stored> for OccupancyConfig {
+    fn from(Stored { resolution, cascades, mut skip, silhouettes }: Stored) -> Self {
+        if let Some(silhouettes) = silhouettes {
+            skip.carving = u32::from(silhouettes && skip.grid);
+        }
+        OccupancyConfig { resolution, cascades, skip }
     }
 }
 
@@ -124,7 +148,7 @@ impl OccupancyConfig {
             );
             return Err(Error::setting("occupancy.resolution", what));
         }
-        Ok(())
+        self.skip.check()
     }
 }
 
@@ -219,7 +243,7 @@ impl OccupancyGrid {
             .par_chunks(CELLS * TASK)
             .map(|part| {
                 part.iter()
-                    .filter(|x| !x.is_nan() && **x != carve::CARVED)
+                    .filter(|x| !x.is_nan() && **x != CARVED)
                     .fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1))
             })
             .collect();

@@ -1,7 +1,8 @@
 //! How much empty-looking space may be skipped.
 
+use crate::range::check_range;
 use crate::{Error, Result};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
@@ -50,6 +51,81 @@ impl Skip {
     }
 }
 
+/// What is left out, switch by switch: a [`Skip`] is a set of these, and a configuration may say each for itself. In a file
+/// it is such a name, or an object with these fields.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Skipping {
+    /// Whether training passes over cells in which the field holds little. What it has passed over is empty in views too:
+    /// the field was never asked there.
+    pub grid: bool,
+    /// Before training, cells go that so many photographs show to be empty, by being fully transparent there; 0 carves
+    /// nothing. One wrong mask empties nothing if two have to agree. Of few photographs fewer are asked for: one of eight.
+    pub carving: u32,
+    /// Views pass over cells that together add no more than this optical depth to any ray: a pixel changes by at most as
+    /// much, times the range of colours. 0 is none.
+    pub pruning: f64,
+    /// In views a ray ends where less light than this is left: a pixel changes by at most as much.
+    pub termination: f64,
+    /// In views samples whose weights add up to at most this have no colour of their own: a pixel changes by at most as
+    /// much. Quadratures of two nodes an interval colour every sample.
+    pub colors: f64,
+}
+
+/// Photographs that must agree that a cell is empty.
+const VOTES: u32 = 3;
+
+impl From<Skip> for Skipping {
+    fn from(skip: Skip) -> Self {
+        let (grid, carving, pruning) = (true, VOTES, skip.max_depth());
+        match skip {
+            Skip::Off => Skipping { grid: false, carving: 0, pruning, termination: 0.0, colors: 0.0 },
+            Skip::Lossless => Skipping { grid, carving, pruning, termination: 1e-4, colors: 1e-4 },
+            Skip::Fast => Skipping { grid, carving, pruning, termination: 1e-3, colors: 2e-3 },
+        }
+    }
+}
+
+/// What a file may say.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Stored {
+    Named(Skip),
+    Each(Each),
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Each {
+    grid: bool,
+    carving: u32,
+    pruning: f64,
+    termination: f64,
+    colors: f64,
+}
+
+impl<'de> Deserialize<'de> for Skipping {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        Ok(match Stored::deserialize(deserializer)? {
+            Stored::Named(skip) => skip.into(),
+            Stored::Each(Each { grid, carving, pruning, termination, colors }) => {
+                Skipping { grid, carving, pruning, termination, colors }
+            }
+        })
+    }
+}
+
+impl Skipping {
+    /// Whether the numbers make sense.
+    ///
+    /// # Errors
+    /// If one is out of range.
+    pub fn check(&self) -> Result<()> {
+        check_range("occupancy.skip.pruning", self.pruning, 0.0, 1.0)?;
+        check_range("occupancy.skip.termination", self.termination, 0.0, 1.0)?;
+        check_range("occupancy.skip.colors", self.colors, 0.0, 1.0)
+    }
+}
+
 impl fmt::Display for Skip {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
@@ -69,5 +145,26 @@ impl FromStr for Skip {
             "fast" => Ok(Skip::Fast),
             _ => Err(Error::setting("skip", format!("there is no `{name}`; use off, lossless or fast"))),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn switches_are_a_name_or_each_for_itself() {
+        let read = |text: &str| serde_json::from_str::<Skipping>(text);
+        for skip in [Skip::Off, Skip::Lossless, Skip::Fast] {
+            let switches = Skipping::from(skip);
+            assert_eq!(read(&format!("\"{skip}\"")).unwrap(), switches);
+            assert_eq!(read(&serde_json::to_string(&switches).unwrap()).unwrap(), switches);
+            assert!(switches.check().is_ok() && switches.pruning == skip.max_depth());
+        }
+        let none = Skipping::from(Skip::Off);
+        assert!(!none.grid && none.carving == 0 && none.pruning + none.termination + none.colors == 0.0);
+        assert!(read(r#"{"grid": true, "carving": 1, "pruning": 0, "termination": 0}"#).is_err());
+        let wrong = Skipping { colors: 1.5, ..none }.check().unwrap_err().to_string();
+        assert!(wrong.starts_with("`occupancy.skip.colors`: is 1.5"), "{wrong}");
     }
 }

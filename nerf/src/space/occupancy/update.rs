@@ -1,7 +1,6 @@
 //! Looking at a field: a few cells at a time in training, all that matter before rendering.
 
-use super::carve::uncarved;
-use super::lattice::{CELLS, cell};
+use super::lattice::{CELLS, cell, uncarved};
 use super::{OccupancyGrid, TASK, bits, exceeding};
 use crate::random::stream;
 use rand::RngExt;
@@ -18,6 +17,9 @@ pub type DensityFn<'a> = dyn Fn(&[[f32; 3]], &mut [f32]) + Sync + 'a;
 pub const POINTS: usize = 4096;
 /// Samples along each edge of a cell in [`OccupancyGrid::rebuild`].
 const REBUILD: usize = 2;
+
+/// Samples along each edge of a cell that [`OccupancyGrid::prune`] would empty.
+const CLOSELY: usize = 4;
 
 /// Which cells an update looks at, and how.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -164,12 +166,17 @@ impl OccupancyGrid {
         count
     }
 
-    /// Looks at the occupied cells of a finished field, at the middles of their eight octants, and empties those where
-    /// none has more than `min_sigma`. Returns the number of densities that were asked for.
+    /// Looks at the occupied cells of a finished field, and empties those where no density exceeds `min_sigma`: first at
+    /// the middles of their eight octants and then, in what that would empty, at one random place in each of 64 parts, so
+    /// that what is thinner than an octant is seldom missed. Returns the number of densities that were asked for.
     pub fn prune(&mut self, min_sigma: f32, density: &DensityFn<'_>) -> u64 {
         let mut occupied = self.words.clone();
-        let rng = |_| stream(0, [0, 0]);
-        let count = self.look(&Places::middles(REBUILD), |word| occupied[word], rng, |_, new| new, density);
+        let fixed = |_| stream(0, [0, 0]);
+        let mut count = self.look(&Places::middles(REBUILD), |word| occupied[word], fixed, |_, new| new, density);
+        let found = self.exceeding(min_sigma);
+        let random = |task: usize| stream(1, [0, task as u64]);
+        count +=
+            self.look(&Places::random(CLOSELY), |word| occupied[word] & !found[word], random, |_, new| new, density);
         for (word, exceeding) in occupied.iter_mut().zip(self.exceeding(min_sigma)) {
             *word &= exceeding;
         }

@@ -2,9 +2,8 @@
 
 use super::{Intervals, Plan, Quadrature, Share};
 use crate::camera::rays::Samples;
-use crate::field::Field;
-use raygrad_autograd::{Real, Scalar, Segments, Tape, Tensor};
-use raygrad_nn::Bound;
+use crate::volume::query::Query;
+use raygrad_autograd::{Real, Scalar, Segments, Tensor};
 
 /// No interval is halved more often.
 const MOST_HALVINGS: usize = 24;
@@ -41,16 +40,9 @@ struct Link {
 ///
 /// Intervals that no more light than `least` reaches are left out. Nothing is recorded: no gradient flows through the
 /// choice of places. A feature that shows at no node of `steps` is not found.
-pub fn refine<'t, T: Scalar>(
-    field: &dyn Field<T>,
-    params: &Bound<'t, T>,
-    steps: &Samples<T>,
-    tolerance: f64,
-    least: f64,
-    tape: &'t Tape<T>,
-) -> Refined<T> {
-    let first = Quadrature::PiecewiseLinear.plan(steps, tape.pool());
-    let mut asker = Asker { field, params, steps, tape, evaluations: 0 };
+pub fn refine<'t, T: Scalar>(query: &Query<'_, 't, T>, steps: &Samples<T>, tolerance: f64, least: f64) -> Refined<T> {
+    let first = Quadrature::PiecewiseLinear.plan(steps, query.tape().pool());
+    let mut asker = Asker { query, steps, evaluations: 0 };
     let mut rays = asker.begin(&first);
     for _ in 0..MOST_HALVINGS {
         let middles: Vec<Vec<f64>> = rays.iter().map(|links| middles::<T>(links, least)).collect();
@@ -63,6 +55,18 @@ pub fn refine<'t, T: Scalar>(
         }
     }
     Refined { plan: asker.finish(&rays, least), evaluations: asker.evaluations }
+}
+
+impl Quadrature {
+    /// The plan for steps along rays that is made for this field: an adaptive rule asks it where to look, and leaves out
+    /// what no more light than `least` reaches.
+    pub fn plan_for<'t, T: Scalar>(self, query: &Query<'_, 't, T>, steps: &Samples<T>, least: f64) -> Refined<T> {
+        if let Quadrature::Adaptive { tolerance } = self {
+            return refine(query, steps, tolerance, least);
+        }
+        let plan = self.plan(steps, query.tape().pool());
+        Refined { evaluations: plan.len(), plan }
+    }
 }
 
 /// Places to ask at next: the middles of open intervals that light reaches and that can be halved in this precision.
@@ -125,55 +129,33 @@ fn change(a: Node, middle: Node, b: Node, length: f64) -> f64 {
 
 /// Asks a field, unrecorded.
 struct Asker<'a, 't, T: Scalar> {
-    field: &'a dyn Field<T>,
-    params: &'a Bound<'t, T>,
+    query: &'a Query<'a, 't, T>,
     steps: &'a Samples<T>,
-    tape: &'t Tape<T>,
     evaluations: usize,
 }
 
 impl<T: Scalar> Asker<'_, '_, T> {
     /// Samples at these distances along each ray.
     fn samples(&self, places: &[Vec<f64>]) -> Samples<T> {
-        let Samples { positions, directions, t, segments, .. } = self.steps;
-        let mut ends = vec![0];
-        let (mut out_positions, mut out_t) = (vec![], vec![]);
-        for (ray, places) in places.iter().enumerate() {
-            let start = segments.range(ray).start;
-            for &place in places {
-                let shift = place - t.as_slice()[start].to_f64();
-                out_positions.extend((0..3).map(|axis| {
-                    let direction = directions.as_slice()[3 * ray + axis].to_f64();
-                    T::from_f64(positions.as_slice()[3 * start + axis].to_f64() + shift * direction)
-                }));
-                out_t.push(T::from_f64(place));
-            }
-            ends.push(out_t.len() as u32);
-        }
-        let count = out_t.len();
-        let tensor = |values: Vec<T>, shape: &[usize]| Tensor::from_vec(shape, values);
-        Samples {
-            positions: tensor(out_positions, &[count, 3]),
-            directions: directions.clone(),
-            t: tensor(out_t, &[count]),
-            delta: Tensor::zeros(&[count]),
-            segments: Segments::new(ends),
-        }
+        let t: Vec<T> = places.iter().flatten().map(|&place| T::from_f64(place)).collect();
+        let ends = places.iter().scan(0, |end, places| {
+            *end += places.len() as u32;
+            Some(*end)
+        });
+        let segments = Segments::new([0].into_iter().chain(ends).collect::<Vec<_>>());
+        let count = t.len();
+        self.steps.at(segments, Tensor::from_vec(&[count], t), Tensor::zeros(&[count]))
     }
 
     /// What the field says at these distances along each ray, ray after ray.
     fn ask(&mut self, places: &[Vec<f64>]) -> Vec<Node> {
         let samples = self.samples(places);
         self.evaluations += samples.len();
-        let tape = self.tape;
-        tape.no_grad(|| {
-            let encoding = self.field.encode(self.params, &tape.constant(samples.positions.clone()));
-            let density = self.field.density(self.params, &encoding);
-            let directions = tape.constant(samples.directions.clone());
-            let color = self.field.color(self.params, &density.features, &directions, &samples.segments);
-            let (sigma, color) = (density.sigma(), color.value().as_slice());
+        self.query.tape().no_grad(|| {
+            let density = self.query.density(&samples);
+            let (sigma, color) = (density.sigma(), self.query.color(&density.features, &samples));
             let places = places.iter().flatten();
-            let values = sigma.value().as_slice().iter().zip(color.chunks_exact(3)).zip(places);
+            let values = sigma.value().as_slice().iter().zip(color.value().as_slice().chunks_exact(3)).zip(places);
             let node = |((sigma, color), &t): ((&T, &[T]), &f64)| Node {
                 t,
                 sigma: sigma.to_f64(),

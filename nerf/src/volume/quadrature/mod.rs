@@ -16,81 +16,13 @@
 //! the intervals of the other rules are shifted at random: errors change from step to step.
 
 mod adaptive;
-mod op;
+mod intervals;
 mod plan;
+mod rule;
 #[cfg(test)]
 mod tests;
 
 pub use adaptive::{Refined, refine};
-#[cfg(feature = "check")]
-pub(crate) use op::entries;
-pub use op::{CompositeIntervals, Intervals, Share, gauss_share};
-pub use plan::{Composited, Plan};
-
-use crate::Result;
-use crate::range::check_range;
-use serde::{Deserialize, Serialize};
-use std::fmt;
-
-/// A rule for the integral along a ray.
-///
-/// In a configuration it is a word, such as `"gauss2"`, or `{"adaptive": {"tolerance": 1e-3}}`.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Quadrature {
-    /// One evaluation at the near end of each interval, as in Mildenhall et al. 2020, equation 3, but for the last
-    /// interval, which ends where the ray does.
-    Left,
-    /// One evaluation in the middle of each interval, or at a random place in training.
-    #[default]
-    Midpoint,
-    /// One evaluation at each end of an interval, shared with the next; density linear in between, and the mean colour
-    /// (Uy et al. 2023, "NeRF Revisited: Fixing Quadrature Instability in Volume Rendering", with the mean in place of
-    /// the near colour).
-    PiecewiseLinear,
-    /// Two evaluations in each interval, at the nodes of Gauss's rule; colour linear in optical depth
-    /// ([`gauss_share`]).
-    Gauss2,
-    /// As [`PiecewiseLinear`](Self::PiecewiseLinear), with intervals halved until halving changes the pixel by less than
-    /// `tolerance` each. Colours are evaluated in every round.
-    Adaptive {
-        /// The change of a pixel that is not followed up, 1e-9 to 1.
-        tolerance: f64,
-    },
-}
-
-impl Quadrature {
-    /// Whether the numbers make sense.
-    ///
-    /// # Errors
-    /// If one is out of range.
-    pub fn check(self) -> Result<()> {
-        match self {
-            Quadrature::Adaptive { tolerance } => check_range("quadrature.adaptive.tolerance", tolerance, 1e-9, 1.0),
-            _ => Ok(()),
-        }
-    }
-
-    /// The power of the interval length that the error falls with, for smooth scenes; `None` if intervals have no common
-    /// length.
-    pub fn order(self) -> Option<u32> {
-        match self {
-            Quadrature::Left => Some(1),
-            Quadrature::Midpoint | Quadrature::PiecewiseLinear => Some(2),
-            Quadrature::Gauss2 => Some(4),
-            Quadrature::Adaptive { .. } => None,
-        }
-    }
-}
-
-impl fmt::Display for Quadrature {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Quadrature::Left => f.pad("left"),
-            Quadrature::Midpoint => f.pad("midpoint"),
-            Quadrature::PiecewiseLinear => f.pad("piecewise-linear"),
-            Quadrature::Gauss2 => f.pad("gauss2"),
-            Quadrature::Adaptive { tolerance } => f.pad(&format!("adaptive {tolerance:.0e}")),
-        }
-    }
-}
+pub use intervals::{Intervals, Share, gauss_share};
+pub use plan::Plan;
+pub use rule::Quadrature;

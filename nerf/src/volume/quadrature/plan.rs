@@ -1,14 +1,12 @@
 //! Where a field is asked by a rule, and what is made of the answers.
 
-use super::{CompositeIntervals, Intervals, Quadrature, Refined, Share, refine};
-use crate::camera::rays::stratified;
-use crate::camera::rays::{Rays, Samples};
-use crate::field::{Density, Field};
+use super::{Intervals, Quadrature, Share};
+use crate::camera::rays::{Rays, Samples, stratified};
+use crate::field::Density;
 use crate::random::Jitter;
-use crate::volume::pass::features;
-use crate::volume::visible::{Marched, composite_visible};
-use raygrad_autograd::{Pool, Scalar, Segments, Tape, Tensor, Var};
-use raygrad_nn::Bound;
+use crate::volume::query::Query;
+use crate::volume::render::{Rendered, Weighted, accumulate};
+use raygrad_autograd::{Pool, Scalar, Segments, Tensor, Var};
 use std::sync::Arc;
 
 /// Places along rays where a field is asked, and the intervals that the answers stand for.
@@ -18,16 +16,6 @@ pub struct Plan<T: Scalar> {
     pub samples: Samples<T>,
     /// Intervals between two places each; without them every sample stands for its own `delta`.
     pub intervals: Option<Intervals<T>>,
-}
-
-/// What is seen, and what it took.
-pub struct Composited<'t, T: Scalar> {
-    /// `[rays, 4 or 5]`: colour, distance if asked for, and the transmittance that is left.
-    pub rendered: Var<'t, T>,
-    /// Evaluations of a density alone.
-    pub asked: usize,
-    /// Samples that had light left in front of them, which were evaluated with colour and for gradients.
-    pub kept: usize,
 }
 
 /// Nodes that are added ray by ray, each `offset` intervals from the middle of a step.
@@ -46,25 +34,15 @@ impl<T: Scalar> Nodes<'_, T> {
 
     /// The samples at the nodes.
     fn samples(&self, offsets: Vec<u32>, pool: &Pool<T>) -> Samples<T> {
-        let Samples { positions, directions, t, delta, .. } = self.steps;
+        let (t, delta) = (self.steps.t.as_slice(), self.steps.delta.as_slice());
         let count = self.step.len();
-        let (mut out_p, mut out_t, mut out_delta) =
-            (pool.tensor(&[count, 3]), pool.tensor(&[count]), pool.tensor(&[count]));
-        let segments = Segments::new(offsets);
-        let (p, out, width) = (out_p.as_mut_slice(), out_t.as_mut_slice(), out_delta.as_mut_slice());
-        for (ray, nodes) in segments.ranges().enumerate() {
-            let direction = &directions.as_slice()[3 * ray..3 * ray + 3];
-            for node in nodes {
-                let step = self.step[node] as usize;
-                width[node] = delta.as_slice()[step];
-                let shift = T::from_f64(self.offset[node]) * width[node];
-                out[node] = t.as_slice()[step] + shift;
-                for axis in 0..3 {
-                    p[3 * node + axis] = positions.as_slice()[3 * step + axis] + shift * direction[axis];
-                }
-            }
+        let (mut out_t, mut out_delta) = (pool.tensor(&[count]), pool.tensor(&[count]));
+        let out = out_t.as_mut_slice().iter_mut().zip(out_delta.as_mut_slice());
+        for ((out, width), (&step, &offset)) in out.zip(self.step.iter().zip(&self.offset)) {
+            *width = delta[step as usize];
+            *out = t[step as usize] + T::from_f64(offset) * *width;
         }
-        Samples { positions: out_p, directions: directions.clone(), t: out_t, delta: out_delta, segments }
+        self.steps.at(Segments::new(offsets), out_t, out_delta)
     }
 }
 
@@ -116,48 +94,6 @@ impl Quadrature {
         Plan { samples, intervals: Some(Intervals { nodes: [first.into(), second.into()], length, segments, share }) }
     }
 
-    /// The plan for steps along rays that is made for this field: an adaptive rule asks it where to look, and leaves out
-    /// what no more light than `least` reaches.
-    pub fn plan_for<'t, T: Scalar>(
-        self,
-        field: &dyn Field<T>,
-        params: &Bound<'t, T>,
-        steps: &Samples<T>,
-        least: f64,
-        tape: &'t Tape<T>,
-    ) -> Refined<T> {
-        if let Quadrature::Adaptive { tolerance } = self {
-            return refine(field, params, steps, tolerance, least, tape);
-        }
-        let plan = self.plan(steps, tape.pool());
-        Refined { evaluations: plan.len(), plan }
-    }
-
-    /// What steps along rays show of a field. What no more light than `termination` reaches is left out: a pixel changes
-    /// by at most as much times the range of colours.
-    pub fn render<'t, T: Scalar>(
-        self,
-        field: &dyn Field<T>,
-        params: &Bound<'t, T>,
-        steps: &Samples<T>,
-        termination: f64,
-        with_depth: bool,
-        tape: &'t Tape<T>,
-    ) -> Composited<'t, T> {
-        if let Quadrature::Adaptive { .. } = self {
-            let Refined { plan, evaluations } = self.plan_for(field, params, steps, termination, tape);
-            let rendered = plan.render(field, params, with_depth, tape);
-            return Composited { rendered, asked: evaluations, kept: plan.len() };
-        }
-        let plan = self.plan(steps, tape.pool());
-        if let Some(intervals) = &plan.intervals {
-            return plan.render_lit(intervals, field, params, termination, with_depth, tape);
-        }
-        let Marched { rendered, evaluated, kept } =
-            composite_visible(field, params, &plan.samples, termination, with_depth, tape);
-        Composited { rendered, asked: evaluated, kept }
-    }
-
     /// The plan for equal intervals over the spans of rays, with at most `evaluations` evaluations a ray and with at least
     /// one interval.
     #[inline(never)]
@@ -182,74 +118,47 @@ impl<T: Scalar> Plan<T> {
         self.len() == 0
     }
 
-    /// The features of the plan's samples, composited along their rays: `[rays, channels + 1]` as
-    /// [`Composite`](crate::Composite) gives it.
+    /// The weights of the plan's samples of this density.
     #[track_caller]
     #[inline(never)]
-    pub fn composite<'t>(&self, density: &Density<'t, T>, features: &Var<'t, T>) -> Var<'t, T> {
-        let tape = features.tape();
-        let inputs = [&density.value, features];
+    pub fn weighted<'t>(&self, density: &Density<'t, T>) -> Weighted<'t, T> {
         match &self.intervals {
-            Some(intervals) => tape.apply(CompositeIntervals::new(intervals.clone(), self.len(), density.log), &inputs),
-            None => tape.apply(density.composite(self.samples.delta.clone(), self.samples.segments.clone()), &inputs),
+            Some(intervals) => intervals.weighted(density),
+            None => Weighted::new(density, &self.samples.delta, &self.samples.segments),
         }
     }
 
-    /// Colour (and distance, if `with_depth`) of a field at the plan's samples, composited: `[rays, 4 or 5]`.
-    pub fn render<'t>(
-        &self,
-        field: &dyn Field<T>,
-        params: &Bound<'t, T>,
-        with_depth: bool,
-        tape: &'t Tape<T>,
-    ) -> Var<'t, T> {
-        let encoding = field.encode(params, &tape.constant(self.samples.positions.clone()));
-        self.render_encoded(field, params, &encoding, with_depth, tape)
+    /// What the plan's samples show of a field.
+    #[track_caller]
+    pub fn render<'t>(&self, query: &Query<'_, 't, T>) -> Rendered<'t, T> {
+        let positions = query.positions(&self.samples);
+        let density = query.field.density(query.params, &positions);
+        self.render_density(query, positions, density)
     }
 
-    /// As [`render`](Self::render), from the encoding of the samples' positions.
-    fn render_encoded<'t>(
+    /// As [`render`](Self::render), of a density that is known at the samples' positions.
+    #[track_caller]
+    pub(crate) fn render_density<'t>(
         &self,
-        field: &dyn Field<T>,
-        params: &Bound<'t, T>,
-        encoding: &Var<'t, T>,
-        with_depth: bool,
-        tape: &'t Tape<T>,
-    ) -> Var<'t, T> {
-        let density = field.density(params, encoding);
-        let features = features(field, params, &self.samples, &density, with_depth, tape);
-        self.composite(&density, &features)
-    }
-
-    /// As [`render`](Self::render) in two passes, for a plan with these intervals: an unrecorded one for the densities, and
-    /// a recorded one on the intervals that more than `termination` of the light reaches, which takes its encodings from
-    /// the first.
-    fn render_lit<'t>(
-        &self,
-        intervals: &Intervals<T>,
-        field: &dyn Field<T>,
-        params: &Bound<'t, T>,
-        termination: f64,
-        with_depth: bool,
-        tape: &'t Tape<T>,
-    ) -> Composited<'t, T> {
-        let (encoding, transmittance) = tape.no_grad(|| {
-            let encoding = field.encode(params, &tape.constant(self.samples.positions.clone()));
-            let density = field.density(params, &encoding);
-            let composite = CompositeIntervals::new(intervals.clone(), self.len(), density.log);
-            let [transmittance, _] = composite.transmittance_and_weights(density.value.value(), tape.pool());
-            (encoding.into_value(), transmittance)
-        });
-        let (lit, rows) = self.lit(intervals, &transmittance, T::from_f64(termination), tape.pool());
-        let known = select_rows(&encoding, &rows, tape.pool());
-        let encoding = field.encode_known(params, &tape.constant(lit.samples.positions.clone()), known);
-        let rendered = lit.render_encoded(field, params, &encoding, with_depth, tape);
-        Composited { rendered, asked: self.len(), kept: rows.len() }
+        query: &Query<'_, 't, T>,
+        positions: Var<'t, T>,
+        density: Density<'t, T>,
+    ) -> Rendered<'t, T> {
+        let Weighted { weights, optical_depth } = self.weighted(&density);
+        let color = query.color(&density.features, &self.samples);
+        let color = accumulate(&weights, &color, &self.samples.segments);
+        Rendered { samples: self.samples.clone(), positions, density, weights, optical_depth, color }
     }
 
     /// The plan without the intervals that no more light than `least` reaches, and the numbers of the samples that are
     /// left.
-    fn lit(&self, intervals: &Intervals<T>, transmittance: &Tensor<T>, least: T, pool: &Pool<T>) -> (Self, Vec<u32>) {
+    pub(crate) fn lit(
+        &self,
+        intervals: &Intervals<T>,
+        transmittance: &Tensor<T>,
+        least: T,
+        pool: &Pool<T>,
+    ) -> (Self, Vec<u32>) {
         let Intervals { nodes, length, segments, share } = intervals;
         let is_lit = |k: usize| transmittance.as_slice()[k] > least;
         let kept: Vec<usize> = (0..segments.rows()).filter(|&k| is_lit(k)).collect();
@@ -268,14 +177,4 @@ impl<T: Scalar> Plan<T> {
         };
         (Plan { samples: self.samples.select(&rows, pool), intervals: Some(intervals) }, rows)
     }
-}
-
-/// The rows of a matrix with these numbers.
-fn select_rows<T: Scalar>(x: &Tensor<T>, rows: &[u32], pool: &Pool<T>) -> Tensor<T> {
-    let width = x.shape()[1];
-    let mut out = pool.tensor(&[rows.len(), width]);
-    for (out, &row) in out.as_mut_slice().chunks_exact_mut(width.max(1)).zip(rows) {
-        out.copy_from_slice(&x.as_slice()[row as usize * width..(row as usize + 1) * width]);
-    }
-    out
 }

@@ -7,10 +7,13 @@ use crate::camera::rays::Rays;
 use crate::camera::rays::stratified;
 use crate::dataset::{Split, embedded};
 use crate::field::{FieldConfig, VoxelConfig};
-use crate::model::config::{Config, Preset, SamplerConfig};
+use crate::model::config::{Config, Preset};
 use crate::pictures::metrics::psnr;
 use crate::random::Jitter;
+use crate::sampling::marching::MarchingConfig;
 use crate::training::trainer::Trainer;
+use crate::volume::lit::Lit;
+use crate::volume::query::Query;
 use glam::DVec3;
 use raygrad_autograd::Tape;
 use raygrad_nn::Params;
@@ -157,8 +160,8 @@ fn single_precision_is_as_good_as_its_digits() {
 /// A voxel model of the embedded scene, small.
 fn small(rule: Quadrature) -> Config {
     let mut config = Config::preset(Preset::Voxel);
-    config.field = FieldConfig::Voxel(VoxelConfig { resolution: 20, direction_degree: 1 });
-    let SamplerConfig::Marching(sampler) = &mut config.sampler else { panic!() };
+    config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
+    let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else { panic!() };
     (sampler.step, sampler.samples, sampler.occupancy.resolution) = (0.02, 2048, 32);
     sampler.quadrature = rule;
     config
@@ -208,14 +211,19 @@ fn what_no_light_reaches_is_left_out_within_the_bound() {
     let bound = params.bind(&tape);
     let steps = stratified(&rays, 64, &mut Jitter::Middle, tape.pool());
     for rule in RULES.into_iter().chain([Quadrature::Adaptive { tolerance: 1e-3 }]) {
-        let [all, lit] = [0.0, 1e-4].map(|least| rule.render(&field, &bound, &steps, least, true, &tape));
+        let [all, lit] = [0.0, 1e-4].map(|least| rule.render(&Query::new(&field, &bound), &steps, least));
         // The second ray, through nothing, keeps all of its samples.
         assert!(4 * lit.kept < 3 * all.kept && lit.asked <= all.asked, "{rule}: {} of {}", lit.kept, all.kept);
-        for (a, b) in all.rendered.value().as_slice().iter().zip(lit.rendered.value().as_slice()) {
+        let values = |seen: &Lit<'_, f64>| {
+            let seen = &seen.rendered;
+            [seen.color.clone(), seen.depth(), seen.transmittance()]
+                .map(|value| value.value().as_slice().to_vec())
+                .concat()
+        };
+        for (a, b) in values(&all).into_iter().zip(values(&lit)) {
             assert!((a - b).abs() <= 4.0 * 1e-4, "{rule}: {a} {b}");
         }
-        let gradient =
-            |seen: &Composited<'_, f64>| seen.rendered.slice_axis(1, ..1).sum().grad(&bound.vars()).remove(0);
+        let gradient = |seen: &Lit<'_, f64>| seen.rendered.color.slice_axis(1, ..1).sum().grad(&bound.vars()).remove(0);
         for (a, b) in gradient(&all).as_slice().iter().zip(gradient(&lit).as_slice()) {
             assert!((a - b).abs() <= 1e-3, "{rule}: {a} {b}");
         }

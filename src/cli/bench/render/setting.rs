@@ -4,7 +4,7 @@ use raygrad::Storage;
 use raygrad::nerf::sampling::marching::Marching;
 use raygrad::nerf::space::occupancy::{Skip, Threshold, Update};
 use raygrad::nerf::volume::quadrature::Quadrature;
-use raygrad::nerf::{Camera, Evaluations, Image, Limits, Model, Result, Sampler};
+use raygrad::nerf::{Camera, Evaluations, Image, Limits, Model, Result};
 
 /// The background of all pictures.
 pub const WHITE: [f64; 3] = [1.0; 3];
@@ -49,7 +49,7 @@ impl Setting {
             name: "fast".to_owned(),
             step,
             cells: Cells::Depth(Skip::Fast.max_depth()),
-            limits: Limits::of(Skip::Fast),
+            limits: Limits::of(&Skip::Fast.into()),
             rule: Quadrature::Midpoint,
             double: false,
             storage: Storage::Full,
@@ -60,12 +60,9 @@ impl Setting {
     pub fn model(&self, model: &Model<f32>) -> Model<f32> {
         let mut model = model.clone();
         model.params.round_to(self.storage);
-        let pruned = match &model.sampler {
-            Sampler::Marching(sampler) => Some(self.sampler(&model, sampler.clone())),
-            Sampler::Hierarchical(_) => None,
-        };
+        let pruned = model.marching().map(|sampler| self.sampler(&model, sampler.clone()));
         if let Some(sampler) = pruned {
-            model.sampler = Sampler::Marching(sampler);
+            model.sampler = Box::new(sampler);
         }
         model
     }
@@ -88,7 +85,8 @@ impl Setting {
                 sampler.grid.threshold(&Threshold { min_sigma, or_mean: false, dilate: false });
             }
         }
-        sampler
+        // What the model leaves out of its own accord is forgotten.
+        Marching::new(sampler.config, sampler.grid)
     }
 
     /// The view of such a [`model`](Self::model).
@@ -114,7 +112,7 @@ pub fn settings(step: f64) -> Vec<Setting> {
             "lossless".into(),
             Setting {
                 cells: Cells::Depth(Skip::Lossless.max_depth()),
-                limits: Limits::of(Skip::Lossless),
+                limits: Limits::of(&Skip::Lossless.into()),
                 ..base.clone()
             },
         ),

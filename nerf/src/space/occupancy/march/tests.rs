@@ -262,9 +262,10 @@ fn samples_carry_positions_and_segments() {
     assert_eq!(found.offsets[1], found.offsets[2], "the ray beside the box");
     let samples = found.samples(&rays, &Pool::new());
     assert_eq!(samples.segments.offsets(), found.offsets);
+    let positions = samples.positions(&Pool::new());
     for (ray, rows) in samples.segments.ranges().enumerate() {
         for row in rows {
-            let position = &samples.positions.as_slice()[3 * row..][..3];
+            let position = &positions.as_slice()[3 * row..][..3];
             assert_eq!(position, [rays.origins[ray][0], 0.1, -3.0 + found.t[row]]);
         }
     }

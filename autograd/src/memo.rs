@@ -1,0 +1,212 @@
+//! Outputs that one pass hands to another.
+
+use crate::{Op, Tape, Var};
+use raygrad_tensor::{Pool, Scalar, Tensor};
+use std::cell::Cell;
+
+/// The outputs of those operations of a pass that [are worth keeping](Op::is_kept), in the order in which they ran.
+#[derive(Debug, Clone)]
+pub struct Memo<T: Scalar> {
+    values: Vec<Tensor<T>>,
+}
+
+/// What a tape does with such outputs at the moment.
+#[derive(Default)]
+pub(crate) enum Memory<T: Scalar> {
+    #[default]
+    Off,
+    Remember(Vec<Tensor<T>>),
+    Recall(std::vec::IntoIter<Tensor<T>>),
+}
+
+impl<T: Scalar> Memo<T> {
+    /// The values, in order.
+    pub fn values(&self) -> &[Tensor<T>] {
+        &self.values
+    }
+
+    /// Rows of several memos of the same operations, `[memo, row]` each, as one: where those have looked at other rows of
+    /// one tensor each.
+    ///
+    /// # Panics
+    /// If the memos are not of the same operations or a row is out of range.
+    #[track_caller]
+    pub fn gather(memos: &[Memo<T>], rows: &[[u32; 2]], pool: &Pool<T>) -> Memo<T> {
+        let Some(first) = memos.first() else { return Memo { values: vec![] } };
+        let gather = |which: usize| {
+            let parts: Vec<&[T]> = memos.iter().map(|memo| memo.values[which].as_slice()).collect();
+            let mut shape = first.values[which].shape().to_vec();
+            let width: usize = shape[1..].iter().product();
+            shape[0] = rows.len();
+            let mut out = pool.tensor(&shape);
+            for (out, &[memo, row]) in out.as_mut_slice().chunks_exact_mut(width.max(1)).zip(rows) {
+                out.copy_from_slice(&parts[memo as usize][row as usize * width..(row as usize + 1) * width]);
+            }
+            out
+        };
+        assert!(memos.iter().all(|memo| memo.values.len() == first.values.len()), "memos of the same operations");
+        Memo { values: (0..first.values.len()).map(gather).collect() }
+    }
+}
+
+impl<T: Scalar> Tape<T> {
+    /// Runs `f`, and gives beside its result the outputs of those of its operations that [are kept](Op::is_kept): for
+    /// [`recall`](Self::recall).
+    pub fn remember<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
+        let (result, memory) = self.with_memory(Memory::Remember(vec![]), f);
+        let values = if let Memory::Remember(values) = memory { values } else { vec![] };
+        (result, Memo { values })
+    }
+
+    /// Runs `f`, in which the operations that [are kept](Op::is_kept) take their outputs from a memo of the same operations
+    /// on the same inputs, instead of working them out again; they are recorded as ever. So a pass that was not recorded
+    /// can find out which rows matter, and a recorded one go on with what is known of those.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Grads, Memo, Op, ShapeError, Tape, Vjp};
+    /// use raygrad_tensor::{Pool, Scalar, Shape, Tensor, map};
+    ///
+    /// /// y = x^2, at a price.
+    /// struct Square;
+    /// impl<T: Scalar> Op<T> for Square {
+    ///     fn name(&self) -> &'static str { "square" }
+    ///     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> { Ok(x[0].into()) }
+    ///     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> { map([x[0]], pool, |[x]| x * x) }
+    ///     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> { Grads::one(cx.g() * &cx.x(0) * 2.0) }
+    ///     fn is_kept(&self) -> bool { true }
+    /// }
+    ///
+    /// let tape = Tape::<f64>::new();
+    /// let x = tape.leaf(Tensor::from([1.0, 2.0, 3.0]));
+    /// let (y, memo) = tape.no_grad(|| tape.remember(|| tape.apply(Square, &[&x])));
+    /// let large: Vec<u32> = (0..3).filter(|&i| y.value().as_slice()[i as usize] > 2.0).collect();
+    /// let rows: Vec<[u32; 2]> = large.iter().map(|&row| [0, row]).collect();
+    /// let memo = Memo::gather(&[memo], &rows, tape.pool());
+    /// let again = tape.recall(memo, || tape.apply(Square, &[&x.gather_rows(large)]));
+    /// assert_eq!(again.value(), [4.0, 9.0]);
+    /// assert_eq!(again.sum().grad(&[&x])[0], [0.0, 4.0, 6.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If `f` runs fewer or other such operations than the memo holds outputs of, as far as shapes tell. (An empty memo
+    /// stands for no pass at all: everything is worked out.)
+    #[track_caller]
+    pub fn recall<R>(&self, memo: Memo<T>, f: impl FnOnce() -> R) -> R {
+        if memo.values.is_empty() {
+            return f();
+        }
+        let (result, memory) = self.with_memory(Memory::Recall(memo.values.into_iter()), f);
+        let left = if let Memory::Recall(left) = memory { left.len() } else { 0 };
+        assert_eq!(left, 0, "outputs of a memo that no operation asked for");
+        result
+    }
+
+    /// The output of an operation from a memo, if one is being recalled.
+    #[track_caller]
+    pub(crate) fn recalled(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>]) -> Option<Tensor<T>> {
+        let mut memory = self.memory.take();
+        let value = if let Memory::Recall(values) = &mut memory { Some(values.next()) } else { None };
+        self.memory.set(memory);
+        let value = value?.unwrap_or_else(|| panic!("{}: a memo that ends before this operation", op.name()));
+        let shapes: Vec<&[usize]> = inputs.iter().map(|x| x.shape()).collect();
+        let fits = op.shape(&shapes).is_ok_and(|shape| value.shape() == shape.as_slice());
+        assert!(fits, "{}: a memo holds an output of shape {:?} for it", op.name(), value.shape());
+        Some(value)
+    }
+
+    /// Keeps an output, if outputs are being remembered.
+    pub(crate) fn keep(&self, value: &Tensor<T>) {
+        let mut memory = self.memory.take();
+        if let Memory::Remember(values) = &mut memory {
+            values.push(value.clone());
+        }
+        self.memory.set(memory);
+    }
+
+    fn with_memory<R>(&self, memory: Memory<T>, f: impl FnOnce() -> R) -> (R, Memory<T>) {
+        /// Puts the old memory back, also where `f` panics.
+        struct Restore<'a, T: Scalar>(&'a Cell<Memory<T>>, Memory<T>);
+        impl<T: Scalar> Drop for Restore<'_, T> {
+            fn drop(&mut self) {
+                self.1 = self.0.replace(std::mem::take(&mut self.1));
+            }
+        }
+        let restore = Restore(&self.memory, self.memory.replace(memory));
+        let result = f();
+        let memory = self.memory.take();
+        drop(restore);
+        (result, memory)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Grads, ShapeError, Vjp};
+    use raygrad_tensor::{Shape, map};
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    /// y = 2 x, and how often it was worked out.
+    struct Twice(Arc<AtomicUsize>);
+
+    impl<T: Scalar> Op<T> for Twice {
+        fn name(&self) -> &'static str {
+            "twice"
+        }
+        fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
+            Ok(x[0].into())
+        }
+        fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            map([x[0]], pool, |[x]| x + x)
+        }
+        fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+            Grads::one(cx.g() * 2.0)
+        }
+        fn is_kept(&self) -> bool {
+            true
+        }
+    }
+
+    /// `4 x + 1`, by two operations that are kept and one that is not.
+    fn run<'t>(x: &Var<'t, f64>, count: &Arc<AtomicUsize>) -> Var<'t, f64> {
+        let once = x.tape().apply(Twice(count.clone()), &[x]);
+        x.tape().apply(Twice(count.clone()), &[&once]) + 1.0
+    }
+
+    #[test]
+    fn what_is_remembered_is_not_worked_out_again_and_has_its_gradient() {
+        let (tape, count) = (Tape::new(), Arc::default());
+        let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]));
+        let (first, a) = tape.no_grad(|| tape.remember(|| run(&x.gather_rows([2, 0]), &count)));
+        let (_, b) = tape.no_grad(|| tape.remember(|| run(&x.gather_rows([1]), &count)));
+        assert!(a.values().len() == 2 && !first.is_on_graph() && count.load(Ordering::Relaxed) == 4);
+        // Rows 0 and 1, which are the second of the first memo and the only one of the second.
+        let memo = Memo::gather(&[a, b], &[[0, 1], [1, 0]], tape.pool());
+        let seen = tape.recall(memo, || run(&x.gather_rows([0, 1]), &count));
+        assert_eq!((seen.value(), count.load(Ordering::Relaxed)), (&Tensor::from([[5.0, 9.0], [13.0, 17.0]]), 4));
+        assert_eq!(seen.sum().grad(&[&x])[0], [[4.0, 4.0], [4.0, 4.0], [0.0, 0.0]]);
+        // Afterwards everything is as it was.
+        run(&x, &count);
+        assert_eq!(count.load(Ordering::Relaxed), 6);
+        tape.recall(Memo::gather(&[], &[], tape.pool()), || run(&x, &count));
+        assert_eq!(count.load(Ordering::Relaxed), 8);
+    }
+
+    #[test]
+    #[should_panic(expected = "twice: a memo holds an output of shape [3] for it")]
+    fn a_memo_of_something_else_is_refused() {
+        let (tape, count) = (Tape::new(), Arc::default());
+        let (_, memo) = tape.remember(|| run(&tape.leaf(Tensor::zeros(&[3])), &count));
+        tape.recall(memo, || run(&tape.leaf(Tensor::zeros(&[2])), &count));
+    }
+
+    #[test]
+    #[should_panic(expected = "outputs of a memo that no operation asked for")]
+    fn a_memo_of_more_than_is_asked_for_is_refused() {
+        let tape = Tape::<f64>::new();
+        let (_, memo) = tape.remember(|| run(&tape.leaf(Tensor::zeros(&[3])), &Arc::default()));
+        tape.recall(memo, || ());
+    }
+}

@@ -1,0 +1,128 @@
+//! Photographs with their cameras, and the region that they show.
+
+use super::image::Image;
+use crate::camera::bounds::clip_span;
+use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
+use glam::DVec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// What the images of a part of a dataset are for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// Images to fit.
+    Train,
+    /// Images to watch progress and choose settings by.
+    Val,
+    /// Images to report results on.
+    Test,
+}
+
+impl Split {
+    /// All splits.
+    pub const ALL: [Split; 3] = [Split::Train, Split::Val, Split::Test];
+
+    /// The name that files and the command line use: `train`, `val` or `test`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Split::Train => "train",
+            Split::Val => "val",
+            Split::Test => "test",
+        }
+    }
+}
+
+impl fmt::Display for Split {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Split {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let named = Split::ALL.into_iter().find(|split| split.name() == text);
+        named.ok_or_else(|| Error::setting("split", format!("must be train, val or test, is `{text}`")))
+    }
+}
+
+/// One photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// Its name in the dataset, such as `train/r_0`.
+    pub name: String,
+    /// The camera that took it, for the size that the image has here.
+    pub camera: Camera,
+    /// The picture: RGB or RGBA as in the file, values in 0..=1.
+    pub image: Image,
+}
+
+/// The photographs of one split, all of one size, and the region of space that they show.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Dataset {
+    /// At least one photograph, in the order of the file.
+    pub frames: Vec<Frame>,
+    /// Least and greatest corner of an axis-aligned box that holds the scene, in scene units.
+    pub bounds: [DVec3; 2],
+    /// Distance along a ray, in scene units, before which there is nothing.
+    pub near: f64,
+    /// Distance along a ray, in scene units, beyond which there is nothing.
+    pub far: f64,
+    /// Names of photographs that the dataset lists but whose image files are absent. They were left out; a caller
+    /// should say so.
+    pub skipped: Vec<String>,
+}
+
+impl Dataset {
+    /// Whether some image has transparency and so needs a [background](crate::dataset::background).
+    pub fn has_alpha(&self) -> bool {
+        self.frames.iter().any(|frame| frame.image.channels == 4)
+    }
+
+    /// Whether the photographs show anything of the scene's box at all.
+    ///
+    /// # Errors
+    /// If no ray of any photograph meets the box between `near` and `far`: nothing could ever be learned.
+    pub fn check_reach(&self) -> Result<()> {
+        /// Rays that are tried along each side of an image, before all.
+        const RAYS: usize = 32;
+        let meets = |camera: &Camera, [columns, rows]: [usize; 2]| {
+            let place = |i: usize, n: usize, size: usize| (i as f64 + 0.5) / n as f64 * size as f64;
+            (0..columns * rows).any(|i| {
+                let [x, y] = [place(i % columns, columns, camera.width), place(i / columns, rows, camera.height)];
+                let [enter, leave] = clip_span(&camera.ray(x, y), self.bounds, [self.near, self.far]);
+                enter < leave
+            })
+        };
+        let some = self.frames.iter().any(|frame| meets(&frame.camera, [RAYS; 2]));
+        // A small box may lie between the rays.
+        if some || self.frames.par_iter().any(|Frame { camera, .. }| meets(camera, [camera.width, camera.height])) {
+            return Ok(());
+        }
+        let [low, high] = self.bounds;
+        let distances = self.frames.iter().map(|frame| frame.camera.pose.translation.distance(0.5 * (low + high)));
+        let mean = distances.sum::<f64>() / self.frames.len().max(1) as f64;
+        let what = format!(
+            "no ray of the {} photographs meets the box from {low} to {high} between the distances {} and {} from its \
+             camera; the cameras are {mean:.3} from its middle on average: scale and move their positions to where the \
+             scene lies in the box",
+            self.frames.len(),
+            self.near,
+            self.far
+        );
+        Err(Error::setting("dataset", what))
+    }
+}
+
+/// At most `count` of the items, in order and evenly spaced from the first: of `n` items those numbered `i n / count`,
+/// rounded down.
+pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
+    let (n, count) = (items.len(), count.min(items.len()));
+    let mut wanted = (0..count).map(|i| i * n / count).peekable();
+    items.into_iter().enumerate().filter(|(i, _)| wanted.next_if_eq(i).is_some()).map(|(_, item)| item).collect()
+}

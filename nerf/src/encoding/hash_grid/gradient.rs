@@ -1,0 +1,58 @@
+//! The gradient of the table: where samples are, and the gradients of their features, until an optimiser adds them up
+//! level by level.
+
+use super::grid::HashGrid;
+use raygrad_autograd::{RowShare, RowSums, Scalar, SparseGrad, Tensor};
+
+/// What a tile leaves for the table: where its samples are, and the gradients of their features.
+#[derive(Debug, Clone)]
+pub struct HashGrad<T: Scalar> {
+    /// The grid.
+    pub grid: HashGrid,
+    /// Positions in the unit cube, `[samples, 3]`.
+    pub positions: Tensor<T>,
+    /// Gradient of the encoding, `[samples, width]`.
+    pub d_out: Tensor<T>,
+}
+
+impl<T: Scalar> SparseGrad<T> for HashGrad<T> {
+    fn shape(&self) -> &[usize] {
+        self.grid.shape()
+    }
+
+    fn add_to(&self, dense: &mut Tensor<T>) {
+        let features = self.grid.features();
+        for (number, level) in self.grid.levels().iter().enumerate() {
+            let part = &mut dense.as_mut_slice()[level.rows.start * features..level.rows.end * features];
+            let mut sums = RowSums::new(level.rows.len(), features);
+            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut sums);
+            sums.add_to(part);
+        }
+    }
+
+    fn as_rows(&self) -> Option<&dyn RowShare<T>> {
+        Some(self)
+    }
+}
+
+impl<T: Scalar> RowShare<T> for HashGrad<T> {
+    fn scatter(&self, sums: &mut RowSums<T>) {
+        let features = self.grid.features();
+        assert_eq!([sums.table_rows(), sums.features()], [self.grid.rows(), features], "sums of the grid's rows");
+        for (number, level) in self.grid.levels().iter().enumerate() {
+            let mut part = RowSums::new(level.rows.len(), features);
+            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut part);
+            for (&row, sum) in part.rows().iter().zip(part.sums().chunks_exact(features)) {
+                sums.add(level.rows.start + row as usize, sum);
+            }
+        }
+    }
+
+    fn parts(&self) -> Vec<usize> {
+        self.grid.levels().iter().map(|level| level.rows.len()).collect()
+    }
+
+    fn scatter_part(&self, part: usize, sums: &mut RowSums<T>) {
+        self.grid.scatter_level(part, self.positions.as_slice(), self.d_out.as_slice(), sums);
+    }
+}

@@ -1,0 +1,53 @@
+//! A hash grid over a scene, with its table among the parameters.
+
+use crate::Result;
+use crate::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
+use crate::kind::Site;
+use crate::space::cube::Space;
+use rand::RngExt;
+use raygrad_autograd::{Scalar, Var};
+use raygrad_nn::{Bound, ParamId};
+
+/// What fields that look positions up in a table have in common.
+#[derive(Debug, Clone)]
+pub struct Grid {
+    grid: HashGrid,
+    table: ParamId,
+    space: Space,
+}
+
+impl Grid {
+    /// A grid over the scene with a new parameter `<name>.table`. Its gradient is sparse, and only rows that got one are
+    /// moved.
+    ///
+    /// # Errors
+    /// If the configuration is out of range.
+    pub fn new<T: Scalar>(config: &HashGridConfig, site: Site<'_, T>) -> Result<Self> {
+        let grid = HashGrid::new(config)?;
+        let name = format!("{}.table", site.name);
+        let table = site.params.add(name.clone(), grid.init(site.rng.random()));
+        site.params.set_lazy(|other| other == name, true);
+        Ok(Grid { grid, table, space: site.space })
+    }
+
+    /// Channels of an encoding.
+    pub fn width(&self) -> usize {
+        self.grid.width()
+    }
+
+    /// The parameter.
+    pub fn table(&self) -> ParamId {
+        self.table
+    }
+
+    /// The grid.
+    pub fn grid(&self) -> &HashGrid {
+        &self.grid
+    }
+
+    /// The features at positions in scene units, `[samples, 3]` to `[samples, width]`.
+    #[track_caller]
+    pub fn encode<'t, T: Scalar>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
+        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.space.unit(positions), &params[self.table]])
+    }
+}

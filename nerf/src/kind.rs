@@ -1,0 +1,215 @@
+//! Parts of a model that are chosen by name, here or in any crate: a configuration that knows what it builds.
+
+use crate::space::cube::Space;
+use crate::{Error, Result};
+use rand::Rng;
+use raygrad_autograd::Scalar;
+use raygrad_nn::Params;
+use serde::de::{DeserializeOwned, Error as _};
+use serde::ser::SerializeMap;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+use std::any::Any;
+use std::fmt;
+use std::sync::{PoisonError, RwLock};
+
+/// What can be chosen: fields, or samplers.
+pub trait Family: Sized + 'static {
+    /// What one of them is called in messages.
+    const WHAT: &'static str;
+    /// What is built.
+    type Built<T: Scalar>: 'static;
+    /// What was [registered](register).
+    fn registered() -> &'static RwLock<Vec<Registered<Self>>>;
+}
+
+/// Where something is built, and with what.
+pub struct Site<'a, T: Scalar> {
+    /// The scene's region.
+    pub space: Space,
+    /// Where parameters go.
+    pub params: &'a mut Params<T>,
+    /// What their names begin with: `<name>.table`.
+    pub name: &'a str,
+    /// Where their first values come from.
+    pub rng: &'a mut dyn Rng,
+}
+
+/// A configuration that can be chosen by its name: of a field (`Kind<Fields>`) or of a sampler (`Kind<Samplers>`).
+///
+/// In a file it is `{"kind": "<KIND>", ..}` with the configuration's own fields. [`register`] makes the name known to
+/// whatever reads such files.
+pub trait Kind<F: Family>: Serialize + DeserializeOwned + Clone + fmt::Debug + Send + Sync + 'static {
+    /// The name.
+    const KIND: &'static str;
+
+    /// Whether the numbers make sense.
+    ///
+    /// # Errors
+    /// If one is out of range.
+    fn check(&self) -> Result<()> {
+        Ok(())
+    }
+
+    /// Builds what is configured, with new parameters.
+    ///
+    /// # Errors
+    /// If it cannot be built of these numbers.
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<F::Built<T>>;
+}
+
+/// A [`Kind`] whose type is known only while the program runs: what a [`Config`](crate::Config) holds.
+pub struct Part<F: Family>(Box<dyn AnyKind<F>>);
+
+impl<F: Family> Part<F> {
+    /// This configuration.
+    pub fn new(config: impl Kind<F>) -> Self {
+        Part(Box::new(config))
+    }
+
+    /// Its name.
+    pub fn kind(&self) -> &'static str {
+        self.0.kind()
+    }
+
+    /// The configuration, if it is a `K`.
+    pub fn get<K: Kind<F>>(&self) -> Option<&K> {
+        (&*self.0 as &dyn Any).downcast_ref()
+    }
+
+    /// The configuration, to be changed, if it is a `K`.
+    pub fn get_mut<K: Kind<F>>(&mut self) -> Option<&mut K> {
+        (&mut *self.0 as &mut dyn Any).downcast_mut()
+    }
+
+    /// Whether the numbers make sense.
+    ///
+    /// # Errors
+    /// As [`Kind::check`].
+    pub fn check(&self) -> Result<()> {
+        self.0.check()
+    }
+
+    /// Builds what is configured, with new parameters.
+    ///
+    /// # Errors
+    /// As [`Kind::check`] and [`Kind::build`].
+    pub fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<F::Built<T>> {
+        self.check()?;
+        let Site { space, params, name, rng } = site;
+        let built = self.0.build(space, params, name, rng)?;
+        match built.downcast() {
+            Ok(built) => Ok(*built),
+            Err(_) => unreachable!("what is built is of the type of its parameters"),
+        }
+    }
+}
+
+/// What a [`Kind`] does, without its type.
+trait AnyKind<F: Family>: Any + fmt::Debug + Send + Sync {
+    fn kind(&self) -> &'static str;
+    fn check(&self) -> Result<()>;
+    fn value(&self) -> serde_json::Result<Value>;
+    fn boxed(&self) -> Box<dyn AnyKind<F>>;
+    /// `params` are of `f32` or `f64`, and so is what comes back: a `F::Built`.
+    fn build(&self, space: Space, params: &mut dyn Any, name: &str, rng: &mut dyn Rng) -> Result<Box<dyn Any>>;
+}
+
+impl<F: Family, K: Kind<F>> AnyKind<F> for K {
+    fn kind(&self) -> &'static str {
+        K::KIND
+    }
+
+    fn check(&self) -> Result<()> {
+        Kind::check(self)
+    }
+
+    fn value(&self) -> serde_json::Result<Value> {
+        serde_json::to_value(self)
+    }
+
+    fn boxed(&self) -> Box<dyn AnyKind<F>> {
+        Box::new(self.clone())
+    }
+
+    fn build(&self, space: Space, params: &mut dyn Any, name: &str, rng: &mut dyn Rng) -> Result<Box<dyn Any>> {
+        if let Some(params) = params.downcast_mut::<Params<f32>>() {
+            return Ok(Box::new(Kind::build(self, Site { space, params, name, rng })?));
+        }
+        match params.downcast_mut::<Params<f64>>() {
+            Some(params) => Ok(Box::new(Kind::build(self, Site { space, params, name, rng })?)),
+            None => Err(Error::setting(F::WHAT, "can be built in f32 and f64")),
+        }
+    }
+}
+
+impl<F: Family> Clone for Part<F> {
+    fn clone(&self) -> Self {
+        Part(self.0.boxed())
+    }
+}
+
+impl<F: Family> fmt::Debug for Part<F> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl<F: Family> PartialEq for Part<F> {
+    /// Whether both would be written alike.
+    fn eq(&self, other: &Self) -> bool {
+        self.kind() == other.kind() && matches!((self.0.value(), other.0.value()), (Ok(a), Ok(b)) if a == b)
+    }
+}
+
+/// The name of the name.
+const KIND: &str = "kind";
+
+impl<F: Family> Serialize for Part<F> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        use serde::ser::Error;
+        let Value::Object(fields) = self.0.value().map_err(S::Error::custom)? else {
+            return Err(S::Error::custom(format!("the configuration `{}` is not made of fields", self.kind())));
+        };
+        let mut map = serializer.serialize_map(Some(1 + fields.len()))?;
+        map.serialize_entry(KIND, self.kind())?;
+        fields.iter().try_for_each(|(name, value)| map.serialize_entry(name, value))?;
+        map.end()
+    }
+}
+
+impl<'de, F: Family> Deserialize<'de> for Part<F> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        let mut fields = serde_json::Map::deserialize(deserializer)?;
+        let named = fields.remove(KIND);
+        let Some(kind) = named.as_ref().and_then(Value::as_str) else {
+            return Err(D::Error::custom(format!("a {} has a field `{KIND}`: its name", F::WHAT)));
+        };
+        let all = F::registered().read().unwrap_or_else(PoisonError::into_inner);
+        let Some(found) = all.iter().find(|registered| registered.kind == kind) else {
+            let known: Vec<_> = all.iter().map(|registered| registered.kind).collect();
+            let what = format!("there is no {} `{kind}`; known are {}", F::WHAT, known.join(", "));
+            return Err(D::Error::custom(format!("{what}, and what a program registers")));
+        };
+        (found.read)(Value::Object(fields)).map_err(|error| D::Error::custom(format!("{} `{kind}`: {error}", F::WHAT)))
+    }
+}
+
+/// A name, and how to read what it stands for.
+pub struct Registered<F: Family> {
+    kind: &'static str,
+    read: fn(Value) -> serde_json::Result<Part<F>>,
+}
+
+impl<F: Family> Registered<F> {
+    /// Of a configuration.
+    pub const fn of<K: Kind<F>>() -> Self {
+        Registered { kind: K::KIND, read: |fields| Ok(Part::new(serde_json::from_value::<K>(fields)?)) }
+    }
+}
+
+/// Makes the name of a [`Kind`] known to whatever reads configurations in this program, beside those of this crate, which
+/// [`Config`](crate::Config) knows: `register::<Fields, MyFieldConfig>()`, once, before the first is read. Who only makes configurations needs it not.
+pub fn register<F: Family, K: Kind<F>>() {
+    F::registered().write().unwrap_or_else(PoisonError::into_inner).push(Registered::of::<K>());
+}

@@ -1,0 +1,28 @@
+//! The fields and samplers of this crate, by name: one line for each.
+
+use crate::field::{ClassicConfig, Fields, InstantConfig, VoxelConfig};
+use crate::kind::{Family, Part, register};
+use crate::sampling::Samplers;
+use crate::sampling::hierarchical::HierarchicalConfig;
+use crate::sampling::marching::MarchingConfig;
+use crate::sampling::proposal::ProposalConfig;
+use serde::{Deserialize, Deserializer};
+use std::sync::Once;
+
+fn register_all() {
+    static DONE: Once = Once::new();
+    DONE.call_once(|| {
+        register::<Fields, ClassicConfig>();
+        register::<Fields, InstantConfig>();
+        register::<Fields, VoxelConfig>();
+        register::<Samplers, HierarchicalConfig>();
+        register::<Samplers, MarchingConfig>();
+        register::<Samplers, ProposalConfig>();
+    });
+}
+
+/// Reads a part of a configuration, which may be one of this crate's.
+pub(super) fn read<'de, F: Family, D: Deserializer<'de>>(deserializer: D) -> Result<Part<F>, D::Error> {
+    register_all();
+    Part::deserialize(deserializer)
+}

@@ -1,0 +1,349 @@
+//! Proposal sampling: small density fields say where along a ray the field is worth asking.
+
+use super::steps::{even_edges, invert_cdf};
+use super::{Level, Limits, Load, Progress, Purpose, Sampled, Sampler, Samplers};
+use crate::camera::rays::{Rays, Samples};
+use crate::encoding::hash_grid::HashGridConfig;
+use crate::field::{Density, Field, Grid, Seen};
+use crate::kind::{Kind, Site};
+use crate::random::Jitter;
+use crate::range::check_range;
+use crate::space::occupancy::DensityFn;
+use crate::volume::query::Query;
+use crate::volume::render::{Evaluations, Weighted};
+use crate::{Error, Result};
+use raygrad_autograd::{Activation, Scalar, Segments, Tensor, Var};
+use raygrad_nn::{Bound, Init, Linear};
+use serde::{Deserialize, Serialize};
+
+/// How places are spread along a ray before anything is known of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Spacing {
+    /// Evenly in distance.
+    #[default]
+    Linear,
+    /// Evenly in inverse distance, as suits scenes without bounds (Barron et al. 2022, section 4): near distances must
+    /// be above 0.
+    Disparity,
+}
+
+/// One proposal: a density field of its own, and how many samples it is asked for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProposalLevel {
+    /// The grid that positions are looked up in.
+    pub grid: HashGridConfig,
+    /// Width of the one hidden layer between the grid and the density.
+    pub width: usize,
+    /// Samples a ray.
+    pub samples: usize,
+}
+
+/// Numbers of a [`Proposal`] sampler.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProposalConfig {
+    /// The proposals, each sampled where the one before it found something; at least one.
+    pub levels: Vec<ProposalLevel>,
+    /// Samples a ray of the field itself.
+    pub samples: usize,
+    /// Share of all samples that is spread evenly, in 0..=1.
+    pub uniform_share: f64,
+    /// Steps over which proposals gain their full say (Barron et al. 2022, section 4, "annealing").
+    pub anneal: u64,
+    /// How the first samples are spread.
+    #[serde(default)]
+    pub spacing: Spacing,
+    /// Rays in a training step.
+    pub batch: usize,
+    /// Rays in a tile: one tape, on one core.
+    pub tile: usize,
+    /// Samples with less light than this in front of them are dropped.
+    pub termination: f64,
+}
+
+impl Default for ProposalConfig {
+    /// Two proposals of 48 and 24 samples, and 16 of the field: figures are in docs/benchmarks.md, section Samplers.
+    fn default() -> Self {
+        let level = |finest, samples| ProposalLevel {
+            grid: HashGridConfig { levels: 4, features: 2, log2_table: 14, coarsest: 16, finest },
+            width: 16,
+            samples,
+        };
+        ProposalConfig {
+            levels: vec![level(64, 48), level(128, 24)],
+            samples: 16,
+            uniform_share: 0.01,
+            anneal: 500,
+            spacing: Spacing::Linear,
+            batch: 2048,
+            tile: 256,
+            termination: 1e-3,
+        }
+    }
+}
+
+impl Kind<Samplers> for ProposalConfig {
+    const KIND: &'static str = "proposal";
+
+    fn check(&self) -> Result<()> {
+        if self.levels.is_empty() {
+            return Err(Error::setting("levels", "is empty; use one proposal or more"));
+        }
+        for level in &self.levels {
+            check_range("levels.samples", level.samples, 1, 1 << 12)?;
+            check_range("levels.width", level.width, 1, 1 << 12)?;
+        }
+        check_range("samples", self.samples, 1, 1 << 12)?;
+        check_range("batch", self.batch, 1, 1 << 20)?;
+        check_range("tile", self.tile, 1, 1 << 16)?;
+        check_range("termination", self.termination, 0.0, 1.0)?;
+        check_range("uniform_share", self.uniform_share, 0.0, 1.0)
+    }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
+        let Site { space, params, rng, .. } = site;
+        let mut fields = vec![];
+        for (i, level) in self.levels.iter().enumerate() {
+            let name = format!("proposal.{i}");
+            fields.push(Proposer::new(level, Site { space, params, name: &name, rng })?);
+        }
+        Ok(Box::new(Proposal { config: self.clone(), fields, trust: 0.0 }))
+    }
+}
+
+/// A hash grid and a small network that give a density, of which only the place matters.
+#[derive(Debug, Clone)]
+struct Proposer {
+    grid: Grid,
+    layers: [Linear; 2],
+    /// Subtracted from the logarithm of the density.
+    shift: f64,
+}
+
+impl Proposer {
+    fn new<T: Scalar>(level: &ProposalLevel, site: Site<'_, T>) -> Result<Self> {
+        let Site { space, params, name, rng } = site;
+        let grid = Grid::new(&level.grid, Site { space, params, name, rng })?;
+        let mut layer = |part: usize, sizes, activation| {
+            Linear::without_bias(params, &format!("{name}.density.{part}"), sizes, activation, Init::He, &mut *rng)
+        };
+        let hidden = layer(0, [grid.width(), level.width], Activation::Relu);
+        let layers = [hidden, layer(1, [level.width, 1], Activation::Identity)];
+        Ok(Proposer { grid, layers, shift: 1.0 + space.unit.ln() })
+    }
+}
+
+impl<T: Scalar> Field<T> for Proposer {
+    fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
+        let hidden = self.layers[0].forward(params, &self.grid.encode(params, positions));
+        let features = self.layers[1].forward(params, &hidden);
+        let value = features.reshape(&[positions.shape()[0]]) - self.shift;
+        Density { value, log: true, features }
+    }
+
+    /// A grey that nobody asks for.
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+        features.tape().constant(Tensor::full(&[features.shape()[0], 3], T::from_f64(0.5)))
+    }
+}
+
+/// Proposals, and the numbers (Barron et al. 2022, mip-NeRF 360, section 3): each proposal is a density field that is
+/// asked at few places; where its weights lie the next one is asked, and at last the field itself. Proposals are not
+/// fitted to photographs but to the weights of the field, with [`interlevel`](crate::losses::interlevel).
+#[derive(Debug, Clone)]
+pub struct Proposal {
+    /// The numbers.
+    pub config: ProposalConfig,
+    fields: Vec<Proposer>,
+    /// The exponent of the proposals' weights: 0 is no say at all.
+    trust: f64,
+}
+
+/// How far a place is along a ray of this span, as a share that is even in the spacing.
+struct Scale {
+    ends: [f64; 2],
+    disparity: bool,
+}
+
+impl Scale {
+    fn new<T: Scalar>(spacing: Spacing, span: [T; 2]) -> Self {
+        let [near, far] = span.map(T::to_f64);
+        let disparity = spacing == Spacing::Disparity && near > 0.0;
+        Scale { ends: if disparity { [1.0 / near, 1.0 / far] } else { [near, far] }, disparity }
+    }
+
+    fn distance(&self, share: f64) -> f64 {
+        let [near, far] = self.ends;
+        let place = near + share * (far - near);
+        if self.disparity { 1.0 / place } else { place }
+    }
+}
+
+impl Proposal {
+    /// The bins between edges, given as shares of each ray's span, as samples in their middles, and their edges as
+    /// distances.
+    fn steps<T: Scalar>(&self, rays: &Rays<T>, shares: &[f64], bins: usize, query: &Query<'_, '_, T>) -> Steps<T> {
+        let pool = query.tape().pool();
+        let segments = Segments::uniform(rays.len(), bins);
+        let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
+        let mut edges = Vec::with_capacity(shares.len());
+        let mut out = t.as_mut_slice().iter_mut().zip(delta.as_mut_slice());
+        for (span, shares) in rays.spans.iter().zip(shares.chunks_exact(bins + 1)) {
+            let scale = Scale::new(self.config.spacing, *span);
+            let first = edges.len();
+            edges.extend(shares.iter().map(|&share| scale.distance(share)));
+            for (pair, (t, delta)) in edges[first..].windows(2).zip(&mut out) {
+                *t = T::from_f64(0.5 * (pair[0] + pair[1]));
+                *delta = T::from_f64((pair[1] - pair[0]).max(0.0));
+            }
+        }
+        Steps { samples: Samples::new(rays, segments, t, delta, pool), edges }
+    }
+
+    /// Edges of `bins` bins a ray, as shares of its span, around places that a histogram over `shares` says are worth it.
+    /// With `whole` the outermost bins go to the ends of the span.
+    fn resampled<T: Scalar>(
+        &self,
+        shares: &[f64],
+        weights: &[T],
+        [old, bins]: [usize; 2],
+        whole: bool,
+        jitter: &mut Jitter<'_>,
+    ) -> Vec<f64> {
+        let rays = weights.len() / old;
+        let (mut u, mut places, mut out) = (vec![0.0; bins], vec![0.0; bins], Vec::with_capacity(rays * (bins + 1)));
+        let mut tempered = vec![0.0_f64; old];
+        for (shares, weights) in shares.chunks_exact(old + 1).zip(weights.chunks_exact(old)) {
+            let shift = jitter.draw();
+            u.iter_mut().enumerate().for_each(|(i, u)| *u = (i as f64 + shift) / bins as f64);
+            // What made a weight bad shows in the colours.
+            let temper = |weight: &T| match weight.to_f64() {
+                weight if weight.is_finite() && weight > 0.0 => weight.powf(self.trust),
+                _ => 0.0,
+            };
+            tempered.iter_mut().zip(weights).for_each(|(out, weight)| *out = temper(weight));
+            if invert_cdf(shares, &tempered, self.config.uniform_share, &u, &mut places).is_err() {
+                places.copy_from_slice(&u);
+            }
+            let first = out.len();
+            out.push(0.0);
+            out.extend(places.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])));
+            out.push(1.0);
+            if !whole && bins > 1 {
+                // As far beyond the outermost places as the next edges are before them.
+                out[first] = (2.0 * places[0] - out[first + 1]).max(0.0);
+                out[first + bins] = (2.0 * places[bins - 1] - out[first + bins - 1]).min(1.0);
+            }
+        }
+        out
+    }
+}
+
+/// Bins as samples, and their edges.
+struct Steps<T: Scalar> {
+    samples: Samples<T>,
+    edges: Vec<f64>,
+}
+
+impl<T: Scalar> Sampler<T> for Proposal {
+    fn sample<'t>(
+        &self,
+        query: &Query<'_, 't, T>,
+        rays: &Rays<T>,
+        _: Purpose,
+        jitter: &mut Jitter<'_>,
+    ) -> Sampled<'t, T> {
+        let mut shares: Vec<f64> = even_edges(self.config.levels[0].samples).repeat(rays.len());
+        let (mut levels, mut asked) = (vec![], 0);
+        for (i, (level, field)) in self.config.levels.iter().zip(&self.fields).enumerate() {
+            let Steps { samples, edges } = self.steps(rays, &shares, level.samples, query);
+            let density = query.of(field).density(&samples);
+            let weights = Weighted::new(&density, &samples.delta, &samples.segments).weights;
+            let next = self.config.levels.get(i + 1);
+            let bins = [level.samples, next.map_or(self.config.samples, |next| next.samples)];
+            shares = self.resampled(&shares, weights.value().as_slice(), bins, next.is_some(), jitter);
+            asked += samples.len() as u64;
+            levels.push(Level { edges, weights, segments: samples.segments });
+        }
+        let steps = self.steps(rays, &shares, self.config.samples, query).samples;
+        let unskipped = asked + steps.len() as u64;
+        Sampled { steps, coarse: vec![], levels, evaluations: Evaluations { density: asked, color: 0, unskipped } }
+    }
+
+    fn load(&self) -> Load {
+        Load::Rays { step: self.config.batch, tile: self.config.tile }
+    }
+
+    fn boxed(&self) -> Box<dyn Sampler<T>> {
+        Box::new(self.clone())
+    }
+
+    fn termination(&self) -> f64 {
+        self.config.termination
+    }
+
+    fn limits(&self) -> Limits {
+        Limits { termination: self.config.termination as f32, color_budget: self.config.termination as f32 }
+    }
+
+    fn view_tile(&self) -> usize {
+        256
+    }
+
+    fn fields(&self) -> Vec<&dyn Field<T>> {
+        self.fields.iter().map(|field| field as &dyn Field<T>).collect()
+    }
+
+    fn update(&mut self, progress: &Progress, _: &DensityFn<'_>) -> bool {
+        // Schlick's bias function with slope 10.
+        let x = (progress.step as f64 / self.config.anneal.max(1) as f64).min(1.0);
+        self.trust = 10.0 * x / (9.0 * x + 1.0);
+        false
+    }
+
+    fn finish(&mut self, _: &DensityFn<'_>) {
+        self.trust = 1.0;
+    }
+
+    fn load_state(&mut self, _: &std::collections::HashMap<String, Vec<u8>>) -> Result<()> {
+        self.trust = 1.0;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_go_where_proposals_point_and_cover_what_they_should() {
+        let config = ProposalConfig { uniform_share: 0.0, samples: 8, ..ProposalConfig::default() };
+        let sampler = Proposal { config, fields: vec![], trust: 1.0 };
+        let shares = even_edges(10).repeat(2);
+        let mut weights = vec![0.0; 20];
+        (weights[3], weights[15]) = (0.5, 1.0);
+        let found = sampler.resampled::<f64>(&shares, &weights, [10, 8], false, &mut Jitter::Middle);
+        for (edges, range) in found.chunks_exact(9).zip([0.2999999..=0.4000001, 0.4999999..=0.6000001]) {
+            assert!(edges.iter().all(|edge| range.contains(edge)), "{edges:?}");
+            assert!(edges.windows(2).all(|pair| pair[0] < pair[1]), "{edges:?}");
+        }
+        let whole = sampler.resampled::<f64>(&shares, &weights, [10, 8], true, &mut Jitter::Middle);
+        assert!(whole.chunks_exact(9).all(|edges| edges[0] == 0.0 && edges[8] == 1.0));
+        // Without any say of the weights, evenly.
+        let sampler = Proposal { trust: 0.0, ..sampler };
+        let even = sampler.resampled::<f64>(&shares, &[0.25; 20], [10, 4], true, &mut Jitter::Middle);
+        assert!(even.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0].repeat(2)).all(|(a, b)| (a - b).abs() < 1e-12));
+    }
+
+    #[test]
+    fn spacings_reach_from_near_to_far() {
+        for spacing in [Spacing::Linear, Spacing::Disparity] {
+            let scale = Scale::new(spacing, [2.0, 10.0]);
+            assert!((scale.distance(0.0) - 2.0).abs() < 1e-12 && (scale.distance(1.0) - 10.0).abs() < 1e-12);
+        }
+        assert!((Scale::new(Spacing::Disparity, [2.0, 10.0]).distance(0.5) - 10.0 / 3.0).abs() < 1e-12);
+        assert!(Scale::new(Spacing::Disparity, [0.0, 10.0]).distance(0.5) == 5.0, "no inverse of 0");
+    }
+}

@@ -1,0 +1,110 @@
+//! The map from the scene to the unit cube.
+
+use super::contraction::contract;
+use crate::{Error, Result};
+use glam::DVec3;
+use raygrad_autograd::{Scalar, Tensor, Var};
+use serde::{Deserialize, Serialize};
+
+/// Where a scene is: the one map from scene units to the unit cube, in which encodings and grids live.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Space {
+    /// Lower and upper corner of the box that holds the scene, in scene units.
+    pub bounds: [DVec3; 2],
+    /// Whether the scene goes on beyond the box: then all of space is [contracted](crate::contract) into the cube, the ball
+    /// around the box's middle that touches its nearest sides onto a ball of radius 1/4.
+    #[serde(default)]
+    pub unbounded: bool,
+    /// The length, in scene units, that fields measure their densities by: a density of 1 is 1 / `unit`. In files from
+    /// before there was a choice it is 1.
+    #[serde(default = "one")]
+    pub unit: f64,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+/// The longest side of a box in its own units: so a new field hides as much of what is behind it whatever unit the scene
+/// is in.
+const UNITS: f64 = 3.0;
+
+impl Space {
+    /// A scene within a box, lower and upper corner in scene units.
+    pub fn within(bounds: [DVec3; 2]) -> Self {
+        let unit = (bounds[1] - bounds[0]).max_element() / UNITS;
+        Space { bounds, unbounded: false, unit }
+    }
+
+    /// Whether the box is one.
+    ///
+    /// # Errors
+    /// If a corner is not finite or the lower one is not below the upper one along each axis, or the unit is no length.
+    pub fn check(&self) -> Result<()> {
+        let [low, high] = self.bounds;
+        if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
+            return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
+        }
+        if self.unit > 0.0 && self.unit.is_finite() {
+            return Ok(());
+        }
+        Err(Error::setting("unit", format!("is {}; use a length above 0", self.unit)))
+    }
+
+    /// The longest side of the box, in scene units.
+    pub fn side(&self) -> f64 {
+        (self.bounds[1] - self.bounds[0]).max_element()
+    }
+
+    /// Positions `[samples, 3]` in scene units as positions in the unit cube. In a bounded space the box's lower corner is
+    /// the origin and its longest side has length 1; what lies outside of the box lies outside of the cube.
+    #[track_caller]
+    pub fn unit<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
+        let row = |x: DVec3| positions.tape().constant(Tensor::from_vec(&[3], x.to_array().map(T::from_f64).to_vec()));
+        let [low, high] = self.bounds;
+        if !self.unbounded {
+            let scale = 1.0 / self.side();
+            return positions * scale + row(-low * scale);
+        }
+        let scale = 2.0 / (high - low).min_element();
+        contract(&(positions * scale + row(-0.5 * (low + high) * scale))) * 0.25 + 0.5
+    }
+
+    /// The same in the cube from -1 to 1 around the middle of the box, as networks of sinusoids have it: a bounded box's
+    /// longest side is from -1 to 1.
+    #[track_caller]
+    pub fn centred<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
+        if self.unbounded {
+            return self.unit(positions) * 2.0 - 1.0;
+        }
+        let centre = (0.5 * (self.bounds[0] + self.bounds[1])).to_array().map(T::from_f64);
+        (positions - positions.tape().constant(Tensor::from_vec(&[3], centre.to_vec()))) * (2.0 / self.side())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_autograd::Tape;
+
+    #[test]
+    fn boxes_become_cubes_and_space_a_ball() {
+        let bounds = [DVec3::new(-1.0, 0.0, 2.0), DVec3::new(3.0, 2.0, 4.0)];
+        let tape = Tape::<f64>::new();
+        let points = [[-1.0, 0.0, 2.0], [3.0, 2.0, 4.0], [1.0, 1.0, 3.0], [1.0, 1.0, 1e9], [1.0, 1.5, 3.0]];
+        let points = tape.constant(Tensor::from(points));
+        let within = Space::within(bounds);
+        let unit = within.unit(&points);
+        assert_eq!(&unit.value().as_slice()[..9], [0.0, 0.0, 0.0, 1.0, 0.5, 0.5, 0.5, 0.25, 0.25]);
+        let centred = within.centred(&points);
+        assert_eq!(&centred.value().as_slice()[..9], [-1.0, -0.5, -0.5, 1.0, 0.5, 0.5, 0.0, 0.0, 0.0]);
+        let all = Space { unbounded: true, ..within }.unit(&points);
+        let far = &all.value().as_slice()[6..];
+        assert!(far[..3] == [0.5; 3] && far[3..5] == [0.5; 2] && (far[5] - 1.0).abs() < 1e-4, "{far:?}");
+        assert!((far[7] - 0.625).abs() < 1e-12, "half a unit of the ball of radius 1 is an eighth: {far:?}");
+        assert_eq!((within.side(), within.unit), (4.0, 4.0 / 3.0));
+        let error = Space::within([DVec3::ONE, DVec3::ONE]).check().unwrap_err().to_string();
+        assert!(error.contains("is no box"), "{error}");
+    }
+}

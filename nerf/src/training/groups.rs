@@ -1,0 +1,97 @@
+//! Groups of parameters, each with an optimiser, a schedule and a decay of its own.
+
+use crate::model::config::{Config, GroupConfig};
+use raygrad_autograd::Gradient;
+use raygrad_nn::{AdamW, Optimizer, Params, Schedule, UpdateReport};
+
+/// One group.
+struct Group {
+    /// For each parameter of the store whether it belongs here.
+    members: Vec<bool>,
+    adam: AdamW<f32>,
+    schedule: Schedule,
+}
+
+/// All groups: a parameter belongs to the first that its name fits, and else to the tables, if only rows of it are moved,
+/// or to the rest.
+pub(crate) struct Groups(Vec<Group>);
+
+impl Groups {
+    /// Groups of these parameters that have seen nothing.
+    pub fn new(config: &Config, params: &Params<f32>) -> Self {
+        let rest = |adam| GroupConfig { params: String::new(), adam, schedule: config.schedule, decay: 0.0 };
+        let settings: Vec<_> =
+            config.groups.iter().cloned().chain([rest(config.table_adam), rest(config.adam)]).collect();
+        let named = config.groups.len();
+        let place = |name: &str, lazy: bool| {
+            let fits = |group: &GroupConfig| name.starts_with(&group.params);
+            config.groups.iter().position(fits).unwrap_or(if lazy { named } else { named + 1 })
+        };
+        let places: Vec<usize> = params.ids().map(|id| place(params.name(id), params.is_lazy(id))).collect();
+        let group = |(i, GroupConfig { adam, schedule, decay, .. }): (usize, GroupConfig)| Group {
+            members: places.iter().map(|&place| place == i).collect(),
+            adam: AdamW::new(adam, decay),
+            schedule,
+        };
+        Groups(settings.into_iter().enumerate().map(group).filter(|group| group.members.contains(&true)).collect())
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.0.first().map_or(0, |group| group.adam.steps())
+    }
+
+    /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them.
+    pub fn update(&mut self, params: &mut Params<f32>, grads: &[Gradient<f32>], fraction: f64) -> UpdateReport {
+        let mut report = UpdateReport::default();
+        for Group { members, adam, schedule } in &mut self.0 {
+            let free = params.ids().zip(&*members).filter(|(id, _)| !params.is_frozen(*id));
+            let own = |((_, member), grad): ((_, &bool), &Gradient<f32>)| match member {
+                true => grad.clone(),
+                false => Gradient::zero(grad.shape()),
+            };
+            let own: Vec<_> = free.zip(grads).map(own).collect();
+            let UpdateReport { moved, skipped, bad } = adam.update(params, &own, schedule.rate(fraction));
+            report.moved += moved;
+            report.skipped += skipped;
+            report.bad.extend(bad);
+        }
+        report
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::config::Preset;
+    use raygrad_autograd::Tensor;
+    use raygrad_nn::AdamConfig;
+
+    #[test]
+    fn each_group_has_its_rate_and_decay_and_each_parameter_one_group() {
+        let mut config = Config::preset(Preset::Instant);
+        config.schedule = Schedule::Constant { rate: 0.1 };
+        let group = |params: &str, rate, decay| GroupConfig {
+            params: params.into(),
+            adam: AdamConfig::default(),
+            schedule: Schedule::Constant { rate },
+            decay,
+        };
+        config.groups = vec![group("pose", 0.001, 0.0), group("field.color", 0.2, 0.5)];
+        let mut params = Params::new();
+        for name in ["field.table", "field.color.0", "pose.3", "field.density"] {
+            params.add(name, Tensor::full(&[2, 2], 1.0_f32));
+        }
+        params.set_lazy(|name| name == "field.table", true);
+        params.freeze(|name| name == "field.density");
+        let mut groups = Groups::new(&config, &params);
+        let grads: Vec<_> = (0..3).map(|_| Gradient::from(Tensor::full(&[2, 2], 3.0))).collect();
+        let report = groups.update(&mut params, &grads, 0.0);
+        assert_eq!((report.moved, report.skipped, groups.steps()), (12, 0, 1));
+        let moved: Vec<f32> = params.values().iter().map(|value| value.as_slice()[0]).collect();
+        // Adam's first step is the learning rate; what decays does so first.
+        for (found, expected) in moved.iter().zip([0.9, 1.0 * (1.0 - 0.2 * 0.5) - 0.2, 0.999, 1.0]) {
+            assert!((found - expected).abs() < 1e-6, "{moved:?}");
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! What a tile of a training step does: from rays to a loss, as ordinary graph code.
+
+use crate::dataset::batch::Batch;
+use crate::losses::interlevel::interlevel;
+use crate::losses::photometric::Loss;
+use crate::model::Model;
+use crate::random::Jitter;
+use crate::sampling::{Purpose, Sampled};
+use crate::volume::lit::Lit;
+use crate::volume::query::Query;
+use raygrad_autograd::{Scalar, Var};
+use raygrad_nn::Bound;
+use std::ops::Add;
+
+/// What was done and what came out, summed over rays.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Work {
+    /// Samples placed on rays.
+    pub marched: u64,
+    /// Evaluations of a density.
+    pub samples: u64,
+    /// Evaluations of a colour.
+    pub shaded: u64,
+    /// Samples there would be of either if nothing in the box were skipped.
+    pub unskipped: u64,
+    /// What is minimised, before the mean over rays and channels.
+    pub loss: f64,
+    /// Squared error of the field.
+    pub error: f64,
+    /// Opacity.
+    pub opacity: f64,
+}
+
+impl Add for Work {
+    type Output = Work;
+    fn add(self, other: Work) -> Work {
+        Work {
+            marched: self.marched + other.marched,
+            samples: self.samples + other.samples,
+            shaded: self.shaded + other.shaded,
+            unskipped: self.unskipped + other.unskipped,
+            loss: self.loss + other.loss,
+            error: self.error + other.error,
+            opacity: self.opacity + other.opacity,
+        }
+    }
+}
+
+/// The loss of some rays, a sum over rays and channels, and what it took.
+pub(crate) fn rays_loss<'t>(
+    model: &Model<f32>,
+    params: &Bound<'t, f32>,
+    batch: &Batch,
+    jitter: &mut Jitter<'_>,
+) -> (Var<'t, f32>, Work) {
+    let (tape, sampler) = (params.tape(), &*model.sampler);
+    let query = Query { frames: Some(&batch.frames), ..Query::new(&*model.field, params) };
+    let rows = |values: &[[f32; 3]]| tape.pool().copy_of(&[values.len(), 3], values.as_flattened());
+    let (target, background) = (rows(&batch.target), rows(&batch.background));
+    let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, &batch.rays, Purpose::Training, jitter);
+    let Lit { rendered, asked, kept } = sampler.quadrature().render(&query, &steps, sampler.termination());
+    let color = rendered.over(&background);
+    let fine = model.config.loss.sum(&color, &target);
+    let error = match model.config.loss {
+        Loss::Mse => fine.item(),
+        // PSNR is made of squared errors whatever is minimised.
+        _ => tape.no_grad(|| Loss::Mse.sum(&color, &target).item()),
+    };
+    let coarse = coarse.iter().map(|seen| model.config.loss.sum(&seen.over(&background), &target));
+    let weights = rendered.weights.value();
+    let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
+    let loss = coarse.chain(levels).fold(fine, |sum, term| term + sum);
+    let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());
+    let work = Work {
+        marched: evaluations.density + steps.len() as u64,
+        samples: evaluations.density + asked as u64,
+        shaded: evaluations.color + kept as u64,
+        unskipped: evaluations.unskipped,
+        loss: f64::from(loss.item()),
+        error: f64::from(error),
+        opacity: batch.rays.len() as f64 - left,
+    };
+    (loss, work)
+}

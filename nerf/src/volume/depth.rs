@@ -1,0 +1,158 @@
+//! Optical depths: how much each interval of a ray dims the light.
+
+use crate::{Error, Result};
+#[cfg(feature = "check")]
+use raygrad_autograd::check::Entry;
+use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+use raygrad_tensor::map;
+
+/// The optical depth `x_i = sigma_i delta_i` of intervals of length `delta`: `[samples]` to `[samples]`, of densities of at
+/// least 0, or of their logarithms (see [`of_log_density`](Self::of_log_density)).
+///
+/// A density of 0 has no optical depth even if `delta` is infinite; where `delta` is infinite the gradient of the density
+/// is defined as 0.
+#[derive(Debug, Clone)]
+pub struct OpticalDepth<T: Scalar> {
+    delta: Tensor<T>,
+    log_density: bool,
+}
+
+/// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
+pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
+
+impl<T: Scalar> OpticalDepth<T> {
+    /// For densities of samples that stand for intervals of length `delta` `[samples]`. The operation panics where a
+    /// density is negative; ask [`check`](Self::check) first if one may be.
+    ///
+    /// # Panics
+    /// As [`try_new`](Self::try_new).
+    #[track_caller]
+    pub fn new(delta: Tensor<T>) -> Self {
+        OpticalDepth::try_new(delta).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// As [`new`](Self::new).
+    ///
+    /// # Errors
+    /// If an interval is negative or NaN.
+    pub fn try_new(delta: Tensor<T>) -> Result<Self> {
+        match delta.as_slice().iter().position(|&delta| !(delta >= T::ZERO)) {
+            Some(i) => Err(Error::setting(format!("delta[{i}]"), format!("is {}; use 0 or more", delta.as_slice()[i]))),
+            None => Ok(OpticalDepth { delta, log_density: false }),
+        }
+    }
+
+    /// The same for logarithms z of densities, `sigma = e^z`. The exponential is part of the operation: its gradient `x`
+    /// stays finite, and so does `x e^-x`, what [weights](super::Weights) make of it, where that of a separate exponential
+    /// is infinity times 0.
+    #[track_caller]
+    pub fn of_log_density(delta: Tensor<T>) -> Self {
+        OpticalDepth { log_density: true, ..OpticalDepth::new(delta) }
+    }
+
+    /// Whether every density is one: at least 0, or NaN, which is somebody else's fault and passes through. Any number is
+    /// the logarithm of one.
+    ///
+    /// # Errors
+    /// If a density is negative; the error says which.
+    pub fn check(&self, density: &Tensor<T>) -> Result<()> {
+        let density = density.as_slice();
+        match density.iter().position(|&sigma| !self.log_density && sigma < T::ZERO) {
+            Some(i) => {
+                let what = format!("is {}; a density is at least 0: end the network with a softplus", density[i]);
+                Err(Error::setting(format!("density[{i}]"), what))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+impl<T: Scalar> Op<T> for OpticalDepth<T> {
+    fn name(&self) -> &'static str {
+        "optical_depth"
+    }
+
+    fn arity(&self) -> Option<usize> {
+        Some(1)
+    }
+
+    fn shape(&self, x: &[&[usize]]) -> std::result::Result<Shape, ShapeError> {
+        match x[0] == self.delta.shape() {
+            true => Ok(x[0].into()),
+            false => Err(format!("densities must be {:?}, one for each interval", self.delta.shape())),
+        }
+    }
+
+    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
+        if let Err(error) = self.check(x[0]) {
+            panic!("{error}");
+        }
+        let most = T::from_f64(MOST_LOG_DENSITY);
+        if self.log_density {
+            map(
+                [x[0], &self.delta],
+                pool,
+                #[inline(always)]
+                |[z, delta]| (if z > most { most } else { z }).exp() * delta,
+            )
+        } else {
+            map(
+                [x[0], &self.delta],
+                pool,
+                #[inline(always)]
+                // Not the product alone, which is NaN for 0 times infinity.
+                |[sigma, delta]| if sigma == T::ZERO { T::ZERO } else { sigma * delta },
+            )
+        }
+    }
+
+    fn reads(&self) -> Reads {
+        // dx/dz = x for x = e^z delta, and dx/dsigma = delta.
+        Reads::INPUTS.and_if(self.log_density, Reads::OUTPUT)
+    }
+
+    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
+        let slope = if self.log_density { cx.output() } else { &self.delta };
+        let grad = map(
+            [cx.g().value(), slope],
+            cx.pool(),
+            #[inline(always)]
+            |[g, slope]| if slope.is_finite() { g * slope } else { T::ZERO },
+        );
+        Grads::one(cx.constant(grad))
+    }
+
+    fn is_fused(&self) -> bool {
+        true
+    }
+
+    fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
+        let sigma = if self.log_density { x[0].exp() } else { x[0].clone() };
+        let constant = |f: &dyn Fn(T, T) -> T| {
+            let pairs = self.delta.as_slice().iter().zip(sigma.value().as_slice());
+            let values = pairs.map(|(&delta, &sigma)| f(delta, sigma)).collect();
+            sigma.tape().constant(Tensor::from_vec(self.delta.shape(), values))
+        };
+        // An infinite interval adds a constant: nothing to no density, and infinity to any.
+        let finite = constant(&|delta, _| if delta.is_finite() { delta } else { T::ZERO });
+        let infinite = constant(&|delta, sigma| if delta.is_finite() || sigma == T::ZERO { T::ZERO } else { delta });
+        Some(sigma * finite + infinite)
+    }
+}
+
+/// The catalogue entries of this file. [`OpticalDepth`] holds a tensor of its own number type, so each precision has its
+/// own.
+#[cfg(feature = "check")]
+pub(crate) fn entries() -> Vec<Entry> {
+    let delta = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.5, 0.125, 0.5, 1.0, 0.0, 0.375]);
+    let sigma = |values: [f64; 7]| Tensor::from_vec(&[7], values.to_vec());
+    vec![
+        Entry::of(OpticalDepth::new(delta()), OpticalDepth::new(delta().cast::<f32>()))
+            .sample_of(vec![sigma([0.4, 1.3, 2.0, 0.1, 3.0, 0.7, 0.2])])
+            .sample_of(vec![sigma([30.0, 0.5, 9.0, 0.01, 20.0, 5.0, 40.0])]),
+        Entry::of(OpticalDepth::of_log_density(delta()), OpticalDepth::of_log_density(delta().cast::<f32>()))
+            .sample_of(vec![sigma([0.4, -1.3, 2.0, -3.1, 1.0, 0.7, 0.2])]),
+        Entry::of(OpticalDepth::<f64>::new(Tensor::zeros(&[0])), OpticalDepth::<f32>::new(Tensor::zeros(&[0])))
+            .sample(&[&[0]]),
+    ]
+}
