@@ -39,7 +39,7 @@ pub use field::{
 pub use field::{Seen, Voxel, VoxelConfig};
 pub use glam;
 pub use kind::{Family, Kind, Part, Site, register};
-pub use losses::Loss;
+pub use losses::{Loss, Term, TermConfig, Terms};
 pub use model::{Config, Extent, Model, Preset};
 pub use pictures::{quantise, write_atomic};
 pub use random::Jitter;

@@ -26,6 +26,9 @@ pub struct Viewpoint {
 /// At an elevation closer to the poles than this, in radians, there is no telling where up is.
 const FROM_POLE: f64 = 0.1;
 
+/// Cameras that are nearer to the centre, as a share of the box's side, look outwards.
+const FROM_CENTRE: f64 = 0.02;
+
 /// Most pixels on a side of a training image: more would only come from a damaged file.
 const LARGEST: usize = 1 << 16;
 
@@ -53,7 +56,7 @@ impl Viewpoint {
             ("viewpoint.width", (1..=LARGEST).contains(&self.width)),
             ("viewpoint.height", (1..=LARGEST).contains(&self.height)),
             ("viewpoint.angle_x", positive(self.angle_x) && self.angle_x < PI),
-            ("viewpoint.distance", positive(self.distance)),
+            ("viewpoint.distance", self.distance >= 0.0 && self.distance.is_finite()),
             ("viewpoint.elevation", self.elevation.abs() < FRAC_PI_2),
         ];
         match checks.iter().find(|(_, good)| !good) {
@@ -62,14 +65,17 @@ impl Viewpoint {
         }
     }
 
-    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards.
+    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards. Those of a panorama,
+    /// which was taken from the centre, stand there and look around.
     pub fn orbit(&self, extent: &Extent, count: usize) -> Vec<Camera> {
         let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
         let camera = |i: usize| {
             let (sin, cos) = (i as f64 / count as f64 * TAU).sin_cos();
             let (height, radius) = self.elevation.sin_cos();
             let eye = centre + self.distance * DVec3::new(radius * cos, radius * sin, height);
-            let pose = Camera::look_at(eye, centre, DVec3::Z);
+            let outwards = self.distance <= FROM_CENTRE * extent.space().side();
+            let target = if outwards { centre + DVec3::new(radius * cos, radius * sin, height) } else { centre };
+            let pose = Camera::look_at(if outwards { centre } else { eye }, target, DVec3::Z);
             Camera::from_angle(self.width, self.height, self.angle_x, pose)
         };
         (0..count).map(camera).collect()
@@ -88,6 +94,19 @@ pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
 
 #[cfg(test)]
 mod tests {
+    #[test]
+    fn a_panorama_is_looked_around_in() {
+        let viewpoint = Viewpoint { width: 40, height: 30, angle_x: 1.0, distance: 0.0, elevation: 0.0 };
+        viewpoint.check().unwrap();
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 4.0]);
+        let cameras = viewpoint.orbit(&extent, 4);
+        let looks: Vec<DVec3> = cameras.iter().map(|camera| camera.ray(20.0, 15.0).direction).collect();
+        for (look, expected) in looks.iter().zip([DVec3::X, DVec3::Y, DVec3::NEG_X, DVec3::NEG_Y]) {
+            assert!(look.distance(expected) < 1e-12, "{look}");
+        }
+        assert!(cameras.iter().all(|camera| camera.pose.translation == DVec3::ZERO));
+    }
+
     use super::*;
     use raygrad::nerf::dataset::{Split, embedded};
 

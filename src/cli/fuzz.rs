@@ -16,6 +16,7 @@ mod damage;
 
 fn run_config() -> RunConfig {
     RunConfig {
+        budget: None,
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
         downscale: 1,

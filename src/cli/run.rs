@@ -3,7 +3,7 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::{Config, Error, Extent, Model, Result, write_atomic};
+use raygrad::nerf::{Budget, Config, Error, Extent, Model, Result, write_atomic};
 use serde::{Deserialize, Serialize};
 
 use super::cameras::Viewpoint;
@@ -27,6 +27,9 @@ pub struct RunConfig {
     pub extent: Extent,
     /// Where the photographs were taken from, on average.
     pub viewpoint: Viewpoint,
+    /// How long it was to be trained; the first edition did not say.
+    #[serde(default)]
+    pub budget: Option<Budget>,
     /// The model and how it is trained.
     pub config: Config,
 }

@@ -116,7 +116,7 @@ pub fn run(args: &Args) -> Result<Trained> {
     let finished = watch.finish(&trainer, !interrupted);
     watched.and(finished)?;
     summarise(&run, &trainer.stats(), interrupted)?;
-    let diverged = trainer.stats().has_diverged();
+    let diverged = trainer.stats().ends_diverged();
     if diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
@@ -131,17 +131,12 @@ pub fn run(args: &Args) -> Result<Trained> {
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        if let Budget::Time(time) = self.budget() {
-            config = config.with_budget(time.as_secs_f64());
-        }
+        config = config.with_budget(self.budget().seconds());
         if let Some(background) = self.background {
             config.background = background;
         }
-        if config.background == Background::Random && !data.has_alpha() {
-            if self.background.is_some() {
-                let what = "random needs images with transparency, and these have none";
-                return Err(Error::setting("background", what));
-            }
+        // Asked for, it tells fog from what opaque photographs show.
+        if config.background == Background::Random && !data.has_alpha() && self.background.is_none() {
             config.background = Background::White;
         }
         if let Some(skip) = self.skip {
@@ -160,6 +155,7 @@ impl Args {
             downscale: self.downscale,
             extent: trainer.model.extent,
             viewpoint: Viewpoint::of(data),
+            budget: Some(self.budget()),
             config: trainer.model.config.clone(),
         })
     }

@@ -225,7 +225,7 @@ mod tests {
         let x = Tensor::from_fn(&[4, 6], |i| ((i + 5 * tile) as f32).cos());
         let mut y = params.tape().constant(x).matmul(&params[a]);
         if tile % 3 == 1 {
-            y = y * params[b].slice_axis(0, ..4);
+            y *= params[b].slice_axis(0, ..4);
         }
         let rows = params[table].gather_rows([tile as u32 % 6, 2]).sum();
         let loss = y.square().sum() + rows.square();

@@ -3,6 +3,7 @@
 use super::Dataset;
 use super::background::{Background, over};
 use crate::camera::rays::Rays;
+use glam::DVec3;
 use rand::{Rng, RngExt};
 
 /// Rays with what photographs show along them.
@@ -21,18 +22,24 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Random pixels of random photographs.
+    /// Random pixels of random photographs, with rays that are sampled within the box `bounds`.
     ///
     /// # Panics
     /// If the dataset has no frames.
-    pub fn draw(data: &Dataset, count: usize, background: Background, rng: &mut (impl Rng + ?Sized)) -> Self {
+    pub fn draw(
+        data: &Dataset,
+        count: usize,
+        bounds: [DVec3; 2],
+        background: Background,
+        rng: &mut (impl Rng + ?Sized),
+    ) -> Self {
         let mut batch = Batch::default();
         for _ in 0..count {
             let number = rng.random_range(0..data.frames.len());
             let frame = &data.frames[number];
             let pixel = [rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height)];
             let color = background.draw(rng);
-            batch.rays.push_pixel(&frame.camera, pixel, data.bounds, [data.near, data.far]);
+            batch.rays.push_pixel(&frame.camera, pixel, bounds, [data.near, data.far]);
             batch.frames.push(number as u32);
             batch.pixels.push(pixel.map(|x| x as u32));
             batch.target.push(over(frame.image.pixel(pixel[0], pixel[1]), color));

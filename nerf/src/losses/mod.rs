@@ -1,7 +1,63 @@
-//! What training minimises.
+//! What training minimises: the [photometric loss](Loss) of every picture of the rays, what fits the sampler's proposals
+//! ([`interlevel`]), and any number of further [terms](Term) of what is rendered.
 
 pub(crate) mod interlevel;
 pub(crate) mod photometric;
+pub(crate) mod terms;
 
 pub use interlevel::interlevel;
 pub use photometric::Loss;
+pub use terms::{DistortionConfig, EntropyConfig, OrientationConfig};
+
+use crate::camera::rays::Rays;
+use crate::kind::{Family, Part, Registered};
+use crate::volume::render::Rendered;
+use raygrad_autograd::{Scalar, Tensor, Var};
+use raygrad_nn::Bound;
+use std::any::Any;
+use std::sync::{Arc, RwLock};
+
+/// What a term may use: what is rendered of some rays, and what photographs show along them.
+pub struct Outputs<'a, 't, T: Scalar> {
+    /// The parameters.
+    pub params: &'a Bound<'t, T>,
+    /// The rays.
+    pub rays: &'a Rays<T>,
+    /// The number of the photograph of each ray.
+    pub frames: &'a [u32],
+    /// What is seen of the field, with a name for everything.
+    pub rendered: &'a Rendered<'t, T>,
+    /// What the photographs show, `[rays, 3]`, over the background where they have alpha.
+    pub target: &'a Tensor<T>,
+    /// The background of each ray, `[rays, 3]`.
+    pub background: &'a Tensor<T>,
+}
+
+/// A term of the loss beside that of the colours.
+///
+/// A term of one's own implements this and, for its configuration, [`Kind<Terms>`](crate::Kind).
+pub trait Term<T: Scalar>: Any + Send + Sync {
+    /// The term as a sum over rays, a scalar, times its weight. (The mean of it is minimised, beside that of the squared
+    /// errors of three channels: so a weight of 1 stands for three squared errors.)
+    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T>;
+
+    /// Whether it reads [normals](Rendered::normals), for which positions have to be on the tape.
+    fn reads_normals(&self) -> bool {
+        false
+    }
+}
+
+/// The family of terms.
+pub struct Terms;
+
+impl Family for Terms {
+    const WHAT: &'static str = "term";
+    type Built<T: Scalar> = Arc<dyn Term<T>>;
+    fn registered() -> &'static RwLock<Vec<Registered<Self>>> {
+        static OTHERS: RwLock<Vec<Registered<Terms>>> = RwLock::new(vec![]);
+        &OTHERS
+    }
+}
+
+/// Which term, and its weight.
+pub type TermConfig = Part<Terms>;

@@ -3,7 +3,9 @@
 use crate::dataset::background::Background;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
+use crate::losses::TermConfig;
 use crate::losses::photometric::Loss;
+use crate::range::check_range;
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -68,6 +70,10 @@ pub struct GroupConfig {
     pub decay: f64,
 }
 
+fn is_false(value: &bool) -> bool {
+    !value
+}
+
 /// A model and how it is trained. It is stored with the model, so that a run can be read back.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -78,9 +84,17 @@ pub struct Config {
     /// Where it is sampled.
     #[serde(deserialize_with = "super::known::read")]
     pub sampler: SamplerConfig,
+    /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), and rays are
+    /// sampled as far as the sampler goes: marching, up to the outermost of the [cascades](OccupancyConfig::cascades) of its
+    /// grid; others, over the whole span.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub unbounded: bool,
     /// What is minimised.
     #[serde(default)]
     pub loss: Loss,
+    /// What is minimised beside it.
+    #[serde(default, deserialize_with = "super::known::read_terms", skip_serializing_if = "Vec::is_empty")]
+    pub terms: Vec<TermConfig>,
     /// Learning rate over the run.
     pub schedule: Schedule,
     /// The optimiser's constants, for networks.
@@ -109,7 +123,9 @@ impl Config {
         let classic = Config {
             field: FieldConfig::new(paper.clone()),
             sampler: SamplerConfig::new(HierarchicalConfig::default()),
+            unbounded: false,
             loss: Loss::Mse,
+            terms: vec![],
             schedule: Schedule::Exponential { from: 5e-4, to: 5e-6, warmup: 0.0 },
             adam: AdamConfig::default(),
             table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
@@ -204,6 +220,24 @@ impl Config {
         for (part, checked) in checked {
             checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
         }
+        for group in &self.groups {
+            let parts = [group.schedule.check(), group.adam.check()];
+            for checked in parts {
+                checked
+                    .map_err(|error| Error::setting(format!("groups.{}.{}", group.params, error.name), error.what))?;
+            }
+            check_range("groups.decay", group.decay, 0.0, 1e30)?;
+        }
+        if let Some(marching) = self.sampler.get::<MarchingConfig>() {
+            let cascades = marching.occupancy.cascades;
+            if self.unbounded != (cascades > 1) {
+                let what = format!(
+                    "is {cascades}; use 1 for a scene within its box, and 2 to 8 with `unbounded` for one that goes on"
+                );
+                return Err(Error::setting("occupancy.cascades", what));
+            }
+        }
+        self.terms.iter().try_for_each(TermConfig::check)?;
         self.field.check()?;
         self.sampler.check()
     }

@@ -1,7 +1,8 @@
-//! The fields and samplers of this crate, by name: one line for each.
+//! The fields, samplers and terms of this crate, by name: one line for each.
 
 use crate::field::{ClassicConfig, Fields, InstantConfig, VoxelConfig};
 use crate::kind::{Family, Part, register};
+use crate::losses::{DistortionConfig, EntropyConfig, OrientationConfig, TermConfig, Terms};
 use crate::sampling::Samplers;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -18,6 +19,9 @@ fn register_all() {
         register::<Samplers, HierarchicalConfig>();
         register::<Samplers, MarchingConfig>();
         register::<Samplers, ProposalConfig>();
+        register::<Terms, DistortionConfig>();
+        register::<Terms, EntropyConfig>();
+        register::<Terms, OrientationConfig>();
     });
 }
 
@@ -25,4 +29,10 @@ fn register_all() {
 pub(super) fn read<'de, F: Family, D: Deserializer<'de>>(deserializer: D) -> Result<Part<F>, D::Error> {
     register_all();
     Part::deserialize(deserializer)
+}
+
+/// As [`read`], for a list of terms.
+pub(super) fn read_terms<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TermConfig>, D::Error> {
+    register_all();
+    Vec::deserialize(deserializer)
 }

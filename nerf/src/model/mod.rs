@@ -10,6 +10,7 @@ use crate::Result;
 use crate::camera::rays::{Rays, Samples};
 use crate::field::Field;
 use crate::kind::Site;
+use crate::losses::{Term, TermConfig};
 use crate::random::Jitter;
 use crate::sampling::marching::Marching;
 use crate::sampling::{Purpose, Sampler};
@@ -48,7 +49,7 @@ impl Extent {
         Extent { bounds, span, unit: Space::within(bounds).unit }
     }
 
-    /// The map to the unit cube.
+    /// The map to the unit cube, for a scene within its box.
     pub fn space(&self) -> Space {
         Space { unit: self.unit, ..Space::within(self.bounds) }
     }
@@ -66,6 +67,8 @@ pub struct Model<T: Scalar> {
     pub field: Arc<dyn Field<T>>,
     /// Where it is sampled.
     pub sampler: Box<dyn Sampler<T>>,
+    /// What is minimised beside the loss of colours.
+    pub terms: Vec<Arc<dyn Term<T>>>,
 }
 
 impl<T: Scalar> Clone for Model<T> {
@@ -76,6 +79,7 @@ impl<T: Scalar> Clone for Model<T> {
             params: self.params.clone(),
             field: self.field.clone(),
             sampler: self.sampler.boxed(),
+            terms: self.terms.clone(),
         }
     }
 }
@@ -88,13 +92,25 @@ impl<T: Scalar> Model<T> {
     #[inline(never)]
     pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
         config.check()?;
-        let space = extent.space();
+        let space = Space { unbounded: config.unbounded, ..extent.space() };
         space.check()?;
         let mut params = Params::new();
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
         let sampler = config.sampler.build(Site { space, params: &mut params, name: "sampler", rng })?;
         let field = config.field.build(Site { space, params: &mut params, name: "field", rng })?;
-        Ok(Model { config, extent, params, field, sampler })
+        let term = |term: &TermConfig| term.build(Site { space, params: &mut params, name: "terms", rng });
+        let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
+        Ok(Model { config, extent, params, field, sampler, terms })
+    }
+
+    /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
+    /// grid ends.
+    pub fn reach(&self) -> [DVec3; 2] {
+        match self.sampler.grid() {
+            Some(grid) => grid.outer_bounds(),
+            None if self.config.unbounded => [DVec3::NEG_INFINITY, DVec3::INFINITY],
+            None => self.extent.bounds,
+        }
     }
 
     /// All fields: those of the sampler, if it has any, and the one that is rendered.

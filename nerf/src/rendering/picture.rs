@@ -56,12 +56,13 @@ impl<T: Scalar> Model<T> {
         see: impl Fn(&mut S, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
     ) -> (Vec<Pixel>, Evaluations) {
         let mut pixels = vec![Pixel::default(); camera.width * camera.height];
+        let bounds = self.reach();
         let tiles = pixels.par_chunks_mut(tile).enumerate();
         let evaluations = tiles.map_init(S::default, |scratch, (which, out)| {
             let mut rays = Rays::new();
             for pixel in which * tile..which * tile + out.len() {
                 let place = [pixel % camera.width, pixel / camera.width];
-                rays.push_pixel(camera, place, self.extent.bounds, self.extent.span);
+                rays.push_pixel(camera, place, bounds, self.extent.span);
             }
             parallel::serial(|| see(scratch, &rays, out))
         });

@@ -34,6 +34,10 @@ pub struct MarchingConfig {
     /// The same in rendering. Training starts each ray at random, so it fits what finer steps show.
     #[serde(default = "view_step")]
     pub view_step: f64,
+    /// How much longer a step is for each scene unit of distance, 0 to 1: see [`Step::cone`]. 0 is even steps; 1/256 is
+    /// customary where a scene goes on beyond its box.
+    #[serde(default)]
+    pub cone: f64,
     /// Samples that a training step places on its rays; the number of rays follows.
     pub samples: usize,
     /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
@@ -57,6 +61,7 @@ impl Default for MarchingConfig {
             step: 1.0 / 200.0,
             last_step: None,
             view_step: view_step(),
+            cone: 0.0,
             samples: 24576,
             termination: 1e-3,
             quadrature: Quadrature::Midpoint,
@@ -72,6 +77,7 @@ impl Kind<Samplers> for MarchingConfig {
         check_range("step", self.step, 1e-5, 1.0)?;
         self.last_step.map_or(Ok(()), |step| check_range("last_step", step, 1e-5, 1.0))?;
         check_range("view_step", self.view_step, 1e-5, 1.0)?;
+        check_range("cone", self.cone, 0.0, 1.0)?;
         check_range("samples", self.samples, 1, 1 << 24)?;
         self.quadrature.check()?;
         check_range("termination", self.termination, 0.0, 1.0)
@@ -133,7 +139,7 @@ impl Marching {
     }
 
     fn length(&self, share: f64) -> f32 {
-        let [low, high] = self.grid.outer_bounds();
+        let [low, high] = self.grid.bounds();
         (share * (high - low).max_element()) as f32
     }
 
@@ -180,7 +186,10 @@ impl<T: Scalar> Sampler<T> for Marching {
             Purpose::Training => (&self.grid, self.step()),
             Purpose::View { finer } => (self.view_grid(), self.view_step() / finer as f32),
         };
-        let (steps, unskipped) = self.march(grid, rays, &Step::uniform(length), jitter, query.tape().pool());
+        // Steps that are shorter than the first of training are so all along the ray.
+        let cone = (self.config.cone as f32 * length / self.length(self.config.step)).min(1.0);
+        let step = Step { cone, ..Step::uniform(length) };
+        let (steps, unskipped) = self.march(grid, rays, &step, jitter, query.tape().pool());
         Sampled { evaluations: Evaluations { unskipped, ..Evaluations::default() }, ..Sampled::new(steps) }
     }
 
@@ -270,6 +279,40 @@ impl Limits {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::analytic::{AnalyticField, scenes};
+    use crate::volume::quadrature::Plan;
+    use raygrad_autograd::{Tape, Tensor};
+    use raygrad_nn::Params;
+
+    /// A ball that lies beyond the box is seen through the outer cascades, with even steps and with growing ones.
+    #[test]
+    fn cascades_show_what_lies_beyond_the_box_and_cones_take_fewer_steps() {
+        let scene = scenes().into_iter().find(|scene| scene.name == "sphere").unwrap();
+        let mut params = Params::<f64>::new();
+        let field = AnalyticField::new(scene.medium.clone(), &mut params);
+        let tape = Tape::new();
+        let bound = params.bind_constant(&tape);
+        let query = Query::new(&field, &bound);
+        let seen = |cascades: usize, cone: f64| {
+            let occupancy = OccupancyConfig { resolution: 32, cascades, skip: Skip::Off.into() };
+            let grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &occupancy).unwrap();
+            let reach = grid.outer_bounds();
+            let config = MarchingConfig { occupancy, cone, view_step: 1e-3, ..MarchingConfig::default() };
+            let sampler = Marching::new(config, grid);
+            let mut rays = Rays::new();
+            rays.push(&scene.ray, crate::camera::bounds::clip_span(&scene.ray, reach, [0.0, scene.length]));
+            let steps = sampler.sample(&query, &rays, Purpose::View { finer: 1 }, &mut Jitter::Middle).steps;
+            let count = steps.len();
+            let color = Plan { samples: steps, intervals: None }.render(&query).over(&Tensor::full(&[1, 3], 1.0));
+            (color.value().as_slice()[1], count)
+        };
+        assert_eq!(seen(1, 0.0).0, 1.0, "within the box there is nothing");
+        let (even, many) = seen(3, 0.0);
+        let (growing, few) = seen(3, 0.02);
+        assert!((even - scene.exact.color).abs() < 2e-3, "{even} for {}", scene.exact.color);
+        assert!((growing - scene.exact.color).abs() < 1e-2, "{growing} for {}", scene.exact.color);
+        assert!(many == 2000 && few < many / 3, "{many} and {few} steps");
+    }
     use glam::DVec3;
 
     #[test]

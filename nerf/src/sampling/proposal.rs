@@ -42,7 +42,7 @@ pub struct ProposalLevel {
 
 /// Numbers of a [`Proposal`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub struct ProposalConfig {
     /// The proposals, each sampled where the one before it found something; at least one.
     pub levels: Vec<ProposalLevel>,
@@ -53,7 +53,6 @@ pub struct ProposalConfig {
     /// Steps over which proposals gain their full say (Barron et al. 2022, section 4, "annealing").
     pub anneal: u64,
     /// How the first samples are spread.
-    #[serde(default)]
     pub spacing: Spacing,
     /// Rays in a training step.
     pub batch: usize,

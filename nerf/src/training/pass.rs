@@ -1,6 +1,7 @@
 //! What a tile of a training step does: from rays to a loss, as ordinary graph code.
 
 use crate::dataset::batch::Batch;
+use crate::losses::Outputs;
 use crate::losses::interlevel::interlevel;
 use crate::losses::photometric::Loss;
 use crate::model::Model;
@@ -54,7 +55,8 @@ pub(crate) fn rays_loss<'t>(
     jitter: &mut Jitter<'_>,
 ) -> (Var<'t, f32>, Work) {
     let (tape, sampler) = (params.tape(), &*model.sampler);
-    let query = Query { frames: Some(&batch.frames), ..Query::new(&*model.field, params) };
+    let slopes = model.terms.iter().any(|term| term.reads_normals());
+    let query = Query { frames: Some(&batch.frames), slopes, ..Query::new(&*model.field, params) };
     let rows = |values: &[[f32; 3]]| tape.pool().copy_of(&[values.len(), 3], values.as_flattened());
     let (target, background) = (rows(&batch.target), rows(&batch.background));
     let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, &batch.rays, Purpose::Training, jitter);
@@ -69,7 +71,10 @@ pub(crate) fn rays_loss<'t>(
     let coarse = coarse.iter().map(|seen| model.config.loss.sum(&seen.over(&background), &target));
     let weights = rendered.weights.value();
     let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
-    let loss = coarse.chain(levels).fold(fine, |sum, term| term + sum);
+    let (rays, frames) = (&batch.rays, &batch.frames[..]);
+    let seen = Outputs { params, rays, frames, rendered: &rendered, target: &target, background: &background };
+    let terms = model.terms.iter().map(|term| term.loss(&seen));
+    let loss = coarse.chain(levels).chain(terms).fold(fine, |sum, term| term + sum);
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());
     let work = Work {
         marched: evaluations.density + steps.len() as u64,

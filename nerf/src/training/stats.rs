@@ -1,18 +1,50 @@
 //! How long to train, and what was done.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::time::Duration;
 
 /// Steps in a row without a finite gradient after which a run has diverged: an overflow of one batch passes.
 pub(crate) const STUCK: u64 = 100;
 
 /// How long to train.
-#[derive(Debug, Clone, Copy, PartialEq)]
+///
+/// In a file it is `{"steps": 5000}` or `{"seconds": 60}`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Budget {
     /// A number of steps.
+    #[serde(rename = "steps")]
     Steps(u64),
     /// Training time; what happens between steps does not count. The schedule stretches to it.
+    #[serde(rename = "seconds", with = "seconds")]
     Time(Duration),
+}
+
+/// Steps that the instant preset takes in a second of training on two cores, about: so a number of steps stands for a
+/// time, and gives the model that is made for it on any machine.
+const STEPS_PER_SECOND: f64 = 80.0;
+
+impl Budget {
+    /// The training time that it stands for, in seconds: what [`Config::with_budget`](crate::Config::with_budget) takes.
+    pub fn seconds(self) -> f64 {
+        match self {
+            Budget::Steps(steps) => steps as f64 / STEPS_PER_SECOND,
+            Budget::Time(time) => time.as_secs_f64(),
+        }
+    }
+}
+
+/// A duration as a number of seconds.
+mod seconds {
+    use serde::{Deserialize, Deserializer, Serializer, de::Error};
+    use std::time::Duration;
+
+    pub fn serialize<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_f64(time.as_secs_f64())
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
+        Duration::try_from_secs_f64(f64::deserialize(deserializer)?).map_err(D::Error::custom)
+    }
 }
 
 /// What one step did, and the run so far.
@@ -59,6 +91,12 @@ impl StepStats {
     pub fn has_diverged(&self) -> bool {
         self.stuck >= STUCK
     }
+
+    /// Whether a run that ends here ends in numbers that are not finite: it [has diverged](Self::has_diverged), or would
+    /// have, since no gradient of its second half was finite.
+    pub fn ends_diverged(&self) -> bool {
+        self.has_diverged() || (self.stuck > 0 && 2 * self.stuck >= self.step)
+    }
 }
 
 impl Default for StepStats {
@@ -82,5 +120,30 @@ impl Default for StepStats {
             stuck: 0,
             restarts: 0,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn budgets_are_read_and_stand_for_a_time() {
+        let read = |text: &str| serde_json::from_str::<Budget>(text);
+        for (text, budget, seconds) in [
+            (r#"{"steps":4000}"#, Budget::Steps(4000), 50.0),
+            (r#"{"seconds":62.5}"#, Budget::Time(Duration::from_millis(62_500)), 62.5),
+        ] {
+            assert_eq!((read(text).unwrap(), serde_json::to_string(&budget).unwrap()), (budget, text.to_owned()));
+            assert_eq!(budget.seconds(), seconds);
+        }
+        assert!(read(r#"{"seconds":-1}"#).is_err() && read(r#"{"seconds":1e300}"#).is_err());
+    }
+
+    #[test]
+    fn a_short_run_of_bad_numbers_ends_badly() {
+        let at = |step, stuck| StepStats { step, stuck, ..StepStats::default() };
+        assert!(!at(0, 0).ends_diverged() && !at(50, 20).ends_diverged() && !at(5000, 99).ends_diverged());
+        assert!(at(50, 25).ends_diverged() && at(1, 1).ends_diverged() && at(5000, 100).ends_diverged());
     }
 }

@@ -138,10 +138,11 @@ impl Trainer {
             // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
             Load::Samples(_) => self.batch.div_ceil(SLOTS),
         };
-        let (model, data, total) = (&self.model, &*self.data, self.batch);
+        let (model, data, total, bounds) = (&self.model, &*self.data, self.batch, self.model.reach());
         let step = self.tiles.differentiate(&model.params, total.div_ceil(tile), |which, params, ()| {
             let rng = &mut stream(seed, [number, which as u64]);
-            let batch = Batch::draw(data, tile.min(total - which * tile), model.config.background, rng);
+            let count = tile.min(total - which * tile);
+            let batch = Batch::draw(data, count, bounds, model.config.background, rng);
             let (loss, work) = rays_loss(model, params, &batch, &mut Jitter::Random(rng));
             (loss * (1.0 / (3.0 * total as f64)), work)
         });

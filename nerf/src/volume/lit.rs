@@ -77,7 +77,7 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
     let mut depths = vec![0.0; ranges.len()];
     let mut alive: Vec<usize> = (0..ranges.len()).collect();
     // Of what is found: the number of the sample, and its place among what was asked.
-    let (mut found, mut memos): (Vec<(u32, [u32; 2])>, Vec<Memo<T>>) = (vec![], vec![]);
+    let (mut found, mut memos) = (Vec::<(u32, [u32; 2])>::new(), vec![]);
     let (mut done, mut size, mut asked) = (0, FIRST_ROUND, 0);
     loop {
         alive.retain(|&ray| ranges[ray].len() > done && depths[ray] < opaque);

@@ -147,7 +147,7 @@ impl<T: Scalar> Op<T> for Weights {
         if let Some(depths) = &self.before {
             let depths = depths.iter().map(|&x| T::from_f64(x)).collect();
             let depths = x[0].tape().constant(Tensor::from_vec(&[self.segments.len()], depths));
-            before = before + depths.segment_expand(&self.segments);
+            before += depths.segment_expand(&self.segments);
         }
         Some((-before).exp() * -(-&x[0]).expm1())
     }
