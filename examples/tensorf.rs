@@ -115,7 +115,7 @@ impl TensorF {
 
 impl<T: Scalar> Field<T> for TensorF {
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
-        let [x, y, z] = self.products(params, &self.space.unit(positions));
+        let [x, y, z] = self.products(params, &self.space.cube(positions));
         let [density, color] = self.config.components;
         let sum = [&x, &y, &z].map(|part| part.slice_axis(1, ..density).sum_over(1));
         let raw = sum.into_iter().sum::<Var<'_, T>>() * 10.0;

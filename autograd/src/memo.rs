@@ -1,6 +1,8 @@
 //! Outputs that one pass hands to another.
 
-use crate::{Op, Tape, Var};
+#[cfg(doc)]
+use crate::Op;
+use crate::Tape;
 use raygrad_tensor::{Pool, Scalar, Tensor};
 use std::cell::Cell;
 
@@ -8,15 +10,6 @@ use std::cell::Cell;
 #[derive(Debug, Clone)]
 pub struct Memo<T: Scalar> {
     values: Vec<Tensor<T>>,
-}
-
-/// What a tape does with such outputs at the moment.
-#[derive(Default)]
-pub(crate) enum Memory<T: Scalar> {
-    #[default]
-    Off,
-    Remember(Vec<Tensor<T>>),
-    Recall(std::vec::IntoIter<Tensor<T>>),
 }
 
 impl<T: Scalar> Memo<T> {
@@ -44,7 +37,9 @@ impl<T: Scalar> Memo<T> {
             }
             out
         };
-        assert!(memos.iter().all(|memo| memo.values.len() == first.values.len()), "memos of the same operations");
+        let row = |value: &Tensor<T>| value.shape().get(1..).map(<[usize]>::to_vec);
+        let alike = |memo: &Memo<T>| memo.values.iter().map(row).eq(first.values.iter().map(row));
+        assert!(memos.iter().all(alike), "memos of the same operations");
         Memo { values: (0..first.values.len()).map(gather).collect() }
     }
 }
@@ -53,8 +48,10 @@ impl<T: Scalar> Tape<T> {
     /// Runs `f`, and gives beside its result the outputs of those of its operations that [are kept](Op::is_kept): for
     /// [`recall`](Self::recall).
     pub fn remember<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
-        let (result, memory) = self.with_memory(Memory::Remember(vec![]), f);
-        let values = if let Memory::Remember(values) = memory { values } else { vec![] };
+        let (result, values) = with_cell(&self.remembered, Some(vec![]), f);
+        let values = values.unwrap_or_default();
+        // Who remembers around it remembers this too.
+        values.iter().for_each(|value| self.keep(value));
         (result, Memo { values })
     }
 
@@ -95,54 +92,50 @@ impl<T: Scalar> Tape<T> {
         if memo.values.is_empty() {
             return f();
         }
-        let (result, memory) = self.with_memory(Memory::Recall(memo.values.into_iter()), f);
-        let left = if let Memory::Recall(left) = memory { left.len() } else { 0 };
-        assert_eq!(left, 0, "outputs of a memo that no operation asked for");
+        let (result, left) = with_cell(&self.recalled, Some(memo.values.into_iter()), f);
+        assert_eq!(left.map_or(0, |left| left.len()), 0, "outputs of a memo that no operation asked for");
         result
     }
 
     /// The output of an operation from a memo, if one is being recalled.
     #[track_caller]
-    pub(crate) fn recalled(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>]) -> Option<Tensor<T>> {
-        let mut memory = self.memory.take();
-        let value = if let Memory::Recall(values) = &mut memory { Some(values.next()) } else { None };
-        self.memory.set(memory);
-        let value = value?.unwrap_or_else(|| panic!("{}: a memo that ends before this operation", op.name()));
-        let shapes: Vec<&[usize]> = inputs.iter().map(|x| x.shape()).collect();
-        let fits = op.shape(&shapes).is_ok_and(|shape| value.shape() == shape.as_slice());
-        assert!(fits, "{}: a memo holds an output of shape {:?} for it", op.name(), value.shape());
+    pub(crate) fn recalled(&self, op: &'static str, shape: &[usize]) -> Option<Tensor<T>> {
+        let mut values = self.recalled.take()?;
+        let value = values.next();
+        self.recalled.set(Some(values));
+        let value = value.unwrap_or_else(|| panic!("{op}: a memo that ends before this operation"));
+        assert_eq!(value.shape(), shape, "{op}: a memo holds an output of another shape for it");
         Some(value)
     }
 
     /// Keeps an output, if outputs are being remembered.
     pub(crate) fn keep(&self, value: &Tensor<T>) {
-        let mut memory = self.memory.take();
-        if let Memory::Remember(values) = &mut memory {
+        if let Some(mut values) = self.remembered.take() {
             values.push(value.clone());
+            self.remembered.set(Some(values));
         }
-        self.memory.set(memory);
     }
+}
 
-    fn with_memory<R>(&self, memory: Memory<T>, f: impl FnOnce() -> R) -> (R, Memory<T>) {
-        /// Puts the old memory back, also where `f` panics.
-        struct Restore<'a, T: Scalar>(&'a Cell<Memory<T>>, Memory<T>);
-        impl<T: Scalar> Drop for Restore<'_, T> {
-            fn drop(&mut self) {
-                self.1 = self.0.replace(std::mem::take(&mut self.1));
-            }
+/// Runs `f` with a value in a cell, and gives what is in it at the end. The old value returns, also where `f` panics.
+fn with_cell<V, R>(cell: &Cell<Option<V>>, value: Option<V>, f: impl FnOnce() -> R) -> (R, Option<V>) {
+    struct Restore<'a, V>(&'a Cell<Option<V>>, Option<V>);
+    impl<V> Drop for Restore<'_, V> {
+        fn drop(&mut self) {
+            self.0.set(self.1.take());
         }
-        let restore = Restore(&self.memory, self.memory.replace(memory));
-        let result = f();
-        let memory = self.memory.take();
-        drop(restore);
-        (result, memory)
     }
+    let restore = Restore(cell, cell.replace(value));
+    let result = f();
+    let value = cell.take();
+    drop(restore);
+    (result, value)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Grads, ShapeError, Vjp};
+    use crate::{Grads, Op, ShapeError, Var, Vjp};
     use raygrad_tensor::{Shape, map};
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
@@ -195,7 +188,25 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "twice: a memo holds an output of shape [3] for it")]
+    fn passes_within_passes_remember_and_recall_their_own() {
+        let (tape, count) = (Tape::new(), Arc::default());
+        let x = tape.leaf(Tensor::from([1.0, 2.0]));
+        let ((_, inner), outer) = tape.remember(|| tape.remember(|| run(&x, &count)));
+        assert_eq!((inner.values().len(), outer.values().len()), (2, 2));
+        let (seen, again) = tape.recall(outer, || tape.remember(|| run(&x, &count)));
+        assert_eq!(
+            (seen.value(), again.values().len(), count.load(Ordering::Relaxed)),
+            (&Tensor::from([5.0, 9.0]), 2, 2)
+        );
+        // A panic leaves nothing behind.
+        let caught = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| tape.remember(|| panic!("on purpose"))));
+        assert!(caught.is_err() && tape.remember(|| ()).1.values().is_empty());
+        run(&x, &count);
+        assert_eq!(count.load(Ordering::Relaxed), 4);
+    }
+
+    #[test]
+    #[should_panic(expected = "twice: a memo holds an output of another shape for it")]
     fn a_memo_of_something_else_is_refused() {
         let (tape, count) = (Tape::new(), Arc::default());
         let (_, memo) = tape.remember(|| run(&tape.leaf(Tensor::zeros(&[3])), &count));

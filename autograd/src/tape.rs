@@ -1,6 +1,5 @@
 //! The tape: a list of operations in the order in which they ran, which is a topological order.
 
-use crate::memo::Memory;
 use crate::nodes::{CONSTANT, Node, Nodes};
 use crate::op::Kept;
 use crate::{Error, Op, ShapeError, Var};
@@ -35,8 +34,9 @@ pub struct Tape<T: Scalar> {
     differentiating: Cell<Option<&'static Location<'static>>>,
     /// While a method that is made of operations runs: the line of the user's code that called it.
     within: Cell<Option<&'static Location<'static>>>,
-    /// Outputs that are remembered or recalled.
-    pub(crate) memory: Cell<Memory<T>>,
+    /// Outputs that are remembered, and those that are recalled.
+    pub(crate) remembered: Cell<Option<Vec<Tensor<T>>>>,
+    pub(crate) recalled: Cell<Option<std::vec::IntoIter<Tensor<T>>>>,
 }
 
 impl<T: Scalar> fmt::Debug for Tape<T> {
@@ -68,7 +68,8 @@ impl<T: Scalar> Tape<T> {
             trying: Cell::new(false),
             differentiating: Cell::new(None),
             within: Cell::new(None),
-            memory: Cell::default(),
+            remembered: Cell::default(),
+            recalled: Cell::default(),
         }
     }
 
@@ -308,10 +309,12 @@ impl<T: Scalar> Tape<T> {
         inputs: &[&Var<'_, T>],
         at: &'static Location<'static>,
     ) -> Result<Tensor<T>, Error> {
-        let value = match self.recalled(op, inputs) {
+        let shape = self.check_shapes(op, inputs, at)?;
+        let value = match self.recalled(op.name(), &shape) {
             Some(value) => value,
             None => self.run(op, inputs, at)?,
         };
+        self.check_output(op.name(), inputs, &value, at)?;
         self.keep(&value);
         Ok(value)
     }

@@ -185,13 +185,17 @@ impl<'de, F: Family> Deserialize<'de> for Part<F> {
         let Some(kind) = named.as_ref().and_then(Value::as_str) else {
             return Err(D::Error::custom(format!("a {} has a field `{KIND}`: its name", F::WHAT)));
         };
+        // A copy: what is read may hold parts of its own.
         let all = F::registered().read().unwrap_or_else(PoisonError::into_inner);
-        let Some(found) = all.iter().find(|registered| registered.kind == kind) else {
-            let known: Vec<_> = all.iter().map(|registered| registered.kind).collect();
+        let all: Vec<_> = all.iter().map(|registered| (registered.kind, registered.read)).collect();
+        let Some((_, read)) = all.iter().find(|(known, _)| *known == kind) else {
+            let known: Vec<_> = all.iter().map(|(known, _)| *known).collect();
             let what = format!("there is no {} `{kind}`; known are {}", F::WHAT, known.join(", "));
-            return Err(D::Error::custom(format!("{what}, and what a program registers")));
+            let what =
+                if known.is_empty() { "nothing is registered but as part of a whole configuration" } else { &what };
+            return Err(D::Error::custom(format!("{what}; a program registers what is its own")));
         };
-        (found.read)(Value::Object(fields)).map_err(|error| D::Error::custom(format!("{} `{kind}`: {error}", F::WHAT)))
+        read(Value::Object(fields)).map_err(|error| D::Error::custom(format!("{} `{kind}`: {error}", F::WHAT)))
     }
 }
 
@@ -209,7 +213,7 @@ impl<F: Family> Registered<F> {
 }
 
 /// Makes the name of a [`Kind`] known to whatever reads configurations in this program, beside those of this crate, which
-/// [`Config`](crate::Config) knows: `register::<Fields, MyFieldConfig>()`, once, before the first is read. Who only makes configurations needs it not.
+/// [`Config`](crate::Config) knows, and whose names stay theirs: `register::<Fields, MyFieldConfig>()`, once, before the first is read. Who only makes configurations needs it not.
 pub fn register<F: Family, K: Kind<F>>() {
     F::registered().write().unwrap_or_else(PoisonError::into_inner).push(Registered::of::<K>());
 }

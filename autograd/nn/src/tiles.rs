@@ -43,7 +43,6 @@ pub const SLOTS: usize = 8;
 /// }
 /// assert!((params.get(a).item() - 3.0).abs() < 0.01 && (params.get(b).item() + 1.0).abs() < 0.01);
 /// ```
-#[derive(Default)]
 pub struct Tiles<T: Scalar, S = ()> {
     slots: Vec<Slot<T>>,
     /// What no thread is working with.
@@ -74,6 +73,12 @@ struct Slot<T: Scalar> {
 /// The list; it is whole at every point where a panic could strike.
 fn locked<S>(free: &Mutex<Vec<S>>) -> MutexGuard<'_, Vec<S>> {
     free.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl<T: Scalar, S: Default + Send> Default for Tiles<T, S> {
+    fn default() -> Self {
+        Tiles::new()
+    }
 }
 
 impl<T: Scalar, S: Default + Send> Tiles<T, S> {
@@ -127,7 +132,9 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
             for (_, other) in rest.iter().map(|slot| &slot.sums[i]).filter(|(is_set, _)| *is_set) {
                 match (&mut *sum, other) {
                     (Some(sum), Some(other)) if *is_set => add_assign(sum.as_mut_slice(), other.as_slice()),
-                    (Some(sum), Some(other)) => sum.as_mut_slice().copy_from_slice(other.as_slice()),
+                    (Some(sum), Some(other)) if sum.shape() == other.shape() => {
+                        sum.as_mut_slice().copy_from_slice(other.as_slice());
+                    }
                     (sum, other) => *sum = other.clone(),
                 }
                 *is_set = true;
@@ -254,8 +261,7 @@ mod tests {
             for (grad, expected) in grads.iter().zip(expected) {
                 let (grad, expected) = (grad.clone().into_dense(&Pool::none()), expected.into_dense(&Pool::none()));
                 let pairs = grad.as_slice().iter().zip(expected.as_slice());
-                let worst =
-                    pairs.fold(0.0, |worst: f32, (a, b)| if (a - b).abs() <= worst { worst } else { (a - b).abs() });
+                let worst = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, raygrad_tensor::Real::maximum);
                 assert!(worst <= 1e-4, "{count} tiles: {worst}");
             }
             tiles.take_back(grads);

@@ -84,18 +84,18 @@ impl Dataset {
         self.frames.iter().any(|frame| frame.image.channels == 4)
     }
 
-    /// Whether the photographs show anything of the scene's box at all.
+    /// Whether the photographs show anything of the box `bounds` at all, within which rays are sampled.
     ///
     /// # Errors
     /// If no ray of any photograph meets the box between `near` and `far`: nothing could ever be learned.
-    pub fn check_reach(&self) -> Result<()> {
+    pub fn check_reach(&self, bounds: [DVec3; 2]) -> Result<()> {
         /// Rays that are tried along each side of an image, before all.
         const RAYS: usize = 32;
         let meets = |camera: &Camera, [columns, rows]: [usize; 2]| {
             let place = |i: usize, n: usize, size: usize| (i as f64 + 0.5) / n as f64 * size as f64;
             (0..columns * rows).any(|i| {
                 let [x, y] = [place(i % columns, columns, camera.width), place(i / columns, rows, camera.height)];
-                let [enter, leave] = clip_span(&camera.ray(x, y), self.bounds, [self.near, self.far]);
+                let [enter, leave] = clip_span(&camera.ray(x, y), bounds, [self.near, self.far]);
                 enter < leave
             })
         };
@@ -104,7 +104,7 @@ impl Dataset {
         if some || self.frames.par_iter().any(|Frame { camera, .. }| meets(camera, [camera.width, camera.height])) {
             return Ok(());
         }
-        let [low, high] = self.bounds;
+        let [low, high] = bounds;
         let distances = self.frames.iter().map(|frame| frame.camera.pose.translation.distance(0.5 * (low + high)));
         let mean = distances.sum::<f64>() / self.frames.len().max(1) as f64;
         let what = format!(

@@ -48,6 +48,6 @@ impl Grid {
     /// The features at positions in scene units, `[samples, 3]` to `[samples, width]`.
     #[track_caller]
     pub fn encode<'t, T: Scalar>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.space.unit(positions), &params[self.table]])
+        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.space.cube(positions), &params[self.table]])
     }
 }

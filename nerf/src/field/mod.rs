@@ -17,6 +17,9 @@ use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::sync::{Arc, RwLock};
 
+/// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
+pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
+
 /// What a field says of positions alone.
 pub struct Density<'t, T: Scalar> {
     /// Density per scene unit, at least 0, or its natural logarithm, `[samples]`.
@@ -28,10 +31,10 @@ pub struct Density<'t, T: Scalar> {
 }
 
 impl<'t, T: Scalar> Density<'t, T> {
-    /// Density per scene unit, `[samples]`.
+    /// Density per scene unit, `[samples]`; a logarithm counts as at most 80.
     #[track_caller]
     pub fn sigma(&self) -> Var<'t, T> {
-        if self.log { self.value.exp() } else { self.value.clone() }
+        if self.log { self.value.minimum(MOST_LOG_DENSITY).exp() } else { self.value.clone() }
     }
 }
 
@@ -53,7 +56,9 @@ pub struct Seen<'a, 't, T: Scalar> {
 /// A field of one's own implements this and, for its configuration, [`Kind<Fields>`](crate::Kind); with
 /// [`register`](crate::kind::register) it is trained, rendered, saved and loaded like those of this crate.
 pub trait Field<T: Scalar>: Any + Send + Sync {
-    /// The density at `positions` `[samples, 3]`, in scene units.
+    /// The density at `positions` `[samples, 3]`, in scene units. What it says of one position must not depend on the
+    /// others: training asks of many and goes on with some, and takes the outputs of operations that
+    /// [are kept](raygrad_autograd::Op::is_kept), row by row, from the first time (if they have a row for each position).
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T>;
 
     /// Colour `[samples, 3]` in 0..=1, for the features that [`density`](Self::density) gave, some rows of them or all.

@@ -25,6 +25,10 @@ pub struct Outputs<'a, 't, T: Scalar> {
     pub rays: &'a Rays<T>,
     /// The number of the photograph of each ray.
     pub frames: &'a [u32],
+    /// Column and row of its pixel.
+    pub pixels: &'a [[u32; 2]],
+    /// How much of the run is done, 0 to 1.
+    pub fraction: f64,
     /// What is seen of the field, with a name for everything.
     pub rendered: &'a Rendered<'t, T>,
     /// What the photographs show, `[rays, 3]`, over the background where they have alpha.

@@ -76,7 +76,7 @@ impl<T: Scalar> Term<T> for EntropyConfig {
         // With x the optical depth, ln(1 - o) = -x: exact where the ray is opaque, and o keeps its digits where it is thin.
         let (opacity, x) = (seen.rendered.opacity(), &seen.rendered.optical_depth);
         let met = &opacity * opacity.maximum(1e-20).ln();
-        let left = seen.rendered.transmittance() * x;
+        let left = seen.rendered.transmittance() * x.minimum(1e3);
         (left - met).sum() * self.weight
     }
 }
@@ -137,8 +137,9 @@ mod tests {
         let query = Query { slopes: term.reads_normals(), ..Query::new(&Slope, &bound) };
         let rendered = &Plan { samples, intervals: None }.render(&query);
         let nothing = &Tensor::zeros(&[2, 3]);
-        let (rays, frames) = (&rays, &[0, 0][..]);
-        term.loss(&Outputs { params: &bound, rays, frames, rendered, target: nothing, background: nothing })
+        let (params, rays, frames, pixels) = (&bound, &rays, &[0, 0][..], &[[0, 0]; 2][..]);
+        let (target, background) = (nothing, nothing);
+        term.loss(&Outputs { params, rays, frames, pixels, fraction: 0.5, rendered, target, background })
     }
 
     fn at(term: &dyn Term<f64>, much: f64, steep: f64) -> f64 {

@@ -3,13 +3,14 @@
 use crate::dataset::background::Background;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
-use crate::losses::TermConfig;
 use crate::losses::photometric::Loss;
+use crate::losses::{DistortionConfig, TermConfig};
 use crate::range::check_range;
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
 use crate::space::occupancy::Skip;
+use crate::volume::quadrature::Quadrature;
 use crate::{Error, Result};
 use raygrad_nn::{AdamConfig, Schedule, Storage};
 use serde::{Deserialize, Serialize};
@@ -70,10 +71,6 @@ pub struct GroupConfig {
     pub decay: f64,
 }
 
-fn is_false(value: &bool) -> bool {
-    !value
-}
-
 /// A model and how it is trained. It is stored with the model, so that a run can be read back.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -85,15 +82,15 @@ pub struct Config {
     #[serde(deserialize_with = "super::known::read")]
     pub sampler: SamplerConfig,
     /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), and rays are
-    /// sampled as far as the sampler goes: marching, up to the outermost of the [cascades](OccupancyConfig::cascades) of its
+    /// sampled as far as the sampler goes: marching, up to the outermost of the [cascades](crate::space::occupancy::OccupancyConfig::cascades) of its
     /// grid; others, over the whole span.
-    #[serde(default, skip_serializing_if = "is_false")]
+    #[serde(default)]
     pub unbounded: bool,
     /// What is minimised.
     #[serde(default)]
     pub loss: Loss,
     /// What is minimised beside it.
-    #[serde(default, deserialize_with = "super::known::read_terms", skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, deserialize_with = "super::known::read_terms")]
     pub terms: Vec<TermConfig>,
     /// Learning rate over the run.
     pub schedule: Schedule,
@@ -102,7 +99,7 @@ pub struct Config {
     /// The optimiser's constants for the rows of a table.
     pub table_adam: AdamConfig,
     /// Parameters that are moved in a way of their own; all others as the fields above say.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[serde(default)]
     pub groups: Vec<GroupConfig>,
     /// What photographs with alpha are composited over.
     pub background: Background,
@@ -236,6 +233,12 @@ impl Config {
                 );
                 return Err(Error::setting("occupancy.cascades", what));
             }
+        }
+        let rule = self.sampler.get::<MarchingConfig>().map(|marching| marching.quadrature);
+        let one_node = matches!(rule, None | Some(Quadrature::Midpoint | Quadrature::Left));
+        if !one_node && self.terms.iter().any(|term| term.get::<DistortionConfig>().is_some()) {
+            let what = "needs samples that stand for an interval each: use the quadrature midpoint or left";
+            return Err(Error::setting("terms.distortion", what));
         }
         self.terms.iter().try_for_each(TermConfig::check)?;
         self.field.check()?;

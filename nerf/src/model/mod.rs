@@ -188,10 +188,12 @@ impl Model<f32> {
         densities(&*self.field, &self.params, &Pool::new(), points, out);
     }
 
-    /// Chooses what views leave out from now on. A model without an occupancy grid leaves out what it has to.
+    /// Chooses what views leave out from now on; what training has left out stays so. A model without an occupancy grid leaves out what it has to.
     pub fn set_skip(&mut self, skip: impl Into<Skipping>) {
         if let Some(marching) = self.marching_mut() {
-            marching.config.occupancy.skip = skip.into();
+            // What training left out cannot be put back.
+            let Skipping { grid, carving, .. } = marching.config.occupancy.skip;
+            marching.config.occupancy.skip = Skipping { grid, carving, ..skip.into() };
             self.finish();
         }
     }

@@ -21,7 +21,7 @@ use std::sync::{Mutex, PoisonError};
 
 /// Numbers of a [`Marching`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, default)]
 pub struct MarchingConfig {
     /// The occupancy grid, and what may be skipped with it.
     pub occupancy: OccupancyConfig,
@@ -230,7 +230,8 @@ impl<T: Scalar> Sampler<T> for Marching {
             return false;
         }
         let plan = if step < WARM_UP { Update::ALL } else { Update::PARTIAL };
-        self.grid.update(&plan, seed, step, densities);
+        // Updates are counted, not steps: so every cell has its turn.
+        self.grid.update(&plan, seed, step / GRID_EVERY, densities);
         let min_sigma = TRAINING_DEPTH / self.step();
         self.grid.threshold(&Threshold { min_sigma, or_mean: true, dilate: false });
         true

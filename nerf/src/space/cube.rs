@@ -60,7 +60,7 @@ impl Space {
     /// Positions `[samples, 3]` in scene units as positions in the unit cube. In a bounded space the box's lower corner is
     /// the origin and its longest side has length 1; what lies outside of the box lies outside of the cube.
     #[track_caller]
-    pub fn unit<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
+    pub fn cube<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
         let row = |x: DVec3| positions.tape().constant(Tensor::from_vec(&[3], x.to_array().map(T::from_f64).to_vec()));
         let [low, high] = self.bounds;
         if !self.unbounded {
@@ -76,7 +76,7 @@ impl Space {
     #[track_caller]
     pub fn centred<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
         if self.unbounded {
-            return self.unit(positions) * 2.0 - 1.0;
+            return self.cube(positions) * 2.0 - 1.0;
         }
         let centre = (0.5 * (self.bounds[0] + self.bounds[1])).to_array().map(T::from_f64);
         (positions - positions.tape().constant(Tensor::from_vec(&[3], centre.to_vec()))) * (2.0 / self.side())
@@ -95,11 +95,11 @@ mod tests {
         let points = [[-1.0, 0.0, 2.0], [3.0, 2.0, 4.0], [1.0, 1.0, 3.0], [1.0, 1.0, 1e9], [1.0, 1.5, 3.0]];
         let points = tape.constant(Tensor::from(points));
         let within = Space::within(bounds);
-        let unit = within.unit(&points);
+        let unit = within.cube(&points);
         assert_eq!(&unit.value().as_slice()[..9], [0.0, 0.0, 0.0, 1.0, 0.5, 0.5, 0.5, 0.25, 0.25]);
         let centred = within.centred(&points);
         assert_eq!(&centred.value().as_slice()[..9], [-1.0, -0.5, -0.5, 1.0, 0.5, 0.5, 0.0, 0.0, 0.0]);
-        let all = Space { unbounded: true, ..within }.unit(&points);
+        let all = Space { unbounded: true, ..within }.cube(&points);
         let far = &all.value().as_slice()[6..];
         assert!(far[..3] == [0.5; 3] && far[3..5] == [0.5; 2] && (far[5] - 1.0).abs() < 1e-4, "{far:?}");
         assert!((far[7] - 0.625).abs() < 1e-12, "half a unit of the ball of radius 1 is an eighth: {far:?}");

@@ -1,6 +1,7 @@
 //! Groups of parameters, each with an optimiser, a schedule and a decay of its own.
 
 use crate::model::config::{Config, GroupConfig};
+use crate::{Error, Result};
 use raygrad_autograd::Gradient;
 use raygrad_nn::{AdamW, Optimizer, Params, Schedule, UpdateReport};
 
@@ -18,7 +19,10 @@ pub(crate) struct Groups(Vec<Group>);
 
 impl Groups {
     /// Groups of these parameters that have seen nothing.
-    pub fn new(config: &Config, params: &Params<f32>) -> Self {
+    ///
+    /// # Errors
+    /// If a group of the configuration has no parameter.
+    pub fn new(config: &Config, params: &Params<f32>) -> Result<Self> {
         let rest = |adam| GroupConfig { params: String::new(), adam, schedule: config.schedule, decay: 0.0 };
         let settings: Vec<_> =
             config.groups.iter().cloned().chain([rest(config.table_adam), rest(config.adam)]).collect();
@@ -33,7 +37,13 @@ impl Groups {
             adam: AdamW::new(adam, decay),
             schedule,
         };
-        Groups(settings.into_iter().enumerate().map(group).filter(|group| group.members.contains(&true)).collect())
+        if let Some(empty) = (0..named).find(|i| !places.contains(i)) {
+            let names: Vec<&str> = params.names().collect();
+            let what = format!("no parameter begins so that is in no group before it; there are {}", names.join(", "));
+            return Err(Error::setting(format!("groups.{}", config.groups[empty].params), what));
+        }
+        let groups = settings.into_iter().enumerate().map(group).filter(|group| group.members.contains(&true));
+        Ok(Groups(groups.collect()))
     }
 
     /// Steps taken.
@@ -84,7 +94,7 @@ mod tests {
         }
         params.set_lazy(|name| name == "field.table", true);
         params.freeze(|name| name == "field.density");
-        let mut groups = Groups::new(&config, &params);
+        let mut groups = Groups::new(&config, &params).unwrap();
         let grads: Vec<_> = (0..3).map(|_| Gradient::from(Tensor::full(&[2, 2], 3.0))).collect();
         let report = groups.update(&mut params, &grads, 0.0);
         assert_eq!((report.moved, report.skipped, groups.steps()), (12, 0, 1));
@@ -93,5 +103,29 @@ mod tests {
         for (found, expected) in moved.iter().zip([0.9, 1.0 * (1.0 - 0.2 * 0.5) - 0.2, 0.999, 1.0]) {
             assert!((found - expected).abs() < 1e-6, "{moved:?}");
         }
+        // The first group that fits counts; one that fits nothing is an error.
+        config.groups = vec![group("field.", 0.5, 0.0), group("field.color", 0.2, 0.0)];
+        let error = Groups::new(&config, &params).err().unwrap().to_string();
+        assert!(error.starts_with("`groups.field.color`") && error.contains("pose.3"), "{error}");
+    }
+
+    #[test]
+    fn tables_and_networks_have_their_own_constants() {
+        // With a beta1 of 0 the second step forgets the first gradient; with .9 it does not.
+        let mut config = Config::preset(Preset::Instant);
+        config.schedule = Schedule::Constant { rate: 0.1 };
+        config.table_adam = AdamConfig { beta1: 0.0, ..AdamConfig::default() };
+        config.adam = AdamConfig { beta1: 0.9, ..AdamConfig::default() };
+        let mut params = Params::new();
+        params.add("table", Tensor::full(&[1, 1], 0.0_f32));
+        params.add("weight", Tensor::full(&[1, 1], 0.0_f32));
+        params.set_lazy(|name| name == "table", true);
+        let mut groups = Groups::new(&config, &params).unwrap();
+        for g in [1.0, -1.0] {
+            let grads: Vec<_> = (0..2).map(|_| Gradient::from(Tensor::full(&[1, 1], g))).collect();
+            assert_eq!(groups.update(&mut params, &grads, 0.0).moved, 2);
+        }
+        let [table, weight] = [0, 1].map(|i| params.values()[i].item());
+        assert!(table.abs() < 1e-6 && weight < -0.05, "{table} {weight}");
     }
 }

@@ -52,6 +52,7 @@ pub(crate) fn rays_loss<'t>(
     model: &Model<f32>,
     params: &Bound<'t, f32>,
     batch: &Batch,
+    fraction: f64,
     jitter: &mut Jitter<'_>,
 ) -> (Var<'t, f32>, Work) {
     let (tape, sampler) = (params.tape(), &*model.sampler);
@@ -71,8 +72,9 @@ pub(crate) fn rays_loss<'t>(
     let coarse = coarse.iter().map(|seen| model.config.loss.sum(&seen.over(&background), &target));
     let weights = rendered.weights.value();
     let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
-    let (rays, frames) = (&batch.rays, &batch.frames[..]);
-    let seen = Outputs { params, rays, frames, rendered: &rendered, target: &target, background: &background };
+    let (rays, frames, pixels) = (&batch.rays, &batch.frames[..], &batch.pixels[..]);
+    let (rendered, target, background) = (&rendered, &target, &background);
+    let seen = Outputs { params, rays, frames, pixels, fraction, rendered, target, background };
     let terms = model.terms.iter().map(|term| term.loss(&seen));
     let loss = coarse.chain(levels).chain(terms).fold(fine, |sum, term| term + sum);
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());

@@ -65,11 +65,11 @@ impl Trainer {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
-        data.check_reach()?;
         let extent = Extent::new(data.bounds, [data.near, data.far]);
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
+        data.check_reach(model.reach())?;
         let mut trainer = Trainer {
-            groups: Groups::new(&model.config, &model.params),
+            groups: Groups::new(&model.config, &model.params)?,
             tiles: Tiles::new(),
             pool: Pool::new(),
             batch: match model.sampler.load() {
@@ -132,7 +132,8 @@ impl Trainer {
         let number = self.done.step + 1;
         // A restart draws other rays too.
         let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
-        self.update_sampler(&Progress { step: number, fraction, seed });
+        // Of a model that began again, from its own beginning.
+        self.update_sampler(&Progress { step: self.groups.steps() + 1, fraction, seed });
         let tile = match self.model.sampler.load() {
             Load::Rays { tile, .. } => tile,
             // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
@@ -143,7 +144,7 @@ impl Trainer {
             let rng = &mut stream(seed, [number, which as u64]);
             let count = tile.min(total - which * tile);
             let batch = Batch::draw(data, count, bounds, model.config.background, rng);
-            let (loss, work) = rays_loss(model, params, &batch, &mut Jitter::Random(rng));
+            let (loss, work) = rays_loss(model, params, &batch, fraction, &mut Jitter::Random(rng));
             (loss * (1.0 / (3.0 * total as f64)), work)
         });
         let report = self.groups.update(&mut self.model.params, &step.grads, fraction);
@@ -212,7 +213,9 @@ impl Trainer {
             self.model = model;
         }
         self.prepare();
-        self.groups = Groups::new(&self.model.config, &self.model.params);
+        if let Ok(groups) = Groups::new(&self.model.config, &self.model.params) {
+            self.groups = groups;
+        }
     }
 }
 
@@ -244,7 +247,7 @@ mod tests {
         // Near enough, and looking away.
         data.frames.drain(..2);
         data.frames[0].camera.pose.matrix3 = -data.frames[0].camera.pose.matrix3;
-        assert!(data.check_reach().is_err());
+        assert!(data.check_reach(data.bounds).is_err());
     }
 
     #[test]

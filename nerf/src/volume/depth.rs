@@ -1,5 +1,6 @@
 //! Optical depths: how much each interval of a ray dims the light.
 
+use crate::field::MOST_LOG_DENSITY;
 use crate::{Error, Result};
 #[cfg(feature = "check")]
 use raygrad_autograd::check::Entry;
@@ -16,9 +17,6 @@ pub struct OpticalDepth<T: Scalar> {
     delta: Tensor<T>,
     log_density: bool,
 }
-
-/// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
-pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
 
 impl<T: Scalar> OpticalDepth<T> {
     /// For densities of samples that stand for intervals of length `delta` `[samples]`. The operation panics where a
@@ -93,7 +91,11 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
                 [x[0], &self.delta],
                 pool,
                 #[inline(always)]
-                |[z, delta]| (if z > most { most } else { z }).exp() * delta,
+                // Not the product alone, which is NaN for 0 times infinity.
+                |[z, delta]| {
+                    let sigma = (if z > most { most } else { z }).exp();
+                    if sigma == T::ZERO { T::ZERO } else { sigma * delta }
+                },
             )
         } else {
             map(
@@ -112,13 +114,26 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let slope = if self.log_density { cx.output() } else { &self.delta };
-        let grad = map(
-            [cx.g().value(), slope],
-            cx.pool(),
-            #[inline(always)]
-            |[g, slope]| if slope.is_finite() { g * slope } else { T::ZERO },
-        );
+        let (g, most) = (cx.g().value(), T::from_f64(MOST_LOG_DENSITY));
+        let grad = if self.log_density {
+            map(
+                [g, cx.input(0), cx.output(), &self.delta],
+                cx.pool(),
+                #[inline(always)]
+                // An infinite depth blocks everything; NaN passes through.
+                |[g, z, x, delta]| {
+                    let infinite = !delta.is_finite() || (!x.is_finite() && x == x);
+                    if infinite || z > most { T::ZERO } else { g * x }
+                },
+            )
+        } else {
+            map(
+                [g, &self.delta],
+                cx.pool(),
+                #[inline(always)]
+                |[g, delta]| if delta.is_finite() { g * delta } else { T::ZERO },
+            )
+        };
         Grads::one(cx.constant(grad))
     }
 
@@ -127,7 +142,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
     }
 
     fn reference<'t>(&self, x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
-        let sigma = if self.log_density { x[0].exp() } else { x[0].clone() };
+        let sigma = if self.log_density { x[0].minimum(MOST_LOG_DENSITY).exp() } else { x[0].clone() };
         let constant = |f: &dyn Fn(T, T) -> T| {
             let pairs = self.delta.as_slice().iter().zip(sigma.value().as_slice());
             let values = pairs.map(|(&delta, &sigma)| f(delta, sigma)).collect();
@@ -155,4 +170,33 @@ pub(crate) fn entries() -> Vec<Entry> {
         Entry::of(OpticalDepth::<f64>::new(Tensor::zeros(&[0])), OpticalDepth::<f32>::new(Tensor::zeros(&[0])))
             .sample(&[&[0]]),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_autograd::Tape;
+
+    #[test]
+    fn logarithms_have_an_upper_end_and_infinite_intervals_a_lower_one() {
+        let depth = |z: f32, delta: f32| {
+            let tape = Tape::new();
+            let z = tape.leaf(Tensor::from([z]));
+            let x = tape.apply(OpticalDepth::of_log_density(Tensor::from([delta])), &[&z]);
+            (x.item(), x.sum().grad(&[&z])[0].item())
+        };
+        assert_eq!(depth(-200.0, f32::INFINITY), (0.0, 0.0), "no density, however far");
+        assert_eq!(depth(0.0, f32::INFINITY), (f32::INFINITY, 0.0));
+        assert_eq!(depth(100.0, 0.0), (0.0, 0.0));
+        assert_eq!(depth(31.6, 7.3e25), (f32::INFINITY, 0.0), "a product that overflows");
+        assert_eq!(depth(100.0, 1.0), (80.0_f32.exp(), 0.0), "beyond the end nothing changes");
+        let (x, slope) = depth(f32::NAN, 1.0);
+        assert!(x.is_nan() && slope.is_nan(), "a NaN passes through");
+        // What is recorded once more is the same function.
+        let tape = Tape::new();
+        let z = tape.leaf(Tensor::from([100.0_f32, 2.0]));
+        let x = tape.apply(OpticalDepth::of_log_density(Tensor::from([0.0, 0.5])), &[&z]);
+        let first = x.sum().grad_graph(&[&z]).remove(0);
+        assert_eq!(first.value().as_slice(), [0.0, 2.0_f32.exp() * 0.5]);
+    }
 }

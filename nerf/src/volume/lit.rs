@@ -49,10 +49,12 @@ impl Quadrature {
                 });
                 let (lit, rows) = plan.lit(intervals, &transmittance, T::from_f64(termination), pool);
                 let rows: Vec<[u32; 2]> = rows.into_iter().map(|row| [0, row]).collect();
-                (lit, Memo::gather(&[memo], &rows, pool), plan.len())
+                (lit, gathered(vec![memo], &rows, &[plan.len()], pool), plan.len())
             }
         };
         let positions = query.positions(&lit.samples);
+        // Rays that are variables may be other rays than those that were marched.
+        let memo = if query.rays.is_some() { Memo::gather(&[], &[], pool) } else { memo };
         let density = tape.recall(memo, || query.field.density(query.params, &positions));
         Lit { kept: lit.len(), rendered: lit.render_density(query, positions, density), asked }
     }
@@ -77,7 +79,7 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
     let mut depths = vec![0.0; ranges.len()];
     let mut alive: Vec<usize> = (0..ranges.len()).collect();
     // Of what is found: the number of the sample, and its place among what was asked.
-    let (mut found, mut memos) = (Vec::<(u32, [u32; 2])>::new(), vec![]);
+    let (mut found, mut memos, mut sizes) = (Vec::<(u32, [u32; 2])>::new(), vec![], vec![]);
     let (mut done, mut size, mut asked) = (0, FIRST_ROUND, 0);
     loop {
         alive.retain(|&ray| ranges[ray].len() > done && depths[ray] < opaque);
@@ -101,10 +103,20 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
             }
         }
         asked += part.len();
+        sizes.push(part.len());
         memos.push(memo);
         (done, size) = (done + size, 2 * size);
     }
     found.sort_unstable_by_key(|(sample, _)| *sample);
     let (rows, places): (Vec<u32>, Vec<[u32; 2]>) = found.into_iter().unzip();
-    Visible { rows, memo: Memo::gather(&memos, &places, pool), asked }
+    Visible { rows, memo: gathered(memos, &places, &sizes, pool), asked }
+}
+
+/// Rows of what was dear to work out for so many samples at a time; nothing if it has other rows than samples.
+fn gathered<T: Scalar>(memos: Vec<Memo<T>>, rows: &[[u32; 2]], sizes: &[usize], pool: &Pool<T>) -> Memo<T> {
+    let fits = |(memo, size): (&Memo<T>, &usize)| memo.values().iter().all(|value| value.shape().first() == Some(size));
+    match memos.iter().zip(sizes).all(fits) {
+        true => Memo::gather(&memos, rows, pool),
+        false => Memo::gather(&[], &[], pool),
+    }
 }

@@ -145,7 +145,8 @@ impl<'t, T: Scalar> Rendered<'t, T> {
     /// If positions are not on the tape: see [`Query::slopes`](super::Query::slopes).
     #[track_caller]
     pub fn normals(&self) -> Var<'t, T> {
-        let slopes = self.density.sigma().sum().grad_graph(&[&self.positions]).remove(0);
+        // The logarithm falls in the same direction, and does not overflow.
+        let slopes = self.density.value.sum().grad_graph(&[&self.positions]).remove(0);
         // In units of the largest, so that no square overflows.
         let largest = slopes.value().as_slice().chunks_exact(3);
         let least = T::from_f64(1e-30);

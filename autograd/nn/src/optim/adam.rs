@@ -167,14 +167,17 @@ impl<T: Scalar> Adam<T> {
             *memory = Memory::Rows(Box::new(Table { adam, sums: vec![] }));
         }
         let Memory::Rows(table) = memory else { panic!("`{}` was not lazy until now", part.name) };
-        let (shares, sizes) = part.row_parts();
+        let (shares, parts) = part.row_parts();
+        let (in_parts, sizes) = (parts.is_some(), parts.unwrap_or_else(|| vec![rows]));
         if !table.sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
             table.sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
         }
         // A gradient that does not consist of rows is added up first: then all its rows are there.
         let dense = shares.is_none().then(|| part.dense_grad(&self.pool));
         let fill = |i: usize, sums: &mut RowSums<T>| {
-            shares.iter().flatten().for_each(|share| share.scatter_part(i, sums));
+            for share in shares.iter().flatten() {
+                if in_parts { share.scatter_part(i, sums) } else { share.scatter(sums) }
+            }
             if let Some(dense) = &dense {
                 dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
             }

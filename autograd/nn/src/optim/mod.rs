@@ -60,16 +60,17 @@ impl<'a, T: Scalar> Move<'a, T> {
         [shape.first().copied().unwrap_or(1), shape.iter().skip(1).product()]
     }
 
-    /// The shares of a gradient that consists of rows, and the parts in which its rows can be added up by themselves. All
-    /// rows are one part where shares disagree, or where there are others.
-    fn row_parts(&self) -> (Option<Vec<&'a dyn RowShare<T>>>, Vec<usize>) {
+    /// The shares of a gradient that consists of rows, and the rows of the parts that can be added up by themselves; `None`
+    /// where shares disagree on these, or where there are others.
+    #[allow(clippy::type_complexity)]
+    fn row_parts(&self) -> (Option<Vec<&'a dyn RowShare<T>>>, Option<Vec<usize>>) {
         let [rows, _] = self.table();
         let shares: Option<Vec<_>> = self.grad.sparse().iter().map(|share| share.as_rows()).collect();
         let shares = shares.filter(|_| self.grad.dense().is_none());
         let mut parts = shares.iter().flatten().map(|share| share.parts());
         let first = parts.next().unwrap_or_default();
         let agreed = first.iter().sum::<usize>() == rows && parts.all(|other| other == first);
-        (shares, if agreed { first } else { vec![rows] })
+        (shares, agreed.then_some(first))
     }
 
     /// The sums of the gradient's rows, which are made at the first step. A gradient that does not consist of rows is
