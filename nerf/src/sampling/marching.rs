@@ -317,6 +317,27 @@ mod tests {
     use glam::DVec3;
 
     #[test]
+    fn every_cell_has_its_turn_after_the_warm_up_too() {
+        let occupancy = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
+        let grid = OccupancyGrid::new([DVec3::ZERO, DVec3::ONE], &occupancy).unwrap();
+        let mut sampler: Box<dyn Sampler<f32>> =
+            Box::new(Marching::new(MarchingConfig { occupancy, ..Default::default() }, grid));
+        let seen = Mutex::new(std::collections::HashSet::new());
+        let look = |points: &[[f32; 3]], out: &mut [f32]| {
+            out.fill(0.0);
+            seen.lock().unwrap().extend(points.iter().map(|point| point.map(|x| (x * 16.0) as u32)));
+        };
+        for step in 1..=WARM_UP + 16 * GRID_EVERY + 1 {
+            if step == WARM_UP {
+                assert_eq!(seen.lock().unwrap().len(), 4096, "all in the warm-up");
+                seen.lock().unwrap().clear();
+            }
+            sampler.update(&Progress { step, fraction: 0.0, seed: 1 }, &look);
+        }
+        assert_eq!(seen.lock().unwrap().len(), 4096, "one in sixteen each time, and another one each time");
+    }
+
+    #[test]
     fn steps_shrink_evenly_from_the_first_to_the_last() {
         let config = MarchingConfig { step: 0.01, last_step: Some(0.0025), ..MarchingConfig::default() };
         let grid = OccupancyGrid::new([DVec3::ZERO, DVec3::new(1.0, 4.0, 2.0)], &config.occupancy).unwrap();

@@ -122,7 +122,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
                 #[inline(always)]
                 // An infinite depth blocks everything; NaN passes through.
                 |[g, z, x, delta]| {
-                    let infinite = !delta.is_finite() || (!x.is_finite() && x == x);
+                    let infinite = !delta.is_finite() || (x > T::ZERO && !x.is_finite());
                     if infinite || z > most { T::ZERO } else { g * x }
                 },
             )
