@@ -13,7 +13,7 @@ use std::any::Any;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// What can be chosen: fields, or samplers.
+/// What can be chosen: fields, samplers, or terms of the loss.
 pub trait Family: Sized + 'static {
     /// What one of them is called in messages.
     const WHAT: &'static str;

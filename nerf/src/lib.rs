@@ -1,8 +1,9 @@
 //! Neural radiance fields on the [`raygrad_autograd`] tape. This crate knows no command line.
 //!
 //! There is a room for each stage that data passes, and each knows only those before it:
-//! [`camera`] → [`dataset`] → [`encoding`] → [`space`] → [`field`] → [`volume`] → [`sampling`] → [`model`] → [`rendering`]
-//! → [`training`]; [`pictures`] and [`analytic`] stand beside them. Each stage can be used alone.
+//! [`camera`] → [`dataset`] → [`encoding`] → [`space`] → [`field`] → [`volume`] → [`sampling`] → [`losses`] →
+//! [`model`] → [`rendering`] → [`training`]; [`pictures`] and [`analytic`] stand beside them, and [`kind`] is how a field, a
+//! sampler or a term of the loss of one's own comes in. Each stage can be used alone.
 
 pub mod analytic;
 pub mod camera;

@@ -50,7 +50,7 @@ pub struct Args {
     /// Train at 1/K of the images' size
     #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
-    /// What lies behind transparent images: white, black or random [default: random for instant and voxel, else white]
+    /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]

@@ -18,8 +18,8 @@ pub enum Background {
     White,
     /// Black.
     Black,
-    /// While training, a colour drawn anew for each ray, so that no density can pose as background; it needs images
-    /// with alpha. White when images are shown or measured.
+    /// While training, a colour drawn anew for each ray, so that no density can pose as background: with images that
+    /// have alpha, or that are opaque throughout. White when images are shown or measured.
     Random,
 }
 
