@@ -51,7 +51,7 @@ const GAUSS: f64 = 0.288_675_134_594_812_9;
 
 impl Quadrature {
     /// The plan for steps along rays, each sample being the middle of an interval of length `delta`. An adaptive rule
-    /// begins with this one; see [`refine`].
+    /// begins with this one; see [`refine`](super::refine).
     pub fn plan<T: Scalar>(self, steps: &Samples<T>, pool: &Pool<T>) -> Plan<T> {
         if self == Quadrature::Midpoint {
             return Plan { samples: steps.clone(), intervals: None };

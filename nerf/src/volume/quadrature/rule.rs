@@ -22,7 +22,7 @@ pub enum Quadrature {
     /// the near colour).
     PiecewiseLinear,
     /// Two evaluations in each interval, at the nodes of Gauss's rule; colour linear in optical depth
-    /// ([`gauss_share`]).
+    /// ([`gauss_share`](super::gauss_share)).
     Gauss2,
     /// As [`PiecewiseLinear`](Self::PiecewiseLinear), with intervals halved until halving changes the pixel by less than
     /// `tolerance` each. Colours are evaluated in every round.
