@@ -126,3 +126,25 @@ pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
     let mut wanted = (0..count).map(|i| i * n / count).peekable();
     items.into_iter().enumerate().filter(|(i, _)| wanted.next_if_eq(i).is_some()).map(|(_, item)| item).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::embedded;
+
+    #[test]
+    fn a_small_box_anywhere_in_the_picture_is_found_and_one_beside_it_is_not() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(1);
+        let pose = Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y);
+        data.frames[0].camera = Camera::from_angle(75, 50, 0.8, pose);
+        let found = |x: f64, y: f64| {
+            let middle = DVec3::new(x, y, 0.0);
+            data.check_reach([middle - 0.03, middle + 0.03]).is_ok()
+        };
+        for (x, y) in [(0.0, 0.0), (1.5, 0.3), (-1.5, 0.9), (0.4, -1.0), (1.55, -1.05), (-0.2, 1.05)] {
+            assert!(found(x, y), "{x} {y}");
+        }
+        assert!(!found(1.9, 0.0) && !found(0.0, 1.4) && !found(-1.9, -1.3));
+    }
+}

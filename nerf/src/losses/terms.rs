@@ -158,6 +158,9 @@ mod tests {
         }
         // A thin fog is spread over the span, a thick one stands at its front.
         assert!(at(terms[0], 0.0, 0.0) > 2.0 * at(terms[0], 6.0, 0.0));
+        assert!((at(terms[0], 0.5, 0.2) - 2.0 * at(&DistortionConfig { weight: 1.0 }, 0.5, 0.2)).abs() < 1e-12);
+        // A wall in the first of five bins has its own length alone, a third of a fifth of the span, for both rays.
+        assert!((at(terms[0], 9.0, 0.0) - 2.0 * 2.0 / 15.0).abs() < 1e-6, "{}", at(terms[0], 9.0, 0.0));
         // Nothing and a wall have no entropy; at an opacity of a half each ray has ln 2, in halves of it.
         assert!(at(terms[1], -60.0, 0.0).abs() < 1e-12 && at(terms[1], 9.0, 0.0).abs() < 1e-12);
         let half = (2.0_f64.ln() / 1.5).ln();

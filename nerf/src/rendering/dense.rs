@@ -123,6 +123,11 @@ mod tests {
         let picture = exact.picture();
         let differences = view.color.data.iter().zip(&picture.color.data).map(|(a, b)| (a - b).abs());
         assert!(differences.fold(0.0, Real::maximum) <= 1e-5, "the view that leaves out nothing is the same");
+        let depths = |one: &Picture, other: &Picture| {
+            let pairs = one.depth.data.iter().zip(&other.depth.data).map(|(a, b)| (a - b).abs());
+            pairs.fold(0.0, Real::maximum)
+        };
+        assert!(depths(&view, &picture) <= 1e-4 && picture.depth.data.iter().any(|&t| t > 3.0), "and so are distances");
         assert!(
             picture.opacity.data.iter().any(|&x| x > 0.5) && exact.pixels != double.dense_view(camera, black, 1).pixels
         );
@@ -146,6 +151,11 @@ mod tests {
             let worst = differences.fold(0.0, Real::maximum);
             println!("{rule:16} {worst:.1e} {:?}", seen.evaluations);
             assert!(worst <= 1e-2 && seen.evaluations.density > 0, "{rule}: {worst}");
+            // Distances where most of the light is blocked.
+            let solid = (0..seen.depth.data.len()).filter(|&i| reference.opacity.data[i] > 0.5);
+            let far = solid.map(|i| (seen.depth.data[i] - reference.depth.data[i]).abs());
+            let (count, worst) = far.fold((0, 0.0), |(n, worst), x| (n + 1, Real::maximum(worst, x)));
+            assert!(count > 20 && worst <= 0.05, "{rule}: distances of {count} pixels are {worst} off");
         }
     }
 }
