@@ -186,8 +186,8 @@ impl<'de, F: Family> Deserialize<'de> for Part<F> {
             return Err(D::Error::custom(format!("a {} has a field `{KIND}`: its name", F::WHAT)));
         };
         // A copy: what is read may hold parts of its own.
-        let all = F::registered().read().unwrap_or_else(PoisonError::into_inner);
-        let all: Vec<_> = all.iter().map(|registered| (registered.kind, registered.read)).collect();
+        let copy = |registered: &Registered<F>| (registered.kind, registered.read);
+        let all: Vec<_> = F::registered().read().unwrap_or_else(PoisonError::into_inner).iter().map(copy).collect();
         let Some((_, read)) = all.iter().find(|(known, _)| *known == kind) else {
             let known: Vec<_> = all.iter().map(|(known, _)| *known).collect();
             let what = format!("there is no {} `{kind}`; known are {}", F::WHAT, known.join(", "));
