@@ -37,7 +37,7 @@ impl Kind<Fields> for SirenConfig {
     const KIND: &'static str = "siren";
 
     fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
-        let Site { space, params, name, rng } = site;
+        let Site { space, params, name, rng, .. } = site;
         let mut layers = vec![Sine::new(params, &format!("{name}.0"), [3, self.width], self.frequency, true, rng)];
         for i in 1..self.depth {
             layers.push(Sine::new(params, &format!("{name}.{i}"), [self.width; 2], 1.0, false, rng));

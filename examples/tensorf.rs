@@ -36,7 +36,7 @@ impl Kind<Fields> for TensorFConfig {
     const KIND: &'static str = "tensorf";
 
     fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
-        let Site { space, params, name, rng } = site;
+        let Site { space, params, name, rng, .. } = site;
         let (n, [density, color], direction) = (self.resolution, self.components, SphericalHarmonics::new(3));
         let factors = |axis: usize| {
             let channels = density + color;

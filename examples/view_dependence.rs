@@ -72,7 +72,7 @@ fn learn(scene: &Scene, sights: &[Sight], seen: bool) -> Result<(Classic, Params
     let config = ClassicConfig { depth: 4, width: 96, skips: vec![], view_width: 64, ..ClassicConfig::paper() };
     let field = {
         let space = Space::within(scene.bounds());
-        Classic::new(&config, Site { space, params: &mut params, name: "field", rng: &mut rng })?
+        Classic::new(&config, Site { space, frames: 0, params: &mut params, name: "field", rng: &mut rng })?
     };
     let mut adam = Adam::new(AdamConfig::default());
     let schedule = Schedule::Exponential { from: 3e-3, to: 1e-4, warmup: 0.02 };

@@ -385,6 +385,18 @@ fn bad_places_to_write_are_named() {
 }
 
 #[test]
+fn how_many_masks_must_agree_can_be_said() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    for (flag, expected) in [("", 3), ("--carve 0", 0), ("--carve 5 --skip lossless", 5)] {
+        place.succeeds(&format!("train scene --steps 1 --out run-{expected} {small} {flag}"));
+        let config = place.json(&format!("run-{expected}/config.json"));
+        assert_eq!(config["config"]["sampler"]["occupancy"]["skip"]["carving"], expected, "{config}");
+    }
+    place.fails("train scene --preset small --steps 1 --carve 2", &["`carve`", "the preset small", "--skip fast"]);
+}
+
+#[test]
 fn bad_arguments_are_usage_errors() {
     let place = Place::empty();
     let bad = [

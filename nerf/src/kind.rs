@@ -27,6 +27,8 @@ pub trait Family: Sized + 'static {
 pub struct Site<'a, T: Scalar> {
     /// The scene's region.
     pub space: Space,
+    /// How many photographs the model is fitted to, for what has numbers of its own for each: 0 if that is not known.
+    pub frames: usize,
     /// Where parameters go.
     pub params: &'a mut Params<T>,
     /// What their names begin with: `<name>.table`.
@@ -96,8 +98,8 @@ impl<F: Family> Part<F> {
     /// As [`Kind::check`] and [`Kind::build`].
     pub fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<F::Built<T>> {
         self.check()?;
-        let Site { space, params, name, rng } = site;
-        let built = self.0.build(space, params, name, rng)?;
+        let Site { space, frames, params, name, rng } = site;
+        let built = self.0.build(space, frames, params, name, rng)?;
         match built.downcast() {
             Ok(built) => Ok(*built),
             Err(_) => unreachable!("what is built is of the type of its parameters"),
@@ -112,7 +114,14 @@ trait AnyKind<F: Family>: Any + fmt::Debug + Send + Sync {
     fn value(&self) -> serde_json::Result<Value>;
     fn boxed(&self) -> Box<dyn AnyKind<F>>;
     /// `params` are of `f32` or `f64`, and so is what comes back: a `F::Built`.
-    fn build(&self, space: Space, params: &mut dyn Any, name: &str, rng: &mut dyn Rng) -> Result<Box<dyn Any>>;
+    fn build(
+        &self,
+        space: Space,
+        frames: usize,
+        params: &mut dyn Any,
+        name: &str,
+        rng: &mut dyn Rng,
+    ) -> Result<Box<dyn Any>>;
 }
 
 impl<F: Family, K: Kind<F>> AnyKind<F> for K {
@@ -132,12 +141,19 @@ impl<F: Family, K: Kind<F>> AnyKind<F> for K {
         Box::new(self.clone())
     }
 
-    fn build(&self, space: Space, params: &mut dyn Any, name: &str, rng: &mut dyn Rng) -> Result<Box<dyn Any>> {
+    fn build(
+        &self,
+        space: Space,
+        frames: usize,
+        params: &mut dyn Any,
+        name: &str,
+        rng: &mut dyn Rng,
+    ) -> Result<Box<dyn Any>> {
         if let Some(params) = params.downcast_mut::<Params<f32>>() {
-            return Ok(Box::new(Kind::build(self, Site { space, params, name, rng })?));
+            return Ok(Box::new(Kind::build(self, Site { space, frames, params, name, rng })?));
         }
         match params.downcast_mut::<Params<f64>>() {
-            Some(params) => Ok(Box::new(Kind::build(self, Site { space, params, name, rng })?)),
+            Some(params) => Ok(Box::new(Kind::build(self, Site { space, frames, params, name, rng })?)),
             None => Err(Error::setting(F::WHAT, "can be built in f32 and f64")),
         }
     }
@@ -213,7 +229,8 @@ impl<F: Family> Registered<F> {
 }
 
 /// Makes the name of a [`Kind`] known to whatever reads configurations in this program, beside those of this crate, which
-/// [`Config`](crate::Config) knows, and whose names stay theirs: `register::<Fields, MyFieldConfig>()`, once, before the first is read. Who only makes configurations needs it not.
+/// [`Config`](crate::Config) knows, and whose names stay theirs: `register::<Fields, MyFieldConfig>()`, once, before the
+/// first is read. Who only makes configurations needs it not.
 pub fn register<F: Family, K: Kind<F>>() {
     F::registered().write().unwrap_or_else(PoisonError::into_inner).push(Registered::of::<K>());
 }

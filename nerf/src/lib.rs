@@ -41,7 +41,7 @@ pub use field::{Seen, Voxel, VoxelConfig};
 pub use glam;
 pub use kind::{Family, Kind, Part, Site, register};
 pub use losses::{Loss, Term, TermConfig, Terms};
-pub use model::{Config, Extent, Model, Preset};
+pub use model::{Config, Extent, GroupConfig, Model, Preset};
 pub use pictures::{quantise, write_atomic};
 pub use random::Jitter;
 pub use rendering::{DenseView, Picture};

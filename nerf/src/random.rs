@@ -31,4 +31,12 @@ impl Jitter<'_> {
             Jitter::Random(rng) => rng.random::<f64>(),
         }
     }
+
+    /// What other random numbers begin from.
+    pub(crate) fn seed(&mut self) -> u64 {
+        match self {
+            Jitter::Middle => 0,
+            Jitter::Random(rng) => rng.random(),
+        }
+    }
 }

@@ -142,7 +142,7 @@ static ASKED: [AtomicUsize; 2] = [AtomicUsize::new(0), AtomicUsize::new(0)];
 impl Kind<Fields> for BareConfig {
     const KIND: &'static str = "bare";
     fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
-        let Site { space, params, name, rng } = site;
+        let Site { space, params, name, rng, .. } = site;
         let mut layer = |part: &str, sizes| {
             let activation = raygrad_autograd::Activation::Identity;
             Linear::new(params, &format!("{name}.{part}"), sizes, activation, Init::Glorot, &mut *rng)

@@ -9,6 +9,7 @@ use std::time::Duration;
 use clap::Parser;
 use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, Split};
+use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
 use serde_json::Value;
@@ -37,6 +38,10 @@ pub struct Args {
     /// sample hierarchically instead]
     #[arg(long)]
     skip: Option<Skip>,
+    /// How many photographs must show a place to be empty, by being transparent there, for it to be left out from the start;
+    /// 0 trusts no mask [default: 3]
+    #[arg(long, value_name = "N")]
+    carve: Option<u32>,
     /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it, and the table of an instant model grows with it
     /// [default: by preset]
     #[arg(long, value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
@@ -141,6 +146,13 @@ impl Args {
         }
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
+        }
+        if let Some(carve) = self.carve {
+            let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
+                let what = format!("the preset {} has no grid to carve; choose `--skip fast` beside it", self.preset);
+                return Err(Error::setting("carve", what));
+            };
+            sampler.occupancy.skip.carving = carve;
         }
         if self.no_encoding {
             config = config.without_encoding();

@@ -41,7 +41,7 @@ fn config() -> Config {
     config
 }
 
-const EXTENT: Extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0], unit: 1.0 };
+const EXTENT: Extent = Extent { bounds: [DVec3::NEG_ONE, DVec3::ONE], span: [2.0, 6.0], unit: 1.0, frames: 0 };
 
 fn params<T: Scalar>() -> Params<T> {
     let mut params = Params::new();

@@ -243,6 +243,15 @@ impl<T: Scalar> Params<T> {
         self.settings[self.names.place(id)].rate
     }
 
+    /// The factor of a parameter's weight decay.
+    ///
+    /// # Panics
+    /// If the handle is that of another store.
+    #[track_caller]
+    pub fn decay(&self, id: ParamId) -> f64 {
+        self.settings[self.names.place(id)].decay
+    }
+
     /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
     /// not frozen and whose gradient has a share.
     ///

@@ -61,7 +61,7 @@ pub(super) fn load(folder: &Path, split: Split, downscale: usize, views: usize) 
         let image = Image::open(path).map_err(|e| Error::field(&file, entry.field("file_path"), e))?;
         let image = if downscale == 1 { image } else { image.downscaled(downscale) };
         let camera = Camera::from_angle(image.width, image.height, transforms.camera_angle_x, entry.pose);
-        Ok(Frame { name: entry.name().to_owned(), camera, image })
+        Ok(Frame { name: entry.name().to_owned(), camera, image, distances: None })
     };
     // All results first: which of several errors is reported must not depend on timing.
     let frames: Vec<Result<Frame>> = present.par_iter().map(decode).collect();

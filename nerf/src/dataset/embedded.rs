@@ -19,7 +19,7 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
     };
     let frame = |(i, camera): (usize, Camera)| {
         let image = scene.render(&camera, SAMPLES).color;
-        Frame { name: format!("{split}/{i}"), camera, image }
+        Frame { name: format!("{split}/{i}"), camera, image, distances: None }
     };
     // Room around the model, as a real capture would have it.
     let [low, high] = scene.bounds();

@@ -60,6 +60,9 @@ pub struct Frame {
     pub camera: Camera,
     /// The picture: RGB or RGBA as in the file, values in 0..=1.
     pub image: Image,
+    /// What was measured beside it, if anything, for the term [`depth`](crate::losses::DepthConfig) of the loss: one channel
+    /// of the same size, the distance along the ray through each pixel's centre in scene units, and 0 where it is not known.
+    pub distances: Option<Image>,
 }
 
 /// The photographs of one split, all of one size, and the region of space that they show.
@@ -82,6 +85,30 @@ impl Dataset {
     /// Whether some image has transparency and so needs a [background](crate::dataset::background).
     pub fn has_alpha(&self) -> bool {
         self.frames.iter().any(|frame| frame.image.channels == 4)
+    }
+
+    /// Whether [distances](Frame::distances), where there are some, fit their photographs, and there are some if they are
+    /// `needed`.
+    ///
+    /// # Errors
+    /// If they are of another size or have several channels, or are needed and there are none.
+    pub fn check_distances(&self, needed: bool) -> Result<()> {
+        let mut found = false;
+        for Frame { name, image, distances, .. } in &self.frames {
+            let Some(distances) = distances else { continue };
+            found = true;
+            let [own, other] =
+                [[image.width, image.height, 1], [distances.width, distances.height, distances.channels]];
+            if own != other {
+                let what = format!("has distances of {other:?} columns, rows and channels, and not {own:?}");
+                return Err(Error::setting(name.clone(), what));
+            }
+        }
+        if needed && !found {
+            let what = "needs photographs of which distances were measured, and there are none in this dataset";
+            return Err(Error::setting("terms.depth", what));
+        }
+        Ok(())
     }
 
     /// Whether the photographs show anything of the box `bounds` at all, within which rays are sampled.

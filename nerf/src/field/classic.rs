@@ -91,7 +91,7 @@ impl Classic {
     /// # Errors
     /// If the configuration is out of range.
     pub fn new<T: Scalar>(config: &ClassicConfig, site: Site<'_, T>) -> Result<Self> {
-        let Site { space, params, name, rng } = site;
+        let Site { space, params, name, rng, .. } = site;
         config.check()?;
         let ClassicConfig { width, view_width, .. } = *config;
         let positions = PositionalEncoding { levels: config.position_levels, input: true }.width(3);

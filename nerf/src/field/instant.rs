@@ -2,13 +2,13 @@
 
 use super::grid::Grid;
 use super::{Density, Field, Fields, Seen};
-use crate::Result;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
 use crate::kind::{Kind, Site};
 use crate::range::check_range;
-use raygrad_autograd::{Activation, Scalar, Var};
-use raygrad_nn::{Bound, Init, Linear};
+use crate::{Error, Result};
+use raygrad_autograd::{Activation, Scalar, Tensor, Var};
+use raygrad_nn::{Bound, Init, Linear, ParamId};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -28,6 +28,11 @@ pub struct InstantConfig {
     pub color_depth: usize,
     /// Degree of the spherical harmonics that encode directions, 1 to 4.
     pub direction_degree: usize,
+    /// Numbers of a code of its own that the colour network sees of each photograph, 0 (no codes) to 256: what light,
+    /// exposure or a passer-by make of it (Martin-Brualla et al. 2021, "NeRF in the Wild", section 4.1). New views have the
+    /// mean of all codes.
+    #[serde(default)]
+    pub codes: usize,
 }
 
 impl Kind<Fields> for InstantConfig {
@@ -38,7 +43,8 @@ impl Kind<Fields> for InstantConfig {
         check_range("features", self.features, 1, 1 << 12)?;
         check_range("color_width", self.color_width, 1, 1 << 12)?;
         check_range("color_depth", self.color_depth, 1, 64)?;
-        check_range("direction_degree", self.direction_degree, 1, 4)
+        check_range("direction_degree", self.direction_degree, 1, 4)?;
+        check_range("codes", self.codes, 0, 256)
     }
 
     fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
@@ -60,35 +66,41 @@ pub struct Instant {
     shift: f64,
     density: [Linear; 2],
     color: Vec<Linear>,
+    /// A code for each photograph, if there are codes.
+    codes: Option<ParamId>,
 }
 
 impl Instant {
-    /// A field with new parameters `<name>...`.
+    /// A field with new parameters `<name>...`; codes are 0, so that all photographs are alike at first.
     ///
     /// # Errors
-    /// If the configuration is out of range.
+    /// If the configuration is out of range, or has codes and the number of photographs is not known.
     pub fn new<T: Scalar>(config: &InstantConfig, site: Site<'_, T>) -> Result<Self> {
         config.check()?;
         let shift = LOG_DENSITY_SHIFT + site.space.unit.ln();
-        let Site { space, params, name, rng } = site;
-        let grid = Grid::new(&config.grid, Site { space, params, name, rng })?;
+        let Site { space, frames, params, name, rng } = site;
+        let grid = Grid::new(&config.grid, Site { space, frames, params, name, rng })?;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let mut layer = |part: String, sizes, activation| {
             Linear::without_bias(params, &format!("{name}.{part}"), sizes, activation, Init::He, &mut *rng)
         };
-        let InstantConfig { density_width, features, color_width, color_depth, .. } = *config;
+        let InstantConfig { density_width, features, color_width, color_depth, codes, .. } = *config;
         let density = [
             layer("density.0".into(), [grid.width(), density_width], Activation::Relu),
             layer("density.1".into(), [density_width, features], Activation::Identity),
         ];
         let mut color = Vec::with_capacity(color_depth + 1);
         for i in 0..=color_depth {
-            let inputs = if i == 0 { features + direction.width() } else { color_width };
+            let inputs = if i == 0 { features + direction.width() + codes } else { color_width };
             let last = i == color_depth;
             let (outputs, activation) = if last { (3, Activation::Identity) } else { (color_width, Activation::Relu) };
             color.push(layer(format!("color.{i}"), [inputs, outputs], activation));
         }
-        Ok(Instant { grid, direction, shift, density, color })
+        if codes > 0 && frames == 0 {
+            return Err(Error::setting("codes", "are for photographs, and it is not known how many there are"));
+        }
+        let codes = (codes > 0).then(|| params.add(format!("{name}.codes"), Tensor::zeros(&[frames, codes])));
+        Ok(Instant { grid, direction, shift, density, color, codes })
     }
 
     /// The grid that positions are looked up in.
@@ -107,7 +119,16 @@ impl<T: Scalar> Field<T> for Instant {
 
     fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
         let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
-        let mut hidden = Var::concat(&[features, &directions], 1);
+        let mut hidden = match self.codes.map(|codes| &params[codes]) {
+            None => Var::concat(&[features, &directions], 1),
+            Some(codes) => {
+                let rays = match seen.frames {
+                    Some(frames) => codes.gather_rows(frames),
+                    None => codes.mean_over(0).broadcast_to(&[seen.segments.len(), codes.shape()[1]]),
+                };
+                Var::concat(&[features, &directions, &rays.segment_expand(seen.segments)], 1)
+            }
+        };
         for layer in &self.color {
             hidden = layer.forward(params, &hidden);
         }

@@ -4,10 +4,12 @@
 pub(crate) mod interlevel;
 pub(crate) mod photometric;
 pub(crate) mod terms;
+pub(crate) mod variation;
 
 pub use interlevel::interlevel;
 pub use photometric::Loss;
-pub use terms::{DistortionConfig, EntropyConfig, OrientationConfig};
+pub use terms::{DepthConfig, DistortionConfig, EntropyConfig, OrientationConfig};
+pub use variation::TotalVariationConfig;
 
 use crate::camera::rays::Rays;
 use crate::kind::{Family, Part, Registered};
@@ -21,12 +23,16 @@ use std::sync::{Arc, RwLock};
 pub struct Outputs<'a, 't, T: Scalar> {
     /// The parameters.
     pub params: &'a Bound<'t, T>,
-    /// The rays.
+    /// The rays, as they were sampled.
     pub rays: &'a Rays<T>,
     /// The number of the photograph of each ray.
     pub frames: &'a [u32],
     /// Column and row of its pixel.
     pub pixels: &'a [[u32; 2]],
+    /// The distance along each ray, in scene units, at which what it meets was measured to be; 0 where it was not.
+    pub distances: &'a [f32],
+    /// A random number, another one each time: what a term that draws begins from.
+    pub seed: u64,
     /// How much of the run is done, 0 to 1.
     pub fraction: f64,
     /// What is seen of the field, with a name for everything.

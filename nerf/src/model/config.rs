@@ -82,8 +82,8 @@ pub struct Config {
     #[serde(deserialize_with = "super::known::read")]
     pub sampler: SamplerConfig,
     /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), and rays are
-    /// sampled as far as the sampler goes: marching, up to the outermost of the [cascades](crate::space::occupancy::OccupancyConfig::cascades) of its
-    /// grid; others, over the whole span.
+    /// sampled as far as the sampler goes: marching, up to the outermost of the
+    /// [cascades](crate::space::occupancy::OccupancyConfig::cascades) of its grid; others, over the whole span.
     #[serde(default)]
     pub unbounded: bool,
     /// What is minimised.
@@ -101,6 +101,10 @@ pub struct Config {
     /// Parameters that are moved in a way of their own; all others as the fields above say.
     #[serde(default)]
     pub groups: Vec<GroupConfig>,
+    /// The learning rate over the run of the photographs' poses, if they are to be learned: see
+    /// [`Poses`](crate::model::Poses). 1e-3 falling to 1e-5 is usual for poses that are a degree off.
+    #[serde(default)]
+    pub poses: Option<Schedule>,
     /// What photographs with alpha are composited over.
     pub background: Background,
     /// Seed of everything random.
@@ -127,6 +131,7 @@ impl Config {
             adam: AdamConfig::default(),
             table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
             groups: vec![],
+            poses: None,
             background: Background::White,
             seed: 0,
             storage: Storage::Full,
@@ -154,6 +159,7 @@ impl Config {
                     color_width: 64,
                     color_depth: 2,
                     direction_degree: 4,
+                    codes: 0,
                 }),
                 sampler: SamplerConfig::new(MarchingConfig::default()),
                 schedule: Schedule::Linear { from: 2e-2, to: 0.0, warmup: 0.005 },
@@ -216,6 +222,11 @@ impl Config {
         ];
         for (part, checked) in checked {
             checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
+        }
+        if let Some(schedule) = self.poses {
+            schedule
+                .check()
+                .map_err(|error| Error::setting(format!("poses.{}.{}", schedule.name(), error.name), error.what))?;
         }
         for group in &self.groups {
             let parts = [group.schedule.check(), group.adam.check()];

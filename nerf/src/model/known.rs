@@ -2,7 +2,8 @@
 
 use crate::field::{ClassicConfig, Fields, InstantConfig, VoxelConfig};
 use crate::kind::{Family, Part, register};
-use crate::losses::{DistortionConfig, EntropyConfig, OrientationConfig, TermConfig, Terms};
+use crate::losses::{DepthConfig, DistortionConfig, EntropyConfig, OrientationConfig, TotalVariationConfig};
+use crate::losses::{TermConfig, Terms};
 use crate::sampling::Samplers;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -22,6 +23,8 @@ fn register_all() {
         register::<Terms, DistortionConfig>();
         register::<Terms, EntropyConfig>();
         register::<Terms, OrientationConfig>();
+        register::<Terms, DepthConfig>();
+        register::<Terms, TotalVariationConfig>();
     });
 }
 

@@ -2,11 +2,14 @@
 
 pub(crate) mod config;
 mod known;
+mod poses;
 mod store;
 
-pub use config::{Config, Preset};
+pub use config::{Config, GroupConfig, Preset};
+pub use poses::Poses;
 
 use crate::Result;
+use crate::camera::pinhole::Camera;
 use crate::camera::rays::{Rays, Samples};
 use crate::field::Field;
 use crate::kind::Site;
@@ -26,7 +29,7 @@ use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::sync::Arc;
 
-/// The scene's extent, stored with the model.
+/// The scene's extent and what it was photographed with, stored with the model.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Extent {
@@ -37,6 +40,9 @@ pub struct Extent {
     /// The length that the field measures its densities by, in scene units: see [`Space::unit`].
     #[serde(default = "one")]
     pub unit: f64,
+    /// How many photographs the model is fitted to; 0 if that is not known.
+    #[serde(default)]
+    pub frames: usize,
 }
 
 fn one() -> f64 {
@@ -46,7 +52,7 @@ fn one() -> f64 {
 impl Extent {
     /// Of a new model.
     pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
-        Extent { bounds, span, unit: Space::within(bounds).unit }
+        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0 }
     }
 
     /// The map to the unit cube, for a scene within its box.
@@ -69,6 +75,8 @@ pub struct Model<T: Scalar> {
     pub sampler: Box<dyn Sampler<T>>,
     /// What is minimised beside the loss of colours.
     pub terms: Vec<Arc<dyn Term<T>>>,
+    /// Corrections of the photographs' poses, if they are learned.
+    pub poses: Option<Poses>,
 }
 
 impl<T: Scalar> Clone for Model<T> {
@@ -80,6 +88,7 @@ impl<T: Scalar> Clone for Model<T> {
             field: self.field.clone(),
             sampler: self.sampler.boxed(),
             terms: self.terms.clone(),
+            poses: self.poses,
         }
     }
 }
@@ -94,13 +103,14 @@ impl<T: Scalar> Model<T> {
         config.check()?;
         let space = Space { unbounded: config.unbounded, ..extent.space() };
         space.check()?;
-        let mut params = Params::new();
+        let (mut params, frames) = (Params::new(), extent.frames);
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
-        let sampler = config.sampler.build(Site { space, params: &mut params, name: "sampler", rng })?;
-        let field = config.field.build(Site { space, params: &mut params, name: "field", rng })?;
-        let term = |term: &TermConfig| term.build(Site { space, params: &mut params, name: "terms", rng });
+        let sampler = config.sampler.build(Site { space, frames, params: &mut params, name: "sampler", rng })?;
+        let field = config.field.build(Site { space, frames, params: &mut params, name: "field", rng })?;
+        let term = |term: &TermConfig| term.build(Site { space, frames, params: &mut params, name: "terms", rng });
         let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
-        Ok(Model { config, extent, params, field, sampler, terms })
+        let poses = config.poses.map(|_| Poses::new(frames, extent.unit, &mut params)).transpose()?;
+        Ok(Model { config, extent, params, field, sampler, terms, poses })
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -116,6 +126,15 @@ impl<T: Scalar> Model<T> {
     /// All fields: those of the sampler, if it has any, and the one that is rendered.
     pub fn fields(&self) -> Vec<&dyn Field<T>> {
         self.sampler.fields().into_iter().chain([&*self.field]).collect()
+    }
+
+    /// The camera of the photograph of this number where the model has found it to be: where it was, unless poses are
+    /// [learned](Config::poses).
+    ///
+    /// # Panics
+    /// If there is no such photograph.
+    pub fn learned_camera(&self, number: usize, camera: &Camera) -> Camera {
+        self.poses.map_or_else(|| camera.clone(), |poses| poses.camera(&self.params, number, camera))
     }
 
     /// The sampler, if it marches through an occupancy grid.
@@ -188,7 +207,8 @@ impl Model<f32> {
         densities(&*self.field, &self.params, &Pool::new(), points, out);
     }
 
-    /// Chooses what views leave out from now on; what training has left out stays so. A model without an occupancy grid leaves out what it has to.
+    /// Chooses what views leave out from now on; what training has left out stays so. A model without an occupancy grid
+    /// leaves out what it has to.
     pub fn set_skip(&mut self, skip: impl Into<Skipping>) {
         if let Some(marching) = self.marching_mut() {
             // What training left out cannot be put back.

@@ -259,6 +259,11 @@ impl<T: Scalar> Sampler<T> for Marching {
         vec![(GRID, self.grid.occupied_to_bytes())]
     }
 
+    /// With the densities of the cells, which go on to be averaged.
+    fn training_state(&self) -> Vec<(&'static str, Vec<u8>)> {
+        vec![(GRID, self.grid.to_bytes())]
+    }
+
     fn load_state(&mut self, state: &HashMap<String, Vec<u8>>) -> Result<()> {
         let Some(bytes) = state.get(GRID) else { return Err(Error::setting(GRID, "holds no occupancy grid")) };
         let grid = OccupancyGrid::from_bytes(bytes)?;

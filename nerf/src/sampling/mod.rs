@@ -177,7 +177,13 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
         vec![]
     }
 
-    /// Takes back what [`state`](Self::state) gave.
+    /// What is written down of a run that is to go on: all that the next steps depend on and that
+    /// [`update`](Self::update) is not told.
+    fn training_state(&self) -> Vec<(&'static str, Vec<u8>)> {
+        self.state()
+    }
+
+    /// Takes back what [`state`](Self::state) or [`training_state`](Self::training_state) gave.
     ///
     /// # Errors
     /// If something is absent, or of a sampler of another configuration.

@@ -23,8 +23,8 @@ pub enum Spacing {
     /// Evenly in distance.
     #[default]
     Linear,
-    /// Evenly in inverse distance, as suits scenes without bounds (Barron et al. 2022, section 4): near distances must
-    /// be above 0.
+    /// Evenly in inverse distance, as suits scenes without bounds (Barron et al. 2022, section 4). Rays then begin at a
+    /// thousandth of their far end, if not later.
     Disparity,
 }
 
@@ -102,11 +102,11 @@ impl Kind<Samplers> for ProposalConfig {
     }
 
     fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
-        let Site { space, params, rng, .. } = site;
+        let Site { space, frames, params, rng, .. } = site;
         let mut fields = vec![];
         for (i, level) in self.levels.iter().enumerate() {
             let name = format!("proposal.{i}");
-            fields.push(Proposer::new(level, Site { space, params, name: &name, rng })?);
+            fields.push(Proposer::new(level, Site { space, frames, params, name: &name, rng })?);
         }
         Ok(Box::new(Proposal { config: self.clone(), fields, trust: 0.0 }))
     }
@@ -123,8 +123,8 @@ struct Proposer {
 
 impl Proposer {
     fn new<T: Scalar>(level: &ProposalLevel, site: Site<'_, T>) -> Result<Self> {
-        let Site { space, params, name, rng } = site;
-        let grid = Grid::new(&level.grid, Site { space, params, name, rng })?;
+        let Site { space, frames, params, name, rng } = site;
+        let grid = Grid::new(&level.grid, Site { space, frames, params, name, rng })?;
         let mut layer = |part: usize, sizes, activation| {
             Linear::without_bias(params, &format!("{name}.density.{part}"), sizes, activation, Init::He, &mut *rng)
         };
@@ -160,6 +160,9 @@ pub struct Proposal {
     trust: f64,
 }
 
+/// In disparity a ray begins at this share of its far end, if not later: at 0 disparity has no end.
+const NEAREST: f64 = 1e-3;
+
 /// How far a place is along a ray of this span, as a share that is even in the spacing.
 struct Scale {
     ends: [f64; 2],
@@ -169,7 +172,8 @@ struct Scale {
 impl Scale {
     fn new<T: Scalar>(spacing: Spacing, span: [T; 2]) -> Self {
         let [near, far] = span.map(T::to_f64);
-        let disparity = spacing == Spacing::Disparity && near > 0.0;
+        let disparity = spacing == Spacing::Disparity && far > 0.0;
+        let near = if disparity { near.max(NEAREST * far) } else { near };
         Scale { ends: if disparity { [1.0 / near, 1.0 / far] } else { [near, far] }, disparity }
     }
 
@@ -343,6 +347,11 @@ mod tests {
             assert!((scale.distance(0.0) - 2.0).abs() < 1e-12 && (scale.distance(1.0) - 10.0).abs() < 1e-12);
         }
         assert!((Scale::new(Spacing::Disparity, [2.0, 10.0]).distance(0.5) - 10.0 / 3.0).abs() < 1e-12);
-        assert!(Scale::new(Spacing::Disparity, [0.0, 10.0]).distance(0.5) == 5.0, "no inverse of 0");
+        let from_zero = Scale::new(Spacing::Disparity, [0.0, 10.0]);
+        assert!(
+            (from_zero.distance(0.0) - 0.01).abs() < 1e-12 && (from_zero.distance(0.5) - 0.02 / 1.001).abs() < 1e-12
+        );
+        let nothing = Scale::new(Spacing::Disparity, [0.0, 0.0]);
+        assert_eq!([nothing.distance(0.0), nothing.distance(1.0)], [0.0; 2], "a ray of no length");
     }
 }

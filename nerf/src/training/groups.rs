@@ -3,7 +3,7 @@
 use crate::model::config::{Config, GroupConfig};
 use crate::{Error, Result};
 use raygrad_autograd::Gradient;
-use raygrad_nn::{AdamW, Optimizer, Params, Schedule, UpdateReport};
+use raygrad_nn::{AdamW, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
 
 /// One group.
 struct Group {
@@ -13,8 +13,8 @@ struct Group {
     schedule: Schedule,
 }
 
-/// All groups: a parameter belongs to the first that its name fits, and else to the tables, if only rows of it are moved,
-/// or to the rest.
+/// All groups: a parameter belongs to the first that its name fits, and else to that of the poses, if it is these, to the
+/// tables, if only rows of it are moved, or to the rest.
 pub(crate) struct Groups(Vec<Group>);
 
 impl Groups {
@@ -23,13 +23,19 @@ impl Groups {
     /// # Errors
     /// If a group of the configuration has no parameter.
     pub fn new(config: &Config, params: &Params<f32>) -> Result<Self> {
-        let rest = |adam| GroupConfig { params: String::new(), adam, schedule: config.schedule, decay: 0.0 };
-        let settings: Vec<_> =
-            config.groups.iter().cloned().chain([rest(config.table_adam), rest(config.adam)]).collect();
+        let rest = |adam, schedule| GroupConfig { params: String::new(), adam, schedule, decay: 0.0 };
+        let poses = rest(config.adam, config.poses.unwrap_or(config.schedule));
+        let others = [poses, rest(config.table_adam, config.schedule), rest(config.adam, config.schedule)];
+        let settings: Vec<_> = config.groups.iter().cloned().chain(others).collect();
         let named = config.groups.len();
         let place = |name: &str, lazy: bool| {
             let fits = |group: &GroupConfig| name.starts_with(&group.params);
-            config.groups.iter().position(fits).unwrap_or(if lazy { named } else { named + 1 })
+            let other = match (name, lazy) {
+                ("poses", _) => 0,
+                (_, true) => 1,
+                (_, false) => 2,
+            };
+            config.groups.iter().position(fits).unwrap_or(named + other)
         };
         let places: Vec<usize> = params.ids().map(|id| place(params.name(id), params.is_lazy(id))).collect();
         let group = |(i, GroupConfig { adam, schedule, decay, .. }): (usize, GroupConfig)| Group {
@@ -49,6 +55,31 @@ impl Groups {
     /// Steps taken.
     pub fn steps(&self) -> u64 {
         self.0.first().map_or(0, |group| group.adam.steps())
+    }
+
+    /// What the optimisers remember of these parameters, as bytes for each group.
+    ///
+    /// # Errors
+    /// If the format cannot hold it.
+    pub fn state(&self, params: &Params<f32>) -> Result<Vec<Vec<u8>>> {
+        let failed = |error: StateError| Error::setting("groups", error.to_string());
+        self.0.iter().map(|group| group.adam.state(params).to_safetensors().map_err(failed)).collect()
+    }
+
+    /// Takes back what [`state`](Self::state) gave.
+    ///
+    /// # Errors
+    /// If it is that of other groups or of other parameters.
+    pub fn load_state(&mut self, params: &Params<f32>, state: &[Vec<u8>]) -> Result<()> {
+        if state.len() != self.0.len() {
+            let what = format!("are {}, and the optimisers' states are {}", self.0.len(), state.len());
+            return Err(Error::setting("groups", what));
+        }
+        for (group, bytes) in self.0.iter_mut().zip(state) {
+            let load = OptimizerState::from_safetensors(bytes).and_then(|state| group.adam.load_state(params, &state));
+            load.map_err(|error| Error::setting("groups", error.to_string()))?;
+        }
+        Ok(())
     }
 
     /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them.

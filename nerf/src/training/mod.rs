@@ -3,6 +3,7 @@
 pub(crate) mod groups;
 pub(crate) mod pass;
 pub(crate) mod startup;
+mod state;
 pub(crate) mod stats;
 pub(crate) mod trainer;
 

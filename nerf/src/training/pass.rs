@@ -57,10 +57,13 @@ pub(crate) fn rays_loss<'t>(
 ) -> (Var<'t, f32>, Work) {
     let (tape, sampler) = (params.tape(), &*model.sampler);
     let slopes = model.terms.iter().any(|term| term.reads_normals());
-    let query = Query { frames: Some(&batch.frames), slopes, ..Query::new(&*model.field, params) };
+    let moved =
+        model.poses.map(|poses| poses.rays(params, &batch.rays, &batch.frames, model.reach(), model.extent.span));
+    let (vars, rays) = moved.as_ref().map_or((None, &batch.rays), |(vars, rays)| (Some(vars), rays));
+    let query = Query { frames: Some(&batch.frames), rays: vars, slopes, ..Query::new(&*model.field, params) };
     let rows = |values: &[[f32; 3]]| tape.pool().copy_of(&[values.len(), 3], values.as_flattened());
     let (target, background) = (rows(&batch.target), rows(&batch.background));
-    let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, &batch.rays, Purpose::Training, jitter);
+    let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, rays, Purpose::Training, jitter);
     let Lit { rendered, asked, kept } = sampler.quadrature().render(&query, &steps, sampler.termination());
     let color = rendered.over(&background);
     let fine = model.config.loss.sum(&color, &target);
@@ -72,9 +75,10 @@ pub(crate) fn rays_loss<'t>(
     let coarse = coarse.iter().map(|seen| model.config.loss.sum(&seen.over(&background), &target));
     let weights = rendered.weights.value();
     let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
-    let (rays, frames, pixels) = (&batch.rays, &batch.frames[..], &batch.pixels[..]);
+    let (frames, pixels, distances) = (&batch.frames[..], &batch.pixels[..], &batch.distances[..]);
     let (rendered, target, background) = (&rendered, &target, &background);
-    let seen = Outputs { params, rays, frames, pixels, fraction, rendered, target, background };
+    let seed = if model.terms.is_empty() { 0 } else { jitter.seed() };
+    let seen = Outputs { params, rays, frames, pixels, distances, seed, fraction, rendered, target, background };
     let terms = model.terms.iter().map(|term| term.loss(&seen));
     let loss = coarse.chain(levels).chain(terms).fold(fine, |sum, term| term + sum);
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());

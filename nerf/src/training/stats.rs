@@ -1,6 +1,6 @@
 //! How long to train, and what was done.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use std::time::Duration;
 
 /// Steps in a row without a finite gradient after which a run has diverged: an overflow of one batch passes.
@@ -48,7 +48,7 @@ mod seconds {
 }
 
 /// What one step did, and the run so far.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct StepStats {
     /// Number of the step, from 1.
     pub step: u64,
@@ -67,10 +67,13 @@ pub struct StepStats {
     /// Elements of parameters that were moved so far; of tables only rows that a sample looked up are.
     pub moved: u64,
     /// The mean loss, of a hierarchical model that of the coarse field plus that of the fine one.
+    #[serde(deserialize_with = "number_or_nan")]
     pub loss: f64,
     /// PSNR on this step's rays, in dB.
+    #[serde(deserialize_with = "number_or_nan")]
     pub psnr: f64,
     /// Mean opacity of this step's rays, 0 to 1.
+    #[serde(deserialize_with = "number_or_nan")]
     pub opacity: f64,
     /// Share of the occupancy grid that is occupied; 1 without a grid.
     pub occupied: f64,
@@ -83,6 +86,11 @@ pub struct StepStats {
     pub stuck: u64,
     /// How often the start-up detector began again with another seed.
     pub restarts: u32,
+}
+
+/// A number that files write as nothing if it is not finite.
+fn number_or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
 
 impl StepStats {

@@ -6,6 +6,7 @@ use super::startup;
 use super::stats::{Budget, StepStats};
 use crate::dataset::Dataset;
 use crate::dataset::batch::Batch;
+use crate::losses::DepthConfig;
 use crate::model::config::Config;
 use crate::model::{Extent, Model, densities};
 use crate::pictures::metrics::psnr_from_mse;
@@ -28,18 +29,18 @@ pub struct Trainer {
     /// The model as it is now.
     pub model: Model<f32>,
     data: Arc<Dataset>,
-    groups: Groups,
+    pub(super) groups: Groups,
     tiles: Tiles<f32>,
     /// For what happens outside of the tiles.
     pool: Pool<f32>,
     /// Rays of the next step.
-    batch: usize,
+    pub(super) batch: usize,
     /// What time it is.
     clock: Box<dyn Fn() -> Duration + Send + Sync>,
-    elapsed: Duration,
+    pub(super) elapsed: Duration,
     /// How many models of this run have collapsed.
-    collapses: u32,
-    done: StepStats,
+    pub(super) collapses: u32,
+    pub(super) done: StepStats,
 }
 
 impl Trainer {
@@ -65,7 +66,8 @@ impl Trainer {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
-        let extent = Extent::new(data.bounds, [data.near, data.far]);
+        data.check_distances(config.terms.iter().any(|term| term.get::<DepthConfig>().is_some()))?;
+        let extent = Extent { frames: data.frames.len(), ..Extent::new(data.bounds, [data.near, data.far]) };
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
         data.check_reach(model.reach())?;
         let mut trainer = Trainer {

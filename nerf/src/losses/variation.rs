@@ -1,0 +1,220 @@
+//! How much a table varies from cell to cell.
+
+use super::{Outputs, Term, Terms};
+use crate::kind::{Kind, Site};
+use crate::random::stream;
+use crate::range::check_range;
+use crate::{Error, Result};
+use rand::RngExt;
+use raygrad_autograd::{Scalar, Var};
+use raygrad_nn::ParamId;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// The squared differences of a table's neighbouring cells, summed over axes and channels, the mean over cells (Chen et al.
+/// 2022, "TensoRF", section 4.3, and Fridovich-Keil et al. 2022, "Plenoxels", equation 3, without its root): a table that is
+/// smooth where photographs say nothing.
+///
+/// Each step looks at a few cells for each ray, at random: the expectation is that of all, and only their rows are moved.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TotalVariationConfig {
+    /// Its weight, 0 to 1e6. The mean over rays is minimised: a weight of 1 stands for three squared errors of colours.
+    pub weight: f64,
+    /// The parameter's name: `field.table`.
+    pub params: String,
+    /// Cells along each of its axes, the slowest first, where its rows are numbered through, as those of a [voxel
+    /// field](crate::VoxelConfig) are (`resolution + 1`, three times; rows beyond them are padding). Without them the
+    /// parameter's own axes; the last one is that of the channels.
+    #[serde(default)]
+    pub cells: Option<Vec<usize>>,
+    /// Cells that are looked at for each ray, 1 to 1024.
+    #[serde(default = "draws")]
+    pub draws: usize,
+}
+
+fn draws() -> usize {
+    4
+}
+
+impl Kind<Terms> for TotalVariationConfig {
+    const KIND: &'static str = "total_variation";
+
+    fn check(&self) -> Result<()> {
+        check_range("total_variation.draws", self.draws, 1, 1024)?;
+        check_range("total_variation.weight", self.weight, 0.0, 1e6)
+    }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+        let error = |what: String| Err(Error::setting("total_variation", what));
+        let Some(id) = site.params.find(&self.params) else {
+            let names: Vec<&str> = site.params.names().collect();
+            return error(format!("there is no parameter `{}`; there are {}", self.params, names.join(", ")));
+        };
+        let shape = site.params.get(id).shape();
+        let Some((&channels, own)) = shape.split_last() else {
+            return error(format!("the parameter `{}` is a number", self.params));
+        };
+        let cells = self.cells.clone().unwrap_or_else(|| own.to_vec());
+        let rows: usize = cells.iter().product();
+        if rows > own.iter().product::<usize>() || rows == 0 || u32::try_from(rows).is_err() {
+            let what = format!(
+                "the cells {cells:?} are more than those of the parameter `{}`, which is {shape:?}",
+                self.params
+            );
+            return error(what);
+        }
+        Ok(Arc::new(TotalVariation { id, cells, channels, draws: self.draws, weight: self.weight }))
+    }
+}
+
+/// The table and the numbers.
+struct TotalVariation {
+    id: ParamId,
+    /// Along each axis, the slowest first.
+    cells: Vec<usize>,
+    channels: usize,
+    draws: usize,
+    weight: f64,
+}
+
+impl TotalVariation {
+    /// Numbers of random cells, and of the next ones along each axis: at the end of an axis the cell itself.
+    fn pairs(&self, count: usize, seed: u64) -> [Vec<u32>; 2] {
+        let rows: usize = self.cells.iter().product();
+        let rng = &mut stream(seed, [0, 0]);
+        let (mut cells, mut next) = (vec![], vec![]);
+        for _ in 0..count {
+            let cell = rng.random_range(0..rows);
+            let mut stride = rows;
+            for &along in &self.cells {
+                stride /= along;
+                let is_last = cell / stride % along == along - 1;
+                cells.push(cell as u32);
+                next.push(if is_last { cell } else { cell + stride } as u32);
+            }
+        }
+        [cells, next]
+    }
+}
+
+impl<T: Scalar> Term<T> for TotalVariation {
+    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+        let pairs = self.pairs(self.draws * seen.rays.len(), seen.seed);
+        let table = &seen.params[self.id];
+        // A gradient of rows stays one where nothing lies in between.
+        let all = table.value().len() / self.channels.max(1);
+        let flat = if table.shape().len() == 2 { table.clone() } else { table.reshape(&[all, self.channels]) };
+        let [cells, next] = pairs.map(|index| flat.gather_rows(index));
+        (next - cells).square().sum() * (self.weight / self.draws as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::pinhole::Ray;
+    use crate::camera::rays::{Rays, stratified};
+    use crate::random::Jitter;
+    use crate::space::cube::Space;
+    use crate::volume::quadrature::Plan;
+    use crate::volume::query::Query;
+    use glam::DVec3;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
+    use raygrad_autograd::check::{Check, check_function};
+    use raygrad_autograd::{Pool, Tape, Tensor};
+    use raygrad_nn::Params;
+
+    fn config(cells: Option<Vec<usize>>) -> TotalVariationConfig {
+        TotalVariationConfig { weight: 2.0, params: "field.table".into(), cells, draws: 1024 }
+    }
+
+    fn build(config: &TotalVariationConfig, params: &mut Params<f64>) -> Result<Arc<dyn Term<f64>>> {
+        let space = Space::within([DVec3::ZERO, DVec3::ONE]);
+        config.build(Site { space, frames: 0, params, name: "terms", rng: &mut Pcg64Mcg::seed_from_u64(0) })
+    }
+
+    /// The term for `count` rays that meet nothing.
+    fn value<'t>(term: &dyn Term<f64>, params: &raygrad_nn::Bound<'t, f64>, count: usize, seed: u64) -> Var<'t, f64> {
+        let mut rays = Rays::new();
+        (0..count).for_each(|_| rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [0.0, 1.0]));
+        let medium = crate::analytic::scenes().remove(0).medium;
+        let mut own = Params::new();
+        let field = crate::analytic::AnalyticField::new(medium, &mut own);
+        let bound = own.bind_constant(params.tape());
+        let samples = stratified(&rays, 1, &mut Jitter::Middle, &Pool::new());
+        let rendered = &Plan { samples, intervals: None }.render(&Query::new(&field, &bound));
+        let nothing = &Tensor::zeros(&[count, 3]);
+        term.loss(&Outputs {
+            params,
+            rays: &rays,
+            frames: &vec![0; count],
+            pixels: &vec![[0; 2]; count],
+            distances: &vec![0.0; count],
+            seed,
+            fraction: 0.0,
+            rendered,
+            target: nothing,
+            background: nothing,
+        })
+    }
+
+    #[test]
+    fn it_is_the_mean_over_cells_of_squared_differences_along_every_axis() {
+        let [planes, rows, columns, channels] = [3, 4, 5, 2];
+        let number = |i: usize| (i as f64 * 0.7).sin();
+        for cells in [None, Some(vec![planes, rows, columns])] {
+            let shape: &[usize] = if cells.is_none() { &[3, 4, 5, 2] } else { &[60, 2] };
+            let mut params = Params::<f64>::new();
+            params.add("field.table", Tensor::from_fn(shape, number));
+            let term = build(&config(cells), &mut params).unwrap();
+            let mut sum = 0.0;
+            for place in 0..planes * rows * columns {
+                let [z, y, x] = [place / (rows * columns), place / columns % rows, place % columns];
+                for (inside, stride) in
+                    [(z + 1 < planes, rows * columns), (y + 1 < rows, columns), (x + 1 < columns, 1)]
+                {
+                    for c in 0..channels {
+                        let difference = number((place + stride) * channels + c) - number(place * channels + c);
+                        sum += if inside { difference * difference } else { 0.0 };
+                    }
+                }
+            }
+            let expected = 2.0 * sum / 60.0;
+            let tape = Tape::new();
+            let bound = params.bind(&tape);
+            // 200 times 1024 draws.
+            let found = (0..20).map(|seed| value(&*term, &bound, 10, seed).item()).sum::<f64>() / 200.0;
+            assert!((found / expected - 1.0).abs() < 0.01, "{found} {expected}");
+            assert!(value(&*term, &bound, 1, 0).item() != value(&*term, &bound, 1, 1).item(), "other cells each time");
+            let grads = value(&*term, &bound, 1, 0).backward(&bound.vars());
+            assert_eq!(grads[0].is_rows(), shape.len() == 2, "only rows that were looked at");
+        }
+    }
+
+    #[test]
+    fn gradients_are_what_differences_show() {
+        let mut params = Params::<f64>::new();
+        params.add("field.table", Tensor::zeros(&[2, 3, 2]));
+        let term = build(&TotalVariationConfig { draws: 5, ..config(None) }, &mut params).unwrap();
+        let table = Tensor::from_fn(&[2, 3, 2], |i| (i as f64 * 1.3).cos());
+        let report =
+            check_function(&Check::default(), &[table], |x| value(&*term, &params.layout().bind(x.to_vec()), 2, 7));
+        assert!(report.unwrap().comparisons >= 12);
+    }
+
+    #[test]
+    fn what_is_no_table_of_such_cells_is_an_error_that_says_so() {
+        let mut params = Params::<f64>::new();
+        params.add("field.table", Tensor::zeros(&[60, 2]));
+        let mut message = |config: TotalVariationConfig| build(&config, &mut params).err().unwrap().to_string();
+        let error = message(TotalVariationConfig { params: "table".into(), ..config(None) });
+        assert!(error.starts_with("`total_variation`") && error.contains("there are field.table"), "{error}");
+        let error = message(config(Some(vec![3, 4, 6])));
+        assert!(error.contains("[3, 4, 6]") && error.contains("[60, 2]"), "{error}");
+        assert!(Kind::check(&TotalVariationConfig { draws: 0, ..config(None) }).is_err());
+        let read: TotalVariationConfig = serde_json::from_str(r#"{"weight": 0.5, "params": "field.table"}"#).unwrap();
+        assert_eq!((read.draws, read.cells), (4, None));
+    }
+}

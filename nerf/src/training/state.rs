@@ -1,0 +1,133 @@
+//! A run as one thing that can be written down, and gone on with.
+
+use super::groups::Groups;
+use super::stats::StepStats;
+use super::trainer::Trainer;
+use crate::{Error, Result};
+use raygrad_nn::{ParamsError, Storage};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::time::Duration;
+
+/// The name of the trainer's own numbers in the bytes.
+const TRAINER: &str = "trainer";
+
+/// What a trainer knows beside the model and the optimisers. There is no random state: every random number is a function of
+/// the seed, the number of the step and that of the tile.
+#[derive(Serialize, Deserialize)]
+struct Counts {
+    stats: StepStats,
+    elapsed: Duration,
+    /// Rays of the next step.
+    batch: usize,
+    collapses: u32,
+    /// How many groups of parameters there are.
+    groups: usize,
+    /// What was said of the parameters, in their order.
+    settings: Vec<Setting>,
+}
+
+/// What was said of a parameter.
+#[derive(Serialize, Deserialize)]
+struct Setting {
+    name: String,
+    frozen: bool,
+    rate: f64,
+    decay: f64,
+}
+
+/// The name of the state of the optimiser of a group.
+fn group(number: usize) -> String {
+    format!("optimizer.{number}")
+}
+
+impl Trainer {
+    /// All that the next steps depend on, beside the configuration and the photographs, as a safetensors file: parameters in
+    /// full and what was said of them, what the optimisers and the sampler remember, the step, the training time and the
+    /// number of rays. [`load_state`](Self::load_state) goes on from it.
+    ///
+    /// # Errors
+    /// If the format cannot hold it.
+    pub fn state(&self) -> Result<Vec<u8>> {
+        let failed = |what: String| Error::setting("state", what);
+        let params = &self.model.params;
+        let groups = self.groups.state(params)?;
+        let setting = |id| Setting {
+            name: params.name(id).to_owned(),
+            frozen: params.is_frozen(id),
+            rate: params.rate(id),
+            decay: params.decay(id),
+        };
+        let counts = Counts {
+            stats: self.done,
+            elapsed: self.elapsed,
+            batch: self.batch,
+            collapses: self.collapses,
+            groups: groups.len(),
+            settings: params.ids().map(setting).collect(),
+        };
+        let counts = serde_json::to_vec(&counts).map_err(|error| failed(error.to_string()))?;
+        let names: Vec<String> = (0..groups.len()).map(group).collect();
+        let mut blobs = self.model.sampler.training_state();
+        blobs.push((TRAINER, counts));
+        blobs.extend(names.iter().map(String::as_str).zip(groups));
+        let metadata = HashMap::from([("format".into(), "raygrad training".into())]);
+        let bytes = params.to_safetensors(Storage::Full, metadata, &blobs);
+        bytes.map_err(|error: ParamsError| failed(error.to_string()))
+    }
+
+    /// Goes on from a [state](Self::state) of a trainer of the same configuration and photographs: the next steps are what
+    /// they would have been there, bit for bit. If it fails, nothing has changed.
+    ///
+    /// ```
+    /// use raygrad_nerf::dataset::{Split, embedded};
+    /// use raygrad_nerf::{Config, Preset, Trainer};
+    /// use std::sync::Arc;
+    /// let (config, data) = (Config::preset(Preset::Instant).with_budget(1.0), Arc::new(embedded(Split::Train, 16)));
+    /// let mut trainer = Trainer::new(config.clone(), data.clone())?;
+    /// trainer.step(0.0);
+    /// let state = trainer.state()?;
+    /// let expected = trainer.step(0.5).loss;
+    ///
+    /// let mut later = Trainer::new(config, data)?;
+    /// later.load_state(&state)?;
+    /// assert_eq!(later.stats().step, 1);
+    /// assert_eq!(later.step(0.5).loss, expected);
+    /// # Ok::<(), raygrad_nerf::Error>(())
+    /// ```
+    ///
+    /// # Errors
+    /// If the bytes are no such state, or one of another configuration.
+    pub fn load_state(&mut self, state: &[u8]) -> Result<()> {
+        let failed = |what: String| Error::setting("state", what);
+        let mut model = self.model.clone();
+        let mut blobs = model.params.load_safetensors(state).map_err(|error| failed(error.to_string()))?;
+        let Some(counts) = blobs.remove(TRAINER) else {
+            return Err(failed("holds a model, and not a run that can go on".into()));
+        };
+        let counts: Counts = serde_json::from_slice(&counts).map_err(|error| failed(error.to_string()))?;
+        for Setting { name, frozen, rate, decay } in &counts.settings {
+            let is_own = |other: &str| other == name;
+            if !(*rate >= 0.0 && rate.is_finite() && *decay >= 0.0 && decay.is_finite()) {
+                return Err(failed(format!("gives `{name}` a learning rate times {rate} and a decay times {decay}")));
+            }
+            if *frozen {
+                model.params.freeze(is_own)
+            } else {
+                model.params.unfreeze(is_own)
+            };
+            model.params.set_rate(is_own, *rate);
+            model.params.set_decay(is_own, *decay);
+        }
+        let missing = || failed("lacks what an optimiser remembers".into());
+        let remembered: Vec<Vec<u8>> =
+            (0..counts.groups).map(|i| blobs.remove(&group(i)).ok_or_else(missing)).collect::<Result<_>>()?;
+        let mut groups = Groups::new(&model.config, &model.params)?;
+        groups.load_state(&model.params, &remembered)?;
+        model.sampler.load_state(&blobs)?;
+        (self.model, self.groups) = (model, groups);
+        (self.done, self.elapsed, self.batch, self.collapses) =
+            (counts.stats, counts.elapsed, counts.batch.max(1), counts.collapses);
+        Ok(())
+    }
+}
