@@ -397,6 +397,17 @@ fn how_many_masks_must_agree_can_be_said() {
 }
 
 #[test]
+fn codes_and_poses_are_trained_and_read_back() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    let learned = r#"--set field.codes=4 --set poses={"constant":{"rate":0.001}}"#;
+    place.succeeds(&format!("train scene --steps 2 --out run {small} {learned}"));
+    let config = place.json("run/config.json");
+    assert_eq!((&config["config"]["field"]["codes"], &config["extent"]["frames"]), (&4.into(), &6.into()), "{config}");
+    assert!(place.succeeds("eval run --split test --json").contains("psnr"));
+}
+
+#[test]
 fn bad_arguments_are_usage_errors() {
     let place = Place::empty();
     let bad = [

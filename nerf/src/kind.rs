@@ -37,6 +37,13 @@ pub struct Site<'a, T: Scalar> {
     pub rng: &'a mut dyn Rng,
 }
 
+impl<T: Scalar> Site<'_, T> {
+    /// The same place for a part with another name.
+    pub fn child<'b>(&'b mut self, name: &'b str) -> Site<'b, T> {
+        Site { space: self.space, frames: self.frames, params: &mut *self.params, name, rng: &mut *self.rng }
+    }
+}
+
 /// A configuration that can be chosen by its name: of a field (`Kind<Fields>`) or of a sampler (`Kind<Samplers>`).
 ///
 /// In a file it is `{"kind": "<KIND>", ..}` with the configuration's own fields. [`register`] makes the name known to

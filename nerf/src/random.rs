@@ -5,6 +5,11 @@ use rand_pcg::Pcg64Mcg;
 
 /// A generator for one purpose: mixes the parts so that neighbouring numbers give unrelated streams.
 pub(crate) fn stream(seed: u64, parts: [u64; 2]) -> Pcg64Mcg {
+    Pcg64Mcg::seed_from_u64(mixed(seed, parts))
+}
+
+/// The seed of such a generator.
+pub(crate) fn mixed(seed: u64, parts: [u64; 2]) -> u64 {
     let mut state = seed ^ 0x9e37_79b9_7f4a_7c15;
     for part in parts {
         // The finaliser of SplitMix64 (Steele, Lea, Flood 2014).
@@ -13,7 +18,7 @@ pub(crate) fn stream(seed: u64, parts: [u64; 2]) -> Pcg64Mcg {
         state = (state ^ (state >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         state ^= state >> 31;
     }
-    Pcg64Mcg::seed_from_u64(state)
+    state
 }
 
 /// Uniform random numbers in `[0, 1)`, or the middle of every bin when rendering.

@@ -2,7 +2,7 @@
 //! form through the path that every view takes.
 
 use raygrad_autograd::{Real, Tape};
-use raygrad_nerf::analytic::{AnalyticField, AnalyticScene, scenes};
+use raygrad_nerf::analytic::{AnalyticField, AnalyticScene, Layer, Layers, scenes};
 use raygrad_nerf::dataset::scene::{DISTANCE, Scene, View};
 use raygrad_nerf::dataset::{Dataset, Frame};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
@@ -189,6 +189,22 @@ fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
             assert!(normals_apart(&trainer.model, &camera, &wrong) > normals + 10.0, "and its normals");
         }
     }
+}
+
+/// A wall across the ray: what is left out of it is made up for, in its distance too.
+#[test]
+fn what_ends_early_is_as_far_away_as_what_does_not() {
+    let wall = Layer { from: 3.0, to: 3.5, sigma: 200.0, color: [0.5, 0.0] };
+    let layers = Layers::new(std::slice::from_ref(&wall));
+    let exact = layers.exact(4.0, 1.0);
+    let scene = AnalyticScene { name: "wall", medium: Arc::new(layers), exact, ..scenes().remove(0) };
+    let pose = Camera::look_at(scene.ray.origin, scene.ray.at(1.0), DVec3::Y);
+    let camera = Camera { width: 1, height: 1, focal: [1.0; 2], centre: [0.5; 2], pose };
+    let model = medium(&scene, Quadrature::Midpoint, Skip::Off);
+    let seen = model.view_within(&camera, [1.0; 3], &Limits { termination: 0.2, color_budget: 0.0 });
+    let [depth, opacity] = [seen.depth.data[0], seen.opacity.data[0]];
+    assert!((depth - 3.005).abs() < 0.01 && opacity == 1.0, "{depth} {opacity}");
+    assert!((seen.color.data[0] - 0.5).abs() < 1e-5, "{:?}", seen.color.data);
 }
 
 /// A model that is a medium of which everything is known, marched with steps of 1/400 of the box.

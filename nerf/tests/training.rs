@@ -1,5 +1,6 @@
 //! What training can be told beside the photographs: codes, poses, distances, smooth tables, and a run that goes on.
 
+use raygrad_autograd::Real;
 use raygrad_nerf::camera::Pose;
 use raygrad_nerf::dataset::scene::Scene;
 use raygrad_nerf::dataset::{Dataset, Split, embedded};
@@ -46,7 +47,7 @@ fn a_run_goes_on_from_its_state_bit_for_bit() {
     let mut everything = instant();
     everything.field.get_mut::<InstantConfig>().unwrap().codes = 3;
     everything.poses = Some(Schedule::Constant { rate: 1e-3 });
-    let smooth = TotalVariationConfig { weight: 0.1, params: "field.table".into(), cells: None, draws: 2 };
+    let smooth = TotalVariationConfig { weight: 0.1, params: "field.density.0.weight".into(), cells: None, draws: 2 };
     everything.terms = vec![TermConfig::new(smooth)];
     let proposal = ProposalConfig { samples: 8, batch: 128, tile: 32, anneal: 30, ..ProposalConfig::default() };
     let proposals = Config { sampler: SamplerConfig::new(proposal), ..instant() };
@@ -59,16 +60,22 @@ fn a_run_goes_on_from_its_state_bit_for_bit() {
         let go_on = |trainer: &mut Trainer, steps: std::ops::Range<u32>| -> Vec<u64> {
             steps.map(|i| trainer.step(f64::from(i) / 60.0).loss.to_bits()).collect()
         };
-        go_on(&mut trainer, 0..21);
+        trainer.model.params.set_lazy(|name| name == "field.codes", false);
+        // One beyond the steps in which all cells are looked at, and far into those.
+        let before = [261, 21][i];
+        go_on(&mut trainer, 0..before);
         let state = trainer.state().unwrap();
         let mut later = new();
+        later.model.params.freeze(|name| name.starts_with("field.density"));
         go_on(&mut later, 0..5);
         later.load_state(&state).unwrap();
         let (now, then) = (trainer.stats(), later.stats());
         assert_eq!((now.step, now.rays, now.samples, now.moved), (then.step, then.rays, then.samples, then.moved));
         assert_eq!((now.train_seconds, now.loss), (then.train_seconds, then.loss));
         assert_eq!(trainer.state().unwrap(), later.state().unwrap(), "what is written down is all there is");
-        assert_eq!(go_on(&mut trainer, 21..60), go_on(&mut later, 21..60), "configuration {i}");
+        let more = before..before + 40;
+        assert_eq!(go_on(&mut trainer, more.clone()), go_on(&mut later, more), "configuration {i}");
+        assert_eq!(later.stats().rate, later.model.config.schedule.rate(f64::from(before + 39) / 60.0));
         assert_eq!(trainer.model.params.values(), later.model.params.values());
         let find = |part: &str| later.model.params.find(&format!("field.color.{part}.weight")).unwrap();
         let color = find("1");
@@ -101,7 +108,12 @@ fn what_is_no_state_of_this_run_changes_nothing() {
         (before[..before.len() - 9].to_vec(), "safetensors"),
         (std::fs::read(path).unwrap(), "holds a model"),
         (new(other).state().unwrap(), "field.color"),
-        (new(grouped).state().unwrap(), "groups"),
+        (new(grouped).state().unwrap(), "another configuration"),
+        (new(Config { seed: 1, ..instant() }).state().unwrap(), "another configuration"),
+        (
+            Trainer::new(instant(), Arc::new(photographs(7, 16))).unwrap().state().unwrap(),
+            "another configuration, or of other photographs",
+        ),
     ];
     for (bytes, expected) in cases {
         let error = trainer.load_state(&bytes).unwrap_err().to_string();
@@ -136,11 +148,12 @@ fn codes_take_up_what_photographs_differ_in() {
         let seen = model.view(camera, [0.0; 3]);
         f64::from(seen.color.data.iter().sum::<f32>()) / f64::from(seen.opacity.data.iter().sum::<f32>()) / 3.0
     };
-    let with_code = |model: &Model<f32>, number: usize| {
+    let with_code = |model: &Model<f32>, number: u32| {
         let mut own = model.clone();
-        let id = own.params.find("field.codes").unwrap();
-        let row = own.params.get(id).as_slice()[4 * number..4 * number + 4].to_vec();
-        own.params.get_mut(id).as_mut_slice().chunks_exact_mut(4).for_each(|code| code.copy_from_slice(&row));
+        own.look = Some(number);
+        let [view, dense] = [own.view(camera, [0.0; 3]), own.dense_view(camera, [0.0; 3], 1).picture()];
+        let apart = view.color.data.iter().zip(&dense.color.data).map(|(a, b)| (a - b).abs());
+        assert!(apart.fold(0.0, Real::maximum) < 0.01, "views and references have the same look");
         mean(&own)
     };
     let [dark, bright, usual] = [with_code(model, 2), with_code(model, 3), mean(model)];
@@ -200,11 +213,47 @@ fn poses_that_are_off_are_found_in_a_scene_that_is_known() {
     println!("poses: {before:?} to {after:?}, loss {first} to {last}");
     assert!(last < 0.5 * first, "{first} {last}");
     assert!(after[0] < 0.6 * before[0] && after[1] < 0.3 * before[1], "{before:?} {after:?}");
+    // A correction of 1 is a unit of the scene.
+    let mut model = trainer.model.clone();
+    let id = model.params.find("poses").unwrap();
+    model.params.get_mut(id).as_mut_slice().fill(0.0);
+    model.params.get_mut(id).as_mut_slice()[6 + 4] = 1.0;
+    let [still, moved] = [0, 1].map(|i| model.learned_camera(i, &right.frames[0].camera).pose.translation);
+    assert!((moved - still - model.extent.unit * DVec3::Y).length() < 1e-12 && model.extent.unit < 0.95);
+    // Nothing is carved away that photographs show to be empty from where they were not.
+    assert_eq!(Trainer::new(known.model.config.clone(), Arc::new(wrong.clone())).unwrap().stats().occupied, 1.0);
     let error = Model::<f32>::new(trainer.model.config.clone(), Extent { frames: 0, ..trainer.model.extent }, 0);
     assert!(error.err().unwrap().to_string().starts_with("`poses`"));
     let mut bad = trainer.model.config.clone();
     bad.poses = Some(Schedule::Constant { rate: -1.0 });
     assert!(bad.check().unwrap_err().to_string().starts_with("`poses.constant.rate`"));
+}
+
+#[test]
+fn scene_and_poses_are_learned_together() {
+    let right = photographs(40, 32);
+    let mut wrong = right.clone();
+    for (i, frame) in wrong.frames.iter_mut().enumerate() {
+        let [a, b, c] = [1.0, 2.0, 3.0].map(|k| (k * (i as f64 + 1.0)).sin());
+        let turn = DAffine3::from(Pose::from_vector([0.01 * a, -0.01 * b, 0.01 * c], [0.0; 3])).matrix3;
+        frame.camera.pose.matrix3 = turn * frame.camera.pose.matrix3;
+    }
+    let proposal = ProposalConfig { samples: 16, batch: 512, tile: 64, anneal: 50, ..ProposalConfig::default() };
+    for sampler in [instant().sampler, SamplerConfig::new(proposal)] {
+        let data = Arc::new(wrong.clone());
+        let loss = |poses| {
+            let mut config = Config { poses, sampler: sampler.clone(), ..instant() };
+            // What learns poses does not carve; neither does what it is compared with.
+            if let Some(marching) = config.sampler.get_mut::<MarchingConfig>() {
+                marching.occupancy.skip.carving = 0;
+            }
+            train(&mut Trainer::new(config, data.clone()).unwrap(), 400)
+        };
+        let fixed = loss(None);
+        let learned = loss(Some(Schedule::Exponential { from: 2e-3, to: 2e-5, warmup: 0.0 }));
+        println!("{}: loss {fixed} with fixed poses, {learned} with learned ones", sampler.kind());
+        assert!(learned < 0.7 * fixed, "{}: {learned} {fixed}", sampler.kind());
+    }
 }
 
 #[test]
@@ -231,16 +280,28 @@ fn distances_that_were_measured_show_where_surfaces_are() {
     let bare = with(&instant(), &data);
     let depth = Config { terms: vec![TermConfig::new(DepthConfig { weight: 1.0 })], ..instant() };
     let error = Trainer::new(depth.clone(), Arc::new(data.clone())).err().unwrap().to_string();
-    assert!(error.starts_with("`terms.depth`"), "{error}");
+    assert!(error.starts_with("`terms`") && error.contains("Frame::distances"), "{error}");
     for frame in &mut data.frames {
         frame.distances = Some(scene.render(&frame.camera, 1).depth);
     }
     let measured = with(&depth, &data);
     println!("distances of three photographs: {bare} without, {measured} with");
     assert!(measured < 0.7 * bare, "{measured} {bare}");
-    data.frames[1].distances = Some(Image::new(24, 23, 1));
-    let error = Trainer::new(depth, Arc::new(data)).err().unwrap().to_string();
-    assert!(error.starts_with("`train/1`") && error.contains("[24, 23, 1]"), "{error}");
+    for (width, height, channels) in [(24, 23, 1), (23, 24, 1), (24, 24, 3)] {
+        data.frames[1].distances = Some(Image::new(width, height, channels));
+        let error = Trainer::new(depth.clone(), Arc::new(data.clone())).err().unwrap().to_string();
+        assert!(
+            error.starts_with("`train/1`") && error.contains(&format!("[{width}, {height}, {channels}]")),
+            "{error}"
+        );
+    }
+    for bad in [f32::INFINITY, -1.0, f32::NAN] {
+        let mut image = Image::new(24, 24, 1);
+        image.data[77] = bad;
+        data.frames[1].distances = Some(image);
+        let error = Trainer::new(depth.clone(), Arc::new(data.clone())).err().unwrap().to_string();
+        assert!(error.starts_with("`train/1`") && error.contains(&format!("the distance {bad}")), "{error}");
+    }
 }
 
 #[test]

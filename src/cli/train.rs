@@ -38,8 +38,8 @@ pub struct Args {
     /// sample hierarchically instead]
     #[arg(long)]
     skip: Option<Skip>,
-    /// How many photographs must show a place to be empty, by being transparent there, for it to be left out from the start;
-    /// 0 trusts no mask [default: 3]
+    /// How many photographs must show a place to be empty, by being transparent there, for it to be left out from the start
+    /// (of fewer than 17, one of eight is enough); 0 trusts no mask [default: 3]
     #[arg(long, value_name = "N")]
     carve: Option<u32>,
     /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it, and the table of an instant model grows with it

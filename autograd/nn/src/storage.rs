@@ -3,8 +3,9 @@
 use crate::Params;
 use half::{bf16, f16};
 use raygrad_tensor::{Scalar, Tensor};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensors, View};
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::HashMap;
 
 /// The number type in which a file holds parameters. They are rounded once, when they are written; arithmetic stays in
@@ -97,6 +98,42 @@ pub enum ParamsError {
     },
 }
 
+/// A part of a file, which is written out only when its turn comes: so no second copy of all parameters is made.
+enum Part<'a, T: Scalar> {
+    Value(Storage, &'a Tensor<T>),
+    Bytes([usize; 1], &'a [u8]),
+}
+
+impl<T: Scalar> View for Part<'_, T> {
+    fn dtype(&self) -> Dtype {
+        match self {
+            Part::Value(storage, _) => storage.dtype::<T>(),
+            Part::Bytes(..) => Dtype::U8,
+        }
+    }
+
+    fn shape(&self) -> &[usize] {
+        match self {
+            Part::Value(_, value) => value.shape(),
+            Part::Bytes(len, _) => len,
+        }
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        match self {
+            Part::Value(storage, value) => storage.write(value.as_slice()).into(),
+            Part::Bytes(_, bytes) => Cow::Borrowed(bytes),
+        }
+    }
+
+    fn data_len(&self) -> usize {
+        match self {
+            Part::Value(storage, value) => value.len() * storage.dtype::<T>().bitsize() / 8,
+            Part::Bytes(_, bytes) => bytes.len(),
+        }
+    }
+}
+
 impl<T: Scalar> Params<T> {
     /// Rounds every value to what is stored.
     pub fn round_to(&mut self, storage: Storage) {
@@ -116,19 +153,9 @@ impl<T: Scalar> Params<T> {
         metadata: HashMap<String, String>,
         blobs: &[(&str, Vec<u8>)],
     ) -> Result<Vec<u8>, ParamsError> {
-        let written = |value: &Tensor<T>| {
-            let storage = storage.that_fits(value.as_slice());
-            (storage, storage.write(value.as_slice()))
-        };
-        let bytes: Vec<(Storage, Vec<u8>)> = self.values().iter().map(written).collect();
-        let mut views = Vec::with_capacity(self.len() + blobs.len());
-        for ((name, value), (storage, bytes)) in self.iter().zip(&bytes) {
-            views.push((name, TensorView::new(storage.dtype::<T>(), value.shape().to_vec(), bytes)?));
-        }
-        for (name, bytes) in blobs {
-            views.push((name, TensorView::new(Dtype::U8, vec![bytes.len()], bytes)?));
-        }
-        Ok(safetensors::serialize(views, Some(metadata))?)
+        let values = self.iter().map(|(name, value)| (name, Part::Value(storage.that_fits(value.as_slice()), value)));
+        let blobs = blobs.iter().map(|(name, bytes)| (*name, Part::Bytes([bytes.len()], bytes)));
+        Ok(safetensors::serialize(values.chain(blobs), Some(metadata))?)
     }
 
     /// Replaces every value by that of the same name in a safetensors file, and returns the further bytes that the file

@@ -258,6 +258,11 @@ mod tests {
             let expected = sum.backward(&bound.vars());
             assert_eq!(grads.len(), 3);
             assert!(grads[2].is_rows() && grads[2].sparse().len() == count && grads[1].is_zero() == (count < 2));
+            for (tile, share) in grads[2].sparse().iter().enumerate() {
+                let mut sums = raygrad_autograd::RowSums::new(6, 3);
+                share.as_rows().unwrap().scatter(&mut sums);
+                assert_eq!(sums.rows()[0], tile as u32 % 6, "in the order of the tiles");
+            }
             for (grad, expected) in grads.iter().zip(expected) {
                 let (grad, expected) = (grad.clone().into_dense(&Pool::none()), expected.into_dense(&Pool::none()));
                 let pairs = grad.as_slice().iter().zip(expected.as_slice());

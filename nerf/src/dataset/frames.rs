@@ -91,7 +91,7 @@ impl Dataset {
     /// `needed`.
     ///
     /// # Errors
-    /// If they are of another size or have several channels, or are needed and there are none.
+    /// If they are of another size, have several channels, or are no lengths; or are needed and there are none.
     pub fn check_distances(&self, needed: bool) -> Result<()> {
         let mut found = false;
         for Frame { name, image, distances, .. } in &self.frames {
@@ -103,10 +103,15 @@ impl Dataset {
                 let what = format!("has distances of {other:?} columns, rows and channels, and not {own:?}");
                 return Err(Error::setting(name.clone(), what));
             }
+            if let Some(bad) = distances.data.iter().find(|x| !(x.is_finite() && **x >= 0.0)) {
+                let what = format!("has the distance {bad}; use lengths in scene units, and 0 where nothing is known");
+                return Err(Error::setting(name.clone(), what));
+            }
         }
         if needed && !found {
-            let what = "needs photographs of which distances were measured, and there are none in this dataset";
-            return Err(Error::setting("terms.depth", what));
+            let what = "one needs photographs with distances that were measured, and there are none; a program sets \
+                        `Frame::distances`";
+            return Err(Error::setting("terms", what));
         }
         Ok(())
     }

@@ -75,11 +75,11 @@ impl Instant {
     ///
     /// # Errors
     /// If the configuration is out of range, or has codes and the number of photographs is not known.
-    pub fn new<T: Scalar>(config: &InstantConfig, site: Site<'_, T>) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &InstantConfig, mut site: Site<'_, T>) -> Result<Self> {
         config.check()?;
         let shift = LOG_DENSITY_SHIFT + site.space.unit.ln();
-        let Site { space, frames, params, name, rng } = site;
-        let grid = Grid::new(&config.grid, Site { space, frames, params, name, rng })?;
+        let grid = Grid::new(&config.grid, site.child(site.name))?;
+        let Site { frames, params, name, rng, .. } = site;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let mut layer = |part: String, sizes, activation| {
             Linear::without_bias(params, &format!("{name}.{part}"), sizes, activation, Init::He, &mut *rng)
@@ -99,7 +99,13 @@ impl Instant {
         if codes > 0 && frames == 0 {
             return Err(Error::setting("codes", "are for photographs, and it is not known how many there are"));
         }
-        let codes = (codes > 0).then(|| params.add(format!("{name}.codes"), Tensor::zeros(&[frames, codes])));
+        let codes = (codes > 0).then(|| {
+            let name = format!("{name}.codes");
+            let id = params.add(&name, Tensor::zeros(&[frames, codes]));
+            // A step sees few photographs of many.
+            params.set_lazy(|other| other == name, true);
+            id
+        });
         Ok(Instant { grid, direction, shift, density, color, codes })
     }
 

@@ -20,6 +20,7 @@ use std::any::Any;
 use std::sync::{Arc, RwLock};
 
 /// What a term may use: what is rendered of some rays, and what photographs show along them.
+#[derive(Clone, Copy)]
 pub struct Outputs<'a, 't, T: Scalar> {
     /// The parameters.
     pub params: &'a Bound<'t, T>,
@@ -31,7 +32,7 @@ pub struct Outputs<'a, 't, T: Scalar> {
     pub pixels: &'a [[u32; 2]],
     /// The distance along each ray, in scene units, at which what it meets was measured to be; 0 where it was not.
     pub distances: &'a [f32],
-    /// A random number, another one each time: what a term that draws begins from.
+    /// A random number, another one for each term, tile and step: what a term that draws begins from.
     pub seed: u64,
     /// How much of the run is done, 0 to 1.
     pub fraction: f64,
@@ -53,6 +54,11 @@ pub trait Term<T: Scalar>: Any + Send + Sync {
 
     /// Whether it reads [normals](Rendered::normals), for which positions have to be on the tape.
     fn reads_normals(&self) -> bool {
+        false
+    }
+
+    /// Whether it needs [distances](Outputs::distances) that were measured: an error where a dataset has none.
+    fn reads_distances(&self) -> bool {
         false
     }
 }

@@ -37,11 +37,12 @@ pub struct OrientationConfig {
     pub weight: f64,
 }
 
-/// The mean square of how far from what was measured the light of a ray comes from, in its span:
-/// `sum of w ((t - d) / s)^2 + T ((far - d) / s)^2` for the weights w of samples at t, the light T that is left at the far
-/// end of the span, of length s, and the [distance](crate::dataset::Frame::distances) d. It is least where all light comes
-/// from d. Rays of which nothing was measured count nothing. (Of the kind of Deng et al. 2022, "Depth-supervised NeRF",
-/// section 4; the square stands in place of their likelihood, so that it has no width to choose and is finite everywhere.)
+/// How far from what was measured the light of a ray comes from: `sum of w e(t) + T e(far)` for the weights w of samples at
+/// t and the light T that is left at the far end of the span, with `e(t) = min(1, ((t - d) / u)^2)` for the
+/// [distance](crate::dataset::Frame::distances) d and the [unit](crate::Space::unit) u of the scene. It is least where all
+/// light comes from d, and where d lies beyond the span, where all is left. Rays of which nothing was measured, or something
+/// before the span begins, count nothing. (Of the kind of Deng et al. 2022, "Depth-supervised NeRF", section 4; the square up
+/// to 1 stands in place of their likelihood, so that it is finite everywhere.)
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {
@@ -64,12 +65,26 @@ macro_rules! terms {
     };
 }
 
-terms!(
-    "distortion" DistortionConfig,
-    "entropy" EntropyConfig,
-    "orientation" OrientationConfig,
-    "depth" DepthConfig
-);
+terms!("distortion" DistortionConfig, "entropy" EntropyConfig, "orientation" OrientationConfig);
+
+impl Kind<Terms> for DepthConfig {
+    const KIND: &'static str = "depth";
+
+    fn check(&self) -> Result<()> {
+        check_range("depth.weight", self.weight, 0.0, 1e6)
+    }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+        Ok(Arc::new(Depth { weight: self.weight, unit: site.space.unit }))
+    }
+}
+
+/// The numbers.
+struct Depth {
+    weight: f64,
+    /// The length that errors are measured by, in scene units.
+    unit: f64,
+}
 
 impl<T: Scalar> Term<T> for DistortionConfig {
     fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
@@ -101,8 +116,7 @@ impl<T: Scalar> Term<T> for EntropyConfig {
 impl<T: Scalar> Term<T> for OrientationConfig {
     fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
         let rendered = seen.rendered;
-        let tape = rendered.weights.tape();
-        let directions = tape.constant(rendered.samples.directions.clone()).segment_expand(&rendered.samples.segments);
+        let directions = rendered.directions.segment_expand(&rendered.samples.segments);
         let away = (rendered.normals() * directions).sum_over(1).relu().square();
         (away * &rendered.weights).sum() * self.weight
     }
@@ -112,7 +126,7 @@ impl<T: Scalar> Term<T> for OrientationConfig {
     }
 }
 
-impl<T: Scalar> Term<T> for DepthConfig {
+impl<T: Scalar> Term<T> for Depth {
     fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
         let samples = &seen.rendered.samples;
         let (mut errors, mut behind) = (Vec::with_capacity(samples.len()), Vec::with_capacity(seen.rays.len()));
@@ -120,16 +134,21 @@ impl<T: Scalar> Term<T> for DepthConfig {
         for ((rows, [near, far]), measured) in samples.segments.ranges().zip(&seen.rays.spans).zip(measured) {
             let [near, far] = [near, far].map(|x| x.to_f64());
             let error = |t: f64| match measured {
-                Some(distance) if near < far => T::from_f64(((t - distance) / (far - near)).powi(2)),
-                _ => T::ZERO,
+                Some(distance) if near < distance && near < far => ((t - distance) / self.unit).powi(2).min(1.0),
+                _ => 0.0,
             };
-            errors.extend(samples.t.as_slice()[rows].iter().map(|t| error(t.to_f64())));
-            behind.push(error(far));
+            errors.extend(samples.t.as_slice()[rows].iter().map(|t| T::from_f64(error(t.to_f64()))));
+            let is_beyond = measured.is_some_and(|distance| distance >= far);
+            behind.push(T::from_f64(if is_beyond { 0.0 } else { error(far) }));
         }
         let tape = seen.rendered.weights.tape();
         let met = (tape.constant(Tensor::from_vec(&[samples.len()], errors)) * &seen.rendered.weights).sum();
         let left = tape.constant(Tensor::from_vec(&[seen.rays.len()], behind)) * seen.rendered.transmittance();
         (met + left.sum()) * self.weight
+    }
+
+    fn reads_distances(&self) -> bool {
+        true
     }
 }
 
@@ -163,6 +182,11 @@ mod tests {
 
     /// A term's value for two rays along z, as a function of the two parameters.
     fn value<'t>(term: &dyn Term<f64>, x: &[Var<'t, f64>]) -> Var<'t, f64> {
+        value_at(term, x, 0.65)
+    }
+
+    /// The same, with this distance measured along the first ray, and none along the second.
+    fn value_at<'t>(term: &dyn Term<f64>, x: &[Var<'t, f64>], distance: f64) -> Var<'t, f64> {
         let mut params = Params::<f64>::new();
         params.add("much", Tensor::scalar(0.0));
         params.add("steep", Tensor::scalar(0.0));
@@ -176,8 +200,8 @@ mod tests {
         let rendered = &Plan { samples, intervals: None }.render(&query);
         let nothing = &Tensor::zeros(&[2, 3]);
         let (params, rays, frames, pixels) = (&bound, &rays, &[0, 0][..], &[[0, 0]; 2][..]);
-        // Of the second ray nothing was measured.
-        let (target, background, distances, seed, fraction) = (nothing, nothing, &[0.65, 0.0][..], 0, 0.5);
+        let distances = &[distance as f32, 0.0][..];
+        let (target, background, seed, fraction) = (nothing, nothing, 0, 0.5);
         term.loss(&Outputs { params, rays, frames, pixels, distances, seed, fraction, rendered, target, background })
     }
 
@@ -192,7 +216,7 @@ mod tests {
             &DistortionConfig { weight: 2.0 },
             &EntropyConfig { weight: 0.5 },
             &OrientationConfig { weight: 3.0 },
-            &DepthConfig { weight: 4.0 },
+            &Depth { weight: 4.0, unit: 1.6 },
         ];
         for (i, term) in terms.into_iter().enumerate() {
             let report =
@@ -212,10 +236,66 @@ mod tests {
         assert_eq!(at(terms[2], 0.0, 1.0), 0.0);
         let opacity = at(&Opacity, 0.0, -1.0);
         assert!((at(terms[2], 0.0, -1.0) - 3.0 * opacity).abs() < 1e-9 && opacity > 0.5, "{opacity}");
-        // A wall in the first bin, from .5 to .8 of a span to 2, is where it was measured; of a ray that meets nothing all
-        // light counts as from the far end.
+        // A wall in the first bin, from .5 to .8 of a span to 2, is where it was measured, or so far from it, before or
+        // behind; of a ray that meets nothing all light counts as from the far end.
         assert!(at(terms[3], 9.0, 0.0).abs() < 1e-6, "{}", at(terms[3], 9.0, 0.0));
-        assert!((at(terms[3], -60.0, 0.0) - 4.0 * 0.9 * 0.9).abs() < 1e-6, "{}", at(terms[3], -60.0, 0.0));
+        let far = (1.35_f64 / 1.6).powi(2);
+        assert!((at(terms[3], -60.0, 0.0) - 4.0 * far).abs() < 1e-6, "{}", at(terms[3], -60.0, 0.0));
+        let wall = |distance: f64| {
+            let tape = Tape::new();
+            let x = [9.0, 0.0].map(|x| tape.leaf(Tensor::scalar(x)));
+            value_at(&Depth { weight: 4.0, unit: 0.2 }, &x, distance).item()
+        };
+        for (distance, error) in [(0.55, 0.25), (0.75, 0.25), (1.5, 1.0), (9.0, 1.0), (0.5, 0.0), (0.3, 0.0)] {
+            assert!((wall(distance) - 4.0 * error).abs() < 1e-5, "{distance}: {}", wall(distance));
+        }
+        let tape = Tape::new();
+        let clear = [-60.0, 0.0].map(|x| tape.leaf(Tensor::scalar(x)));
+        let beyond = value_at(&Depth { weight: 4.0, unit: 0.2 }, &clear, 9.0).item();
+        assert!(beyond.abs() < 1e-9, "what lies beyond the span is seen through it: {beyond}");
+    }
+
+    /// A density that falls along (2, 1, 2).
+    struct Tilted;
+
+    impl Field<f64> for Tilted {
+        fn density<'t>(&self, _: &Bound<'t, f64>, positions: &Var<'t, f64>) -> Density<'t, f64> {
+            let fall = positions.tape().constant(Tensor::from([[-2.0], [-1.0], [-2.0]]));
+            let value = positions.matmul(&fall).reshape(&[positions.shape()[0]]);
+            Density { value, log: true, features: positions.clone() }
+        }
+        fn color<'t>(&self, _: &Bound<'t, f64>, features: &Var<'t, f64>, _: &Seen<'_, 't, f64>) -> Var<'t, f64> {
+            features.constant(0.5).broadcast_to(features.shape())
+        }
+    }
+
+    #[test]
+    fn orientation_knows_the_axes_of_normals_and_rays() {
+        let params = Params::<f64>::new();
+        let tape = Tape::new();
+        let bound = params.bind(&tape);
+        let mut rays = Rays::new();
+        rays.push(&Ray { origin: DVec3::new(0.1, -0.2, 0.3), direction: DVec3::new(0.6, 0.0, 0.8) }, [0.5, 2.0]);
+        let samples = stratified(&rays, 5, &mut Jitter::Middle, &Pool::new());
+        let rendered =
+            &Plan { samples, intervals: None }.render(&Query { slopes: true, ..Query::new(&Tilted, &bound) });
+        let nothing = &Tensor::zeros(&[1, 3]);
+        let seen = Outputs {
+            params: &bound,
+            rays: &rays,
+            frames: &[0],
+            pixels: &[[0; 2]],
+            distances: &[0.0],
+            seed: 0,
+            fraction: 0.0,
+            rendered,
+            target: nothing,
+            background: nothing,
+        };
+        let away = (2.0 * 0.6 + 2.0 * 0.8) / 3.0_f64;
+        let expected = 0.5 * away * away * rendered.opacity().item();
+        let found = OrientationConfig { weight: 0.5 }.loss(&seen).item();
+        assert!((found - expected).abs() < 1e-9 && expected > 0.01, "{found} {expected}");
     }
 
     /// The sum of opacities.

@@ -15,7 +15,8 @@ use std::sync::Arc;
 /// 2022, "TensoRF", section 4.3, and Fridovich-Keil et al. 2022, "Plenoxels", equation 3, without its root): a table that is
 /// smooth where photographs say nothing.
 ///
-/// Each step looks at a few cells for each ray, at random: the expectation is that of all, and only their rows are moved.
+/// Each step looks at some cells for each ray, at random: the expectation is that of all, and of a lazy table only their rows
+/// are moved. (What no ray touches is moved by Adam by about the learning rate, whatever the weight.)
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TotalVariationConfig {
@@ -24,8 +25,8 @@ pub struct TotalVariationConfig {
     /// The parameter's name: `field.table`.
     pub params: String,
     /// Cells along each of its axes, the slowest first, where its rows are numbered through, as those of a [voxel
-    /// field](crate::VoxelConfig) are (`resolution + 1`, three times; rows beyond them are padding). Without them the
-    /// parameter's own axes; the last one is that of the channels.
+    /// field](crate::VoxelConfig) are (`resolution + 1`, three times; rows beyond them, less than 64, are
+    /// padding). Without them the parameter's own axes; the last one is that of the channels.
     #[serde(default)]
     pub cells: Option<Vec<usize>>,
     /// Cells that are looked at for each ray, 1 to 1024.
@@ -34,8 +35,11 @@ pub struct TotalVariationConfig {
 }
 
 fn draws() -> usize {
-    4
+    1
 }
+
+/// Rows that a table may have beyond its cells, less than so many.
+const PADDING: usize = 64;
 
 impl Kind<Terms> for TotalVariationConfig {
     const KIND: &'static str = "total_variation";
@@ -55,13 +59,15 @@ impl Kind<Terms> for TotalVariationConfig {
         let Some((&channels, own)) = shape.split_last() else {
             return error(format!("the parameter `{}` is a number", self.params));
         };
+        if own.is_empty() || self.cells.is_none() && site.params.is_lazy(id) {
+            return error(format!("the parameter `{}` is {shape:?}: say its `cells` along each axis", self.params));
+        }
         let cells = self.cells.clone().unwrap_or_else(|| own.to_vec());
-        let rows: usize = cells.iter().product();
-        if rows > own.iter().product::<usize>() || rows == 0 || u32::try_from(rows).is_err() {
-            let what = format!(
-                "the cells {cells:?} are more than those of the parameter `{}`, which is {shape:?}",
-                self.params
-            );
+        let all: usize = own.iter().product();
+        let rows = cells.iter().try_fold(1, |rows: usize, &along| rows.checked_mul(along)).unwrap_or(usize::MAX);
+        if cells.is_empty() || rows == 0 || rows > all || all - rows >= PADDING || u32::try_from(rows).is_err() {
+            let what =
+                format!("the cells {cells:?} are not those of the parameter `{}`, which is {shape:?}", self.params);
             return error(what);
         }
         Ok(Arc::new(TotalVariation { id, cells, channels, draws: self.draws, weight: self.weight }))
@@ -211,10 +217,24 @@ mod tests {
         let mut message = |config: TotalVariationConfig| build(&config, &mut params).err().unwrap().to_string();
         let error = message(TotalVariationConfig { params: "table".into(), ..config(None) });
         assert!(error.starts_with("`total_variation`") && error.contains("there are field.table"), "{error}");
-        let error = message(config(Some(vec![3, 4, 6])));
-        assert!(error.contains("[3, 4, 6]") && error.contains("[60, 2]"), "{error}");
+        for wrong in [vec![3, 4, 6], vec![0, 4], vec![3, usize::MAX / 2], vec![]] {
+            let error = message(config(Some(wrong.clone())));
+            assert!(error.contains(&format!("{wrong:?}")) && error.contains("[60, 2]"), "{error}");
+        }
+        let mut few = Params::<f64>::new();
+        few.add("field.table", Tensor::zeros(&[100, 2]));
+        assert!(build(&config(Some(vec![5, 7])), &mut few).is_err(), "35 cells are not those of 100 rows");
+        assert!(build(&config(Some(vec![5, 8])), &mut few).is_ok(), "60 rows of padding");
+        few.set_lazy(|_| true, true);
+        let error = build(&config(None), &mut few).err().unwrap().to_string();
+        assert!(error.contains("say its `cells`"), "{error}");
+        for shape in [&[7][..], &[]] {
+            let mut line = Params::<f64>::new();
+            line.add("field.table", Tensor::zeros(shape));
+            assert!(build(&config(None), &mut line).is_err(), "{shape:?}");
+        }
         assert!(Kind::check(&TotalVariationConfig { draws: 0, ..config(None) }).is_err());
         let read: TotalVariationConfig = serde_json::from_str(r#"{"weight": 0.5, "params": "field.table"}"#).unwrap();
-        assert_eq!((read.draws, read.cells), (4, None));
+        assert_eq!((read.draws, read.cells), (1, None));
     }
 }

@@ -6,6 +6,7 @@ mod poses;
 mod store;
 
 pub use config::{Config, GroupConfig, Preset};
+pub(crate) use poses::POSES;
 pub use poses::Poses;
 
 use crate::Result;
@@ -77,6 +78,9 @@ pub struct Model<T: Scalar> {
     pub terms: Vec<Arc<dyn Term<T>>>,
     /// Corrections of the photographs' poses, if they are learned.
     pub poses: Option<Poses>,
+    /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
+    /// look like none in particular.
+    pub look: Option<u32>,
 }
 
 impl<T: Scalar> Clone for Model<T> {
@@ -89,6 +93,7 @@ impl<T: Scalar> Clone for Model<T> {
             sampler: self.sampler.boxed(),
             terms: self.terms.clone(),
             poses: self.poses,
+            look: self.look,
         }
     }
 }
@@ -110,7 +115,7 @@ impl<T: Scalar> Model<T> {
         let term = |term: &TermConfig| term.build(Site { space, frames, params: &mut params, name: "terms", rng });
         let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
         let poses = config.poses.map(|_| Poses::new(frames, extent.unit, &mut params)).transpose()?;
-        Ok(Model { config, extent, params, field, sampler, terms, poses })
+        Ok(Model { config, extent, params, field, sampler, terms, poses, look: None })
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -157,7 +162,8 @@ impl<T: Scalar> Model<T> {
     }
 
     /// The photometric loss at given samples, a differentiable function of the parameters alone: the sum over fields, rays
-    /// and channels of the configured loss against `target` `[rays, 3]` over `background` `[rays, 3]`.
+    /// and channels of the configured loss against `target` `[rays, 3]` over `background` `[rays, 3]`. Rays are those of no
+    /// photograph in particular, and stay where they are.
     ///
     /// # Panics
     /// If there are more sets of samples than [`fields`](Self::fields).
@@ -188,6 +194,7 @@ impl<T: Scalar> Model<T> {
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::new(self.config.clone(), self.extent, 0)?;
         model.params.assign(&self.params);
+        model.look = self.look;
         let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
         model.sampler.load_state(&state)?;
         if let (Some(old), Some(new)) = (self.marching(), model.marching_mut()) {

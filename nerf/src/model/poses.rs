@@ -11,10 +11,14 @@ use glam::{DAffine3, DVec3};
 use raygrad_autograd::{Scalar, Tensor};
 use raygrad_nn::{Bound, ParamId, Params};
 
+/// The name of the parameter.
+pub(crate) const POSES: &str = "poses";
+
 /// Corrections of the poses of photographs, a parameter `poses` `[photographs, 6]`: for each a rotation vector (radians, in
 /// the axes of the scene) that it is turned by about its own centre, and a translation in units of the
 /// [extent](crate::Extent::unit) (the pose of the photograph with 0 everywhere). The gradient comes through the
-/// [rays](RayVars) of the samples (Lin et al. 2021, "BARF", equation 5, with the two parts apart).
+/// [rays](RayVars) of the samples (Lin et al. 2021, "BARF", equation 5, with the two parts apart and without its
+/// coarse-to-fine mask). What photographs show to be empty is not carved away while their poses are not known.
 ///
 /// A scene and its cameras can turn and move together without any photograph changing: only what cameras are to one another
 /// is found.
@@ -33,7 +37,10 @@ impl Poses {
         if frames == 0 {
             return Err(Error::setting("poses", "are those of photographs, and it is not known how many there are"));
         }
-        Ok(Poses { id: params.add("poses", Tensor::zeros(&[frames, 6])), unit })
+        let id = params.add(POSES, Tensor::zeros(&[frames, 6]));
+        // A step sees few photographs of many.
+        params.set_lazy(|name| name == POSES, true);
+        Ok(Poses { id, unit })
     }
 
     /// The rays of photographs `frames` `[rays]` as variables, corrected, and the same rays as numbers with the part of `span`

@@ -48,7 +48,8 @@ impl<T: Scalar> Model<T> {
     fn dense_rays(&self, rays: &Rays<T>, finer: usize, out: &mut [Pixel]) -> Evaluations {
         let tape = Tape::new();
         let params = self.params.bind_constant(&tape);
-        let query = &Query::new(&*self.field, &params);
+        let frames = self.look.map(|look| vec![look; rays.len()]);
+        let query = &Query { frames: frames.as_deref(), ..Query::new(&*self.field, &params) };
         let sampled = self.sampler.sample(query, rays, Purpose::View { finer }, &mut Jitter::Middle);
         let seen = self.sampler.quadrature().plan_for(query, &sampled.steps, 0.0);
         let rendered = seen.plan.render(query);

@@ -39,7 +39,8 @@ impl Viewer {
     pub fn see(&mut self, model: &Model<f32>, rays: &Rays<f32>, limits: &Limits, out: &mut [Pixel]) -> Evaluations {
         let tape = Tape::with_pool(self.pool.clone());
         let params = model.params.bind_constant(&tape);
-        let query = &Query::new(&*model.field, &params);
+        let frames = model.look.map(|look| vec![look; rays.len()]);
+        let query = &Query { frames: frames.as_deref(), ..Query::new(&*model.field, &params) };
         let sampled = model.sampler.sample(query, rays, Purpose::View { finer: 1 }, &mut Jitter::Middle);
         let rule = model.sampler.quadrature();
         let asked = match rule {
@@ -112,6 +113,8 @@ fn round(
         return count;
     }
     let seen = part.select(&shaded, pool);
+    // Every ray has the look of the same photograph.
+    let query = Query { frames: query.frames.map(|frames| &frames[..alive.len()]), ..*query };
     let color = query.color(&density.features.gather_rows(&shaded[..]), &seen);
     let color = accumulate(&weights.gather_rows(&shaded[..]), &color, &seen.segments);
     for (&ray, color) in alive.iter().zip(color.value().as_slice().chunks_exact(3)) {

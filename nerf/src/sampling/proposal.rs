@@ -101,12 +101,10 @@ impl Kind<Samplers> for ProposalConfig {
         check_range("uniform_share", self.uniform_share, 0.0, 1.0)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
-        let Site { space, frames, params, rng, .. } = site;
+    fn build<T: Scalar>(&self, mut site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
         let mut fields = vec![];
         for (i, level) in self.levels.iter().enumerate() {
-            let name = format!("proposal.{i}");
-            fields.push(Proposer::new(level, Site { space, frames, params, name: &name, rng })?);
+            fields.push(Proposer::new(level, site.child(&format!("proposal.{i}")))?);
         }
         Ok(Box::new(Proposal { config: self.clone(), fields, trust: 0.0 }))
     }
@@ -122,9 +120,9 @@ struct Proposer {
 }
 
 impl Proposer {
-    fn new<T: Scalar>(level: &ProposalLevel, site: Site<'_, T>) -> Result<Self> {
-        let Site { space, frames, params, name, rng } = site;
-        let grid = Grid::new(&level.grid, Site { space, frames, params, name, rng })?;
+    fn new<T: Scalar>(level: &ProposalLevel, mut site: Site<'_, T>) -> Result<Self> {
+        let grid = Grid::new(&level.grid, site.child(site.name))?;
+        let Site { space, params, name, rng, .. } = site;
         let mut layer = |part: usize, sizes, activation| {
             Linear::without_bias(params, &format!("{name}.density.{part}"), sizes, activation, Init::He, &mut *rng)
         };
@@ -258,6 +256,8 @@ impl<T: Scalar> Sampler<T> for Proposal {
         _: Purpose,
         jitter: &mut Jitter<'_>,
     ) -> Sampled<'t, T> {
+        // Proposals follow the field, and pull at nothing else.
+        let query = &Query { rays: None, ..*query };
         let mut shares: Vec<f64> = even_edges(self.config.levels[0].samples).repeat(rays.len());
         let (mut levels, mut asked) = (vec![], 0);
         for (i, (level, field)) in self.config.levels.iter().zip(&self.fields).enumerate() {
@@ -338,6 +338,40 @@ mod tests {
         let sampler = Proposal { trust: 0.0, ..sampler };
         let even = sampler.resampled::<f64>(&shares, &[0.25; 20], [10, 4], true, &mut Jitter::Middle);
         assert!(even.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0].repeat(2)).all(|(a, b)| (a - b).abs() < 1e-12));
+    }
+
+    #[test]
+    fn trust_grows_as_the_bias_function_of_schlick_and_is_whole_at_last() {
+        let config = ProposalConfig { anneal: 100, spacing: Spacing::Disparity, ..ProposalConfig::default() };
+        let mut sampler: Box<Proposal> = Box::new(Proposal { config, fields: vec![], trust: 0.0 });
+        let mut at = |step: u64| {
+            let progress = Progress { step, fraction: 0.0, seed: 0 };
+            Sampler::<f64>::update(&mut *sampler, &progress, &|_, _| {});
+            sampler.trust
+        };
+        for (step, expected) in [(1, 0.1 / 1.09), (50, 5.0 / 5.5), (100, 1.0), (1000, 1.0), (10, 1.0 / 1.9)] {
+            assert!((at(step) - expected).abs() < 1e-12, "{step}: {}", at(step));
+        }
+        Sampler::<f64>::finish(&mut *sampler, &|_, _| {});
+        assert_eq!(sampler.trust, 1.0);
+        // The spacing that is configured is that of the steps.
+        let params = raygrad_nn::Params::<f64>::new();
+        let tape = raygrad_autograd::Tape::new();
+        let bound = params.bind(&tape);
+        let field = crate::analytic::AnalyticField::new(
+            crate::analytic::scenes().remove(0).medium,
+            &mut raygrad_nn::Params::<f64>::new(),
+        );
+        let mut rays = Rays::new();
+        let ray = crate::camera::pinhole::Ray { origin: glam::DVec3::ZERO, direction: glam::DVec3::Z };
+        rays.push(&ray, [1.0, 5.0]);
+        let steps = sampler.steps(&rays, &even_edges(2), 2, &Query::new(&field, &bound));
+        assert!(
+            (steps.edges[1] - 5.0 / 3.0).abs() < 1e-12 && (steps.edges[2] - 5.0).abs() < 1e-12,
+            "{:?}",
+            steps.edges
+        );
+        assert!((steps.samples.t.as_slice()[0] - 4.0 / 3.0).abs() < 1e-12);
     }
 
     #[test]

@@ -103,6 +103,9 @@ mod tests {
         let far = &all.value().as_slice()[6..];
         assert!(far[..3] == [0.5; 3] && far[3..5] == [0.5; 2] && (far[5] - 1.0).abs() < 1e-4, "{far:?}");
         assert!((far[7] - 0.625).abs() < 1e-12, "half a unit of the ball of radius 1 is an eighth: {far:?}");
+        let centred = Space { unbounded: true, ..within }.centred(&points);
+        let pairs = centred.value().as_slice().iter().zip(all.value().as_slice());
+        assert!(pairs.clone().count() == 15 && pairs.clone().all(|(c, u)| (c - (2.0 * u - 1.0)).abs() < 1e-15));
         assert_eq!((within.side(), within.unit), (4.0, 4.0 / 3.0));
         let error = Space::within([DVec3::ONE, DVec3::ONE]).check().unwrap_err().to_string();
         assert!(error.contains("is no box"), "{error}");

@@ -1,5 +1,6 @@
 //! Groups of parameters, each with an optimiser, a schedule and a decay of its own.
 
+use crate::model::POSES;
 use crate::model::config::{Config, GroupConfig};
 use crate::{Error, Result};
 use raygrad_autograd::Gradient;
@@ -31,7 +32,7 @@ impl Groups {
         let place = |name: &str, lazy: bool| {
             let fits = |group: &GroupConfig| name.starts_with(&group.params);
             let other = match (name, lazy) {
-                ("poses", _) => 0,
+                (POSES, _) if config.poses.is_some() => 0,
                 (_, true) => 1,
                 (_, false) => 2,
             };
@@ -133,6 +134,16 @@ mod tests {
         // Adam's first step is the learning rate; what decays does so first.
         for (found, expected) in moved.iter().zip([0.9, 1.0 * (1.0 - 0.2 * 0.5) - 0.2, 0.999, 1.0]) {
             assert!((found - expected).abs() < 1e-6, "{moved:?}");
+        }
+        // Poses have a rate of their own, if they are learned.
+        for (poses, expected) in [(Some(Schedule::Constant { rate: 0.25 }), 0.75), (None, 0.9)] {
+            let mut learned = Params::new();
+            learned.add("poses", Tensor::full(&[1, 6], 1.0_f32));
+            let config = Config { poses, groups: vec![], ..config.clone() };
+            let grads = [Gradient::from(Tensor::full(&[1, 6], 3.0))];
+            let report = Groups::new(&config, &learned).unwrap().update(&mut learned, &grads, 0.0);
+            assert_eq!(report.moved, 6);
+            assert!((learned.values()[0].as_slice()[0] - expected).abs() < 1e-6, "{:?}", learned.values());
         }
         // The first group that fits counts; one that fits nothing is an error.
         config.groups = vec![group("field.", 0.5, 0.0), group("field.color", 0.2, 0.0)];

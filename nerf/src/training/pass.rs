@@ -5,7 +5,7 @@ use crate::losses::Outputs;
 use crate::losses::interlevel::interlevel;
 use crate::losses::photometric::Loss;
 use crate::model::Model;
-use crate::random::Jitter;
+use crate::random::{Jitter, mixed};
 use crate::sampling::{Purpose, Sampled};
 use crate::volume::lit::Lit;
 use crate::volume::query::Query;
@@ -79,7 +79,7 @@ pub(crate) fn rays_loss<'t>(
     let (rendered, target, background) = (&rendered, &target, &background);
     let seed = if model.terms.is_empty() { 0 } else { jitter.seed() };
     let seen = Outputs { params, rays, frames, pixels, distances, seed, fraction, rendered, target, background };
-    let terms = model.terms.iter().map(|term| term.loss(&seen));
+    let terms = (0..).zip(&model.terms).map(|(i, term)| term.loss(&Outputs { seed: mixed(seed, [i, 0]), ..seen }));
     let loss = coarse.chain(levels).chain(terms).fold(fine, |sum, term| term + sum);
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());
     let work = Work {

@@ -3,12 +3,16 @@
 use super::groups::Groups;
 use super::stats::StepStats;
 use super::trainer::Trainer;
+use crate::model::Extent;
+use crate::model::config::Config;
 use crate::{Error, Result};
 use raygrad_nn::{ParamsError, Storage};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::time::Duration;
 
+/// The most rays that a step may have.
+const MOST_RAYS: usize = 1 << 20;
 /// The name of the trainer's own numbers in the bytes.
 const TRAINER: &str = "trainer";
 
@@ -16,6 +20,8 @@ const TRAINER: &str = "trainer";
 /// the seed, the number of the step and that of the tile.
 #[derive(Serialize, Deserialize)]
 struct Counts {
+    config: Config,
+    extent: Extent,
     stats: StepStats,
     elapsed: Duration,
     /// Rays of the next step.
@@ -32,6 +38,7 @@ struct Counts {
 struct Setting {
     name: String,
     frozen: bool,
+    lazy: bool,
     rate: f64,
     decay: f64,
 }
@@ -55,10 +62,13 @@ impl Trainer {
         let setting = |id| Setting {
             name: params.name(id).to_owned(),
             frozen: params.is_frozen(id),
+            lazy: params.is_lazy(id),
             rate: params.rate(id),
             decay: params.decay(id),
         };
         let counts = Counts {
+            config: self.model.config.clone(),
+            extent: self.model.extent,
             stats: self.done,
             elapsed: self.elapsed,
             batch: self.batch,
@@ -106,7 +116,13 @@ impl Trainer {
             return Err(failed("holds a model, and not a run that can go on".into()));
         };
         let counts: Counts = serde_json::from_slice(&counts).map_err(|error| failed(error.to_string()))?;
-        for Setting { name, frozen, rate, decay } in &counts.settings {
+        if counts.config != self.model.config || counts.extent != self.model.extent {
+            return Err(failed("is that of another configuration, or of other photographs".into()));
+        }
+        if !(1..=MOST_RAYS).contains(&counts.batch) {
+            return Err(failed(format!("has steps of {} rays; use 1 to {MOST_RAYS}", counts.batch)));
+        }
+        for Setting { name, frozen, lazy, rate, decay } in &counts.settings {
             let is_own = |other: &str| other == name;
             if !(*rate >= 0.0 && rate.is_finite() && *decay >= 0.0 && decay.is_finite()) {
                 return Err(failed(format!("gives `{name}` a learning rate times {rate} and a decay times {decay}")));
@@ -116,6 +132,7 @@ impl Trainer {
             } else {
                 model.params.unfreeze(is_own)
             };
+            model.params.set_lazy(is_own, *lazy);
             model.params.set_rate(is_own, *rate);
             model.params.set_decay(is_own, *decay);
         }
@@ -127,7 +144,7 @@ impl Trainer {
         model.sampler.load_state(&blobs)?;
         (self.model, self.groups) = (model, groups);
         (self.done, self.elapsed, self.batch, self.collapses) =
-            (counts.stats, counts.elapsed, counts.batch.max(1), counts.collapses);
+            (counts.stats, counts.elapsed, counts.batch, counts.collapses);
         Ok(())
     }
 }

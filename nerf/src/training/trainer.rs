@@ -6,7 +6,6 @@ use super::startup;
 use super::stats::{Budget, StepStats};
 use crate::dataset::Dataset;
 use crate::dataset::batch::Batch;
-use crate::losses::DepthConfig;
 use crate::model::config::Config;
 use crate::model::{Extent, Model, densities};
 use crate::pictures::metrics::psnr_from_mse;
@@ -66,10 +65,10 @@ impl Trainer {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
-        data.check_distances(config.terms.iter().any(|term| term.get::<DepthConfig>().is_some()))?;
         let extent = Extent { frames: data.frames.len(), ..Extent::new(data.bounds, [data.near, data.far]) };
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
         data.check_reach(model.reach())?;
+        data.check_distances(model.terms.iter().any(|term| term.reads_distances()))?;
         let mut trainer = Trainer {
             groups: Groups::new(&model.config, &model.params)?,
             tiles: Tiles::new(),
@@ -92,7 +91,10 @@ impl Trainer {
     /// Lets the sampler learn from the photographs. That is training too.
     fn prepare(&mut self) {
         let start = (self.clock)();
-        self.model.sampler.prepare(&self.data);
+        // Not from poses that are to be corrected: what is carved away never comes back.
+        if self.model.poses.is_none() {
+            self.model.sampler.prepare(&self.data);
+        }
         self.count_occupied();
         self.elapsed += (self.clock)().saturating_sub(start);
     }
@@ -123,6 +125,8 @@ impl Trainer {
             }
         }
         let start = (self.clock)();
+        // What the last look at the field takes is not to stand beside what steps took.
+        (self.tiles, self.pool) = (Tiles::new(), Pool::new());
         self.model.finish();
         self.count_occupied();
         self.elapsed += (self.clock)().saturating_sub(start);

@@ -1,7 +1,7 @@
 //! Rendering only those samples that light reaches.
 
 use super::quadrature::{Plan, Quadrature, refine};
-use super::query::Query;
+use super::query::{Query, RayVars};
 use super::render::Rendered;
 use crate::camera::rays::Samples;
 use raygrad_autograd::{Memo, Pool, Scalar};
@@ -54,7 +54,10 @@ impl Quadrature {
         };
         let positions = query.positions(&lit.samples);
         // Rays that are variables may be other rays than those that were marched.
-        let memo = if query.rays.is_some() { Memo::gather(&[], &[], pool) } else { memo };
+        let same = |rays: &RayVars<'t, T>| {
+            rays.origins.value() == &lit.samples.origins && rays.directions.value() == &lit.samples.directions
+        };
+        let memo = if query.rays.is_none_or(same) { memo } else { Memo::gather(&[], &[], pool) };
         let density = tape.recall(memo, || query.field.density(query.params, &positions));
         Lit { kept: lit.len(), rendered: lit.render_density(query, positions, density), asked }
     }

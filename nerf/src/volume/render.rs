@@ -94,6 +94,8 @@ pub struct Rendered<'t, T: Scalar> {
     pub samples: Samples<T>,
     /// The places, `[samples, 3]`: on the tape where a [query](super::Query) has them there.
     pub positions: Var<'t, T>,
+    /// Unit directions of the rays, `[rays, 3]`: on the tape where rays are variables.
+    pub directions: Var<'t, T>,
     /// The density there.
     pub density: Density<'t, T>,
     /// How much of each sample arrives at the eye, `[samples]`.

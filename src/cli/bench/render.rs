@@ -9,6 +9,7 @@ use std::sync::Arc;
 use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced};
 use raygrad::nerf::pictures::metrics::{mse, psnr, psnr_from_mse};
+use raygrad::nerf::sampling::marching::Marching;
 use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Config, Error, Evaluations, Image, Instant, Model, Preset, Result, Trainer, Voxel};
 
@@ -99,7 +100,12 @@ fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
     if data.frames.is_empty() {
         return Err(Error::file(folder, "its scene has no test views to compare with"));
     }
-    Ok((run.model()?, data))
+    let mut model = run.model()?;
+    // What its views leave out of their own accord is for the settings to say.
+    if let Some(Marching { config, grid, .. }) = model.marching().cloned() {
+        model.sampler = Box::new(Marching::new(config, grid));
+    }
+    Ok((model, data))
 }
 
 /// What views are compared with.

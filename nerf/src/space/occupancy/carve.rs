@@ -4,6 +4,7 @@ use super::lattice::{CARVED, CELLS, cell, uncarved};
 use super::{OccupancyGrid, TASK};
 use glam::DVec3;
 use rayon::prelude::*;
+use std::sync::Arc;
 
 impl OccupancyGrid {
     /// Marks as empty for good the cells for which `is_empty(centre, radius)` holds, a ball around the cell in scene
@@ -11,7 +12,7 @@ impl OccupancyGrid {
     /// [`occupy_all_but_carved`](Self::occupy_all_but_carved).
     pub fn carve(&mut self, is_empty: &(dyn Fn(DVec3, f64) -> bool + Sync)) {
         let lattice = &self.lattice;
-        self.densities.par_chunks_mut(CELLS * TASK).enumerate().for_each(|(task, densities)| {
+        Arc::make_mut(&mut self.densities).par_chunks_mut(CELLS * TASK).enumerate().for_each(|(task, densities)| {
             for (word, densities) in densities.chunks_exact_mut(CELLS).enumerate() {
                 let [corner, size] = lattice.block(task * TASK + word);
                 let mut left = uncarved(densities);

@@ -63,6 +63,7 @@ use lattice::{CARVED, CELLS, Lattice};
 use leaps::Leaps;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 pub use march::{MAX_STEPS, MarchBuffer, Step};
 pub use skip::{Skip, Skipping};
@@ -170,7 +171,8 @@ pub struct Threshold {
 pub struct OccupancyGrid {
     lattice: Lattice,
     /// For each cell, in the order of the words and their bits, the decayed largest density; NaN if never looked at.
-    densities: Vec<f32>,
+    /// Shared with copies until one of them looks.
+    densities: Arc<Vec<f32>>,
     /// For each block its occupied cells; see [`bits::coarsen`] for the inner blocks of larger cascades.
     words: Vec<u64>,
     leaps: Leaps,
@@ -190,7 +192,7 @@ impl OccupancyGrid {
         let lattice = Lattice { bounds, resolution: config.resolution, cascades: config.cascades };
         let words = vec![u64::MAX; lattice.words()];
         let leaps = Leaps::new(&words, &lattice);
-        Ok(OccupancyGrid { densities: vec![f32::NAN; CELLS * words.len()], lattice, words, leaps })
+        Ok(OccupancyGrid { densities: Arc::new(vec![f32::NAN; CELLS * words.len()]), lattice, words, leaps })
     }
 
     /// The box of cascade 0 as it was given.

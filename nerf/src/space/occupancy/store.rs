@@ -5,6 +5,7 @@ use super::leaps::Leaps;
 use super::{OccupancyConfig, OccupancyGrid};
 use crate::{Error, Result};
 use glam::DVec3;
+use std::sync::Arc;
 
 /// What a stored grid begins with, a name and a version: with the densities of its cells, and without.
 const WHOLE: [u8; 8] = *b"raygocc1";
@@ -66,10 +67,11 @@ impl OccupancyGrid {
         }
         let mut grid = OccupancyGrid::new(corners, &config)?;
         grid.words.iter_mut().for_each(|word| *word = u64::from_le_bytes(take(&mut rest)));
+        let densities = Arc::make_mut(&mut grid.densities);
         if is_whole {
-            grid.densities.iter_mut().for_each(|density| *density = f32::from_le_bytes(take(&mut rest)));
+            densities.iter_mut().for_each(|density| *density = f32::from_le_bytes(take(&mut rest)));
         } else {
-            for (cells, word) in grid.densities.chunks_exact_mut(CELLS).zip(&grid.words) {
+            for (cells, word) in densities.chunks_exact_mut(CELLS).zip(&grid.words) {
                 cells
                     .iter_mut()
                     .enumerate()

@@ -1,6 +1,6 @@
 //! Looking at a field: a few cells at a time in training, all that matter before rendering.
 
-use super::lattice::{CELLS, cell, uncarved};
+use super::lattice::{CELLS, Lattice, cell, uncarved};
 use super::{OccupancyGrid, TASK, bits, exceeding};
 use crate::random::stream;
 use rand::RngExt;
@@ -8,6 +8,7 @@ use rand_pcg::Pcg64Mcg;
 use raygrad_tensor::parallel;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// A field's density: writes that of each position (scene units) into the slot of the same number (1 / scene unit).
 /// It is called from several threads at a time, with [`POINTS`] positions or fewer that lie close together.
@@ -169,17 +170,29 @@ impl OccupancyGrid {
     /// Looks at the occupied cells of a finished field, and empties those where no density exceeds `min_sigma`: first at
     /// the middles of their eight octants and then, in what that would empty, at one random place in each of 64 parts, so
     /// that what is thinner than an octant is seldom missed. Returns the number of densities that were asked for.
+    ///
+    /// What was known of the cells stays: a copy of a grid that is pruned shares it with the grid.
     pub fn prune(&mut self, min_sigma: f32, density: &DensityFn<'_>) -> u64 {
-        let mut occupied = self.words.clone();
-        let fixed = |_| stream(0, [0, 0]);
-        let mut count = self.look(&Places::middles(REBUILD), |word| occupied[word], fixed, |_, new| new, density);
-        let found = self.exceeding(min_sigma);
-        let random = |task: usize| stream(1, [0, task as u64]);
-        count +=
-            self.look(&Places::random(CLOSELY), |word| occupied[word] & !found[word], random, |_, new| new, density);
-        for (word, exceeding) in occupied.iter_mut().zip(self.exceeding(min_sigma)) {
-            *word &= exceeding;
-        }
+        let (fixed, random) = (Places::middles(REBUILD), Places::random(CLOSELY));
+        let (lattice, mut occupied) = (&self.lattice, self.words.clone());
+        let prune = |(waiting, found): &mut (Waiting, Vec<f32>), (task, words): (usize, &mut [u64])| {
+            found.clear();
+            found.resize(CELLS * words.len(), f32::NAN);
+            let mut look = |places: &Places, words: &[u64], rng: Pcg64Mcg| {
+                let chosen = |word: usize| words[word - task * TASK];
+                let count = Look { lattice, places, density }.at(task, found, chosen, rng, |_, new| new, waiting);
+                (count, found.chunks_exact(CELLS).map(|densities| exceeding(densities, min_sigma)).collect::<Vec<_>>())
+            };
+            let (count, exceeding) = look(&fixed, words, stream(0, [0, 0]));
+            let emptied: Vec<u64> = words.iter().zip(exceeding).map(|(word, exceeding)| word & !exceeding).collect();
+            let (more, exceeding) = look(&random, &emptied, stream(1, [0, task as u64]));
+            for (i, (word, exceeding)) in words.iter_mut().zip(exceeding).enumerate() {
+                *word &= if lattice.is_used(task * TASK + i) { exceeding } else { 0 };
+            }
+            count + more
+        };
+        let tasks = occupied.par_chunks_mut(TASK).enumerate();
+        let count = tasks.map_init(Default::default, |scratch, task| parallel::serial(|| prune(scratch, task))).sum();
         self.occupy(occupied, false);
         count
     }
@@ -193,38 +206,61 @@ impl OccupancyGrid {
         keep: impl Fn(f32, f32) -> f32 + Sync,
         density: &DensityFn<'_>,
     ) -> u64 {
-        let lattice = &self.lattice;
+        let look = Look { lattice: &self.lattice, places, density };
+        let tasks = Arc::make_mut(&mut self.densities).par_chunks_mut(CELLS * TASK).enumerate();
+        let at = |waiting: &mut Waiting, (task, densities): (usize, &mut [f32])| {
+            parallel::serial(|| look.at(task, densities, &chosen, rng(task), &keep, waiting))
+        };
+        tasks.map_init(Waiting::default, at).sum()
+    }
+}
+
+/// What is looked at, and where in a cell.
+struct Look<'a> {
+    lattice: &'a Lattice,
+    places: &'a Places,
+    density: &'a DensityFn<'a>,
+}
+
+impl Look<'_> {
+    /// Looks at the chosen cells of each word of a task, whose densities these are, and returns how many densities were asked
+    /// for.
+    fn at(
+        &self,
+        task: usize,
+        densities: &mut [f32],
+        chosen: impl Fn(usize) -> u64,
+        mut rng: Pcg64Mcg,
+        keep: impl Fn(f32, f32) -> f32,
+        waiting: &mut Waiting,
+    ) -> u64 {
+        let Look { lattice, places, density } = *self;
         let samples = places.corners.len();
-        let look = |waiting: &mut Waiting, (task, densities): (usize, &mut [f32])| {
-            let mut rng = rng(task);
-            let mut count = 0;
-            for word in 0..densities.len() / CELLS {
-                let mut cells = if lattice.is_used(task * TASK + word) { chosen(task * TASK + word) } else { 0 };
-                if cells != 0 {
-                    cells &= uncarved(&densities[word * CELLS..(word + 1) * CELLS]);
+        let mut count = 0;
+        for word in 0..densities.len() / CELLS {
+            let mut cells = if lattice.is_used(task * TASK + word) { chosen(task * TASK + word) } else { 0 };
+            if cells != 0 {
+                cells &= uncarved(&densities[word * CELLS..(word + 1) * CELLS]);
+            }
+            let [corner, size] = lattice.block(task * TASK + word).map(|x| x.to_array());
+            count += samples * cells.count_ones() as usize;
+            while cells != 0 {
+                let bit = cells.trailing_zeros() as usize;
+                cells &= cells - 1;
+                if waiting.points.len() + samples > POINTS {
+                    waiting.flush(density, samples, densities, &keep);
                 }
-                let [corner, size] = lattice.block(task * TASK + word).map(|x| x.to_array());
-                count += samples * cells.count_ones() as usize;
-                while cells != 0 {
-                    let bit = cells.trailing_zeros() as usize;
-                    cells &= cells - 1;
-                    if waiting.points.len() + samples > POINTS {
-                        waiting.flush(density, samples, densities, &keep);
-                    }
-                    waiting.cells.push(word * CELLS + bit);
-                    let cell = cell(bit);
-                    for part in &places.corners {
-                        waiting.points.push(std::array::from_fn(|axis| {
-                            let inside = if places.size > 0.0 { places.size * rng.random::<f64>() } else { 0.0 };
-                            (corner[axis] + size[axis] * (cell[axis] as f64 + part[axis] + inside)) as f32
-                        }));
-                    }
+                waiting.cells.push(word * CELLS + bit);
+                let cell = cell(bit);
+                for part in &places.corners {
+                    waiting.points.push(std::array::from_fn(|axis| {
+                        let inside = if places.size > 0.0 { places.size * rng.random::<f64>() } else { 0.0 };
+                        (corner[axis] + size[axis] * (cell[axis] as f64 + part[axis] + inside)) as f32
+                    }));
                 }
             }
-            waiting.flush(density, samples, densities, &keep);
-            count as u64
-        };
-        let tasks = self.densities.par_chunks_mut(CELLS * TASK).enumerate();
-        tasks.map_init(Waiting::default, |waiting, task| parallel::serial(|| look(waiting, task))).sum()
+        }
+        waiting.flush(density, samples, densities, &keep);
+        count as u64
     }
 }

@@ -147,7 +147,8 @@ impl<T: Scalar> Plan<T> {
         let Weighted { weights, optical_depth } = self.weighted(&density);
         let color = query.color(&density.features, &self.samples);
         let color = accumulate(&weights, &color, &self.samples.segments);
-        Rendered { samples: self.samples.clone(), positions, density, weights, optical_depth, color }
+        let directions = query.directions(&self.samples);
+        Rendered { samples: self.samples.clone(), positions, directions, density, weights, optical_depth, color }
     }
 
     /// The plan without the intervals that no more light than `least` reaches, and the numbers of the samples that are
