@@ -22,13 +22,14 @@ impl<T: Scalar> Memo<T> {
     /// one tensor each.
     ///
     /// # Panics
-    /// If the memos are not of the same operations or a row is out of range.
+    /// If the memos are not of the same operations, an output has no rows, or a row is out of range.
     #[track_caller]
     pub fn gather(memos: &[Memo<T>], rows: &[[u32; 2]], pool: &Pool<T>) -> Memo<T> {
         let Some(first) = memos.first() else { return Memo { values: vec![] } };
         let gather = |which: usize| {
             let parts: Vec<&[T]> = memos.iter().map(|memo| memo.values[which].as_slice()).collect();
             let mut shape = first.values[which].shape().to_vec();
+            assert!(!shape.is_empty(), "rows of an output that is a number");
             let width: usize = shape[1..].iter().product();
             shape[0] = rows.len();
             let mut out = pool.tensor(&shape);
@@ -185,6 +186,25 @@ mod tests {
         assert_eq!(count.load(Ordering::Relaxed), 6);
         tape.recall(Memo::gather(&[], &[], tape.pool()), || run(&x, &count));
         assert_eq!(count.load(Ordering::Relaxed), 8);
+    }
+
+    #[test]
+    fn the_nan_finder_looks_at_what_is_recalled() {
+        let (tape, count) = (Tape::new(), Arc::default());
+        let (bad, good) = (tape.leaf(Tensor::from([1.0, f64::INFINITY])), tape.leaf(Tensor::from([1.0, 2.0])));
+        let twice = |x: &Var<'_, f64>| x.tape().try_apply(Twice(Arc::clone(&count)), &[x]).map(|y| y.into_value());
+        let (_, memo) = tape.remember(|| twice(&bad).unwrap());
+        tape.check_finite(true);
+        assert!(twice(&good).is_ok() && tape.recall(memo, || twice(&good)).is_err());
+    }
+
+    #[test]
+    #[should_panic(expected = "rows of an output that is a number")]
+    fn numbers_have_no_rows() {
+        let tape = Tape::new();
+        let x = tape.leaf(Tensor::scalar(1.0));
+        let (_, memo) = tape.remember(|| run(&x, &Arc::default()));
+        Memo::gather(&[memo], &[[0, 0]], tape.pool());
     }
 
     #[test]

@@ -1,20 +1,22 @@
 //! What training can be told beside the photographs: codes, poses, distances, smooth tables, and a run that goes on.
 
-use raygrad_autograd::Real;
+use raygrad_autograd::{Real, Scalar, Var};
 use raygrad_nerf::camera::Pose;
 use raygrad_nerf::dataset::scene::Scene;
 use raygrad_nerf::dataset::{Dataset, Split, embedded};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
 use raygrad_nerf::glam::{DAffine3, DVec3};
-use raygrad_nerf::losses::{DepthConfig, TotalVariationConfig};
+use raygrad_nerf::losses::{DepthConfig, Outputs, TotalVariationConfig};
 use raygrad_nerf::sampling::marching::MarchingConfig;
 use raygrad_nerf::sampling::proposal::ProposalConfig;
 use raygrad_nerf::{
-    Config, Extent, FieldConfig, GroupConfig, Image, InstantConfig, Model, Preset, SamplerConfig, TermConfig, Trainer,
-    VoxelConfig,
+    Config, Extent, FieldConfig, GroupConfig, Image, InstantConfig, Kind, Model, Preset, Result, SamplerConfig, Site,
+    Term, TermConfig, Terms, Trainer, VoxelConfig,
 };
 use raygrad_nn::Schedule;
-use std::sync::Arc;
+use serde::{Deserialize, Serialize};
+use std::collections::HashSet;
+use std::sync::{Arc, Mutex};
 
 /// A small instant model.
 fn instant() -> Config {
@@ -302,6 +304,41 @@ fn distances_that_were_measured_show_where_surfaces_are() {
         let error = Trainer::new(depth.clone(), Arc::new(data.clone())).err().unwrap().to_string();
         assert!(error.starts_with("`train/1`") && error.contains(&format!("the distance {bad}")), "{error}");
     }
+}
+
+/// A term that is nothing, and writes down what it is given to draw from.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SpyConfig {
+    number: usize,
+}
+
+static SEEDS: Mutex<Vec<(usize, u64)>> = Mutex::new(vec![]);
+
+impl Kind<Terms> for SpyConfig {
+    const KIND: &'static str = "spy";
+    fn build<T: Scalar>(&self, _: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+        Ok(Arc::new(self.clone()))
+    }
+}
+
+impl<T: Scalar> Term<T> for SpyConfig {
+    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+        SEEDS.lock().unwrap().push((self.number, seen.seed));
+        assert_eq!([seen.frames.len(), seen.pixels.len(), seen.distances.len()], [seen.rays.len(); 3]);
+        seen.rendered.color.sum() * 0.0
+    }
+}
+
+#[test]
+fn every_term_draws_anew_in_every_tile_of_every_step() {
+    let terms = [0, 1].map(|number| TermConfig::new(SpyConfig { number })).to_vec();
+    let mut trainer = Trainer::new(Config { terms, ..instant() }, Arc::new(photographs(6, 16))).unwrap();
+    train(&mut trainer, 3);
+    let seeds = SEEDS.lock().unwrap().clone();
+    let different: HashSet<u64> = seeds.iter().map(|(_, seed)| *seed).collect();
+    assert_eq!((seeds.len(), different.len()), (3 * 8 * 2, 3 * 8 * 2));
+    assert_eq!(seeds.iter().filter(|(number, _)| *number == 1).count(), 24);
 }
 
 #[test]

@@ -46,7 +46,7 @@ pub struct Seen<'a, 't, T: Scalar> {
     /// Which samples belong to which ray.
     pub segments: &'a Segments,
     /// The number of the photograph that each ray belongs to, `[rays]`: for a field with a code for each photograph. There
-    /// is none in new views.
+    /// is none in views, unless they are to have the [look](crate::Model::look) of one.
     pub frames: Option<&'a [u32]>,
 }
 

@@ -148,3 +148,63 @@ impl Trainer {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::{Split, embedded};
+    use crate::model::Preset;
+    use std::sync::Arc;
+
+    fn trainer() -> Trainer {
+        let mut config = Config::preset(Preset::Instant).with_budget(1.0);
+        if let Some(sampler) = config.sampler.get_mut::<crate::sampling::marching::MarchingConfig>() {
+            (sampler.occupancy.resolution, sampler.samples) = (16, 512);
+        }
+        Trainer::new(config, Arc::new(embedded(Split::Train, 8))).unwrap()
+    }
+
+    #[test]
+    fn counts_come_back_before_the_first_step_too() {
+        let mut trainer = trainer();
+        (trainer.collapses, trainer.done.restarts, trainer.batch) = (2, 3, 512);
+        trainer.elapsed = Duration::from_nanos(1_234_567_891);
+        let state = trainer.state().unwrap();
+        let mut later = self::trainer();
+        later.load_state(&state).unwrap();
+        assert_eq!((later.collapses, later.done.restarts, later.batch), (2, 3, 512));
+        assert_eq!((later.elapsed, later.done.step), (trainer.elapsed, 0));
+        assert!([later.done.loss, later.done.psnr, later.done.opacity].iter().all(|x| x.is_nan()), "{:?}", later.done);
+    }
+
+    #[test]
+    fn numbers_that_no_run_has_are_refused() {
+        let mut trainer = trainer();
+        let written = |change: &dyn Fn(&mut Counts)| {
+            let params = &trainer.model.params;
+            let state = trainer.state().unwrap();
+            let mut blobs = params.clone().load_safetensors(&state).unwrap();
+            let mut counts: Counts = serde_json::from_slice(&blobs.remove(TRAINER).unwrap()).unwrap();
+            change(&mut counts);
+            blobs.insert(TRAINER.into(), serde_json::to_vec(&counts).unwrap());
+            let blobs: Vec<_> = blobs.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
+            params.to_safetensors(Storage::Full, HashMap::new(), &blobs).unwrap()
+        };
+        let states = [
+            (written(&|counts| counts.batch = 0), "steps of 0 rays"),
+            (written(&|counts| counts.batch = usize::MAX), "rays; use 1 to"),
+            (written(&|counts| counts.settings[0].rate = -1.0), "a learning rate times -1"),
+            (written(&|counts| counts.settings[1].decay = -2.0), "a decay times -2"),
+            (written(&|counts| counts.groups = 9), "lacks what an optimiser remembers"),
+            (written(&|counts| counts.groups = 0), "groups"),
+            (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),
+        ];
+        let before = trainer.state().unwrap();
+        for (state, expected) in &states {
+            let error = trainer.load_state(state).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+        assert!(trainer.state().unwrap() == before);
+        trainer.load_state(&before).unwrap();
+    }
+}

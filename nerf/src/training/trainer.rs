@@ -367,6 +367,34 @@ mod tests {
     }
 
     #[test]
+    fn steps_get_as_many_rays_as_have_the_samples_that_are_wanted() {
+        let mut trainer = Trainer::new(tiny_table(), Arc::new(embedded(Split::Train, 12))).unwrap();
+        let mut next = |batch: usize, marched: u64| {
+            trainer.batch = batch;
+            trainer.adapt_batch(&Work { marched, ..Work::default() });
+            trainer.batch
+        };
+        // 24576 samples of 8 each are 3072 rays: half of the way there.
+        assert_eq!(next(1024, 8 * 1024), 2048);
+        assert_eq!(next(5120, 8 * 5120), 4096);
+        // At most twice as many, whole slots, and within bounds.
+        assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
+        assert_eq!(next(1500, 8 * 1500), 2288);
+        assert_eq!([next(256, 10_000_000), next(1 << 16, 0)], [256, 1 << 16]);
+    }
+
+    #[test]
+    fn a_restart_draws_other_rays() {
+        let data = Arc::new(embedded(Split::Train, 12));
+        let [one, other] = [0, 1].map(|restarts| {
+            let mut trainer = Trainer::new(tiny_table(), data.clone()).unwrap();
+            trainer.done.restarts = restarts;
+            trainer.step(0.0).loss
+        });
+        assert!(one != other && one.is_finite() && other.is_finite(), "{one} {other}");
+    }
+
+    #[test]
     fn settings_of_optimisers_are_checked() {
         let mut config = Config { schedule: Schedule::Constant { rate: 1e300 }, ..tiny() };
         let message = |config: &Config| config.check().unwrap_err().to_string();
