@@ -274,6 +274,19 @@ mod tests {
     }
 
     #[test]
+    fn another_model_may_follow() {
+        let mut tiles = Tiles::<f64>::new();
+        for shape in [[2, 3], [3, 2], [4, 5], [2, 3]] {
+            let mut params = Params::new();
+            let x = params.add("x", Tensor::ones(&shape));
+            let step = tiles.differentiate(&params, 10, |_, params, _| (params[x].square().sum(), ()));
+            assert_eq!(step.grads[0].shape(), shape);
+            assert_eq!(step.grads[0].dense().unwrap(), &Tensor::full(&shape, 20.0));
+            tiles.take_back(step.grads);
+        }
+    }
+
+    #[test]
     fn threads_change_no_bit_and_frozen_parameters_have_no_gradient() {
         let (mut params, ids) = store();
         params.freeze(|name| name == "b");
