@@ -31,6 +31,8 @@ impl Model<f32> {
         let mut model = Model::new(config, extent, 0)?;
         let state = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
         model.sampler.load_state(&state).map_err(|error| Error::file(&path, error))?;
+        // A look at the field is not to stand beside the file.
+        drop((bytes, state));
         model.finish();
         Ok(model)
     }

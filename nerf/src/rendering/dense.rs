@@ -10,6 +10,7 @@ use crate::sampling::Purpose;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Scalar, Tape, Var};
+use rayon::prelude::*;
 
 /// A view in double precision.
 #[derive(Debug, Clone)]
@@ -40,8 +41,11 @@ impl<T: Scalar> Model<T> {
     pub fn dense_view(&self, camera: &Camera, background: [f64; 3], finer: usize) -> DenseView {
         assert!(finer > 0, "steps that are 0 times smaller");
         let see = |_: &mut (), rays: &Rays<T>, out: &mut [Pixel]| self.dense_rays(rays, finer, out);
-        let (pixels, evaluations) = self.pixels(camera, TILE, see);
-        let pixels = pixels.into_iter().map(|pixel| pixel.over(background)).collect();
+        let mut pixels = vec![Pixel::default(); camera.width * camera.height];
+        let keep = |seen: &[Pixel], out: &mut [Pixel]| {
+            out.iter_mut().zip(seen).for_each(|(out, pixel)| *out = pixel.over(background));
+        };
+        let evaluations = self.pixels(camera, TILE, see, pixels.par_chunks_mut(TILE), keep);
         DenseView { width: camera.width, height: camera.height, pixels, evaluations }
     }
 
@@ -73,7 +77,10 @@ fn numbers<T: Scalar>(values: &Var<'_, T>) -> Vec<f64> {
 impl DenseView {
     /// The view rounded to single precision.
     pub fn picture(&self) -> Picture {
-        Picture::new([self.width, self.height], &self.pixels, self.evaluations)
+        let mut picture = Picture::new([self.width, self.height]);
+        picture.parts(self.pixels.len().max(1)).for_each(|part| part.fill(self.pixels.iter().copied()));
+        picture.evaluations = self.evaluations;
+        picture
     }
 }
 

@@ -29,45 +29,66 @@ pub struct Picture {
 const VISIBLE: f64 = 1e-3;
 
 impl Picture {
-    /// A picture of these pixels, row by row, in single precision.
-    pub(crate) fn new(camera: [usize; 2], pixels: &[Pixel], evaluations: Evaluations) -> Self {
-        let [width, height] = camera;
-        let image = |channels: usize, values: &dyn Fn(&Pixel, usize) -> f64| {
-            let data = pixels.iter().flat_map(|pixel| (0..channels).map(move |c| values(pixel, c) as f32));
-            Image { width, height, channels, data: data.collect() }
-        };
-        let opacity = |pixel: &Pixel| 1.0 - pixel.transmittance;
-        let depth = |pixel: &Pixel| if opacity(pixel) > VISIBLE { pixel.depth / opacity(pixel) } else { 0.0 };
-        Picture {
-            color: image(3, &|pixel, c| pixel.color[c]),
-            depth: image(1, &|pixel, _| depth(pixel)),
-            opacity: image(1, &|pixel, _| opacity(pixel)),
-            evaluations,
+    /// A picture of nothing.
+    pub(crate) fn new([width, height]: [usize; 2]) -> Self {
+        let image = |channels| Image::new(width, height, channels);
+        Picture { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
+    }
+
+    /// Its parts of `tile` pixels each, row by row.
+    pub(crate) fn parts(&mut self, tile: usize) -> impl IndexedParallelIterator<Item = Part<'_>> {
+        let [color, depth, opacity] = [&mut self.color, &mut self.depth, &mut self.opacity];
+        let rest = depth.data.par_chunks_mut(tile).zip(opacity.data.par_chunks_mut(tile));
+        let parts = color.data.par_chunks_mut(3 * tile).zip(rest);
+        parts.map(|(color, (depth, opacity))| Part { color, depth, opacity })
+    }
+}
+
+/// A part of a picture.
+pub(crate) struct Part<'a> {
+    color: &'a mut [f32],
+    depth: &'a mut [f32],
+    opacity: &'a mut [f32],
+}
+
+impl Part<'_> {
+    /// Takes these pixels, in single precision.
+    pub fn fill(self, pixels: impl Iterator<Item = Pixel>) {
+        let rest = self.depth.iter_mut().zip(self.opacity);
+        for (pixel, (color, (depth, opacity))) in pixels.zip(self.color.chunks_exact_mut(3).zip(rest)) {
+            color.iter_mut().zip(pixel.color).for_each(|(out, value)| *out = value as f32);
+            let blocked = 1.0 - pixel.transmittance;
+            *depth = if blocked > VISIBLE { pixel.depth / blocked } else { 0.0 } as f32;
+            *opacity = blocked as f32;
         }
     }
 }
 
 impl<T: Scalar> Model<T> {
-    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays.
-    pub(crate) fn pixels<S: Default>(
+    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile shows
+    /// to its part of `out`.
+    pub(crate) fn pixels<S: Default, P: Send>(
         &self,
         camera: &Camera,
         tile: usize,
         see: impl Fn(&mut S, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
-    ) -> (Vec<Pixel>, Evaluations) {
-        let mut pixels = vec![Pixel::default(); camera.width * camera.height];
-        let bounds = self.reach();
-        let tiles = pixels.par_chunks_mut(tile).enumerate();
-        let evaluations = tiles.map_init(S::default, |scratch, (which, out)| {
-            let mut rays = Rays::new();
-            for pixel in which * tile..which * tile + out.len() {
-                let place = [pixel % camera.width, pixel / camera.width];
-                rays.push_pixel(camera, place, bounds, self.extent.span);
-            }
-            parallel::serial(|| see(scratch, &rays, out))
-        });
-        let evaluations = evaluations.reduce(Evaluations::default, |a, b| a + b);
-        (pixels, evaluations)
+        out: impl IndexedParallelIterator<Item = P>,
+        keep: impl Fn(&[Pixel], P) + Sync,
+    ) -> Evaluations {
+        let (bounds, count) = (self.reach(), camera.width * camera.height);
+        let tiles =
+            out.enumerate().map_init(Default::default, |(scratch, pixels): &mut (S, Vec<Pixel>), (which, out)| {
+                let mut rays = Rays::new();
+                for pixel in which * tile..count.min((which + 1) * tile) {
+                    let place = [pixel % camera.width, pixel / camera.width];
+                    rays.push_pixel(camera, place, bounds, self.extent.span);
+                }
+                pixels.resize(rays.len(), Pixel::default());
+                let evaluations = parallel::serial(|| see(scratch, &rays, pixels));
+                keep(pixels, out);
+                evaluations
+            });
+        tiles.reduce(Evaluations::default, |a, b| a + b)
     }
 }
 
@@ -81,9 +102,11 @@ impl Model<f32> {
     /// As [`view`](Self::view), with these limits in place of those that go with the configuration.
     pub fn view_within(&self, camera: &Camera, background: [f32; 3], limits: &Limits) -> Picture {
         let see = |viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [Pixel]| viewer.see(self, rays, limits, out);
-        let (pixels, evaluations) = self.pixels(camera, self.sampler.view_tile(), see);
-        let pixels: Vec<_> = pixels.into_iter().map(|pixel| pixel.over(background.map(f64::from))).collect();
-        Picture::new([camera.width, camera.height], &pixels, evaluations)
+        let (mut picture, tile) = (Picture::new([camera.width, camera.height]), self.sampler.view_tile());
+        let background = background.map(f64::from);
+        let keep = |pixels: &[Pixel], out: Part<'_>| out.fill(pixels.iter().map(|pixel| pixel.over(background)));
+        picture.evaluations = self.pixels(camera, tile, see, picture.parts(tile), keep);
+        picture
     }
 
     /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole: something

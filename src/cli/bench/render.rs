@@ -52,7 +52,7 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
     let scale = if quick {
         Scale { steps: 600, size: 64, views: 1, rounds: 2 }
     } else {
-        Scale { steps: 3000, size: 200, views: 4, rounds: 7 }
+        Scale { steps: 3000, size: 200, views: 4, rounds: 3 }
     };
     let (model, views) = match folder {
         Some(folder) => stored(folder, &scale)?,
