@@ -71,6 +71,9 @@ fn a_run_goes_on_from_its_state_bit_for_bit() {
         later.model.params.freeze(|name| name.starts_with("field.density"));
         go_on(&mut later, 0..5);
         later.load_state(&state).unwrap();
+        let sampler = &later.model.sampler;
+        let grows = sampler.training_state() != sampler.state();
+        assert_eq!(grows, sampler.grid().is_some(), "what a run needs beyond a model is the grid's densities");
         let (now, then) = (trainer.stats(), later.stats());
         assert_eq!((now.step, now.rays, now.samples, now.moved), (then.step, then.rays, then.samples, then.moved));
         assert_eq!((now.train_seconds, now.loss), (then.train_seconds, then.loss));

@@ -134,7 +134,7 @@ impl<T: Scalar> Term<T> for Depth {
         for ((rows, [near, far]), measured) in samples.segments.ranges().zip(&seen.rays.spans).zip(measured) {
             let [near, far] = [near, far].map(|x| x.to_f64());
             let error = |t: f64| match measured {
-                Some(distance) if near < distance && near < far => ((t - distance) / self.unit).powi(2).min(1.0),
+                Some(distance) if near < distance => ((t - distance) / self.unit).powi(2).min(1.0),
                 _ => 0.0,
             };
             errors.extend(samples.t.as_slice()[rows].iter().map(|t| T::from_f64(error(t.to_f64()))));
