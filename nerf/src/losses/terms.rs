@@ -46,7 +46,7 @@ pub struct OrientationConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {
-    /// Its weight, 0 to 1e6: 0.1 to 1 is usual.
+    /// Its weight, 0 to 1e6; the tests have 1.
     pub weight: f64,
 }
 

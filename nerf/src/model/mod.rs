@@ -79,7 +79,7 @@ pub struct Model<T: Scalar> {
     /// Corrections of the photographs' poses, if they are learned.
     pub poses: Option<Poses>,
     /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
-    /// look like none in particular.
+    /// look like none in particular. Of a photograph that there is not, views panic.
     pub look: Option<u32>,
 }
 

@@ -16,7 +16,7 @@ pub(crate) const POSES: &str = "poses";
 
 /// Corrections of the poses of photographs, a parameter `poses` `[photographs, 6]`: for each a rotation vector (radians, in
 /// the axes of the scene) that it is turned by about its own centre, and a translation in units of the
-/// [extent](crate::Extent::unit) (the pose of the photograph with 0 everywhere). The gradient comes through the
+/// [extent](crate::Extent::unit); 0 everywhere leaves the pose as it was given. The gradient comes through the
 /// [rays](RayVars) of the samples (Lin et al. 2021, "BARF", equation 5, with the two parts apart and without its
 /// coarse-to-fine mask). What photographs show to be empty is not carved away while their poses are not known.
 ///
