@@ -27,7 +27,7 @@ pub mod space;
 pub mod training;
 pub mod volume;
 
-pub use camera::{Camera, Ndc, NdcRay, Pose, RadialLens, Ray, Rays, Samples, clip_span, intersect_box};
+pub use camera::{Camera, Lens, Ndc, NdcRay, Pose, RadialLens, Ray, Rays, Samples, clip_span, intersect_box};
 pub use camera::{rotation_exp, rotation_log};
 #[cfg(feature = "check")]
 pub use catalogue::catalogue;

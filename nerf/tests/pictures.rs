@@ -12,8 +12,8 @@ use raygrad_nerf::sampling::marching::MarchingConfig;
 use raygrad_nerf::space::occupancy::{OccupancyConfig, Skip};
 use raygrad_nerf::volume::quadrature::Quadrature;
 use raygrad_nerf::{
-    Camera, Config, Extent, Image, InstantConfig, Jitter, Limits, Model, Preset, Purpose, Query, Rays, SamplerConfig,
-    Trainer,
+    Camera, Config, Extent, Image, InstantConfig, Jitter, Lens, Limits, Model, Preset, Purpose, Query, Rays,
+    SamplerConfig, Trainer,
 };
 use raygrad_nn::Params;
 use std::path::PathBuf;
@@ -27,7 +27,7 @@ fn camera(number: usize) -> Camera {
     let eye = DISTANCE * DVec3::new(radius * angle.cos(), radius * angle.sin(), height);
     let mut pose = Camera::look_at(eye, DVec3::new(0.1, -0.1, 0.2), DVec3::Z);
     pose.matrix3 *= DMat3::from_rotation_z(0.3 + number as f64);
-    Camera { width: 60, height: 44, focal: [110.0, 99.0], centre: [33.0, 19.0], pose }
+    Camera { width: 60, height: 44, focal: [110.0, 99.0], centre: [33.0, 19.0], lens: Lens::Pinhole, pose }
 }
 
 /// Where a golden file lies.
@@ -199,7 +199,7 @@ fn what_ends_early_is_as_far_away_as_what_does_not() {
     let exact = layers.exact(4.0, 1.0);
     let scene = AnalyticScene { name: "wall", medium: Arc::new(layers), exact, ..scenes().remove(0) };
     let pose = Camera::look_at(scene.ray.origin, scene.ray.at(1.0), DVec3::Y);
-    let camera = Camera { width: 1, height: 1, focal: [1.0; 2], centre: [0.5; 2], pose };
+    let camera = Camera { width: 1, height: 1, focal: [1.0; 2], centre: [0.5; 2], lens: Lens::Pinhole, pose };
     let model = medium(&scene, Quadrature::Midpoint, Skip::Off);
     let seen = model.view_within(&camera, [1.0; 3], &Limits { termination: 0.2, color_budget: 0.0 });
     let [depth, opacity] = [seen.depth.data[0], seen.opacity.data[0]];
@@ -232,7 +232,7 @@ fn views_of_known_media_are_exact_by_every_rule_and_within_every_limit() {
     for scene in scenes() {
         // The ray is that of the pixel in column 3 and row 1 of a picture that is wider than high.
         let pose = Camera::look_at(scene.ray.origin, scene.ray.at(1.0), DVec3::Y);
-        let camera = Camera { width: 5, height: 3, focal: [40.0, 30.0], centre: [3.5, 1.5], pose };
+        let camera = Camera { width: 5, height: 3, focal: [40.0, 30.0], centre: [3.5, 1.5], lens: Lens::Pinhole, pose };
         assert!(camera.pixel_ray(3, 1).direction.distance(scene.ray.direction) < 1e-12);
         let white = [scene.background as f32; 3];
         let exact = &scene.exact;

@@ -89,7 +89,7 @@ pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
     let new = [width as f64, height as f64];
     let scale = (new[0] / old[0]).min(new[1] / old[1]);
     let centre = |axis: usize| 0.5 * new[axis] + scale * (camera.centre[axis] - 0.5 * old[axis]);
-    Camera { width, height, focal: camera.focal.map(|f| f * scale), centre: [centre(0), centre(1)], pose: camera.pose }
+    Camera { width, height, focal: camera.focal.map(|f| f * scale), centre: [centre(0), centre(1)], ..*camera }
 }
 
 #[cfg(test)]

@@ -46,7 +46,7 @@ impl Preview {
             height: truth.height,
             focal: frame.camera.focal.map(|f| f * scale),
             centre: frame.camera.centre.map(|c| c * scale),
-            pose: frame.camera.pose,
+            ..frame.camera
         };
         Preview { name: frame.name.clone(), camera, truth, background }
     }

@@ -1,6 +1,69 @@
 //! Radial lens distortion, and how to undo it.
 
 use crate::{Error, Result};
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+/// How a camera's glass bends light: the map between directions and places in the image plane.
+///
+/// Directions and places have the axes of images here: `x` right, `y` down, `z` into the scene. A place is in units of the
+/// focal length from the principal point, `[(column - cx) / fx, (row - cy) / fy]`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Lens {
+    /// None: straight lines stay straight.
+    #[default]
+    Pinhole,
+    /// OpenCV's rational model with radial coefficients `k1 .. k6` (the last three in the denominator) and tangential
+    /// `p1, p2` (Brown 1966): COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
+    Brown {
+        /// Radial coefficients `k1 .. k6`.
+        k: [f64; 6],
+        /// Tangential coefficients `p1, p2`.
+        p: [f64; 2],
+    },
+    /// The equidistant fisheye (Kannala and Brandt 2006): an angle `a` to the axis is put at
+    /// `a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8)`; then tangential and thin-prism terms. OpenCV's `fisheye`; COLMAP's
+    /// SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE and THIN_PRISM_FISHEYE.
+    Fisheye {
+        /// Radial coefficients `k1 .. k4`.
+        k: [f64; 4],
+        /// Tangential coefficients `p1, p2` (thin prism alone).
+        p: [f64; 2],
+        /// Thin-prism coefficients `sx1, sy1`.
+        s: [f64; 2],
+    },
+    /// One parameter, the field of view `omega` in radians (Devernay and Faugeras 2001): COLMAP's FOV.
+    Fov {
+        /// The field of view in radians.
+        omega: f64,
+    },
+    /// All directions: columns are longitudes, rows latitudes. A focal length is in pixels for each radian.
+    Equirectangular,
+}
+
+impl Lens {
+    /// The direction, of length 1, of the light that reaches this place; `None` where the lens puts nothing.
+    pub fn direction(&self, [x, y]: [f64; 2]) -> Option<DVec3> {
+        match self {
+            Lens::Pinhole => Some(DVec3::new(x, y, 1.0).normalize()),
+            _ => unimplemented!(),
+        }
+    }
+
+    /// As [`direction`](Self::direction); where the lens puts nothing, the outermost direction towards there.
+    pub fn nearest(&self, place: [f64; 2]) -> DVec3 {
+        self.direction(place).unwrap_or(DVec3::Z)
+    }
+
+    /// Where light from this direction, of any length but 0, reaches the image plane; `None` if it does not.
+    pub fn place(&self, direction: DVec3) -> Option<[f64; 2]> {
+        match self {
+            Lens::Pinhole => (direction.z > 0.0).then(|| [direction.x / direction.z, direction.y / direction.z]),
+            _ => unimplemented!(),
+        }
+    }
+}
 
 /// A lens that moves the point at distance `r` from the optical axis, in units of the focal length, to
 /// `r (1 + k1 r^2 + k2 r^4)` (Brown 1966; OpenCV's first two coefficients).

@@ -9,7 +9,7 @@ pub(crate) mod rays;
 pub(crate) mod rotation;
 
 pub use bounds::{clip_span, intersect_box};
-pub use lens::RadialLens;
+pub use lens::{Lens, RadialLens};
 pub use ndc::{Ndc, NdcRay};
 pub use pinhole::{Camera, Ray};
 pub use pose::Pose;

@@ -1,5 +1,6 @@
 //! Pinhole cameras and the rays through their pixels.
 
+use crate::camera::lens::Lens;
 use glam::{DAffine3, DVec3};
 
 /// A straight line `origin + t * direction`, `t >= 0`.
@@ -18,7 +19,7 @@ impl Ray {
     }
 }
 
-/// A pinhole camera.
+/// A camera.
 ///
 /// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates
 /// are continuous, with `(0, 0)` at the upper left corner of the image, so the centre of the pixel in column `i` and
@@ -33,6 +34,8 @@ pub struct Camera {
     pub focal: [f64; 2],
     /// The principal point in pixels.
     pub centre: [f64; 2],
+    /// How light is bent on its way to the image.
+    pub lens: Lens,
     /// Camera-to-world transform: a rotation and a translation.
     pub pose: DAffine3,
 }
@@ -43,7 +46,8 @@ impl Camera {
     /// `angle_x` is the horizontal field of view in radians: `focal = width / (2 tan(angle_x / 2))`.
     pub fn from_angle(width: usize, height: usize, angle_x: f64, pose: DAffine3) -> Self {
         let focal = 0.5 * width as f64 / (0.5 * angle_x).tan();
-        Camera { width, height, focal: [focal; 2], centre: [0.5 * width as f64, 0.5 * height as f64], pose }
+        let centre = [0.5 * width as f64, 0.5 * height as f64];
+        Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }
     }
 
     /// A pose at `eye` that looks at `target`, with `up` upwards in the image.
@@ -55,10 +59,32 @@ impl Camera {
         DAffine3 { matrix3: glam::DMat3::from_cols(right, back.cross(right), back), translation: eye }
     }
 
-    /// The ray through the continuous pixel position `(x, y)`.
+    /// The ray through the continuous pixel position `(x, y)`. Where the [lens](Lens) puts nothing, that of the outermost
+    /// direction towards there: see [`sees`](Self::sees).
     pub fn ray(&self, x: f64, y: f64) -> Ray {
-        let local = DVec3::new((x - self.centre[0]) / self.focal[0], -(y - self.centre[1]) / self.focal[1], -1.0);
+        let [x, y] = self.plane(x, y);
+        let local = match self.lens {
+            Lens::Pinhole => DVec3::new(x, -y, -1.0),
+            lens => lens.nearest([x, y]) * DVec3::new(1.0, -1.0, -1.0),
+        };
         Ray { origin: self.pose.translation, direction: (self.pose.matrix3 * local).normalize() }
+    }
+
+    /// Whether some light reaches the continuous pixel position `(x, y)` through the [lens](Lens).
+    pub fn sees(&self, x: f64, y: f64) -> bool {
+        self.lens.direction(self.plane(x, y)).is_some()
+    }
+
+    /// The continuous pixel position at which a point in world coordinates is seen, which may lie outside of the image;
+    /// `None` for points that no light comes from, such as those behind a pinhole.
+    pub fn pixel_of(&self, point: DVec3) -> Option<[f64; 2]> {
+        let local = self.pose.matrix3.transpose() * (point - self.pose.translation);
+        let [x, y] = self.lens.place(local * DVec3::new(1.0, -1.0, -1.0))?;
+        Some([x * self.focal[0] + self.centre[0], y * self.focal[1] + self.centre[1]])
+    }
+
+    fn plane(&self, x: f64, y: f64) -> [f64; 2] {
+        [(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1]]
     }
 
     /// The ray through the centre of the pixel in column `column` and row `row`.
@@ -74,7 +100,7 @@ impl Camera {
             height,
             focal: [self.focal[0] * sx, self.focal[1] * sy],
             centre: [self.centre[0] * sx, self.centre[1] * sy],
-            pose: self.pose,
+            ..*self
         }
     }
 }

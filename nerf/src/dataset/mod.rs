@@ -5,6 +5,7 @@
 pub mod background;
 pub(crate) mod batch;
 mod blender;
+pub mod capture;
 pub(crate) mod color_space;
 mod embedded;
 mod frames;
