@@ -9,7 +9,7 @@
 //! too, so its picture is that of `off`, which leaves those cells out and nothing else. `bare` asks the field in those
 //! cells as well, where no photograph ever judged it.
 
-use raygrad::nerf::dataset::{Split, load_views};
+use raygrad::nerf::dataset::{Capture, Reading, Split};
 use raygrad::nerf::pictures::metrics::psnr;
 use raygrad::nerf::space::occupancy::{OccupancyGrid, Skip};
 use raygrad::nerf::{Camera, Config, Evaluations, Extent, Image, Model};
@@ -30,7 +30,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let extent: Extent = serde_json::from_value(about["extent"].clone())?;
     let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
     let mut model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
-    let views = load_views(folder, Split::Test, 1, VIEWS)?;
+    let capture = Capture::read(folder)?;
+    let views = capture.load(Split::Test, &capture.survey(None)?, &Reading { views: VIEWS, ..Reading::default() })?;
     let cameras: Vec<Camera> = views.frames.iter().map(|frame| frame.camera.resized(size, size)).collect();
 
     model.set_skip(Skip::Off);

@@ -29,7 +29,7 @@ impl Place {
             let mut frames = vec![];
             for (i, frame) in evenly_spaced(embedded(split, SIZE).frames, views).into_iter().enumerate() {
                 let name = format!("{split}/r_{i}");
-                frame.image.save_png(place.path(&format!("scene/{name}.png"))).unwrap();
+                frame.image.to_image().save_png(place.path(&format!("scene/{name}.png"))).unwrap();
                 let (rotation, eye) = (frame.camera.pose.matrix3, frame.camera.pose.translation);
                 let row = |r: usize| [rotation.row(r).x, rotation.row(r).y, rotation.row(r).z, eye[r]];
                 let matrix = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];

@@ -4,7 +4,7 @@
 use raygrad_autograd::{Real, Tape};
 use raygrad_nerf::analytic::{AnalyticField, AnalyticScene, Layer, Layers, scenes};
 use raygrad_nerf::dataset::scene::{DISTANCE, Scene, View};
-use raygrad_nerf::dataset::{Dataset, Frame};
+use raygrad_nerf::dataset::{Dataset, Frame, Placement, Scope};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
 use raygrad_nerf::glam::{DMat3, DVec3};
 use raygrad_nerf::pictures::metrics::psnr;
@@ -138,8 +138,8 @@ fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
     let scene = Scene::bulldozer();
     let frame = |number: usize| {
         let camera = camera(number);
-        let image = scene.render(&camera, 5).color;
-        Frame { name: format!("train/{number}"), camera, image, distances: None }
+        let image = scene.render(&camera, 5).color.into();
+        Frame { name: format!("train/{number}"), camera, image, mask: None, distances: None }
     };
     let [low, high] = scene.bounds();
     let data = Dataset {
@@ -147,6 +147,8 @@ fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
         bounds: [low - 0.02, high + 0.02],
         near: 2.0,
         far: 6.0,
+        scope: Scope::Bounded,
+        placement: Placement::default(),
         skipped: vec![],
     };
     let mut config = Config::preset(Preset::Instant);

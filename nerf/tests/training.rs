@@ -135,7 +135,9 @@ fn codes_take_up_what_photographs_differ_in() {
         data.frames[i] = data.frames[i + 1].clone();
     }
     for frame in data.frames.iter_mut().step_by(2) {
-        frame.image.data.chunks_exact_mut(4).for_each(|pixel| pixel[..3].iter_mut().for_each(|x| *x *= 0.5));
+        let mut image = frame.image.to_image();
+        image.data.chunks_exact_mut(4).for_each(|pixel| pixel[..3].iter_mut().for_each(|x| *x *= 0.5));
+        frame.image = image.into();
     }
     let data = Arc::new(data);
     let mut with = instant();

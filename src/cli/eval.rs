@@ -112,7 +112,8 @@ pub fn run(args: &Args) -> Result<()> {
         model.set_skip(skip);
     }
     let scene = run.scene(args.scene.as_ref())?;
-    let data = scene.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
+    let opened = scene.open_for(&run.config.extent)?;
+    let data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     let name = args.name();
     let pictures = run.file(&name);
     make_folder(&pictures)?;

@@ -7,7 +7,7 @@ use raygrad::nerf::pictures::metrics::psnr;
 use raygrad::nerf::{Camera, Image, Model, Result};
 
 use super::output::complain;
-use super::scene::Scene;
+use super::scene::Opened;
 
 /// Longest side of a preview in pixels: it is to be quick.
 const LONGEST: usize = 128;
@@ -24,7 +24,7 @@ pub struct Preview {
 impl Preview {
     /// A photograph that is not trained on: of the validation split or else the test split. If there is neither, one
     /// of the training photographs.
-    pub fn choose(scene: &Scene, downscale: usize, train: &Dataset, background: [f32; 3]) -> Self {
+    pub fn choose(scene: &Opened, downscale: usize, train: &Dataset, background: [f32; 3]) -> Self {
         let held_out = scene.load(Split::Val, downscale, 1);
         let held_out = held_out.or_else(|error| scene.load(Split::Test, downscale, 1).map_err(|_| error));
         match held_out {
@@ -38,7 +38,7 @@ impl Preview {
 
     fn new(frame: &Frame, background: [f32; 3]) -> Self {
         let factor = frame.image.width.max(frame.image.height).div_ceil(LONGEST);
-        let truth = cropped_to_multiple(&frame.image, factor).downscaled(factor).over(background);
+        let truth = cropped_to_multiple(&frame.image.to_image(), factor).downscaled(factor).over(background);
         let scale = 1.0 / factor as f64;
         // Columns and rows are cut off at the right and at the bottom, where they do not move the principal point.
         let camera = Camera {

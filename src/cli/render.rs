@@ -140,7 +140,7 @@ fn cameras(args: &Args, run: &Run) -> Result<Vec<Camera>> {
         (CameraPath::Orbit, Scene::Embedded) => test_cameras(frames, view.width),
         (CameraPath::Orbit, Scene::Folder(_)) => view.orbit(&config.extent, frames),
         (CameraPath::Test, _) => {
-            let scene = run.scene(args.scene.as_ref())?;
+            let scene = run.scene(args.scene.as_ref())?.open_for(&config.extent)?;
             let data = scene.load(Split::Test, config.downscale, args.frames.unwrap_or(usize::MAX))?;
             data.frames.into_iter().map(|frame| frame.camera).collect()
         }

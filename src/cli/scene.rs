@@ -4,11 +4,14 @@ use std::ffi::OsString;
 use std::fmt;
 use std::path::PathBuf;
 
-use raygrad::nerf::dataset::{Dataset, Split, embedded, evenly_spaced, load_views};
-use raygrad::nerf::{Error, Result};
+use std::sync::{Mutex, PoisonError};
+
+use raygrad::nerf::dataset::{Capture, Dataset, Reading, Scope, Split, Survey, embedded, evenly_spaced};
+use raygrad::nerf::{Error, Extent, Result};
 use serde::{Deserialize, Serialize};
 
 use super::output::complain;
+use super::progress::Progress;
 
 /// Width and height of the embedded scene's images in pixels.
 const EMBEDDED_SIZE: usize = 200;
@@ -40,23 +43,21 @@ impl fmt::Display for Scene {
 }
 
 impl Scene {
-    /// At most `views` evenly spaced photographs of a split, at `1 / downscale` of their size. Warns of absent images.
-    pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
-        let data = match self {
-            Scene::Embedded if !EMBEDDED_SIZE.is_multiple_of(downscale) => {
-                let what = format!("{downscale} does not divide the image size {EMBEDDED_SIZE}x{EMBEDDED_SIZE}");
-                return Err(Error::setting("downscale", what));
-            }
-            Scene::Embedded => {
-                let data = embedded(split, EMBEDDED_SIZE / downscale);
-                Dataset { frames: evenly_spaced(data.frames, views), ..data }
-            }
-            Scene::Folder(folder) => load_views(folder, split, downscale, views)?,
-        };
-        for name in &data.skipped {
-            complain(&format!("warning: {self}: the {split} image `{name}` is absent and was skipped"));
-        }
-        Ok(data)
+    /// What the scene's files say, and where it lies; `asked` overrules how far it goes.
+    pub fn open(&self, asked: Option<Scope>) -> Result<Opened> {
+        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None }) };
+        let capture = Capture::read(folder)?;
+        let survey = capture.survey(asked)?;
+        Ok(Opened { scene: self.clone(), capture: Some((capture, survey)) })
+    }
+
+    /// The same, lying where a model has it.
+    pub fn open_for(&self, extent: &Extent) -> Result<Opened> {
+        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None }) };
+        let Extent { placement, bounds, span: [near, far], .. } = *extent;
+        let (scope, reason) = (Scope::Bounded, "as the model has it".to_owned());
+        let survey = Survey { placement, scope, bounds, near, far, reason };
+        Ok(Opened { scene: self.clone(), capture: Some((Capture::read(folder)?, survey)) })
     }
 
     /// The same scene, found from any working directory.
@@ -65,5 +66,40 @@ impl Scene {
             Scene::Embedded => Ok(Scene::Embedded),
             Scene::Folder(folder) => std::path::absolute(folder).map(Scene::Folder).map_err(|e| Error::file(folder, e)),
         }
+    }
+}
+
+/// A scene whose files have been read, but for the photographs.
+pub struct Opened {
+    scene: Scene,
+    /// What a folder holds.
+    pub capture: Option<(Capture, Survey)>,
+}
+
+impl Opened {
+    /// At most `views` evenly spaced photographs of a split, at `1 / downscale` of their size. Warns of absent images.
+    pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
+        let data = match &self.capture {
+            None if !EMBEDDED_SIZE.is_multiple_of(downscale) => {
+                let what = format!("{downscale} does not divide the image size {EMBEDDED_SIZE}x{EMBEDDED_SIZE}");
+                return Err(Error::setting("downscale", what));
+            }
+            None => {
+                let data = embedded(split, EMBEDDED_SIZE / downscale);
+                Dataset { frames: evenly_spaced(data.frames, views), ..data }
+            }
+            Some((capture, survey)) => {
+                let progress = Mutex::new(Progress::new());
+                let show = |done: usize, total: usize| {
+                    let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+                    progress.set(done as f64 / total as f64, || format!("{done} of {total} {split} photographs read"));
+                };
+                capture.load(split, survey, &Reading { downscale, views, progress: &show })?
+            }
+        };
+        for name in &data.skipped {
+            complain(&format!("warning: {}: the {split} image `{name}` is absent and was skipped", self.scene));
+        }
+        Ok(data)
     }
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raygrad::Schedule;
-use raygrad::nerf::dataset::{Dataset, Split};
+use raygrad::nerf::dataset::{Dataset, Scope, Split};
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
@@ -19,7 +19,7 @@ use super::output::{complain, print};
 use super::preview::Preview;
 use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
-use super::scene::Scene;
+use super::scene::{Opened, Scene};
 use super::watch::Watch;
 use super::{interrupt, parse};
 
@@ -55,6 +55,9 @@ pub struct Args {
     /// Train at 1/K of the images' size
     #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
+    /// How far the scene goes: bounded (an object before nothing) or unbounded [default: found out from the photographs]
+    #[arg(long)]
+    scope: Option<Scope>,
     /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
@@ -100,14 +103,15 @@ impl Trained {
 /// Trains and leaves the model in a new folder.
 pub fn run(args: &Args) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let data = Arc::new(args.scene.load(Split::Train, args.downscale, usize::MAX)?);
+    let scene = args.scene.open(args.scope)?;
+    let data = Arc::new(scene.load(Split::Train, args.downscale, usize::MAX)?);
     let config = args.config(&data)?;
     let background = config.background.shown();
     let mut trainer = Trainer::new(config, data.clone())?;
     let run = Run::create(folder, args.run_config(&trainer, &data)?)?;
-    describe(&run, &trainer, &data)?;
+    describe(&run, &trainer, &data, &scene)?;
 
-    let preview = Preview::choose(&args.scene, args.downscale, &data, background);
+    let preview = Preview::choose(&scene, args.downscale, &data, background);
     let budget = args.budget();
     let mut watch = Watch::new(&run, &trainer, budget, preview)?;
     interrupt::listen();
@@ -136,7 +140,7 @@ pub fn run(args: &Args) -> Result<Trained> {
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        config = config.with_budget(self.budget().seconds());
+        config = config.with_budget(self.budget().seconds()).with_scope(data.scope);
         if let Some(background) = self.background {
             config.background = background;
         }
@@ -202,8 +206,19 @@ fn default_budget(preset: Preset) -> Duration {
     }
 }
 
-fn describe(run: &Run, trainer: &Trainer, data: &Dataset) -> Result<()> {
+fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Result<()> {
     let (views, image) = (data.frames.len(), &data.frames[0].image);
+    if let Some((capture, survey)) = &scene.capture {
+        let held_out = capture.present().count() - views;
+        print(&format!(
+            "capture  {}, {} of {} images exist, {held_out} held out; {}: {}\n",
+            capture.format,
+            capture.present().count(),
+            capture.views.len(),
+            survey.scope,
+            survey.reason
+        ))?;
+    }
     print(&format!(
         "scene    {}: {views} views of {}x{}\nmodel    {} parameters, {} threads\nrun      {}\n",
         run.config.scene,

@@ -47,6 +47,17 @@ impl Lens {
     pub fn direction(&self, [x, y]: [f64; 2]) -> Option<DVec3> {
         match self {
             Lens::Pinhole => Some(DVec3::new(x, y, 1.0).normalize()),
+            Lens::Brown { k, p } => {
+                let (mut a, mut b) = (x, y);
+                for _ in 0..30 {
+                    let r = a * a + b * b;
+                    let radial = 1.0 + r * (k[0] + r * k[1]);
+                    let (dx, dy) =
+                        (2.0 * p[0] * a * b + p[1] * (r + 2.0 * a * a), p[0] * (r + 2.0 * b * b) + 2.0 * p[1] * a * b);
+                    (a, b) = ((x - dx) / radial, (y - dy) / radial);
+                }
+                Some(DVec3::new(a, b, 1.0).normalize())
+            }
             _ => unimplemented!(),
         }
     }

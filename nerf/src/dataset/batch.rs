@@ -39,14 +39,17 @@ impl Batch {
         for _ in 0..count {
             let number = rng.random_range(0..data.frames.len());
             let frame = &data.frames[number];
-            let pixel = [rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height)];
+            let pixel = match &frame.mask {
+                Some(mask) => mask.draw(rng),
+                None => [rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height)],
+            };
             let color = background.draw(rng);
             batch.rays.push_pixel(&frame.camera, pixel, bounds, [data.near, data.far]);
             batch.frames.push(number as u32);
             batch.pixels.push(pixel.map(|x| x as u32));
             let distance = frame.distances.as_ref().map_or(0.0, |image| image.pixel(pixel[0], pixel[1])[0]);
             batch.distances.push(distance);
-            batch.target.push(over(frame.image.pixel(pixel[0], pixel[1]), color));
+            batch.target.push(over(&frame.image.pixel(pixel[0], pixel[1]), color));
             batch.background.push(color);
         }
         batch

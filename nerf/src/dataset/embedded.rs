@@ -1,6 +1,6 @@
 //! The embedded scene as a dataset: needs no files.
 
-use super::{Dataset, Frame, Split};
+use super::{Dataset, Frame, Placement, Scope, Split};
 use crate::camera::pinhole::Camera;
 use crate::dataset::scene::{DISTANCE, Scene, test_cameras, train_cameras, val_cameras};
 
@@ -18,8 +18,8 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
         Split::Test => test_cameras(20, size),
     };
     let frame = |(i, camera): (usize, Camera)| {
-        let image = scene.render(&camera, SAMPLES).color;
-        Frame { name: format!("{split}/{i}"), camera, image, distances: None }
+        let image = scene.render(&camera, SAMPLES).color.into();
+        Frame { name: format!("{split}/{i}"), camera, image, mask: None, distances: None }
     };
     // Room around the model, as a real capture would have it.
     let [low, high] = scene.bounds();
@@ -30,6 +30,8 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
         bounds,
         near: DISTANCE - reach,
         far: DISTANCE + reach,
+        scope: Scope::Bounded,
+        placement: Placement::default(),
         skipped: vec![],
     }
 }

@@ -1,6 +1,10 @@
 //! Photographs with their cameras, and the region that they show.
 
 use super::image::Image;
+use super::mask::Mask;
+use super::photo::Photo;
+use super::placement::Placement;
+use super::survey::Scope;
 use crate::camera::bounds::clip_span;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
@@ -58,14 +62,16 @@ pub struct Frame {
     pub name: String,
     /// The camera that took it, for the size that the image has here.
     pub camera: Camera,
-    /// The picture: RGB or RGBA as in the file, values in 0..=1.
-    pub image: Image,
+    /// The picture: RGB or RGBA as in the file.
+    pub image: Photo,
+    /// Which of its pixels are used; all, where there is none.
+    pub mask: Option<Mask>,
     /// What was measured beside it, if anything, for the term [`depth`](crate::losses::DepthConfig) of the loss: one channel
     /// of the same size, the distance along the ray through each pixel's centre in scene units, and 0 where it is not known.
     pub distances: Option<Image>,
 }
 
-/// The photographs of one split, all of one size, and the region of space that they show.
+/// The photographs of one split, and the region of space that they show.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
     /// At least one photograph, in the order of the file.
@@ -76,6 +82,10 @@ pub struct Dataset {
     pub near: f64,
     /// Distance along a ray, in scene units, beyond which there is nothing.
     pub far: f64,
+    /// How far the scene goes.
+    pub scope: Scope,
+    /// From the coordinates of the files to those of the scene, in which everything here is.
+    pub placement: Placement,
     /// Names of photographs that the dataset lists but whose image files are absent. They were left out; a caller
     /// should say so.
     pub skipped: Vec<String>,
@@ -84,7 +94,7 @@ pub struct Dataset {
 impl Dataset {
     /// Whether some image has transparency and so needs a [background](crate::dataset::background).
     pub fn has_alpha(&self) -> bool {
-        self.frames.iter().any(|frame| frame.image.channels == 4)
+        self.frames.iter().any(|frame| frame.image.has_alpha())
     }
 
     /// Whether [distances](Frame::distances), where there are some, fit their photographs, and there are some if they are

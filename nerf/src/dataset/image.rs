@@ -2,9 +2,8 @@
 
 use std::path::Path;
 
-use image::{DynamicImage, ImageReader};
-
-use crate::error::{Error, Result};
+use super::photo::{Photo, average};
+use crate::error::Result;
 
 /// An image of `channels` values a pixel, row by row from the top.
 ///
@@ -48,39 +47,12 @@ impl Image {
         &mut self.data[start..start + self.channels]
     }
 
-    /// Reads a PNG or JPEG file, whichever its contents say it is: RGBA if it has transparency, otherwise RGB.
-    ///
-    /// Values are the stored integers over their maximum (255, or 65535 for 16-bit files); grey becomes three equal
-    /// channels.
+    /// Reads an image file as [`Photo::open`] does, into floats.
     ///
     /// # Errors
     /// If the file cannot be read or decoded; the error names it.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        let decoded = reader(path)?.decode().map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
-        Ok(Self::from_decoded(decoded))
-    }
-
-    /// Width and height of an image file, read from its header alone.
-    pub(crate) fn size_of_file(path: &Path) -> Result<[usize; 2]> {
-        let size = reader(path)?.into_dimensions();
-        let (width, height) = size.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
-        Ok([width as usize, height as usize])
-    }
-
-    fn from_decoded(decoded: DynamicImage) -> Self {
-        let (width, height) = (decoded.width() as usize, decoded.height() as usize);
-        let format = decoded.color();
-        let eight_bits = format.bytes_per_pixel() == format.channel_count();
-        let bytes = |values: Vec<u8>| values.into_iter().map(|v| f32::from(v) / 255.0).collect();
-        let words = |values: Vec<u16>| values.into_iter().map(|v| f32::from(v) / 65535.0).collect();
-        let (channels, data) = match (format.has_alpha(), eight_bits) {
-            (false, true) => (3, bytes(decoded.into_rgb8().into_raw())),
-            (true, true) => (4, bytes(decoded.into_rgba8().into_raw())),
-            (false, false) => (3, words(decoded.into_rgb16().into_raw())),
-            (true, false) => (4, words(decoded.into_rgba16().into_raw())),
-        };
-        Image { width, height, channels, data }
+        Ok(Photo::open(path, None)?.to_image())
     }
 
     /// The image at `1 / factor` of its size: each pixel is the average of a box of `factor x factor` pixels.
@@ -98,36 +70,10 @@ impl Image {
         if factor == 1 {
             return self.clone();
         }
-        let mut out = Image::new(self.width / factor, self.height / factor, self.channels);
-        for y in 0..out.height {
-            for x in 0..out.width {
-                self.average_box(x * factor, y * factor, factor, out.pixel_mut(x, y));
-            }
-        }
-        out
-    }
-
-    /// The average over the box of side `side` whose upper left pixel is `(left, top)`, in f64 so that a constant
-    /// image keeps its value to the last bit.
-    fn average_box(&self, left: usize, top: usize, side: usize, out: &mut [f32]) {
-        let mut sum = [0.0f64; 4];
-        let mut weight = 0.0f64;
-        for y in top..top + side {
-            for x in left..left + side {
-                let pixel = self.pixel(x, y);
-                let alpha = if self.channels == 4 { f64::from(pixel[3]) } else { 1.0 };
-                weight += alpha;
-                for (sum, &value) in sum.iter_mut().zip(pixel).take(3) {
-                    *sum += alpha * f64::from(value);
-                }
-            }
-        }
-        for (out, sum) in out.iter_mut().zip(sum).take(3) {
-            *out = if weight == 0.0 { 0.0 } else { (sum / weight) as f32 };
-        }
-        if self.channels == 4 {
-            out[3] = (weight / (side * side) as f64) as f32;
-        }
+        let Image { width, height, channels, .. } = *self;
+        let small = [width / factor, height / factor];
+        let data = average(&self.data, channels, [width, height], small);
+        Image { width: small[0], height: small[1], channels, data }
     }
 
     /// Images side by side, from left to right.
@@ -161,11 +107,6 @@ impl Image {
         let shape = |i: &Image| [i.height, i.width, i.channels];
         assert_eq!(shape(self), shape(other), "the images differ in height, width or channels");
     }
-}
-
-fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>> {
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
-    reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))
 }
 
 #[cfg(test)]
@@ -218,19 +159,6 @@ mod tests {
     #[should_panic(expected = "one height")]
     fn hconcat_refuses_other_heights() {
         Image::hconcat(&[&Image::new(1, 2, 1), &Image::new(1, 3, 1)]);
-    }
-
-    #[test]
-    fn every_pixel_format_becomes_rgb_or_rgba() {
-        for byte in 0..=255 {
-            let value = f32::from(byte) / 255.0;
-            let grey = DynamicImage::ImageLuma8(image::GrayImage::from_raw(1, 1, vec![byte]).unwrap());
-            assert_eq!(Image::from_decoded(grey).data, [value; 3]);
-            let clear = DynamicImage::ImageLumaA8(image::ImageBuffer::from_raw(1, 1, vec![byte, 51]).unwrap());
-            assert_eq!(Image::from_decoded(clear).data, [value, value, value, 0.2]);
-        }
-        let deep = DynamicImage::ImageRgba16(image::ImageBuffer::from_raw(1, 1, vec![0, 65535, 13107, 65535]).unwrap());
-        assert_eq!(Image::from_decoded(deep).data, [0.0, 1.0, 0.2, 1.0]);
     }
 
     #[test]

@@ -4,64 +4,44 @@
 
 pub mod background;
 pub(crate) mod batch;
-mod blender;
 pub mod capture;
 pub(crate) mod color_space;
 mod embedded;
+pub(crate) mod formats;
 mod frames;
 pub(crate) mod image;
+mod load;
+mod mask;
+pub(crate) mod photo;
+pub(crate) mod placement;
 pub mod scene;
+pub(crate) mod survey;
 
 pub use self::image::Image;
 pub use background::Background;
 pub use batch::Batch;
+pub use capture::{Capture, Format, Point, View};
 pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use embedded::embedded;
 pub use frames::{Dataset, Frame, Split, evenly_spaced};
+pub use load::Reading;
+pub use mask::Mask;
+pub use photo::Photo;
+pub use placement::Placement;
+pub use survey::{Scope, Survey};
 
 use std::path::Path;
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 
-/// Reads one split of the dataset in `folder`, its images [averaged](Image::downscaled) down by the integer factor
-/// `downscale` (1 keeps them).
-///
-/// Recognised is the NeRF-synthetic format: `transforms_train.json`, `transforms_val.json`, `transforms_test.json`,
-/// written by Blender. Its scenes lie within +-1.5 of the origin, between distances 2 and 6 of the cameras.
+/// Reads one split of the dataset in `folder`, its images [averaged](Photo::resized) down by the factor `downscale` (1 keeps
+/// them): [`Capture::read`], [`Capture::survey`] and [`Capture::load`] in one.
 ///
 /// # Errors
-/// If the folder is absent or of no known format, lacks the split, has a file with a bad field or an image that cannot
-/// be decoded or differs in size from the others, or if no image is left; if `downscale` is 0 or does not divide the
-/// width and the height. Every error names the file and the field. A single absent image is no error: see
-/// [`Dataset::skipped`].
+/// As these. Every error names the file and the field. A single absent image is no error: see [`Dataset::skipped`].
 pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<Dataset> {
-    load_views(folder, split, downscale, usize::MAX)
-}
-
-/// As [`load`], but reads only `views` [evenly spaced](evenly_spaced) photographs of those that exist.
-///
-/// # Errors
-/// As [`load`], where photographs that are not read cannot be at fault; if `views` is 0.
-pub fn load_views(folder: impl AsRef<Path>, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
-    let folder = folder.as_ref();
-    if views == 0 {
-        return Err(Error::setting("views", "must be 1 or more, is 0"));
-    }
-    if downscale == 0 {
-        return Err(Error::setting("downscale", "must be 1 or more, is 0"));
-    }
-    if !folder.is_dir() {
-        let what = if folder.exists() { "is not a folder" } else { "there is no such folder" };
-        return Err(Error::file(folder, what));
-    }
-    if Split::ALL.into_iter().any(|split| blender::transforms_file(folder, split).is_file()) {
-        return blender::load(folder, split, downscale, views);
-    }
-    let what = match folder.join("transforms.json").is_file() {
-        true => "is in the format of instant-ngp and nerfstudio (transforms.json), whose cameras are not supported yet",
-        false => "is not a dataset: expected a file transforms_train.json, transforms_val.json or transforms_test.json",
-    };
-    Err(Error::file(folder, what))
+    let capture = Capture::read(folder)?;
+    capture.load(split, &capture.survey(None)?, &Reading { downscale, ..Reading::default() })
 }
 
 #[cfg(test)]

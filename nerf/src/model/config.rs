@@ -1,5 +1,6 @@
 //! What to train and how: the presets and every number behind them.
 
+use crate::dataset::Scope;
 use crate::dataset::background::Background;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
@@ -16,6 +17,11 @@ use raygrad_nn::{AdamConfig, Schedule, Storage};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
+
+/// Nested boxes of an unbounded scene, each twice as large as the one before.
+const CASCADES: usize = 6;
+/// How much longer a step through an unbounded scene is for each unit of distance.
+const CONE: f64 = 1.0 / 256.0;
 
 /// A named configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -189,6 +195,15 @@ impl Config {
                 (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / 450.0));
                 marching.samples *= if seconds > 300.0 { 2 } else { 1 };
             }
+        }
+        self
+    }
+
+    /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded).
+    pub fn with_scope(mut self, scope: Scope) -> Self {
+        self.unbounded = scope == Scope::Unbounded;
+        if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
+            (marching.occupancy.cascades, marching.cone) = if self.unbounded { (CASCADES, CONE) } else { (1, 0.0) };
         }
         self
     }

@@ -12,6 +12,7 @@ pub use poses::Poses;
 use crate::Result;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::{Rays, Samples};
+use crate::dataset::Placement;
 use crate::field::Field;
 use crate::kind::Site;
 use crate::losses::{Term, TermConfig};
@@ -44,6 +45,9 @@ pub struct Extent {
     /// How many photographs the model is fitted to; 0 if that is not known.
     #[serde(default)]
     pub frames: usize,
+    /// From the coordinates of the photographs' files to those of the scene.
+    #[serde(default)]
+    pub placement: Placement,
 }
 
 fn one() -> f64 {
@@ -53,7 +57,7 @@ fn one() -> f64 {
 impl Extent {
     /// Of a new model.
     pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
-        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0 }
+        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0, placement: Placement::default() }
     }
 
     /// The map to the unit cube, for a scene within its box.

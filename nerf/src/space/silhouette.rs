@@ -1,8 +1,8 @@
 //! Carving with silhouettes: where a photograph is fully transparent, nothing lies between its camera and infinity.
 
+use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
-use crate::dataset::Dataset;
-use crate::dataset::image::Image;
+use crate::dataset::{Dataset, Frame};
 use crate::space::occupancy::OccupancyGrid;
 use glam::{DAffine3, DVec3};
 
@@ -18,9 +18,10 @@ struct Silhouette<'a> {
 }
 
 impl<'a> Silhouette<'a> {
-    /// `None` if the image has no transparency.
-    fn new(camera: &'a Camera, image: &Image) -> Option<Self> {
-        if image.channels != 4 {
+    /// `None` if the photograph has no transparency, or a lens that bends lines.
+    fn new(frame: &'a Frame) -> Option<Self> {
+        let Frame { camera, image, mask, .. } = frame;
+        if !image.has_alpha() || camera.lens != Lens::Pinhole {
             return None;
         }
         let stride = image.width + 1;
@@ -28,7 +29,8 @@ impl<'a> Silhouette<'a> {
         for y in 0..image.height {
             let mut row = 0;
             for x in 0..image.width {
-                row += u32::from(image.pixel(x, y)[3] > 0.0);
+                let used = mask.as_ref().is_none_or(|mask| mask.uses(x, y));
+                row += u32::from(!used || image.pixel(x, y)[3] > 0.0);
                 sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row;
             }
         }
@@ -68,7 +70,7 @@ const EACH: usize = 8;
 /// few. What is left is the visual hull (Laurentini 1994), up to wrong masks in fewer photographs. Photographs without
 /// transparency say nothing; 0 votes empty nothing.
 pub(crate) fn carve(grid: &mut OccupancyGrid, data: &Dataset, votes: u32) {
-    let views = data.frames.iter().filter_map(|frame| Silhouette::new(&frame.camera, &frame.image));
+    let views = data.frames.iter().filter_map(Silhouette::new);
     carve_views(grid, &views.collect::<Vec<_>>(), votes);
 }
 
@@ -86,23 +88,25 @@ fn carve_views(grid: &mut OccupancyGrid, views: &[Silhouette<'_>], votes: u32) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::{Image, Mask};
     use crate::space::occupancy::OccupancyConfig;
 
     /// Looks along -z at a picture whose middle third is opaque.
-    fn view(eye: DVec3, up: DVec3) -> (Camera, Image) {
+    fn view(eye: DVec3, up: DVec3) -> Frame {
         let mut image = Image::new(60, 60, 4);
         for y in 20..40 {
             for x in 20..40 {
                 image.pixel_mut(x, y)[3] = 0.01;
             }
         }
-        (Camera::from_angle(60, 60, 0.5, Camera::look_at(eye, DVec3::ZERO, up)), image)
+        let camera = Camera::from_angle(60, 60, 0.5, Camera::look_at(eye, DVec3::ZERO, up));
+        Frame { name: String::new(), camera, image: image.into(), mask: None, distances: None }
     }
 
     #[test]
     fn a_ball_is_clear_only_where_every_pixel_that_could_show_it_is() {
-        let (camera, image) = view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y);
-        let silhouette = Silhouette::new(&camera, &image).unwrap();
+        let frame = view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y);
+        let silhouette = Silhouette::new(&frame).unwrap();
         // At distance 10 the picture is 5.1 wide, a pixel .085.
         assert!(!silhouette.is_clear(DVec3::ZERO, 0.01), "in the middle");
         assert!(silhouette.is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
@@ -114,7 +118,12 @@ mod tests {
         assert!(
             silhouette.is_clear(1.1 * right + 1.1 * up, 0.02) && !silhouette.is_clear(0.8 * right + 0.8 * up, 0.02)
         );
-        assert!(Silhouette::new(&camera, &Image::new(60, 60, 3)).is_none());
+        let opaque = Frame { image: Image::new(60, 60, 3).into(), ..frame.clone() };
+        let bent = Frame { camera: Camera { lens: Lens::Fov { omega: 0.3 }, ..frame.camera.clone() }, ..frame.clone() };
+        assert!(Silhouette::new(&opaque).is_none() && Silhouette::new(&bent).is_none());
+        // Where nothing is known of a pixel it may show something.
+        let masked = Frame { mask: Some(Mask::new(60, 60, |x, _| x < 40)), ..frame.clone() };
+        assert!(!Silhouette::new(&masked).unwrap().is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
     }
 
     #[test]
@@ -122,7 +131,7 @@ mod tests {
         let views = [view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y), view(DVec3::new(10.0, 0.0, 0.0), DVec3::Y)];
         let mut grid =
             OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &OccupancyConfig::default()).unwrap();
-        let views: Vec<_> = views.iter().map(|(camera, image)| Silhouette::new(camera, image).unwrap()).collect();
+        let views: Vec<_> = views.iter().map(|frame| Silhouette::new(frame).unwrap()).collect();
         carve_views(&mut grid, &views, 1);
         let [low, high] = grid.occupied_bounds().unwrap();
         // A third of 5.1, seen in perspective, with two pixels and a cell of margin.
@@ -142,11 +151,11 @@ mod tests {
         let left = |wrong: Option<usize>, votes: u32| {
             let mut views: Vec<_> = (0..16).map(around).collect();
             if let Some(wrong) = wrong {
-                views[wrong].1 = Image::new(60, 60, 4);
+                views[wrong].image = Image::new(60, 60, 4).into();
             }
             let config = OccupancyConfig { resolution: 32, ..OccupancyConfig::default() };
             let mut grid = OccupancyGrid::new([DVec3::splat(-1.5), DVec3::splat(1.5)], &config).unwrap();
-            let views: Vec<_> = views.iter().map(|(camera, image)| Silhouette::new(camera, image).unwrap()).collect();
+            let views: Vec<_> = views.iter().map(|frame| Silhouette::new(frame).unwrap()).collect();
             carve_views(&mut grid, &views, votes);
             grid.occupied_share()
         };

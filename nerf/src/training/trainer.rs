@@ -65,7 +65,11 @@ impl Trainer {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
-        let extent = Extent { frames: data.frames.len(), ..Extent::new(data.bounds, [data.near, data.far]) };
+        let extent = Extent {
+            frames: data.frames.len(),
+            placement: data.placement,
+            ..Extent::new(data.bounds, [data.near, data.far])
+        };
         let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
         data.check_reach(model.reach())?;
         data.check_distances(model.terms.iter().any(|term| term.reads_distances()))?;

@@ -1,0 +1,100 @@
+//! Which pixels of a photograph are used.
+
+use rand::{Rng, RngExt};
+
+/// Which pixels of a photograph are used: the others are neither trained on nor compared with.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Mask {
+    width: usize,
+    height: usize,
+    /// A bit for each pixel, row by row.
+    words: Vec<u64>,
+    used: usize,
+}
+
+impl Mask {
+    /// The pixels, column and row, for which `used` is true.
+    pub fn new(width: usize, height: usize, used: impl Fn(usize, usize) -> bool) -> Self {
+        let mut words = vec![0_u64; (width * height).div_ceil(64)];
+        let mut count = 0;
+        for pixel in 0..width * height {
+            if used(pixel % width, pixel / width) {
+                words[pixel / 64] |= 1 << (pixel % 64);
+                count += 1;
+            }
+        }
+        Mask { width, height, words, used: count }
+    }
+
+    /// Width and height.
+    pub fn size(&self) -> [usize; 2] {
+        [self.width, self.height]
+    }
+
+    /// How many pixels are used.
+    pub fn used(&self) -> usize {
+        self.used
+    }
+
+    /// Whether a pixel is used.
+    ///
+    /// # Panics
+    /// If it lies outside of the photograph.
+    pub fn uses(&self, x: usize, y: usize) -> bool {
+        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} mask", self.width, self.height);
+        self.bit(y * self.width + x)
+    }
+
+    fn bit(&self, pixel: usize) -> bool {
+        self.words[pixel / 64] >> (pixel % 64) & 1 == 1
+    }
+
+    /// A random one of the pixels that are used, column and row, each as likely as the others but where fewer than one of a
+    /// hundred is used.
+    ///
+    /// # Panics
+    /// If none is used.
+    pub fn draw(&self, rng: &mut (impl Rng + ?Sized)) -> [usize; 2] {
+        assert!(self.used > 0, "no pixel of this photograph is used");
+        let count = self.width * self.height;
+        let mut pixel = rng.random_range(0..count);
+        for _ in 0..1000 {
+            if self.bit(pixel) {
+                break;
+            }
+            pixel = rng.random_range(0..count);
+        }
+        while !self.bit(pixel) {
+            pixel = (pixel + 1) % count;
+        }
+        [pixel % self.width, pixel / self.width]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand::rngs::StdRng;
+
+    #[test]
+    fn used_pixels_alone_are_drawn_and_all_as_often() {
+        let mask = Mask::new(10, 7, |x, y| (x + y) % 3 == 0);
+        assert_eq!((mask.used(), mask.size()), (24, [10, 7]));
+        let (mut rng, mut counts) = (StdRng::seed_from_u64(1), vec![0; 70]);
+        for _ in 0..24_000 {
+            let [x, y] = mask.draw(&mut rng);
+            assert!(mask.uses(x, y) && (x + y) % 3 == 0);
+            counts[10 * y + x] += 1;
+        }
+        assert!(counts.iter().filter(|n| **n > 0).all(|n| (850..1150).contains(n)), "{counts:?}");
+        let single = Mask::new(100, 100, |x, y| [x, y] == [3, 99]);
+        assert_eq!(single.draw(&mut rng), [3, 99]);
+    }
+
+    #[test]
+    #[should_panic(expected = "no pixel of this photograph")]
+    fn a_photograph_without_pixels_has_none_to_draw() {
+        Mask::new(3, 3, |_, _| false).draw(&mut StdRng::seed_from_u64(1));
+    }
+}

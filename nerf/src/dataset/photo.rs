@@ -1,0 +1,280 @@
+//! Photographs in memory, in the integers that their files hold.
+
+use super::background::over;
+use super::image::Image;
+use crate::error::{Error, Result};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageReader};
+use std::path::Path;
+
+/// A photograph of RGB or RGBA values. A pixel takes three or four bytes, or twice as many where the file has 16 bits.
+///
+/// Colours keep the transfer curve of the file that they came from (sRGB for PNG, JPEG and WebP). Alpha, where there is
+/// some, is not premultiplied.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Photo {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Number of rows.
+    pub height: usize,
+    /// Values in a pixel: 3 for RGB, 4 for RGBA.
+    pub channels: usize,
+    values: Values,
+}
+
+/// What a photograph holds, row by row from the top.
+#[derive(Debug, Clone, PartialEq)]
+enum Values {
+    Bytes(Vec<u8>),
+    Words(Vec<u16>),
+    Floats(Vec<f32>),
+}
+
+/// A number that a value of a pixel is stored as.
+pub(super) trait Stored: Copy {
+    /// The value in 0..=1.
+    fn unit(self) -> f32;
+    /// The nearest to a value in 0..=1.
+    fn nearest(value: f64) -> Self;
+}
+
+impl Stored for u8 {
+    fn unit(self) -> f32 {
+        f32::from(self) / 255.0
+    }
+
+    fn nearest(value: f64) -> Self {
+        (value * 255.0).round() as u8
+    }
+}
+
+impl Stored for u16 {
+    fn unit(self) -> f32 {
+        f32::from(self) / 65535.0
+    }
+
+    fn nearest(value: f64) -> Self {
+        (value * 65535.0).round() as u16
+    }
+}
+
+impl Stored for f32 {
+    fn unit(self) -> f32 {
+        self
+    }
+
+    fn nearest(value: f64) -> Self {
+        value as f32
+    }
+}
+
+impl From<Image> for Photo {
+    /// Grey becomes three equal channels. The values stay floats, of 12 or 16 bytes a pixel.
+    ///
+    /// # Panics
+    /// If the image has not 1, 3 or 4 channels.
+    fn from(image: Image) -> Self {
+        let Image { width, height, channels, data } = image;
+        let (channels, data) = match channels {
+            1 => (3, data.into_iter().flat_map(|x| [x; 3]).collect()),
+            3 | 4 => (channels, data),
+            _ => panic!("a photograph has 1, 3 or 4 channels, not {channels}"),
+        };
+        Photo { width, height, channels, values: Values::Floats(data) }
+    }
+}
+
+impl Photo {
+    /// Reads a PNG, JPEG or WebP file, whichever its contents say it is: RGBA if it has transparency, otherwise RGB; turned
+    /// as its EXIF orientation says. Where `size` is the width and height of the file's pixels as they are stored, and not
+    /// of those turned, a program has measured its camera before turning, and they are taken as they are stored.
+    ///
+    /// # Errors
+    /// If the file cannot be read or decoded; the error names it.
+    pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
+        let path = path.as_ref();
+        let bad = |e: image::ImageError| Error::file(path, format!("cannot be decoded: {e}"));
+        let mut decoder = reader(path)?.into_decoder().map_err(bad)?;
+        let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+        let stored = [decoder.dimensions().0 as usize, decoder.dimensions().1 as usize];
+        let mut decoded = DynamicImage::from_decoder(decoder).map_err(bad)?;
+        if turned_size(stored, turn) == stored || size != Some(stored) {
+            decoded.apply_orientation(turn);
+        }
+        Ok(Self::from_decoded(decoded))
+    }
+
+    fn from_decoded(decoded: DynamicImage) -> Self {
+        let (width, height) = (decoded.width() as usize, decoded.height() as usize);
+        let format = decoded.color();
+        let eight_bits = format.bytes_per_pixel() == format.channel_count();
+        let (channels, values) = match (format.has_alpha(), eight_bits) {
+            (false, true) => (3, Values::Bytes(decoded.into_rgb8().into_raw())),
+            (true, true) => (4, Values::Bytes(decoded.into_rgba8().into_raw())),
+            (false, false) => (3, Values::Words(decoded.into_rgb16().into_raw())),
+            (true, false) => (4, Values::Words(decoded.into_rgba16().into_raw())),
+        };
+        Photo { width, height, channels, values }
+    }
+
+    /// Width and height of an image file as it is stored and as it is shown, read from its header alone.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is no image.
+    pub fn size_of_file(path: impl AsRef<Path>) -> Result<[[usize; 2]; 2]> {
+        let path = path.as_ref();
+        let decoder = reader(path)?.into_decoder();
+        let mut decoder = decoder.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+        let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+        let stored = [decoder.dimensions().0 as usize, decoder.dimensions().1 as usize];
+        Ok([stored, turned_size(stored, turn)])
+    }
+
+    /// Whether an image file has an alpha channel, from its header alone.
+    ///
+    /// # Errors
+    /// If the file cannot be read or is no image.
+    pub fn file_has_alpha(path: impl AsRef<Path>) -> Result<bool> {
+        let path = path.as_ref();
+        let decoder = reader(path)?.into_decoder();
+        let decoder = decoder.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+        Ok(decoder.color_type().has_alpha())
+    }
+
+    /// Whether some pixel is not opaque.
+    pub fn is_transparent(&self) -> bool {
+        let alpha = |pixel: usize| self.pixel(pixel % self.width, pixel / self.width)[3];
+        self.has_alpha() && (0..self.width * self.height).any(|pixel| alpha(pixel) < 1.0)
+    }
+
+    /// A pixel as red, green, blue and alpha in 0..=1; alpha is 1 where there is none.
+    ///
+    /// # Panics
+    /// If the pixel lies outside the photograph.
+    pub fn pixel(&self, x: usize, y: usize) -> [f32; 4] {
+        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} photograph", self.width, self.height);
+        let start = (y * self.width + x) * self.channels;
+        match &self.values {
+            Values::Bytes(values) => rgba(&values[start..start + self.channels]),
+            Values::Words(values) => rgba(&values[start..start + self.channels]),
+            Values::Floats(values) => rgba(&values[start..start + self.channels]),
+        }
+    }
+
+    /// Whether there is an alpha channel.
+    pub fn has_alpha(&self) -> bool {
+        self.channels == 4
+    }
+
+    /// Bytes that the pixels take.
+    pub fn bytes(&self) -> usize {
+        match &self.values {
+            Values::Bytes(values) => values.len(),
+            Values::Words(values) => 2 * values.len(),
+            Values::Floats(values) => 4 * values.len(),
+        }
+    }
+
+    /// The same as an image of floats.
+    pub fn to_image(&self) -> Image {
+        let data = match &self.values {
+            Values::Bytes(values) => values.iter().map(|x| x.unit()).collect(),
+            Values::Words(values) => values.iter().map(|x| x.unit()).collect(),
+            Values::Floats(values) => values.clone(),
+        };
+        Image { width: self.width, height: self.height, channels: self.channels, data }
+    }
+
+    /// The photograph over a background colour: RGB, of the same size.
+    pub fn over(&self, background: [f32; 3]) -> Image {
+        let places = (0..self.height).flat_map(|y| (0..self.width).map(move |x| (x, y)));
+        let data = places.flat_map(|(x, y)| over(&self.pixel(x, y), background)).collect();
+        Image { width: self.width, height: self.height, channels: 3, data }
+    }
+
+    /// The photograph at another, smaller size: each pixel is the mean over the part of the photograph that it covers, whole
+    /// pixels or parts of them, rounded to the integers of the file.
+    ///
+    /// In an RGBA photograph colours are weighted by their alpha, so what hides in transparent pixels does not bleed into
+    /// their neighbours; what is wholly transparent becomes zero.
+    ///
+    /// # Panics
+    /// If a side is 0 or longer than it was.
+    #[track_caller]
+    pub fn resized(&self, [width, height]: [usize; 2]) -> Photo {
+        let fits = (1..=self.width).contains(&width) && (1..=self.height).contains(&height);
+        assert!(fits, "a {}x{} photograph cannot be averaged to {width}x{height}", self.width, self.height);
+        if [width, height] == [self.width, self.height] {
+            return self.clone();
+        }
+        let from = [self.width, self.height];
+        let values = match &self.values {
+            Values::Bytes(values) => Values::Bytes(average(values, self.channels, from, [width, height])),
+            Values::Words(values) => Values::Words(average(values, self.channels, from, [width, height])),
+            Values::Floats(values) => Values::Floats(average(values, self.channels, from, [width, height])),
+        };
+        Photo { width, height, channels: self.channels, values }
+    }
+}
+
+/// The averages of `channels` values over the parts of an image of the size `from` that pixels of one of the size `to` cover.
+/// In f64, so that a constant keeps its value to the last bit.
+pub(super) fn average<S: Stored>(values: &[S], channels: usize, from: [usize; 2], to: [usize; 2]) -> Vec<S> {
+    let (columns, rows) = (shares(from[0], to[0]), shares(from[1], to[1]));
+    let mut out = Vec::with_capacity(to[0] * to[1] * channels);
+    for row in &rows {
+        for column in &columns {
+            let (mut sum, mut alphas, mut weights) = ([0.0_f64; 3], 0.0, 0.0);
+            for &(y, down) in row {
+                for &(x, across) in column {
+                    let start = (y * from[0] + x) * channels;
+                    let pixel = &values[start..start + channels];
+                    let weight = down * across;
+                    let alpha = pixel.get(3).map_or(weight, |alpha| weight * f64::from(alpha.unit()));
+                    (weights, alphas) = (weights + weight, alphas + alpha);
+                    sum.iter_mut().zip(pixel).for_each(|(sum, x)| *sum += alpha * f64::from(x.unit()));
+                }
+            }
+            let mean = |sum: &f64| S::nearest(if alphas == 0.0 { 0.0 } else { sum / alphas });
+            out.extend(sum.iter().take(channels).map(mean));
+            if channels == 4 {
+                out.push(S::nearest(alphas / weights));
+            }
+        }
+    }
+    out
+}
+
+/// For each of `to` equal parts of a line of `from` pixels the pixels in it, and how much of each.
+fn shares(from: usize, to: usize) -> Vec<Vec<(usize, f64)>> {
+    // In units of 1 / to of a pixel all ends are whole numbers.
+    let part = |i: usize| {
+        let [start, end] = [i * from, (i + 1) * from];
+        let covered = |pixel: usize| (end.min((pixel + 1) * to) - start.max(pixel * to)) as f64 / to as f64;
+        (start / to..end.div_ceil(to)).map(|pixel| (pixel, covered(pixel))).collect()
+    };
+    (0..to).map(part).collect()
+}
+
+fn rgba<S: Stored>(pixel: &[S]) -> [f32; 4] {
+    let alpha = pixel.get(3).map_or(1.0, |alpha| alpha.unit());
+    [pixel[0].unit(), pixel[1].unit(), pixel[2].unit(), alpha]
+}
+
+/// The size of an image that is turned.
+fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
+    match turn {
+        Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH => {
+            [height, width]
+        }
+        _ => [width, height],
+    }
+}
+
+fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>> {
+    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
+    reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))
+}
+
+#[cfg(test)]
+mod tests;

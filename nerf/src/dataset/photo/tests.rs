@@ -1,0 +1,115 @@
+use super::*;
+use proptest::prelude::*;
+
+fn bytes(width: usize, height: usize, channels: usize, values: &[u8]) -> Photo {
+    assert_eq!(values.len(), width * height * channels);
+    Photo { width, height, channels, values: Values::Bytes(values.to_vec()) }
+}
+
+#[test]
+fn every_pixel_format_becomes_rgb_or_rgba() {
+    for byte in 0..=255 {
+        let value = f32::from(byte) / 255.0;
+        let grey = DynamicImage::ImageLuma8(image::GrayImage::from_raw(1, 1, vec![byte]).unwrap());
+        assert_eq!(Photo::from_decoded(grey).to_image().data, [value; 3]);
+        let clear = DynamicImage::ImageLumaA8(image::ImageBuffer::from_raw(1, 1, vec![byte, 51]).unwrap());
+        assert_eq!(Photo::from_decoded(clear).pixel(0, 0), [value, value, value, 0.2]);
+    }
+    let deep = DynamicImage::ImageRgba16(image::ImageBuffer::from_raw(1, 1, vec![0, 65535, 13107, 65535]).unwrap());
+    let deep = Photo::from_decoded(deep);
+    assert_eq!((deep.to_image().data, deep.bytes()), (vec![0.0, 1.0, 0.2, 1.0], 8));
+}
+
+#[test]
+fn a_photograph_takes_as_many_bytes_as_its_file_has_values() {
+    assert_eq!(bytes(4, 3, 3, &[7; 36]).bytes(), 36);
+    assert_eq!(bytes(4, 3, 3, &[7; 36]).resized([2, 1]).bytes(), 6);
+    assert_eq!(Photo::from(Image::new(4, 3, 1)).bytes(), 4 * 36);
+}
+
+#[test]
+fn sizes_that_do_not_divide_share_pixels() {
+    let line = bytes(3, 1, 3, &[0, 0, 0, 90, 90, 90, 240, 240, 240]);
+    // Two pixels of one and a half: (0 + 90 / 2) / 1.5 and (90 / 2 + 240) / 1.5.
+    assert_eq!(line.resized([2, 1]), bytes(2, 1, 3, &[30, 30, 30, 190, 190, 190]));
+    assert_eq!(line.resized([3, 1]), line);
+    // What is transparent does not bleed into what is not.
+    let rgba = bytes(3, 1, 4, &[200, 0, 0, 255, 9, 9, 9, 0, 0, 100, 0, 255]);
+    assert_eq!(rgba.resized([1, 1]), bytes(1, 1, 4, &[100, 50, 0, 170]));
+    assert!(rgba.is_transparent() && !bytes(1, 1, 4, &[1, 2, 3, 255]).is_transparent() && !line.is_transparent());
+}
+
+#[test]
+#[should_panic(expected = "cannot be averaged to 4x1")]
+fn averaging_does_not_enlarge() {
+    bytes(3, 1, 3, &[0; 9]).resized([4, 1]);
+}
+
+/// A JPEG of 16 x 8 pixels whose left half is white, with this EXIF orientation.
+fn jpeg(orientation: u8) -> Vec<u8> {
+    let mut plain = vec![];
+    let picture = image::RgbImage::from_fn(16, 8, |x, _| image::Rgb([if x < 8 { 255 } else { 0 }; 3]));
+    picture.write_to(&mut std::io::Cursor::new(&mut plain), image::ImageFormat::Jpeg).unwrap();
+    // An APP1 segment with one directory of one entry: tag 0x0112, a short.
+    let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
+    [&plain[..2], &exif, &plain[2..]].concat()
+}
+
+#[test]
+fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measured_before() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("photo.jpg");
+    let white = |photo: &Photo, x: usize, y: usize| photo.pixel(x, y)[0] > 0.5;
+    for (orientation, size, corners) in [
+        (1, [16, 8], [true, false, true]),
+        (3, [16, 8], [false, true, false]),
+        (6, [8, 16], [true, true, false]),
+        (8, [8, 16], [false, false, true]),
+    ] {
+        std::fs::write(&path, jpeg(orientation)).unwrap();
+        assert_eq!(Photo::size_of_file(&path).unwrap(), [[16, 8], size]);
+        for asked in [None, Some(size)] {
+            let photo = Photo::open(&path, asked).unwrap();
+            let [right, bottom] = [photo.width - 1, photo.height - 1];
+            assert_eq!([photo.width, photo.height], size);
+            let seen = [white(&photo, 0, 0), white(&photo, right, 0), white(&photo, 0, bottom)];
+            assert_eq!(seen, corners, "orientation {orientation}");
+        }
+        if size != [16, 8] {
+            let stored = Photo::open(&path, Some([16, 8])).unwrap();
+            assert!([stored.width, stored.height] == [16, 8] && white(&stored, 0, 7) && !white(&stored, 15, 0));
+        }
+    }
+}
+
+#[test]
+fn png_jpeg_and_webp_are_told_by_their_contents() {
+    let folder = tempfile::tempdir().unwrap();
+    let picture = image::RgbaImage::from_fn(5, 4, |x, y| image::Rgba([x as u8 * 50, y as u8 * 60, 7, 255 - x as u8]));
+    for (format, alpha) in [(image::ImageFormat::Png, true), (image::ImageFormat::WebP, true)] {
+        let path = folder.path().join("picture.JPG");
+        picture.save_with_format(&path, format).unwrap();
+        let photo = Photo::open(&path, None).unwrap();
+        assert_eq!((Photo::file_has_alpha(&path).unwrap(), photo.has_alpha()), (alpha, alpha));
+        assert_eq!(photo.pixel(4, 3), [200.0 / 255.0, 180.0 / 255.0, 7.0 / 255.0, 251.0 / 255.0]);
+    }
+}
+
+proptest! {
+    #[test]
+    fn the_mean_of_a_photograph_stays_at_any_size(
+        [width, height] in prop::array::uniform2(1..12_usize), to in prop::array::uniform2(1..12_usize), seed in any::<u8>(),
+    ) {
+        let to = [to[0].min(width), to[1].min(height)];
+        let data = (0..3 * width * height).map(|i| ((i as u8).wrapping_mul(37).wrapping_add(seed)) as f32 / 255.0).collect();
+        let photo = Photo::from(Image { width, height, channels: 3, data });
+        let mean = |photo: &Photo| {
+            let data = photo.to_image().data;
+            data.iter().map(|x| f64::from(*x)).sum::<f64>() / data.len() as f64
+        };
+        let small = photo.resized(to);
+        prop_assert_eq!([small.width, small.height], to);
+        prop_assert!((mean(&small) - mean(&photo)).abs() < 1e-6);
+    }
+}

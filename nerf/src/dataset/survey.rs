@@ -1,0 +1,228 @@
+//! How a scene lies in its capture, found out from its cameras: up, middle, scale, and how far it goes.
+
+use super::capture::{Capture, Format, Point, View};
+use super::placement::Placement;
+use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// How far a scene goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Scope {
+    /// It ends at its box: an object before a background that is transparent or of one colour.
+    Bounded,
+    /// It goes on beyond its box, and photographs show what is there.
+    Unbounded,
+}
+
+impl fmt::Display for Scope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Scope::Bounded => "bounded",
+            Scope::Unbounded => "unbounded",
+        })
+    }
+}
+
+impl FromStr for Scope {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "bounded" => Ok(Scope::Bounded),
+            "unbounded" => Ok(Scope::Unbounded),
+            _ => Err(Error::setting("scope", format!("must be bounded or unbounded, is `{text}`"))),
+        }
+    }
+}
+
+/// Where a scene is and how far it goes, in scene units, and why that is thought.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Survey {
+    /// From the capture's coordinates to those of the scene.
+    pub placement: Placement,
+    /// How far it goes.
+    pub scope: Scope,
+    /// Lower and upper corner of its box.
+    pub bounds: [DVec3; 2],
+    /// Distance along a ray before which there is nothing.
+    pub near: f64,
+    /// Distance along a ray beyond which there is nothing.
+    pub far: f64,
+    /// How the scope was found, in a few words.
+    pub reason: String,
+}
+
+/// Half of a box's side in scene units, as in the NeRF-synthetic scenes.
+const HALF_BOX: f64 = 1.5;
+/// Near and far of the NeRF-synthetic scenes: their files do not say where the scene lies, and all work on them uses these.
+const CONVENTION: [f64; 2] = [2.0, 6.0];
+/// Where nothing else is known, a ray of an unbounded scene begins at this share of the cameras' distance from its middle.
+const NEAR_SHARE: f64 = 0.05;
+/// An unbounded scene's end, in sides of its box.
+const FAR_SIDES: f64 = 1000.0;
+/// Half of the box of an unbounded scene, as a share of the cameras' distance from its middle.
+const INNER_SHARE: f64 = 0.5;
+
+impl Survey {
+    /// Of a capture, from all photographs that exist. `transparent` says whether they show nothing somewhere, which only
+    /// their pixels tell; `asked` overrules what is found.
+    ///
+    /// # Errors
+    /// If there is no photograph, or all cameras stand in one place, so that nothing has a size.
+    pub fn new(capture: &Capture, transparent: bool, asked: Option<Scope>) -> Result<Survey> {
+        let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
+        if cameras.is_empty() {
+            return Err(Error::file(&capture.file, "has no photograph whose image exists"));
+        }
+        if capture.format == Format::Blender && asked != Some(Scope::Unbounded) && conventional(&cameras) {
+            return Ok(Survey {
+                placement: Placement::default(),
+                scope: Scope::Bounded,
+                bounds: [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)],
+                near: CONVENTION[0],
+                far: CONVENTION[1],
+                reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
+            });
+        }
+        let (scope, reason) = match (asked, transparent) {
+            (Some(scope), _) => (scope, "as asked"),
+            (None, true) => (Scope::Bounded, "photographs are transparent where there is nothing"),
+            (None, false) => (Scope::Unbounded, "photographs are opaque, so they show what lies behind"),
+        };
+        let middle = middle(&cameras);
+        let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
+        if !(distance > 1e-9 * (1.0 + middle.length())) {
+            let what = "all cameras stand in one place: nothing in the scene has a size";
+            return Err(Error::file(&capture.file, what));
+        }
+        let half = match scope {
+            Scope::Bounded => half_width(&cameras, middle),
+            Scope::Unbounded => INNER_SHARE * distance,
+        };
+        let placement = Placement { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
+        let bounds = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
+        let [near, far] = match scope {
+            Scope::Bounded => {
+                let distances = || cameras.iter().map(|camera| camera.pose.translation.distance(middle));
+                let reach = 3.0_f64.sqrt() * half;
+                let nearest = distances().fold(f64::INFINITY, f64::min);
+                [(nearest - reach).max(NEAR_SHARE * distance), distances().fold(0.0, f64::max) + reach]
+            }
+            Scope::Unbounded => {
+                let near = nearest_point(&cameras, &capture.points).map_or(NEAR_SHARE * distance, |near| 0.5 * near);
+                [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
+            }
+        };
+        let [near, far] = [near, far].map(|length| length * placement.scale);
+        Ok(Survey { placement, scope, bounds, near, far, reason: reason.to_owned() })
+    }
+}
+
+impl Capture {
+    /// The photographs whose images exist.
+    pub fn present(&self) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(|view| view.image.is_some())
+    }
+}
+
+/// Whether cameras stand around the origin as those of the NeRF-synthetic scenes, and look at it.
+fn conventional(cameras: &[&Camera]) -> bool {
+    let [near, far] = CONVENTION;
+    cameras.iter().all(|camera| {
+        let eye = camera.pose.translation;
+        let looks = -camera.pose.matrix3.z_axis;
+        (near + 0.5..far - 0.5).contains(&eye.length()) && looks.dot(-eye.normalize()) > 0.7
+    })
+}
+
+/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. Where they do
+/// not look at one place, as in a room, the middle of the cameras themselves.
+fn middle(cameras: &[&Camera]) -> DVec3 {
+    let count = cameras.len() as f64;
+    let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
+    let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
+    let (mut matrix, mut sum) = (DMat3::ZERO, DVec3::ZERO);
+    for camera in cameras {
+        let axis = camera.pose.matrix3.z_axis;
+        let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+        matrix += across;
+        // Around the mean, so that coordinates far from the origin keep their digits.
+        sum += across * (camera.pose.translation - mean);
+    }
+    // Axes that are nearly parallel meet nowhere in particular.
+    let found = mean + (matrix + DMat3::from_diagonal(DVec3::splat(1e-3 * count))).inverse() * sum;
+    let ahead = |camera: &&&Camera| (found - camera.pose.translation).dot(-camera.pose.matrix3.z_axis) > 0.0;
+    let most = 4 * cameras.iter().filter(ahead).count() > 3 * cameras.len();
+    if most && found.is_finite() && found.distance(mean) < 100.0 * spread { found } else { mean }
+}
+
+/// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal axes
+/// (the least principal axis of these), on the side of their own up.
+fn upright(cameras: &[&Camera]) -> DMat3 {
+    let count = cameras.len() as f64;
+    let mean = cameras.iter().map(|camera| camera.pose.matrix3.y_axis).sum::<DVec3>() / count;
+    let mut spread = DMat3::from_diagonal(DVec3::splat(1e-4));
+    for camera in cameras {
+        let right = camera.pose.matrix3.x_axis;
+        spread += DMat3::from_cols(right * right.x, right * right.y, right * right.z) * (1.0 / count);
+    }
+    let inverse = spread.inverse();
+    let mut up = if mean.length() > 1e-3 { mean.normalize() } else { DVec3::Z };
+    for _ in 0..64 {
+        up = (inverse * up).normalize();
+    }
+    if !up.is_finite() {
+        return DMat3::IDENTITY;
+    }
+    let up = if up.dot(mean) < 0.0 { -up } else { up };
+    // The shortest way, so that a capture that is upright already is not turned.
+    DMat3::from_quat(glam::DQuat::from_rotation_arc(up, DVec3::Z))
+}
+
+/// Half of the width of what cameras see at the middle of the scene.
+fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
+    median(cameras.iter().map(|camera| {
+        let [x, y] = [0, 1].map(|axis| {
+            let size = [camera.width, camera.height][axis] as f64;
+            0.5 * size / camera.focal[axis]
+        });
+        camera.pose.translation.distance(middle) * x.max(y).min(1.0)
+    }))
+}
+
+/// The distance of the nearest points from the cameras that see them; `None` if there are too few to trust.
+fn nearest_point(cameras: &[&Camera], points: &[Point]) -> Option<f64> {
+    /// Photographs that a point must be seen in, and pixels that it may be off.
+    const TRUSTED: (u32, f64) = (3, 2.0);
+    const FEWEST: usize = 100;
+    let trusted: Vec<DVec3> =
+        points.iter().filter(|p| p.views >= TRUSTED.0 && p.error <= TRUSTED.1).map(|p| p.position).collect();
+    if trusted.len() < FEWEST {
+        return None;
+    }
+    let nearest = cameras.iter().filter_map(|camera| {
+        let inside = |p: &&DVec3| {
+            camera.pixel_of(**p).is_some_and(|[x, y]| {
+                (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y)
+            })
+        };
+        let mut depths: Vec<f64> = trusted.iter().filter(inside).map(|p| p.distance(camera.pose.translation)).collect();
+        depths.sort_by(f64::total_cmp);
+        // The nearest of two hundred: a few are always wrong.
+        depths.get(depths.len() / 200).copied()
+    });
+    let mut nearest: Vec<f64> = nearest.collect();
+    nearest.sort_by(f64::total_cmp);
+    nearest.get(nearest.len() / 20).copied()
+}
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
