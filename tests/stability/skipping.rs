@@ -149,7 +149,7 @@ fn a_fog_just_below_the_usual_threshold_stays() {
         assert_eq!(grid.occupied_share(), 1.0, "in training, step {training_step}");
     }
     for skip in [Skip::Lossless, Skip::Fast] {
-        grid.rebuild(skip.min_sigma(grid.diagonal()), false, &fog);
+        grid.rebuild(skip.min_sigma(grid.longest_path()), false, &fog);
         assert_eq!(grid.occupied_share(), 1.0, "{skip}");
     }
     // And where there is nothing, nothing stays.
@@ -166,16 +166,16 @@ fn the_worst_fog_costs_no_more_than_declared() {
     for skip in [Skip::Lossless, Skip::Fast] {
         let config = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
         let mut grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
-        let sigma = skip.min_sigma(grid.diagonal());
+        let sigma = skip.min_sigma(grid.longest_path());
         let share = |grid: &mut OccupancyGrid, sigma: f32| {
             let fog = move |points: &[[f32; 3]], out: &mut [f32]| out[..points.len()].fill(sigma);
-            grid.rebuild(skip.min_sigma(grid.diagonal()), false, &fog);
+            grid.rebuild(skip.min_sigma(grid.longest_path()), false, &fog);
             grid.occupied_share()
         };
         assert_eq!(share(&mut grid, sigma.next_up()), 1.0);
         assert_eq!(share(&mut grid, sigma), 0.0);
         // From corner to corner, alpha is what is lost of white fog over black.
-        let lost = -(-f64::from(sigma) * grid.diagonal()).exp_m1();
+        let lost = -(-f64::from(sigma) * grid.longest_path()).exp_m1();
         assert!(lost <= skip.error_bound() * (1.0 + 1e-6) && lost > 0.9 * skip.error_bound(), "{skip}: {lost}");
     }
 }

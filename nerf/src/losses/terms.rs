@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// The [distortion](Distortion) of the weights along each ray, over its span: pulls them together, against floaters and fog
-/// (Barron et al. 2022, equation 15).
+/// (Barron et al. 2022, equation 15). In an unbounded scene distances beyond half of the side of its box count by their
+/// inverses, as [space](crate::Contraction) does.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DistortionConfig {
@@ -65,7 +66,38 @@ macro_rules! terms {
     };
 }
 
-terms!("distortion" DistortionConfig, "entropy" EntropyConfig, "orientation" OrientationConfig);
+terms!("entropy" EntropyConfig, "orientation" OrientationConfig);
+
+impl Kind<Terms> for DistortionConfig {
+    const KIND: &'static str = "distortion";
+
+    fn check(&self) -> Result<()> {
+        check_range("distortion.weight", self.weight, 0.0, 1e6)
+    }
+
+    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+        let reach = site.space.unbounded.then_some(0.5 * site.space.side());
+        Ok(Arc::new(Evenness { weight: self.weight, reach }))
+    }
+}
+
+/// The distortion, with what distances are measured by.
+struct Evenness {
+    weight: f64,
+    /// Half of the side of an unbounded scene's box: farther away, distances count by their inverses.
+    reach: Option<f64>,
+}
+
+impl Evenness {
+    /// A distance as it counts along a ray of this span, rising.
+    fn place(&self, distance: f64, [near, far]: [f64; 2]) -> f64 {
+        match self.reach {
+            None => (distance - near) / (far - near).max(1e-12),
+            Some(reach) if distance <= reach => 0.5 * distance / reach,
+            Some(reach) => 1.0 - 0.5 * reach / distance,
+        }
+    }
+}
 
 impl Kind<Terms> for DepthConfig {
     const KIND: &'static str = "depth";
@@ -86,16 +118,19 @@ struct Depth {
     unit: f64,
 }
 
-impl<T: Scalar> Term<T> for DistortionConfig {
+impl<T: Scalar> Term<T> for Evenness {
     fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
         let samples = &seen.rendered.samples;
         let (mut middles, mut lengths) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
-        for (rows, [near, far]) in samples.segments.ranges().zip(&seen.rays.spans) {
-            let scale = 1.0 / (far.to_f64() - near.to_f64()).max(1e-12);
-            // A sample may stand for an interval that ends beyond the span.
-            let share = |x: f64| T::from_f64(x * scale);
-            middles.extend(samples.t.as_slice()[rows.clone()].iter().map(|t| share(t.to_f64() - near.to_f64())));
-            lengths.extend(samples.delta.as_slice()[rows].iter().map(|delta| share(delta.to_f64())));
+        for (rows, span) in samples.segments.ranges().zip(&seen.rays.spans) {
+            let span = span.map(T::to_f64);
+            for (t, delta) in samples.t.as_slice()[rows.clone()].iter().zip(&samples.delta.as_slice()[rows]) {
+                let (t, half) = (t.to_f64(), 0.5 * delta.to_f64());
+                // A sample may stand for an interval that ends beyond the span.
+                let [start, end] = [(t - half).max(0.0), t + half].map(|distance| self.place(distance, span));
+                middles.push(T::from_f64(0.5 * (start + end)));
+                lengths.push(T::from_f64(end - start));
+            }
         }
         let tensor = |values: Vec<T>| Tensor::from_vec(&[samples.len()], values);
         let op = Distortion::new(tensor(middles), tensor(lengths), samples.segments.clone());

@@ -9,7 +9,7 @@ use crate::range::check_range;
 use crate::space::occupancy::{
     DensityFn, MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Skipping, Step, Threshold, Update,
 };
-use crate::space::silhouette;
+use crate::space::{silhouette, visibility};
 use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
@@ -217,8 +217,11 @@ impl<T: Scalar> Sampler<T> for Marching {
         512
     }
 
-    /// Leaves out what the silhouettes of the photographs show to be empty.
+    /// Leaves out what no photograph shows, and what their silhouettes show to be empty.
     fn prepare(&mut self, data: &Dataset) {
+        if self.config.occupancy.skip.grid {
+            visibility::carve_unseen(&mut self.grid, data);
+        }
         silhouette::carve(&mut self.grid, data, self.config.occupancy.skip.carving);
     }
 
@@ -246,7 +249,7 @@ impl<T: Scalar> Sampler<T> for Marching {
         let pruning = self.config.occupancy.skip.pruning;
         self.pruned = (pruning > 0.0).then(|| {
             let mut grid = self.grid.clone();
-            grid.prune((pruning / grid.diagonal()) as f32, densities);
+            grid.prune((pruning / grid.longest_path()) as f32, densities);
             grid
         });
     }

@@ -4,6 +4,7 @@ pub(crate) mod contraction;
 pub(crate) mod cube;
 pub mod occupancy;
 pub(crate) mod silhouette;
+pub(crate) mod visibility;
 
 pub use contraction::{Contraction, contract};
 pub use cube::Space;

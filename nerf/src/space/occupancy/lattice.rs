@@ -48,6 +48,11 @@ impl Lattice {
         (word / self.blocks(), [block % side, block / side % side, block / (side * side)])
     }
 
+    /// How many times larger a word's cells are than those of cascade 0.
+    pub fn enlargement(&self, word: usize) -> f32 {
+        (1_u32 << self.place(word).0) as f32
+    }
+
     /// Whether a word's cells are looked at: not if a smaller cascade holds the same part of space.
     pub fn is_used(&self, word: usize) -> bool {
         let (cascade, block) = self.place(word);

@@ -33,7 +33,7 @@
 //!         *out = if DVec3::from(point.map(f64::from)).length() < 0.5 { 10.0 } else { 0.0 };
 //!     }
 //! };
-//! grid.rebuild(Skip::Lossless.min_sigma(grid.diagonal()), true, &ball);
+//! grid.rebuild(Skip::Lossless.min_sigma(grid.longest_path()), true, &ball);
 //! assert!(grid.occupied_share() < 0.15);
 //!
 //! let mut rays = Rays::new();
@@ -157,7 +157,8 @@ impl OccupancyConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Threshold {
-    /// Cells with more than this density, in 1 / scene unit, are occupied.
+    /// Cells with more than this density, in 1 / scene unit, are occupied; those of each further cascade with more than half of
+    /// that of the one before, as they are twice as large and steps through them as long.
     pub min_sigma: f32,
     /// Whether cells below the mean density of all cells are passed over instead, where that is smaller: the customary rule
     /// in training, with which a field that is faint everywhere is not skipped before it has taken shape.
@@ -170,7 +171,8 @@ pub struct Threshold {
 #[derive(Debug, Clone)]
 pub struct OccupancyGrid {
     lattice: Lattice,
-    /// For each cell, in the order of the words and their bits, the decayed largest density; NaN if never looked at.
+    /// For each cell, in the order of the words and their bits, the decayed largest density, as many times over as the cell is
+    /// larger than those of cascade 0; NaN if never looked at.
     /// Shared with copies until one of them looks.
     densities: Arc<Vec<f32>>,
     /// For each block its occupied cells; see [`bits::coarsen`] for the inner blocks of larger cascades.
@@ -205,10 +207,11 @@ impl OccupancyGrid {
         self.lattice.extent(self.lattice.cascades - 1)
     }
 
-    /// The longest path through the grid, in scene units: the diagonal of the outermost box.
-    pub fn diagonal(&self) -> f64 {
-        let [low, high] = self.outer_bounds();
-        low.distance(high)
+    /// The longest path through the grid, in scene units and as thresholds have it: that through each further
+    /// cascade is twice as long, and its thresholds half as high, so that each counts as the first, the diagonal of the box.
+    pub fn longest_path(&self) -> f64 {
+        let [low, high] = self.bounds();
+        self.cascades() as f64 * low.distance(high)
     }
 
     /// Cells along each axis of a cascade.
@@ -236,8 +239,8 @@ impl OccupancyGrid {
         bits::bounds(&self.words, &self.lattice)
     }
 
-    /// The mean density of the cells that were looked at, in 1 / scene unit; 0 if there are none. Carved cells do not
-    /// count.
+    /// The mean density of the cells that were looked at, in 1 / scene unit, that of each cell as many times over as it is
+    /// larger than those of cascade 0; 0 if there are none. Carved cells do not count.
     pub fn mean_density(&self) -> f64 {
         // In tasks of fixed size, so that the sum has the same bits at any number of threads.
         let sums: Vec<(f64, usize)> = self

@@ -124,6 +124,27 @@ fn coarser_cascades_hold_what_finer_ones_do() {
 }
 
 #[test]
+fn thresholds_of_each_further_cascade_are_half_as_high() {
+    for (sigma, expected) in [(0.9, [false, true, true]), (1.1, [true, true, true]), (0.4, [false, false, true])] {
+        let mut grid = grid(16, 3);
+        grid.update(&Update::ALL, 0, 0, &|points, out| out[..points.len()].fill(sigma));
+        grid.threshold(&Threshold { min_sigma: 1.0, or_mean: false, dilate: false });
+        let lattice = &grid.lattice;
+        let occupied = [0, 1, 2].map(|cascade| {
+            let words = lattice.cascade(cascade).filter(|word| lattice.is_used(*word));
+            words.map(|word| grid.words[word]).collect::<Vec<_>>()
+        });
+        for (cascade, words) in occupied.iter().enumerate() {
+            assert!(words.iter().all(|word| *word == if expected[cascade] { u64::MAX } else { 0 }), "{sigma} {cascade}");
+        }
+        // A fog that is just not seen is no more along the longest path than the threshold says.
+        let [low, high] = grid.bounds();
+        let through: f64 = (0..3).map(|k| f64::from(1 << k) * low.distance(high) / f64::from(1 << k)).sum();
+        assert_eq!(grid.longest_path(), through);
+    }
+}
+
+#[test]
 fn cells_tile_the_boxes() {
     let lattice = Lattice { bounds: BOX, resolution: 16, cascades: 2 };
     let [low, high] = lattice.extent(1);
@@ -396,7 +417,7 @@ fn render(grid: &OccupancyGrid, density: &DensityFn<'_>) -> (Vec<f32>, u64) {
 fn skipping_costs_no_more_than_its_bound() {
     let all = grid(32, 1);
     for skip in [Skip::Lossless, Skip::Fast] {
-        let min_sigma = skip.min_sigma(all.diagonal());
+        let min_sigma = skip.min_sigma(all.longest_path());
         for (fog, is_skipped) in [(0.99, false), (1.01 * min_sigma, false), (0.99 * min_sigma, true)] {
             let density = |points: &[[f32; 3]], out: &mut [f32]| {
                 balls(points, out);
@@ -415,6 +436,6 @@ fn skipping_costs_no_more_than_its_bound() {
     }
     assert_eq!(Skip::Off.min_sigma(1.0), f32::NEG_INFINITY);
     let mut off = all.clone();
-    off.rebuild(Skip::Off.min_sigma(all.diagonal()), false, &|_, out| out.fill(0.0));
+    off.rebuild(Skip::Off.min_sigma(all.longest_path()), false, &|_, out| out.fill(0.0));
     assert_eq!(off.occupied_share(), 1.0);
 }

@@ -77,8 +77,16 @@ struct Waiting {
 }
 
 impl Waiting {
-    /// Looks at what waits; `keep` makes a cell's density of its old one and the largest new one.
-    fn flush(&mut self, density: &DensityFn<'_>, samples: usize, out: &mut [f32], keep: impl Fn(f32, f32) -> f32) {
+    /// Looks at what waits; `scale` is what the densities of a word's cells are multiplied by, and `keep` makes a cell's density
+    /// of its old one and the largest new one.
+    fn flush(
+        &mut self,
+        density: &DensityFn<'_>,
+        samples: usize,
+        out: &mut [f32],
+        scale: impl Fn(usize) -> f32,
+        keep: impl Fn(f32, f32) -> f32,
+    ) {
         if self.points.is_empty() {
             return;
         }
@@ -86,7 +94,8 @@ impl Waiting {
         self.densities.resize(self.points.len(), f32::NAN);
         density(&self.points, &mut self.densities);
         for (&cell, found) in self.cells.iter().zip(self.densities.chunks_exact(samples)) {
-            out[cell] = keep(out[cell], found.iter().fold(f32::NEG_INFINITY, |a, &b| larger(a, b)));
+            let found = found.iter().fold(f32::NEG_INFINITY, |a, &b| larger(a, b));
+            out[cell] = keep(out[cell], scale(cell / CELLS) * found);
         }
         self.cells.clear();
         self.points.clear();
@@ -236,6 +245,7 @@ impl Look<'_> {
     ) -> u64 {
         let Look { lattice, places, density } = *self;
         let samples = places.corners.len();
+        let scale = |word: usize| lattice.enlargement(task * TASK + word);
         let mut count = 0;
         for word in 0..densities.len() / CELLS {
             let mut cells = if lattice.is_used(task * TASK + word) { chosen(task * TASK + word) } else { 0 };
@@ -248,7 +258,7 @@ impl Look<'_> {
                 let bit = cells.trailing_zeros() as usize;
                 cells &= cells - 1;
                 if waiting.points.len() + samples > POINTS {
-                    waiting.flush(density, samples, densities, &keep);
+                    waiting.flush(density, samples, densities, scale, &keep);
                 }
                 waiting.cells.push(word * CELLS + bit);
                 let cell = cell(bit);
@@ -260,7 +270,7 @@ impl Look<'_> {
                 }
             }
         }
-        waiting.flush(density, samples, densities, &keep);
+        waiting.flush(density, samples, densities, scale, &keep);
         count as u64
     }
 }

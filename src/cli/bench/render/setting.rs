@@ -74,7 +74,7 @@ impl Setting {
         match self.cells {
             Cells::Trained => {}
             Cells::Depth(depth) => {
-                let min_sigma = (depth / sampler.grid.diagonal()) as f32;
+                let min_sigma = (depth / sampler.grid.longest_path()) as f32;
                 sampler.grid.prune(min_sigma, &ask);
             }
             Cells::OneSample(depth) => {

@@ -1,0 +1,85 @@
+//! What no photograph shows.
+
+use crate::camera::pinhole::Camera;
+use crate::dataset::Dataset;
+use crate::space::occupancy::OccupancyGrid;
+use glam::DVec3;
+
+/// Pixels along each border of an image whose rays are asked how far the image reaches.
+const BORDER: usize = 16;
+
+/// The cone around all that a camera sees.
+struct Cone {
+    eye: DVec3,
+    axis: DVec3,
+    /// Between the axis and the border, in radians.
+    half_angle: f64,
+}
+
+impl Cone {
+    fn new(camera: &Camera) -> Self {
+        let [width, height] = [camera.width as f64, camera.height as f64];
+        let axis = camera.ray(0.5 * width, 0.5 * height).direction;
+        let shares = (0..=BORDER).map(|i| i as f64 / BORDER as f64);
+        let border = shares.flat_map(|share| [[share, 0.0], [share, 1.0], [0.0, share], [1.0, share]]);
+        let angle = |[x, y]: [f64; 2]| camera.ray(x * width, y * height).direction.angle_between(axis);
+        Cone { eye: camera.pose.translation, axis, half_angle: border.map(angle).fold(0.0, f64::max) }
+    }
+
+    /// Whether some of a ball may be seen farther away than `near`.
+    fn sees(&self, centre: DVec3, radius: f64, near: f64) -> bool {
+        let offset = centre - self.eye;
+        let distance = offset.length();
+        if distance + radius < near {
+            return false;
+        }
+        distance <= radius || offset.angle_between(self.axis) <= self.half_angle + (radius / distance).asin()
+    }
+}
+
+/// Empties for good the cells of a grid that no photograph shows: nothing could be learned of them, and what a field says there
+/// would float before cameras that look from elsewhere.
+pub(crate) fn carve_unseen(grid: &mut OccupancyGrid, data: &Dataset) {
+    let cones: Vec<Cone> = data.frames.iter().map(|frame| Cone::new(&frame.camera)).collect();
+    grid.carve(&|centre, radius| !cones.iter().any(|cone| cone.sees(centre, radius, data.near)));
+    grid.occupy_all_but_carved();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::{Split, embedded};
+    use crate::space::occupancy::OccupancyConfig;
+
+    #[test]
+    fn what_one_camera_sees_stays_and_nothing_else() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(1);
+        let pose = Camera::look_at(DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO, DVec3::Y);
+        data.frames[0].camera = Camera::from_angle(40, 30, 0.6, pose);
+        data.near = 1.5;
+        let config = OccupancyConfig { resolution: 32, cascades: 3, ..OccupancyConfig::default() };
+        let mut grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
+        let whole = grid.occupied_share();
+        carve_unseen(&mut grid, &data);
+        let share = grid.occupied_share();
+        assert!(share > 0.02 && share < 0.3 * whole, "{share} of {whole}");
+        let [low, high] = grid.occupied_bounds().unwrap();
+        // It looks down from 3, sees nothing nearer than 1.5, and down to the floor of the outermost box.
+        assert!(high.z > 1.4 && high.z < 2.0 && low.z == -4.0, "{low} {high}");
+        // tan .3 at the distance 7, 3 / 4 of that, and the corner of the image, with a cell around.
+        assert!(high.x > 2.1 && high.x < 3.4 && high.y > 1.6 && high.y < 3.4, "{high}");
+        // Every place on a ray of the camera is still there: also those on its border.
+        let mut rays = crate::Rays::new();
+        for pixel in [[0, 0], [39, 29], [39, 0], [20, 15]] {
+            rays.push_pixel(&data.frames[0].camera, pixel, grid.outer_bounds(), [1.5, 6.0]);
+        }
+        let count = |grid: &OccupancyGrid| {
+            let mut found = crate::space::occupancy::MarchBuffer::default();
+            let step = crate::space::occupancy::Step::uniform(0.01);
+            grid.march(&rays, &step, &mut crate::Jitter::Middle, &mut found);
+            found.t.len()
+        };
+        assert_eq!(count(&grid), count(&OccupancyGrid::new(grid.bounds(), &config).unwrap()));
+    }
+}
