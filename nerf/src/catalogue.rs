@@ -15,5 +15,6 @@ pub fn catalogue() -> Vec<Entry> {
     entries.extend(crate::space::contraction::entries());
     entries.extend(crate::volume::distortion::entries());
     entries.extend(crate::camera::rotation::entries());
+    entries.extend(crate::camera::lens::recorded::entries());
     entries
 }

@@ -27,8 +27,8 @@ pub mod space;
 pub mod training;
 pub mod volume;
 
-pub use camera::{Camera, Lens, Ndc, NdcRay, Pose, RadialLens, Ray, Rays, Samples, clip_span, intersect_box};
-pub use camera::{rotation_exp, rotation_log};
+pub use camera::{Camera, Lens, Ndc, NdcRay, Pose, Ray, Rays, Samples, clip_span, intersect_box};
+pub use camera::{lens_places, rotation_exp, rotation_log};
 #[cfg(feature = "check")]
 pub use catalogue::catalogue;
 pub use dataset::{Background, Image, SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};

@@ -8,7 +8,7 @@ use raygrad::nerf::sampling::steps::{even_edges, invert_cdf};
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 use raygrad::nerf::volume::{self, OpticalDepth, Weights};
 use raygrad::nerf::{
-    Distortion, Ndc, Pose, PositionalEncoding, RadialLens, Ray, Rays, contract, glam::DVec3, intersect_box,
+    Distortion, Lens, Ndc, Pose, PositionalEncoding, Ray, Rays, contract, glam::DVec3, intersect_box,
     rotation_exp, srgb_decode, srgb_encode,
 };
 use raygrad::{Adam, AdamConfig, Op, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
@@ -286,11 +286,14 @@ proptest! {
         if let Ok(ray) = ndc.ray::<f64>(o, d) {
             prop_assert!(ray.origin.iter().chain(&ray.direction).all(|x| x.is_finite()), "{:?}", ray);
         }
-        let lens = RadialLens { k1: k[0], k2: k[1] };
-        if let Ok(undone) = lens.undistort(r) {
-            prop_assert!(undone >= 0.0 && undone <= lens.fold(), "{} {}", undone, lens.fold());
-            let again = lens.distort(undone);
-            prop_assert!((again - r).abs() <= 1e-9 * r + f64::MIN_POSITIVE, "{} {}", again, r);
+        let lens = Lens::Brown { k: [k[0], k[1], 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+        if lens.check().is_ok() && r.is_finite() {
+            let nearest = lens.nearest([r, 0.0]);
+            prop_assert!((nearest.length() - 1.0).abs() < 1e-9 && nearest.z >= 0.0, "{}", nearest);
+            let undone = lens.direction([r, 0.0]).and_then(|direction| lens.place(direction));
+            if let Some([again, _]) = undone {
+                prop_assert!((again - r).abs() <= 1e-9 * r.abs() + f64::MIN_POSITIVE, "{} {}", again, r);
+            }
         }
     }
 }

@@ -1,8 +1,18 @@
-//! Radial lens distortion, and how to undo it.
+//! Lenses: between directions and places in the image plane, both ways.
 
+pub(crate) mod fold;
+pub(crate) mod inverse;
+pub(crate) mod maps;
+pub(crate) mod recorded;
+#[cfg(test)]
+mod tests;
+
+use crate::camera::lens::inverse::Distortion;
 use crate::{Error, Result};
 use glam::DVec3;
+use raygrad_autograd::Real;
 use serde::{Deserialize, Serialize};
+use std::f64::consts::{FRAC_PI_2, PI};
 
 /// How a camera's glass bends light: the map between directions and places in the image plane.
 ///
@@ -44,153 +54,180 @@ pub enum Lens {
 
 impl Lens {
     /// The direction, of length 1, of the light that reaches this place; `None` where the lens puts nothing.
-    pub fn direction(&self, [x, y]: [f64; 2]) -> Option<DVec3> {
-        match self {
-            Lens::Pinhole => Some(DVec3::new(x, y, 1.0).normalize()),
-            Lens::Brown { k, p } => {
-                let (mut a, mut b) = (x, y);
-                for _ in 0..30 {
-                    let r = a * a + b * b;
-                    let radial = 1.0 + r * (k[0] + r * k[1]);
-                    let (dx, dy) =
-                        (2.0 * p[0] * a * b + p[1] * (r + 2.0 * a * a), p[0] * (r + 2.0 * b * b) + 2.0 * p[1] * a * b);
-                    (a, b) = ((x - dx) / radial, (y - dy) / radial);
-                }
-                Some(DVec3::new(a, b, 1.0).normalize())
-            }
-            _ => unimplemented!(),
-        }
-    }
-
-    /// As [`direction`](Self::direction); where the lens puts nothing, the outermost direction towards there.
-    pub fn nearest(&self, place: [f64; 2]) -> DVec3 {
-        self.direction(place).unwrap_or(DVec3::Z)
-    }
-
-    /// Where light from this direction, of any length but 0, reaches the image plane; `None` if it does not.
-    pub fn place(&self, direction: DVec3) -> Option<[f64; 2]> {
-        match self {
-            Lens::Pinhole => (direction.z > 0.0).then(|| [direction.x / direction.z, direction.y / direction.z]),
-            _ => unimplemented!(),
-        }
-    }
-}
-
-/// A lens that moves the point at distance `r` from the optical axis, in units of the focal length, to
-/// `r (1 + k1 r^2 + k2 r^4)` (Brown 1966; OpenCV's first two coefficients).
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct RadialLens {
-    /// Coefficient of `r^2`; negative for a barrel.
-    pub k1: f64,
-    /// Coefficient of `r^4`.
-    pub k2: f64,
-}
-
-/// Newton steps, each at least as good as halving an interval of doubles.
-const MOST_STEPS: usize = 1100;
-
-impl RadialLens {
-    /// Where the lens puts the point at distance `r`.
-    pub fn distort(&self, r: f64) -> f64 {
-        let s = r * r;
-        r * (1.0 + s * (self.k1 + s * self.k2))
-    }
-
-    /// The derivative of [`distort`](Self::distort).
-    fn slope(&self, r: f64) -> f64 {
-        let s = r * r;
-        1.0 + s * (3.0 * self.k1 + s * 5.0 * self.k2)
-    }
-
-    /// The distance from the axis up to which points keep their order: beyond, the image folds back. Infinite for most
-    /// lenses; `1 / sqrt(3 |k1|)` for `k1 < 0` and `k2 = 0`.
-    pub fn fold(&self) -> f64 {
-        // The least positive root s of 1 + b s + a s^2.
-        let (a, b) = (5.0 * self.k2, 3.0 * self.k1);
-        let discriminant = b * b - 4.0 * a;
-        if discriminant < 0.0 {
-            return f64::INFINITY;
-        }
-        // Both roots from sums of equal signs: 1 / s = (-b +- root) / 2, and a positive s is least for the plus.
-        let root = discriminant.sqrt();
-        let inverse = if b <= 0.0 { 0.5 * (root - b) } else { -2.0 * a / (b + root) };
-        if inverse > 0.0 { inverse.recip().sqrt() } else { f64::INFINITY }
-    }
-
-    /// The distance at which a point was that the lens has put at `distorted`, at least 0 and up to the
-    /// [`fold`](Self::fold): by Newton's method, kept between bounds that hold the root.
+    ///
+    /// A distortion is undone up to where it first folds the image back, on the way from the axis, and nowhere else.
     ///
     /// ```
-    /// use raygrad_nerf::RadialLens;
-    /// let barrel = RadialLens { k1: -0.5, k2: 0.0 };
-    /// assert!((barrel.undistort(0.54)? - 0.7562852).abs() < 1e-7);
-    /// assert!(barrel.undistort(0.6).is_err(), "this lens puts nothing there");
-    /// # Ok::<(), raygrad_nerf::Error>(())
+    /// use raygrad_nerf::Lens;
+    /// let barrel = Lens::Brown { k: [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    /// let direction = barrel.direction([0.54, 0.0]).unwrap();
+    /// assert!((direction.x / direction.z - 0.7562852).abs() < 1e-7);
+    /// assert!(barrel.direction([0.6, 0.0]).is_none(), "this lens puts nothing there");
     /// ```
+    pub fn direction(&self, place: [f64; 2]) -> Option<DVec3> {
+        self.solve(place).ok().filter(|direction| direction.is_finite())
+    }
+
+    /// As [`direction`](Self::direction); where the lens puts nothing, the outermost direction towards there. Finite for
+    /// every finite place.
+    pub fn nearest(&self, place: [f64; 2]) -> DVec3 {
+        let (Ok(direction) | Err(direction)) = self.solve(place);
+        // Only coefficients and places beyond all measure have no answer in numbers.
+        if direction.is_finite() { direction } else { DVec3::Z }
+    }
+
+    /// Where light from this direction, of any length but 0, reaches the image plane; `None` if it does not: from behind
+    /// the image plane, except by a fisheye or an equirectangular image, and from beyond the first fold of the image.
+    pub fn place(&self, direction: DVec3) -> Option<[f64; 2]> {
+        // Squares of what is left neither overflow nor vanish.
+        let [x, y, z] = (direction / direction.abs().max_element()).to_array();
+        let place = match self.distortion() {
+            Some(distortion) => {
+                let before = match distortion {
+                    Distortion::Rational(_) => (z > 0.0).then(|| maps::perspective([x, y, z])),
+                    // All directions around it are as near to straight behind, so it has no place.
+                    Distortion::ThinPrism(_) => (z > 0.0 || x != 0.0 || y != 0.0).then(|| maps::equidistant([x, y, z])),
+                }?;
+                distortion.domain().holds(before).then(|| distortion.of(before))?
+            }
+            None => match self {
+                Lens::Fov { omega } => (z > 0.0).then(|| maps::field_of_view(*omega, [x, y, z]))?,
+                Lens::Equirectangular => maps::longitude_and_latitude([x, y, z]),
+                _ => (z > 0.0).then(|| maps::perspective([x, y, z]))?,
+            },
+        };
+        place.iter().all(|x| x.is_finite()).then_some(place)
+    }
+
+    /// The formula of [`place`](Self::place), for a lens of this kind with these [`coefficients`](Self::coefficients), and
+    /// for any kind of number: with variables it has derivatives by all of them. It knows nothing of folds, and of
+    /// directions from behind a lens that sees none it makes what the formula gives.
+    ///
+    /// # Panics
+    /// If the coefficients are not as many as the lens has.
+    pub fn project<E: Real>(&self, coefficients: &[E], direction: [E; 3]) -> [E; 2] {
+        match (self, coefficients) {
+            (Lens::Pinhole, []) => maps::perspective(direction),
+            (Lens::Brown { .. }, &[a, b, c, d, e, f, g, h]) => {
+                maps::rational([a, b, c, d, e, f, g, h], maps::perspective(direction))
+            }
+            (Lens::Fisheye { .. }, &[a, b, c, d, e, f, g, h]) => {
+                maps::thin_prism([a, b, c, d, e, f, g, h], maps::equidistant(direction))
+            }
+            (Lens::Fov { .. }, &[omega]) => maps::field_of_view(omega, direction),
+            (Lens::Equirectangular, []) => maps::longitude_and_latitude(direction),
+            _ => panic!("{} coefficients for {self:?}", coefficients.len()),
+        }
+    }
+
+    /// What describes the lens, in order: `k1 .. k6, p1, p2`; `k1 .. k4, p1, p2, sx1, sy1`; `omega`; or nothing.
+    pub fn coefficients(&self) -> Vec<f64> {
+        match self {
+            Lens::Pinhole | Lens::Equirectangular => vec![],
+            Lens::Brown { k, p } => [&k[..], p].concat(),
+            Lens::Fisheye { k, p, s } => [&k[..], p, s].concat(),
+            Lens::Fov { omega } => vec![*omega],
+        }
+    }
+
+    /// A lens of this kind with other [`coefficients`](Self::coefficients).
+    ///
+    /// # Panics
+    /// If they are not as many.
+    #[must_use]
+    pub fn with_coefficients(&self, coefficients: &[f64]) -> Lens {
+        match (self, coefficients) {
+            (Lens::Pinhole | Lens::Equirectangular, []) => *self,
+            (Lens::Brown { .. }, &[k1, k2, k3, k4, k5, k6, p1, p2]) => {
+                Lens::Brown { k: [k1, k2, k3, k4, k5, k6], p: [p1, p2] }
+            }
+            (Lens::Fisheye { .. }, &[k1, k2, k3, k4, p1, p2, sx1, sy1]) => {
+                Lens::Fisheye { k: [k1, k2, k3, k4], p: [p1, p2], s: [sx1, sy1] }
+            }
+            (Lens::Fov { .. }, &[omega]) => Lens::Fov { omega },
+            _ => panic!("{} coefficients for {self:?}", coefficients.len()),
+        }
+    }
+
+    /// Whether this is a lens.
     ///
     /// # Errors
-    /// If the lens puts no point there, or a number is negative or not finite.
-    pub fn undistort(&self, distorted: f64) -> Result<f64> {
-        if !(distorted >= 0.0 && distorted.is_finite() && self.k1.is_finite() && self.k2.is_finite()) {
-            let RadialLens { k1, k2 } = self;
-            return Err(Error::setting("lens", format!("no distance {distorted} for k1 = {k1}, k2 = {k2}")));
+    /// If a coefficient is not finite, or a field of view is not below half a turn.
+    pub fn check(&self) -> Result<()> {
+        if let Some(bad) = self.coefficients().iter().find(|x| !x.is_finite()) {
+            return Err(Error::setting("lens", format!("a coefficient is {bad}: {self:?}")));
         }
-        let mut high = self.fold();
-        if high.is_infinite() {
-            high = distorted.max(f64::MIN_POSITIVE);
-            while self.distort(high) < distorted {
-                high *= 2.0;
+        match self {
+            Lens::Fov { omega } if !(omega.abs() < PI) => {
+                Err(Error::setting("lens", format!("a field of view of {omega}; it is in radians, below pi")))
             }
-        } else if self.distort(high) < distorted {
-            let most = self.distort(high);
-            let what = format!("puts nothing at {distorted} from the axis, only up to {most:.7}; crop the image");
-            return Err(Error::setting("lens", what));
+            _ => Ok(()),
         }
-        let (mut low, mut r) = (0.0, distorted.min(high));
-        for _ in 0..MOST_STEPS {
-            let excess = self.distort(r) - distorted;
-            if excess > 0.0 {
-                high = r
-            } else {
-                low = r
+    }
+
+    /// The distortion of the image plane, of lenses that are made of one.
+    fn distortion(&self) -> Option<Distortion> {
+        match *self {
+            Lens::Brown { k: [k1, k2, k3, k4, k5, k6], p: [p1, p2] } => {
+                Some(Distortion::Rational([k1, k2, k3, k4, k5, k6, p1, p2]))
             }
-            let newton = r - excess / self.slope(r);
-            let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-            if excess == 0.0 || next == r || !(low < next && next < high) {
-                break;
+            Lens::Fisheye { k: [k1, k2, k3, k4], p: [p1, p2], s: [sx1, sy1] } => {
+                Some(Distortion::ThinPrism([k1, k2, k3, k4, p1, p2, sx1, sy1]))
             }
-            r = next;
+            _ => None,
         }
-        Ok(r)
+    }
+
+    /// The direction of a place, or else the outermost one towards there.
+    fn solve(&self, [x, y]: [f64; 2]) -> std::result::Result<DVec3, DVec3> {
+        if let Some(distortion) = self.distortion() {
+            let direction = |place: [f64; 2]| match distortion {
+                Distortion::Rational(_) => before(place),
+                Distortion::ThinPrism(_) => at_angle(place),
+            };
+            return distortion.undo([x, y]).map(direction).map_err(direction);
+        }
+        match *self {
+            Lens::Fov { omega } => {
+                // The angle in the formula's arc tangent; the outermost direction is square to the axis.
+                let angle = x.hypot(y) * omega.abs();
+                let side = |angle: f64| sinc(angle) / maps::twice_tangent_of_half_over(omega);
+                let direction = |angle: f64, k: f64| unit(DVec3::new(x * k, y * k, angle.cos()));
+                if angle < FRAC_PI_2 {
+                    Ok(direction(angle, side(angle)))
+                } else {
+                    Err(direction(FRAC_PI_2, side(FRAC_PI_2) * (FRAC_PI_2 / angle)))
+                }
+            }
+            Lens::Equirectangular => {
+                let (longitude, latitude) = (x.clamp(-PI, PI), y.clamp(-FRAC_PI_2, FRAC_PI_2));
+                let (sin, cos) = latitude.sin_cos();
+                let direction = DVec3::new(cos * longitude.sin(), sin, cos * longitude.cos());
+                if [longitude, latitude] == [x, y] { Ok(direction) } else { Err(direction) }
+            }
+            _ => Ok(before([x, y])),
+        }
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
+/// `sin(angle) / angle`.
+fn sinc(angle: f64) -> f64 {
+    if angle == 0.0 { 1.0 } else { angle.sin() / angle }
+}
 
-    #[test]
-    fn the_fold_is_where_the_slope_is_zero() {
-        for (k1, k2) in [(-0.5, 0.0), (-0.3, 0.01), (0.2, -0.1), (0.0, -0.5), (-1e-9, 0.0), (5.0, -1e-6)] {
-            let lens = RadialLens { k1, k2 };
-            let (fold, scale) = (lens.fold(), 1.0 + 3.0 * k1.abs() * lens.fold().powi(2));
-            assert!(lens.slope(fold).abs() < 1e-9 * scale, "{lens:?}: {fold}, slope {}", lens.slope(fold));
-            assert!((1..100).all(|i| lens.slope(fold * f64::from(i) / 100.0) > 0.0), "{lens:?}: not the first");
-        }
-        for (k1, k2) in [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (-0.1, 0.5)] {
-            assert_eq!(RadialLens { k1, k2 }.fold(), f64::INFINITY, "{k1} {k2}");
-        }
-    }
+/// A vector at length 1, whatever its own length.
+fn unit(v: DVec3) -> DVec3 {
+    (v / v.abs().max_element()).normalize()
+}
 
-    proptest! {
-        #[test]
-        fn undoes_what_the_lens_does(k1 in -1.0..1.0_f64, k2 in -1.0..1.0_f64, share in 0.0..0.999_f64) {
-            let lens = RadialLens { k1, k2 };
-            let r = share * lens.fold().min(10.0);
-            let again = lens.undistort(lens.distort(r)).unwrap();
-            // Near the fold many distances have nearly one image.
-            prop_assert!((again - r).abs() <= 1e-13 * r / lens.slope(r).min(1.0) + 1e-15, "{} {}", again, r);
-        }
-    }
+/// The direction through a place on a plane at distance 1.
+fn before([x, y]: [f64; 2]) -> DVec3 {
+    unit(DVec3::new(x, y, 1.0))
+}
+
+/// The direction at an angle to the axis, given as its components.
+fn at_angle([x, y]: [f64; 2]) -> DVec3 {
+    let angle = x.hypot(y);
+    let k = sinc(angle);
+    DVec3::new(x * k, y * k, angle.cos())
 }

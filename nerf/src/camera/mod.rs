@@ -1,5 +1,6 @@
 //! Cameras, their lenses and poses, and the rays through their pixels.
 
+pub(crate) mod angles;
 pub(crate) mod bounds;
 pub(crate) mod lens;
 pub(crate) mod ndc;
@@ -9,7 +10,7 @@ pub(crate) mod rays;
 pub(crate) mod rotation;
 
 pub use bounds::{clip_span, intersect_box};
-pub use lens::{Lens, RadialLens};
+pub use lens::{Lens, recorded::lens_places};
 pub use ndc::{Ndc, NdcRay};
 pub use pinhole::{Camera, Ray};
 pub use pose::Pose;

@@ -1,29 +1,9 @@
 //! Rotations for poses that are optimised: from and to rotation vectors, with gradients at every angle.
 
+use crate::camera::angles::{angle_over, sinc_and_cos_of_root};
 #[cfg(feature = "check")]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Mask, Real, Scalar, Shape, Tensor, Var, record};
-
-/// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
-///
-/// Written with [`Real`], so that with variables it has derivatives of every order. Each branch sees an argument that it
-/// is good for, since a gradient of 0 times infinity would be NaN.
-#[inline(always)]
-fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
-    let one = s.like(1.0);
-    let excess = s - one;
-    let (near, far) = (excess.if_positive(one, s), excess.if_positive(s, one));
-    // Up to s = 1 the first terms left out are below 1e-20. `1 - s / (n (n + 1)) (1 - s / ((n + 2) (n + 3)) (..))`.
-    let series = |first: u32| {
-        (0..11).rev().fold(s.like(1.0), |sum, k| {
-            let n = f64::from(first + 2 * k);
-            s.like(1.0) - s.like(1.0 / (n * (n + 1.0))) * near * sum
-        })
-    };
-    let root = far.sqrt();
-    let sinc = root.sin() / root;
-    [excess.if_positive(sinc, series(2)), excess.if_positive(root.cos(), series(1))]
-}
 
 /// The matrix, row by row, of the rotation by `|w|` radians about `w` (Rodrigues): `1 + a K + b K^2` with the matrix K of
 /// `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`. Both come from half the angle, as for a quaternion: `b` as
@@ -81,20 +61,8 @@ pub(crate) fn log_from<E: Real>(m: &[E; 9], largest: usize) -> [E; 3] {
     // Of the two quaternions of a rotation the one with w >= 0, so that the angle is at most pi.
     let flip = |q: E| (-w).if_positive(-q, q);
     let [w, x, y, z] = [w, x, y, z].map(flip);
-    // 2 atan2(v, w) / v with v = |(x, y, z)|, smooth through 0: in r = (v/w)^2 up to 1/16 a series of atan(v/w) / (v/w).
-    let v2 = x * x + y * y + z * z;
-    let w2 = w * w;
-    let excess = v2 - w.like(0.0625) * w2;
-    let one = w.like(1.0);
-    let w_near = excess.if_positive(one, w);
-    let r = excess.if_positive(v2.like(0.0), v2) / (w_near * w_near);
-    let series = (0..14).rev().fold(r.like(0.0), |sum, k| {
-        let term = if k % 2 == 0 { 1.0 } else { -1.0 } / f64::from(2 * k + 1);
-        sum * r + r.like(term)
-    });
-    let v = excess.if_positive(v2, one).sqrt();
-    let far = v.atan2(w) / v;
-    let factor = w2.like(2.0) * excess.if_positive(far, series / w_near);
+    // 2 atan2(v, w) / v with v = |(x, y, z)|.
+    let factor = w.like(2.0) * angle_over(x * x + y * y + z * z, w);
     [x, y, z].map(|q| factor * q)
 }
 

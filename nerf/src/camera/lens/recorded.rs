@@ -1,0 +1,71 @@
+//! Lenses on a tape, with gradients by their coefficients.
+
+use crate::camera::lens::Lens;
+use raygrad_autograd::{Scalar, Var, record};
+#[cfg(feature = "check")]
+use raygrad_autograd::{Tensor, check::Entry};
+
+/// Places `[.., 2]` of directions `[.., 3]`, of any length, through a lens of the kind of `lens` with the coefficients `[n]`,
+/// in the order of [`Lens::coefficients`]: [`Lens::project`] with variables. The axes are those of [`Lens`].
+///
+/// ```
+/// use raygrad_autograd::{Tape, Tensor};
+/// use raygrad_nerf::{Lens, lens_places};
+/// let lens = Lens::Fov { omega: 0.9 };
+/// let tape = Tape::<f64>::new();
+/// let coefficients = tape.leaf(Tensor::from_vec(&[1], lens.coefficients()));
+/// let directions = tape.leaf(Tensor::from_vec(&[2, 3], vec![0.3, 0.1, 1.0, -0.5, 0.2, 0.8]));
+/// let places = lens_places(&lens, &coefficients, &directions);
+/// assert_eq!(places.shape(), [2, 2]);
+/// assert_eq!(places.sum().grad(&[&coefficients])[0].shape(), [1]);
+/// ```
+///
+/// # Panics
+/// If the last extent of directions is not 3, or the coefficients are not as many as the lens has.
+#[track_caller]
+pub fn lens_places<'t, T: Scalar>(lens: &Lens, coefficients: &Var<'t, T>, directions: &Var<'t, T>) -> Var<'t, T> {
+    assert_eq!(directions.shape().last(), Some(&3), "directions of three elements");
+    let count = lens.coefficients().len();
+    assert_eq!(coefficients.shape(), [count], "coefficients of {lens:?}");
+    let inputs = (0..3).map(|i| directions.slice_axis(-1, i..i + 1));
+    let inputs: Vec<_> = inputs.chain((0..count).map(|i| coefficients.slice_axis(0, i..i + 1))).collect();
+    let places = match count {
+        0 => places_of::<T, 3>(lens, &inputs),
+        1 => places_of::<T, 4>(lens, &inputs),
+        _ => places_of::<T, 11>(lens, &inputs),
+    };
+    Var::concat(&[&places[0], &places[1]], -1)
+}
+
+/// The formula with `N` variables: a direction, then coefficients.
+fn places_of<'t, T: Scalar, const N: usize>(lens: &Lens, inputs: &[Var<'t, T>]) -> [Var<'t, T>; 2] {
+    record::<T, N, 2>(std::array::from_fn(|i| &inputs[i]), |x| lens.project(&x[3..], [x[0], x[1], x[2]]))
+}
+
+/// The catalogue entries of this file.
+#[cfg(feature = "check")]
+pub(crate) fn entries() -> Vec<Entry> {
+    let directions = |from: f64, to: f64| {
+        let wave = |i: usize| ((i * 7) % 13) as f64 / 6.0 - 1.0;
+        let z = |i: usize| from + (to - from) * (0.5 + 0.5 * wave(i + 4));
+        Tensor::from_fn(&[6, 3], |i| if i % 3 == 2 { z(i) } else { wave(i) + 0.03 })
+    };
+    let tensor = |values: &[f64]| Tensor::from_vec(&[values.len()], values.to_vec());
+    let brown = [0.1, -0.2, 0.03, 0.2, -0.05, 0.01, 0.002, -0.003];
+    let fisheye = [0.05, -0.02, 0.003, 0.001, 0.002, -0.003, 0.004, -0.001];
+    let (before, around) = ((0.8, 1.5), (-0.1, 1.2));
+    macro_rules! entry {
+        ($name:literal, $lens:expr, $coefficients:expr, $z:expr) => {
+            Entry::function($name, |x| lens_places(&$lens, &x[0], &x[1]), |x| lens_places(&$lens, &x[0], &x[1]))
+                .sample_of(vec![tensor(&$coefficients), directions($z.0, $z.1)])
+        };
+    }
+    vec![
+        entry!("lens_brown", Lens::Brown { k: [0.0; 6], p: [0.0; 2] }, brown, before),
+        entry!("lens_fisheye", Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] }, fisheye, around),
+        entry!("lens_fov", Lens::Fov { omega: 0.0 }, [0.9], before)
+            .sample_of(vec![tensor(&[1e-3]), directions(0.8, 1.5)]),
+        entry!("lens_equirectangular", Lens::Equirectangular, [], around),
+        entry!("lens_pinhole", Lens::Pinhole, [], before),
+    ]
+}
