@@ -1,0 +1,227 @@
+//! COLMAP's sparse reconstructions (Schönberger and Frahm 2016): `cameras`, `images` and `points3D`, each a `.bin` or
+//! a `.txt` file.
+//!
+//! A pose there goes from the world to a camera that looks along its `+z` with `+y` down, as a quaternion with its
+//! real part first and a translation. Pixels are counted as [`Camera`] counts them. Since version 3.12 `rigs` and
+//! `frames` stand beside: they say how cameras are mounted, and the poses of the images are in `images` still.
+
+mod beside;
+mod binary;
+mod models;
+mod pose;
+mod table;
+mod text;
+
+use crate::camera::pinhole::Camera;
+use crate::dataset::capture::{Capture, Format, Point, View};
+use crate::error::{Error, Result};
+use crate::pictures::write_atomic;
+use glam::DAffine3;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use table::Table;
+
+/// How COLMAP's files are written. Both hold the same numbers, bit for bit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Encoding {
+    /// `.bin`, little-endian: what COLMAP writes by default.
+    Binary,
+    /// `.txt`.
+    Text,
+}
+
+impl Encoding {
+    /// Where a folder has both, the first is read.
+    const ALL: [Encoding; 2] = [Encoding::Binary, Encoding::Text];
+
+    fn extension(self) -> &'static str {
+        match self {
+            Encoding::Binary => "bin",
+            Encoding::Text => "txt",
+        }
+    }
+
+    /// The files of a model in `folder`: cameras, images and points.
+    fn files(self, folder: &Path) -> [PathBuf; 3] {
+        ["cameras", "images", "points3D"].map(|stem| folder.join(stem).with_extension(self.extension()))
+    }
+}
+
+/// Where a model may be in the folder of a capture, in the order in which they are looked at.
+const PLACES: [&str; 4] = ["sparse/0", "sparse", "", "colmap/sparse/0"];
+
+/// The folder of the model of a capture, and how it is written.
+fn find(folder: &Path) -> Option<(PathBuf, Encoding)> {
+    let folders = PLACES.iter().map(|place| if place.is_empty() { folder.to_owned() } else { folder.join(place) });
+    let all = folders.flat_map(|folder| Encoding::ALL.map(|encoding| (folder.clone(), encoding)));
+    all.into_iter().find(|(folder, encoding)| {
+        let [cameras, images, _] = encoding.files(folder);
+        cameras.is_file() && images.is_file()
+    })
+}
+
+/// Whether the folder holds cameras in this format.
+pub(crate) fn detect(folder: &Path) -> bool {
+    find(folder).is_some()
+}
+
+/// Reads the cameras and points of `folder`, views in the order of their names. No image is decoded.
+///
+/// # Errors
+/// If a file is absent or damaged, an image belongs to no camera, an identifier or a name is there twice, a camera's
+/// model is not supported, or a number is not finite. The error names the file and the entry, or the line.
+pub fn read(folder: &Path) -> Result<Capture> {
+    let Some((model, encoding)) = find(folder) else {
+        let what = "holds no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
+        return Err(Error::file(folder, what));
+    };
+    let files = encoding.files(&model);
+    let content = |file: &Path| std::fs::read(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")));
+    let [cameras, images, points] = &files;
+    // A model without points is one of known cameras.
+    let points = if points.is_file() { Some(content(points)?) } else { None };
+    let mut capture = parse(folder, encoding, &files, [&content(cameras)?, &content(images)?], points.as_deref())?;
+    beside::attach(&mut capture, &model);
+    Ok(capture)
+}
+
+/// Writes the cameras and points of `capture` to `sparse/0` in `folder`. Images are the caller's: each must be in
+/// `images` by the name of its view. Views with the same camera share an entry; which photographs show a point is not
+/// written.
+///
+/// # Errors
+/// If COLMAP has no model for a camera, a name or a number cannot be written, another model is in the folder that
+/// would be read in place of this or together with it, or a file cannot be written. The error names the view or the
+/// file.
+pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()> {
+    let table = Table::new(capture, encoding)?;
+    let folder = folder.join("sparse").join("0");
+    let mut others = vec!["rigs.bin", "frames.bin", "rigs.txt", "frames.txt"];
+    match encoding {
+        Encoding::Binary => others.extend(["cameras.txt", "images.txt", "points3D.txt"]),
+        Encoding::Text => others.extend(["cameras.bin", "images.bin", "points3D.bin"]),
+    }
+    if let Some(other) = others.iter().map(|name| folder.join(name)).find(|file| file.exists()) {
+        return Err(Error::file(other, "belongs to another model in the same folder: move that away first"));
+    }
+    std::fs::create_dir_all(&folder).map_err(|e| Error::file(&folder, format!("cannot be made: {e}")))?;
+    let bytes = match encoding {
+        Encoding::Binary => binary::encode(&table),
+        Encoding::Text => text::encode(&table),
+    };
+    encoding.files(&folder).iter().zip(bytes).try_for_each(|(file, bytes)| write_atomic(file, &bytes))
+}
+
+/// Where a file speaks of something.
+#[derive(Debug, Clone, Copy)]
+enum Place {
+    /// An entry of a binary file: the list and the position in it.
+    Item(&'static str, usize),
+    /// A line of a text, counted from 1.
+    Line(usize),
+}
+
+impl Place {
+    fn name(self) -> String {
+        match self {
+            Place::Item(list, index) => format!("{list}[{index}]"),
+            Place::Line(line) => format!("line {line}"),
+        }
+    }
+
+    /// An error about a member of what is there.
+    fn error(self, file: &Path, member: &str, what: impl ToString) -> Error {
+        match self {
+            Place::Item(..) => Error::field(file, format!("{}.{member}", self.name()), what),
+            Place::Line(_) => Error::field(file, self.name(), format!("{member}: {}", what.to_string())),
+        }
+    }
+}
+
+/// A camera of the file; its pose is the identity.
+struct CameraEntry {
+    place: Place,
+    id: u32,
+    camera: Camera,
+}
+
+/// An image of the file.
+struct ImageEntry {
+    place: Place,
+    id: u32,
+    pose: DAffine3,
+    camera: u32,
+    name: String,
+}
+
+impl ImageEntry {
+    /// `q` is the quaternion with its real part first.
+    fn new(file: &Path, place: Place, id: u32, q: [f64; 4], t: [f64; 3], camera: u32, name: &str) -> Result<Self> {
+        let pose = pose::from_file(q, t).map_err(|(member, what)| place.error(file, member, what))?;
+        let name = name.strip_prefix("./").unwrap_or(name).to_owned();
+        if name.is_empty() {
+            return Err(place.error(file, "name", "is empty"));
+        }
+        Ok(ImageEntry { place, id, pose, camera, name })
+    }
+}
+
+/// What the bytes of the files say. Nothing else is read.
+fn parse(
+    folder: &Path,
+    encoding: Encoding,
+    files: &[PathBuf; 3],
+    [cameras, images]: [&[u8]; 2],
+    points: Option<&[u8]>,
+) -> Result<Capture> {
+    let [cameras_file, images_file, points_file] = files;
+    let (cameras, images) = match encoding {
+        Encoding::Binary => (binary::cameras(cameras_file, cameras)?, binary::images(images_file, images)?),
+        Encoding::Text => (text::cameras(cameras_file, cameras)?, text::images(images_file, images)?),
+    };
+    let points: Vec<Point> = match (points, encoding) {
+        (None, _) => vec![],
+        (Some(points), Encoding::Binary) => binary::points(points_file, points)?,
+        (Some(points), Encoding::Text) => text::points(points_file, points)?,
+    };
+    distinct(cameras_file, "camera_id", cameras.iter().map(|entry| (entry.id, entry.place)))?;
+    distinct(images_file, "image_id", images.iter().map(|entry| (entry.id, entry.place)))?;
+    distinct(images_file, "name", images.iter().map(|entry| (entry.name.as_str(), entry.place)))?;
+    if images.is_empty() {
+        return Err(Error::field(images_file, "images", "is empty: there is nothing to load"));
+    }
+    let cameras: HashMap<u32, Camera> = cameras.into_iter().map(|entry| (entry.id, entry.camera)).collect();
+    let view = |entry: ImageEntry| {
+        let ImageEntry { place, pose, name, camera: id, .. } = entry;
+        let Some(camera) = cameras.get(&id) else {
+            let what = format!("is {id}, but {} has no such camera", cameras_file.display());
+            return Err(place.error(images_file, "camera_id", what));
+        };
+        let camera = Camera { pose, ..camera.clone() };
+        let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
+        Ok(View { name, field: place.name(), image, camera, split, mask, depth, sharpness, bounds })
+    };
+    let mut views = images.into_iter().map(view).collect::<Result<Vec<View>>>()?;
+    views.sort_by(|a, b| a.name.cmp(&b.name));
+    let (folder, file, format) = (folder.to_owned(), images_file.clone(), Format::Colmap);
+    Ok(Capture { folder, file, format, views, points, aabb_scale: None, applied: DAffine3::IDENTITY })
+}
+
+/// That no two entries of a list have the same key.
+fn distinct<K: Eq + std::hash::Hash + std::fmt::Display>(
+    file: &Path,
+    member: &str,
+    entries: impl Iterator<Item = (K, Place)>,
+) -> Result<()> {
+    let mut seen: HashMap<K, Place> = HashMap::new();
+    for (key, place) in entries {
+        if let Some(before) = seen.get(&key) {
+            return Err(place.error(file, member, format!("is `{key}`, as that of {} is", before.name())));
+        }
+        seen.insert(key, place);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

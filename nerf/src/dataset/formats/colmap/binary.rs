@@ -1,0 +1,185 @@
+//! COLMAP's `.bin` files: numbers in a row, little-endian, each list after its length.
+
+use super::models::Model;
+use super::table::Table;
+use super::{CameraEntry, ImageEntry, Place};
+use crate::dataset::capture::Point;
+use crate::error::{Error, Result};
+use glam::DVec3;
+use std::path::Path;
+
+/// The place of an observation, and the point that is observed.
+const OBSERVATION: usize = 8 + 8 + 8;
+/// An image that shows a point, and which of its observations does.
+const TRACK_ELEMENT: usize = 4 + 4;
+/// The bytes of a camera with the fewest parameters.
+const LEAST_CAMERA: usize = 4 + 4 + 8 + 8 + 3 * 8;
+/// The bytes of an image with an empty name and no observation.
+const LEAST_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
+/// The bytes of a point that no image shows.
+const LEAST_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
+
+/// What of a file is not read yet.
+struct Cursor<'a> {
+    file: &'a Path,
+    rest: &'a [u8],
+}
+
+impl<'a> Cursor<'a> {
+    /// The number of entries that the file announces. It is bounded by the bytes that are there, so that memory for it
+    /// may be taken at once.
+    fn count(&mut self, list: &str, least: usize) -> Result<usize> {
+        let bad = |what: String| Error::field(self.file, list, what);
+        let Some((head, rest)) = self.rest.split_first_chunk() else {
+            return Err(bad("the file ends before their number: was it copied completely?".into()));
+        };
+        let (count, most) = (u64::from_le_bytes(*head), rest.len() / least);
+        self.rest = rest;
+        match usize::try_from(count) {
+            Ok(count) if count <= most => Ok(count),
+            _ => Err(bad(format!(
+                "announces {count} entries, but {} bytes follow, which hold {most} at most: was it copied completely?",
+                rest.len()
+            ))),
+        }
+    }
+
+    fn ended(&self, place: Place, member: &str) -> Error {
+        place.error(self.file, member, "the file ends here: was it copied completely?")
+    }
+
+    fn array<const N: usize>(&mut self, place: Place, member: &str) -> Result<[u8; N]> {
+        let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.ended(place, member))?;
+        self.rest = rest;
+        Ok(*head)
+    }
+
+    fn u32(&mut self, place: Place, member: &str) -> Result<u32> {
+        self.array(place, member).map(u32::from_le_bytes)
+    }
+
+    fn u64(&mut self, place: Place, member: &str) -> Result<u64> {
+        self.array(place, member).map(u64::from_le_bytes)
+    }
+
+    fn number(&mut self, place: Place, member: &str) -> Result<f64> {
+        let value = f64::from_le_bytes(self.array(place, member)?);
+        if !value.is_finite() {
+            return Err(place.error(self.file, member, format!("must be a finite number, is {value}")));
+        }
+        Ok(value)
+    }
+
+    fn numbers<const N: usize>(&mut self, place: Place, member: &str) -> Result<[f64; N]> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.number(place, member)?;
+        }
+        Ok(values)
+    }
+
+    /// A text that ends in a zero byte.
+    fn text(&mut self, place: Place, member: &str) -> Result<&'a str> {
+        let end = self.rest.iter().position(|byte| *byte == 0).ok_or_else(|| self.ended(place, member))?;
+        let (text, rest) = self.rest.split_at(end);
+        self.rest = &rest[1..];
+        std::str::from_utf8(text).map_err(|e| place.error(self.file, member, format!("is not UTF-8 text: {e}")))
+    }
+
+    /// Passes over a list; its length.
+    fn skip_list(&mut self, place: Place, member: &str, size: usize) -> Result<u64> {
+        let count = self.u64(place, member)?;
+        let bytes = usize::try_from(count).ok().and_then(|count| count.checked_mul(size));
+        let Some((_, rest)) = bytes.and_then(|bytes| self.rest.split_at_checked(bytes)) else {
+            let what =
+                format!("announces {count} entries, but {} bytes follow: was it copied completely?", self.rest.len());
+            return Err(place.error(self.file, member, what));
+        };
+        self.rest = rest;
+        Ok(count)
+    }
+}
+
+pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
+    let mut cursor = Cursor { file, rest: bytes };
+    let count = cursor.count("cameras", LEAST_CAMERA)?;
+    let mut cameras = Vec::with_capacity(count);
+    for index in 0..count {
+        let place = Place::Item("cameras", index);
+        let id = cursor.u32(place, "camera_id")?;
+        let model = cursor.array(place, "model").map(i32::from_le_bytes)?;
+        let model = Model::by_id(model).map_err(|what| place.error(file, "model", what))?;
+        let size = [cursor.u64(place, "width")?, cursor.u64(place, "height")?];
+        let params = model.params.iter().map(|name| cursor.number(place, name));
+        let params = params.collect::<Result<Vec<f64>>>()?;
+        let camera = model.camera(size, &params).map_err(|(member, what)| place.error(file, member, what))?;
+        cameras.push(CameraEntry { place, id, camera });
+    }
+    Ok(cameras)
+}
+
+pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
+    let mut cursor = Cursor { file, rest: bytes };
+    let count = cursor.count("images", LEAST_IMAGE)?;
+    let mut images = Vec::with_capacity(count);
+    for index in 0..count {
+        let place = Place::Item("images", index);
+        let id = cursor.u32(place, "image_id")?;
+        let (q, t) = (cursor.numbers(place, "qvec")?, cursor.numbers(place, "tvec")?);
+        let camera = cursor.u32(place, "camera_id")?;
+        let name = cursor.text(place, "name")?;
+        cursor.skip_list(place, "points2D", OBSERVATION)?;
+        images.push(ImageEntry::new(file, place, id, q, t, camera, name)?);
+    }
+    Ok(images)
+}
+
+pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
+    let mut cursor = Cursor { file, rest: bytes };
+    let count = cursor.count("points3D", LEAST_POINT)?;
+    let mut points = Vec::with_capacity(count);
+    for index in 0..count {
+        let place = Place::Item("points3D", index);
+        cursor.u64(place, "point3D_id")?;
+        let position = DVec3::from_array(cursor.numbers(place, "xyz")?);
+        let color = cursor.array(place, "rgb")?;
+        let error = cursor.number(place, "error")?;
+        let views = cursor.skip_list(place, "track", TRACK_ELEMENT)?;
+        points.push(Point { position, color, error, views: u32::try_from(views).unwrap_or(u32::MAX) });
+    }
+    Ok(points)
+}
+
+/// The three files: cameras, images and points.
+pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
+    let (mut cameras, mut images, mut points) = (vec![], vec![], vec![]);
+    let numbers = |out: &mut Vec<u8>, values: &[f64]| values.iter().for_each(|x| out.extend(x.to_le_bytes()));
+    cameras.extend((table.cameras.len() as u64).to_le_bytes());
+    for camera in &table.cameras {
+        cameras.extend(camera.id.to_le_bytes());
+        cameras.extend(camera.model.id.to_le_bytes());
+        camera.size.iter().for_each(|side| cameras.extend(side.to_le_bytes()));
+        numbers(&mut cameras, &camera.params);
+    }
+    images.extend((table.images.len() as u64).to_le_bytes());
+    for image in &table.images {
+        images.extend(image.id.to_le_bytes());
+        numbers(&mut images, &image.q);
+        numbers(&mut images, &image.t);
+        images.extend(image.camera.to_le_bytes());
+        images.extend(image.name.as_bytes());
+        // The end of the name, and no observation.
+        images.push(0);
+        images.extend(0_u64.to_le_bytes());
+    }
+    points.extend((table.points.len() as u64).to_le_bytes());
+    for (id, point) in (1_u64..).zip(table.points) {
+        points.extend(id.to_le_bytes());
+        numbers(&mut points, &point.position.to_array());
+        points.extend(point.color);
+        numbers(&mut points, &[point.error]);
+        // An empty track.
+        points.extend(0_u64.to_le_bytes());
+    }
+    [cameras, images, points]
+}

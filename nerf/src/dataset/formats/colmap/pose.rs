@@ -1,0 +1,102 @@
+//! Poses between COLMAP's form and that of cameras here.
+
+use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
+
+/// The rotation of a quaternion of any length, its real part first; `None` if the length is 0.
+fn rotation(q: [f64; 4]) -> Option<DMat3> {
+    let q = DVec4::from_array(q);
+    // The largest becomes 1 first, so that no square underflows.
+    let largest = q.abs().max_element();
+    let [w, x, y, z] = (largest > 0.0).then(|| (q / largest).normalize().to_array())?;
+    Some(DMat3::from_quat(DQuat::from_xyzw(x, y, z, w)))
+}
+
+/// The pose of an image; or what is wrong, and with which of its members.
+pub(super) fn from_file(q: [f64; 4], t: [f64; 3]) -> Result<DAffine3, (&'static str, String)> {
+    let Some(to_camera) = rotation(q) else {
+        return Err(("qvec", "is a quaternion of length 0, which is no rotation".into()));
+    };
+    let to_world = to_camera.transpose();
+    let translation = -(to_world * DVec3::from_array(t));
+    if !translation.is_finite() {
+        return Err(("tvec", format!("is too large: {t:?}")));
+    }
+    // From an image's axes, `y` down and `z` into the scene, to those of OpenGL.
+    let matrix3 = DMat3::from_cols(to_world.x_axis, -to_world.y_axis, -to_world.z_axis);
+    Ok(DAffine3 { matrix3, translation })
+}
+
+/// The quaternion, real part first and not negative, and the translation that COLMAP writes for a pose.
+pub(super) fn to_file(pose: &DAffine3) -> ([f64; 4], [f64; 3]) {
+    let DMat3 { x_axis, y_axis, z_axis } = pose.matrix3;
+    let q = DQuat::from_mat3(&DMat3::from_cols(x_axis, -y_axis, -z_axis).transpose()).normalize();
+    let q = if q.w < 0.0 { -q } else { q };
+    let q = [q.w, q.x, q.y, q.z];
+    // By the rotation that will be read, so that the rounding of the quaternion does not move the camera.
+    let to_camera = rotation(q).unwrap_or(DMat3::IDENTITY);
+    // Adding zero leaves no negative zero.
+    (q, (DVec3::ZERO - to_camera * pose.translation).to_array())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::pinhole::Camera;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_quarter_turn_has_the_sense_that_colmap_gives_it() {
+        // By +90 degrees about z: the world's x is the camera's y, which is down in the image.
+        let s = 0.5_f64.sqrt();
+        let pose = from_file([s, 0.0, 0.0, s], [1.0, 2.0, 3.0]).unwrap();
+        let near = |a: DVec3, b: [f64; 3]| assert!((a - DVec3::from_array(b)).length() < 1e-15, "{a}");
+        // Right in the image is the camera's x, which is the world's -y.
+        near(pose.matrix3.x_axis, [0.0, -1.0, 0.0]);
+        near(pose.matrix3.y_axis, [-1.0, 0.0, 0.0]);
+        near(pose.matrix3.z_axis, [0.0, 0.0, -1.0]);
+        // R p + t = 0 for R p = (-p.y, p.x, p.z).
+        near(pose.translation, [-2.0, 1.0, -3.0]);
+    }
+
+    #[test]
+    fn lengths_do_not_matter_but_for_zero() {
+        let pose = from_file([0.9, 0.1, -0.2, 0.3], [1.0, 2.0, 3.0]).unwrap();
+        for scale in [1e-300, 1e-310, -1.0, 7.0, 1e300] {
+            let other = from_file([0.9, 0.1, -0.2, 0.3].map(|x: f64| x * scale), [1.0, 2.0, 3.0]).unwrap();
+            assert!(pose.abs_diff_eq(other, 1e-10), "{scale}");
+        }
+        assert_eq!(from_file([0.0, -0.0, 0.0, 0.0], [0.0; 3]).unwrap_err().0, "qvec");
+        assert!(from_file([0.5; 4], [1.7e308; 3]).is_ok(), "which only changes the order of the three");
+        assert_eq!(from_file([0.8, 0.6, 0.0, 0.0], [0.0, 1.7e308, 1.7e308]).unwrap_err().0, "tvec");
+    }
+
+    proptest! {
+        #[test]
+        fn a_pose_comes_back(
+            q in prop::array::uniform4(-1.0..1.0_f64),
+            eye in prop::array::uniform3(-1e3..1e3_f64),
+        ) {
+            prop_assume!(DVec4::from_array(q).length() > 0.1);
+            let matrix3 = DMat3::from_quat(DQuat::from_array(q).normalize());
+            let pose = DAffine3 { matrix3, translation: DVec3::from_array(eye) };
+            let (q, t) = to_file(&pose);
+            let again = from_file(q, t).unwrap();
+            prop_assert!(again.matrix3.abs_diff_eq(pose.matrix3, 4e-15), "{:?} {:?}", pose, again);
+            prop_assert!(again.translation.abs_diff_eq(pose.translation, 4e-15 * (1.0 + pose.translation.length())));
+            // What looks at a point still does: the camera's -z is COLMAP's +z.
+            let ahead = again.translation - 2.0 * pose.matrix3.z_axis;
+            let seen = DMat3::from_quat(DQuat::from_xyzw(q[1], q[2], q[3], q[0])) * ahead + DVec3::from_array(t);
+            prop_assert!(seen.abs_diff_eq(DVec3::new(0.0, 0.0, 2.0), 1e-11), "{}", seen);
+        }
+    }
+
+    #[test]
+    fn half_turns_come_back() {
+        for (up, eye) in [(DVec3::Y, DVec3::Z), (DVec3::Y, -DVec3::Z), (DVec3::Z, DVec3::X), (-DVec3::Z, DVec3::Y)] {
+            let pose = Camera::look_at(eye, DVec3::ZERO, up);
+            let (q, t) = to_file(&pose);
+            assert!(q[0] >= 0.0);
+            assert!(from_file(q, t).unwrap().abs_diff_eq(pose, 1e-15), "{pose:?}");
+        }
+    }
+}

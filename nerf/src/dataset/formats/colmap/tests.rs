@@ -1,0 +1,289 @@
+use super::*;
+use crate::camera::lens::Lens;
+use glam::{DMat3, DQuat, DVec3};
+use std::fs;
+
+mod damaged;
+mod reference;
+mod round_trip;
+
+/// Bytes as COLMAP's documentation lays them out.
+#[derive(Default)]
+pub(super) struct Bytes(pub Vec<u8>);
+
+impl Bytes {
+    fn u8s(mut self, values: &[u8]) -> Self {
+        self.0.extend(values);
+        self
+    }
+
+    fn u32(self, value: u32) -> Self {
+        self.u8s(&value.to_le_bytes())
+    }
+
+    fn u64(self, value: u64) -> Self {
+        self.u8s(&value.to_le_bytes())
+    }
+
+    fn f64s(self, values: &[f64]) -> Self {
+        values.iter().fold(self, |bytes, value| bytes.u8s(&value.to_le_bytes()))
+    }
+}
+
+/// Cameras, images and points: two cameras, two images and two points, with numbers that binary fractions hold.
+pub(super) fn binary() -> [Vec<u8>; 3] {
+    let cameras = Bytes::default().u64(2);
+    let cameras = cameras.u32(7).u32(1).u64(640).u64(480).f64s(&[500.5, 501.5, 320.25, 240.75]);
+    let cameras = cameras.u32(9).u32(2).u64(100).u64(80).f64s(&[90.0, 50.0, 40.0, -0.125]);
+    let images = Bytes::default().u64(2);
+    let images = images.u32(3).f64s(&[0.5, 0.5, 0.5, 0.5]).f64s(&[1.0, 2.0, 3.0]).u32(9).u8s(b"b/second.png\0");
+    let images = images.u64(2).f64s(&[10.5, 11.5]).u64(1).f64s(&[12.5, 13.5]).u64(u64::MAX);
+    let images = images.u32(1).f64s(&[1.0, 0.0, 0.0, 0.0]).f64s(&[0.0, 0.0, 4.0]).u32(7).u8s(b"a.png\0").u64(0);
+    let points = Bytes::default().u64(2);
+    let points = points.u64(11).f64s(&[0.5, -1.5, 2.0]).u8s(&[1, 2, 255]).f64s(&[0.25]);
+    let points = points.u64(2).u32(3).u32(0).u32(1).u32(5);
+    let points = points.u64(12).f64s(&[3.0, 4.0, 5.0]).u8s(&[9, 8, 7]).f64s(&[-1.0]).u64(0);
+    [cameras.0, images.0, points.0]
+}
+
+/// The same, as text.
+pub(super) const TEXT: [&str; 3] = [
+    "# Camera list\n7 PINHOLE 640 480 500.5 501.5 320.25 240.75\n\n9 SIMPLE_RADIAL 100 80 90 50 40 -0.125\n",
+    "# Image list\n# with two lines each\n3 0.5 0.5 0.5 0.5 1 2 3 9 b/second.png\n10.5 11.5 1 12.5 13.5 -1 \n\
+     1 1 0 0 0 0 0 4.0e0 7 a.png\n\n",
+    "# Points\n11 0.5 -1.5 2 1 2 255 0.25 3 0 1 5\n12 3 4 5 9 8 7 -1\n",
+];
+
+pub(super) fn text() -> [Vec<u8>; 3] {
+    TEXT.map(|text| text.as_bytes().to_vec())
+}
+
+/// A capture's folder with these files in `place`.
+pub(super) fn folder(encoding: Encoding, place: &str, files: &[Vec<u8>; 3]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir_all(folder.path().join(place)).unwrap();
+    for (path, bytes) in encoding.files(&folder.path().join(place)).iter().zip(files) {
+        fs::write(path, bytes).unwrap();
+    }
+    folder
+}
+
+/// What the fixture says, worked out by hand.
+#[track_caller]
+fn is_the_fixture(capture: &Capture) {
+    let [a, b] = &capture.views[..] else { panic!("{} views", capture.views.len()) };
+    assert_eq!((a.name.as_str(), b.name.as_str()), ("a.png", "b/second.png"));
+    // Four units behind the origin, and looks at it, with the image's up the world's -y.
+    let pose =
+        DAffine3 { matrix3: DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z), translation: DVec3::new(0.0, 0.0, -4.0) };
+    let pinhole =
+        Camera { width: 640, height: 480, focal: [500.5, 501.5], centre: [320.25, 240.75], lens: Lens::Pinhole, pose };
+    assert_eq!(a.camera, pinhole);
+    // In the middle of the axis, and up and to the left of it.
+    assert_eq!(a.camera.pixel_of(DVec3::ZERO), Some([320.25, 240.75]));
+    assert_eq!(a.camera.pixel_of(DVec3::new(-4.0, -2.0, 0.0)), Some([320.25 - 500.5, 240.75 - 0.5 * 501.5]));
+    // The quaternion turns x to y, y to z and z to x: the camera's axes are the world's y, z, x.
+    let pose = DAffine3 {
+        matrix3: DMat3::from_cols(DVec3::Z, -DVec3::X, -DVec3::Y),
+        translation: DVec3::new(-2.0, -3.0, -1.0),
+    };
+    let lens = Lens::Brown { k: [-0.125, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    let radial = Camera { width: 100, height: 80, focal: [90.0; 2], centre: [50.0, 40.0], lens, pose };
+    assert_eq!(b.camera, radial);
+    let points = [
+        Point { position: DVec3::new(0.5, -1.5, 2.0), color: [1, 2, 255], error: 0.25, views: 2 },
+        Point { position: DVec3::new(3.0, 4.0, 5.0), color: [9, 8, 7], error: -1.0, views: 0 },
+    ];
+    assert_eq!(capture.points, points);
+    assert_eq!((capture.format, capture.applied, capture.aabb_scale), (Format::Colmap, DAffine3::IDENTITY, None));
+    assert!(capture.views.iter().all(|v| v.split.is_none() && v.depth.is_none() && v.bounds.is_none()));
+}
+
+#[test]
+fn both_encodings_say_what_they_say_wherever_they_are() {
+    for (encoding, files) in [(Encoding::Binary, binary()), (Encoding::Text, text())] {
+        for place in PLACES {
+            let folder = folder(encoding, place, &files);
+            assert!(detect(folder.path()));
+            let capture = read(folder.path()).unwrap();
+            is_the_fixture(&capture);
+            let expected = encoding.files(&folder.path().join(place))[1].clone();
+            assert_eq!((&capture.file, capture.folder.as_path()), (&expected, folder.path()), "{place}");
+        }
+    }
+    let empty = tempfile::tempdir().unwrap();
+    assert!(!detect(empty.path()));
+    assert!(read(empty.path()).unwrap_err().to_string().contains("holds no COLMAP model"));
+}
+
+#[test]
+fn entries_are_named_by_where_they_are() {
+    let fields = |encoding, files| {
+        let capture = read(folder(encoding, "sparse/0", &files).path()).unwrap();
+        capture.views.into_iter().map(|view| view.field).collect::<Vec<_>>()
+    };
+    assert_eq!(fields(Encoding::Binary, binary()), ["images[1]", "images[0]"]);
+    assert_eq!(fields(Encoding::Text, text()), ["line 5", "line 3"]);
+}
+
+#[test]
+fn binary_files_come_first_and_files_of_rigs_are_passed_over() {
+    let folder = folder(Encoding::Binary, "sparse/0", &binary());
+    let model = folder.path().join("sparse/0");
+    for file in ["cameras.txt", "images.txt", "rigs.bin", "frames.bin"] {
+        fs::write(model.join(file), "?").unwrap();
+    }
+    is_the_fixture(&read(folder.path()).unwrap());
+    // Points are no part that a model must have.
+    fs::remove_file(model.join("points3D.bin")).unwrap();
+    assert_eq!(read(folder.path()).unwrap().points, []);
+}
+
+#[test]
+fn images_and_masks_are_found() {
+    let folder = folder(Encoding::Binary, "sparse/0", &binary());
+    let root = folder.path();
+    let touch = |path: &str| {
+        let path = root.join(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, "").unwrap();
+        path
+    };
+    let found = |folder: &Path| {
+        let views = read(folder).unwrap().views;
+        views.into_iter().map(|view| [view.image, view.mask]).collect::<Vec<_>>()
+    };
+    assert_eq!(found(root), [[None, None], [None, None]]);
+    let a = touch("a.png");
+    assert_eq!(found(root)[0], [Some(a), None], "names may begin at the folder");
+    let b = touch("input/b/second.png");
+    assert_eq!(found(root), [[None, None], [Some(b), None]], "images come from one folder");
+    let (a, b) = (touch("images/a.png"), touch("images/b/second.png"));
+    let (mask_a, mask_b) = (touch("mask/a.png"), touch("masks/b/second.png.png"));
+    assert_eq!(found(root), [[Some(a), Some(mask_a)], [Some(b), Some(mask_b)]]);
+    let mask_a = touch("masks/a.png.png");
+    assert_eq!(found(root)[0][1], Some(mask_a), "COLMAP's own name comes first");
+    // The folder of the model itself was asked for.
+    let from_model = found(&root.join("sparse/0"));
+    assert!(from_model.iter().flatten().all(Option::is_some), "{from_model:?}");
+}
+
+/// Reads the fixture with one file replaced, and expects this error of the file.
+#[track_caller]
+pub(super) fn fails(encoding: Encoding, which: usize, bytes: &[u8], field: &str, expected: &str) {
+    let mut files = match encoding {
+        Encoding::Binary => binary(),
+        Encoding::Text => text(),
+    };
+    files[which] = bytes.to_vec();
+    let folder = folder(encoding, "sparse/0", &files);
+    let message = read(folder.path()).unwrap_err().to_string();
+    let file = encoding.files(Path::new(""))[which].display().to_string();
+    assert!(message.contains(&file) && message.contains(field) && message.contains(expected), "{message}");
+    assert!(message.lines().count() == 1, "{message}");
+}
+
+#[test]
+fn text_errors_name_the_line() {
+    let cases = [
+        (0, "-0.125", "NaN", "`line 4`", "k1: must be a finite number, is `NaN`"),
+        (0, "-0.125", "1e400", "`line 4`", "k1: must be a finite number"),
+        (0, " -0.125", "", "`line 4`", "k1: is missing"),
+        (0, "-0.125", "0 0", "`line 4`", "PARAMS: SIMPLE_RADIAL has 4, here are more"),
+        (0, "SIMPLE_RADIAL", "EUCM", "`line 4`", "EUCM is not supported"),
+        (0, "SIMPLE_RADIAL", "radial", "`line 4`", "MODEL: radial is not supported"),
+        (0, "9 SIMPLE", "7 SIMPLE", "`line 4`", "camera_id: is `7`, as that of line 2 is"),
+        (0, "100 80", "0 80", "`line 4`", "width: must be 1 to"),
+        (0, "100 80", "100 99999999999", "`line 4`", "height: must be 1 to"),
+        (0, "100 80", "100.0 80", "`line 4`", "WIDTH: must be a whole number of 64 bits, is `100.0`"),
+        (0, " 90 ", " -90 ", "`line 4`", "focal length: must be more than 0, is -90"),
+        (0, "9 SIMPLE", "-9 SIMPLE", "`line 4`", "CAMERA_ID: must be a whole number of 32 bits"),
+        (1, "0.5 0.5 0.5 0.5", "0 0 0 0", "`line 3`", "qvec: is a quaternion of length 0"),
+        (1, "0.5 0.5 0.5 0.5", "inf 0 0 0", "`line 3`", "QVEC: must be a finite number, is `inf`"),
+        (1, " 9 b", " 8 b", "`line 3`", "camera_id: is 8, but"),
+        (1, "1 1 0", "3 1 0", "`line 5`", "image_id: is `3`, as that of line 3 is"),
+        (1, "a.png", "b/second.png", "`line 5`", "name: is `b/second.png`, as that of line 3 is"),
+        (1, " a.png", "", "`line 5`", "name: is empty"),
+        (1, "10.5 11.5 1 12.5 13.5 -1 \n", "", "`line 4`", "POINTS2D: must be triples"),
+        (1, "13.5 -1 \n", "13.5\n", "`line 4`", "POINTS2D: must be triples"),
+        (2, "2 1 2 255", "2 1 2 256", "`line 2`", "B: must be a whole number of 8 bits, is `256`"),
+        (2, "5 9 8", "nan 9 8", "`line 3`", "Z: must be a finite number, is `nan`"),
+        (2, "7 -1", "7 -1 5", "`line 3`", "TRACK: must be pairs"),
+        (2, " -1\n", "", "`line 3`", "ERROR: is missing"),
+    ];
+    for (which, from, to, field, expected) in cases {
+        assert_eq!(TEXT[which].matches(from).count(), 1, "{from}");
+        fails(Encoding::Text, which, TEXT[which].replacen(from, to, 1).as_bytes(), field, expected);
+    }
+    fails(Encoding::Text, 1, b"# nothing\n", "`images`", "is empty");
+    fails(Encoding::Text, 0, b"\xff", "cameras.txt", "is not UTF-8 text");
+}
+
+#[test]
+fn binary_errors_name_the_entry() {
+    use Encoding::Binary;
+    let [cameras, images, points] = binary();
+    let with = |bytes: &[u8], at: usize, new: &[u8]| {
+        let mut bytes = bytes.to_vec();
+        bytes[at..at + new.len()].copy_from_slice(new);
+        bytes
+    };
+    // The second camera begins after 8 + 24 + 32 bytes: number, model, width, height, parameters.
+    let second = 64;
+    fails(Binary, 0, &with(&cameras, second, &[7]), "`cameras[1].camera_id`", "is `7`, as that of cameras[0] is");
+    let model = |id: u32, expected| {
+        let bytes = with(&cameras, second + 4, &id.to_le_bytes());
+        fails(Binary, 0, &bytes, "`cameras[1].model`", expected);
+    };
+    model(11, "RAD_TAN_THIN_PRISM_FISHEYE (11) is not supported");
+    model(17, "EQUIRECTANGULAR (17) is not supported");
+    model(18, "18 is not supported");
+    model(u32::MAX, "-1 is not supported");
+    fails(Binary, 0, &with(&cameras, second + 8, &[0]), "`cameras[1].width`", "must be 1 to");
+    fails(Binary, 0, &with(&cameras, second + 16, &[255; 8]), "`cameras[1].height`", "must be 1 to");
+    fails(Binary, 0, &with(&cameras, second + 48, &f64::NAN.to_le_bytes()), "`cameras[1].k1`", "finite number, is NaN");
+    fails(Binary, 0, &with(&cameras, second + 24, &[0; 8]), "`cameras[1].focal length`", "must be more than 0, is 0");
+    fails(Binary, 0, &cameras[..cameras.len() - 1], "`cameras[1].k1`", "the file ends here");
+    fails(Binary, 0, &cameras[..5], "`cameras`", "the file ends before their number");
+    // Counts that no memory could hold, and one that just is not there.
+    for count in [u64::MAX, 1 << 60, 1 << 33, 3] {
+        for (which, bytes, list) in [(0, &cameras, "`cameras`"), (1, &images, "`images`"), (2, &points, "`points3D`")] {
+            fails(Binary, which, &with(bytes, 0, &count.to_le_bytes()), list, &format!("announces {count} entries"));
+        }
+    }
+    // The first image begins at 8, its name at 8 + 4 + 56 + 4 = 72, its observations at 72 + 13.
+    fails(Binary, 1, &with(&images, 12, &[0; 32]), "`images[0].qvec`", "length 0");
+    fails(Binary, 1, &with(&images, 44, &f64::INFINITY.to_le_bytes()), "`images[0].tvec`", "finite number, is inf");
+    fails(Binary, 1, &with(&images, 68, &[8]), "`images[0].camera_id`", "is 8, but");
+    fails(Binary, 1, &with(&images, 72, &[255]), "`images[0].name`", "is not UTF-8");
+    fails(Binary, 1, &with(&images, 72, &[0]), "`images[0]", "");
+    for count in [u64::MAX, 1 << 61, 100] {
+        let what = format!("announces {count} entries");
+        fails(Binary, 1, &with(&images, 85, &count.to_le_bytes()), "`images[0].points2D`", &what);
+    }
+    let third = 85 + 8 + 48;
+    fails(Binary, 1, &with(&images, third, &[3]), "`images[1].image_id`", "is `3`, as that of images[0] is");
+    fails(Binary, 1, &0_u64.to_le_bytes(), "`images`", "is empty");
+    fails(Binary, 2, &with(&points, 16, &f64::NAN.to_le_bytes()), "`points3D[0].xyz`", "finite");
+    fails(Binary, 2, &with(&points, 43, &f64::NAN.to_le_bytes()), "`points3D[0].error`", "finite");
+    fails(Binary, 2, &with(&points, 51, &[200]), "`points3D[0].track`", "announces 200 entries");
+    // Bytes after the end are no fault.
+    let mut longer = binary();
+    longer.iter_mut().for_each(|bytes| bytes.extend([1, 2, 3]));
+    is_the_fixture(&read(folder(Binary, "sparse", &longer).path()).unwrap());
+}
+
+#[test]
+fn what_people_write_by_hand_is_read() {
+    let mut files = text();
+    // Ends of lines of Windows, names with spaces and dots, a mark of the order of bytes, no last empty line.
+    files[1] = "\u{feff}# images\r\n5 -1 0 0 0 0 0 4 7 ./dir/my image (1).png\r\n\r\n6\t1 0 0 0 0 0 4 7 b.png".into();
+    let views = read(folder(Encoding::Text, "sparse", &files).path()).unwrap().views;
+    assert_eq!(views.iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["b.png", "dir/my image (1).png"]);
+    assert_eq!(views[0].camera, views[1].camera, "a quaternion and its negative are one rotation");
+    let turned = DQuat::from_xyzw(0.0, 0.0, 0.0, 1.0);
+    assert_eq!(
+        DMat3::from_quat(turned),
+        views[0].camera.pose.matrix3 * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0))
+    );
+}

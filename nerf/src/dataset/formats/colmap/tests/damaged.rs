@@ -1,0 +1,36 @@
+//! Damaged files are an error, or a capture that is sound; never a panic.
+
+use super::*;
+use crate::dataset::formats::damage::{Damage, clear, damage, damaged};
+use crate::dataset::formats::{cases, rigid};
+use proptest::prelude::*;
+
+/// The fixture with one of its files damaged, without a disk.
+fn parsed(encoding: Encoding, which: usize, damage: &[Damage]) -> Result<Capture> {
+    let mut files = match encoding {
+        Encoding::Binary => binary(),
+        Encoding::Text => text(),
+    };
+    files[which] = damaged(&files[which], damage);
+    let [cameras, images, points] = &files;
+    parse(Path::new(""), encoding, &encoding.files(Path::new("")), [cameras, images], Some(points))
+}
+
+proptest! {
+    #![proptest_config(cases(2000))]
+
+    #[test]
+    fn files(damage in damage(), which in 0..3_usize, is_text: bool) {
+        let encoding = if is_text { Encoding::Text } else { Encoding::Binary };
+        match parsed(encoding, which, &damage) {
+            Ok(capture) => for view in &capture.views {
+                let camera = &view.camera;
+                prop_assert!(rigid::pose(&camera.pose).is_ok(), "{:?}", camera);
+                prop_assert!(camera.focal.iter().chain(&camera.centre).all(|x| x.is_finite()), "{:?}", camera);
+                prop_assert!(camera.focal[0] > 0.0 && camera.focal[1] > 0.0 && camera.width * camera.height > 0);
+            },
+            // Two files may be at fault where numbers of one are those of the other.
+            Err(error) => clear(error, &format!(".{}", encoding.extension())),
+        }
+    }
+}

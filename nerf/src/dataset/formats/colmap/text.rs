@@ -1,0 +1,172 @@
+//! COLMAP's `.txt` files: an entry a line, and comments that start with `#`.
+
+use super::models::Model;
+use super::table::Table;
+use super::{CameraEntry, ImageEntry, Place};
+use crate::dataset::capture::Point;
+use crate::error::{Error, Result};
+use glam::DVec3;
+use std::fmt::Write;
+use std::path::Path;
+use std::str::FromStr;
+
+/// What of a line is not read yet.
+struct Words<'a> {
+    file: &'a Path,
+    place: Place,
+    rest: &'a str,
+}
+
+impl<'a> Words<'a> {
+    fn error(&self, member: &str, what: impl ToString) -> Error {
+        self.place.error(self.file, member, what)
+    }
+
+    fn word(&mut self, member: &str) -> Result<&'a str> {
+        let rest = self.rest.trim_start();
+        let (word, rest) = rest.split_at(rest.find(char::is_whitespace).unwrap_or(rest.len()));
+        self.rest = rest;
+        if word.is_empty() { Err(self.error(member, "is missing")) } else { Ok(word) }
+    }
+
+    /// A whole number.
+    fn integer<T: FromStr>(&mut self, member: &str) -> Result<T> {
+        let word = self.word(member)?;
+        word.parse().map_err(|_| {
+            let most = 8 * size_of::<T>();
+            self.error(member, format!("must be a whole number of {most} bits, is `{}`", start(word)))
+        })
+    }
+
+    fn number(&mut self, member: &str) -> Result<f64> {
+        let word = self.word(member)?;
+        match word.parse::<f64>() {
+            Ok(value) if value.is_finite() => Ok(value),
+            _ => Err(self.error(member, format!("must be a finite number, is `{}`", start(word)))),
+        }
+    }
+
+    fn numbers<const N: usize>(&mut self, member: &str) -> Result<[f64; N]> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.number(member)?;
+        }
+        Ok(values)
+    }
+}
+
+/// So much of a word as a message may hold.
+fn start(word: &str) -> String {
+    word.chars().take(40).collect()
+}
+
+/// The lines of a file with their numbers, from 1.
+fn lines<'a>(file: &'a Path, bytes: &'a [u8]) -> Result<impl Iterator<Item = Words<'a>>> {
+    let text = std::str::from_utf8(bytes).map_err(|e| Error::file(file, format!("is not UTF-8 text: {e}")))?;
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    Ok((1..).zip(text.lines()).map(move |(line, rest)| Words { file, place: Place::Line(line), rest: rest.trim() }))
+}
+
+/// Whether a line has something to say.
+fn speaks(line: &Words<'_>) -> bool {
+    !line.rest.is_empty() && !line.rest.starts_with('#')
+}
+
+pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
+    let camera = |mut line: Words<'_>| {
+        let id = line.integer("CAMERA_ID")?;
+        let model = Model::by_name(line.word("MODEL")?).map_err(|what| line.error("MODEL", what))?;
+        let size = [line.integer("WIDTH")?, line.integer("HEIGHT")?];
+        let params = model.params.iter().map(|name| line.number(name)).collect::<Result<Vec<f64>>>()?;
+        if !line.rest.trim().is_empty() {
+            return Err(line.error("PARAMS", format!("{} has {}, here are more", model.name, model.params.len())));
+        }
+        let camera = model.camera(size, &params).map_err(|(member, what)| line.error(member, what))?;
+        Ok(CameraEntry { place: line.place, id, camera })
+    };
+    lines(file, bytes)?.filter(speaks).map(camera).collect()
+}
+
+pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
+    let mut lines = lines(file, bytes)?;
+    let mut images = vec![];
+    while let Some(mut line) = lines.next() {
+        if !speaks(&line) {
+            continue;
+        }
+        let id = line.integer("IMAGE_ID")?;
+        let (q, t) = (line.numbers("QVEC")?, line.numbers("TVEC")?);
+        let camera = line.integer("CAMERA_ID")?;
+        // The rest of the line: a name may have spaces.
+        images.push(ImageEntry::new(file, line.place, id, q, t, camera, line.rest.trim())?);
+        // The next line belongs to the image, whatever it holds, and often it is empty.
+        if let Some(line) = lines.next() {
+            observations(&line)?;
+        }
+    }
+    Ok(images)
+}
+
+/// That a line is one of observations. Where somebody has left out an empty one, the next image is in its place, and
+/// must not be lost in silence.
+fn observations(line: &Words<'_>) -> Result<()> {
+    let (mut count, mut last) = (0, "-1");
+    for word in line.rest.split_whitespace() {
+        (count, last) = (count + 1, word);
+    }
+    if count % 3 != 0 || last.parse::<i64>().is_err() {
+        let what = "must be triples X Y POINT3D_ID of the image in the line before; leave it empty if there are none";
+        return Err(line.error("POINTS2D", what));
+    }
+    Ok(())
+}
+
+pub(super) fn points(file: &Path, bytes: &[u8]) -> Result<Vec<Point>> {
+    let point = |mut line: Words<'_>| {
+        line.integer::<u64>("POINT3D_ID")?;
+        let position = DVec3::from_array([line.number("X")?, line.number("Y")?, line.number("Z")?]);
+        let color = [line.integer("R")?, line.integer("G")?, line.integer("B")?];
+        let error = line.number("ERROR")?;
+        let track = line.rest.split_whitespace().count();
+        if !track.is_multiple_of(2) {
+            return Err(line.error("TRACK", "must be pairs IMAGE_ID POINT2D_IDX"));
+        }
+        Ok(Point { position, color, error, views: u32::try_from(track / 2).unwrap_or(u32::MAX) })
+    };
+    lines(file, bytes)?.filter(speaks).map(point).collect()
+}
+
+/// The three files: cameras, images and points.
+pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
+    let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
+    let mut images =
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n".to_owned();
+    let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n".to_owned();
+    let numbers = |out: &mut String, values: &[f64]| {
+        for value in values {
+            // As few digits as bring every bit back. Writing to a string cannot fail.
+            let _ = write!(out, " {value:?}");
+        }
+    };
+    for camera in &table.cameras {
+        let _ = write!(cameras, "{} {} {} {}", camera.id, camera.model.name, camera.size[0], camera.size[1]);
+        numbers(&mut cameras, &camera.params);
+        cameras.push('\n');
+    }
+    for image in &table.images {
+        let _ = write!(images, "{}", image.id);
+        numbers(&mut images, &image.q);
+        numbers(&mut images, &image.t);
+        // And the empty line of an image without observations.
+        let _ = write!(images, " {} {}\n\n", image.camera, image.name);
+    }
+    for (id, point) in (1_u64..).zip(table.points) {
+        let [r, g, b] = point.color;
+        let _ = write!(points, "{id}");
+        numbers(&mut points, &point.position.to_array());
+        let _ = write!(points, " {r} {g} {b}");
+        numbers(&mut points, &[point.error]);
+        points.push('\n');
+    }
+    [cameras, images, points].map(String::into_bytes)
+}

@@ -1,0 +1,196 @@
+//! `poses_bounds.npy` of local light field fusion (Mildenhall et al. 2019): a row of 17 numbers for each image.
+//!
+//! The first 15 are a matrix of three rows and five columns: the directions down, right and backwards of the camera,
+//! its position, and height, width and focal length in pixels. Then come the nearest and the farthest depth that the
+//! image shows. Rows belong to the images of the folder `images` in the order of their names.
+
+use super::npy::Matrix;
+use super::{MOST_PIXELS, rigid};
+use crate::camera::lens::Lens;
+use crate::camera::pinhole::Camera;
+use crate::dataset::capture::{Capture, Format, View};
+use crate::error::{Error, Result};
+use crate::pictures::write_atomic;
+use glam::{DAffine3, DMat3, DVec3};
+use std::path::{Path, PathBuf};
+
+const FILE: &str = "poses_bounds.npy";
+const COLUMNS: usize = 17;
+const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+
+/// Whether the folder holds cameras in this format.
+pub(crate) fn detect(folder: &Path) -> bool {
+    folder.join(FILE).is_file()
+}
+
+/// Reads the cameras of `folder`. No image is decoded.
+///
+/// # Errors
+/// If a file is absent or damaged, there are not as many images as cameras, or a number cannot be that of a camera.
+/// The error names the file and the row, which are counted from 0.
+pub fn read(folder: &Path) -> Result<Capture> {
+    let file = folder.join(FILE);
+    let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
+    parse(folder, &bytes, images(folder)?)
+}
+
+/// As [`read`], for what the file and the folder hold.
+fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<Capture> {
+    let file = folder.join(FILE);
+    let matrix = Matrix::read(bytes).map_err(|what| Error::file(&file, what))?;
+    let shape = |what: String| Error::field(&file, "shape", what);
+    if matrix.columns != COLUMNS {
+        return Err(shape(format!("must be {COLUMNS} columns, is {}", matrix.columns)));
+    }
+    if matrix.rows == 0 {
+        return Err(shape("has no row: there is nothing to load".into()));
+    }
+    if matrix.rows != images.len() {
+        let beside =
+            images.first().and_then(|(_, path)| path.parent()).map_or("".into(), |p| format!(" in {}", p.display()));
+        let what = "every row must have its image, in the order of their names";
+        return Err(shape(format!("has {} rows, but there are {} images{beside}: {what}", matrix.rows, images.len())));
+    }
+    let rows = matrix.values.chunks_exact(COLUMNS).zip(images).enumerate();
+    let views = rows.map(|(index, (row, (name, path)))| {
+        let field = format!("row {index}");
+        let bad = |what| Error::field(&file, &field, what);
+        let row = row.try_into().map_err(|_| bad("must have 17 numbers".into()))?;
+        let (camera, bounds) = camera(row).map_err(bad)?;
+        let image = Some(path);
+        let (split, mask, depth, sharpness) = (None, None, None, None);
+        Ok(View { name, field, image, camera, split, mask, depth, sharpness, bounds: Some(bounds) })
+    });
+    let views = views.collect::<Result<_>>()?;
+    let (folder, format) = (folder.to_owned(), Format::Llff);
+    Ok(Capture { folder, file, format, views, points: vec![], aabb_scale: None, applied: DAffine3::IDENTITY })
+}
+
+/// The camera of a row, and the depths that it shows.
+fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, [f64; 2]), String> {
+    if let Some(column) = row.iter().position(|value| !value.is_finite()) {
+        return Err(format!("column {column} is not a finite number"));
+    }
+    let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
+    let pose = DAffine3 { matrix3: DMat3::from_cols(column(1), -column(0), column(2)), translation: column(3) };
+    rigid::pose(&pose).map_err(|what| format!("its first three columns (down, right, backwards): {what}"))?;
+    let [height, width, focal] = column(4).to_array();
+    let pixels = |name: &str, value: f64| match value.round() {
+        side if side >= 1.0 && side <= MOST_PIXELS as f64 => Ok(side as usize),
+        _ => Err(format!("{name} must be 1 to {MOST_PIXELS} pixels, is {value}")),
+    };
+    let (width, height) = (pixels("width", width)?, pixels("height", height)?);
+    if focal <= 0.0 {
+        return Err(format!("focal length must be more than 0, is {focal}"));
+    }
+    let [near, far] = [row[15], row[16]];
+    if !(near >= 0.0 && far > near) {
+        return Err(format!("depths must be 0 or more and the second the larger, are {near} and {far}"));
+    }
+    let centre = [0.5 * width as f64, 0.5 * height as f64];
+    Ok((Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }, [near, far]))
+}
+
+/// The names and paths of images in the order of their names: those of the folder `images`, or of the least reduced
+/// folder `images_N` if there are none.
+fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
+    let mut reduced: Vec<(u32, String)> = vec![];
+    for name in names(folder)? {
+        reduced.extend(name.strip_prefix("images_").and_then(|n| n.parse().ok()).map(|n: u32| (n, name.clone())));
+    }
+    reduced.sort();
+    for name in std::iter::once("images".to_owned()).chain(reduced.into_iter().map(|(_, name)| name)) {
+        let folder = folder.join(name);
+        if !folder.is_dir() {
+            continue;
+        }
+        let mut found = names(&folder)?;
+        found.retain(|name| is_image(name) && folder.join(name).is_file());
+        found.sort();
+        if !found.is_empty() {
+            return Ok(found.into_iter().map(|name| (name.clone(), folder.join(name))).collect());
+        }
+    }
+    let what = "there are no images (png, jpg): expected them in this folder or in images_4, images_8";
+    Err(Error::file(folder.join("images"), what))
+}
+
+fn is_image(name: &str) -> bool {
+    let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
+    EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+}
+
+/// What a folder holds.
+fn names(folder: &Path) -> Result<Vec<String>> {
+    let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
+    let entries = std::fs::read_dir(folder).map_err(bad)?;
+    let name = |entry: std::io::Result<std::fs::DirEntry>| {
+        let name = entry.map_err(bad)?.file_name();
+        name.into_string().map_err(|name| Error::file(folder.join(name), "has a name that is not UTF-8: rename it"))
+    };
+    entries.map(name).collect()
+}
+
+/// Writes the cameras of `capture` to `poses_bounds.npy` in `folder`, which must exist. Images are the caller's: each
+/// must be in `images` by the name of its view.
+///
+/// # Errors
+/// If the cameras differ in more than their poses, have a lens or a principal point beside the middle, or a view has
+/// no bounds or no plain name of an image; if the file cannot be written. The error names the view.
+pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
+    let mut views: Vec<&View> = capture.views.iter().collect();
+    views.sort_by(|a, b| a.name.cmp(&b.name));
+    let Some(first) = views.first() else {
+        return Err(Error::file(&capture.file, "has no view: there is nothing to write"));
+    };
+    let mut values = Vec::with_capacity(COLUMNS * views.len());
+    for (index, view) in views.iter().enumerate() {
+        let bad = |member: &str, what| Error::field(&capture.file, format!("{}.{member}", view.field), what);
+        if !is_image(&view.name) || view.name.contains(['/', '\\']) {
+            let what = format!("`{}` must be the plain name of a png or jpg file: LLFF has a single folder", view.name);
+            return Err(bad("name", what));
+        }
+        if index > 0 && views[index - 1].name == view.name {
+            return Err(bad("name", format!("`{}` is there twice", view.name)));
+        }
+        plain(&view.camera, &first.camera).map_err(|what| bad("camera", what))?;
+        let Some([near, far]) = view.bounds else {
+            return Err(bad("bounds", "are not known, and LLFF needs the nearest and the farthest depth".into()));
+        };
+        let Camera { width, height, focal, pose, .. } = &view.camera;
+        let size = [*height as f64, *width as f64, focal[0]];
+        let [right, up, back] = [pose.matrix3.x_axis, pose.matrix3.y_axis, pose.matrix3.z_axis];
+        let mut row = [0.0; COLUMNS];
+        for r in 0..3 {
+            row[5 * r..5 * r + 5].copy_from_slice(&[-up[r], right[r], back[r], pose.translation[r], size[r]]);
+        }
+        [row[15], row[16]] = [near, far];
+        // What could not be read again is not written.
+        camera(&row).map_err(|what| bad("camera", what))?;
+        values.extend(row);
+    }
+    write_atomic(folder.join(FILE), &Matrix { rows: views.len(), columns: COLUMNS, values }.write())
+}
+
+/// What keeps a camera from being written, beside one that is.
+fn plain(camera: &Camera, first: &Camera) -> std::result::Result<(), String> {
+    const UNDISTORT: &str = "LLFF holds equal pinhole cameras alone: undistort first (raygrad prepare --undistort)";
+    let Camera { width, height, focal, centre, lens, .. } = camera;
+    if *lens != Lens::Pinhole {
+        return Err(format!("has a lens; {UNDISTORT}"));
+    }
+    if focal[0] != focal[1] {
+        return Err(format!("has focal lengths {} and {}, which differ; {UNDISTORT}", focal[0], focal[1]));
+    }
+    if *centre != [0.5 * *width as f64, 0.5 * *height as f64] {
+        let [x, y] = centre;
+        return Err(format!("has its principal point at ({x}, {y}), not in the middle; {UNDISTORT}"));
+    }
+    if (*width, *height, *focal) != (first.width, first.height, first.focal) {
+        return Err(format!("differs in size or focal length from the others; {UNDISTORT}"));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

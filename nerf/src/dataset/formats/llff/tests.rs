@@ -1,0 +1,160 @@
+use super::super::damage::{clear, damage, damaged};
+use super::*;
+use crate::dataset::formats::cases;
+use proptest::prelude::*;
+use std::fs;
+
+/// Two rows by hand: a camera at (1, 2, 3) that looks along the world's -z with +y up, and one at (0, 0, 5) that looks
+/// along -x with +z up.
+#[rustfmt::skip]
+const ROWS: [[f64; COLUMNS]; 2] = [
+    [0.0, 1.0, 0.0, 1.0, 30.0,
+     -1.0, 0.0, 0.0, 2.0, 40.2,
+     0.0, 0.0, 1.0, 3.0, 55.5, 1.5, 20.0],
+    [0.0, 0.0, 1.0, 0.0, 30.0,
+     0.0, 1.0, 0.0, 0.0, 40.2,
+     -1.0, 0.0, 0.0, 5.0, 55.5, 2.5, 9.0],
+];
+
+/// A file as NumPy writes it.
+fn npy(rows: &[[f64; COLUMNS]]) -> Vec<u8> {
+    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 17), }}\n", rows.len());
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((header.len() as u16).to_le_bytes());
+    bytes.extend(header.bytes());
+    rows.iter().flatten().for_each(|value| bytes.extend(value.to_le_bytes()));
+    bytes
+}
+
+fn folder(bytes: &[u8], images: &[&str]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join(FILE), bytes).unwrap();
+    for image in images {
+        let path = folder.path().join(image);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, "").unwrap();
+    }
+    folder
+}
+
+/// The images of two rows, and what is none.
+const IMAGES: [&str; 4] = ["images/b.JPG", "images/a.png", "images/notes.txt", "images/c.png/x"];
+
+#[test]
+fn rows_are_cameras_of_images_in_the_order_of_their_names() {
+    let folder = folder(&npy(&ROWS), &IMAGES);
+    assert!(detect(folder.path()));
+    let capture = read(folder.path()).unwrap();
+    let [a, b] = &capture.views[..] else { panic!("{} views", capture.views.len()) };
+    assert_eq!((a.name.as_str(), b.name.as_str(), a.field.as_str()), ("a.png", "b.JPG", "row 0"));
+    assert_eq!(a.image, Some(folder.path().join("images/a.png")));
+    assert_eq!((a.bounds, b.bounds), (Some([1.5, 20.0]), Some([2.5, 9.0])));
+    let pose = DAffine3 { matrix3: DMat3::IDENTITY, translation: DVec3::new(1.0, 2.0, 3.0) };
+    let expected = Camera { width: 40, height: 30, focal: [55.5; 2], centre: [20.0, 15.0], lens: Lens::Pinhole, pose };
+    assert_eq!(a.camera, expected);
+    let pose = Camera::look_at(DVec3::new(0.0, 0.0, 5.0), DVec3::new(-9.0, 0.0, 5.0), DVec3::Z);
+    assert_eq!(b.camera, Camera { pose, ..expected });
+    // Right and above of the axis.
+    assert_eq!(a.camera.pixel_of(DVec3::new(2.0, 4.0, 2.0)), Some([20.0 + 55.5, 15.0 - 111.0]));
+    assert_eq!((capture.format, capture.file), (Format::Llff, folder.path().join(FILE)));
+}
+
+#[test]
+fn reduced_images_stand_in_for_absent_ones() {
+    let all =
+        folder(&npy(&ROWS), &["images_8/0.png", "images_8/1.png", "images_4/2.png", "images_4/3.png", "images_x/y"]);
+    assert_eq!(read(all.path()).unwrap().views[0].name, "2.png", "the least reduced");
+    fs::create_dir(all.path().join("images")).unwrap();
+    assert_eq!(read(all.path()).unwrap().views[0].name, "2.png", "an empty folder has none");
+    let none = folder(&npy(&ROWS), &[]);
+    let message = read(none.path()).unwrap_err().to_string();
+    assert!(message.contains("images") && message.contains("there are no images"), "{message}");
+}
+
+#[test]
+fn errors_name_the_row() {
+    let fails_as = |bytes: &[u8], expected: &str| {
+        let message = read(folder(bytes, &IMAGES).path()).unwrap_err().to_string();
+        assert!(message.contains(FILE) && message.contains(expected), "{message}");
+    };
+    let fails = |column: usize, value: f64, expected: &str| {
+        let mut rows = ROWS;
+        rows[1][column] = value;
+        fails_as(&npy(&rows), &format!("`row 1`: {expected}"));
+    };
+    fails(3, f64::NAN, "column 3 is not a finite number");
+    fails(16, f64::INFINITY, "column 16 is not a finite number");
+    fails(2, -1.0, "its first three columns (down, right, backwards): must be a rotation, but it mirrors");
+    fails(2, 1.002, "its first three columns (down, right, backwards): must be a rotation, but its columns are not");
+    fails(4, 0.4, "height must be 1 to");
+    fails(9, 1e300, "width must be 1 to");
+    fails(14, 0.0, "focal length must be more than 0");
+    fails(15, -1.0, "depths must be 0 or more");
+    fails(16, 2.5, "depths must be 0 or more");
+    fails_as(&npy(&ROWS[..1]), "`shape`: has 1 rows, but there are 2 images");
+    fails_as(&npy(&[]), "`shape`: has no row");
+    fails_as(&Matrix { rows: 2, columns: 15, values: vec![0.0; 30] }.write(), "`shape`: must be 17 columns, is 15");
+    fails_as(b"?", "is not a whole npy file");
+}
+
+#[test]
+fn what_is_written_comes_back_bit_for_bit() {
+    let mut rows = ROWS;
+    // As long as files of NumPy's float32 may make it, and kept as it is.
+    rows[1][2] = 1.0 + 1.0 / 3000.0;
+    let before = read(folder(&npy(&rows), &IMAGES).path()).unwrap();
+    let other = folder(b"", &IMAGES);
+    write(&before, other.path()).unwrap();
+    let after = read(other.path()).unwrap();
+    let said = |capture: &Capture| {
+        capture.views.iter().map(|v| format!("{} {:?} {:?}", v.name, v.camera, v.bounds)).collect::<Vec<_>>()
+    };
+    assert_eq!(said(&before), said(&after));
+    let bits = |bytes: &[u8]| Matrix::read(bytes).unwrap().values;
+    let mut whole = bits(&npy(&rows));
+    // Sides are whole pixels in a camera.
+    [9, 26].into_iter().for_each(|i| whole[i] = 40.0);
+    assert_eq!(bits(&fs::read(other.path().join(FILE)).unwrap()), whole);
+}
+
+#[test]
+fn what_cannot_be_written_is_named() {
+    let fails = |change: &dyn Fn(&mut Capture), expected: &str| {
+        let mut capture = read(folder(&npy(&ROWS), &IMAGES).path()).unwrap();
+        change(&mut capture);
+        let message = write(&capture, Path::new("absent")).unwrap_err().to_string();
+        assert!(message.contains(FILE) && message.contains(expected), "{message}");
+    };
+    let camera = |change: &dyn Fn(&mut Camera), expected: &str| {
+        fails(&|capture| change(&mut capture.views[1].camera), &format!("`row 1.camera`: {expected}"));
+    };
+    camera(
+        &|c| c.lens = Lens::Fov { omega: 1.0 },
+        "has a lens; LLFF holds equal pinhole cameras alone: undistort first",
+    );
+    camera(&|c| c.centre[1] = 14.0, "has its principal point at (20, 14), not in the middle");
+    camera(&|c| c.focal[1] = 14.0, "has focal lengths 55.5 and 14, which differ");
+    camera(&|c| c.focal = [14.0; 2], "differs in size or focal length from the others; LLFF holds");
+    camera(&|c| c.pose.matrix3 *= 2.0, "its first three columns (down, right, backwards): must be a rotation");
+    fails(&|capture| capture.views[1].bounds = None, "`row 1.bounds`: are not known");
+    fails(&|capture| capture.views[1].name = "a/b.png".into(), "`row 1.name`: `a/b.png` must be the plain name");
+    fails(&|capture| capture.views[1].name = "b".into(), "`row 1.name`: `b` must be the plain name");
+    fails(&|capture| capture.views[1].name = "a.png".into(), "`row 1.name`: `a.png` is there twice");
+    fails(&|capture| capture.views.clear(), "has no view");
+}
+
+proptest! {
+    #![proptest_config(cases(1000))]
+
+    #[test]
+    fn damaged_files(damage in damage()) {
+        let images = ["a.png", "b.png"].map(|name| (name.to_owned(), PathBuf::from(name))).to_vec();
+        match parse(Path::new("x"), &damaged(&npy(&ROWS), &damage), images) {
+            Ok(capture) => for View { camera, bounds, .. } in &capture.views {
+                prop_assert!(rigid::pose(&camera.pose).is_ok() && camera.focal[0] > 0.0, "{:?}", camera);
+                prop_assert!(bounds.is_some_and(|[near, far]| 0.0 <= near && near < far && far.is_finite()));
+            },
+            Err(error) => clear(error, FILE),
+        }
+    }
+}

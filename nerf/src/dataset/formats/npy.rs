@@ -1,0 +1,154 @@
+//! NumPy's `.npy` files, of two axes.
+
+/// A matrix, row by row.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Matrix {
+    /// Number of rows.
+    pub rows: usize,
+    /// Number of columns.
+    pub columns: usize,
+    /// `rows * columns` values.
+    pub values: Vec<f64>,
+}
+
+const MAGIC: &[u8] = b"\x93NUMPY";
+
+/// What a file that is no npy file is told.
+const BROKEN: &str = "is not a whole npy file: was it copied completely?";
+
+impl Matrix {
+    /// The matrix of a `.npy` file of f32 or f64 numbers, in either order of elements; or what is wrong, as the end of
+    /// a sentence that begins with the file's name.
+    pub fn read(bytes: &[u8]) -> Result<Self, String> {
+        let (header, data) = split(bytes).ok_or(BROKEN)?;
+        let descr = member(header, "descr").ok_or(BROKEN)?.trim_start_matches(['\'', '"']);
+        let descr = descr.split(['\'', '"']).next().unwrap_or_default();
+        let size = match descr {
+            "<f8" => 8,
+            "<f4" => 4,
+            _ => {
+                let found: String = descr.chars().take(20).collect();
+                let what = "not `<f8` or `<f4`: write it with astype(numpy.float64)";
+                return Err(format!("holds numbers of type `{found}`, {what}"));
+            }
+        };
+        let [rows, columns] = shape(header)?;
+        // Only as much memory as the file has elements: no product of what a header says decides it.
+        let announced = rows.checked_mul(columns).and_then(|count| count.checked_mul(size));
+        if announced != Some(data.len()) {
+            return Err(format!(
+                "has {} bytes of elements, which is not what shape ({rows}, {columns}) needs",
+                data.len()
+            ));
+        }
+        let value = |element: &[u8]| match element.try_into() {
+            Ok(bytes) => f64::from_le_bytes(bytes),
+            Err(_) => element.try_into().map_or(f64::NAN, |bytes| f64::from(f32::from_le_bytes(bytes))),
+        };
+        let values: Vec<f64> = data.chunks_exact(size).map(value).collect();
+        let by_columns = member(header, "fortran_order").ok_or(BROKEN)?.starts_with("True");
+        let values = match by_columns {
+            true => (0..values.len()).map(|i| values[i % columns * rows + i / columns]).collect(),
+            false => values,
+        };
+        Ok(Matrix { rows, columns, values })
+    }
+
+    /// The bytes of a `.npy` file of version 1 with f64 numbers.
+    pub fn write(&self) -> Vec<u8> {
+        let (rows, columns) = (self.rows, self.columns);
+        let mut header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+        // The elements start at a multiple of 64 bytes, after magic, version and length: 10 bytes.
+        let padding = (10 + header.len() + 1).next_multiple_of(64) - 10 - header.len() - 1;
+        header.extend(std::iter::repeat_n(' ', padding));
+        header.push('\n');
+        let mut bytes = MAGIC.to_vec();
+        bytes.extend([1, 0]);
+        bytes.extend((header.len() as u16).to_le_bytes());
+        bytes.extend(header.as_bytes());
+        self.values.iter().for_each(|value| bytes.extend(value.to_le_bytes()));
+        bytes
+    }
+}
+
+/// The header, a Python dictionary, and the elements after it.
+fn split(bytes: &[u8]) -> Option<(&str, &[u8])> {
+    let [major, _minor, rest @ ..] = bytes.strip_prefix(MAGIC)? else { return None };
+    let (length, rest) = match major {
+        1 => rest.split_first_chunk().map(|(length, rest)| (usize::from(u16::from_le_bytes(*length)), rest))?,
+        2 | 3 => rest.split_first_chunk().map(|(length, rest)| (u32::from_le_bytes(*length) as usize, rest))?,
+        _ => return None,
+    };
+    let (header, data) = rest.split_at_checked(length)?;
+    Some((std::str::from_utf8(header).ok()?, data))
+}
+
+/// What follows a key of the header.
+fn member<'a>(header: &'a str, key: &str) -> Option<&'a str> {
+    let after = |quote: char| header.split_once(&format!("{quote}{key}{quote}"));
+    let (_, rest) = after('\'').or_else(|| after('"'))?;
+    Some(rest.trim_start().strip_prefix(':')?.trim_start())
+}
+
+/// The two extents of the shape.
+fn shape(header: &str) -> Result<[usize; 2], String> {
+    let extents = member(header, "shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')'));
+    let (extents, _) = extents.ok_or(BROKEN)?;
+    let words = extents.split(',').map(str::trim).filter(|extent| !extent.is_empty());
+    let numbers = words.map(|extent| extent.parse().map_err(|_| BROKEN)).take(9).collect::<Result<Vec<usize>, _>>()?;
+    numbers.try_into().map_err(|numbers: Vec<usize>| format!("has {} axes, not rows and columns", numbers.len()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A file as NumPy writes it, with this dictionary.
+    fn file(version: u8, dictionary: &str, data: &[u8]) -> Vec<u8> {
+        let mut bytes = vec![0x93, b'N', b'U', b'M', b'P', b'Y', version, 0];
+        match version {
+            1 => bytes.extend((dictionary.len() as u16).to_le_bytes()),
+            _ => bytes.extend((dictionary.len() as u32).to_le_bytes()),
+        }
+        bytes.extend(dictionary.as_bytes());
+        bytes.extend(data);
+        bytes
+    }
+
+    #[test]
+    fn both_orders_and_both_precisions_are_read() {
+        let doubles: Vec<u8> = [1.0, 2.0, 3.0, 4.0, 5.0, 6.5_f64].iter().flat_map(|x| x.to_le_bytes()).collect();
+        let floats: Vec<u8> = [1.0, 4.0, 2.0, 5.0, 3.0, 6.5_f32].iter().flat_map(|x| x.to_le_bytes()).collect();
+        let rows = file(1, "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 3), }\n", &doubles);
+        let columns = file(2, r#"{"descr": "<f4", "fortran_order": True, "shape": (2, 3)}"#, &floats);
+        let expected = Matrix { rows: 2, columns: 3, values: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.5] };
+        assert_eq!(Matrix::read(&rows), Ok(expected.clone()));
+        assert_eq!(Matrix::read(&columns), Ok(expected.clone()));
+        let written = expected.write();
+        assert_eq!((Matrix::read(&written), (written.len() - 48) % 64), (Ok(expected), 0));
+        let empty = file(1, "{'descr': '<f8', 'fortran_order': True, 'shape': (0, 17), }", &[]);
+        assert_eq!(Matrix::read(&empty), Ok(Matrix { rows: 0, columns: 17, values: vec![] }));
+    }
+
+    #[test]
+    fn what_is_wrong_is_said() {
+        let fails = |bytes: &[u8], expected: &str| {
+            let what = Matrix::read(bytes).unwrap_err();
+            assert!(what.contains(expected), "{what}");
+        };
+        let of = |descr: &str, shape: &str, size: usize| {
+            file(1, &format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}"), &vec![0; size])
+        };
+        fails(b"", "not a whole npy file");
+        fails(b"\x93NUMPY\x01\x00\xff\xff{}", "not a whole npy file");
+        fails(&file(4, "{}", &[]), "not a whole npy file");
+        fails(&of("<i8", "1, 1", 8), "of type `<i8`");
+        fails(&of("<f8", "1,", 8), "has 1 axes");
+        fails(&of("<f8", "1, 1, 1", 8), "has 3 axes");
+        fails(&of("<f8", "1, x", 8), "not a whole npy file");
+        fails(&of("<f8", "2, 1", 8), "8 bytes of elements, which is not what shape (2, 1) needs");
+        // Announces more than any memory holds.
+        fails(&of("<f8", "4294967296, 4294967297", 8), "8 bytes of elements");
+        fails(&of("<f8", "99999999999999999999, 1", 8), "not a whole npy file");
+    }
+}

@@ -1,0 +1,57 @@
+//! Whether a matrix of a file is a rotation.
+
+use glam::{DAffine3, DMat3};
+
+/// How far an entry of `R' R` may be from that of the identity. Files carry rounding of about 1e-6.
+pub(crate) const TOLERANCE: f64 = 1e-3;
+
+/// What is wrong with a matrix that should be a rotation, as the end of a sentence that begins with its name.
+pub(crate) fn rotation(matrix: &DMat3) -> Result<(), String> {
+    if !matrix.is_finite() {
+        return Err("must be a rotation, but an entry is not a finite number".to_owned());
+    }
+    // Entries that are finite may have products that are not: a NaN must not pass.
+    let excess = matrix.transpose() * *matrix - DMat3::IDENTITY;
+    if !excess.to_cols_array().iter().all(|value| value.abs() <= TOLERANCE) {
+        return Err("must be a rotation, but its columns are not orthonormal to 1e-3".to_owned());
+    }
+    if matrix.determinant() < 0.0 {
+        return Err("must be a rotation, but it mirrors: its determinant is -1".to_owned());
+    }
+    Ok(())
+}
+
+/// As [`rotation`], for a rotation and a translation.
+pub(crate) fn pose(pose: &DAffine3) -> Result<(), String> {
+    rotation(&pose.matrix3)?;
+    match pose.translation.is_finite() {
+        true => Ok(()),
+        false => Err("has a position that is not finite".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+
+    #[test]
+    fn rotations_pass_and_nothing_else() {
+        let turned = DMat3::from_quat(DQuat::from_xyzw(0.1, -0.2, 0.3, 0.9).normalize());
+        assert_eq!(rotation(&turned), Ok(()));
+        assert_eq!(rotation(&(turned * 1.0004)), Ok(()));
+        let fails = |matrix: DMat3, expected: &str| {
+            let what = rotation(&matrix).unwrap_err();
+            assert!(what.contains(expected), "{what}");
+        };
+        fails(turned * 1.001, "orthonormal");
+        fails(DMat3::ZERO, "orthonormal");
+        fails(DMat3::from_cols(DVec3::X, DVec3::X, DVec3::Z), "orthonormal");
+        // The product of these columns is infinity minus infinity.
+        fails(DMat3::from_cols(DVec3::X, DVec3::splat(1e200), DVec3::new(1e200, -1e200, 0.0)), "orthonormal");
+        fails(DMat3::from_cols(DVec3::X, DVec3::Y, -DVec3::Z), "mirrors");
+        fails(DMat3::from_cols(DVec3::X, DVec3::Y, DVec3::Z * f64::NAN), "finite");
+        let far = DAffine3 { matrix3: turned, translation: DVec3::new(0.0, f64::INFINITY, 0.0) };
+        assert!(pose(&far).unwrap_err().contains("position"));
+    }
+}
