@@ -12,6 +12,7 @@ mod pose;
 mod table;
 mod text;
 
+use super::start;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, Point, View};
 use crate::error::{Error, Result};
@@ -162,6 +163,9 @@ impl ImageEntry {
         if name.is_empty() {
             return Err(place.error(file, "name", "is empty"));
         }
+        if name.chars().any(char::is_control) {
+            return Err(place.error(file, "name", format!("`{}` has a control character", start(&name))));
+        }
         Ok(ImageEntry { place, id, pose, camera, name })
     }
 }
@@ -216,7 +220,11 @@ fn distinct<K: Eq + std::hash::Hash + std::fmt::Display>(
     let mut seen: HashMap<K, Place> = HashMap::new();
     for (key, place) in entries {
         if let Some(before) = seen.get(&key) {
-            return Err(place.error(file, member, format!("is `{key}`, as that of {} is", before.name())));
+            return Err(place.error(
+                file,
+                member,
+                format!("is `{}`, as that of {} is", start(&key.to_string()), before.name()),
+            ));
         }
         seen.insert(key, place);
     }

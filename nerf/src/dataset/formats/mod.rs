@@ -11,6 +11,11 @@ pub(crate) mod rigid;
 /// An image side of more pixels than this is taken for damage to the file.
 const MOST_PIXELS: usize = 1 << 24;
 
+/// So much of what a file says as a message may hold, which is one line.
+fn start(word: &str) -> String {
+    word.chars().take(80).flat_map(char::escape_debug).collect()
+}
+
 #[cfg(test)]
 #[path = "../../../../tests/stability/damage.rs"]
 mod damage;

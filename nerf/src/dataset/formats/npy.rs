@@ -1,5 +1,7 @@
 //! NumPy's `.npy` files, of two axes.
 
+use super::start;
+
 /// A matrix, row by row.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Matrix {
@@ -27,7 +29,7 @@ impl Matrix {
             "<f8" => 8,
             "<f4" => 4,
             _ => {
-                let found: String = descr.chars().take(20).collect();
+                let found = start(descr);
                 let what = "not `<f8` or `<f4`: write it with astype(numpy.float64)";
                 return Err(format!("holds numbers of type `{found}`, {what}"));
             }
@@ -143,6 +145,7 @@ mod tests {
         fails(b"\x93NUMPY\x01\x00\xff\xff{}", "not a whole npy file");
         fails(&file(4, "{}", &[]), "not a whole npy file");
         fails(&of("<i8", "1, 1", 8), "of type `<i8`");
+        fails(&of("<f8\n", "1, 1", 8), "of type `<f8\\n`");
         fails(&of("<f8", "1,", 8), "has 1 axes");
         fails(&of("<f8", "1, 1, 1", 8), "has 3 axes");
         fails(&of("<f8", "1, x", 8), "not a whole npy file");

@@ -10,7 +10,6 @@ pub(crate) fn rotation(matrix: &DMat3) -> Result<(), String> {
     if !matrix.is_finite() {
         return Err("must be a rotation, but an entry is not a finite number".to_owned());
     }
-    // Entries that are finite may have products that are not: a NaN must not pass.
     let excess = matrix.transpose() * *matrix - DMat3::IDENTITY;
     if !excess.to_cols_array().iter().all(|value| value.abs() <= TOLERANCE) {
         return Err("must be a rotation, but its columns are not orthonormal to 1e-3".to_owned());
@@ -47,7 +46,7 @@ mod tests {
         fails(turned * 1.001, "orthonormal");
         fails(DMat3::ZERO, "orthonormal");
         fails(DMat3::from_cols(DVec3::X, DVec3::X, DVec3::Z), "orthonormal");
-        // The product of these columns is infinity minus infinity.
+        // Products that are infinite, and their differences.
         fails(DMat3::from_cols(DVec3::X, DVec3::splat(1e200), DVec3::new(1e200, -1e200, 0.0)), "orthonormal");
         fails(DMat3::from_cols(DVec3::X, DVec3::Y, -DVec3::Z), "mirrors");
         fails(DMat3::from_cols(DVec3::X, DVec3::Y, DVec3::Z * f64::NAN), "finite");

@@ -1,6 +1,6 @@
 //! COLMAP's camera models.
 
-use super::super::MOST_PIXELS;
+use super::super::{MOST_PIXELS, start};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use glam::DAffine3;
@@ -65,7 +65,7 @@ impl Model {
 
     /// The model of a name, or why there is none.
     pub fn by_name(name: &str) -> Result<&'static Model, String> {
-        MODELS.iter().find(|model| model.name == name).ok_or_else(|| unsupported(name))
+        MODELS.iter().find(|model| model.name == name).ok_or_else(|| unsupported(&start(name)))
     }
 
     /// The camera with these parameters, its pose the identity; or which of them is wrong, and what with it.

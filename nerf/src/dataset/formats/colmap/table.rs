@@ -87,7 +87,7 @@ impl CameraRow {
 /// What keeps a name from being written such that it is read again.
 fn check_name(view: &View, encoding: Encoding) -> std::result::Result<(), String> {
     let name = &view.name;
-    if name.is_empty() || name.starts_with("./") || name.contains(['\0', '\n', '\r']) || name.trim() != name {
+    if name.is_empty() || name.starts_with("./") || name.contains(char::is_control) || name.trim() != name {
         return Err(format!("{name:?} cannot be the name of an image: rename the file"));
     }
     // We could read it, but COLMAP ends a name at its first space.

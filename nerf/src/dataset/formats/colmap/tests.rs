@@ -257,6 +257,7 @@ fn binary_errors_name_the_entry() {
     fails(Binary, 1, &with(&images, 68, &[8]), "`images[0].camera_id`", "is 8, but");
     fails(Binary, 1, &with(&images, 72, &[255]), "`images[0].name`", "is not UTF-8");
     fails(Binary, 1, &with(&images, 72, &[0]), "`images[0]", "");
+    fails(Binary, 1, &with(&images, 73, b"\n"), "`images[0].name`", "`b\\nsecond.png` has a control character");
     for count in [u64::MAX, 1 << 61, 100] {
         let what = format!("announces {count} entries");
         fails(Binary, 1, &with(&images, 85, &count.to_le_bytes()), "`images[0].points2D`", &what);

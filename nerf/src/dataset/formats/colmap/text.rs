@@ -1,5 +1,6 @@
 //! COLMAP's `.txt` files: an entry a line, and comments that start with `#`.
 
+use super::super::start;
 use super::models::Model;
 use super::table::Table;
 use super::{CameraEntry, ImageEntry, Place};
@@ -53,11 +54,6 @@ impl<'a> Words<'a> {
         }
         Ok(values)
     }
-}
-
-/// So much of a word as a message may hold.
-fn start(word: &str) -> String {
-    word.chars().take(40).collect()
 }
 
 /// The lines of a file with their numbers, from 1.
