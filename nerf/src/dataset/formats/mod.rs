@@ -1,20 +1,51 @@
-//! How programs write cameras to files: a file for each format, and none knows of another.
+//! The formats that captures come in, each in a file of its own that knows none of the others: `detect` says whether a
+//! folder holds one, `read` parses it without decoding any image, and `write` writes its files but for the images.
 
-// What recognises a folder's format calls these.
-#[allow(dead_code)]
-pub(crate) mod colmap;
-#[allow(dead_code)]
-pub(crate) mod llff;
+pub mod blender;
+pub mod colmap;
+mod frames;
+mod intrinsics;
+mod json;
+mod lens;
+mod limits;
+pub mod llff;
+mod matrix;
 mod npy;
+mod paths;
+mod ply;
 pub(crate) mod rigid;
+pub mod transforms;
 
-/// An image side of more pixels than this is taken for damage to the file.
-const MOST_PIXELS: usize = 1 << 24;
+use super::capture::Capture;
+use crate::error::{Error, Result};
+use std::path::Path;
 
-/// So much of what a file says as a message may hold, which is one line.
-fn start(word: &str) -> String {
-    word.chars().take(80).flat_map(char::escape_debug).collect()
+/// Reads what a folder holds. Where it has several formats, the first of `transforms.json`, Blender's, COLMAP's and LLFF's
+/// counts: the earlier ones say more, and are what other programs have made of the later.
+///
+/// # Errors
+/// If the folder holds none of them, or as the format's own `read`.
+pub fn read(folder: &Path) -> Result<Capture> {
+    type Known = (fn(&Path) -> bool, fn(&Path) -> Result<Capture>);
+    const KNOWN: [Known; 4] = [
+        (transforms::detect, transforms::read),
+        (blender::detect, blender::read),
+        (colmap::detect, colmap::read),
+        (llff::detect, llff::read),
+    ];
+    match KNOWN.iter().find(|(detect, _)| detect(folder)) {
+        Some((_, read)) => read(folder),
+        None => Err(Error::file(
+            folder,
+            "is not a dataset: expected transforms.json (instant-ngp, nerfstudio), transforms_train.json (Blender), \
+             sparse/0/cameras.bin or .txt (COLMAP) or poses_bounds.npy (LLFF); `raygrad prepare` makes one of a video or \
+             of photographs",
+        )),
+    }
 }
+
+#[cfg(test)]
+mod kit;
 
 #[cfg(test)]
 #[path = "../../../../tests/stability/damage.rs"]
@@ -25,4 +56,30 @@ mod damage;
 fn cases(short: u32) -> proptest::prelude::ProptestConfig {
     let cases = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(short);
     proptest::prelude::ProptestConfig { cases, ..Default::default() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::capture::Format;
+
+    #[test]
+    fn the_first_format_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        let message = read(folder.path()).unwrap_err().to_string();
+        for expected in ["is not a dataset", "transforms.json", "transforms_train.json", "sparse/0", "poses_bounds.npy"]
+        {
+            assert!(message.contains(expected), "{message}");
+        }
+        // From the last to the first: each is found beside those that were there before.
+        let capture = kit::picture_with_camera(folder.path());
+        llff::write(&capture, folder.path()).unwrap();
+        assert_eq!(read(folder.path()).unwrap().format, Format::Llff);
+        colmap::write(&capture, folder.path(), colmap::Encoding::Text).unwrap();
+        assert_eq!(read(folder.path()).unwrap().format, Format::Colmap);
+        blender::write(&capture, folder.path()).unwrap();
+        assert_eq!(read(folder.path()).unwrap().format, Format::Blender);
+        transforms::write(&capture, folder.path()).unwrap();
+        assert_eq!(read(folder.path()).unwrap().format, Format::Transforms);
+    }
 }

@@ -1,0 +1,101 @@
+//! The frames of a JSON file as views.
+
+use super::intrinsics::{Layers, check_known};
+use super::json::Object;
+use super::{matrix, paths};
+use crate::dataset::capture::View;
+use crate::dataset::image::Image;
+use crate::error::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// The length of a unit of integer depth images, as nerfstudio has it: a millimetre where scenes are in metres.
+const DEPTH_UNIT: f64 = 1e-3;
+
+/// Which programs a file is for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Dialect {
+    /// instant-ngp's and nerfstudio's. Images that no size is given for may differ.
+    Transforms,
+    /// Blender's: all images are of one size, and `camera_angle_y` is not that of the images.
+    Blender,
+}
+
+/// All frames, in the order of the file. No image is decoded; headers are read where the file gives no size.
+pub(super) fn views(top: &Object<'_>, folder: &Path, dialect: Dialect) -> Result<Vec<View>> {
+    check_known(top)?;
+    let frames = top.frames()?;
+    let mut places = Vec::with_capacity(frames.len());
+    for frame in &frames {
+        let name = paths::normal(frame, "file_path", frame.required("file_path")?)?;
+        let image = paths::find(folder, &name);
+        places.push((name, image));
+    }
+    let first = frames.iter().zip(&places).find_map(|(frame, (_, image))| Some((frame, image.as_deref()?)));
+    let mut common = None;
+    let mut views = Vec::with_capacity(frames.len());
+    for (frame, (name, image)) in frames.iter().zip(&places) {
+        check_known(frame)?;
+        let pose = matrix::pose(frame, "transform_matrix")?;
+        let header = || {
+            // An absent image is as large as the first, as far as anybody can say.
+            let own = image.as_deref().filter(|_| dialect == Dialect::Transforms).map(|image| (frame, image));
+            match (own, first) {
+                (Some(own), _) => size(own),
+                (None, Some(first)) => common.map_or_else(|| size(first), Ok).inspect(|size| common = Some(*size)),
+                (None, None) => Ok([0, 0]),
+            }
+        };
+        let camera = Layers { top, frame }.camera(pose, header, dialect == Dialect::Transforms)?;
+        views.push(View {
+            name: name.clone(),
+            field: frame.path.clone(),
+            image: image.clone(),
+            camera,
+            split: None,
+            mask: beside(frame, folder, "mask_path", image.is_some())?,
+            depth: depth(top, frame, folder, image.is_some())?,
+            sharpness: frame.number("sharpness")?,
+            bounds: None,
+        });
+    }
+    Ok(views)
+}
+
+/// The size of a frame's image, from its header.
+fn size((frame, image): (&Object<'_>, &Path)) -> Result<[usize; 2]> {
+    Image::size_of_file(image).map_err(|e| match e {
+        Error::File { path, what } => frame.error("file_path", format!("{}: {what}", path.display())),
+        other => other,
+    })
+}
+
+/// A file that belongs to an image, which must be there if the image is.
+fn beside(frame: &Object<'_>, folder: &Path, name: &str, needed: bool) -> Result<Option<PathBuf>> {
+    let Some(value) = frame.get(name) else { return Ok(None) };
+    let path = paths::normal(frame, name, value)?;
+    match paths::find(folder, &path) {
+        None if needed => {
+            let what = format!("there is no file {path}: remove the field if the photograph is to be used without it");
+            Err(frame.error(name, what))
+        }
+        found => Ok(found),
+    }
+}
+
+/// A file of depths with its unit: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which is only used with
+/// an `integer_depth_scale`.
+fn depth(top: &Object<'_>, frame: &Object<'_>, folder: &Path, needed: bool) -> Result<Option<(PathBuf, f64)>> {
+    let layers = Layers { top, frame };
+    let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;
+    if let Some(path) = beside(frame, folder, "depth_file_path", needed)? {
+        // Arrays of floats are in the units of the scene already.
+        let floats = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
+        let default = if floats { 1.0 } else { DEPTH_UNIT };
+        return Ok(Some((path, unit.unwrap_or(default))));
+    }
+    let Some(scale) = top.number("integer_depth_scale")?.filter(|scale| *scale > 0.0) else { return Ok(None) };
+    if top.flag("enable_depth_loading")? == Some(false) {
+        return Ok(None);
+    }
+    Ok(beside(frame, folder, "depth_path", needed)?.map(|path| (path, scale)))
+}

@@ -1,0 +1,221 @@
+//! Focal lengths, principal points and sizes: of a whole file, or of a frame of it.
+
+use super::json::{Object, shown};
+use super::lens;
+use crate::camera::lens::Lens;
+use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
+use glam::DAffine3;
+use serde_json::{Map, Value};
+use std::f64::consts::PI;
+
+/// Fields of instant-ngp and nerfstudio that change where light falls or which pixels count, and that are not read here. Dropped without a word they would spoil every picture.
+const NOT_READ: [&str; 14] = [
+    "x_fov",
+    "y_fov",
+    "distortion_params",
+    "fisheye_crop_radius",
+    "ftheta_p0",
+    "ftheta_p1",
+    "ftheta_p2",
+    "ftheta_p3",
+    "ftheta_p4",
+    "latlong",
+    "equirectangular",
+    "rolling_shutter",
+    "transform_matrix_start",
+    "transform_matrix_end",
+];
+
+/// Lengths in pixels that a camera may have.
+const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
+const CENTRE: f64 = 1e9;
+const SIDE: f64 = 1048576.0;
+
+/// How far a field may be from what a panorama must have, as a share of it.
+const PANORAMA: f64 = 0.01;
+
+/// # Errors
+/// If the object has a field of a camera that is not read here, unless its value does nothing.
+pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
+    fn nothing(value: &Value) -> bool {
+        match value {
+            Value::Bool(flag) => !flag,
+            Value::Number(number) => number.as_f64() == Some(0.0),
+            Value::Array(values) => values.iter().all(nothing),
+            _ => false,
+        }
+    }
+    let named = NOT_READ.into_iter().find_map(|name| Some((name, object.get(name).filter(|value| !nothing(value))?)));
+    let Some((name, value)) = named else { return Ok(()) };
+    let what = match name {
+        "x_fov" | "y_fov" => "write the field of view in radians as camera_angle_x and camera_angle_y",
+        "latlong" | "equirectangular" => "write camera_model EQUIRECTANGULAR if the images are such panoramas",
+        "distortion_params" => "write the coefficients by name (k1, k2, p1, p2) with their camera_model",
+        "fisheye_crop_radius" => "write masks of the pixels to use, as mask_path",
+        "rolling_shutter" | "transform_matrix_start" | "transform_matrix_end" => {
+            "cameras that move while they take a photograph are not supported"
+        }
+        _ => "such cameras are not supported",
+    };
+    Err(object.error(name, format!("is {}, and cannot be followed: {what}", shown(value))))
+}
+
+/// What the file as a whole says, and what a frame says in its place.
+pub(super) struct Layers<'a, 'b> {
+    pub(super) top: &'b Object<'a>,
+    pub(super) frame: &'b Object<'a>,
+}
+
+impl<'a, 'b> Layers<'a, 'b> {
+    /// The object whose field counts.
+    fn of(&self, name: &str) -> &'b Object<'a> {
+        if self.frame.get(name).is_none() && self.top.get(name).is_some() { self.top } else { self.frame }
+    }
+
+    pub(super) fn find<T>(&self, name: &str, read: impl Fn(&'b Object<'a>, &str) -> Result<T>) -> Result<T> {
+        read(self.of(name), name)
+    }
+
+    pub(super) fn number(&self, name: &str) -> Result<Option<f64>> {
+        self.of(name).number(name)
+    }
+
+    pub(super) fn error(&self, name: &str, what: impl ToString) -> Error {
+        self.of(name).error(name, what)
+    }
+
+    /// A number of pixels.
+    fn side(&self, name: &str) -> Result<Option<usize>> {
+        match self.number(name)? {
+            Some(x) if !((1.0..=SIDE).contains(&x) && x.fract() == 0.0) => {
+                Err(self.error(name, format!("must be a whole number of pixels, of 1 to {SIDE}, is {x}")))
+            }
+            other => Ok(other.map(|x| x as usize)),
+        }
+    }
+
+    /// Width and height, if the file says.
+    fn size(&self) -> Result<Option<[usize; 2]>> {
+        match (self.side("w")?, self.side("h")?) {
+            (Some(w), Some(h)) => Ok(Some([w, h])),
+            (None, None) => Ok(None),
+            (Some(_), None) => Err(self.of("w").error("h", "is missing beside `w`")),
+            (None, Some(_)) => Err(self.of("h").error("w", "is missing beside `h`")),
+        }
+    }
+
+    /// The camera at `pose`. `header` is asked for the size of the image where the file says none, and gives zeros where
+    /// there is no image either. `angle_y`: whether `camera_angle_y` is that of the image; Blender's is that of its sensor.
+    pub(super) fn camera(
+        &self,
+        pose: DAffine3,
+        header: impl FnOnce() -> Result<[usize; 2]>,
+        angle_y: bool,
+    ) -> Result<Camera> {
+        let [width, height] = self.size()?.map_or_else(header, Ok)?;
+        let lens = lens::read(self)?;
+        let middle = [0.5 * width as f64, 0.5 * height as f64];
+        if lens == Lens::Equirectangular {
+            let focal = self.panorama([width, height])?;
+            return Ok(Camera { width, height, focal, centre: middle, lens, pose });
+        }
+        let mut centre = middle;
+        for (value, name) in centre.iter_mut().zip(["cx", "cy"]) {
+            *value = self.number(name)?.unwrap_or(*value);
+            if value.abs() > CENTRE {
+                return Err(self.error(name, format!("must be a place in pixels, is {value}")));
+            }
+        }
+        let focal = self.focal([width, height], angle_y)?;
+        Ok(Camera { width, height, focal, centre, lens, pose })
+    }
+
+    /// Focal lengths: those of the frame if it has any, otherwise the file's. One alone counts for both, as in instant-ngp.
+    fn focal(&self, size: [usize; 2], angle_y: bool) -> Result<[f64; 2]> {
+        let [top, frame] = [focal_of(self.top, size, angle_y)?, focal_of(self.frame, size, angle_y)?];
+        let given = if frame == [None; 2] { top } else { frame };
+        match (given, top) {
+            ([Some(x), Some(y)], _) => Ok([x, y]),
+            ([None, None], _) => {
+                let what = "is missing: give the horizontal field of view in radians, or focal lengths in pixels as fl_x and fl_y";
+                Err(self.top.error("camera_angle_x", what))
+            }
+            // Whether the other is to be the file's or the frame's no two programs agree on.
+            ([x, _], [Some(a), Some(b)]) if a != b => {
+                let [given, missing] = if x.is_some() { ["fl_x", "fl_y"] } else { ["fl_y", "fl_x"] };
+                let what = format!(
+                    "is missing beside the frame's own `{given}`: the file's focal lengths differ, {a} and {b}"
+                );
+                Err(self.frame.error(missing, what))
+            }
+            ([Some(f), None] | [None, Some(f)], _) => Ok([f, f]),
+        }
+    }
+
+    /// Focal lengths of a panorama of all directions, in pixels for each radian.
+    fn panorama(&self, [width, height]: [usize; 2]) -> Result<[f64; 2]> {
+        let [w, h] = [width as f64, height as f64];
+        let focal = [w / (2.0 * PI), h / PI];
+        // nerfstudio has its focal lengths in pixels for each half turn.
+        let rules: [(&str, [f64; 2], f64); 6] = [
+            ("fl_x", [focal[0], 0.5 * w], 0.0),
+            ("fl_y", [focal[1], h], 0.0),
+            ("cx", [0.5 * w; 2], 0.5),
+            ("cy", [0.5 * h; 2], 0.5),
+            ("camera_angle_x", [2.0 * PI; 2], 0.0),
+            ("camera_angle_y", [PI; 2], 0.0),
+        ];
+        for (name, allowed, slack) in rules {
+            let Some(value) = self.number(name)? else { continue };
+            if width > 0 && !allowed.iter().any(|x| (value - x).abs() <= f64::max(PANORAMA * x, slack)) {
+                let what = format!(
+                    "is {value}, and must be {:.3} or absent: a camera_model EQUIRECTANGULAR shows all directions",
+                    allowed[1]
+                );
+                return Err(self.error(name, what));
+            }
+        }
+        Ok(focal)
+    }
+}
+
+/// The focal lengths that one object gives: `fl_x` and `fl_y`, in whose place the angles stand.
+fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Option<f64>; 2]> {
+    let axis = |length: &str, angle: &str, side: usize| {
+        if let Some(f) = object.number(length)? {
+            if !FOCAL.contains(&f) {
+                return Err(object.error(length, format!("must be a focal length in pixels, of 1e-3 to 1e9, is {f}")));
+            }
+            return Ok(Some(f));
+        }
+        if angle == "camera_angle_y" && !angle_y {
+            return Ok(None);
+        }
+        let Some(a) = object.number(angle)? else { return Ok(None) };
+        let f = 0.5 * side as f64 / (0.5 * a).tan();
+        if !(a > 0.0 && a < PI) || (side > 0 && !FOCAL.contains(&f)) {
+            return Err(object.error(angle, format!("must be an angle in radians between 0 and pi, is {a}")));
+        }
+        Ok(Some(f))
+    };
+    Ok([axis("fl_x", "camera_angle_x", size[0])?, axis("fl_y", "camera_angle_y", size[1])?])
+}
+
+/// Writes everything that a camera has but its pose, for a `model` of this name.
+pub(super) fn write(camera: &Camera, model: &str, out: &mut Map<String, Value>) {
+    let Camera { width, height, focal, centre, lens, .. } = camera;
+    // A panorama's are nerfstudio's, in pixels for each half turn.
+    let focal = match lens {
+        Lens::Equirectangular => [0.5 * *width as f64, *height as f64],
+        _ => *focal,
+    };
+    let numbers = [("fl_x", focal[0]), ("fl_y", focal[1]), ("cx", centre[0]), ("cy", centre[1])];
+    out.extend(numbers.map(|(name, value)| (name.to_owned(), value.into())));
+    out.extend([("w", width), ("h", height)].map(|(name, &side)| (name.to_owned(), side.into())));
+    out.insert("camera_model".to_owned(), model.into());
+    lens::write(lens, model, out);
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,313 @@
+use crate::camera::lens::Lens;
+use crate::camera::pinhole::Camera;
+use crate::dataset::formats::kit::{failure, frames, picture, remove, says};
+use crate::dataset::formats::transforms;
+use serde_json::{Value, json};
+use std::f64::consts::PI;
+
+const FILE: &str = "transforms.json";
+
+/// Two frames and a pinhole whose numbers all differ.
+fn document() -> Value {
+    json!({ "fl_x": 100.0, "fl_y": 110.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48, "frames": frames(&["0", "1"]) })
+}
+
+/// The cameras after a change to the document.
+fn read(change: impl FnOnce(&mut Value)) -> crate::Result<Vec<Camera>> {
+    let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
+    change(&mut document);
+    std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+    Ok(transforms::read(folder.path())?.views.into_iter().map(|view| view.camera).collect())
+}
+
+#[track_caller]
+fn cameras(change: impl FnOnce(&mut Value)) -> Vec<Camera> {
+    read(change).unwrap()
+}
+
+#[track_caller]
+fn fails(change: impl FnOnce(&mut Value), parts: &[&str]) {
+    let message = read(change).unwrap_err().to_string();
+    assert!(!message.contains('\n') && message.contains("transforms.json: "), "{message}");
+    says(&message, parts);
+}
+
+fn set(object: &mut Value, fields: &Value) {
+    object.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone());
+}
+
+/// What the camera is of a file with these fields at the top, and of a frame with them whose file has others.
+#[track_caller]
+fn with(fields: Value) -> Camera {
+    let top = cameras(|document| set(document, &fields));
+    assert_eq!(top[0], top[1]);
+    let frame = cameras(|document| set(&mut document["frames"][1], &fields));
+    assert_eq!(frame[0], cameras(|_| {})[0], "the other frame keeps the file's");
+    assert_eq!(frame[1], top[0]);
+    top[0].clone()
+}
+
+#[test]
+fn every_number_of_a_pinhole_counts() {
+    let plain = cameras(|_| {})[0].clone();
+    assert_eq!((plain.width, plain.height, plain.focal, plain.centre), (64, 48, [100.0, 110.0], [31.0, 25.0]));
+    assert_eq!((plain.lens, plain.pose.translation.z), (Lens::Pinhole, 4.0));
+    assert_eq!(with(json!({ "fl_x": 90, "fl_y": 95.5 })), Camera { focal: [90.0, 95.5], ..plain.clone() });
+    assert_eq!(with(json!({ "cx": 30.25 })), Camera { centre: [30.25, 25.0], ..plain.clone() });
+    assert_eq!(with(json!({ "cy": 30.25 })), Camera { centre: [31.0, 30.25], ..plain.clone() });
+    assert_eq!(with(json!({ "w": 128.0 })), Camera { width: 128, ..plain.clone() });
+    assert_eq!(with(json!({ "h": 96 })), Camera { height: 96, ..plain.clone() });
+    // Without a principal point it is the middle, of each axis for itself.
+    assert_eq!(cameras(|d| remove(d, "cx"))[0].centre, [32.0, 25.0]);
+    assert_eq!(cameras(|d| remove(d, "cy"))[0].centre, [31.0, 24.0]);
+}
+
+#[test]
+fn angles_stand_where_focal_lengths_are_absent() {
+    let of = |angle: f64, side: f64| 0.5 * side / (0.5 * angle).tan();
+    let angles = json!({ "camera_angle_x": 0.8, "camera_angle_y": 0.7 });
+    let without = |d: &mut Value, names: &[&str]| names.iter().for_each(|name| remove(d, name));
+    let focal = |names: &[&str]| {
+        let cameras = cameras(|d| {
+            without(d, names);
+            set(d, &angles);
+        });
+        cameras[0].focal
+    };
+    assert_eq!(focal(&[]), [100.0, 110.0], "focal lengths win");
+    assert_eq!(focal(&["fl_x"]), [of(0.8, 64.0), 110.0]);
+    assert_eq!(focal(&["fl_y"]), [100.0, of(0.7, 48.0)]);
+    assert_eq!(focal(&["fl_x", "fl_y"]), [of(0.8, 64.0), of(0.7, 48.0)]);
+    // One alone counts for both.
+    for (angle, side) in [("camera_angle_x", 64.0), ("camera_angle_y", 48.0)] {
+        let cameras = cameras(|d| {
+            without(d, &["fl_x", "fl_y"]);
+            d[angle] = json!(0.9);
+        });
+        assert_eq!(cameras[0].focal, [of(0.9, side); 2], "{angle}");
+    }
+    assert_eq!(cameras(|d| remove(d, "fl_y"))[0].focal, [100.0; 2]);
+    assert_eq!(cameras(|d| remove(d, "fl_x"))[0].focal, [110.0; 2]);
+    // A frame's angle comes before the file's focal length.
+    let own = cameras(|d| set(&mut d["frames"][1], &angles));
+    assert_eq!([own[0].focal, own[1].focal], [[100.0, 110.0], [of(0.8, 64.0), of(0.7, 48.0)]]);
+    let own = cameras(|d| {
+        without(d, &["fl_y"]);
+        d["frames"][1]["fl_x"] = json!(90.0);
+    });
+    assert_eq!(own[1].focal, [90.0; 2]);
+    fails(|d| d["frames"][1]["fl_x"] = json!(90), &["`frames[1].fl_y`: is missing", "`fl_x`", "100 and 110"]);
+    fails(|d| d["frames"][1]["fl_y"] = json!(90), &["`frames[1].fl_x`: is missing"]);
+    fails(|d| without(d, &["fl_x", "fl_y"]), &["`camera_angle_x`: is missing", "fl_x and fl_y"]);
+}
+
+#[test]
+fn every_coefficient_of_every_model_counts_and_others_are_errors() {
+    let brown = |k: [f64; 6], p: [f64; 2]| Lens::Brown { k, p };
+    let fisheye = |k: [f64; 4], p: [f64; 2], s: [f64; 2]| Lens::Fisheye { k, p, s };
+    let zero = [0.0; 2];
+    let models = [
+        ("SIMPLE_PINHOLE", json!({}), Lens::Pinhole),
+        ("PINHOLE", json!({}), Lens::Pinhole),
+        ("SIMPLE_RADIAL", json!({ "k1": 0.1 }), brown([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], zero)),
+        ("RADIAL", json!({ "k1": 0.1, "k2": 0.2 }), brown([0.1, 0.2, 0.0, 0.0, 0.0, 0.0], zero)),
+        (
+            "OPENCV",
+            json!({ "k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.7, "p2": 0.8 }),
+            brown([0.1, 0.2, 0.3, 0.0, 0.0, 0.0], [0.7, 0.8]),
+        ),
+        (
+            "FULL_OPENCV",
+            json!({ "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "k5": 0.5, "k6": 0.6, "p1": 0.7, "p2": 0.8 }),
+            brown([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.7, 0.8]),
+        ),
+        ("SIMPLE_RADIAL_FISHEYE", json!({ "k1": 0.1 }), fisheye([0.1, 0.0, 0.0, 0.0], zero, zero)),
+        ("RADIAL_FISHEYE", json!({ "k1": 0.1, "k2": 0.2 }), fisheye([0.1, 0.2, 0.0, 0.0], zero, zero)),
+        (
+            "OPENCV_FISHEYE",
+            json!({ "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4 }),
+            fisheye([0.1, 0.2, 0.3, 0.4], zero, zero),
+        ),
+        (
+            "THIN_PRISM_FISHEYE",
+            json!({ "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0.7, "p2": 0.8, "sx1": 0.9, "sy1": 0.95 }),
+            fisheye([0.1, 0.2, 0.3, 0.4], [0.7, 0.8], [0.9, 0.95]),
+        ),
+        ("FOV", json!({ "omega": 0.9 }), Lens::Fov { omega: 0.9 }),
+    ];
+    for (model, own, lens) in models {
+        let mut fields = own.clone();
+        fields["camera_model"] = json!(model);
+        assert_eq!(with(fields.clone()).lens, lens, "{model}");
+        for name in ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1", "omega"] {
+            let set_to = |value: Value| {
+                let mut fields = fields.clone();
+                fields[name] = value;
+                move |d: &mut Value| set(d, &fields)
+            };
+            fails(set_to(json!("0.1")), &[&format!("`{name}`: must be a finite number, is \"0.1\"")]);
+            if own.get(name).is_some() {
+                assert_ne!(cameras(set_to(json!(0.15)))[0].lens, lens, "{model} {name}");
+                continue;
+            }
+            fails(set_to(json!(0.1)), &[&format!("`{name}`: is 0.1"), "set it to 0"]);
+            let frame = read(|d| {
+                set(d, &fields);
+                d["frames"][1][name] = json!(-1e-3);
+            });
+            says(&frame.unwrap_err().to_string(), &[&format!("`frames[1].{name}`: is -0.001")]);
+            for nothing in [json!(0), json!(-1e-17), json!(null)] {
+                assert_eq!(cameras(set_to(nothing))[0].lens, lens, "{model} {name}");
+            }
+        }
+    }
+    // Without a name.
+    let lens = with(json!({ "k1": 0.1, "k2": -0.2, "p1": 0.01, "p2": 0.02 })).lens;
+    assert_eq!(lens, brown([0.1, -0.2, 0.0, 0.0, 0.0, 0.0], [0.01, 0.02]));
+    assert_eq!(with(json!({ "k1": 0, "k2": 0.0, "p1": 0, "p2": 0, "k3": 0, "k4": 0 })).lens, Lens::Pinhole);
+    for model in ["OPENCV", "FULL_OPENCV"] {
+        assert_eq!(with(json!({ "camera_model": model, "k1": 0 })).lens, Lens::Pinhole, "{model}");
+    }
+    fails(|d| d["k4"] = json!(0.1), &["`k4`", "nerfstudio", "OpenCV divides", "FULL_OPENCV"]);
+    for omega in [json!(null), json!(0), json!(-0.5), json!(3.2)] {
+        let change = |d: &mut Value| set(d, &json!({ "camera_model": "FOV", "omega": omega }));
+        fails(change, &["omega`: must be the field of view in radians"]);
+    }
+}
+
+#[test]
+fn instant_ngp_says_that_a_lens_is_a_fisheye() {
+    let fisheye = Lens::Fisheye { k: [0.1, 0.2, 0.3, 0.4], p: [0.0; 2], s: [0.0; 2] };
+    let k = json!({ "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "is_fisheye": true });
+    assert_eq!(with(k.clone()).lens, fisheye);
+    for (flag, model, fine) in [
+        (json!(true), "OPENCV_FISHEYE", true),
+        (json!(1), "OPENCV_FISHEYE", true),
+        (json!(false), "OPENCV", true),
+        (json!(0), "PINHOLE", true),
+        (json!(false), "OPENCV_FISHEYE", false),
+        (json!(true), "PINHOLE", false),
+    ] {
+        let fields = json!({ "is_fisheye": flag, "camera_model": model });
+        match fine {
+            true => drop(with(fields)),
+            false => fails(|d| set(d, &fields), &["`is_fisheye`: contradicts `camera_model`", model]),
+        }
+    }
+    fails(|d| d["is_fisheye"] = json!("yes"), &["`is_fisheye`: must be true or false, is \"yes\""]);
+    fails(|d| set(d, &json!({ "is_fisheye": true, "p1": 0.1 })), &["`p1`", "OPENCV_FISHEYE has no such"]);
+}
+
+#[test]
+fn unknown_models_are_named() {
+    for model in ["OPENCV5", "opencv", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_L", ""] {
+        fails(|d| d["camera_model"] = json!(model), &["`camera_model`", &format!("is {model},"), "THIN_PRISM_FISHEYE"]);
+        fails(|d| d["frames"][1]["camera_model"] = json!(model), &["`frames[1].camera_model`"]);
+    }
+    fails(|d| d["camera_model"] = json!(4), &["`camera_model`: must be a string, is 4"]);
+    fails(|d| d["camera_model"] = json!("a\nb".repeat(50)), &["`camera_model`"]);
+}
+
+#[test]
+fn panoramas_show_all_directions() {
+    let panorama = |fields: Value| {
+        move |d: &mut Value| {
+            *d = json!({ "camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "frames": d["frames"].clone() });
+            set(d, &fields);
+        }
+    };
+    let camera = cameras(panorama(json!({})))[0].clone();
+    assert_eq!((camera.lens, camera.focal), (Lens::Equirectangular, [32.0 / PI, 32.0 / PI]));
+    assert_eq!(camera.centre, [32.0, 16.0]);
+    for fields in [
+        json!({ "fl_x": 32, "fl_y": 32, "cx": 32, "cy": 16 }),
+        json!({ "fl_x": 10.2, "fl_y": 10.2, "cx": 31.5, "cy": 15.5 }),
+        json!({ "camera_angle_x": 6.283185, "camera_angle_y": 3.14159 }),
+    ] {
+        assert_eq!(cameras(panorama(fields))[0], camera);
+    }
+    for (name, value) in
+        [("fl_x", 64.0), ("fl_y", 16.0), ("cx", 30.0), ("cy", 18.0), ("camera_angle_x", PI), ("camera_angle_y", 1.5)]
+    {
+        fails(panorama(json!({ name: value })), &[&format!("`{name}`: is {value}, and must be"), "all directions"]);
+    }
+    fails(panorama(json!({ "k1": 0.1 })), &["`k1`", "EQUIRECTANGULAR has no such"]);
+    // Axes for themselves.
+    let wide = cameras(panorama(json!({ "h": 16 })))[0].clone();
+    assert_eq!(wide.focal, [32.0 / PI, 16.0 / PI]);
+}
+
+#[test]
+fn fields_that_cannot_be_followed_are_named() {
+    for (name, value, hint) in [
+        ("x_fov", json!(45.8), "camera_angle_x"),
+        ("y_fov", json!(45.8), "camera_angle_y"),
+        ("distortion_params", json!([0.1, 0]), "k1, k2, p1, p2"),
+        ("fisheye_crop_radius", json!(500.0), "mask_path"),
+        ("ftheta_p0", json!(1e-3), "not supported"),
+        ("ftheta_p4", json!("NaN"), "not supported"),
+        ("latlong", json!(true), "EQUIRECTANGULAR"),
+        ("equirectangular", json!(1), "EQUIRECTANGULAR"),
+        ("rolling_shutter", json!([0, 0, 1, 0]), "move"),
+        ("transform_matrix_start", json!([[1, 0, 0, 0]]), "move"),
+        ("transform_matrix_end", json!([[1, 0, 0, 0]]), "move"),
+    ] {
+        fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "cannot be followed"]);
+        fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), hint]);
+        for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, 0]), json!([])] {
+            assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");
+        }
+    }
+}
+
+#[test]
+fn numbers_that_are_none_are_named() {
+    for name in ["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "p2"] {
+        for value in ["NaN", "Infinity", "-Infinity", "[1]", "\"1\"", "{}", "1e999"] {
+            let (folder, mut document) = (tempfile::tempdir().unwrap(), document());
+            document[name] = json!(12345);
+            let text = document.to_string().replace("12345", value);
+            std::fs::write(folder.path().join(FILE), text).unwrap();
+            let message = failure(transforms::read(folder.path()), FILE);
+            let expected = format!("`{name}`: must be a finite number, is ");
+            assert!(message.contains(&expected) || value == "1e999", "{message}");
+        }
+    }
+    for value in [json!(0), json!(-64), json!(64.5), json!(1e9)] {
+        fails(|d| d["w"] = value.clone(), &["`w`: must be a whole number of pixels, of 1 to 1048576"]);
+        fails(|d| d["frames"][0]["h"] = value, &["`frames[0].h`: must be a whole number"]);
+    }
+    for value in [json!(0), json!(-100), json!(1e-9), json!(1e300)] {
+        fails(|d| d["fl_x"] = value.clone(), &["`fl_x`: must be a focal length"]);
+        fails(|d| d["fl_y"] = value, &["`fl_y`: must be a focal length"]);
+    }
+    for angle in [json!(0), json!(-0.5), json!(3.2), json!(3.141592653589793_f64), json!(1e-300)] {
+        let change = |d: &mut Value| {
+            remove(d, "fl_x");
+            d["camera_angle_x"] = angle;
+        };
+        fails(change, &["`camera_angle_x`: must be an angle in radians between 0 and pi"]);
+    }
+    fails(|d| d["cx"] = json!(1e12), &["`cx`: must be a place in pixels"]);
+    fails(|d| remove(d, "h"), &["`h`: is missing beside `w`"]);
+    fails(|d| remove(d, "w"), &["`w`: is missing beside `h`"]);
+}
+
+#[test]
+fn sizes_that_are_not_given_are_those_of_the_images() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut document = json!({ "camera_angle_x": 0.8, "frames": frames(&["a", "0.png", "1.png", "2"]) });
+    let read = |document: &Value| {
+        std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+        let views = transforms::read(folder.path())?.views;
+        Ok::<_, crate::Error>(views.iter().map(|view| [view.camera.width, view.camera.height]).collect::<Vec<_>>())
+    };
+    assert_eq!(read(&document).unwrap(), [[0, 0]; 4], "nobody knows");
+    picture(&folder.path().join("0.png"), 8, 6);
+    picture(&folder.path().join("1.png"), 6, 8);
+    assert_eq!(read(&document).unwrap(), [[8, 6], [8, 6], [6, 8], [8, 6]]);
+    std::fs::write(folder.path().join("1.png"), b"not a picture").unwrap();
+    says(&read(&document).unwrap_err().to_string(), &["`frames[2].file_path`: ", "1.png: cannot be decoded"]);
+    set(&mut document, &json!({ "w": 16, "h": 12 }));
+    assert_eq!(read(&document).unwrap(), [[16, 12]; 4], "headers are not read");
+}

@@ -1,0 +1,171 @@
+//! JSON documents whose errors name the field.
+
+use crate::error::{Error, Result};
+use crate::pictures::write_atomic;
+use serde_json::{Map, Value};
+use std::path::Path;
+
+/// The most characters of a value that an error repeats.
+const SHOWN: usize = 40;
+
+/// Reads and parses a file.
+pub(super) fn read(file: &Path) -> Result<Value> {
+    let text = std::fs::read_to_string(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
+    parse(&text).map_err(|e| Error::file(file, format!("is not valid JSON: {e}")))
+}
+
+/// Writes a file as a whole. Finite numbers come back bit for bit.
+pub(super) fn write(file: &Path, object: Map<String, Value>) -> Result<()> {
+    let text = serde_json::to_string_pretty(&object);
+    let text = text.map_err(|e| Error::file(file, format!("cannot be written: {e}")))?;
+    write_atomic(file, (text + "\n").as_bytes())
+}
+
+/// Parses JSON. Python also writes NaN and Infinity, which JSON does not have: they are read as strings, so that the error
+/// can name the field instead of a line. (As null they would count as absent.)
+fn parse(text: &str) -> serde_json::Result<Value> {
+    let text = text.trim_start_matches('\u{feff}');
+    serde_json::from_str(text).or_else(|error| serde_json::from_str(&quoted(text)).map_err(|_| error))
+}
+
+/// The text with quotes around all numbers that are not finite.
+fn quoted(text: &str) -> String {
+    let (mut out, mut rest, mut in_string) = (String::with_capacity(text.len()), text, false);
+    while let Some(c) = rest.chars().next() {
+        let word = ["NaN", "Infinity", "-Infinity"].into_iter().find(|word| !in_string && rest.starts_with(word));
+        let taken = match word {
+            Some(word) => word.len(),
+            // The character after a backslash does not end a string.
+            None if c == '\\' => rest.chars().take(2).map(char::len_utf8).sum(),
+            None => c.len_utf8(),
+        };
+        in_string ^= c == '"';
+        let (part, after) = rest.split_at(taken);
+        match word {
+            Some(word) => out.extend(["\"", word, "\""]),
+            None => out.push_str(part),
+        }
+        rest = after;
+    }
+    out
+}
+
+/// A value as an error repeats it: on one line, and not all of a long one.
+pub(super) fn shown(value: &Value) -> String {
+    let text = value.to_string();
+    match text.char_indices().nth(SHOWN) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text,
+    }
+}
+
+/// An object in a document, which knows where it is.
+#[derive(Debug, Clone)]
+pub(super) struct Object<'a> {
+    /// The file, for errors.
+    pub(super) file: &'a Path,
+    /// Its path in the document: empty at the top, or as `frames[3]`.
+    pub(super) path: String,
+    members: &'a Map<String, Value>,
+}
+
+impl<'a> Object<'a> {
+    /// The document as a whole.
+    pub(super) fn top(file: &'a Path, document: &'a Value) -> Result<Self> {
+        let members = document.as_object().ok_or_else(|| {
+            let what = format!("must be an object with a list `frames`, is {}", shown(document));
+            Error::file(file, what)
+        })?;
+        Ok(Object { file, path: String::new(), members })
+    }
+
+    /// The elements of the list `frames`, at least one.
+    pub(super) fn frames(&self) -> Result<Vec<Object<'a>>> {
+        let frames = self.get("frames").ok_or_else(|| self.error("frames", "is missing"))?;
+        let frames = frames.as_array().ok_or_else(|| self.error("frames", "must be a list"))?;
+        if frames.is_empty() {
+            return Err(self.error("frames", "is empty: there is nothing to load"));
+        }
+        let object = |(i, frame): (usize, &'a Value)| {
+            let path = format!("frames[{i}]");
+            let what = || Error::field(self.file, &path, format!("must be an object, is {}", shown(frame)));
+            let members = frame.as_object().ok_or_else(what)?;
+            Ok(Object { file: self.file, path, members })
+        };
+        frames.iter().enumerate().map(object).collect()
+    }
+
+    /// A member, unless it is absent or null.
+    pub(super) fn get(&self, name: &str) -> Option<&'a Value> {
+        self.members.get(name).filter(|value| !value.is_null())
+    }
+
+    /// A member that must be there.
+    pub(super) fn required(&self, name: &str) -> Result<&'a Value> {
+        self.get(name).ok_or_else(|| self.error(name, "is missing"))
+    }
+
+    /// The path of a member in the document.
+    pub(super) fn field(&self, name: &str) -> String {
+        if self.path.is_empty() { name.to_owned() } else { format!("{}.{name}", self.path) }
+    }
+
+    /// An error about a member.
+    pub(super) fn error(&self, name: &str, what: impl ToString) -> Error {
+        Error::field(self.file, self.field(name), what)
+    }
+
+    /// A finite number.
+    pub(super) fn number(&self, name: &str) -> Result<Option<f64>> {
+        let Some(value) = self.get(name) else { return Ok(None) };
+        match value.as_f64().filter(|x| x.is_finite()) {
+            Some(x) => Ok(Some(x)),
+            None => Err(self.error(name, format!("must be a finite number, is {}", shown(value)))),
+        }
+    }
+
+    /// A number above 0.
+    pub(super) fn positive(&self, name: &str) -> Result<Option<f64>> {
+        match self.number(name)? {
+            Some(x) if x <= 0.0 => Err(self.error(name, format!("must be above 0, is {x}"))),
+            other => Ok(other),
+        }
+    }
+
+    /// A string.
+    pub(super) fn text(&self, name: &str) -> Result<Option<&'a str>> {
+        let Some(value) = self.get(name) else { return Ok(None) };
+        let text = value.as_str().ok_or_else(|| self.error(name, format!("must be a string, is {}", shown(value))));
+        text.map(Some)
+    }
+
+    /// Yes or no; numbers count, as in Python.
+    pub(super) fn flag(&self, name: &str) -> Result<Option<bool>> {
+        let Some(value) = self.get(name) else { return Ok(None) };
+        let flag = value.as_bool().or_else(|| value.as_f64().map(|x| x != 0.0));
+        let flag = flag.ok_or_else(|| self.error(name, format!("must be true or false, is {}", shown(value))));
+        flag.map(Some)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn numbers_that_are_not_finite_become_strings_and_strings_stay() {
+        let text = "\u{feff}{\"NaN\\\"NaN\": [NaN, -Infinity, Infinity, \"Infinity \\\\\", 1.5], \"\u{e9}\": NaN}";
+        let expected = json!({ "NaN\"NaN": ["NaN", "-Infinity", "Infinity", "Infinity \\", 1.5], "\u{e9}": "NaN" });
+        assert_eq!(parse(text).unwrap(), expected);
+        assert!(parse("{\"a\": NaNa}").unwrap_err().to_string().contains("column 7"), "the place in the file");
+        assert!(parse("\"\\").is_err() && parse("").is_err());
+    }
+
+    #[test]
+    fn long_values_are_cut() {
+        assert_eq!(shown(&json!([1, 2])), "[1,2]");
+        let long = shown(&json!("\u{e9}".repeat(100)));
+        assert_eq!(long.chars().count(), SHOWN + 3);
+    }
+}

@@ -1,0 +1,67 @@
+//! What the tests of JSON formats share.
+
+use crate::dataset::capture::Capture;
+use crate::dataset::image::Image;
+use crate::error::Result;
+use serde_json::{Value, json};
+use std::path::Path;
+
+#[path = "../../../../tests/stability/damage.rs"]
+pub(super) mod damage;
+
+/// A camera 4 units up the z axis that looks down at the origin.
+pub(super) fn pose() -> Value {
+    json!([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]])
+}
+
+/// A list of frames of these paths, all with that pose.
+pub(super) fn frames(names: &[&str]) -> Value {
+    names.iter().map(|name| json!({ "file_path": name, "transform_matrix": pose() })).collect()
+}
+
+/// Writes a small image, and the folder that it is in.
+pub(super) fn picture(path: &Path, width: usize, height: usize) {
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    Image::new(width, height, 3).save_png(path).unwrap();
+}
+
+/// Removes a member.
+pub(super) fn remove(object: &mut Value, name: &str) {
+    object.as_object_mut().unwrap().remove(name).unwrap();
+}
+
+/// The one-line message of an error, which names the file.
+#[track_caller]
+pub(super) fn failure(result: Result<Capture>, file: &str) -> String {
+    let message = result.unwrap_err().to_string();
+    assert!(message.contains(&format!("{file}: ")) && !message.contains('\n'), "{message}");
+    message
+}
+
+#[track_caller]
+pub(super) fn says(message: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(message.contains(part), "no `{part}` in: {message}");
+    }
+}
+
+/// How many damaged files are tried: few, or what PROPTEST_CASES says.
+pub(super) fn cases() -> u32 {
+    std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(300)
+}
+
+/// What holds for any capture that was read from a file, damaged or not.
+#[track_caller]
+pub(super) fn is_whole(capture: &Capture) {
+    assert!(!capture.views.is_empty() && capture.applied.is_finite());
+    assert!(capture.aabb_scale.is_none_or(|scale| scale.is_finite() && scale > 0.0));
+    assert!(capture.points.iter().all(|point| point.position.is_finite()));
+    for view in &capture.views {
+        let camera = &view.camera;
+        let [fx, fy] = camera.focal;
+        assert!(camera.pose.is_finite() && camera.centre.iter().all(|x| x.is_finite()), "{view:?}");
+        assert!(fx.is_finite() && fy.is_finite() && (camera.width == 0 || fx > 0.0 && fy > 0.0), "{view:?}");
+        assert!(view.depth.as_ref().is_none_or(|(_, unit)| unit.is_finite() && *unit > 0.0));
+        assert!(view.sharpness.is_none_or(f64::is_finite) && !view.name.is_empty() && !view.field.is_empty());
+    }
+}

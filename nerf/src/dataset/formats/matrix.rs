@@ -1,0 +1,77 @@
+//! Matrices of transforms in JSON: three or four rows of four numbers.
+
+use super::json::{Object, shown};
+use crate::error::Result;
+use glam::{DAffine3, DMat3, DVec3};
+use serde_json::{Value, json};
+
+/// How far an entry of a pose may be from that of a rigid motion. Files carry rounding of about 1e-6.
+const RIGID_TOLERANCE: f64 = 1e-3;
+
+/// An affine transform, whatever it does, so long as it can be undone.
+pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>> {
+    let Some(matrix) = object.get(name) else { return Ok(None) };
+    let transform = rows(matrix).map_err(|what| object.error(name, what))?;
+    let determinant = transform.matrix3.determinant();
+    if !(determinant != 0.0 && determinant.is_finite()) {
+        return Err(object.error(name, format!("cannot be undone: its determinant is {determinant}")));
+    }
+    Ok(Some(transform))
+}
+
+/// A camera-to-world matrix, which must be a rotation and a translation.
+pub(super) fn pose(object: &Object<'_>, name: &str) -> Result<DAffine3> {
+    let matrix = object.required(name)?;
+    rows(matrix).and_then(rigid).map_err(|what| object.error(name, what))
+}
+
+/// Three or four rows of four finite numbers, the last of four `0 0 0 1`; or what is wrong with them.
+fn rows(matrix: &Value) -> std::result::Result<DAffine3, String> {
+    let shape = || format!("must be 3 or 4 rows of 4 numbers, is {}", shown(matrix));
+    let rows = matrix.as_array().filter(|rows| rows.len() == 3 || rows.len() == 4).ok_or_else(shape)?;
+    let mut m = [[0.0, 0.0, 0.0, 1.0]; 4];
+    for (r, row) in rows.iter().enumerate() {
+        let row = row.as_array().filter(|row| row.len() == 4).ok_or_else(shape)?;
+        for (c, value) in row.iter().enumerate() {
+            let finite = value.as_f64().filter(|x| x.is_finite());
+            let what = || format!("row {r}, column {c} is not a finite number: {}", shown(value));
+            m[r][c] = finite.ok_or_else(what)?;
+        }
+    }
+    if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| (value - expected).abs() > RIGID_TOLERANCE) {
+        return Err(format!("the last row must be 0 0 0 1, is {} {} {} {}", m[3][0], m[3][1], m[3][2], m[3][3]));
+    }
+    let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
+    Ok(DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) })
+}
+
+/// The transform if it is a rotation and a translation; or what is wrong with it.
+fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
+    let m = transform.matrix3;
+    let off =
+        |m: DMat3| (m.transpose() * m - DMat3::IDENTITY).to_cols_array().iter().any(|x| !(x.abs() <= RIGID_TOLERANCE));
+    if off(m) {
+        let scale = (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0;
+        if scale > 0.0 && scale.is_finite() && !off(m * scale.recip()) {
+            return Err(format!(
+                "the upper left 3x3 must be a rotation, but it also scales by {scale:.6}: divide these nine numbers by \
+                 that, and leave the position in the last column as it is"
+            ));
+        }
+        return Err("the upper left 3x3 must be a rotation, but its columns are not orthonormal to 1e-3".to_owned());
+    }
+    if m.determinant() < 0.0 {
+        return Err("the upper left 3x3 must be a rotation, but it mirrors: its determinant is -1".to_owned());
+    }
+    Ok(transform)
+}
+
+/// Three rows of four numbers, as [`affine`] and [`pose`] read them; a fourth row for a pose, as all programs write it.
+pub(super) fn to_json(transform: DAffine3, count: usize) -> Value {
+    let (m, t) = (transform.matrix3, transform.translation);
+    let row = |r: usize| match r {
+        0..3 => json!([m.x_axis[r], m.y_axis[r], m.z_axis[r], t[r]]),
+        _ => json!([0.0, 0.0, 0.0, 1.0]),
+    };
+    (0..count).map(row).collect()
+}

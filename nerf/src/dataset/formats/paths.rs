@@ -1,0 +1,128 @@
+//! Paths in JSON files: of Windows, without an ending, or with one in other letters.
+
+use super::json::Object;
+use crate::error::Result;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// Endings of image files, tried in this order where a name has none.
+const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+
+/// The longest path, in bytes: systems take no more than a few times as many.
+const LONGEST: usize = 1024;
+
+/// A path as it is used here: with slashes, and without a leading `./`. `name` is the field that holds it, for errors.
+pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<String> {
+    let path = value.as_str().ok_or_else(|| object.error(name, "must be a string"))?;
+    if path.len() > LONGEST || path.chars().any(char::is_control) {
+        let what = format!("must be a path, without control characters and of at most {LONGEST} bytes");
+        return Err(object.error(name, what));
+    }
+    // Written on Windows. A name with a backslash in it is not one that a dataset has.
+    let path = path.replace('\\', "/");
+    let mut rest = path.as_str();
+    while let Some(shorter) = rest.strip_prefix("./") {
+        rest = shorter.trim_start_matches('/');
+    }
+    match rest {
+        "" | "." => Err(object.error(name, "is empty, and must be the path of a file")),
+        rest => Ok(rest.to_owned()),
+    }
+}
+
+/// The ending of an image file, if the path has one that is known.
+pub(super) fn extension(path: &str) -> Option<&str> {
+    let (stem, given) = path.rsplit_once('.')?;
+    (!stem.is_empty() && EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(given))).then_some(given)
+}
+
+/// The file at this path from `folder`, or with an ending more, or with its ending in other letters, if there is one.
+pub(super) fn find(folder: &Path, path: &str) -> Option<PathBuf> {
+    let both = |stem: &str, extension: &str| {
+        [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()].map(|extension| format!("{stem}.{extension}"))
+    };
+    let others: Vec<String> = match extension(path) {
+        Some(given) => both(&path[..path.len() - given.len() - 1], given).into(),
+        None => EXTENSIONS.iter().flat_map(|extension| both(path, extension)).collect(),
+    };
+    let names = std::iter::once(path.to_owned()).chain(others);
+    names.map(|name| folder.join(name)).find(|path| path.is_file())
+}
+
+/// The path of a view's image for a file to be written: its name, with the ending that the image has.
+pub(super) fn written(name: &str, image: Option<&Path>) -> String {
+    let Some(ending) = image.and_then(Path::to_str).and_then(extension) else { return name.to_owned() };
+    match extension(name) {
+        None => format!("{name}.{ending}"),
+        Some(given) if given.eq_ignore_ascii_case(ending) => {
+            format!("{}{ending}", &name[..name.len() - given.len()])
+        }
+        Some(_) => name.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn paths_are_normal() {
+        let (document, file) = (json!({}), Path::new("t.json"));
+        let top = Object::top(file, &document).unwrap();
+        let of = |path: &str| normal(&top, "file_path", &json!(path));
+        for (path, expected) in [
+            ("./images/0.png", "images/0.png"),
+            (".\\images\\0.png", "images/0.png"),
+            ("././/images/0.png", "images/0.png"),
+            ("../images/0", "../images/0"),
+            ("/data/0.png", "/data/0.png"),
+            (".hidden", ".hidden"),
+        ] {
+            assert_eq!(of(path).unwrap(), expected);
+        }
+        for path in ["", "./", ".", "a\nb", "a\0", &"x".repeat(2000)] {
+            assert!(of(path).unwrap_err().to_string().starts_with("t.json: `file_path`: "), "{path:?}");
+        }
+        assert!(normal(&top, "file_path", &json!(3)).unwrap_err().to_string().contains("must be a string"));
+    }
+
+    #[test]
+    fn files_are_found() {
+        let folder = tempfile::tempdir().unwrap();
+        let found = |path: &str| find(folder.path(), path).map(|p| p.strip_prefix(folder.path()).unwrap().to_owned());
+        for name in ["a.png", "b.JPG", "c.jpeg", "d.1.WEBP", "e.PNG", "f.png", "f.jpg", "depth.npy"] {
+            std::fs::write(folder.path().join(name), b"").unwrap();
+        }
+        for (path, expected) in [
+            ("a.png", "a.png"),
+            ("a", "a.png"),
+            ("a.PNG", "a.png"),
+            ("b", "b.JPG"),
+            ("b.jpg", "b.JPG"),
+            ("b.Jpg", "b.JPG"),
+            ("c", "c.jpeg"),
+            ("d.1", "d.1.WEBP"),
+            ("e", "e.PNG"),
+            ("f", "f.png"),
+            ("f.jpg", "f.jpg"),
+            ("depth.npy", "depth.npy"),
+        ] {
+            assert_eq!(found(path), Some(expected.into()), "{path}");
+        }
+        assert_eq!(found("a.jpg"), None, "another image");
+        assert_eq!(found("g"), None);
+        let whole = folder.path().join("a");
+        assert_eq!(find(Path::new("elsewhere"), whole.to_str().unwrap()), Some(folder.path().join("a.png")));
+    }
+
+    #[test]
+    fn written_paths_have_the_ending_of_the_image() {
+        let of = |name, image| written(name, Some(Path::new(image)));
+        assert_eq!(of("train/r_0", "/d/train/r_0.png"), "train/r_0.png");
+        assert_eq!(of("r.5", "/d/r.5.JPG"), "r.5.JPG");
+        assert_eq!(of("r.jpg", "/d/r.JPG"), "r.JPG");
+        assert_eq!(of("r.jpg", "/d/r.jpg"), "r.jpg");
+        assert_eq!(written("train/r_0", None), "train/r_0");
+    }
+}

@@ -1,0 +1,231 @@
+//! `transforms.json`, which instant-ngp (Mueller et al. 2022) and nerfstudio (Tancik et al. 2023) read and write.
+//!
+//! Camera parameters stand at the top of the file or in its frames, where those of a frame count. Poses are as the file has
+//! them: instant-ngp's `scale` and `offset` only say how it puts the scene into its unit cube, and nerfstudio orients and
+//! scales poses when it reads them. `scale` and other fields that do not bear on cameras pass.
+
+use super::frames::{Dialect, views};
+use super::json::{self, Object, shown};
+use super::{intrinsics, lens, matrix, paths, ply};
+use crate::camera::lens::Lens;
+use crate::camera::pinhole::Camera;
+use crate::dataset::capture::{Capture, Format, View};
+use crate::dataset::frames::Split;
+use crate::error::{Error, Result};
+use crate::pictures::write_atomic;
+use glam::DAffine3;
+use serde_json::{Map, Value};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+const FILE: &str = "transforms.json";
+
+/// Where points are written: nerfstudio's name.
+const POINTS: &str = "sparse_pc.ply";
+
+/// Whether the folder holds a file of this format.
+#[allow(dead_code, reason = "the loader is yet to call it")]
+pub(crate) fn detect(folder: &Path) -> bool {
+    folder.join(FILE).is_file()
+}
+
+/// Reads the file. A photograph is in the split whose list of file names has it; one that is listed for validation and for
+/// tests, as nerfstudio wants it where there is one set for both, is for tests.
+///
+/// # Errors
+/// If the file cannot be read, lacks a field or has one that is wrong or cannot be followed; if a mask, a file of depths or
+/// the file of points is damaged or, but for that of points, absent.
+pub fn read(folder: &Path) -> Result<Capture> {
+    let file = folder.join(FILE);
+    let document = json::read(&file)?;
+    let top = Object::top(&file, &document)?;
+    let mut views = views(&top, folder, Dialect::Transforms)?;
+    read_splits(&top, &mut views)?;
+    let scale = top.positive("applied_scale")?.unwrap_or(1.0);
+    let transform = matrix::affine(&top, "applied_transform")?.unwrap_or(DAffine3::IDENTITY);
+    // nerfstudio scales what it has transformed.
+    let applied = DAffine3 { matrix3: scale * transform.matrix3, translation: scale * transform.translation };
+    let aabb_scale = top.positive("aabb_scale")?;
+    let points = match top.get("ply_file_path") {
+        Some(path) => folder.join(paths::normal(&top, "ply_file_path", path)?),
+        None => PathBuf::new(),
+    };
+    // Its points are in the coordinates of the file: nerfstudio has transformed them along with the cameras.
+    let points = if points.is_file() { ply::read(&points)? } else { vec![] };
+    Ok(Capture { folder: folder.to_owned(), file, format: Format::Transforms, views, points, aabb_scale, applied })
+}
+
+/// The field that lists the photographs of a split.
+fn list(split: Split) -> String {
+    format!("{split}_filenames")
+}
+
+fn read_splits(top: &Object<'_>, views: &mut [View]) -> Result<()> {
+    let mut named: HashMap<&str, Vec<usize>> = HashMap::new();
+    views.iter().enumerate().for_each(|(i, view)| named.entry(&view.name).or_default().push(i));
+    let mut splits: Vec<Option<Split>> = vec![None; views.len()];
+    for split in Split::ALL {
+        let field = list(split);
+        let Some(value) = top.get(&field) else { continue };
+        let what = || top.error(&field, format!("must be a list of file paths, is {}", shown(value)));
+        for (i, name) in value.as_array().ok_or_else(what)?.iter().enumerate() {
+            let field = format!("{field}[{i}]");
+            let name = paths::normal(top, &field, name)?;
+            let Some(places) = named.get(name.as_str()) else {
+                return Err(top.error(&field, format!("no frame has the file_path {name}")));
+            };
+            for &place in places {
+                if split != Split::Train && splits[place] == Some(Split::Train) {
+                    let what = format!("{name} is in train_filenames too: take it out of one, or results mean nothing");
+                    return Err(top.error(&field, what));
+                }
+                splits[place] = Some(split);
+            }
+        }
+    }
+    views.iter_mut().zip(splits).for_each(|(view, split)| view.split = split);
+    Ok(())
+}
+
+/// Writes `transforms.json` into `folder`, as nerfstudio reads it, and `sparse_pc.ply` if there are points. Images, masks
+/// and depths are to be copied to where they were in the capture's folder. What a photograph says of the
+/// [bounds](View::bounds) of its scene has no place in the format.
+///
+/// # Errors
+/// If there are no views, if one's camera is not whole, or if a file cannot be written.
+pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
+    let file = folder.join(FILE);
+    if capture.views.is_empty() {
+        return Err(Error::file(&file, "cannot be written: there are no photographs"));
+    }
+    for view in &capture.views {
+        check(view, &file)?;
+    }
+    let whole = capture.applied.is_finite() && capture.aabb_scale.is_none_or(f64::is_finite);
+    if !whole || capture.points.iter().any(|point| !point.position.is_finite()) {
+        let what = "cannot be written: the transform before, the box or a point has a number that is not finite";
+        return Err(Error::file(&file, what));
+    }
+    let models = models(&capture.views);
+    let intrinsics = capture.views.iter().zip(&models).map(|(view, model)| {
+        let mut out = Map::new();
+        intrinsics::write(&view.camera, model, &mut out);
+        out
+    });
+    let intrinsics: Vec<_> = intrinsics.collect();
+    let shared = intrinsics.iter().all(|other| *other == intrinsics[0]);
+    let mut top = if shared { intrinsics[0].clone() } else { Map::new() };
+    let unit = shared_unit(&capture.views);
+    if let Some(unit) = unit {
+        top.insert("depth_unit_scale_factor".into(), unit.into());
+    }
+    let mut frames = vec![];
+    for (view, own) in capture.views.iter().zip(intrinsics) {
+        let mut frame = if shared { Map::new() } else { own };
+        frame.insert("file_path".into(), file_path(view).into());
+        frame.insert("transform_matrix".into(), matrix::to_json(view.camera.pose, 4));
+        if let Some(mask) = &view.mask {
+            frame.insert("mask_path".into(), relative(capture, folder, mask, &file)?.into());
+        }
+        if let Some((depth, own)) = &view.depth {
+            frame.insert("depth_file_path".into(), relative(capture, folder, depth, &file)?.into());
+            if unit.is_none() {
+                frame.insert("depth_unit_scale_factor".into(), (*own).into());
+            }
+        }
+        if let Some(sharpness) = view.sharpness.filter(|sharpness| sharpness.is_finite()) {
+            frame.insert("sharpness".into(), sharpness.into());
+        }
+        frames.push(Value::Object(frame));
+    }
+    top.insert("frames".into(), frames.into());
+    write_splits(&capture.views, &mut top);
+    if capture.applied != DAffine3::IDENTITY {
+        // With its scale in it: poses and points are scaled alike, which nerfstudio's `applied_scale` does not say.
+        top.insert("applied_transform".into(), matrix::to_json(capture.applied, 3));
+    }
+    if let Some(scale) = capture.aabb_scale {
+        top.insert("aabb_scale".into(), scale.into());
+    }
+    if !capture.points.is_empty() {
+        write_atomic(folder.join(POINTS), &ply::to_bytes(&capture.points))?;
+        top.insert("ply_file_path".into(), POINTS.into());
+    }
+    json::write(&file, top)
+}
+
+/// # Errors
+/// If a number of the camera is not finite, or it has no size.
+fn check(view: &View, file: &Path) -> Result<()> {
+    let Camera { width, height, focal, centre, lens, pose } = &view.camera;
+    let mut coefficients = Map::new();
+    lens::write(lens, lens::model(lens), &mut coefficients);
+    let numbers = focal.iter().chain(centre).all(|x| x.is_finite()) && pose.is_finite();
+    let unit = view.depth.as_ref().is_none_or(|(_, unit)| unit.is_finite());
+    // JSON has no other numbers than finite ones: the rest becomes null.
+    if !numbers || !unit || coefficients.values().any(Value::is_null) || *width == 0 || *height == 0 {
+        let what = format!("cannot be written: the camera of {} has no size or a number that is not finite", view.name);
+        return Err(Error::file(file, what));
+    }
+    let [w, h] = [*width as f64, *height as f64];
+    let whole = [w / (2.0 * std::f64::consts::PI), h / std::f64::consts::PI];
+    if *lens == Lens::Equirectangular && (*focal != whole || *centre != [0.5 * w, 0.5 * h]) {
+        let what = format!("cannot be written: the panorama {} does not show all directions", view.name);
+        return Err(Error::file(file, what));
+    }
+    Ok(())
+}
+
+/// The camera model of each view. nerfstudio reads one for the whole file: a pinhole among OPENCV's is one without
+/// distortion.
+fn models(views: &[View]) -> Vec<&'static str> {
+    let mut models: Vec<_> = views.iter().map(|view| lens::model(&view.camera.lens)).collect();
+    if models.contains(&"OPENCV") {
+        models.iter_mut().filter(|model| **model == "PINHOLE").for_each(|model| *model = "OPENCV");
+    }
+    models
+}
+
+/// The one unit of all depths, if there are any.
+fn shared_unit(views: &[View]) -> Option<f64> {
+    let mut units = views.iter().filter_map(|view| Some(view.depth.as_ref()?.1));
+    let first = units.next()?;
+    units.all(|unit| unit == first).then_some(first)
+}
+
+fn file_path(view: &View) -> String {
+    paths::written(&view.name, view.image.as_deref())
+}
+
+/// The path of a file that belongs to the capture, as it is written.
+fn relative(capture: &Capture, folder: &Path, path: &Path, file: &Path) -> Result<String> {
+    let inside = path.strip_prefix(&capture.folder).or_else(|_| path.strip_prefix(folder)).unwrap_or(path);
+    let text = inside.to_str().ok_or_else(|| {
+        Error::file(file, format!("cannot be written: the path {} is not Unicode; rename the file", path.display()))
+    })?;
+    Ok(if cfg!(windows) { text.replace('\\', "/") } else { text.to_owned() })
+}
+
+/// Writes the lists of the splits, if there are any. nerfstudio then wants all: where there is no set for validation it is
+/// that for tests, which [`read`] knows.
+fn write_splits(views: &[View], top: &mut Map<String, Value>) {
+    if views.iter().all(|view| view.split.is_none()) {
+        return;
+    }
+    let of = |split: Split| -> Vec<String> {
+        views.iter().filter(|view| view.split == Some(split)).map(file_path).collect()
+    };
+    for split in Split::ALL {
+        let mut names = of(split);
+        if names.is_empty() && split == Split::Val {
+            names = of(Split::Test);
+        }
+        top.insert(list(split), names.into());
+    }
+}
+
+#[cfg(test)]
+mod tests;
+
+#[cfg(test)]
+mod writing;

@@ -1,0 +1,291 @@
+use super::*;
+use crate::dataset::capture::Point;
+use crate::dataset::formats::kit::{cases, damage, failure, frames, is_whole, picture, pose, remove, says};
+use glam::DVec3;
+use proptest::prelude::*;
+use serde_json::json;
+
+fn document() -> Value {
+    json!({ "fl_x": 10.0, "w": 8, "h": 6, "frames": frames(&["./images/0.png", "images/1.png", "images/2.png"]) })
+}
+
+/// A folder with the first two images, and the document after a change.
+fn folder(change: impl FnOnce(&mut Value)) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    picture(&folder.path().join("images/0.png"), 8, 6);
+    picture(&folder.path().join("images/1.png"), 8, 6);
+    let mut document = document();
+    change(&mut document);
+    std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+    folder
+}
+
+#[track_caller]
+fn good(change: impl FnOnce(&mut Value)) -> Capture {
+    let capture = read(folder(change).path()).unwrap();
+    is_whole(&capture);
+    capture
+}
+
+#[track_caller]
+fn fails(change: impl FnOnce(&mut Value), parts: &[&str]) {
+    says(&failure(read(folder(change).path()), FILE), parts);
+}
+
+#[test]
+fn a_folder_is_recognised() {
+    assert!(detect(folder(|_| {}).path()));
+    assert!(!detect(tempfile::tempdir().unwrap().path()));
+}
+
+#[test]
+fn views_are_in_order_and_know_where_they_are() {
+    let folder = folder(|_| {});
+    let capture = read(folder.path()).unwrap();
+    let names: Vec<_> = capture.views.iter().map(|view| (view.name.as_str(), view.field.as_str())).collect();
+    let expected = [("images/0.png", "frames[0]"), ("images/1.png", "frames[1]"), ("images/2.png", "frames[2]")];
+    assert_eq!(names, expected);
+    assert_eq!(capture.views[1].image, Some(folder.path().join("images/1.png")));
+    assert_eq!(capture.views[2].image, None, "absent");
+    assert_eq!(capture.views[0].camera.pose.translation, DVec3::new(0.0, 0.0, 4.0));
+    assert_eq!((capture.format, capture.file), (Format::Transforms, folder.path().join(FILE)));
+    assert_eq!((capture.points.len(), capture.aabb_scale, capture.applied), (0, None, DAffine3::IDENTITY));
+}
+
+#[test]
+fn poses_are_as_they_are_given() {
+    let turned = json!([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]);
+    let capture = good(|d| d["frames"][1]["transform_matrix"] = turned);
+    let pose = capture.views[1].camera.pose;
+    assert_eq!((pose.translation, pose.matrix3.x_axis), (DVec3::new(1.0, 2.0, 3.0), DVec3::Y));
+    // instant-ngp's cube is no matter of the cameras.
+    let other = good(|d| {
+        (d["scale"], d["offset"], d["aabb"]) = (json!(0.5), json!([0.1, 0.2, 0.3]), json!([[0, 0, 0], [2, 2, 2]]));
+    });
+    assert_eq!(other.views[0].camera, good(|_| {}).views[0].camera);
+}
+
+#[test]
+fn a_pose_that_is_none_is_named() {
+    let bad = |value: Value, part: &str| {
+        fails(|d| d["frames"][1]["transform_matrix"] = value, &["`frames[1].transform_matrix`: ", part]);
+    };
+    let with = |row: usize, column: usize, value: f64| {
+        let mut pose = pose();
+        pose[row][column] = json!(value);
+        pose
+    };
+    for value in [json!("identity"), json!([[["deep"]]]), json!([[1, 0, 0, 0], [0, 1, 0, 0]]), json!([[1], [1], [1]])] {
+        bad(value, "must be 3 or 4 rows of 4 numbers");
+    }
+    bad(with(0, 0, 1.01), "not orthonormal");
+    bad(with(0, 1, 0.01), "not orthonormal");
+    bad(with(1, 1, 1e200), "not orthonormal");
+    bad(with(2, 2, -1.0), "mirrors");
+    bad(with(3, 3, 0.0), "the last row must be 0 0 0 1, is 0 0 0 0");
+    bad(with(3, 1, 0.5), "the last row must be 0 0 0 1");
+    bad(json!([[2, 0, 0, 0], [0, 0, -2, 0], [0, 2, 0, 4]]), "also scales by 2.000000: divide");
+    bad(json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]), "not orthonormal");
+    bad(json!([[1, 0, 0, null], [0, 1, 0, 0], [0, 0, 1, 0]]), "row 0, column 3 is not a finite number: null");
+    for value in ["NaN", "Infinity", "-Infinity"] {
+        let folder = folder(|_| {});
+        let text = document().to_string().replacen("4.0", value, 1);
+        std::fs::write(folder.path().join(FILE), text).unwrap();
+        let expected = format!("row 2, column 3 is not a finite number: \"{value}\"");
+        says(&failure(read(folder.path()), FILE), &["`frames[0].transform_matrix`", &expected]);
+    }
+    assert!(
+        good(|d| d["frames"][1]["transform_matrix"] = with(0, 1, 1e-4)).views[1].camera.pose.matrix3.y_axis.x == 1e-4
+    );
+    fails(|d| remove(&mut d["frames"][1], "transform_matrix"), &["`frames[1].transform_matrix`: is missing"]);
+}
+
+#[test]
+fn documents_that_are_none_are_located() {
+    let of = |text: &str| {
+        let folder = folder(|_| {});
+        std::fs::write(folder.path().join(FILE), text).unwrap();
+        failure(read(folder.path()), FILE)
+    };
+    says(&of("{\n  \"frames\": [}\n"), &["is not valid JSON", "line 2 column 14"]);
+    says(&of(""), &["is not valid JSON"]);
+    says(&of("[]"), &["must be an object"]);
+    says(&failure(read(tempfile::tempdir().unwrap().path()), FILE), &["cannot be read"]);
+    fails(|d| remove(d, "frames"), &["`frames`: is missing"]);
+    fails(|d| d["frames"] = json!([]), &["`frames`: is empty"]);
+    fails(|d| d["frames"] = json!({}), &["`frames`: must be a list"]);
+    fails(|d| d["frames"][1] = json!(7), &["`frames[1]`: must be an object, is 7"]);
+    fails(|d| remove(&mut d["frames"][1], "file_path"), &["`frames[1].file_path`: is missing"]);
+    fails(|d| d["frames"][1]["file_path"] = json!(3), &["`frames[1].file_path`: must be a string"]);
+}
+
+#[test]
+fn images_are_found_however_their_path_is_written() {
+    for path in ["images/0.png", "./images/0.png", ".\\images\\0.png", "images/0", "images/0.PNG"] {
+        let folder = folder(|d| d["frames"][0]["file_path"] = json!(path));
+        let view = &read(folder.path()).unwrap().views[0];
+        assert_eq!(view.image, Some(folder.path().join("images/0.png")), "{path}");
+        assert!(view.name.starts_with("images/0"));
+    }
+    let (elsewhere, folder) = (folder(|_| {}), folder(|_| {}));
+    let mut document = document();
+    let path = elsewhere.path().join("images/1.png");
+    document["frames"][0]["file_path"] = json!(path);
+    std::fs::write(folder.path().join(FILE), document.to_string()).unwrap();
+    assert_eq!(read(folder.path()).unwrap().views[0].image, Some(path));
+}
+
+#[test]
+fn masks_depths_and_sharpness_are_read() {
+    let folder = folder(|d| {
+        let own = json!({ "mask_path": "masks/0.png", "depth_file_path": "depth/0.png", "sharpness": 31.5 });
+        d["frames"][0].as_object_mut().unwrap().extend(own.as_object().unwrap().clone());
+        d["frames"][1]["depth_file_path"] = json!(".\\depth\\1.npy");
+        // Of an absent image.
+        d["frames"][2]["mask_path"] = json!("masks/2.png");
+    });
+    let at = |name: &str| folder.path().join(name);
+    says(&failure(read(folder.path()), FILE), &["`frames[0].mask_path`: there is no file masks/0.png"]);
+    picture(&at("masks/0.png"), 8, 6);
+    says(&failure(read(folder.path()), FILE), &["`frames[0].depth_file_path`: there is no file depth/0.png"]);
+    picture(&at("depth/0.png"), 8, 6);
+    std::fs::write(at("depth/1.npy"), b"").unwrap();
+    let views = read(folder.path()).unwrap().views;
+    assert_eq!((views[0].mask.clone(), views[0].sharpness), (Some(at("masks/0.png")), Some(31.5)));
+    assert_eq!(views[0].depth, Some((at("depth/0.png"), 1e-3)));
+    assert_eq!(views[1].depth, Some((at("depth/1.npy"), 1.0)));
+    assert_eq!((views[1].mask.clone(), views[2].mask.clone(), views[1].sharpness), (None, None, None));
+    let with = |name: &str, value: Value| {
+        let mut document: Value = serde_json::from_slice(&std::fs::read(at(FILE)).unwrap()).unwrap();
+        document[name] = value;
+        document["frames"][2]["depth_path"] = json!("depth/0.png");
+        document["integer_depth_scale"] = json!(0.02);
+        let text = document.to_string();
+        let other = tempfile::tempdir_in(folder.path()).unwrap();
+        std::fs::write(other.path().join(FILE), text.replace("masks/", "../masks/").replace("depth/", "../depth/"))
+            .unwrap();
+        let text = std::fs::read_to_string(other.path().join(FILE)).unwrap().replace("images/", "../images/");
+        std::fs::write(other.path().join(FILE), text.replace(".\\\\depth\\\\", "../depth/")).unwrap();
+        read(other.path())
+            .map(|capture| capture.views.iter().map(|v| v.depth.as_ref().map(|d| d.1)).collect::<Vec<_>>())
+    };
+    let units = |name, value| with(name, value).unwrap();
+    assert_eq!(units("depth_unit_scale_factor", json!(0.25)), [Some(0.25), Some(0.25), Some(0.02)]);
+    assert_eq!(units("enable_depth_loading", json!(false)), [Some(1e-3), Some(1.0), None]);
+    let message = with("depth_unit_scale_factor", json!(0)).unwrap_err().to_string();
+    says(&message, &["`depth_unit_scale_factor`: must be above 0, is 0"]);
+    fails(|d| d["frames"][0]["sharpness"] = json!("very"), &["`frames[0].sharpness`: must be a finite number"]);
+}
+
+#[test]
+fn lists_of_names_are_splits() {
+    let splits = |change: fn(&mut Value)| good(change).views.iter().map(|view| view.split).collect::<Vec<_>>();
+    assert_eq!(splits(|_| {}), [None; 3]);
+    let [train, val, test] = Split::ALL.map(Some);
+    let all = splits(|d| {
+        d["train_filenames"] = json!(["images/0.png"]);
+        d["val_filenames"] = json!([".\\images\\1.png"]);
+        d["test_filenames"] = json!(["./images/2.png"]);
+    });
+    assert_eq!(all, [train, val, test]);
+    let both = splits(|d| {
+        d["train_filenames"] = json!(["images/2.png"]);
+        d["val_filenames"] = json!(["images/1.png"]);
+        d["test_filenames"] = json!(["images/1.png"]);
+    });
+    assert_eq!(both, [None, test, train]);
+    fails(|d| d["val_filenames"] = json!("images/0.png"), &["`val_filenames`: must be a list"]);
+    fails(|d| d["val_filenames"] = json!([7]), &["`val_filenames[0]`: must be a string"]);
+    fails(|d| d["test_filenames"] = json!(["images/0.png", "7.png"]), &["`test_filenames[1]`: no frame has", "7.png"]);
+    let twice = |d: &mut Value| {
+        d["train_filenames"] = json!(["images/0.png"]);
+        d["test_filenames"] = json!(["images/0.png"]);
+    };
+    fails(twice, &["`test_filenames[0]`: images/0.png is in train_filenames too"]);
+}
+
+#[test]
+fn the_transform_before_and_its_scale_are_combined() {
+    let applied =
+        |fields: Value| good(|d| d.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone())).applied;
+    // nerfstudio's, from COLMAP's axes.
+    let three = json!([[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]);
+    let mut four = three.clone();
+    four.as_array_mut().unwrap().push(json!([0, 0, 0, 1]));
+    for transform in [three, four] {
+        let once = applied(json!({ "applied_transform": transform }));
+        assert_eq!(once.transform_point3(DVec3::new(1.0, 2.0, 3.0)), DVec3::new(1.5, 3.0, -2.0));
+        let scaled = applied(json!({ "applied_transform": transform, "applied_scale": 2.0 }));
+        assert_eq!(scaled.transform_point3(DVec3::new(1.0, 2.0, 3.0)), DVec3::new(3.0, 6.0, -4.0));
+    }
+    assert_eq!(applied(json!({ "applied_scale": 4 })), DAffine3::from_scale(DVec3::splat(4.0)));
+    fails(|d| d["applied_scale"] = json!(0), &["`applied_scale`: must be above 0"]);
+    fails(|d| d["applied_transform"] = json!([[1, 2]]), &["`applied_transform`: must be 3 or 4 rows"]);
+    let flat = json!([[1, 0, 0, 0], [0, 0, 0, 0], [0, -1, 0, 0]]);
+    fails(|d| d["applied_transform"] = flat, &["`applied_transform`: cannot be undone"]);
+}
+
+#[test]
+fn the_box_is_read_and_harmless_fields_pass() {
+    assert_eq!(good(|d| d["aabb_scale"] = json!(4)).aabb_scale, Some(4.0));
+    fails(|d| d["aabb_scale"] = json!(-4), &["`aabb_scale`: must be above 0, is -4"]);
+    fails(|d| d["aabb_scale"] = json!([4]), &["`aabb_scale`: must be a finite number"]);
+    let harmless = json!({ "n_frames": 2, "up": [0, 0, 1], "white_transparent": true, "orientation_override": "none",
+        "auto_scale_poses_override": false, "colmap_im_id": 3, "sharpness_discard_threshold": 1, "rotation": 0.1,
+        "from_na": true, "ply_file_path": "absent.ply", "anything": { "else": [1] } });
+    let capture = good(|d| {
+        d.as_object_mut().unwrap().extend(harmless.as_object().unwrap().clone());
+        d["frames"][0]["colmap_im_id"] = json!(17);
+    });
+    assert_eq!(
+        capture.views.iter().map(|v| &v.camera).collect::<Vec<_>>(),
+        good(|_| {}).views.iter().map(|v| &v.camera).collect::<Vec<_>>()
+    );
+    assert_eq!(capture.points, []);
+}
+
+#[test]
+fn the_fox_is_read() {
+    let fox = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/fox"));
+    if !fox.is_dir() {
+        println!("skipped: there is no {}", fox.display());
+        return;
+    }
+    let capture = read(fox).unwrap();
+    is_whole(&capture);
+    assert_eq!((capture.views.len(), capture.aabb_scale), (67, Some(4.0)));
+    assert_eq!(capture.views.iter().filter(|view| view.image.is_some()).count(), 50);
+    let Camera { width, height, focal, centre, lens, .. } = capture.views[0].camera;
+    assert_eq!((width, height, focal, centre), (1080, 1920, [1375.52, 1374.49], [554.558, 965.268]));
+    let k = [0.0578421, -0.0805099, 0.0, 0.0, 0.0, 0.0];
+    assert_eq!(lens, Lens::Brown { k, p: [-0.000980296, 0.00015575] });
+    assert_eq!(capture.views[0].sharpness, Some(31.752987436300323));
+    assert_eq!(capture.views[0].camera.pose.translation.x, 3.168359405609479);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: cases(), ..ProptestConfig::default() })]
+
+    #[test]
+    fn damaged_files_are_errors_that_name_them(damage in damage::damage(), points in any::<bool>()) {
+        let folder = folder(|d| {
+            d["train_filenames"] = json!(["images/0.png"]);
+            d["applied_transform"] = json!([[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]);
+            d["k1"] = json!(0.1);
+            d["camera_model"] = json!("OPENCV");
+            d["ply_file_path"] = json!("points.ply");
+            d["frames"][0]["mask_path"] = json!("images/1.png");
+        });
+        let position = DVec3::new(0.1, 0.2, 0.3);
+        let bytes = ply::to_bytes(&[Point { position, color: [1, 2, 3], error: 0.5, views: 3 }; 3]);
+        std::fs::write(folder.path().join("points.ply"), &bytes).unwrap();
+        prop_assert_eq!(read(folder.path()).unwrap().points.len(), 3);
+        let name = if points { "points.ply" } else { FILE };
+        let whole = std::fs::read(folder.path().join(name)).unwrap();
+        std::fs::write(folder.path().join(name), damage::damaged(&whole, &damage)).unwrap();
+        match read(folder.path()) {
+            Ok(capture) => is_whole(&capture),
+            Err(error) => damage::clear(error, folder.path().to_str().unwrap()),
+        }
+    }
+}
