@@ -297,8 +297,8 @@ mod tests {
             ("float y", "list uchar int y", "not understood"),
             ("uint8 red", "float red", "not of the type uchar"),
             ("uint8 red", "uint8 rot", "only some of the properties red, green, blue"),
-            ("-1.25", "nan", "vertex 0 whose place is not finite"),
-            ("-1.25", "x", "vertex 0 without a number for y"),
+            ("-1.250000", "nan", "vertex 0 whose place is not finite"),
+            ("-1.250000", "x", "vertex 0 without a number for y"),
             ("255", "256", "a colour of 256"),
             ("end_header", "end", "not understood: `end`"),
         ] {

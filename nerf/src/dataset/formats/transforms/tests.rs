@@ -263,29 +263,32 @@ fn the_fox_is_read() {
     assert_eq!(capture.views[0].camera.pose.translation.x, 3.168359405609479);
 }
 
-proptest! {
-    #![proptest_config(ProptestConfig { cases: cases(), ..ProptestConfig::default() })]
-
-    #[test]
-    fn damaged_files_are_errors_that_name_them(damage in damage::damage(), points in any::<bool>()) {
-        let folder = folder(|d| {
-            d["train_filenames"] = json!(["images/0.png"]);
-            d["applied_transform"] = json!([[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]);
-            d["k1"] = json!(0.1);
-            d["camera_model"] = json!("OPENCV");
-            d["ply_file_path"] = json!("points.ply");
-            d["frames"][0]["mask_path"] = json!("images/1.png");
-        });
-        let position = DVec3::new(0.1, 0.2, 0.3);
-        let bytes = ply::to_bytes(&[Point { position, color: [1, 2, 3], error: 0.5, views: 3 }; 3]);
-        std::fs::write(folder.path().join("points.ply"), &bytes).unwrap();
-        prop_assert_eq!(read(folder.path()).unwrap().points.len(), 3);
-        let name = if points { "points.ply" } else { FILE };
-        let whole = std::fs::read(folder.path().join(name)).unwrap();
-        std::fs::write(folder.path().join(name), damage::damaged(&whole, &damage)).unwrap();
-        match read(folder.path()) {
+#[test]
+fn damaged_files_are_errors_that_name_them() {
+    let folder = folder(|d| {
+        d["train_filenames"] = json!(["images/0.png"]);
+        d["applied_transform"] = json!([[1, 0, 0, 0.5], [0, 0, 1, 0], [0, -1, 0, 0]]);
+        (d["camera_model"], d["k1"], d["is_fisheye"]) = (json!("OPENCV"), json!(0.1), json!(false));
+        (d["ply_file_path"], d["aabb_scale"]) = (json!("points.ply"), json!(4));
+        d["frames"][0]["mask_path"] = json!("images/1.png");
+        (d["frames"][1]["fl_x"], d["frames"][1]["camera_angle_y"]) = (json!(10), json!(0.8));
+    });
+    let point = Point { position: DVec3::new(0.1, 0.2, 0.3), color: [1, 2, 3], error: 0.5, views: 3 };
+    let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+        end_header\n0.5 1 2\n3 -4 5\n";
+    let points = [ply::to_bytes(&[point; 3]), text.as_bytes().to_vec()];
+    let files = [FILE, "points.ply", "points.ply"].map(|name| folder.path().join(name));
+    let whole = [std::fs::read(&files[0]).unwrap(), points[0].clone(), points[1].clone()];
+    std::fs::write(&files[1], &whole[1]).unwrap();
+    assert_eq!(read(folder.path()).unwrap().points, [point; 3]);
+    let config = ProptestConfig { cases: cases(), ..ProptestConfig::default() };
+    proptest!(config, |(damage in damage::damage(), which in 0..3_usize)| {
+        std::fs::write(&files[which], damage::damaged(&whole[which], &damage)).unwrap();
+        let result = read(folder.path());
+        std::fs::write(&files[which], &whole[which]).unwrap();
+        match result {
             Ok(capture) => is_whole(&capture),
             Err(error) => damage::clear(error, folder.path().to_str().unwrap()),
         }
-    }
+    });
 }
