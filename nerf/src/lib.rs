@@ -15,6 +15,7 @@ pub mod dataset;
 pub mod encoding;
 mod error;
 pub mod field;
+pub(crate) mod files;
 pub mod kind;
 pub mod losses;
 pub mod model;
@@ -38,11 +39,12 @@ pub use field::{
     Classic, ClassicConfig, Density, DensityActivation, Field, FieldConfig, Fields, Instant, InstantConfig,
 };
 pub use field::{Seen, Voxel, VoxelConfig};
+pub use files::write_atomic;
 pub use glam;
 pub use kind::{Family, Kind, Part, Site, register};
 pub use losses::{Loss, Term, TermConfig, Terms};
 pub use model::{Config, Extent, GroupConfig, Model, Preset};
-pub use pictures::{quantise, write_atomic};
+pub use pictures::quantise;
 pub use random::Jitter;
 pub use rendering::{DenseView, Picture};
 pub use sampling::{Limits, Load, Progress, Purpose, Sampled, Sampler, SamplerConfig, Samplers};

@@ -2,7 +2,7 @@
 
 use super::config::Config;
 use super::{Extent, Model};
-use crate::pictures::output::write_atomic;
+use crate::files::write_atomic;
 use crate::{Error, Result};
 use std::collections::HashMap;
 use std::path::Path;

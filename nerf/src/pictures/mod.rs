@@ -4,4 +4,4 @@ pub mod colormap;
 pub mod metrics;
 pub(crate) mod output;
 
-pub use output::{quantise, write_atomic};
+pub use output::quantise;

@@ -1,4 +1,4 @@
-//! Images to files: 8-bit quantisation, PNG, and writing that leaves no half-written file.
+//! Images to files: 8-bit quantisation and PNG.
 
 use std::path::Path;
 
@@ -6,7 +6,8 @@ use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 
 use crate::dataset::image::Image;
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::files::write_atomic;
 
 /// A value of 0..=1 as a byte: `round(255 clamp(x, 0, 1))`. NaN becomes 0.
 pub fn quantise(value: f32) -> u8 {
@@ -50,16 +51,6 @@ impl Image {
     }
 }
 
-/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched: see
-/// [`raygrad_nn::write_atomic`].
-///
-/// # Errors
-/// If the folder does not exist or the file cannot be written; the error names `path`.
-pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
-    let path = path.as_ref();
-    raygrad_nn::write_atomic(path, bytes).map_err(|e| Error::file(path, format!("cannot be written: {e}")))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -89,21 +80,6 @@ mod tests {
         Image { width: 2, height: 1, channels: 1, data: vec![0.0, 1.0] }.save_png(&path).unwrap();
         assert_eq!(Image::open(&path).unwrap().data, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2, "no temporary file stays behind");
-    }
-
-    #[test]
-    fn a_failed_write_names_the_file_and_harms_nothing() {
-        let folder = tempfile::tempdir().unwrap();
-        let absent = folder.path().join("absent/image.png");
-        let message = write_atomic(&absent, b"x").unwrap_err().to_string();
-        assert!(message.contains("absent/image.png: cannot be written"), "{message}");
-        // A folder in the place of the file: the rename fails, and the temporary file goes.
-        let taken = folder.path().join("taken");
-        std::fs::create_dir(&taken).unwrap();
-        std::fs::write(taken.join("inside"), b"kept").unwrap();
-        assert!(write_atomic(&taken, b"x").is_err());
-        assert_eq!(std::fs::read(taken.join("inside")).unwrap(), b"kept");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 
     #[test]

@@ -16,7 +16,7 @@ use super::start;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, Point, View};
 use crate::error::{Error, Result};
-use crate::pictures::write_atomic;
+use crate::files::write_atomic;
 use glam::DAffine3;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

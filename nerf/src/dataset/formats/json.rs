@@ -1,7 +1,7 @@
 //! JSON documents whose errors name the field.
 
 use crate::error::{Error, Result};
-use crate::pictures::write_atomic;
+use crate::files::write_atomic;
 use serde_json::{Map, Value};
 use std::path::Path;
 

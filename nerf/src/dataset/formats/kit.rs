@@ -1,8 +1,10 @@
 //! What the tests of JSON formats share.
 
-use crate::dataset::capture::Capture;
+use crate::camera::pinhole::Camera;
+use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::image::Image;
 use crate::error::Result;
+use glam::{DAffine3, DVec3};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -63,5 +65,32 @@ pub(super) fn is_whole(capture: &Capture) {
         assert!(fx.is_finite() && fy.is_finite() && (camera.width == 0 || fx > 0.0 && fy > 0.0), "{view:?}");
         assert!(view.depth.as_ref().is_none_or(|(_, unit)| unit.is_finite() && *unit > 0.0));
         assert!(view.sharpness.is_none_or(f64::is_finite) && !view.name.is_empty() && !view.field.is_empty());
+    }
+}
+
+/// A capture of one photograph, which is written to `images`, that every format can hold.
+pub(super) fn picture_with_camera(folder: &Path) -> Capture {
+    let image = folder.join("images/0.png");
+    picture(&image, 8, 6);
+    let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
+    let view = View {
+        name: "0.png".into(),
+        field: "frames[0]".into(),
+        image: Some(image),
+        camera: Camera::from_angle(8, 6, 0.9, pose),
+        split: None,
+        mask: None,
+        depth: None,
+        sharpness: None,
+        bounds: Some([1.0, 2.0]),
+    };
+    Capture {
+        folder: folder.into(),
+        file: folder.join("transforms.json"),
+        format: Format::Transforms,
+        views: vec![view],
+        points: vec![],
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
     }
 }

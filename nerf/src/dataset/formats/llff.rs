@@ -10,7 +10,7 @@ use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::error::{Error, Result};
-use crate::pictures::write_atomic;
+use crate::files::write_atomic;
 use glam::{DAffine3, DMat3, DVec3};
 use std::path::{Path, PathBuf};
 

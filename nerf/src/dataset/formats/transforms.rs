@@ -12,7 +12,7 @@ use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
 use crate::error::{Error, Result};
-use crate::pictures::write_atomic;
+use crate::files::write_atomic;
 use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::collections::HashMap;
