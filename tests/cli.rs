@@ -198,6 +198,7 @@ fn the_embedded_scene_needs_no_files() {
     assert_eq!(place.json("run/eval-1.json")["background"], "white");
     place.succeeds("render run --out one.png");
     place.fails("train --downscale 3", &["`downscale`", "200x200"]);
+    place.fails("train landscape --downscale 16", &["`downscale`", "400x300"]);
 }
 
 #[test]

@@ -3,8 +3,8 @@
 
 use raygrad_autograd::{Real, Tape};
 use raygrad_nerf::analytic::{AnalyticField, AnalyticScene, Layer, Layers, scenes};
-use raygrad_nerf::dataset::scene::{DISTANCE, Scene, View};
-use raygrad_nerf::dataset::{Dataset, Frame, Placement, Scope};
+use raygrad_nerf::dataset::scene::{DISTANCE, Landscape, Scene, View, walk_cameras};
+use raygrad_nerf::dataset::{Dataset, Frame, Placement, Scope, Split};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
 use raygrad_nerf::glam::{DMat3, DVec3};
 use raygrad_nerf::pictures::metrics::psnr;
@@ -35,6 +35,13 @@ fn golden(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference").join(name)
 }
 
+/// All pictures that are kept: of the bulldozer alone, and of the landscape around it.
+fn all_pictures() -> Vec<(&'static str, Image)> {
+    let mut all = Vec::from(pictures(&Scene::bulldozer().render(&camera(1), 9)));
+    all.push(("golden-landscape.png", Landscape::new().render(&walk_cameras(Split::Test, 64)[3], 9)));
+    all
+}
+
 /// Colour over white, distances of 2 to 6 as grey, and normals as colours.
 fn pictures(view: &View) -> [(&'static str, Image); 3] {
     let each = |image: &Image, f: &dyn Fn(&[f32]) -> [f32; 3]| {
@@ -52,7 +59,7 @@ fn pictures(view: &View) -> [(&'static str, Image); 3] {
 /// once and kept.
 #[test]
 fn the_scene_looks_as_it_did_from_a_camera_that_no_symmetry_helps() {
-    for (name, image) in pictures(&Scene::bulldozer().render(&camera(1), 9)) {
+    for (name, image) in all_pictures() {
         let kept = Image::open(golden(name)).unwrap();
         assert_eq!([kept.width, kept.height], [image.width, image.height], "{name}");
         let pairs = kept.data.chunks_exact(kept.channels).zip(image.data.chunks_exact(3));
@@ -64,7 +71,7 @@ fn the_scene_looks_as_it_did_from_a_camera_that_no_symmetry_helps() {
 #[test]
 #[ignore = "writes the pictures that the test before it compares with: look at them before they are kept"]
 fn write_golden_pictures() {
-    for (name, image) in pictures(&Scene::bulldozer().render(&camera(1), 9)) {
+    for (name, image) in all_pictures() {
         image.save_png(golden(name)).unwrap();
     }
 }

@@ -138,7 +138,7 @@ fn cameras(args: &Args, run: &Run) -> Result<Vec<Camera>> {
     let frames = args.frames.unwrap_or(ORBIT_FRAMES);
     let cameras = match (args.path, &config.scene) {
         (CameraPath::Orbit, Scene::Embedded) => test_cameras(frames, view.width),
-        (CameraPath::Orbit, Scene::Folder(_)) => view.orbit(&config.extent, frames),
+        (CameraPath::Orbit, Scene::Landscape | Scene::Folder(_)) => view.orbit(&config.extent, frames),
         (CameraPath::Test, _) => {
             let scene = run.scene(args.scene.as_ref())?.open_for(&config.extent)?;
             let data = scene.load(Split::Test, config.downscale, args.frames.unwrap_or(usize::MAX))?;

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use std::sync::{Mutex, PoisonError};
 
-use raygrad::nerf::dataset::{Capture, Dataset, Reading, Scope, Split, Survey, embedded, evenly_spaced};
+use raygrad::nerf::dataset::{Capture, Dataset, Reading, Scope, Split, Survey, embedded, evenly_spaced, landscape};
 use raygrad::nerf::{Error, Extent, Result};
 use serde::{Deserialize, Serialize};
 
@@ -15,21 +15,29 @@ use super::progress::Progress;
 
 /// Width and height of the embedded scene's images in pixels.
 const EMBEDDED_SIZE: usize = 200;
+/// Width and height of the landscape's images in pixels.
+const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
 
-/// A folder of photographs, or the scene that needs none.
+/// A folder of photographs, or a scene that needs none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Scene {
     /// The bulldozer that is built in.
     Embedded,
+    /// The bulldozer in a landscape without bounds, built in too.
+    Landscape,
     /// A dataset in this folder.
     Folder(PathBuf),
 }
 
 impl From<OsString> for Scene {
-    /// `embedded` is the built-in scene (a folder of that name is `./embedded`), anything else a folder.
+    /// `embedded` and `landscape` are the built-in scenes (a folder of that name is `./embedded`), anything else a folder.
     fn from(text: OsString) -> Self {
-        if text == "embedded" { Scene::Embedded } else { Scene::Folder(text.into()) }
+        match text.to_str() {
+            Some("embedded") => Scene::Embedded,
+            Some("landscape") => Scene::Landscape,
+            _ => Scene::Folder(text.into()),
+        }
     }
 }
 
@@ -37,6 +45,7 @@ impl fmt::Display for Scene {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Scene::Embedded => f.write_str("embedded"),
+            Scene::Landscape => f.write_str("landscape"),
             Scene::Folder(folder) => folder.display().fmt(f),
         }
     }
@@ -63,7 +72,7 @@ impl Scene {
     /// The same scene, found from any working directory.
     pub fn absolute(&self) -> Result<Scene> {
         match self {
-            Scene::Embedded => Ok(Scene::Embedded),
+            Scene::Embedded | Scene::Landscape => Ok(self.clone()),
             Scene::Folder(folder) => std::path::absolute(folder).map(Scene::Folder).map_err(|e| Error::file(folder, e)),
         }
     }
@@ -80,12 +89,17 @@ impl Opened {
     /// At most `views` evenly spaced photographs of a split, at `1 / downscale` of their size. Warns of absent images.
     pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
         let data = match &self.capture {
-            None if !EMBEDDED_SIZE.is_multiple_of(downscale) => {
-                let what = format!("{downscale} does not divide the image size {EMBEDDED_SIZE}x{EMBEDDED_SIZE}");
-                return Err(Error::setting("downscale", what));
-            }
             None => {
-                let data = embedded(split, EMBEDDED_SIZE / downscale);
+                let data = match self.scene {
+                    Scene::Landscape => {
+                        divides(downscale, LANDSCAPE_SIZE)?;
+                        landscape(split, LANDSCAPE_SIZE[0] / downscale)
+                    }
+                    _ => {
+                        divides(downscale, [EMBEDDED_SIZE; 2])?;
+                        embedded(split, EMBEDDED_SIZE / downscale)
+                    }
+                };
                 Dataset { frames: evenly_spaced(data.frames, views), ..data }
             }
             Some((capture, survey)) => {
@@ -102,4 +116,12 @@ impl Opened {
         }
         Ok(data)
     }
+}
+
+/// Whether images of this size can be made smaller by that factor.
+fn divides(downscale: usize, [width, height]: [usize; 2]) -> Result<()> {
+    if width.is_multiple_of(downscale) && height.is_multiple_of(downscale) {
+        return Ok(());
+    }
+    Err(Error::setting("downscale", format!("{downscale} does not divide the image size {width}x{height}")))
 }

@@ -28,7 +28,7 @@ use super::{interrupt, parse};
 /// Ctrl-C finishes the step, saves the model and exits with code 130; a second Ctrl-C exits at once.
 #[derive(Parser)]
 pub struct Args {
-    /// Folder with transforms_train.json and its images, or the scene that is built in
+    /// Folder with transforms_train.json and its images, or a scene that is built in: embedded or landscape
     #[arg(default_value = "embedded")]
     scene: Scene,
     /// Kind of model: instant (a minute), voxel (no network), small (minutes) or classic (the paper's, hours)

@@ -8,8 +8,8 @@ use raygrad::nerf::sampling::steps::{even_edges, invert_cdf};
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 use raygrad::nerf::volume::{self, OpticalDepth, Weights};
 use raygrad::nerf::{
-    Distortion, Lens, Ndc, Pose, PositionalEncoding, Ray, Rays, contract, glam::DVec3, intersect_box,
-    rotation_exp, srgb_decode, srgb_encode,
+    Distortion, Lens, Ndc, Pose, PositionalEncoding, Ray, Rays, contract, glam::DVec3, intersect_box, rotation_exp,
+    srgb_decode, srgb_encode,
 };
 use raygrad::{Adam, AdamConfig, Op, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
 

@@ -28,7 +28,6 @@ fn name_of(split: Split) -> String {
 }
 
 /// Whether the folder holds a file of this format.
-#[allow(dead_code, reason = "the loader is yet to call it")]
 pub(crate) fn detect(folder: &Path) -> bool {
     Split::ALL.into_iter().any(|split| file_of(folder, split).is_file())
 }

@@ -12,7 +12,7 @@ mod pose;
 mod table;
 mod text;
 
-use super::start;
+use super::limits::start;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, Point, View};
 use crate::error::{Error, Result};

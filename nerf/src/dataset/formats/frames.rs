@@ -4,7 +4,7 @@ use super::intrinsics::{Layers, check_known};
 use super::json::Object;
 use super::{matrix, paths};
 use crate::dataset::capture::View;
-use crate::dataset::image::Image;
+use crate::dataset::photo::Photo;
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -63,7 +63,7 @@ pub(super) fn views(top: &Object<'_>, folder: &Path, dialect: Dialect) -> Result
 
 /// The size of a frame's image, from its header.
 fn size((frame, image): (&Object<'_>, &Path)) -> Result<[usize; 2]> {
-    Image::size_of_file(image).map_err(|e| match e {
+    Photo::size_of_file(image).map(|[_, shown]| shown).map_err(|e| match e {
         Error::File { path, what } => frame.error("file_path", format!("{}: {what}", path.display())),
         other => other,
     })

@@ -8,8 +8,7 @@ use glam::{DAffine3, DVec3};
 use serde_json::{Value, json};
 use std::path::Path;
 
-#[path = "../../../../tests/stability/damage.rs"]
-pub(super) mod damage;
+pub(super) use super::damage;
 
 /// A camera 4 units up the z axis that looks down at the origin.
 pub(super) fn pose() -> Value {

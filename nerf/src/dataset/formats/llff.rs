@@ -4,8 +4,9 @@
 //! its position, and height, width and focal length in pixels. Then come the nearest and the farthest depth that the
 //! image shows. Rows belong to the images of the folder `images` in the order of their names.
 
+use super::limits::MOST_PIXELS;
 use super::npy::Matrix;
-use super::{MOST_PIXELS, rigid};
+use super::rigid;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};

@@ -1,6 +1,6 @@
 //! NumPy's `.npy` files, of two axes.
 
-use super::start;
+use super::limits::start;
 
 /// A matrix, row by row.
 #[derive(Debug, Clone, PartialEq)]

@@ -24,7 +24,6 @@ const FILE: &str = "transforms.json";
 const POINTS: &str = "sparse_pc.ply";
 
 /// Whether the folder holds a file of this format.
-#[allow(dead_code, reason = "the loader is yet to call it")]
 pub(crate) fn detect(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }

@@ -24,12 +24,32 @@ const LEAF: usize = 2;
 /// meet there, and either answer is right.
 const PADDING: f64 = 1e-9;
 
+/// What a hierarchy asks of a shape.
+pub trait Surface {
+    /// Where a ray first crosses the surface: its distance, positive, and the outward unit normal. A ray that starts
+    /// inside meets the surface where it leaves.
+    fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)>;
+
+    /// The corners of an axis-aligned box around the shape, preferably the smallest.
+    fn bounds(&self) -> [DVec3; 2];
+}
+
+impl Surface for Shape {
+    fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)> {
+        self.intersect(ray)
+    }
+
+    fn bounds(&self) -> [DVec3; 2] {
+        self.bounds()
+    }
+}
+
 /// A binary tree of boxes over shapes, split by the surface area heuristic.
 #[derive(Debug, Clone)]
-pub struct Bvh {
+pub struct Bvh<S = Shape> {
     nodes: Vec<Node>,
     /// Shapes with their original indices, in the order of the leaves.
-    shapes: Vec<(usize, Shape)>,
+    shapes: Vec<(usize, S)>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -42,12 +62,12 @@ struct Node {
     count: u32,
 }
 
-impl Bvh {
+impl<S: Surface> Bvh<S> {
     /// A hierarchy over `shapes`.
     ///
     /// # Panics
     /// If there are none.
-    pub fn new(shapes: Vec<Shape>) -> Self {
+    pub fn new(shapes: Vec<S>) -> Self {
         assert!(!shapes.is_empty(), "a scene has at least one solid");
         let shapes: Vec<_> = shapes.into_iter().enumerate().collect();
         let nodes = vec![Node { min: DVec3::ZERO, max: DVec3::ZERO, first: 0, count: 0 }];
@@ -80,8 +100,13 @@ impl Bvh {
 
     /// The nearest surface along a ray.
     pub fn trace(&self, ray: &Ray) -> Option<Hit> {
+        self.trace_before(ray, f64::INFINITY)
+    }
+
+    /// The nearest surface along a ray, if it is nearer than `limit`.
+    pub fn trace_before(&self, ray: &Ray, limit: f64) -> Option<Hit> {
         let mut nearest: Option<Hit> = None;
-        self.walk(ray, f64::INFINITY, |solid, shape, limit| {
+        self.walk(ray, limit, |solid, shape, limit| {
             if let Some((distance, normal)) = shape.intersect(ray)
                 && distance < *limit
             {
@@ -106,7 +131,7 @@ impl Bvh {
 
     /// Visits the shapes whose boxes a ray enters before `limit`, nearer boxes first; `visit` may lower the limit.
     #[inline]
-    fn walk(&self, ray: &Ray, mut limit: f64, mut visit: impl FnMut(usize, &Shape, &mut f64)) {
+    fn walk(&self, ray: &Ray, mut limit: f64, mut visit: impl FnMut(usize, &S, &mut f64)) {
         let inverse = ray.direction.recip();
         let mut stack = [(0u32, 0.0f64); MAX_DEPTH + 1];
         stack[0] = (0, self.nodes[0].entry(ray.origin, inverse));
@@ -138,7 +163,9 @@ impl Bvh {
             }
         }
     }
+}
 
+impl Bvh {
     /// The signed distance from a point to the nearest shape, or `limit` if that is less.
     pub fn distance(&self, point: DVec3, limit: f64) -> f64 {
         let mut nearest = limit;
@@ -196,13 +223,13 @@ fn union(a: [DVec3; 2], b: [DVec3; 2]) -> [DVec3; 2] {
 ///
 /// The surface area heuristic: a random ray meets a convex box with a probability proportional to its surface, so a
 /// split costs the sum of surface times number of shapes over the two parts.
-fn best_split(shapes: &mut [(usize, Shape)]) -> usize {
+fn best_split<S: Surface>(shapes: &mut [(usize, S)]) -> usize {
     let area = |[min, max]: [DVec3; 2]| {
         let size = max - min;
         size.x * size.y + size.y * size.z + size.z * size.x
     };
-    let sort = |shapes: &mut [(usize, Shape)], axis: usize| {
-        let key = |shape: &Shape| shape.bounds()[0][axis] + shape.bounds()[1][axis];
+    let sort = |shapes: &mut [(usize, S)], axis: usize| {
+        let key = |shape: &S| shape.bounds()[0][axis] + shape.bounds()[1][axis];
         shapes.sort_by(|a, b| key(&a.1).total_cmp(&key(&b.1)).then(a.0.cmp(&b.0)));
     };
     let (mut best, mut best_axis, mut best_cost) = (shapes.len() / 2, 0, f64::INFINITY);

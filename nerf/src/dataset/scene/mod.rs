@@ -27,18 +27,26 @@
 
 mod bulldozer;
 mod bvh;
+mod form;
 mod golden;
 mod kit;
+mod landscape;
+mod noise;
+mod paint;
 mod render;
+mod scenery;
 mod shade;
 mod shape;
 mod views;
+mod walk;
 
 use glam::DVec3;
 
 pub use bvh::Hit;
+pub use landscape::Landscape;
 pub use render::View;
 pub use views::{ANGLE_X, DISTANCE, test_cameras, train_cameras, val_cameras};
+pub use walk::walk_cameras;
 
 use crate::camera::pinhole::Ray;
 use bvh::Bvh;
@@ -106,7 +114,7 @@ mod tests {
             let hit = scene.trace(&ray).expect("the roof");
             assert!(ray.at(hit.distance).distance(roof) < 1e-9, "something stands before the roof");
             let material = &scene.materials[hit.solid];
-            shade::radiance(&scene.bvh, material, &ray, &hit, shade::sun_direction(0, 1), 1.0)
+            shade::radiance(|ray| scene.bvh.occluded(ray), material, &ray, &hit, shade::sun_direction(0, 1), 1.0)
         };
         let (left, right) = (color(DVec3::new(0.48, 0.36, 0.8)), color(DVec3::new(-0.48, -0.36, 0.8)));
         assert!(right.min_element() > 0.0 && (right - left).min_element() > 0.1, "{left} {right}");

@@ -74,7 +74,8 @@ impl Scene {
                 _ => shade::openness(&self.bvh, ray.at(hit.distance), hit.normal),
             };
             last = Some((hit, openness));
-            let light = shade::radiance(&self.bvh, &self.materials[hit.solid], &ray, &hit, sun, openness);
+            let light =
+                shade::radiance(|ray| self.bvh.occluded(ray), &self.materials[hit.solid], &ray, &hit, sun, openness);
             // Clamped before the mean, or the edge of a highlight would stay jagged.
             sum += light.clamp(DVec3::ZERO, DVec3::ONE);
             covered += 1;
@@ -89,10 +90,10 @@ impl Scene {
 
 /// Where the rays of a pixel pass, in pixels from its centre, and to which point of the sun each of them looks: the
 /// pixel's area and the sun's disc are averaged together.
-struct Pattern(Vec<(DVec2, DVec3)>);
+pub(super) struct Pattern(pub(super) Vec<(DVec2, DVec3)>);
 
 impl Pattern {
-    fn new(samples: usize) -> Self {
+    pub(super) fn new(samples: usize) -> Self {
         // The R2 sequence: multiples of (1/p, 1/p^2), where p is the plastic number, p^3 = p + 1, modulo the pixel. Its
         // terms 0, 1, -1, 2, -2 ... are as evenly spread as 0, 1, 2 ... and symmetric about the centre.
         let plastic = 1.324717957244746;

@@ -55,15 +55,22 @@ pub fn openness(bvh: &Bvh, point: DVec3, normal: DVec3) -> f64 {
 }
 
 /// The light that a surface sends back along a ray, linear RGB, with the sun a point in direction `sun` and the sky's
-/// light dimmed by `openness`.
-pub fn radiance(bvh: &Bvh, material: &Material, ray: &Ray, hit: &Hit, sun: DVec3, openness: f64) -> DVec3 {
+/// light dimmed by `openness`. `occluded` says whether anything stands in the way of a ray.
+pub fn radiance(
+    occluded: impl Fn(&Ray) -> bool,
+    material: &Material,
+    ray: &Ray,
+    hit: &Hit,
+    sun: DVec3,
+    openness: f64,
+) -> DVec3 {
     let (normal, view) = (hit.normal, -ray.direction);
     let reflected = ray.direction.reflect(normal);
     let facing = normal.dot(view).max(0.0);
     let mut light =
         openness / PI * (material.albedo * sky(normal) + sheen(material.roughness, facing) * sky(reflected));
     let cosine = normal.dot(sun);
-    if cosine > 0.0 && !bvh.occluded(&Ray { origin: ray.at(hit.distance) + OFFSET * normal, direction: sun }) {
+    if cosine > 0.0 && !occluded(&Ray { origin: ray.at(hit.distance) + OFFSET * normal, direction: sun }) {
         light += cosine * SUN_COLOR * (material.albedo / PI + highlight(material.roughness, normal, view, sun));
     }
     light
@@ -105,7 +112,14 @@ mod tests {
         let ray = Ray { origin: 4.0 * viewer, direction: -viewer };
         let (bvh, material) = (floor(), Material { albedo: DVec3::splat(0.5), roughness });
         let hit = bvh.trace(&ray).unwrap();
-        radiance(&bvh, &material, &ray, &hit, SUN.normalize(), openness(&bvh, ray.at(hit.distance), hit.normal))
+        radiance(
+            |ray| bvh.occluded(ray),
+            &material,
+            &ray,
+            &hit,
+            SUN.normalize(),
+            openness(&bvh, ray.at(hit.distance), hit.normal),
+        )
     }
 
     #[test]
@@ -153,7 +167,10 @@ mod tests {
         assert!(near < openness(&bvh, DVec3::new(-0.1, 0.0, 0.0), DVec3::Z));
         let material = Material { albedo: DVec3::splat(0.5), roughness: 0.3 };
         let ray = Ray { origin: DVec3::new(-0.1, 0.0, 3.0), direction: DVec3::NEG_Z };
-        let light = |bvh: &Bvh| radiance(bvh, &material, &ray, &bvh.trace(&ray).unwrap(), SUN.normalize(), 1.0);
+        let light = |bvh: &Bvh| {
+            let hit = bvh.trace(&ray).unwrap();
+            radiance(|ray| bvh.occluded(ray), &material, &ray, &hit, SUN.normalize(), 1.0)
+        };
         assert!(light(&bvh).max_element() < 0.6 * light(&open).min_element());
     }
 

@@ -135,7 +135,10 @@ fn thresholds_of_each_further_cascade_are_half_as_high() {
             words.map(|word| grid.words[word]).collect::<Vec<_>>()
         });
         for (cascade, words) in occupied.iter().enumerate() {
-            assert!(words.iter().all(|word| *word == if expected[cascade] { u64::MAX } else { 0 }), "{sigma} {cascade}");
+            assert!(
+                words.iter().all(|word| *word == if expected[cascade] { u64::MAX } else { 0 }),
+                "{sigma} {cascade}"
+            );
         }
         // A fog that is just not seen is no more along the longest path than the threshold says.
         let [low, high] = grid.bounds();

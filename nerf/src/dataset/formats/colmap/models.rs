@@ -1,8 +1,8 @@
 //! COLMAP's camera models.
 
-use super::super::{MOST_PIXELS, start};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
+use crate::dataset::formats::limits::{MOST_PIXELS, start};
 use glam::DAffine3;
 use std::f64::consts::PI;
 

@@ -1,6 +1,6 @@
 //! COLMAP's `.txt` files: an entry a line, and comments that start with `#`.
 
-use super::super::start;
+use super::super::limits::start;
 use super::models::Model;
 use super::table::Table;
 use super::{CameraEntry, ImageEntry, Place};

@@ -1,0 +1,83 @@
+//! The bulldozer in an unbounded landscape as a dataset: needs no files.
+
+use super::{Dataset, Frame, Placement, Scope, Split};
+use crate::camera::pinhole::Camera;
+use crate::dataset::image::Image;
+use crate::dataset::scene::{Landscape, walk_cameras};
+
+/// Rays a pixel, for anti-aliasing.
+const SAMPLES: usize = 5;
+/// Nothing is nearer to a camera than this, in scene units.
+const NEAR: f64 = 0.05;
+/// Nothing but the sky is farther from a camera than this, in scene units.
+const FAR: f64 = 1e4;
+
+/// The views of the procedural bulldozer in a landscape that goes out to a thousand units and has a sky: 100 to train on,
+/// 10 to validate, 20 to test, each `width` pixels wide, three quarters of that high, and opaque.
+///
+/// [`landscape_distances`] tells what in them is near, far and sky. The bounds are those of the bulldozer and the
+/// cameras: most of what is seen lies beyond them.
+///
+/// Ray-traced on the current rayon pool in about ten seconds at 400 pixels on two cores.
+///
+/// # Panics
+/// If `width` is not a multiple of 4.
+#[track_caller]
+pub fn landscape(split: Split, width: usize) -> Dataset {
+    assert!(width.is_multiple_of(4), "a width of {width} pixels has no whole number of rows at 4:3");
+    let landscape = Landscape::new();
+    let frame = |(i, camera): (usize, Camera)| {
+        let image = landscape.render(&camera, SAMPLES).into();
+        Frame { name: format!("{split}/{i}"), camera, image, mask: None, distances: None }
+    };
+    let cameras = walk_cameras(split, width);
+    let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
+    let bounds = eyes.fold(landscape.bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
+    Dataset {
+        frames: cameras.into_iter().enumerate().map(frame).collect(),
+        bounds: [bounds[0] - 0.02, bounds[1] + 0.02],
+        near: NEAR,
+        far: FAR,
+        scope: Scope::Unbounded,
+        placement: Placement::default(),
+        skipped: vec![],
+    }
+}
+
+/// The exact distances to what a camera sees of the [`landscape`]: one channel, along the unit ray through each pixel's
+/// centre to the first surface, in scene units; 0 for the sky.
+pub fn landscape_distances(camera: &Camera) -> Image {
+    Landscape::new().distances(camera)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn landscape_images_are_opaque_finite_and_in_range() {
+        for (split, count) in Split::ALL.into_iter().zip([100, 10, 20]) {
+            let data = landscape(split, 16);
+            assert_eq!(data.frames.len(), count);
+            for (i, frame) in data.frames.iter().enumerate() {
+                assert_eq!(frame.name, format!("{split}/{i}"));
+                let image = &frame.image;
+                assert_eq!([image.width, image.height, image.channels], [16, 12, 3]);
+                assert!(image.to_image().data.iter().all(|v| (0.0..=1.0).contains(v)));
+                let distances = landscape_distances(&frame.camera);
+                assert!(
+                    distances.data.iter().all(|d| *d == 0.0 || f64::from(*d) > data.near && f64::from(*d) < data.far)
+                );
+                let eye = frame.camera.pose.translation;
+                assert!(eye.cmpgt(data.bounds[0]).all() && eye.cmplt(data.bounds[1]).all(), "{eye}");
+            }
+            assert!(!data.has_alpha());
+        }
+    }
+
+    #[test]
+    fn landscape_bounds_are_those_of_every_split() {
+        let [train, val, test] = Split::ALL.map(|split| landscape(split, 4).bounds);
+        assert!(train == val && val == test);
+    }
+}
