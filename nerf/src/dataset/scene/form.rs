@@ -189,6 +189,12 @@ mod tests {
                 let step = 1e-5 * placed.scale;
                 let out = |side: f64| implicit(&placed.form, placed.local(ray.at(t) + side * step * normal));
                 prop_assert!(out(1.0) > 0.0, "{}", out(1.0));
+                if let Form::Ellipsoid { .. } = placed.form {
+                    // Sideways the surface is left by the square of a step only.
+                    let aside = step * normal.any_orthonormal_vector();
+                    let sides = [aside, normal.cross(aside)].map(|u| implicit(&placed.form, placed.local(ray.at(t) + u)));
+                    prop_assert!(sides.iter().all(|side| side.abs() < 1e-7), "{sides:?}");
+                }
                 let [low, high] = placed.bounds();
                 prop_assert!(ray.at(t).cmpge(low - 1e-9).all() && ray.at(t).cmple(high + 1e-9).all());
             }

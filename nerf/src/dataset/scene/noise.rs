@@ -38,10 +38,10 @@ fn hash(point: [u32; 3], seed: u32) -> u32 {
     h ^ (h >> 15)
 }
 
-/// How much of features of the size `length` a pixel shows that covers `footprint`: all if they are three times larger,
-/// nothing if they are smaller, which the pixels around it could not tell apart.
+/// How much of features of the size `length` a pixel shows that covers `footprint`: all if they are twice as large, nothing
+/// if they are half as large, which average out within it. In between the share is near that of a pixel's mean.
 fn visible(length: f64, footprint: f64) -> f64 {
-    let t = ((length / footprint - 0.8) / 2.0).clamp(0.0, 1.0);
+    let t = ((length / footprint - 0.5) / 1.5).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 

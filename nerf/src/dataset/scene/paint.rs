@@ -129,3 +129,51 @@ const CLARITY: f64 = 1600.0;
 pub fn through_air(light: DVec3, distance: f64) -> DVec3 {
     HAZE.lerp(light, (-distance / CLARITY).exp())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::noise::random;
+    use super::super::scenery::GROUND;
+    use super::super::walk_cameras;
+    use super::*;
+    use crate::dataset::Split;
+
+    /// Five rays that each average over their share of a far pixel come nearer to the pixel's mean than five that see a
+    /// point each.
+    #[test]
+    fn landscape_ground_far_away_is_averaged_over_pixels() {
+        let (mut filtered, mut points, mut count) = (0.0, 0.0, 0);
+        for camera in walk_cameras(Split::Val, 400) {
+            for i in 0..4000 {
+                let corner = [random(i, 61) * 399.0, random(i, 62) * 299.0];
+                // The colour of the ground where a ray through the pixel meets it, with a footprint of its share.
+                let color = |x: f64, y: f64, share: f64| {
+                    let ray = camera.ray(corner[0] + x, corner[1] + y);
+                    let distance = (GROUND - ray.origin.z) / ray.direction.z;
+                    let place = ray.at(distance).xy();
+                    let across = share * distance / camera.focal[0];
+                    let along = across * (1.0 / (-5.0 * ray.direction.z)).max(1.0);
+                    ground(place, ray.direction.xy().normalize(), [along, across])
+                };
+                let ray = camera.ray(corner[0] + 0.5, corner[1] + 0.5);
+                let distance = (GROUND - ray.origin.z) / ray.direction.z;
+                // The edges of the road are tested by themselves.
+                if !(20.0..400.0).contains(&distance) || road_distance(ray.at(distance).xy()) < 4.0 {
+                    continue;
+                }
+                let five = |share: f64| {
+                    let offsets = [[0.5, 0.5], [0.25, 0.93], [0.75, 0.07], [0.01, 0.64], [0.99, 0.36]];
+                    offsets.iter().map(|[x, y]| color(*x, *y, share)).sum::<DVec3>() / 5.0
+                };
+                let mean =
+                    (0..400).map(|k| color(random(k, 63), (k as f64 + 0.5) / 400.0, 1e-9)).sum::<DVec3>() / 400.0;
+                filtered += five(1.0).distance_squared(mean);
+                points += five(1e-9).distance_squared(mean);
+                count += 1;
+            }
+        }
+        let [filtered, points] = [filtered, points].map(|sum: f64| (sum / f64::from(count)).sqrt());
+        println!("{filtered:.5} and {points:.5} off over {count} pixels");
+        assert!(count > 1000 && filtered < 0.02 && filtered < 0.7 * points, "{filtered} {points} over {count}");
+    }
+}
