@@ -248,7 +248,7 @@ mod tests {
     #[test]
     fn terms_say_what_they_should_and_have_the_gradients_that_differences_show() {
         let terms: [&dyn Term<f64>; 4] = [
-            &DistortionConfig { weight: 2.0 },
+            &Evenness { weight: 2.0, reach: None },
             &EntropyConfig { weight: 0.5 },
             &OrientationConfig { weight: 3.0 },
             &Depth { weight: 4.0, unit: 1.6 },
@@ -260,9 +260,15 @@ mod tests {
         }
         // A thin fog is spread over the span, a thick one stands at its front.
         assert!(at(terms[0], 0.0, 0.0) > 2.0 * at(terms[0], 6.0, 0.0));
-        assert!((at(terms[0], 0.5, 0.2) - 2.0 * at(&DistortionConfig { weight: 1.0 }, 0.5, 0.2)).abs() < 1e-12);
+        assert!((at(terms[0], 0.5, 0.2) - 2.0 * at(&Evenness { weight: 1.0, reach: None }, 0.5, 0.2)).abs() < 1e-12);
         // A wall in the first of five bins has its own length alone, a third of a fifth of the span, for both rays.
         assert!((at(terms[0], 9.0, 0.0) - 2.0 * 2.0 / 15.0).abs() < 1e-6, "{}", at(terms[0], 9.0, 0.0));
+        // Of an unbounded scene, half of whose box is 1.1 wide: up to there evenly, then by inverses, and up to 1.
+        let unbounded = Evenness { weight: 2.0, reach: Some(1.1) };
+        let places = [0.0, 0.55, 1.1, 2.2, 1e9].map(|distance| unbounded.place(distance, [0.5, 2.0]));
+        assert!(places.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{places:?}");
+        // The wall's bin from .5 to .8 is .3 / 2.2 of that.
+        assert!((at(&unbounded, 9.0, 0.0) - 2.0 * 2.0 / 3.0 * 0.3 / 2.2).abs() < 1e-6, "{}", at(&unbounded, 9.0, 0.0));
         // Nothing and a wall have no entropy; at an opacity of a half each ray has ln 2, in halves of it.
         assert!(at(terms[1], -60.0, 0.0).abs() < 1e-12 && at(terms[1], 9.0, 0.0).abs() < 1e-12);
         let half = (2.0_f64.ln() / 1.5).ln();

@@ -20,8 +20,15 @@ use std::str::FromStr;
 
 /// Nested boxes of an unbounded scene, each twice as large as the one before.
 const CASCADES: usize = 6;
-/// How much longer a step through an unbounded scene is for each unit of distance.
-const CONE: f64 = 1.0 / 256.0;
+/// Cells along each axis of each of them.
+const RESOLUTION: usize = 32;
+/// Steps through an unbounded scene, in training and in views, as shares of the box's side.
+const STEP: f64 = 1.0 / 100.0;
+const VIEW_STEP: f64 = 1.0 / 150.0;
+/// How much longer they are for each unit of distance.
+const CONE: f64 = 1.0 / 64.0;
+/// Weight of the distortion of rays through an unbounded scene, of which photographs show every place from few sides.
+const DISTORTION: f64 = 0.1;
 
 /// A named configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -199,11 +206,26 @@ impl Config {
         self
     }
 
-    /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded).
+    /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
+    /// boxes at steps that grow, a hash grid is twice as fine, as it holds all of space, and a
+    /// [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in docs/benchmarks.md, section
+    /// Captures.
     pub fn with_scope(mut self, scope: Scope) -> Self {
         self.unbounded = scope == Scope::Unbounded;
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
-            (marching.occupancy.cascades, marching.cone) = if self.unbounded { (CASCADES, CONE) } else { (1, 0.0) };
+            marching.occupancy.cascades = 1;
+            if self.unbounded {
+                (marching.occupancy.cascades, marching.occupancy.resolution) = (CASCADES, RESOLUTION);
+                (marching.step, marching.last_step, marching.cone) = (STEP, None, CONE);
+                marching.view_step = VIEW_STEP;
+                marching.samples *= 4;
+            }
+        }
+        if self.unbounded {
+            self.terms.push(TermConfig::new(DistortionConfig { weight: DISTORTION }));
+            if let Some(field) = self.field.get_mut::<InstantConfig>() {
+                field.grid.finest *= 2;
+            }
         }
         self
     }

@@ -47,11 +47,6 @@ pub fn read(folder: &Path) -> Result<Capture> {
 #[cfg(test)]
 mod kit;
 
-/// So much of what a file says as a message may hold, which is one line.
-fn start(word: &str) -> String {
-    word.chars().take(80).flat_map(char::escape_debug).collect()
-}
-
 #[cfg(test)]
 #[path = "../../../../tests/stability/damage.rs"]
 mod damage;
