@@ -111,15 +111,18 @@ proptest! {
     /// What is before the fold is found again.
     #[test]
     fn what_is_before_the_fold_is_found(
-        c in prop::array::uniform8(-0.3..0.3_f64), prism: bool, off in 0.0..0.1_f64, u in -1.5..1.5_f64, v in -1.5..1.5_f64,
+        c in prop::array::uniform8(-0.3..0.3_f64), prism: bool, off in 0.0..0.1_f64, turn in -PI..PI, share in 0.0..0.99_f64,
     ) {
         let c = [c[0], c[1], c[2], c[3], if prism { off * c[4] } else { c[4] }, if prism { off * c[5] } else { c[5] },
             off * c[6], off * c[7]];
         let distortion = if prism { Distortion::ThinPrism(c) } else { Distortion::Rational(c) };
-        prop_assume!(distortion.domain().holds([u, v].map(|x| 1.01 * x)));
-        let again = distortion.undo(distortion.of([u, v]));
+        let e = [turn.cos(), turn.sin()];
+        let r = share * distortion.domain().edge(e, 2.0).unwrap_or(2.0);
+        let place = e.map(|e| e * r);
+        prop_assert!(distortion.domain().holds(place));
+        let again = distortion.undo(distortion.of(place));
         prop_assert!(again.is_ok(), "{:?}", again);
         let again = again.unwrap();
-        prop_assert!((again[0] - u).hypot(again[1] - v) < 1e-9, "{:?} for {:?}", again, [u, v]);
+        prop_assert!((again[0] - place[0]).hypot(again[1] - place[1]) < 1e-9, "{:?} for {:?}", again, place);
     }
 }
