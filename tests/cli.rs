@@ -254,10 +254,10 @@ fn bad_scenes_are_named_and_leave_no_run() {
     }
     place.write_transforms(Split::Train, &good);
     std::fs::write(place.path("scene/train/r_3.png"), b"no picture").unwrap();
-    place.fails("train scene --preset small", &["`frames[3].file_path`", "r_3.png", "cannot be decoded"]);
+    place.fails("train scene --preset small", &["`frames[3]`", "r_3.png", "cannot be decoded"]);
     Image::new(SIZE, SIZE + 1, 3).save_png(place.path("scene/train/r_3.png")).unwrap();
-    place.fails("train scene --preset small", &["`frames[3].file_path`", "has 24x25 pixels"]);
-    place.fails("train scene --preset small --downscale 5", &["`frames[3].file_path`"]);
+    place.fails("train scene --preset small", &["`frames[3]`", "has 24x25 pixels"]);
+    place.fails("train scene --preset small --downscale 5", &["`frames[3]`"]);
     place.fails("train absent", &["absent: there is no such folder"]);
     place.fails("train .", &[".: is not a dataset"]);
     assert!(!place.path("run").exists());

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
+use raygrad::nerf::dataset::{Dataset, Frame, Split, evenly_spaced};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
@@ -114,6 +114,15 @@ pub fn run(args: &Args) -> Result<()> {
     let scene = run.scene(args.scene.as_ref())?;
     let opened = scene.open_for(&run.config.extent)?;
     let data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
+    if args.split != Split::Train
+        && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
+    {
+        let what = format!(
+            "holds out the {} photograph `{}`, which the run was trained on: the files have changed since",
+            args.split, frame.name
+        );
+        return Err(Error::setting("scene", what));
+    }
     let name = args.name();
     let pictures = run.file(&name);
     make_folder(&pictures)?;
@@ -195,7 +204,7 @@ fn compare(
         evaluations = evaluations + picture.evaluations;
         picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
         let truth = frame.image.over(background);
-        let score = score(frame.name.clone(), &picture.color, &truth);
+        let score = score(frame, &picture.color, &truth);
         if drawn.contains(&i) {
             draw(&picture, &truth, span).save_png(pictures.join(numbered(i, DIGITS)))?;
         }
@@ -208,9 +217,24 @@ fn compare(
     Ok((scores, seconds / data.frames.len() as f64, evaluations))
 }
 
-fn score(name: String, render: &Image, truth: &Image) -> Score {
-    let large_enough = truth.width >= SSIM_WINDOW && truth.height >= SSIM_WINDOW;
-    Score { name, psnr: psnr(render, truth), ssim: large_enough.then(|| ssim(render, truth)) }
+/// Of the pixels that are [used](Frame::mask); where some are not, windows have no similarity to speak of.
+fn score(frame: &Frame, render: &Image, truth: &Image) -> Score {
+    let name = frame.name.clone();
+    let Some(mask) = &frame.mask else {
+        let large_enough = truth.width >= SSIM_WINDOW && truth.height >= SSIM_WINDOW;
+        return Score { name, psnr: psnr(render, truth), ssim: large_enough.then(|| ssim(render, truth)) };
+    };
+    let used = |image: &Image| {
+        let places = (0..image.width * image.height).map(|i| (i % image.width, i / image.width));
+        let used = places.filter(|(x, y)| mask.uses(*x, *y));
+        Image {
+            width: mask.used(),
+            height: 1,
+            channels: 3,
+            data: used.flat_map(|(x, y)| image.pixel(x, y).to_vec()).collect(),
+        }
+    };
+    Score { name, psnr: psnr(&used(render), &used(truth)), ssim: None }
 }
 
 /// Photograph, render, error and depth, side by side.

@@ -17,6 +17,7 @@ mod damage;
 fn run_config() -> RunConfig {
     RunConfig {
         budget: None,
+        photographs: vec!["train/0".into()],
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
         downscale: 1,

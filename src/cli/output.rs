@@ -64,7 +64,11 @@ pub fn remove(files: &[PathBuf]) {
     }
 }
 
-/// The depth of a picture in false colour: yellow near, violet far, black where there is nothing to see.
+/// How many times farther than it begins a scene ends, for its distances to be shown by their logarithms.
+const DEEP: f64 = 100.0;
+
+/// The depth of a picture in false colour: yellow near, violet far, black where there is nothing to see. That of a scene which
+/// goes on and on by its logarithm, from twice the near distance to two hundred times it.
 pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
     let mut depth = picture.depth.clone();
     for (depth, &opacity) in depth.data.iter_mut().zip(&picture.opacity.data) {
@@ -72,5 +76,12 @@ pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
             *depth = 0.0;
         }
     }
-    colormap::depth_map(&depth, near, far)
+    if far <= DEEP * near {
+        return colormap::depth_map(&depth, near, far);
+    }
+    let ends = [2.0 * near, far.min(2.0 * DEEP * near)].map(f64::ln);
+    let share = |depth: f32| ((f64::from(depth).ln() - ends[0]) / (ends[1] - ends[0])).clamp(0.0, 1.0) as f32;
+    // Shown from 1 to 2, as 0 is nothing.
+    depth.data.iter_mut().filter(|depth| **depth > 0.0).for_each(|depth| *depth = 1.0 + share(*depth));
+    colormap::depth_map(&depth, 1.0, 2.0)
 }

@@ -27,6 +27,9 @@ pub struct RunConfig {
     pub extent: Extent,
     /// Where the photographs were taken from, on average.
     pub viewpoint: Viewpoint,
+    /// Names of the photographs that it is trained on.
+    #[serde(default)]
+    pub photographs: Vec<String>,
     /// How long it was to be trained; the first edition did not say.
     #[serde(default)]
     pub budget: Option<Budget>,

@@ -54,19 +54,19 @@ impl fmt::Display for Scene {
 impl Scene {
     /// What the scene's files say, and where it lies; `asked` overrules how far it goes.
     pub fn open(&self, asked: Option<Scope>) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None }) };
+        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None, asked }) };
         let capture = Capture::read(folder)?;
         let survey = capture.survey(asked)?;
-        Ok(Opened { scene: self.clone(), capture: Some((capture, survey)) })
+        Ok(Opened { scene: self.clone(), capture: Some((capture, survey)), asked })
     }
 
     /// The same, lying where a model has it.
     pub fn open_for(&self, extent: &Extent) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None }) };
+        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None, asked: None }) };
         let Extent { placement, bounds, span: [near, far], .. } = *extent;
         let (scope, reason) = (Scope::Bounded, "as the model has it".to_owned());
         let survey = Survey { placement, scope, bounds, near, far, reason };
-        Ok(Opened { scene: self.clone(), capture: Some((Capture::read(folder)?, survey)) })
+        Ok(Opened { scene: self.clone(), capture: Some((Capture::read(folder)?, survey)), asked: None })
     }
 
     /// The same scene, found from any working directory.
@@ -83,6 +83,8 @@ pub struct Opened {
     scene: Scene,
     /// What a folder holds.
     pub capture: Option<(Capture, Survey)>,
+    /// How far the scene is to go, if that was asked for.
+    asked: Option<Scope>,
 }
 
 impl Opened {
@@ -100,7 +102,7 @@ impl Opened {
                         embedded(split, EMBEDDED_SIZE / downscale)
                     }
                 };
-                Dataset { frames: evenly_spaced(data.frames, views), ..data }
+                Dataset { frames: evenly_spaced(data.frames, views), scope: self.asked.unwrap_or(data.scope), ..data }
             }
             Some((capture, survey)) => {
                 let progress = Mutex::new(Progress::new());

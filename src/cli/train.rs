@@ -140,7 +140,7 @@ pub fn run(args: &Args) -> Result<Trained> {
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        config = config.with_budget(self.budget().seconds()).with_scope(data.scope);
+        config = config.with_budget(self.budget().seconds());
         if let Some(background) = self.background {
             config.background = background;
         }
@@ -151,6 +151,7 @@ impl Args {
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
+        config = config.with_scope(data.scope);
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
                 let what = format!("the preset {} has no grid to carve; choose `--skip fast` beside it", self.preset);
@@ -171,6 +172,7 @@ impl Args {
             downscale: self.downscale,
             extent: trainer.model.extent,
             viewpoint: Viewpoint::of(data),
+            photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
             budget: Some(self.budget()),
             config: trainer.model.config.clone(),
         })

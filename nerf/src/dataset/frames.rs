@@ -13,6 +13,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
+use std::sync::Arc;
 
 /// What the images of a part of a dataset are for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -65,7 +66,7 @@ pub struct Frame {
     /// The picture: RGB or RGBA as in the file.
     pub image: Photo,
     /// Which of its pixels are used; all, where there is none.
-    pub mask: Option<Mask>,
+    pub mask: Option<Arc<Mask>>,
     /// What was measured beside it, if anything, for the term [`depth`](crate::losses::DepthConfig) of the loss: one channel
     /// of the same size, the distance along the ray through each pixel's centre in scene units, and 0 where it is not known.
     pub distances: Option<Image>,

@@ -10,15 +10,19 @@ use super::survey::{Scope, Survey};
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
+use glam::DAffine3;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Of photographs that no file puts in a split, every one of this number, from the first by name, is held out to test on.
 const HELD_OUT: usize = 8;
 /// Photographs that are looked at to find out whether they are transparent anywhere.
 const LOOKED_AT: usize = 3;
+/// How much of such a photograph is so.
+const CLEAR: f64 = 0.05;
 /// How much of a pixel of a mask must be white for it to be used.
 const WHITE: f32 = 0.99;
 
@@ -40,9 +44,9 @@ impl Default for Reading<'_> {
 }
 
 impl Capture {
-    /// What the files of a folder say: its format is found out, and photographs that no file puts in a split are put in
-    /// one. Sorted by name, every eighth of those that exist is held out to [test](Split::Test) on, from the first; all
-    /// others are to train on.
+    /// What the files of a folder say: its format is found out, and where they put no photograph in a split, this does: sorted
+    /// by name, every eighth of them is held out to [test](Split::Test) on, from the first, whether its image exists or not;
+    /// all others are to train on. If they say only what to train on, the others are to test on.
     ///
     /// # Errors
     /// If the folder is absent or of no known format, or a file has a bad field; if a photograph is to be trained and tested
@@ -54,22 +58,21 @@ impl Capture {
             return Err(Error::file(folder, what));
         }
         let mut capture = formats::read(folder)?;
-        capture.views.sort_by(|a, b| (a.split.map(Split::name), &a.name).cmp(&(b.split.map(Split::name), &b.name)));
         capture.hold_out();
         capture.check_splits()?;
         Ok(capture)
     }
 
     fn hold_out(&mut self) {
-        if self.views.iter().any(|view| view.split.is_some()) {
-            return;
-        }
-        let few = self.present().count() < 3;
-        let mut number = 0;
-        for view in &mut self.views {
-            let held = !few && view.image.is_some() && number % HELD_OUT == 0;
-            number += usize::from(view.image.is_some());
-            view.split = Some(if held { Split::Test } else { Split::Train });
+        let held_out = |view: &View| matches!(view.split, Some(Split::Val | Split::Test));
+        if self.views.iter().all(|view| view.split.is_none()) {
+            self.views.sort_by(|a, b| a.name.cmp(&b.name));
+            let few = self.present().count() < 3;
+            for (number, view) in self.views.iter_mut().enumerate() {
+                view.split = Some(if !few && number % HELD_OUT == 0 { Split::Test } else { Split::Train });
+            }
+        } else if !self.views.iter().any(held_out) {
+            self.views.iter_mut().for_each(|view| view.split = view.split.or(Some(Split::Test)));
         }
     }
 
@@ -114,14 +117,16 @@ impl Capture {
     /// If an image that has an alpha channel cannot be read, or as [`Survey::new`].
     pub fn survey(&self, asked: Option<Scope>) -> Result<Survey> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
-        let mut transparent = false;
+        let (mut clear, total) = (0, looked_at.len());
         for view in looked_at {
             let Some(path) = &view.image else { continue };
-            if Photo::file_has_alpha(path)? {
-                transparent |= Photo::open(path, None)?.is_transparent();
+            let name = |error| Error::field(&self.file, &view.field, error);
+            if Photo::file_has_alpha(path).map_err(name)? {
+                clear += usize::from(Photo::open(path, None).map_err(name)?.transparent_share() > CLEAR);
             }
         }
-        Survey::new(self, transparent, asked)
+        // A border that was left when photographs were straightened is no sign of an empty background.
+        Survey::new(self, 2 * clear > total, asked)
     }
 
     /// Reads the photographs of a split, in parallel, and puts their cameras where the survey says.
@@ -144,13 +149,17 @@ impl Capture {
             return Err(Error::field(&self.file, &first.field, what));
         }
         let present = evenly_spaced(present, reading.views);
-        let (done, total) = (AtomicUsize::new(0), present.len());
-        let frames: Vec<Result<Frame>> = present
+        // What headers tell is found out before anything is decoded.
+        let plans: Vec<Result<Plan<'_>>> =
+            present.par_iter().map(|view| self.named(view, Plan::new(self, view, reading.downscale))).collect();
+        let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
+        let (done, total, lit) = (AtomicUsize::new(0), plans.len(), Lit::default());
+        let frames: Vec<Result<Frame>> = plans
             .par_iter()
-            .map(|view| {
-                let frame = self.frame(view, &survey.placement, reading.downscale);
+            .map(|plan| {
+                let frame = plan.frame(&survey.placement, &lit);
                 (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
-                frame.map_err(|error| Error::field(&self.file, &view.field, error))
+                self.named(plan.view, frame)
             })
             .collect();
         Ok(Dataset {
@@ -164,76 +173,128 @@ impl Capture {
         })
     }
 
-    fn frame(&self, view: &View, placement: &Placement, downscale: usize) -> Result<Frame> {
-        let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
-        let (path, downscale) = match smaller(path, downscale) {
-            Some(path) => (path, 1),
-            None => (path.clone(), downscale),
-        };
-        let [stored, shown] = Photo::size_of_file(&path)?;
-        let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera)).ok_or_else(|| {
-            let Camera { width, height, .. } = view.camera;
-            let [w, h] = shown;
-            Error::file(
-                &path,
-                format!("has {w}x{h} pixels, and its camera is for {width}x{height}: they must have one shape"),
-            )
-        })?;
-        let photo = Photo::open(&path, Some(size))?;
-        let smaller =
-            [photo.width, photo.height].map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
-        let photo = photo.resized(smaller);
-        let camera = placement.camera(&view.camera.resized(photo.width, photo.height));
-        let mask = view.mask.as_ref().map(|path| read_mask(path, &photo)).transpose()?;
-        let mask = seen(&camera, mask);
-        if mask.as_ref().is_some_and(|mask| mask.used() == 0) {
-            return Err(Error::file(&path, "shows nothing: all of its pixels are masked, or not reached by light"));
-        }
-        Ok(Frame { name: view.name.clone(), camera, image: photo, mask, distances: None })
+    /// An error with where the files speak of the photograph that it is about.
+    fn named<T>(&self, view: &View, result: Result<T>) -> Result<T> {
+        result.map_err(|error| Error::field(&self.file, &view.field, error))
     }
 }
 
-/// The same image in a folder of images that somebody has made smaller by this factor, as `images_4` beside `images`.
-fn smaller(path: &Path, downscale: usize) -> Option<PathBuf> {
-    if downscale == 1 {
-        return None;
+/// How one photograph is read.
+struct Plan<'a> {
+    view: &'a View,
+    path: PathBuf,
+    /// The size of the file's pixels that the camera was measured for, at another scale.
+    size: [usize; 2],
+    /// The size that it will have here.
+    to: [usize; 2],
+}
+
+impl<'a> Plan<'a> {
+    fn new(capture: &Capture, view: &'a View, downscale: usize) -> Result<Self> {
+        let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
+        let (path, downscale) = made_smaller(&capture.folder, path, downscale);
+        let [stored, shown] = Photo::size_of_file(&path)?;
+        let Some(size) = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera)) else {
+            let Camera { width, height, .. } = view.camera;
+            let [w, h] = stored;
+            let what = format!("has {w}x{h} pixels, and its camera is for {width}x{height}: they must have one shape");
+            return Err(Error::file(&path, what));
+        };
+        let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
+        Ok(Plan { view, path, size, to })
     }
-    let folder = path.ancestors().find(|folder| folder.file_name().is_some_and(|name| name == "images"))?;
-    let inside = path.strip_prefix(folder).ok()?;
-    let other = folder.with_file_name(format!("images_{downscale}")).join(inside);
-    let endings = ["", "png", "jpg", "JPG", "jpeg", "webp"];
-    let named = |ending: &&str| if ending.is_empty() { other.clone() } else { other.with_extension(ending) };
-    endings.iter().map(named).find(|path| path.is_file())
+
+    fn frame(&self, placement: &Placement, lit: &Lit) -> Result<Frame> {
+        let Plan { view, path, size, to } = self;
+        let photo = Photo::open(path, Some(*size))?;
+        let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };
+        let camera = view.camera.resized(to[0], to[1]);
+        let given = view.mask.as_ref().map(|path| read_mask(path, *size, *to)).transpose()?;
+        let mask = match (given, lit.of(&camera)) {
+            (Some(given), Some(lit)) => {
+                Some(Arc::new(Mask::new(to[0], to[1], |x, y| given.uses(x, y) && lit.uses(x, y))))
+            }
+            (given, lit) => given.map(Arc::new).or(lit),
+        };
+        if mask.as_ref().is_some_and(|mask| mask.used() == 0) {
+            return Err(Error::file(path, "shows nothing: all of its pixels are masked, or not reached by light"));
+        }
+        Ok(Frame { name: view.name.clone(), camera: placement.camera(&camera), image, mask, distances: None })
+    }
+}
+
+/// The same image in a folder of images that somebody has made smaller by this factor, as `images_4` beside `images`, and
+/// what is left to do; or the image itself.
+fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize) {
+    let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
+    let mut parts = inside.components();
+    let first = parts.next().and_then(|part| part.as_os_str().to_str()).unwrap_or("");
+    // Of a capture that has no others.
+    if let Some(factor) = first.strip_prefix("images_").and_then(|factor| factor.parse::<usize>().ok()) {
+        return (path.to_owned(), if factor > 0 { downscale.div_ceil(factor) } else { downscale });
+    }
+    if downscale == 1 || first != "images" {
+        return (path.to_owned(), downscale);
+    }
+    let other = folder.join(format!("images_{downscale}")).join(parts.as_path());
+    let endings = ["png", "jpg", "JPG", "jpeg", "webp"].map(|ending| other.with_extension(ending));
+    let found = [other].into_iter().chain(endings).find(|path| path.is_file());
+    found.map_or_else(|| (path.to_owned(), downscale), |path| (path, 1))
 }
 
 /// Whether an image of this size can have been taken by the camera, at another scale: up to the rounding of a side.
 fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
+    if [width, height] == [camera.width, camera.height] {
+        return true;
+    }
     let [w, h] = [width as f64, height as f64];
     let [cw, ch] = [camera.width as f64, camera.height as f64];
-    (w * ch - h * cw).abs() <= 1.01 * cw.max(ch).max(w).max(h)
+    // Half a pixel of the smaller of the two, at the scale of the larger.
+    (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
 }
 
-/// Reads a mask, white where the photograph is used.
-fn read_mask(path: &Path, photo: &Photo) -> Result<Mask> {
-    let mask = Photo::open(path, None)?;
-    let Photo { width, height, .. } = *photo;
-    if mask.width < width || mask.height < height {
-        let what = format!("has {}x{} pixels, fewer than its photograph's {width}x{height}", mask.width, mask.height);
+/// Reads a mask, white where the photograph is used, of a photograph of the size `of` that becomes one of the size `to`.
+fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
+    let mask = Photo::open(path, Some(of))?;
+    let [width, height] = to;
+    let shape = (mask.width * of[1]).abs_diff(mask.height * of[0]) <= of[0].max(of[1]);
+    if !shape || mask.width < width || mask.height < height {
+        let what = format!(
+            "has {}x{} pixels, and its photograph {}x{}: it must be as large, or the same at another scale",
+            mask.width, mask.height, of[0], of[1]
+        );
         return Err(Error::file(path, what));
     }
-    let mask = mask.resized([width, height]);
+    let mask = mask.resized(to);
     Ok(Mask::new(width, height, |x, y| mask.pixel(x, y)[0] >= WHITE))
 }
 
-/// Without the pixels that no light reaches through the camera's lens.
-fn seen(camera: &Camera, mask: Option<Mask>) -> Option<Mask> {
-    let Camera { width, height, .. } = *camera;
-    let centre = |x: usize, y: usize| camera.sees(x as f64 + 0.5, y as f64 + 0.5);
-    // A lens that reaches the border reaches all that is within.
-    let border =
-        (0..width).flat_map(|x| [(x, 0), (x, height - 1)]).chain((0..height).flat_map(|y| [(0, y), (width - 1, y)]));
-    if camera.lens == Lens::Pinhole || border.into_iter().all(|(x, y)| centre(x, y)) {
-        return mask;
+/// The pixels that light reaches, found once for all photographs of a camera.
+#[derive(Default)]
+struct Lit(Mutex<Vec<(Camera, Option<Arc<Mask>>)>>);
+
+impl Lit {
+    /// `None` where light reaches all.
+    fn of(&self, camera: &Camera) -> Option<Arc<Mask>> {
+        if camera.lens == Lens::Pinhole {
+            return None;
+        }
+        let here = Camera { pose: DAffine3::IDENTITY, ..camera.clone() };
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, lit)) = known.iter().find(|(camera, _)| *camera == here) {
+            return lit.clone();
+        }
+        let Camera { width, height, .. } = here;
+        let reached = |x: usize, y: usize| here.sees(x as f64 + 0.5, y as f64 + 0.5);
+        let sides = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
+        let mut border = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]).chain(sides);
+        // A lens that reaches the border reaches all that is within.
+        let whole = border.all(|(x, y)| reached(x, y));
+        let lit = (!whole).then(|| Arc::new(Mask::new(width, height, reached)));
+        known.push((here, lit.clone()));
+        lit
     }
-    Some(Mask::new(width, height, |x, y| centre(x, y) && mask.as_ref().is_none_or(|mask| mask.uses(x, y))))
 }
+
+#[cfg(test)]
+mod tests;

@@ -9,6 +9,8 @@ pub struct Mask {
     height: usize,
     /// A bit for each pixel, row by row.
     words: Vec<u64>,
+    /// For each word how many pixels before it are used.
+    before: Vec<u32>,
     used: usize,
 }
 
@@ -16,14 +18,15 @@ impl Mask {
     /// The pixels, column and row, for which `used` is true.
     pub fn new(width: usize, height: usize, used: impl Fn(usize, usize) -> bool) -> Self {
         let mut words = vec![0_u64; (width * height).div_ceil(64)];
-        let mut count = 0;
-        for pixel in 0..width * height {
-            if used(pixel % width, pixel / width) {
-                words[pixel / 64] |= 1 << (pixel % 64);
-                count += 1;
-            }
+        for pixel in (0..width * height).filter(|pixel| used(pixel % width, pixel / width)) {
+            words[pixel / 64] |= 1 << (pixel % 64);
         }
-        Mask { width, height, words, used: count }
+        let (mut count, mut before) = (0, Vec::with_capacity(words.len()));
+        for word in &words {
+            before.push(count);
+            count += word.count_ones();
+        }
+        Mask { width, height, words, before, used: count as usize }
     }
 
     /// Width and height.
@@ -42,31 +45,23 @@ impl Mask {
     /// If it lies outside of the photograph.
     pub fn uses(&self, x: usize, y: usize) -> bool {
         assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} mask", self.width, self.height);
-        self.bit(y * self.width + x)
-    }
-
-    fn bit(&self, pixel: usize) -> bool {
+        let pixel = y * self.width + x;
         self.words[pixel / 64] >> (pixel % 64) & 1 == 1
     }
 
-    /// A random one of the pixels that are used, column and row, each as likely as the others but where fewer than one of a
-    /// hundred is used.
+    /// A random one of the pixels that are used, column and row, each as likely as the others.
     ///
     /// # Panics
     /// If none is used.
     pub fn draw(&self, rng: &mut (impl Rng + ?Sized)) -> [usize; 2] {
         assert!(self.used > 0, "no pixel of this photograph is used");
-        let count = self.width * self.height;
-        let mut pixel = rng.random_range(0..count);
-        for _ in 0..1000 {
-            if self.bit(pixel) {
-                break;
-            }
-            pixel = rng.random_range(0..count);
+        let number = rng.random_range(0..self.used) as u32;
+        let word = self.before.partition_point(|before| *before <= number) - 1;
+        let mut left = self.words[word];
+        for _ in self.before[word]..number {
+            left &= left - 1;
         }
-        while !self.bit(pixel) {
-            pixel = (pixel + 1) % count;
-        }
+        let pixel = 64 * word + left.trailing_zeros() as usize;
         [pixel % self.width, pixel / self.width]
     }
 }
@@ -88,8 +83,10 @@ mod tests {
             counts[10 * y + x] += 1;
         }
         assert!(counts.iter().filter(|n| **n > 0).all(|n| (850..1150).contains(n)), "{counts:?}");
-        let single = Mask::new(100, 100, |x, y| [x, y] == [3, 99]);
-        assert_eq!(single.draw(&mut rng), [3, 99]);
+        for place in [[3, 99], [0, 0], [99, 99]] {
+            let single = Mask::new(100, 100, |x, y| [x, y] == place);
+            assert_eq!(single.draw(&mut rng), place);
+        }
     }
 
     #[test]

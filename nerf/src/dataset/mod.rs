@@ -84,12 +84,6 @@ mod tests {
         let file = folder.path().join("transforms.json");
         std::fs::write(&file, "{}").unwrap();
         fails(&file, "is not a folder");
-        fails(folder.path(), "instant-ngp");
-    }
-
-    #[test]
-    fn a_downscale_of_zero_is_named() {
-        let message = load(".", Split::Train, 0).unwrap_err().to_string();
-        assert_eq!(message, "`downscale`: must be 1 or more, is 0");
+        fails(folder.path(), "`frames`: is missing");
     }
 }

@@ -86,19 +86,18 @@ impl From<Image> for Photo {
 
 impl Photo {
     /// Reads a PNG, JPEG or WebP file, whichever its contents say it is: RGBA if it has transparency, otherwise RGB; turned
-    /// as its EXIF orientation says. Where `size` is the width and height of the file's pixels as they are stored, and not
-    /// of those turned, a program has measured its camera before turning, and they are taken as they are stored.
+    /// as its EXIF orientation says. But where `size`, the width and height that a camera was measured for, is that of the
+    /// file's pixels as they are stored, so are the pixels: programs that find cameras look at these.
     ///
     /// # Errors
-    /// If the file cannot be read or decoded; the error names it.
+    /// If the file cannot be read or decoded, or has more than 2^28 pixels; the error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
-        let bad = |e: image::ImageError| Error::file(path, format!("cannot be decoded: {e}"));
-        let mut decoder = reader(path)?.into_decoder().map_err(bad)?;
+        let (mut decoder, stored) = decoder(path)?;
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-        let stored = [decoder.dimensions().0 as usize, decoder.dimensions().1 as usize];
-        let mut decoded = DynamicImage::from_decoder(decoder).map_err(bad)?;
-        if turned_size(stored, turn) == stored || size != Some(stored) {
+        let decoded = DynamicImage::from_decoder(decoder);
+        let mut decoded = decoded.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+        if size != Some(stored) {
             decoded.apply_orientation(turn);
         }
         Ok(Self::from_decoded(decoded))
@@ -117,16 +116,13 @@ impl Photo {
         Photo { width, height, channels, values }
     }
 
-    /// Width and height of an image file as it is stored and as it is shown, read from its header alone.
+    /// Width and height of an image file, as it is stored and as it is shown, read from its header alone.
     ///
     /// # Errors
-    /// If the file cannot be read or is no image.
+    /// If the file cannot be read, is no image or has more than 2^28 pixels.
     pub fn size_of_file(path: impl AsRef<Path>) -> Result<[[usize; 2]; 2]> {
-        let path = path.as_ref();
-        let decoder = reader(path)?.into_decoder();
-        let mut decoder = decoder.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+        let (mut decoder, stored) = decoder(path.as_ref())?;
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-        let stored = [decoder.dimensions().0 as usize, decoder.dimensions().1 as usize];
         Ok([stored, turned_size(stored, turn)])
     }
 
@@ -135,16 +131,14 @@ impl Photo {
     /// # Errors
     /// If the file cannot be read or is no image.
     pub fn file_has_alpha(path: impl AsRef<Path>) -> Result<bool> {
-        let path = path.as_ref();
-        let decoder = reader(path)?.into_decoder();
-        let decoder = decoder.map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
-        Ok(decoder.color_type().has_alpha())
+        Ok(decoder(path.as_ref())?.0.color_type().has_alpha())
     }
 
-    /// Whether some pixel is not opaque.
-    pub fn is_transparent(&self) -> bool {
-        let alpha = |pixel: usize| self.pixel(pixel % self.width, pixel / self.width)[3];
-        self.has_alpha() && (0..self.width * self.height).any(|pixel| alpha(pixel) < 1.0)
+    /// The share of pixels that are wholly transparent.
+    pub fn transparent_share(&self) -> f64 {
+        let count = self.width * self.height;
+        let clear = (0..count).filter(|pixel| self.pixel(pixel % self.width, pixel / self.width)[3] == 0.0);
+        if self.has_alpha() { clear.count() as f64 / count.max(1) as f64 } else { 0.0 }
     }
 
     /// A pixel as red, green, blue and alpha in 0..=1; alpha is 1 where there is none.
@@ -271,9 +265,20 @@ fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
     }
 }
 
-fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>> {
+/// More pixels than any camera has: a file that says so is damaged, and would take all memory.
+const MOST_PIXELS: usize = 1 << 28;
+
+/// What decodes a file, and the size of its pixels as they are stored.
+fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
     let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
-    reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))
+    let reader = reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
+    let decoder = reader.into_decoder().map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+    let (width, height) = decoder.dimensions();
+    let size = [width as usize, height as usize];
+    if size[0].saturating_mul(size[1]) > MOST_PIXELS {
+        return Err(Error::file(path, format!("cannot be decoded: {width}x{height} pixels are more than 2^28")));
+    }
+    Ok((decoder, size))
 }
 
 #[cfg(test)]

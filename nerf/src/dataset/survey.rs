@@ -1,10 +1,12 @@
 //! How a scene lies in its capture, found out from its cameras: up, middle, scale, and how far it goes.
 
 use super::capture::{Capture, Format, Point, View};
+use super::frames::evenly_spaced;
 use super::placement::Placement;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -67,6 +69,8 @@ const NEAR_SHARE: f64 = 0.05;
 const FAR_SIDES: f64 = 1000.0;
 /// Half of the box of an unbounded scene, as a share of the cameras' distance from its middle.
 const INNER_SHARE: f64 = 0.5;
+/// Times that the middle is found, the last ones without what is far off.
+const ROUNDS: usize = 8;
 
 impl Survey {
     /// Of a capture, from all photographs that exist. `transparent` says whether they show nothing somewhere, which only
@@ -77,7 +81,16 @@ impl Survey {
     pub fn new(capture: &Capture, transparent: bool, asked: Option<Scope>) -> Result<Survey> {
         let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
         if cameras.is_empty() {
-            return Err(Error::file(&capture.file, "has no photograph whose image exists"));
+            let Some(first) = capture.views.first() else {
+                return Err(Error::file(&capture.file, "lists no photographs"));
+            };
+            let what = format!(
+                "none of the {} images exists, not even that of the first, `{}`, in or below {}",
+                capture.views.len(),
+                first.name,
+                capture.folder.display()
+            );
+            return Err(Error::field(&capture.file, &first.field, what));
         }
         if capture.format == Format::Blender && asked != Some(Scope::Unbounded) && conventional(&cameras) {
             return Ok(Survey {
@@ -94,7 +107,8 @@ impl Survey {
             (None, true) => (Scope::Bounded, "photographs are transparent where there is nothing"),
             (None, false) => (Scope::Unbounded, "photographs are opaque, so they show what lies behind"),
         };
-        let middle = middle(&cameras);
+        let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
+        let middle = if depths.len() == cameras.len() { ahead(&cameras, &depths) } else { middle(&cameras) };
         let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if !(distance > 1e-9 * (1.0 + middle.length())) {
             let what = "all cameras stand in one place: nothing in the scene has a size";
@@ -114,7 +128,9 @@ impl Survey {
                 [(nearest - reach).max(NEAR_SHARE * distance), distances().fold(0.0, f64::max) + reach]
             }
             Scope::Unbounded => {
-                let near = nearest_point(&cameras, &capture.points).map_or(NEAR_SHARE * distance, |near| 0.5 * near);
+                let given = depths.iter().map(|[near, _]| *near).reduce(f64::min);
+                let near = given.or_else(|| nearest_point(&cameras, &capture.points));
+                let near = near.map_or(NEAR_SHARE * distance, |near| 0.5 * near);
                 [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
             }
         };
@@ -146,19 +162,41 @@ fn middle(cameras: &[&Camera]) -> DVec3 {
     let count = cameras.len() as f64;
     let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
     let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
-    let (mut matrix, mut sum) = (DMat3::ZERO, DVec3::ZERO);
-    for camera in cameras {
-        let axis = camera.pose.matrix3.z_axis;
-        let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
-        matrix += across;
-        // Around the mean, so that coordinates far from the origin keep their digits.
-        sum += across * (camera.pose.translation - mean);
+    let mut weights = vec![1.0; cameras.len()];
+    let mut found = mean;
+    // A camera that is lost is not to move it: the farther an axis passes, the less it counts.
+    for _ in 0..ROUNDS {
+        let (mut matrix, mut sum, mut total) = (DMat3::ZERO, DVec3::ZERO, 0.0);
+        for (camera, weight) in cameras.iter().zip(&weights) {
+            let across = across(camera) * *weight;
+            matrix += across;
+            // Around the mean, so that coordinates far from the origin keep their digits.
+            sum += across * (camera.pose.translation - mean);
+            total += weight;
+        }
+        // Axes that are nearly parallel meet nowhere in particular.
+        found = mean + (matrix + DMat3::from_diagonal(DVec3::splat(1e-3 * total))).inverse() * sum;
+        let passes = |camera: &&Camera| (across(camera) * (found - camera.pose.translation)).length();
+        let usual = median(cameras.iter().map(passes)).max(1e-2 * spread);
+        weights = cameras.iter().map(|camera| 1.0 / (1.0 + (passes(camera) / (3.0 * usual)).powi(2))).collect();
     }
-    // Axes that are nearly parallel meet nowhere in particular.
-    let found = mean + (matrix + DMat3::from_diagonal(DVec3::splat(1e-3 * count))).inverse() * sum;
     let ahead = |camera: &&&Camera| (found - camera.pose.translation).dot(-camera.pose.matrix3.z_axis) > 0.0;
     let most = 4 * cameras.iter().filter(ahead).count() > 3 * cameras.len();
     if most && found.is_finite() && found.distance(mean) < 100.0 * spread { found } else { mean }
+}
+
+/// What is left of a vector without its part along a camera's optical axis.
+fn across(camera: &Camera) -> DMat3 {
+    let axis = camera.pose.matrix3.z_axis;
+    DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z)
+}
+
+/// The middle of what lies ahead of cameras whose files say how near and far it is: halfway in inverse distance.
+fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
+    let places = cameras.iter().zip(depths).map(|(camera, [near, far])| {
+        camera.pose.translation - camera.pose.matrix3.z_axis * (2.0 / (1.0 / near + 1.0 / far))
+    });
+    places.sum::<DVec3>() / cameras.len() as f64
 }
 
 /// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal axes
@@ -179,7 +217,10 @@ fn upright(cameras: &[&Camera]) -> DMat3 {
     if !up.is_finite() {
         return DMat3::IDENTITY;
     }
-    let up = if up.dot(mean) < 0.0 { -up } else { up };
+    // Of cameras that look straight down no side is up in their pictures: what they look away from is.
+    let back = cameras.iter().map(|camera| camera.pose.matrix3.z_axis).sum::<DVec3>() / count;
+    let side = if up.dot(mean).abs() > 0.1 { up.dot(mean) } else { up.dot(back) };
+    let up = if side < 0.0 { -up } else { up };
     // The shortest way, so that a capture that is upright already is not turned.
     DMat3::from_quat(glam::DQuat::from_rotation_arc(up, DVec3::Z))
 }
@@ -200,12 +241,16 @@ fn nearest_point(cameras: &[&Camera], points: &[Point]) -> Option<f64> {
     /// Photographs that a point must be seen in, and pixels that it may be off.
     const TRUSTED: (u32, f64) = (3, 2.0);
     const FEWEST: usize = 100;
-    let trusted: Vec<DVec3> =
-        points.iter().filter(|p| p.views >= TRUSTED.0 && p.error <= TRUSTED.1).map(|p| p.position).collect();
+    /// Cameras and points that are asked: more would say the same.
+    const ASKED: [usize; 2] = [64, 20_000];
+    // Some files do not say in how many photographs a point is seen.
+    let trusted = |p: &&Point| (p.views == 0 || p.views >= TRUSTED.0) && !(p.error > TRUSTED.1);
+    let trusted: Vec<DVec3> = points.iter().filter(trusted).map(|p| p.position).collect();
     if trusted.len() < FEWEST {
         return None;
     }
-    let nearest = cameras.iter().filter_map(|camera| {
+    let trusted = evenly_spaced(trusted, ASKED[1]);
+    let nearest = |camera: &&Camera| {
         let inside = |p: &&DVec3| {
             camera.pixel_of(**p).is_some_and(|[x, y]| {
                 (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y)
@@ -215,8 +260,8 @@ fn nearest_point(cameras: &[&Camera], points: &[Point]) -> Option<f64> {
         depths.sort_by(f64::total_cmp);
         // The nearest of two hundred: a few are always wrong.
         depths.get(depths.len() / 200).copied()
-    });
-    let mut nearest: Vec<f64> = nearest.collect();
+    };
+    let mut nearest: Vec<f64> = evenly_spaced(cameras.to_vec(), ASKED[0]).par_iter().filter_map(nearest).collect();
     nearest.sort_by(f64::total_cmp);
     nearest.get(nearest.len() / 20).copied()
 }
@@ -226,3 +271,6 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
+
+#[cfg(test)]
+mod tests;

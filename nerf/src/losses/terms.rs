@@ -267,8 +267,8 @@ mod tests {
         let unbounded = Evenness { weight: 2.0, reach: Some(1.1) };
         let places = [0.0, 0.55, 1.1, 2.2, 1e9].map(|distance| unbounded.place(distance, [0.5, 2.0]));
         assert!(places.iter().zip([0.0, 0.25, 0.5, 0.75, 1.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{places:?}");
-        // The wall's bin from .5 to .8 is .3 / 2.2 of that.
-        assert!((at(&unbounded, 9.0, 0.0) - 2.0 * 2.0 / 3.0 * 0.3 / 2.2).abs() < 1e-6, "{}", at(&unbounded, 9.0, 0.0));
+        // The walls' bins, of .3 and .25, are so many 2.2ths of that.
+        assert!((at(&unbounded, 9.0, 0.0) - 2.0 / 3.0 * 0.55 / 2.2).abs() < 1e-6, "{}", at(&unbounded, 9.0, 0.0));
         // Nothing and a wall have no entropy; at an opacity of a half each ray has ln 2, in halves of it.
         assert!(at(terms[1], -60.0, 0.0).abs() < 1e-12 && at(terms[1], 9.0, 0.0).abs() < 1e-12);
         let half = (2.0_f64.ln() / 1.5).ln();

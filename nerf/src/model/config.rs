@@ -25,6 +25,8 @@ const RESOLUTION: usize = 32;
 /// Steps through an unbounded scene, in training and in views, as shares of the box's side.
 const STEP: f64 = 1.0 / 100.0;
 const VIEW_STEP: f64 = 1.0 / 150.0;
+/// Samples of a training step: most of them lie behind what is opaque, and cost little.
+const SAMPLES: usize = 4 * 24576;
 /// How much longer they are for each unit of distance.
 const CONE: f64 = 1.0 / 64.0;
 /// Weight of the distortion of rays through an unbounded scene, of which photographs show every place from few sides.
@@ -209,23 +211,32 @@ impl Config {
     /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
     /// boxes at steps that grow, a hash grid is twice as fine, as it holds all of space, and a
     /// [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in docs/benchmarks.md, section
-    /// Captures.
+    /// Captures. What a [budget](Self::with_budget) says of steps is left behind. A second call with the same scope changes
+    /// nothing.
     pub fn with_scope(mut self, scope: Scope) -> Self {
-        self.unbounded = scope == Scope::Unbounded;
+        let before = std::mem::replace(&mut self.unbounded, scope == Scope::Unbounded);
+        if before == self.unbounded {
+            return self;
+        }
+        let usual = MarchingConfig::default();
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
-            marching.occupancy.cascades = 1;
+            let occupancy = &mut marching.occupancy;
             if self.unbounded {
-                (marching.occupancy.cascades, marching.occupancy.resolution) = (CASCADES, RESOLUTION);
+                (occupancy.cascades, occupancy.resolution) = (CASCADES, RESOLUTION);
                 (marching.step, marching.last_step, marching.cone) = (STEP, None, CONE);
-                marching.view_step = VIEW_STEP;
-                marching.samples *= 4;
+                (marching.view_step, marching.samples) = (VIEW_STEP, SAMPLES);
+            } else {
+                (occupancy.cascades, occupancy.resolution) = (1, usual.occupancy.resolution);
+                *marching = MarchingConfig { occupancy: marching.occupancy, ..usual };
             }
         }
+        let field = self.field.get_mut::<InstantConfig>();
         if self.unbounded {
             self.terms.push(TermConfig::new(DistortionConfig { weight: DISTORTION }));
-            if let Some(field) = self.field.get_mut::<InstantConfig>() {
-                field.grid.finest *= 2;
-            }
+            field.into_iter().for_each(|field| field.grid.finest *= 2);
+        } else {
+            self.terms.retain(|term| term.get::<DistortionConfig>().is_none());
+            field.into_iter().for_each(|field| field.grid.finest /= 2);
         }
         self
     }
@@ -312,5 +323,34 @@ impl Config {
             field.density = DensityActivation::Relu;
         }
         self
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scope_changes_what_a_scene_asks_for_once() {
+        let preset = Config::preset(Preset::Instant);
+        let unbounded = preset.clone().with_scope(Scope::Unbounded);
+        unbounded.check().unwrap();
+        let [before, after] =
+            [&preset, &unbounded].map(|config| config.sampler.get::<MarchingConfig>().unwrap().clone());
+        assert_eq!((after.occupancy.cascades, after.occupancy.resolution, after.samples), (6, 32, 4 * before.samples));
+        assert_eq!((after.step, after.last_step, after.cone, after.view_step), (0.01, None, 1.0 / 64.0, 1.0 / 150.0));
+        let [coarse, fine] =
+            [&preset, &unbounded].map(|config| config.field.get::<InstantConfig>().unwrap().grid.finest);
+        assert_eq!(fine, 2 * coarse);
+        assert!(unbounded.unbounded && unbounded.terms.len() == 1);
+        assert_eq!(unbounded.clone().with_scope(Scope::Unbounded), unbounded);
+        assert_eq!(unbounded.with_scope(Scope::Bounded), preset);
+        assert_eq!(preset.clone().with_scope(Scope::Bounded), preset);
+        for other in [Preset::Voxel, Preset::Small, Preset::Classic] {
+            Config::preset(other).with_scope(Scope::Unbounded).check().unwrap();
+        }
+        Config::preset(Preset::Small).with_skip(Skip::Fast).with_scope(Scope::Unbounded).check().unwrap();
+        let long = Config::preset(Preset::Instant).with_budget(600.0).with_scope(Scope::Unbounded);
+        assert_eq!(long.sampler.get::<MarchingConfig>().unwrap().last_step, None);
     }
 }

@@ -122,7 +122,7 @@ mod tests {
         let bent = Frame { camera: Camera { lens: Lens::Fov { omega: 0.3 }, ..frame.camera.clone() }, ..frame.clone() };
         assert!(Silhouette::new(&opaque).is_none() && Silhouette::new(&bent).is_none());
         // Where nothing is known of a pixel it may show something.
-        let masked = Frame { mask: Some(Mask::new(60, 60, |x, _| x < 40)), ..frame.clone() };
+        let masked = Frame { mask: Some(Mask::new(60, 60, |x, _| x < 40).into()), ..frame.clone() };
         assert!(!Silhouette::new(&masked).unwrap().is_clear(DVec3::new(1.7, 0.0, 0.0), 0.3));
     }
 

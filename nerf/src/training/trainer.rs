@@ -4,8 +4,8 @@ use super::groups::Groups;
 use super::pass::{Work, rays_loss};
 use super::startup;
 use super::stats::{Budget, StepStats};
-use crate::dataset::Dataset;
 use crate::dataset::batch::Batch;
+use crate::dataset::{Dataset, Scope};
 use crate::model::config::Config;
 use crate::model::{Extent, Model, densities};
 use crate::pictures::metrics::psnr_from_mse;
@@ -64,6 +64,11 @@ impl Trainer {
     ) -> Result<Self> {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
+        }
+        if data.scope == Scope::Unbounded && !config.unbounded {
+            let what = "is false, and the photographs show what lies beyond the scene's box; use `Config::with_scope` with \
+                        the scope of the dataset";
+            return Err(Error::setting("unbounded", what));
         }
         let extent = Extent {
             frames: data.frames.len(),

@@ -53,19 +53,30 @@ pub(crate) fn entries() -> Vec<Entry> {
     let tensor = |values: &[f64]| Tensor::from_vec(&[values.len()], values.to_vec());
     let brown = [0.1, -0.2, 0.03, 0.2, -0.05, 0.01, 0.002, -0.003];
     let fisheye = [0.05, -0.02, 0.003, 0.001, 0.002, -0.003, 0.004, -0.001];
-    let (before, around) = ((0.8, 1.5), (-0.1, 1.2));
-    macro_rules! entry {
-        ($name:literal, $lens:expr, $coefficients:expr, $z:expr) => {
-            Entry::function($name, |x| lens_places(&$lens, &x[0], &x[1]), |x| lens_places(&$lens, &x[0], &x[1]))
-                .sample_of(vec![tensor(&$coefficients), directions($z.0, $z.1)])
-        };
-    }
+    const BROWN: Lens = Lens::Brown { k: [0.0; 6], p: [0.0; 2] };
+    const FISHEYE: Lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
+    const FOV: Lens = Lens::Fov { omega: 0.0 };
+    const ALL: Lens = Lens::Equirectangular;
+    const NONE: Lens = Lens::Pinhole;
     vec![
-        entry!("lens_brown", Lens::Brown { k: [0.0; 6], p: [0.0; 2] }, brown, before),
-        entry!("lens_fisheye", Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] }, fisheye, around),
-        entry!("lens_fov", Lens::Fov { omega: 0.0 }, [0.9], before)
+        Entry::function("lens_brown", |x| lens_places(&BROWN, &x[0], &x[1]), |x| lens_places(&BROWN, &x[0], &x[1]))
+            .sample_of(vec![tensor(&brown), directions(0.8, 1.5)]),
+        Entry::function(
+            "lens_fisheye",
+            |x| lens_places(&FISHEYE, &x[0], &x[1]),
+            |x| lens_places(&FISHEYE, &x[0], &x[1]),
+        )
+        .sample_of(vec![tensor(&fisheye), directions(-0.1, 1.2)]),
+        Entry::function("lens_fov", |x| lens_places(&FOV, &x[0], &x[1]), |x| lens_places(&FOV, &x[0], &x[1]))
+            .sample_of(vec![tensor(&[0.9]), directions(0.8, 1.5)])
             .sample_of(vec![tensor(&[1e-3]), directions(0.8, 1.5)]),
-        entry!("lens_equirectangular", Lens::Equirectangular, [], around),
-        entry!("lens_pinhole", Lens::Pinhole, [], before),
+        Entry::function(
+            "lens_equirectangular",
+            |x| lens_places(&ALL, &x[0], &x[1]),
+            |x| lens_places(&ALL, &x[0], &x[1]),
+        )
+        .sample_of(vec![tensor(&[]), directions(-0.1, 1.2)]),
+        Entry::function("lens_pinhole", |x| lens_places(&NONE, &x[0], &x[1]), |x| lens_places(&NONE, &x[0], &x[1]))
+            .sample_of(vec![tensor(&[]), directions(0.8, 1.5)]),
     ]
 }

@@ -36,7 +36,12 @@ fn sizes_that_do_not_divide_share_pixels() {
     // What is transparent does not bleed into what is not.
     let rgba = bytes(3, 1, 4, &[200, 0, 0, 255, 9, 9, 9, 0, 0, 100, 0, 255]);
     assert_eq!(rgba.resized([1, 1]), bytes(1, 1, 4, &[100, 50, 0, 170]));
-    assert!(rgba.is_transparent() && !bytes(1, 1, 4, &[1, 2, 3, 255]).is_transparent() && !line.is_transparent());
+    assert_eq!((rgba.transparent_share(), line.transparent_share()), (1.0 / 3.0, 0.0));
+    assert_eq!(bytes(1, 2, 4, &[1, 2, 3, 255, 1, 2, 3, 0]).transparent_share(), 0.5);
+    // Rows and columns are not exchanged, and words stay words.
+    let words = Photo { width: 4, height: 2, channels: 3, values: Values::Words((0..24).map(|i| i * 2000).collect()) };
+    let Values::Words(small) = words.resized([2, 1]).values else { panic!("no words") };
+    assert_eq!(small, [15000, 17000, 19000, 27000, 29000, 31000]);
 }
 
 #[test]
@@ -69,17 +74,17 @@ fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measure
     ] {
         std::fs::write(&path, jpeg(orientation)).unwrap();
         assert_eq!(Photo::size_of_file(&path).unwrap(), [[16, 8], size]);
-        for asked in [None, Some(size)] {
+        let camera = if size == [16, 8] { None } else { Some(size) };
+        for asked in [None, camera] {
             let photo = Photo::open(&path, asked).unwrap();
             let [right, bottom] = [photo.width - 1, photo.height - 1];
             assert_eq!([photo.width, photo.height], size);
             let seen = [white(&photo, 0, 0), white(&photo, right, 0), white(&photo, 0, bottom)];
             assert_eq!(seen, corners, "orientation {orientation}");
         }
-        if size != [16, 8] {
-            let stored = Photo::open(&path, Some([16, 8])).unwrap();
-            assert!([stored.width, stored.height] == [16, 8] && white(&stored, 0, 7) && !white(&stored, 15, 0));
-        }
+        // A camera that was measured on the pixels as they are stored, also where turning would not change their size.
+        let stored = Photo::open(&path, Some([16, 8])).unwrap();
+        assert!([stored.width, stored.height] == [16, 8] && white(&stored, 0, 7) && !white(&stored, 15, 0));
     }
 }
 
@@ -87,13 +92,30 @@ fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measure
 fn png_jpeg_and_webp_are_told_by_their_contents() {
     let folder = tempfile::tempdir().unwrap();
     let picture = image::RgbaImage::from_fn(5, 4, |x, y| image::Rgba([x as u8 * 50, y as u8 * 60, 7, 255 - x as u8]));
-    for (format, alpha) in [(image::ImageFormat::Png, true), (image::ImageFormat::WebP, true)] {
+    for format in [image::ImageFormat::Png, image::ImageFormat::WebP] {
         let path = folder.path().join("picture.JPG");
         picture.save_with_format(&path, format).unwrap();
         let photo = Photo::open(&path, None).unwrap();
-        assert_eq!((Photo::file_has_alpha(&path).unwrap(), photo.has_alpha()), (alpha, alpha));
+        assert_eq!((Photo::file_has_alpha(&path).unwrap(), photo.has_alpha()), (true, true));
         assert_eq!(photo.pixel(4, 3), [200.0 / 255.0, 180.0 / 255.0, 7.0 / 255.0, 251.0 / 255.0]);
     }
+}
+
+#[test]
+fn a_header_that_promises_too_much_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("picture.png");
+    std::fs::write(&path, jpeg(1)).unwrap();
+    assert!(!Photo::file_has_alpha(&path).unwrap() && Photo::open(&path, None).is_ok());
+    // A PNG whose header, with its checksum, says 2^20 x 2^20 pixels.
+    let head: &[u8] = b"IHDR\0\x10\0\0\0\x10\0\0\x08\x02\0\0\0";
+    let checksum = head.iter().fold(!0_u32, |sum, byte| {
+        (0..8).fold(sum ^ u32::from(*byte), |sum, _| if sum & 1 == 1 { 0xedb8_8320 ^ (sum >> 1) } else { sum >> 1 })
+    });
+    let file = [b"\x89PNG\r\n\x1a\n\0\0\0\x0d", head, &(!checksum).to_be_bytes(), &[0, 0, 0, 0], b"IDAT"].concat();
+    std::fs::write(&path, file).unwrap();
+    let message = Photo::open(&path, None).unwrap_err().to_string();
+    assert!(message.contains("picture.png: cannot be decoded"), "{message}");
 }
 
 proptest! {

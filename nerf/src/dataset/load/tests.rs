@@ -1,0 +1,209 @@
+use super::*;
+use crate::dataset::Image;
+use glam::DVec3;
+use std::sync::Mutex;
+
+/// A capture of photographs of 12 x 8 pixels with rising brightness; the third image is absent.
+fn capture(folder: &Path, count: usize) -> Capture {
+    let view = |i: usize| {
+        let name = format!("images/{i:02}.png");
+        let path = folder.join(&name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let data = (0..12 * 8 * 3).map(|k| ((k + i) % 200) as f32 / 255.0).collect();
+        let image = Image { width: 12, height: 8, channels: 3, data };
+        std::fs::write(&path, image.to_png()).unwrap();
+        let eye = DVec3::new(i as f64, 3.0, 1.0);
+        let camera = Camera::from_angle(24, 16, 0.8, Camera::look_at(eye, DVec3::ZERO, DVec3::Z));
+        View {
+            field: format!("frames[{i}]"),
+            image: (i != 2).then_some(path),
+            camera: Camera { centre: [13.0, 7.0], ..camera },
+            split: None,
+            mask: None,
+            depth: None,
+            sharpness: None,
+            bounds: None,
+            name,
+        }
+    };
+    Capture {
+        folder: folder.into(),
+        file: folder.join("transforms.json"),
+        format: Format::Transforms,
+        views: (0..count).rev().map(view).collect(),
+        points: vec![],
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
+    }
+}
+
+fn numbers(views: &[&View]) -> Vec<String> {
+    views.iter().map(|view| view.field.clone()).collect()
+}
+
+#[test]
+fn every_eighth_photograph_is_held_out_whether_others_exist_or_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut whole = capture(folder.path(), 17);
+    whole.hold_out();
+    assert_eq!(numbers(&whole.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
+    assert_eq!(numbers(&whole.split(Split::Val).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
+    let train = numbers(&whole.split(Split::Train).unwrap());
+    assert!(train.len() == 14 && train[0] == "frames[1]" && !train.contains(&"frames[8]".to_owned()), "{train:?}");
+    // An image that is lost puts no photograph in another split.
+    let mut lost = capture(folder.path(), 17);
+    lost.views.iter_mut().find(|view| view.field == "frames[5]").unwrap().image = None;
+    lost.hold_out();
+    assert_eq!(numbers(&lost.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
+    let mut few = capture(folder.path(), 2);
+    few.hold_out();
+    assert!(few.split(Split::Test).is_err() && few.split(Split::Train).unwrap().len() == 2);
+    // Where files say what to train on, the others are to test on; where they say more, nothing is added.
+    let mut listed = capture(folder.path(), 4);
+    listed.views[1].split = Some(Split::Train);
+    listed.hold_out();
+    assert_eq!(listed.split(Split::Test).unwrap().len(), 3);
+    let mut both = capture(folder.path(), 4);
+    (both.views[1].split, both.views[2].split) = (Some(Split::Train), Some(Split::Val));
+    both.hold_out();
+    assert_eq!((both.split(Split::Test).unwrap().len(), both.split(Split::Train).unwrap().len()), (1, 1));
+}
+
+#[test]
+fn no_image_is_trained_and_tested_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 17);
+    capture.hold_out();
+    capture.check_splits().unwrap();
+    let survey = capture.survey(None).unwrap();
+    let names = |split: Split| {
+        let data = capture.load(split, &survey, &Reading::default()).unwrap();
+        data.frames.into_iter().map(|frame| frame.name).collect::<Vec<_>>()
+    };
+    let (train, test) = (names(Split::Train), names(Split::Test));
+    assert!(!test.is_empty() && test.iter().all(|name| !train.contains(name)));
+    let image = capture.views.iter().find(|view| view.field == "frames[8]").unwrap().image.clone();
+    capture.views.iter_mut().find(|view| view.field == "frames[3]").unwrap().image = image;
+    let message = capture.check_splits().unwrap_err().to_string();
+    assert!(message.contains("frames[8]") && message.contains("frames[3]"), "{message}");
+}
+
+#[test]
+fn cameras_follow_their_images_to_any_size_and_into_the_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.hold_out();
+    let survey = capture.survey(None).unwrap();
+    let seen = Mutex::new(vec![]);
+    let progress = |done: usize, total: usize| seen.lock().unwrap().push((done, total));
+    let reading = Reading { downscale: 5, views: 3, progress: &progress };
+    let data = capture.load(Split::Train, &survey, &reading).unwrap();
+    assert_eq!((data.frames.len(), &data.skipped[..]), (3, &["images/02.png".to_owned()][..]));
+    let frame = &data.frames[0];
+    let view = capture.views.iter().find(|view| view.name == frame.name).unwrap();
+    // 12 / 5 and 8 / 5, rounded; the camera was for 24 x 16.
+    assert_eq!([frame.image.width, frame.image.height, frame.camera.width, frame.camera.height], [2, 2, 2, 2]);
+    assert!((frame.camera.centre[0] - 13.0 / 12.0).abs() < 1e-12 && (frame.camera.centre[1] - 7.0 / 8.0).abs() < 1e-12);
+    assert!((frame.camera.focal[0] - view.camera.focal[0] / 12.0).abs() < 1e-12);
+    let eye = survey.placement.point(view.camera.pose.translation);
+    assert!(frame.camera.pose.translation.distance(eye) < 1e-12 && data.placement == survey.placement);
+    assert_eq!(seen.lock().unwrap().iter().max(), Some(&(3, 3)));
+    let full = capture.load(Split::Train, &survey, &Reading::default()).unwrap();
+    assert_eq!(full.frames[0].image.bytes(), 12 * 8 * 3);
+    for (name, wrong) in [
+        ("views", Reading { views: 0, ..Reading::default() }),
+        ("downscale", Reading { downscale: 0, ..Reading::default() }),
+    ] {
+        let message = capture.load(Split::Train, &survey, &wrong).unwrap_err().to_string();
+        assert!(message.starts_with(&format!("`{name}`")), "{message}");
+    }
+}
+
+#[test]
+fn images_of_another_shape_than_their_camera_are_errors_and_the_first_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.hold_out();
+    let survey = capture.survey(None).unwrap();
+    for name in ["03", "05"] {
+        let image = Image::new(13, 8, 3);
+        std::fs::write(folder.path().join(format!("images/{name}.png")), image.to_png()).unwrap();
+    }
+    let message = capture.load(Split::Train, &survey, &Reading::default()).unwrap_err().to_string();
+    assert!(
+        message.contains("frames[3]") && message.contains("03.png: has 13x8 pixels") && message.contains("24x16"),
+        "{message}"
+    );
+    let camera = |width: usize, height: usize| Camera { width, height, ..capture.views[0].camera.clone() };
+    for (size, of, fits) in [
+        ([24, 24], [24, 24], true),
+        ([24, 25], [24, 24], false),
+        ([1000, 750], [4000, 3000], true),
+        ([1001, 750], [4000, 3000], false),
+        ([333, 250], [4000, 3000], true),
+        ([750, 1000], [4000, 3000], false),
+        ([270, 480], [1080, 1920], true),
+    ] {
+        assert_eq!(same_shape(size, &camera(of[0], of[1])), fits, "{size:?} for {of:?}");
+    }
+}
+
+#[test]
+fn smaller_images_that_stand_beside_are_not_made_smaller_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.hold_out();
+    std::fs::create_dir(folder.path().join("images_4")).unwrap();
+    let small = Image { width: 3, height: 2, channels: 3, data: vec![1.0; 18] };
+    std::fs::write(folder.path().join("images_4/01.png"), small.to_png()).unwrap();
+    let survey = capture.survey(None).unwrap();
+    let data = capture.load(Split::Train, &survey, &Reading { downscale: 4, ..Reading::default() }).unwrap();
+    assert!(data.frames[0].name == "images/01.png" && data.frames[0].image.to_image() == small);
+    assert_eq!([data.frames[1].image.width, data.frames[1].image.height], [3, 2]);
+    let alone = Path::new("scene/images_4/a/01.png");
+    assert_eq!(made_smaller(Path::new("scene"), alone, 8), (alone.to_owned(), 2));
+    assert_eq!(made_smaller(Path::new("scene"), alone, 4), (alone.to_owned(), 1));
+    assert_eq!(made_smaller(Path::new("images/scene"), Path::new("images/scene/01.png"), 4).1, 4);
+}
+
+#[test]
+fn masks_leave_out_what_is_not_white_and_what_no_light_reaches() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.hold_out();
+    let path = folder.path().join("mask.png");
+    let mut mask = Image { width: 24, height: 16, channels: 1, data: vec![1.0; 24 * 16] };
+    mask.pixel_mut(9, 2)[0] = 0.0;
+    std::fs::write(&path, mask.to_png()).unwrap();
+    capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
+    let survey = capture.survey(None).unwrap();
+    let data = capture.load(Split::Train, &survey, &Reading::default()).unwrap();
+    let used = data.frames[0].mask.as_ref().unwrap();
+    assert!(used.used() == 12 * 8 - 1 && !used.uses(4, 1), "one pixel, at half the size");
+    for (size, fits) in [([24, 16], true), ([16, 24], false), ([6, 4], false)] {
+        std::fs::write(
+            &path,
+            Image { width: size[0], height: size[1], channels: 1, data: vec![1.0; size[0] * size[1]] }.to_png(),
+        )
+        .unwrap();
+        let read = capture.load(Split::Train, &survey, &Reading::default());
+        assert_eq!(read.is_ok(), fits, "{size:?}");
+        assert!(read.err().is_none_or(|e| e.to_string().contains("mask.png: has")));
+    }
+    std::fs::write(&path, Image::new(24, 16, 1).to_png()).unwrap();
+    let message = capture.load(Split::Train, &survey, &Reading::default()).unwrap_err().to_string();
+    assert!(message.contains("shows nothing"), "{message}");
+    // Half a turn is 31.4 pixels from the centre of a fisheye of focal length 10.
+    let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
+    let camera =
+        Camera { width: 100, height: 60, focal: [10.0; 2], centre: [50.0, 30.0], lens, pose: DAffine3::IDENTITY };
+    let lit = Lit::default();
+    let mask = lit.of(&camera).unwrap();
+    for (x, y) in (0..100).flat_map(|x| (0..60).map(move |y| (x, y))) {
+        let r = f64::hypot(x as f64 - 49.5, y as f64 - 29.5);
+        assert_eq!(mask.uses(x, y), r <= 10.0 * std::f64::consts::PI, "{x} {y}");
+    }
+    let moved = Camera { pose: DAffine3::from_translation(DVec3::X), ..camera.clone() };
+    assert!(Arc::ptr_eq(&mask, &lit.of(&moved).unwrap()), "one for each camera, wherever it stands");
+    assert!(lit.of(&Camera { focal: [40.0; 2], ..camera }).is_none());
+}

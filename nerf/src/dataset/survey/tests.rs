@@ -1,0 +1,169 @@
+use super::*;
+use glam::DAffine3;
+use std::path::PathBuf;
+
+fn camera(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
+    Camera { focal: [500.0, 250.0], ..Camera::from_angle(400, 300, 0.8, Camera::look_at(eye, target, up)) }
+}
+
+fn capture(format: Format, cameras: Vec<Camera>) -> Capture {
+    let view = |(i, camera): (usize, Camera)| View {
+        name: format!("{i}.png"),
+        field: format!("frames[{i}]"),
+        image: Some(PathBuf::from(format!("{i}.png"))),
+        camera,
+        split: None,
+        mask: None,
+        depth: None,
+        sharpness: None,
+        bounds: None,
+    };
+    Capture {
+        folder: "scene".into(),
+        file: "scene/transforms.json".into(),
+        format,
+        views: cameras.into_iter().enumerate().map(view).collect(),
+        points: vec![],
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
+    }
+}
+
+const CENTRE: DVec3 = DVec3::new(10.0, 20.0, 5.0);
+
+/// Eyes on a quarter of a circle of that radius around the centre, pitched down, with y downwards as COLMAP has it.
+fn quarter(radius: f64) -> Vec<Camera> {
+    let eye = |i: usize| {
+        let angle = i as f64 * 0.3;
+        CENTRE + radius * DVec3::new(0.8 * angle.cos(), -0.6, 0.8 * angle.sin())
+    };
+    (0..6).map(|i| camera(eye(i), CENTRE, DVec3::NEG_Y)).collect()
+}
+
+#[test]
+fn the_middle_is_what_cameras_look_at_and_up_is_theirs() {
+    let survey = Survey::new(&capture(Format::Colmap, quarter(4.0)), false, None).unwrap();
+    assert_eq!(survey.scope, Scope::Unbounded);
+    // Axes are held back a little towards the cameras.
+    assert!(survey.placement.origin.distance(CENTRE) < 0.05, "{}", survey.placement.origin);
+    let up = survey.placement.rotation * DVec3::NEG_Y;
+    assert!(up.distance(DVec3::Z) < 1e-3, "{up}");
+    survey.placement.check().unwrap();
+    // Half of the box is half of the cameras' distance, and 1.5 units.
+    assert!((survey.placement.scale - 1.5 / 2.0).abs() < 0.005, "{}", survey.placement.scale);
+    assert_eq!(survey.bounds, [DVec3::splat(-1.5), DVec3::splat(1.5)]);
+    assert!((survey.near - 0.05 * 3.0).abs() < 1e-3 && (survey.far - 3000.0).abs() < 1e-9, "{survey:?}");
+    // A camera that is lost, far away and looking elsewhere, moves it little.
+    let mut cameras = quarter(4.0);
+    cameras.push(camera(CENTRE + DVec3::new(300.0, 50.0, 0.0), CENTRE + DVec3::new(300.0, 90.0, 20.0), DVec3::NEG_Y));
+    let lost = Survey::new(&capture(Format::Colmap, cameras), false, None).unwrap();
+    assert!(lost.placement.origin.distance(CENTRE) < 0.5, "{}", lost.placement.origin);
+}
+
+#[test]
+fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
+    let outwards = [[1.0, 0.0], [0.0, 1.0], [0.3, -1.0], [2.0, 0.5]].map(|[x, y]| {
+        let eye = DVec3::new(x, y, 0.0);
+        camera(eye, 3.0 * eye, DVec3::Z)
+    });
+    let mean = outwards.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / 4.0;
+    let survey = Survey::new(&capture(Format::Transforms, outwards.to_vec()), false, None).unwrap();
+    assert!(survey.placement.origin.distance(mean) < 1e-9, "{}", survey.placement.origin);
+    assert!(survey.placement.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
+}
+
+#[test]
+fn cameras_that_look_down_have_the_sky_behind_them() {
+    // Two strips of a flight, the second flown back: no side of the pictures is up.
+    let flight = (0..8).map(|i| {
+        let north = if i % 2 == 0 { DVec3::Y } else { DVec3::NEG_Y };
+        let eye = DVec3::new(f64::from(i), f64::from(i % 3), 50.0);
+        camera(eye, eye - DVec3::Z * 50.0, north)
+    });
+    let survey = Survey::new(&capture(Format::Colmap, flight.collect()), false, None).unwrap();
+    assert!((survey.placement.rotation * DVec3::Z).z > 0.9, "{:?}", survey.placement.rotation);
+}
+
+#[test]
+fn a_bounded_scene_is_as_wide_as_what_cameras_see_of_it() {
+    let eyes = [DVec3::new(3.0, 0.0, 0.0), DVec3::new(0.0, 4.0, 0.0), DVec3::new(-8.0, 0.0, 0.0)];
+    let cameras = eyes.map(|eye| camera(eye, DVec3::ZERO, DVec3::Z));
+    let survey = Survey::new(&capture(Format::Transforms, cameras.to_vec()), true, None).unwrap();
+    assert_eq!(survey.scope, Scope::Bounded);
+    // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: .6 of the distance 4.
+    let half = 1.5 / survey.placement.scale;
+    assert!((half - 2.4).abs() < 0.02, "{half}");
+    let (near, far) = (survey.near / survey.placement.scale, survey.far / survey.placement.scale);
+    assert!((near - 0.2).abs() < 0.02 && (far - (8.0 + 3.0_f64.sqrt() * 2.4)).abs() < 0.1, "{near} {far}");
+}
+
+#[test]
+fn points_and_depths_say_where_a_scene_begins() {
+    let mut capture = capture(Format::Colmap, quarter(4.0));
+    let eye = capture.views[0].camera.pose.translation;
+    let towards = (CENTRE - eye).normalize();
+    let point = |distance: f64| Point { position: eye + distance * towards, color: [0; 3], error: 1.0, views: 3 };
+    // Of four hundred the two nearest are not believed.
+    capture.points =
+        (0..400).map(|i| point([0.1, 0.2, 1.0].get(i).copied().unwrap_or(1.0 + 0.01 * i as f64))).collect();
+    let near = |capture: &Capture| {
+        let survey = Survey::new(capture, false, None).unwrap();
+        survey.near / survey.placement.scale
+    };
+    assert!((near(&capture) - 0.5).abs() < 0.2, "{}", near(&capture));
+    let usual = 0.05 * 4.0;
+    for spoil in [|p: &mut Point| p.views = 2, |p: &mut Point| p.error = 2.01] {
+        let mut spoilt = capture.clone();
+        spoilt.points.iter_mut().for_each(spoil);
+        assert!((near(&spoilt) - usual).abs() < 0.01, "{}", near(&spoilt));
+    }
+    // Files of nerfstudio do not count photographs.
+    capture.points.iter_mut().for_each(|p| (p.views, p.error) = (0, f64::NAN));
+    assert!((near(&capture) - 0.5).abs() < 0.2);
+    // A capture that looks forward: the middle is ahead, halfway in inverse distance.
+    let forward = (0..5).map(|i| {
+        let eye = DVec3::new(0.1 * f64::from(i), 0.0, 0.0);
+        camera(eye, eye + DVec3::Y, DVec3::Z)
+    });
+    let mut forward = self::capture(Format::Llff, forward.collect());
+    forward.views.iter_mut().for_each(|view| view.bounds = Some([2.0, 6.0]));
+    let survey = Survey::new(&forward, false, None).unwrap();
+    assert!(survey.placement.origin.distance(DVec3::new(0.2, 3.0, 0.0)) < 1e-9, "{}", survey.placement.origin);
+    assert!((survey.near / survey.placement.scale - 1.0).abs() < 1e-9);
+}
+
+#[test]
+fn what_is_asked_for_counts_then_the_convention_then_transparency() {
+    let around = |radius: f64| {
+        let mut capture = capture(Format::Blender, quarter(radius));
+        capture.views.iter_mut().for_each(|view| view.camera.pose.translation -= CENTRE);
+        capture
+    };
+    let conventional = Survey::new(&around(4.0), false, None).unwrap();
+    assert_eq!((conventional.near, conventional.far, conventional.placement), (2.0, 6.0, Placement::default()));
+    assert_eq!(conventional.scope, Scope::Bounded);
+    assert_eq!(Survey::new(&around(4.0), true, Some(Scope::Unbounded)).unwrap().scope, Scope::Unbounded);
+    for radius in [2.4, 5.6] {
+        let other = Survey::new(&around(radius), true, None).unwrap();
+        assert!(other.placement != Placement::default() && other.scope == Scope::Bounded, "{radius}");
+        assert_eq!(Survey::new(&around(radius), false, None).unwrap().scope, Scope::Unbounded);
+    }
+    assert_eq!("unbounded".parse::<Scope>().unwrap().to_string(), "unbounded");
+    let message = "endless".parse::<Scope>().unwrap_err().to_string();
+    assert!(message.starts_with("`scope`"), "{message}");
+}
+
+#[test]
+fn captures_without_size_or_images_are_errors() {
+    let mut one = capture(Format::Colmap, vec![quarter(4.0)[0].clone(); 5]);
+    let message = Survey::new(&one, false, None).unwrap_err().to_string();
+    assert!(message.contains("one place"), "{message}");
+    one.views.iter_mut().for_each(|view| view.image = None);
+    let message = Survey::new(&one, false, None).unwrap_err().to_string();
+    assert!(
+        message.contains("frames[0]") && message.contains("none of the 5 images") && message.contains("0.png"),
+        "{message}"
+    );
+    one.views.clear();
+    assert!(Survey::new(&one, false, None).is_err());
+}
