@@ -12,6 +12,7 @@ mod catalogue;
 #[doc(hidden)]
 pub mod compiled;
 pub mod dataset;
+pub mod doctor;
 pub mod encoding;
 mod error;
 pub mod field;

@@ -11,6 +11,7 @@ const ROOMS: [&str; 18] = [
     "files",
     "camera",
     "dataset",
+    "doctor",
     "pictures",
     "encoding",
     "space",

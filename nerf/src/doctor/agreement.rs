@@ -1,0 +1,197 @@
+//! Whether photographs agree with their cameras: what one shows at a place, another must show on a certain line.
+//!
+//! Patches of one photograph are looked for in another, along the line on which the cameras say that they lie (the epipolar
+//! line), and along lines beside it, where they should not be found. How often the first has the best match says how well
+//! cameras and photographs fit: as often as any other line if they do not, nearly always if they do. No threshold on the
+//! likeness of patches decides, and what is wrong about it, such as reflections, is wrong for all lines alike.
+
+use super::numbers::median;
+use super::picture::{Patch, Picture};
+use super::poses::Focus;
+use glam::{DAffine3, DMat3, DVec3};
+use rayon::prelude::*;
+
+/// Photographs that each one is compared with.
+const NEIGHBOURS: usize = 5;
+/// The angle between optical axes, in radians, beyond which photographs are hardly alike.
+const ANGLE: f64 = 0.8;
+/// How far beside the line of a patch the others lie, in pixels.
+const BESIDE: [f64; 5] = [0.0, -16.0, -8.0, 8.0, 16.0];
+/// The cosine (normalised cross-correlation) from which patches are alike.
+const ALIKE: f32 = 0.8;
+/// Pixels between the places at which a patch is looked for, and the most places.
+const STEP: f64 = 1.3;
+const MOST_STEPS: f64 = 160.0;
+
+/// A photograph with the pose that it is said to have.
+#[derive(Clone, Copy)]
+pub(super) struct Placed<'a> {
+    pub picture: &'a Picture,
+    pub pose: DAffine3,
+}
+
+/// How often the line on which the cameras put a patch has its best match.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Tally {
+    /// How often it has.
+    pub wins: usize,
+    /// Of how many patches that have a match on some line.
+    pub trials: usize,
+}
+
+impl Tally {
+    /// 1 if it always has, 0 if as often as by chance.
+    pub fn skill(self) -> f64 {
+        let chance = 1.0 / BESIDE.len() as f64;
+        (self.wins as f64 / self.trials.max(1) as f64 - chance) / (1.0 - chance)
+    }
+}
+
+impl std::ops::Add for Tally {
+    type Output = Tally;
+
+    fn add(self, other: Tally) -> Tally {
+        Tally { wins: self.wins + other.wins, trials: self.trials + other.trials }
+    }
+}
+
+/// Two photographs that were compared, by their numbers.
+pub(super) struct Pair {
+    pub views: [usize; 2],
+    pub tally: Tally,
+}
+
+/// Compares those of the photographs whose numbers are in `of` with their neighbours, in parallel.
+pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
+    let poses: Vec<DAffine3> = all.iter().map(|placed| placed.pose).collect();
+    let focus = Focus::of(&poses).filter(|focus| focus.ahead > 0.75);
+    let usual = usual_gap(&poses);
+    let pairs: Vec<[usize; 2]> =
+        of.iter().flat_map(|&i| neighbours(&poses, i, usual).into_iter().map(move |j| [i, j])).collect();
+    let one = |&[i, j]: &[usize; 2]| {
+        // Nothing is nearer than a quarter of the way to what all look at.
+        let nearest = focus.map_or(0.0, |focus| 0.25 * focus.place.distance(poses[i].translation));
+        Pair { views: [i, j], tally: matched(all[i], all[j], nearest) }
+    };
+    pairs.par_iter().map(one).collect()
+}
+
+/// The median distance of a camera from that which is the fifth nearest.
+fn usual_gap(poses: &[DAffine3]) -> f64 {
+    median(poses.iter().map(|a| {
+        let mut gaps: Vec<f64> = poses.iter().map(|b| a.translation.distance(b.translation)).collect();
+        gaps.sort_by(f64::total_cmp);
+        gaps.get(NEIGHBOURS).or(gaps.last()).copied().unwrap_or(0.0)
+    }))
+}
+
+/// The numbers of the photographs that are most like one: near, and looking the same way, but not from the same place.
+fn neighbours(poses: &[DAffine3], i: usize, usual: f64) -> Vec<usize> {
+    let a = poses[i];
+    let mut costs: Vec<(f64, usize)> = poses
+        .iter()
+        .enumerate()
+        .filter_map(|(j, b)| {
+            let gap = a.translation.distance(b.translation);
+            let angle = a.matrix3.z_axis.angle_between(b.matrix3.z_axis);
+            let apart = i != j && gap > 1e-2 * usual && angle < ANGLE;
+            apart.then(|| ((gap / usual).powi(2) + (angle / 0.35).powi(2), j))
+        })
+        .collect();
+    costs.sort_by(|a, b| a.0.total_cmp(&b.0));
+    costs.into_iter().take(NEIGHBOURS).map(|(_, j)| j).collect()
+}
+
+/// From pixels of one picture and an inverse depth to pixels of another.
+struct Transfer<'a> {
+    from: &'a Picture,
+    to: &'a Picture,
+    rotation: DMat3,
+    translation: DVec3,
+}
+
+impl Transfer<'_> {
+    /// Where the other picture shows what lies at the inverse depth `inverse` behind a pixel; `None` if behind its camera.
+    fn place(&self, [x, y]: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
+        let Picture { focal, centre, .. } = self.from;
+        let direction = DVec3::new((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0);
+        let point = self.rotation * direction + inverse * self.translation;
+        let Picture { focal, centre, .. } = self.to;
+        (point.z > 0.1).then(|| [point.x / point.z * focal[0] + centre[0], point.y / point.z * focal[1] + centre[1]])
+    }
+
+    /// The same, and what a pixel to the right and one down become for a surface that faces the first camera.
+    fn patch(&self, [x, y]: [f64; 2], inverse: f64) -> Option<([f64; 2], [[f64; 2]; 2])> {
+        let place = self.place([x, y], inverse)?;
+        let step = |other: [f64; 2]| [other[0] - place[0], other[1] - place[1]];
+        let [across, down] =
+            [step(self.place([x + 1.0, y], inverse)?), step(self.place([x, y + 1.0], inverse)?)];
+        let area = across[0] * down[1] - across[1] * down[0];
+        (0.3..3.0).contains(&area).then_some((place, [across, down]))
+    }
+}
+
+/// Looks for the patches of one photograph in another.
+fn matched(a: Placed<'_>, b: Placed<'_>, nearest: f64) -> Tally {
+    // From the axes of OpenGL to those of images.
+    let axes = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    let back = axes * b.pose.matrix3.transpose();
+    let transfer = Transfer {
+        from: a.picture,
+        to: b.picture,
+        rotation: back * a.pose.matrix3 * axes,
+        translation: back * (a.pose.translation - b.pose.translation),
+    };
+    // What is nearer than about the distance between the cameras is not alike.
+    let most = (1.2 / transfer.translation.length()).min(nearest.recip());
+    let mut tally = Tally::default();
+    for &corner in &a.picture.corners {
+        let Some(patch) = a.picture.patch(corner, [[1.0, 0.0], [0.0, 1.0]]) else { continue };
+        if let Some(first) = best_line(&transfer, corner, &patch, most) {
+            tally.trials += 1;
+            tally.wins += usize::from(first);
+        }
+    }
+    tally
+}
+
+/// Whether the line itself, and not one beside it, has the best match of a patch; `None` if none has a good one, or they are
+/// not of like length within the picture.
+fn best_line(transfer: &Transfer<'_>, corner: [f64; 2], patch: &Patch, most: f64) -> Option<bool> {
+    let start = transfer.place(corner, 0.0)?;
+    let mut last = most;
+    let end = loop {
+        match transfer.place(corner, last) {
+            Some(place) => break place,
+            None => last *= 0.8,
+        }
+        if last < 1e-3 * most {
+            return None;
+        }
+    };
+    let line = [end[0] - start[0], end[1] - start[1]];
+    let length = line[0].hypot(line[1]);
+    let beside = if length > 2.0 { [-line[1] / length, line[0] / length] } else { [0.0, 1.0] };
+    let steps = (length / STEP).clamp(2.0, MOST_STEPS).ceil();
+    let (mut best, mut counts) = ([-1.0_f32; BESIDE.len()], [0_usize; BESIDE.len()]);
+    for step in 0..=steps as usize {
+        let Some((place, frame)) = transfer.patch(corner, last * step as f64 / steps) else { continue };
+        for (i, offset) in BESIDE.iter().enumerate() {
+            let moved = [place[0] + offset * beside[0], place[1] + offset * beside[1]];
+            let inside = moved[0] > 0.0
+                && moved[1] > 0.0
+                && moved[0] < transfer.to.width as f64
+                && moved[1] < transfer.to.height as f64;
+            counts[i] += usize::from(inside);
+            let other = if inside { transfer.to.patch(moved, frame) } else { None };
+            if let Some(other) = other {
+                best[i] = best[i].max(patch.iter().zip(&other).map(|(x, y)| x * y).sum());
+            }
+        }
+    }
+    // A line that is outside of the picture cannot win: nor must it lose.
+    let longest = counts.into_iter().max()?;
+    let fair = counts.iter().all(|count| 2 * count >= longest);
+    let others = best[1..].iter().copied().fold(-1.0, f32::max);
+    (fair && best[0].max(others) > ALIKE).then_some(best[0] > others)
+}

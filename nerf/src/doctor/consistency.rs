@@ -1,0 +1,129 @@
+//! What the agreement of photographs with each other says: under which convention cameras are written, and which of them are
+//! wrong.
+
+use super::agreement::{Pair, Placed, Tally, compare};
+use super::layout::{opencv_axes, world_to_camera};
+use super::numbers::median;
+use super::picture::Picture;
+use super::poses::Convention;
+use super::report::{FindingKind as Kind, Findings, Severity};
+use crate::dataset::evenly_spaced;
+use Severity::{Error, Warning};
+use glam::DAffine3;
+
+/// Photographs that are compared with their neighbours under each convention.
+const TRIED: usize = 20;
+/// Patches that must have a match before agreement says anything: of the capture, and of a single photograph.
+const ENOUGH: [usize; 2] = [150, 25];
+/// The agreement of good cameras.
+const GOOD: f64 = 0.2;
+/// Below it photographs and cameras have nothing to do with each other.
+const NONE: f64 = 0.06;
+/// A camera is wrong whose agreement is a smaller share of that of the others.
+const WRONG: f64 = 0.35;
+
+/// A photograph that can be compared: its name, picture and pose.
+pub(super) struct Compared<'a> {
+    pub name: String,
+    pub picture: &'a Picture,
+    pub pose: DAffine3,
+}
+
+/// Adds what is wrong about how photographs agree with each other; returns how well they do, if there is enough to compare.
+pub(super) fn examine(all: &[Compared<'_>], most: usize, findings: &mut Findings) -> Option<f64> {
+    let under = |convention: Convention| -> Vec<Placed<'_>> {
+        all.iter().map(|one| Placed { picture: one.picture, pose: convention.apply(one.pose) }).collect()
+    };
+    let tried = evenly_spaced((0..all.len()).collect(), TRIED);
+    let tally = |convention: Convention| total(&compare(&under(convention), &tried));
+    let read = tally(Convention::AsRead);
+    let own = if read.trials >= ENOUGH[0] { read.skill() } else { 0.0 };
+    if own < 2.0 * GOOD {
+        let others = Convention::ALL[1..].iter().map(|convention| (*convention, tally(*convention)));
+        let enough = others.filter(|(_, tally)| tally.trials >= ENOUGH[0]);
+        let best = enough.max_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
+        if let Some((convention, tally)) = best.filter(|(_, tally)| tally.skill() > GOOD && tally.skill() > 2.0 * own) {
+            another(convention, [own, tally.skill()], findings);
+            return Some(own);
+        }
+    }
+    if read.trials < ENOUGH[0] {
+        return None;
+    }
+    if own < NONE && read.trials >= 2 * ENOUGH[0] {
+        findings.add(
+            Kind::NoAgreement,
+            Warning,
+            "photographs agree with their cameras no better than by chance, under any convention",
+            "Are images and poses in one order, and of one capture? Is the focal length right? If photographs have little to \
+             recognise, such as walls of one colour, this may mean nothing.",
+            vec![],
+        );
+        return Some(own);
+    }
+    let of = evenly_spaced((0..all.len()).collect(), most);
+    let pairs = compare(&under(Convention::AsRead), &of);
+    wrong_poses(all, &pairs, findings);
+    Some(total(&pairs).skill())
+}
+
+fn total(pairs: &[Pair]) -> Tally {
+    pairs.iter().fold(Tally::default(), |sum, pair| sum + pair.tally)
+}
+
+/// The finding that photographs agree under another convention than the one that is read.
+fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findings) {
+    // What poses alone made one think is settled.
+    findings.0.retain(|finding| {
+        !matches!(finding.kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera | Kind::OnePlace)
+    });
+    match convention {
+        Convention::AsRead => (),
+        Convention::OpenCv => opencv_axes(findings),
+        Convention::WorldToCamera | Convention::WorldToOpenCv => world_to_camera(Error, findings),
+        Convention::Mirrored | Convention::MirroredUpsideDown | Convention::MirroredBackwards => findings.add(
+            Kind::Mirrored,
+            Error,
+            "the cameras see the world in a mirror: one axis has the wrong sign",
+            "Cameras or positions were taken to left-handed axes. Change the sign of one row of the matrices, and of one \
+             column of their rotations to keep them rotations.",
+            vec![],
+        ),
+    }
+    if let Some(finding) = findings.0.last_mut() {
+        finding.what += &format!(" (photographs agree to {other:.2} so, and to {own:.2} as it is read)");
+        if convention == Convention::WorldToOpenCv {
+            finding.advice += " Then change the signs of the second and third column: their camera axes are OpenCV's.";
+        }
+    }
+}
+
+/// The photographs that agree with none of their neighbours, though these agree with each other.
+fn wrong_poses(all: &[Compared<'_>], pairs: &[Pair], findings: &mut Findings) {
+    let scores: Vec<Option<f64>> = (0..all.len()).map(|view| score(view, pairs)).collect();
+    let usual = median(scores.iter().flatten().copied());
+    if usual < GOOD {
+        return;
+    }
+    let wrong = |view: &usize| scores[*view].is_some_and(|score| score < WRONG * usual);
+    let names = (0..all.len()).filter(wrong).map(|view| all[view].name.clone()).collect();
+    findings.about(
+        Kind::WrongPose,
+        Warning,
+        names,
+        |count| format!("{count} do not fit their neighbours: what they show is not where their poses put it"),
+        "Look at them: their poses are wrong, or they show something that has moved, or hardly anything. Leave them out, or \
+         have poses learned with the scene.",
+    );
+}
+
+/// The agreement of a photograph with the half of its neighbours that it agrees with best: one wrong camera does not make
+/// those beside it wrong.
+fn score(view: usize, pairs: &[Pair]) -> Option<f64> {
+    let mut own: Vec<Tally> = pairs.iter().filter(|pair| pair.views.contains(&view)).map(|pair| pair.tally).collect();
+    own.retain(|tally| tally.trials > 2);
+    own.sort_by(|a, b| b.skill().total_cmp(&a.skill()));
+    let half = own.len().div_ceil(2);
+    let sum = own[..half].iter().fold(Tally::default(), |sum, tally| sum + *tally);
+    (sum.trials >= ENOUGH[1]).then(|| sum.skill())
+}

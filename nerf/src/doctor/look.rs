@@ -1,0 +1,123 @@
+//! What the pixels of one photograph say, read once and at a small size.
+
+use super::picture::{Picture, grey};
+use crate::dataset::{Capture, Image, Photo, View};
+use crate::error::Result;
+use rayon::prelude::*;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Longest side of the images in which blur is looked for: smaller ones are sharp in any case.
+const LONGEST: usize = 800;
+/// Longest side of those that are compared with each other.
+const SMALL: usize = 200;
+/// Brightness below which a pixel counts as this.
+const DARK: f64 = 0.01;
+
+/// What the pixels of a photograph say.
+pub(super) struct Look {
+    /// Whether some pixel is transparent; `None` without an alpha channel.
+    pub transparent: Option<bool>,
+    /// Equal for equal photographs.
+    pub hash: u64,
+    /// The logarithm of the variance of the Laplacian over the variance of the brightness; `None` of a flat image.
+    pub sharpness: Option<f64>,
+    /// The mean logarithm of the brightness of what is there; `None` where nothing is.
+    pub luminance: Option<f64>,
+    /// The logarithms of red and of blue over green, of the means.
+    pub balance: [f64; 2],
+    /// The share of the pixels that the mask uses, if there is one.
+    pub used: Option<f64>,
+    /// The photograph as a small grey pinhole image, if its camera fits.
+    pub picture: Option<Picture>,
+}
+
+/// Looks at the photographs, in parallel; the result has the order of the views, of which each has an image.
+pub(super) fn look_at_all(
+    capture: &Capture,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Vec<(String, Result<Look>)> {
+    let views: Vec<&View> = capture.present().collect();
+    let (done, total) = (AtomicUsize::new(0), views.len());
+    let one = |view: &&View| {
+        let look = look_at(view);
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+        (view.name.clone(), look)
+    };
+    views.par_iter().map(one).collect()
+}
+
+fn look_at(view: &View) -> Result<Look> {
+    let path = view.image.clone().unwrap_or_default();
+    // As it is stored if the camera was measured so, otherwise as it is shown.
+    let [stored, shown] = Photo::size_of_file(&path)?;
+    let size = [stored, shown].into_iter().find(|size| fits(*size, view));
+    let photo = Photo::open(&path, size)?;
+    let transparent = photo.has_alpha().then(|| photo.is_transparent());
+    let middle = shrunk(&photo, LONGEST);
+    let small = shrunk(&photo, SMALL);
+    let mask = view.mask.as_ref().map(|path| Photo::open(path, None)).transpose()?;
+    let used = mask.as_ref().map(|mask| {
+        let places = (0..mask.width * mask.height).map(|i| mask.pixel(i % mask.width, i / mask.width)[0]);
+        places.filter(|value| *value >= 0.99).count() as f64 / (mask.width * mask.height) as f64
+    });
+    let mut hasher = DefaultHasher::new();
+    [photo.width, photo.height].hash(&mut hasher);
+    middle.to_image().data.iter().for_each(|value| value.to_bits().hash(&mut hasher));
+    let (luminance, balance) = light(&small.to_image());
+    let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
+    let sharpness = sharpness(&grey(&middle));
+    Ok(Look { transparent, hash: hasher.finish(), sharpness, luminance, balance, used, picture })
+}
+
+/// Whether an image of this size can have been taken by the camera of a view, at another scale: up to the rounding of a side.
+pub(super) fn fits([width, height]: [usize; 2], view: &View) -> bool {
+    let [w, h] = [width as f64, height as f64];
+    let [cw, ch] = [view.camera.width as f64, view.camera.height as f64];
+    (w * ch - h * cw).abs() <= 1.01 * cw.max(ch).max(w).max(h) && cw > 0.0 && ch > 0.0
+}
+
+/// A photograph whose longest side is at most this.
+fn shrunk(photo: &Photo, longest: usize) -> Photo {
+    let Photo { width, height, .. } = *photo;
+    let share = (longest as f64 / width.max(height) as f64).min(1.0);
+    photo.resized([width, height].map(|side| ((side as f64 * share).round() as usize).max(1)))
+}
+
+/// See [`Look::sharpness`].
+fn sharpness(grey: &Image) -> Option<f64> {
+    let Image { width, height, .. } = *grey;
+    if width < 8 || height < 8 {
+        return None;
+    }
+    let at = |x: usize, y: usize| f64::from(grey.data[y * width + x]);
+    let laplacian = (1..height - 1).flat_map(|y| {
+        (1..width - 1).map(move |x| at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1) - 4.0 * at(x, y))
+    });
+    let (edges, contrast) = (variance(laplacian), variance(grey.data.iter().map(|x| f64::from(*x))));
+    (contrast > 1e-6 && edges > 0.0).then(|| (edges / contrast).ln())
+}
+
+fn variance(values: impl Iterator<Item = f64>) -> f64 {
+    let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
+    for value in values {
+        (count, sum, squares) = (count + 1.0, sum + value, squares + value * value);
+    }
+    squares / count - (sum / count) * (sum / count)
+}
+
+/// See [`Look::luminance`] and [`Look::balance`]: of linear light, weighted by alpha.
+fn light(image: &Image) -> (Option<f64>, [f64; 2]) {
+    let (mut weights, mut logs, mut means) = (0.0, 0.0, [0.0; 3]);
+    for pixel in image.data.chunks_exact(image.channels) {
+        let alpha = pixel.get(3).map_or(1.0, |alpha| f64::from(*alpha));
+        let rgb = [0, 1, 2].map(|i| f64::from(pixel[i]).powf(2.2));
+        weights += alpha;
+        logs += alpha * (0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]).max(DARK).ln();
+        (0..3).for_each(|i| means[i] += alpha * rgb[i].max(0.1 * DARK));
+    }
+    if !(weights > 0.01 * (image.width * image.height) as f64) {
+        return (None, [0.0; 2]);
+    }
+    (Some(logs / weights), [(means[0] / means[1]).ln(), (means[2] / means[1]).ln()])
+}

@@ -1,0 +1,129 @@
+//! Whether a capture is good, and if not, what is wrong with it and what to do.
+//!
+//! [`examine_cameras`] looks at poses, lenses and the headers of images; [`examine`] at pixels too: how sharp and how bright
+//! photographs are, and whether they agree with each other where the cameras say that they show the same.
+
+mod agreement;
+mod consistency;
+mod layout;
+mod look;
+mod numbers;
+mod picture;
+mod pixels;
+mod poses;
+mod report;
+mod single;
+
+pub use report::{Facts, Finding, FindingKind, Lie, Part, Range, Report, Resolution, Severity};
+
+use crate::dataset::{Capture, Split, Survey};
+use consistency::Compared;
+use glam::DVec3;
+use pixels::Seen;
+use report::Findings;
+
+/// How a capture is examined.
+#[derive(Clone, Copy)]
+pub struct Options<'a> {
+    /// How many photographs are compared with their neighbours at most, evenly spaced; all of them are looked at otherwise.
+    pub compared: usize,
+    /// Is told how many are read, of how many; from several threads.
+    pub progress: &'a (dyn Fn(usize, usize) + Sync),
+}
+
+impl Default for Options<'_> {
+    fn default() -> Self {
+        Options { compared: 120, progress: &|_, _| {} }
+    }
+}
+
+/// What can be said of a capture without reading its pixels: this takes no time to speak of. Without a survey, as
+/// [`Capture::survey`] fails for captures that have no size, nothing is said of up and of the scene's box.
+pub fn examine_cameras(capture: &Capture, survey: Option<&Survey>) -> Report {
+    let mut findings = Findings::default();
+    let facts = without_pixels(capture, survey, &mut findings);
+    Report { facts, findings: findings.sorted() }
+}
+
+/// Everything that can be said of a capture: its photographs are read, in parallel.
+pub fn examine(capture: &Capture, survey: Option<&Survey>, options: &Options<'_>) -> Report {
+    let mut findings = Findings::default();
+    let mut facts = without_pixels(capture, survey, &mut findings);
+    let looks = look::look_at_all(capture, options.progress);
+    pixels::unreadable(&looks, &mut findings);
+    let seen: Vec<Seen<'_>> = capture
+        .present()
+        .zip(&looks)
+        .filter_map(|(view, (_, look))| Some(Seen { view, look: look.as_ref().ok()? }))
+        .collect();
+    pixels::examine(&seen, &mut findings);
+    let compared: Vec<Compared<'_>> = seen
+        .iter()
+        .filter_map(|one| {
+            let picture = one.look.picture.as_ref()?;
+            Some(Compared { name: one.view.name.clone(), picture, pose: one.view.camera.pose })
+        })
+        .collect();
+    facts.agreement = consistency::examine(&compared, options.compared, &mut findings);
+    Report { facts, findings: findings.sorted() }
+}
+
+fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Findings) -> Facts {
+    let absent: Vec<String> =
+        capture.views.iter().filter(|view| view.image.is_none()).map(|view| view.name.clone()).collect();
+    let severity = if absent.len() == capture.views.len() { Severity::Error } else { Severity::Warning };
+    findings.about(
+        FindingKind::ImagesAbsent,
+        severity,
+        absent,
+        |count| format!("the images of {count} do not exist; there are {}", capture.views.len()),
+        "They are left out. If they should be there, look at the paths in the file, and at the ending of their names.",
+    );
+    single::examine(capture, findings);
+    layout::examine(capture, survey, findings);
+    let resolutions = pixels::sizes(capture, findings)
+        .into_iter()
+        .map(|([width, height], photographs)| Resolution { width, height, photographs })
+        .collect();
+    let parts = Split::ALL.into_iter().map(|split| {
+        let count = |exists: bool| {
+            let views = capture.views.iter().filter(|view| view.split == Some(split));
+            views.filter(|view| view.image.is_some() == exists).count()
+        };
+        Part { split, present: count(true), absent: count(false) }
+    });
+    let sized = || capture.views.iter().map(|view| &view.camera).filter(|camera| camera.width > 0);
+    let mut lenses: Vec<String> = capture.views.iter().map(|view| single::described(&view.camera.lens)).collect();
+    lenses.sort();
+    lenses.dedup();
+    Facts {
+        folder: capture.folder.clone(),
+        format: capture.format.to_string(),
+        parts: parts.filter(|part| part.present + part.absent > 0).collect(),
+        resolutions,
+        focal: range(sized().map(|camera| camera.focal[0]).collect()),
+        field_of_view: range(sized().map(|camera| single::field_of_view(camera, 0)).collect()),
+        lenses,
+        points: capture.points.len(),
+        lie: survey.map(|survey| Lie {
+            scope: survey.scope,
+            reason: survey.reason.clone(),
+            near: survey.near,
+            far: survey.far,
+            bounds: survey.bounds,
+            scale: survey.placement.scale,
+            up: survey.placement.rotation.transpose() * DVec3::Z,
+            middle: survey.placement.origin,
+        }),
+        agreement: None,
+    }
+}
+
+fn range(values: Vec<f64>) -> Option<Range> {
+    let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    (!values.is_empty()).then(|| Range { least, median: numbers::median(values), most })
+}
+
+#[cfg(test)]
+mod tests;

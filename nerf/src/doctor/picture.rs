@@ -1,0 +1,147 @@
+//! A small grey image with the camera of a pinhole, whatever lens took the photograph.
+
+use crate::camera::{Camera, Lens};
+use crate::dataset::{Image, Photo};
+
+/// Half of the width of a patch, in pixels.
+pub(super) const HALF: i32 = 3;
+/// Pixels in a patch.
+pub(super) const PATCH: usize = (2 * HALF as usize + 1).pow(2);
+/// Side of the squares of which each gives one patch at most.
+const CELL: usize = 16;
+/// Patches of a picture at most.
+const PATCHES: usize = 36;
+/// Smallest contrast of a patch, as the root of the mean square of its steps from pixel to pixel across its weakest direction.
+const CONTRAST: f32 = 0.02;
+
+/// What transparent pixels are put over.
+const BEHIND: [f32; 3] = [0.5; 3];
+
+/// A grey image of a pinhole camera in the axes of images: x right, y down, z ahead.
+pub(super) struct Picture {
+    pub width: usize,
+    pub height: usize,
+    pub focal: [f64; 2],
+    pub centre: [f64; 2],
+    /// Row by row; NaN where nothing is known.
+    values: Vec<f32>,
+    /// Where there is something to recognise.
+    pub corners: Vec<[f64; 2]>,
+}
+
+/// A patch of mean 0 and length 1.
+pub(super) type Patch = [f32; PATCH];
+
+impl Picture {
+    /// Of a small photograph of a camera; `None` if its lens has no middle that a pinhole could show.
+    pub fn new(camera: &Camera, photo: &Photo, mask: Option<&Photo>) -> Option<Picture> {
+        let camera = camera.resized(photo.width, photo.height);
+        if camera.lens == Lens::Equirectangular || !(camera.focal[0] > 0.0 && camera.focal[1] > 0.0) {
+            return None;
+        }
+        let Camera { width, height, focal, centre, lens, .. } = camera;
+        let mut image = grey(photo);
+        if let Some(mask) = mask {
+            hide(&mut image, mask);
+        }
+        let mut picture = Picture { width, height, focal, centre, values: image.data, corners: vec![] };
+        if lens != Lens::Pinhole {
+            let pixels = (0..width * height).map(|i| {
+                let [x, y] = [(i % width) as f64 + 0.5, (i / width) as f64 + 0.5];
+                let direction = glam::DVec3::new((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0);
+                let place = lens.place(direction);
+                place.map_or(f32::NAN, |[x, y]| picture.at(x * focal[0] + centre[0], y * focal[1] + centre[1]))
+            });
+            picture.values = pixels.collect();
+        }
+        picture.corners = picture.find_corners();
+        Some(picture)
+    }
+
+    /// The value at a place, between pixels; NaN outside.
+    pub fn at(&self, x: f64, y: f64) -> f32 {
+        let [x, y] = [(x - 0.5) as f32, (y - 0.5) as f32];
+        if !(x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f32 && y < (self.height - 1) as f32) {
+            return f32::NAN;
+        }
+        let (column, row) = (x as usize, y as usize);
+        let (s, t) = (x - column as f32, y - row as f32);
+        let start = row * self.width + column;
+        let [a, b] = [self.values[start], self.values[start + 1]];
+        let [c, d] = [self.values[start + self.width], self.values[start + self.width + 1]];
+        let (above, below) = (a + s * (b - a), c + s * (d - c));
+        above + t * (below - above)
+    }
+
+    /// The patch around a place whose columns and rows step by these vectors; `None` where something is not known or there
+    /// is no contrast.
+    pub fn patch(&self, [x, y]: [f64; 2], [across, down]: [[f64; 2]; 2]) -> Option<Patch> {
+        let mut patch = [0.0; PATCH];
+        let mut sum = 0.0;
+        for (i, value) in patch.iter_mut().enumerate() {
+            let side = 2 * HALF as usize + 1;
+            let [u, v] = [(i % side) as f64 - f64::from(HALF), (i / side) as f64 - f64::from(HALF)];
+            *value = self.at(x + u * across[0] + v * down[0], y + u * across[1] + v * down[1]);
+            sum += *value;
+        }
+        // One value that is not known makes the sum unknown.
+        let mean = sum / PATCH as f32;
+        let length = patch.iter().map(|value| (value - mean) * (value - mean)).sum::<f32>().sqrt();
+        if !(length > 0.005 * (PATCH as f32).sqrt()) {
+            return None;
+        }
+        patch.iter_mut().for_each(|value| *value = (*value - mean) / length);
+        Some(patch)
+    }
+
+    /// In each cell the place that moves most in whatever direction the image is shifted (Shi and Tomasi 1994), the best
+    /// first.
+    fn find_corners(&self) -> Vec<[f64; 2]> {
+        let border = HALF as usize + 2;
+        if self.width <= 2 * border + 1 || self.height <= 2 * border + 1 {
+            return vec![];
+        }
+        let value = |x: usize, y: usize| self.values[y * self.width + x];
+        let tensor = |x: usize, y: usize| {
+            let mut sums = [0.0_f32; 3];
+            for (u, v) in (y - 2..=y + 2).flat_map(|v| (x - 2..=x + 2).map(move |u| (u, v))) {
+                let [across, down] = [value(u + 1, v) - value(u - 1, v), value(u, v + 1) - value(u, v - 1)];
+                sums = [sums[0] + across * across, sums[1] + across * down, sums[2] + down * down];
+            }
+            let [a, b, c] = sums.map(|sum| sum / (4.0 * 25.0));
+            0.5 * (a + c) - (0.25 * (a - c) * (a - c) + b * b).sqrt()
+        };
+        let mut best: Vec<(f32, [f64; 2])> = vec![];
+        for top in (border..self.height - border).step_by(CELL) {
+            for left in (border..self.width - border).step_by(CELL) {
+                let rows = top..(top + CELL).min(self.height - border);
+                let places = rows.flat_map(|y| (left..(left + CELL).min(self.width - border)).map(move |x| (x, y)));
+                let strengths = places.map(|(x, y)| (tensor(x, y), [x as f64 + 0.5, y as f64 + 0.5]));
+                let strong = strengths.filter(|(strength, _)| *strength > CONTRAST * CONTRAST);
+                best.extend(strong.max_by(|a, b| a.0.total_cmp(&b.0)));
+            }
+        }
+        best.sort_by(|a, b| b.0.total_cmp(&a.0));
+        best.into_iter().take(PATCHES).map(|(_, place)| place).collect()
+    }
+}
+
+/// Brightness, one value a pixel, in the curve of the file: what eyes see as even steps.
+pub(super) fn grey(photo: &Photo) -> Image {
+    let image = photo.over(BEHIND);
+    let data = image.data.chunks_exact(3).map(|rgb| 0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]).collect();
+    Image { channels: 1, data, ..image }
+}
+
+/// Makes unknown what a mask does not use.
+fn hide(image: &mut Image, mask: &Photo) {
+    let Image { width, height, .. } = *image;
+    for y in 0..height {
+        for x in 0..width {
+            let [column, row] = [x * mask.width / width, y * mask.height / height];
+            if mask.pixel(column, row)[0] < 0.99 {
+                image.data[y * width + x] = f32::NAN;
+            }
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! What photographs say of their own quality, and of each other's.
+
+use super::look::{Look, fits};
+use super::numbers::{median, spread};
+use super::report::{FindingKind as Kind, Findings, Severity};
+use crate::dataset::{Capture, Photo, Split, View};
+use crate::error::Result;
+use Severity::{Error, Note, Warning};
+use std::collections::HashMap;
+
+/// A photograph with what its pixels say.
+pub(super) struct Seen<'a> {
+    pub view: &'a View,
+    pub look: &'a Look,
+}
+
+/// How many usual deviations an outlier is from the others.
+const FAR: f64 = 5.0;
+/// The least ratios that are worth a word: of the contrast of edges, of brightness, and of colours.
+const BLUR: f64 = 4.0;
+const BRIGHTNESS: f64 = 1.5;
+const COLOUR: f64 = 1.2;
+/// Neighbours that a photograph is compared with.
+const NEIGHBOURS: usize = 6;
+
+/// The sizes of the photographs, from the headers of their files, the most frequent first.
+pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
+    let mut counts: HashMap<[usize; 2], usize> = HashMap::new();
+    let (mut shapes, mut first) = (vec![], None);
+    for view in capture.present() {
+        let Some(Ok([stored, shown])) = view.image.as_ref().map(Photo::size_of_file) else { continue };
+        *counts.entry(shown).or_default() += 1;
+        if view.camera.width > 0 && !fits(stored, view) && !fits(shown, view) {
+            let [w, h] = shown;
+            first.get_or_insert_with(|| format!("{w}x{h} pixels for {}x{}", view.camera.width, view.camera.height));
+            shapes.push(view.name.clone());
+        }
+    }
+    let first = first.unwrap_or_default();
+    findings.about(
+        Kind::ShapeMismatch,
+        Error,
+        shapes,
+        |count| format!("{count} have another shape than their cameras: {first}"),
+        "Images that were cropped or turned after their cameras were measured cannot be used: take the original ones, or \
+         measure again.",
+    );
+    let mut counts: Vec<_> = counts.into_iter().collect();
+    counts.sort_by_key(|(size, count)| (std::cmp::Reverse(*count), *size));
+    if counts.len() > 1 {
+        let listed: Vec<String> = counts.iter().map(|([w, h], n)| format!("{n} of {w}x{h}")).collect();
+        findings.add(
+            Kind::MixedResolutions,
+            Note,
+            format!("photographs have several resolutions: {}", listed.join(", ")),
+            "Nothing needs to be done: each is used at its own.",
+            vec![],
+        );
+    }
+    counts
+}
+
+/// Adds what photographs that cannot be read say.
+pub(super) fn unreadable(looks: &[(String, Result<Look>)], findings: &mut Findings) {
+    let errors: Vec<_> = looks.iter().filter_map(|(name, look)| Some((name, look.as_ref().err()?))).collect();
+    let first = errors.first().map(|(_, error)| error.to_string()).unwrap_or_default();
+    findings.about(
+        Kind::ImagesUndecodable,
+        Error,
+        errors.iter().map(|(name, _)| (*name).clone()).collect(),
+        |count| format!("the images or masks of {count} cannot be decoded; the first: {first}"),
+        "Copy these files again, or take them out of the capture; PNG, JPEG and WebP can be read.",
+    );
+}
+
+/// Adds what is wrong with photographs that can be read.
+pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
+    duplicates(seen, findings);
+    blurred(seen, findings);
+    light(seen, findings);
+    masks(seen, findings);
+    alpha(seen, findings);
+}
+
+fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
+    let mut first: HashMap<u64, &View> = HashMap::new();
+    let (mut same, mut leaks) = (vec![], vec![]);
+    for Seen { view, look } in seen {
+        // Images of one colour are all alike.
+        if look.sharpness.is_none() {
+            continue;
+        }
+        let Some(other) = first.get(&look.hash) else {
+            first.insert(look.hash, view);
+            continue;
+        };
+        let named = format!("{} (as {})", view.name, other.name);
+        let across = (view.split == Some(Split::Train)) != (other.split == Some(Split::Train));
+        if across { leaks.push(named) } else { same.push(named) }
+    }
+    findings.about(
+        Kind::DuplicateImages,
+        Warning,
+        same,
+        |count| format!("{count} are pixel by pixel another one"),
+        "If their poses differ, one of them is wrong; if not, one photograph counts twice. Leave one out.",
+    );
+    if !leaks.is_empty() && !findings.0.iter().any(|finding| finding.kind == Kind::Leak) {
+        super::layout::leak(leaks, findings);
+    }
+}
+
+/// Of each value how far it is from the median of the neighbours' that have one: what all around share is no fault.
+fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Option<f64>> {
+    let values: Vec<Option<f64>> = seen.iter().map(|one| value(one.look)).collect();
+    let pose = |i: usize| seen[i].view.camera.pose;
+    let gap = |i: usize, j: usize| pose(i).translation.distance(pose(j).translation);
+    let usual = median((0..seen.len()).map(|i| gap(i, 0))).max(f64::MIN_POSITIVE);
+    let residual = |i: usize| {
+        let own = values[i]?;
+        let mut others: Vec<(f64, f64)> = (0..seen.len())
+            .filter(|j| *j != i)
+            .filter_map(|j| {
+                let angle = pose(i).matrix3.z_axis.angle_between(pose(j).matrix3.z_axis);
+                Some((gap(i, j) / usual + angle, values[j]?))
+            })
+            .collect();
+        others.sort_by(|a, b| a.0.total_cmp(&b.0));
+        (others.len() >= 3).then(|| own - median(others.iter().take(NEIGHBOURS).map(|(_, value)| *value)))
+    };
+    (0..seen.len()).map(residual).collect()
+}
+
+/// The names of the photographs whose value is this far from their neighbours', and from what is usual.
+fn outliers(seen: &[Seen<'_>], residuals: &[Option<f64>], least: f64, wrong: impl Fn(f64) -> f64) -> Vec<String> {
+    let known: Vec<f64> = residuals.iter().flatten().copied().collect();
+    let limit = (FAR * spread(&known)).max(least);
+    let far = |residual: &Option<f64>| residual.is_some_and(|x| wrong(x) > limit);
+    residuals.iter().zip(seen).filter(|(x, _)| far(x)).map(|(_, one)| one.view.name.clone()).collect()
+}
+
+fn blurred(seen: &[Seen<'_>], findings: &mut Findings) {
+    let residuals = residuals(seen, |look| look.sharpness);
+    findings.about(
+        Kind::Blurred,
+        Warning,
+        outliers(seen, &residuals, BLUR.ln(), |x| -x),
+        |count| format!("{count} are far less sharp than those beside them"),
+        "Leave them out if others show the same: what is blurred in a photograph becomes blurred in the scene.",
+    );
+}
+
+fn light(seen: &[Seen<'_>], findings: &mut Findings) {
+    let brightness = residuals(seen, |look| look.luminance);
+    findings.about(
+        Kind::ExposureJump,
+        Warning,
+        outliers(seen, &brightness, BRIGHTNESS.ln(), f64::abs),
+        |count| format!("{count} are much brighter or darker than those beside them"),
+        "Photograph with a fixed exposure. With photographs as they are, codes for each photograph (`--set field.codes=8`) \
+         take up what differs.",
+    );
+    let mut names: Vec<String> = vec![];
+    for colour in 0..2 {
+        let balance = residuals(seen, |look| look.luminance.map(|_| look.balance[colour]));
+        for name in outliers(seen, &balance, COLOUR.ln(), f64::abs) {
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+    }
+    findings.about(
+        Kind::WhiteBalanceJump,
+        Warning,
+        names,
+        |count| format!("{count} have other colours than those beside them"),
+        "Photograph with a fixed white balance. With photographs as they are, codes for each photograph \
+         (`--set field.codes=8`) take up what differs.",
+    );
+}
+
+fn masks(seen: &[Seen<'_>], findings: &mut Findings) {
+    let with = |share: f64| -> Vec<String> {
+        seen.iter().filter(|one| one.look.used == Some(share)).map(|one| one.view.name.clone()).collect()
+    };
+    findings.about(
+        Kind::MaskHidesAll,
+        Error,
+        with(0.0),
+        |count| format!("the masks of {count} hide all of it"),
+        "Masks are white where a photograph is used: they may be the wrong way round. Leave these photographs out otherwise.",
+    );
+    findings.about(
+        Kind::MaskHidesNothing,
+        Note,
+        with(1.0),
+        |count| format!("the masks of {count} hide nothing"),
+        "Nothing needs to be done if there is nothing to hide.",
+    );
+}
+
+fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
+    let names: Vec<String> = seen
+        .iter()
+        .filter(|one| one.look.transparent == Some(false))
+        .map(|one| one.view.name.clone())
+        .collect();
+    let mixed = seen.iter().any(|one| one.look.transparent == Some(true));
+    let severity = if mixed { Warning } else { Note };
+    findings.about(
+        Kind::OpaqueAlpha,
+        severity,
+        names,
+        |count| format!("the alpha channels of {count} are opaque throughout"),
+        if mixed {
+            "Others are transparent where there is nothing: these were saved without, and their background is learned as part \
+             of the scene."
+        } else {
+            "They say nothing, and the scene is taken to go on behind. If it does not, save what is transparent as such."
+        },
+    );
+}

@@ -1,0 +1,176 @@
+//! Poses under several conventions, and what cameras look at under each.
+
+use super::numbers::median;
+use glam::{DAffine3, DMat3, DVec3};
+
+/// A way in which the matrices of a capture may be meant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Convention {
+    /// As they are read: from the camera to the world, and the camera looks along its -z with y up (OpenGL).
+    AsRead,
+    /// The camera looks along its +z with y down (OpenCV).
+    OpenCv,
+    /// From the world to the camera.
+    WorldToCamera,
+    /// From the world to the camera, which looks along its +z with y down: as COLMAP stores them.
+    WorldToOpenCv,
+    /// The world is mirrored, and so are the cameras, from side to side.
+    Mirrored,
+    /// The same, and the cameras are upside down.
+    MirroredUpsideDown,
+    /// The same, and the cameras look the other way.
+    MirroredBackwards,
+}
+
+impl Convention {
+    /// All of them.
+    pub const ALL: [Convention; 7] = [
+        Convention::AsRead,
+        Convention::OpenCv,
+        Convention::WorldToCamera,
+        Convention::WorldToOpenCv,
+        Convention::Mirrored,
+        Convention::MirroredUpsideDown,
+        Convention::MirroredBackwards,
+    ];
+
+    /// The pose that a pose would be if it were meant in this way.
+    pub fn apply(self, pose: DAffine3) -> DAffine3 {
+        let turned = |pose: DAffine3, axes: DVec3| DAffine3 {
+            matrix3: pose.matrix3 * DMat3::from_diagonal(axes),
+            translation: pose.translation,
+        };
+        let inverse = || {
+            let matrix3 = pose.matrix3.transpose();
+            DAffine3 { matrix3, translation: -(matrix3 * pose.translation) }
+        };
+        let mirror = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0));
+        let mirrored = || DAffine3 { matrix3: mirror * pose.matrix3, translation: mirror * pose.translation };
+        match self {
+            Convention::AsRead => pose,
+            Convention::OpenCv => turned(pose, DVec3::new(1.0, -1.0, -1.0)),
+            Convention::WorldToCamera => inverse(),
+            Convention::WorldToOpenCv => turned(inverse(), DVec3::new(1.0, -1.0, -1.0)),
+            Convention::Mirrored => turned(mirrored(), DVec3::new(-1.0, 1.0, 1.0)),
+            Convention::MirroredUpsideDown => turned(mirrored(), DVec3::new(1.0, -1.0, 1.0)),
+            Convention::MirroredBackwards => turned(mirrored(), DVec3::new(1.0, 1.0, -1.0)),
+        }
+    }
+}
+
+/// What cameras look at.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Focus {
+    /// The place nearest to all optical axes, in the sense of least squares.
+    pub place: DVec3,
+    /// The median distance of the axes from it, as a share of the cameras' distance.
+    pub miss: f64,
+    /// The share of the cameras that have it before them.
+    pub ahead: f64,
+    /// The median distance of the cameras from it.
+    pub distance: f64,
+}
+
+impl Focus {
+    /// Of poses in OpenGL's axes; `None` if there are fewer than two or the axes are parallel.
+    pub fn of(poses: &[DAffine3]) -> Option<Focus> {
+        let count = poses.len() as f64;
+        let mean = poses.iter().map(|pose| pose.translation).sum::<DVec3>() / count;
+        let (mut matrix, mut sum) = (DMat3::ZERO, DVec3::ZERO);
+        for pose in poses {
+            let axis = pose.matrix3.z_axis;
+            let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+            matrix += across;
+            sum += across * (pose.translation - mean);
+        }
+        // Directions that differ by less than about 3 degrees meet nowhere in particular.
+        if poses.len() < 2 || !(matrix.determinant() > 1e-3 * count.powi(3)) {
+            return None;
+        }
+        let place = mean + matrix.inverse() * sum;
+        let offsets = || poses.iter().map(|pose| (place - pose.translation, -pose.matrix3.z_axis));
+        let distance = median(offsets().map(|(offset, _)| offset.length()));
+        let miss = median(offsets().map(|(offset, axis)| offset.reject_from_normalized(axis).length()));
+        let ahead = offsets().filter(|(offset, axis)| offset.dot(*axis) > 0.0).count() as f64 / count;
+        Some(Focus { place, miss: miss / distance.max(f64::MIN_POSITIVE), ahead, distance })
+    }
+
+    /// Whether cameras clearly stand around one thing and look at it.
+    pub fn is_inward(&self) -> bool {
+        self.ahead > 0.9 && self.miss < 0.3
+    }
+}
+
+/// How far places are from one another: the root of the mean square of their distance from their mean, along the principal
+/// axes, the greatest first.
+pub(super) fn extents(places: &[DVec3]) -> [f64; 3] {
+    let count = places.len().max(1) as f64;
+    let mean = places.iter().sum::<DVec3>() / count;
+    let mut scatter = DMat3::ZERO;
+    for place in places {
+        let d = *place - mean;
+        scatter += DMat3::from_cols(d * d.x, d * d.y, d * d.z) * (1.0 / count);
+    }
+    let mut out = [0.0; 3];
+    for extent in &mut out {
+        // Power iteration from the axis that is moved farthest, and then without what was found.
+        let columns = [scatter.x_axis, scatter.y_axis, scatter.z_axis];
+        let mut axis = columns.into_iter().max_by(|a, b| a.length().total_cmp(&b.length())).unwrap_or(DVec3::X);
+        if !(axis.length() > 0.0) {
+            break;
+        }
+        for _ in 0..100 {
+            let next = scatter * axis.normalize();
+            if !(next.length() > 0.0) {
+                break;
+            }
+            axis = next;
+        }
+        let axis = axis.normalize();
+        let value = (scatter * axis).dot(axis).max(0.0);
+        scatter -= DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z) * value;
+        *extent = value.sqrt();
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Camera;
+    use crate::dataset::scene::train_cameras;
+
+    #[test]
+    fn conventions_are_undone_by_themselves() {
+        let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.3, -0.2, 0.1), DVec3::Z);
+        let undo = |convention: Convention| match convention {
+            Convention::WorldToOpenCv => {
+                Convention::WorldToCamera.apply(Convention::OpenCv.apply(convention.apply(pose)))
+            }
+            other => other.apply(other.apply(pose)),
+        };
+        for convention in Convention::ALL {
+            assert!((convention.apply(pose).matrix3.determinant() - 1.0).abs() < 1e-12, "{convention:?}");
+            assert!(undo(convention).abs_diff_eq(pose, 1e-12), "{convention:?}");
+        }
+    }
+
+    #[test]
+    fn cameras_around_a_thing_look_at_it_and_flipped_ones_away() {
+        let poses: Vec<DAffine3> = train_cameras(20, 8).into_iter().map(|camera| camera.pose).collect();
+        let focus = Focus::of(&poses).unwrap();
+        assert!(focus.place.length() < 1e-9 && (focus.distance - 4.0).abs() < 1e-9 && focus.is_inward());
+        let flipped: Vec<DAffine3> = poses.iter().map(|pose| Convention::OpenCv.apply(*pose)).collect();
+        assert_eq!(Focus::of(&flipped).unwrap().ahead, 0.0);
+        assert!(Focus::of(&poses[..1]).is_none() && Focus::of(&[poses[0]; 5]).is_none());
+    }
+
+    #[test]
+    fn extents_of_a_box_and_of_a_line() {
+        let corners = (0..8).map(|i| DVec3::new(f64::from(i & 1) * 6.0, f64::from(i >> 1 & 1) * 4.0, f64::from(i >> 2) * 2.0));
+        let [a, b, c] = extents(&corners.collect::<Vec<_>>());
+        assert!((a - 3.0).abs() < 1e-6 && (b - 2.0).abs() < 1e-6 && (c - 1.0).abs() < 1e-6, "{a} {b} {c}");
+        let line: Vec<DVec3> = (0..5).map(|i| DVec3::new(1.0, 2.0, -1.0) * f64::from(i)).collect();
+        assert!(extents(&line)[1] < 1e-6 && extents(&[DVec3::ONE; 3]) == [0.0; 3]);
+    }
+}

@@ -1,0 +1,153 @@
+//! What can be said of each camera alone: its field of view, its principal point, its lens.
+
+use super::report::{FindingKind, Findings, Severity};
+use crate::camera::{Camera, Lens};
+use crate::dataset::{Capture, View};
+
+/// Fields of view that lenses have, in degrees, and those of lenses that show half of the world and more.
+const VIEWS: [f64; 2] = [10.0, 150.0];
+const WIDE: f64 = 230.0;
+/// Most that horizontal and vertical focal length differ in a camera with square pixels.
+const ASPECT: f64 = 0.05;
+/// Most that the principal point is from the middle, in sides of the image.
+const OFF_CENTRE: f64 = 0.1;
+/// A lens that bends light by more degrees than this at some border is a strong one.
+const BENDS: f64 = 10.0;
+/// Places along a line from the principal point to the border at which a lens is asked.
+const STEPS: usize = 32;
+
+/// Adds what is wrong with single cameras.
+pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
+    use FindingKind as Kind;
+    use Severity::{Note, Warning};
+    let sized = || capture.views.iter().filter(|view| view.camera.width > 0 && view.camera.height > 0);
+    let named = |wrong: &dyn Fn(&Camera) -> bool| -> Vec<String> {
+        sized().filter(|view| wrong(&view.camera)).map(name).collect()
+    };
+    let implausible = |camera: &Camera| {
+        let most = if matches!(camera.lens, Lens::Fisheye { .. } | Lens::Fov { .. }) { WIDE } else { VIEWS[1] };
+        camera.lens != Lens::Equirectangular
+            && [0, 1].into_iter().any(|axis| !(VIEWS[0]..=most).contains(&field_of_view(camera, axis)))
+    };
+    findings.about(
+        Kind::FieldOfView,
+        Warning,
+        named(&implausible),
+        |count| format!("the cameras of {count} have fields of view below 10 or above 150 degrees"),
+        "Check the unit of the focal length (pixels, for the size of the images that the file names; not millimetres) and of \
+         `camera_angle_x` (radians).",
+    );
+    let stretched = |camera: &Camera| {
+        let [x, y] = camera.focal;
+        camera.lens != Lens::Equirectangular && !((x / y - 1.0).abs() <= ASPECT)
+    };
+    findings.about(
+        Kind::PixelAspect,
+        Warning,
+        named(&stretched),
+        |count| format!("horizontal and vertical focal length differ by more than 5 % in the cameras of {count}"),
+        "Cameras have square pixels: if the images were stretched, say so in both focal lengths; otherwise use one for both.",
+    );
+    let off_centre = |camera: &Camera| {
+        let sides = [camera.width as f64, camera.height as f64];
+        (0..2).any(|axis| !((camera.centre[axis] / sides[axis] - 0.5).abs() <= OFF_CENTRE))
+    };
+    findings.about(
+        Kind::PrincipalPoint,
+        Warning,
+        named(&off_centre),
+        |count| format!("the principal point of {count} is more than a tenth of the image from its middle"),
+        "If the images are smaller than those that the cameras were measured with, scale `cx` and `cy` with them; if they were \
+         cropped, this may be right.",
+    );
+    findings.about(
+        Kind::LensFolds,
+        Warning,
+        named(&|camera| !reaches(camera)),
+        |count| format!("the lens of {count} puts nothing in a part of the image, or folds it back on itself"),
+        "The coefficients were found from points nearer to the middle, and do not hold at the border: find them anew with \
+         fewer of them (k1 alone), or crop or undistort the images. Pixels that no light reaches are left out.",
+    );
+    findings.about(
+        Kind::StrongDistortion,
+        Note,
+        named(&|camera| reaches(camera) && bends(camera) > BENDS),
+        |count| format!("the lens of {count} bends light by more than 10 degrees at the border"),
+        "Nothing needs to be done if the coefficients are right. Straight lines that are curved in rendered views say that they \
+         are not.",
+    );
+}
+
+fn name(view: &View) -> String {
+    view.name.clone()
+}
+
+/// The horizontal (`axis` 0) or vertical field of view in degrees, distortion aside.
+pub(super) fn field_of_view(camera: &Camera, axis: usize) -> f64 {
+    let size = [camera.width, camera.height][axis] as f64;
+    let half = 0.5 * size / camera.focal[axis];
+    let radians = match camera.lens {
+        // Places are angles, or nearly so.
+        Lens::Fisheye { .. } | Lens::Equirectangular | Lens::Fov { .. } => 2.0 * half,
+        Lens::Pinhole | Lens::Brown { .. } => 2.0 * half.atan(),
+    };
+    radians.to_degrees()
+}
+
+/// Corners of the image and the middles of its sides, as places in the image plane.
+fn border(camera: &Camera) -> impl Iterator<Item = [f64; 2]> {
+    let [width, height] = [camera.width as f64, camera.height as f64];
+    let [cx, cy] = camera.centre;
+    let [fx, fy] = camera.focal;
+    let ends = |side: f64| [0.5, 0.5 * side, side - 0.5];
+    ends(width).into_iter().flat_map(move |x| ends(height).map(move |y| [(x - cx) / fx, (y - cy) / fy]))
+}
+
+/// Whether light reaches all of the image, and from farther off the axis the farther from the principal point.
+fn reaches(camera: &Camera) -> bool {
+    if matches!(camera.lens, Lens::Pinhole | Lens::Equirectangular) {
+        return true;
+    }
+    border(camera).all(|[x, y]| {
+        let mut last = 0.0;
+        (1..=STEPS).all(|step| {
+            let share = step as f64 / STEPS as f64;
+            let Some(direction) = camera.lens.direction([share * x, share * y]) else { return false };
+            let angle = direction.truncate().length().atan2(direction.z);
+            let grows = angle > last || x.hypot(y) < 1e-3;
+            last = angle;
+            grows
+        })
+    })
+}
+
+/// The most degrees between the direction that light comes from at the border and that without distortion.
+fn bends(camera: &Camera) -> f64 {
+    if !matches!(camera.lens, Lens::Brown { .. }) {
+        return 0.0;
+    }
+    let angles = border(camera).map(|place| {
+        let plain = Lens::Pinhole.direction(place).zip(camera.lens.direction(place));
+        plain.map_or(0.0, |(plain, bent)| plain.angle_between(bent))
+    });
+    angles.fold(0.0, f64::max).to_degrees()
+}
+
+/// A lens and its coefficients, without those that are 0 at the end.
+pub(super) fn described(lens: &Lens) -> String {
+    let listed = |name: &str, values: &[f64]| {
+        let used = values.iter().rposition(|x| *x != 0.0).map_or(0, |last| last + 1);
+        let numbered = values[..used].iter().enumerate().map(|(i, x)| format!(", {name}{} {x}", i + 1));
+        numbered.collect::<String>()
+    };
+    match lens {
+        Lens::Pinhole => "pinhole".to_owned(),
+        Lens::Brown { k, p } => {
+            let coefficients = listed("k", k) + &listed("p", p);
+            if coefficients.is_empty() { "pinhole".to_owned() } else { format!("Brown{coefficients}") }
+        }
+        Lens::Fisheye { k, p, s } => format!("fisheye{}{}{}", listed("k", k), listed("p", p), listed("sx", s)),
+        Lens::Fov { omega } => format!("FOV, omega {omega}"),
+        Lens::Equirectangular => "equirectangular".to_owned(),
+    }
+}
