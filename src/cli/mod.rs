@@ -1,10 +1,12 @@
 //! Reads the command line, runs what it asks for, and turns errors into one line and an exit code.
 //!
-//! Exit codes: 0 done, 1 an error, 2 a command line that cannot be understood, 130 interrupted.
+//! Exit codes: 0 done, 1 an error, 2 a command line that cannot be understood, 130 interrupted; of `doctor` also 3 and 4: it has
+//! found something of the severity of a warning, or of an error.
 
 mod animation;
 mod bench;
 mod cameras;
+mod doctor;
 mod eval;
 #[cfg(test)]
 mod fuzz;
@@ -47,6 +49,7 @@ enum Command {
     Train(train::Args),
     Eval(eval::Args),
     Render(render::Args),
+    Doctor(doctor::Args),
     Bench(bench::Args),
 }
 
@@ -75,6 +78,7 @@ fn run(cli: Cli) -> Result<ExitCode> {
             Ok(trained.exit_code())
         }
         Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
+        Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Render(args)) => render::run(&args).map(|()| ExitCode::SUCCESS),
     }

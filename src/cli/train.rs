@@ -21,7 +21,7 @@ use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::watch::Watch;
-use super::{interrupt, parse};
+use super::{doctor, interrupt, parse};
 
 /// Train a model on a scene
 ///
@@ -110,6 +110,8 @@ pub fn run(args: &Args) -> Result<Trained> {
     let mut trainer = Trainer::new(config, data.clone())?;
     let run = Run::create(folder, args.run_config(&trainer, &data)?)?;
     describe(&run, &trainer, &data, &scene)?;
+    // Once nothing else can be wrong: an error is then the one line that is said.
+    doctor::warn(&scene);
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
     let budget = args.budget();

@@ -45,6 +45,12 @@ impl Tally {
         let chance = 1.0 / BESIDE.len() as f64;
         (self.wins as f64 / self.trials.max(1) as f64 - chance) / (1.0 - chance)
     }
+
+    /// How often a line wins at this skill.
+    pub fn rate(skill: f64) -> f64 {
+        let chance = 1.0 / BESIDE.len() as f64;
+        chance + (1.0 - chance) * skill
+    }
 }
 
 impl std::ops::Add for Tally {

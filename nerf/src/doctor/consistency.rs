@@ -13,8 +13,11 @@ use glam::DAffine3;
 
 /// Photographs that are compared with their neighbours under each convention.
 const TRIED: usize = 20;
-/// Patches that must have a match before agreement says anything: of the capture, and of a single photograph.
-const ENOUGH: [usize; 2] = [150, 25];
+/// Patches that must have a match before agreement says anything of the capture.
+const ENOUGH: usize = 150;
+/// The same of a single photograph, and how many standard deviations it must be from what is usual.
+const FEWEST: usize = 8;
+const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
 const GOOD: f64 = 0.2;
 /// Below it photographs and cameras have nothing to do with each other.
@@ -37,20 +40,20 @@ pub(super) fn examine(all: &[Compared<'_>], most: usize, findings: &mut Findings
     let tried = evenly_spaced((0..all.len()).collect(), TRIED);
     let tally = |convention: Convention| total(&compare(&under(convention), &tried));
     let read = tally(Convention::AsRead);
-    let own = if read.trials >= ENOUGH[0] { read.skill() } else { 0.0 };
+    let own = if read.trials >= ENOUGH { read.skill() } else { 0.0 };
     if own < 2.0 * GOOD {
         let others = Convention::ALL[1..].iter().map(|convention| (*convention, tally(*convention)));
-        let enough = others.filter(|(_, tally)| tally.trials >= ENOUGH[0]);
+        let enough = others.filter(|(_, tally)| tally.trials >= ENOUGH);
         let best = enough.max_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
         if let Some((convention, tally)) = best.filter(|(_, tally)| tally.skill() > GOOD && tally.skill() > 2.0 * own) {
             another(convention, [own, tally.skill()], findings);
             return Some(own);
         }
     }
-    if read.trials < ENOUGH[0] {
+    if read.trials < ENOUGH {
         return None;
     }
-    if own < NONE && read.trials >= 2 * ENOUGH[0] {
+    if own < NONE && read.trials >= 2 * ENOUGH {
         findings.add(
             Kind::NoAgreement,
             Warning,
@@ -98,32 +101,39 @@ fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findin
     }
 }
 
-/// The photographs that agree with none of their neighbours, though these agree with each other.
+/// The photographs that do not agree with their neighbours, though these agree with each other.
 fn wrong_poses(all: &[Compared<'_>], pairs: &[Pair], findings: &mut Findings) {
-    let scores: Vec<Option<f64>> = (0..all.len()).map(|view| score(view, pairs)).collect();
-    let usual = median(scores.iter().flatten().copied());
-    if usual < GOOD {
-        return;
+    let mut wrong: Vec<usize> = vec![];
+    // The worst first, and then without it: one wrong camera does not make those beside it wrong.
+    loop {
+        let left: Vec<&Pair> = pairs.iter().filter(|pair| pair.views.iter().all(|view| !wrong.contains(view))).collect();
+        let of = |view: usize| {
+            let own = left.iter().filter(|pair| pair.views.contains(&view));
+            own.fold(Tally::default(), |sum, pair| sum + pair.tally)
+        };
+        let tallies = (0..all.len()).map(|view| (view, of(view)));
+        let tallies: Vec<(usize, Tally)> = tallies.filter(|(_, tally)| tally.trials >= FEWEST).collect();
+        let usual = median(tallies.iter().map(|(_, tally)| tally.skill()));
+        let worst = tallies.into_iter().min_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
+        match worst.filter(|(_, tally)| usual >= GOOD && is_wrong(*tally, usual)) {
+            Some((view, _)) => wrong.push(view),
+            None => break,
+        }
     }
-    let wrong = |view: &usize| scores[*view].is_some_and(|score| score < WRONG * usual);
-    let names = (0..all.len()).filter(wrong).map(|view| all[view].name.clone()).collect();
+    wrong.sort_unstable();
     findings.about(
         Kind::WrongPose,
         Warning,
-        names,
-        |count| format!("{count} do not fit their neighbours: what they show is not where their poses put it"),
+        wrong.into_iter().map(|view| all[view].name.clone()).collect(),
+        |count| format!("{count} cannot be matched with their neighbours: what is seen there is not where poses put it"),
         "Look at them: their poses are wrong, or they show something that has moved, or hardly anything. Leave them out, or \
          have poses learned with the scene.",
     );
 }
 
-/// The agreement of a photograph with the half of its neighbours that it agrees with best: one wrong camera does not make
-/// those beside it wrong.
-fn score(view: usize, pairs: &[Pair]) -> Option<f64> {
-    let mut own: Vec<Tally> = pairs.iter().filter(|pair| pair.views.contains(&view)).map(|pair| pair.tally).collect();
-    own.retain(|tally| tally.trials > 2);
-    own.sort_by(|a, b| b.skill().total_cmp(&a.skill()));
-    let half = own.len().div_ceil(2);
-    let sum = own[..half].iter().fold(Tally::default(), |sum, tally| sum + *tally);
-    (sum.trials >= ENOUGH[1]).then(|| sum.skill())
+/// Whether a photograph agrees far less than is usual, and that is no chance.
+fn is_wrong(tally: Tally, usual: f64) -> bool {
+    let (count, rate) = (tally.trials as f64, Tally::rate(usual));
+    let deviation = (count * rate * (1.0 - rate)).sqrt();
+    tally.skill() < WRONG * usual && (tally.wins as f64) < count * rate - DEVIATIONS * deviation
 }

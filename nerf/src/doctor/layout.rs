@@ -11,7 +11,7 @@ use glam::{DAffine3, DVec3};
 /// Fewer photographs than these are too few, and hardly enough.
 const FEW: [usize; 2] = [5, 20];
 /// Cameras that are not farther apart than this share of their distance from the origin stand in one place.
-const ONE_PLACE: f64 = 1e-6;
+const ONE_PLACE: f64 = 1e-9;
 /// Cameras whose second extent is a smaller share of the first stand on a line.
 const LINE: f64 = 0.02;
 /// The cosine of half of the cone around the poles in which roll and azimuth say nothing.
@@ -80,8 +80,8 @@ fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
         let severity = if views.len() < FEW[0] { Error } else { Warning };
         let what = match views.len() {
             0 => "there is no photograph".to_owned(),
-            1 => "there is 1 photograph alone".to_owned(),
-            count => format!("there are {count} photographs alone"),
+            1 => "there is only 1 photograph".to_owned(),
+            count => format!("there are only {count} photographs"),
         };
         let advice = "Use 50 to 200 photographs, each part of the scene on at least three of them: more from where it has much \
                       detail or hides things.";
@@ -198,17 +198,17 @@ fn pairs(views: &[&View], distance: f64, size: f64, findings: &mut Findings) {
             let across = (a.split == Some(Split::Train)) != (b.split == Some(Split::Train));
             if across && near(a, b, distance, NEARLY) {
                 let (held, trained) = if a.split == Some(Split::Train) { (b, a) } else { (a, b) };
-                leaks.push(format!("{} (as {})", held.name, trained.name));
+                leaks.push([held.name.clone(), trained.name.clone()]);
             } else if !across && near(a, b, size, SAME) {
-                duplicates.push(format!("{} (as {})", a.name, b.name));
+                duplicates.push([a.name.clone(), b.name.clone()]);
             }
         }
     }
-    findings.about(
+    findings.alike(
         Kind::DuplicatePoses,
         Warning,
         duplicates,
-        |count| format!("{count} have exactly the pose of another"),
+        |count| format!("the pose of {count} is exactly that of another"),
         "Two photographs are hardly ever taken from the same place: if the images differ, one of the poses is wrong; leave it \
          out.",
     );
@@ -216,12 +216,12 @@ fn pairs(views: &[&View], distance: f64, size: f64, findings: &mut Findings) {
 }
 
 /// The finding that these photographs are trained and tested on.
-pub(super) fn leak(views: Vec<String>, findings: &mut Findings) {
-    findings.about(
+pub(super) fn leak(pairs: Vec<[String; 2]>, findings: &mut Findings) {
+    findings.alike(
         Kind::Leak,
         Warning,
-        views,
-        |count| format!("{count} of those held out are trained on too, or taken from the same place"),
+        pairs,
+        |count| format!("of those held out, {count} can be found among those to train on, or taken from the same place"),
         "Test on photographs from other places: what is measured on these says nothing of new views.",
     );
 }
@@ -241,7 +241,7 @@ fn far_cameras(views: &[&View], findings: &mut Findings) {
         Kind::FarCamera,
         Warning,
         names,
-        |count| format!("{count} were taken far from all others"),
+        |count| format!("the camera of {count} was far from all others"),
         "Their poses are probably wrong: leave them out. A single far camera makes the scene small in its box.",
     );
 }
@@ -296,7 +296,7 @@ fn roll(views: &[&View], up: DVec3, findings: &mut Findings) {
         Kind::Roll,
         Note,
         names,
-        |count| format!("{count} were taken with the camera turned by more than 30 degrees about its axis"),
+        |count| format!("in {count} the camera was turned by more than 30 degrees about its axis"),
         "This is right where portrait and landscape are mixed. If not, some images are turned (EXIF) and their poses are not. \
          Up is found from all cameras, and may be off.",
     );
@@ -323,8 +323,8 @@ fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) 
 }
 
 fn in_the_box(views: &[&View], survey: &Survey, findings: &mut Findings) {
-    /// Rays that are tried along each side of an image.
-    const RAYS: usize = 12;
+    /// Rays that are tried along each side of an image; the second where all of the first miss a box that may lie between.
+    const RAYS: [usize; 2] = [12, 200];
     if survey.scope != Scope::Bounded {
         return;
     }
@@ -336,26 +336,28 @@ fn in_the_box(views: &[&View], survey: &Survey, findings: &mut Findings) {
     };
     let misses = |view: &&&View| {
         let camera = placed(view);
-        let place = |i: usize, size: usize| (i as f64 + 0.5) / RAYS as f64 * size as f64;
-        camera.width > 0
-            && (0..RAYS * RAYS).all(|i| {
-                let ray = camera.ray(place(i % RAYS, camera.width), place(i / RAYS, camera.height));
+        let place = |i: usize, rays: usize, size: usize| (i as f64 + 0.5) / rays as f64 * size as f64;
+        let past = |rays: usize| {
+            (0..rays * rays).all(|i| {
+                let ray = camera.ray(place(i % rays, rays, camera.width), place(i / rays, rays, camera.height));
                 let [enter, leave] = clip_span(&ray, survey.bounds, [survey.near, survey.far]);
                 !(enter < leave)
             })
+        };
+        camera.width > 0 && RAYS.into_iter().all(past)
     };
     findings.about(
         Kind::CameraInBox,
         Warning,
         views.iter().filter(inside).map(|view| view.name.clone()).collect(),
-        |count| format!("the cameras of {count} stand in the box that is to hold the scene"),
+        |count| format!("the camera of {count} stands in the box that is to hold the scene"),
         "A scene that ends at its box is seen from outside. If it is a room, train with `--scope unbounded`.",
     );
     findings.about(
         Kind::MissesBox,
         Warning,
         views.iter().filter(misses).map(|view| view.name.clone()).collect(),
-        |count| format!("{count} show nothing of the box that is to hold the scene"),
+        |count| format!("nothing of the box that is to hold the scene is seen in {count}"),
         "They look past it: their poses are wrong, or they belong to another scene; leave them out.",
     );
 }

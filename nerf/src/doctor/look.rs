@@ -66,7 +66,7 @@ fn look_at(view: &View) -> Result<Look> {
     middle.to_image().data.iter().for_each(|value| value.to_bits().hash(&mut hasher));
     let (luminance, balance) = light(&small.to_image());
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
-    let sharpness = sharpness(&grey(&middle));
+    let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
     Ok(Look { transparent, hash: hasher.finish(), sharpness, luminance, balance, used, picture })
 }
 
@@ -104,6 +104,17 @@ fn variance(values: impl Iterator<Item = f64>) -> f64 {
         (count, sum, squares) = (count + 1.0, sum + value, squares + value * value);
     }
     squares / count - (sum / count) * (sum / count)
+}
+
+/// The mean colour of what is there: put behind what is not, it makes no edge that changes with the exposure.
+fn mean(image: &Image) -> [f32; 3] {
+    let (mut sum, mut weights) = ([0.0; 3], f32::MIN_POSITIVE);
+    for pixel in image.data.chunks_exact(image.channels) {
+        let alpha = pixel.get(3).copied().unwrap_or(1.0);
+        weights += alpha;
+        (0..3).for_each(|i| sum[i] += alpha * pixel[i]);
+    }
+    sum.map(|sum| sum / weights)
 }
 
 /// See [`Look::luminance`] and [`Look::balance`]: of linear light, weighted by alpha.

@@ -76,7 +76,7 @@ fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Fin
         FindingKind::ImagesAbsent,
         severity,
         absent,
-        |count| format!("the images of {count} do not exist; there are {}", capture.views.len()),
+        |count| format!("there is no image of {count}; {} are listed", capture.views.len()),
         "They are left out. If they should be there, look at the paths in the file, and at the ending of their names.",
     );
     single::examine(capture, findings);

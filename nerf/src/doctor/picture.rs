@@ -40,7 +40,7 @@ impl Picture {
             return None;
         }
         let Camera { width, height, focal, centre, lens, .. } = camera;
-        let mut image = grey(photo);
+        let mut image = grey(photo, BEHIND);
         if let Some(mask) = mask {
             hide(&mut image, mask);
         }
@@ -127,8 +127,8 @@ impl Picture {
 }
 
 /// Brightness, one value a pixel, in the curve of the file: what eyes see as even steps.
-pub(super) fn grey(photo: &Photo) -> Image {
-    let image = photo.over(BEHIND);
+pub(super) fn grey(photo: &Photo, behind: [f32; 3]) -> Image {
+    let image = photo.over(behind);
     let data = image.data.chunks_exact(3).map(|rgb| 0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]).collect();
     Image { channels: 1, data, ..image }
 }

@@ -41,7 +41,7 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
         Kind::ShapeMismatch,
         Error,
         shapes,
-        |count| format!("{count} have another shape than their cameras: {first}"),
+        |count| format!("the shape of {count} is not that of the camera: {first}"),
         "Images that were cropped or turned after their cameras were measured cannot be used: take the original ones, or \
          measure again.",
     );
@@ -94,15 +94,15 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
             first.insert(look.hash, view);
             continue;
         };
-        let named = format!("{} (as {})", view.name, other.name);
+        let named = [view.name.clone(), other.name.clone()];
         let across = (view.split == Some(Split::Train)) != (other.split == Some(Split::Train));
         if across { leaks.push(named) } else { same.push(named) }
     }
-    findings.about(
+    findings.alike(
         Kind::DuplicateImages,
         Warning,
         same,
-        |count| format!("{count} are pixel by pixel another one"),
+        |count| format!("the image of {count} is pixel by pixel that of another"),
         "If their poses differ, one of them is wrong; if not, one photograph counts twice. Leave one out.",
     );
     if !leaks.is_empty() && !findings.0.iter().any(|finding| finding.kind == Kind::Leak) {
@@ -145,7 +145,7 @@ fn blurred(seen: &[Seen<'_>], findings: &mut Findings) {
         Kind::Blurred,
         Warning,
         outliers(seen, &residuals, BLUR.ln(), |x| -x),
-        |count| format!("{count} are far less sharp than those beside them"),
+        |count| format!("the sharpness of {count} is far below that of those beside"),
         "Leave them out if others show the same: what is blurred in a photograph becomes blurred in the scene.",
     );
 }
@@ -156,7 +156,7 @@ fn light(seen: &[Seen<'_>], findings: &mut Findings) {
         Kind::ExposureJump,
         Warning,
         outliers(seen, &brightness, BRIGHTNESS.ln(), f64::abs),
-        |count| format!("{count} are much brighter or darker than those beside them"),
+        |count| format!("the brightness of {count} is far from that of those beside"),
         "Photograph with a fixed exposure. With photographs as they are, codes for each photograph (`--set field.codes=8`) \
          take up what differs.",
     );
@@ -173,7 +173,7 @@ fn light(seen: &[Seen<'_>], findings: &mut Findings) {
         Kind::WhiteBalanceJump,
         Warning,
         names,
-        |count| format!("{count} have other colours than those beside them"),
+        |count| format!("the balance of colours in {count} is far from that of those beside"),
         "Photograph with a fixed white balance. With photographs as they are, codes for each photograph \
          (`--set field.codes=8`) take up what differs.",
     );
@@ -211,7 +211,7 @@ fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
         Kind::OpaqueAlpha,
         severity,
         names,
-        |count| format!("the alpha channels of {count} are opaque throughout"),
+        |count| format!("the alpha channel of {count} is opaque throughout"),
         if mixed {
             "Others are transparent where there is nothing: these were saved without, and their background is learned as part \
              of the scene."

@@ -270,6 +270,21 @@ impl Findings {
         }
     }
 
+    /// Adds a finding about photographs that are like another one each, if there are some: the first pair is named.
+    pub fn alike(
+        &mut self,
+        kind: FindingKind,
+        severity: Severity,
+        pairs: Vec<[String; 2]>,
+        what: impl Fn(&str) -> String,
+        advice: &str,
+    ) {
+        let Some([first, other]) = pairs.first() else { return };
+        let named = format!(": `{first}` and `{other}`{}", if pairs.len() > 1 { ", and others" } else { "" });
+        let views = pairs.iter().map(|[name, _]| name.clone()).collect();
+        self.about(kind, severity, views, |count| what(count) + &named, advice);
+    }
+
     /// All of them, the gravest first, those of one severity in the order of their kinds.
     pub fn sorted(mut self) -> Vec<Finding> {
         self.0.sort_by_key(|finding| (std::cmp::Reverse(finding.severity), finding.kind));

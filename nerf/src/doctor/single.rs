@@ -12,7 +12,7 @@ const ASPECT: f64 = 0.05;
 /// Most that the principal point is from the middle, in sides of the image.
 const OFF_CENTRE: f64 = 0.1;
 /// A lens that bends light by more degrees than this at some border is a strong one.
-const BENDS: f64 = 10.0;
+const BENDS: f64 = 5.0;
 /// Places along a line from the principal point to the border at which a lens is asked.
 const STEPS: usize = 32;
 
@@ -33,7 +33,7 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
         Kind::FieldOfView,
         Warning,
         named(&implausible),
-        |count| format!("the cameras of {count} have fields of view below 10 or above 150 degrees"),
+        |count| format!("the field of view of {count} is below 10 or above 150 degrees"),
         "Check the unit of the focal length (pixels, for the size of the images that the file names; not millimetres) and of \
          `camera_angle_x` (radians).",
     );
@@ -45,7 +45,7 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
         Kind::PixelAspect,
         Warning,
         named(&stretched),
-        |count| format!("horizontal and vertical focal length differ by more than 5 % in the cameras of {count}"),
+        |count| format!("the horizontal focal length of {count} is more than 5 % off the vertical one"),
         "Cameras have square pixels: if the images were stretched, say so in both focal lengths; otherwise use one for both.",
     );
     let off_centre = |camera: &Camera| {
@@ -72,7 +72,7 @@ pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
         Kind::StrongDistortion,
         Note,
         named(&|camera| reaches(camera) && bends(camera) > BENDS),
-        |count| format!("the lens of {count} bends light by more than 10 degrees at the border"),
+        |count| format!("the lens of {count} bends light by more than 5 degrees at the border"),
         "Nothing needs to be done if the coefficients are right. Straight lines that are curved in rendered views say that they \
          are not.",
     );

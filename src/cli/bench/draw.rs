@@ -36,12 +36,17 @@ const LETTER: i32 = 8;
 type Area<B> = DrawingArea<B, Shift>;
 type Drawn<B> = std::result::Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>>;
 
-/// Writes `NAME.svg` and `NAME.png` into a folder; returns the text of the SVG.
-pub fn save(figure: &Figure, folder: &Path) -> Result<String> {
+/// Makes the letters of this program known to plotters, as `sans-serif`.
+pub fn register_letters() {
     REGISTERED.call_once(|| {
         // A font that is part of the program can be read, as every run shows.
         let _ = register_font("sans-serif", FontStyle::Normal, FONT);
     });
+}
+
+/// Writes `NAME.svg` and `NAME.png` into a folder; returns the text of the SVG.
+pub fn save(figure: &Figure, folder: &Path) -> Result<String> {
+    register_letters();
     let size = size(figure);
     let mut svg = String::new();
     let svg_path = folder.join(format!("{}.svg", figure.name));

@@ -17,6 +17,7 @@ use clap::ValueEnum;
 use raygrad::nerf::{Error, Result};
 
 use super::output::{make_folder, note, print};
+pub use draw::register_letters;
 use figure::Figure;
 use table::Table;
 

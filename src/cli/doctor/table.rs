@@ -1,0 +1,99 @@
+//! Facts and findings as lines of text.
+
+use raygrad::nerf::doctor::{Facts, Finding, Lie, Part, Range, Report, Resolution};
+
+/// Names of photographs that are printed with a finding; the page has all of them.
+const NAMES: usize = 6;
+/// Columns of a line of advice.
+const WIDTH: usize = 96;
+
+/// The facts, each with its name.
+pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
+    let mut rows = vec![("format", facts.format.clone())];
+    let parts = facts.parts.iter().map(|Part { split, present, absent }| match absent {
+        0 => format!("{present} {split}"),
+        _ => format!("{present} {split} ({absent} absent)"),
+    });
+    rows.push(("images", joined(parts)));
+    let sizes = facts.resolutions.iter().map(|Resolution { width, height, photographs }| {
+        if facts.resolutions.len() == 1 {
+            format!("{width}x{height}")
+        } else {
+            format!("{width}x{height} ({photographs})")
+        }
+    });
+    rows.push(("resolution", joined(sizes)));
+    rows.extend(facts.focal.map(|focal| ("focal length", format!("{} pixels", range(focal)))));
+    rows.extend(facts.field_of_view.map(|view| ("field of view", format!("{} degrees across", range(view)))));
+    rows.push(("lens", joined(facts.lenses.iter().take(4).cloned())));
+    if facts.points > 0 {
+        rows.push(("points", facts.points.to_string()));
+    }
+    if let Some(Lie { scope, reason, near, far, bounds: [low, high], scale, up, middle }) = &facts.lie {
+        rows.push(("scope", format!("{scope}: {reason}")));
+        rows.push(("rays", format!("from {near:.3} to {far:.3} scene units")));
+        rows.push(("box", format!("{low:.2} to {high:.2} scene units")));
+        rows.push(("scale", format!("{scale:.4} scene units to a unit of the files")));
+        rows.push(("up", format!("{up:.3} in the files")));
+        rows.push(("middle", format!("{middle:.3} in the files")));
+    }
+    if let Some(agreement) = facts.agreement {
+        let word = if agreement < 0.1 { "poor" } else if agreement < 0.25 { "fair" } else { "good" };
+        rows.push(("agreement", format!("{agreement:.2} of photographs with each other, which is {word} (0 is chance, 1 most)")));
+    }
+    rows
+}
+
+/// The names of photographs that a finding is about, as far as they are printed.
+pub fn names(finding: &Finding, most: usize) -> String {
+    let mut text = joined(finding.views.iter().take(most).cloned());
+    if finding.views.len() > most {
+        text += &format!(" and {} more", finding.views.len() - most);
+    }
+    text
+}
+
+/// Everything, for a terminal.
+pub fn text(report: &Report) -> String {
+    let rows = facts(&report.facts);
+    let width = rows.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
+    let mut text = format!("{}\n", report.facts.folder.display());
+    rows.iter().for_each(|(name, value)| text += &format!("  {name:width$}  {value}\n"));
+    if report.findings.is_empty() {
+        text += "\nnothing is wrong with it\n";
+    }
+    for finding in &report.findings {
+        let Finding { kind, severity, what, advice, .. } = finding;
+        text += &format!("\n{severity}: {kind}: {what}\n");
+        if !finding.views.is_empty() {
+            text += &format!("  {}\n", names(finding, NAMES));
+        }
+        text += &wrapped(advice);
+    }
+    text + "\n"
+}
+
+fn joined(parts: impl Iterator<Item = String>) -> String {
+    parts.collect::<Vec<_>>().join(", ")
+}
+
+fn range(Range { least, median, most }: Range) -> String {
+    if most - least < 0.005 * median.abs() {
+        format!("{median:.1}")
+    } else {
+        format!("{least:.1} to {most:.1}")
+    }
+}
+
+/// Lines of at most [`WIDTH`] columns, indented.
+fn wrapped(text: &str) -> String {
+    let (mut out, mut line) = (String::new(), String::new());
+    for word in text.split(' ') {
+        if line.len() + word.len() > WIDTH {
+            out += &format!("  {}\n", line.trim_end());
+            line.clear();
+        }
+        line += &format!("{word} ");
+    }
+    out + &format!("  {}\n", line.trim_end())
+}
