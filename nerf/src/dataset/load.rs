@@ -24,7 +24,7 @@ const LOOKED_AT: usize = 3;
 /// How much of such a photograph is so.
 const CLEAR: f64 = 0.05;
 /// How much of a pixel of a mask must be white for it to be used.
-const WHITE: f32 = 0.99;
+pub(super) const WHITE: f32 = 0.99;
 
 /// How photographs are read.
 #[derive(Clone, Copy)]
@@ -193,13 +193,7 @@ impl<'a> Plan<'a> {
     fn new(capture: &Capture, view: &'a View, downscale: usize) -> Result<Self> {
         let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
         let (path, downscale) = made_smaller(&capture.folder, path, downscale);
-        let [stored, shown] = Photo::size_of_file(&path)?;
-        let Some(size) = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera)) else {
-            let Camera { width, height, .. } = view.camera;
-            let [w, h] = stored;
-            let what = format!("has {w}x{h} pixels, and its camera is for {width}x{height}: they must have one shape");
-            return Err(Error::file(&path, what));
-        };
+        let size = size_for(&path, &view.camera)?;
         let to = size.map(|side| ((side as f64 / downscale as f64).round() as usize).max(1));
         Ok(Plan { view, path, size, to })
     }
@@ -221,6 +215,21 @@ impl<'a> Plan<'a> {
         }
         Ok(Frame { name: view.name.clone(), camera: placement.camera(&camera), image, mask, distances: None })
     }
+}
+
+/// The size that an image has for a camera, which was measured before or after it was turned.
+pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
+    let [stored, shown] = Photo::size_of_file(path)?;
+    [stored, shown].into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
+        let (Camera { width, height, .. }, [w, h]) = (camera, stored);
+        let what = format!("has {w}x{h} pixels, and its camera is for {width}x{height}: they must have one shape");
+        Error::file(path, what)
+    })
+}
+
+/// Reads an image as its camera has taken it.
+pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
+    Photo::open(path, Some(size_for(path, camera)?))
 }
 
 /// The same image in a folder of images that somebody has made smaller by this factor, as `images_4` beside `images`, and

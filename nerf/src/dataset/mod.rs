@@ -17,6 +17,7 @@ pub(crate) mod photo;
 pub(crate) mod placement;
 pub mod scene;
 pub(crate) mod survey;
+mod undistort;
 
 pub use self::image::Image;
 pub use background::Background;
@@ -29,6 +30,7 @@ pub use landscape::{landscape, landscape_distances};
 pub use load::Reading;
 pub use mask::Mask;
 pub use photo::Photo;
+pub use photo::save::copy_upright;
 pub use placement::Placement;
 pub use survey::{Scope, Survey};
 

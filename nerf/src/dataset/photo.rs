@@ -7,6 +7,10 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageReader};
 use std::path::Path;
 
+mod resample;
+pub(crate) mod save;
+mod sharpness;
+
 /// A photograph of RGB or RGBA values. A pixel takes three or four bytes, or twice as many where the file has 16 bits.
 ///
 /// Colours keep the transfer curve of the file that they came from (sRGB for PNG, JPEG and WebP). Alpha, where there is

@@ -130,8 +130,7 @@ impl Transfer<'_> {
     fn patch(&self, [x, y]: [f64; 2], inverse: f64) -> Option<([f64; 2], [[f64; 2]; 2])> {
         let place = self.place([x, y], inverse)?;
         let step = |other: [f64; 2]| [other[0] - place[0], other[1] - place[1]];
-        let [across, down] =
-            [step(self.place([x + 1.0, y], inverse)?), step(self.place([x, y + 1.0], inverse)?)];
+        let [across, down] = [step(self.place([x + 1.0, y], inverse)?), step(self.place([x, y + 1.0], inverse)?)];
         let area = across[0] * down[1] - across[1] * down[0];
         (0.3..3.0).contains(&area).then_some((place, [across, down]))
     }

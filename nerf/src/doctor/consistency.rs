@@ -106,7 +106,8 @@ fn wrong_poses(all: &[Compared<'_>], pairs: &[Pair], findings: &mut Findings) {
     let mut wrong: Vec<usize> = vec![];
     // The worst first, and then without it: one wrong camera does not make those beside it wrong.
     loop {
-        let left: Vec<&Pair> = pairs.iter().filter(|pair| pair.views.iter().all(|view| !wrong.contains(view))).collect();
+        let left: Vec<&Pair> =
+            pairs.iter().filter(|pair| pair.views.iter().all(|view| !wrong.contains(view))).collect();
         let of = |view: usize| {
             let own = left.iter().filter(|pair| pair.views.contains(&view));
             own.fold(Tally::default(), |sum, pair| sum + pair.tally)

@@ -158,9 +158,9 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity
 
 /// Whether a point lies in the image of a camera.
 fn is_seen(camera: &Camera, point: DVec3) -> bool {
-    camera.pixel_of(point).is_some_and(|[x, y]| {
-        (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y)
-    })
+    camera
+        .pixel_of(point)
+        .is_some_and(|[x, y]| (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y))
 }
 
 /// The same, from what cameras look at: as those that look around in a room look away from each other too, that is no proof.
@@ -168,7 +168,8 @@ fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Conve
     if focus.is_some_and(|focus| focus.is_inward() && size > 1e-3 * focus.distance) {
         return None;
     }
-    let under = |convention: Convention| -> Vec<DAffine3> { poses.iter().map(|pose| convention.apply(*pose)).collect() };
+    let under =
+        |convention: Convention| -> Vec<DAffine3> { poses.iter().map(|pose| convention.apply(*pose)).collect() };
     for convention in [Convention::WorldToCamera, Convention::WorldToOpenCv] {
         let poses = under(convention);
         let places: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
@@ -221,7 +222,9 @@ pub(super) fn leak(pairs: Vec<[String; 2]>, findings: &mut Findings) {
         Kind::Leak,
         Warning,
         pairs,
-        |count| format!("of those held out, {count} can be found among those to train on, or taken from the same place"),
+        |count| {
+            format!("of those held out, {count} can be found among those to train on, or taken from the same place")
+        },
         "Test on photographs from other places: what is measured on these says nothing of new views.",
     );
 }
@@ -230,10 +233,14 @@ fn far_cameras(views: &[&View], findings: &mut Findings) {
     let places: Vec<DVec3> = views.iter().map(|view| view.camera.pose.translation).collect();
     let middle = DVec3::from([0, 1, 2].map(|axis| median(places.iter().map(|place| place[axis]))));
     let usual = median(places.iter().map(|place| place.distance(middle)));
-    let nearest: Vec<f64> = places.iter().enumerate().map(|(i, a)| {
-        let others = places.iter().enumerate().filter(|(j, _)| *j != i);
-        others.map(|(_, b)| a.distance(*b)).fold(f64::INFINITY, f64::min)
-    }).collect();
+    let nearest: Vec<f64> = places
+        .iter()
+        .enumerate()
+        .map(|(i, a)| {
+            let others = places.iter().enumerate().filter(|(j, _)| *j != i);
+            others.map(|(_, b)| a.distance(*b)).fold(f64::INFINITY, f64::min)
+        })
+        .collect();
     let gap = median(nearest.iter().copied());
     let far = |i: &usize| places[*i].distance(middle) > 4.0 * usual && nearest[*i] > 8.0 * gap;
     let names = (0..views.len()).filter(far).map(|i| views[i].name.clone()).collect();

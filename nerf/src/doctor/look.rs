@@ -33,10 +33,7 @@ pub(super) struct Look {
 }
 
 /// Looks at the photographs, in parallel; the result has the order of the views, of which each has an image.
-pub(super) fn look_at_all(
-    capture: &Capture,
-    progress: &(dyn Fn(usize, usize) + Sync),
-) -> Vec<(String, Result<Look>)> {
+pub(super) fn look_at_all(capture: &Capture, progress: &(dyn Fn(usize, usize) + Sync)) -> Vec<(String, Result<Look>)> {
     let views: Vec<&View> = capture.present().collect();
     let (done, total) = (AtomicUsize::new(0), views.len());
     let one = |view: &&View| {

@@ -200,11 +200,8 @@ fn masks(seen: &[Seen<'_>], findings: &mut Findings) {
 }
 
 fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
-    let names: Vec<String> = seen
-        .iter()
-        .filter(|one| one.look.transparent == Some(false))
-        .map(|one| one.view.name.clone())
-        .collect();
+    let names: Vec<String> =
+        seen.iter().filter(|one| one.look.transparent == Some(false)).map(|one| one.view.name.clone()).collect();
     let mixed = seen.iter().any(|one| one.look.transparent == Some(true));
     let severity = if mixed { Warning } else { Note };
     findings.about(

@@ -167,7 +167,8 @@ mod tests {
 
     #[test]
     fn extents_of_a_box_and_of_a_line() {
-        let corners = (0..8).map(|i| DVec3::new(f64::from(i & 1) * 6.0, f64::from(i >> 1 & 1) * 4.0, f64::from(i >> 2) * 2.0));
+        let corners =
+            (0..8).map(|i| DVec3::new(f64::from(i & 1) * 6.0, f64::from(i >> 1 & 1) * 4.0, f64::from(i >> 2) * 2.0));
         let [a, b, c] = extents(&corners.collect::<Vec<_>>());
         assert!((a - 3.0).abs() < 1e-6 && (b - 2.0).abs() < 1e-6 && (c - 1.0).abs() < 1e-6, "{a} {b} {c}");
         let line: Vec<DVec3> = (0..5).map(|i| DVec3::new(1.0, 2.0, -1.0) * f64::from(i)).collect();

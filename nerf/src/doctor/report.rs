@@ -251,7 +251,14 @@ pub(super) struct Findings(pub Vec<Finding>);
 
 impl Findings {
     /// Adds a finding.
-    pub fn add(&mut self, kind: FindingKind, severity: Severity, what: impl ToString, advice: &str, views: Vec<String>) {
+    pub fn add(
+        &mut self,
+        kind: FindingKind,
+        severity: Severity,
+        what: impl ToString,
+        advice: &str,
+        views: Vec<String>,
+    ) {
         let (what, advice) = (what.to_string(), advice.to_owned());
         self.0.push(Finding { kind, severity, what, advice, views });
     }

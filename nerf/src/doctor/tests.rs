@@ -114,9 +114,7 @@ fn found(report: &Report, kind: Kind, severity: Severity, views: &[usize], besid
     assert_eq!(finding.severity, severity, "{finding:#?}");
     let named: Vec<usize> = finding.views.iter().map(|name| name.trim_end_matches(".png").parse().unwrap()).collect();
     assert_eq!(named, views, "{finding:#?}");
-    let other = |finding: &&Finding| {
-        finding.severity > Note && finding.kind != kind && !beside.contains(&finding.kind)
-    };
+    let other = |finding: &&Finding| finding.severity > Note && finding.kind != kind && !beside.contains(&finding.kind);
     let others: Vec<_> = report.findings.iter().filter(other).collect();
     assert!(others.is_empty(), "beside {kind}: {others:#?}");
 }
@@ -148,7 +146,8 @@ fn images_that_are_absent_broken_or_of_another_shape() {
     found(&planted.report(), Kind::ImagesUndecodable, Error, &[5, 7], &[]);
 
     let planted = Planted::new();
-    let cropped = |image: &Image| Image { height: SIZE - 20, data: image.data[..4 * SIZE * (SIZE - 20)].to_vec(), ..*image };
+    let cropped =
+        |image: &Image| Image { height: SIZE - 20, data: image.data[..4 * SIZE * (SIZE - 20)].to_vec(), ..*image };
     planted.redraw(4, cropped);
     found(&planted.cameras(), Kind::ShapeMismatch, Error, &[4], &[]);
 
@@ -196,9 +195,7 @@ fn conventions_are_told_apart() {
         planted.repose(|pose| {
             let moved = DAffine3 { translation: pose.translation + glam::DVec3::new(1.0, -2.0, 0.5), ..pose };
             match convention {
-                Convention::WorldToOpenCv => {
-                    Convention::WorldToCamera.apply(Convention::OpenCv.apply(moved))
-                }
+                Convention::WorldToOpenCv => Convention::WorldToCamera.apply(Convention::OpenCv.apply(moved)),
                 other => other.apply(moved),
             }
         });
@@ -219,9 +216,9 @@ fn poses_alone_tell_conventions_apart_too() {
     planted.repose(|pose| Convention::WorldToCamera.apply(pose));
     found(&planted.cameras(), Kind::WorldToCamera, Warning, &[], &[]);
     // And points prove it.
-    let points = (0..100).map(|i| glam::DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
-    let points: Vec<Point> =
-        points.map(|p| Point { position: 0.5 * p, color: [0; 3], error: 0.5, views: 4 }).collect();
+    let points =
+        (0..100).map(|i| glam::DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
+    let points: Vec<Point> = points.map(|p| Point { position: 0.5 * p, color: [0; 3], error: 0.5, views: 4 }).collect();
     let mut planted = Planted::new();
     planted.capture.points = points;
     assert!(planted.cameras().findings.is_empty());
@@ -259,7 +256,13 @@ fn single_poses_that_are_wrong() {
 
     let mut planted = Planted::new();
     planted.camera(10).pose = planted.capture.views[12].camera.pose;
-    found(&planted.report(), Kind::DuplicatePoses, Warning, &[12], &[Kind::WrongPose, Kind::ExposureJump, Kind::WhiteBalanceJump]);
+    found(
+        &planted.report(),
+        Kind::DuplicatePoses,
+        Warning,
+        &[12],
+        &[Kind::WrongPose, Kind::ExposureJump, Kind::WhiteBalanceJump],
+    );
 
     let mut planted = Planted::new();
     planted.camera(10).pose.translation *= 12.0;
@@ -280,7 +283,13 @@ fn single_poses_that_are_wrong() {
 fn one_image_under_two_names() {
     let planted = Planted::new();
     std::fs::copy(planted.path(8), planted.path(9)).unwrap();
-    found(&planted.report(), Kind::DuplicateImages, Warning, &[9], &[Kind::WrongPose, Kind::ExposureJump, Kind::WhiteBalanceJump]);
+    found(
+        &planted.report(),
+        Kind::DuplicateImages,
+        Warning,
+        &[9],
+        &[Kind::WrongPose, Kind::ExposureJump, Kind::WhiteBalanceJump],
+    );
     let mut planted = Planted::new();
     std::fs::copy(planted.path(8), planted.path(41)).unwrap();
     planted.camera(41).pose = planted.capture.views[8].camera.pose;
@@ -315,7 +324,13 @@ fn masks_and_alpha_that_say_nothing() {
         Image { data, ..*image }
     };
     planted.redraw(3, opaque);
-    found(&planted.report(), Kind::OpaqueAlpha, Warning, &[3], &[Kind::ExposureJump, Kind::WhiteBalanceJump, Kind::Blurred]);
+    found(
+        &planted.report(),
+        Kind::OpaqueAlpha,
+        Warning,
+        &[3],
+        &[Kind::ExposureJump, Kind::WhiteBalanceJump, Kind::Blurred],
+    );
     (0..48).for_each(|view| planted.redraw(view, opaque));
     found(&planted.report(), Kind::OpaqueAlpha, Note, &(0..48).collect::<Vec<_>>(), &[]);
 }

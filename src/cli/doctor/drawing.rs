@@ -37,8 +37,10 @@ pub fn draw(stage: &Stage, path: &Path) -> Result<()> {
 
 fn both(stage: &Stage, area: &Area<'_>) -> Drawn {
     area.fill(&WHITE)?;
-    let views: [(&str, fn(DVec3) -> [f64; 2]); 2] =
-        [("from above (x to the right, y up)", |p| [p.x, p.y]), ("from the side (x to the right, z up)", |p| [p.x, p.z])];
+    let views: [(&str, fn(DVec3) -> [f64; 2]); 2] = [
+        ("from above (x to the right, y up)", |p| [p.x, p.y]),
+        ("from the side (x to the right, z up)", |p| [p.x, p.z]),
+    ];
     for (i, (title, flat)) in views.into_iter().enumerate() {
         let left = i as i32 * PANEL;
         area.draw(&Text::new(title, (left + 14, HEAD + 10), ("sans-serif", 16).into_font().color(&BOX)))?;
@@ -91,8 +93,11 @@ fn look(camera: &Pyramid) -> (RGBColor, u32) {
 
 /// The twelve edges of a box.
 fn edges([low, high]: [DVec3; 2]) -> impl Iterator<Item = [DVec3; 2]> {
-    let corner = move |i: usize| DVec3::from([0, 1, 2].map(|axis| if i >> axis & 1 == 1 { high[axis] } else { low[axis] }));
-    (0..8).flat_map(move |i| (0..3).filter(move |axis| i >> axis & 1 == 0).map(move |axis| [corner(i), corner(i | 1 << axis)]))
+    let corner =
+        move |i: usize| DVec3::from([0, 1, 2].map(|axis| if i >> axis & 1 == 1 { high[axis] } else { low[axis] }));
+    (0..8).flat_map(move |i| {
+        (0..3).filter(move |axis| i >> axis & 1 == 0).map(move |axis| [corner(i), corner(i | 1 << axis)])
+    })
 }
 
 fn legend(stage: &Stage, area: &Area<'_>) -> Drawn {

@@ -19,7 +19,8 @@ const NAMES: usize = 60;
 /// The text of the page.
 pub fn page(capture: &Capture, report: &Report, stage: &Stage) -> Result<String> {
     let rows = table::facts(&report.facts);
-    let facts: String = rows.iter().map(|(name, value)| format!("<tr><th>{name}</th><td>{}</td></tr>\n", escaped(value))).collect();
+    let facts: String =
+        rows.iter().map(|(name, value)| format!("<tr><th>{name}</th><td>{}</td></tr>\n", escaped(value))).collect();
     let mut findings: String = report.findings.iter().map(|finding| section(capture, finding)).collect();
     if findings.is_empty() {
         findings = "<p class=\"good\">Nothing is wrong with it.</p>".to_owned();
@@ -45,7 +46,9 @@ fn section(capture: &Capture, finding: &Finding) -> String {
     let images = views.iter().filter_map(|name| Some((name, thumbnail(capture, name)?)));
     let figures = images.take(SHOWN).map(|(name, png)| {
         let name = escaped(name);
-        format!("<figure><img alt=\"{name}\" src=\"data:image/png;base64,{png}\"><figcaption>{name}</figcaption></figure>\n")
+        format!(
+            "<figure><img alt=\"{name}\" src=\"data:image/png;base64,{png}\"><figcaption>{name}</figcaption></figure>\n"
+        )
     });
     text + &figures.collect::<String>() + "</section>\n"
 }

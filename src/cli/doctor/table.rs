@@ -38,8 +38,17 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
         rows.push(("middle", format!("{middle:.3} in the files")));
     }
     if let Some(agreement) = facts.agreement {
-        let word = if agreement < 0.1 { "poor" } else if agreement < 0.25 { "fair" } else { "good" };
-        rows.push(("agreement", format!("{agreement:.2} of photographs with each other, which is {word} (0 is chance, 1 most)")));
+        let word = if agreement < 0.1 {
+            "poor"
+        } else if agreement < 0.25 {
+            "fair"
+        } else {
+            "good"
+        };
+        rows.push((
+            "agreement",
+            format!("{agreement:.2} of photographs with each other, which is {word} (0 is chance, 1 most)"),
+        ));
     }
     rows
 }
@@ -78,11 +87,7 @@ fn joined(parts: impl Iterator<Item = String>) -> String {
 }
 
 fn range(Range { least, median, most }: Range) -> String {
-    if most - least < 0.005 * median.abs() {
-        format!("{median:.1}")
-    } else {
-        format!("{least:.1} to {most:.1}")
-    }
+    if most - least < 0.005 * median.abs() { format!("{median:.1}") } else { format!("{least:.1} to {most:.1}") }
 }
 
 /// Lines of at most [`WIDTH`] columns, indented.

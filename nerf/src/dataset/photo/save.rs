@@ -1,0 +1,163 @@
+//! Photographs to files.
+
+use super::{Photo, Values, reader};
+use crate::error::{Error, Result};
+use crate::files::write_atomic;
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::PngEncoder;
+use image::codecs::webp::WebPEncoder;
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageBuffer, ImageDecoder, ImageEncoder};
+use std::path::Path;
+
+/// Of 100: what is lost cannot be seen.
+const JPEG_QUALITY: u8 = 95;
+
+/// What a file says of its image, beside its pixels.
+#[derive(Default)]
+struct About {
+    exif: Option<Vec<u8>>,
+    icc: Option<Vec<u8>>,
+}
+
+impl Photo {
+    /// Writes the photograph as the ending of the file's name says: PNG, with 16 bits where it has them; JPEG of quality 95;
+    /// or WebP without loss.
+    ///
+    /// # Errors
+    /// If the ending is another, JPEG is to hold an alpha channel, or the file cannot be written.
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        let [width, height] = [self.width as u32, self.height as u32];
+        let decoded = match (&self.values, self.channels) {
+            (Values::Bytes(v), 3) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgb8),
+            (Values::Bytes(v), _) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgba8),
+            (Values::Words(v), 3) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgb16),
+            (Values::Words(v), _) => ImageBuffer::from_raw(width, height, v.clone()).map(DynamicImage::ImageRgba16),
+            // What was no integer before is a byte now.
+            (Values::Floats(v), channels) => {
+                let bytes = v.iter().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+                match channels {
+                    3 => ImageBuffer::from_raw(width, height, bytes).map(DynamicImage::ImageRgb8),
+                    _ => ImageBuffer::from_raw(width, height, bytes).map(DynamicImage::ImageRgba8),
+                }
+            }
+        };
+        let decoded = decoded.ok_or_else(|| Error::file(path, "has another number of pixels than its size says"))?;
+        save(&decoded, path, About::default())
+    }
+}
+
+/// Copies an image file. Where its EXIF orientation says that it is to be turned, its pixels are, and the rest of what it
+/// says stays, such as the focal length; otherwise it is copied as it is.
+///
+/// # Errors
+/// If the file cannot be read, decoded or written.
+pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
+    let (from, to) = (from.as_ref(), to.as_ref());
+    let bad = |e: image::ImageError| Error::file(from, format!("cannot be decoded: {e}"));
+    let mut decoder = reader(from)?.into_decoder().map_err(bad)?;
+    let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    if turn == Orientation::NoTransforms {
+        return std::fs::copy(from, to).map(drop).map_err(|e| Error::file(to, format!("cannot be written: {e}")));
+    }
+    let mut about = About { exif: decoder.exif_metadata().ok().flatten(), icc: decoder.icc_profile().ok().flatten() };
+    about.exif = about.exif.filter(|exif| Orientation::from_exif_chunk(exif).is_some());
+    if let Some(exif) = &mut about.exif {
+        Orientation::remove_from_exif_chunk(exif);
+    }
+    let mut decoded = DynamicImage::from_decoder(decoder).map_err(bad)?;
+    decoded.apply_orientation(turn);
+    save(&decoded, to, about)
+}
+
+fn save(decoded: &DynamicImage, path: &Path, about: About) -> Result<()> {
+    let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let mut bytes = vec![];
+    let encoded = match ending.as_str() {
+        "png" => encode(decoded, PngEncoder::new(&mut bytes), about),
+        "jpg" | "jpeg" if decoded.color().has_alpha() => {
+            return Err(Error::file(path, "cannot be written: JPEG has no alpha channel; name the images .png"));
+        }
+        "jpg" | "jpeg" => encode(decoded, JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY), about),
+        "webp" => encode(decoded, WebPEncoder::new_lossless(&mut bytes), about),
+        _ => return Err(Error::file(path, "cannot be written: name it .png, .jpg or .webp")),
+    };
+    encoded.map_err(|e| Error::file(path, format!("cannot be encoded: {e}")))?;
+    write_atomic(path, &bytes)
+}
+
+fn encode(decoded: &DynamicImage, mut encoder: impl ImageEncoder, about: About) -> image::ImageResult<()> {
+    if let Some(exif) = about.exif {
+        encoder.set_exif_metadata(exif)?;
+    }
+    if let Some(icc) = about.icc {
+        encoder.set_icc_profile(icc)?;
+    }
+    decoded.write_with_encoder(encoder)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_hold_as_many_bits_as_photographs() {
+        let folder = tempfile::tempdir().unwrap();
+        let words = |channels: usize| (0..channels as u16 * 6).map(|i| i * 2700).collect::<Vec<u16>>();
+        for (channels, values) in [
+            (3, Values::Words(words(3))),
+            (4, Values::Words(words(4))),
+            (3, Values::Bytes(words(3).iter().map(|x| (x >> 8) as u8).collect())),
+            (4, Values::Bytes(words(4).iter().map(|x| (x >> 8) as u8).collect())),
+        ] {
+            let photo = Photo { width: 3, height: 2, channels, values };
+            let path = folder.path().join("photo.PNG");
+            photo.save(&path).unwrap();
+            assert_eq!(Photo::open(&path, None).unwrap(), photo);
+            if let (Values::Bytes(_), true) = (&photo.values, channels == 4) {
+                photo.save(folder.path().join("photo.webp")).unwrap();
+                assert_eq!(Photo::open(folder.path().join("photo.webp"), None).unwrap(), photo);
+                let message = photo.save(folder.path().join("photo.jpg")).unwrap_err().to_string();
+                assert!(message.contains("photo.jpg: cannot be written: JPEG has no alpha"), "{message}");
+            }
+        }
+        let grey = Photo { width: 16, height: 8, channels: 3, values: Values::Bytes(vec![90; 384]) };
+        grey.save(folder.path().join("grey.jpeg")).unwrap();
+        assert_eq!(Photo::open(folder.path().join("grey.jpeg"), None).unwrap(), grey);
+        assert!(grey.save(folder.path().join("grey.tif")).unwrap_err().to_string().contains("name it .png"));
+    }
+
+    #[test]
+    fn copies_are_upright_and_keep_what_else_their_file_says() {
+        let folder = tempfile::tempdir().unwrap();
+        let [from, to] = ["from.jpg", "to.jpg"].map(|name| folder.path().join(name));
+        // Two entries: the orientation, and the focal length as on film of 35 mm.
+        let exif = |turn: u8| {
+            let mut exif = b"MM\0*\0\0\0\x08\0\x02\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+            exif.extend([turn, 0, 0]);
+            exif.extend(b"\xa4\x05\0\x03\0\0\0\x01\0\x1c\0\0\0\0\0\0");
+            exif
+        };
+        let picture = image::RgbImage::from_fn(16, 8, |x, _| image::Rgb([if x < 8 { 255 } else { 0 }; 3]));
+        for turn in [1, 6] {
+            let about = About { exif: Some(exif(turn)), icc: Some(vec![7; 300]) };
+            save(&picture.clone().into(), &from, about).unwrap();
+            copy_upright(&from, &to).unwrap();
+            if turn == 1 {
+                assert_eq!(std::fs::read(&from).unwrap(), std::fs::read(&to).unwrap());
+                continue;
+            }
+            assert_eq!(Photo::size_of_file(&to).unwrap(), [[8, 16]; 2], "it needs no turning any more");
+            assert_eq!(
+                Photo::open(&to, None).unwrap().resized([1, 2]),
+                Photo::open(&from, None).unwrap().resized([1, 2])
+            );
+            let mut decoder = reader(&to).unwrap().into_decoder().unwrap();
+            assert_eq!(decoder.exif_metadata().unwrap(), Some(exif(1)));
+            assert_eq!(decoder.icc_profile().unwrap(), Some(vec![7; 300]));
+        }
+        std::fs::write(&from, b"no picture").unwrap();
+        assert!(copy_upright(&from, &to).unwrap_err().to_string().contains("from.jpg: cannot be decoded"));
+    }
+}

@@ -1,0 +1,131 @@
+//! Photographs as a camera without a lens would have taken them.
+
+use super::capture::View;
+use super::image::Image;
+use super::load::{WHITE, open, size_for};
+use super::photo::Photo;
+use crate::camera::lens::Lens;
+use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
+use glam::DVec3;
+use std::f64::consts::PI;
+
+/// The widest view of a fisheye's pinhole, in radians: at its border a pixel is stretched 2.4 times already.
+const WIDEST: f64 = 100.0 / 180.0 * PI;
+/// The farthest from the optical axis that anything is looked for, as a tangent.
+const FARTHEST: f64 = 8.0;
+/// Shapes of the picture that are tried, from a quarter of the width over the height to four times as much.
+const SHAPES: i32 = 16;
+/// Places on a side of the picture that are looked at.
+const PLACES: usize = 64;
+/// Halvings of a length, to a thousandth of a pixel.
+const HALVINGS: usize = 32;
+
+impl Camera {
+    /// The pinhole camera that keeps most of what these have taken, from where the first stood: with square pixels, its
+    /// principal point in the middle and their focal length (their median, where they differ). All that it sees, each of
+    /// them sees, so that photographs of it have no empty pixel. It is at most 100 degrees wide and high where a lens is a
+    /// fisheye.
+    ///
+    /// # Errors
+    /// If there is no camera, or no such picture: one shows all directions, or does not see its own optical axis.
+    pub fn undistorted(cameras: &[&Camera]) -> Result<Camera> {
+        let bad = |what: &str| Error::setting("undistort", what);
+        let first = cameras.first().ok_or_else(|| bad("there is no camera"))?;
+        if cameras.iter().any(|camera| camera.lens == Lens::Equirectangular) {
+            return Err(bad("a panorama shows all directions, and no pinhole camera does"));
+        }
+        let mut focals: Vec<f64> = cameras.iter().map(|camera| (camera.focal[0] * camera.focal[1]).sqrt()).collect();
+        focals.sort_by(f64::total_cmp);
+        let focal = focals[focals.len() / 2];
+        let around = |half: [f64; 2]| cameras.iter().all(|camera| sees_all(camera, half));
+        let shape = first.width as f64 / first.height as f64;
+        let halves = (-SHAPES..=SHAPES).map(|step| {
+            let shape = shape * 4.0_f64.powf(f64::from(step) / f64::from(SHAPES));
+            largest([shape.sqrt(), shape.sqrt().recip()], around)
+        });
+        let best = halves.max_by(|a, b| (a[0] * a[1]).total_cmp(&(b[0] * b[1]))).unwrap_or_default();
+        let [width, height] = best.map(|half| (2.0 * half * focal) as usize);
+        if width == 0 || height == 0 {
+            return Err(bad("a camera does not see its own optical axis: there is no picture around it"));
+        }
+        let centre = [0.5 * width as f64, 0.5 * height as f64];
+        Ok(Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose: first.pose })
+    }
+}
+
+/// The largest rectangle of a shape, as tangents of half of its angles, that is good.
+fn largest([x, y]: [f64; 2], good: impl Fn([f64; 2]) -> bool) -> [f64; 2] {
+    let (mut low, mut high) = (0.0, FARTHEST);
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (low + high);
+        if good([middle * x, middle * y]) { low = middle } else { high = middle }
+    }
+    [low * x, low * y]
+}
+
+/// Whether a camera sees the rectangle of directions with these half sides. What it sees has no holes, so that its border
+/// tells.
+fn sees_all(camera: &Camera, [x, y]: [f64; 2]) -> bool {
+    let most = match camera.lens {
+        Lens::Fisheye { .. } | Lens::Fov { .. } => (0.5 * WIDEST).tan(),
+        _ => FARTHEST,
+    };
+    let [width, height] = [camera.width as f64, camera.height as f64];
+    let sees = |a: f64, b: f64| {
+        camera.lens.place(DVec3::new(a, b, 1.0)).is_some_and(|place| {
+            let [u, v] = [0, 1].map(|axis| place[axis] * camera.focal[axis] + camera.centre[axis]);
+            (0.0..=width).contains(&u) && (0.0..=height).contains(&v)
+        })
+    };
+    let along = |i: usize| 2.0 * i as f64 / PLACES as f64 - 1.0;
+    let seen = |i: usize| {
+        let t = along(i);
+        [(t * x, -y), (t * x, y), (-x, t * y), (x, t * y)].into_iter().all(|(a, b)| sees(a, b))
+    };
+    // The corners are what fails first.
+    x <= most && y <= most && seen(0) && (0..=PLACES).all(seen)
+}
+
+impl View {
+    /// The camera for the size that the image has, which may be another than what the file of the cameras says.
+    ///
+    /// # Errors
+    /// If there is no image, or its header cannot be read, or it is of another shape than the camera.
+    pub fn camera_of_image(&self) -> Result<Camera> {
+        let Some(image) = &self.image else { return Err(Error::file(&self.name, "does not exist")) };
+        let [width, height] = size_for(image, &self.camera)?;
+        Ok(self.camera.resized(width, height))
+    }
+
+    /// The photograph as the camera `to` would have taken it, which stands where this one does, and its mask: 1 where the
+    /// photograph is used.
+    ///
+    /// # Errors
+    /// If an image cannot be read or decoded, or is of another shape than the camera.
+    pub fn seen_by(&self, to: &Camera) -> Result<(Photo, Option<Image>)> {
+        let Some(image) = &self.image else { return Err(Error::file(&self.name, "does not exist")) };
+        let size = [to.width, to.height];
+        let moved = |photo: &Photo| {
+            let from = self.camera.resized(photo.width, photo.height);
+            photo.resampled(size, |pixel| place(to, &from, pixel))
+        };
+        let photo = moved(&open(image, &self.camera)?);
+        let Some(mask) = &self.mask else { return Ok((photo, None)) };
+        let mask = moved(&open(mask, &self.camera)?);
+        let pixels = (0..size[0] * size[1]).map(|i| mask.pixel(i % size[0], i / size[0])[0]);
+        let data = pixels.map(|value| f32::from(u8::from(value >= WHITE))).collect();
+        Ok((photo, Some(Image { width: size[0], height: size[1], channels: 1, data })))
+    }
+}
+
+/// Where the camera `from` has what the pinhole camera `to` has at a pixel.
+fn place(to: &Camera, from: &Camera, pixel: [f64; 2]) -> [f64; 2] {
+    let [x, y] = [0, 1].map(|axis| (pixel[axis] - to.centre[axis]) / to.focal[axis]);
+    // A pixel beside the picture may be seen by nobody: it is only asked how far pixels are apart.
+    let place = from.lens.place(DVec3::new(x, y, 1.0)).unwrap_or([f64::NAN; 2]);
+    [0, 1].map(|axis| place[axis] * from.focal[axis] + from.centre[axis])
+}
+
+#[cfg(test)]
+mod tests;

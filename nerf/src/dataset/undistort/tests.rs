@@ -1,0 +1,140 @@
+use super::*;
+use glam::DAffine3;
+use std::path::Path;
+
+fn camera(lens: Lens) -> Camera {
+    Camera { width: 160, height: 120, focal: [110.0, 112.0], centre: [78.0, 61.5], lens, pose: DAffine3::IDENTITY }
+}
+
+fn barrel() -> Lens {
+    Lens::Brown { k: [-0.2, 0.05, 0.0, 0.0, 0.0, 0.0], p: [1e-3, -2e-3] }
+}
+
+fn pincushion() -> Lens {
+    Lens::Brown { k: [0.15, 0.02, 0.0, 0.0, 0.0, 0.0], p: [0.0, 1e-3] }
+}
+
+fn fisheye() -> Lens {
+    Lens::Fisheye { k: [0.01, -0.02, 0.0, 0.0], p: [0.0; 2], s: [0.0; 2] }
+}
+
+/// A smooth function of direction, whose waves are a good ten pixels long.
+fn color(direction: DVec3) -> [f32; 3] {
+    let DVec3 { x, y, z } = direction;
+    [(9.0 * x + 3.0 * y).sin(), (8.0 * y * z - 2.0 * x).cos(), (7.0 * (x * y + z)).sin()]
+        .map(|value| (0.5 + 0.4 * value) as f32)
+}
+
+/// What a camera sees of it, as 16-bit PNG.
+fn taken(camera: &Camera, path: &Path) {
+    let pixels = (0..camera.width * camera.height).map(|i| (i % camera.width, i / camera.width));
+    let words = pixels.flat_map(|(x, y)| color(camera.pixel_ray(x, y).direction).map(|v| (v * 65535.0).round() as u16));
+    let (width, height) = (camera.width as u32, camera.height as u32);
+    image::ImageBuffer::<image::Rgb<u16>, _>::from_raw(width, height, words.collect::<Vec<_>>())
+        .unwrap()
+        .save(path)
+        .unwrap();
+}
+
+fn view(camera: Camera, path: &Path) -> View {
+    View {
+        name: "photo.png".into(),
+        field: "frames[0]".into(),
+        image: Some(path.into()),
+        camera,
+        split: None,
+        mask: None,
+        depth: None,
+        sharpness: None,
+        bounds: None,
+    }
+}
+
+#[test]
+fn an_undistorted_photograph_is_what_a_pinhole_sees() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("photo.png");
+    for lens in [barrel(), pincushion(), fisheye(), Lens::Fov { omega: 0.9 }, Lens::Pinhole] {
+        let view = view(camera(lens), &path);
+        taken(&view.camera, &path);
+        let to = Camera::undistorted(&[&view.camera_of_image().unwrap()]).unwrap();
+        let (photo, mask) = view.seen_by(&to).unwrap();
+        assert!(mask.is_none() && photo.bytes() == 6 * to.width * to.height, "16 bits stay 16 bits");
+        let mut worst = 0.0_f32;
+        for (x, y) in (0..to.height).flat_map(|y| (0..to.width).map(move |x| (x, y))) {
+            let expected = color(to.pixel_ray(x, y).direction);
+            let off = photo.pixel(x, y).iter().zip(expected).map(|(a, b)| (a - b).abs());
+            // At the border the photograph itself ends within a pixel.
+            let inside = (2..to.width - 2).contains(&x) && (2..to.height - 2).contains(&y);
+            worst = off.fold(worst, |worst, off| if inside { worst.max(off) } else { worst });
+        }
+        assert!(worst < 2e-3, "{lens:?}: {worst}");
+    }
+}
+
+#[test]
+fn no_pixel_is_empty_and_none_could_be_more() {
+    for lens in [barrel(), pincushion(), Lens::Pinhole] {
+        let from = camera(lens);
+        let to = Camera::undistorted(&[&from]).unwrap();
+        let inside = |x: f64, y: f64| {
+            let [u, v] = from.pixel_of(to.ray(x, y).at(1.0)).unwrap();
+            (-1e-6..=160.0 + 1e-6).contains(&u) && (-1e-6..=120.0 + 1e-6).contains(&v)
+        };
+        let [w, h] = [to.width as f64, to.height as f64];
+        let border = |grow: f64| {
+            (0..=500).map(|i| f64::from(i) / 500.0).all(|t| {
+                let (x, y) = (t * (w + 2.0 * grow) - grow, t * (h + 2.0 * grow) - grow);
+                inside(x, -grow) && inside(x, h + grow) && inside(-grow, y) && inside(w + grow, y)
+            })
+        };
+        assert!(border(0.0) && !border(1.5), "{lens:?}: {w}x{h}");
+        assert_eq!((to.focal, to.centre), ([(110.0_f64 * 112.0).sqrt(); 2], [0.5 * w, 0.5 * h]));
+        // A tenth at most is lost where the lens does little.
+        assert!(lens == barrel() || w * h > 0.8 * 160.0 * 120.0, "{lens:?}: {w}x{h}");
+    }
+}
+
+#[test]
+fn a_fisheye_becomes_a_hundred_degrees_at_most() {
+    let from = Camera { width: 1000, height: 1000, focal: [300.0; 2], centre: [500.0; 2], ..camera(fisheye()) };
+    let to = Camera::undistorted(&[&from]).unwrap();
+    let angle = |side: usize| 2.0 * (0.5 * side as f64 / 300.0).atan().to_degrees();
+    assert!((99.5..=100.0).contains(&angle(to.width)) && (99.5..=100.0).contains(&angle(to.height)), "{to:?}");
+}
+
+#[test]
+fn one_pinhole_serves_cameras_that_differ() {
+    let (wide, tall) = (camera(barrel()), Camera { width: 120, height: 160, centre: [60.0, 80.0], ..camera(barrel()) });
+    let both = Camera::undistorted(&[&wide, &tall]).unwrap();
+    let each = [&wide, &tall].map(|camera| Camera::undistorted(&[camera]).unwrap());
+    assert!(each.iter().all(|one| one.width >= both.width && one.height >= both.height), "{both:?}");
+    let bad = |camera: Camera, expected: &str| {
+        let message = Camera::undistorted(&[&camera]).unwrap_err().to_string();
+        assert!(message.starts_with("`undistort`: ") && message.contains(expected), "{message}");
+    };
+    bad(Camera { centre: [-20.0, 60.0], ..camera(Lens::Pinhole) }, "its own optical axis");
+    bad(camera(Lens::Equirectangular), "a panorama");
+    assert!(Camera::undistorted(&[]).is_err());
+}
+
+#[test]
+fn masks_are_carried_along_and_stay_black_or_white() {
+    let folder = tempfile::tempdir().unwrap();
+    let [image, mask] = ["photo.png", "mask.png"].map(|name| folder.path().join(name));
+    let mut view = view(camera(barrel()), &image);
+    taken(&view.camera, &image);
+    // Of half the size, black to the right of the middle.
+    let picture = image::GrayImage::from_fn(80, 60, |x, _| image::Luma([if x < 40 { 255 } else { 0 }]));
+    picture.save(&mask).unwrap();
+    view.mask = Some(mask);
+    let to = Camera::undistorted(&[&view.camera]).unwrap();
+    let (_, mask) = view.seen_by(&to).unwrap();
+    let mask = mask.unwrap();
+    assert_eq!([mask.width, mask.height, mask.channels], [to.width, to.height, 1]);
+    for (x, y) in (0..to.height).flat_map(|y| (0..to.width).map(move |x| (x, y))) {
+        let [u, _] = place(&to, &view.camera, [x as f64 + 0.5, y as f64 + 0.5]);
+        let expected = if u < 80.0 { 1.0 } else { 0.0 };
+        assert!((u - 80.0).abs() < 2.1 || mask.pixel(x, y) == [expected], "{x} {y}");
+    }
+}
