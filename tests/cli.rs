@@ -10,6 +10,15 @@ use raygrad::nerf::dataset::{Split, embedded, evenly_spaced};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+#[path = "cli/convert.rs"]
+mod convert;
+#[path = "cli/export.rs"]
+mod export;
+// Scripts stand in for other programs.
+#[cfg(unix)]
+#[path = "cli/prepare.rs"]
+mod prepare;
+
 /// Width and height of the test images.
 const SIZE: usize = 24;
 

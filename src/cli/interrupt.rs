@@ -11,14 +11,23 @@ static REQUESTED: AtomicBool = AtomicBool::new(false);
 
 /// From now on a first Ctrl-C only sets [`requested`]; a second one ends the program at once.
 pub fn listen() {
-    let handler = || {
+    set("stopping after this step; Ctrl-C again stops at once", "save the model");
+}
+
+/// As [`listen`], for work whose unfinished result is removed.
+pub fn listen_to_remove() {
+    set("stopping, and removing what is unfinished; Ctrl-C again stops at once", "remove what is unfinished");
+}
+
+fn set(said: &'static str, promise: &str) {
+    let handler = move || {
         if REQUESTED.swap(true, Ordering::Relaxed) {
             std::process::exit(EXIT_CODE.into());
         }
-        note("stopping after this step; Ctrl-C again stops at once");
+        note(said);
     };
     if let Err(error) = ctrlc::set_handler(handler) {
-        complain(&format!("warning: Ctrl-C will not save the model: {error}"));
+        complain(&format!("warning: Ctrl-C will not {promise}: {error}"));
     }
 }
 

@@ -8,12 +8,14 @@ mod bench;
 mod cameras;
 mod doctor;
 mod eval;
+mod export;
 #[cfg(test)]
 mod fuzz;
 mod interrupt;
 mod output;
 mod parse;
 mod precision;
+mod prepare;
 mod preview;
 mod progress;
 mod render;
@@ -46,10 +48,12 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    Prepare(prepare::Args),
     Train(train::Args),
     Eval(eval::Args),
     Render(render::Args),
     Doctor(doctor::Args),
+    Export(export::Args),
     Bench(bench::Args),
 }
 
@@ -77,6 +81,8 @@ fn run(cli: Cli) -> Result<ExitCode> {
             }
             Ok(trained.exit_code())
         }
+        Some(Command::Prepare(args)) => prepare::run(&args),
+        Some(Command::Export(args)) => export::run(&args),
         Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),

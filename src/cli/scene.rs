@@ -14,7 +14,7 @@ use super::output::complain;
 use super::progress::Progress;
 
 /// Width and height of the embedded scene's images in pixels.
-const EMBEDDED_SIZE: usize = 200;
+pub const EMBEDDED_SIZE: usize = 200;
 /// Width and height of the landscape's images in pixels.
 const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
 

@@ -20,6 +20,8 @@ const SHAPES: i32 = 16;
 const PLACES: usize = 64;
 /// Halvings of a length, to a thousandth of a pixel.
 const HALVINGS: usize = 32;
+/// What a length of whole pixels may fall short by, in pixels.
+const ROUNDING: f64 = 1e-4;
 
 impl Camera {
     /// The pinhole camera that keeps most of what these have taken, from where the first stood: with square pixels, its
@@ -45,7 +47,7 @@ impl Camera {
             largest([shape.sqrt(), shape.sqrt().recip()], around)
         });
         let best = halves.max_by(|a, b| (a[0] * a[1]).total_cmp(&(b[0] * b[1]))).unwrap_or_default();
-        let [width, height] = best.map(|half| (2.0 * half * focal) as usize);
+        let [width, height] = best.map(|half| (2.0 * half * focal + ROUNDING) as usize);
         if width == 0 || height == 0 {
             return Err(bad("a camera does not see its own optical axis: there is no picture around it"));
         }

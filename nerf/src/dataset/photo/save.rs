@@ -7,7 +7,7 @@ use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::codecs::webp::WebPEncoder;
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageBuffer, ImageDecoder, ImageEncoder};
+use image::{DynamicImage, ImageBuffer, ImageDecoder, ImageEncoder, ImageError};
 use std::path::Path;
 
 /// Of 100: what is lost cannot be seen.
@@ -55,7 +55,7 @@ impl Photo {
 /// If the file cannot be read, decoded or written.
 pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
     let (from, to) = (from.as_ref(), to.as_ref());
-    let bad = |e: image::ImageError| Error::file(from, format!("cannot be decoded: {e}"));
+    let bad = |e: ImageError| Error::file(from, format!("cannot be decoded: {e}"));
     let mut decoder = reader(from)?.into_decoder().map_err(bad)?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     if turn == Orientation::NoTransforms {
@@ -64,7 +64,7 @@ pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> 
     let mut about = About { exif: decoder.exif_metadata().ok().flatten(), icc: decoder.icc_profile().ok().flatten() };
     about.exif = about.exif.filter(|exif| Orientation::from_exif_chunk(exif).is_some());
     if let Some(exif) = &mut about.exif {
-        Orientation::remove_from_exif_chunk(exif);
+        let _ = Orientation::remove_from_exif_chunk(exif);
     }
     let mut decoded = DynamicImage::from_decoder(decoder).map_err(bad)?;
     decoded.apply_orientation(turn);
@@ -89,10 +89,10 @@ fn save(decoded: &DynamicImage, path: &Path, about: About) -> Result<()> {
 
 fn encode(decoded: &DynamicImage, mut encoder: impl ImageEncoder, about: About) -> image::ImageResult<()> {
     if let Some(exif) = about.exif {
-        encoder.set_exif_metadata(exif)?;
+        encoder.set_exif_metadata(exif).map_err(ImageError::Unsupported)?;
     }
     if let Some(icc) = about.icc {
-        encoder.set_icc_profile(icc)?;
+        encoder.set_icc_profile(icc).map_err(ImageError::Unsupported)?;
     }
     decoded.write_with_encoder(encoder)
 }

@@ -63,7 +63,8 @@ fn an_undistorted_photograph_is_what_a_pinhole_sees() {
         let mut worst = 0.0_f32;
         for (x, y) in (0..to.height).flat_map(|y| (0..to.width).map(move |x| (x, y))) {
             let expected = color(to.pixel_ray(x, y).direction);
-            let off = photo.pixel(x, y).iter().zip(expected).map(|(a, b)| (a - b).abs());
+            let pixel = photo.pixel(x, y);
+            let off = pixel.iter().zip(expected).map(|(a, b)| (a - b).abs());
             // At the border the photograph itself ends within a pixel.
             let inside = (2..to.width - 2).contains(&x) && (2..to.height - 2).contains(&y);
             worst = off.fold(worst, |worst, off| if inside { worst.max(off) } else { worst });

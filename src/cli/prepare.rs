@@ -1,0 +1,144 @@
+//! `raygrad prepare`: a dataset of a video, of photographs, or of another dataset.
+
+mod bounds;
+pub mod convert;
+mod photographs;
+mod poses;
+pub mod program;
+mod undistort;
+mod video;
+mod workplace;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::ValueEnum;
+use raygrad::nerf::dataset::Capture;
+use raygrad::nerf::{Error, Result};
+
+use super::interrupt;
+use super::output::{complain, print};
+use super::parse;
+use convert::Target;
+use program::{Stop, Work};
+use workplace::Workplace;
+
+/// Names of photographs that are said, before it is only said how many more there are.
+const NAMED: usize = 8;
+
+/// Make a dataset of a video or of photographs, or write a dataset in another format
+///
+/// Of a video the sharpest frames are taken, with ffmpeg; where photographs were taken from is found out with COLMAP. Both
+/// must be installed. A dataset that has cameras already is converted with --to, --undistort or both.
+#[derive(clap::Args)]
+pub struct Args {
+    /// A video, a folder of photographs, or a dataset
+    input: PathBuf,
+    /// Folder for the dataset, which must not exist yet or be empty
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Write a dataset that has cameras in this format
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    to: Option<Target>,
+    /// Make the images of a dataset those of a camera without a lens; they are cropped so that no pixel is empty
+    #[arg(long)]
+    undistort: bool,
+    /// Frames to take from a video, about: of three times as many, the sharpest
+    #[arg(long, value_name = "N", default_value_t = 120, value_parser = parse::count(10_000),
+          conflicts_with_all = ["to", "undistort"])]
+    frames: usize,
+    /// The lens that the photographs were taken with
+    #[arg(long, value_enum, default_value_t, conflicts_with_all = ["to", "undistort"])]
+    lens: Glass,
+}
+
+/// Kinds of lenses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+enum Glass {
+    /// Straight lines are nearly straight
+    #[default]
+    Perspective,
+    /// Straight lines are bent, as by action cameras
+    Fisheye,
+}
+
+impl Glass {
+    /// COLMAP's name.
+    fn model(self) -> &'static str {
+        match self {
+            Glass::Perspective => "OPENCV",
+            Glass::Fisheye => "OPENCV_FISHEYE",
+        }
+    }
+}
+
+/// Makes the dataset.
+pub fn run(args: &Args) -> Result<ExitCode> {
+    interrupt::listen_to_remove();
+    let done = match (args.to, args.undistort) {
+        (None, false) => prepare(args),
+        (to, undistort) => {
+            let capture = Capture::read(&args.input)?;
+            let to = to.unwrap_or_else(|| Target::of(capture.format));
+            convert::convert(capture, to, undistort, &args.out)
+        }
+    };
+    finished(done, &args.out)
+}
+
+/// What is said at the end, and the exit code.
+pub fn finished(done: Work<()>, out: &Path) -> Result<ExitCode> {
+    match done {
+        Ok(()) => {
+            // A call of the doctor is to be added here: until then it is only named.
+            print(&format!("next     raygrad doctor {}\n", out.display()))?;
+            Ok(ExitCode::SUCCESS)
+        }
+        Err(Stop::Interrupted) => Ok(interrupt::EXIT_CODE.into()),
+        Err(Stop::Failed(error)) => Err(error),
+    }
+}
+
+/// Of a video or photographs.
+fn prepare(args: &Args) -> Work<()> {
+    let input = &args.input;
+    if !input.exists() {
+        return Err(Error::file(input, "there is no such file or folder").into());
+    }
+    let is_video = input.is_file();
+    if !is_video && Capture::read(input).is_ok() {
+        let what = "is a dataset that has cameras already: say with --to in which format to write it";
+        return Err(Error::file(input, what).into());
+    }
+    // Before work that may take long.
+    if is_video {
+        program::FFMPEG.check()?;
+    }
+    poses::check()?;
+    let place = Workplace::new(&args.out)?;
+    let count = match is_video {
+        true => video::frames(input, args.frames, &place)?,
+        false => photographs::copy(input, &place)?,
+    };
+    let what = if is_video { "sharp frames of" } else { "photographs of" };
+    print(&format!("images   {count} {what} {}\n", input.display()))?;
+    let found = poses::find(&place, is_video, args.lens.model())?;
+    place.finish()?;
+    report(&found, count, &args.out)
+}
+
+fn report(found: &poses::Found, count: usize, out: &Path) -> Work<()> {
+    let poses::Found { registered, lost, models } = found;
+    let models = if *models > 1 { format!(", in the largest of {models} models") } else { String::new() };
+    print(&format!("cameras  {registered} of {count} photographs registered{models}\n"))?;
+    if !lost.is_empty() {
+        let more = lost.len().saturating_sub(NAMED);
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        print(&format!("lost     {}{more}\n", lost[..lost.len().min(NAMED)].join(", ")))?;
+    }
+    if 2 * registered < count {
+        complain("warning: most photographs have no camera: they may overlap too little, or be blurred");
+    }
+    print(&format!("scene    {}\n", out.display()))?;
+    Ok(())
+}

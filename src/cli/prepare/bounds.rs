@@ -1,0 +1,59 @@
+//! The nearest and farthest depth that a photograph shows, which LLFF needs.
+
+use raygrad::nerf::Result;
+use raygrad::nerf::dataset::{Capture, Point, View};
+use raygrad::nerf::glam::DVec3;
+
+use crate::cli::output::note;
+
+/// Fewer points in a photograph say nothing of its depths.
+const FEWEST: usize = 20;
+/// The share of points that may be wrong at either end, as LLFF has it.
+const WRONG: f64 = 0.001;
+
+/// Gives each view its depths: those that the file has, else those of the points that it shows, else those of the box that
+/// holds the scene.
+pub fn fill(capture: &mut Capture) -> Result<()> {
+    if capture.views.iter().all(|view| view.bounds.is_some()) {
+        return Ok(());
+    }
+    let mut found: Vec<Option<[f64; 2]>> =
+        capture.views.iter().map(|view| view.bounds.or_else(|| shown(view, &capture.points))).collect();
+    let guessed = found.iter().filter(|bounds| bounds.is_none()).count();
+    if guessed > 0 {
+        let survey = capture.survey(None)?;
+        let placement = survey.placement;
+        let reach = survey.bounds[0].distance(survey.bounds[1]) * 0.5 / placement.scale;
+        let middle = placement.point_back(0.5 * (survey.bounds[0] + survey.bounds[1]));
+        let near = survey.near / placement.scale;
+        for (bounds, view) in found.iter_mut().zip(&capture.views) {
+            let far = view.camera.pose.translation.distance(middle) + reach;
+            bounds.get_or_insert([near.min(0.5 * far), far]);
+        }
+        note(&format!(
+            "{guessed} photographs show too few points to tell their depths: those of the scene's box are written"
+        ));
+    }
+    capture.views.iter_mut().zip(found).for_each(|(view, bounds)| view.bounds = bounds);
+    Ok(())
+}
+
+/// The depths of the points that a photograph shows.
+fn shown(view: &View, points: &[Point]) -> Option<[f64; 2]> {
+    let camera = &view.camera;
+    let depth = |point: DVec3| {
+        let [x, y] = camera.pixel_of(point)?;
+        let inside = (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y);
+        let depth = -(point - camera.pose.translation).dot(camera.pose.matrix3.z_axis);
+        (inside && depth > 0.0).then_some(depth)
+    };
+    let mut depths: Vec<f64> = points.iter().filter_map(|point| depth(point.position)).collect();
+    if depths.len() < FEWEST {
+        return None;
+    }
+    depths.sort_by(f64::total_cmp);
+    let last = depths.len() - 1;
+    let at = |share: f64| depths[(share * last as f64).round() as usize];
+    let [near, far] = [at(WRONG), at(1.0 - WRONG)];
+    (near < far).then_some([near, far])
+}

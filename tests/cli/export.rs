@@ -1,0 +1,69 @@
+//! `raygrad export`: the cameras of a run.
+
+use super::Place;
+use raygrad::nerf::Camera;
+use raygrad::nerf::dataset::{Capture, Split};
+use std::path::Path;
+
+/// The cameras in a file of this name, read as a dataset's in the folder `scene`.
+fn exported(place: &Place, file: &str) -> Vec<(String, Option<Split>, Camera)> {
+    let folder = tempfile::tempdir_in(place.path("")).unwrap();
+    std::fs::copy(place.path(file), folder.path().join("transforms.json")).unwrap();
+    cameras(folder.path())
+}
+
+fn cameras(folder: &Path) -> Vec<(String, Option<Split>, Camera)> {
+    let capture = Capture::read(folder).unwrap();
+    let name = |name: &str| name.trim_end_matches(".png").to_owned();
+    capture.views.iter().map(|view| (name(&view.name), view.split, view.camera.clone())).collect()
+}
+
+#[test]
+fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    place.succeeds(&format!("train scene --steps 1 --out plain {small}"));
+    let said = place.succeeds("export plain cameras.json");
+    assert_eq!(said, "exported 11 cameras, 0 of them refined: cameras.json\n");
+    let given = cameras(&place.path("scene"));
+    let close = |a: &Camera, b: &Camera, slack: f64| a.pose.abs_diff_eq(b.pose, slack);
+    for (before, after) in given.iter().zip(exported(&place, "cameras.json")) {
+        assert_eq!((&before.0, before.1, before.2.focal), (&after.0, after.1, after.2.focal));
+        assert_eq!(before.2.pose, after.2.pose, "to the last bit");
+    }
+
+    let learned = r#"--set poses={"constant":{"rate":0.01}}"#;
+    place.succeeds(&format!("train scene --steps 8 --out run --scope unbounded {small} {learned}"));
+    let said = place.succeeds("export run run/cameras.json");
+    assert_eq!(said, "exported 11 cameras, 6 of them refined: run/cameras.json\n");
+    for (before, after) in given.iter().zip(exported(&place, "run/cameras.json")) {
+        let trained = before.1 == Some(Split::Train);
+        assert_eq!(before.2.pose == after.2.pose, !trained, "{}", before.0);
+        // A step moves by a little, in the coordinates of the files and not in those of the scene.
+        assert!(close(&before.2, &after.2, 0.5), "{}: {:?} {:?}", before.0, before.2.pose, after.2.pose);
+    }
+    // As a dataset: the same cameras, and images beside them.
+    place.succeeds("export run colmap --to colmap");
+    let (file, colmap) = (exported(&place, "run/cameras.json"), cameras(&place.path("colmap")));
+    for (name, _, camera) in &colmap {
+        let (_, _, before) = file.iter().find(|(other, ..)| other == name).unwrap();
+        assert!(close(camera, before, 1e-9), "{name}");
+    }
+    assert!(colmap.len() == 11 && place.path("colmap/images/train/r_0.png").exists());
+    place.fails("export run scene", &["scene: is a folder", "--to"]);
+    place.fails("export run colmap --to llff", &["colmap: holds files already"]);
+    // Other photographs than those that it was trained on have no refined cameras.
+    std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
+    place.fails("export run other.json", &["has 5 photographs to train on", "trained on 6"]);
+    assert!(!place.path("other.json").exists());
+}
+
+#[test]
+fn the_built_in_scene_has_cameras_too() {
+    let place = Place::empty();
+    place.succeeds("train --preset small --steps 1 --downscale 10");
+    assert!(place.succeeds("export run cameras.json").starts_with("exported 90 cameras, 0 of them refined"));
+    let cameras = exported(&place, "cameras.json");
+    let of = |split: Split| cameras.iter().filter(|(_, given, _)| *given == Some(split)).count();
+    assert_eq!((of(Split::Train), of(Split::Val), of(Split::Test)), (60, 10, 20));
+}

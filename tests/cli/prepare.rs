@@ -1,0 +1,267 @@
+//! `raygrad prepare` of videos and photographs, with scripts in place of ffmpeg and colmap.
+
+use super::{Place, complained, wait};
+use raygrad::nerf::Image;
+use raygrad::nerf::dataset::Photo;
+use std::os::unix::fs::PermissionsExt;
+use std::process::{Command, Output, Stdio};
+
+/// In place of ffmpeg: writes a line of its arguments, and 30 frames of which the second of three is the sharp one.
+const FFMPEG: &str = r#"#!/bin/sh
+echo "ffmpeg $*" >> "$LOG"
+case "$*" in
+  *"-i"*"%06d.jpg") ;;
+  *-i*) echo "  Duration: 00:00:10.00, start: 0.000000, bitrate: 1 kb/s" >&2
+     echo "  Stream #0:0: Video: h264, yuv420p, 16x8, 30 fps, 30 tbr" >&2
+     echo "At least one output file must be specified" >&2; exit 1 ;;
+  *) exit 0 ;;
+esac
+for out; do :; done
+folder=$(dirname "$out")
+i=1
+while [ $i -le 30 ]; do
+  if [ $((i % 3)) -eq 2 ]; then from=sharp.jpg; else from=soft.jpg; fi
+  cp "$from" "$folder/$(printf %06d $i).jpg"
+  echo "frame=$i"
+  i=$((i + 1))
+done
+echo progress=end
+"#;
+
+/// In place of colmap: registers all photographs but the last two, in the second of two models.
+const COLMAP: &str = r#"#!/bin/sh
+echo "colmap $*" >> "$LOG"
+case "$*" in "-h"|*" -h") echo "  --$GPU.use_gpu arg (=1)"; exit 0 ;; esac
+if [ "$1" = "$FAILS" ]; then echo "Processed file [1/3]"; echo "elapsed"; echo "out of luck" >&2; exit 3; fi
+if [ "$1" = "$SLEEPS" ]; then echo begun >> "$LOG"; exec sleep 60; fi
+[ "$1" = feature_extractor ] && echo "Processed file [1/10]"
+[ "$1" = mapper ] || exit 0
+while [ $# -gt 0 ]; do
+  [ "$1" = --image_path ] && images=$2
+  [ "$1" = --output_path ] && models=$2
+  shift
+done
+[ "$MODELS" = none ] && exit 0
+for model in 0 1; do
+  mkdir -p "$models/$model"
+  echo "1 OPENCV 16 8 20 20 8 4 0.01 0 0 0" > "$models/$model/cameras.txt"
+  : > "$models/$model/points3D.txt"
+done
+id=1
+count=$(ls "$images" | wc -l)
+for name in $(ls "$images"); do
+  [ $id -gt $((count - 2)) ] && break
+  echo "Registering image #$id ($id)"
+  [ $id -le 2 ] && printf '%s 1 0 0 0 0 0 %s 1 %s\n\n' $id $id "$name" >> "$models/0/images.txt"
+  printf '%s 1 0 0 0 %s 0 3 1 %s\n\n' $id $id "$name" >> "$models/1/images.txt"
+  id=$((id + 1))
+done
+"#;
+
+/// A folder with both scripts in `bin`, a video, and photographs in `photos`.
+fn place() -> Place {
+    let place = Place::empty();
+    std::fs::create_dir(place.path("bin")).unwrap();
+    for (name, script) in [("ffmpeg", FFMPEG), ("colmap", COLMAP)] {
+        let path = place.path(&format!("bin/{name}"));
+        std::fs::write(&path, script).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    std::fs::write(place.path("walk.mp4"), "a video").unwrap();
+    std::fs::create_dir(place.path("photos")).unwrap();
+    for (name, period) in [("sharp.jpg", 2), ("soft.jpg", 16)] {
+        std::fs::write(place.path(name), jpeg(period, 1)).unwrap();
+    }
+    for i in 0..5 {
+        std::fs::write(place.path(&format!("photos/{i}.JPG")), jpeg(4, 1)).unwrap();
+    }
+    place
+}
+
+/// A JPEG of 16 x 8 pixels in stripes, with an EXIF orientation.
+fn jpeg(period: usize, orientation: u8) -> Vec<u8> {
+    let file = tempfile::Builder::new().suffix(".jpg").tempfile().unwrap();
+    let stripe = |x: usize| if x % period < period / 2 { 1.0 } else { 0.0 };
+    let data = (0..16 * 8).flat_map(|i| [stripe(i % 16); 3]).collect();
+    Photo::from(Image { width: 16, height: 8, channels: 3, data }).save(file.path()).unwrap();
+    let plain = std::fs::read(file.path()).unwrap();
+    let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
+    [&plain[..2], &exif, &plain[2..]].concat()
+}
+
+fn command(place: &Place, arguments: &str) -> Command {
+    let mut command = place.command(arguments);
+    // The scripts need a few programs of the system, among which there must be no real ones.
+    let path = std::env::join_paths([place.path("bin"), "/usr/bin".into(), "/bin".into()]).unwrap();
+    command.env("PATH", path).env("LOG", place.path("log")).env("GPU", "SiftExtraction");
+    command.env("FAILS", "").env("SLEEPS", "").env("MODELS", "");
+    command
+}
+
+fn run(place: &Place, arguments: &str) -> Output {
+    command(place, arguments).output().unwrap()
+}
+
+#[track_caller]
+fn succeeds(place: &Place, arguments: &str) -> String {
+    let output = run(place, arguments);
+    assert!(output.status.success(), "{arguments}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn log(place: &Place) -> String {
+    String::from_utf8(place.bytes("log")).unwrap()
+}
+
+/// Whether a line of the log has all of these in this order.
+fn ran(place: &Place, parts: &[&str]) -> bool {
+    log(place).lines().any(|line| {
+        let mut rest = line;
+        parts.iter().all(|part| rest.split_once(part).map(|(_, after)| rest = after).is_some())
+    })
+}
+
+/// What is in the folder of the place, but for what was put there.
+fn made(place: &Place) -> Vec<String> {
+    let there = ["bin", "walk.mp4", "photos", "sharp.jpg", "soft.jpg", "log"];
+    let entries = std::fs::read_dir(place.path("")).unwrap();
+    let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    names.filter(|name| !there.contains(&name.as_str())).collect()
+}
+
+#[test]
+fn a_video_becomes_a_dataset_of_its_sharp_frames() {
+    let place = place();
+    let said = succeeds(&place, "prepare walk.mp4 --out made --frames 10");
+    assert!(said.contains("images   10 sharp frames of walk.mp4\n"), "{said}");
+    assert!(said.contains("cameras  8 of 10 photographs registered, in the largest of 2 models\n"), "{said}");
+    assert!(said.contains("lost     frame_00009.jpg, frame_00010.jpg\n"), "{said}");
+    assert!(said.ends_with("next     raygrad doctor made\n"), "{said}");
+    // Three candidates for each frame: 30 of 10 seconds.
+    assert!(ran(&place, &["ffmpeg ", "-progress pipe:1", "walk.mp4", "fps=3.000000", "-q:v 1", "%06d.jpg"]));
+    assert!(ran(
+        &place,
+        &["feature_extractor", "camera_model OPENCV", "single_camera 1", "--SiftExtraction.use_gpu 0"]
+    ));
+    assert!(ran(&place, &["sequential_matcher", "--database_path"]) && !log(&place).contains("exhaustive"));
+    assert!(ran(&place, &["mapper", "--database_path", "--image_path", "--output_path"]));
+    for i in 1..=10 {
+        assert_eq!(place.bytes(&format!("made/images/frame_{i:05}.jpg")), place.bytes("sharp.jpg"), "{i}");
+    }
+    let mut names: Vec<_> = std::fs::read_dir(place.path("made")).unwrap().map(|e| e.unwrap().file_name()).collect();
+    names.sort();
+    assert_eq!((names, made(&place)), (vec!["images".into(), "sparse".into()], vec!["made".to_owned()]));
+    assert!(place.path("made/sparse/0/cameras.txt").exists() && !place.path("made/sparse/1").exists());
+    assert_eq!(std::fs::metadata(place.path("made")).unwrap().permissions().mode() & 0o700, 0o700);
+    // It is a dataset, and no second one is written over it.
+    place.succeeds("train made --preset small --steps 1");
+    complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: holds files already", "--out"]);
+}
+
+#[test]
+fn photographs_become_a_dataset_turned_as_they_were_held() {
+    let place = place();
+    std::fs::write(place.path("photos/notes.txt"), "").unwrap();
+    // Stored across, shown upright: another size than the rest, so that each has its own camera.
+    std::fs::write(place.path("photos/turned.jpg"), jpeg(4, 6)).unwrap();
+    let said = succeeds(&place, "prepare photos --out made --lens fisheye");
+    assert!(said.contains("images   6 photographs of photos\ncameras  4 of 6 photographs"), "{said}");
+    assert!(
+        ran(&place, &["feature_extractor", "camera_model OPENCV_FISHEYE"]) && !log(&place).contains("single_camera")
+    );
+    assert!(ran(&place, &["exhaustive_matcher"]) && !log(&place).contains("ffmpeg"));
+    assert_eq!(place.bytes("made/images/0.JPG"), place.bytes("photos/0.JPG"));
+    assert_eq!(Photo::size_of_file(place.path("made/images/turned.jpg")).unwrap(), [[8, 16]; 2]);
+    assert!(!place.path("made/images/notes.txt").exists());
+    // Newer versions of COLMAP have another name for the graphics processor.
+    std::fs::remove_dir_all(place.path("made")).unwrap();
+    let output = command(&place, "prepare photos --out made").env("GPU", "FeatureExtraction").output().unwrap();
+    assert!(
+        output.status.success() && ran(&place, &["feature_extractor", "--FeatureExtraction.use_gpu 0"]),
+        "{output:?}"
+    );
+}
+
+#[test]
+fn programs_that_are_absent_are_named_with_how_to_install_them() {
+    let place = place();
+    let bare = |arguments: &str| command(&place, arguments).env("PATH", place.path("photos")).output().unwrap();
+    let install =
+        |name: &str| format!("`apt install {name}`, `brew install {name}`, `conda install -c conda-forge {name}`");
+    complained(
+        "ffmpeg",
+        &bare("prepare walk.mp4 --out made"),
+        &["`ffmpeg`: is not on the PATH", &install("ffmpeg"), "winget"],
+    );
+    complained(
+        "colmap",
+        &bare("prepare photos --out made"),
+        &["`colmap`: is not on the PATH", &install("colmap"), "winget"],
+    );
+    assert_eq!(made(&place), [""; 0]);
+}
+
+#[test]
+fn programs_that_fail_show_their_last_words_and_nothing_is_left() {
+    let place = place();
+    for step in ["feature_extractor", "exhaustive_matcher", "mapper"] {
+        let output = command(&place, "prepare photos --out made").env("FAILS", step).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        for expected in
+            ["  elapsed\n", "  out of luck\n", &format!("raygrad: `colmap {step}`: has failed (exit code 3), ")]
+        {
+            assert!(said.contains(expected), "{said}");
+        }
+        assert_eq!(made(&place), [""; 0]);
+    }
+    let output = command(&place, "prepare photos --out made").env("MODELS", "none").output().unwrap();
+    complained("no model", &output, &["`colmap mapper`: has found no cameras", "overlap too little"]);
+    std::fs::write(place.path("bin/ffmpeg"), "#!/bin/sh\necho walk.mp4: Invalid data found >&2\nexit 1\n").unwrap();
+    let output = run(&place, "prepare walk.mp4 --out made");
+    complained("no video", &output, &["walk.mp4: is no video", "it says: walk.mp4: Invalid data found"]);
+    assert_eq!(made(&place), [""; 0]);
+}
+
+#[test]
+fn ctrl_c_ends_the_program_and_leaves_nothing() {
+    let place = place();
+    let mut command = command(&place, "prepare photos --out made");
+    command.env("SLEEPS", "mapper").stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    wait(&mut child, || std::fs::read_to_string(place.path("log")).is_ok_and(|log| log.contains("begun")));
+    assert_eq!(made(&place).len(), 1, "it works in a folder of its own");
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{output:?}");
+    assert_eq!(made(&place), [""; 0]);
+}
+
+#[test]
+fn bad_inputs_are_named() {
+    let place = place();
+    std::fs::create_dir(place.path("empty")).unwrap();
+    complained("absent", &run(&place, "prepare absent --out made"), &["absent: there is no such file or folder"]);
+    complained("empty", &run(&place, "prepare empty --out made"), &["empty: holds no photographs"]);
+    std::fs::write(place.path("empty/0.HEIC"), "").unwrap();
+    complained("heic", &run(&place, "prepare empty --out made"), &["1 images are HEIC", "convert them"]);
+    complained("no cameras", &run(&place, "prepare photos --out made --to colmap"), &["photos: is not a dataset"]);
+    complained("a file", &run(&place, "prepare photos --out walk.mp4"), &["walk.mp4: is not a folder"]);
+    succeeds(&place, "prepare photos --out made");
+    complained("a dataset", &run(&place, "prepare made --out other"), &["made: is a dataset", "--to"]);
+    std::fs::write(place.path("photos/4.JPG"), "no picture").unwrap();
+    complained("a damaged one", &run(&place, "prepare photos --out other"), &["4.JPG: cannot be decoded"]);
+    assert!(!made(&place).iter().any(|name| name.contains("other")));
+    for (arguments, expected) in [
+        ("prepare photos", "--out"),
+        ("prepare photos --out made --to tiff", "possible values: nerfstudio, colmap, colmap-text, llff, blender"),
+        ("prepare photos --out made --frames 0", "0 is not in 1.."),
+        ("prepare photos --out made --to colmap --frames 3", "cannot be used with"),
+    ] {
+        let output = run(&place, arguments);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && said.contains(expected), "{arguments}: {said}");
+    }
+}
