@@ -4,7 +4,7 @@ use super::image::Image;
 use super::mask::Mask;
 use super::photo::Photo;
 use super::placement::Placement;
-use super::survey::Scope;
+use super::scope::Scope;
 use crate::camera::bounds::clip_span;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};

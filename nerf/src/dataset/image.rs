@@ -1,9 +1,6 @@
 //! Images in memory: rows of f32 channels.
 
-use std::path::Path;
-
-use super::photo::{Photo, average};
-use crate::error::Result;
+use super::average::average;
 
 /// An image of `channels` values a pixel, row by row from the top.
 ///
@@ -45,14 +42,6 @@ impl Image {
         assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} image", self.width, self.height);
         let start = (y * self.width + x) * self.channels;
         &mut self.data[start..start + self.channels]
-    }
-
-    /// Reads an image file as [`Photo::open`] does, into floats.
-    ///
-    /// # Errors
-    /// If the file cannot be read or decoded; the error names it.
-    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
-        Ok(Photo::open(path, None)?.to_image())
     }
 
     /// The image at `1 / factor` of its size: each pixel is the average of a box of `factor x factor` pixels.

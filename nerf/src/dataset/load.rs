@@ -6,7 +6,8 @@ use super::frames::{Dataset, Frame, Split, evenly_spaced};
 use super::mask::Mask;
 use super::photo::Photo;
 use super::placement::Placement;
-use super::survey::{Scope, Survey};
+use super::scope::Scope;
+use super::survey::Survey;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
@@ -40,6 +41,18 @@ pub struct Reading<'a> {
 impl Default for Reading<'_> {
     fn default() -> Self {
         Reading { downscale: 1, views: usize::MAX, progress: &|_, _| {} }
+    }
+}
+
+impl Reading<'_> {
+    /// Whether the numbers are usable.
+    pub(super) fn check(&self) -> Result<()> {
+        for (name, value) in [("views", self.views), ("downscale", self.downscale)] {
+            if value == 0 {
+                return Err(Error::setting(name, "must be 1 or more, is 0"));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -136,11 +149,7 @@ impl Capture {
     /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. A single absent image is
     /// no error: see [`Dataset::skipped`].
     pub fn load(&self, split: Split, survey: &Survey, reading: &Reading<'_>) -> Result<Dataset> {
-        for (name, value) in [("views", reading.views), ("downscale", reading.downscale)] {
-            if value == 0 {
-                return Err(Error::setting(name, "must be 1 or more, is 0"));
-            }
-        }
+        reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
             self.split(split)?.into_iter().partition(|view| view.image.is_some());
         if present.is_empty() {

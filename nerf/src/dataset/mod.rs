@@ -2,6 +2,7 @@
 //!
 //! Each format has a file of its own here, and [`load`] recognises which one a folder holds.
 
+mod average;
 pub mod background;
 pub(crate) mod batch;
 pub mod capture;
@@ -16,6 +17,7 @@ mod mask;
 pub(crate) mod photo;
 pub(crate) mod placement;
 pub mod scene;
+pub(crate) mod scope;
 pub(crate) mod survey;
 mod undistort;
 
@@ -32,7 +34,8 @@ pub use mask::Mask;
 pub use photo::Photo;
 pub use photo::save::copy_upright;
 pub use placement::Placement;
-pub use survey::{Scope, Survey};
+pub use scope::Scope;
+pub use survey::Survey;
 
 use std::path::Path;
 
@@ -44,8 +47,10 @@ use crate::error::Result;
 /// # Errors
 /// As these. Every error names the file and the field. A single absent image is no error: see [`Dataset::skipped`].
 pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<Dataset> {
+    let reading = Reading { downscale, ..Reading::default() };
+    reading.check()?;
     let capture = Capture::read(folder)?;
-    capture.load(split, &capture.survey(None)?, &Reading { downscale, ..Reading::default() })
+    capture.load(split, &capture.survey(None)?, &reading)
 }
 
 #[cfg(test)]

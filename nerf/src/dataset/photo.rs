@@ -1,5 +1,6 @@
 //! Photographs in memory, in the integers that their files hold.
 
+use super::average::{Stored, average};
 use super::background::over;
 use super::image::Image;
 use crate::error::{Error, Result};
@@ -32,44 +33,6 @@ enum Values {
     Bytes(Vec<u8>),
     Words(Vec<u16>),
     Floats(Vec<f32>),
-}
-
-/// A number that a value of a pixel is stored as.
-pub(super) trait Stored: Copy {
-    /// The value in 0..=1.
-    fn unit(self) -> f32;
-    /// The nearest to a value in 0..=1.
-    fn nearest(value: f64) -> Self;
-}
-
-impl Stored for u8 {
-    fn unit(self) -> f32 {
-        f32::from(self) / 255.0
-    }
-
-    fn nearest(value: f64) -> Self {
-        (value * 255.0).round() as u8
-    }
-}
-
-impl Stored for u16 {
-    fn unit(self) -> f32 {
-        f32::from(self) / 65535.0
-    }
-
-    fn nearest(value: f64) -> Self {
-        (value * 65535.0).round() as u16
-    }
-}
-
-impl Stored for f32 {
-    fn unit(self) -> f32 {
-        self
-    }
-
-    fn nearest(value: f64) -> Self {
-        value as f32
-    }
 }
 
 impl From<Image> for Photo {
@@ -215,48 +178,19 @@ impl Photo {
     }
 }
 
-/// The averages of `channels` values over the parts of an image of the size `from` that pixels of one of the size `to` cover.
-/// In f64, so that a constant keeps its value to the last bit.
-pub(super) fn average<S: Stored>(values: &[S], channels: usize, from: [usize; 2], to: [usize; 2]) -> Vec<S> {
-    let (columns, rows) = (shares(from[0], to[0]), shares(from[1], to[1]));
-    let mut out = Vec::with_capacity(to[0] * to[1] * channels);
-    for row in &rows {
-        for column in &columns {
-            let (mut sum, mut alphas, mut weights) = ([0.0_f64; 3], 0.0, 0.0);
-            for &(y, down) in row {
-                for &(x, across) in column {
-                    let start = (y * from[0] + x) * channels;
-                    let pixel = &values[start..start + channels];
-                    let weight = down * across;
-                    let alpha = pixel.get(3).map_or(weight, |alpha| weight * f64::from(alpha.unit()));
-                    (weights, alphas) = (weights + weight, alphas + alpha);
-                    sum.iter_mut().zip(pixel).for_each(|(sum, x)| *sum += alpha * f64::from(x.unit()));
-                }
-            }
-            let mean = |sum: &f64| S::nearest(if alphas == 0.0 { 0.0 } else { sum / alphas });
-            out.extend(sum.iter().take(channels).map(mean));
-            if channels == 4 {
-                out.push(S::nearest(alphas / weights));
-            }
-        }
-    }
-    out
-}
-
-/// For each of `to` equal parts of a line of `from` pixels the pixels in it, and how much of each.
-fn shares(from: usize, to: usize) -> Vec<Vec<(usize, f64)>> {
-    // In units of 1 / to of a pixel all ends are whole numbers.
-    let part = |i: usize| {
-        let [start, end] = [i * from, (i + 1) * from];
-        let covered = |pixel: usize| (end.min((pixel + 1) * to) - start.max(pixel * to)) as f64 / to as f64;
-        (start / to..end.div_ceil(to)).map(|pixel| (pixel, covered(pixel))).collect()
-    };
-    (0..to).map(part).collect()
-}
-
 fn rgba<S: Stored>(pixel: &[S]) -> [f32; 4] {
     let alpha = pixel.get(3).map_or(1.0, |alpha| alpha.unit());
     [pixel[0].unit(), pixel[1].unit(), pixel[2].unit(), alpha]
+}
+
+impl Image {
+    /// Reads an image file as [`Photo::open`] does, into floats.
+    ///
+    /// # Errors
+    /// If the file cannot be read or decoded; the error names it.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
+        Ok(Photo::open(path, None)?.to_image())
+    }
 }
 
 /// The size of an image that is turned.

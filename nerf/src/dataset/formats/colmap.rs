@@ -7,6 +7,8 @@
 
 mod beside;
 mod binary;
+mod encoding;
+mod entries;
 mod models;
 mod pose;
 mod table;
@@ -17,36 +19,13 @@ use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, Point, View};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
+use entries::{ImageEntry, Place};
 use glam::DAffine3;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use table::Table;
 
-/// How COLMAP's files are written. Both hold the same numbers, bit for bit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Encoding {
-    /// `.bin`, little-endian: what COLMAP writes by default.
-    Binary,
-    /// `.txt`.
-    Text,
-}
-
-impl Encoding {
-    /// Where a folder has both, the first is read.
-    const ALL: [Encoding; 2] = [Encoding::Binary, Encoding::Text];
-
-    fn extension(self) -> &'static str {
-        match self {
-            Encoding::Binary => "bin",
-            Encoding::Text => "txt",
-        }
-    }
-
-    /// The files of a model in `folder`: cameras, images and points.
-    fn files(self, folder: &Path) -> [PathBuf; 3] {
-        ["cameras", "images", "points3D"].map(|stem| folder.join(stem).with_extension(self.extension()))
-    }
-}
+pub use encoding::Encoding;
 
 /// Where a model may be in the folder of a capture, in the order in which they are looked at.
 const PLACES: [&str; 4] = ["sparse/0", "sparse", "", "colmap/sparse/0"];
@@ -111,63 +90,6 @@ pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()>
         Encoding::Text => text::encode(&table),
     };
     encoding.files(&folder).iter().zip(bytes).try_for_each(|(file, bytes)| write_atomic(file, &bytes))
-}
-
-/// Where a file speaks of something.
-#[derive(Debug, Clone, Copy)]
-enum Place {
-    /// An entry of a binary file: the list and the position in it.
-    Item(&'static str, usize),
-    /// A line of a text, counted from 1.
-    Line(usize),
-}
-
-impl Place {
-    fn name(self) -> String {
-        match self {
-            Place::Item(list, index) => format!("{list}[{index}]"),
-            Place::Line(line) => format!("line {line}"),
-        }
-    }
-
-    /// An error about a member of what is there.
-    fn error(self, file: &Path, member: &str, what: impl ToString) -> Error {
-        match self {
-            Place::Item(..) => Error::field(file, format!("{}.{member}", self.name()), what),
-            Place::Line(_) => Error::field(file, self.name(), format!("{member}: {}", what.to_string())),
-        }
-    }
-}
-
-/// A camera of the file; its pose is the identity.
-struct CameraEntry {
-    place: Place,
-    id: u32,
-    camera: Camera,
-}
-
-/// An image of the file.
-struct ImageEntry {
-    place: Place,
-    id: u32,
-    pose: DAffine3,
-    camera: u32,
-    name: String,
-}
-
-impl ImageEntry {
-    /// `q` is the quaternion with its real part first.
-    fn new(file: &Path, place: Place, id: u32, q: [f64; 4], t: [f64; 3], camera: u32, name: &str) -> Result<Self> {
-        let pose = pose::from_file(q, t).map_err(|(member, what)| place.error(file, member, what))?;
-        let name = name.strip_prefix("./").unwrap_or(name).to_owned();
-        if name.is_empty() {
-            return Err(place.error(file, "name", "is empty"));
-        }
-        if name.chars().any(char::is_control) {
-            return Err(place.error(file, "name", format!("`{}` has a control character", start(&name))));
-        }
-        Ok(ImageEntry { place, id, pose, camera, name })
-    }
 }
 
 /// What the bytes of the files say. Nothing else is read.

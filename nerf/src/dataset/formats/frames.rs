@@ -1,7 +1,8 @@
 //! The frames of a JSON file as views.
 
-use super::intrinsics::{Layers, check_known};
+use super::intrinsics::check_known;
 use super::json::Object;
+use super::layers::Layers;
 use super::{matrix, paths};
 use crate::dataset::capture::View;
 use crate::dataset::photo::Photo;

@@ -1,10 +1,11 @@
 //! Focal lengths, principal points and sizes: of a whole file, or of a frame of it.
 
 use super::json::{Object, shown};
+use super::layers::Layers;
 use super::lens;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::f64::consts::PI;
@@ -61,30 +62,7 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     Err(object.error(name, format!("is {}, and cannot be followed: {what}", shown(value))))
 }
 
-/// What the file as a whole says, and what a frame says in its place.
-pub(super) struct Layers<'a, 'b> {
-    pub(super) top: &'b Object<'a>,
-    pub(super) frame: &'b Object<'a>,
-}
-
-impl<'a, 'b> Layers<'a, 'b> {
-    /// The object whose field counts.
-    fn of(&self, name: &str) -> &'b Object<'a> {
-        if self.frame.get(name).is_none() && self.top.get(name).is_some() { self.top } else { self.frame }
-    }
-
-    pub(super) fn find<T>(&self, name: &str, read: impl Fn(&'b Object<'a>, &str) -> Result<T>) -> Result<T> {
-        read(self.of(name), name)
-    }
-
-    pub(super) fn number(&self, name: &str) -> Result<Option<f64>> {
-        self.of(name).number(name)
-    }
-
-    pub(super) fn error(&self, name: &str, what: impl ToString) -> Error {
-        self.of(name).error(name, what)
-    }
-
+impl Layers<'_, '_> {
     /// A number of pixels.
     fn side(&self, name: &str) -> Result<Option<usize>> {
         match self.number(name)? {

@@ -1,6 +1,6 @@
 //! Camera models by name, and their coefficients.
 
-use super::intrinsics::Layers;
+use super::layers::Layers;
 use crate::camera::lens::Lens;
 use crate::error::Result;
 use serde_json::{Map, Value};

@@ -6,6 +6,7 @@ pub mod colmap;
 mod frames;
 mod intrinsics;
 mod json;
+mod layers;
 mod lens;
 mod limits;
 pub mod llff;

@@ -1,6 +1,7 @@
 //! A photograph on another grid of pixels.
 
-use super::{Photo, Stored, Values};
+use super::{Photo, Values};
+use crate::dataset::average::Stored;
 
 /// How many pixels of the photograph a new one must be wide before it is averaged over more than one place. A little above
 /// one: less shows no aliasing, and an average would only blur.

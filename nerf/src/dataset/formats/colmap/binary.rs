@@ -1,8 +1,8 @@
 //! COLMAP's `.bin` files: numbers in a row, little-endian, each list after its length.
 
+use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models::Model;
 use super::table::Table;
-use super::{CameraEntry, ImageEntry, Place};
 use crate::dataset::capture::Point;
 use crate::error::{Error, Result};
 use glam::DVec3;

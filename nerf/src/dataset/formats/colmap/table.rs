@@ -1,8 +1,9 @@
 //! A capture as the tables that COLMAP's files are.
 
 use super::super::rigid;
+use super::encoding::Encoding;
 use super::models::{Model, model_of};
-use super::{Encoding, pose};
+use super::pose;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Point, View};
 use crate::error::{Error, Result};

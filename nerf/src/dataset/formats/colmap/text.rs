@@ -1,9 +1,9 @@
 //! COLMAP's `.txt` files: an entry a line, and comments that start with `#`.
 
 use super::super::limits::start;
+use super::entries::{CameraEntry, ImageEntry, Place};
 use super::models::Model;
 use super::table::Table;
-use super::{CameraEntry, ImageEntry, Place};
 use crate::dataset::capture::Point;
 use crate::error::{Error, Result};
 use glam::DVec3;

@@ -1,0 +1,29 @@
+//! The two ways in which COLMAP's files are written.
+
+use std::path::{Path, PathBuf};
+
+/// How COLMAP's files are written. Both hold the same numbers, bit for bit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Encoding {
+    /// `.bin`, little-endian: what COLMAP writes by default.
+    Binary,
+    /// `.txt`.
+    Text,
+}
+
+impl Encoding {
+    /// Where a folder has both, the first is read.
+    pub(super) const ALL: [Encoding; 2] = [Encoding::Binary, Encoding::Text];
+
+    pub(super) fn extension(self) -> &'static str {
+        match self {
+            Encoding::Binary => "bin",
+            Encoding::Text => "txt",
+        }
+    }
+
+    /// The files of a model in `folder`: cameras, images and points.
+    pub(super) fn files(self, folder: &Path) -> [PathBuf; 3] {
+        ["cameras", "images", "points3D"].map(|stem| folder.join(stem).with_extension(self.extension()))
+    }
+}

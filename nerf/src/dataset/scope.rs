@@ -1,0 +1,37 @@
+//! How far scenes go.
+
+use crate::error::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// How far a scene goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Scope {
+    /// It ends at its box: an object before a background that is transparent or of one colour.
+    Bounded,
+    /// It goes on beyond its box, and photographs show what is there.
+    Unbounded,
+}
+
+impl fmt::Display for Scope {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Scope::Bounded => "bounded",
+            Scope::Unbounded => "unbounded",
+        })
+    }
+}
+
+impl FromStr for Scope {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "bounded" => Ok(Scope::Bounded),
+            "unbounded" => Ok(Scope::Unbounded),
+            _ => Err(Error::setting("scope", format!("must be bounded or unbounded, is `{text}`"))),
+        }
+    }
+}
