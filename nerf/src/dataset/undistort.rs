@@ -44,9 +44,14 @@ impl Camera {
         let shape = first.width as f64 / first.height as f64;
         let halves = (-SHAPES..=SHAPES).map(|step| {
             let shape = shape * 4.0_f64.powf(f64::from(step) / f64::from(SHAPES));
-            largest([shape.sqrt(), shape.sqrt().recip()], around)
+            let [x, y] = [shape.sqrt(), shape.sqrt().recip()];
+            let scale = last(0.0, |scale| around([scale * x, scale * y]));
+            [scale * x, scale * y]
         });
         let best = halves.max_by(|a, b| (a[0] * a[1]).total_cmp(&(b[0] * b[1]))).unwrap_or_default();
+        // The shape was one of a few: what is left beside it is taken too.
+        let x = last(best[0], |x| around([x, best[1]]));
+        let best = [x, last(best[1], |y| around([x, y]))];
         let [width, height] = best.map(|half| (2.0 * half * focal + ROUNDING) as usize);
         if width == 0 || height == 0 {
             return Err(bad("a camera does not see its own optical axis: there is no picture around it"));
@@ -56,14 +61,14 @@ impl Camera {
     }
 }
 
-/// The largest rectangle of a shape, as tangents of half of its angles, that is good.
-fn largest([x, y]: [f64; 2], good: impl Fn([f64; 2]) -> bool) -> [f64; 2] {
-    let (mut low, mut high) = (0.0, FARTHEST);
+/// The largest number that is good, where all smaller ones from `low` on are.
+fn last(mut low: f64, good: impl Fn(f64) -> bool) -> f64 {
+    let mut high = FARTHEST.max(low);
     for _ in 0..HALVINGS {
         let middle = 0.5 * (low + high);
-        if good([middle * x, middle * y]) { low = middle } else { high = middle }
+        if good(middle) { low = middle } else { high = middle }
     }
-    [low * x, low * y]
+    low
 }
 
 /// Whether a camera sees the rectangle of directions with these half sides. What it sees has no holes, so that its border
