@@ -2,8 +2,10 @@
 
 use super::Place;
 use raygrad::nerf::dataset::{Capture, Format, Photo, Split, View};
+use raygrad::nerf::glam::{DMat3, DVec3};
 use raygrad::nerf::{Camera, Image, Lens};
 use serde_json::{Value, json};
+use std::collections::HashSet;
 use std::path::PathBuf;
 
 /// Pixels that a ray may be off after any number of conversions.
@@ -74,7 +76,7 @@ fn by_name(capture: &Capture) -> Vec<(String, &View)> {
 
 /// Whether both captures have the same photographs and pixels of them the same rays.
 #[track_caller]
-fn same_rays(a: &Capture, b: &Capture) {
+fn same_rays(a: &Capture, b: &Capture, most: f64) {
     let (a, b) = (by_name(a), by_name(b));
     let names = |views: &[(String, &View)]| views.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
     assert_eq!(names(&a), names(&b));
@@ -84,7 +86,7 @@ fn same_rays(a: &Capture, b: &Capture) {
         for (x, y) in grid(one) {
             let (ray, again) = (one.ray(x, y), other.ray(x, y));
             let off = one.focal[0].max(one.focal[1]) * ray.direction.distance(again.direction);
-            assert!(off < OFF, "{name} {x} {y}: {off} pixels");
+            assert!(off < most, "{name} {x} {y}: {off} pixels");
             assert!(ray.origin.distance(again.origin) < 1e-9 * (1.0 + ray.origin.length()), "{name}");
         }
     }
@@ -97,7 +99,7 @@ fn grid(camera: &Camera) -> impl Iterator<Item = (f64, f64)> {
 }
 
 /// Over all formats that have lenses, and back.
-fn there_and_back(place: &Place, scene: &str) {
+fn there_and_back(place: &Place, scene: &str, most: f64) {
     place.succeeds(&format!("prepare {scene} --to colmap-text --out text"));
     place.succeeds("prepare text --to colmap --out binary");
     place.succeeds("prepare binary --to nerfstudio --out back");
@@ -105,7 +107,7 @@ fn there_and_back(place: &Place, scene: &str) {
     for (folder, format) in [("text", Format::Colmap), ("binary", Format::Colmap), ("back", Format::Transforms)] {
         let capture = read(place, folder);
         assert_eq!(capture.format, format);
-        same_rays(&original, &capture);
+        same_rays(&original, &capture, most);
         let present = |capture: &Capture| capture.present().count();
         assert_eq!(present(&original), present(&capture), "{folder}");
     }
@@ -116,7 +118,7 @@ fn there_and_back(place: &Place, scene: &str) {
 fn lenses_and_poses_survive_every_format() {
     let place = Place::empty();
     with_lens(&place);
-    there_and_back(&place, "scene");
+    there_and_back(&place, "scene", OFF);
     let back = read(&place, "back");
     assert_eq!(back.views.iter().filter(|view| view.mask.is_some()).count(), 1);
     for name in ["0.jpg", "7.png", "more/9.png"] {
@@ -146,7 +148,7 @@ fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
     transforms["frames"][0]["file_path"] = "images/more_9.png".into();
     transforms["frames"][1].as_object_mut().unwrap().remove("mask_path");
     std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
-    place.fails("prepare scene --to blender --undistort --out made", &["more_9.png", "as another would"]);
+    place.fails("prepare scene --to llff --undistort --out made", &["more_9.png", "as another would"]);
     place.fails("prepare scene --to colmap --out scene", &["scene: holds files already"]);
     std::fs::write(place.path("scene/images/5.png"), "no picture").unwrap();
     place.fails("prepare scene --to colmap --out made", &["`frames[5]`", "5.png: cannot be decoded"]);
@@ -182,14 +184,64 @@ fn undistorted_images_are_pinholes_that_every_format_holds() {
         place.succeeds(&format!("prepare flat --to {to} --undistort --out {to}"));
     }
     for to in ["llff", "colmap", "nerfstudio"] {
-        same_rays(&flat, &read(&place, to));
+        same_rays(&flat, &read(&place, to), OFF);
     }
-    assert_eq!(place.bytes("flat/images/7.png"), place.bytes("llff/images/7.png"));
+    assert_eq!(place.bytes("flat/images/1.jpg"), place.bytes("llff/images/1.jpg"));
     let blender = read(&place, "blender");
     assert_eq!(blender.split(Split::Test).unwrap().len(), flat.split(Split::Test).unwrap().len());
     assert!(blender.views.iter().all(|view| view.image.is_some()));
     let llff = read(&place, "llff");
     assert!(llff.views.iter().all(|view| view.bounds.is_some_and(|[near, far]| near > 0.0 && near < 3.0 && far > 3.0)));
+}
+
+#[test]
+fn cameras_that_differ_become_one_where_a_format_has_one() {
+    let place = Place::empty();
+    with_lens(&place);
+    let mut transforms = place.json("scene/transforms.json");
+    for (i, frame) in transforms["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+        frame.as_object_mut().unwrap().remove("mask_path");
+        if i % 2 == 0 {
+            (frame["fl_x"], frame["fl_y"], frame["cx"]) = (50.0.into(), 50.5.into(), 22.0.into());
+        }
+    }
+    std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
+    let original = read(&place, "scene");
+    for (to, one) in [("llff", true), ("blender", true), ("colmap", false)] {
+        place.succeeds(&format!("prepare scene --undistort --to {to} --out {to}"));
+        let made = read(&place, to);
+        let sizes = made.views.iter().map(|view| [view.camera.width, view.camera.height]);
+        assert_eq!(sizes.collect::<HashSet<_>>().len() == 1, one, "{to}");
+        if to == "blender" {
+            // Its names have the split in them.
+            continue;
+        }
+        for (name, view) in by_name(&made) {
+            let (_, before) = by_name(&original).into_iter().find(|(other, _)| *other == name).unwrap();
+            let pose = before.camera.pose;
+            assert!(view.camera.pose.abs_diff_eq(pose, 1e-9));
+            assert_same_directions(&Camera { pose, ..view.camera.clone() }, &before.camera);
+        }
+    }
+}
+
+#[test]
+fn cameras_are_written_for_the_size_that_images_have() {
+    let place = Place::empty();
+    with_lens(&place);
+    // Somebody has made the images smaller, and not told the file.
+    for view in read(&place, "scene").present() {
+        let path = view.image.as_ref().unwrap();
+        Photo::open(path, None).unwrap().resized([24, 16]).save(path).unwrap();
+    }
+    place.succeeds("prepare scene --to nerfstudio --out made");
+    let original = read(&place, "scene");
+    for (name, view) in by_name(&read(&place, "made")).into_iter().filter(|(_, view)| view.image.is_some()) {
+        assert_eq!([view.camera.width, view.camera.height], [24, 16]);
+        let (_, before) = by_name(&original).into_iter().find(|(other, _)| *other == name).unwrap();
+        let [one, other] = [view.camera.ray(6.0, 11.0), before.camera.ray(12.0, 22.0)];
+        assert!(one.direction.distance(other.direction) < 1e-9, "{name}");
+    }
 }
 
 /// Whether an undistorted camera has at each of its pixels what the original had where it saw that.
@@ -229,6 +281,19 @@ fn points_tell_depths_and_go_along() {
     }
 }
 
+/// Makes the upper left of a matrix the nearest rotation, by Newton's method.
+fn make_rigid(matrix: &mut Value) {
+    let at = |r: usize, c: usize| matrix[r][c].as_f64().unwrap();
+    let column = |c: usize| DVec3::new(at(0, c), at(1, c), at(2, c));
+    let mut rotation = DMat3::from_cols(column(0), column(1), column(2));
+    for _ in 0..5 {
+        rotation = rotation * (DMat3::IDENTITY * 3.0 - rotation.transpose() * rotation) * 0.5;
+    }
+    for (r, c) in (0..9).map(|i| (i / 3, i % 3)) {
+        matrix[r][c] = rotation.col(c)[r].into();
+    }
+}
+
 #[test]
 fn the_fox_is_the_same_in_every_format() {
     let Some(fox) = fox() else { return };
@@ -244,7 +309,16 @@ fn the_fox_is_the_same_in_every_format() {
         }
     }
     std::fs::write(place.path("fox/transforms.json"), transforms.to_string()).unwrap();
-    there_and_back(&place, "fox");
+    // Its matrices are rotations to a millionth only, which quaternions are not asked to keep.
+    there_and_back(&place, "fox", 2e-3);
+    for folder in ["text", "binary", "back"] {
+        std::fs::remove_dir_all(place.path(folder)).unwrap();
+    }
+    for frame in transforms["frames"].as_array_mut().unwrap() {
+        make_rigid(&mut frame["transform_matrix"]);
+    }
+    std::fs::write(place.path("fox/transforms.json"), transforms.to_string()).unwrap();
+    there_and_back(&place, "fox", OFF);
     place.succeeds("prepare fox --undistort --to llff --out llff");
     let (original, llff) = (read(&place, "fox"), read(&place, "llff"));
     assert_eq!(llff.views.len(), original.present().count());

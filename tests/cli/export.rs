@@ -1,8 +1,8 @@
 //! `raygrad export`: the cameras of a run.
 
 use super::Place;
-use raygrad::nerf::Camera;
 use raygrad::nerf::dataset::{Capture, Split};
+use raygrad::nerf::{Camera, Config, Extent, Model};
 use std::path::Path;
 
 /// The cameras in a file of this name, read as a dataset's in the folder `scene`.
@@ -36,7 +36,19 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
     place.succeeds(&format!("train scene --steps 8 --out run --scope unbounded {small} {learned}"));
     let said = place.succeeds("export run run/cameras.json");
     assert_eq!(said, "exported 11 cameras, 6 of them refined: run/cameras.json\n");
+    let config = place.json("run/config.json");
+    let part = |name: &str| config[name].clone();
+    let extent: Extent = serde_json::from_value(part("extent")).unwrap();
+    let settings: Config = serde_json::from_value(part("config")).unwrap();
+    let model = Model::<f32>::load(place.path("run/model.safetensors"), settings, extent).unwrap();
+    let mut number = 0;
     for (before, after) in given.iter().zip(exported(&place, "run/cameras.json")) {
+        if before.1 == Some(Split::Train) {
+            let learned = model.learned_camera(number, &extent.placement.camera(&before.2));
+            number += 1;
+            let back = extent.placement.camera_back(&learned);
+            assert!(close(&back, &after.2, 1e-12) && !close(&back, &before.2, 1e-5), "{}", before.0);
+        }
         let trained = before.1 == Some(Split::Train);
         assert_eq!(before.2.pose == after.2.pose, !trained, "{}", before.0);
         // A step moves by a little, in the coordinates of the files and not in those of the scene.

@@ -5,6 +5,7 @@ use raygrad::nerf::Image;
 use raygrad::nerf::dataset::Photo;
 use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 /// In place of ffmpeg: writes a line of its arguments, and 30 frames of which the second of three is the sharp one.
 const FFMPEG: &str = r#"#!/bin/sh
@@ -33,7 +34,7 @@ const COLMAP: &str = r#"#!/bin/sh
 echo "colmap $*" >> "$LOG"
 case "$*" in "-h"|*" -h") echo "  --$GPU.use_gpu arg (=1)"; exit 0 ;; esac
 if [ "$1" = "$FAILS" ]; then echo "Processed file [1/3]"; echo "elapsed"; echo "out of luck" >&2; exit 3; fi
-if [ "$1" = "$SLEEPS" ]; then echo begun >> "$LOG"; exec sleep 60; fi
+if [ "$1" = "$SLEEPS" ]; then echo "begun $$" >> "$LOG"; exec sleep 60; fi
 [ "$1" = feature_extractor ] && echo "Processed file [1/10]"
 [ "$1" = mapper ] || exit 0
 while [ $# -gt 0 ]; do
@@ -232,11 +233,16 @@ fn ctrl_c_ends_the_program_and_leaves_nothing() {
     let mut child = command.spawn().unwrap();
     wait(&mut child, || std::fs::read_to_string(place.path("log")).is_ok_and(|log| log.contains("begun")));
     assert_eq!(made(&place).len(), 1, "it works in a folder of its own");
+    let start = Instant::now();
     let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     assert!(sent.success());
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(130), "{output:?}");
     assert_eq!(made(&place), [""; 0]);
+    let log = log(&place);
+    let colmap = log.lines().find_map(|line| line.strip_prefix("begun ")).unwrap();
+    let lives = Command::new("kill").args(["-0", colmap]).stderr(Stdio::null()).status().unwrap();
+    assert!(start.elapsed() < Duration::from_secs(30) && !lives.success(), "colmap goes on");
 }
 
 #[test]

@@ -4,38 +4,30 @@ use raygrad::nerf::Result;
 use raygrad::nerf::dataset::{Capture, Point, View};
 use raygrad::nerf::glam::DVec3;
 
-use crate::cli::output::note;
-
 /// Fewer points in a photograph say nothing of its depths.
 const FEWEST: usize = 20;
 /// The share of points that may be wrong at either end, as LLFF has it.
 const WRONG: f64 = 0.001;
 
-/// Gives each view its depths: those that the file has, else those of the points that it shows, else those of the box that
-/// holds the scene.
-pub fn fill(capture: &mut Capture) -> Result<()> {
-    if capture.views.iter().all(|view| view.bounds.is_some()) {
-        return Ok(());
-    }
-    let mut found: Vec<Option<[f64; 2]>> =
-        capture.views.iter().map(|view| view.bounds.or_else(|| shown(view, &capture.points))).collect();
+/// The depths of each view: those that the file has, else those of the points that it shows, else those of the box that
+/// holds the scene. Says beside how many are of the last kind.
+pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
+    let found: Vec<_> = capture.views.iter().map(|view| view.bounds.or_else(|| shown(view, &capture.points))).collect();
     let guessed = found.iter().filter(|bounds| bounds.is_none()).count();
-    if guessed > 0 {
-        let survey = capture.survey(None)?;
-        let placement = survey.placement;
-        let reach = survey.bounds[0].distance(survey.bounds[1]) * 0.5 / placement.scale;
-        let middle = placement.point_back(0.5 * (survey.bounds[0] + survey.bounds[1]));
-        let near = survey.near / placement.scale;
-        for (bounds, view) in found.iter_mut().zip(&capture.views) {
-            let far = view.camera.pose.translation.distance(middle) + reach;
-            bounds.get_or_insert([near.min(0.5 * far), far]);
-        }
-        note(&format!(
-            "{guessed} photographs show too few points to tell their depths: those of the scene's box are written"
-        ));
+    if guessed == 0 {
+        return Ok((found.into_iter().flatten().collect(), 0));
     }
-    capture.views.iter_mut().zip(found).for_each(|(view, bounds)| view.bounds = bounds);
-    Ok(())
+    let survey = capture.survey(None)?;
+    let placement = survey.placement;
+    let reach = survey.bounds[0].distance(survey.bounds[1]) * 0.5 / placement.scale;
+    let middle = placement.point_back(0.5 * (survey.bounds[0] + survey.bounds[1]));
+    let near = survey.near / placement.scale;
+    let guess = |view: &View| {
+        let far = view.camera.pose.translation.distance(middle) + reach;
+        [near.min(0.5 * far), far]
+    };
+    let all = found.iter().zip(&capture.views).map(|(bounds, view)| bounds.unwrap_or_else(|| guess(view)));
+    Ok((all.collect(), guessed))
 }
 
 /// The depths of the points that a photograph shows.

@@ -17,7 +17,7 @@ use super::program::{Stop, Work};
 use super::undistort;
 use super::workplace::Workplace;
 use crate::cli::interrupt;
-use crate::cli::output::{complain, print};
+use crate::cli::output::{complain, note, print};
 use crate::cli::progress::Progress;
 
 /// Formats that can be written.
@@ -104,13 +104,16 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, out: &Pa
             view.camera = view.camera_of_image().map_err(|e| Error::field(&capture.file, &view.field, e))?;
         }
     }
-    if target == Target::Llff {
-        bounds::fill(&mut capture)?;
-    }
     let place = Workplace::new(out)?;
     let mut jobs = jobs(&capture, target, undistorted, place.folder())?;
     if undistorted {
         undistort::plan(&mut jobs.iter_mut().map(|job| (&mut job.to.camera, &mut job.seen_by)), target.is_plain())?;
+    }
+    let mut guessed = 0;
+    if target == Target::Llff {
+        let bounds;
+        (bounds, guessed) = bounds::of(&capture)?;
+        jobs.iter_mut().zip(bounds).for_each(|(job, bounds)| job.to.bounds = Some(bounds));
     }
     let views = jobs.iter().map(|job| job.to.clone()).collect();
     let written = Capture { folder: place.folder().into(), views, ..capture.clone() };
@@ -119,6 +122,11 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, out: &Pa
     copy(&jobs)?;
     place.finish()?;
     describe(&capture, &jobs, out)?;
+    if guessed > 0 {
+        note(&format!(
+            "{guessed} photographs show too few points to tell their depths: those of the scene's box were written"
+        ));
+    }
     Ok(())
 }
 
