@@ -50,7 +50,7 @@ fn look_at(view: &View) -> Result<Look> {
     let [stored, shown] = Photo::size_of_file(&path)?;
     let size = [stored, shown].into_iter().find(|size| fits(*size, view));
     let photo = Photo::open(&path, size)?;
-    let transparent = photo.has_alpha().then(|| photo.is_transparent());
+    let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
     let middle = shrunk(&photo, LONGEST);
     let small = shrunk(&photo, SMALL);
     let mask = view.mask.as_ref().map(|path| Photo::open(path, None)).transpose()?;

@@ -1,6 +1,6 @@
 //! Photographs to files.
 
-use super::{Photo, Values, reader};
+use super::{Photo, Values, decoder};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use image::codecs::jpeg::JpegEncoder;
@@ -56,7 +56,7 @@ impl Photo {
 pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> {
     let (from, to) = (from.as_ref(), to.as_ref());
     let bad = |e: ImageError| Error::file(from, format!("cannot be decoded: {e}"));
-    let mut decoder = reader(from)?.into_decoder().map_err(bad)?;
+    let (mut decoder, _) = decoder(from)?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     if turn == Orientation::NoTransforms {
         return std::fs::copy(from, to).map(drop).map_err(|e| Error::file(to, format!("cannot be written: {e}")));
