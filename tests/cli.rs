@@ -149,6 +149,52 @@ fn a_run_is_complete_and_can_be_evaluated() {
 }
 
 #[test]
+fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
+    const SIZE: usize = 120;
+    let place = Place::empty();
+    std::fs::create_dir_all(place.path("capture/images")).unwrap();
+    let mut frames = vec![];
+    for (i, frame) in evenly_spaced(embedded(Split::Train, SIZE).frames, 40).into_iter().enumerate() {
+        let name = format!("images/{i:02}.png");
+        frame.image.to_image().save_png(place.path(&format!("capture/{name}"))).unwrap();
+        let (rotation, eye) = (frame.camera.pose.matrix3, frame.camera.pose.translation);
+        let row = |r: usize| [rotation.row(r).x, rotation.row(r).y, rotation.row(r).z, eye[r]];
+        let matrix = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+        frames.push(json!({ "file_path": name, "transform_matrix": matrix }));
+    }
+    let (side, focal) = (SIZE as f64, 0.5 * SIZE as f64 / (0.5 * ANGLE_X).tan());
+    let transforms = json!({
+        "w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "cx": 0.5 * side, "cy": 0.5 * side, "frames": frames
+    });
+    std::fs::write(place.path("capture/transforms.json"), transforms.to_string()).unwrap();
+
+    let table = place.succeeds("doctor capture");
+    assert!(table.contains("nothing is wrong") && table.contains("bounded: photographs are transparent"), "{table}");
+    let picture = png(&place.path("doctor/cameras.png"));
+    assert!(picture.width > 1000 && picture.data.iter().any(|value| *value < 0.5));
+    let page = String::from_utf8(place.bytes("doctor/doctor.html")).unwrap();
+    assert!(page.contains("images/07.png") && !page.contains("{{") && !page.contains("http"));
+
+    let report = |code: i32| -> Value {
+        let output = place.command("doctor capture --json --out other").output().unwrap();
+        assert_eq!(output.status.code(), Some(code), "{output:?}");
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    assert_eq!(report(0)["findings"], json!([]));
+    std::fs::remove_file(place.path("capture/images/05.png")).unwrap();
+    let found = report(3)["findings"][0].clone();
+    assert_eq!(
+        json!([found["kind"], found["severity"], found["views"]]),
+        json!(["images-absent", "warning", ["images/05.png"]])
+    );
+    std::fs::write(place.path("capture/images/09.png"), b"no image").unwrap();
+    assert_eq!(report(4)["findings"][0]["kind"], "images-undecodable");
+    assert!(String::from_utf8(place.bytes("other/doctor.html")).unwrap().contains("images-undecodable"));
+    place.fails("doctor embedded", &["`scene`", "name a folder"]);
+    place.fails("doctor absent", &["absent: there is no such folder"]);
+}
+
+#[test]
 fn pictures_and_animations() {
     let place = Place::with_run();
     place.succeeds("render run --frames 2");

@@ -2,7 +2,7 @@
 //!
 //! There is a room for each stage that data passes, and each knows only those before it:
 //! [`camera`] → [`dataset`] → [`encoding`] → [`space`] → [`field`] → [`volume`] → [`sampling`] → [`losses`] →
-//! [`model`] → [`rendering`] → [`training`]; [`pictures`] and [`analytic`] stand beside them, and [`kind`] is how a field, a
+//! [`model`] → [`rendering`] → [`training`]; [`doctor`], [`pictures`] and [`analytic`] stand beside them, and [`kind`] is how a field, a
 //! sampler or a term of the loss of one's own comes in. Each stage can be used alone.
 
 pub mod analytic;

@@ -42,6 +42,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let model = run.model()?;
     let mut capture = match run.scene(args.scene.as_ref())? {
         Scene::Embedded => embedded(),
+        Scene::Landscape => {
+            return Err(Error::setting("scene", "the landscape has no files that cameras could be written for"));
+        }
         Scene::Folder(folder) => Capture::read(folder)?,
     };
     let refined = refine(&mut capture, &model)?;
@@ -63,7 +66,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// Puts the cameras of the photographs that the model was trained on where it has found them to be; says how many those are.
 fn refine(capture: &mut Capture, model: &Model<f32>) -> Result<usize> {
-    if model.poses.is_none() {
+    if model.refine.is_none() {
         return Ok(0);
     }
     let placement = model.extent.placement;

@@ -12,9 +12,9 @@ use Severity::{Error, Warning};
 use glam::DAffine3;
 
 /// Photographs that are compared with their neighbours under each convention.
-const TRIED: usize = 20;
+const TRIED: usize = 12;
 /// Patches that must have a match before agreement says anything of the capture.
-const ENOUGH: usize = 150;
+const ENOUGH: usize = 100;
 /// The same of a single photograph, and how many standard deviations it must be from what is usual.
 const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;

@@ -6,7 +6,7 @@ use crate::camera::{Camera, Lens};
 use crate::dataset::capture::{Format, Point, View};
 use crate::dataset::{Image, Scope, embedded, evenly_spaced};
 use FindingKind as Kind;
-use glam::{DAffine3, DMat3, DQuat};
+use glam::{DAffine3, DMat3, DQuat, DVec3};
 use std::path::PathBuf;
 use std::sync::LazyLock;
 use tempfile::TempDir;
@@ -193,7 +193,7 @@ fn conventions_are_told_apart() {
         let mut planted = Planted::new();
         // Not around the origin: as most captures are.
         planted.repose(|pose| {
-            let moved = DAffine3 { translation: pose.translation + glam::DVec3::new(1.0, -2.0, 0.5), ..pose };
+            let moved = DAffine3 { translation: pose.translation + DVec3::new(1.0, -2.0, 0.5), ..pose };
             match convention {
                 Convention::WorldToOpenCv => Convention::WorldToCamera.apply(Convention::OpenCv.apply(moved)),
                 other => other.apply(moved),
@@ -217,7 +217,7 @@ fn poses_alone_tell_conventions_apart_too() {
     found(&planted.cameras(), Kind::WorldToCamera, Warning, &[], &[]);
     // And points prove it.
     let points =
-        (0..100).map(|i| glam::DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
+        (0..100).map(|i| DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
     let points: Vec<Point> = points.map(|p| Point { position: 0.5 * p, color: [0; 3], error: 0.5, views: 4 }).collect();
     let mut planted = Planted::new();
     planted.capture.points = points;
@@ -229,8 +229,7 @@ fn poses_alone_tell_conventions_apart_too() {
 #[test]
 fn scales_that_differ_and_digits_that_are_lost() {
     let mut planted = Planted::new();
-    planted.capture.points =
-        vec![Point { position: glam::DVec3::splat(5000.0), color: [0; 3], error: 0.1, views: 5 }; 20];
+    planted.capture.points = vec![Point { position: DVec3::splat(5000.0), color: [0; 3], error: 0.1, views: 5 }; 20];
     found(&planted.cameras(), Kind::Scale, Warning, &[], &[]);
     let mut planted = Planted::new();
     planted.capture.format = Format::Blender;
@@ -238,7 +237,7 @@ fn scales_that_differ_and_digits_that_are_lost() {
     planted.repose(|pose| DAffine3 { translation: 1000.0 * pose.translation, ..pose });
     found(&planted.cameras(), Kind::Scale, Warning, &[], &[]);
     let mut planted = Planted::new();
-    planted.repose(|pose| DAffine3 { translation: pose.translation + glam::DVec3::new(5e6, 0.0, 0.0), ..pose });
+    planted.repose(|pose| DAffine3 { translation: pose.translation + DVec3::new(5e6, 0.0, 0.0), ..pose });
     found(&planted.cameras(), Kind::FarFromOrigin, Note, &[], &[]);
 }
 
@@ -338,15 +337,15 @@ fn masks_and_alpha_that_say_nothing() {
 #[test]
 fn places_that_give_no_depth_or_leave_gaps() {
     let mut planted = Planted::new();
-    planted.repose(|pose| DAffine3 { translation: glam::DVec3::ZERO, ..pose });
+    planted.repose(|pose| DAffine3 { translation: DVec3::ZERO, ..pose });
     found(&planted.cameras(), Kind::OnePlace, Error, &[], &[]);
 
     let mut planted = Planted::new();
     let mut x = 0.0;
     planted.capture.views.iter_mut().for_each(|view| {
         x += 0.1;
-        let eye = glam::DVec3::new(x - 2.5, -4.0, 1.0);
-        view.camera.pose = Camera::look_at(eye, glam::DVec3::ZERO, glam::DVec3::Z);
+        let eye = DVec3::new(x - 2.5, -4.0, 1.0);
+        view.camera.pose = Camera::look_at(eye, DVec3::ZERO, DVec3::Z);
     });
     found(&planted.cameras(), Kind::OnALine, Warning, &[], &[]);
 

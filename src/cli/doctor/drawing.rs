@@ -54,7 +54,7 @@ fn panel(stage: &Stage, area: &Area<'_>, left: i32, flat: fn(DVec3) -> [f64; 2])
     let inner = area.clone().shrink((left, HEAD), (PANEL, PANEL));
     let scale = 0.5 * f64::from(PANEL) / stage.reach;
     let place = |point: DVec3| {
-        let [x, y] = flat(point);
+        let [x, y] = flat(point - stage.centre);
         let pixel = |v: f64| (0.5 * f64::from(PANEL) + v * scale).round().clamp(-4e3, 4e3) as i32;
         (pixel(x), pixel(-y))
     };
@@ -64,6 +64,12 @@ fn panel(stage: &Stage, area: &Area<'_>, left: i32, flat: fn(DVec3) -> [f64; 2])
     let style = BOX.mix(if stage.bounded { 0.9 } else { 0.4 });
     for [a, b] in edges(stage.bounds) {
         inner.draw(&PathElement::new([place(a), place(b)], style))?;
+    }
+    // The middle of the scene.
+    let middle = place(DVec3::ZERO);
+    for [across, down] in [[6, 0], [0, 6]] {
+        let ends = [(middle.0 - across, middle.1 - down), (middle.0 + across, middle.1 + down)];
+        inner.draw(&PathElement::new(ends, BOX))?;
     }
     for camera in &stage.cameras {
         let (color, width) = look(camera);
@@ -76,7 +82,7 @@ fn panel(stage: &Stage, area: &Area<'_>, left: i32, flat: fn(DVec3) -> [f64; 2])
         for corner in corners {
             inner.draw(&PathElement::new([eye, corner], color.mix(0.8).stroke_width(width)))?;
         }
-        inner.draw(&Circle::new(eye, 2 + width as i32, color.filled()))?;
+        inner.draw(&Circle::new(eye, 1 + width as i32, color.filled()))?;
     }
     Ok(())
 }

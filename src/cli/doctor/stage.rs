@@ -10,7 +10,7 @@ use serde::Serialize;
 /// Points that are drawn at most.
 const POINTS: usize = 6000;
 /// The length of a drawn camera, as a share of the median distance of cameras from the middle.
-const LENGTH: f64 = 0.13;
+const LENGTH: f64 = 0.1;
 
 /// A camera as a pyramid.
 #[derive(Serialize)]
@@ -39,7 +39,8 @@ pub struct Stage {
     pub bounds: [DVec3; 2],
     /// Whether the scene ends there.
     pub bounded: bool,
-    /// Half of the width of what is drawn.
+    /// The middle of what is drawn, and half of its width.
+    pub centre: DVec3,
     pub reach: f64,
 }
 
@@ -77,15 +78,19 @@ impl Stage {
         });
         let mut cameras: Vec<Pyramid> = cameras.collect();
         cameras.retain(|camera| camera.eye.is_finite());
-        let farthest = cameras.iter().map(|camera| camera.eye.abs().max_element()).fold(0.0, f64::max);
-        // One camera that is far away must not hide all others.
         let bounds = survey.map_or([DVec3::splat(-0.5 * usual), DVec3::splat(0.5 * usual)], |survey| survey.bounds);
-        let side = bounds.iter().map(|corner| corner.abs().max_element()).fold(0.0, f64::max);
-        let reach = 1.12 * (farthest + LENGTH * usual).min(5.0 * usual).max(side);
+        let [mut low, mut high] = bounds;
+        for camera in &cameras {
+            // One camera that is far away must not hide all others.
+            let eye = camera.eye.clamp(DVec3::splat(-5.0 * usual), DVec3::splat(5.0 * usual));
+            (low, high) = (low.min(eye), high.max(eye));
+        }
+        let centre = 0.5 * (low + high);
+        let reach = 1.1 * (0.5 * (high - low).max_element() + LENGTH * usual);
         let inside = capture.points.iter().map(|point| (placement.point(point.position), point.color));
-        let inside = inside.filter(|(place, _)| place.abs().max_element() < 1.5 * reach).collect();
+        let inside = inside.filter(|(place, _)| (*place - centre).abs().max_element() < 1.5 * reach).collect();
         let (points, colors) = evenly_spaced(inside, POINTS).into_iter().unzip();
         let bounded = survey.is_none_or(|survey| survey.scope == Scope::Bounded);
-        Stage { cameras, points, colors, bounds, bounded, reach }
+        Stage { cameras, points, colors, bounds, bounded, centre, reach }
     }
 }

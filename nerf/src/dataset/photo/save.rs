@@ -153,7 +153,7 @@ mod tests {
                 Photo::open(&to, None).unwrap().resized([1, 2]),
                 Photo::open(&from, None).unwrap().resized([1, 2])
             );
-            let mut decoder = reader(&to).unwrap().into_decoder().unwrap();
+            let (mut decoder, _) = decoder(&to).unwrap();
             assert_eq!(decoder.exif_metadata().unwrap(), Some(exif(1)));
             assert_eq!(decoder.icc_profile().unwrap(), Some(vec![7; 300]));
         }
