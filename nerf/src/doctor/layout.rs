@@ -34,7 +34,7 @@ pub(super) fn examine(capture: &Capture, survey: Option<&Survey>, findings: &mut
     let focus = Focus::of(&poses);
     let meant = by_points(capture, &views).or_else(|| by_axes(&poses, focus, size[0]));
     match meant {
-        Some((Convention::OpenCv, severity)) if severity == Error => opencv_axes(findings),
+        Some((Convention::OpenCv, Error)) => opencv_axes(findings),
         Some((Convention::OpenCv, _)) => looks_away(findings),
         Some((_, severity)) => world_to_camera(severity, findings),
         None => (),

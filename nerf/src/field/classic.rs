@@ -139,7 +139,7 @@ impl<T: Scalar> Field<T> for Classic {
             let row = Tensor::from_fn(&[3 + 6 * weights.len()], |i| {
                 T::from_f64(if i < 3 { 1.0 } else { weights[(i - 3) / 6] })
             });
-            encoding = encoding * positions.tape().constant(row);
+            encoding *= positions.tape().constant(row);
         }
         let features = self.trunk.forward(params, &encoding);
         let raw = self.density.forward(params, &features).reshape(&[positions.shape()[0]]);

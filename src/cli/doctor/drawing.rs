@@ -37,7 +37,8 @@ pub fn draw(stage: &Stage, path: &Path) -> Result<()> {
 
 fn both(stage: &Stage, area: &Area<'_>) -> Drawn {
     area.fill(&WHITE)?;
-    let views: [(&str, fn(DVec3) -> [f64; 2]); 2] = [
+    type Flat = fn(DVec3) -> [f64; 2];
+    let views: [(&str, Flat); 2] = [
         ("from above (x to the right, y up)", |p| [p.x, p.y]),
         ("from the side (x to the right, z up)", |p| [p.x, p.z]),
     ];

@@ -172,7 +172,7 @@ impl Refine {
             let corrections = params[poses].gather_rows(frames);
             let turns = rotation_exp(&corrections.slice_axis(1, ..3));
             directions = (turns * directions.reshape(&[count, 1, 3])).sum_over(-1);
-            origins = origins + corrections.slice_axis(1, 3..) * self.unit;
+            origins += corrections.slice_axis(1, 3..) * self.unit;
         }
         let mut moved = Rays::new();
         let lines = origins.value().as_slice().chunks_exact(3).zip(directions.value().as_slice().chunks_exact(3));
