@@ -66,7 +66,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// Puts the cameras of the photographs that the model was trained on where it has found them to be; says how many those are.
 fn refine(capture: &mut Capture, model: &Model<f32>) -> Result<usize> {
-    if model.refine.is_none() {
+    if model.poses.is_none() {
         return Ok(0);
     }
     let placement = model.extent.placement;

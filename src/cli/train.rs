@@ -9,7 +9,6 @@ use std::time::Duration;
 use clap::Parser;
 use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, Scope, Split};
-use raygrad::nerf::model::Refined;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
@@ -62,10 +61,6 @@ pub struct Args {
     /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
-    /// What of the cameras is corrected while the scene is trained, such as poses,focal,lens: where they were, how long their
-    /// focal length is, how their lens bends light
-    #[arg(long, value_name = "PARTS", value_delimiter = ',')]
-    refine: Vec<Refined>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -166,7 +161,6 @@ impl Args {
             };
             sampler.occupancy.skip.carving = carve;
         }
-        config = config.with_refined(&self.refine);
         if self.no_encoding {
             config = config.without_encoding();
         }

@@ -128,7 +128,8 @@ impl<T: Scalar> Term<T> for Evenness {
                 let (t, half) = (t.to_f64(), 0.5 * delta.to_f64());
                 // A sample may stand for an interval that ends beyond the span.
                 let [start, end] = [(t - half).max(0.0), t + half].map(|distance| self.place(distance, span));
-                middles.push(T::from_f64(0.5 * (start + end)));
+                // Intervals of any lengths may overlap; places rise.
+                middles.push(T::from_f64(self.place(t, span)));
                 lengths.push(T::from_f64(end - start));
             }
         }

@@ -2,12 +2,12 @@
 
 pub(crate) mod config;
 mod known;
-mod refine;
+mod poses;
 mod store;
 
 pub use config::{Config, GroupConfig, Preset};
-pub(crate) use refine::{FOCAL, LENS, POSES};
-pub use refine::{Refine, RefineConfig, Refined};
+pub(crate) use poses::POSES;
+pub use poses::Poses;
 
 use crate::Result;
 use crate::camera::pinhole::Camera;
@@ -80,8 +80,8 @@ pub struct Model<T: Scalar> {
     pub sampler: Box<dyn Sampler<T>>,
     /// What is minimised beside the loss of colours.
     pub terms: Vec<Arc<dyn Term<T>>>,
-    /// Corrections of the photographs' cameras, if some are learned.
-    pub refine: Option<Refine>,
+    /// Corrections of the photographs' poses, if they are learned.
+    pub poses: Option<Poses>,
     /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
     /// look like none in particular. Of a photograph that there is not, views panic.
     pub look: Option<u32>,
@@ -96,7 +96,7 @@ impl<T: Scalar> Clone for Model<T> {
             field: self.field.clone(),
             sampler: self.sampler.boxed(),
             terms: self.terms.clone(),
-            refine: self.refine.clone(),
+            poses: self.poses,
             look: self.look,
         }
     }
@@ -107,17 +107,8 @@ impl<T: Scalar> Model<T> {
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
-        Model::with_cameras(config, extent, &[], seed)
-    }
-
-    /// As [`new`](Self::new), of a model that knows the cameras that its photographs were taken by, in their order: what
-    /// one needs that learns [focal lengths or lenses](RefineConfig). One that learns nothing of them forgets them.
-    ///
-    /// # Errors
-    /// If the configuration is out of range, or there is not one camera for each photograph.
     #[inline(never)]
-    pub fn with_cameras(config: Config, extent: Extent, cameras: &[Camera], seed: u64) -> Result<Self> {
+    pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
         config.check()?;
         let space = Space { unbounded: config.unbounded, ..extent.space() };
         space.check()?;
@@ -127,8 +118,8 @@ impl<T: Scalar> Model<T> {
         let field = config.field.build(Site { space, frames, params: &mut params, name: "field", rng })?;
         let term = |term: &TermConfig| term.build(Site { space, frames, params: &mut params, name: "terms", rng });
         let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
-        let refine = Refine::new(config.poses.is_some(), &config.refine, frames, cameras, extent.unit, &mut params)?;
-        Ok(Model { config, extent, params, field, sampler, terms, refine, look: None })
+        let poses = config.poses.map(|_| Poses::new(frames, extent.unit, &mut params)).transpose()?;
+        Ok(Model { config, extent, params, field, sampler, terms, poses, look: None })
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -146,32 +137,13 @@ impl<T: Scalar> Model<T> {
         self.sampler.fields().into_iter().chain([&*self.field]).collect()
     }
 
-    /// The camera of the photograph of this number as the model has found it to be: as it was, unless something of it is
-    /// [learned](Refine).
+    /// The camera of the photograph of this number where the model has found it to be: where it was, unless poses are
+    /// [learned](Config::poses).
     ///
     /// # Panics
     /// If there is no such photograph.
     pub fn learned_camera(&self, number: usize, camera: &Camera) -> Camera {
-        self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.camera(&self.params, number, camera))
-    }
-
-    /// A camera that took none of the photographs and is given beside theirs, where the model would have it: see
-    /// [`Refine::other_camera`].
-    pub fn other_camera(&self, camera: &Camera) -> Camera {
-        self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.other_camera(&self.params, camera))
-    }
-
-    /// The cameras that the model was given, if it learns something of them and was told.
-    pub fn cameras(&self) -> &[Camera] {
-        self.refine.as_ref().map_or(&[], Refine::cameras)
-    }
-
-    /// Gives all fields that share of their detail, 0 to 1: see [`Field::with_detail`]. All parameters stay.
-    pub fn set_detail(&mut self, detail: f64) {
-        if let Some(field) = self.field.with_detail(detail) {
-            self.field = field;
-        }
-        self.sampler.set_detail(detail);
+        self.poses.map_or_else(|| camera.clone(), |poses| poses.camera(&self.params, number, camera))
     }
 
     /// The sampler, if it marches through an occupancy grid.
@@ -224,7 +196,7 @@ impl<T: Scalar> Model<T> {
     /// If the configuration is out of range, which that of a model in use is not.
     #[inline(never)]
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
-        let mut model = Model::with_cameras(self.config.clone(), self.extent, self.cameras(), 0)?;
+        let mut model = Model::new(self.config.clone(), self.extent, 0)?;
         model.params.assign(&self.params);
         model.look = self.look;
         let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();

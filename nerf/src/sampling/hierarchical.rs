@@ -97,8 +97,4 @@ impl<T: Scalar> Sampler<T> for Hierarchical {
     fn fields(&self) -> Vec<&dyn Field<T>> {
         vec![&self.proposal]
     }
-
-    fn set_detail(&mut self, detail: f64) {
-        self.proposal = self.proposal.coarsened(detail);
-    }
 }
