@@ -464,6 +464,23 @@ fn codes_and_poses_are_trained_and_read_back() {
 }
 
 #[test]
+fn cameras_are_corrected_and_said_to_be() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    let runs = [("", "none", "none"), ("poses,focal,lens", "similarity of the training cameras", "as learned")];
+    let glass = ("focal", "focal length and lens as learned", "as learned");
+    for (i, (parts, test, train)) in runs.into_iter().chain([glass]).enumerate() {
+        let refine = if parts.is_empty() { String::new() } else { format!("--refine {parts}") };
+        place.succeeds(&format!("train scene --steps 2 --out run-{i} {small} {refine}"));
+        for (split, expected) in [("test", test), ("train", train)] {
+            place.succeeds(&format!("eval run-{i} --split {split}"));
+            let name = if split == "test" { "eval" } else { "eval-train" };
+            assert_eq!(place.json(&format!("run-{i}/{name}.json"))["cameras"], expected);
+        }
+    }
+}
+
+#[test]
 fn bad_arguments_are_usage_errors() {
     let place = Place::empty();
     let bad = [
@@ -477,6 +494,7 @@ fn bad_arguments_are_usage_errors() {
         ("train --threads 0", "0 is not in 1.."),
         ("train --preset huge", "use classic, small, instant or voxel"),
         ("train --background grey", "white, black or random"),
+        ("train --refine all", "use poses, focal or lens"),
         ("eval", "required arguments"),
         ("eval run --split all", "must be train, val or test"),
         ("eval run --views 0", "0 is not in 1.."),

@@ -220,13 +220,6 @@ fn poses_that_are_off_are_found_in_a_scene_that_is_known() {
     println!("poses: {before:?} to {after:?}, loss {first} to {last}");
     assert!(last < 0.5 * first, "{first} {last}");
     assert!(after[0] < 0.6 * before[0] && after[1] < 0.3 * before[1], "{before:?} {after:?}");
-    // A correction of 1 is a unit of the scene.
-    let mut model = trainer.model.clone();
-    let id = model.params.find("poses").unwrap();
-    model.params.get_mut(id).as_mut_slice().fill(0.0);
-    model.params.get_mut(id).as_mut_slice()[6 + 4] = 1.0;
-    let [still, moved] = [0, 1].map(|i| model.learned_camera(i, &right.frames[0].camera).pose.translation);
-    assert!((moved - still - model.extent.unit * DVec3::Y).length() < 1e-12 && model.extent.unit < 0.95);
     // Nothing is carved away that photographs show to be empty from where they were not.
     assert_eq!(Trainer::new(known.model.config.clone(), Arc::new(wrong.clone())).unwrap().stats().occupied, 1.0);
     let error = Model::<f32>::new(trainer.model.config.clone(), Extent { frames: 0, ..trainer.model.extent }, 0);
@@ -257,7 +250,7 @@ fn scene_and_poses_are_learned_together() {
             train(&mut Trainer::new(config, data.clone()).unwrap(), 400)
         };
         let fixed = loss(None);
-        let learned = loss(Some(Schedule::Exponential { from: 2e-3, to: 2e-5, warmup: 0.0 }));
+        let learned = loss(Some(Schedule::Exponential { from: 3e-3, to: 3e-5, warmup: 0.1 }));
         println!("{}: loss {fixed} with fixed poses, {learned} with learned ones", sampler.kind());
         assert!(learned < 0.7 * fixed, "{}: {learned} {fixed}", sampler.kind());
     }

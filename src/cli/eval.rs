@@ -7,7 +7,7 @@ use raygrad::nerf::dataset::{Dataset, Frame, Split, evenly_spaced};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result};
+use raygrad::nerf::{Background, Error, Evaluations, Image, Model, Picture, Result};
 use serde::Serialize;
 
 use super::output::{depth_colors, make_folder, numbered, other_numbered, print, remove};
@@ -79,6 +79,8 @@ struct Report {
     skip: Option<Skipping>,
     /// `f32`, or `f64` with nothing left out but empty cells.
     precision: Precision,
+    /// Where the cameras are: as the scene has them, or as the model has found out.
+    cameras: Alignment,
     /// Where in a pixel its ray passes: 0.5 is the centre.
     pixel_offset: f64,
     /// `none`: floating-point renders, clamped to 0..=1, are compared.
@@ -94,6 +96,45 @@ struct Report {
     color_per_pixel: f64,
     unskipped_per_pixel: f64,
     per_view: Vec<Score>,
+}
+
+/// From where views are rendered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+enum Alignment {
+    /// From where the scene has its cameras: the model has learned nothing of them.
+    #[serde(rename = "none")]
+    None,
+    /// From where the model has found the cameras of its photographs to be.
+    #[serde(rename = "as learned")]
+    Learned,
+    /// Focal length and lens are those that were found; poses are the scene's.
+    #[serde(rename = "focal length and lens as learned")]
+    Glass,
+    /// As well, and poses moved by the similarity that takes the training cameras from where they were given to where they
+    /// were found.
+    #[serde(rename = "similarity of the training cameras")]
+    Similarity,
+}
+
+impl Alignment {
+    /// Puts the cameras of the photographs where the model has them.
+    fn apply(model: &Model<f32>, split: Split, data: &mut Dataset) -> Self {
+        let Some(refine) = &model.refine else { return Alignment::None };
+        if split == Split::Train {
+            // Views may be some of all photographs, as they are chosen for reading.
+            let numbers = evenly_spaced((0..model.extent.frames).collect(), data.frames.len());
+            for (number, frame) in numbers.into_iter().zip(&mut data.frames) {
+                frame.camera = model.learned_camera(number, &frame.camera);
+            }
+            return Alignment::Learned;
+        }
+        data.frames.iter_mut().for_each(|frame| frame.camera = model.other_camera(&frame.camera));
+        match refine.placement(&model.params) {
+            Some(_) => Alignment::Similarity,
+            None if refine.has_poses() && refine.cameras().is_empty() => Alignment::None,
+            None => Alignment::Glass,
+        }
+    }
 }
 
 /// The result for one view.
@@ -113,7 +154,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let scene = run.scene(args.scene.as_ref())?;
     let opened = scene.open_for(&run.config.extent)?;
-    let data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
+    let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     if args.split != Split::Train
         && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
     {
@@ -123,6 +164,7 @@ pub fn run(args: &Args) -> Result<()> {
         );
         return Err(Error::setting("scene", what));
     }
+    let cameras = Alignment::apply(&model, args.split, &mut data);
     let name = args.name();
     let pictures = run.file(&name);
     make_folder(&pictures)?;
@@ -143,6 +185,7 @@ pub fn run(args: &Args) -> Result<()> {
         background: shown_background(background),
         skip,
         precision: args.precision,
+        cameras,
         pixel_offset: 0.5,
         quantisation: "none",
         psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),

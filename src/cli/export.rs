@@ -4,17 +4,15 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use raygrad::nerf::dataset::formats::transforms;
-use raygrad::nerf::dataset::scene::{test_cameras, train_cameras, val_cameras};
-use raygrad::nerf::dataset::{Capture, Format, Split, View};
-use raygrad::nerf::glam::DAffine3;
-use raygrad::nerf::{Camera, Error, Model, Result};
+use raygrad::nerf::dataset::{Capture, Split};
+use raygrad::nerf::{Error, Model, Result};
 
-use super::interrupt;
 use super::output::print;
 use super::prepare::convert::{Target, convert};
 use super::prepare::program::Stop;
 use super::run::Run;
-use super::scene::{EMBEDDED_SIZE, Scene};
+use super::scene::Scene;
+use super::{builtin, interrupt};
 
 /// Write the cameras of a run for other programs, as the run has refined them
 ///
@@ -41,11 +39,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
     let model = run.model()?;
     let mut capture = match run.scene(args.scene.as_ref())? {
-        Scene::Embedded => embedded(),
-        Scene::Landscape => {
-            return Err(Error::setting("scene", "the landscape has no files that cameras could be written for"));
-        }
         Scene::Folder(folder) => Capture::read(folder)?,
+        scene => builtin::capture(&scene, None, None)?,
     };
     let refined = refine(&mut capture, &model)?;
     let cameras = capture.views.len();
@@ -66,7 +61,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// Puts the cameras of the photographs that the model was trained on where it has found them to be; says how many those are.
 fn refine(capture: &mut Capture, model: &Model<f32>) -> Result<usize> {
-    if model.poses.is_none() {
+    if model.refine.is_none() {
         return Ok(0);
     }
     let placement = model.extent.placement;
@@ -104,37 +99,4 @@ fn write(mut capture: Capture, out: &Path) -> Result<()> {
     let folder = tempfile::tempdir_in(parent).map_err(bad)?;
     transforms::write(&capture, folder.path())?;
     std::fs::rename(folder.path().join("transforms.json"), out).map_err(bad)
-}
-
-/// The built-in scene as a capture without images.
-fn embedded() -> Capture {
-    let size = EMBEDDED_SIZE;
-    let splits = [
-        (Split::Train, train_cameras(60, size)),
-        (Split::Val, val_cameras(10, size)),
-        (Split::Test, test_cameras(20, size)),
-    ];
-    let view = |split: Split, number: usize, camera: Camera| View {
-        name: format!("{split}/{number}"),
-        field: format!("{split}/{number}"),
-        image: None,
-        camera,
-        split: Some(split),
-        mask: None,
-        depth: None,
-        sharpness: None,
-        bounds: None,
-    };
-    let views = splits.into_iter().flat_map(|(split, cameras)| {
-        cameras.into_iter().enumerate().map(move |(number, camera)| view(split, number, camera))
-    });
-    Capture {
-        folder: "embedded".into(),
-        file: "embedded".into(),
-        format: Format::Blender,
-        views: views.collect(),
-        points: vec![],
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    }
 }

@@ -5,6 +5,7 @@
 
 mod animation;
 mod bench;
+mod builtin;
 mod cameras;
 mod doctor;
 mod eval;

@@ -16,9 +16,10 @@ use clap::ValueEnum;
 use raygrad::nerf::dataset::Capture;
 use raygrad::nerf::{Error, Result};
 
-use super::interrupt;
 use super::output::{complain, print};
 use super::parse;
+use super::scene::Scene;
+use super::{builtin, doctor, interrupt};
 use convert::Target;
 use program::{Stop, Work};
 use workplace::Workplace;
@@ -32,7 +33,7 @@ const NAMED: usize = 8;
 /// must be installed. A dataset that has cameras already is converted with --to, --undistort or both.
 #[derive(clap::Args)]
 pub struct Args {
-    /// A video, a folder of photographs, or a dataset
+    /// A video, a folder of photographs, a dataset, or a scene that is built in: embedded or landscape
     input: PathBuf,
     /// Folder for the dataset, which must not exist yet or be empty
     #[arg(long, value_name = "DIR")]
@@ -50,6 +51,9 @@ pub struct Args {
     /// The lens that the photographs were taken with
     #[arg(long, value_enum, default_value_t, conflicts_with_all = ["to", "undistort"])]
     lens: Glass,
+    /// Width in pixels of the pictures of a built-in scene, embedded or landscape, which --to writes [default: 200 and 400]
+    #[arg(long, value_name = "PIXELS", value_parser = parse::count(8192), requires = "to")]
+    size: Option<usize>,
 }
 
 /// Kinds of lenses.
@@ -78,7 +82,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let done = match (args.to, args.undistort) {
         (None, false) => prepare(args),
         (to, undistort) => {
-            let capture = Capture::read(&args.input)?;
+            let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
+            let capture = match Scene::from(args.input.clone().into_os_string()) {
+                Scene::Folder(folder) => Capture::read(folder)?,
+                scene => builtin::capture(&scene, args.size, Some(pictures.path()))?,
+            };
             let to = to.unwrap_or_else(|| Target::of(capture.format));
             convert::convert(capture, to, undistort, &args.out)
         }
@@ -90,8 +98,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 pub fn finished(done: Work<()>, out: &Path) -> Result<ExitCode> {
     match done {
         Ok(()) => {
-            // A call of the doctor is to be added here: until then it is only named.
-            print(&format!("next     raygrad doctor {}\n", out.display()))?;
+            let out = out.display();
+            print(&format!(
+                "next     raygrad doctor {out}   to examine it\n         raygrad train {out}   to train on it\n"
+            ))?;
             Ok(ExitCode::SUCCESS)
         }
         Err(Stop::Interrupted) => Ok(interrupt::EXIT_CODE.into()),
@@ -102,6 +112,10 @@ pub fn finished(done: Work<()>, out: &Path) -> Result<ExitCode> {
 /// Of a video or photographs.
 fn prepare(args: &Args) -> Work<()> {
     let input = &args.input;
+    if !matches!(Scene::from(input.clone().into_os_string()), Scene::Folder(_)) {
+        let what = "is a scene that is built in: say with --to in which format to write it";
+        return Err(Error::file(input, what).into());
+    }
     if !input.exists() {
         return Err(Error::file(input, "there is no such file or folder").into());
     }
@@ -124,7 +138,13 @@ fn prepare(args: &Args) -> Work<()> {
     print(&format!("images   {count} {what} {}\n", input.display()))?;
     let found = poses::find(&place, is_video, args.lens.model())?;
     place.finish()?;
-    report(&found, count, &args.out)
+    report(&found, count, &args.out)?;
+    // The dataset is there whatever is found in it.
+    let (scene, out) = (Scene::Folder(args.out.clone()), args.out.join("doctor"));
+    if let Err(error) = doctor::run(&doctor::Args { scene, scope: None, out, json: false }) {
+        complain(&format!("warning: {error}"));
+    }
+    Ok(())
 }
 
 fn report(found: &poses::Found, count: usize, out: &Path) -> Work<()> {

@@ -16,6 +16,8 @@ const LONGEST: usize = 128;
 pub struct Preview {
     /// The photograph's name.
     pub name: String,
+    /// The number of the photograph, if it is trained on.
+    number: Option<usize>,
     camera: Camera,
     truth: Image,
     background: [f32; 3],
@@ -28,15 +30,15 @@ impl Preview {
         let held_out = scene.load(Split::Val, downscale, 1);
         let held_out = held_out.or_else(|error| scene.load(Split::Test, downscale, 1).map_err(|_| error));
         match held_out {
-            Ok(data) => Self::new(&data.frames[0], background),
+            Ok(data) => Self::new(&data.frames[0], None, background),
             Err(error) => {
                 complain(&format!("warning: previews show a training view, as there is no other: {error}"));
-                Self::new(&train.frames[0], background)
+                Self::new(&train.frames[0], Some(0), background)
             }
         }
     }
 
-    fn new(frame: &Frame, background: [f32; 3]) -> Self {
+    fn new(frame: &Frame, number: Option<usize>, background: [f32; 3]) -> Self {
         let factor = frame.image.width.max(frame.image.height).div_ceil(LONGEST);
         let truth = cropped_to_multiple(&frame.image.to_image(), factor).downscaled(factor).over(background);
         let scale = 1.0 / factor as f64;
@@ -48,12 +50,17 @@ impl Preview {
             centre: frame.camera.centre.map(|c| c * scale),
             ..frame.camera
         };
-        Preview { name: frame.name.clone(), camera, truth, background }
+        Preview { name: frame.name.clone(), number, camera, truth, background }
     }
 
     /// Writes what the model sees next to the photograph, and returns its PSNR in dB.
     pub fn save(&self, model: &Model<f32>, path: &Path) -> Result<f64> {
-        let color = model.view(&self.camera, self.background).color;
+        // Where the model has found the camera to be, if it looks for it.
+        let camera = match self.number {
+            Some(number) => model.learned_camera(number, &self.camera),
+            None => model.other_camera(&self.camera),
+        };
+        let color = model.view(&camera, self.background).color;
         Image::hconcat(&[&color, &self.truth]).save_png(path)?;
         Ok(psnr(&color, &self.truth))
     }
@@ -80,7 +87,7 @@ mod tests {
     #[test]
     fn a_preview_sees_what_the_photograph_saw() {
         let frame = &embedded(Split::Val, 300).frames[0];
-        let preview = Preview::new(frame, [1.0; 3]);
+        let preview = Preview::new(frame, None, [1.0; 3]);
         assert_eq!([preview.truth.width, preview.truth.height], [100, 100]);
         let (large, small) = (frame.camera.ray(30.0, 90.0), preview.camera.ray(10.0, 30.0));
         assert!(large.direction.distance(small.direction) < 1e-12);

@@ -6,7 +6,9 @@ use std::path::PathBuf;
 
 use std::sync::{Mutex, PoisonError};
 
-use raygrad::nerf::dataset::{Capture, Dataset, Reading, Scope, Split, Survey, embedded, evenly_spaced, landscape};
+use raygrad::nerf::dataset::{
+    Capture, Dataset, Frame, Reading, Scope, Split, Survey, embedded, evenly_spaced, landscape, landscape_distances,
+};
 use raygrad::nerf::{Error, Extent, Result};
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +18,7 @@ use super::progress::Progress;
 /// Width and height of the embedded scene's images in pixels.
 pub const EMBEDDED_SIZE: usize = 200;
 /// Width and height of the landscape's images in pixels.
-const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
+pub const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
 
 /// A folder of photographs, or a scene that needs none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -54,19 +56,19 @@ impl fmt::Display for Scene {
 impl Scene {
     /// What the scene's files say, and where it lies; `asked` overrules how far it goes.
     pub fn open(&self, asked: Option<Scope>) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None, asked }) };
+        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
         let capture = Capture::read(folder)?;
         let survey = capture.survey(asked)?;
-        Ok(Opened { scene: self.clone(), capture: Some((capture, survey)), asked })
+        Ok(Opened::new(self, Some((capture, survey)), asked))
     }
 
     /// The same, lying where a model has it.
     pub fn open_for(&self, extent: &Extent) -> Result<Opened> {
-        let Scene::Folder(folder) = self else { return Ok(Opened { scene: self.clone(), capture: None, asked: None }) };
+        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
         let Extent { placement, bounds, span: [near, far], .. } = *extent;
         let (scope, reason) = (Scope::Bounded, "as the model has it".to_owned());
         let survey = Survey { placement, scope, bounds, near, far, reason };
-        Ok(Opened { scene: self.clone(), capture: Some((Capture::read(folder)?, survey)), asked: None })
+        Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
     }
 
     /// The same scene, found from any working directory.
@@ -80,6 +82,8 @@ impl Scene {
 
 /// A scene whose files have been read, but for the photographs.
 pub struct Opened {
+    /// Whether depths that were measured are read with the photographs.
+    pub depth: bool,
     scene: Scene,
     /// What a folder holds.
     pub capture: Option<(Capture, Survey)>,
@@ -88,6 +92,10 @@ pub struct Opened {
 }
 
 impl Opened {
+    fn new(scene: &Scene, capture: Option<(Capture, Survey)>, asked: Option<Scope>) -> Self {
+        Opened { depth: false, scene: scene.clone(), capture, asked }
+    }
+
     /// At most `views` evenly spaced photographs of a split, at `1 / downscale` of their size. Warns of absent images.
     pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
         let data = match &self.capture {
@@ -95,7 +103,13 @@ impl Opened {
                 let data = match self.scene {
                     Scene::Landscape => {
                         divides(downscale, LANDSCAPE_SIZE)?;
-                        landscape(split, LANDSCAPE_SIZE[0] / downscale)
+                        let mut data = landscape(split, LANDSCAPE_SIZE[0] / downscale);
+                        if self.depth {
+                            let measure =
+                                |frame: &mut Frame| frame.distances = Some(landscape_distances(&frame.camera));
+                            data.frames.iter_mut().for_each(measure);
+                        }
+                        data
                     }
                     _ => {
                         divides(downscale, [EMBEDDED_SIZE; 2])?;
@@ -110,7 +124,7 @@ impl Opened {
                     let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
                     progress.set(done as f64 / total as f64, || format!("{done} of {total} {split} photographs read"));
                 };
-                capture.load(split, survey, &Reading { downscale, views, progress: &show })?
+                capture.load(split, survey, &Reading { downscale, views, distances: self.depth, progress: &show })?
             }
         };
         for name in &data.skipped {

@@ -9,9 +9,11 @@ use std::time::Duration;
 use clap::Parser;
 use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, Scope, Split};
+use raygrad::nerf::losses::DepthConfig;
+use raygrad::nerf::model::Refined;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, Trainer};
+use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, TermConfig, Trainer};
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
@@ -28,7 +30,7 @@ use super::{doctor, interrupt, parse};
 /// Ctrl-C finishes the step, saves the model and exits with code 130; a second Ctrl-C exits at once.
 #[derive(Parser)]
 pub struct Args {
-    /// Folder with transforms_train.json and its images, or a scene that is built in: embedded or landscape
+    /// Folder of a capture (transforms.json, Blender, COLMAP or LLFF), or a scene that is built in: embedded or landscape
     #[arg(default_value = "embedded")]
     scene: Scene,
     /// Kind of model: instant (a minute), voxel (no network), small (minutes) or classic (the paper's, hours)
@@ -61,6 +63,14 @@ pub struct Args {
     /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
+    /// What of the cameras is corrected while the scene is trained, such as poses,focal,lens: where they were, how long their
+    /// focal length is, how their lens bends light
+    #[arg(long, value_name = "PARTS", value_delimiter = ',')]
+    refine: Vec<Refined>,
+    /// Hold the scene to depths that were measured beside the photographs (depth_file_path in transforms.json), with that
+    /// weight in the loss
+    #[arg(long, value_name = "WEIGHT", num_args = 0..=1, default_missing_value = "0.1")]
+    depth: Option<f64>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -103,7 +113,8 @@ impl Trained {
 /// Trains and leaves the model in a new folder.
 pub fn run(args: &Args) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let scene = args.scene.open(args.scope)?;
+    let mut scene = args.scene.open(args.scope)?;
+    scene.depth = args.depth.is_some();
     let data = Arc::new(scene.load(Split::Train, args.downscale, usize::MAX)?);
     let config = args.config(&data)?;
     let background = config.background.shown();
@@ -160,6 +171,10 @@ impl Args {
                 return Err(Error::setting("carve", what));
             };
             sampler.occupancy.skip.carving = carve;
+        }
+        config = config.with_refined(&self.refine);
+        if let Some(weight) = self.depth {
+            config.terms.push(TermConfig::new(DepthConfig { weight }));
         }
         if self.no_encoding {
             config = config.without_encoding();

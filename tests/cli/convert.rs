@@ -329,3 +329,30 @@ fn the_fox_is_the_same_in_every_format() {
         assert!(10 * kept > 9 * before.camera.width * before.camera.height, "{:?}", view.camera);
     }
 }
+
+#[test]
+fn built_in_scenes_are_written_for_other_programs() {
+    let place = Place::empty();
+    for (scene, format, size, count) in
+        [("embedded", "nerfstudio", [24, 24], 90), ("landscape", "colmap", [16, 12], 130)]
+    {
+        place.succeeds(&format!("prepare {scene} --to {format} --size {} --out {scene}-made", size[0]));
+        let capture = Capture::read(place.path(&format!("{scene}-made"))).unwrap();
+        assert_eq!(capture.present().count(), count);
+        let view = capture.present().find(|view| view.name.ends_with("test/3.png")).unwrap();
+        let photo = Photo::open(view.image.as_ref().unwrap(), None).unwrap();
+        assert_eq!(([photo.width, photo.height], photo.has_alpha()), (size, scene == "embedded"));
+        let data = match scene {
+            "embedded" => raygrad::nerf::dataset::embedded(Split::Test, size[0]),
+            _ => raygrad::nerf::dataset::landscape(Split::Test, size[0]),
+        };
+        let (found, expected) = (view.camera_of_image().unwrap(), &data.frames[3].camera);
+        let [a, b] = [&found, expected].map(|camera| camera.ray(5.5, 3.5));
+        assert!(a.origin.distance(b.origin) < 1e-6 && a.direction.distance(b.direction) < 1e-7, "{found:?}");
+        place.succeeds(&format!("train {scene}-made --steps 1 --preset small --out run-{scene}"));
+    }
+    place.fails("prepare embedded --out other", &["embedded", "--to"]);
+    place.fails("prepare landscape --to colmap --size 15 --out other", &["`size`: 15"]);
+    place.fails("prepare absent --to colmap --size 16 --out other", &["absent: there is no such folder"]);
+    assert!(!place.path("other").exists());
+}

@@ -32,7 +32,7 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
         assert_eq!(before.2.pose, after.2.pose, "to the last bit");
     }
 
-    let learned = r#"--set poses={"constant":{"rate":0.01}}"#;
+    let learned = r#"--set poses={"constant":{"rate":0.001}}"#;
     place.succeeds(&format!("train scene --steps 8 --out run --scope unbounded {small} {learned}"));
     let said = place.succeeds("export run run/cameras.json");
     assert_eq!(said, "exported 11 cameras, 6 of them refined: run/cameras.json\n");

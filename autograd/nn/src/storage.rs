@@ -192,6 +192,17 @@ impl<T: Scalar> Params<T> {
     }
 }
 
+/// The bytes of this name that stand beside the parameters in a safetensors file, for what has to be known before there
+/// are parameters to read.
+///
+/// # Errors
+/// If it is no such file.
+pub fn stored_bytes(bytes: &[u8], name: &str) -> Result<Option<Vec<u8>>, ParamsError> {
+    let file = SafeTensors::deserialize(bytes)?;
+    let found = file.tensor(name).ok().filter(|view| view.dtype() == Dtype::U8);
+    Ok(found.map(|view| view.data().to_vec()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

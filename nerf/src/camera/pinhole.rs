@@ -2,6 +2,7 @@
 
 use crate::camera::lens::Lens;
 use glam::{DAffine3, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// A straight line `origin + t * direction`, `t >= 0`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,7 +25,8 @@ impl Ray {
 /// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates
 /// are continuous, with `(0, 0)` at the upper left corner of the image, so the centre of the pixel in column `i` and
 /// row `j` is `(i + 0.5, j + 0.5)`.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Camera {
     /// Image width in pixels.
     pub width: usize,

@@ -120,8 +120,8 @@ impl Dataset {
             }
         }
         if needed && !found {
-            let what = "one needs photographs with distances that were measured, and there are none; a program sets \
-                        `Frame::distances`";
+            let what = "one needs photographs with depths that were measured, and there are none: `depth_file_path` of \
+                        transforms.json names their files, and a program sets `Frame::distances`";
             return Err(Error::setting("terms", what));
         }
         Ok(())

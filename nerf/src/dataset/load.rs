@@ -1,6 +1,7 @@
 //! From a capture to photographs in memory.
 
 use super::capture::{Capture, Format, View};
+use super::depth::distances;
 use super::formats;
 use super::frames::{Dataset, Frame, Split, evenly_spaced};
 use super::mask::Mask;
@@ -34,13 +35,16 @@ pub struct Reading<'a> {
     pub downscale: usize,
     /// How many of them are read at most, [evenly spaced](evenly_spaced).
     pub views: usize,
+    /// Whether [distances](Frame::distances) are read too, of the photographs that have a [file of depths](View::depth):
+    /// four bytes a pixel.
+    pub distances: bool,
     /// Is told how many are read, of how many; from several threads.
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
 }
 
 impl Default for Reading<'_> {
     fn default() -> Self {
-        Reading { downscale: 1, views: usize::MAX, progress: &|_, _| {} }
+        Reading { downscale: 1, views: usize::MAX, distances: false, progress: &|_, _| {} }
     }
 }
 
@@ -166,7 +170,7 @@ impl Capture {
         let frames: Vec<Result<Frame>> = plans
             .par_iter()
             .map(|plan| {
-                let frame = plan.frame(&survey.placement, &lit);
+                let frame = plan.frame(&survey.placement, &lit, reading.distances);
                 (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
                 self.named(plan.view, frame)
             })
@@ -207,7 +211,7 @@ impl<'a> Plan<'a> {
         Ok(Plan { view, path, size, to })
     }
 
-    fn frame(&self, placement: &Placement, lit: &Lit) -> Result<Frame> {
+    fn frame(&self, placement: &Placement, lit: &Lit, is_measured: bool) -> Result<Frame> {
         let Plan { view, path, size, to } = self;
         let photo = Photo::open(path, Some(*size))?;
         let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };
@@ -222,7 +226,10 @@ impl<'a> Plan<'a> {
         if mask.as_ref().is_some_and(|mask| mask.used() == 0) {
             return Err(Error::file(path, "shows nothing: all of its pixels are masked, or not reached by light"));
         }
-        Ok(Frame { name: view.name.clone(), camera: placement.camera(&camera), image, mask, distances: None })
+        let camera = placement.camera(&camera);
+        let measured = view.depth.as_ref().filter(|_| is_measured);
+        let distances = measured.map(|(path, unit)| distances(path, unit * placement.scale, &camera)).transpose()?;
+        Ok(Frame { name: view.name.clone(), camera, image, mask, distances })
     }
 }
 

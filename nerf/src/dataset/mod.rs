@@ -7,6 +7,7 @@ pub mod background;
 pub(crate) mod batch;
 pub mod capture;
 pub(crate) mod color_space;
+mod depth;
 mod embedded;
 pub mod formats;
 mod frames;

@@ -2,7 +2,7 @@
 
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
-use glam::{DAffine3, DMat3, DVec3};
+use glam::{DAffine3, DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 /// The map from a capture's own coordinates, which its files have, to those of the scene, which models are trained in:
@@ -26,6 +26,33 @@ impl Default for Placement {
 }
 
 impl Placement {
+    /// The similarity that takes `from` nearest to `to`, point by point: with the least sum of squared distances (Umeyama
+    /// 1991; the rotation as a quaternion, Horn 1987). `None` if there are fewer than three points, not as many of each, or
+    /// they are all in a line, about which anything can turn.
+    pub fn between(from: &[DVec3], to: &[DVec3]) -> Option<Self> {
+        if from.len() < 3 || from.len() != to.len() {
+            return None;
+        }
+        let mean = |points: &[DVec3]| points.iter().sum::<DVec3>() / points.len() as f64;
+        let (origin, middle) = (mean(from), mean(to));
+        let pairs = || from.iter().zip(to).map(|(a, b)| (*a - origin, *b - middle));
+        // Row i, column j: the sum of products of coordinate i of `from` and j of `to`.
+        let s: [[f64; 3]; 3] =
+            std::array::from_fn(|i| std::array::from_fn(|j| pairs().map(|(a, b)| a[i] * b[j]).sum()));
+        let [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = s;
+        let ([most, second], [w, x, y, z]) = leading([
+            [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+            [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+            [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+            [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+        ]);
+        let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        let size: f64 = pairs().map(|(a, _)| a.length_squared()).sum();
+        let scale = pairs().map(|(a, b)| b.dot(rotation * a)).sum::<f64>() / size;
+        let found = Placement { rotation, scale, origin: origin - rotation.transpose() * middle / scale };
+        (most - second > 1e-6 * most && found.check().is_ok()).then_some(found)
+    }
+
     /// Whether the numbers are usable.
     ///
     /// # Errors
@@ -64,10 +91,78 @@ impl Placement {
     }
 }
 
+/// The two largest eigenvalues of a symmetric matrix and the eigenvector of the first, by Jacobi's rotations.
+fn leading(mut a: [[f64; 4]; 4]) -> ([f64; 2], [f64; 4]) {
+    /// Sweeps: each squares what is left beside the diagonal.
+    const SWEEPS: usize = 30;
+    let mut vectors: [[f64; 4]; 4] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
+    for _ in 0..SWEEPS {
+        for (p, q) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
+            if a[p][q] == 0.0 {
+                continue;
+            }
+            let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+            let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
+            let cos = 1.0 / t.hypot(1.0);
+            let sin = t * cos;
+            let turn =
+                |row: &mut [f64; 4]| (row[p], row[q]) = (cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]);
+            a.iter_mut().for_each(turn);
+            vectors.iter_mut().for_each(turn);
+            for k in 0..4 {
+                (a[p][k], a[q][k]) = (cos * a[p][k] - sin * a[q][k], sin * a[p][k] + cos * a[q][k]);
+            }
+        }
+    }
+    let mut order = [0, 1, 2, 3];
+    order.sort_by(|&i, &j| a[j][j].total_cmp(&a[i][i]));
+    ([a[order[0]][order[0]], a[order[1]][order[1]]], vectors.map(|row| row[order[0]]))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DQuat;
+
+    #[test]
+    fn a_similarity_is_found_again_among_points_that_are_not_in_a_line() {
+        let rotation = DMat3::from_quat(DQuat::from_rotation_y(2.9) * DQuat::from_rotation_z(-1.0));
+        let truth = Placement { rotation, scale: 0.3, origin: DVec3::new(1.0, 2.0, -30.0) };
+        // In a plane, as cameras around an object are, and everywhere.
+        for height in [0.0, 1.0] {
+            let point = |i: usize| {
+                let angle = i as f64;
+                truth.origin + 3.0 * DVec3::new(angle.cos(), angle.sin(), height * (3.0 * angle).sin())
+            };
+            let from: Vec<DVec3> = (0..9).map(point).collect();
+            let mut to: Vec<DVec3> = from.iter().map(|&point| truth.point(point)).collect();
+            let found = Placement::between(&from, &to).unwrap();
+            assert!(from.iter().zip(&to).all(|(a, b)| found.point(*a).distance(*b) < 1e-12), "{found:?}");
+            assert!((found.scale - 0.3).abs() < 1e-12 && found.rotation.abs_diff_eq(rotation, 1e-12));
+            // Of points that no similarity fits, the least squares: no small change is better.
+            to.iter_mut().enumerate().for_each(|(i, point)| point.x += 0.1 * (5.0 * i as f64).cos());
+            let error = |placement: &Placement| -> f64 {
+                from.iter().zip(&to).map(|(a, b)| placement.point(*a).distance_squared(*b)).sum()
+            };
+            let found = Placement::between(&from, &to).unwrap();
+            for sign in [-1e-4, 1e-4] {
+                let turn = |axis| DMat3::from_axis_angle(axis, sign);
+                let turned = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| found.rotation * turn(axis));
+                let others = turned.map(|rotation| {
+                    let middle = from.iter().sum::<DVec3>() / 9.0;
+                    let origin = middle - rotation.transpose() * found.point(middle) / found.scale;
+                    Placement { rotation, origin, ..found }
+                });
+                assert!(others.iter().all(|other| error(other) > error(&found)), "turned");
+                assert!(error(&Placement { scale: found.scale * (1.0 + sign), ..found }) > error(&found), "grown");
+                let origin = found.origin + DVec3::splat(sign);
+                assert!(error(&Placement { origin, ..found }) > error(&found), "moved");
+            }
+            assert!(Placement::between(&from[..2], &to[..2]).is_none());
+            assert!(Placement::between(&from, &to[1..]).is_none());
+        }
+        let line: Vec<DVec3> = (0..5).map(|i| DVec3::new(1.0, 2.0, 0.5) * f64::from(i)).collect();
+        assert!(Placement::between(&line, &line).is_none());
+    }
 
     #[test]
     fn cameras_see_the_same_in_either_coordinates() {

@@ -36,6 +36,10 @@ const NEAR_SHARE: f64 = 0.05;
 const FAR_SIDES: f64 = 1000.0;
 /// Half of the box of an unbounded scene, as a share of the cameras' distance from its middle.
 const INNER_SHARE: f64 = 0.5;
+/// Where cameras look about nothing in common and nothing says how far they see: how much farther than they stand apart.
+const AHEAD: f64 = 5.0;
+/// The same where they look all around.
+const AROUND: f64 = 3.0;
 /// Times that the middle is found, the last ones without what is far off.
 const ROUNDS: usize = 8;
 
@@ -75,7 +79,9 @@ impl Survey {
             (None, false) => (Scope::Unbounded, "photographs are opaque, so they show what lies behind"),
         };
         let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
-        let middle = if depths.len() == cameras.len() { ahead(&cameras, &depths) } else { middle(&cameras) };
+        let points = trusted(&capture.points);
+        let Layout { middle, inner, looks } = Layout::new(&cameras, &depths, &points);
+        let reason = if asked.is_none() { format!("{reason}; {looks}") } else { reason.to_owned() };
         let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if !(distance > 1e-9 * (1.0 + middle.length())) {
             let what = "all cameras stand in one place: nothing in the scene has a size";
@@ -83,7 +89,7 @@ impl Survey {
         }
         let half = match scope {
             Scope::Bounded => half_width(&cameras, middle),
-            Scope::Unbounded => INNER_SHARE * distance,
+            Scope::Unbounded => inner,
         };
         let placement = Placement { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
         let bounds = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
@@ -96,13 +102,13 @@ impl Survey {
             }
             Scope::Unbounded => {
                 let given = depths.iter().map(|[near, _]| *near).reduce(f64::min);
-                let near = given.or_else(|| nearest_point(&cameras, &capture.points));
+                let near = given.or_else(|| nearest_point(&cameras, &points));
                 let near = near.map_or(NEAR_SHARE * distance, |near| 0.5 * near);
                 [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
             }
         };
         let [near, far] = [near, far].map(|length| length * placement.scale);
-        Ok(Survey { placement, scope, bounds, near, far, reason: reason.to_owned() })
+        Ok(Survey { placement, scope, bounds, near, far, reason })
     }
 }
 
@@ -123,9 +129,42 @@ fn conventional(cameras: &[&Camera]) -> bool {
     })
 }
 
-/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. Where they do
-/// not look at one place, as in a room, the middle of the cameras themselves.
-fn middle(cameras: &[&Camera]) -> DVec3 {
+/// Where a scene lies for cameras that look at it, ahead or around.
+struct Layout {
+    middle: DVec3,
+    /// Half of the box of an unbounded scene.
+    inner: f64,
+    /// How cameras look, in a few words.
+    looks: &'static str,
+}
+
+impl Layout {
+    /// `depths` are the nearest and farthest that each camera sees, if all are known, and `points` some of what they see.
+    fn new(cameras: &[&Camera], depths: &[[f64; 2]], points: &[DVec3]) -> Self {
+        let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
+        if depths.len() == cameras.len() {
+            let middle = ahead(cameras, depths);
+            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "depths say where it lies" };
+        }
+        if let Some(middle) = middle(cameras) {
+            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look at one place" };
+        }
+        let count = cameras.len() as f64;
+        let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
+        let forward = cameras.iter().map(|camera| -camera.pose.matrix3.z_axis).sum::<DVec3>() / count;
+        let spread = distances(mean);
+        let seen = (points.len() >= FEWEST).then(|| median(points.iter().map(|point| point.distance(mean))));
+        if forward.length() > 0.8 {
+            let middle = mean + seen.unwrap_or(AHEAD * spread) * forward.normalize();
+            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look the same way" };
+        }
+        Layout { middle: mean, inner: seen.unwrap_or(AROUND * spread).max(spread), looks: "cameras look around" }
+    }
+}
+
+/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. `None` where
+/// they do not look at one place, as in a room or along a wall.
+fn middle(cameras: &[&Camera]) -> Option<DVec3> {
     let count = cameras.len() as f64;
     let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
     let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
@@ -149,7 +188,7 @@ fn middle(cameras: &[&Camera]) -> DVec3 {
     }
     let ahead = |camera: &&&Camera| (found - camera.pose.translation).dot(-camera.pose.matrix3.z_axis) > 0.0;
     let most = 4 * cameras.iter().filter(ahead).count() > 3 * cameras.len();
-    if most && found.is_finite() && found.distance(mean) < 100.0 * spread { found } else { mean }
+    (most && found.is_finite() && found.distance(mean) < 100.0 * spread).then_some(found)
 }
 
 /// What is left of a vector without its part along a camera's optical axis.
@@ -203,20 +242,25 @@ fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
     }))
 }
 
-/// The distance of the nearest points from the cameras that see them; `None` if there are too few to trust.
-fn nearest_point(cameras: &[&Camera], points: &[Point]) -> Option<f64> {
+/// Cameras and points that are asked: more would say the same.
+const ASKED: [usize; 2] = [64, 20_000];
+/// Points that say something together.
+const FEWEST: usize = 100;
+
+/// Some of the points that can be trusted.
+fn trusted(points: &[Point]) -> Vec<DVec3> {
     /// Photographs that a point must be seen in, and pixels that it may be off.
     const TRUSTED: (u32, f64) = (3, 2.0);
-    const FEWEST: usize = 100;
-    /// Cameras and points that are asked: more would say the same.
-    const ASKED: [usize; 2] = [64, 20_000];
     // Some files do not say in how many photographs a point is seen.
     let trusted = |p: &&Point| (p.views == 0 || p.views >= TRUSTED.0) && !(p.error > TRUSTED.1);
-    let trusted: Vec<DVec3> = points.iter().filter(trusted).map(|p| p.position).collect();
+    evenly_spaced(points.iter().filter(trusted).map(|p| p.position).collect(), ASKED[1])
+}
+
+/// The distance of the nearest points from the cameras that see them; `None` if there are too few to trust.
+fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
     if trusted.len() < FEWEST {
         return None;
     }
-    let trusted = evenly_spaced(trusted, ASKED[1]);
     let nearest = |camera: &&Camera| {
         let inside = |p: &&DVec3| {
             camera.pixel_of(**p).is_some_and(|[x, y]| {

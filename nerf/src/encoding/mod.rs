@@ -1,8 +1,10 @@
 //! Encodings: what networks see in place of bare coordinates.
 
+mod detail;
 pub mod hash_grid;
 pub(crate) mod sinusoids;
 pub(crate) mod spherical;
 
+pub use detail::detail_weights;
 pub use sinusoids::PositionalEncoding;
 pub use spherical::SphericalHarmonics;

@@ -1,15 +1,19 @@
 //! The network of the NeRF paper.
 
 use super::{Density, DensityActivation, Field, Fields, Seen};
+use crate::encoding::detail_weights;
 use crate::encoding::sinusoids::PositionalEncoding;
 use crate::kind::{Kind, Site};
 use crate::range::{check_parameters, check_range};
 use crate::space::cube::Space;
 use crate::{Error, Result};
-use raygrad_autograd::{Activation, Scalar, Var};
+use raygrad_autograd::{Activation, Scalar, Tensor, Var};
 use raygrad_nn::{Bound, Init, Linear, Mlp};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
+
+/// Frequencies that are there from the start where detail comes in: they tell halves of the box apart.
+const FIRST_LEVELS: usize = 2;
 
 /// Size and shape of a [`Classic`] field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -83,6 +87,8 @@ pub struct Classic {
     feature: Linear,
     view: Linear,
     color: Linear,
+    /// The weight of each frequency of positions, if they are not all 1.
+    weights: Option<Arc<[f64]>>,
 }
 
 impl Classic {
@@ -108,7 +114,15 @@ impl Classic {
             feature: layer("feature", [width, width], Activation::Identity, Init::Glorot),
             view: layer("view", [width + directions, view_width], Activation::Relu, Init::He),
             color: layer("color", [view_width, 3], Activation::Identity, Init::Glorot),
+            weights: None,
         })
+    }
+
+    /// The same field with that share of the frequencies of positions, 0 to 1, the lowest first: see [`detail_weights`].
+    #[must_use]
+    pub fn coarsened(&self, detail: f64) -> Self {
+        let weights = detail_weights(detail, self.config.position_levels, FIRST_LEVELS).map(Into::into);
+        Classic { weights, ..self.clone() }
     }
 
     #[track_caller]
@@ -119,7 +133,14 @@ impl Classic {
 
 impl<T: Scalar> Field<T> for Classic {
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
-        let encoding = self.sinusoids(&self.space.centred(positions), self.config.position_levels);
+        let mut encoding = self.sinusoids(&self.space.centred(positions), self.config.position_levels);
+        if let Some(weights) = &self.weights {
+            // The bare coordinates come first, then sine and cosine of each for each frequency.
+            let row = Tensor::from_fn(&[3 + 6 * weights.len()], |i| {
+                T::from_f64(if i < 3 { 1.0 } else { weights[(i - 3) / 6] })
+            });
+            encoding *= positions.tape().constant(row);
+        }
         let features = self.trunk.forward(params, &encoding);
         let raw = self.density.forward(params, &features).reshape(&[positions.shape()[0]]);
         let value = self.config.density.apply(&raw);
@@ -132,5 +153,9 @@ impl<T: Scalar> Field<T> for Classic {
         let directions = self.sinusoids(seen.directions, self.config.direction_levels).segment_expand(seen.segments);
         let hidden = self.view.forward(params, &Var::concat(&[&feature, &directions], 1));
         self.color.forward(params, &hidden).sigmoid()
+    }
+
+    fn with_detail(&self, detail: f64) -> Option<Arc<dyn Field<T>>> {
+        Some(Arc::new(self.coarsened(detail)))
     }
 }

@@ -1,12 +1,17 @@
 //! A hash grid over a scene, with its table among the parameters.
 
 use crate::Result;
+use crate::encoding::detail_weights;
 use crate::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
 use crate::kind::Site;
 use crate::space::cube::Space;
 use rand::RngExt;
-use raygrad_autograd::{Scalar, Var};
+use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId};
+use std::sync::Arc;
+
+/// Levels that are there from the start where [detail](Grid::with_detail) comes in.
+const FIRST_LEVELS: usize = 3;
 
 /// What fields that look positions up in a table have in common.
 #[derive(Debug, Clone)]
@@ -14,6 +19,8 @@ pub struct Grid {
     grid: HashGrid,
     table: ParamId,
     space: Space,
+    /// The weight of each level, if they are not all 1.
+    weights: Option<Arc<[f64]>>,
 }
 
 impl Grid {
@@ -27,7 +34,14 @@ impl Grid {
         let name = format!("{}.table", site.name);
         let table = site.params.add(name.clone(), grid.init(site.rng.random()));
         site.params.set_lazy(|other| other == name, true);
-        Ok(Grid { grid, table, space: site.space })
+        Ok(Grid { grid, table, space: site.space, weights: None })
+    }
+
+    /// The same grid with that share of its levels, 0 to 1, the coarsest first: see [`detail_weights`].
+    #[must_use]
+    pub fn with_detail(&self, detail: f64) -> Self {
+        let weights = detail_weights(detail, self.grid.levels().len(), FIRST_LEVELS).map(Into::into);
+        Grid { weights, ..self.clone() }
     }
 
     /// Channels of an encoding.
@@ -48,6 +62,10 @@ impl Grid {
     /// The features at positions in scene units, `[samples, 3]` to `[samples, width]`.
     #[track_caller]
     pub fn encode<'t, T: Scalar>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
-        positions.tape().apply(HashEncoding(self.grid.clone()), &[&self.space.cube(positions), &params[self.table]])
+        let tape = positions.tape();
+        let features = tape.apply(HashEncoding(self.grid.clone()), &[&self.space.cube(positions), &params[self.table]]);
+        let Some(weights) = &self.weights else { return features };
+        let each = self.grid.features();
+        features * tape.constant(Tensor::from_fn(&[self.width()], |i| T::from_f64(weights[i / each])))
     }
 }

@@ -140,4 +140,8 @@ impl<T: Scalar> Field<T> for Instant {
         }
         hidden.sigmoid()
     }
+
+    fn with_detail(&self, detail: f64) -> Option<Arc<dyn Field<T>>> {
+        Some(Arc::new(Instant { grid: self.grid.with_detail(detail), ..self.clone() }))
+    }
 }

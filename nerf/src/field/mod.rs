@@ -63,6 +63,13 @@ pub trait Field<T: Scalar>: Any + Send + Sync {
 
     /// Colour `[samples, 3]` in 0..=1, for the features that [`density`](Self::density) gave, some rows of them or all.
     fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T>;
+
+    /// The same field, with the same parameters, as it is with that share of its detail, 0 to 1: while cameras are learned,
+    /// detail comes in [from coarse to fine](crate::model::RefineConfig::coarse). `None` for a field that has all of it at
+    /// once.
+    fn with_detail(&self, _detail: f64) -> Option<Arc<dyn Field<T>>> {
+        None
+    }
 }
 
 /// The family of fields.

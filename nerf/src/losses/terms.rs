@@ -15,7 +15,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DistortionConfig {
-    /// Its weight, 0 to 1e6: 0.001 to 0.01 is usual.
+    /// Its weight, 0 to 1e6: 0.001 to 0.01 is usual, and 0.1 in an unbounded scene.
     pub weight: f64,
 }
 

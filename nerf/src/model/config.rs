@@ -6,6 +6,7 @@ use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
 use crate::losses::photometric::Loss;
 use crate::losses::{DistortionConfig, TermConfig};
+use crate::model::refine::{FOCAL, LENS, POSES, RefineConfig, Refined, check_schedule};
 use crate::range::check_range;
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
@@ -31,6 +32,16 @@ const SAMPLES: usize = 4 * 24576;
 const CONE: f64 = 1.0 / 64.0;
 /// Weight of the distortion of rays through an unbounded scene, of which photographs show every place from few sides.
 const DISTORTION: f64 = 0.1;
+
+/// Learning rates of cameras, at the beginning of a run and at its end: radians that a photograph moves by, logarithms of
+/// focal lengths, coefficients of lenses.
+const POSE_RATE: [f64; 2] = [3e-3, 3e-5];
+const FOCAL_RATE: [f64; 2] = [5e-3, 5e-5];
+const LENS_RATE: [f64; 2] = [1e-3, 1e-5];
+/// The share of a run over which these rates rise from 0: before there is a scene, cameras drift.
+const CAMERA_WARMUP: f64 = 0.1;
+/// The share of a run in which poses are learned over which detail comes in.
+const COARSE: f64 = 0.4;
 
 /// A named configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -117,9 +128,17 @@ pub struct Config {
     #[serde(default)]
     pub groups: Vec<GroupConfig>,
     /// The learning rate over the run of the photographs' poses, if they are to be learned: see
-    /// [`Poses`](crate::model::Poses). In the tests 2e-3 falling to 2e-5 finds poses that are half a degree off.
+    /// [`Refine`](crate::model::Refine).
     #[serde(default)]
     pub poses: Option<Schedule>,
+    /// What else is learned of cameras, and how.
+    #[serde(default)]
+    pub refine: RefineConfig,
+    /// Samples nearer to their camera than this, in units of the [extent](crate::Extent::unit), learn less, by the square of
+    /// their distance: they lie closer than others in front of each camera, and what they learn shows in one photograph alone
+    /// (Philip and Deschaintre 2023, "Floaters No More", equation 6). 0 for none.
+    #[serde(default)]
+    pub near_gradients: f64,
     /// What photographs with alpha are composited over.
     pub background: Background,
     /// Seed of everything random.
@@ -147,6 +166,8 @@ impl Config {
             table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
             groups: vec![],
             poses: None,
+            refine: RefineConfig::default(),
+            near_gradients: 0.0,
             background: Background::White,
             seed: 0,
             storage: Storage::Full,
@@ -241,6 +262,30 @@ impl Config {
         self
     }
 
+    /// The same with these parts of the cameras learned, at rates that were found with the embedded scene
+    /// (`examples/refine.rs`); while poses are, detail comes in from coarse to fine.
+    pub fn with_refined(mut self, parts: &[Refined]) -> Self {
+        let rate = |from: f64, to: f64| Some(Schedule::Exponential { from, to, warmup: CAMERA_WARMUP });
+        for part in parts {
+            match part {
+                Refined::Poses => (self.poses, self.refine.coarse) = (rate(POSE_RATE[0], POSE_RATE[1]), COARSE),
+                Refined::Focal => self.refine.focal = rate(FOCAL_RATE[0], FOCAL_RATE[1]),
+                Refined::Lens => self.refine.lens = rate(LENS_RATE[0], LENS_RATE[1]),
+            }
+        }
+        self
+    }
+
+    /// The learning rate of the parameter of this name, if it is one of a camera.
+    pub(crate) fn camera_rate(&self, name: &str) -> Option<Schedule> {
+        match name {
+            POSES => self.poses,
+            FOCAL => self.refine.focal,
+            LENS => self.refine.lens,
+            _ => None,
+        }
+    }
+
     /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves another sampler alone).
     pub fn with_skip(mut self, skip: Skip) -> Self {
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
@@ -271,11 +316,9 @@ impl Config {
         for (part, checked) in checked {
             checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
         }
-        if let Some(schedule) = self.poses {
-            schedule
-                .check()
-                .map_err(|error| Error::setting(format!("poses.{}.{}", schedule.name(), error.name), error.what))?;
-        }
+        check_schedule(POSES, self.poses)?;
+        self.refine.check()?;
+        check_range("near_gradients", self.near_gradients, 0.0, 1e6)?;
         for group in &self.groups {
             let parts = [group.schedule.check(), group.adam.check()];
             for checked in parts {

@@ -1,18 +1,19 @@
 //! A model: a field, where it is sampled, and its parameters.
 
 pub(crate) mod config;
+mod extent;
 mod known;
-mod poses;
+mod refine;
 mod store;
 
 pub use config::{Config, GroupConfig, Preset};
-pub(crate) use poses::POSES;
-pub use poses::Poses;
+pub use extent::Extent;
+pub(crate) use refine::{FOCAL, LENS, POSES};
+pub use refine::{Refine, RefineConfig, Refined};
 
 use crate::Result;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::{Rays, Samples};
-use crate::dataset::Placement;
 use crate::field::Field;
 use crate::kind::Site;
 use crate::losses::{Term, TermConfig};
@@ -27,44 +28,8 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Pool, Scalar, Tape, Tensor, Var};
 use raygrad_nn::{Bound, Params};
-use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::sync::Arc;
-
-/// The scene's extent and what it was photographed with, stored with the model.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Extent {
-    /// Lower and upper corner of the box that holds the scene.
-    pub bounds: [DVec3; 2],
-    /// Distances along a ray between which it is sampled.
-    pub span: [f64; 2],
-    /// The length that the field measures its densities by, in scene units: see [`Space::unit`].
-    #[serde(default = "one")]
-    pub unit: f64,
-    /// How many photographs the model is fitted to; 0 if that is not known.
-    #[serde(default)]
-    pub frames: usize,
-    /// From the coordinates of the photographs' files to those of the scene.
-    #[serde(default)]
-    pub placement: Placement,
-}
-
-fn one() -> f64 {
-    1.0
-}
-
-impl Extent {
-    /// Of a new model.
-    pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
-        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0, placement: Placement::default() }
-    }
-
-    /// The map to the unit cube, for a scene within its box.
-    pub fn space(&self) -> Space {
-        Space { unit: self.unit, ..Space::within(self.bounds) }
-    }
-}
 
 /// A field with its sampler and parameters.
 pub struct Model<T: Scalar> {
@@ -80,8 +45,8 @@ pub struct Model<T: Scalar> {
     pub sampler: Box<dyn Sampler<T>>,
     /// What is minimised beside the loss of colours.
     pub terms: Vec<Arc<dyn Term<T>>>,
-    /// Corrections of the photographs' poses, if they are learned.
-    pub poses: Option<Poses>,
+    /// Corrections of the photographs' cameras, if some are learned.
+    pub refine: Option<Refine>,
     /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
     /// look like none in particular. Of a photograph that there is not, views panic.
     pub look: Option<u32>,
@@ -96,7 +61,7 @@ impl<T: Scalar> Clone for Model<T> {
             field: self.field.clone(),
             sampler: self.sampler.boxed(),
             terms: self.terms.clone(),
-            poses: self.poses,
+            refine: self.refine.clone(),
             look: self.look,
         }
     }
@@ -107,8 +72,17 @@ impl<T: Scalar> Model<T> {
     ///
     /// # Errors
     /// If the configuration is out of range.
-    #[inline(never)]
     pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
+        Model::with_cameras(config, extent, &[], seed)
+    }
+
+    /// As [`new`](Self::new), of a model that knows the cameras that its photographs were taken by, in their order: what
+    /// one needs that learns [focal lengths or lenses](RefineConfig). One that learns nothing of them forgets them.
+    ///
+    /// # Errors
+    /// If the configuration is out of range, or there is not one camera for each photograph.
+    #[inline(never)]
+    pub fn with_cameras(config: Config, extent: Extent, cameras: &[Camera], seed: u64) -> Result<Self> {
         config.check()?;
         let space = Space { unbounded: config.unbounded, ..extent.space() };
         space.check()?;
@@ -118,8 +92,8 @@ impl<T: Scalar> Model<T> {
         let field = config.field.build(Site { space, frames, params: &mut params, name: "field", rng })?;
         let term = |term: &TermConfig| term.build(Site { space, frames, params: &mut params, name: "terms", rng });
         let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
-        let poses = config.poses.map(|_| Poses::new(frames, extent.unit, &mut params)).transpose()?;
-        Ok(Model { config, extent, params, field, sampler, terms, poses, look: None })
+        let refine = Refine::new(config.poses.is_some(), &config.refine, &extent, cameras, &mut params)?;
+        Ok(Model { config, extent, params, field, sampler, terms, refine, look: None })
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -137,13 +111,32 @@ impl<T: Scalar> Model<T> {
         self.sampler.fields().into_iter().chain([&*self.field]).collect()
     }
 
-    /// The camera of the photograph of this number where the model has found it to be: where it was, unless poses are
-    /// [learned](Config::poses).
+    /// The camera of the photograph of this number as the model has found it to be: as it was, unless something of it is
+    /// [learned](Refine).
     ///
     /// # Panics
     /// If there is no such photograph.
     pub fn learned_camera(&self, number: usize, camera: &Camera) -> Camera {
-        self.poses.map_or_else(|| camera.clone(), |poses| poses.camera(&self.params, number, camera))
+        self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.camera(&self.params, number, camera))
+    }
+
+    /// A camera that took none of the photographs and is given beside theirs, where the model would have it: see
+    /// [`Refine::other_camera`].
+    pub fn other_camera(&self, camera: &Camera) -> Camera {
+        self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.other_camera(&self.params, camera))
+    }
+
+    /// The cameras that the model was given, if it learns something of them and was told.
+    pub fn cameras(&self) -> &[Camera] {
+        self.refine.as_ref().map_or(&[], Refine::cameras)
+    }
+
+    /// Gives all fields that share of their detail, 0 to 1: see [`Field::with_detail`]. All parameters stay.
+    pub fn set_detail(&mut self, detail: f64) {
+        if let Some(field) = self.field.with_detail(detail) {
+            self.field = field;
+        }
+        self.sampler.set_detail(detail);
     }
 
     /// The sampler, if it marches through an occupancy grid.
@@ -196,7 +189,7 @@ impl<T: Scalar> Model<T> {
     /// If the configuration is out of range, which that of a model in use is not.
     #[inline(never)]
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
-        let mut model = Model::new(self.config.clone(), self.extent, 0)?;
+        let mut model = Model::with_cameras(self.config.clone(), self.extent, self.cameras(), 0)?;
         model.params.assign(&self.params);
         model.look = self.look;
         let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();

@@ -2,8 +2,10 @@
 
 use super::config::Config;
 use super::{Extent, Model};
+use crate::camera::Camera;
 use crate::files::write_atomic;
 use crate::{Error, Result};
+use raygrad_nn::stored_bytes;
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -15,9 +17,13 @@ impl Model<f32> {
     /// If the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let metadata = HashMap::from([("format".into(), "raygrad".into())]);
+        let mut blobs = self.sampler.state();
+        if !self.cameras().is_empty() {
+            blobs.push((CAMERAS, serde_json::to_vec(self.cameras()).map_err(|error| Error::file(&path, error))?));
+        }
         let bytes = self
             .params
-            .to_safetensors(self.config.storage, metadata, &self.sampler.state())
+            .to_safetensors(self.config.storage, metadata, &blobs)
             .map_err(|error| Error::file(&path, error))?;
         write_atomic(path, &bytes)
     }
@@ -28,7 +34,10 @@ impl Model<f32> {
     /// If the file cannot be read or belongs to a model of another configuration.
     pub fn load(path: impl AsRef<Path>, config: Config, extent: Extent) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
-        let mut model = Model::new(config, extent, 0)?;
+        // How many parameters there are depends on the cameras.
+        let stored = stored_bytes(&bytes, CAMERAS).map_err(|error| Error::file(&path, error))?;
+        let cameras = cameras(stored.as_deref()).map_err(|error| Error::file(&path, error))?;
+        let mut model = Model::with_cameras(config, extent, &cameras, 0)?;
         let state = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
         model.sampler.load_state(&state).map_err(|error| Error::file(&path, error))?;
         // A look at the field is not to stand beside the file.
@@ -36,6 +45,23 @@ impl Model<f32> {
         model.finish();
         Ok(model)
     }
+}
+
+/// The name of the cameras that the photographs were taken by, in files of models that learn something of them.
+const CAMERAS: &str = "cameras";
+
+/// The cameras in the file of a model, as they are stored, if they are.
+fn cameras(stored: Option<&[u8]>) -> Result<Vec<Camera>> {
+    let wrong = |what: String| Error::setting(CAMERAS, what);
+    let Some(stored) = stored else { return Ok(vec![]) };
+    let cameras: Vec<Camera> = serde_json::from_slice(stored).map_err(|error| wrong(error.to_string()))?;
+    for camera in &cameras {
+        camera.lens.check()?;
+        if !(camera.focal.iter().all(|focal| *focal > 0.0) && camera.width > 0 && camera.height > 0) {
+            return Err(wrong(format!("{camera:?} is none")));
+        }
+    }
+    Ok(cameras)
 }
 
 #[cfg(test)]

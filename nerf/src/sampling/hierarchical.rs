@@ -97,4 +97,8 @@ impl<T: Scalar> Sampler<T> for Hierarchical {
     fn fields(&self) -> Vec<&dyn Field<T>> {
         vec![&self.proposal]
     }
+
+    fn set_detail(&mut self, detail: f64) {
+        self.proposal = self.proposal.coarsened(detail);
+    }
 }

@@ -156,6 +156,9 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
         vec![]
     }
 
+    /// Gives fields of the sampler's own that share of their detail: see [`Field::with_detail`].
+    fn set_detail(&mut self, _detail: f64) {}
+
     /// Learns from the photographs what can be known before the first step.
     fn prepare(&mut self, _data: &Dataset) {}
 

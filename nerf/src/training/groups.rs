@@ -1,10 +1,13 @@
 //! Groups of parameters, each with an optimiser, a schedule and a decay of its own.
 
-use crate::model::POSES;
 use crate::model::config::{Config, GroupConfig};
+use crate::model::{FOCAL, LENS, POSES};
 use crate::{Error, Result};
 use raygrad_autograd::Gradient;
 use raygrad_nn::{AdamW, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
+
+/// Parameters of cameras, each of which has a learning rate of its own.
+const CAMERAS: [&str; 3] = [POSES, FOCAL, LENS];
 
 /// One group.
 struct Group {
@@ -14,7 +17,7 @@ struct Group {
     schedule: Schedule,
 }
 
-/// All groups: a parameter belongs to the first that its name fits, and else to that of the poses, if it is these, to the
+/// All groups: a parameter belongs to the first that its name fits, and else to one of its own, if it is of cameras, to the
 /// tables, if only rows of it are moved, or to the rest.
 pub(crate) struct Groups(Vec<Group>);
 
@@ -25,17 +28,14 @@ impl Groups {
     /// If a group of the configuration has no parameter.
     pub fn new(config: &Config, params: &Params<f32>) -> Result<Self> {
         let rest = |adam, schedule| GroupConfig { params: String::new(), adam, schedule, decay: 0.0 };
-        let poses = rest(config.adam, config.poses.unwrap_or(config.schedule));
-        let others = [poses, rest(config.table_adam, config.schedule), rest(config.adam, config.schedule)];
-        let settings: Vec<_> = config.groups.iter().cloned().chain(others).collect();
+        let cameras = CAMERAS.map(|name| rest(config.adam, config.camera_rate(name).unwrap_or(config.schedule)));
+        let others = [rest(config.table_adam, config.schedule), rest(config.adam, config.schedule)];
+        let settings: Vec<_> = config.groups.iter().cloned().chain(cameras).chain(others).collect();
         let named = config.groups.len();
         let place = |name: &str, lazy: bool| {
             let fits = |group: &GroupConfig| name.starts_with(&group.params);
-            let other = match (name, lazy) {
-                (POSES, _) if config.poses.is_some() => 0,
-                (_, true) => 1,
-                (_, false) => 2,
-            };
+            let camera = CAMERAS.iter().position(|camera| *camera == name && config.camera_rate(name).is_some());
+            let other = camera.unwrap_or(CAMERAS.len() + usize::from(!lazy));
             config.groups.iter().position(fits).unwrap_or(named + other)
         };
         let places: Vec<usize> = params.ids().map(|id| place(params.name(id), params.is_lazy(id))).collect();

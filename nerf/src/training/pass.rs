@@ -57,10 +57,12 @@ pub(crate) fn rays_loss<'t>(
 ) -> (Var<'t, f32>, Work) {
     let (tape, sampler) = (params.tape(), &*model.sampler);
     let slopes = model.terms.iter().any(|term| term.reads_normals());
+    let seen = (&batch.frames[..], &batch.pixels[..]);
     let moved =
-        model.poses.map(|poses| poses.rays(params, &batch.rays, &batch.frames, model.reach(), model.extent.span));
+        model.refine.as_ref().map(|refine| refine.rays(params, &batch.rays, seen, model.reach(), model.extent.span));
     let (vars, rays) = moved.as_ref().map_or((None, &batch.rays), |(vars, rays)| (Some(vars), rays));
-    let query = Query { frames: Some(&batch.frames), rays: vars, slopes, ..Query::new(&*model.field, params) };
+    let near = model.config.near_gradients * model.extent.unit;
+    let query = Query { frames: Some(&batch.frames), rays: vars, slopes, near, ..Query::new(&*model.field, params) };
     let rows = |values: &[[f32; 3]]| tape.pool().copy_of(&[values.len(), 3], values.as_flattened());
     let (target, background) = (rows(&batch.target), rows(&batch.background));
     let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, rays, Purpose::Training, jitter);

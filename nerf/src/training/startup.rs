@@ -1,6 +1,7 @@
 //! The start-up detector: a network can begin, or soon end, without density anywhere, and then never learns.
 
 use crate::Result;
+use crate::camera::Camera;
 use crate::field::Field;
 use crate::model::config::Config;
 use crate::model::{Extent, Model};
@@ -21,10 +22,15 @@ const COLLAPSES: u32 = 3;
 
 /// The first of the models with seeds `seed`, `seed + 1`, .. whose fields have a gradient to learn from, and how many
 /// were passed over.
-pub(crate) fn living_model(config: &Config, extent: Extent, seed: u64) -> Result<(Model<f32>, u32)> {
+pub(crate) fn living_model(
+    config: &Config,
+    extent: Extent,
+    cameras: &[Camera],
+    seed: u64,
+) -> Result<(Model<f32>, u32)> {
     let mut attempt = 0;
     loop {
-        let model = Model::new(config.clone(), extent, seed.wrapping_add(attempt.into()))?;
+        let model = Model::with_cameras(config.clone(), extent, cameras, seed.wrapping_add(attempt.into()))?;
         let alive = model.fields().iter().all(|field| alive_share(&model, *field) > ALIVE);
         if alive || attempt + 1 == ATTEMPTS {
             return Ok((model, attempt));

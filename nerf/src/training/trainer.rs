@@ -4,6 +4,7 @@ use super::groups::Groups;
 use super::pass::{Work, rays_loss};
 use super::startup;
 use super::stats::{Budget, StepStats};
+use crate::camera::Camera;
 use crate::dataset::batch::Batch;
 use crate::dataset::{Dataset, Scope};
 use crate::model::config::Config;
@@ -75,7 +76,8 @@ impl Trainer {
             placement: data.placement,
             ..Extent::new(data.bounds, [data.near, data.far])
         };
-        let (model, restarts) = startup::living_model(&config, extent, config.seed)?;
+        let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
+        let (model, restarts) = startup::living_model(&config, extent, &cameras, config.seed)?;
         data.check_reach(model.reach())?;
         data.check_distances(model.terms.iter().any(|term| term.reads_distances()))?;
         let mut trainer = Trainer {
@@ -100,8 +102,8 @@ impl Trainer {
     /// Lets the sampler learn from the photographs. That is training too.
     fn prepare(&mut self) {
         let start = (self.clock)();
-        // Not from poses that are to be corrected: what is carved away never comes back.
-        if self.model.poses.is_none() {
+        // Not from cameras that are to be corrected: what is carved away never comes back.
+        if self.model.refine.is_none() {
             self.model.sampler.prepare(&self.data);
         }
         self.count_occupied();
@@ -147,6 +149,9 @@ impl Trainer {
         let number = self.done.step + 1;
         // A restart draws other rays too.
         let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
+        if self.model.config.refine.coarse > 0.0 {
+            self.model.set_detail(self.model.config.refine.detail(fraction));
+        }
         // Of a model that began again, from its own beginning.
         self.update_sampler(&Progress { step: self.groups.steps() + 1, fraction, seed });
         let tile = match self.model.sampler.load() {
@@ -222,7 +227,7 @@ impl Trainer {
         self.done.restarts += 1;
         self.collapses += 1;
         let seed = config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
-        if let Ok((mut model, _)) = startup::living_model(&config, self.model.extent, seed) {
+        if let Ok((mut model, _)) = startup::living_model(&config, self.model.extent, self.model.cameras(), seed) {
             // What was loaded and frozen is not thrown away, and rates are not forgotten.
             model.params.inherit(&self.model.params);
             self.model = model;

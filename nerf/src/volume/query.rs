@@ -27,12 +27,15 @@ pub struct Query<'a, 't, T: Scalar> {
     pub rays: Option<&'a RayVars<'t, T>>,
     /// Whether positions are variables of the tape although rays are not: what normals need.
     pub slopes: bool,
+    /// The distance within which samples learn less, by the square of theirs, in scene units; 0 for none. See
+    /// [`Config::near_gradients`](crate::Config::near_gradients).
+    pub near: f64,
 }
 
 impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     /// Of a field, along rays of which nothing is known.
     pub fn new(field: &'a dyn Field<T>, params: &'a Bound<'t, T>) -> Self {
-        Query { field, params, frames: None, rays: None, slopes: false }
+        Query { field, params, frames: None, rays: None, slopes: false, near: 0.0 }
     }
 
     /// The same of another field.
@@ -70,7 +73,20 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     /// The density at samples.
     #[track_caller]
     pub fn density(&self, samples: &Samples<T>) -> Density<'t, T> {
-        self.field.density(self.params, &self.positions(samples))
+        let density = self.field.density(self.params, &self.positions(samples));
+        match self.less(samples) {
+            Some(shares) => Density { value: with_slopes(density.value, &shares), ..density },
+            None => density,
+        }
+    }
+
+    /// What part of its gradient each sample learns from, `[samples]`, if any learns less.
+    fn less(&self, samples: &Samples<T>) -> Option<Tensor<T>> {
+        let near = self.near;
+        if !self.tape().is_recording() || !samples.t.as_slice().iter().any(|t| t.to_f64() < near) {
+            return None;
+        }
+        Some(samples.t.map(|t| T::from_f64((t.to_f64() / near).powi(2).min(1.0))))
     }
 
     /// The density at samples in 1 / scene unit, `[samples]`, as numbers.
@@ -84,6 +100,33 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     pub fn color(&self, features: &Var<'t, T>, samples: &Samples<T>) -> Var<'t, T> {
         let directions = &self.directions(samples);
         let seen = Seen { directions, segments: &samples.segments, frames: self.frames };
-        self.field.color(self.params, features, &seen)
+        let color = self.field.color(self.params, features, &seen);
+        match self.less(samples) {
+            Some(shares) => with_slopes(color, &shares.reshape(&[samples.len(), 1])),
+            None => color,
+        }
+    }
+}
+
+/// The same values with that part of their gradients.
+fn with_slopes<'t, T: Scalar>(x: Var<'t, T>, shares: &Tensor<T>) -> Var<'t, T> {
+    // What is added is 0.
+    let moved = (&x - x.detach()) * x.tape().constant(shares.clone());
+    x.detach() + moved
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_autograd::Tape;
+
+    #[test]
+    fn gradients_are_less_by_their_shares_and_values_stay() {
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from([[1.0, 2.0], [0.1, -1e300], [7.0, 0.0]]));
+        let y = with_slopes(x.clone(), &Tensor::from_vec(&[3, 1], vec![0.25, 0.0, 1.0]));
+        assert_eq!(y.value(), x.value());
+        let grads = (y * 2.0).sum().grad(&[&x]);
+        assert_eq!(grads[0].as_slice(), [0.5, 0.5, 0.0, 0.0, 2.0, 2.0]);
     }
 }

@@ -27,16 +27,16 @@ use stage::Stage;
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder of photographs with poses, in any format that can be trained on
-    scene: Scene,
+    pub scene: Scene,
     /// How far the scene goes: bounded or unbounded [default: found out from the photographs]
     #[arg(long)]
-    scope: Option<Scope>,
+    pub scope: Option<Scope>,
     /// Folder for the picture and the page; files of the same names are replaced
     #[arg(long, value_name = "DIR", default_value = "doctor")]
-    out: PathBuf,
+    pub out: PathBuf,
     /// Print facts and findings as JSON in place of a table
     #[arg(long)]
-    json: bool,
+    pub json: bool,
 }
 
 /// Examines, writes the files and prints the result.

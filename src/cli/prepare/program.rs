@@ -66,8 +66,8 @@ impl Program {
     }
 
     /// Runs it to its end and tells every line that it says. If it fails, its last lines are shown; if there is a Ctrl-C, it
-    /// is ended.
-    pub fn run(&self, command: &mut Command, mut line: impl FnMut(&str)) -> Work<()> {
+    /// is ended. One that says the words of `excuse` has not failed, whatever its exit code.
+    pub fn run(&self, command: &mut Command, excuse: Option<&str>, mut line: impl FnMut(&str)) -> Work<()> {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|e| self.unusable(&e))?;
         let (sender, lines) = mpsc::channel();
@@ -79,10 +79,12 @@ impl Program {
         }
         drop(sender);
         let mut kept = VecDeque::new();
+        let mut excused = false;
         loop {
             match lines.recv_timeout(INTERVAL) {
                 Ok(said) => {
                     line(&said);
+                    excused |= excuse.is_some_and(|words| said.contains(words));
                     kept.push_back(said);
                     if kept.len() > KEPT {
                         kept.pop_front();
@@ -101,7 +103,7 @@ impl Program {
         if interrupt::requested() {
             return Err(Stop::Interrupted);
         }
-        if status.success() {
+        if status.success() || excused {
             return Ok(());
         }
         for line in &kept {

@@ -43,7 +43,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     command.arg(video).arg("-map").arg("0:v:0").arg("-vf").arg(format!("fps={rate:.6}"));
     // The best JPEG there is: 1 is taken only where the least is 1 too.
     command.args(["-qmin", "1", "-q:v", "1"]).arg(folder.join("%06d.jpg"));
-    FFMPEG.run(&mut command, |line| {
+    FFMPEG.run(&mut command, None, |line| {
         let Some(frame) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
         progress.set(frame / wanted, || format!("{frame} of about {wanted:.0} frames taken from the video"));
     })?;

@@ -5,8 +5,9 @@ use raygrad_autograd::{Scalar, Var, record};
 #[cfg(feature = "check")]
 use raygrad_autograd::{Tensor, check::Entry};
 
-/// Places `[.., 2]` of directions `[.., 3]`, of any length, through a lens of the kind of `lens` with the coefficients `[n]`,
-/// in the order of [`Lens::coefficients`]: [`Lens::project`] with variables. The axes are those of [`Lens`].
+/// Places `[.., 2]` of directions `[.., 3]`, of any length, through a lens of the kind of `lens` with the coefficients `[n]`
+/// or, for each direction its own, `[.., n]`, in the order of [`Lens::coefficients`]: [`Lens::project`] with variables. The
+/// axes are those of [`Lens`].
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -26,9 +27,9 @@ use raygrad_autograd::{Tensor, check::Entry};
 pub fn lens_places<'t, T: Scalar>(lens: &Lens, coefficients: &Var<'t, T>, directions: &Var<'t, T>) -> Var<'t, T> {
     assert_eq!(directions.shape().last(), Some(&3), "directions of three elements");
     let count = lens.coefficients().len();
-    assert_eq!(coefficients.shape(), [count], "coefficients of {lens:?}");
+    assert_eq!(coefficients.shape().last(), Some(&count), "coefficients of {lens:?}");
     let inputs = (0..3).map(|i| directions.slice_axis(-1, i..i + 1));
-    let inputs: Vec<_> = inputs.chain((0..count).map(|i| coefficients.slice_axis(0, i..i + 1))).collect();
+    let inputs: Vec<_> = inputs.chain((0..count).map(|i| coefficients.slice_axis(-1, i..i + 1))).collect();
     let places = match count {
         0 => places_of::<T, 3>(lens, &inputs),
         1 => places_of::<T, 4>(lens, &inputs),

@@ -11,7 +11,7 @@ mod lens;
 mod limits;
 pub mod llff;
 mod matrix;
-mod npy;
+pub(super) mod npy;
 mod paths;
 mod ply;
 pub(crate) mod rigid;

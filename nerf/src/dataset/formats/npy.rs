@@ -4,7 +4,7 @@ use super::limits::start;
 
 /// A matrix, row by row.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Matrix {
+pub(in crate::dataset) struct Matrix {
     /// Number of rows.
     pub rows: usize,
     /// Number of columns.
@@ -13,7 +13,8 @@ pub(super) struct Matrix {
     pub values: Vec<f64>,
 }
 
-const MAGIC: &[u8] = b"\x93NUMPY";
+/// How a file begins.
+pub(in crate::dataset) const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// What a file that is no npy file is told.
 const BROKEN: &str = "is not a whole npy file: was it copied completely?";

@@ -96,7 +96,7 @@ fn cameras_follow_their_images_to_any_size_and_into_the_scene() {
     let survey = capture.survey(None).unwrap();
     let seen = Mutex::new(vec![]);
     let progress = |done: usize, total: usize| seen.lock().unwrap().push((done, total));
-    let reading = Reading { downscale: 5, views: 3, progress: &progress };
+    let reading = Reading { downscale: 5, views: 3, progress: &progress, ..Reading::default() };
     let data = capture.load(Split::Train, &survey, &reading).unwrap();
     assert_eq!((data.frames.len(), &data.skipped[..]), (3, &["images/02.png".to_owned()][..]));
     let frame = &data.frames[0];

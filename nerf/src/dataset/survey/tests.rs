@@ -70,6 +70,41 @@ fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
     let survey = Survey::new(&capture(Format::Transforms, outwards.to_vec()), false, None).unwrap();
     assert!(survey.placement.origin.distance(mean) < 1e-9, "{}", survey.placement.origin);
     assert!(survey.placement.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
+    assert!(survey.reason.ends_with("; cameras look around"), "{}", survey.reason);
+    // What they see is thought to be three times as far as they stand apart, unless points say where.
+    let spread = median(outwards.iter().map(|camera| camera.pose.translation.distance(mean)));
+    let half = |survey: &Survey| 1.5 / survey.placement.scale;
+    assert!((half(&survey) - 3.0 * spread).abs() < 1e-9, "{}", half(&survey));
+    let mut room = capture(Format::Colmap, outwards.to_vec());
+    let wall = |i: usize| mean + 7.0 * DVec3::new((i as f64).cos(), (i as f64).sin(), 0.0);
+    room.points = (0..150).map(|i| Point { position: wall(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    assert!((half(&Survey::new(&room, false, None).unwrap()) - 7.0).abs() < 1e-9);
+    // Points in between the cameras do not make the box smaller than their own.
+    room.points.iter_mut().for_each(|point| point.position = mean + 1e-3 * point.position);
+    assert!((half(&Survey::new(&room, false, None).unwrap()) - spread).abs() < 1e-9);
+}
+
+#[test]
+fn what_cameras_that_look_the_same_way_show_lies_ahead() {
+    let wall = (0..5).map(|i| {
+        let eye = DVec3::new(0.1 * f64::from(i), 0.05 * f64::from(i % 2), 0.0);
+        camera(eye, eye + DVec3::Y, DVec3::Z)
+    });
+    let mut wall = capture(Format::Colmap, wall.collect());
+    let mean = wall.views.iter().map(|view| view.camera.pose.translation).sum::<DVec3>() / 5.0;
+    let spread = median(wall.views.iter().map(|view| view.camera.pose.translation.distance(mean)));
+    let survey = Survey::new(&wall, false, None).unwrap();
+    assert!(survey.placement.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", survey.placement.origin);
+    assert!(survey.reason.ends_with("; cameras look the same way"), "{}", survey.reason);
+    let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
+    wall.points = (0..150).map(|i| Point { position: place(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    let survey = Survey::new(&wall, false, None).unwrap();
+    assert!(survey.placement.origin.distance(mean + 3.98 * DVec3::Y) < 0.01, "{}", survey.placement.origin);
+    assert!((1.5 / survey.placement.scale - 1.99).abs() < 0.03, "half of the distance");
+    // Ninety-nine points are too few.
+    wall.points.truncate(99);
+    let few = Survey::new(&wall, false, None).unwrap();
+    assert!(few.placement.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9);
 }
 
 #[test]

@@ -1,0 +1,107 @@
+//! Depths that were measured beside photographs, and the distances along rays that follow from them.
+
+use super::formats::npy;
+use super::image::Image;
+use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
+use image::DynamicImage;
+use std::path::Path;
+
+/// Reads a file of depths along the optical axis, a PNG of integers or a `.npy` array of floats, in units of which each has
+/// the length `unit` in those of the scene: the distance along the ray through the centre of each of the camera's pixels, in
+/// scene units, and 0 where nothing was measured. Depths of another size are looked up and never averaged: halfway between
+/// what is near and what is behind it there is nothing.
+pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
+    let wrong = |what: String| Error::file(path, what);
+    let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
+    let ([width, height], depths): (_, Vec<f64>) = if bytes.starts_with(npy::MAGIC) {
+        let npy::Matrix { rows, columns, values } = npy::Matrix::read(&bytes).map_err(wrong)?;
+        ([columns, rows], values)
+    } else {
+        let decoded = image::load_from_memory(&bytes).map_err(|error| wrong(format!("cannot be decoded: {error}")))?;
+        let size = [decoded.width() as usize, decoded.height() as usize];
+        let values = match decoded {
+            DynamicImage::ImageLuma8(image) => image.into_raw().into_iter().map(f64::from).collect(),
+            DynamicImage::ImageLuma16(image) => image.into_raw().into_iter().map(f64::from).collect(),
+            _ => return Err(wrong("has colours: depths are one channel of 8 or 16 bits, or a .npy array".into())),
+        };
+        (size, values)
+    };
+    let Camera { width: columns, height: rows, .. } = *camera;
+    // Up to the rounding of a side.
+    let apart = 2 * (width * rows).abs_diff(height * columns);
+    if width == 0 || height == 0 || apart > width.max(height).max(rows).max(columns) {
+        return Err(wrong(format!(
+            "has {width}x{height} depths, and its photograph {columns}x{rows} pixels: they must have one shape"
+        )));
+    }
+    let axis = -camera.pose.matrix3.z_axis;
+    let mut out = Image::new(columns, rows, 1);
+    for (i, distance) in out.data.iter_mut().enumerate() {
+        let (x, y) = (i % columns, i / columns);
+        let at = |i: usize, of: usize, count: usize| ((2 * i + 1) * count / (2 * of)).min(count - 1);
+        let depth = unit * depths[at(y, rows, height) * width + at(x, columns, width)];
+        let ray = camera.ray(x as f64 + 0.5, y as f64 + 0.5);
+        let found = depth / ray.direction.dot(axis);
+        *distance = if depth > 0.0 && found > 0.0 && found <= f64::from(f32::MAX) { found as f32 } else { 0.0 };
+    }
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DAffine3, DVec3};
+    use image::{ImageBuffer, Luma, Rgb};
+
+    #[test]
+    fn depths_become_distances_along_rays_and_are_never_averaged() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("depth.png");
+        // Twice as large as the photograph: 0 is not known.
+        let values = [0_u16, 1000, 2000, 3000, 4000, 5000, 6000, 65535];
+        let picture = ImageBuffer::<Luma<u16>, _>::from_fn(8, 4, |x, y| Luma([values[((x + 8 * y) / 4) as usize]]));
+        picture.save(&path).unwrap();
+        let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
+        let camera = Camera::from_angle(4, 2, 1.0, pose);
+        let found = distances(&path, 0.002, &camera).unwrap();
+        assert_eq!([found.width, found.height, found.channels], [4, 2, 1]);
+        for (i, distance) in found.data.iter().enumerate() {
+            let (x, y) = (i % 4, i / 4);
+            let depth = 0.002 * f64::from(values[(2 * x + 1 + 8 * (2 * y + 1)) / 4]);
+            let place = camera.ray(x as f64 + 0.5, y as f64 + 0.5).at(f64::from(*distance));
+            let along = -(DAffine3::from(camera.pose).inverse().transform_point3(place)).z;
+            assert!((along - depth).abs() < 1e-5 && (*distance == 0.0) == (depth == 0.0), "{i}: {along} {depth}");
+        }
+    }
+
+    #[test]
+    fn arrays_of_floats_are_read_and_what_is_no_depth_is_not_known() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("depth.npy");
+        let values = vec![1.0, f64::NAN, -1.0, f64::INFINITY, 2.5, 1e300];
+        std::fs::write(&path, npy::Matrix { rows: 2, columns: 3, values }.write()).unwrap();
+        let camera = Camera::from_angle(3, 2, 0.1, DAffine3::IDENTITY);
+        let found = distances(&path, 2.0, &camera).unwrap();
+        assert!((found.data[0] - 2.0).abs() < 0.01 && (found.data[4] - 5.0).abs() < 0.02, "{found:?}");
+        assert_eq!([1, 2, 3, 5].map(|i| found.data[i]), [0.0; 4]);
+    }
+
+    #[test]
+    fn what_is_no_file_of_depths_is_an_error_that_names_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let camera = Camera::from_angle(3, 2, 0.1, DAffine3::IDENTITY);
+        let fails = |name: &str, expected: &str| {
+            let message = distances(&folder.path().join(name), 1.0, &camera).unwrap_err().to_string();
+            assert!(message.contains(name) && message.contains(expected), "{message}");
+        };
+        fails("absent.png", "");
+        std::fs::write(folder.path().join("broken.png"), b"x").unwrap();
+        fails("broken.png", "cannot be decoded");
+        ImageBuffer::<Rgb<u8>, _>::new(3, 2).save(folder.path().join("color.png")).unwrap();
+        fails("color.png", "has colours");
+        ImageBuffer::<Luma<u8>, _>::new(2, 3).save(folder.path().join("turned.png")).unwrap();
+        ImageBuffer::<Luma<u8>, _>::new(9, 3).save(folder.path().join("wide.png")).unwrap();
+        fails("wide.png", "has 9x3 depths, and its photograph 3x2 pixels");
+    }
+}

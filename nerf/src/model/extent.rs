@@ -1,0 +1,41 @@
+//! Where a scene is.
+
+use crate::dataset::Placement;
+use crate::space::cube::Space;
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+/// The scene's extent and what it was photographed with, stored with the model.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Extent {
+    /// Lower and upper corner of the box that holds the scene.
+    pub bounds: [DVec3; 2],
+    /// Distances along a ray between which it is sampled.
+    pub span: [f64; 2],
+    /// The length that the field measures its densities by, in scene units: see [`Space::unit`].
+    #[serde(default = "one")]
+    pub unit: f64,
+    /// How many photographs the model is fitted to; 0 if that is not known.
+    #[serde(default)]
+    pub frames: usize,
+    /// From the coordinates of the photographs' files to those of the scene.
+    #[serde(default)]
+    pub placement: Placement,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+impl Extent {
+    /// Of a new model.
+    pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
+        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0, placement: Placement::default() }
+    }
+
+    /// The map to the unit cube, for a scene within its box.
+    pub fn space(&self) -> Space {
+        Space { unit: self.unit, ..Space::within(self.bounds) }
+    }
+}

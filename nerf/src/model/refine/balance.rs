@@ -1,0 +1,176 @@
+//! Corrections of a pose that show alike in its photograph, and each on its own.
+//!
+//! A camera that turns to the left and one that moves there show nearly the same; an optimiser that takes numbers one by
+//! one walks along such a valley in very small steps. Numbers that are told apart by what they move make it round (Park et
+//! al. 2023, "CamP: Camera Preconditioning for Neural Radiance Fields", section 4; here with the factor of Cholesky in place
+//! of the square root, and the angles of directions in place of pixels, so that it serves every lens).
+
+use crate::camera::bounds::clip_span;
+use crate::camera::pinhole::Camera;
+use glam::DVec3;
+
+/// Numbers of a pose: a rotation vector and a translation.
+pub(super) const POSE: usize = 6;
+
+/// A matrix, row by row.
+pub(super) type Matrix = [[f64; POSE]; POSE];
+
+/// Pixels along each side of a photograph, and places along the ray through each, that are followed.
+const PLACES: [usize; 2] = [6, 3];
+/// What is added to the diagonal, as a part of it: how far a valley is widened at most.
+const DAMPING: f64 = 0.1;
+
+/// The matrix from six numbers to a rotation vector (radians, in the axes of the scene) about the camera's centre and a
+/// translation (scene units), upper triangular: 1 of any of the six moves what the camera sees of the box by about a radian,
+/// and no two of them alike.
+pub(super) fn balance(camera: &Camera, bounds: [DVec3; 2], span: [f64; 2], unit: f64) -> Matrix {
+    let [columns, depths] = PLACES;
+    let mut sum = [[0.0; POSE]; POSE];
+    let mut count = 0.0;
+    for i in 0..columns * columns {
+        let place = |i: usize, size: usize| (i as f64 + 0.5) / columns as f64 * size as f64;
+        let ray = camera.ray(place(i % columns, camera.width), place(i / columns, camera.height));
+        let [from, to] = clip_span(&ray, bounds, span);
+        for k in 0..depths {
+            let share = (k as f64 + 0.5) / depths as f64;
+            let t = from + share * (to - from);
+            if !(to > from && t.is_finite()) {
+                continue;
+            }
+            for row in slopes(ray.direction, t) {
+                (0..POSE).for_each(|a| (0..POSE).for_each(|b| sum[a][b] += row[a] * row[b]));
+            }
+            count += 1.0;
+        }
+    }
+    if count == 0.0 {
+        // It sees nothing of the box: as if from one unit away.
+        return std::array::from_fn(|a| {
+            std::array::from_fn(|b| {
+                if a != b {
+                    0.0
+                } else if a < 3 {
+                    1.0
+                } else {
+                    unit
+                }
+            })
+        });
+    }
+    for (a, row) in sum.iter_mut().enumerate() {
+        row.iter_mut().for_each(|x| *x /= count);
+        row[a] *= 1.0 + DAMPING;
+    }
+    inverse_transposed(&cholesky(&sum))
+}
+
+/// How the direction to a place at the distance `t` along a unit direction moves, seen from a camera that turns or moves:
+/// rows of three components, columns of six numbers.
+fn slopes(direction: DVec3, t: f64) -> [[f64; POSE]; 3] {
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+    let turned = axes.map(|axis| -axis.cross(direction));
+    let moved = axes.map(|axis| -(axis - direction * direction.dot(axis)) / t);
+    let columns = [turned[0], turned[1], turned[2], moved[0], moved[1], moved[2]];
+    std::array::from_fn(|i| std::array::from_fn(|k| columns[k][i]))
+}
+
+/// The lower triangle L of a symmetric positive matrix `L L^T`.
+fn cholesky(matrix: &Matrix) -> Matrix {
+    let mut lower = [[0.0; POSE]; POSE];
+    for i in 0..POSE {
+        for j in 0..=i {
+            let rest = matrix[i][j] - (0..j).map(|k| lower[i][k] * lower[j][k]).sum::<f64>();
+            lower[i][j] = if i == j { rest.sqrt() } else { rest / lower[j][j] };
+        }
+    }
+    lower
+}
+
+/// The inverse of the transpose of a lower triangle.
+fn inverse_transposed(lower: &Matrix) -> Matrix {
+    let mut out = [[0.0; POSE]; POSE];
+    for column in 0..POSE {
+        // Upper triangular: from the last row up.
+        for row in (0..=column).rev() {
+            let own = if row == column { 1.0 } else { 0.0 };
+            let rest = own - (row + 1..=column).map(|k| lower[k][row] * out[k][column]).sum::<f64>();
+            out[row][column] = rest / lower[row][row];
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::lens::Lens;
+    use glam::DAffine3;
+
+    const BOX: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
+
+    fn camera() -> Camera {
+        Camera::from_angle(40, 30, 0.8, Camera::look_at(DVec3::new(3.0, -1.0, 2.0), DVec3::ZERO, DVec3::Z))
+    }
+
+    #[test]
+    fn what_is_seen_moves_alike_for_each_number_and_not_together() {
+        for lens in [Lens::Pinhole, Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] }] {
+            let camera = Camera { lens, ..camera() };
+            let matrix = balance(&camera, BOX, [0.1, 9.0], 1.0);
+            let (mut seen, mut plain) = ([[0.0; POSE]; POSE], [[0.0; POSE]; POSE]);
+            let mut count = 0.0;
+            for i in 0..36 {
+                let ray = camera.ray((i % 6) as f64 * 40.0 / 6.0 + 3.3, (i / 6) as f64 * 5.0 + 2.5);
+                let [from, to] = clip_span(&ray, BOX, [0.1, 9.0]);
+                for k in [1.0, 3.0, 5.0] {
+                    if to > from {
+                        let rows = slopes(ray.direction, from + k / 6.0 * (to - from));
+                        for row in rows {
+                            let by: [f64; POSE] =
+                                std::array::from_fn(|b| (0..POSE).map(|a| row[a] * matrix[a][b]).sum());
+                            for (a, b) in (0..POSE).flat_map(|a| (0..POSE).map(move |b| (a, b))) {
+                                seen[a][b] += by[a] * by[b];
+                                plain[a][b] += row[a] * row[b];
+                            }
+                        }
+                        count += 1.0;
+                    }
+                }
+            }
+            let alike = |sums: &Matrix| {
+                let pairs = (0..POSE).flat_map(|a| (0..a).map(move |b| (a, b)));
+                pairs.map(|(a, b)| sums[a][b].abs() / (sums[a][a] * sums[b][b]).sqrt()).fold(0.0, f64::max)
+            };
+            assert!(alike(&plain) > 0.9 && alike(&seen) < 0.7, "{} {}", alike(&plain), alike(&seen));
+            for a in 0..POSE {
+                // Damping leaves what moves least behind.
+                assert!((0.1..1.0).contains(&(seen[a][a] / count)), "{seen:?}");
+                assert!((0..a).all(|b| matrix[a][b] == 0.0));
+            }
+        }
+    }
+
+    #[test]
+    fn slopes_are_those_of_differences() {
+        let (direction, t, step) = (DVec3::new(0.3, -0.5, 0.8).normalize(), 2.5, 1e-6);
+        let found = slopes(direction, t);
+        for k in 0..POSE {
+            let mut numbers = [0.0; POSE];
+            numbers[k] = step;
+            let [x, y, z, a, b, c] = numbers;
+            // The camera turns by that: what it sees turns back. It moves: what it sees moves back.
+            let turn = DAffine3::from(crate::camera::pose::Pose::from_vector([x, y, z], [0.0; 3])).matrix3;
+            let moved = (turn.transpose() * (t * direction - DVec3::new(a, b, c))).normalize();
+            for i in 0..3 {
+                assert!(((moved[i] - direction[i]) / step - found[i][k]).abs() < 1e-5, "{i} {k}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_camera_that_sees_nothing_is_turned_and_moved_as_it_is() {
+        let away = Camera::from_angle(4, 4, 0.5, Camera::look_at(DVec3::X * 5.0, DVec3::X * 9.0, DVec3::Z));
+        let matrix = balance(&away, BOX, [0.1, 9.0], 1.5);
+        assert!((0..POSE).all(|i| matrix[i][i] == if i < 3 { 1.0 } else { 1.5 }) && matrix[0][4] == 0.0);
+    }
+}

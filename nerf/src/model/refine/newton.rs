@@ -1,0 +1,137 @@
+//! The directions of pixels, differentiable by focal length and lens.
+//!
+//! The direction that belongs to a pixel is a root and no formula: the lens must put it at the pixel. It is found in
+//! numbers; then one step of Newton's method from it, recorded on the tape with the Jacobian as a constant, leaves it where
+//! it is and has its exact gradient, by the implicit function theorem.
+
+use crate::camera::lens::Lens;
+use crate::camera::lens_places;
+use crate::camera::pinhole::Camera;
+use glam::DVec3;
+use raygrad_autograd::{Dual, Scalar, Tape, Tensor, Var};
+use std::mem::{Discriminant, discriminant};
+
+/// Numbers that a lens is corrected by.
+pub(super) const CORRECTIONS: usize = 4;
+
+/// Below this determinant of its Jacobian a lens is so near to a fold that its inverse has no slope to speak of.
+const FOLDED: f64 = 1e-6;
+
+/// The coefficients of a lens that are corrected, by their number: `k1, k2, p1, p2`, and of a fisheye `k1, k2`; the others
+/// hardly show in photographs, and what does not show drifts.
+pub(super) fn corrected(lens: &Lens) -> &'static [usize] {
+    match lens {
+        Lens::Pinhole | Lens::Equirectangular => &[],
+        Lens::Brown { .. } => &[0, 1, 6, 7],
+        Lens::Fisheye { .. } => &[0, 1],
+        Lens::Fov { .. } => &[0],
+    }
+}
+
+/// The lens with numbers added to the coefficients that are [`corrected`].
+pub(super) fn with_corrections(lens: &Lens, added: [f64; CORRECTIONS]) -> Lens {
+    let mut coefficients = lens.coefficients();
+    corrected(lens).iter().zip(added).for_each(|(&i, x)| coefficients[i] += x);
+    lens.with_coefficients(&coefficients)
+}
+
+/// A pixel as its camera sees it now, and by how much the direction follows if the place that it is put at moves.
+struct Sight {
+    lens: Lens,
+    /// In units of the focal length that was given, from the principal point.
+    given: [f64; 2],
+    /// In units of the focal length that is found now.
+    place: [f64; 2],
+    /// In the axes of the [`Lens`].
+    local: DVec3,
+    /// In the axes of the scene, and so its slopes.
+    direction: DVec3,
+    slopes: [DVec3; 2],
+}
+
+impl Sight {
+    /// Of a continuous pixel position. `given` is the camera as it was, whose pose the result has; `now` has the focal
+    /// length and the lens that are found now.
+    fn new(given: &Camera, now: &Camera, [x, y]: [f64; 2]) -> Self {
+        let plane =
+            |camera: &Camera| [(x - camera.centre[0]) / camera.focal[0], (y - camera.centre[1]) / camera.focal[1]];
+        let (lens, place) = (now.lens, plane(now));
+        let found = lens.direction(place);
+        let local = found.unwrap_or_else(|| lens.nearest(place));
+        let slopes = found.and_then(|local| slopes(&lens, local)).unwrap_or([DVec3::ZERO; 2]);
+        let turned = |v: DVec3| given.pose.matrix3 * (v * DVec3::new(1.0, -1.0, -1.0));
+        Sight { lens, given: plane(given), place, local, direction: turned(local), slopes: slopes.map(turned) }
+    }
+}
+
+/// How the unit direction that is put at a place moves with the two coordinates of that; `None` where the lens folds.
+fn slopes(lens: &Lens, local: DVec3) -> Option<[DVec3; 2]> {
+    let (a, b) = local.any_orthonormal_pair();
+    let direction = [0, 1, 2].map(|i| Dual { value: local[i], slopes: [Some(a[i]), Some(b[i])] });
+    let coefficients: Vec<_> =
+        lens.coefficients().into_iter().map(|value| Dual { value, slopes: [None, None] }).collect();
+    let [[ua, ub], [va, vb]] =
+        lens.project(&coefficients, direction).map(|place| place.slopes.map(|slope| slope.unwrap_or(0.0)));
+    let determinant = ua * vb - ub * va;
+    let found = [(vb * a - va * b) / determinant, (ua * b - ub * a) / determinant];
+    (determinant.abs() > FOLDED && found.iter().all(|slope| slope.is_finite())).then_some(found)
+}
+
+/// Unit directions `[rays, 3]`, in the axes of the scene and before any turn of the cameras, of pixels.
+///
+/// Each ray has the camera as it was given, the same as it is found now, and the continuous position of its pixel. `focal`
+/// `[rays, 2]` are the logarithms of the factors by which focal lengths have grown, `lens` `[rays, 4]` what was added to
+/// the coefficients; what is `None` is not learned.
+pub(super) fn directions<'t, T: Scalar>(
+    tape: &'t Tape<T>,
+    pixels: &[(&Camera, &Camera, [f64; 2])],
+    focal: Option<&Var<'t, T>>,
+    lens: Option<&Var<'t, T>>,
+) -> Var<'t, T> {
+    let sights: Vec<_> = pixels.iter().map(|(given, now, at)| Sight::new(given, now, *at)).collect();
+    let count = sights.len();
+    let table = |width: usize, of: &dyn Fn(&Sight, usize) -> f64| {
+        tape.constant(Tensor::from_fn(&[count, width], |i| T::from_f64(of(&sights[i / width], i % width))))
+    };
+    let target = match focal {
+        Some(focal) => table(2, &|sight, i| sight.given[i]) * (-focal).exp(),
+        None => table(2, &|sight, i| sight.place[i]),
+    };
+    let start = table(3, &|sight, i| sight.direction[i]);
+    // By how much a place misses its target: nothing, but with a gradient.
+    let step = |miss: Var<'t, T>, of: &dyn Fn(&Sight) -> bool| {
+        let slopes = table(6, &|sight, i| if of(sight) { sight.slopes[i % 2][i / 2] } else { 0.0 });
+        (slopes.reshape(&[count, 3, 2]) * miss.reshape(&[count, 1, 2])).sum_over(-1)
+    };
+    let Some(lens) = lens else {
+        return start - step(table(2, &|sight, i| sight.place[i]) - target, &|_| true);
+    };
+    // A formula for each kind of lens that there is; rays of other kinds are held at its axis, and do not take its step.
+    let mut kinds: Vec<(Discriminant<Lens>, Lens)> = vec![];
+    for (given, now, _) in pixels {
+        let kind = discriminant(&now.lens);
+        if !kinds.iter().any(|(other, _)| *other == kind) {
+            kinds.push((kind, given.lens));
+        }
+    }
+    kinds.into_iter().fold(start, |found, (kind, given)| {
+        let own = |sight: &Sight| discriminant(&sight.lens) == kind;
+        let axis = |sight: &Sight, i: usize| if own(sight) { sight.local[i] } else { [0.0, 0.0, 1.0][i] };
+        let moved = corrected(&given);
+        let width = given.coefficients().len();
+        let places = if moved.is_empty() {
+            table(2, &|sight, i| sight.place[i])
+        } else {
+            let base = Tensor::from_fn(&[count, width], |i| {
+                let (given, now, _) = pixels[i / width];
+                T::from_f64(if discriminant(&now.lens) == kind { given.lens.coefficients()[i % width] } else { 0.0 })
+            });
+            let spread = Tensor::from_fn(&[CORRECTIONS, width], |i| {
+                T::from_f64(if moved.get(i / width) == Some(&(i % width)) { 1.0 } else { 0.0 })
+            });
+            let coefficients = tape.constant(base) + lens.matmul(tape.constant(spread));
+            lens_places(&given, &coefficients, &table(3, &axis))
+        };
+        found - step(places - &target, &own)
+    })
+}

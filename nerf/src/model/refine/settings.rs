@@ -1,0 +1,85 @@
+//! What of the cameras is learned, and how fast.
+
+use crate::range::check_range;
+use crate::{Error, Result};
+use raygrad_nn::Schedule;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+
+/// The name of the parameter of poses.
+pub(crate) const POSES: &str = "poses";
+/// That of focal lengths.
+pub(crate) const FOCAL: &str = "focal";
+/// That of lenses.
+pub(crate) const LENS: &str = "lens";
+
+/// What is learned of cameras beside their poses, and how the scene is held back meanwhile.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RefineConfig {
+    /// The learning rate over the run of focal lengths, if they are learned: see [`Refine`](crate::model::Refine).
+    pub focal: Option<Schedule>,
+    /// The learning rate over the run of the lenses' coefficients, if they are learned.
+    pub lens: Option<Schedule>,
+    /// The share of the run over which detail comes in, from coarse to fine (Lin et al. 2021, "BARF", equation 14); 0 has
+    /// all of it from the start. Cameras follow the slopes of what they see, and those of fine detail point to the nearest
+    /// repetition of a pattern and not to where it belongs.
+    pub coarse: f64,
+}
+
+impl RefineConfig {
+    /// How much of the detail there is at this fraction of the run, 0 to 1.
+    pub fn detail(&self, fraction: f64) -> f64 {
+        if self.coarse > 0.0 { (fraction / self.coarse).clamp(0.0, 1.0) } else { 1.0 }
+    }
+
+    /// Whether the numbers make sense.
+    ///
+    /// # Errors
+    /// If one is out of range.
+    pub fn check(&self) -> Result<()> {
+        check_range("refine.coarse", self.coarse, 0.0, 1.0)?;
+        check_schedule("refine.focal", self.focal)?;
+        check_schedule("refine.lens", self.lens)
+    }
+}
+
+/// Whether the learning rate of this name makes sense, if there is one.
+pub(crate) fn check_schedule(name: &str, schedule: Option<Schedule>) -> Result<()> {
+    let Some(schedule) = schedule else { return Ok(()) };
+    schedule.check().map_err(|error| Error::setting(format!("{name}.{}.{}", schedule.name(), error.name), error.what))
+}
+
+/// A part of a camera that can be learned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refined {
+    /// Where it was and how it was held, for each photograph.
+    Poses,
+    /// Its focal length.
+    Focal,
+    /// The coefficients of its lens.
+    Lens,
+}
+
+impl FromStr for Refined {
+    type Err = Error;
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            POSES => Ok(Refined::Poses),
+            FOCAL => Ok(Refined::Focal),
+            LENS => Ok(Refined::Lens),
+            _ => Err(Error::setting("refine", format!("there is no `{name}`; use poses, focal or lens"))),
+        }
+    }
+}
+
+impl fmt::Display for Refined {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Refined::Poses => POSES,
+            Refined::Focal => FOCAL,
+            Refined::Lens => LENS,
+        })
+    }
+}

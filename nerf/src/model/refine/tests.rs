@@ -1,0 +1,222 @@
+//! Corrected cameras, against their rays as numbers and against differences.
+
+use super::*;
+use raygrad_autograd::Tape;
+use raygrad_autograd::check::{Check, check_function};
+use raygrad_nn::Schedule;
+
+const BOX: [DVec3; 2] = [DVec3::splat(-1.0), DVec3::splat(1.0)];
+const SPAN: [f64; 2] = [0.5, 9.0];
+
+const MIDDLE: DVec3 = DVec3::new(0.1, -0.2, 0.3);
+
+/// Of a scene that so many photographs show.
+fn extent(frames: usize) -> Extent {
+    Extent { unit: 1.5, frames, ..Extent::new([MIDDLE - 1.0, MIDDLE + 1.0], SPAN) }
+}
+
+/// The six numbers by which a camera turns and moves like that.
+fn numbers(refine: &Refine, number: usize, correction: [f64; POSE]) -> [f64; POSE] {
+    let matrix = &refine.balance[number];
+    let mut found = [0.0; POSE];
+    for row in (0..POSE).rev() {
+        let rest: f64 = (row + 1..POSE).map(|k| matrix[row][k] * found[k]).sum();
+        found[row] = (correction[row] - rest) / matrix[row][row];
+    }
+    found
+}
+
+/// Cameras of five kinds; the first two are one that took two photographs.
+fn cameras() -> Vec<Camera> {
+    let pose = |x: f64| Camera::look_at(DVec3::new(x, -3.0, 2.0), DVec3::ZERO, DVec3::Z);
+    let camera =
+        |x: f64, lens| Camera { centre: [3.0, 5.5], focal: [8.0, 8.5], lens, ..Camera::from_angle(9, 7, 0.8, pose(x)) };
+    let brown = Lens::Brown { k: [0.1, -0.05, 0.01, 0.02, 0.0, 0.0], p: [0.01, -0.02] };
+    let fisheye = Lens::Fisheye { k: [0.05, -0.02, 0.003, 0.0], p: [0.002, 0.001], s: [0.0; 2] };
+    let lenses = [brown, brown, fisheye, Lens::Fov { omega: 0.7 }, Lens::Pinhole, Lens::Equirectangular];
+    lenses.into_iter().enumerate().map(|(i, lens)| camera(1.0 + 0.3 * i as f64, lens)).collect()
+}
+
+fn all() -> RefineConfig {
+    let rate = Some(Schedule::Constant { rate: 1e-3 });
+    RefineConfig { focal: rate, lens: rate, coarse: 0.0 }
+}
+
+const FRAMES: [u32; 8] = [0, 1, 1, 2, 3, 4, 5, 2];
+const PIXELS: [[u32; 2]; 8] = [[0, 0], [8, 1], [4, 6], [2, 3], [7, 4], [1, 6], [3, 2], [8, 6]];
+
+fn given(cameras: &[Camera]) -> Rays<f64> {
+    let mut rays = Rays::new();
+    for (frame, pixel) in FRAMES.into_iter().zip(PIXELS) {
+        rays.push_pixel(&cameras[frame as usize], pixel.map(|x| x as usize), BOX, SPAN);
+    }
+    rays
+}
+
+#[test]
+fn rays_are_those_of_the_camera_that_is_corrected() {
+    let cameras = cameras();
+    for (poses, config) in [
+        (true, RefineConfig::default()),
+        (false, RefineConfig { lens: None, ..all() }),
+        (false, RefineConfig { focal: None, ..all() }),
+        (true, all()),
+    ] {
+        let mut params = Params::<f64>::new();
+        let refine = Refine::new(poses, &config, &extent(6), &cameras, &mut params).unwrap().unwrap();
+        let rays = given(&cameras);
+        for scale in [0.0, 1.0] {
+            for value in params.values_mut() {
+                value.as_mut_slice().iter_mut().enumerate().for_each(|(i, x)| *x = scale * 0.1 * (i as f64).sin());
+            }
+            let mut expected = Rays::<f64>::new();
+            for (frame, pixel) in FRAMES.into_iter().zip(PIXELS) {
+                let camera = refine.camera(&params, frame as usize, &cameras[frame as usize]);
+                expected.push_pixel(&camera, pixel.map(|x| x as usize), BOX, SPAN);
+            }
+            let tape = Tape::new();
+            let (vars, moved) = refine.rays(&params.bind(&tape), &rays, (&FRAMES, &PIXELS), BOX, SPAN);
+            let apart = |a: &[[f64; 3]], b: &[[f64; 3]]| {
+                let pairs = a.as_flattened().iter().zip(b.as_flattened());
+                pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+            };
+            assert!(apart(&moved.origins, &expected.origins) < 1e-14, "{config:?}");
+            assert!(apart(&moved.directions, &expected.directions) < 1e-13, "{config:?}, {moved:?}, {expected:?}");
+            assert_eq!(vars.directions.value().as_slice(), moved.directions.as_flattened());
+            let same = apart(&moved.directions, &rays.directions);
+            assert_eq!(same < 1e-13, scale == 0.0, "{same}");
+        }
+    }
+}
+
+/// Something that depends on the lines that rays are, and not on where on them they begin: their moments and directions.
+fn seen<'t>(vars: &RayVars<'t, f64>) -> Var<'t, f64> {
+    let RayVars { origins, directions } = vars;
+    let at = |var: &Var<'t, f64>, i: usize| var.slice_axis(1, i..i + 1);
+    let moment = |i: usize, j: usize| at(origins, i) * at(directions, j) - at(origins, j) * at(directions, i);
+    let moments = Var::concat(&[&moment(1, 2), &moment(2, 0), &moment(0, 1)], 1);
+    (moments.sin() * directions.exp()).sum()
+}
+
+#[test]
+fn corrections_have_the_gradients_that_differences_show() {
+    let cameras = cameras();
+    let mut layout = Params::<f64>::new();
+    let refine = Refine::new(true, &all(), &extent(6), &cameras, &mut layout).unwrap().unwrap();
+    let shapes: Vec<_> = layout.values().iter().map(|value| value.shape().to_vec()).collect();
+    assert_eq!(shapes, [vec![6, 6], vec![5, 2], vec![5, 4]], "two photographs are of one camera");
+    let rays = given(&cameras);
+    for at in [0.0, 0.05] {
+        let start = |shape: &Vec<usize>| Tensor::from_fn(shape, |i| at * (1.3 * i as f64).sin());
+        let starts: Vec<_> = shapes.iter().map(start).collect();
+        // The step of Newton's method has the first derivatives of the root, and no others.
+        let check = Check { second_order: false, ..Check::default() };
+        let report = check_function(&check, &starts, |x| {
+            let bound = layout.layout().bind(x.to_vec());
+            let (vars, _) = refine.rays(&bound, &rays, (&FRAMES, &PIXELS), BOX, SPAN);
+            seen(&vars)
+        });
+        assert!(report.unwrap().comparisons > 60);
+    }
+    // Where on its line a ray begins has no gradient.
+    let tape = Tape::new();
+    let bound = layout.bind(&tape);
+    let (vars, moved) = refine.rays(&bound, &rays, (&FRAMES, &PIXELS), BOX, SPAN);
+    let along = tape.constant(Tensor::from_vec(&[8, 3], moved.directions.as_flattened().to_vec()));
+    let slid = (&vars.origins * along).sum().grad(&bound.vars());
+    assert!(slid.iter().flat_map(|grad| grad.as_slice()).all(|slope| slope.abs() < 1e-12), "{slid:?}");
+    // Every number that should move something does.
+    let tape = Tape::new();
+    let bound = layout.bind(&tape);
+    let (vars, _) = refine.rays(&bound, &rays, (&FRAMES, &PIXELS), BOX, SPAN);
+    let grads = seen(&vars).grad(&bound.vars());
+    assert!(grads[1].as_slice().iter().all(|slope| slope.abs() > 1e-6), "{:?}", grads[1]);
+    let still: Vec<usize> = (0..20).filter(|&i| grads[2].as_slice()[i] == 0.0).collect();
+    // Of a fisheye the last two, of a field of view the last three, of an equirectangular image all.
+    assert_eq!(still, [6, 7, 9, 10, 11, 16, 17, 18, 19]);
+}
+
+#[test]
+fn where_a_lens_puts_nothing_nothing_is_learned() {
+    let mut cameras = cameras();
+    cameras.truncate(1);
+    cameras[0].lens = Lens::Brown { k: [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    let mut params = Params::<f64>::new();
+    let refine = Refine::new(false, &all(), &extent(1), &cameras, &mut params).unwrap().unwrap();
+    let mut rays = Rays::new();
+    let pixels = [[3, 5], [8, 0]];
+    pixels.iter().for_each(|pixel: &[u32; 2]| rays.push_pixel(&cameras[0], pixel.map(|x| x as usize), BOX, SPAN));
+    assert!(!cameras[0].sees(8.5, 0.5) && cameras[0].sees(3.5, 5.5));
+    let tape = Tape::new();
+    let bound = params.bind(&tape);
+    let (vars, moved) = refine.rays(&bound, &rays, (&[0, 0], &pixels), BOX, SPAN);
+    assert!(moved.directions.as_flattened().iter().all(|x| x.is_finite()));
+    for (row, expected) in [(0, true), (1, false)] {
+        let grads = vars.directions.slice_axis(0, row..row + 1).sum().grad(&bound.vars());
+        let moves = grads.iter().flat_map(|grad| grad.as_slice()).any(|slope| *slope != 0.0);
+        assert!(moves == expected && grads.iter().all(Tensor::is_finite), "{grads:?}");
+    }
+}
+
+#[test]
+fn cameras_have_to_be_known_where_they_are_corrected() {
+    let new = |poses, config: &RefineConfig, frames, cameras: &[Camera]| {
+        Refine::new(poses, config, &extent(frames), cameras, &mut Params::<f64>::new())
+    };
+    let cameras = cameras();
+    let none = RefineConfig::default();
+    assert!(new(false, &none, 6, &cameras).unwrap().is_none());
+    // Poses were learned before cameras were stored: by rotation vectors and translations in units of the scene.
+    let plain = new(true, &none, 6, &[]).unwrap().unwrap();
+    assert_eq!(numbers(&plain, 5, [0.1, 0.2, 0.3, 1.5, 3.0, -1.5]), [0.1, 0.2, 0.3, 1.0, 2.0, -1.0]);
+    let message = |poses, config: &RefineConfig, frames, cameras: &[Camera]| {
+        new(poses, config, frames, cameras).err().unwrap().to_string()
+    };
+    assert!(message(true, &none, 0, &[]).starts_with("`poses`"));
+    assert!(message(true, &none, 7, &cameras).starts_with("`poses`"));
+    assert!(message(false, &all(), 6, &[]).starts_with("`refine.focal`"));
+    assert!(message(true, &RefineConfig { focal: None, ..all() }, 5, &cameras).starts_with("`refine.lens`"));
+}
+
+#[test]
+fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass() {
+    let cameras = cameras();
+    let mut params = Params::<f64>::new();
+    let refine = Refine::new(true, &all(), &extent(6), &cameras, &mut params).unwrap().unwrap();
+    // All move by the same.
+    let moved = DVec3::new(0.15, -0.3, 0.45);
+    let set = |params: &mut Params<f64>, name: &str, values: &[f64]| {
+        let id = params.find(name).unwrap();
+        let all = params.get_mut(id).as_mut_slice();
+        all.iter_mut().enumerate().for_each(|(i, x)| *x = values[i % values.len()]);
+    };
+    let moves = |refine: &Refine| -> Vec<f64> {
+        (0..6).flat_map(|i| numbers(refine, i, [0.0, 0.0, 0.0, moved.x, moved.y, moved.z])).collect()
+    };
+    set(&mut params, "poses", &moves(&refine));
+    set(&mut params, "focal", &[0.1, 0.2]);
+    set(&mut params, "lens", &[0.01]);
+    // They were given in a line, about which anything can turn.
+    assert!(refine.placement(&params).is_none());
+    let mut around = cameras.clone();
+    around.iter_mut().enumerate().for_each(|(i, camera)| camera.pose.translation.z += (i as f64).sin());
+    let mut params = Params::<f64>::new();
+    let refine = Refine::new(true, &all(), &extent(6), &around, &mut params).unwrap().unwrap();
+    set(&mut params, "poses", &moves(&refine));
+    set(&mut params, "focal", &[0.1, 0.2]);
+    set(&mut params, "lens", &[0.01]);
+    let pose = Camera::look_at(DVec3::new(0.0, 4.0, 1.0), DVec3::ZERO, DVec3::Z);
+    // The fifth is a pinhole, and the picture is twice as large.
+    let other = Camera { pose, ..around[4].resized(18, 14) };
+    let found = refine.other_camera(&params, &other);
+    // They have stepped back as well, by the mean of the factors of columns and rows.
+    let expected = MIDDLE + 0.15_f64.exp() * (pose.translation - MIDDLE) + moved;
+    assert!(found.pose.translation.distance(expected) < 1e-9, "{found:?}");
+    assert!(found.pose.matrix3.abs_diff_eq(pose.matrix3, 1e-9));
+    assert!((found.focal[0] / 16.0 - 0.1_f64.exp()).abs() < 1e-12 && (found.focal[1] / 17.0).ln() > 0.19);
+    assert!(matches!(found.lens, Lens::Brown { k, p } if k[..3] == [0.01, 0.01, 0.0] && p == [0.01; 2]));
+    // Of a camera that took none of the photographs nothing is known.
+    let unknown = Camera { focal: [9.0, 9.0], ..other };
+    let found = refine.other_camera(&params, &unknown);
+    assert_eq!((found.focal, found.lens), (unknown.focal, unknown.lens));
+}
