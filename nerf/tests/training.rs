@@ -365,3 +365,26 @@ fn a_table_that_is_to_be_smooth_becomes_smoother() {
     let read: Config = serde_json::from_str(&serde_json::to_string(&config).unwrap()).unwrap();
     assert_eq!(read, config);
 }
+
+#[test]
+fn samples_near_a_camera_learn_less_where_that_is_asked_for() {
+    let data = Arc::new(photographs(12, 24));
+    let moved = |near_gradients: f64| {
+        let config = Config { near_gradients, ..instant() };
+        let mut trainer = Trainer::new(config, data.clone()).unwrap();
+        let grid = trainer.model.params.find("field.table").unwrap();
+        let before = trainer.model.params.get(grid).clone();
+        let first = trainer.step(0.3).loss;
+        // The first step of Adam has the size of its rate whatever the gradient; the second tells.
+        let second = trainer.step(0.3).loss;
+        let after = trainer.model.params.get(grid);
+        let far = before.as_slice().iter().zip(after.as_slice()).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
+        (first, second, far)
+    };
+    let (usual, none, all) = (moved(0.0), moved(1e-3), moved(1e6));
+    assert_eq!(usual, none, "no sample is as near as that");
+    assert_eq!(usual.0, all.0, "values stay");
+    assert!(usual.2 > 0.0 && all.2.is_finite() && usual.2 != all.2, "{usual:?} {all:?}");
+    let bad = Config { near_gradients: -1.0, ..instant() };
+    assert!(bad.check().unwrap_err().to_string().starts_with("`near_gradients`"));
+}

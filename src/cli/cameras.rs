@@ -21,7 +21,20 @@ pub struct Viewpoint {
     pub distance: f64,
     /// Their mean angle above the horizon as seen from there, in radians.
     pub elevation: f64,
+    /// The direction, in radians about the vertical, that cameras stand in on average, if they stand in a part of the circle.
+    #[serde(default)]
+    pub azimuth: f64,
+    /// How far on either side of it they stand, in radians; half a turn where they stand all around.
+    #[serde(default = "all_around")]
+    pub reach: f64,
 }
+
+fn all_around() -> f64 {
+    PI
+}
+
+/// Cameras leave at most this angle of a circle free, in radians, that stand all around.
+const GAP: f64 = 2.0 * PI / 3.0;
 
 /// At an elevation closer to the poles than this, in radians, there is no telling where up is.
 const FROM_POLE: f64 = 0.1;
@@ -40,7 +53,10 @@ impl Viewpoint {
         let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
         let offsets = || data.frames.iter().map(|frame| frame.camera.pose.translation - centre);
         let elevation = offsets().map(|offset| offset.z.atan2(offset.truncate().length())).sum::<f64>() / count;
+        let (azimuth, reach) = arc(offsets().map(|offset| offset.y.atan2(offset.x)).collect());
         Viewpoint {
+            azimuth,
+            reach,
             width: camera.width,
             height: camera.height,
             angle_x: 2.0 * (0.5 * camera.width as f64 / camera.focal[0]).atan(),
@@ -58,6 +74,8 @@ impl Viewpoint {
             ("viewpoint.angle_x", positive(self.angle_x) && self.angle_x < PI),
             ("viewpoint.distance", self.distance >= 0.0 && self.distance.is_finite()),
             ("viewpoint.elevation", self.elevation.abs() < FRAC_PI_2),
+            ("viewpoint.azimuth", self.azimuth.is_finite()),
+            ("viewpoint.reach", (0.0..=PI).contains(&self.reach)),
         ];
         match checks.iter().find(|(_, good)| !good) {
             Some((name, _)) => Err(Error::setting(name, "is out of range")),
@@ -65,20 +83,34 @@ impl Viewpoint {
         }
     }
 
-    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards. Those of a panorama,
-    /// which was taken from the centre, stand there and look around.
+    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards; where the photographs
+    /// are from a part of the circle, they swing to and fro on that. Those of a panorama, which was taken from the centre, stand
+    /// there and look around.
     pub fn orbit(&self, extent: &Extent, count: usize) -> Vec<Camera> {
         let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
         let camera = |i: usize| {
-            let (sin, cos) = (i as f64 / count as f64 * TAU).sin_cos();
+            let outwards = self.distance <= FROM_CENTRE * extent.space().side();
+            let turn = i as f64 / count as f64 * TAU;
+            let swings = self.reach < PI && !outwards;
+            let (sin, cos) = if swings { self.azimuth + self.reach * turn.sin() } else { turn }.sin_cos();
             let (height, radius) = self.elevation.sin_cos();
             let eye = centre + self.distance * DVec3::new(radius * cos, radius * sin, height);
-            let outwards = self.distance <= FROM_CENTRE * extent.space().side();
             let target = if outwards { centre + DVec3::new(radius * cos, radius * sin, height) } else { centre };
             let pose = Camera::look_at(if outwards { centre } else { eye }, target, DVec3::Z);
             Camera::from_angle(self.width, self.height, self.angle_x, pose)
         };
         (0..count).map(camera).collect()
+    }
+}
+
+/// The middle and half the width of the part of a circle that angles are in: half a turn if there is no large gap.
+fn arc(mut angles: Vec<f64>) -> (f64, f64) {
+    angles.sort_by(f64::total_cmp);
+    let next = angles.iter().skip(1).copied().chain(angles.first().map(|first| first + TAU));
+    let gaps = angles.iter().zip(next).map(|(from, to)| [*from, to]);
+    match gaps.max_by(|a, b| (a[1] - a[0]).total_cmp(&(b[1] - b[0]))) {
+        Some([from, to]) if to - from > GAP => (0.5 * (from + to) + PI, PI - 0.5 * (to - from)),
+        _ => (0.0, PI),
     }
 }
 
@@ -96,7 +128,8 @@ pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
 mod tests {
     #[test]
     fn a_panorama_is_looked_around_in() {
-        let viewpoint = Viewpoint { width: 40, height: 30, angle_x: 1.0, distance: 0.0, elevation: 0.0 };
+        let viewpoint =
+            Viewpoint { width: 40, height: 30, angle_x: 1.0, distance: 0.0, elevation: 0.0, azimuth: 0.3, reach: 0.2 };
         viewpoint.check().unwrap();
         let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 4.0]);
         let cameras = viewpoint.orbit(&extent, 4);
@@ -127,6 +160,35 @@ mod tests {
         }
         assert!((view.angle_x - raygrad::nerf::dataset::scene::ANGLE_X).abs() < 1e-12);
         view.check().unwrap();
+    }
+
+    #[test]
+    fn an_orbit_swings_where_photographs_are_from() {
+        assert_eq!(viewpoint().0.reach, PI, "they are from all around");
+        assert_eq!(arc((0..4).map(|i| f64::from(i) * FRAC_PI_2).collect()), (0.0, PI));
+        // Across the place where angles begin again.
+        let (middle, half) = arc(vec![3.0, -3.0, 2.5, -2.8]);
+        let ends = [2.5, TAU - 2.8];
+        assert!((half - 0.5 * (ends[1] - ends[0])).abs() < 1e-12, "{half}");
+        assert!((middle - 0.5 * (ends[0] + ends[1])).rem_euclid(TAU).min(TAU - 1e-9) < 1e-9, "{middle}");
+        let (view, extent) = viewpoint();
+        let view = Viewpoint { azimuth: 1.0, reach: 0.4, ..view };
+        let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        let angles = view.orbit(&extent, 8).into_iter().map(|camera| {
+            let offset = camera.pose.translation - centre;
+            offset.y.atan2(offset.x)
+        });
+        for (angle, expected) in angles.zip([
+            1.0,
+            1.0 + 0.4 * 0.5_f64.sqrt(),
+            1.4,
+            1.0 + 0.4 * 0.5_f64.sqrt(),
+            1.0,
+            1.0 - 0.4 * 0.5_f64.sqrt(),
+            0.6,
+        ]) {
+            assert!((angle - expected).abs() < 1e-12, "{angle} {expected}");
+        }
     }
 
     #[test]

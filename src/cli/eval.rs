@@ -118,22 +118,27 @@ enum Alignment {
 
 impl Alignment {
     /// Puts the cameras of the photographs where the model has them.
-    fn apply(model: &Model<f32>, split: Split, data: &mut Dataset) -> Self {
-        let Some(refine) = &model.refine else { return Alignment::None };
+    ///
+    /// # Errors
+    /// If a photograph is said to be one of those that were trained on, whose names are `trained`, and is not.
+    fn apply(model: &Model<f32>, trained: &[String], split: Split, data: &mut Dataset) -> Result<Self> {
+        let Some(refine) = &model.refine else { return Ok(Alignment::None) };
         if split == Split::Train {
-            // Views may be some of all photographs, as they are chosen for reading.
-            let numbers = evenly_spaced((0..model.extent.frames).collect(), data.frames.len());
-            for (number, frame) in numbers.into_iter().zip(&mut data.frames) {
+            for frame in &mut data.frames {
+                let number = trained.iter().position(|name| *name == frame.name).ok_or_else(|| {
+                    let what = format!("the run was not trained on `{}`, and has not found its camera", frame.name);
+                    Error::setting("scene", what)
+                })?;
                 frame.camera = model.learned_camera(number, &frame.camera);
             }
-            return Alignment::Learned;
+            return Ok(Alignment::Learned);
         }
         data.frames.iter_mut().for_each(|frame| frame.camera = model.other_camera(&frame.camera));
-        match refine.placement(&model.params) {
+        Ok(match refine.placement(&model.params) {
             Some(_) => Alignment::Similarity,
-            None if refine.has_poses() && refine.cameras().is_empty() => Alignment::None,
+            None if refine.has_poses() => Alignment::None,
             None => Alignment::Glass,
-        }
+        })
     }
 }
 
@@ -164,7 +169,7 @@ pub fn run(args: &Args) -> Result<()> {
         );
         return Err(Error::setting("scene", what));
     }
-    let cameras = Alignment::apply(&model, args.split, &mut data);
+    let cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
     let name = args.name();
     let pictures = run.file(&name);
     make_folder(&pictures)?;
@@ -298,5 +303,11 @@ fn table(report: &Report) -> String {
     text += &format!("{mean_of:width$}  {:>7.2}  {:>7}\n", report.psnr_mean, ssim(report.ssim_mean));
     let Report { split, background, seconds_per_view, .. } = report;
     let size = format!("{}x{}", report.width, report.height);
-    text + &format!("{split} views of {size} over {background}, {seconds_per_view:.2} s to render each\n")
+    text += &format!("{split} views of {size} over {background}, {seconds_per_view:.2} s to render each\n");
+    text + match report.cameras {
+        Alignment::None => "",
+        Alignment::Learned => "cameras: as learned\n",
+        Alignment::Glass => "cameras: focal length and lens as learned\n",
+        Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
+    }
 }

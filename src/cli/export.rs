@@ -17,7 +17,8 @@ use super::{builtin, interrupt};
 /// Write the cameras of a run for other programs, as the run has refined them
 ///
 /// They are in the coordinates of the photographs' own files. Where the run has learned poses, photographs that it was
-/// trained on have the refined ones, and all others those that they were given.
+/// trained on have the refined ones, moved as a whole to where the given ones are; of others, held-out ones, only focal length
+/// and lens follow.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -38,11 +39,12 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
     let model = run.model()?;
+    let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
     let mut capture = match run.scene(args.scene.as_ref())? {
         Scene::Folder(folder) => Capture::read(folder)?,
-        scene => builtin::capture(&scene, None, None)?,
+        scene => builtin::capture(scene, None, args.to.map(|_| pictures.path()))?,
     };
-    let refined = refine(&mut capture, &model)?;
+    let refined = refine(&mut capture, &model, &run.config.photographs)?;
     let cameras = capture.views.len();
     match args.to {
         None => write(capture, &args.out)?,
@@ -60,16 +62,23 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 }
 
 /// Puts the cameras of the photographs that the model was trained on where it has found them to be; says how many those are.
-fn refine(capture: &mut Capture, model: &Model<f32>) -> Result<usize> {
-    if model.refine.is_none() {
-        return Ok(0);
-    }
+///
+/// What cameras have done as a whole is undone, which no photograph shows: so those of other photographs, and points, stay
+/// where they belong.
+fn refine(capture: &mut Capture, model: &Model<f32>, names: &[String]) -> Result<usize> {
+    let Some(refine) = &model.refine else { return Ok(0) };
+    let drift = refine.placement(&model.params).unwrap_or_default();
     let placement = model.extent.placement;
     // In the order in which they were read for training, which numbers them.
     let train = capture.split(Split::Train)?.into_iter();
     let made = capture.present().next().is_none();
     let train = train.filter(|view| made || view.image.is_some());
-    let trained: Vec<String> = train.map(|view| view.field.clone()).collect();
+    let (trained, named): (Vec<String>, Vec<String>) =
+        train.map(|view| (view.field.clone(), view.name.clone())).unzip();
+    if trained.len() == names.len() && !made && named != names {
+        let what = "has other photographs to train on than those that the run was trained on: say with --scene where those are";
+        return Err(Error::file(&capture.file, what));
+    }
     if trained.len() != model.extent.frames {
         let what = format!(
             "has {} photographs to train on, and the run was trained on {}: say with --scene where those are",
@@ -78,13 +87,17 @@ fn refine(capture: &mut Capture, model: &Model<f32>) -> Result<usize> {
         );
         return Err(Error::file(&capture.file, what));
     }
-    let mut count = 0;
-    for (number, field) in trained.iter().enumerate() {
-        let Some(view) = capture.views.iter_mut().find(|view| view.field == *field) else { continue };
-        view.camera = placement.camera_back(&model.learned_camera(number, &placement.camera(&view.camera)));
-        count += 1;
+    for view in &mut capture.views {
+        let given = placement.camera(&view.camera);
+        let found = match trained.iter().position(|field| *field == view.field) {
+            Some(number) => model.learned_camera(number, &given),
+            None => model.other_camera(&given),
+        };
+        if found != given {
+            view.camera = placement.camera_back(&drift.camera_back(&found));
+        }
     }
-    Ok(count)
+    Ok(trained.len())
 }
 
 /// Writes the cameras alone.

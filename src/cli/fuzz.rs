@@ -22,7 +22,15 @@ fn run_config() -> RunConfig {
         scene: Scene::Embedded,
         downscale: 1,
         extent: Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]),
-        viewpoint: Viewpoint { width: 8, height: 6, angle_x: 0.7, distance: 4.0, elevation: 0.5 },
+        viewpoint: Viewpoint {
+            width: 8,
+            height: 6,
+            angle_x: 0.7,
+            distance: 4.0,
+            elevation: 0.5,
+            azimuth: 0.0,
+            reach: 1.0,
+        },
         config: Config::preset(Preset::Instant),
     }
 }

@@ -56,7 +56,7 @@ pub struct Args {
 /// Where the camera goes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum CameraPath {
-    /// Around the scene, at the distance and the height of the average training camera
+    /// Around the scene, or to and fro where photographs are from one side, at the distance and the height of the average training camera
     Orbit,
     /// From test view to test view
     Test,

@@ -68,8 +68,8 @@ pub struct Args {
     #[arg(long, value_name = "PARTS", value_delimiter = ',')]
     refine: Vec<Refined>,
     /// Hold the scene to depths that were measured beside the photographs (depth_file_path in transforms.json), with that
-    /// weight in the loss
-    #[arg(long, value_name = "WEIGHT", num_args = 0..=1, default_missing_value = "0.1")]
+    /// weight in the loss: --depth, or --depth=0.2
+    #[arg(long, value_name = "WEIGHT", num_args = 0..=1, require_equals = true, default_missing_value = "0.1")]
     depth: Option<f64>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]

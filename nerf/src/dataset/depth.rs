@@ -30,7 +30,7 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     let Camera { width: columns, height: rows, .. } = *camera;
     // Up to the rounding of a side.
     let apart = 2 * (width * rows).abs_diff(height * columns);
-    if width == 0 || height == 0 || apart > width.max(height).max(rows).max(columns) {
+    if width == 0 || height == 0 || apart > (width + height).max(rows + columns) {
         return Err(wrong(format!(
             "has {width}x{height} depths, and its photograph {columns}x{rows} pixels: they must have one shape"
         )));
@@ -70,7 +70,7 @@ mod tests {
             let (x, y) = (i % 4, i / 4);
             let depth = 0.002 * f64::from(values[(2 * x + 1 + 8 * (2 * y + 1)) / 4]);
             let place = camera.ray(x as f64 + 0.5, y as f64 + 0.5).at(f64::from(*distance));
-            let along = -(DAffine3::from(camera.pose).inverse().transform_point3(place)).z;
+            let along = -(camera.pose.inverse().transform_point3(place)).z;
             assert!((along - depth).abs() < 1e-5 && (*distance == 0.0) == (depth == 0.0), "{i}: {along} {depth}");
         }
     }
@@ -88,6 +88,25 @@ mod tests {
     }
 
     #[test]
+    fn small_files_are_looked_up_and_nothing_is_behind_a_camera() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("depth.png");
+        ImageBuffer::<Luma<u8>, _>::from_fn(2, 1, |x, _| Luma([[0, 200][x as usize]])).save(&path).unwrap();
+        let camera = Camera::from_angle(8, 4, 0.1, DAffine3::IDENTITY);
+        let found = distances(&path, 0.01, &camera).unwrap();
+        assert!((0..32).all(|i| if i % 8 < 4 { found.data[i] == 0.0 } else { (found.data[i] - 2.0).abs() < 0.01 }));
+        let lens = crate::camera::lens::Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
+        let wide = Camera { lens, focal: [1.5; 2], ..camera };
+        let behind = |i: usize| wide.ray((i % 8) as f64 + 0.5, (i / 8) as f64 + 0.5).direction.z > 0.0;
+        ImageBuffer::<Luma<u8>, _>::from_pixel(8, 4, Luma([200])).save(&path).unwrap();
+        let found = distances(&path, 0.01, &wide).unwrap();
+        assert!((0..32).any(behind) && (0..32).all(|i| (found.data[i] == 0.0) == behind(i)), "{found:?}");
+        // Both sides of a photograph that was made smaller are rounded.
+        ImageBuffer::<Luma<u8>, _>::new(1002, 753).save(&path).unwrap();
+        distances(&path, 1.0, &Camera::from_angle(251, 188, 0.5, DAffine3::IDENTITY)).unwrap();
+    }
+
+    #[test]
     fn what_is_no_file_of_depths_is_an_error_that_names_it() {
         let folder = tempfile::tempdir().unwrap();
         let camera = Camera::from_angle(3, 2, 0.1, DAffine3::IDENTITY);
@@ -102,6 +121,7 @@ mod tests {
         fails("color.png", "has colours");
         ImageBuffer::<Luma<u8>, _>::new(2, 3).save(folder.path().join("turned.png")).unwrap();
         ImageBuffer::<Luma<u8>, _>::new(9, 3).save(folder.path().join("wide.png")).unwrap();
+        fails("turned.png", "has 2x3 depths");
         fails("wide.png", "has 9x3 depths, and its photograph 3x2 pixels");
     }
 }

@@ -21,10 +21,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Of photographs that no file puts in a split, every one of this number, from the first by name, is held out to test on.
 const HELD_OUT: usize = 8;
-/// Photographs that are looked at to find out whether they are transparent anywhere.
+/// Photographs that are looked at to find out whether they show nothing somewhere.
 const LOOKED_AT: usize = 3;
 /// How much of such a photograph is so.
 const CLEAR: f64 = 0.05;
+/// How much of the border of photographs is white that show an object before white.
+const WHITE_BORDER: f64 = 0.98;
 /// How much of a pixel of a mask must be white for it to be used.
 pub(super) const WHITE: f32 = 0.99;
 
@@ -134,16 +136,28 @@ impl Capture {
     /// If an image that has an alpha channel cannot be read, or as [`Survey::new`].
     pub fn survey(&self, asked: Option<Scope>) -> Result<Survey> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
-        let (mut clear, total) = (0, looked_at.len());
+        let ([mut clear, mut white], total) = ([0; 2], looked_at.len());
         for view in looked_at {
             let Some(path) = &view.image else { continue };
             let name = |error| Error::field(&self.file, &view.field, error);
-            if Photo::file_has_alpha(path).map_err(name)? {
-                clear += usize::from(Photo::open(path, None).map_err(name)?.transparent_share() > CLEAR);
+            let has_alpha = Photo::file_has_alpha(path).map_err(name)?;
+            match Photo::open(path, None) {
+                Ok(photo) => {
+                    // A border that was left when photographs were straightened is no sign of an empty background.
+                    clear += usize::from(photo.transparent_share() > CLEAR);
+                    white += usize::from(!has_alpha && photo.white_border() > WHITE_BORDER);
+                }
+                Err(error) if has_alpha => return Err(name(error)),
+                // Loading says it, if it is loaded.
+                Err(_) => {}
             }
         }
-        // A border that was left when photographs were straightened is no sign of an empty background.
-        Survey::new(self, 2 * clear > total, asked)
+        let empty = match (2 * clear > total, white == total) {
+            (true, _) => Some("photographs are transparent where there is nothing"),
+            (_, true) => Some("photographs show an object before white"),
+            _ => None,
+        };
+        Survey::new(self, empty, asked)
     }
 
     /// Reads the photographs of a split, in parallel, and puts their cameras where the survey says.

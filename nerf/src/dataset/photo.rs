@@ -108,6 +108,19 @@ impl Photo {
         if self.has_alpha() { clear.count() as f64 / count.max(1) as f64 } else { 0.0 }
     }
 
+    /// How much of its border, one pixel wide, is white, up to what JPEG makes of it: 0 to 1.
+    pub(super) fn white_border(&self) -> f64 {
+        /// The least value of a channel.
+        const WHITE: f32 = 0.97;
+        let Photo { width, height, .. } = *self;
+        let border = (0..width * height).map(|i| [i % width, i / width]);
+        let border = border.filter(|[x, y]| *x == 0 || *y == 0 || x + 1 == width || y + 1 == height);
+        let (count, white) = border.fold((0, 0), |(count, white), [x, y]| {
+            (count + 1, white + usize::from(self.pixel(x, y)[..3].iter().all(|value| *value >= WHITE)))
+        });
+        white as f64 / f64::from(count.max(1))
+    }
+
     /// A pixel as red, green, blue and alpha in 0..=1; alpha is 1 where there is none.
     ///
     /// # Panics

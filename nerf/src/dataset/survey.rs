@@ -44,12 +44,12 @@ const AROUND: f64 = 3.0;
 const ROUNDS: usize = 8;
 
 impl Survey {
-    /// Of a capture, from all photographs that exist. `transparent` says whether they show nothing somewhere, which only
-    /// their pixels tell; `asked` overrules what is found.
+    /// Of a capture, from all photographs that exist. `empty` says in a few words why it is thought, if it is, that there is
+    /// nothing behind an object, which only their pixels tell; `asked` overrules what is found.
     ///
     /// # Errors
     /// If there is no photograph, or all cameras stand in one place, so that nothing has a size.
-    pub fn new(capture: &Capture, transparent: bool, asked: Option<Scope>) -> Result<Survey> {
+    pub fn new(capture: &Capture, empty: Option<&str>, asked: Option<Scope>) -> Result<Survey> {
         let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
         if cameras.is_empty() {
             let Some(first) = capture.views.first() else {
@@ -73,15 +73,15 @@ impl Survey {
                 reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
             });
         }
-        let (scope, reason) = match (asked, transparent) {
+        let (scope, reason) = match (asked, empty) {
             (Some(scope), _) => (scope, "as asked"),
-            (None, true) => (Scope::Bounded, "photographs are transparent where there is nothing"),
-            (None, false) => (Scope::Unbounded, "photographs are opaque, so they show what lies behind"),
+            (None, Some(why)) => (Scope::Bounded, why),
+            (None, None) => (Scope::Unbounded, "photographs are opaque, so they show what lies behind"),
         };
         let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
         let points = trusted(&capture.points);
         let Layout { middle, inner, looks } = Layout::new(&cameras, &depths, &points);
-        let reason = if asked.is_none() { format!("{reason}; {looks}") } else { reason.to_owned() };
+        let reason = format!("{reason}; {looks}");
         let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if !(distance > 1e-9 * (1.0 + middle.length())) {
             let what = "all cameras stand in one place: nothing in the scene has a size";
@@ -153,11 +153,15 @@ impl Layout {
         let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
         let forward = cameras.iter().map(|camera| -camera.pose.matrix3.z_axis).sum::<DVec3>() / count;
         let spread = distances(mean);
-        let seen = (points.len() >= FEWEST).then(|| median(points.iter().map(|point| point.distance(mean))));
+        let known = points.len() >= FEWEST;
         if forward.length() > 0.8 {
-            let middle = mean + seen.unwrap_or(AHEAD * spread) * forward.normalize();
-            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look the same way" };
+            let forward = forward.normalize();
+            let depth = known.then(|| median(points.iter().map(|point| (*point - mean).dot(forward))));
+            let middle = mean + depth.filter(|depth| *depth > 0.0).unwrap_or(AHEAD * spread) * forward;
+            let inner = (INNER_SHARE * distances(middle)).max(spread);
+            return Layout { middle, inner, looks: "cameras look the same way" };
         }
+        let seen = known.then(|| median(points.iter().map(|point| point.distance(mean))));
         Layout { middle: mean, inner: seen.unwrap_or(AROUND * spread).max(spread), looks: "cameras look around" }
     }
 }
@@ -182,13 +186,22 @@ fn middle(cameras: &[&Camera]) -> Option<DVec3> {
         }
         // Axes that are nearly parallel meet nowhere in particular.
         found = mean + (matrix + DMat3::from_diagonal(DVec3::splat(1e-3 * total))).inverse() * sum;
-        let passes = |camera: &&Camera| (across(camera) * (found - camera.pose.translation)).length();
-        let usual = median(cameras.iter().map(passes)).max(1e-2 * spread);
+        let passes = passes_at(found);
+        let usual = median(cameras.iter().map(&passes)).max(1e-2 * spread);
         weights = cameras.iter().map(|camera| 1.0 / (1.0 + (passes(camera) / (3.0 * usual)).powi(2))).collect();
     }
+    let passes = passes_at(found);
     let ahead = |camera: &&&Camera| (found - camera.pose.translation).dot(-camera.pose.matrix3.z_axis) > 0.0;
     let most = 4 * cameras.iter().filter(ahead).count() > 3 * cameras.len();
-    (most && found.is_finite() && found.distance(mean) < 100.0 * spread).then_some(found)
+    // Axes come together there, and do not meet by chance, as nearly parallel ones do.
+    let together =
+        2.0 * median(cameras.iter().map(&passes)) < median(cameras.iter().map(|c| c.pose.translation.distance(mean)));
+    (most && together && found.is_finite() && found.distance(mean) < 100.0 * spread).then_some(found)
+}
+
+/// How far from a place the optical axis of a camera passes.
+fn passes_at(place: DVec3) -> impl Fn(&&Camera) -> f64 {
+    move |camera| (across(camera) * (place - camera.pose.translation)).length()
 }
 
 /// What is left of a vector without its part along a camera's optical axis.

@@ -50,6 +50,8 @@ pub struct Model<T: Scalar> {
     /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
     /// look like none in particular. Of a photograph that there is not, views panic.
     pub look: Option<u32>,
+    /// How much of their detail fields have: see [`set_detail`](Self::set_detail).
+    detail: f64,
 }
 
 impl<T: Scalar> Clone for Model<T> {
@@ -63,6 +65,7 @@ impl<T: Scalar> Clone for Model<T> {
             terms: self.terms.clone(),
             refine: self.refine.clone(),
             look: self.look,
+            detail: self.detail,
         }
     }
 }
@@ -92,8 +95,9 @@ impl<T: Scalar> Model<T> {
         let field = config.field.build(Site { space, frames, params: &mut params, name: "field", rng })?;
         let term = |term: &TermConfig| term.build(Site { space, frames, params: &mut params, name: "terms", rng });
         let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
-        let refine = Refine::new(config.poses.is_some(), &config.refine, &extent, cameras, &mut params)?;
-        Ok(Model { config, extent, params, field, sampler, terms, refine, look: None })
+        let refine =
+            Refine::new(config.poses.is_some(), &config.refine, (&extent, config.unbounded), cameras, &mut params)?;
+        Ok(Model { config, extent, params, field, sampler, terms, refine, look: None, detail: 1.0 })
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -133,6 +137,7 @@ impl<T: Scalar> Model<T> {
 
     /// Gives all fields that share of their detail, 0 to 1: see [`Field::with_detail`]. All parameters stay.
     pub fn set_detail(&mut self, detail: f64) {
+        self.detail = detail;
         if let Some(field) = self.field.with_detail(detail) {
             self.field = field;
         }
@@ -192,6 +197,7 @@ impl<T: Scalar> Model<T> {
         let mut model = Model::with_cameras(self.config.clone(), self.extent, self.cameras(), 0)?;
         model.params.assign(&self.params);
         model.look = self.look;
+        model.set_detail(self.detail);
         let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
         model.sampler.load_state(&state)?;
         if let (Some(old), Some(new)) = (self.marching(), model.marching_mut()) {

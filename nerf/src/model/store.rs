@@ -18,6 +18,9 @@ impl Model<f32> {
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let metadata = HashMap::from([("format".into(), "raygrad".into())]);
         let mut blobs = self.sampler.state();
+        if self.detail < 1.0 {
+            blobs.push((DETAIL, self.detail.to_le_bytes().to_vec()));
+        }
         if !self.cameras().is_empty() {
             blobs.push((CAMERAS, serde_json::to_vec(self.cameras()).map_err(|error| Error::file(&path, error))?));
         }
@@ -40,6 +43,12 @@ impl Model<f32> {
         let mut model = Model::with_cameras(config, extent, &cameras, 0)?;
         let state = model.params.load_safetensors(&bytes).map_err(|error| Error::file(&path, error))?;
         model.sampler.load_state(&state).map_err(|error| Error::file(&path, error))?;
+        // A run that was ended before all of it was there.
+        let detail = stored_bytes(&bytes, DETAIL).map_err(|error| Error::file(&path, error))?;
+        let detail = detail.and_then(|bytes| Some(f64::from_le_bytes(bytes.try_into().ok()?)));
+        if let Some(detail) = detail.filter(|detail| (0.0..=1.0).contains(detail)) {
+            model.set_detail(detail);
+        }
         // A look at the field is not to stand beside the file.
         drop((bytes, state));
         model.finish();
@@ -49,6 +58,8 @@ impl Model<f32> {
 
 /// The name of the cameras that the photographs were taken by, in files of models that learn something of them.
 const CAMERAS: &str = "cameras";
+/// That of how much of its detail the field has.
+const DETAIL: &str = "detail";
 
 /// The cameras in the file of a model, as they are stored, if they are.
 fn cameras(stored: Option<&[u8]>) -> Result<Vec<Camera>> {

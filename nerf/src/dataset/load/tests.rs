@@ -207,3 +207,65 @@ fn masks_leave_out_what_is_not_white_and_what_no_light_reaches() {
     assert!(Arc::ptr_eq(&mask, &lit.of(&moved).unwrap()), "one for each camera, wherever it stands");
     assert!(lit.of(&Camera { focal: [40.0; 2], ..camera }).is_none());
 }
+
+#[test]
+fn an_object_before_white_is_bounded() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.hold_out();
+    let paint = |border: f32, spoilt: usize| {
+        for (i, view) in capture.views.iter().enumerate() {
+            let mut image = Image::new(12, 8, 3);
+            image.data.iter_mut().enumerate().for_each(|(k, value)| {
+                let (x, y) = (k / 3 % 12, k / 36);
+                let is_border = x == 0 || y == 0 || x == 11 || y == 7;
+                // A little darker than white in one channel, as JPEG has it.
+                *value = if is_border { border - 0.02 * (k % 3 / 2) as f32 } else { 0.3 };
+            });
+            if i < spoilt {
+                // Of 36 pixels one.
+                image.data[3 * 11] = 0.5;
+            }
+            std::fs::write(
+                folder.path().join(format!("images/{:02}.png", view.field[7..8].parse::<u8>().unwrap())),
+                image.to_png(),
+            )
+            .unwrap();
+        }
+        capture.survey(None).unwrap()
+    };
+    let white = paint(1.0, 0);
+    assert_eq!((white.scope, &white.reason[..41]), (Scope::Bounded, "photographs show an object before white; "));
+    assert_eq!(paint(0.9, 0).scope, Scope::Unbounded);
+    assert_eq!(paint(1.0, 9).scope, Scope::Unbounded, "a spot on the border of each");
+    // Of three that are looked at, all have to be so.
+    assert_eq!(paint(1.0, 3).scope, Scope::Unbounded);
+}
+
+#[test]
+fn distances_are_read_where_they_are_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 9);
+    capture.hold_out();
+    let path = folder.path().join("depth.png");
+    image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(12, 8, image::Luma([500])).save(&path).unwrap();
+    let measured = capture.views.iter_mut().find(|view| view.field == "frames[3]").unwrap();
+    measured.depth = Some((path, 0.01));
+    let survey = capture.survey(None).unwrap();
+    let read = |distances| {
+        let reading = Reading { distances, ..Reading::default() };
+        capture.load(Split::Train, &survey, &reading).unwrap()
+    };
+    assert!(read(false).frames.iter().all(|frame| frame.distances.is_none()));
+    let data = read(true);
+    data.check_distances(true).unwrap();
+    for frame in &data.frames {
+        let Some(found) = &frame.distances else { continue };
+        assert_eq!((frame.name.as_str(), [found.width, found.height]), ("images/03.png", [12, 8]));
+        // Five units of the capture along the axis.
+        let place = frame.camera.ray(1.5, 2.5).at(f64::from(found.data[2 * 12 + 1]));
+        let depth = -frame.camera.pose.inverse().transform_point3(place).z / survey.placement.scale;
+        assert!((depth - 5.0).abs() < 1e-5, "{depth}");
+    }
+    assert_eq!(data.frames.iter().filter(|frame| frame.distances.is_some()).count(), 1);
+}

@@ -42,7 +42,7 @@ fn quarter(radius: f64) -> Vec<Camera> {
 
 #[test]
 fn the_middle_is_what_cameras_look_at_and_up_is_theirs() {
-    let survey = Survey::new(&capture(Format::Colmap, quarter(4.0)), false, None).unwrap();
+    let survey = Survey::new(&capture(Format::Colmap, quarter(4.0)), None, None).unwrap();
     assert_eq!(survey.scope, Scope::Unbounded);
     // Axes are held back a little towards the cameras.
     assert!(survey.placement.origin.distance(CENTRE) < 0.05, "{}", survey.placement.origin);
@@ -56,7 +56,7 @@ fn the_middle_is_what_cameras_look_at_and_up_is_theirs() {
     // A camera that is lost, far away and looking elsewhere, moves it little.
     let mut cameras = quarter(4.0);
     cameras.push(camera(CENTRE + DVec3::new(300.0, 50.0, 0.0), CENTRE + DVec3::new(300.0, 90.0, 20.0), DVec3::NEG_Y));
-    let lost = Survey::new(&capture(Format::Colmap, cameras), false, None).unwrap();
+    let lost = Survey::new(&capture(Format::Colmap, cameras), None, None).unwrap();
     assert!(lost.placement.origin.distance(CENTRE) < 0.5, "{}", lost.placement.origin);
 }
 
@@ -67,7 +67,7 @@ fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
         camera(eye, 3.0 * eye, DVec3::Z)
     });
     let mean = outwards.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / 4.0;
-    let survey = Survey::new(&capture(Format::Transforms, outwards.to_vec()), false, None).unwrap();
+    let survey = Survey::new(&capture(Format::Transforms, outwards.to_vec()), None, None).unwrap();
     assert!(survey.placement.origin.distance(mean) < 1e-9, "{}", survey.placement.origin);
     assert!(survey.placement.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
     assert!(survey.reason.ends_with("; cameras look around"), "{}", survey.reason);
@@ -78,10 +78,10 @@ fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
     let mut room = capture(Format::Colmap, outwards.to_vec());
     let wall = |i: usize| mean + 7.0 * DVec3::new((i as f64).cos(), (i as f64).sin(), 0.0);
     room.points = (0..150).map(|i| Point { position: wall(i), color: [0; 3], error: 1.0, views: 3 }).collect();
-    assert!((half(&Survey::new(&room, false, None).unwrap()) - 7.0).abs() < 1e-9);
+    assert!((half(&Survey::new(&room, None, None).unwrap()) - 7.0).abs() < 1e-9);
     // Points in between the cameras do not make the box smaller than their own.
     room.points.iter_mut().for_each(|point| point.position = mean + 1e-3 * point.position);
-    assert!((half(&Survey::new(&room, false, None).unwrap()) - spread).abs() < 1e-9);
+    assert!((half(&Survey::new(&room, None, None).unwrap()) - spread).abs() < 1e-9);
 }
 
 #[test]
@@ -93,17 +93,34 @@ fn what_cameras_that_look_the_same_way_show_lies_ahead() {
     let mut wall = capture(Format::Colmap, wall.collect());
     let mean = wall.views.iter().map(|view| view.camera.pose.translation).sum::<DVec3>() / 5.0;
     let spread = median(wall.views.iter().map(|view| view.camera.pose.translation.distance(mean)));
-    let survey = Survey::new(&wall, false, None).unwrap();
+    let survey = Survey::new(&wall, None, None).unwrap();
     assert!(survey.placement.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", survey.placement.origin);
     assert!(survey.reason.ends_with("; cameras look the same way"), "{}", survey.reason);
     let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
     wall.points = (0..150).map(|i| Point { position: place(i), color: [0; 3], error: 1.0, views: 3 }).collect();
-    let survey = Survey::new(&wall, false, None).unwrap();
+    let survey = Survey::new(&wall, None, None).unwrap();
     assert!(survey.placement.origin.distance(mean + 3.98 * DVec3::Y) < 0.01, "{}", survey.placement.origin);
     assert!((1.5 / survey.placement.scale - 1.99).abs() < 0.03, "half of the distance");
+    // Depth counts, and not how far to a side: a flight at a height of 50 over a wide field.
+    let flight = (0..25).map(|i| {
+        let eye = DVec3::new(100.0 * f64::from(i % 5), 100.0 * f64::from(i / 5), 50.0);
+        // Held a little askew, as by the wind: axes meet nowhere in particular.
+        let askew = 3.0 * DVec3::new((7.0 * f64::from(i)).sin(), (3.0 * f64::from(i)).cos(), 0.0);
+        camera(eye, eye + askew - 50.0 * DVec3::Z, DVec3::Y)
+    });
+    let mut flight = capture(Format::Colmap, flight.collect());
+    let field = |i: usize| DVec3::new(400.0 * (i as f64).sin().powi(2), 400.0 * (1.3 * i as f64).cos().powi(2), 0.0);
+    flight.points = (0..500).map(|i| Point { position: field(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    // A hundred that are not to be trusted.
+    let bad = Point { position: DVec3::new(0.0, 0.0, -900.0), color: [0; 3], error: 9.0, views: 1 };
+    flight.points.extend(std::iter::repeat_n(bad, 600));
+    let survey = Survey::new(&flight, None, None).unwrap();
+    assert!(survey.reason.ends_with("; cameras look the same way"), "{}", survey.reason);
+    assert!(survey.placement.origin.distance(DVec3::new(200.0, 200.0, 0.0)) < 8.0, "{}", survey.placement.origin);
+    assert!(1.5 / survey.placement.scale > 100.0, "all of the flight is in the box");
     // Ninety-nine points are too few.
     wall.points.truncate(99);
-    let few = Survey::new(&wall, false, None).unwrap();
+    let few = Survey::new(&wall, None, None).unwrap();
     assert!(few.placement.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9);
 }
 
@@ -115,7 +132,7 @@ fn cameras_that_look_down_have_the_sky_behind_them() {
         let eye = DVec3::new(f64::from(i), f64::from(i % 3), 50.0);
         camera(eye, eye - DVec3::Z * 50.0, north)
     });
-    let survey = Survey::new(&capture(Format::Colmap, flight.collect()), false, None).unwrap();
+    let survey = Survey::new(&capture(Format::Colmap, flight.collect()), None, None).unwrap();
     assert!((survey.placement.rotation * DVec3::Z).z > 0.9, "{:?}", survey.placement.rotation);
 }
 
@@ -123,7 +140,7 @@ fn cameras_that_look_down_have_the_sky_behind_them() {
 fn a_bounded_scene_is_as_wide_as_what_cameras_see_of_it() {
     let eyes = [DVec3::new(3.0, 0.0, 0.0), DVec3::new(0.0, 4.0, 0.0), DVec3::new(-8.0, 0.0, 0.0)];
     let cameras = eyes.map(|eye| camera(eye, DVec3::ZERO, DVec3::Z));
-    let survey = Survey::new(&capture(Format::Transforms, cameras.to_vec()), true, None).unwrap();
+    let survey = Survey::new(&capture(Format::Transforms, cameras.to_vec()), Some("it is transparent"), None).unwrap();
     assert_eq!(survey.scope, Scope::Bounded);
     // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: .6 of the distance 4.
     let half = 1.5 / survey.placement.scale;
@@ -142,7 +159,7 @@ fn points_and_depths_say_where_a_scene_begins() {
     capture.points =
         (0..400).map(|i| point([0.1, 0.2, 1.0].get(i).copied().unwrap_or(1.0 + 0.01 * i as f64))).collect();
     let near = |capture: &Capture| {
-        let survey = Survey::new(capture, false, None).unwrap();
+        let survey = Survey::new(capture, None, None).unwrap();
         survey.near / survey.placement.scale
     };
     assert!((near(&capture) - 0.5).abs() < 0.2, "{}", near(&capture));
@@ -162,7 +179,7 @@ fn points_and_depths_say_where_a_scene_begins() {
     });
     let mut forward = self::capture(Format::Llff, forward.collect());
     forward.views.iter_mut().for_each(|view| view.bounds = Some([2.0, 6.0]));
-    let survey = Survey::new(&forward, false, None).unwrap();
+    let survey = Survey::new(&forward, None, None).unwrap();
     assert!(survey.placement.origin.distance(DVec3::new(0.2, 3.0, 0.0)) < 1e-9, "{}", survey.placement.origin);
     assert!((survey.near / survey.placement.scale - 1.0).abs() < 1e-9);
 }
@@ -174,14 +191,17 @@ fn what_is_asked_for_counts_then_the_convention_then_transparency() {
         capture.views.iter_mut().for_each(|view| view.camera.pose.translation -= CENTRE);
         capture
     };
-    let conventional = Survey::new(&around(4.0), false, None).unwrap();
+    let conventional = Survey::new(&around(4.0), None, None).unwrap();
     assert_eq!((conventional.near, conventional.far, conventional.placement), (2.0, 6.0, Placement::default()));
     assert_eq!(conventional.scope, Scope::Bounded);
-    assert_eq!(Survey::new(&around(4.0), true, Some(Scope::Unbounded)).unwrap().scope, Scope::Unbounded);
+    assert_eq!(
+        Survey::new(&around(4.0), Some("it is transparent"), Some(Scope::Unbounded)).unwrap().scope,
+        Scope::Unbounded
+    );
     for radius in [2.4, 5.6] {
-        let other = Survey::new(&around(radius), true, None).unwrap();
+        let other = Survey::new(&around(radius), Some("it is transparent"), None).unwrap();
         assert!(other.placement != Placement::default() && other.scope == Scope::Bounded, "{radius}");
-        assert_eq!(Survey::new(&around(radius), false, None).unwrap().scope, Scope::Unbounded);
+        assert_eq!(Survey::new(&around(radius), None, None).unwrap().scope, Scope::Unbounded);
     }
     assert_eq!("unbounded".parse::<Scope>().unwrap().to_string(), "unbounded");
     let message = "endless".parse::<Scope>().unwrap_err().to_string();
@@ -191,14 +211,14 @@ fn what_is_asked_for_counts_then_the_convention_then_transparency() {
 #[test]
 fn captures_without_size_or_images_are_errors() {
     let mut one = capture(Format::Colmap, vec![quarter(4.0)[0].clone(); 5]);
-    let message = Survey::new(&one, false, None).unwrap_err().to_string();
+    let message = Survey::new(&one, None, None).unwrap_err().to_string();
     assert!(message.contains("one place"), "{message}");
     one.views.iter_mut().for_each(|view| view.image = None);
-    let message = Survey::new(&one, false, None).unwrap_err().to_string();
+    let message = Survey::new(&one, None, None).unwrap_err().to_string();
     assert!(
         message.contains("frames[0]") && message.contains("none of the 5 images") && message.contains("0.png"),
         "{message}"
     );
     one.views.clear();
-    assert!(Survey::new(&one, false, None).is_err());
+    assert!(Survey::new(&one, None, None).is_err());
 }

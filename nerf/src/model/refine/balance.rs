@@ -19,49 +19,52 @@ pub(super) type Matrix = [[f64; POSE]; POSE];
 const PLACES: [usize; 2] = [6, 3];
 /// What is added to the diagonal, as a part of it: how far a valley is widened at most.
 const DAMPING: f64 = 0.1;
+/// What a number moves at least, squared: a single ray along an axis shows nothing of a turn about that.
+const LEAST: f64 = 1e-12;
 
 /// The matrix from six numbers to a rotation vector (radians, in the axes of the scene) about the camera's centre and a
 /// translation (scene units), upper triangular: 1 of any of the six moves what the camera sees of the box by about a radian,
-/// and no two of them alike.
-pub(super) fn balance(camera: &Camera, bounds: [DVec3; 2], span: [f64; 2], unit: f64) -> Matrix {
+/// and no two of them alike. What it sees of a scene that goes on beyond counts as well, infinitely far away.
+pub(super) fn balance(camera: &Camera, bounds: [DVec3; 2], span: [f64; 2], unit: f64, unbounded: bool) -> Matrix {
     let [columns, depths] = PLACES;
     let mut sum = [[0.0; POSE]; POSE];
-    let mut count = 0.0;
+    let (mut count, mut inside) = (0.0, false);
     for i in 0..columns * columns {
         let place = |i: usize, size: usize| (i as f64 + 0.5) / columns as f64 * size as f64;
-        let ray = camera.ray(place(i % columns, camera.width), place(i / columns, camera.height));
+        let [x, y] = [place(i % columns, camera.width), place(i / columns, camera.height)];
+        if !camera.sees(x, y) {
+            continue;
+        }
+        let ray = camera.ray(x, y);
         let [from, to] = clip_span(&ray, bounds, span);
-        for k in 0..depths {
-            let share = (k as f64 + 0.5) / depths as f64;
-            let t = from + share * (to - from);
-            if !(to > from && t.is_finite()) {
-                continue;
-            }
+        let within = (0..depths).map(|k| from + (k as f64 + 0.5) / depths as f64 * (to - from));
+        let within = within.filter(|t| to > from && t.is_finite());
+        for t in within.chain(unbounded.then_some(f64::INFINITY)) {
             for row in slopes(ray.direction, t) {
                 (0..POSE).for_each(|a| (0..POSE).for_each(|b| sum[a][b] += row[a] * row[b]));
             }
             count += 1.0;
+            inside |= t.is_finite();
         }
     }
-    if count == 0.0 {
-        // It sees nothing of the box: as if from one unit away.
-        return std::array::from_fn(|a| {
-            std::array::from_fn(|b| {
-                if a != b {
-                    0.0
-                } else if a < 3 {
-                    1.0
-                } else {
-                    unit
-                }
-            })
-        });
+    if !inside {
+        return plain(unit);
     }
     for (a, row) in sum.iter_mut().enumerate() {
         row.iter_mut().for_each(|x| *x /= count);
-        row[a] *= 1.0 + DAMPING;
+        row[a] = (row[a] * (1.0 + DAMPING)).max(LEAST);
     }
     inverse_transposed(&cholesky(&sum))
+}
+
+/// That of a camera that sees nothing of the box, or of which nothing is known: as if that were one unit away.
+pub(super) fn plain(unit: f64) -> Matrix {
+    let entry = |a: usize, b: usize| match (a == b, a < 3) {
+        (true, true) => 1.0,
+        (true, false) => unit,
+        (false, _) => 0.0,
+    };
+    std::array::from_fn(|a| std::array::from_fn(|b| entry(a, b)))
 }
 
 /// How the direction to a place at the distance `t` along a unit direction moves, seen from a camera that turns or moves:
@@ -116,7 +119,7 @@ mod tests {
     fn what_is_seen_moves_alike_for_each_number_and_not_together() {
         for lens in [Lens::Pinhole, Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] }] {
             let camera = Camera { lens, ..camera() };
-            let matrix = balance(&camera, BOX, [0.1, 9.0], 1.0);
+            let matrix = balance(&camera, BOX, [0.1, 9.0], 1.0, false);
             let (mut seen, mut plain) = ([[0.0; POSE]; POSE], [[0.0; POSE]; POSE]);
             let mut count = 0.0;
             for i in 0..36 {
@@ -168,9 +171,34 @@ mod tests {
     }
 
     #[test]
+    fn what_lies_beyond_an_open_scene_counts_too() {
+        // The box is small in the picture: within it, a turn about the axis that the camera looks along shows little.
+        let narrow = camera();
+        let small = BOX.map(|corner| 0.5 * corner);
+        let turned = |unbounded| {
+            let matrix = balance(&narrow, small, [0.1, 9.0], 1.0, unbounded);
+            // The largest turn about any axis that one of the first three numbers makes.
+            (0..3).map(|b| DVec3::new(matrix[0][b], matrix[1][b], matrix[2][b]).length()).fold(0.0, f64::max)
+        };
+        assert!(turned(true) < 0.7 * turned(false), "{} {}", turned(true), turned(false));
+    }
+
+    #[test]
+    fn a_scene_in_other_units_is_balanced_alike() {
+        let (near, mut far) = (camera(), camera());
+        far.pose.translation *= 100.0;
+        let a = balance(&near, BOX, [0.1, 9.0], 1.0, false);
+        let b = balance(&far, BOX.map(|x| 100.0 * x), [10.0, 900.0], 100.0, false);
+        for (i, j) in (0..POSE).flat_map(|i| (0..POSE).map(move |j| (i, j))) {
+            let factor = if i < 3 { 1.0 } else { 100.0 };
+            assert!((factor * a[i][j] - b[i][j]).abs() < 1e-9 * factor, "{i} {j}");
+        }
+    }
+
+    #[test]
     fn a_camera_that_sees_nothing_is_turned_and_moved_as_it_is() {
         let away = Camera::from_angle(4, 4, 0.5, Camera::look_at(DVec3::X * 5.0, DVec3::X * 9.0, DVec3::Z));
-        let matrix = balance(&away, BOX, [0.1, 9.0], 1.5);
+        let matrix = balance(&away, BOX, [0.1, 9.0], 1.5, true);
         assert!((0..POSE).all(|i| matrix[i][i] == if i < 3 { 1.0 } else { 1.5 }) && matrix[0][4] == 0.0);
     }
 }

@@ -17,7 +17,7 @@ use crate::dataset::Placement;
 use crate::model::extent::Extent;
 use crate::volume::query::RayVars;
 use crate::{Error, Result};
-use balance::{Matrix, POSE, balance};
+use balance::{Matrix, POSE, balance, plain};
 use glam::{DAffine3, DVec3};
 use newton::{CORRECTIONS, with_corrections};
 use raygrad_autograd::{Scalar, Tensor, Var};
@@ -105,16 +105,16 @@ fn with_glass(camera: &Camera) -> Camera {
 }
 
 impl Refine {
-    /// Corrections of the photographs of a scene that correct nothing so far; `cameras` are theirs, or none. `None` if
-    /// nothing is to be learned.
+    /// Corrections of the photographs of a scene that correct nothing so far; `cameras` are theirs, or none, and with the
+    /// scene's extent stands whether it goes on beyond its box. `None` if nothing is to be learned.
     ///
     /// # Errors
     /// If there is no photograph, there is not one camera for each, or focal lengths or lenses are to be learned and there
-    /// are no cameras.
+    /// are no cameras, or none that has any.
     pub fn new<T: Scalar>(
         poses: bool,
         config: &RefineConfig,
-        extent: &Extent,
+        (extent, unbounded): (&Extent, bool),
         cameras: &[Camera],
         params: &mut Params<T>,
     ) -> Result<Option<Self>> {
@@ -129,6 +129,11 @@ impl Refine {
             let what = format!("corrects the cameras of {frames} photographs, and {} are known", cameras.len());
             return Err(Error::setting(if focal || lens { wanted[usize::from(!focal) + 1].1 } else { name }, what));
         }
+        let panoramas = cameras.iter().all(|camera| camera.lens == Lens::Equirectangular);
+        if panoramas && (focal || lens) {
+            let what = "equirectangular images have no focal length and no lens that could be wrong";
+            return Err(Error::setting(wanted[usize::from(!focal) + 1].1, what));
+        }
         let cameras: Arc<[Camera]> =
             cameras.iter().map(|camera| if lens { with_glass(camera) } else { camera.clone() }).collect();
         let (groups, count) = grouped(&cameras);
@@ -138,22 +143,9 @@ impl Refine {
         // A step sees few photographs of many.
         params.set_lazy(|name| name == POSES, true);
         let Extent { bounds, span, unit, .. } = *extent;
-        let plain = || {
-            std::array::from_fn(|a| {
-                std::array::from_fn(|b| {
-                    if a != b {
-                        0.0
-                    } else if a < 3 {
-                        1.0
-                    } else {
-                        unit
-                    }
-                })
-            })
-        };
         let balance = match cameras.is_empty() {
-            true => (0..frames).map(|_| plain()).collect(),
-            false => cameras.iter().map(|camera| balance(camera, bounds, span, unit)).collect(),
+            true => vec![plain(unit); frames].into(),
+            false => cameras.iter().map(|camera| balance(camera, bounds, span, unit, unbounded)).collect(),
         };
         Ok(Some(Refine { poses, focal, lens, extent: *extent, balance, cameras, groups: groups.into() }))
     }
@@ -211,7 +203,7 @@ impl Refine {
             let turned = |matrices: &Var<'t, T>, rows: &Var<'t, T>| (matrices * rows.unsqueeze(1)).sum_over(-1);
             let entry = |i: usize| {
                 let (ray, at) = (i / (POSE * POSE), i % (POSE * POSE));
-                T::from_f64(self.balance[frames[ray] as usize][at / POSE][at % POSE])
+                T::from_f64(self.balance[frames[ray] as usize].as_flattened()[at])
             };
             let balance = tape.constant(Tensor::from_fn(&[count, POSE, POSE], entry));
             let corrections = turned(&balance, &params[poses].gather_rows(frames));
@@ -220,7 +212,7 @@ impl Refine {
             let mut arms = origins - &middle;
             if let Some(focal) = self.focal {
                 let groups: Vec<u32> = frames.iter().map(|&frame| self.groups[frame as usize]).collect();
-                arms = arms * params[focal].mean_over(1).exp().unsqueeze(1).gather_rows(groups);
+                arms *= params[focal].mean_over(1).exp().unsqueeze(1).gather_rows(groups);
             }
             origins = arms + middle + corrections.slice_axis(1, 3..);
         }
@@ -273,13 +265,7 @@ impl Refine {
         let [x, y, z, a, b, c] =
             self.balance[number].map(|numbers| numbers.iter().zip(row).map(|(a, b)| a * b.to_f64()).sum::<f64>());
         let turn = DAffine3::from(Pose::from_vector([x, y, z], [0.0; 3])).matrix3;
-        let grown = match (focal, self.groups.get(number)) {
-            (Some(focal), Some(&group)) => {
-                let [a, b] = [0, 1].map(|k| focal.as_slice()[2 * group as usize + k].to_f64());
-                (0.5 * (a + b)).exp()
-            }
-            _ => 1.0,
-        };
+        let grown = self.groups.get(number).map_or(1.0, |group| self.growth(params, Some(*group)));
         let pose = DAffine3 {
             matrix3: turn * camera.pose.matrix3,
             translation: self.middle() + grown * (camera.pose.translation - self.middle()) + DVec3::new(a, b, c),
@@ -287,24 +273,63 @@ impl Refine {
         Camera { pose, ..camera }
     }
 
-    /// How the cameras have moved as a whole: the similarity that takes their places as they were given nearest to those
-    /// that were found. `None` if poses are not learned, cameras are not known, or fewer than three or all in a line.
-    pub fn placement<T: Scalar>(&self, params: &Params<T>) -> Option<Placement> {
-        self.poses?;
-        let place = |(i, camera): (usize, &Camera)| self.camera(params, i, camera).pose.translation;
-        let found: Vec<DVec3> = self.cameras.iter().enumerate().map(place).collect();
-        let given: Vec<DVec3> = self.cameras.iter().map(|camera| camera.pose.translation).collect();
-        Placement::between(&given, &found)
+    /// By how much a camera steps back from the scene's middle, with the focal length of its group, or, if that is not
+    /// known, with all on average; 1 if poses or focal lengths are not learned.
+    fn growth<T: Scalar>(&self, params: &Params<T>, group: Option<u32>) -> f64 {
+        let (Some(focal), Some(_)) = (self.focal, self.poses) else { return 1.0 };
+        let all = params.get(focal).as_slice();
+        let own = group.map_or(all, |group| &all[2 * group as usize..2 * group as usize + 2]);
+        (own.iter().map(|x| x.to_f64()).sum::<f64>() / own.len() as f64).exp()
     }
 
-    /// A camera that took none of the photographs, given beside theirs: moved as they [have](Self::placement) as a whole
-    /// and, if one of them is the same but for its pose, with what was found of its focal length and lens.
+    /// The camera, that many times as far from the scene's middle.
+    fn stepped(&self, camera: &Camera, growth: f64) -> Camera {
+        let mut stepped = camera.clone();
+        stepped.pose.translation = self.middle() + growth * (camera.pose.translation - self.middle());
+        stepped
+    }
+
+    /// The similarity that takes the cameras, each stepped back by its growth, nearest to where they were found; how they
+    /// are held counts as much as where they stand, so that it is known of many in a line, too. `None` if poses are not
+    /// learned, or cameras are not known.
+    fn similarity<T: Scalar>(&self, params: &Params<T>, growths: &[f64]) -> Option<Placement> {
+        self.poses?;
+        let count = self.cameras.len() as f64;
+        let mean = self.cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
+        let spread = self.cameras.iter().map(|camera| camera.pose.translation.distance(mean)).sum::<f64>() / count;
+        let arm = spread.max(0.1 * self.extent.unit);
+        let places = |camera: &Camera| {
+            let DAffine3 { matrix3, translation } = camera.pose;
+            [DVec3::ZERO, matrix3.x_axis, matrix3.y_axis, matrix3.z_axis].map(|axis| translation + arm * axis)
+        };
+        let given =
+            self.cameras.iter().zip(growths).flat_map(|(camera, growth)| places(&self.stepped(camera, *growth)));
+        let found = self.cameras.iter().enumerate().flat_map(|(i, camera)| places(&self.camera(params, i, camera)));
+        Placement::between(&given.collect::<Vec<_>>(), &found.collect::<Vec<_>>())
+    }
+
+    /// How the cameras have moved as a whole: the similarity that takes them as they were given nearest to how they were
+    /// found. `None` if poses are not learned, or cameras are not known.
+    pub fn placement<T: Scalar>(&self, params: &Params<T>) -> Option<Placement> {
+        let growth = self.growth(params, None);
+        let rest = self.similarity(params, &vec![growth; self.cameras.len()])?;
+        // The step from the middle, and then the rest.
+        let origin = self.middle() - (self.middle() - rest.origin) / growth;
+        Some(Placement { scale: rest.scale * growth, origin, ..rest })
+    }
+
+    /// A camera that took none of the photographs, given beside theirs: moved as they have as a whole and, if one of them is
+    /// the same but for its pose, with what was found of its focal length and lens.
     pub fn other_camera<T: Scalar>(&self, params: &Params<T>, camera: &Camera) -> Camera {
         let [focal, lens] = [self.focal, self.lens].map(|id| id.map(|id| params.get(id)));
         let glass = if lens.is_some() { with_glass(camera) } else { camera.clone() };
-        let same = self.cameras.iter().position(|other| is_same(other, &glass));
-        let camera = self.glass(focal, lens, same.map(|i| self.groups[i]), camera);
-        self.placement(params).map_or(camera.clone(), |placement| placement.camera(&camera))
+        let same = self.cameras.iter().position(|other| is_same(other, &glass)).map(|i| self.groups[i]);
+        let camera = self.glass(focal, lens, same, camera);
+        let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
+        match self.similarity(params, &growths) {
+            Some(similarity) => similarity.camera(&self.stepped(&camera, self.growth(params, same))),
+            None => camera,
+        }
     }
 }
 

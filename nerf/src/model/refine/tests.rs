@@ -1,6 +1,7 @@
 //! Corrected cameras, against their rays as numbers and against differences.
 
 use super::*;
+use glam::DMat3;
 use raygrad_autograd::Tape;
 use raygrad_autograd::check::{Check, check_function};
 use raygrad_nn::Schedule;
@@ -63,7 +64,7 @@ fn rays_are_those_of_the_camera_that_is_corrected() {
         (true, all()),
     ] {
         let mut params = Params::<f64>::new();
-        let refine = Refine::new(poses, &config, &extent(6), &cameras, &mut params).unwrap().unwrap();
+        let refine = Refine::new(poses, &config, (&extent(6), false), &cameras, &mut params).unwrap().unwrap();
         let rays = given(&cameras);
         for scale in [0.0, 1.0] {
             for value in params.values_mut() {
@@ -81,6 +82,9 @@ fn rays_are_those_of_the_camera_that_is_corrected() {
                 pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
             };
             assert!(apart(&moved.origins, &expected.origins) < 1e-14, "{config:?}");
+            assert!(moved.origins.as_flattened().iter().all(|x| x.is_finite()));
+            let spans = |rays: &Rays<f64>| rays.spans.as_flattened().to_vec();
+            assert!(spans(&moved).iter().zip(spans(&expected)).all(|(a, b)| (a - b).abs() < 1e-12), "{config:?}");
             assert!(apart(&moved.directions, &expected.directions) < 1e-13, "{config:?}, {moved:?}, {expected:?}");
             assert_eq!(vars.directions.value().as_slice(), moved.directions.as_flattened());
             let same = apart(&moved.directions, &rays.directions);
@@ -102,7 +106,7 @@ fn seen<'t>(vars: &RayVars<'t, f64>) -> Var<'t, f64> {
 fn corrections_have_the_gradients_that_differences_show() {
     let cameras = cameras();
     let mut layout = Params::<f64>::new();
-    let refine = Refine::new(true, &all(), &extent(6), &cameras, &mut layout).unwrap().unwrap();
+    let refine = Refine::new(true, &all(), (&extent(6), false), &cameras, &mut layout).unwrap().unwrap();
     let shapes: Vec<_> = layout.values().iter().map(|value| value.shape().to_vec()).collect();
     assert_eq!(shapes, [vec![6, 6], vec![5, 2], vec![5, 4]], "two photographs are of one camera");
     let rays = given(&cameras);
@@ -137,12 +141,41 @@ fn corrections_have_the_gradients_that_differences_show() {
 }
 
 #[test]
+fn every_photograph_has_a_balance_of_its_own() {
+    let mut cameras = cameras();
+    cameras[3].pose = Camera::look_at(DVec3::new(0.0, 9.0, -1.0), MIDDLE, DVec3::Z);
+    for unbounded in [false, true] {
+        let extent = Extent { span: [0.5, 30.0], ..extent(6) };
+        let mut params = Params::<f64>::new();
+        let config = RefineConfig::default();
+        let refine = Refine::new(true, &config, (&extent, unbounded), &cameras, &mut params).unwrap().unwrap();
+        for (i, camera) in cameras.iter().enumerate() {
+            let expected = balance(camera, extent.bounds, extent.span, extent.unit, unbounded);
+            assert!(refine.balance[i] == expected && expected != plain(extent.unit), "{i}");
+        }
+        // Any of the six moves by about itself what the photograph shows.
+        for k in 0..POSE {
+            let id = params.find(POSES).unwrap();
+            params.get_mut(id).as_mut_slice().fill(0.0);
+            params.get_mut(id).as_mut_slice()[3 * POSE + k] = 1e-4;
+            let [a, b] = [&cameras[3], &refine.camera(&params, 3, &cameras[3])].map(|camera| camera.pose.inverse());
+            let off = (0..8).map(|j| {
+                let place = MIDDLE + 0.5 * DVec3::from([0, 1, 2].map(|d| f64::from(j >> d & 1) * 2.0 - 1.0));
+                a.transform_point3(place).angle_between(b.transform_point3(place)) / 1e-4
+            });
+            let mean = off.sum::<f64>() / 8.0;
+            assert!((0.1..3.0).contains(&mean), "{k}: {mean}");
+        }
+    }
+}
+
+#[test]
 fn where_a_lens_puts_nothing_nothing_is_learned() {
     let mut cameras = cameras();
     cameras.truncate(1);
     cameras[0].lens = Lens::Brown { k: [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
     let mut params = Params::<f64>::new();
-    let refine = Refine::new(false, &all(), &extent(1), &cameras, &mut params).unwrap().unwrap();
+    let refine = Refine::new(false, &all(), (&extent(1), false), &cameras, &mut params).unwrap().unwrap();
     let mut rays = Rays::new();
     let pixels = [[3, 5], [8, 0]];
     pixels.iter().for_each(|pixel: &[u32; 2]| rays.push_pixel(&cameras[0], pixel.map(|x| x as usize), BOX, SPAN));
@@ -161,7 +194,7 @@ fn where_a_lens_puts_nothing_nothing_is_learned() {
 #[test]
 fn cameras_have_to_be_known_where_they_are_corrected() {
     let new = |poses, config: &RefineConfig, frames, cameras: &[Camera]| {
-        Refine::new(poses, config, &extent(frames), cameras, &mut Params::<f64>::new())
+        Refine::new(poses, config, (&extent(frames), false), cameras, &mut Params::<f64>::new())
     };
     let cameras = cameras();
     let none = RefineConfig::default();
@@ -175,6 +208,11 @@ fn cameras_have_to_be_known_where_they_are_corrected() {
     assert!(message(true, &none, 0, &[]).starts_with("`poses`"));
     assert!(message(true, &none, 7, &cameras).starts_with("`poses`"));
     assert!(message(false, &all(), 6, &[]).starts_with("`refine.focal`"));
+    let panoramas = vec![cameras[5].clone(); 2];
+    assert!(
+        message(true, &RefineConfig { focal: None, ..all() }, 2, &panoramas).starts_with("`refine.lens`: equirect")
+    );
+    assert!(new(true, &none, 2, &panoramas).unwrap().is_some());
     assert!(message(true, &RefineConfig { focal: None, ..all() }, 5, &cameras).starts_with("`refine.lens`"));
 }
 
@@ -182,7 +220,7 @@ fn cameras_have_to_be_known_where_they_are_corrected() {
 fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass() {
     let cameras = cameras();
     let mut params = Params::<f64>::new();
-    let refine = Refine::new(true, &all(), &extent(6), &cameras, &mut params).unwrap().unwrap();
+    let refine = Refine::new(true, &all(), (&extent(6), false), &cameras, &mut params).unwrap().unwrap();
     // All move by the same.
     let moved = DVec3::new(0.15, -0.3, 0.45);
     let set = |params: &mut Params<f64>, name: &str, values: &[f64]| {
@@ -196,25 +234,28 @@ fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass(
     set(&mut params, "poses", &moves(&refine));
     set(&mut params, "focal", &[0.1, 0.2]);
     set(&mut params, "lens", &[0.01]);
-    // They were given in a line, about which anything can turn.
-    assert!(refine.placement(&params).is_none());
+    // They were given in a line, about which anything could turn if it were for their places alone.
+    let line = refine.placement(&params).unwrap();
+    assert!((line.scale - 0.15_f64.exp()).abs() < 1e-9 && line.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "{line:?}");
     let mut around = cameras.clone();
     around.iter_mut().enumerate().for_each(|(i, camera)| camera.pose.translation.z += (i as f64).sin());
     let mut params = Params::<f64>::new();
-    let refine = Refine::new(true, &all(), &extent(6), &around, &mut params).unwrap().unwrap();
+    let refine = Refine::new(true, &all(), (&extent(6), false), &around, &mut params).unwrap().unwrap();
     set(&mut params, "poses", &moves(&refine));
-    set(&mut params, "focal", &[0.1, 0.2]);
-    set(&mut params, "lens", &[0.01]);
+    // Each group has a factor of its own: that of the pinhole, the fourth, is .2 and .4.
+    let each: Vec<f64> = (0..10).map(|i| [0.05, 0.1][i % 2] * (i / 2 + 1) as f64).collect();
+    set(&mut params, "focal", &each);
+    set(&mut params, "lens", &[0.01, 0.02, 0.03, 0.04]);
     let pose = Camera::look_at(DVec3::new(0.0, 4.0, 1.0), DVec3::ZERO, DVec3::Z);
     // The fifth is a pinhole, and the picture is twice as large.
     let other = Camera { pose, ..around[4].resized(18, 14) };
     let found = refine.other_camera(&params, &other);
     // They have stepped back as well, by the mean of the factors of columns and rows.
-    let expected = MIDDLE + 0.15_f64.exp() * (pose.translation - MIDDLE) + moved;
+    let expected = MIDDLE + 0.3_f64.exp() * (pose.translation - MIDDLE) + moved;
     assert!(found.pose.translation.distance(expected) < 1e-9, "{found:?}");
     assert!(found.pose.matrix3.abs_diff_eq(pose.matrix3, 1e-9));
-    assert!((found.focal[0] / 16.0 - 0.1_f64.exp()).abs() < 1e-12 && (found.focal[1] / 17.0).ln() > 0.19);
-    assert!(matches!(found.lens, Lens::Brown { k, p } if k[..3] == [0.01, 0.01, 0.0] && p == [0.01; 2]));
+    assert!(((found.focal[0] / 16.0).ln() - 0.2).abs() < 1e-12 && ((found.focal[1] / 17.0).ln() - 0.4).abs() < 1e-12);
+    assert!(matches!(found.lens, Lens::Brown { k, p } if k[..3] == [0.01, 0.02, 0.0] && p == [0.03, 0.04]));
     // Of a camera that took none of the photographs nothing is known.
     let unknown = Camera { focal: [9.0, 9.0], ..other };
     let found = refine.other_camera(&params, &unknown);

@@ -1,0 +1,76 @@
+//! Three ways to hold a scene that goes on to the horizon, by what they make of near, far and sky.
+//!
+//! ```text
+//! cargo run --release --example unbounded [seconds=60] [pixels=200] [only=bounded|contraction|cascades]
+//! ```
+//!
+//! The bulldozer in its landscape (exact out to a thousand units) is trained as if it ended at the box of the bulldozer and
+//! the cameras; contracted, with samples that proposals place (Barron et al. 2022, "Mip-NeRF 360"); and contracted, with
+//! steps that grow through cascades of an occupancy grid (Mueller et al. 2022, "Instant NGP"), which is what `raygrad
+//! train` does. Of the views that it has not seen, near is what lies in that box.
+
+use raygrad::nerf::dataset::{Dataset, Scope, Split, evenly_spaced, landscape, landscape_distances};
+use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::pictures::metrics::psnr_from_mse;
+use raygrad::nerf::sampling::proposal::{ProposalConfig, Spacing};
+use raygrad::nerf::{Background, Budget, Config, Model, Preset, Result, SamplerConfig, Trainer};
+use std::ops::ControlFlow;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Views that are compared.
+const VIEWS: usize = 6;
+
+/// PSNR of near, far, sky and all of it, in dB.
+fn score(model: &Model<f32>, views: &Dataset) -> [f64; 4] {
+    let mut sums = [[0.0; 2]; 4];
+    let [low, high] = views.bounds;
+    for frame in &views.frames {
+        let camera = &frame.camera;
+        let (seen, truth) = (model.view(camera, [1.0; 3]).color, frame.image.to_image());
+        for (i, distance) in landscape_distances(camera).data.iter().enumerate() {
+            let ray = camera.ray((i % truth.width) as f64 + 0.5, (i / truth.width) as f64 + 0.5);
+            let place: DVec3 = ray.at(f64::from(*distance));
+            let is_near = place.cmpge(low).all() && place.cmple(high).all();
+            let part = if *distance == 0.0 { 2 } else { usize::from(!is_near) };
+            let error: f64 = (0..3).map(|k| f64::from(seen.data[3 * i + k] - truth.data[3 * i + k]).powi(2)).sum();
+            for part in [part, 3] {
+                sums[part][0] += error;
+                sums[part][1] += 3.0;
+            }
+        }
+    }
+    sums.map(|[error, count]| psnr_from_mse(error / count))
+}
+
+fn main() -> Result<()> {
+    let argument =
+        |name: &str| std::env::args().find_map(|text| Some(text.strip_prefix(name)?.strip_prefix('=')?.to_owned()));
+    let number = |name: &str, usual: f64| argument(name).and_then(|text| text.parse().ok()).unwrap_or(usual);
+    let (seconds, pixels) = (number("seconds", 60.0), number("pixels", 200.0) as usize);
+    let train = landscape(Split::Train, pixels);
+    let mut views = landscape(Split::Test, pixels);
+    views.frames = evenly_spaced(views.frames, VIEWS);
+    let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) }.with_budget(seconds);
+    let cascades = usual.clone().with_scope(Scope::Unbounded);
+    let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };
+    let contraction = Config { sampler: SamplerConfig::new(proposal), ..cascades.clone() };
+    println!("way           steps  near (dB)  far (dB)  sky (dB)  all (dB)  seconds a view");
+    for (name, config, scope) in [
+        ("bounded", usual, Scope::Bounded),
+        ("contraction", contraction, Scope::Unbounded),
+        ("cascades", cascades, Scope::Unbounded),
+    ] {
+        if argument("only").is_some_and(|only| only != name) {
+            continue;
+        }
+        let mut trainer = Trainer::new(config, Arc::new(Dataset { scope, ..train.clone() }))?;
+        trainer.run(Budget::Time(Duration::from_secs_f64(seconds)), |_| ControlFlow::Continue(()));
+        let start = Instant::now();
+        let [near, far, sky, all] = score(&trainer.model, &views);
+        let each = start.elapsed().as_secs_f64() / VIEWS as f64;
+        let steps = trainer.stats().step;
+        println!("{name:11}  {steps:6}  {near:9.2}  {far:8.2}  {sky:8.2}  {all:8.2}  {each:14.2}");
+    }
+    Ok(())
+}
