@@ -2,7 +2,7 @@
 
 Render or take photographs whose cameras are known, recover the cameras from the photographs alone, and compare:
 
-    raygrad prepare TRUE/images --out FOUND                      # COLMAP on the photographs, without their cameras
+    raygrad prepare PICTURES --out FOUND                         # COLMAP on copies of the photographs, without their cameras
     raygrad prepare FOUND --to nerfstudio --out FOUND_JSON       # cameras as JSON, if FOUND holds COLMAP's own files
     python colmap.py TRUE FOUND_JSON
 
