@@ -137,7 +137,9 @@ fn a_lens_is_found_with_the_focal_length() {
             (0..49).map(|i| right.ray(4.0 + f64::from(i % 7) * 40.0 / 6.0, 4.0 + f64::from(i / 7) * 40.0 / 6.0));
         let off = places.map(|ray| {
             let [a, b] = [camera, right].map(|camera| camera.pixel_of(ray.at(4.0)).unwrap());
-            (a[0] - b[0]).hypot(a[1] - b[1])
+            let off = (a[0] - b[0]).hypot(a[1] - b[1]);
+            assert!(off.is_finite(), "{a:?} {b:?}");
+            off
         });
         off.fold(0.0, f64::max)
     };

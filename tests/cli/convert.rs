@@ -336,7 +336,8 @@ fn built_in_scenes_are_written_for_other_programs() {
     for (scene, format, size, count) in
         [("embedded", "nerfstudio", [24, 24], 90), ("landscape", "colmap", [16, 12], 130)]
     {
-        place.succeeds(&format!("prepare {scene} --to {format} --size {} --out {scene}-made", size[0]));
+        let said = place.succeeds(&format!("prepare {scene} --to {format} --size {} --out {scene}-made", size[0]));
+        assert!(said.starts_with(&format!("capture  {scene} (")), "{said}");
         let capture = Capture::read(place.path(&format!("{scene}-made"))).unwrap();
         assert_eq!(capture.present().count(), count);
         let view = capture.present().find(|view| view.name.ends_with("test/3.png")).unwrap();

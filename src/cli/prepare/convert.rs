@@ -140,7 +140,9 @@ fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
             parts.push(format!("{count} {what}"));
         }
     }
-    print(&format!("capture  {} ({})\n", capture.folder.display(), capture.format))?;
+    // Of a scene that is built in, its pictures were nowhere for long.
+    let from = if capture.file.starts_with(&capture.folder) { &capture.folder } else { &capture.file };
+    print(&format!("capture  {} ({})\n", from.display(), capture.format))?;
     if let Some(Camera { width, height, .. }) = jobs.iter().find_map(|job| job.seen_by.as_ref()) {
         parts.push(format!("the first to {width}x{height}"));
     }

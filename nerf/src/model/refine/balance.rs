@@ -144,6 +144,7 @@ mod tests {
                 let pairs = (0..POSE).flat_map(|a| (0..a).map(move |b| (a, b)));
                 pairs.map(|(a, b)| sums[a][b].abs() / (sums[a][a] * sums[b][b]).sqrt()).fold(0.0, f64::max)
             };
+            assert!(seen.as_flattened().iter().all(|x| x.is_finite()), "{seen:?}");
             assert!(alike(&plain) > 0.9 && alike(&seen) < 0.7, "{} {}", alike(&plain), alike(&seen));
             for a in 0..POSE {
                 // Damping leaves what moves least behind.
@@ -177,6 +178,7 @@ mod tests {
         let small = BOX.map(|corner| 0.5 * corner);
         let turned = |unbounded| {
             let matrix = balance(&narrow, small, [0.1, 9.0], 1.0, unbounded);
+            assert!(matrix.as_flattened().iter().all(|x| x.is_finite()), "{matrix:?}");
             // The largest turn about any axis that one of the first three numbers makes.
             (0..3).map(|b| DVec3::new(matrix[0][b], matrix[1][b], matrix[2][b]).length()).fold(0.0, f64::max)
         };

@@ -82,7 +82,8 @@ fn rays_are_those_of_the_camera_that_is_corrected() {
                 pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
             };
             assert!(apart(&moved.origins, &expected.origins) < 1e-14, "{config:?}");
-            assert!(moved.origins.as_flattened().iter().all(|x| x.is_finite()));
+            let numbers = moved.origins.iter().chain(&moved.directions);
+            assert!(numbers.flatten().all(|x| x.is_finite()), "{moved:?}");
             let spans = |rays: &Rays<f64>| rays.spans.as_flattened().to_vec();
             assert!(spans(&moved).iter().zip(spans(&expected)).all(|(a, b)| (a - b).abs() < 1e-12), "{config:?}");
             assert!(apart(&moved.directions, &expected.directions) < 1e-13, "{config:?}, {moved:?}, {expected:?}");
