@@ -83,7 +83,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     /// What part of its gradient each sample learns from, `[samples]`, if any learns less.
     fn less(&self, samples: &Samples<T>) -> Option<Tensor<T>> {
         let near = self.near;
-        if !self.tape().is_recording() || !samples.t.as_slice().iter().any(|t| t.to_f64() < near) {
+        if near == 0.0 || !self.tape().is_recording() || !samples.t.as_slice().iter().any(|t| t.to_f64() < near) {
             return None;
         }
         Some(samples.t.map(|t| T::from_f64((t.to_f64() / near).powi(2).min(1.0))))
