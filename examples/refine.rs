@@ -103,7 +103,9 @@ fn main() -> Result<()> {
     };
     views.frames = evenly_spaced(views.frames, VIEWS);
     let wrong = disturbed(&right, number("degrees", 2.0), number("share", 0.02), number("focal", 1.05));
-    let mut plain = Config::preset(Preset::Instant).with_budget(seconds).with_scope(right.scope);
+    let budget = Budget::Time(Duration::from_secs_f64(seconds));
+    let plain = Config::preset(Preset::Instant).for_budget(budget.samples(), right.footprints());
+    let mut plain = plain.with_scope(right.scope);
     if !right.has_alpha() {
         plain.background = Background::White;
     }
@@ -140,7 +142,7 @@ fn main() -> Result<()> {
                 println!("{name:18}  {degrees:12.3}  {share:18.3}  {focal:16.3}  {psnr:9.2}");
             }
         };
-        trainer.run(Budget::Time(Duration::from_secs_f64(seconds)), |trainer| {
+        trainer.run(budget, |trainer| {
             if trainer.stats().train_seconds > next {
                 next += each;
                 report(&format!("after {:.0} s", trainer.stats().train_seconds), &trainer.model);

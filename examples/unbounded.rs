@@ -51,7 +51,9 @@ fn main() -> Result<()> {
     let train = landscape(Split::Train, pixels);
     let mut views = landscape(Split::Test, pixels);
     views.frames = evenly_spaced(views.frames, VIEWS);
-    let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) }.with_budget(seconds);
+    let budget = Budget::Time(Duration::from_secs_f64(seconds));
+    let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) };
+    let usual = usual.for_budget(budget.samples(), train.footprints());
     let cascades = usual.clone().with_scope(Scope::Unbounded);
     let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };
     let contraction = Config { sampler: SamplerConfig::new(proposal), ..cascades.clone() };
@@ -65,7 +67,7 @@ fn main() -> Result<()> {
             continue;
         }
         let mut trainer = Trainer::new(config, Arc::new(Dataset { scope, ..train.clone() }))?;
-        trainer.run(Budget::Time(Duration::from_secs_f64(seconds)), |_| ControlFlow::Continue(()));
+        trainer.run(budget, |_| ControlFlow::Continue(()));
         let start = Instant::now();
         let [near, far, sky, all] = score(&trainer.model, &views);
         let each = start.elapsed().as_secs_f64() / VIEWS as f64;

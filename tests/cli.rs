@@ -10,6 +10,8 @@ use raygrad::nerf::dataset::{Split, embedded, evenly_spaced};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+#[path = "cli/captures.rs"]
+mod captures;
 #[path = "cli/convert.rs"]
 mod convert;
 #[path = "cli/export.rs"]

@@ -107,7 +107,7 @@ fn main() -> raygrad_nerf::Result<()> {
         [levels, features, log2_table] => {
             vec![HashGridConfig { levels, features, log2_table: log2_table as u32, ..HashGridConfig::paper() }]
         }
-        _ => vec![HashGridConfig::cpu(60.0), HashGridConfig::paper()],
+        _ => vec![HashGridConfig::cpu(0.0, f64::INFINITY), HashGridConfig::paper()],
     };
     println!("ns a sample on one thread, steps of {} samples", TILE * TILES);
     println!("{:<21} {:>8} {:>8} {:>8} {:>8} {:>12}", "", "encode", "scatter", "adam", "(a row)", "rows moved");

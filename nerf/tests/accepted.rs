@@ -153,7 +153,7 @@ fn what_is_accepted_of_damaged_captures_is_trained_and_rendered() {
         let file = file.index(files[which].len());
         std::fs::write(&files[which][file], damaged(&whole[which][file], &damage)).unwrap();
         let accepted = counts[which][1].get();
-        let outcome = tried(folders[which].path(), accepted < ALL_USED || accepted % 10 == 0);
+        let outcome = tried(folders[which].path(), accepted < ALL_USED || accepted.is_multiple_of(10));
         std::fs::write(&files[which][file], &whole[which][file]).unwrap();
         count(which, 0);
         match outcome {

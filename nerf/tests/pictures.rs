@@ -220,7 +220,7 @@ fn what_ends_early_is_as_far_away_as_what_does_not() {
 fn medium(scene: &AnalyticScene, rule: Quadrature, skip: Skip) -> Model<f32> {
     let occupancy = OccupancyConfig { resolution: 32, cascades: 1, skip: skip.into() };
     let marching = MarchingConfig { occupancy, quadrature: rule, view_step: 1.0 / 400.0, ..MarchingConfig::default() };
-    let config = Config { sampler: SamplerConfig::new(marching), ..Config::preset(Preset::Instant).with_budget(1.0) };
+    let config = Config { sampler: SamplerConfig::new(marching), ..Config::preset(Preset::Instant) };
     let mut model = Model::new(config, Extent::new(scene.bounds(), [0.0, scene.length]), 0).unwrap();
     let mut params = Params::new();
     model.field = Arc::new(AnalyticField::new(scene.medium.clone(), &mut params));

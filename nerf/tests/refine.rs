@@ -1,5 +1,6 @@
 //! Cameras that are corrected while a scene is trained.
 
+use raygrad_autograd::Real;
 use raygrad_nerf::camera::Pose;
 use raygrad_nerf::dataset::scene::Scene;
 use raygrad_nerf::dataset::{Dataset, Placement, Split, embedded};
@@ -77,7 +78,7 @@ fn errors(model: &Model<f32>, right: &Dataset, wrong: &Dataset) -> [f64; 2] {
 
 /// A field that was trained with the right cameras and rests, and the wrong cameras that move.
 fn before_a_known_scene(config: Config, right: &Dataset, wrong: &Dataset) -> Trainer {
-    let is_camera = |name: &str| ["poses", "focal", "lens"].contains(&name);
+    let is_camera = |name: &str| ["poses", "focal", "lens", "exposure", "vignetting"].contains(&name);
     let mut known = Trainer::new(config.clone(), Arc::new(right.clone())).unwrap();
     known.model.params.freeze(is_camera);
     train(&mut known, 400);
@@ -196,4 +197,60 @@ fn detail_comes_in_from_coarse_to_fine() {
     assert!(view(&model) == whole, "after that share of the run everything is there");
     model.set_detail(0.0);
     assert!(view(&model) != whole);
+}
+
+#[test]
+fn exposures_and_vignetting_are_found_in_a_scene_that_is_known() {
+    let right = photographs(24, 32, Lens::Pinhole);
+    let mut seen = right.clone();
+    // From .55 to 1 times as bright, so that nothing is cut off, the red more than the blue; and corners at half of the
+    // brightness of the middle.
+    let exposure = |i: usize| {
+        let e = 0.3 * ((2.0 * i as f64 + 0.3).sin() - 1.0);
+        [e, 0.8 * e, 0.5 * e]
+    };
+    for (i, frame) in seen.frames.iter_mut().enumerate() {
+        let mut image = frame.image.to_image();
+        for (place, pixel) in image.data.chunks_exact_mut(4).enumerate() {
+            let off_axis = frame.camera.off_axis([place % 32, place / 32]);
+            pixel.iter_mut().zip(exposure(i)).for_each(|(x, e)| *x *= (e - 0.7 * off_axis).exp() as f32);
+        }
+        frame.image = image.into();
+    }
+    let mut config = instant().with_refined(&[Refined::Exposure, Refined::Vignetting]);
+    let rate = Some(Schedule::Exponential { from: 2e-2, to: 2e-4, warmup: 0.0 });
+    (config.tone.exposure, config.tone.vignetting) = (rate, rate);
+    let mut trainer = before_a_known_scene(config, &right, &seen);
+    train(&mut trainer, 300);
+    let model = &trainer.model;
+    let numbers = |name: &str| model.params.get(model.params.find(name).unwrap()).as_slice().to_vec();
+    let found = numbers("exposure");
+    for k in 0..3 {
+        let off = (0..24).map(|i| f64::from(found[3 * i + k]) - exposure(i)[k]);
+        let worst = off.map(f64::abs).reduce(Real::maximum).unwrap();
+        println!("exposures of channel {k} are off by {worst}");
+        assert!(worst < [0.03, 0.03, 0.06][k], "{k}: {worst}");
+    }
+    let vignetting = numbers("vignetting");
+    println!("vignetting {vignetting:?}");
+    // The bulldozer does not reach the corners.
+    for s in [0.1_f32, 0.2, 0.3] {
+        let falloff = s * (vignetting[0] + s * (vignetting[1] + s * vignetting[2]));
+        assert!((falloff + 0.7 * s).abs() < 0.03, "{s}: {falloff}");
+    }
+    // A view like a photograph is one; a view of one's own is as bright as all on average, to its corners.
+    let mut model = model.clone();
+    model.finish();
+    let mut error = |look: Option<u32>, vignetted: bool, truth: &Dataset| {
+        (model.look, model.vignetted) = (look, vignetted);
+        let view = model.view(&right.frames[5].camera, [0.0; 3]).color;
+        let truth = truth.frames[5].image.over([0.0; 3]);
+        let [sum, all] =
+            view.data.iter().zip(&truth.data).fold([0.0; 2], |[sum, all], (a, b)| [sum + (a - b).abs(), all + b]);
+        sum / all
+    };
+    let [own, bright_corners, usual] =
+        [error(Some(5), true, &seen), error(Some(5), false, &seen), error(None, false, &seen)];
+    println!("photograph 5 is off by {own}, {bright_corners} and {usual}");
+    assert!(own < 0.9 * bright_corners && own < 0.5 * usual, "{own} {bright_corners} {usual}");
 }

@@ -1,5 +1,6 @@
 //! `raygrad eval`: how close a model comes to photographs.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -7,7 +8,7 @@ use raygrad::nerf::dataset::{Dataset, Frame, Split, evenly_spaced};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Evaluations, Image, Model, Picture, Result};
+use raygrad::nerf::{Background, Error, Evaluations, Image, InstantConfig, Model, Picture, Result};
 use serde::Serialize;
 
 use super::output::{depth_colors, make_folder, numbered, other_numbered, print, remove};
@@ -25,7 +26,7 @@ const PICTURES: usize = 10;
 /// Compare a model with photographs: PSNR and SSIM
 ///
 /// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth. Another split, number of
-/// views, --skip or --precision stands in the name, as in RUN/eval-val-10-off.json, so that none replaces another's result; that
+/// views, --skip, --precision or --fit-half stands in the name, as in RUN/eval-val-10-off.json, so that none replaces another's result; that
 /// of another --scene does.
 #[derive(clap::Args)]
 pub struct Args {
@@ -43,6 +44,10 @@ pub struct Args {
     /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
     #[arg(long)]
     skip: Option<Skip>,
+    /// Fit a gain for each colour channel to the left half of each photograph, and compare the right half: where photographs
+    /// differ in exposure, nobody can know that of one that was held out
+    #[arg(long)]
+    fit_half: bool,
     /// Arithmetic of the pictures
     #[arg(long, value_enum, default_value_t)]
     precision: Precision,
@@ -57,7 +62,8 @@ impl Args {
         let split = (self.split != Split::Test).then(|| self.split.to_string());
         let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
         let [views, skip] = [self.views.map(|n| n.to_string()), self.skip.map(|skip| skip.to_string())];
-        let parts = ["eval".to_owned()].into_iter().chain([split, views, skip, precision].into_iter().flatten());
+        let half = self.fit_half.then(|| "half".to_owned());
+        let parts = ["eval".to_owned()].into_iter().chain([split, views, skip, precision, half].into_iter().flatten());
         parts.collect::<Vec<_>>().join("-")
     }
 }
@@ -81,6 +87,8 @@ struct Report {
     precision: Precision,
     /// Where the cameras are: as the scene has them, or as the model has found out.
     cameras: Alignment,
+    /// As what photograph's exposure and code views are rendered.
+    appearance: Appearance,
     /// Where in a pixel its ray passes: 0.5 is the centre.
     pixel_offset: f64,
     /// `none`: floating-point renders, clamped to 0..=1, are compared.
@@ -114,6 +122,31 @@ enum Alignment {
     /// were found.
     #[serde(rename = "similarity of the training cameras")]
     Similarity,
+}
+
+/// What is done about what photographs differ in and nobody knows of one that was held out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+enum Appearance {
+    /// Nothing: the model takes all photographs to be alike.
+    #[serde(rename = "none")]
+    None,
+    /// Views have the mean of what was learned of the photographs that were trained on: of their codes, and of their exposures.
+    #[serde(rename = "mean of the training photographs")]
+    Mean,
+    /// As well, and a gain for each channel makes the left half most like the photograph's; the right half is compared.
+    #[serde(rename = "gains fitted to the left half, right half compared")]
+    Half,
+}
+
+impl Appearance {
+    fn of(model: &Model<f32>, fit_half: bool) -> Self {
+        let has_codes = model.config.field.get::<InstantConfig>().is_some_and(|field| field.codes > 0);
+        match fit_half {
+            true => Appearance::Half,
+            false if has_codes || model.config.tone.exposure.is_some() => Appearance::Mean,
+            false => Appearance::None,
+        }
+    }
 }
 
 impl Alignment {
@@ -169,6 +202,9 @@ pub fn run(args: &Args) -> Result<()> {
         );
         return Err(Error::setting("scene", what));
     }
+    let appearance = Appearance::of(&model, args.fit_half);
+    // Corners are as dark in every photograph.
+    model.vignetted = true;
     let cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
     let name = args.name();
     let pictures = run.file(&name);
@@ -176,7 +212,7 @@ pub fn run(args: &Args) -> Result<()> {
     let (background, span) = (model.config.background, model.extent.span);
     let skip = model.marching().map(|marching| marching.config.occupancy.skip);
     let renderer = Renderer::new(model, args.precision)?;
-    let (per_view, seconds_per_view, evaluations) = compare(&renderer, background, span, &data, &pictures)?;
+    let (per_view, seconds_per_view, evaluations) = compare(&renderer, background, span, &data, appearance, &pictures)?;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
     let per_pixel = |count: u64| count as f64 / pixels as f64;
     let report = Report {
@@ -191,6 +227,7 @@ pub fn run(args: &Args) -> Result<()> {
         skip,
         precision: args.precision,
         cameras,
+        appearance,
         pixel_offset: 0.5,
         quantisation: "none",
         psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
@@ -238,6 +275,7 @@ fn compare(
     background: Background,
     span: [f64; 2],
     data: &Dataset,
+    appearance: Appearance,
     pictures: &Path,
 ) -> Result<(Vec<Score>, f64, Evaluations)> {
     let background = background.shown();
@@ -250,9 +288,18 @@ fn compare(
         let mut picture = renderer.view(&frame.camera, background);
         seconds += start.elapsed().as_secs_f64();
         evaluations = evaluations + picture.evaluations;
-        picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
         let truth = frame.image.over(background);
-        let score = score(frame, &picture.color, &truth);
+        let half = if appearance == Appearance::Half { truth.width / 2 } else { 0 };
+        if half > 0 {
+            if frame.mask.is_some() && used(frame, &truth, half..truth.width).data.is_empty() {
+                let what = format!("the mask of `{}` leaves nothing of its right half to compare", frame.name);
+                return Err(Error::setting("fit-half", what));
+            }
+            let gains = gains(frame, &picture.color, &truth, half);
+            scale(&mut picture.color, gains);
+        }
+        picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
+        let score = score(frame, &picture.color, &truth, half);
         if drawn.contains(&i) {
             draw(&picture, &truth, span).save_png(pictures.join(numbered(i, DIGITS)))?;
         }
@@ -265,24 +312,38 @@ fn compare(
     Ok((scores, seconds / data.frames.len() as f64, evaluations))
 }
 
-/// Of the pixels that are [used](Frame::mask); where some are not, windows have no similarity to speak of.
-fn score(frame: &Frame, render: &Image, truth: &Image) -> Score {
+/// The pixels of these columns of an image that are [used](Frame::mask), in a row.
+fn used(frame: &Frame, image: &Image, columns: Range<usize>) -> Image {
+    let places = (0..image.height).flat_map(|y| columns.clone().map(move |x| (x, y)));
+    let used = places.filter(|(x, y)| frame.mask.as_ref().is_none_or(|mask| mask.uses(*x, *y)));
+    let data: Vec<f32> = used.flat_map(|(x, y)| image.pixel(x, y).to_vec()).collect();
+    Image { width: data.len() / 3, height: 1, channels: 3, data }
+}
+
+/// The factors of red, green and blue that make the columns before `half` of a render most like the photograph, in the sense of least
+/// squares; 1 where there is nothing to multiply.
+fn gains(frame: &Frame, render: &Image, truth: &Image, half: usize) -> [f32; 3] {
+    let [render, truth] = [render, truth].map(|image| used(frame, image, 0..half));
+    std::array::from_fn(|channel| {
+        let pairs = render.data.iter().zip(&truth.data).skip(channel).step_by(3);
+        let [both, own] = pairs.fold([0.0; 2], |[both, own], (&a, &b)| [both + a * b, own + a * a]);
+        if own > 0.0 { both / own } else { 1.0 }
+    })
+}
+
+fn scale(image: &mut Image, gains: [f32; 3]) {
+    image.data.chunks_exact_mut(3).for_each(|pixel| pixel.iter_mut().zip(gains).for_each(|(x, gain)| *x *= gain));
+}
+
+/// Of the pixels from column `half` on that are used; where some are not, windows have no similarity to speak of.
+fn score(frame: &Frame, render: &Image, truth: &Image, half: usize) -> Score {
     let name = frame.name.clone();
-    let Some(mask) = &frame.mask else {
-        let large_enough = truth.width >= SSIM_WINDOW && truth.height >= SSIM_WINDOW;
-        return Score { name, psnr: psnr(render, truth), ssim: large_enough.then(|| ssim(render, truth)) };
-    };
-    let used = |image: &Image| {
-        let places = (0..image.width * image.height).map(|i| (i % image.width, i / image.width));
-        let used = places.filter(|(x, y)| mask.uses(*x, *y));
-        Image {
-            width: mask.used(),
-            height: 1,
-            channels: 3,
-            data: used.flat_map(|(x, y)| image.pixel(x, y).to_vec()).collect(),
-        }
-    };
-    Score { name, psnr: psnr(&used(render), &used(truth)), ssim: None }
+    let [seen, shown] = [render, truth].map(|image| used(frame, image, half..image.width));
+    let psnr = psnr(&seen, &shown);
+    let [width, height] = [truth.width - half, truth.height];
+    let whole = frame.mask.is_none() && width >= SSIM_WINDOW && height >= SSIM_WINDOW;
+    let shaped = |image: Image| Image { width, height, ..image };
+    Score { name, psnr, ssim: whole.then(|| ssim(&shaped(seen), &shaped(shown))) }
 }
 
 /// Photograph, render, error and depth, side by side.
@@ -304,10 +365,49 @@ fn table(report: &Report) -> String {
     let Report { split, background, seconds_per_view, .. } = report;
     let size = format!("{}x{}", report.width, report.height);
     text += &format!("{split} views of {size} over {background}, {seconds_per_view:.2} s to render each\n");
+    text += match report.appearance {
+        Appearance::None => "",
+        Appearance::Mean => "exposures and codes: the mean of the training photographs'\n",
+        Appearance::Half => "compared: right halves, after gains that were fitted to left halves\n",
+    };
     text + match report.cameras {
         Alignment::None => "",
         Alignment::Learned => "cameras: as learned\n",
         Alignment::Glass => "cameras: focal length and lens as learned\n",
         Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::dataset::{Mask, embedded};
+    use std::sync::Arc;
+
+    #[test]
+    fn gains_make_up_for_an_exposure_and_the_other_half_is_compared() {
+        let mut frame = embedded(Split::Test, 26).frames.remove(0);
+        let truth = frame.image.over([1.0; 3]);
+        // Too dark by a factor for each channel, but for one pixel on the right.
+        let mut render = truth.clone();
+        scale(&mut render, [0.5, 0.8, 1.25]);
+        let found = gains(&frame, &render, &truth, 13);
+        assert!(found.iter().zip([2.0, 1.25, 0.8]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
+        scale(&mut render, found);
+        assert!(score(&frame, &render, &truth, 13).psnr > 100.0);
+        render.pixel_mut(20, 7)[1] += 0.5;
+        // A quarter, of 13 x 26 pixels of 3 channels; the similarity is that of the right half.
+        let off = score(&frame, &render, &truth, 13);
+        assert!((off.psnr - 10.0 * (3.0 * 13.0 * 26.0 / 0.25_f64).log10()).abs() < 1e-3, "{}", off.psnr);
+        assert!(off.ssim.unwrap() < 0.999 && score(&frame, &render, &truth, 0).psnr > off.psnr + 2.9);
+        render.pixel_mut(3, 7)[1] = 9.0;
+        assert_eq!(score(&frame, &render, &truth, 13).psnr, off.psnr, "what was fitted to is not compared");
+        // Pixels that are not used neither fit nor count; a render of nothing has no gain.
+        let mask = Mask::new(26, 26, |x, y| y != 7 || (x != 3 && x != 20));
+        frame.mask = Some(Arc::new(mask));
+        let masked = score(&frame, &render, &truth, 13);
+        assert!(masked.psnr > 100.0 && masked.ssim.is_none(), "{}", masked.psnr);
+        assert!(gains(&frame, &render, &truth, 13).iter().all(|gain| (gain - 1.0).abs() < 1e-5));
+        assert_eq!(gains(&frame, &Image::new(26, 26, 3), &truth, 13), [1.0; 3]);
     }
 }

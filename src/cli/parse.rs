@@ -45,6 +45,14 @@ pub fn setting(text: &str) -> Result<(String, Value), String> {
     Ok((name.to_owned(), value))
 }
 
+/// `NAME=WEIGHT`, a number of at least 0.
+pub fn weight(text: &str) -> Result<(String, f64), String> {
+    let usage = || "write NAME=WEIGHT such as entropy=0.001".to_owned();
+    let (name, weight) = text.split_once('=').ok_or_else(usage)?;
+    let weight = weight.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0).ok_or_else(usage)?;
+    Ok((name.to_owned(), weight))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

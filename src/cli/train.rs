@@ -63,14 +63,22 @@ pub struct Args {
     /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]
     #[arg(long)]
     background: Option<Background>,
-    /// What of the cameras is corrected while the scene is trained, such as poses,focal,lens: where they were, how long their
-    /// focal length is, how their lens bends light
+    /// What is corrected while the scene is trained, of poses,focal,lens,exposure,vignetting: where cameras were, how long
+    /// their focal length is, how their lens bends light; how bright each photograph is and of what white balance, how dark
+    /// all are in their corners
     #[arg(long, value_name = "PARTS", value_delimiter = ',')]
     refine: Vec<Refined>,
     /// Hold the scene to depths that were measured beside the photographs (depth_file_path in transforms.json), with that
     /// weight in the loss: --depth, or --depth=0.2
     #[arg(long, value_name = "WEIGHT", num_args = 0..=1, require_equals = true, default_missing_value = "0.1")]
     depth: Option<f64>,
+    /// Distance from each camera before which nothing is looked for, in the capture's own units [default: found out]
+    #[arg(long, value_name = "LENGTH")]
+    near: Option<f64>,
+    /// A term of the loss with its weight, such as entropy=1e-3 (rays meet something or nothing) or distortion=0.1 (what they meet is
+    /// in one place); 0 takes it away
+    #[arg(long, value_name = "NAME=WEIGHT", value_parser = parse::weight)]
+    term: Vec<(String, f64)>,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -115,7 +123,11 @@ pub fn run(args: &Args) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let mut scene = args.scene.open(args.scope)?;
     scene.depth = args.depth.is_some();
-    let data = Arc::new(scene.load(Split::Train, args.downscale, usize::MAX)?);
+    let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
+    if let Some(near) = args.near {
+        set_near(&mut data, near)?;
+    }
+    let data = Arc::new(data);
     let config = args.config(&data)?;
     let background = config.background.shown();
     let mut trainer = Trainer::new(config, data.clone())?;
@@ -153,7 +165,7 @@ pub fn run(args: &Args) -> Result<Trained> {
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        config = config.with_budget(self.budget().seconds());
+        config = config.for_budget(self.budget().samples(), data.footprints());
         if let Some(background) = self.background {
             config.background = background;
         }
@@ -175,6 +187,9 @@ impl Args {
         config = config.with_refined(&self.refine);
         if let Some(weight) = self.depth {
             config.terms.push(TermConfig::new(DepthConfig { weight }));
+        }
+        for (kind, weight) in &self.term {
+            config = with_term(config, kind, *weight)?;
         }
         if self.no_encoding {
             config = config.without_encoding();
@@ -202,6 +217,31 @@ impl Args {
             (None, None) => Budget::Time(default_budget(self.preset)),
         }
     }
+}
+
+/// Photographs before whose cameras nothing is looked for nearer than that, in the units of their files.
+fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
+    let far = data.far / data.placement.scale;
+    if !(0.0..far).contains(&near) {
+        return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, where the scene ends")));
+    }
+    data.near = near * data.placement.scale;
+    Ok(())
+}
+
+/// The configuration with a term of the loss of that weight, and without it at 0.
+fn with_term(mut config: Config, kind: &str, weight: f64) -> Result<Config> {
+    config.terms.retain(|term| term.kind() != kind);
+    if weight != 0.0 {
+        let bad = |e| Error::setting("term", format!("cannot be {kind}={weight}: {e}"));
+        // Which terms there are, a configuration knows when it is read.
+        let mut all = serde_json::to_value(&config).map_err(bad)?;
+        if let Some(terms) = all.get_mut("terms").and_then(Value::as_array_mut) {
+            terms.push(serde_json::json!({ "kind": kind, "weight": weight }));
+        }
+        config = serde_json::from_value(all).map_err(bad)?;
+    }
+    Ok(config)
 }
 
 /// The configuration with the number of that dotted name replaced.

@@ -94,6 +94,14 @@ impl Camera {
         self.ray(column as f64 + 0.5, row as f64 + 0.5)
     }
 
+    /// How far the centre of the pixel `[column, row]` lies from the principal point: the square of the distance, in halves of
+    /// the picture's diagonal, so that corners of a centred picture have 1.
+    pub fn off_axis(&self, [column, row]: [usize; 2]) -> f64 {
+        let [x, y] = [column as f64 + 0.5 - self.centre[0], row as f64 + 0.5 - self.centre[1]];
+        let [width, height] = [self.width, self.height].map(|side| 0.5 * side as f64);
+        (x * x + y * y) / (width * width + height * height)
+    }
+
     /// The same view at another image size.
     pub fn resized(&self, width: usize, height: usize) -> Self {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);

@@ -15,6 +15,8 @@ pub struct Batch {
     pub frames: Vec<u32>,
     /// For each ray the column and the row of its pixel.
     pub pixels: Vec<[u32; 2]>,
+    /// For each ray how far its pixel lies [off the axis](crate::camera::Camera::off_axis).
+    pub off_axis: Vec<f32>,
     /// For each ray the [distance](super::Frame::distances) that was measured along it; 0 where none was.
     pub distances: Vec<f32>,
     /// The photographs' colours, over the background where they have alpha.
@@ -47,6 +49,7 @@ impl Batch {
             batch.rays.push_pixel(&frame.camera, pixel, bounds, [data.near, data.far]);
             batch.frames.push(number as u32);
             batch.pixels.push(pixel.map(|x| x as u32));
+            batch.off_axis.push(frame.camera.off_axis(pixel) as f32);
             let distance = frame.distances.as_ref().map_or(0.0, |image| image.pixel(pixel[0], pixel[1])[0]);
             batch.distances.push(distance);
             batch.target.push(over(&frame.image.pixel(pixel[0], pixel[1]), color));

@@ -2,10 +2,12 @@
 
 use super::image::Image;
 use super::mask::Mask;
+use super::numbers::median;
 use super::photo::Photo;
 use super::placement::Placement;
 use super::scope::Scope;
 use crate::camera::bounds::clip_span;
+use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use glam::DVec3;
@@ -93,6 +95,23 @@ pub struct Dataset {
 }
 
 impl Dataset {
+    /// How many pixels of the photographs lie side by side along the longest side of the scene's box where they show its middle:
+    /// the median over photographs. One that was taken from within the box counts as if its camera stood at its side.
+    pub fn footprints(&self) -> f64 {
+        let [lower, upper] = self.bounds;
+        let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
+        let each = self.frames.iter().map(|Frame { camera, .. }| {
+            let distance = camera.pose.translation.distance(middle).max(0.5 * side);
+            // Of a panorama, a radian is so many pixels.
+            let focal = match camera.lens {
+                Lens::Equirectangular => camera.width as f64 / std::f64::consts::TAU,
+                _ => camera.focal[0].max(camera.focal[1]),
+            };
+            side * focal / distance
+        });
+        median(each)
+    }
+
     /// Whether some image has transparency and so needs a [background](crate::dataset::background).
     pub fn has_alpha(&self) -> bool {
         self.frames.iter().any(|frame| frame.image.has_alpha())
@@ -174,6 +193,27 @@ pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
 mod tests {
     use super::*;
     use crate::dataset::embedded;
+
+    #[test]
+    fn footprints_are_pixels_side_by_side_where_photographs_show_the_middle() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(3);
+        data.bounds = [DVec3::new(-1.0, -2.0, -1.0), DVec3::new(1.0, 2.0, 3.0)];
+        // The middle is one above the origin, the longest side 4.
+        let camera = |distance: f64| {
+            let pose = Camera::look_at(DVec3::new(0.0, 0.0, 1.0 + distance), DVec3::Z, DVec3::Y);
+            Camera { focal: [90.0, 100.0], ..Camera::from_angle(75, 50, 0.8, pose) }
+        };
+        for (frame, distance) in data.frames.iter_mut().zip([8.0, 5.0, 40.0]) {
+            frame.camera = camera(distance);
+        }
+        assert!((data.footprints() - 4.0 * 100.0 / 8.0).abs() < 1e-9, "{}", data.footprints());
+        // Inside, as from a side.
+        data.frames.iter_mut().for_each(|frame| frame.camera = camera(0.5));
+        assert!((data.footprints() - 200.0).abs() < 1e-9, "{}", data.footprints());
+        data.frames.iter_mut().for_each(|frame| frame.camera.lens = Lens::Equirectangular);
+        assert!((data.footprints() - 2.0 * 75.0 / std::f64::consts::TAU).abs() < 1e-9, "{}", data.footprints());
+    }
 
     #[test]
     fn a_small_box_anywhere_in_the_picture_is_found_and_one_beside_it_is_not() {

@@ -15,6 +15,7 @@ pub(crate) mod image;
 mod landscape;
 mod load;
 mod mask;
+pub(crate) mod numbers;
 pub(crate) mod photo;
 pub(crate) mod placement;
 pub mod scene;

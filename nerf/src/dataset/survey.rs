@@ -2,6 +2,7 @@
 
 use super::capture::{Capture, Format, Point, View};
 use super::frames::evenly_spaced;
+use super::numbers::median;
 use super::placement::Placement;
 use super::scope::Scope;
 use crate::camera::pinhole::Camera;
@@ -288,12 +289,6 @@ fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
     let mut nearest: Vec<f64> = evenly_spaced(cameras.to_vec(), ASKED[0]).par_iter().filter_map(nearest).collect();
     nearest.sort_by(f64::total_cmp);
     nearest.get(nearest.len() / 20).copied()
-}
-
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
 #[cfg(test)]

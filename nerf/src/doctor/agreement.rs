@@ -5,9 +5,9 @@
 //! cameras and photographs fit: as often as any other line if they do not, nearly always if they do. No threshold on the
 //! likeness of patches decides, and what is wrong about it, such as reflections, is wrong for all lines alike.
 
-use super::numbers::median;
 use super::picture::{Patch, Picture};
 use super::poses::Focus;
+use crate::dataset::numbers::median;
 use glam::{DAffine3, DMat3, DVec3};
 use rayon::prelude::*;
 

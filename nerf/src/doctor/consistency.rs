@@ -3,11 +3,11 @@
 
 use super::agreement::{Pair, Placed, Tally, compare};
 use super::layout::{opencv_axes, world_to_camera};
-use super::numbers::median;
 use super::picture::Picture;
 use super::poses::Convention;
 use super::report::{FindingKind as Kind, Findings, Severity};
 use crate::dataset::evenly_spaced;
+use crate::dataset::numbers::median;
 use Severity::{Error, Warning};
 use glam::DAffine3;
 

@@ -7,7 +7,6 @@ mod agreement;
 mod consistency;
 mod layout;
 mod look;
-mod numbers;
 mod picture;
 mod pixels;
 mod poses;
@@ -16,6 +15,7 @@ mod single;
 
 pub use report::{Facts, Finding, FindingKind, Lie, Part, Range, Report, Resolution, Severity};
 
+use crate::dataset::numbers::median;
 use crate::dataset::{Capture, Split, Survey};
 use consistency::Compared;
 use glam::DVec3;
@@ -122,7 +122,7 @@ fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Fin
 fn range(values: Vec<f64>) -> Option<Range> {
     let least = values.iter().copied().fold(f64::INFINITY, f64::min);
     let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    (!values.is_empty()).then(|| Range { least, median: numbers::median(values), most })
+    (!values.is_empty()).then(|| Range { least, median: median(values), most })
 }
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! What photographs say of their own quality, and of each other's.
 
 use super::look::{Look, fits};
-use super::numbers::{median, spread};
 use super::report::{FindingKind as Kind, Findings, Severity};
+use crate::dataset::numbers::{median, spread};
 use crate::dataset::{Capture, Photo, Split, View};
 use crate::error::Result;
 use Severity::{Error, Note, Warning};

@@ -1,6 +1,6 @@
 //! Poses under several conventions, and what cameras look at under each.
 
-use super::numbers::median;
+use crate::dataset::numbers::median;
 use glam::{DAffine3, DMat3, DVec3};
 
 /// A way in which the matrices of a capture may be meant.

@@ -7,6 +7,7 @@ use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig,
 use crate::losses::photometric::Loss;
 use crate::losses::{DistortionConfig, TermConfig};
 use crate::model::refine::{FOCAL, LENS, POSES, RefineConfig, Refined, check_schedule};
+use crate::model::tone::{EXPOSURE, ToneConfig, VIGNETTING};
 use crate::range::check_range;
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
@@ -38,6 +39,8 @@ const DISTORTION: f64 = 0.1;
 const POSE_RATE: [f64; 2] = [3e-3, 3e-5];
 const FOCAL_RATE: [f64; 2] = [5e-3, 5e-5];
 const LENS_RATE: [f64; 2] = [1e-3, 1e-5];
+/// Those of the logarithms of gains.
+const TONE_RATE: [f64; 2] = [1e-2, 1e-4];
 /// The share of a run over which these rates rise from 0: before there is a scene, cameras drift.
 const CAMERA_WARMUP: f64 = 0.1;
 /// The share of a run in which poses are learned over which detail comes in.
@@ -134,6 +137,9 @@ pub struct Config {
     /// What else is learned of cameras, and how.
     #[serde(default)]
     pub refine: RefineConfig,
+    /// What is learned of how photographs show colours.
+    #[serde(default)]
+    pub tone: ToneConfig,
     /// Samples nearer to their camera than this, in units of the [extent](crate::Extent::unit), learn less, by the square of
     /// their distance: they lie closer than others in front of each camera, and what they learn shows in one photograph alone
     /// (Philip and Deschaintre 2023, "Floaters No More", equation 6). 0 for none.
@@ -167,6 +173,7 @@ impl Config {
             groups: vec![],
             poses: None,
             refine: RefineConfig::default(),
+            tone: ToneConfig::default(),
             near_gradients: 0.0,
             background: Background::White,
             seed: 0,
@@ -189,7 +196,7 @@ impl Config {
             },
             Preset::Instant => Config {
                 field: FieldConfig::new(InstantConfig {
-                    grid: HashGridConfig::cpu(60.0),
+                    grid: HashGridConfig::cpu(0.0, f64::INFINITY),
                     density_width: 64,
                     features: 16,
                     color_width: 64,
@@ -213,17 +220,18 @@ impl Config {
         }
     }
 
-    /// The same for a training time: the table of a hash grid is as large as pays within it, see [`HashGridConfig::cpu`],
-    /// beyond 100 seconds the steps along a ray grow shorter as training goes on, and beyond 300 a training step has twice
-    /// as many samples.
-    pub fn with_budget(mut self, seconds: f64) -> Self {
+    /// The same for what it is trained with: a number of [samples](crate::Budget::samples), and photographs of so many
+    /// [pixels](crate::dataset::Dataset::footprints) along a side of the scene. The table of a hash grid is as large and as fine as
+    /// pays, see [`HashGridConfig::cpu`]; beyond 200 million samples (100 seconds on two cores) the steps along a ray grow
+    /// shorter as training goes on, down to a pixel's footprint, and beyond 600 million a training step has twice as many.
+    pub fn for_budget(mut self, samples: f64, footprints: f64) -> Self {
         if let Some(field) = self.field.get_mut::<InstantConfig>() {
-            field.grid = HashGridConfig::cpu(seconds);
+            field.grid = HashGridConfig::cpu(samples, footprints);
             if let Some(marching) = self.sampler.get_mut::<MarchingConfig>()
-                && seconds > 100.0
+                && samples > 2e8
             {
-                (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / 450.0));
-                marching.samples *= if seconds > 300.0 { 2 } else { 1 };
+                (marching.step, marching.last_step) = (1.0 / 150.0, Some(1.0 / footprints.clamp(150.0, 450.0)));
+                marching.samples *= if samples > 6e8 { 2 } else { 1 };
             }
         }
         self
@@ -232,7 +240,7 @@ impl Config {
     /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
     /// boxes at steps that grow, a hash grid is twice as fine, as it holds all of space, and a
     /// [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in docs/benchmarks.md, section
-    /// Captures. What a [budget](Self::with_budget) says of steps is left behind. A second call with the same scope changes
+    /// Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
     /// nothing.
     pub fn with_scope(mut self, scope: Scope) -> Self {
         let before = std::mem::replace(&mut self.unbounded, scope == Scope::Unbounded);
@@ -271,17 +279,21 @@ impl Config {
                 Refined::Poses => (self.poses, self.refine.coarse) = (rate(POSE_RATE[0], POSE_RATE[1]), COARSE),
                 Refined::Focal => self.refine.focal = rate(FOCAL_RATE[0], FOCAL_RATE[1]),
                 Refined::Lens => self.refine.lens = rate(LENS_RATE[0], LENS_RATE[1]),
+                Refined::Exposure => self.tone.exposure = rate(TONE_RATE[0], TONE_RATE[1]),
+                Refined::Vignetting => self.tone.vignetting = rate(TONE_RATE[0], TONE_RATE[1]),
             }
         }
         self
     }
 
-    /// The learning rate of the parameter of this name, if it is one of a camera.
+    /// The learning rate of the parameter of this name, if it is one of cameras or of what they make of colours.
     pub(crate) fn camera_rate(&self, name: &str) -> Option<Schedule> {
         match name {
             POSES => self.poses,
             FOCAL => self.refine.focal,
             LENS => self.refine.lens,
+            EXPOSURE => self.tone.exposure,
+            VIGNETTING => self.tone.vignetting,
             _ => None,
         }
     }
@@ -318,6 +330,7 @@ impl Config {
         }
         check_schedule(POSES, self.poses)?;
         self.refine.check()?;
+        self.tone.check()?;
         check_range("near_gradients", self.near_gradients, 0.0, 1e6)?;
         for group in &self.groups {
             let parts = [group.schedule.check(), group.adam.check()];
@@ -374,6 +387,59 @@ mod tests {
     use super::*;
 
     #[test]
+    fn each_part_that_is_refined_has_a_rate_of_its_own() {
+        let refined = |part| Config::preset(Preset::Instant).with_refined(&[part]);
+        let rate = |from, to| Some(Schedule::Exponential { from, to, warmup: 0.1 });
+        let expected = [
+            (Refined::Poses, "poses", rate(3e-3, 3e-5)),
+            (Refined::Focal, "focal", rate(5e-3, 5e-5)),
+            (Refined::Lens, "lens", rate(1e-3, 1e-5)),
+            (Refined::Exposure, "exposure", rate(1e-2, 1e-4)),
+            (Refined::Vignetting, "vignetting", rate(1e-2, 1e-4)),
+        ];
+        for (part, name, rate) in expected {
+            let config = refined(part);
+            config.check().unwrap();
+            for (_, other, _) in expected {
+                assert_eq!(config.camera_rate(other), rate.filter(|_| other == name), "{part}: {other}");
+            }
+            assert_eq!(config.camera_rate("field.table"), None);
+            assert_eq!((part.to_string(), name.parse::<Refined>().unwrap()), (name.to_owned(), part));
+            // Detail comes in slowly while poses are learned, and only then.
+            let coarse = if part == Refined::Poses { 0.4 } else { 0.0 };
+            assert_eq!(config.refine.coarse, coarse);
+            let details = [0.0, 0.1, 0.4, 1.0].map(|fraction| config.refine.detail(fraction));
+            assert_eq!(details, if coarse > 0.0 { [0.0, 0.25, 1.0, 1.0] } else { [1.0; 4] });
+        }
+        assert!(
+            "tone".parse::<Refined>().unwrap_err().to_string().contains("poses, focal, lens, exposure or vignetting")
+        );
+        let mut wrong = refined(Refined::Vignetting);
+        wrong.tone.vignetting = Some(Schedule::Constant { rate: f64::NAN });
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`tone.vignetting.constant.rate`"));
+        wrong.tone = ToneConfig { exposure: wrong.tone.vignetting, vignetting: None };
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`tone.exposure.constant.rate`"));
+    }
+
+    #[test]
+    fn a_model_is_as_large_as_its_budget_and_its_photographs_ask_for() {
+        let made = |samples: f64, footprints: f64| {
+            let config = Config::preset(Preset::Instant).for_budget(samples, footprints);
+            config.check().unwrap();
+            let grid = &config.field.get::<InstantConfig>().unwrap().grid;
+            let marching = config.sampler.get::<MarchingConfig>().unwrap();
+            (grid.log2_table, grid.finest, marching.samples, marching.last_step)
+        };
+        let samples = MarchingConfig::default().samples;
+        assert_eq!(made(2e8, 400.0), (17, 512, samples, None));
+        assert_eq!(made(2.5e8, 400.0), (18, 512, samples, Some(1.0 / 400.0)));
+        assert_eq!(made(6.5e8, 1000.0), (19, 768, 2 * samples, Some(1.0 / 450.0)));
+        assert_eq!(made(6.5e8, 100.0), (19, 200, 2 * samples, Some(1.0 / 150.0)));
+        // What has no grid stays as it is.
+        assert_eq!(Config::preset(Preset::Classic).for_budget(1e9, 50.0), Config::preset(Preset::Classic));
+    }
+
+    #[test]
     fn a_scope_changes_what_a_scene_asks_for_once() {
         let preset = Config::preset(Preset::Instant);
         let unbounded = preset.clone().with_scope(Scope::Unbounded);
@@ -393,7 +459,7 @@ mod tests {
             Config::preset(other).with_scope(Scope::Unbounded).check().unwrap();
         }
         Config::preset(Preset::Small).with_skip(Skip::Fast).with_scope(Scope::Unbounded).check().unwrap();
-        let long = Config::preset(Preset::Instant).with_budget(600.0).with_scope(Scope::Unbounded);
+        let long = Config::preset(Preset::Instant).for_budget(1.2e9, 400.0).with_scope(Scope::Unbounded);
         assert_eq!(long.sampler.get::<MarchingConfig>().unwrap().last_step, None);
     }
 }

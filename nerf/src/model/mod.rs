@@ -5,11 +5,14 @@ mod extent;
 mod known;
 mod refine;
 mod store;
+mod tone;
 
 pub use config::{Config, GroupConfig, Preset};
 pub use extent::Extent;
 pub(crate) use refine::{FOCAL, LENS, POSES};
 pub use refine::{Refine, RefineConfig, Refined};
+pub(crate) use tone::{EXPOSURE, VIGNETTING};
+pub use tone::{Tone, ToneConfig};
 
 use crate::Result;
 use crate::camera::pinhole::Camera;
@@ -47,9 +50,13 @@ pub struct Model<T: Scalar> {
     pub terms: Vec<Arc<dyn Term<T>>>,
     /// Corrections of the photographs' cameras, if some are learned.
     pub refine: Option<Refine>,
+    /// What photographs make of the scene's colours, if that is learned.
+    pub tone: Option<Tone>,
     /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
     /// look like none in particular. Of a photograph that there is not, views panic.
     pub look: Option<u32>,
+    /// Whether views have the photographs' darker corners, if a [`Tone`] knows of them. They have not, at first.
+    pub vignetted: bool,
     /// How much of their detail fields have: see [`set_detail`](Self::set_detail).
     detail: f64,
 }
@@ -64,7 +71,9 @@ impl<T: Scalar> Clone for Model<T> {
             sampler: self.sampler.boxed(),
             terms: self.terms.clone(),
             refine: self.refine.clone(),
+            tone: self.tone.clone(),
             look: self.look,
+            vignetted: self.vignetted,
             detail: self.detail,
         }
     }
@@ -97,7 +106,9 @@ impl<T: Scalar> Model<T> {
         let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
         let refine =
             Refine::new(config.poses.is_some(), &config.refine, (&extent, config.unbounded), cameras, &mut params)?;
-        Ok(Model { config, extent, params, field, sampler, terms, refine, look: None, detail: 1.0 })
+        let tone = Tone::new(&config.tone, frames, &mut params)?;
+        let (look, vignetted, detail) = (None, false, 1.0);
+        Ok(Model { config, extent, params, field, sampler, terms, refine, tone, look, vignetted, detail })
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -196,7 +207,7 @@ impl<T: Scalar> Model<T> {
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::with_cameras(self.config.clone(), self.extent, self.cameras(), 0)?;
         model.params.assign(&self.params);
-        model.look = self.look;
+        (model.look, model.vignetted) = (self.look, self.vignetted);
         model.set_detail(self.detail);
         let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
         model.sampler.load_state(&state)?;

@@ -81,9 +81,11 @@ mod tests {
     use crate::dataset::scene::train_cameras;
     use crate::field::{FieldConfig, VoxelConfig};
     use crate::model::config::Preset;
+    use crate::model::densities;
     use crate::sampling::marching::MarchingConfig;
     use crate::space::occupancy::OccupancyGrid;
     use glam::DVec3;
+    use raygrad_autograd::Pool;
     use raygrad_nn::Storage;
 
     fn voxel(direction_degree: usize) -> Config {
@@ -119,6 +121,34 @@ mod tests {
         assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));
         let error = Model::load(&path, voxel(3), extent).err().unwrap().to_string();
         assert!(error.contains("field.table"), "{error}");
+    }
+
+    #[test]
+    fn a_run_that_was_ended_early_comes_back_with_the_detail_that_it_had() {
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.safetensors");
+        let mut model = Model::new(Config::preset(Preset::Small), extent, 3).unwrap();
+        let camera = &train_cameras(4, 12)[1];
+        let view = |model: &Model<f32>| model.view(camera, [1.0; 3]).color;
+        let whole = view(&model);
+        // Of the coarse field, which says where the other one is sampled.
+        let coarse = |model: &Model<f32>| {
+            let mut out = [0.0; 3];
+            let points = [[0.1, -0.7, 0.4], [0.33, 0.2, -0.9], [-0.5, 0.6, 0.1]];
+            densities(model.fields()[0], &model.params, &Pool::new(), &points, &mut out);
+            out
+        };
+        let all = coarse(&model);
+        for (detail, stored) in [(0.3, true), (0.0, true), (1.0, false)] {
+            model.set_detail(detail);
+            model.save(&path).unwrap();
+            assert_eq!(stored_bytes(&std::fs::read(&path).unwrap(), DETAIL).unwrap().is_some(), stored, "{detail}");
+            let read = Model::load(&path, model.config.clone(), extent).unwrap();
+            assert!(view(&read) == view(&model) && (view(&read) == whole) == (detail == 1.0), "{detail}");
+            assert!(view(&read.cast::<f32>().unwrap()) == view(&model), "{detail}");
+            assert!(coarse(&read) == coarse(&model) && (coarse(&read) == all) == (detail == 1.0), "{detail}");
+        }
     }
 
     #[test]

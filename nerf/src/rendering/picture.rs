@@ -76,15 +76,23 @@ impl<T: Scalar> Model<T> {
         keep: impl Fn(&[Pixel], P) + Sync,
     ) -> Evaluations {
         let (bounds, count) = (self.reach(), camera.width * camera.height);
+        let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
+        let place = |pixel: usize| [pixel % camera.width, pixel / camera.width];
         let tiles =
             out.enumerate().map_init(Default::default, |(scratch, pixels): &mut (S, Vec<Pixel>), (which, out)| {
                 let mut rays = Rays::new();
                 for pixel in which * tile..count.min((which + 1) * tile) {
-                    let place = [pixel % camera.width, pixel / camera.width];
-                    rays.push_pixel(camera, place, bounds, self.extent.span);
+                    rays.push_pixel(camera, place(pixel), bounds, self.extent.span);
                 }
                 pixels.resize(rays.len(), Pixel::default());
                 let evaluations = parallel::serial(|| see(scratch, &rays, pixels));
+                if let Some(gain) = &gain {
+                    for (seen, pixel) in pixels.iter_mut().zip(which * tile..) {
+                        let gains = gain.at(camera.off_axis(place(pixel)));
+                        let color = seen.color.iter_mut().zip(gains);
+                        color.for_each(|(color, gain)| *color = (*color * gain).min(1.0));
+                    }
+                }
                 keep(pixels, out);
                 evaluations
             });

@@ -1,13 +1,13 @@
 //! Groups of parameters, each with an optimiser, a schedule and a decay of its own.
 
 use crate::model::config::{Config, GroupConfig};
-use crate::model::{FOCAL, LENS, POSES};
+use crate::model::{EXPOSURE, FOCAL, LENS, POSES, VIGNETTING};
 use crate::{Error, Result};
 use raygrad_autograd::Gradient;
 use raygrad_nn::{AdamW, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
 
 /// Parameters of cameras, each of which has a learning rate of its own.
-const CAMERAS: [&str; 3] = [POSES, FOCAL, LENS];
+const CAMERAS: [&str; 5] = [POSES, FOCAL, LENS, EXPOSURE, VIGNETTING];
 
 /// One group.
 struct Group {

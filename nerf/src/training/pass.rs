@@ -9,6 +9,7 @@ use crate::random::{Jitter, mixed};
 use crate::sampling::{Purpose, Sampled};
 use crate::volume::lit::Lit;
 use crate::volume::query::Query;
+use crate::volume::render::Rendered;
 use raygrad_autograd::{Scalar, Var};
 use raygrad_nn::Bound;
 use std::ops::Add;
@@ -67,14 +68,20 @@ pub(crate) fn rays_loss<'t>(
     let (target, background) = (rows(&batch.target), rows(&batch.background));
     let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, rays, Purpose::Training, jitter);
     let Lit { rendered, asked, kept } = sampler.quadrature().render(&query, &steps, sampler.termination());
-    let color = rendered.over(&background);
+    let gains = model.tone.as_ref().map(|tone| tone.gains(params, batch));
+    // As the photograph has it: what lies behind it is not of the scene.
+    let shown = |seen: &Rendered<'t, f32>| match &gains {
+        Some(gains) => seen.over(&background) + &seen.color * (gains - 1.0),
+        None => seen.over(&background),
+    };
+    let color = shown(&rendered);
     let fine = model.config.loss.sum(&color, &target);
     let error = match model.config.loss {
         Loss::Mse => fine.item(),
         // PSNR is made of squared errors whatever is minimised.
         _ => tape.no_grad(|| Loss::Mse.sum(&color, &target).item()),
     };
-    let coarse = coarse.iter().map(|seen| model.config.loss.sum(&seen.over(&background), &target));
+    let coarse = coarse.iter().map(|seen| model.config.loss.sum(&shown(seen), &target));
     let weights = rendered.weights.value();
     let levels = levels.iter().map(|level| interlevel(level, &rendered.samples, weights));
     let (frames, pixels, distances) = (&batch.frames[..], &batch.pixels[..], &batch.distances[..]);

@@ -93,7 +93,7 @@ impl Trainer {
     /// use raygrad_nerf::dataset::{Split, embedded};
     /// use raygrad_nerf::{Config, Preset, Trainer};
     /// use std::sync::Arc;
-    /// let (config, data) = (Config::preset(Preset::Instant).with_budget(1.0), Arc::new(embedded(Split::Train, 16)));
+    /// let (config, data) = (Config::preset(Preset::Instant), Arc::new(embedded(Split::Train, 16)));
     /// let mut trainer = Trainer::new(config.clone(), data.clone())?;
     /// trainer.step(0.0);
     /// let state = trainer.state()?;
@@ -157,7 +157,7 @@ mod tests {
     use std::sync::Arc;
 
     fn trainer() -> Trainer {
-        let mut config = Config::preset(Preset::Instant).with_budget(1.0);
+        let mut config = Config::preset(Preset::Instant);
         if let Some(sampler) = config.sampler.get_mut::<crate::sampling::marching::MarchingConfig>() {
             (sampler.occupancy.resolution, sampler.samples) = (16, 512);
         }

@@ -19,16 +19,18 @@ pub enum Budget {
     Time(Duration),
 }
 
-/// Steps that the instant preset takes in a second of training on two cores, about: so a number of steps stands for a
-/// time, and gives the model that is made for it on any machine.
-const STEPS_PER_SECOND: f64 = 80.0;
+/// Samples of a step of the instant preset.
+const SAMPLES_PER_STEP: f64 = 24576.0;
+/// Samples that it is trained with in a second by each core, about.
+const SAMPLES_PER_SECOND: f64 = 1e6;
 
 impl Budget {
-    /// The training time that it stands for, in seconds: what [`Config::with_budget`](crate::Config::with_budget) takes.
-    pub fn seconds(self) -> f64 {
+    /// How many samples along rays training has time for, about: what [`Config::for_budget`](crate::Config::for_budget) takes. A
+    /// number of steps gives the same on any machine; a time more of them where there are more threads.
+    pub fn samples(self) -> f64 {
         match self {
-            Budget::Steps(steps) => steps as f64 / STEPS_PER_SECOND,
-            Budget::Time(time) => time.as_secs_f64(),
+            Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP,
+            Budget::Time(time) => time.as_secs_f64() * SAMPLES_PER_SECOND * rayon::current_num_threads() as f64,
         }
     }
 }
@@ -136,14 +138,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn budgets_are_read_and_stand_for_a_time() {
+    fn budgets_are_read_and_stand_for_samples() {
         let read = |text: &str| serde_json::from_str::<Budget>(text);
-        for (text, budget, seconds) in [
-            (r#"{"steps":4000}"#, Budget::Steps(4000), 50.0),
-            (r#"{"seconds":62.5}"#, Budget::Time(Duration::from_millis(62_500)), 62.5),
+        let threads = rayon::current_num_threads() as f64;
+        for (text, budget, samples) in [
+            (r#"{"steps":4000}"#, Budget::Steps(4000), 4000.0 * 24576.0),
+            (r#"{"seconds":62.5}"#, Budget::Time(Duration::from_millis(62_500)), 62.5e6 * threads),
         ] {
             assert_eq!((read(text).unwrap(), serde_json::to_string(&budget).unwrap()), (budget, text.to_owned()));
-            assert_eq!(budget.seconds(), seconds);
+            assert_eq!(budget.samples(), samples);
         }
         assert!(read(r#"{"seconds":-1}"#).is_err() && read(r#"{"seconds":1e300}"#).is_err());
     }

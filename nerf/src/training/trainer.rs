@@ -245,6 +245,7 @@ mod tests {
     use crate::dataset::{Split, embedded};
     use crate::encoding::hash_grid::HashGridConfig;
     use crate::field::{ClassicConfig, InstantConfig};
+    use crate::model::Refined;
     use crate::sampling::SamplerConfig;
     use crate::sampling::hierarchical::HierarchicalConfig;
     use crate::training::stats::STUCK;
@@ -288,6 +289,27 @@ mod tests {
         assert!(params.is_frozen(ids[0]) && params.rate(ids[1]) == 0.5 && !params.is_frozen(ids[1]));
         assert_eq!(params.values()[0], before[0]);
         assert!(params.values().iter().zip(&before).skip(1).any(|(new, old)| new != old), "other numbers");
+    }
+
+    #[test]
+    fn a_restart_knows_the_cameras_that_it_corrects() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(3);
+        let config = tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure]);
+        let mut trainer = Trainer::new(config, Arc::new(data.clone())).unwrap();
+        trainer.step(0.0);
+        trainer.restart();
+        let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
+        assert_eq!(trainer.model.cameras(), cameras);
+        assert!(trainer.model.tone.is_some() && trainer.model.refine.is_some());
+        // They are as they were given, and move on.
+        let moved = |trainer: &Trainer| trainer.model.learned_camera(1, &cameras[1]) != cameras[1];
+        assert!(!moved(&trainer));
+        let before = trainer.stats().step;
+        for fraction in [0.3, 0.4, 0.5] {
+            trainer.step(fraction);
+        }
+        assert!(trainer.stats().step == before + 3 && moved(&trainer));
     }
 
     /// Two tiny networks, and few rays of few samples.

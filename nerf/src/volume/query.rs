@@ -118,7 +118,51 @@ fn with_slopes<'t, T: Scalar>(x: Var<'t, T>, shares: &Tensor<T>) -> Var<'t, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use raygrad_autograd::Tape;
+    use crate::camera::pinhole::Ray;
+    use crate::camera::rays::{Rays, stratified};
+    use crate::random::Jitter;
+    use glam::DVec3;
+    use raygrad_autograd::{Pool, Tape};
+    use raygrad_nn::Params;
+
+    /// A density and a colour that are one parameter everywhere.
+    struct Here;
+
+    impl Field<f64> for Here {
+        fn density<'t>(&self, params: &Bound<'t, f64>, positions: &Var<'t, f64>) -> Density<'t, f64> {
+            let value = params.vars()[0].broadcast_to(&[positions.shape()[0]]);
+            Density { value, log: false, features: positions.clone() }
+        }
+        fn color<'t>(&self, params: &Bound<'t, f64>, features: &Var<'t, f64>, _: &Seen<'_, 't, f64>) -> Var<'t, f64> {
+            params.vars()[0].broadcast_to(&[features.shape()[0], 3])
+        }
+    }
+
+    #[test]
+    fn samples_learn_less_by_the_square_of_their_distance_up_to_where_it_is_near() {
+        let mut params = Params::<f64>::new();
+        params.add("much", Tensor::scalar(0.7));
+        let mut rays = Rays::new();
+        rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [0.0, 4.0]);
+        // In the middles of four bins: at .5, 1.5, 2.5 and 3.5.
+        let samples = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
+        assert_eq!(samples.t.as_slice(), [0.5, 1.5, 2.5, 3.5]);
+        for (near, shares) in [(0.0, [1.0; 4]), (0.5, [1.0; 4]), (2.0, [1.0 / 16.0, 9.0 / 16.0, 1.0, 1.0])] {
+            let tape = Tape::new();
+            let bound = params.bind(&tape);
+            let query = Query { near, ..Query::new(&Here, &bound) };
+            let weights = Tensor::from_vec(&[4], vec![1.0, 10.0, 100.0, 1000.0]);
+            let expected = [1.0, 10.0, 100.0, 1000.0].iter().zip(shares).map(|(w, share)| w * share).sum::<f64>();
+            let density = query.density(&samples);
+            assert!(density.value.value().as_slice().iter().all(|x| *x == 0.7));
+            let found = (&density.value * tape.constant(weights.clone())).sum().grad(&[bound.vars()[0]]);
+            assert!((found[0].item() - expected).abs() < 1e-9, "{near}: {} {expected}", found[0].item());
+            let color = query.color(&density.features, &samples);
+            let weighted = color * tape.constant(weights.reshape(&[4, 1]));
+            let found = weighted.sum().grad(&[bound.vars()[0]]);
+            assert!((found[0].item() - 3.0 * expected).abs() < 1e-9, "{near}: {} {expected}", found[0].item());
+        }
+    }
 
     #[test]
     fn gradients_are_less_by_their_shares_and_values_stay() {

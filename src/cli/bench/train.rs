@@ -120,7 +120,8 @@ fn evaluations(stats: &StepStats) -> f64 {
 /// The model after 1, 1.5, 2.25 ... seconds, and at the end.
 fn train(course: &Course, data: &Arc<Dataset>, test: &Dataset) -> Result<Vec<Point>> {
     let config = Config { seed: course.seed, ..Config::preset(course.preset) };
-    let config = config.with_budget(course.seconds as f64).with_skip(course.skip);
+    let budget = Budget::Time(Duration::from_secs(course.seconds));
+    let config = config.for_budget(budget.samples(), data.footprints()).with_skip(course.skip);
     let mut trainer = Trainer::new(config, data.clone())?;
     let measure = |trainer: &Trainer| {
         let background = trainer.model.config.background.shown();
@@ -133,7 +134,7 @@ fn train(course: &Course, data: &Arc<Dataset>, test: &Dataset) -> Result<Vec<Poi
     };
     let mut points = vec![];
     let mut next = 1.0;
-    trainer.run(Budget::Time(Duration::from_secs(course.seconds)), |trainer| {
+    trainer.run(budget, |trainer| {
         let seconds = trainer.stats().train_seconds;
         if seconds >= next {
             next = 2.0 * next.max(0.5 * seconds);

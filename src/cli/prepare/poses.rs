@@ -9,7 +9,6 @@ use raygrad::nerf::{Error, Result};
 
 use super::program::{COLMAP, Work, counted};
 use super::workplace::Workplace;
-use crate::cli::output::note;
 use crate::cli::progress::Progress;
 
 /// Photographs up to which every pair is compared.
@@ -19,8 +18,6 @@ const FOLDER: &str = "work";
 /// What it calls the processor that it should do without, in the order from new versions to old.
 const EXTRACTION: [&str; 2] = ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"];
 const MATCHING: [&str; 2] = ["FeatureMatching.use_gpu", "SiftMatching.use_gpu"];
-/// What it calls a search for more matches where those that were found say they must be. It is slow.
-const GUIDED: [&str; 2] = ["FeatureMatching.guided_matching", "SiftMatching.guided_matching"];
 /// What the mapper says, with exit code 1, when there is nothing to find: [`find`] has better words for it.
 const NO_MODEL: &str = "failed to create sparse model";
 
@@ -55,24 +52,9 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
         arguments.extend(["--ImageReader.single_camera", "1"]);
     }
     colmap.step("feature_extractor", Some(EXTRACTION), "features found in photographs", &arguments)?;
-    // COLMAP compares no pair again that it has compared.
-    let features = work.join("features.db");
-    copy(&colmap.database, &features)?;
     let matcher = if sequence || names.len() > EXHAUSTIVE { "sequential_matcher" } else { "exhaustive_matcher" };
     colmap.step(matcher, Some(MATCHING), "photographs compared", &[])?;
-    let mut found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
-    let help = COLMAP.ask(&[matcher, "-h"])?;
-    if let Some(name) = GUIDED.iter().find(|name| help.contains(**name))
-        && 2 * most(&found) < names.len()
-    {
-        note("few photographs have cameras: all are compared again, more thoroughly, which takes longer");
-        copy(&features, &colmap.database)?;
-        colmap.step(matcher, Some(MATCHING), "photographs compared again", &[&format!("--{name}"), "1"])?;
-        let again = colmap.map(&place.make(&format!("{FOLDER}/again"))?, names.len())?;
-        if most(&again) > most(&found) {
-            found = again;
-        }
-    }
+    let found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
     let count = found.len();
     // Of equals, the one that was found first.
     let largest = found.into_iter().rev().max_by_key(|(_, capture)| capture.views.len());
@@ -86,16 +68,6 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     place.remove(FOLDER)?;
     let registered = capture.views.len();
     Ok(Found { registered, lost: lost(names, &capture), models: count })
-}
-
-/// How many photographs the largest model has.
-fn most(found: &[(PathBuf, Capture)]) -> usize {
-    found.iter().map(|(_, capture)| capture.views.len()).max().unwrap_or(0)
-}
-
-fn copy(from: &Path, to: &Path) -> Result<()> {
-    let bad = |e: std::io::Error| Error::file(from, format!("cannot be copied to {}: {e}", to.display()));
-    std::fs::copy(from, to).map(drop).map_err(bad)
 }
 
 /// The photographs that have no camera.
@@ -154,7 +126,8 @@ impl Colmap {
         })
     }
 
-    /// Finds the cameras, which COLMAP says one by one: its models and their folders in `models`.
+    /// Finds the cameras, which COLMAP says one by one, and begins with none for each model that it tries: the models and their
+    /// folders in `models`.
     fn map(&self, models: &Path, total: usize) -> Work<Vec<(PathBuf, Capture)>> {
         let mut command = COLMAP.command();
         let paths: [(&str, &OsStr); 3] = [
@@ -163,13 +136,18 @@ impl Colmap {
             ("--output_path", models.as_os_str()),
         ];
         command.arg("mapper");
+        let mut most = 0;
         for (name, path) in paths {
             command.arg(name).arg(path);
         }
         let mut progress = Progress::new();
         COLMAP.run(&mut command, Some(NO_MODEL), |line| {
             let Some(count) = registered(line) else { return };
-            progress.set(count as f64 / total as f64, || format!("{count} of {total} photographs registered"));
+            most = most.max(count);
+            progress.set(most as f64 / total as f64, || match count {
+                count if count < most => format!("{most} of {total} photographs registered; {count} in another model"),
+                _ => format!("{most} of {total} photographs registered"),
+            });
         })?;
         let folders = folders(models)?.into_iter();
         Ok(folders.map(|folder| Ok((folder.clone(), colmap::read(&folder)?))).collect::<Result<_>>()?)

@@ -35,16 +35,21 @@ impl HashGridConfig {
         HashGridConfig { levels: 16, features: 2, log2_table: 19, coarsest: 16, finest: 2048 }
     }
 
-    /// Rows of more features on fewer levels, so fewer places of memory to visit, up to about the resolution of the
-    /// photographs; and as many of both as pay within `seconds` of training on two cores: more of them hold more detail,
-    /// but take longer, the more so if they do not fit the caches.
-    pub fn cpu(seconds: f64) -> Self {
-        let (log2_table, finest) = match seconds {
-            ..=100.0 => (17, 512),
-            ..=300.0 => (18, 512),
+    /// Rows of more features on fewer levels, so fewer places of memory to visit; and as many of both as pay for what it is
+    /// trained with: more of them hold more detail, but take longer, the more so if they do not fit the caches.
+    ///
+    /// `samples` are those of the whole [training](crate::Budget::samples), and `footprints` how many
+    /// [pixels of the photographs](crate::dataset::Dataset::footprints) lie along a side of the scene: no cell is smaller
+    /// than half of one, as nothing would be seen of it.
+    pub fn cpu(samples: f64, footprints: f64) -> Self {
+        let (log2_table, finest) = match samples {
+            ..=2e8 => (17, 512),
+            ..=6e8 => (18, 512),
             _ => (19, 768),
         };
-        HashGridConfig { levels: 8, features: 4, log2_table, coarsest: 16, finest }
+        let coarsest = 16;
+        let finest = ((2.0 * footprints).ceil() as usize).clamp(2 * coarsest, finest);
+        HashGridConfig { levels: 8, features: 4, log2_table, coarsest, finest }
     }
 
     fn check(&self) -> Result<()> {

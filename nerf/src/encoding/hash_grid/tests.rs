@@ -67,7 +67,22 @@ fn the_papers_grid_has_the_papers_levels() {
     assert!(!paper.levels()[4].hashed && paper.levels()[5].hashed && paper.width() == 32);
     assert!(paper.levels().iter().skip(5).all(|level| level.rows.len() == 1 << 19));
     assert!(paper.levels().windows(2).all(|pair| pair[0].rows.end == pair[1].rows.start));
-    assert_eq!(HashGrid::new(&HashGridConfig::cpu(60.0)).unwrap().levels()[7].resolution, 512);
+}
+
+#[test]
+fn a_grid_is_as_large_as_pays_and_as_fine_as_photographs() {
+    let size = |samples: f64, footprints: f64| {
+        let config = HashGridConfig::cpu(samples, footprints);
+        let grid = HashGrid::new(&config).unwrap();
+        assert_eq!(grid.levels()[7].resolution as usize, config.finest);
+        (config.log2_table, config.finest)
+    };
+    assert_eq!(
+        [2e8, 2.1e8, 6e8, 6.1e8].map(|samples| size(samples, 1e4)),
+        [(17, 512), (18, 512), (18, 512), (19, 768)]
+    );
+    assert_eq!([0.0, 100.3, 256.0, 300.0].map(|pixels| size(1e8, pixels).1), [32, 201, 512, 512]);
+    assert_eq!(size(1e9, 300.0), (19, 600));
 }
 
 #[test]

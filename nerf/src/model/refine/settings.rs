@@ -1,5 +1,6 @@
 //! What of the cameras is learned, and how fast.
 
+use crate::model::tone::{EXPOSURE, VIGNETTING};
 use crate::range::check_range;
 use crate::{Error, Result};
 use raygrad_nn::Schedule;
@@ -51,7 +52,7 @@ pub(crate) fn check_schedule(name: &str, schedule: Option<Schedule>) -> Result<(
     schedule.check().map_err(|error| Error::setting(format!("{name}.{}.{}", schedule.name(), error.name), error.what))
 }
 
-/// A part of a camera that can be learned.
+/// A part of what cameras did that can be learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refined {
     /// Where it was and how it was held, for each photograph.
@@ -60,6 +61,10 @@ pub enum Refined {
     Focal,
     /// The coefficients of its lens.
     Lens,
+    /// How bright it made what it saw, and of what white balance, for each photograph.
+    Exposure,
+    /// How dark it made the corners of its photographs.
+    Vignetting,
 }
 
 impl FromStr for Refined {
@@ -69,7 +74,12 @@ impl FromStr for Refined {
             POSES => Ok(Refined::Poses),
             FOCAL => Ok(Refined::Focal),
             LENS => Ok(Refined::Lens),
-            _ => Err(Error::setting("refine", format!("there is no `{name}`; use poses, focal or lens"))),
+            EXPOSURE => Ok(Refined::Exposure),
+            VIGNETTING => Ok(Refined::Vignetting),
+            _ => {
+                let what = format!("there is no `{name}`; use poses, focal, lens, exposure or vignetting");
+                Err(Error::setting("refine", what))
+            }
         }
     }
 }
@@ -80,6 +90,8 @@ impl fmt::Display for Refined {
             Refined::Poses => POSES,
             Refined::Focal => FOCAL,
             Refined::Lens => LENS,
+            Refined::Exposure => EXPOSURE,
+            Refined::Vignetting => VIGNETTING,
         })
     }
 }

@@ -1,7 +1,7 @@
 //! Medians and outliers.
 
 /// The value in the middle; 0 of none.
-pub(super) fn median(values: impl IntoIterator<Item = f64>) -> f64 {
+pub(crate) fn median(values: impl IntoIterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.into_iter().filter(|x| !x.is_nan()).collect();
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)
@@ -9,7 +9,7 @@ pub(super) fn median(values: impl IntoIterator<Item = f64>) -> f64 {
 
 /// How far values usually are from their median: 1.4826 times the median of the distances from it, which is the standard
 /// deviation of normal numbers and is not moved by a few that are not.
-pub(super) fn spread(values: &[f64]) -> f64 {
+pub(crate) fn spread(values: &[f64]) -> f64 {
     let middle = median(values.iter().copied());
     1.4826 * median(values.iter().map(|x| (x - middle).abs()))
 }

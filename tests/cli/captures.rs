@@ -1,0 +1,144 @@
+//! `raygrad train` and `eval` of what captures bring with them: depths, cameras that are off, exposures that differ.
+
+use super::{Place, SIZE, png};
+use raygrad::nerf::dataset::{Dataset, Split, load};
+use raygrad::nerf::{Camera, Config, Extent, Image, Model};
+use serde_json::{Value, json};
+
+/// Settings of a model that is trained in no time.
+const SMALL: &str = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+
+/// The model of a run.
+fn model(place: &Place, run: &str) -> Model<f32> {
+    let config = place.json(&format!("{run}/config.json"));
+    let extent: Extent = serde_json::from_value(config["extent"].clone()).unwrap();
+    let settings: Config = serde_json::from_value(config["config"].clone()).unwrap();
+    Model::load(place.path(&format!("{run}/model.safetensors")), settings, extent).unwrap()
+}
+
+fn terms(place: &Place, run: &str) -> Value {
+    place.json(&format!("{run}/config.json"))["config"]["terms"].clone()
+}
+
+#[test]
+fn depths_are_learned_from_where_that_is_asked_for() {
+    let place = Place::with_scene();
+    place.succeeds("prepare scene --to nerfstudio --out captured");
+    let mut transforms = place.json("captured/transforms.json");
+    std::fs::create_dir(place.path("captured/depths")).unwrap();
+    let depth = Image { width: SIZE, height: SIZE, channels: 1, data: vec![40.0 / 255.0; SIZE * SIZE] };
+    depth.save_png(place.path("captured/depths/all.png")).unwrap();
+    transforms["depth_unit_scale_factor"] = json!(0.1);
+    for frame in transforms["frames"].as_array_mut().unwrap() {
+        frame["depth_file_path"] = json!("depths/all.png");
+    }
+    let loss = |flags: &str, run: &str| {
+        place.succeeds(&format!("train captured --steps 1 --out {run} {SMALL} {flags}"));
+        let text = String::from_utf8(place.bytes(&format!("{run}/metrics.jsonl"))).unwrap();
+        serde_json::from_str::<Value>(text.lines().next().unwrap()).unwrap()["loss"].as_f64().unwrap()
+    };
+    // Without files of depths there is nothing to learn from.
+    place.fails(&format!("train captured --steps 1 --depth {SMALL}"), &["`terms`", "depth_file_path"]);
+    std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
+    let [plain, usual, heavy] = [loss("", "plain"), loss("--depth", "usual"), loss("--depth=2", "heavy")];
+    assert_eq!(terms(&place, "usual"), json!([{ "kind": "depth", "weight": 0.1 }]));
+    assert_eq!(terms(&place, "heavy"), json!([{ "kind": "depth", "weight": 2.0 }]));
+    assert!(usual > plain, "{usual} {plain}");
+    assert!(((heavy - plain) / (usual - plain) - 20.0).abs() < 1e-3, "{plain} {usual} {heavy}");
+    // The landscape measures its own.
+    place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth --out far {SMALL}"));
+    assert_eq!(terms(&place, "far")[1], json!({ "kind": "depth", "weight": 0.1 }));
+    place.fails(&format!("train embedded --downscale 20 --steps 1 --depth {SMALL}"), &["`terms`"]);
+}
+
+#[test]
+fn terms_and_the_nearest_distance_can_be_said() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 1 --out one {SMALL} --term entropy=0.001 --near 2.5"));
+    assert_eq!(terms(&place, "one"), json!([{ "kind": "entropy", "weight": 0.001 }]));
+    assert_eq!(place.json("one/config.json")["extent"]["span"], json!([2.5, 6.0]));
+    // Those that a scope brings are replaced or taken away.
+    for (flag, expected) in [
+        ("distortion=0", json!([])),
+        ("distortion=0.5", json!([{ "kind": "distortion", "weight": 0.5 }])),
+        ("entropy=0", json!([{ "kind": "distortion", "weight": 0.1 }])),
+    ] {
+        place.succeeds(&format!("train scene --scope unbounded --steps 1 --out {flag} {SMALL} --term {flag}"));
+        assert_eq!(terms(&place, flag), expected);
+    }
+    // In the units of the files: here a unit of theirs is not one of the scene.
+    place.succeeds(&format!("train scene --scope unbounded --steps 1 --out near --near 0.25 {SMALL}"));
+    let config = place.json("near/config.json");
+    let scale = config["extent"]["placement"]["scale"].as_f64().unwrap();
+    assert!((config["extent"]["span"][0].as_f64().unwrap() - 0.25 * scale).abs() < 1e-12 && scale != 1.0, "{config}");
+    place.fails(&format!("train scene --steps 1 {SMALL} --near 6"), &["`near`", "less than 6"]);
+    place.fails(&format!("train scene --steps 1 {SMALL} --near=-1"), &["`near`"]);
+    place.fails(&format!("train scene --steps 1 {SMALL} --term fog=1"), &["`term`", "fog=1", "entropy"]);
+    for bad in ["entropy", "entropy=x", "entropy=-1", "entropy=NaN"] {
+        let output = place.command(&format!("train scene --steps 1 --term {bad}")).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{bad}: {output:?}");
+    }
+}
+
+/// The rendered part of the first picture of an evaluation.
+fn rendered(place: &Place, name: &str) -> Image {
+    let picture = png(&place.path(&format!("{name}/000.png")));
+    let data = (0..SIZE * SIZE).flat_map(|i| picture.pixel(SIZE + i % SIZE, i / SIZE).to_vec()).collect();
+    Image { width: SIZE, height: SIZE, channels: 3, data }
+}
+
+/// How far two images are apart, at most.
+fn apart(a: &Image, b: &Image) -> f32 {
+    assert_eq!([a.width, a.height], [b.width, b.height]);
+    a.data.iter().zip(&b.data).map(|(a, b)| (a - b.clamp(0.0, 1.0)).abs()).fold(0.0, f32::max)
+}
+
+#[test]
+fn photographs_are_compared_from_where_the_model_has_their_cameras() {
+    let place = Place::with_scene();
+    // At a rate at which they go astray, so that it can be seen.
+    let fast = r#"--set poses={"constant":{"rate":0.1}} --set refine={"focal":{"constant":{"rate":0.02}}}"#;
+    place.succeeds(&format!("train scene --steps 12 --out run {SMALL} {fast}"));
+    let model = model(&place, "run");
+    let view = |camera: &Camera| model.view(camera, [1.0; 3]).color;
+    for split in [Split::Train, Split::Test] {
+        place.succeeds(&format!("eval run --split {split}"));
+        let shown = rendered(&place, if split == Split::Train { "run/eval-train" } else { "run/eval" });
+        let data: Dataset = load(place.path("scene"), split, 1).unwrap();
+        let given = &data.frames[0].camera;
+        let right = if split == Split::Train { model.learned_camera(0, given) } else { model.other_camera(given) };
+        let [from_there, from_where_it_was] = [&right, given].map(|camera| apart(&shown, &view(camera)));
+        assert!(from_there < 0.01, "{split}: {from_there}");
+        assert!(from_where_it_was > 0.05, "{split}: {from_where_it_was}");
+    }
+}
+
+#[test]
+fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 12 --out plain {SMALL}"));
+    let fast = r#"--set tone={"exposure":{"constant":{"rate":0.05}},"vignetting":{"constant":{"rate":0.05}}}"#;
+    place.succeeds(&format!("train scene --steps 12 --out run {SMALL} {fast}"));
+    place.succeeds(&format!("train scene --steps 1 --out codes {SMALL} --set field.codes=2"));
+    for (run, expected) in [("plain", "none"), ("run", "mean of the training photographs")] {
+        place.succeeds(&format!("eval {run}"));
+        assert_eq!(place.json(&format!("{run}/eval.json"))["appearance"], expected);
+    }
+    assert!(
+        place.succeeds("eval codes --views 1").contains("exposures and codes: the mean of the training photographs'")
+    );
+    // The mean exposure, and corners that are as dark as in all photographs.
+    let mut model = model(&place, "run");
+    let camera = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
+    let shown = rendered(&place, "run/eval");
+    let bright = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    model.vignetted = true;
+    let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    assert!(own < 0.01 && bright > 0.02, "{own} {bright}");
+    // A render that is too dark by a factor is none the worse where the other half has told.
+    place.succeeds("eval plain --fit-half");
+    let half = place.json("plain/eval-half.json");
+    assert_eq!(half["appearance"], "gains fitted to the left half, right half compared");
+    let render = rendered(&place, "plain/eval-half");
+    assert!(apart(&render, &rendered(&place, "plain/eval")) > 0.01);
+}
