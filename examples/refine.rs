@@ -2,12 +2,12 @@
 //! per cent of the scene's size off, and a focal length that is five per cent too long.
 //!
 //! ```text
-//! cargo run --release --example refine [seconds=60] [pixels=200] [folder=.. downscale=1] [degrees=2 share=0.02 focal=1.05]
+//! cargo run --release --example refine [seconds=60|steps=..] [pixels=200] [folder=.. downscale=1] [degrees=2 share=0.02 focal=1.05]
 //!     [only=right|wrong|corrected] [every=10] [poses=1 focal_rate=1 coarse=0.4]
 //! ```
 //!
 //! Without a folder the embedded scene is photographed. It trains with the right cameras, with the wrong ones, and with the
-//! wrong ones that are corrected, a minute each, and prints how far cameras are from the truth and how well new views are
+//! wrong ones that are corrected, a minute or a number of steps each, and prints how far cameras are from the truth and how well new views are
 //! met. A scene and its cameras can turn, move and grow together without any photograph changing; so the true cameras are
 //! first brought to those that were found by the similarity that fits best.
 
@@ -93,7 +93,6 @@ fn main() -> Result<()> {
         .filter_map(|argument| argument.split_once('=').map(|(name, value)| (name.to_owned(), value.to_owned())))
         .collect();
     let number = |name: &str, usual: f64| arguments.get(name).and_then(|text| text.parse().ok()).unwrap_or(usual);
-    let seconds = number("seconds", 60.0);
     let [right, mut views] = match arguments.get("folder") {
         Some(folder) => {
             let downscale = number("downscale", 1.0) as usize;
@@ -103,7 +102,10 @@ fn main() -> Result<()> {
     };
     views.frames = evenly_spaced(views.frames, VIEWS);
     let wrong = disturbed(&right, number("degrees", 2.0), number("share", 0.02), number("focal", 1.05));
-    let budget = Budget::Time(Duration::from_secs_f64(seconds));
+    let budget = match arguments.get("steps").and_then(|text| text.parse().ok()) {
+        Some(steps) => Budget::Steps(steps),
+        None => Budget::Time(Duration::from_secs_f64(number("seconds", 60.0))),
+    };
     let plain = Config::preset(Preset::Instant).for_budget(budget.samples(), right.footprints());
     let mut plain = plain.with_scope(right.scope);
     if !right.has_alpha() {
@@ -123,7 +125,7 @@ fn main() -> Result<()> {
     refined.poses = faster(refined.poses, "poses");
     refined.refine.focal = faster(refined.refine.focal, "focal_rate");
     refined.refine.coarse = number("coarse", refined.refine.coarse);
-    println!("{} photographs, {seconds} s each", right.frames.len());
+    println!("{} photographs, {budget:?} each", right.frames.len());
     println!("cameras             turned (deg)  moved (% of scene)  focal length (%)  PSNR (dB)");
     let runs = [("right", &plain, &right), ("wrong", &plain, &wrong), ("wrong, corrected", &refined, &wrong)];
     for (name, config, data) in runs {

@@ -50,10 +50,10 @@ fn averaging_does_not_enlarge() {
     bytes(3, 1, 3, &[0; 9]).resized([4, 1]);
 }
 
-/// A JPEG of 16 x 8 pixels whose left half is white, with this EXIF orientation.
+/// A JPEG of 16 x 8 pixels that is white in its upper left quarter, with this EXIF orientation.
 fn jpeg(orientation: u8) -> Vec<u8> {
     let mut plain = vec![];
-    let picture = image::RgbImage::from_fn(16, 8, |x, _| image::Rgb([if x < 8 { 255 } else { 0 }; 3]));
+    let picture = image::RgbImage::from_fn(16, 8, |x, y| image::Rgb([if x < 8 && y < 4 { 255 } else { 0 }; 3]));
     picture.write_to(&mut std::io::Cursor::new(&mut plain), image::ImageFormat::Jpeg).unwrap();
     // An APP1 segment with one directory of one entry: tag 0x0112, a short.
     let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
@@ -66,11 +66,16 @@ fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measure
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("photo.jpg");
     let white = |photo: &Photo, x: usize, y: usize| photo.pixel(x, y)[0] > 0.5;
-    for (orientation, size, corners) in [
-        (1, [16, 8], [true, false, true]),
-        (3, [16, 8], [false, true, false]),
-        (6, [8, 16], [true, true, false]),
-        (8, [8, 16], [false, false, true]),
+    // Where the white corner goes: upper left, upper right, lower left, lower right.
+    for (orientation, size, corner) in [
+        (1, [16, 8], 0),
+        (2, [16, 8], 1),
+        (3, [16, 8], 3),
+        (4, [16, 8], 2),
+        (5, [8, 16], 0),
+        (6, [8, 16], 1),
+        (7, [8, 16], 3),
+        (8, [8, 16], 2),
     ] {
         std::fs::write(&path, jpeg(orientation)).unwrap();
         assert_eq!(Photo::size_of_file(&path).unwrap(), [[16, 8], size]);
@@ -79,12 +84,12 @@ fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measure
             let photo = Photo::open(&path, asked).unwrap();
             let [right, bottom] = [photo.width - 1, photo.height - 1];
             assert_eq!([photo.width, photo.height], size);
-            let seen = [white(&photo, 0, 0), white(&photo, right, 0), white(&photo, 0, bottom)];
-            assert_eq!(seen, corners, "orientation {orientation}");
+            let seen = [[0, 0], [right, 0], [0, bottom], [right, bottom]].map(|[x, y]| white(&photo, x, y));
+            assert_eq!(seen, [0, 1, 2, 3].map(|i| i == corner), "orientation {orientation}");
         }
         // A camera that was measured on the pixels as they are stored, also where turning would not change their size.
         let stored = Photo::open(&path, Some([16, 8])).unwrap();
-        assert!([stored.width, stored.height] == [16, 8] && white(&stored, 0, 7) && !white(&stored, 15, 0));
+        assert!([stored.width, stored.height] == [16, 8] && white(&stored, 0, 0) && !white(&stored, 15, 0));
     }
 }
 

@@ -155,3 +155,31 @@ pub(super) fn model_of(camera: &Camera) -> Result<(&'static Model, Vec<f64>), St
     let model = &MODELS[index];
     Ok((model, model.params.iter().map(value).collect()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn models_have_the_numbers_names_and_parameters_of_colmaps_list() {
+        // docs of COLMAP, "Camera Models", and the numbers of sensor/models.h.
+        let list = [
+            (0, "SIMPLE_PINHOLE", 3),
+            (1, "PINHOLE", 4),
+            (2, "SIMPLE_RADIAL", 4),
+            (3, "RADIAL", 5),
+            (4, "OPENCV", 8),
+            (5, "OPENCV_FISHEYE", 8),
+            (6, "FULL_OPENCV", 12),
+            (7, "FOV", 5),
+            (8, "SIMPLE_RADIAL_FISHEYE", 4),
+            (9, "RADIAL_FISHEYE", 5),
+            (10, "THIN_PRISM_FISHEYE", 12),
+        ];
+        for (id, name, count) in list {
+            let [by_id, by_name] = [Model::by_id(id), Model::by_name(name)].map(|model| model.ok().unwrap());
+            assert_eq!((by_id.name, by_id.params.len(), by_name.id), (name, count, id));
+        }
+        assert!(Model::by_id(11).is_err() && Model::by_id(-1).is_err() && Model::by_name("OPENCV2").is_err());
+    }
+}
