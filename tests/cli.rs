@@ -496,7 +496,7 @@ fn bad_arguments_are_usage_errors() {
         ("train --threads 0", "0 is not in 1.."),
         ("train --preset huge", "use classic, small, instant or voxel"),
         ("train --background grey", "white, black or random"),
-        ("train --refine all", "use poses, focal or lens"),
+        ("train --refine all", "use poses, focal, lens, exposure or vignetting"),
         ("eval", "required arguments"),
         ("eval run --split all", "must be train, val or test"),
         ("eval run --views 0", "0 is not in 1.."),

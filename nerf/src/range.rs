@@ -1,6 +1,7 @@
 //! Settings within their ranges.
 
 use crate::{Error, Result};
+use raygrad_nn::Schedule;
 use std::fmt;
 
 /// An error unless `low <= value <= high`.
@@ -19,4 +20,9 @@ pub(crate) fn check_parameters(count: usize) -> Result<()> {
         return Ok(());
     }
     Err(Error::setting("field", format!("has {count} parameters; use smaller numbers, for at most {MOST} parameters")))
+}
+/// Whether the learning rate of this name makes sense, if there is one.
+pub(crate) fn check_schedule(name: &str, schedule: Option<Schedule>) -> Result<()> {
+    let Some(schedule) = schedule else { return Ok(()) };
+    schedule.check().map_err(|error| Error::setting(format!("{name}.{}.{}", schedule.name(), error.name), error.what))
 }

@@ -368,7 +368,10 @@ fn a_table_that_is_to_be_smooth_becomes_smoother() {
 
 #[test]
 fn samples_near_a_camera_learn_less_where_that_is_asked_for() {
-    let data = Arc::new(photographs(12, 24));
+    let mut data = photographs(12, 24);
+    // Its unit is 2, and the nearest samples are 2 away.
+    data.bounds = [DVec3::splat(-3.0), DVec3::splat(3.0)];
+    let data = Arc::new(data);
     let moved = |near_gradients: f64| {
         let config = Config { near_gradients, ..instant() };
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
@@ -381,7 +384,8 @@ fn samples_near_a_camera_learn_less_where_that_is_asked_for() {
         let far = before.as_slice().iter().zip(after.as_slice()).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
         (first, second, far)
     };
-    let (usual, none, all) = (moved(0.0), moved(1e-3), moved(1e6));
+    let (usual, none, all) = (moved(0.0), moved(0.9), moved(1e6));
+    assert_ne!(usual, moved(1.3), "some are");
     assert_eq!(usual, none, "no sample is as near as that");
     assert_eq!(usual.0, all.0, "values stay");
     assert!(usual.2 > 0.0 && all.2.is_finite() && usual.2 != all.2, "{usual:?} {all:?}");

@@ -163,6 +163,20 @@ mod tests {
     }
 
     #[test]
+    fn photographs_from_one_side_are_known_by_their_direction() {
+        let mut data = embedded(Split::Train, 8);
+        let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
+        // Within 40 degrees of the y axis.
+        data.frames.retain(|frame| {
+            let offset = frame.camera.pose.translation - centre;
+            offset.y > 0.0 && offset.x.abs() < 0.8 * offset.y
+        });
+        assert!(data.frames.len() > 5);
+        let view = Viewpoint::of(&data);
+        assert!((view.azimuth.rem_euclid(TAU) - FRAC_PI_2).abs() < 0.3 && (0.3..0.9).contains(&view.reach), "{view:?}");
+    }
+
+    #[test]
     fn an_orbit_swings_where_photographs_are_from() {
         assert_eq!(viewpoint().0.reach, PI, "they are from all around");
         assert_eq!(arc((0..4).map(|i| f64::from(i) * FRAC_PI_2).collect()), (0.0, PI));

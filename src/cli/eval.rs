@@ -133,18 +133,22 @@ enum Appearance {
     /// Views have the mean of what was learned of the photographs that were trained on: of their codes, and of their exposures.
     #[serde(rename = "mean of the training photographs")]
     Mean,
-    /// As well, and a gain for each channel makes the left half most like the photograph's; the right half is compared.
+    /// Views have what was learned of the photograph itself: it was trained on.
+    #[serde(rename = "each photograph's own")]
+    Own,
+    /// As the mean, and a gain for each channel makes the left half most like the photograph's; the right half is compared.
     #[serde(rename = "gains fitted to the left half, right half compared")]
     Half,
 }
 
 impl Appearance {
-    fn of(model: &Model<f32>, fit_half: bool) -> Self {
+    fn of(model: &Model<f32>, split: Split, fit_half: bool) -> Self {
         let has_codes = model.config.field.get::<InstantConfig>().is_some_and(|field| field.codes > 0);
-        match fit_half {
-            true => Appearance::Half,
-            false if has_codes || model.config.tone.exposure.is_some() => Appearance::Mean,
-            false => Appearance::None,
+        match (fit_half, has_codes || model.config.tone.exposure.is_some()) {
+            (true, _) => Appearance::Half,
+            (_, false) => Appearance::None,
+            (_, true) if split == Split::Train => Appearance::Own,
+            (_, true) => Appearance::Mean,
         }
     }
 }
@@ -202,7 +206,7 @@ pub fn run(args: &Args) -> Result<()> {
         );
         return Err(Error::setting("scene", what));
     }
-    let appearance = Appearance::of(&model, args.fit_half);
+    let appearance = Appearance::of(&model, args.split, args.fit_half);
     // Corners are as dark in every photograph.
     model.vignetted = true;
     let cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
@@ -211,8 +215,14 @@ pub fn run(args: &Args) -> Result<()> {
     make_folder(&pictures)?;
     let (background, span) = (model.config.background, model.extent.span);
     let skip = model.marching().map(|marching| marching.config.occupancy.skip);
-    let renderer = Renderer::new(model, args.precision)?;
-    let (per_view, seconds_per_view, evaluations) = compare(&renderer, background, span, &data, appearance, &pictures)?;
+    let mut renderer = Renderer::new(model, args.precision)?;
+    let own = |frame: &Frame| {
+        let number = run.config.photographs.iter().position(|name| *name == frame.name);
+        number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
+    };
+    let looks: Vec<Option<u32>> = data.frames.iter().map(own).collect();
+    let (per_view, seconds_per_view, evaluations) =
+        compare(&mut renderer, background, span, (&data, &looks), appearance, &pictures)?;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
     let per_pixel = |count: u64| count as f64 / pixels as f64;
     let report = Report {
@@ -269,12 +279,12 @@ fn drawn(views: usize) -> Vec<usize> {
     evenly_spaced((0..views).collect(), PICTURES)
 }
 
-/// Scores all views and draws some; also the mean time of rendering one, in seconds, and what was evaluated for all.
+/// Scores all views, each with its look, and draws some; also the mean time of rendering one, in seconds, and what was evaluated for all.
 fn compare(
-    renderer: &Renderer,
+    renderer: &mut Renderer,
     background: Background,
     span: [f64; 2],
-    data: &Dataset,
+    (data, looks): (&Dataset, &[Option<u32>]),
     appearance: Appearance,
     pictures: &Path,
 ) -> Result<(Vec<Score>, f64, Evaluations)> {
@@ -283,8 +293,9 @@ fn compare(
     let mut scores = Vec::with_capacity(data.frames.len());
     let (mut seconds, mut evaluations) = (0.0, Evaluations::default());
     let mut progress = Progress::new();
-    for (i, frame) in data.frames.iter().enumerate() {
+    for (i, (frame, look)) in data.frames.iter().zip(looks).enumerate() {
         let start = Instant::now();
+        renderer.look_like(*look);
         let mut picture = renderer.view(&frame.camera, background);
         seconds += start.elapsed().as_secs_f64();
         evaluations = evaluations + picture.evaluations;
@@ -367,6 +378,7 @@ fn table(report: &Report) -> String {
     text += &format!("{split} views of {size} over {background}, {seconds_per_view:.2} s to render each\n");
     text += match report.appearance {
         Appearance::None => "",
+        Appearance::Own => "exposures and codes: each photograph's own\n",
         Appearance::Mean => "exposures and codes: the mean of the training photographs'\n",
         Appearance::Half => "compared: right halves, after gains that were fitted to left halves\n",
     };

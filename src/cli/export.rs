@@ -8,7 +8,7 @@ use raygrad::nerf::dataset::{Capture, Split};
 use raygrad::nerf::{Error, Model, Result};
 
 use super::output::print;
-use super::prepare::convert::{Target, convert};
+use super::prepare::convert::{Target, convert, relative};
 use super::prepare::program::Stop;
 use super::run::Run;
 use super::scene::Scene;
@@ -104,6 +104,10 @@ fn refine(capture: &mut Capture, model: &Model<f32>, names: &[String]) -> Result
 fn write(mut capture: Capture, out: &Path) -> Result<()> {
     // Points would be a file of their own.
     capture.points.clear();
+    for view in capture.views.iter_mut().filter(|view| view.image.is_some()) {
+        // As masks and depths are: from the folder of the capture.
+        view.name = relative(&capture.folder, view)?;
+    }
     if out.is_dir() {
         return Err(Error::file(out, "is a folder: name a file such as cameras.json, or a format with --to"));
     }

@@ -76,6 +76,8 @@ pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
             *depth = 0.0;
         }
     }
+    // It may be 0.
+    let near = near.max(1e-5 * far);
     if far <= DEEP * near {
         return colormap::depth_map(&depth, near, far);
     }

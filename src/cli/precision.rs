@@ -32,6 +32,14 @@ impl Renderer {
         })
     }
 
+    /// Lets views look like the photograph of this number, or like none in particular.
+    pub fn look_like(&mut self, number: Option<u32>) {
+        match self {
+            Renderer::Single(model) => model.look = number,
+            Renderer::Double(model) => model.look = number,
+        }
+    }
+
     /// The view from a camera over a background.
     pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
         match self {

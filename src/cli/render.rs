@@ -6,7 +6,7 @@ use clap::ValueEnum;
 use raygrad::nerf::dataset::Split;
 use raygrad::nerf::dataset::scene::test_cameras;
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Camera, Error, Image, Result, write_atomic};
+use raygrad::nerf::{Camera, Error, Image, Model, Result, write_atomic};
 
 use super::animation::Animation;
 use super::cameras::fitted;
@@ -97,7 +97,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let out = args.out.clone().unwrap_or_else(|| run.file(args.path.name()));
     let kind = Kind::of(&out);
-    let mut cameras = cameras(args, &run)?;
+    let mut cameras = cameras(args, &run, &model)?;
     if kind == Kind::Png {
         cameras.truncate(1);
     }
@@ -131,7 +131,7 @@ pub fn run(args: &Args) -> Result<()> {
 const DIGITS: usize = 4;
 
 /// The cameras along the path; at least one.
-fn cameras(args: &Args, run: &Run) -> Result<Vec<Camera>> {
+fn cameras(args: &Args, run: &Run, model: &Model<f32>) -> Result<Vec<Camera>> {
     let config = &run.config;
     let view = &config.viewpoint;
     let size = args.size.unwrap_or([view.width, view.height]);
@@ -142,7 +142,8 @@ fn cameras(args: &Args, run: &Run) -> Result<Vec<Camera>> {
         (CameraPath::Test, _) => {
             let scene = run.scene(args.scene.as_ref())?.open_for(&config.extent)?;
             let data = scene.load(Split::Test, config.downscale, args.frames.unwrap_or(usize::MAX))?;
-            data.frames.into_iter().map(|frame| frame.camera).collect()
+            // Where the model has them, if it has learned something of cameras.
+            data.frames.iter().map(|frame| model.other_camera(&frame.camera)).collect()
         }
     };
     Ok(cameras.iter().map(|camera| fitted(camera, size)).collect())

@@ -11,6 +11,7 @@ use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, Scope, Split};
 use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::model::Refined;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, TermConfig, Trainer};
@@ -122,7 +123,8 @@ impl Trained {
 pub fn run(args: &Args) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let mut scene = args.scene.open(args.scope)?;
-    scene.depth = args.depth.is_some();
+    scene.depth = args.depth.is_some() || args.term.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0);
+    warn_of_memory(&scene, args.downscale);
     let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
     if let Some(near) = args.near {
         set_near(&mut data, near)?;
@@ -177,6 +179,14 @@ impl Args {
             config = config.with_skip(skip);
         }
         config = config.with_scope(data.scope);
+        if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
+            let what = format!(
+                "{} samples evenly along rays, and those of a scene that goes on are thousands of units long: use another, add \
+                 `--skip fast`, or say `--scope bounded`",
+                self.preset
+            );
+            return Err(Error::setting("preset", what));
+        }
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
                 let what = format!("the preset {} has no grid to carve; choose `--skip fast` beside it", self.preset);
@@ -216,6 +226,25 @@ impl Args {
             (None, Some(time)) => Budget::Time(time),
             (None, None) => Budget::Time(default_budget(self.preset)),
         }
+    }
+}
+
+/// Bytes of photographs that many a computer has not.
+const HEAVY: f64 = 4e9;
+
+/// Says what photographs will take if that is much, before they are read.
+fn warn_of_memory(scene: &Opened, downscale: usize) {
+    let Some((capture, _)) = &scene.capture else { return };
+    let pixels: f64 = capture.present().map(|view| view.camera.width as f64 * view.camera.height as f64).sum();
+    let bytes = |downscale: usize| 3.0 * pixels / (downscale * downscale) as f64;
+    if bytes(downscale) > HEAVY {
+        let enough = (downscale..).find(|k| bytes(*k) <= 0.5 * HEAVY).unwrap_or(downscale);
+        complain(&format!(
+            "warning: {} photographs take about {:.0} GB of memory at this size, with --downscale {enough} {:.1} GB",
+            capture.present().count(),
+            bytes(downscale) / 1e9,
+            bytes(enough) / 1e9
+        ));
     }
 }
 

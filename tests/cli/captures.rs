@@ -1,6 +1,7 @@
 //! `raygrad train` and `eval` of what captures bring with them: depths, cameras that are off, exposures that differ.
 
 use super::{Place, SIZE, png};
+use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::{Camera, Config, Extent, Image, Model};
 use serde_json::{Value, json};
@@ -90,7 +91,7 @@ fn rendered(place: &Place, name: &str) -> Image {
 /// How far two images are apart, at most.
 fn apart(a: &Image, b: &Image) -> f32 {
     assert_eq!([a.width, a.height], [b.width, b.height]);
-    a.data.iter().zip(&b.data).map(|(a, b)| (a - b.clamp(0.0, 1.0)).abs()).fold(0.0, f32::max)
+    a.data.iter().zip(&b.data).map(|(a, b)| (a - b.clamp(0.0, 1.0)).abs()).fold(0.0, Real::maximum)
 }
 
 #[test]
@@ -101,6 +102,11 @@ fn photographs_are_compared_from_where_the_model_has_their_cameras() {
     place.succeeds(&format!("train scene --steps 12 --out run {SMALL} {fast}"));
     let model = model(&place, "run");
     let view = |camera: &Camera| model.view(camera, [1.0; 3]).color;
+    // An animation from photograph to photograph, too.
+    place.succeeds("render run --path test --out way");
+    let first = png(&place.path("way/0000.png"));
+    let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
+    assert!(apart(&first, &view(&model.other_camera(given))) < 0.01 && apart(&first, &view(given)) > 0.05);
     for split in [Split::Train, Split::Test] {
         place.succeeds(&format!("eval run --split {split}"));
         let shown = rendered(&place, if split == Split::Train { "run/eval-train" } else { "run/eval" });
@@ -135,10 +141,96 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     model.vignetted = true;
     let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
     assert!(own < 0.01 && bright > 0.02, "{own} {bright}");
-    // A render that is too dark by a factor is none the worse where the other half has told.
+    // After a gain for the left half of the picture, the right half of it is compared.
     place.succeeds("eval plain --fit-half");
     let half = place.json("plain/eval-half.json");
     assert_eq!(half["appearance"], "gains fitted to the left half, right half compared");
     let render = rendered(&place, "plain/eval-half");
     assert!(apart(&render, &rendered(&place, "plain/eval")) > 0.01);
+    let truth = png(&place.path("plain/eval-half/000.png"));
+    let errors = (0..SIZE * SIZE).filter(|i| i % SIZE >= SIZE / 2).flat_map(|i| {
+        let [a, b] = [&render, &truth].map(|image| image.pixel(i % SIZE, i / SIZE).to_vec());
+        (0..3).map(move |k| f64::from(a[k] - b[k]).powi(2))
+    });
+    let mse = errors.sum::<f64>() / (3 * SIZE * SIZE / 2) as f64;
+    let psnr = half["per_view"][0]["psnr"].as_f64().unwrap();
+    assert!((psnr + 10.0 * mse.log10()).abs() < 0.05, "{psnr} {mse}");
+    // What was trained on has its own exposure.
+    place.succeeds("eval run --split train");
+    assert_eq!(place.json("run/eval-train.json")["appearance"], "each photograph's own");
+    let camera = &load(place.path("scene"), Split::Train, 1).unwrap().frames[0].camera;
+    let shown = rendered(&place, "run/eval-train");
+    let usual = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    model.look = Some(0);
+    let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    assert!(own < 0.01 && usual > 0.02, "{own} {usual}");
+}
+
+#[test]
+fn scenes_that_are_moved_to_where_models_want_them_are_seen_from_where_they_were_photographed() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --scope unbounded --steps 12 --out run {SMALL} --refine exposure,vignetting"));
+    let config = place.json("run/config.json");
+    assert!(config["extent"]["placement"]["scale"].as_f64().unwrap() != 1.0);
+    let tone = &config["config"]["tone"];
+    assert!(tone["exposure"].is_object() && tone["vignetting"].is_object(), "{tone}");
+    let mut model = model(&place, "run");
+    model.vignetted = true;
+    place.succeeds("eval run");
+    let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
+    let moved = model.extent.placement.camera(given);
+    let [right, wrong] =
+        [&moved, given].map(|camera| apart(&rendered(&place, "run/eval"), &model.view(camera, [1.0; 3]).color));
+    assert!(right < 0.005 && wrong > 0.012, "{right} {wrong}");
+}
+
+#[test]
+fn a_model_is_as_fine_as_its_photographs() {
+    let place = Place::with_scene();
+    let small = SMALL.replace("--set field.grid.log2_table=8", "");
+    place.succeeds(&format!("train scene --steps 1 --out run {small}"));
+    let footprints = load(place.path("scene"), Split::Train, 1).unwrap().footprints();
+    let grid = place.json("run/config.json")["config"]["field"]["grid"].clone();
+    assert_eq!((&grid["finest"], &grid["log2_table"]), (&json!((2.0 * footprints).ceil() as usize), &json!(17)));
+}
+
+#[test]
+fn opaque_photographs_have_a_plain_background_unless_another_is_asked_for() {
+    let place = Place::empty();
+    let background = |flag: &str, run: &str| {
+        place.succeeds(&format!("train landscape --downscale 20 --steps 1 --out {run} {SMALL} {flag}"));
+        place.json(&format!("{run}/config.json"))["config"]["background"].clone()
+    };
+    assert_eq!(background("", "usual"), "white");
+    assert_eq!(background("--background random", "random"), "random");
+    assert_eq!(background("--background black", "black"), "black");
+    // What samples evenly would see nothing of a scene that goes on.
+    place.fails("train landscape --downscale 20 --steps 1 --preset small", &["`preset`", "small", "--skip fast"]);
+    let marched = "--preset small --skip fast --set sampler.samples=512 --set sampler.occupancy.resolution=16";
+    place.succeeds(&format!("train landscape --downscale 20 --steps 1 --out skipped {marched}"));
+}
+
+#[test]
+fn what_was_trained_on_is_no_test() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
+    let mut test = place.transforms(Split::Test);
+    let train = place.transforms(Split::Train);
+    // Later, the second test view is one of those that were trained on, under its name.
+    let mut rest = train.clone();
+    let moved = rest["frames"].as_array_mut().unwrap().remove(3);
+    test["frames"][1] = moved;
+    place.write_transforms(Split::Test, &test);
+    place.write_transforms(Split::Train, &rest);
+    place.fails("eval run", &["holds out the test photograph `train/r_3`", "was trained on"]);
+    place.fails("eval run --split val --scene absent", &["absent"]);
+    // Nor has one that was not trained on a camera that was learned.
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 1 --out run {SMALL} --refine poses"));
+    let mut train = place.transforms(Split::Train);
+    std::fs::rename(place.path("scene/train/r_3.png"), place.path("scene/train/r_9.png")).unwrap();
+    train["frames"][3]["file_path"] = json!("./train/r_9");
+    place.write_transforms(Split::Train, &train);
+    place.fails("eval run --split train", &["was not trained on `train/r_9`"]);
+    place.fails("export run other.json", &["has other photographs to train on than those"]);
 }

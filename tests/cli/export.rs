@@ -64,6 +64,13 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
         assert!(close(camera, before, 1e-9), "{name}");
     }
     assert!(colmap.len() == 11 && place.path("colmap/images/train/r_0.png").exists());
+    // Of a capture whose names are not the paths of its images, too.
+    place.succeeds(&format!("train colmap --steps 1 --out other {small}"));
+    place.succeeds("export other colmap/again.json");
+    for frame in place.json("colmap/again.json")["frames"].as_array().unwrap() {
+        let path = frame["file_path"].as_str().unwrap();
+        assert!(place.path(&format!("colmap/{path}")).is_file(), "{path}");
+    }
     place.fails("export run scene", &["scene: is a folder", "--to"]);
     place.fails("export run colmap --to llff", &["colmap: holds files already"]);
     // Other photographs than those that it was trained on have no refined cameras.

@@ -151,7 +151,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
         &place,
         &["feature_extractor", "camera_model OPENCV", "single_camera 1", "--SiftExtraction.use_gpu 0"]
     ));
-    assert!(ran(&place, &["sequential_matcher", "--database_path"]) && !log(&place).contains("exhaustive"));
+    assert!(ran(&place, &["exhaustive_matcher", "--database_path"]) && !log(&place).contains("sequential"));
     assert!(ran(&place, &["mapper", "--database_path", "--image_path", "--output_path"]));
     for i in 1..=10 {
         assert_eq!(place.bytes(&format!("made/images/frame_{i:05}.jpg")), place.bytes("sharp.jpg"), "{i}");
@@ -165,7 +165,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
     assert!(place.path("made/sparse/0/cameras.txt").exists() && !place.path("made/sparse/1").exists());
     assert_eq!(std::fs::metadata(place.path("made")).unwrap().permissions().mode() & 0o700, 0o700);
     // It is a dataset, and no second one is written over it.
-    place.succeeds("train made --preset small --steps 1");
+    place.succeeds("train made --preset small --scope bounded --steps 1");
     complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: holds files already", "--out"]);
 }
 
@@ -278,5 +278,21 @@ fn bad_inputs_are_named() {
         let output = run(&place, arguments);
         let said = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.code() == Some(2) && said.contains(expected), "{arguments}: {said}");
+    }
+}
+
+#[test]
+fn of_many_photographs_each_is_compared_with_those_that_follow() {
+    let place = place();
+    let photo = std::fs::read(place.path("photos/0.JPG")).unwrap();
+    for (count, matcher, said) in [(200, "exhaustive_matcher", false), (201, "sequential_matcher", true)] {
+        let folder = place.path(&format!("many-{count}"));
+        std::fs::create_dir(&folder).unwrap();
+        (0..count).for_each(|i| std::fs::write(folder.join(format!("{i:03}.jpg")), &photo).unwrap());
+        let output = run(&place, &format!("prepare many-{count} --out made-{count}"));
+        assert!(output.status.success(), "{output:?}");
+        assert!(ran(&place, &[matcher, "--database_path", &format!("made-{count}")]), "{}", log(&place));
+        let noted = String::from_utf8_lossy(&output.stderr).contains("with those that follow by name alone");
+        assert_eq!(noted, said);
     }
 }

@@ -114,3 +114,17 @@ impl Camera {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn how_far_a_pixel_is_off_the_axis_is_measured_from_the_principal_point_in_half_diagonals() {
+        let camera = Camera::from_angle(30, 20, 0.8, DAffine3::IDENTITY);
+        assert!((camera.off_axis([29, 19]) - (14.5 * 14.5 + 9.5 * 9.5) / 325.0).abs() < 1e-12);
+        let shifted = Camera { centre: [10.0, 5.0], ..camera };
+        assert!((shifted.off_axis([13, 9]) - (3.5 * 3.5 + 4.5 * 4.5) / 325.0).abs() < 1e-12);
+        assert_eq!(Camera { centre: [10.5, 5.5], ..shifted }.off_axis([10, 5]), 0.0);
+    }
+}

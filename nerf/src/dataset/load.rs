@@ -136,11 +136,12 @@ impl Capture {
     /// If an image that has an alpha channel cannot be read, or as [`Survey::new`].
     pub fn survey(&self, asked: Option<Scope>) -> Result<Survey> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
-        let ([mut clear, mut white], total) = ([0; 2], looked_at.len());
+        let ([mut clear, mut white, mut alpha], total) = ([0; 3], looked_at.len());
         for view in looked_at {
             let Some(path) = &view.image else { continue };
             let name = |error| Error::field(&self.file, &view.field, error);
             let has_alpha = Photo::file_has_alpha(path).map_err(name)?;
+            alpha += usize::from(has_alpha);
             match Photo::open(path, None) {
                 Ok(photo) => {
                     // A border that was left when photographs were straightened is no sign of an empty background.
@@ -155,6 +156,8 @@ impl Capture {
         let empty = match (2 * clear > total, white == total) {
             (true, _) => Some("photographs are transparent where there is nothing"),
             (_, true) => Some("photographs show an object before white"),
+            // That is how the format has objects.
+            _ if 2 * alpha > total && self.format == Format::Blender => Some("photographs have alpha"),
             _ => None,
         };
         Survey::new(self, empty, asked)
@@ -282,14 +285,14 @@ fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize
 }
 
 /// Whether an image of this size can have been taken by the camera, at another scale: up to the rounding of a side.
-fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
+pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
     if [width, height] == [camera.width, camera.height] {
         return true;
     }
     let [w, h] = [width as f64, height as f64];
     let [cw, ch] = [camera.width as f64, camera.height as f64];
     // Half a pixel of the smaller of the two, at the scale of the larger.
-    (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
+    cw > 0.0 && ch > 0.0 && (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
 }
 
 /// Reads a mask, white where the photograph is used, of a photograph of the size `of` that becomes one of the size `to`.

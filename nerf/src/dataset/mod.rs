@@ -13,7 +13,7 @@ pub mod formats;
 mod frames;
 pub(crate) mod image;
 mod landscape;
-mod load;
+pub(crate) mod load;
 mod mask;
 pub(crate) mod numbers;
 pub(crate) mod photo;

@@ -64,7 +64,9 @@ impl Survey {
             );
             return Err(Error::field(&capture.file, &first.field, what));
         }
-        if capture.format == Format::Blender && asked != Some(Scope::Unbounded) && conventional(&cameras) {
+        // Opaque photographs show what lies behind, wherever their cameras stand.
+        let bounded = asked.map_or(empty.is_some(), |scope| scope == Scope::Bounded);
+        if capture.format == Format::Blender && bounded && conventional(&cameras) {
             return Ok(Survey {
                 placement: Placement::default(),
                 scope: Scope::Bounded,

@@ -1,6 +1,7 @@
 //! What the pixels of one photograph say, read once and at a small size.
 
 use super::picture::{Picture, grey};
+use crate::dataset::load::same_shape;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
 use rayon::prelude::*;
@@ -48,7 +49,7 @@ fn look_at(view: &View) -> Result<Look> {
     let path = view.image.clone().unwrap_or_default();
     // As it is stored if the camera was measured so, otherwise as it is shown.
     let [stored, shown] = Photo::size_of_file(&path)?;
-    let size = [stored, shown].into_iter().find(|size| fits(*size, view));
+    let size = [stored, shown].into_iter().find(|size| same_shape(*size, &view.camera));
     let photo = Photo::open(&path, size)?;
     let transparent = photo.has_alpha().then(|| photo.transparent_share() > 0.0);
     let middle = shrunk(&photo, LONGEST);
@@ -65,13 +66,6 @@ fn look_at(view: &View) -> Result<Look> {
     let picture = size.and_then(|_| Picture::new(&view.camera, &small, mask.as_ref()));
     let sharpness = sharpness(&grey(&middle, mean(&small.to_image())));
     Ok(Look { transparent, hash: hasher.finish(), sharpness, luminance, balance, used, picture })
-}
-
-/// Whether an image of this size can have been taken by the camera of a view, at another scale: up to the rounding of a side.
-pub(super) fn fits([width, height]: [usize; 2], view: &View) -> bool {
-    let [w, h] = [width as f64, height as f64];
-    let [cw, ch] = [view.camera.width as f64, view.camera.height as f64];
-    (w * ch - h * cw).abs() <= 1.01 * cw.max(ch).max(w).max(h) && cw > 0.0 && ch > 0.0
 }
 
 /// A photograph whose longest side is at most this.

@@ -1,7 +1,8 @@
 //! What photographs say of their own quality, and of each other's.
 
-use super::look::{Look, fits};
+use super::look::Look;
 use super::report::{FindingKind as Kind, Findings, Severity};
+use crate::dataset::load::same_shape;
 use crate::dataset::numbers::{median, spread};
 use crate::dataset::{Capture, Photo, Split, View};
 use crate::error::Result;
@@ -30,7 +31,7 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
     for view in capture.present() {
         let Some(Ok([stored, shown])) = view.image.as_ref().map(Photo::size_of_file) else { continue };
         *counts.entry(shown).or_default() += 1;
-        if view.camera.width > 0 && !fits(stored, view) && !fits(shown, view) {
+        if view.camera.width > 0 && !same_shape(stored, &view.camera) && !same_shape(shown, &view.camera) {
             let [w, h] = shown;
             first.get_or_insert_with(|| format!("{w}x{h} pixels for {}x{}", view.camera.width, view.camera.height));
             shapes.push(view.name.clone());

@@ -4,6 +4,7 @@ use super::poses::Convention;
 use super::*;
 use crate::camera::{Camera, Lens};
 use crate::dataset::capture::{Format, Point, View};
+use crate::dataset::scene::Scene;
 use crate::dataset::{Image, Scope, embedded, evenly_spaced};
 use FindingKind as Kind;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
@@ -411,4 +412,41 @@ fn tinted(image: &Image, factors: [f32; 3]) -> Image {
         (0..3).for_each(|i| pixel[i] *= factors[i]);
     }
     out
+}
+
+#[test]
+fn a_good_capture_through_a_lens_half_masked_and_lying_on_its_side_has_none_either() {
+    let mut planted = Planted::new();
+    let size = [200, 130];
+    let scene = Scene::bulldozer();
+    let mut mask = Image { width: size[0], height: size[1], channels: 1, data: vec![1.0; size[0] * size[1]] };
+    // The right quarter, behind the bulldozer, is hidden.
+    (0..size[1]).for_each(|y| (150..size[0]).for_each(|x| mask.pixel_mut(x, y)[0] = 0.0));
+    let hidden = planted.folder.path().join("mask.png");
+    mask.save_png_bytes(&hidden);
+    let mut number = 0;
+    planted.capture.views.retain(|view| {
+        number += 1;
+        view.split == Some(Split::Train) || number % 2 == 0
+    });
+    let lens = Lens::Brown { k: [-0.12, 0.02, 0.0, 0.0, 0.0, 0.0], p: [0.003, -0.002] };
+    for view in &mut planted.capture.views {
+        let focal = view.camera.focal[0];
+        let (focal, centre) = ([focal, 1.04 * focal], [94.0, 70.0]);
+        view.camera = Camera { width: size[0], height: size[1], focal, centre, lens, pose: view.camera.pose };
+        view.mask = Some(hidden.clone());
+        scene.render(&view.camera, 2).color.save_png_bytes(view.image.as_ref().unwrap());
+    }
+    let turn = DAffine3::from_rotation_x(1.2) * DAffine3::from_rotation_z(0.5);
+    planted.repose(|pose| turn * pose);
+    let report = planted.report();
+    let above: Vec<_> = report.findings.iter().filter(|finding| finding.severity > Note).collect();
+    assert!(above.is_empty(), "{above:#?}");
+    let facts = report.facts;
+    assert!(facts.agreement.unwrap() > 0.4, "{:?}", facts.agreement);
+    assert_eq!(facts.resolutions.iter().map(|r| [r.width, r.height]).collect::<Vec<_>>(), [size]);
+    let lie = facts.lie.unwrap();
+    assert!(lie.up.dot(turn.transform_vector3(DVec3::Z)) > 0.98, "{lie:?}");
+    assert!(lie.middle.length() < 0.5 && lie.near < lie.far, "{lie:?}");
+    assert_eq!((facts.lenses.len(), facts.points), (1, 0));
 }

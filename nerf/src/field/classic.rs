@@ -159,3 +159,44 @@ impl<T: Scalar> Field<T> for Classic {
         Some(Arc::new(self.coarsened(detail)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
+    use raygrad_autograd::Tape;
+    use raygrad_nn::Params;
+
+    #[test]
+    fn frequencies_come_in_from_low_to_high_and_each_of_all_three_coordinates() {
+        let config = ClassicConfig { depth: 1, width: 8, skips: vec![], view_width: 4, ..ClassicConfig::paper() };
+        let config = ClassicConfig { position_levels: 6, ..config };
+        let mut params = Params::<f64>::new();
+        let (space, rng) = (Space::within([DVec3::NEG_ONE, DVec3::ONE]), &mut Pcg64Mcg::seed_from_u64(5));
+        let field = Classic::new(&config, Site { space, frames: 0, params: &mut params, name: "field", rng }).unwrap();
+        // How much each input of the first layer matters: the bare coordinates, then six numbers a frequency.
+        let inputs = |detail: f64| {
+            let tape = Tape::new();
+            let bound = params.bind(&tape);
+            let positions = tape.constant(Tensor::from([[0.31, -0.57, 0.83], [0.12, 0.44, -0.95]]));
+            let density = field.coarsened(detail).density(&bound, &positions);
+            let layer = params.ids().position(|id| params.get(id).shape() == [39, 8]).unwrap();
+            let grads = density.value.sum().grad(&[bound.vars()[layer]]);
+            let rows = grads[0].as_slice().chunks_exact(8).map(|row| row.iter().map(|x| x.abs()).sum::<f64>());
+            rows.collect::<Vec<f64>>()
+        };
+        let all = inputs(1.0);
+        assert!(all.iter().all(|x| *x > 0.0), "{all:?}");
+        // Two of six are always there; with 5/8 of the other four the fifth is half there, and the sixth is not.
+        for (detail, shares) in [(0.0, [1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), (0.625, [1.0, 1.0, 1.0, 1.0, 0.5, 0.0])] {
+            let some = inputs(detail);
+            let expected = (0..39).map(|i: usize| if i < 3 { 1.0 } else { shares[(i - 3) / 6] } * all[i]);
+            // What activations make of the rest is the same for all inputs of a unit: compare with the bare coordinates.
+            for (i, expected) in expected.enumerate() {
+                assert_eq!(some[i] == 0.0, expected == 0.0, "{detail}: {i}");
+            }
+        }
+    }
+}

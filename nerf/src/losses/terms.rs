@@ -195,9 +195,12 @@ mod tests {
     use crate::camera::rays::{Rays, stratified};
     use crate::field::{Density, Field, Seen};
     use crate::random::Jitter;
+    use crate::space::cube::Space;
     use crate::volume::quadrature::Plan;
     use crate::volume::query::Query;
     use glam::DVec3;
+    use rand::SeedableRng;
+    use rand_pcg::Pcg64Mcg;
     use raygrad_autograd::check::{Check, check_function};
     use raygrad_autograd::{Pool, Tape};
     use raygrad_nn::{Bound, Params};
@@ -295,6 +298,23 @@ mod tests {
         let clear = [-60.0, 0.0].map(|x| tape.leaf(Tensor::scalar(x)));
         let beyond = value_at(&Depth { weight: 4.0, unit: 0.2 }, &clear, 9.0).item();
         assert!(beyond.abs() < 1e-9, "what lies beyond the span is seen through it: {beyond}");
+    }
+
+    #[test]
+    fn a_distortion_knows_whether_the_scene_goes_on() {
+        let config = DistortionConfig { weight: 2.0 };
+        let space = Space::within([DVec3::splat(-1.1), DVec3::splat(1.1)]);
+        for (unbounded, reach) in [(false, None), (true, Some(1.1))] {
+            let (space, params) = (Space { unbounded, ..space }, &mut Params::<f64>::new());
+            let rng = &mut Pcg64Mcg::seed_from_u64(0);
+            let built = config.build(Site { space, frames: 0, params, name: "terms", rng }).unwrap();
+            let by_hand = Evenness { weight: 2.0, reach };
+            assert_eq!(at(&*built, 0.3, 0.4), at(&by_hand, 0.3, 0.4));
+        }
+        assert_ne!(
+            at(&Evenness { weight: 2.0, reach: None }, 0.3, 0.4),
+            at(&Evenness { weight: 2.0, reach: Some(1.1) }, 0.3, 0.4)
+        );
     }
 
     /// A density that falls along (2, 1, 2).

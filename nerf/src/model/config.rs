@@ -6,12 +6,13 @@ use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
 use crate::losses::photometric::Loss;
 use crate::losses::{DistortionConfig, TermConfig};
-use crate::model::refine::{FOCAL, LENS, POSES, RefineConfig, Refined, check_schedule};
+use crate::model::refine::{FOCAL, LENS, POSES, RefineConfig, Refined};
 use crate::model::tone::{EXPOSURE, ToneConfig, VIGNETTING};
-use crate::range::check_range;
+use crate::range::{check_range, check_schedule};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
+use crate::sampling::proposal::{ProposalConfig, Spacing};
 use crate::space::occupancy::Skip;
 use crate::volume::quadrature::Quadrature;
 use crate::{Error, Result};
@@ -27,8 +28,8 @@ const RESOLUTION: usize = 32;
 /// Steps through an unbounded scene, in training and in views, as shares of the box's side.
 const STEP: f64 = 1.0 / 100.0;
 const VIEW_STEP: f64 = 1.0 / 150.0;
-/// Samples of a training step: most of them lie behind what is opaque, and cost little.
-const SAMPLES: usize = 4 * 24576;
+/// Samples of a training step, for each of one within a box: most of them lie behind what is opaque, and cost little.
+const SAMPLES: usize = 4;
 /// How much longer they are for each unit of distance.
 const CONE: f64 = 1.0 / 64.0;
 /// Weight of the distortion of rays through an unbounded scene, of which photographs show every place from few sides.
@@ -238,7 +239,7 @@ impl Config {
     }
 
     /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
-    /// boxes at steps that grow, a hash grid is twice as fine, as it holds all of space, and a
+    /// boxes at steps that grow, proposals are spread in inverse distance, a hash grid is twice as fine, as it holds all of space, and a
     /// [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in docs/benchmarks.md, section
     /// Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
     /// nothing.
@@ -253,11 +254,15 @@ impl Config {
             if self.unbounded {
                 (occupancy.cascades, occupancy.resolution) = (CASCADES, RESOLUTION);
                 (marching.step, marching.last_step, marching.cone) = (STEP, None, CONE);
-                (marching.view_step, marching.samples) = (VIEW_STEP, SAMPLES);
+                (marching.view_step, marching.samples) = (VIEW_STEP, SAMPLES * marching.samples.min(usual.samples));
             } else {
                 (occupancy.cascades, occupancy.resolution) = (1, usual.occupancy.resolution);
-                *marching = MarchingConfig { occupancy: marching.occupancy, ..usual };
+                *marching =
+                    MarchingConfig { occupancy: marching.occupancy, samples: marching.samples / SAMPLES, ..usual };
             }
+        }
+        if let Some(proposal) = self.sampler.get_mut::<ProposalConfig>() {
+            proposal.spacing = if self.unbounded { Spacing::Disparity } else { Spacing::Linear };
         }
         let field = self.field.get_mut::<InstantConfig>();
         if self.unbounded {

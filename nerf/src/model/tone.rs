@@ -1,7 +1,7 @@
 //! How photographs differ from the scene that they show: exposure, white balance, and corners that are darker.
 
-use super::refine::check_schedule;
 use crate::dataset::batch::Batch;
+use crate::range::check_schedule;
 use crate::{Error, Result};
 use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params, Schedule};

@@ -289,6 +289,7 @@ impl Limits {
 mod tests {
     use super::*;
     use crate::analytic::{AnalyticField, scenes};
+    use crate::dataset::{Split, embedded};
     use crate::volume::quadrature::Plan;
     use raygrad_autograd::{Tape, Tensor};
     use raygrad_nn::Params;
@@ -343,6 +344,25 @@ mod tests {
             sampler.update(&Progress { step, fraction: 0.0, seed: 1 }, &look);
         }
         assert_eq!(seen.lock().unwrap().len(), 4096, "one in sixteen each time, and another one each time");
+    }
+
+    #[test]
+    fn what_no_photograph_shows_is_left_out_from_the_start() {
+        let mut data = embedded(Split::Train, 16);
+        data.frames.truncate(1);
+        let occupied = |grid: bool, data: &Dataset| {
+            let mut config = MarchingConfig::default();
+            (config.occupancy.resolution, config.occupancy.skip.carving, config.occupancy.skip.grid) = (16, 0, grid);
+            let grid = OccupancyGrid::new(data.bounds, &config.occupancy).unwrap();
+            let mut marching = Marching::new(config, grid);
+            Sampler::<f32>::prepare(&mut marching, data);
+            marching.grid.occupied_share()
+        };
+        // It sees the whole box; then a part of it, from nearby; and nothing is left out where nothing is to be.
+        assert_eq!(occupied(true, &data), 1.0);
+        data.frames[0].camera.pose.translation *= 0.4;
+        assert!((0.05..0.8).contains(&occupied(true, &data)), "{}", occupied(true, &data));
+        assert_eq!(occupied(false, &data), 1.0);
     }
 
     #[test]

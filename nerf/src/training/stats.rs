@@ -1,5 +1,6 @@
 //! How long to train, and what was done.
 
+use raygrad_nn::SLOTS;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::time::Duration;
 
@@ -30,7 +31,10 @@ impl Budget {
     pub fn samples(self) -> f64 {
         match self {
             Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP,
-            Budget::Time(time) => time.as_secs_f64() * SAMPLES_PER_SECOND * rayon::current_num_threads() as f64,
+            Budget::Time(time) => {
+                // A step is cut into as many parts as there are slots, and no more threads take part.
+                time.as_secs_f64() * SAMPLES_PER_SECOND * rayon::current_num_threads().min(SLOTS) as f64
+            }
         }
     }
 }
@@ -140,7 +144,7 @@ mod tests {
     #[test]
     fn budgets_are_read_and_stand_for_samples() {
         let read = |text: &str| serde_json::from_str::<Budget>(text);
-        let threads = rayon::current_num_threads() as f64;
+        let threads = rayon::current_num_threads().min(8) as f64;
         for (text, budget, samples) in [
             (r#"{"steps":4000}"#, Budget::Steps(4000), 4000.0 * 24576.0),
             (r#"{"seconds":62.5}"#, Budget::Time(Duration::from_millis(62_500)), 62.5e6 * threads),

@@ -58,7 +58,7 @@ impl Quadrature {
             rays.origins.value() == &lit.samples.origins && rays.directions.value() == &lit.samples.directions
         };
         let memo = if query.rays.is_none_or(same) { memo } else { Memo::gather(&[], &[], pool) };
-        let density = tape.recall(memo, || query.field.density(query.params, &positions));
+        let density = tape.recall(memo, || query.density_at(&lit.samples, &positions));
         Lit { kept: lit.len(), rendered: lit.render_density(query, positions, density), asked }
     }
 }

@@ -73,7 +73,13 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     /// The density at samples.
     #[track_caller]
     pub fn density(&self, samples: &Samples<T>) -> Density<'t, T> {
-        let density = self.field.density(self.params, &self.positions(samples));
+        self.density_at(samples, &self.positions(samples))
+    }
+
+    /// As [`density`](Self::density), of samples whose [positions](Self::positions) are known.
+    #[track_caller]
+    pub fn density_at(&self, samples: &Samples<T>, positions: &Var<'t, T>) -> Density<'t, T> {
+        let density = self.field.density(self.params, positions);
         match self.less(samples) {
             Some(shares) => Density { value: with_slopes(density.value, &shares), ..density },
             None => density,
@@ -121,6 +127,7 @@ mod tests {
     use crate::camera::pinhole::Ray;
     use crate::camera::rays::{Rays, stratified};
     use crate::random::Jitter;
+    use crate::volume::quadrature::Quadrature;
     use glam::DVec3;
     use raygrad_autograd::{Pool, Tape};
     use raygrad_nn::Params;
@@ -161,6 +168,28 @@ mod tests {
             let weighted = color * tape.constant(weights.reshape(&[4, 1]));
             let found = weighted.sum().grad(&[bound.vars()[0]]);
             assert!((found[0].item() - 3.0 * expected).abs() < 1e-9, "{near}: {} {expected}", found[0].item());
+        }
+    }
+
+    #[test]
+    fn by_every_way_to_a_picture_densities_learn_less() {
+        let mut params = Params::<f64>::new();
+        params.add("much", Tensor::scalar(0.7));
+        let mut rays = Rays::new();
+        rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [0.0, 4.0]);
+        let steps = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
+        for rule in [Quadrature::Midpoint, Quadrature::PiecewiseLinear, Quadrature::Adaptive { tolerance: 1e-3 }] {
+            for termination in [0.0, 1e-9] {
+                let learned = |near: f64| {
+                    let tape = Tape::new();
+                    let bound = params.bind(&tape);
+                    let query = Query { near, ..Query::new(&Here, &bound) };
+                    let rendered = rule.render(&query, &steps, termination).rendered;
+                    rendered.weights.sum().grad(&[bound.vars()[0]])[0].item()
+                };
+                let (usual, less) = (learned(0.0), learned(1e6));
+                assert!(usual > 1e-3 && less.abs() < 1e-9, "{rule:?} {termination}: {usual} {less}");
+            }
         }
     }
 

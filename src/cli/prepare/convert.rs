@@ -187,11 +187,17 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         });
         jobs.push(Job { from: view.clone(), to, seen_by: None });
     }
+    if matches!(target, Target::Colmap | Target::Llff) {
+        let held_out =
+            capture.views.iter().filter(|view| view.split.is_some_and(|split| split != Split::Train)).count();
+        let why = "photographs are held out, which the format cannot say: whoever reads it holds out others, such as every eighth";
+        warn(held_out, why);
+    }
     Ok(jobs)
 }
 
 /// The path of a view's image in the folder of its capture, with slashes; that of one from elsewhere is its name alone.
-fn relative(folder: &Path, view: &View) -> Result<String> {
+pub fn relative(folder: &Path, view: &View) -> Result<String> {
     let path = view.image.as_deref().unwrap_or(Path::new(&view.name));
     let inside = match path.strip_prefix(folder) {
         Ok(inside) => inside,

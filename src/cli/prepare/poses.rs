@@ -9,9 +9,10 @@ use raygrad::nerf::{Error, Result};
 
 use super::program::{COLMAP, Work, counted};
 use super::workplace::Workplace;
+use crate::cli::output::note;
 use crate::cli::progress::Progress;
 
-/// Photographs up to which every pair is compared.
+/// Photographs up to which every pair is compared, also of a video: so a walk around something closes.
 const EXHAUSTIVE: usize = 200;
 /// Where COLMAP works until it is done.
 const FOLDER: &str = "work";
@@ -52,7 +53,10 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
         arguments.extend(["--ImageReader.single_camera", "1"]);
     }
     colmap.step("feature_extractor", Some(EXTRACTION), "features found in photographs", &arguments)?;
-    let matcher = if sequence || names.len() > EXHAUSTIVE { "sequential_matcher" } else { "exhaustive_matcher" };
+    let matcher = if names.len() > EXHAUSTIVE { "sequential_matcher" } else { "exhaustive_matcher" };
+    if names.len() > EXHAUSTIVE && !sequence {
+        note(&format!("more than {EXHAUSTIVE} photographs: each is compared with those that follow by name alone"));
+    }
     colmap.step(matcher, Some(MATCHING), "photographs compared", &[])?;
     let found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
     let count = found.len();

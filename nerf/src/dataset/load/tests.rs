@@ -269,3 +269,31 @@ fn distances_are_read_where_they_are_asked_for() {
     }
     assert_eq!(data.frames.iter().filter(|frame| frame.distances.is_some()).count(), 1);
 }
+
+#[test]
+fn pixels_that_no_light_reaches_are_left_out_with_and_without_a_mask() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut capture = capture(folder.path(), 4);
+    capture.hold_out();
+    // Half a turn is 3.14 of the 12 x 8 pixels from the centre, which the camera has for 24 x 16.
+    let lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
+    for view in &mut capture.views {
+        (view.camera.lens, view.camera.focal, view.camera.centre) = (lens, [2.0; 2], [12.0, 8.0]);
+    }
+    let survey = capture.survey(Some(Scope::Bounded)).unwrap();
+    let lit = |x: usize, y: usize| f64::hypot(x as f64 - 5.5, y as f64 - 3.5) <= std::f64::consts::PI;
+    let check = |capture: &Capture, hidden: Option<[usize; 2]>| {
+        let data = capture.load(Split::Train, &survey, &Reading::default()).unwrap();
+        let mask = data.frames[0].mask.as_ref().unwrap();
+        for (x, y) in (0..12).flat_map(|x| (0..8).map(move |y| (x, y))) {
+            assert_eq!(mask.uses(x, y), lit(x, y) && hidden != Some([x, y]), "{x} {y} {hidden:?}");
+        }
+    };
+    check(&capture, None);
+    let path = folder.path().join("mask.png");
+    let mut mask = Image { width: 12, height: 8, channels: 1, data: vec![1.0; 12 * 8] };
+    mask.pixel_mut(5, 3)[0] = 0.0;
+    std::fs::write(&path, mask.to_png()).unwrap();
+    capture.views.iter_mut().for_each(|view| view.mask = Some(path.clone()));
+    check(&capture, Some([5, 3]));
+}

@@ -192,6 +192,9 @@ mod tests {
         let stripes = photo(100, 10, |x, _| (x as usize % 2) as f64);
         let small = stripes.resampled([20, 2], |[x, y]| [5.0 * x, 5.0 * y]);
         assert!((2..18).all(|x| (small.pixel(x, 0)[0] - 0.5).abs() < 0.12), "{small:?}");
+        let lying = photo(10, 100, |_, y| (y as usize % 2) as f64);
+        let small = lying.resampled([2, 20], |[x, y]| [5.0 * x, 5.0 * y]);
+        assert!((2..18).all(|y| (small.pixel(0, y)[0] - 0.5).abs() < 0.12), "{small:?}");
         assert!(!stripes.resampled([1, 1], |_| [f64::NAN, f64::INFINITY]).pixel(0, 0)[0].is_nan());
     }
 

@@ -191,7 +191,11 @@ fn what_is_asked_for_counts_then_the_convention_then_transparency() {
         capture.views.iter_mut().for_each(|view| view.camera.pose.translation -= CENTRE);
         capture
     };
-    let conventional = Survey::new(&around(4.0), None, None).unwrap();
+    // Opaque photographs show what lies behind, wherever their cameras stand.
+    assert_eq!(Survey::new(&around(4.0), None, None).unwrap().scope, Scope::Unbounded);
+    let asked = Survey::new(&around(4.0), None, Some(Scope::Bounded)).unwrap();
+    let conventional = Survey::new(&around(4.0), Some("it is transparent"), None).unwrap();
+    assert_eq!(asked, conventional);
     assert_eq!((conventional.near, conventional.far, conventional.placement), (2.0, 6.0, Placement::default()));
     assert_eq!(conventional.scope, Scope::Bounded);
     assert_eq!(

@@ -4,7 +4,7 @@ mod balance;
 mod newton;
 mod settings;
 
-pub(crate) use settings::{FOCAL, LENS, POSES, check_schedule};
+pub(crate) use settings::{FOCAL, LENS, POSES};
 pub use settings::{RefineConfig, Refined};
 
 use crate::camera::bounds::clip_span;

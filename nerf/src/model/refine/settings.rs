@@ -1,7 +1,7 @@
 //! What of the cameras is learned, and how fast.
 
 use crate::model::tone::{EXPOSURE, VIGNETTING};
-use crate::range::check_range;
+use crate::range::{check_range, check_schedule};
 use crate::{Error, Result};
 use raygrad_nn::Schedule;
 use serde::{Deserialize, Serialize};
@@ -44,12 +44,6 @@ impl RefineConfig {
         check_schedule("refine.focal", self.focal)?;
         check_schedule("refine.lens", self.lens)
     }
-}
-
-/// Whether the learning rate of this name makes sense, if there is one.
-pub(crate) fn check_schedule(name: &str, schedule: Option<Schedule>) -> Result<()> {
-    let Some(schedule) = schedule else { return Ok(()) };
-    schedule.check().map_err(|error| Error::setting(format!("{name}.{}.{}", schedule.name(), error.name), error.what))
 }
 
 /// A part of what cameras did that can be learned.

@@ -1,9 +1,11 @@
 //! Corrected cameras, against their rays as numbers and against differences.
 
 use super::*;
+use crate::dataset::Scope;
+use crate::model::{Config, Model, Preset};
 use glam::DMat3;
-use raygrad_autograd::Tape;
 use raygrad_autograd::check::{Check, check_function};
+use raygrad_autograd::{Real, Tape};
 use raygrad_nn::Schedule;
 
 const BOX: [DVec3; 2] = [DVec3::splat(-1.0), DVec3::splat(1.0)];
@@ -79,7 +81,7 @@ fn rays_are_those_of_the_camera_that_is_corrected() {
             let (vars, moved) = refine.rays(&params.bind(&tape), &rays, (&FRAMES, &PIXELS), BOX, SPAN);
             let apart = |a: &[[f64; 3]], b: &[[f64; 3]]| {
                 let pairs = a.as_flattened().iter().zip(b.as_flattened());
-                pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+                pairs.map(|(a, b)| (a - b).abs()).fold(0.0, Real::maximum)
             };
             assert!(apart(&moved.origins, &expected.origins) < 1e-14, "{config:?}");
             let numbers = moved.origins.iter().chain(&moved.directions);
@@ -238,6 +240,11 @@ fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass(
     // They were given in a line, about which anything could turn if it were for their places alone.
     let line = refine.placement(&params).unwrap();
     assert!((line.scale - 0.15_f64.exp()).abs() < 1e-9 && line.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "{line:?}");
+    // And takes each to where it was found.
+    for (i, camera) in cameras.iter().enumerate() {
+        let (all, own) = (line.camera(camera).pose, refine.camera(&params, i, camera).pose);
+        assert!(all.abs_diff_eq(own, 1e-9), "{i}: {all:?} {own:?}");
+    }
     let mut around = cameras.clone();
     around.iter_mut().enumerate().for_each(|(i, camera)| camera.pose.translation.z += (i as f64).sin());
     let mut params = Params::<f64>::new();
@@ -261,4 +268,21 @@ fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass(
     let unknown = Camera { focal: [9.0, 9.0], ..other };
     let found = refine.other_camera(&params, &unknown);
     assert_eq!((found.focal, found.lens), (unknown.focal, unknown.lens));
+}
+
+#[test]
+fn a_model_tells_its_cameras_whether_the_scene_goes_on() {
+    let cameras = cameras();
+    let bounded = Config { poses: all().focal, ..Config::preset(Preset::Voxel) };
+    let unbounded = bounded.clone().with_scope(Scope::Unbounded);
+    for (config, goes_on) in [(bounded, false), (unbounded, true)] {
+        let model = Model::<f32>::with_cameras(config, extent(6), &cameras, 0).unwrap();
+        let mut params = Params::<f32>::new();
+        let none = RefineConfig::default();
+        let new = |goes_on, params: &mut _| Refine::new(true, &none, (&extent(6), goes_on), &cameras, params);
+        let expected = new(goes_on, &mut params).unwrap().unwrap();
+        let other = new(!goes_on, &mut Params::<f32>::new()).unwrap().unwrap();
+        let found = &model.refine.as_ref().unwrap().balance;
+        assert!(*found == expected.balance && *found != other.balance, "{goes_on}");
+    }
 }

@@ -132,7 +132,7 @@ impl<T: Scalar> Plan<T> {
     #[track_caller]
     pub fn render<'t>(&self, query: &Query<'_, 't, T>) -> Rendered<'t, T> {
         let positions = query.positions(&self.samples);
-        let density = query.field.density(query.params, &positions);
+        let density = query.density_at(&self.samples, &positions);
         self.render_density(query, positions, density)
     }
 
