@@ -463,7 +463,19 @@ mod tests {
         for other in [Preset::Voxel, Preset::Small, Preset::Classic] {
             Config::preset(other).with_scope(Scope::Unbounded).check().unwrap();
         }
-        Config::preset(Preset::Small).with_skip(Skip::Fast).with_scope(Scope::Unbounded).check().unwrap();
+        // As many rays as before, each with more samples.
+        let skipped = Config::preset(Preset::Small).with_skip(Skip::Fast);
+        let samples = |config: &Config| config.sampler.get::<MarchingConfig>().unwrap().samples;
+        let open = skipped.clone().with_scope(Scope::Unbounded);
+        open.check().unwrap();
+        assert_eq!((samples(&skipped), samples(&open)), (16 * 256, 4 * 16 * 256));
+        assert_eq!(open.with_scope(Scope::Bounded), skipped);
+        // Proposals are spread in inverse distance.
+        let proposal = Config { sampler: SamplerConfig::new(ProposalConfig::default()), ..preset.clone() };
+        let spacing = |config: &Config| config.sampler.get::<ProposalConfig>().unwrap().spacing;
+        let open = proposal.clone().with_scope(Scope::Unbounded);
+        assert_eq!((spacing(&proposal), spacing(&open)), (Spacing::Linear, Spacing::Disparity));
+        assert_eq!(open.with_scope(Scope::Bounded), proposal);
         let long = Config::preset(Preset::Instant).for_budget(1.2e9, 400.0).with_scope(Scope::Unbounded);
         assert_eq!(long.sampler.get::<MarchingConfig>().unwrap().last_step, None);
     }
