@@ -50,5 +50,5 @@ pub use random::Jitter;
 pub use rendering::{DenseView, Picture};
 pub use sampling::{Limits, Load, Progress, Purpose, Sampled, Sampler, SamplerConfig, Samplers};
 pub use space::{Contraction, Space, contract};
-pub use training::{Budget, StepStats, Trainer};
+pub use training::{Budget, StepStats, Trainer, fitted_cameras};
 pub use volume::{Distortion, Evaluations, Query, Rendered};

@@ -126,8 +126,8 @@ fn cases() -> ProptestConfig {
     ProptestConfig { cases, ..ProptestConfig::default() }
 }
 
-/// Of more accepted captures than this one in ten is used, so that a million can be tried in an hour.
-const ALL_USED: u32 = 20_000;
+/// Of more accepted captures than this one in a hundred is used, so that a million of each format can be tried in an hour.
+const ALL_USED: u32 = 5_000;
 
 #[test]
 fn what_is_accepted_of_damaged_captures_is_trained_and_rendered() {
@@ -153,7 +153,7 @@ fn what_is_accepted_of_damaged_captures_is_trained_and_rendered() {
         let file = file.index(files[which].len());
         std::fs::write(&files[which][file], damaged(&whole[which][file], &damage)).unwrap();
         let accepted = counts[which][1].get();
-        let outcome = tried(folders[which].path(), accepted < ALL_USED || accepted.is_multiple_of(10));
+        let outcome = tried(folders[which].path(), accepted < ALL_USED || accepted.is_multiple_of(100));
         std::fs::write(&files[which][file], &whole[which][file]).unwrap();
         count(which, 0);
         match outcome {

@@ -8,10 +8,10 @@ use raygrad::nerf::dataset::{Dataset, Frame, Split, evenly_spaced};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Evaluations, Image, InstantConfig, Model, Picture, Result};
+use raygrad::nerf::{Background, Error, Evaluations, Image, InstantConfig, Model, Picture, Result, fitted_cameras};
 use serde::Serialize;
 
-use super::output::{depth_colors, make_folder, numbered, other_numbered, print, remove};
+use super::output::{depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
@@ -26,7 +26,7 @@ const PICTURES: usize = 10;
 /// Compare a model with photographs: PSNR and SSIM
 ///
 /// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth. Another split, number of
-/// views, --skip, --precision or --fit-half stands in the name, as in RUN/eval-val-10-off.json, so that none replaces another's result; that
+/// views, --skip, --precision, --fit-poses or --fit-half stands in the name, as in RUN/eval-val-10-off.json, so that none replaces another's result; that
 /// of another --scene does.
 #[derive(clap::Args)]
 pub struct Args {
@@ -44,6 +44,10 @@ pub struct Args {
     /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
     #[arg(long)]
     skip: Option<Skip>,
+    /// Move each photograph's camera to where the model shows it best, and compare then: of a model whose own cameras were
+    /// corrected, others are where they were given, which may be as wrong
+    #[arg(long)]
+    fit_poses: bool,
     /// Fit a gain for each colour channel to the left half of each photograph, and compare the right half: where photographs
     /// differ in exposure, nobody can know that of one that was held out
     #[arg(long)]
@@ -63,7 +67,9 @@ impl Args {
         let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
         let [views, skip] = [self.views.map(|n| n.to_string()), self.skip.map(|skip| skip.to_string())];
         let half = self.fit_half.then(|| "half".to_owned());
-        let parts = ["eval".to_owned()].into_iter().chain([split, views, skip, precision, half].into_iter().flatten());
+        let poses = self.fit_poses.then(|| "poses".to_owned());
+        let others = [split, views, skip, precision, poses, half];
+        let parts = ["eval".to_owned()].into_iter().chain(others.into_iter().flatten());
         parts.collect::<Vec<_>>().join("-")
     }
 }
@@ -122,6 +128,9 @@ enum Alignment {
     /// were found.
     #[serde(rename = "similarity of the training cameras")]
     Similarity,
+    /// From where the model shows each most nearly, found from where one of the above has them.
+    #[serde(rename = "each fitted to its own photograph")]
+    Fitted,
 }
 
 /// What is done about what photographs differ in and nobody knows of one that was held out.
@@ -209,7 +218,13 @@ pub fn run(args: &Args) -> Result<()> {
     let appearance = Appearance::of(&model, args.split, args.fit_half);
     // Corners are as dark in every photograph.
     model.vignetted = true;
-    let cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
+    let mut cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
+    if args.fit_poses {
+        note("fitting poses to photographs");
+        let found = fitted_cameras(&model, data.clone())?;
+        data.frames.iter_mut().zip(found).for_each(|(frame, camera)| frame.camera = camera);
+        cameras = Alignment::Fitted;
+    }
     let name = args.name();
     let pictures = run.file(&name);
     make_folder(&pictures)?;
@@ -385,6 +400,7 @@ fn table(report: &Report) -> String {
     text + match report.cameras {
         Alignment::None => "",
         Alignment::Learned => "cameras: as learned\n",
+        Alignment::Fitted => "cameras: each fitted to its own photograph\n",
         Alignment::Glass => "cameras: focal length and lens as learned\n",
         Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
     }

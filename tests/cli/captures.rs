@@ -107,6 +107,13 @@ fn photographs_are_compared_from_where_the_model_has_their_cameras() {
     let first = png(&place.path("way/0000.png"));
     let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
     assert!(apart(&first, &view(&model.other_camera(given))) < 0.01 && apart(&first, &view(given)) > 0.05);
+    // Or from where each is shown best.
+    place.succeeds("eval run --fit-poses --views 2");
+    let fitted = place.json("run/eval-2-poses.json");
+    assert_eq!(fitted["cameras"], "each fitted to its own photograph");
+    let psnr = |value: &Value| value["per_view"][0]["psnr"].as_f64().unwrap();
+    place.succeeds("eval run --views 2");
+    assert!(psnr(&fitted) > psnr(&place.json("run/eval-2.json")), "{fitted}");
     for split in [Split::Train, Split::Test] {
         place.succeeds(&format!("eval run --split {split}"));
         let shown = rendered(&place, if split == Split::Train { "run/eval-train" } else { "run/eval" });
