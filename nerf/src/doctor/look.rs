@@ -123,3 +123,21 @@ fn light(image: &Image) -> (Option<f64>, [f64; 2]) {
     }
     (Some(logs / weights), [(means[0] / means[1]).ln(), (means[2] / means[1]).ln()])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sharpness_does_not_change_with_brightness() {
+        let wave = |shift: f32| {
+            let data =
+                (0..40 * 30).map(|i| shift + 0.2 * (0.7 * (i % 40) as f32).sin() + 0.1 * (0.4 * (i / 40) as f32).cos());
+            Image { width: 40, height: 30, channels: 1, data: data.collect() }
+        };
+        let [dark, bright] = [0.3, 0.7].map(|shift| sharpness(&wave(shift)).unwrap());
+        assert!((dark - bright).abs() < 1e-4, "{dark} {bright}");
+        assert!((variance([1.0, 2.0, 6.0].into_iter()) - 14.0 / 3.0).abs() < 1e-12);
+        assert_eq!(sharpness(&Image { width: 4, height: 4, channels: 1, data: vec![0.5; 16] }), None);
+    }
+}

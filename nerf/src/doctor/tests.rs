@@ -267,6 +267,9 @@ fn single_poses_that_are_wrong() {
     let mut planted = Planted::new();
     planted.camera(10).pose.translation *= 12.0;
     found(&planted.cameras(), Kind::FarCamera, Warning, &[10], &[]);
+    // In any unit.
+    planted.repose(|pose| DAffine3 { translation: 0.01 * pose.translation, ..pose });
+    assert_eq!(planted.cameras().finds(Kind::FarCamera).unwrap().views, ["10.png"]);
 
     let mut planted = Planted::new();
     planted.camera(10).pose.matrix3 *= DMat3::from_rotation_z(1.6);

@@ -152,6 +152,21 @@ mod tests {
     }
 
     #[test]
+    fn stored_cameras_have_to_be_some() {
+        let stored = |change: fn(&mut Camera)| {
+            let mut camera = train_cameras(1, 8)[0].clone();
+            change(&mut camera);
+            cameras(Some(&serde_json::to_vec(&[camera]).unwrap()))
+        };
+        assert_eq!(stored(|_| ()).unwrap().len(), 1);
+        for change in [|c: &mut Camera| c.width = 0, |c: &mut Camera| c.height = 0, |c: &mut Camera| c.focal[1] = -1.0]
+        {
+            assert!(stored(change).unwrap_err().to_string().starts_with("`cameras`"));
+        }
+        assert!(cameras(Some(b"[1]")).is_err() && cameras(None).unwrap().is_empty());
+    }
+
+    #[test]
     fn sixteen_bits_take_half_of_the_file() {
         let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let folder = tempfile::tempdir().unwrap();
