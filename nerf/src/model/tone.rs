@@ -45,9 +45,9 @@ impl ToneConfig {
 ///   [distance from the optical axis](crate::camera::Camera::off_axis) in halves of the diagonal (Goldman and Chen 2005,
 ///   "Vignette and exposure calibration and compensation", equation 2, of a logarithm, so that no gain is negative).
 ///
-/// What lies behind the scene, the background, is not multiplied. Views have the geometric mean of all exposures, or that of the photograph that they
-/// [look like](crate::Model::look), and no vignetting but [where it is wanted](crate::Model::vignetted). What photographs
-/// have cut off at white is not found again.
+/// What lies behind the scene, the background, is not multiplied. Views have the geometric mean of all exposures, or that
+/// of the photograph that they [look like](crate::Model::look), and no vignetting but
+/// [where it is wanted](crate::Model::vignetted). What photographs have cut off at white is not found again.
 #[derive(Debug, Clone)]
 pub struct Tone {
     exposure: Option<ParamId>,

@@ -108,6 +108,7 @@ mod tests {
     use super::*;
     use crate::camera::lens::Lens;
     use glam::DAffine3;
+    use raygrad_autograd::Real;
 
     const BOX: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
 
@@ -142,7 +143,7 @@ mod tests {
             }
             let alike = |sums: &Matrix| {
                 let pairs = (0..POSE).flat_map(|a| (0..a).map(move |b| (a, b)));
-                pairs.map(|(a, b)| sums[a][b].abs() / (sums[a][a] * sums[b][b]).sqrt()).fold(0.0, f64::max)
+                pairs.map(|(a, b)| sums[a][b].abs() / (sums[a][a] * sums[b][b]).sqrt()).fold(0.0, Real::maximum)
             };
             assert!(seen.as_flattened().iter().all(|x| x.is_finite()), "{seen:?}");
             assert!(alike(&plain) > 0.9 && alike(&seen) < 0.7, "{} {}", alike(&plain), alike(&seen));
