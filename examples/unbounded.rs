@@ -1,15 +1,16 @@
 //! Three ways to hold a scene that goes on to the horizon, by what they make of near, far and sky.
 //!
 //! ```text
-//! cargo run --release --example unbounded [seconds=60] [pixels=200] [only=bounded|contraction|cascades]
+//! cargo run --release --example unbounded [seconds=60] [pixels=200] [from=walk|window] [only=bounded|contraction|cascades|ndc]
 //! ```
 //!
 //! The bulldozer in its landscape (exact out to a thousand units) is trained as if it ended at the box of the bulldozer and
 //! the cameras; contracted, with samples that proposals place (Barron et al. 2022, "Mip-NeRF 360"); and contracted, with
 //! steps that grow through cascades of an occupancy grid (Mueller et al. 2022, "Instant NGP"), which is what `raygrad
-//! train` does. Of the views that it has not seen, near is what lies in that box.
+//! train` does. From a window, where all photographs look the same way, what they see can be the cube instead of all of space:
+//! normalised device coordinates (Mildenhall et al. 2020, appendix C), with the same steps. Of the views that it has not seen, near is what lies in the box.
 
-use raygrad::nerf::dataset::{Dataset, Scope, Split, evenly_spaced, landscape, landscape_distances};
+use raygrad::nerf::dataset::{Dataset, Scope, Split, evenly_spaced, landscape, landscape_ahead, landscape_distances};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::pictures::metrics::psnr_from_mse;
 use raygrad::nerf::sampling::proposal::{ProposalConfig, Spacing};
@@ -48,8 +49,9 @@ fn main() -> Result<()> {
         |name: &str| std::env::args().find_map(|text| Some(text.strip_prefix(name)?.strip_prefix('=')?.to_owned()));
     let number = |name: &str, usual: f64| argument(name).and_then(|text| text.parse().ok()).unwrap_or(usual);
     let (seconds, pixels) = (number("seconds", 60.0), number("pixels", 200.0) as usize);
-    let train = landscape(Split::Train, pixels);
-    let mut views = landscape(Split::Test, pixels);
+    let window = argument("from").is_some_and(|from| from == "window");
+    let seen = if window { landscape_ahead } else { landscape };
+    let (train, mut views) = (seen(Split::Train, pixels), seen(Split::Test, pixels));
     views.frames = evenly_spaced(views.frames, VIEWS);
     let budget = Budget::Time(Duration::from_secs_f64(seconds));
     let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) };
@@ -61,9 +63,11 @@ fn main() -> Result<()> {
     for (name, config, scope) in [
         ("bounded", usual, Scope::Bounded),
         ("contraction", contraction, Scope::Unbounded),
-        ("cascades", cascades, Scope::Unbounded),
+        ("cascades", cascades.clone(), Scope::Unbounded),
+        ("ndc", cascades, Scope::Forward),
     ] {
-        if argument("only").is_some_and(|only| only != name) {
+        let leave_out = scope == Scope::Forward && !window;
+        if leave_out || argument("only").is_some_and(|only| only != name) {
             continue;
         }
         let mut trainer = Trainer::new(config, Arc::new(Dataset { scope, ..train.clone() }))?;

@@ -29,7 +29,7 @@ pub mod space;
 pub mod training;
 pub mod volume;
 
-pub use camera::{Camera, Lens, Ndc, NdcRay, Pose, Ray, Rays, Samples, clip_span, intersect_box};
+pub use camera::{Camera, Lens, Ndc, Pose, Ray, Rays, Samples, clip_span, intersect_box};
 pub use camera::{lens_places, rotation_exp, rotation_log};
 #[cfg(feature = "check")]
 pub use catalogue::catalogue;

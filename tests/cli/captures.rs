@@ -241,3 +241,36 @@ fn what_was_trained_on_is_no_test() {
     place.fails("eval run --split train", &["was not trained on `train/r_9`"]);
     place.fails("export run other.json", &["has other photographs to train on than those"]);
 }
+
+#[test]
+fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
+    let place = Place::with_scene();
+    place.succeeds("prepare scene --to nerfstudio --out captured");
+    let mut transforms = place.json("captured/transforms.json");
+    for (i, frame) in transforms["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+        let picture = place.path(&format!("captured/{}", frame["file_path"].as_str().unwrap()));
+        png(&picture).over([0.2; 3]).save_png(picture).unwrap();
+        // Along -z, side by side.
+        let [x, y] = [0.3 * (i % 3) as f64, 0.2 * (i / 3) as f64];
+        frame["transform_matrix"] =
+            json!([[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, 0.1 * x], [0.0, 0.0, 0.0, 1.0]]);
+    }
+    std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
+    let said = place.succeeds(&format!("train captured --steps 1 --out ahead {SMALL}"));
+    assert!(
+        said.contains("forward: photographs are opaque, so they show what lies behind, and all look ahead"),
+        "{said}"
+    );
+    let ndc = model(&place, "ahead").extent.ndc.unwrap();
+    // Up is up in the scene, and the picture is taken from behind the cameras, which look at its middle.
+    assert!(ndc.axes.y_axis.z > 0.999 && ndc.near > 0.0, "{ndc:?}");
+    assert_eq!(place.json("ahead/config.json")["config"]["unbounded"], json!(true));
+    place.succeeds("render ahead --frames 2");
+    place.succeeds("eval ahead");
+    place.succeeds(&format!("train captured --scope unbounded --steps 1 --out around {SMALL}"));
+    assert_eq!(model(&place, "around").extent.ndc, None);
+    place.fails(
+        &format!("train scene --scope forward --steps 1 {SMALL}"),
+        &["`scope`", "degrees beside", "use unbounded"],
+    );
+}

@@ -1,8 +1,8 @@
 //! Boxes, directions, contraction, normalised device coordinates, lenses.
 
 use crate::support::*;
-use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Lens, Ndc, Ray, clip_span, contract, intersect_box};
+use raygrad::nerf::glam::{DMat3, DVec3};
+use raygrad::nerf::{Lens, Ndc, Ray, Space, clip_span, contract, intersect_box};
 use raygrad::{Scalar, Tape};
 
 const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
@@ -151,32 +151,32 @@ fn contraction_is_smooth_and_bounded<T: Scalar>() {
     assert!(y.iter().all(|y| y.is_nan()));
 }
 
-/// Matrix: NDC with d_z = 0, +-1e-6, > 0, and o_z = -near.
+/// Matrix: NDC of depths 0, +-1e-6, behind, at the near plane, largest and infinite.
 fn normalised_device_coordinates<T: Scalar>() {
-    let ndc = Ndc::new([2, 2], [1.0, 1.0], 1.0).unwrap();
-    let t = |v: [f64; 3]| v.map(T::from_f64);
-    for flat in [0.0, -0.0, 1e-9, -1e-9] {
-        let error = ndc.ray(t([0.0, 0.0, 0.5]), t([1.0, 0.0, flat])).unwrap_err().to_string();
-        assert!(error.contains("parallel to the image"), "{error}");
+    let ndc = Ndc { eye: DVec3::ZERO, axes: DMat3::IDENTITY, slopes: [1.0, 1.0], near: 1.0 };
+    let space = Space { unbounded: true, ndc: Some(ndc), ..Space::within([DVec3::NEG_ONE, DVec3::ONE]) };
+    let at = |x: [f64; 3]| {
+        let tape = Tape::new();
+        let x = tape.leaf(tensor::<T>(&[1, 3], &x));
+        let cube = space.cube(&x);
+        [numbers(cube.value()), numbers(&cube.sum().grad(&[&x])[0])]
+    };
+    for z in [0.0, -0.0, 1e-6, -1e-6, 0.5, -0.5, 1e20, greatest::<T>()] {
+        let [cube, grad] = at([0.25, -0.5, z]);
+        assert_eq!(cube, [0.625, 0.25, 0.0], "what is nearer than the near plane, or behind, is seen at it: {z}");
+        assert_eq!(grad, [0.5, 0.5, 0.0], "{z}");
     }
-    assert!(ndc.ray(t([0.0, 0.0, 0.5]), t([0.0, 0.0, 0.0])).is_err(), "no direction at all");
-    for bad in [f64::NAN, f64::INFINITY] {
-        assert!(ndc.ray(t([bad, 0.0, 0.5]), t([0.0, 0.0, -1.0])).is_err());
-        assert!(ndc.ray(t([0.0, 0.0, 0.5]), t([0.0, bad, -1.0])).is_err());
-    }
-    for steep in [1e-6, -1e-6, 1.0, -1.0] {
-        let ray = ndc.ray(t([0.1, 0.2, 0.5]), t([0.6, 0.0, steep])).unwrap();
-        let all = ray.origin.iter().chain(&ray.direction);
-        assert!(all.clone().all(|x| Scalar::is_finite(*x)), "{steep}: {ray:?}");
-        assert_eq!(ray.backwards, steep > 0.0, "flagged");
-    }
-    // An origin on the near plane stays, exactly: (x, y, -1) becomes (x, y, -1).
-    let ray = ndc.ray(t([0.25, -0.5, -1.0]), t([0.0, 0.0, -1.0])).unwrap();
-    assert_eq!((ray.origin, ray.direction), (t([0.25, -0.5, -1.0]), t([-0.25, 0.5, 2.0])));
-    let ray = ndc.ray(t([0.0, 0.0, 0.5]), t([0.6, 0.0, -1e-3])).unwrap();
+    // At the near plane places stay, exactly.
+    assert_eq!(at([0.25, -0.5, -1.0])[0], [0.625, 0.25, 0.0]);
     let tolerance = by_type::<T>(2e-7, 1e-14);
-    near::<T>("x", ray.direction[0].to_f64(), constant("normalised-device ray, direction x"), tolerance);
-    near::<T>("z", ray.direction[2].to_f64(), constant("normalised-device ray, direction z"), tolerance);
+    for (cube, name) in at([0.6, -0.2, -7.0])[0].iter().zip(["x", "y", "z"]) {
+        near::<T>(name, *cube, constant(&format!("normalised device coordinates, {name}")), tolerance);
+    }
+    for z in [-1e6, -1e20, -greatest::<T>()] {
+        let [cube, grad] = at([0.25 * z, 0.5 * z, z]);
+        assert!((cube[0] - 0.375).abs() < 1e-6 && (cube[1] - 0.25).abs() < 1e-6, "{z}: {cube:?}");
+        assert!(cube[2] > 0.99999 && cube[2] <= 1.0 && grad.iter().all(|g| g.is_finite()), "{z}: {cube:?} {grad:?}");
+    }
 }
 
 /// Matrix: undistortion with k1 = -.5 at r_d = .54, .545, .6 and k1 = .5 at 3. Catalogue: ten Newton steps at .6.

@@ -8,8 +8,8 @@ use raygrad::nerf::sampling::steps::{even_edges, invert_cdf};
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step};
 use raygrad::nerf::volume::{self, OpticalDepth, Weights};
 use raygrad::nerf::{
-    Distortion, Lens, Ndc, Pose, PositionalEncoding, Ray, Rays, contract, glam::DVec3, intersect_box, rotation_exp,
-    srgb_decode, srgb_encode,
+    Camera, Distortion, Lens, Ndc, Pose, PositionalEncoding, Ray, Rays, contract, glam::DVec3, intersect_box,
+    rotation_exp, srgb_decode, srgb_encode,
 };
 use raygrad::{Adam, AdamConfig, Op, Optimizer, Params, Scalar, Segments, Tape, Tensor, Var};
 
@@ -282,9 +282,11 @@ proptest! {
         o in prop::array::uniform3(any_number()), d in prop::array::uniform3(any_number()),
         k in prop::array::uniform2(any_number()), r in any_number(),
     ) {
-        let ndc = Ndc::new([400, 300], [300.0, 310.0], 0.7).unwrap();
-        if let Ok(ray) = ndc.ray::<f64>(o, d) {
-            prop_assert!(ray.origin.iter().chain(&ray.direction).all(|x| x.is_finite()), "{:?}", ray);
+        let camera = |eye: [f64; 3], d: [f64; 3]| {
+            Camera::from_angle(40, 30, 0.8, Camera::look_at(eye.into(), DVec3::from(eye) + DVec3::from(d), DVec3::Z))
+        };
+        if let Ok(ndc) = Ndc::around(&[camera(o, d), camera(d, d)], r) {
+            prop_assert!(ndc.check().is_ok(), "{:?}", ndc);
         }
         let lens = Lens::Brown { k: [k[0], k[1], 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
         if lens.check().is_ok() && r.is_finite() {

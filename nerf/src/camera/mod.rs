@@ -11,7 +11,7 @@ pub(crate) mod rotation;
 
 pub use bounds::{clip_span, intersect_box};
 pub use lens::{Lens, recorded::lens_places};
-pub use ndc::{Ndc, NdcRay};
+pub use ndc::Ndc;
 pub use pinhole::{Camera, Ray};
 pub use pose::Pose;
 pub use rays::{Rays, Samples, stratified};

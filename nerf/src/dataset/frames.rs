@@ -6,6 +6,7 @@ use super::numbers::median;
 use super::photo::Photo;
 use super::placement::Placement;
 use super::scope::Scope;
+use crate::camera::Ndc;
 use crate::camera::bounds::clip_span;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -96,11 +97,18 @@ pub struct Dataset {
 
 impl Dataset {
     /// How many pixels of the photographs lie side by side along the longest side of the scene's box where they show its middle:
-    /// the median over photographs. One that was taken from within the box counts as if its camera stood at its side.
+    /// the median over photographs. One that was taken from within the box counts as if its camera stood at its side. Where
+    /// all [look the same way](Scope::Forward), those are counted that lie across the [picture](Ndc) of all they see.
     pub fn footprints(&self) -> f64 {
+        let cameras = || self.frames.iter().map(|frame| &frame.camera);
+        if self.scope == Scope::Forward
+            && let Ok(ndc) = Ndc::around(cameras(), self.near)
+        {
+            return median(cameras().map(|camera| ndc.pixels(camera)));
+        }
         let [lower, upper] = self.bounds;
         let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
-        let each = self.frames.iter().map(|Frame { camera, .. }| {
+        let each = cameras().map(|camera| {
             let distance = camera.pose.translation.distance(middle).max(0.5 * side);
             // Of a panorama, a radian is so many pixels.
             let focal = match camera.lens {

@@ -3,7 +3,8 @@
 use super::{Dataset, Frame, Placement, Scope, Split};
 use crate::camera::pinhole::Camera;
 use crate::dataset::image::Image;
-use crate::dataset::scene::{Landscape, walk_cameras};
+use crate::dataset::scene::{Landscape, walk_cameras, window_cameras};
+use glam::DVec3;
 
 /// Rays a pixel, for anti-aliasing.
 const SAMPLES: usize = 5;
@@ -24,21 +25,36 @@ const FAR: f64 = 1e4;
 /// If `width` is not a multiple of 4.
 #[track_caller]
 pub fn landscape(split: Split, width: usize) -> Dataset {
+    let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
+    let bounds = eyes.fold(Landscape::new().bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
+    let bounds = [bounds[0] - 0.02, bounds[1] + 0.02];
+    Dataset { bounds, near: NEAR, far: FAR, scope: Scope::Unbounded, ..seen_from(walk_cameras, split, width) }
+}
+
+/// The same landscape as it is seen ahead from a window before the bulldozer: 30 views to train on, 3 to validate, 6 to test,
+/// between them. Bounds are 3 units about the bulldozer, and nothing is nearer than half a unit.
+///
+/// # Panics
+/// If `width` is not a multiple of 4.
+#[track_caller]
+pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
+    seen_from(window_cameras, split, width)
+}
+
+#[track_caller]
+fn seen_from(cameras: fn(Split, usize) -> Vec<Camera>, split: Split, width: usize) -> Dataset {
     assert!(width.is_multiple_of(4), "a width of {width} pixels has no whole number of rows at 4:3");
     let landscape = Landscape::new();
     let frame = |(i, camera): (usize, Camera)| {
         let image = landscape.render(&camera, SAMPLES).into();
         Frame { name: format!("{split}/{i}"), camera, image, mask: None, distances: None }
     };
-    let cameras = walk_cameras(split, width);
-    let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
-    let bounds = eyes.fold(landscape.bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
     Dataset {
-        frames: cameras.into_iter().enumerate().map(frame).collect(),
-        bounds: [bounds[0] - 0.02, bounds[1] + 0.02],
-        near: NEAR,
+        frames: cameras(split, width).into_iter().enumerate().map(frame).collect(),
+        bounds: [DVec3::splat(-1.5), DVec3::splat(1.5)],
+        near: 0.5,
         far: FAR,
-        scope: Scope::Unbounded,
+        scope: Scope::Forward,
         placement: Placement::default(),
         skipped: vec![],
     }

@@ -30,7 +30,7 @@ pub use capture::{Capture, Format, Point, View};
 pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use embedded::embedded;
 pub use frames::{Dataset, Frame, Split, evenly_spaced};
-pub use landscape::{landscape, landscape_distances};
+pub use landscape::{landscape, landscape_ahead, landscape_distances};
 pub use load::Reading;
 pub use mask::Mask;
 pub use photo::Photo;

@@ -13,6 +13,15 @@ pub enum Scope {
     Bounded,
     /// It goes on beyond its box, and photographs show what is there.
     Unbounded,
+    /// So does this one, and all photographs look the same way: see [`Ndc`](crate::Ndc).
+    Forward,
+}
+
+impl Scope {
+    /// Whether it goes on beyond its box.
+    pub fn goes_on(self) -> bool {
+        self != Scope::Bounded
+    }
 }
 
 impl fmt::Display for Scope {
@@ -20,6 +29,7 @@ impl fmt::Display for Scope {
         f.pad(match self {
             Scope::Bounded => "bounded",
             Scope::Unbounded => "unbounded",
+            Scope::Forward => "forward",
         })
     }
 }
@@ -31,7 +41,8 @@ impl FromStr for Scope {
         match text {
             "bounded" => Ok(Scope::Bounded),
             "unbounded" => Ok(Scope::Unbounded),
-            _ => Err(Error::setting("scope", format!("must be bounded or unbounded, is `{text}`"))),
+            "forward" => Ok(Scope::Forward),
+            _ => Err(Error::setting("scope", format!("must be bounded, unbounded or forward, is `{text}`"))),
         }
     }
 }

@@ -5,6 +5,7 @@ use super::frames::evenly_spaced;
 use super::numbers::median;
 use super::placement::Placement;
 use super::scope::Scope;
+use crate::camera::Ndc;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use glam::{DMat3, DVec3};
@@ -79,7 +80,13 @@ impl Survey {
         let (scope, reason) = match (asked, empty) {
             (Some(scope), _) => (scope, "as asked"),
             (None, Some(why)) => (Scope::Bounded, why),
-            (None, None) => (Scope::Unbounded, "photographs are opaque, so they show what lies behind"),
+            (None, None) => {
+                if Ndc::around(cameras.iter().copied(), 1.0).is_ok() {
+                    (Scope::Forward, "photographs are opaque, so they show what lies behind, and all look ahead")
+                } else {
+                    (Scope::Unbounded, "photographs are opaque, so they show what lies behind")
+                }
+            }
         };
         let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
         let points = trusted(&capture.points);
@@ -92,7 +99,7 @@ impl Survey {
         }
         let half = match scope {
             Scope::Bounded => half_width(&cameras, middle),
-            Scope::Unbounded => inner,
+            Scope::Unbounded | Scope::Forward => inner,
         };
         let placement = Placement { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
         let bounds = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
@@ -103,7 +110,7 @@ impl Survey {
                 let nearest = distances().fold(f64::INFINITY, f64::min);
                 [(nearest - reach).max(NEAR_SHARE * distance), distances().fold(0.0, f64::max) + reach]
             }
-            Scope::Unbounded => {
+            Scope::Unbounded | Scope::Forward => {
                 let given = depths.iter().map(|[near, _]| *near).reduce(f64::min);
                 let near = given.or_else(|| nearest_point(&cameras, &points));
                 let near = near.map_or(NEAR_SHARE * distance, |near| 0.5 * near);

@@ -244,7 +244,7 @@ impl Config {
     /// Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
     /// nothing.
     pub fn with_scope(mut self, scope: Scope) -> Self {
-        let before = std::mem::replace(&mut self.unbounded, scope == Scope::Unbounded);
+        let before = std::mem::replace(&mut self.unbounded, scope.goes_on());
         if before == self.unbounded {
             return self;
         }

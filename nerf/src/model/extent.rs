@@ -1,5 +1,6 @@
 //! Where a scene is.
 
+use crate::camera::Ndc;
 use crate::dataset::Placement;
 use crate::space::cube::Space;
 use glam::DVec3;
@@ -22,6 +23,9 @@ pub struct Extent {
     /// From the coordinates of the photographs' files to those of the scene.
     #[serde(default)]
     pub placement: Placement,
+    /// What the photographs show, where they all look the same way: see [`Space::ndc`].
+    #[serde(default)]
+    pub ndc: Option<Ndc>,
 }
 
 fn one() -> f64 {
@@ -31,11 +35,11 @@ fn one() -> f64 {
 impl Extent {
     /// Of a new model.
     pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
-        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0, placement: Placement::default() }
+        Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0, placement: Placement::default(), ndc: None }
     }
 
-    /// The map to the unit cube, for a scene within its box.
+    /// The map to the unit cube, for a scene within its box: one that goes on is `unbounded` too.
     pub fn space(&self) -> Space {
-        Space { unit: self.unit, ..Space::within(self.bounds) }
+        Space { unit: self.unit, ndc: self.ndc, ..Space::within(self.bounds) }
     }
 }

@@ -1,8 +1,9 @@
 //! The map from the scene to the unit cube.
 
 use super::contraction::contract;
+use crate::camera::Ndc;
 use crate::{Error, Result};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use raygrad_autograd::{Scalar, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
@@ -20,6 +21,10 @@ pub struct Space {
     /// before there was a choice it is 1.
     #[serde(default = "one")]
     pub unit: f64,
+    /// Where an unbounded scene was photographed by cameras that all look the same way: then what they see, and not all of
+    /// space, is the cube.
+    #[serde(default)]
+    pub ndc: Option<Ndc>,
 }
 
 fn one() -> f64 {
@@ -34,18 +39,20 @@ impl Space {
     /// A scene within a box, lower and upper corner in scene units.
     pub fn within(bounds: [DVec3; 2]) -> Self {
         let unit = (bounds[1] - bounds[0]).max_element() / UNITS;
-        Space { bounds, unbounded: false, unit }
+        Space { bounds, unbounded: false, unit, ndc: None }
     }
 
     /// Whether the box is one.
     ///
     /// # Errors
-    /// If a corner is not finite or the lower one is not below the upper one along each axis, or the unit is no length.
+    /// If a corner is not finite or the lower one is not below the upper one along each axis, the unit is no length, or
+    /// normalised device coordinates hold a number out of range.
     pub fn check(&self) -> Result<()> {
         let [low, high] = self.bounds;
         if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
             return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
         }
+        self.ndc.as_ref().map_or(Ok(()), Ndc::check)?;
         if self.unit > 0.0 && self.unit.is_finite() {
             return Ok(());
         }
@@ -58,7 +65,8 @@ impl Space {
     }
 
     /// Positions `[samples, 3]` in scene units as positions in the unit cube. In a bounded space the box's lower corner is
-    /// the origin and its longest side has length 1; what lies outside of the box lies outside of the cube.
+    /// the origin and its longest side has length 1; what lies outside of the box lies outside of the cube. In
+    /// [normalised device coordinates](Ndc) the cube's last axis is 1 - near / depth, from the near plane to infinity.
     #[track_caller]
     pub fn cube<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
         let row = |x: DVec3| positions.tape().constant(Tensor::from_vec(&[3], x.to_array().map(T::from_f64).to_vec()));
@@ -66,6 +74,9 @@ impl Space {
         if !self.unbounded {
             let scale = 1.0 / self.side();
             return positions * scale + row(-low * scale);
+        }
+        if let Some(ndc) = &self.ndc {
+            return project(ndc, &(positions - row(ndc.eye)));
         }
         let scale = 2.0 / (high - low).min_element();
         contract(&(positions * scale + row(-0.5 * (low + high) * scale))) * 0.25 + 0.5
@@ -83,10 +94,60 @@ impl Space {
     }
 }
 
+/// Offsets from the eye of a picture, `[samples, 3]`, as places in it.
+#[track_caller]
+fn project<'t, T: Scalar>(ndc: &Ndc, offsets: &Var<'t, T>) -> Var<'t, T> {
+    let tape = offsets.tape();
+    // To halves of the picture's sides at the near plane, and depths in units of that.
+    let across = ndc.slopes.map(|slope| 0.5 / (slope * ndc.near));
+    let local = ndc.axes * DMat3::from_diagonal(DVec3::new(across[0], across[1], -1.0 / ndc.near));
+    let local = local.transpose().to_cols_array().map(T::from_f64).to_vec();
+    let local = offsets.matmul(tape.constant(Tensor::from_vec(&[3, 3], local)));
+    let depth = local.slice_axis(1, 2..).maximum(1.0);
+    Var::concat(&[&(local.slice_axis(1, ..2) / &depth + 0.5), &(1.0 - depth.reciprocal())], 1)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use raygrad_autograd::Tape;
+
+    #[test]
+    fn pictures_become_cubes() {
+        // From (1, 2, 3) along +y: right is x, up is z, back is -y.
+        let axes = DMat3::from_cols(DVec3::X, DVec3::Z, DVec3::NEG_Y);
+        let ndc = Ndc { eye: DVec3::new(1.0, 2.0, 3.0), axes, slopes: [0.5, 0.25], near: 2.0 };
+        let within = Space::within([DVec3::NEG_ONE, DVec3::ONE]);
+        let space = Space { unbounded: true, ndc: Some(ndc), ..within };
+        space.check().unwrap();
+        let tape = Tape::<f64>::new();
+        // At the near plane and its left border; twice as far, at the border above; far away; before the near plane; behind.
+        let points =
+            [[1.0, 4.0, 3.0], [0.0, 4.0, 3.0], [1.0, 6.0, 4.0], [1.0, 2e9, 3.0], [1.5, 3.0, 3.0], [1.5, -9.0, 3.0]];
+        let cube = space.cube(&tape.constant(Tensor::from(points)));
+        let expected = [
+            [0.5, 0.5, 0.0],
+            [0.0, 0.5, 0.0],
+            [0.5, 1.0, 0.5],
+            [0.5, 0.5, 1.0 - 1e-9],
+            [0.75, 0.5, 0.0],
+            [0.75, 0.5, 0.0],
+        ];
+        for (got, expected) in cube.value().as_slice().iter().zip(expected.as_flattened()) {
+            assert!((got - expected).abs() < 1e-12, "{:?}", cube.value());
+        }
+        // Lines stay lines, and along them it is even in inverse depth.
+        let line = [1.0, 2.0, 4.0].map(|t| [1.0 + 0.1 * t, 2.0 + 4.0 * t, 3.0 + 0.3 - 0.2 * t]);
+        let line = space.cube(&tape.constant(Tensor::from(line)));
+        let [a, b, c] = [0, 1, 2].map(|i| DVec3::from_slice(&line.value().as_slice()[3 * i..]));
+        assert!((b - a).cross(c - a).length() < 1e-12 && ((b - a).z / (c - b).z - 2.0).abs() < 1e-12, "{a} {b} {c}");
+        let wrong = Space { ndc: Some(Ndc { near: 0.0, ..ndc }), ..space };
+        assert!(wrong.check().unwrap_err().to_string().contains("`ndc`"));
+        // A scene within its box has no use for it.
+        let bounded = Space { unbounded: false, ..space };
+        let point = tape.constant(Tensor::from([[0.2, 0.4, 0.6]]));
+        assert_eq!(bounded.cube(&point).value(), within.cube(&point).value());
+    }
 
     #[test]
     fn boxes_become_cubes_and_space_a_ball() {

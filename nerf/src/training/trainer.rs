@@ -4,7 +4,7 @@ use super::groups::Groups;
 use super::pass::{Work, rays_loss};
 use super::startup;
 use super::stats::{Budget, StepStats};
-use crate::camera::Camera;
+use crate::camera::{Camera, Ndc};
 use crate::dataset::batch::Batch;
 use crate::dataset::{Dataset, Scope};
 use crate::model::config::Config;
@@ -66,17 +66,18 @@ impl Trainer {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
-        if data.scope == Scope::Unbounded && !config.unbounded {
+        if data.scope.goes_on() && !config.unbounded {
             let what = "is false, and the photographs show what lies beyond the scene's box; use `Config::with_scope` with \
                         the scope of the dataset";
             return Err(Error::setting("unbounded", what));
         }
+        let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
         let extent = Extent {
             frames: data.frames.len(),
             placement: data.placement,
+            ndc: if data.scope == Scope::Forward { Some(Ndc::around(&cameras, data.near)?) } else { None },
             ..Extent::new(data.bounds, [data.near, data.far])
         };
-        let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
         let (model, restarts) = startup::living_model(&config, extent, &cameras, config.seed)?;
         data.check_reach(model.reach())?;
         data.check_distances(model.terms.iter().any(|term| term.reads_distances()))?;

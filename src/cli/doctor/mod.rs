@@ -28,7 +28,7 @@ use stage::Stage;
 pub struct Args {
     /// Folder of photographs with poses, in any format that can be trained on
     pub scene: Scene,
-    /// How far the scene goes: bounded or unbounded [default: found out from the photographs]
+    /// How far the scene goes: bounded, unbounded or forward [default: found out from the photographs]
     #[arg(long)]
     pub scope: Option<Scope>,
     /// Folder for the picture and the page; files of the same names are replaced

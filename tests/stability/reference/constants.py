@@ -76,12 +76,11 @@ row("undistorted .54 for k1 = -.5", root(mpf("-.5"), mpf(".54")), ".7562852")
 row("undistorted 3 for k1 = .5", root(mpf(".5"), mpf(3)), "1.4561642")
 theta = mpf("1e-4")
 row("(1 - cos t) / t^2 at 1e-4", (1 - cos(theta)) / theta**2, ".5")
-# The normalised-device ray of a camera of focal length W/2 at (0, 0, .5), near plane 1, direction (.6, 0, -1e-3).
-o, d = [mpf(0), mpf(0), mpf(".5")], [mpf(".6"), mpf(0), mpf("-1e-3")]
-t = -(1 + o[2]) / d[2]
-o = [a + t * b for a, b in zip(o, d)]
-row("normalised-device ray, direction x", -(d[0] / d[2] - o[0] / o[2]))
-row("normalised-device ray, direction z", -2 / o[2])
+# The place (.6, -.2, -7) in normalised device coordinates (Mildenhall et al. 2020, equation 20) of a camera whose focal length
+# is half of its width and height, near plane 1 and infinite far plane, from -1..1 to 0..1.
+x, y, z = mpf(".6"), mpf("-.2"), mpf(-7)
+for name, value in [("x", -x / z), ("y", -y / z), ("z", 1 + 2 / z)]:
+    row(f"normalised device coordinates, {name}", (value + 1) / 2)
 row("contraction of norm 1e4", 2 - mpf("1e-4"))
 
 # Reductions, optimiser, metrics.

@@ -39,6 +39,7 @@ mod shade;
 mod shape;
 mod views;
 mod walk;
+mod window;
 
 use glam::DVec3;
 
@@ -47,6 +48,7 @@ pub use landscape::Landscape;
 pub use render::View;
 pub use views::{ANGLE_X, DISTANCE, test_cameras, train_cameras, val_cameras};
 pub use walk::walk_cameras;
+pub use window::window_cameras;
 
 use crate::camera::pinhole::Ray;
 use bvh::Bvh;

@@ -95,7 +95,17 @@ fn what_cameras_that_look_the_same_way_show_lies_ahead() {
     let spread = median(wall.views.iter().map(|view| view.camera.pose.translation.distance(mean)));
     let survey = Survey::new(&wall, None, None).unwrap();
     assert!(survey.placement.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", survey.placement.origin);
-    assert!(survey.reason.ends_with("; cameras look the same way"), "{}", survey.reason);
+    assert_eq!(
+        survey.reason,
+        "photographs are opaque, so they show what lies behind, and all look ahead; cameras look the same way"
+    );
+    assert_eq!(survey.scope, Scope::Forward);
+    let asked = Survey::new(&wall, None, Some(Scope::Unbounded)).unwrap();
+    assert_eq!(
+        asked,
+        Survey { scope: Scope::Unbounded, reason: "as asked; cameras look the same way".into(), ..survey }
+    );
+    assert_eq!(Survey::new(&wall, Some("it is"), None).unwrap().scope, Scope::Bounded);
     let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
     wall.points = (0..150).map(|i| Point { position: place(i), color: [0; 3], error: 1.0, views: 3 }).collect();
     let survey = Survey::new(&wall, None, None).unwrap();
@@ -122,6 +132,17 @@ fn what_cameras_that_look_the_same_way_show_lies_ahead() {
     wall.points.truncate(99);
     let few = Survey::new(&wall, None, None).unwrap();
     assert!(few.placement.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9);
+}
+
+#[test]
+fn a_walk_ahead_is_no_view_from_a_window() {
+    let walk = (0..5).map(|i| {
+        let eye = DVec3::new(0.1 * f64::from(i % 2), 0.3 * f64::from(i), 0.0);
+        camera(eye, eye + DVec3::Y, DVec3::Z)
+    });
+    let survey = Survey::new(&capture(Format::Colmap, walk.collect()), None, None).unwrap();
+    assert_eq!(survey.scope, Scope::Unbounded);
+    assert!(survey.reason.starts_with("photographs are opaque, so they show what lies behind; "), "{}", survey.reason);
 }
 
 #[test]
