@@ -172,6 +172,10 @@ fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
 
     let table = place.succeeds("doctor capture");
     assert!(table.contains("nothing is wrong") && table.contains("bounded: photographs are transparent"), "{table}");
+    assert!(
+        table.contains("  resolution     120x120\n") && table.contains("  images         35 train, 5 test\n"),
+        "{table}"
+    );
     let picture = png(&place.path("doctor/cameras.png"));
     assert!(picture.width > 1000 && picture.data.iter().any(|value| *value < 0.5));
     let page = String::from_utf8(place.bytes("doctor/doctor.html")).unwrap();

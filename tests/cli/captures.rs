@@ -46,6 +46,16 @@ fn depths_are_learned_from_where_that_is_asked_for() {
     assert_eq!(terms(&place, "heavy"), json!([{ "kind": "depth", "weight": 2.0 }]));
     assert!(usual > plain, "{usual} {plain}");
     assert!(((heavy - plain) / (usual - plain) - 20.0).abs() < 1e-3, "{plain} {usual} {heavy}");
+    // They go along where a format has them, and are said to be left where it has none.
+    place.succeeds("prepare captured --to nerfstudio --out again");
+    assert_eq!(place.json("again/transforms.json")["depth_unit_scale_factor"], json!(0.1));
+    let again = place.json("again/transforms.json")["frames"][0]["depth_file_path"].as_str().unwrap().to_owned();
+    assert!(place.bytes(&format!("again/{again}")) == place.bytes("captured/depths/all.png"));
+    for flags in ["--to colmap --out left", "--undistort --out straight"] {
+        let output = place.command(&format!("prepare captured {flags}")).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success() && said.contains("files of depths are left behind: "), "{flags}: {said}");
+    }
     // The landscape measures its own.
     place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth --out far {SMALL}"));
     assert_eq!(terms(&place, "far")[1], json!({ "kind": "depth", "weight": 0.1 }));

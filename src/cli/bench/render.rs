@@ -336,7 +336,22 @@ mod tests {
         };
         let mut outcomes = [(10, 40.0), (20, 60.0), (20, 50.0), (30, 60.0), (5, 30.0)].map(|(e, p)| outcome(e, p));
         mark_dominated(&mut outcomes);
-        assert_eq!(outcomes.map(|o| o.dominated), [false, false, true, true, false]);
+        assert_eq!(outcomes.each_ref().map(|o| o.dominated), [false, false, true, true, false]);
+        // A panel shows them apart, hollow where they are beaten, and a line through the others, of evaluations alone.
+        let lines = |by_time: bool| {
+            let figure = figure(&outcomes, 10.0, by_time);
+            let shown = figure.panels.iter().map(|panel| {
+                let series = panel.series.iter().map(|series| (series.line, series.hollow, series.points.len()));
+                series.collect::<Vec<_>>()
+            });
+            shown.collect::<Vec<_>>()
+        };
+        let marks = vec![(false, false, 3), (false, true, 2)];
+        let front = [vec![(true, false, 3)], marks.clone()].concat();
+        assert_eq!(lines(false), [front, marks.clone(), marks.clone()]);
+        assert_eq!(lines(true), [marks.clone(), marks.clone(), marks]);
+        let front = &figure(&outcomes, 10.0, false).panels[0].series[0];
+        assert_eq!(front.points, [[0.5, 30.0], [1.0, 40.0], [2.0, 60.0]], "from few to many");
     }
 
     /// Gates on counts and errors, never on times.

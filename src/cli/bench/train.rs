@@ -233,3 +233,17 @@ fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, Stri
     let seconds = line.and_then(|line| line["seconds_per_step"].as_f64());
     seconds.ok_or_else(|| format!("{script} printed no seconds_per_step"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn courses_are_named_by_what_is_unusual_in_them() {
+        let name = |preset, skip| Course { preset, skip, seed: 0, seconds: 1 }.name();
+        assert_eq!(name(Preset::Instant, Skip::Lossless), "instant");
+        assert_eq!(name(Preset::Voxel, Skip::Off), "voxel, no skipping");
+        assert_eq!(name(Preset::Small, Skip::Fast), "small, skipping");
+        assert_eq!(name(Preset::Small, Skip::Off), "small");
+    }
+}
