@@ -8,6 +8,7 @@ use crate::{Error, Result};
 use raygrad_autograd::Tensor;
 use raygrad_nn::Schedule;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Steps that are taken with all photographs together.
 const STEPS: u64 = 400;
@@ -30,7 +31,8 @@ pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Ca
         ..model.config.clone()
     };
     let photographs = Arc::new(photographs);
-    let mut trainer = Trainer::new(config, photographs.clone())?;
+    // No time is measured.
+    let mut trainer = Trainer::within(config, photographs.clone(), model.extent, || Duration::ZERO)?;
     let params = &mut trainer.model.params;
     let ids: Vec<_> = params.ids().filter(|id| params.name(*id) != POSES).collect();
     for id in ids {

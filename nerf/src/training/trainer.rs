@@ -63,21 +63,32 @@ impl Trainer {
         data: Arc<Dataset>,
         clock: impl Fn() -> Duration + Send + Sync + 'static,
     ) -> Result<Self> {
-        if data.frames.is_empty() {
-            return Err(Error::setting("dataset", "has no frames to train on"));
-        }
         if data.scope.goes_on() && !config.unbounded {
             let what = "is false, and the photographs show what lies beyond the scene's box; use `Config::with_scope` with \
                         the scope of the dataset";
             return Err(Error::setting("unbounded", what));
         }
-        let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
+        let cameras = data.frames.iter().map(|frame| &frame.camera);
         let extent = Extent {
-            frames: data.frames.len(),
             placement: data.placement,
-            ndc: if data.scope == Scope::Forward { Some(Ndc::around(&cameras, data.near)?) } else { None },
+            ndc: if data.scope == Scope::Forward { Some(Ndc::around(cameras, data.near)?) } else { None },
             ..Extent::new(data.bounds, [data.near, data.far])
         };
+        Trainer::within(config, data, extent, clock)
+    }
+
+    /// The same, for a scene that lies so.
+    pub(super) fn within(
+        config: Config,
+        data: Arc<Dataset>,
+        extent: Extent,
+        clock: impl Fn() -> Duration + Send + Sync + 'static,
+    ) -> Result<Self> {
+        if data.frames.is_empty() {
+            return Err(Error::setting("dataset", "has no frames to train on"));
+        }
+        let extent = Extent { frames: data.frames.len(), ..extent };
+        let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
         let (model, restarts) = startup::living_model(&config, extent, &cameras, config.seed)?;
         data.check_reach(model.reach())?;
         data.check_distances(model.terms.iter().any(|term| term.reads_distances()))?;
