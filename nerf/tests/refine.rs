@@ -287,6 +287,6 @@ fn photographs_that_were_not_trained_on_are_found_where_they_belong_and_nothing_
     let given: Vec<Camera> = wrong.frames.iter().map(|frame| frame.camera.clone()).collect();
     let (before, after) = (off(&given), off(&found));
     println!("off by {before:?} and then by {after:?}");
-    assert!(before > 0.6 && after < 0.4 * before, "{before} {after}");
+    assert!(before > 0.6 && after < 0.3 * before, "{before} {after}");
     assert!(found.iter().zip(&given).all(|(a, b)| a.focal == b.focal && a.lens == b.lens));
 }
