@@ -284,6 +284,26 @@ mod tests {
     }
 
     #[test]
+    fn what_steps_did_adds_up_and_an_error_is_of_one_of_them() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(3);
+        let config = Config { background: crate::Background::White, ..tiny_table() };
+        let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
+        let counts = |trainer: &mut Trainer| {
+            trainer.step(0.0);
+            let StepStats { rays, marched, samples, shaded, unskipped, moved, loss, psnr, .. } = trainer.stats();
+            assert!((psnr - psnr_from_mse(loss)).abs() < 1e-9 && psnr > 1.0, "{psnr} {loss}");
+            [rays, marched, samples, shaded, unskipped, moved]
+        };
+        let [first, second, third] = [(); 3].map(|()| counts(&mut trainer));
+        for i in 0..6 {
+            // A step is not much larger than another.
+            let [a, b, c] = [first[i], second[i] - first[i], third[i] - second[i]].map(|count| count as f64);
+            assert!(a > 0.0 && (0.5..2.0).contains(&(b / a)) && (0.5..2.0).contains(&(c / b)), "{i}: {a} {b} {c}");
+        }
+    }
+
+    #[test]
     fn a_restart_keeps_what_was_said_of_parameters() {
         let mut data = embedded(Split::Train, 8);
         data.frames.truncate(2);
