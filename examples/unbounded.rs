@@ -1,4 +1,4 @@
-//! Three ways to hold a scene that goes on to the horizon, by what they make of near, far and sky.
+//! Ways to hold a scene that goes on to the horizon, by what they make of near, far and sky.
 //!
 //! ```text
 //! cargo run --release --example unbounded [seconds=60] [pixels=200] [from=walk|window] [only=bounded|contraction|cascades|ndc]
@@ -55,22 +55,24 @@ fn main() -> Result<()> {
     views.frames = evenly_spaced(views.frames, VIEWS);
     let budget = Budget::Time(Duration::from_secs_f64(seconds));
     let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) };
-    let usual = usual.for_budget(budget.samples(), train.footprints());
-    let cascades = usual.clone().with_scope(Scope::Unbounded);
-    let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };
-    let contraction = Config { sampler: SamplerConfig::new(proposal), ..cascades.clone() };
     println!("way           steps  near (dB)  far (dB)  sky (dB)  all (dB)  seconds a view");
-    for (name, config, scope) in [
-        ("bounded", usual, Scope::Bounded),
-        ("contraction", contraction, Scope::Unbounded),
-        ("cascades", cascades.clone(), Scope::Unbounded),
-        ("ndc", cascades, Scope::Forward),
+    for (name, scope) in [
+        ("bounded", Scope::Bounded),
+        ("contraction", Scope::Unbounded),
+        ("cascades", Scope::Unbounded),
+        ("ndc", Scope::Forward),
     ] {
         let leave_out = scope == Scope::Forward && !window;
         if leave_out || argument("only").is_some_and(|only| only != name) {
             continue;
         }
-        let mut trainer = Trainer::new(config, Arc::new(Dataset { scope, ..train.clone() }))?;
+        let data = Dataset { scope, ..train.clone() };
+        let mut config = usual.clone().for_budget(budget.samples(), data.footprints()).with_scope(scope);
+        if name == "contraction" {
+            let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };
+            config.sampler = SamplerConfig::new(proposal);
+        }
+        let mut trainer = Trainer::new(config, Arc::new(data))?;
         trainer.run(budget, |_| ControlFlow::Continue(()));
         let start = Instant::now();
         let [near, far, sky, all] = score(&trainer.model, &views);

@@ -20,6 +20,7 @@ pub(crate) mod files;
 pub mod kind;
 pub mod losses;
 pub mod model;
+pub(crate) mod numbers;
 pub mod pictures;
 pub(crate) mod random;
 pub(crate) mod range;

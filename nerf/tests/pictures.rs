@@ -155,6 +155,7 @@ fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
         near: 2.0,
         far: 6.0,
         scope: Scope::Bounded,
+        ndc: None,
         placement: Placement::default(),
         skipped: vec![],
     };

@@ -4,11 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// The rooms in the order in which data passes them. What stands in one line knows nothing of what stands in a later one.
-const ROOMS: [&str; 19] = [
+const ROOMS: [&str; 20] = [
     "error",
     "range",
     "random",
     "files",
+    "numbers",
     "camera",
     "dataset",
     "doctor",

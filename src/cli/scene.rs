@@ -65,9 +65,9 @@ impl Scene {
     /// The same, lying where a model has it.
     pub fn open_for(&self, extent: &Extent) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
-        let Extent { placement, bounds, span: [near, far], .. } = *extent;
+        let Extent { placement, bounds, span: [near, far], ndc, .. } = *extent;
         let (scope, reason) = (Scope::Bounded, "as the model has it".to_owned());
-        let survey = Survey { placement, scope, bounds, near, far, reason };
+        let survey = Survey { placement, scope, bounds, near, far, ndc, reason };
         Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
     }
 

@@ -254,7 +254,9 @@ fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
     if !(0.0..far).contains(&near) {
         return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, where the scene ends")));
     }
-    data.near = near * data.placement.scale;
+    let near = near * data.placement.scale;
+    data.ndc = data.ndc.map(|ndc| ndc.with_near(data.near, near));
+    data.near = near;
     Ok(())
 }
 

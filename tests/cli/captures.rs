@@ -272,8 +272,13 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
         "{said}"
     );
     let ndc = model(&place, "ahead").extent.ndc.unwrap();
-    // Up is up in the scene, and the picture is taken from behind the cameras, which look at its middle.
-    assert!(ndc.axes.y_axis.z > 0.999 && ndc.near > 0.0, "{ndc:?}");
+    // Up is up in the scene, and the picture is taken from behind the cameras. A nearer near plane is nearer in it.
+    let survey = raygrad::nerf::dataset::Capture::read(place.path("captured")).unwrap().survey(None).unwrap();
+    assert_eq!(survey.ndc, Some(ndc));
+    assert!(ndc.axes.y_axis.z > 0.999 && ndc.eye.z.abs() < 1.0, "{ndc:?}");
+    place.succeeds(&format!("train captured --near 0.01 --steps 1 --out close {SMALL}"));
+    let close = model(&place, "close").extent;
+    assert!(close.span[0] < survey.near && close.ndc == Some(ndc.with_near(survey.near, close.span[0])), "{close:?}");
     assert_eq!(place.json("ahead/config.json")["config"]["unbounded"], json!(true));
     place.succeeds("render ahead --frames 2");
     place.succeeds("eval ahead");
@@ -281,6 +286,8 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
     assert_eq!(model(&place, "around").extent.ndc, None);
     place.fails(
         &format!("train scene --scope forward --steps 1 {SMALL}"),
-        &["`scope`", "degrees beside", "use unbounded"],
+        &["`scope`", "turned from each other", "use unbounded"],
     );
+    place.fails(&format!("train embedded --downscale 20 --scope forward --steps 1 {SMALL}"), &["unbounded"]);
+    place.succeeds("eval ahead --fit-poses");
 }

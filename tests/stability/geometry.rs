@@ -151,7 +151,7 @@ fn contraction_is_smooth_and_bounded<T: Scalar>() {
     assert!(y.iter().all(|y| y.is_nan()));
 }
 
-/// Matrix: NDC of depths 0, +-1e-6, behind, at the near plane, largest and infinite.
+/// Matrix: NDC of depths 0, +-1e-6, behind, at the near plane and largest.
 fn normalised_device_coordinates<T: Scalar>() {
     let ndc = Ndc { eye: DVec3::ZERO, axes: DMat3::IDENTITY, slopes: [1.0, 1.0], near: 1.0 };
     let space = Space { unbounded: true, ndc: Some(ndc), ..Space::within([DVec3::NEG_ONE, DVec3::ONE]) };

@@ -285,8 +285,10 @@ proptest! {
         let camera = |eye: [f64; 3], d: [f64; 3]| {
             Camera::from_angle(40, 30, 0.8, Camera::look_at(eye.into(), DVec3::from(eye) + DVec3::from(d), DVec3::Z))
         };
-        if let Ok(ndc) = Ndc::around(&[camera(o, d), camera(d, d)], r) {
-            prop_assert!(ndc.check().is_ok(), "{:?}", ndc);
+        // Not far from each other, for their size: most are no picture, and none panics.
+        let beside = [o[0], o[1] * (1.0 + 1e-3), o[2]];
+        if let Ok(ndc) = Ndc::around(&[camera(o, d), camera(beside, d)], r.abs()) {
+            prop_assert!(ndc.slopes.iter().all(|slope| (0.1..10.0).contains(slope)), "{:?}", ndc);
         }
         let lens = Lens::Brown { k: [k[0], k[1], 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
         if lens.check().is_ok() && r.is_finite() {

@@ -1,6 +1,7 @@
 //! Normalised device coordinates: what cameras see that all look the same way, as a cube.
 
 use super::pinhole::Camera;
+use crate::numbers::median;
 use crate::{Error, Result};
 use glam::{DMat3, DVec2, DVec3, Vec3Swizzles};
 use serde::{Deserialize, Serialize};
@@ -23,81 +24,92 @@ pub struct Ndc {
     pub near: f64,
 }
 
-/// Half of the picture is at most so wide at depth 1: 63 degrees.
-const WIDEST: f64 = 2.0;
 /// How much wider it is than what cameras see: views are taken beside them, and refined cameras move.
-const MARGIN: f64 = 1.05;
-/// Pixels along each border of an image whose rays are asked how far it reaches.
-const BORDER: usize = 8;
+const MARGIN: f64 = 1.1;
+/// The picture is at most so much wider than that of the usual camera: 15 degrees to either side of what is 60 degrees wide.
+const TURNED: f64 = 1.75;
+/// No camera is so many times as far from the middle of all as the usual one.
+const LOST: f64 = 5.0;
 
 impl Ndc {
-    /// All that cameras see beyond the depth `near` before each.
+    /// All that cameras see beyond the distance `near` from each.
     ///
     /// # Errors
-    /// If they do not all look the same way, or move more along it than across: the picture would show what is before the
-    /// foremost from afar. If there is no near plane, because `near` is 0 and all stand in one place.
+    /// If there is no camera; if some are turned from others by more than a part of what they see, or look about an object on an
+    /// arc; if they move more along where they look than across it, or one stands far from all others: then there is no picture
+    /// in which all that matters is as large as in theirs.
     pub fn around<'a>(cameras: impl IntoIterator<Item = &'a Camera>, near: f64) -> Result<Self> {
         let cameras: Vec<&Camera> = cameras.into_iter().collect();
         let mean = |of: fn(&Camera) -> DVec3| cameras.iter().map(|c| of(c)).sum::<DVec3>() / cameras.len() as f64;
-        let bad = |what: String| Error::setting("scope", format!("forward: {what}; use unbounded"));
+        let bad = |what: &str| Err(Error::setting("scope", format!("forward: {what}; use unbounded")));
         let back = mean(|camera| camera.pose.matrix3.z_axis).normalize();
-        let right = mean(|camera| camera.pose.matrix3.y_axis).cross(back).normalize();
+        // Of a flight to and fro no side is up.
+        let up = mean(|camera| camera.pose.matrix3.y_axis);
+        let up = if up.length() < 0.1 { cameras.first().map_or(up, |camera| camera.pose.matrix3.y_axis) } else { up };
+        let right = up.cross(back).normalize();
         let (axes, middle) = (DMat3::from_cols(right, back.cross(right), back), mean(|camera| camera.pose.translation));
         if !(axes.is_finite() && middle.is_finite()) {
-            return Err(bad("cameras look no way in common".into()));
+            return bad("cameras look no way in common");
         }
-        let steepest = cameras.iter().flat_map(|camera| border(camera)).fold(DVec2::ZERO, |most, direction| {
-            let local = axes.transpose() * direction;
-            // What is level with the picture, or behind it, is infinitely wide.
-            most.max(if local.z < 0.0 { local.xy().abs() / -local.z } else { DVec2::INFINITY })
-        });
-        if !(steepest.max_element() <= WIDEST) {
-            let angle = steepest.max_element().atan().to_degrees();
-            return Err(bad(format!(
-                "photographs show what lies {angle:.0} degrees beside where they look on average"
-            )));
+        let slopes = |camera: &Camera, axes: DMat3| {
+            camera.border().fold(DVec2::ZERO, |most, direction| {
+                let local = axes.transpose() * direction;
+                // What is level with the picture, or behind it, is infinitely wide.
+                most.max(if local.z < 0.0 { local.xy().abs() / -local.z } else { DVec2::INFINITY })
+            })
+        };
+        let steepest = cameras.iter().fold(DVec2::ZERO, |most, camera| most.max(slopes(camera, axes)));
+        let usual = median(cameras.iter().map(|camera| slopes(camera, camera.pose.matrix3).max_element()));
+        if !(steepest.max_element() <= TURNED * usual && usual.is_finite()) {
+            return bad("cameras are turned from each other");
         }
         let offsets: Vec<DVec3> = cameras.iter().map(|c| axes.transpose() * (c.pose.translation - middle)).collect();
         let low = offsets.iter().fold(DVec3::INFINITY, |low, offset| low.min(*offset));
         let high = offsets.iter().fold(DVec3::NEG_INFINITY, |high, offset| high.max(*offset));
         let moved = high - low;
         if moved.z > moved.xy().length() {
-            return Err(bad("cameras move more along where they look than across it".into()));
+            return bad("cameras move more along where they look than across it");
+        }
+        let farthest = offsets.iter().fold(0.0, |most: f64, offset| most.max(offset.length()));
+        if farthest > LOST * median(offsets.iter().map(|offset| offset.length())) {
+            return bad("a camera stands far from all others");
         }
         let slopes = MARGIN * steepest;
         let behind = offsets.iter().map(|offset| (offset.xy().abs() / slopes).max_element() + offset.z);
         let behind = behind.fold(f64::NEG_INFINITY, f64::max);
-        let near = near + behind - high.z;
-        if !(near > 0.0 && near.is_finite()) {
-            return Err(bad(format!("the near plane is {near} away, of cameras in one place")));
-        }
-        Ok(Ndc { eye: middle + behind * back, axes, slopes: slopes.to_array(), near })
+        let ndc = Ndc { eye: middle + behind * back, axes, slopes: slopes.to_array(), near: behind - high.z };
+        let ndc = ndc.with_near(0.0, near);
+        ndc.check()?;
+        Ok(ndc)
+    }
+
+    /// The same where nothing is nearer than `to` to a camera, and was thought to be no nearer than `from`.
+    #[must_use]
+    pub fn with_near(self, from: f64, to: f64) -> Self {
+        // In the corners of a picture, distances are longer than depths.
+        let depth = 1.0 / (1.0 + self.slopes[0].powi(2) + self.slopes[1].powi(2)).sqrt();
+        Ndc { near: self.near + depth * (to - from), ..self }
     }
 
     /// Whether the numbers are usable.
     ///
     /// # Errors
-    /// If one is not finite, or a length is not above 0.
+    /// If one is not finite, a length is not above 0, or axes are no rotation.
     pub fn check(&self) -> Result<()> {
         let lengths = [self.slopes[0], self.slopes[1], self.near];
-        if self.eye.is_finite() && self.axes.is_finite() && lengths.iter().all(|x| *x > 0.0 && x.is_finite()) {
+        let turns = (self.axes.transpose() * self.axes).abs_diff_eq(DMat3::IDENTITY, 1e-6);
+        if self.eye.is_finite() && turns && lengths.iter().all(|x| *x > 0.0 && x.is_finite()) {
             return Ok(());
         }
-        Err(Error::setting("ndc", "holds a number that is out of range"))
+        Err(Error::setting("ndc", "needs a near plane and slopes above 0, a finite eye and axes that are a rotation"))
     }
 
-    /// How many pixels of a camera lie side by side across the picture.
-    pub fn pixels(&self, camera: &Camera) -> f64 {
-        (0..2).map(|axis| 2.0 * self.slopes[axis] * camera.focal[axis]).fold(0.0, f64::max)
+    /// How many pixels of a camera lie side by side across the picture at the depth of a place.
+    pub fn pixels(&self, camera: &Camera, place: DVec3) -> f64 {
+        let depth = |eye: DVec3| self.axes.z_axis.dot(eye - place).max(self.near);
+        let wide = (0..2).map(|axis| 2.0 * self.slopes[axis] * camera.focal[axis]).fold(0.0, f64::max);
+        wide * depth(self.eye) / depth(camera.pose.translation)
     }
-}
-
-/// Directions of rays along the border of an image.
-fn border(camera: &Camera) -> impl Iterator<Item = DVec3> {
-    let [width, height] = [camera.width as f64, camera.height as f64];
-    let shares = (0..=BORDER).map(|i| i as f64 / BORDER as f64);
-    let places = shares.flat_map(|share| [[share, 0.0], [share, 1.0], [0.0, share], [1.0, share]]);
-    places.map(move |[x, y]| camera.ray(x * width, y * height).direction)
 }
 
 #[cfg(test)]
@@ -105,7 +117,7 @@ mod tests {
     use super::*;
     use crate::camera::lens::Lens;
 
-    /// Looks along +y from a place, turned by so many degrees to the left.
+    /// Looks along +y from a place, turned by so many degrees to the left; 53 degrees wide and 44 high.
     fn camera(eye: [f64; 3], degrees: f64) -> Camera {
         let (eye, (sin, cos)) = (DVec3::from(eye), degrees.to_radians().sin_cos());
         let pose = Camera::look_at(eye, eye + DVec3::new(-sin, cos, 0.0), DVec3::Z);
@@ -114,47 +126,65 @@ mod tests {
 
     #[test]
     fn all_that_cameras_see_lies_in_the_picture_and_little_else() {
-        let cameras = [camera([-1.0, 0.1, 0.0], 5.0), camera([1.0, -0.2, 0.3], -8.0), camera([0.3, 0.0, -0.4], 0.0)];
+        let cameras = [camera([-1.0, 0.1, 0.0], 5.0), camera([1.0, -0.2, 0.3], 12.0), camera([0.3, 0.0, -0.4], -2.0)];
         let ndc = Ndc::around(&cameras, 0.5).unwrap();
         ndc.check().unwrap();
-        assert!((ndc.axes.transpose() * ndc.axes).abs_diff_eq(DMat3::IDENTITY, 1e-12) && ndc.axes.determinant() > 0.0);
-        assert!(ndc.axes.z_axis.distance(DVec3::NEG_Y) < 0.05 && ndc.axes.y_axis.z > 0.999, "{ndc:?}");
+        assert!(ndc.axes.determinant() > 0.0 && ndc.axes.y_axis.z > 0.999, "{ndc:?}");
+        let (sin, cos) = 5.0_f64.to_radians().sin_cos();
+        assert!(ndc.axes.z_axis.distance(DVec3::new(sin, -cos, 0.0)) < 1e-3, "the mean of where they look: {ndc:?}");
         let (mut widest, mut nearest) = (DVec2::ZERO, f64::INFINITY);
         for camera in &cameras {
-            for direction in border(camera) {
+            for i in 0..=40 {
+                let [x, y] = [(i % 8) as f64 / 7.0 * 100.0, (i / 8) as f64 / 5.0 * 40.0];
                 for distance in [0.5, 1.0, 30.0, 1e6] {
-                    // A place at that depth before the camera.
-                    let along = direction * (distance / -direction.dot(camera.pose.matrix3.z_axis));
-                    let local = ndc.axes.transpose() * (camera.pose.translation + along - ndc.eye);
+                    let local = ndc.axes.transpose() * (camera.ray(x, y).at(distance) - ndc.eye);
                     widest = widest.max(local.xy().abs() / -local.z / DVec2::from(ndc.slopes));
                     nearest = nearest.min(-local.z);
                 }
             }
         }
         assert!(widest.max_element() <= 1.0 && widest.min_element() > 0.8, "{widest}");
-        // Corners are nearer than the middle of a picture that is turned.
-        assert!(nearest > 0.8 * ndc.near && nearest < 1.1 * ndc.near, "{nearest} {}", ndc.near);
-        // The widest is a margin wider than the border of the one that is turned most, about 8 degrees beside the others.
-        let expected = 1.05 * (0.5_f64.atan() + 8.0_f64.to_radians()).tan();
-        assert!((ndc.slopes[0] - expected).abs() < 0.03, "{} {expected}", ndc.slopes[0]);
-        assert!((ndc.pixels(&cameras[0]) - 200.0 * ndc.slopes[0]).abs() < 1e-9);
-        let tall = Camera { focal: [50.0, 100.0], ..cameras[0].clone() };
-        assert!((ndc.pixels(&tall) - (100.0 * ndc.slopes[0]).max(200.0 * ndc.slopes[1])).abs() < 1e-9);
+        assert!(nearest >= ndc.near && nearest < ndc.near + 0.1, "{nearest} {}", ndc.near);
+        // A margin wider than the border of the one that is turned most, by 7 degrees from the others; to the left, where x is below 0.
+        let expected = 1.1 * (0.5_f64.atan() + 7.0_f64.to_radians()).tan();
+        assert!((ndc.slopes[0] - expected).abs() < 0.01, "{} {expected}", ndc.slopes[0]);
+        let mirrored =
+            cameras.map(|c| Camera { pose: glam::DAffine3::from_scale(DVec3::new(-1.0, 1.0, 1.0)) * c.pose, ..c });
+        let mirrored = mirrored.map(|mut c| {
+            c.pose.matrix3.x_axis *= -1.0;
+            c
+        });
+        let other = Ndc::around(&mirrored, 0.5).unwrap();
+        assert!(
+            (DVec2::from(other.slopes) - DVec2::from(ndc.slopes)).length() < 1e-9
+                && (other.near - ndc.near).abs() < 1e-9
+        );
     }
 
     #[test]
     fn one_camera_sees_its_own_picture() {
-        let ndc = Ndc::around(&[camera([1.0, 2.0, 3.0], 0.0)], 0.7).unwrap();
-        assert!(ndc.eye.distance(DVec3::new(1.0, 2.0, 3.0)) < 1e-12 && (ndc.near - 0.7).abs() < 1e-12);
-        assert!((ndc.slopes[0] - 1.05 * 0.5).abs() < 1e-12 && (ndc.slopes[1] - 1.05 * 0.4).abs() < 1e-12, "{ndc:?}");
-        // Two, half a width beside the middle, have it as far behind them as it takes; the near plane is that of the hinder one.
-        let pair = [camera([-0.42, 0.1, 0.0], 0.0), camera([0.42, 0.1, 0.0], 0.0), camera([0.0, 0.0, 0.0], 0.0)];
-        let ndc = Ndc::around(&pair, 0.0).unwrap();
+        let alone = camera([1.0, 2.0, 3.0], 0.0);
+        let ndc = Ndc::around([&alone], 0.7).unwrap();
+        assert!(ndc.eye.distance(DVec3::new(1.0, 2.0, 3.0)) < 1e-12, "{}", ndc.eye);
+        assert!((ndc.slopes[0] - 1.1 * 0.5).abs() < 1e-12 && (ndc.slopes[1] - 1.1 * 0.4).abs() < 1e-12, "{ndc:?}");
+        // The depth of its corners, a little farther out.
+        let depth = 0.7 / (1.0 + 0.55_f64.powi(2) + 0.44_f64.powi(2)).sqrt();
+        assert!((ndc.near - depth).abs() < 1e-12, "{}", ndc.near);
+        assert!((ndc.with_near(0.7, 1.4).near - 2.0 * depth).abs() < 1e-12);
+        // Pixels lie at the place's depth; nothing is nearer than the near plane.
+        assert!((ndc.pixels(&alone, DVec3::new(9.0, 5.0, 1.0)) - 110.0).abs() < 1e-9);
+        let tall = Camera { focal: [50.0, 200.0], ..alone.clone() };
+        assert!((ndc.pixels(&tall, DVec3::new(9.0, 5.0, 1.0)) - 176.0).abs() < 1e-9);
+        // Three, half a width beside the middle, have it as far behind them as it takes; the near plane is that of the hindmost.
+        let row = [camera([-0.44, 0.1, 0.0], 0.0), camera([0.44, 0.1, 0.0], 0.0), camera([0.0, 0.0, 0.0], 0.0)];
+        let ndc = Ndc::around(&row, 0.0).unwrap();
         assert!(ndc.eye.distance(DVec3::new(0.0, 0.1 - 0.8, 0.0)) < 1e-12, "{}", ndc.eye);
         assert!((ndc.near - 0.7).abs() < 1e-12, "{}", ndc.near);
+        assert!((ndc.pixels(&row[2], DVec3::Y) - 110.0 * 1.7).abs() < 1e-9, "farther from the eye");
         let eye = DVec3::new(0.0, f64::NAN, 0.0);
         for bad in [
             Ndc { eye, ..ndc },
+            Ndc { axes: DMat3::ZERO, ..ndc },
             Ndc { axes: DMat3::from_diagonal(eye), ..ndc },
             Ndc { slopes: [0.0, 1.0], ..ndc },
             Ndc { slopes: [1.0, f64::INFINITY], ..ndc },
@@ -165,18 +195,44 @@ mod tests {
     }
 
     #[test]
+    fn a_flight_to_and_fro_has_a_side_that_is_up() {
+        // Looking down, every other strip turned by half a circle.
+        let strip = |i: usize| {
+            let eye = DVec3::new(i as f64, 0.1 * i as f64, 9.0);
+            let up = if i.is_multiple_of(2) { DVec3::Y } else { DVec3::NEG_Y };
+            Camera::from_angle(40, 30, 0.8, Camera::look_at(eye, eye - DVec3::Z, up))
+        };
+        let flight: Vec<Camera> = (0..4).map(strip).collect();
+        let ndc = Ndc::around(&flight, 1.0).unwrap();
+        assert!(ndc.axes.abs_diff_eq(DMat3::IDENTITY, 1e-12), "{ndc:?}");
+    }
+
+    #[test]
     fn cameras_that_do_not_all_look_ahead_are_told_so() {
         let error = |cameras: &[Camera], near: f64| Ndc::around(cameras, near).unwrap_err().to_string();
-        let turned = [camera([0.0; 3], 0.0), camera([1.0, 0.0, 0.0], 80.0)];
-        assert!(error(&turned, 1.0).contains("67 degrees beside"), "{}", error(&turned, 1.0));
+        // Half of the width is 27 degrees, and 1.75 times as wide 41.
+        let turned = |degrees: f64| [camera([0.0; 3], -degrees), camera([1.0, 0.0, 0.0], degrees)];
+        assert!(Ndc::around(&turned(14.0), 1.0).is_ok());
+        assert!(error(&turned(15.0), 1.0).contains("turned from each other"), "{}", error(&turned(15.0), 1.0));
+        // An arc of 60 degrees about an object is none either.
+        let arc = |degrees: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            camera([4.0 * sin, -4.0 * cos, 0.0], degrees)
+        };
+        assert!(error(&[-30.0, -10.0, 10.0, 30.0].map(arc), 1.0).contains("turned"));
         let opposite = [camera([0.0; 3], 0.0), camera([1.0, 0.0, 0.0], 180.0)];
         assert!(error(&opposite, 1.0).ends_with("use unbounded"), "{}", error(&opposite, 1.0));
-        let walk = [camera([0.0; 3], 0.0), camera([0.3, 0.6, 0.3], 0.0)];
-        assert!(error(&walk, 1.0).contains("along"), "{}", error(&walk, 1.0));
-        assert!(error(&[camera([0.0; 3], 0.0)], 0.0).contains("near plane is 0 away"));
+        let walk = |ahead: f64| [camera([0.0; 3], 0.0), camera([0.3, ahead, 0.3], 0.0)];
+        assert!(Ndc::around(&walk(0.4), 1.0).is_ok());
+        assert!(error(&walk(0.45), 1.0).contains("along"), "{}", error(&walk(0.45), 1.0));
+        let mut row: Vec<Camera> = (0..9).map(|i| camera([f64::from(i), 0.0, 0.0], 0.0)).collect();
+        assert!(Ndc::around(&row, 1.0).is_ok());
+        row.push(camera([300.0, 0.0, 0.0], 0.0));
+        assert!(error(&row, 1.0).contains("far from all others"), "{}", error(&row, 1.0));
+        assert!(error(&[camera([0.0; 3], 0.0)], 0.0).contains("near plane"));
         assert!(error(&[camera([0.0; 3], 0.0)], f64::NAN).contains("near plane"));
         assert!(error(&[], 1.0).contains("no way in common"));
         let panorama = Camera { lens: Lens::Equirectangular, focal: [16.0; 2], ..camera([0.0; 3], 0.0) };
-        assert!(error(&[panorama], 1.0).contains("degrees beside"));
+        assert!(error(&[panorama], 1.0).contains("turned"));
     }
 }

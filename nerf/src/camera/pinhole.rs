@@ -85,6 +85,18 @@ impl Camera {
         Some([x * self.focal[0] + self.centre[0], y * self.focal[1] + self.centre[1]])
     }
 
+    /// Directions of rays along the border of the image, of those that light reaches; of all if it reaches none.
+    pub(crate) fn border(&self) -> impl Iterator<Item = DVec3> {
+        /// Places along each side.
+        const PLACES: usize = 16;
+        let [width, height] = [self.width as f64, self.height as f64];
+        let shares = (0..=PLACES).map(|i| i as f64 / PLACES as f64);
+        let places = shares.flat_map(|share| [[share, 0.0], [share, 1.0], [0.0, share], [1.0, share]]);
+        let places: Vec<[f64; 2]> = places.map(|[x, y]| [x * width, y * height]).collect();
+        let dark = !places.iter().any(|[x, y]| self.sees(*x, *y));
+        places.into_iter().filter(move |[x, y]| dark || self.sees(*x, *y)).map(|[x, y]| self.ray(x, y).direction)
+    }
+
     fn plane(&self, x: f64, y: f64) -> [f64; 2] {
         [(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1]]
     }

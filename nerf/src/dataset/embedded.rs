@@ -31,6 +31,7 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
         near: DISTANCE - reach,
         far: DISTANCE + reach,
         scope: Scope::Bounded,
+        ndc: None,
         placement: Placement::default(),
         skipped: vec![],
     }

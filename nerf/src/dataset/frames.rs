@@ -2,7 +2,6 @@
 
 use super::image::Image;
 use super::mask::Mask;
-use super::numbers::median;
 use super::photo::Photo;
 use super::placement::Placement;
 use super::scope::Scope;
@@ -11,6 +10,7 @@ use crate::camera::bounds::clip_span;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
+use crate::numbers::median;
 use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -88,6 +88,8 @@ pub struct Dataset {
     pub far: f64,
     /// How far the scene goes.
     pub scope: Scope,
+    /// What all photographs of the capture show, those of other splits too, where they [look the same way](Scope::Forward).
+    pub ndc: Option<Ndc>,
     /// From the coordinates of the files to those of the scene, in which everything here is.
     pub placement: Placement,
     /// Names of photographs that the dataset lists but whose image files are absent. They were left out; a caller
@@ -98,17 +100,14 @@ pub struct Dataset {
 impl Dataset {
     /// How many pixels of the photographs lie side by side along the longest side of the scene's box where they show its middle:
     /// the median over photographs. One that was taken from within the box counts as if its camera stood at its side. Where
-    /// all [look the same way](Scope::Forward), those are counted that lie across the [picture](Ndc) of all they see.
+    /// all [look the same way](Self::ndc), those are counted that lie across the picture of all they see, at that depth.
     pub fn footprints(&self) -> f64 {
-        let cameras = || self.frames.iter().map(|frame| &frame.camera);
-        if self.scope == Scope::Forward
-            && let Ok(ndc) = Ndc::around(cameras(), self.near)
-        {
-            return median(cameras().map(|camera| ndc.pixels(camera)));
-        }
         let [lower, upper] = self.bounds;
         let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
-        let each = cameras().map(|camera| {
+        let each = self.frames.iter().map(|Frame { camera, .. }| {
+            if let Some(ndc) = self.ndc.filter(|_| self.scope == Scope::Forward) {
+                return ndc.pixels(camera, middle);
+            }
             let distance = camera.pose.translation.distance(middle).max(0.5 * side);
             // Of a panorama, a radian is so many pixels.
             let focal = match camera.lens {

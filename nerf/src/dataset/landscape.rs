@@ -1,6 +1,7 @@
 //! The bulldozer in an unbounded landscape as a dataset: needs no files.
 
 use super::{Dataset, Frame, Placement, Scope, Split};
+use crate::camera::Ndc;
 use crate::camera::pinhole::Camera;
 use crate::dataset::image::Image;
 use crate::dataset::scene::{Landscape, walk_cameras, window_cameras};
@@ -28,7 +29,7 @@ pub fn landscape(split: Split, width: usize) -> Dataset {
     let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
     let bounds = eyes.fold(Landscape::new().bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
     let bounds = [bounds[0] - 0.02, bounds[1] + 0.02];
-    Dataset { bounds, near: NEAR, far: FAR, scope: Scope::Unbounded, ..seen_from(walk_cameras, split, width) }
+    Dataset { bounds, near: NEAR, scope: Scope::Unbounded, ..seen_from(walk_cameras, split, width) }
 }
 
 /// The same landscape as it is seen ahead from a window before the bulldozer: 30 views to train on, 3 to validate, 6 to test,
@@ -38,7 +39,9 @@ pub fn landscape(split: Split, width: usize) -> Dataset {
 /// If `width` is not a multiple of 4.
 #[track_caller]
 pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
-    seen_from(window_cameras, split, width)
+    let cameras: Vec<Camera> = Split::ALL.into_iter().flat_map(|split| window_cameras(split, 4)).collect();
+    let data = seen_from(window_cameras, split, width);
+    Dataset { ndc: Ndc::around(&cameras, data.near).ok(), ..data }
 }
 
 #[track_caller]
@@ -55,6 +58,7 @@ fn seen_from(cameras: fn(Split, usize) -> Vec<Camera>, split: Split, width: usiz
         near: 0.5,
         far: FAR,
         scope: Scope::Forward,
+        ndc: None,
         placement: Placement::default(),
         skipped: vec![],
     }
@@ -89,6 +93,28 @@ mod tests {
             }
             assert!(!data.has_alpha());
         }
+    }
+
+    #[test]
+    fn nothing_is_near_the_window() {
+        let data = landscape_ahead(Split::Test, 16);
+        assert_eq!((data.frames.len(), data.scope), (6, Scope::Forward));
+        for frame in &data.frames {
+            let distances = landscape_distances(&frame.camera);
+            assert!(distances.data.iter().all(|d| *d == 0.0 || f64::from(*d) > data.near));
+            let ndc = data.ndc.unwrap();
+            let local = ndc.axes.transpose() * (frame.camera.pose.translation - ndc.eye);
+            assert!(local.z <= 0.0 && local.x.abs() < 2.0, "seen from behind: {local}");
+        }
+        let nearest = |split| {
+            landscape_ahead(split, 16)
+                .frames
+                .into_iter()
+                .flat_map(|frame| landscape_distances(&frame.camera).data.into_iter().filter(|d| *d > 0.0))
+                .fold(f32::INFINITY, f32::min)
+        };
+        assert!(nearest(Split::Train) < 4.0 * data.near as f32);
+        assert_eq!(landscape_ahead(Split::Train, 8).ndc, data.ndc);
     }
 
     #[test]

@@ -196,6 +196,7 @@ impl Capture {
             frames: frames.into_iter().collect::<Result<_>>()?,
             bounds: survey.bounds,
             near: survey.near,
+            ndc: survey.ndc,
             far: survey.far,
             scope: survey.scope,
             placement: survey.placement,

@@ -15,7 +15,6 @@ pub(crate) mod image;
 mod landscape;
 pub(crate) mod load;
 mod mask;
-pub(crate) mod numbers;
 pub(crate) mod photo;
 pub(crate) mod placement;
 pub mod scene;

@@ -2,12 +2,12 @@
 
 use super::capture::{Capture, Format, Point, View};
 use super::frames::evenly_spaced;
-use super::numbers::median;
 use super::placement::Placement;
 use super::scope::Scope;
 use crate::camera::Ndc;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
+use crate::numbers::median;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
@@ -24,6 +24,8 @@ pub struct Survey {
     pub near: f64,
     /// Distance along a ray beyond which there is nothing.
     pub far: f64,
+    /// What all cameras see, if they [look the same way](Scope::Forward), in scene units.
+    pub ndc: Option<Ndc>,
     /// How the scope was found, in a few words.
     pub reason: String,
 }
@@ -50,7 +52,8 @@ impl Survey {
     /// nothing behind an object, which only their pixels tell; `asked` overrules what is found.
     ///
     /// # Errors
-    /// If there is no photograph, or all cameras stand in one place, so that nothing has a size.
+    /// If there is no photograph, or all cameras stand in one place, so that nothing has a size; if they do not look the same
+    /// way, and [are to](Scope::Forward).
     pub fn new(capture: &Capture, empty: Option<&str>, asked: Option<Scope>) -> Result<Survey> {
         let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
         if cameras.is_empty() {
@@ -74,6 +77,7 @@ impl Survey {
                 bounds: [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)],
                 near: CONVENTION[0],
                 far: CONVENTION[1],
+                ndc: None,
                 reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
             });
         }
@@ -118,7 +122,14 @@ impl Survey {
             }
         };
         let [near, far] = [near, far].map(|length| length * placement.scale);
-        Ok(Survey { placement, scope, bounds, near, far, reason })
+        let ndc = match scope {
+            Scope::Forward => {
+                let placed: Vec<Camera> = cameras.iter().map(|camera| placement.camera(camera)).collect();
+                Some(Ndc::around(&placed, near)?)
+            }
+            Scope::Bounded | Scope::Unbounded => None,
+        };
+        Ok(Survey { placement, scope, bounds, near, far, ndc, reason })
     }
 }
 

@@ -7,7 +7,7 @@
 
 use super::picture::{Patch, Picture};
 use super::poses::Focus;
-use crate::dataset::numbers::median;
+use crate::numbers::median;
 use glam::{DAffine3, DMat3, DVec3};
 use rayon::prelude::*;
 

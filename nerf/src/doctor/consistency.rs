@@ -7,7 +7,7 @@ use super::picture::Picture;
 use super::poses::Convention;
 use super::report::{FindingKind as Kind, Findings, Severity};
 use crate::dataset::evenly_spaced;
-use crate::dataset::numbers::median;
+use crate::numbers::median;
 use Severity::{Error, Warning};
 use glam::DAffine3;
 

@@ -3,8 +3,8 @@
 use super::poses::{Convention, Focus, extents};
 use super::report::{FindingKind as Kind, Findings, Severity};
 use crate::camera::{Camera, clip_span};
-use crate::dataset::numbers::median;
 use crate::dataset::{Capture, Format, Scope, Split, Survey, View, evenly_spaced};
+use crate::numbers::median;
 use Severity::{Error, Note, Warning};
 use glam::{DAffine3, DVec3};
 

@@ -15,8 +15,8 @@ mod single;
 
 pub use report::{Facts, Finding, FindingKind, Lie, Part, Range, Report, Resolution, Severity};
 
-use crate::dataset::numbers::median;
 use crate::dataset::{Capture, Split, Survey};
+use crate::numbers::median;
 use consistency::Compared;
 use glam::DVec3;
 use pixels::Seen;

@@ -3,9 +3,9 @@
 use super::look::Look;
 use super::report::{FindingKind as Kind, Findings, Severity};
 use crate::dataset::load::same_shape;
-use crate::dataset::numbers::{median, spread};
 use crate::dataset::{Capture, Photo, Split, View};
 use crate::error::Result;
+use crate::numbers::{median, spread};
 use Severity::{Error, Note, Warning};
 use std::collections::HashMap;
 

@@ -1,6 +1,6 @@
 //! Poses under several conventions, and what cameras look at under each.
 
-use crate::dataset::numbers::median;
+use crate::numbers::median;
 use glam::{DAffine3, DMat3, DVec3};
 
 /// A way in which the matrices of a capture may be meant.

@@ -111,7 +111,8 @@ pub struct Config {
     /// Where it is sampled.
     #[serde(deserialize_with = "super::known::read")]
     pub sampler: SamplerConfig,
-    /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), and rays are
+    /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), or what all
+    /// photographs show as [one picture](crate::Ndc) where the [extent](crate::Extent::ndc) says so, and rays are
     /// sampled as far as the sampler goes: marching, up to the outermost of the
     /// [cascades](crate::space::occupancy::OccupancyConfig::cascades) of its grid; others, over the whole span.
     #[serde(default)]
@@ -239,7 +240,7 @@ impl Config {
     }
 
     /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
-    /// boxes at steps that grow, proposals are spread in inverse distance, a hash grid is twice as fine, as it holds all of space, and a
+    /// boxes at steps that grow, proposals are spread in inverse distance, a hash grid is twice as fine, as it holds all that is seen, and a
     /// [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in docs/benchmarks.md, section
     /// Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
     /// nothing.

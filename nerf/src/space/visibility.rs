@@ -5,9 +5,6 @@ use crate::dataset::Dataset;
 use crate::space::occupancy::OccupancyGrid;
 use glam::DVec3;
 
-/// Pixels along each border of an image whose rays are asked how far the image reaches.
-const BORDER: usize = 16;
-
 /// The cone around all that a camera sees.
 struct Cone {
     eye: DVec3,
@@ -20,10 +17,8 @@ impl Cone {
     fn new(camera: &Camera) -> Self {
         let [width, height] = [camera.width as f64, camera.height as f64];
         let axis = camera.ray(0.5 * width, 0.5 * height).direction;
-        let shares = (0..=BORDER).map(|i| i as f64 / BORDER as f64);
-        let border = shares.flat_map(|share| [[share, 0.0], [share, 1.0], [0.0, share], [1.0, share]]);
-        let angle = |[x, y]: [f64; 2]| camera.ray(x * width, y * height).direction.angle_between(axis);
-        Cone { eye: camera.pose.translation, axis, half_angle: border.map(angle).fold(0.0, f64::max) }
+        let half_angle = camera.border().map(|direction| direction.angle_between(axis)).fold(0.0, f64::max);
+        Cone { eye: camera.pose.translation, axis, half_angle }
     }
 
     /// Whether some of a ball may be seen farther away than `near`.

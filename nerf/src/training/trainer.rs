@@ -4,7 +4,7 @@ use super::groups::Groups;
 use super::pass::{Work, rays_loss};
 use super::startup;
 use super::stats::{Budget, StepStats};
-use crate::camera::{Camera, Ndc};
+use crate::camera::Camera;
 use crate::dataset::batch::Batch;
 use crate::dataset::{Dataset, Scope};
 use crate::model::config::Config;
@@ -47,8 +47,8 @@ impl Trainer {
     /// A new model for a dataset.
     ///
     /// # Errors
-    /// If the configuration is out of range, the dataset has no frame, or no ray of it
-    /// [meets the scene's box](Dataset::check_reach).
+    /// If the configuration is out of range or not for a scene that [goes so far](Dataset::scope), the dataset has no frame, or no
+    /// ray of it [meets the scene's box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
         let start = Instant::now();
         Trainer::with_clock(config, data, move || start.elapsed())
@@ -68,12 +68,13 @@ impl Trainer {
                         the scope of the dataset";
             return Err(Error::setting("unbounded", what));
         }
-        let cameras = data.frames.iter().map(|frame| &frame.camera);
-        let extent = Extent {
-            placement: data.placement,
-            ndc: if data.scope == Scope::Forward { Some(Ndc::around(cameras, data.near)?) } else { None },
-            ..Extent::new(data.bounds, [data.near, data.far])
-        };
+        let ndc = data.ndc.filter(|_| data.scope == Scope::Forward);
+        if data.scope == Scope::Forward && ndc.is_none() {
+            let what =
+                "forward needs what all photographs show, `Dataset::ndc`, which `Ndc::around` finds; use unbounded";
+            return Err(Error::setting("scope", what));
+        }
+        let extent = Extent { placement: data.placement, ndc, ..Extent::new(data.bounds, [data.near, data.far]) };
         Trainer::within(config, data, extent, clock)
     }
 
@@ -254,7 +255,7 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Split, embedded};
+    use crate::dataset::{Split, embedded, evenly_spaced, landscape_ahead};
     use crate::encoding::hash_grid::HashGridConfig;
     use crate::field::{ClassicConfig, InstantConfig};
     use crate::model::Refined;
@@ -262,6 +263,7 @@ mod tests {
     use crate::sampling::hierarchical::HierarchicalConfig;
     use crate::training::stats::STUCK;
     use crate::{FieldConfig, Preset};
+    use glam::DVec3;
     use raygrad_nn::Schedule;
 
     #[test]
@@ -281,6 +283,47 @@ mod tests {
         data.frames.drain(..2);
         data.frames[0].camera.pose.matrix3 = -data.frames[0].camera.pose.matrix3;
         assert!(data.check_reach(data.bounds).is_err());
+    }
+
+    #[test]
+    fn fields_live_in_the_picture_of_all_that_photographs_show() {
+        let mut data = landscape_ahead(Split::Train, 8);
+        data.frames = evenly_spaced(data.frames, 4);
+        let ndc = data.ndc.unwrap();
+        assert!(data.frames.iter().all(|frame| ndc.pixels(&frame.camera, DVec3::ZERO) < 20.0));
+        assert!((data.footprints() - ndc.pixels(&data.frames[2].camera, DVec3::ZERO)).abs() < 2.0);
+        let config = tiny_table().with_scope(data.scope);
+        let trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
+        assert_eq!(trainer.model.extent.ndc, Some(ndc));
+        // Before its near plane all places of a line from the eye are one, and beside it not.
+        let places = [0.5, 0.9, 1.5].map(|depth| ndc.eye - depth * ndc.near * ndc.axes.z_axis);
+        let places = places.map(|place| place.as_vec3().to_array());
+        let densities = |trainer: &Trainer| {
+            let mut densities = [0.0; 3];
+            trainer.model.densities(&places, &mut densities);
+            densities
+        };
+        let [a, b, c] = densities(&trainer);
+        assert!((a - b).abs() < 1e-7 && (a - c).abs() > 1e-6, "{a} {b} {c}");
+        let unbounded = Dataset { scope: Scope::Unbounded, ..data.clone() };
+        assert!(unbounded.footprints() != data.footprints());
+        let other = Trainer::new(config.clone(), Arc::new(unbounded)).unwrap();
+        assert_eq!(other.model.extent.ndc, None);
+        let [a, b, _] = densities(&other);
+        assert!((a - b).abs() > 1e-6, "{a} {b}");
+        let refused = |config: &Config, data: &Dataset| {
+            Trainer::new(config.clone(), Arc::new(data.clone())).err().unwrap().to_string()
+        };
+        assert!(refused(&tiny_table(), &data).contains("`unbounded`"));
+        assert!(refused(&config, &Dataset { ndc: None, ..data.clone() }).contains("Ndc::around"));
+        // The rest of its state goes with it.
+        let mut trainer = trainer;
+        trainer.step(0.0);
+        let state = trainer.state().unwrap();
+        let mut later = Trainer::new(config, Arc::new(data)).unwrap();
+        later.load_state(&state).unwrap();
+        assert_eq!(later.step(0.5).loss, trainer.step(0.5).loss);
+        assert_eq!(trainer.model.cast::<f64>().unwrap().extent.ndc, Some(ndc));
     }
 
     #[test]

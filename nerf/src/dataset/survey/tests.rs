@@ -100,10 +100,12 @@ fn what_cameras_that_look_the_same_way_show_lies_ahead() {
         "photographs are opaque, so they show what lies behind, and all look ahead; cameras look the same way"
     );
     assert_eq!(survey.scope, Scope::Forward);
+    let placed: Vec<Camera> = wall.views.iter().map(|view| survey.placement.camera(&view.camera)).collect();
+    assert_eq!(survey.ndc, Some(Ndc::around(&placed, survey.near).unwrap()));
     let asked = Survey::new(&wall, None, Some(Scope::Unbounded)).unwrap();
     assert_eq!(
         asked,
-        Survey { scope: Scope::Unbounded, reason: "as asked; cameras look the same way".into(), ..survey }
+        Survey { scope: Scope::Unbounded, ndc: None, reason: "as asked; cameras look the same way".into(), ..survey }
     );
     assert_eq!(Survey::new(&wall, Some("it is"), None).unwrap().scope, Scope::Bounded);
     let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
@@ -141,7 +143,10 @@ fn a_walk_ahead_is_no_view_from_a_window() {
         camera(eye, eye + DVec3::Y, DVec3::Z)
     });
     let survey = Survey::new(&capture(Format::Colmap, walk.collect()), None, None).unwrap();
-    assert_eq!(survey.scope, Scope::Unbounded);
+    assert_eq!((survey.scope, survey.ndc), (Scope::Unbounded, None));
+    let asked =
+        Survey::new(&capture(Format::Colmap, quarter(4.0)), None, Some(Scope::Forward)).unwrap_err().to_string();
+    assert!(asked.contains("`scope`") && asked.contains("forward"), "{asked}");
     assert!(survey.reason.starts_with("photographs are opaque, so they show what lies behind; "), "{}", survey.reason);
 }
 
