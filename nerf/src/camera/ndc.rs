@@ -126,11 +126,11 @@ mod tests {
 
     #[test]
     fn all_that_cameras_see_lies_in_the_picture_and_little_else() {
-        let cameras = [camera([-1.0, 0.1, 0.0], 5.0), camera([1.0, -0.2, 0.3], 12.0), camera([0.3, 0.0, -0.4], -2.0)];
+        let cameras = [camera([-1.0, 0.1, 0.0], 5.0), camera([1.0, -0.2, 0.3], 12.0), camera([0.3, 0.0, -0.4], 1.0)];
         let ndc = Ndc::around(&cameras, 0.5).unwrap();
         ndc.check().unwrap();
         assert!(ndc.axes.determinant() > 0.0 && ndc.axes.y_axis.z > 0.999, "{ndc:?}");
-        let (sin, cos) = 5.0_f64.to_radians().sin_cos();
+        let (sin, cos) = 6.0_f64.to_radians().sin_cos();
         assert!(ndc.axes.z_axis.distance(DVec3::new(sin, -cos, 0.0)) < 1e-3, "the mean of where they look: {ndc:?}");
         let (mut widest, mut nearest) = (DVec2::ZERO, f64::INFINITY);
         for camera in &cameras {
@@ -145,8 +145,8 @@ mod tests {
         }
         assert!(widest.max_element() <= 1.0 && widest.min_element() > 0.8, "{widest}");
         assert!(nearest >= ndc.near && nearest < ndc.near + 0.1, "{nearest} {}", ndc.near);
-        // A margin wider than the border of the one that is turned most, by 7 degrees from the others; to the left, where x is below 0.
-        let expected = 1.1 * (0.5_f64.atan() + 7.0_f64.to_radians()).tan();
+        // A margin wider than the border of the one that is turned most, by 6 degrees from the mean to the left, where x is below 0.
+        let expected = 1.1 * (0.5_f64.atan() + 6.0_f64.to_radians()).tan();
         assert!((ndc.slopes[0] - expected).abs() < 0.01, "{} {expected}", ndc.slopes[0]);
         let mirrored =
             cameras.map(|c| Camera { pose: glam::DAffine3::from_scale(DVec3::new(-1.0, 1.0, 1.0)) * c.pose, ..c });
