@@ -21,6 +21,10 @@ mod export;
 #[path = "cli/prepare.rs"]
 mod prepare;
 
+#[cfg(unix)]
+#[path = "cli/resume.rs"]
+mod resume;
+
 /// Width and height of the test images.
 const SIZE: usize = 24;
 

@@ -7,6 +7,7 @@ mod animation;
 mod bench;
 mod builtin;
 mod cameras;
+mod checkpoint;
 mod doctor;
 mod eval;
 mod export;

@@ -1,5 +1,6 @@
-//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, and later `eval.json` and pictures.
+//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `lock`, and later `eval.json` and pictures.
 
+use std::fs::{DirEntry, File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
@@ -7,7 +8,7 @@ use raygrad::nerf::{Budget, Config, Error, Extent, Model, Result, write_atomic};
 use serde::{Deserialize, Serialize};
 
 use super::cameras::Viewpoint;
-use super::output::make_folder;
+use super::output::{make_folder, remove};
 use super::scene::Scene;
 
 /// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
@@ -50,9 +51,15 @@ impl Run {
     /// Makes the folder of a new run, which [`choose_folder`] has found to be free.
     pub fn create(folder: PathBuf, config: RunConfig) -> Result<Run> {
         make_folder(&folder)?;
-        make_folder(&folder.join("previews"))?;
-        write_json(&folder.join("config.json"), &config)?;
-        Ok(Run { folder, config })
+        let run = Run { folder, config };
+        run.write()?;
+        make_folder(&run.file("previews"))?;
+        Ok(run)
+    }
+
+    /// Writes its `config.json`.
+    pub fn write(&self) -> Result<()> {
+        write_json(&self.file("config.json"), &self.config)
     }
 
     /// The run in a folder.
@@ -72,6 +79,26 @@ impl Run {
             serde_json::from_str(&text).map_err(|e| Error::file(&file, format!("is not a run's: {e}")))?;
         config.check().map_err(|e| Error::file(&file, e))?;
         Ok(Run { folder: folder.into(), config })
+    }
+
+    /// Keeps other programs from training this run, until the file is dropped or this program ends, however it does.
+    pub fn lock(&self) -> Result<File> {
+        let path = self.file("lock");
+        let bad = |e: std::io::Error| Error::file(&path, format!("cannot be locked: {e}"));
+        let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(bad)?;
+        match file.try_lock() {
+            Ok(()) => Ok(file),
+            Err(TryLockError::WouldBlock) => Err(Error::file(&self.folder, "is being trained by another raygrad")),
+            Err(TryLockError::Error(e)) => Err(bad(e)),
+        }
+    }
+
+    /// Removes what a program that was killed was about to write.
+    pub fn sweep(&self) {
+        let folders = [self.folder.clone(), self.file("checkpoints"), self.file("previews")];
+        let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
+        let unfinished = |entry: &DirEntry| entry.file_name().to_string_lossy().starts_with(".tmp");
+        remove(&entries.filter(unfinished).map(|entry| entry.path()).collect::<Vec<_>>());
     }
 
     /// The path of one of the run's files.

@@ -1,7 +1,8 @@
 //! `raygrad train`: photographs to a model.
 
+use std::fs::File;
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,11 +25,30 @@ use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::watch::Watch;
-use super::{doctor, interrupt, parse};
+use super::{checkpoint, doctor, interrupt, parse};
+
+/// What is said of a new run alone.
+const NEW: [&str; 15] = [
+    "scene",
+    "preset",
+    "skip",
+    "carve",
+    "seed",
+    "downscale",
+    "scope",
+    "background",
+    "refine",
+    "depth",
+    "near",
+    "term",
+    "out",
+    "no_encoding",
+    "set",
+];
 
 /// Train a model on a scene
 ///
-/// Ctrl-C finishes the step, saves the model and exits with code 130; a second Ctrl-C exits at once.
+/// Ctrl-C finishes the step, saves the model and exits with code 130; a second Ctrl-C exits at once. `--resume RUN` goes on.
 #[derive(Parser)]
 pub struct Args {
     /// Folder of a capture (transforms.json, Blender, COLMAP or LLFF), or a scene that is built in: embedded or landscape
@@ -80,6 +100,13 @@ pub struct Args {
     /// in one place); 0 takes it away
     #[arg(long, value_name = "NAME=WEIGHT", value_parser = parse::weight)]
     term: Vec<(String, f64)>,
+    /// Go on with a run that was ended, from its last checkpoint: within the steps or the time that it was given, or those that
+    /// are said beside it (--steps, --budget), which count from its beginning
+    #[arg(long, value_name = "RUN", conflicts_with_all = NEW)]
+    resume: Option<PathBuf>,
+    /// Training time between checkpoints, which --resume goes on from
+    #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
+    checkpoint: Duration,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -119,8 +146,16 @@ impl Trained {
     }
 }
 
-/// Trains and leaves the model in a new folder.
+/// Trains and leaves the model in a new folder, or goes on with a run.
 pub fn run(args: &Args) -> Result<Trained> {
+    match &args.resume {
+        None => begin(args),
+        Some(folder) => resume(args, folder),
+    }
+}
+
+/// Trains a new run.
+fn begin(args: &Args) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let mut scene = args.scene.open(args.scope)?;
     scene.depth = args.depth.is_some() || args.term.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0);
@@ -132,20 +167,65 @@ pub fn run(args: &Args) -> Result<Trained> {
     let data = Arc::new(data);
     let config = args.config(&data)?;
     let background = config.background.shown();
-    let mut trainer = Trainer::new(config, data.clone())?;
+    let trainer = Trainer::new(config, data.clone())?;
     let run = Run::create(folder, args.run_config(&trainer, &data)?)?;
     describe(&run, &trainer, &data, &scene)?;
     // Once nothing else can be wrong: an error is then the one line that is said.
     doctor::warn(&scene);
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
-    let budget = args.budget();
-    let mut watch = Watch::new(&run, &trainer, budget, preview)?;
+    let lock = run.lock()?;
+    train((run, lock), trainer, args.budget(), args.checkpoint, preview)
+}
+
+/// Goes on with a run from its last checkpoint.
+fn resume(args: &Args, folder: &Path) -> Result<Trained> {
+    let mut run = Run::open(folder)?;
+    let RunConfig { extent, downscale, config, .. } = run.config.clone();
+    let budget = match (args.given(), run.config.budget) {
+        (Some(budget), _) | (None, Some(budget)) => budget,
+        (None, None) => return Err(Error::setting("budget", "the run does not know its own: say --budget or --steps")),
+    };
+    let mut scene = run.scene(None)?.open_for(&extent)?;
+    scene.depth = config.terms.iter().any(|term| term.kind() == "depth");
+    let data = scene.load(Split::Train, downscale, usize::MAX)?;
+    let [near, far] = extent.span;
+    let data = Dataset { bounds: extent.bounds, near, far, placement: extent.placement, ndc: extent.ndc, ..data };
+    let names = data.frames.iter().map(|frame| &frame.name);
+    if !names.eq(&run.config.photographs) {
+        let what = format!("the run was trained on other photographs than {} has now", run.config.scene);
+        return Err(Error::file(folder, what));
+    }
+    let (data, background) = (Arc::new(data), config.background.shown());
+    let mut trainer = Trainer::with_extent(config, data.clone(), extent)?;
+    let lock = run.lock()?;
+    run.sweep();
+    checkpoint::load(&run, &mut trainer)?;
+    if run.config.budget != Some(budget) {
+        run.config.budget = Some(budget);
+        run.write()?;
+    }
+    describe(&run, &trainer, &data, &scene)?;
+    print(&format!("from     step {}\n", trainer.stats().step))?;
+    let preview = Preview::choose(&scene, downscale, &data, background);
+    train((run, lock), trainer, budget, args.checkpoint, preview)
+}
+
+/// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
+fn train(
+    (run, _lock): (Run, File),
+    mut trainer: Trainer,
+    budget: Budget,
+    interval: Duration,
+    preview: Preview,
+) -> Result<Trained> {
+    let mut watch = Watch::new(&run, &trainer, budget, interval, preview)?;
     interrupt::listen();
     let mut watched = Ok(());
     trainer.run(budget, |trainer| {
-        watched = watch.step(trainer);
-        if watched.is_err() || interrupt::requested() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        let stops = interrupt::requested();
+        watched = watch.step(trainer, stops);
+        if watched.is_err() || stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     let interrupted = interrupt::requested();
     // The model comes first: what went wrong beside it is reported once it is safe.
@@ -221,11 +301,12 @@ impl Args {
     }
 
     fn budget(&self) -> Budget {
-        match (self.steps, self.budget) {
-            (Some(steps), _) => Budget::Steps(steps),
-            (None, Some(time)) => Budget::Time(time),
-            (None, None) => Budget::Time(default_budget(self.preset)),
-        }
+        self.given().unwrap_or_else(|| Budget::Time(default_budget(self.preset)))
+    }
+
+    /// The budget that was asked for.
+    fn given(&self) -> Option<Budget> {
+        self.steps.map(Budget::Steps).or(self.budget.map(Budget::Time))
     }
 }
 
@@ -328,5 +409,6 @@ fn summarise(run: &Run, stats: &StepStats, interrupted: bool) -> Result<()> {
         spoken(stats.train_seconds),
         stats.rays as f64 / stats.train_seconds,
         run.model_file().display()
-    ))
+    ))?;
+    if interrupted { print(&format!("to go on raygrad train --resume {}\n", run.folder.display())) } else { Ok(()) }
 }

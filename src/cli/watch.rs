@@ -1,20 +1,22 @@
 //! What happens beside training: progress, metrics, previews, and saving the model.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
+use std::path::Path;
+use std::time::Duration;
 
-use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer};
+use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer, write_atomic};
 
+use super::checkpoint;
 use super::preview::Preview;
 use super::progress::{Progress, spoken};
 use super::run::Run;
+use serde_json::Value;
 
 /// Steps between lines of `metrics.jsonl`.
 const METRICS_STEPS: u64 = 10;
 /// Training time of the first preview in seconds; each further one comes at twice the time of the one before.
 const FIRST_PREVIEW: f64 = 5.0;
-/// Training time between saves in seconds.
-const SAVE_INTERVAL: f64 = 60.0;
 /// Weight of the latest step in the PSNR that is shown: that of single steps jumps.
 const SMOOTHING: f64 = 0.05;
 
@@ -27,32 +29,43 @@ pub struct Watch<'a> {
     /// The last step in the metrics.
     logged: u64,
     next_preview: f64,
+    /// Training time between saves in seconds.
+    interval: f64,
     next_save: f64,
     psnr: Option<f64>,
     progress: Progress,
 }
 
 impl<'a> Watch<'a> {
-    /// Begins to watch; the untrained model is saved, so that the folder is a whole run from the start.
-    pub fn new(run: &'a Run, trainer: &Trainer, budget: Budget, preview: Preview) -> Result<Self> {
-        trainer.model.save(run.model_file())?;
+    /// Begins to watch; the untrained model is saved, so that the folder is a whole run from the start. What metrics say of steps
+    /// that are to come is cut off.
+    pub fn new(run: &'a Run, trainer: &Trainer, budget: Budget, interval: Duration, preview: Preview) -> Result<Self> {
+        if !run.model_file().exists() {
+            trainer.model.save(run.model_file())?;
+        }
+        let StepStats { step, train_seconds, .. } = trainer.stats();
         let path = run.file("metrics.jsonl");
-        let metrics = File::create(&path).map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?;
+        write_atomic(&path, kept_metrics(&path, step)?.as_bytes())?;
+        let metrics = File::options().append(true).open(&path);
+        let metrics = metrics.map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?;
+        let previews = std::iter::successors(Some(FIRST_PREVIEW), |time| Some(2.0 * time));
+        let interval = interval.as_secs_f64();
         Ok(Watch {
             run,
             budget,
             preview,
             metrics,
-            logged: 0,
-            next_preview: FIRST_PREVIEW,
-            next_save: SAVE_INTERVAL,
+            logged: step,
+            next_preview: previews.into_iter().find(|time| *time > train_seconds).unwrap_or(f64::INFINITY),
+            interval,
+            next_save: train_seconds + interval,
             psnr: None,
             progress: Progress::new(),
         })
     }
 
-    /// Called after each step.
-    pub fn step(&mut self, trainer: &Trainer) -> Result<()> {
+    /// Called after each step; `stops` says that it is the last one, whatever the budget.
+    pub fn step(&mut self, trainer: &Trainer, stops: bool) -> Result<()> {
         let stats = trainer.stats();
         let psnr = self.psnr.map_or(stats.psnr, |psnr| psnr + SMOOTHING * (stats.psnr - psnr));
         self.psnr = Some(psnr);
@@ -69,9 +82,15 @@ impl<'a> Watch<'a> {
             self.next_preview = 2.0 * stats.train_seconds.max(self.next_preview);
             self.preview(trainer)?;
         }
-        if stats.train_seconds >= self.next_save {
-            self.next_save = stats.train_seconds + SAVE_INTERVAL;
-            trainer.model.save(self.run.model_file())?;
+        // Views look at a finished model, and training goes on from one that is not.
+        let ends = stops || fraction >= 1.0;
+        if (ends || stats.train_seconds >= self.next_save) && !stats.has_diverged() {
+            self.next_save = stats.train_seconds + self.interval;
+            let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
+            // A full disk may have room again in a minute.
+            if let Err(error) = model.and_then(|()| checkpoint::save(self.run, trainer)) {
+                self.progress.note(&format!("raygrad: warning: {error}; training goes on"));
+            }
         }
         Ok(())
     }
@@ -116,4 +135,18 @@ impl<'a> Watch<'a> {
             }
         }
     }
+}
+
+/// What metrics in a file say of steps up to this one; nothing if there is no file. A line that is not whole is left out.
+fn kept_metrics(path: &Path, step: u64) -> Result<String> {
+    let text = match std::fs::read(path) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(String::new()),
+        text => text.map_err(|e| Error::file(path, format!("cannot be read: {e}")))?,
+    };
+    let text = String::from_utf8_lossy(&text);
+    let known = |line: &&str| {
+        let value: Option<Value> = serde_json::from_str(line).ok();
+        value.is_some_and(|value| value["step"].as_u64().is_some_and(|own| own <= step))
+    };
+    Ok(text.lines().filter(known).flat_map(|line| [line, "\n"]).collect())
 }

@@ -78,7 +78,17 @@ impl Trainer {
         Trainer::within(config, data, extent, clock)
     }
 
-    /// The same, for a scene that lies so.
+    /// As [`new`](Self::new), for a scene that lies as `extent` says, whatever the dataset says: to
+    /// [go on](Self::load_state) with a run of which no more is known than its model.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn with_extent(config: Config, data: Arc<Dataset>, extent: Extent) -> Result<Self> {
+        let start = Instant::now();
+        Trainer::within(config, data, extent, move || start.elapsed())
+    }
+
+    /// The same, with a clock.
     pub(super) fn within(
         config: Config,
         data: Arc<Dataset>,

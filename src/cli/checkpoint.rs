@@ -1,0 +1,138 @@
+//! What a run goes on from: `checkpoints/STEP.checkpoint`, the last two of them.
+//!
+//! A line of text, `raygrad checkpoint VERSION CRC32 LENGTH`, and a [state](Trainer::state) of that length.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Error, Result, Trainer, write_atomic};
+
+use super::output::{complain, make_folder};
+use super::run::Run;
+
+/// How files are laid out; newer ones are refused.
+const VERSION: u32 = 1;
+/// The first words of a file.
+const MAGIC: &str = "raygrad checkpoint";
+/// Longest first line that is looked for, in bytes.
+const LONGEST: usize = 80;
+/// Checkpoints that are kept: if the last one is damaged, there is the one before.
+const KEPT: usize = 2;
+
+fn folder(run: &Run) -> PathBuf {
+    run.file("checkpoints")
+}
+
+/// Writes where training is, and removes what is older than the one before.
+pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
+    let folder = folder(run);
+    make_folder(&folder)?;
+    let state = trainer.state()?;
+    let mut bytes = format!("{MAGIC} {VERSION} {:08x} {}\n", crc32fast::hash(&state), state.len()).into_bytes();
+    bytes.extend(state);
+    write_atomic(folder.join(format!("{:08}.checkpoint", trainer.stats().step)), &bytes)?;
+    for old in all(&folder)?.into_iter().skip(KEPT) {
+        fs::remove_file(&old).map_err(|e| Error::file(&old, format!("cannot be removed: {e}")))?;
+    }
+    Ok(())
+}
+
+/// The checkpoints in a folder, the latest first.
+fn all(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = match fs::read_dir(folder) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
+        entries => entries.map_err(|e| Error::file(folder, format!("cannot be read: {e}")))?,
+    };
+    let step = |path: &PathBuf| {
+        let name = path.file_name()?.to_str()?;
+        name.strip_suffix(".checkpoint")?.parse::<u64>().ok()
+    };
+    let paths = entries.flatten().map(|entry| entry.path());
+    let mut found: Vec<(u64, PathBuf)> = paths.filter_map(|path| Some((step(&path)?, path))).collect();
+    found.sort_by(|a, b| b.cmp(a));
+    Ok(found.into_iter().map(|(_, path)| path).collect())
+}
+
+/// Takes a trainer to the latest checkpoint that is whole; one that is not is said to be so. Without checkpoints the trainer
+/// stays at its beginning. If none is whole, that is an error.
+pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
+    let mut last = None;
+    for path in all(&folder(run))? {
+        let loaded = read(&path).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
+        let Err(error) = loaded else { return Ok(()) };
+        complain(&format!("warning: {error}"));
+        last = Some(error);
+    }
+    last.map_or(Ok(()), |_| Err(Error::file(folder(run), "no checkpoint is whole: the run cannot go on, train anew")))
+}
+
+/// The state in a file.
+fn read(path: &Path) -> Result<Vec<u8>> {
+    let bad = |what: String| Error::file(path, what);
+    let mut bytes = fs::read(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
+    let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n');
+    let line = end.and_then(|end| std::str::from_utf8(&bytes[..end]).ok()?.strip_prefix(MAGIC));
+    let (Some(end), Some(line)) = (end, line) else {
+        return Err(bad("is no checkpoint, or its beginning is damaged".into()));
+    };
+    let mut words = line.split_whitespace();
+    let version: Option<u32> = words.next().and_then(|word| word.parse().ok());
+    if let Some(version) = version.filter(|version| *version > VERSION) {
+        let what =
+            format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer");
+        return Err(bad(what));
+    }
+    let sum = words.next().and_then(|word| u32::from_str_radix(word, 16).ok());
+    let length: Option<usize> = words.next().and_then(|word| word.parse().ok());
+    let (Some(_), Some(sum), Some(length)) = (version, sum, length) else {
+        return Err(bad("is no checkpoint, or its beginning is damaged".into()));
+    };
+    let state = bytes.split_off(end + 1);
+    if state.len() != length {
+        return Err(bad(format!("is damaged: it has {} bytes of {length}", state.len())));
+    }
+    if crc32fast::hash(&state) != sum {
+        return Err(bad("is damaged: its checksum is another".into()));
+    }
+    Ok(state)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_cut_off_anywhere_or_changed_anywhere_is_no_checkpoint() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("00000007.checkpoint");
+        let state: Vec<u8> = (0..200_u8).collect();
+        let whole = [format!("{MAGIC} 1 {:08x} 200\n", crc32fast::hash(&state)).as_bytes(), &state].concat();
+        let read = |bytes: &[u8]| {
+            fs::write(&path, bytes).unwrap();
+            read(&path)
+        };
+        assert_eq!(read(&whole).unwrap(), state);
+        for length in 0..whole.len() {
+            let error = read(&whole[..length]).unwrap_err().to_string();
+            assert!(error.contains("00000007.checkpoint") && error.contains("damaged"), "{error}");
+        }
+        let mut changed = whole.clone();
+        for bit in 0..8 * whole.len() {
+            changed[bit / 8] ^= 1 << (bit % 8);
+            // Only how the checksum is written may differ: in capitals.
+            assert!(read(&changed).is_err() || read(&changed).unwrap() == state, "bit {bit}");
+            changed[bit / 8] ^= 1 << (bit % 8);
+        }
+        let newer = [b"raygrad checkpoint 2 00000000 200\n".as_slice(), &state].concat();
+        assert!(read(&newer).unwrap_err().to_string().contains("version 2"));
+        // The latest comes first, by number and not by name; others are none.
+        for name in ["00000100.checkpoint", "20.checkpoint", "x.checkpoint", "00000200.tmp"] {
+            fs::write(folder.path().join(name), b"").unwrap();
+        }
+        let names = |path: PathBuf| path.file_name().unwrap().to_str().unwrap().to_owned();
+        let found: Vec<String> = all(folder.path()).unwrap().into_iter().map(names).collect();
+        assert_eq!(found, ["00000100.checkpoint", "20.checkpoint", "00000007.checkpoint"]);
+        assert!(all(&folder.path().join("absent")).unwrap().is_empty());
+    }
+}

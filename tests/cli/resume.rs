@@ -1,0 +1,167 @@
+//! Runs that end before their time, and go on.
+
+use super::Place;
+use serde_json::Value;
+use std::fs::File;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Settings of a model whose steps are short.
+const SMALL: &str = "--set field.grid.log2_table=10 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
+
+/// What each line of a run's metrics says but for times, which differ.
+fn metrics(place: &Place, run: &str) -> Vec<Value> {
+    let text = String::from_utf8(place.bytes(&format!("{run}/metrics.jsonl"))).unwrap();
+    let line = |line: &str| {
+        let mut value: Value = serde_json::from_str(line).unwrap();
+        value.as_object_mut().unwrap().remove("train_seconds");
+        value
+    };
+    text.lines().map(line).collect()
+}
+
+/// The steps of a run's checkpoints, the earliest first.
+fn checkpoints(place: &Place, run: &str) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(place.path(&format!("{run}/checkpoints"))).unwrap();
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    found.sort();
+    found
+}
+
+fn assert_same(place: &Place, a: &str, b: &str) {
+    let model = |run: &str| place.bytes(&format!("{run}/model.safetensors"));
+    assert!(model(a) == model(b), "the models of {a} and {b} differ");
+    assert_eq!(metrics(place, a), metrics(place, b));
+}
+
+/// `KILLS=50 cargo test --release --test cli killed` is the campaign.
+#[test]
+fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
+    let kills: u32 = std::env::var("KILLS").map_or(4, |kills| kills.parse().unwrap());
+    let place = Place::with_scene();
+    let steps = 30 * kills.max(4);
+    let start = Instant::now();
+    place.succeeds(&format!("train scene --steps {steps} --out whole {SMALL}"));
+    let whole = start.elapsed();
+    let (mut killed, mut at) = (0, vec![]);
+    let mut arguments = format!("train scene --steps {steps} --out run --checkpoint 0.02s {SMALL}");
+    loop {
+        let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        // Somewhere in the time that is left of it, by the golden ratio; at last it is let be.
+        let share = (f64::from(killed) * 0.618).fract();
+        let until = Instant::now() + whole.mul_f64(0.1 + 0.9 * share) / kills.max(4) * 2;
+        while child.try_wait().unwrap().is_none() && (killed >= kills || Instant::now() < until) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if let Some(status) = child.try_wait().unwrap() {
+            assert!(status.success());
+            break;
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        killed += 1;
+        if place.path("run/config.json").exists() {
+            arguments = "train --resume run --checkpoint 0.02s".to_owned();
+            let found = if place.path("run/checkpoints").exists() { checkpoints(&place, "run") } else { vec![] };
+            at.push(found.into_iter().rfind(|path| path.extension().is_some_and(|e| e == "checkpoint")));
+        }
+    }
+    println!("{killed} kills, after {at:?}");
+    assert_same(&place, "whole", "run");
+    assert_eq!(checkpoints(&place, "run").len(), 2, "what was about to be written is swept away");
+}
+
+#[test]
+fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 60 --out whole {SMALL}"));
+    let arguments = format!("train scene --steps 60 --out run {SMALL}");
+    let child = place.command(&arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    while !place.path("run/metrics.jsonl").exists() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    std::thread::sleep(Duration::from_millis(50));
+    Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    if output.status.code() == Some(130) {
+        assert!(said.contains("to go on raygrad train --resume run\n"), "{said}");
+        assert_eq!(checkpoints(&place, "run").len(), 1, "a minute has not passed");
+        let said = place.succeeds("train --resume run");
+        assert!(said.contains("from     step ") && !said.contains("from     step 0\n"), "{said}");
+    }
+    assert_same(&place, "whole", "run");
+    // That it is at its end is no error.
+    place.succeeds("train --resume run");
+    assert_same(&place, "whole", "run");
+    let said = place.succeeds("train --resume run --steps 80");
+    assert!(said.contains("from     step 60\n") && said.contains("trained  80 steps"), "{said}");
+    assert_eq!(metrics(&place, "run").last().unwrap()["step"], 80);
+    assert_eq!(metrics(&place, "run")[..7], metrics(&place, "whole")[..]);
+    assert_eq!(place.json("run/config.json")["budget"]["steps"], 80);
+}
+
+#[test]
+fn what_is_damaged_leaves_the_checkpoint_before_it() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 30 --out whole {SMALL}"));
+    place.succeeds(&format!("train scene --steps 30 --out run --checkpoint 0.001s {SMALL}"));
+    let [before, last] = checkpoints(&place, "run").try_into().unwrap();
+    let bytes = std::fs::read(&last).unwrap();
+    std::fs::write(&last, &bytes[..bytes.len() - 1]).unwrap();
+    std::fs::write(place.path("run/checkpoints/.tmp123"), b"half").unwrap();
+    let output = place.command("train --resume run").output().unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        output.status.success() && message.contains("warning: ") && message.contains("is damaged: it has"),
+        "{message}"
+    );
+    assert!(String::from_utf8(output.stdout).unwrap().contains("from     step 29\n"));
+    assert_same(&place, "whole", "run");
+    assert!(!place.path("run/checkpoints/.tmp123").exists());
+    // What is not whole in the metrics is written again.
+    let mut text = place.bytes("run/metrics.jsonl");
+    text.truncate(text.len() - 5);
+    std::fs::write(place.path("run/metrics.jsonl"), text).unwrap();
+    for path in [&before, &last] {
+        let mut bytes = std::fs::read(path).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 4;
+        std::fs::write(path, bytes).unwrap();
+    }
+    let model = place.bytes("run/model.safetensors");
+    let output = place.command("train --resume run").output().unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.code() == Some(1) && message.contains("checkpoints: no checkpoint is whole"), "{message}");
+    assert_eq!(message.matches("its checksum is another").count(), 2, "{message}");
+    assert!(place.bytes("run/model.safetensors") == model, "nothing is lost");
+    // Without any it begins again.
+    std::fs::remove_dir_all(place.path("run/checkpoints")).unwrap();
+    assert!(place.succeeds("train --resume run").contains("from     step 0\n"));
+    assert_same(&place, "whole", "run");
+}
+
+#[test]
+fn a_run_goes_on_alone_and_with_its_own_photographs() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 2 --out run --near 2.5 {SMALL}"));
+    let lock = File::options().write(true).open(place.path("run/lock")).unwrap();
+    lock.lock().unwrap();
+    place.fails("train --resume run", &["run: is being trained by another raygrad"]);
+    drop(lock);
+    place.succeeds("train --resume run --steps 4");
+    assert_eq!(place.json("run/config.json")["extent"]["span"][0], 2.5);
+    place.fails("train --resume absent", &["absent: there is no such folder"]);
+    for flag in ["scene --resume run", "--resume run --seed 3", "--resume run --set seed=3", "--resume run --out other"]
+    {
+        assert_eq!(place.command(&format!("train {flag}")).output().unwrap().status.code(), Some(2), "{flag}");
+    }
+    let mut config = place.json("run/config.json");
+    config["budget"] = Value::Null;
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.fails("train --resume run", &["`budget`", "--steps"]);
+    config["photographs"][0] = "other".into();
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.fails("train --resume run --steps 5", &["run: ", "other photographs"]);
+}
