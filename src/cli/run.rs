@@ -97,8 +97,7 @@ impl Run {
     pub fn sweep(&self) {
         let folders = [self.folder.clone(), self.file("checkpoints"), self.file("previews")];
         let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
-        let unfinished = |entry: &DirEntry| entry.file_name().to_string_lossy().starts_with(".tmp");
-        remove(&entries.filter(unfinished).map(|entry| entry.path()).collect::<Vec<_>>());
+        remove(&entries.filter(is_unfinished).map(|entry| entry.path()).collect::<Vec<_>>());
     }
 
     /// The path of one of the run's files.
@@ -176,9 +175,14 @@ fn holds_other_files(folder: &Path) -> Error {
     Error::file(folder, "holds files that are not a run's: choose another folder with --out")
 }
 
+/// Whether a file is one that was about to be written and to get its name.
+fn is_unfinished(entry: &DirEntry) -> bool {
+    entry.file_name().to_string_lossy().starts_with(".tmp")
+}
+
 /// What there is at a path.
 enum Contents {
-    /// Nothing, or an empty folder.
+    /// Nothing, or a folder without anything finished.
     Nothing,
     Run,
     Other,
@@ -189,7 +193,11 @@ fn contents(folder: &Path) -> Result<Contents> {
         return Ok(Contents::Run);
     }
     match std::fs::read_dir(folder) {
-        Ok(mut entries) => Ok(if entries.next().is_none() { Contents::Nothing } else { Contents::Other }),
+        // What a program that was killed was about to write is nothing.
+        Ok(mut entries) => Ok(match entries.any(|entry| !entry.is_ok_and(|entry| is_unfinished(&entry))) {
+            true => Contents::Other,
+            false => Contents::Nothing,
+        }),
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(Contents::Nothing),
         Err(e) => Err(Error::file(folder, format!("cannot be used as the run's folder: {e}"))),
     }

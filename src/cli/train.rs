@@ -221,16 +221,13 @@ fn train(
 ) -> Result<Trained> {
     let mut watch = Watch::new(&run, &trainer, budget, interval, preview)?;
     interrupt::listen();
-    let mut watched = Ok(());
     trainer.run(budget, |trainer| {
         let stops = interrupt::requested();
-        watched = watch.step(trainer, stops);
-        if watched.is_err() || stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        watch.step(trainer, stops);
+        if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     let interrupted = interrupt::requested();
-    // The model comes first: what went wrong beside it is reported once it is safe.
-    let finished = watch.finish(&trainer, !interrupted);
-    watched.and(finished)?;
+    watch.finish(&trainer, !interrupted)?;
     summarise(&run, &trainer.stats(), interrupted)?;
     let diverged = trainer.stats().ends_diverged();
     if diverged {

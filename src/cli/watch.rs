@@ -34,6 +34,8 @@ pub struct Watch<'a> {
     next_save: f64,
     psnr: Option<f64>,
     progress: Progress,
+    /// The last words about a file that could not be written.
+    warned: String,
 }
 
 impl<'a> Watch<'a> {
@@ -45,7 +47,8 @@ impl<'a> Watch<'a> {
         }
         let StepStats { step, train_seconds, .. } = trainer.stats();
         let path = run.file("metrics.jsonl");
-        write_atomic(&path, kept_metrics(&path, step)?.as_bytes())?;
+        let (kept, logged) = kept_metrics(&path, step)?;
+        write_atomic(&path, kept.as_bytes())?;
         let metrics = File::options().append(true).open(&path);
         let metrics = metrics.map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?;
         let previews = std::iter::successors(Some(FIRST_PREVIEW), |time| Some(2.0 * time));
@@ -55,22 +58,25 @@ impl<'a> Watch<'a> {
             budget,
             preview,
             metrics,
-            logged: step,
+            logged,
             next_preview: previews.into_iter().find(|time| *time > train_seconds).unwrap_or(f64::INFINITY),
             interval,
             next_save: train_seconds + interval,
             psnr: None,
             progress: Progress::new(),
+            warned: String::new(),
         })
     }
 
-    /// Called after each step; `stops` says that it is the last one, whatever the budget.
-    pub fn step(&mut self, trainer: &Trainer, stops: bool) -> Result<()> {
+    /// Called after each step; `stops` says that it is the last one, whatever the budget. What cannot be written is said, and
+    /// training goes on: a full disk may have room again in a minute.
+    pub fn step(&mut self, trainer: &Trainer, stops: bool) {
         let stats = trainer.stats();
         let psnr = self.psnr.map_or(stats.psnr, |psnr| psnr + SMOOTHING * (stats.psnr - psnr));
         self.psnr = Some(psnr);
-        if stats.step == 1 || stats.step.is_multiple_of(METRICS_STEPS) {
-            self.log(&stats)?;
+        if is_logged(stats.step) {
+            let logged = self.log(&stats);
+            self.warn(logged);
         }
         let (fraction, left) = self.remaining(&stats);
         self.progress.set(fraction, || {
@@ -80,23 +86,34 @@ impl<'a> Watch<'a> {
         });
         if stats.train_seconds >= self.next_preview {
             self.next_preview = 2.0 * stats.train_seconds.max(self.next_preview);
-            self.preview(trainer)?;
+            let shown = self.preview(trainer);
+            self.warn(shown);
         }
         // Views look at a finished model, and training goes on from one that is not.
         let ends = stops || fraction >= 1.0;
         if (ends || stats.train_seconds >= self.next_save) && !stats.has_diverged() {
             self.next_save = stats.train_seconds + self.interval;
             let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
-            // A full disk may have room again in a minute.
-            if let Err(error) = model.and_then(|()| checkpoint::save(self.run, trainer)) {
-                self.progress.note(&format!("raygrad: warning: {error}; training goes on"));
-            }
+            let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
+            self.warn(saved);
         }
-        Ok(())
     }
 
-    /// Called when training has ended; `preview` asks for a last one.
+    /// Says what went wrong, if it was not said last.
+    fn warn(&mut self, done: Result<()>) {
+        let Err(error) = done else { return };
+        let words = format!("raygrad: warning: {error}; training goes on");
+        if words != self.warned {
+            self.progress.note(&words);
+            self.warned = words;
+        }
+    }
+
+    /// Called when training has ended; `preview` asks for a last one. A folder that was removed is made again.
     pub fn finish(mut self, trainer: &Trainer, preview: bool) -> Result<()> {
+        if !self.run.file("config.json").exists() {
+            Run::create(self.run.folder.clone(), self.run.config.clone())?;
+        }
         trainer.model.save(self.run.model_file())?;
         let stats = trainer.stats();
         if stats.step != self.logged {
@@ -137,16 +154,48 @@ impl<'a> Watch<'a> {
     }
 }
 
-/// What metrics in a file say of steps up to this one; nothing if there is no file. A line that is not whole is left out.
-fn kept_metrics(path: &Path, step: u64) -> Result<String> {
+/// The lines of metrics in a file of steps up to this one, and the last of these steps; none if there is no file. What was
+/// written because a run ended there is left out, as a run that was not ended has no such line; and a line that is not whole.
+fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
     let text = match std::fs::read(path) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(String::new()),
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok((String::new(), 0)),
         text => text.map_err(|e| Error::file(path, format!("cannot be read: {e}")))?,
     };
     let text = String::from_utf8_lossy(&text);
-    let known = |line: &&str| {
-        let value: Option<Value> = serde_json::from_str(line).ok();
-        value.is_some_and(|value| value["step"].as_u64().is_some_and(|own| own <= step))
+    let known = |line: &str| {
+        let value: Value = serde_json::from_str(line).ok()?;
+        value["step"].as_u64().filter(|own| *own <= step && is_logged(*own))
     };
-    Ok(text.lines().filter(known).flat_map(|line| [line, "\n"]).collect())
+    let (mut kept, mut last) = (String::new(), 0);
+    for (line, own) in text.lines().filter_map(|line| Some((line, known(line)?))) {
+        kept.extend([line, "\n"]);
+        last = own;
+    }
+    Ok((kept, last))
+}
+
+/// Whether metrics have a line of a step that is not the last one.
+fn is_logged(step: u64) -> bool {
+    step == 1 || step.is_multiple_of(METRICS_STEPS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn metrics_are_cut_to_where_a_run_goes_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.jsonl");
+        assert_eq!(kept_metrics(&path, 9).unwrap(), (String::new(), 0));
+        let line = |step: u64| format!("{{\"step\":{step},\"loss\":0.5}}\n");
+        let lines = |steps: &[u64]| steps.iter().map(|step| line(*step)).collect::<String>();
+        // It was ended at 14, went on, and was killed while it wrote of 40.
+        std::fs::write(&path, lines(&[1, 10, 14, 20, 30]) + "{\"step\":40,\"lo").unwrap();
+        for (step, expected) in
+            [(0, vec![]), (9, vec![1]), (19, vec![1, 10]), (20, vec![1, 10, 20]), (99, vec![1, 10, 20, 30])]
+        {
+            assert_eq!(kept_metrics(&path, step).unwrap(), (lines(&expected), expected.last().copied().unwrap_or(0)));
+        }
+    }
 }

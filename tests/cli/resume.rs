@@ -75,13 +75,12 @@ fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
 #[test]
 fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 60 --out whole {SMALL}"));
-    let arguments = format!("train scene --steps 60 --out run {SMALL}");
-    let child = place.command(&arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
-    while !place.path("run/metrics.jsonl").exists() {
-        std::thread::sleep(Duration::from_millis(1));
-    }
-    std::thread::sleep(Duration::from_millis(50));
+    place.succeeds(&format!("train scene --steps 200 --out whole {SMALL}"));
+    let arguments = format!("train scene --steps 200 --out run {SMALL}");
+    let mut child = place.command(&arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    // Two lines: it has begun, and makes steps.
+    let lines = || std::fs::read(place.path("run/metrics.jsonl")).map_or(0, |text| text.split(|b| *b == b'\n').count());
+    super::wait(&mut child, || lines() > 2);
     Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
@@ -95,11 +94,11 @@ fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() 
     // That it is at its end is no error.
     place.succeeds("train --resume run");
     assert_same(&place, "whole", "run");
-    let said = place.succeeds("train --resume run --steps 80");
-    assert!(said.contains("from     step 60\n") && said.contains("trained  80 steps"), "{said}");
-    assert_eq!(metrics(&place, "run").last().unwrap()["step"], 80);
-    assert_eq!(metrics(&place, "run")[..7], metrics(&place, "whole")[..]);
-    assert_eq!(place.json("run/config.json")["budget"]["steps"], 80);
+    let said = place.succeeds("train --resume run --steps 220");
+    assert!(said.contains("from     step 200\n") && said.contains("trained  220 steps"), "{said}");
+    assert_eq!(metrics(&place, "run").last().unwrap()["step"], 220);
+    assert_eq!(metrics(&place, "run")[..21], metrics(&place, "whole")[..]);
+    assert_eq!(place.json("run/config.json")["budget"]["steps"], 220);
 }
 
 #[test]
@@ -143,6 +142,22 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
 }
 
 #[test]
+fn what_cannot_be_written_for_a_while_does_not_end_a_run() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 40 --out whole {SMALL}"));
+    let arguments = format!("train scene --steps 40 --out run --checkpoint 0.01s {SMALL}");
+    let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    super::wait(&mut child, || place.path("run/checkpoints").exists());
+    // Again and again, as it makes it anew for each checkpoint.
+    while std::fs::remove_dir_all(place.path("run")).is_err() {}
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && said.contains("training goes on"), "{said}");
+    assert!(place.bytes("run/model.safetensors") == place.bytes("whole/model.safetensors"));
+    place.succeeds("eval run --views 1");
+}
+
+#[test]
 fn a_run_goes_on_alone_and_with_its_own_photographs() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 2 --out run --near 2.5 {SMALL}"));
@@ -152,6 +167,10 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
     drop(lock);
     place.succeeds("train --resume run --steps 4");
     assert_eq!(place.json("run/config.json")["extent"]["span"][0], 2.5);
+    // A folder in which nothing was finished is as good as none.
+    std::fs::create_dir(place.path("begun")).unwrap();
+    std::fs::write(place.path("begun/.tmpx1"), b"{").unwrap();
+    place.succeeds(&format!("train scene --steps 1 --out begun {SMALL}"));
     place.fails("train --resume absent", &["absent: there is no such folder"]);
     for flag in ["scene --resume run", "--resume run --seed 3", "--resume run --set seed=3", "--resume run --out other"]
     {
