@@ -144,8 +144,8 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
 #[test]
 fn what_cannot_be_written_for_a_while_does_not_end_a_run() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 40 --out whole {SMALL}"));
-    let arguments = format!("train scene --steps 40 --out run --checkpoint 0.01s {SMALL}");
+    place.succeeds(&format!("train scene --steps 150 --out whole {SMALL}"));
+    let arguments = format!("train scene --steps 150 --out run --checkpoint 0.01s {SMALL}");
     let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     super::wait(&mut child, || place.path("run/checkpoints").exists());
     // Again and again, as it makes it anew for each checkpoint.
