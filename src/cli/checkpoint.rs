@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result, Trainer, write_atomic};
 
-use super::output::{complain, make_folder};
+use super::output::{complain, make_folder, remove};
 use super::run::Run;
 
 /// How files are laid out; newer ones are refused.
@@ -17,29 +17,33 @@ const VERSION: u32 = 1;
 const MAGIC: &str = "raygrad checkpoint";
 /// Longest first line that is looked for, in bytes.
 const LONGEST: usize = 80;
-/// Checkpoints that are kept: if the last one is damaged, there is the one before.
-const KEPT: usize = 2;
 
 fn folder(run: &Run) -> PathBuf {
     run.file("checkpoints")
 }
 
-/// Writes where training is, and removes what is older than the one before.
+/// Writes where training is, and removes all others but the one before: if this one is damaged, there is that.
 pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
     let folder = folder(run);
     make_folder(&folder)?;
     let state = trainer.state()?;
     let mut bytes = format!("{MAGIC} {VERSION} {:08x} {}\n", crc32fast::hash(&state), state.len()).into_bytes();
     bytes.extend(state);
-    write_atomic(folder.join(format!("{:08}.checkpoint", trainer.stats().step)), &bytes)?;
-    for old in all(&folder)?.into_iter().skip(KEPT) {
-        fs::remove_file(&old).map_err(|e| Error::file(&old, format!("cannot be removed: {e}")))?;
-    }
+    let step = trainer.stats().step;
+    write_atomic(folder.join(format!("{step:08}.checkpoint")), &bytes)?;
+    // What is said to be later was damaged, and passed over.
+    let (later, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
+    remove(&later.into_iter().chain(others.into_iter().skip(2)).map(|(_, path)| path).collect::<Vec<_>>());
     Ok(())
 }
 
-/// The checkpoints in a folder, the latest first.
-fn all(folder: &Path) -> Result<Vec<PathBuf>> {
+/// Whether a run has a checkpoint, whole or not.
+pub fn exists(run: &Run) -> Result<bool> {
+    Ok(!all(&folder(run))?.is_empty())
+}
+
+/// The checkpoints in a folder with their steps, the latest first.
+fn all(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     let entries = match fs::read_dir(folder) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(vec![]),
         entries => entries.map_err(|e| Error::file(folder, format!("cannot be read: {e}")))?,
@@ -51,20 +55,28 @@ fn all(folder: &Path) -> Result<Vec<PathBuf>> {
     let paths = entries.flatten().map(|entry| entry.path());
     let mut found: Vec<(u64, PathBuf)> = paths.filter_map(|path| Some((step(&path)?, path))).collect();
     found.sort_by(|a, b| b.cmp(a));
-    Ok(found.into_iter().map(|(_, path)| path).collect())
+    Ok(found)
 }
 
-/// Takes a trainer to the latest checkpoint that is whole; one that is not is said to be so. Without checkpoints the trainer
-/// stays at its beginning. If none is whole, that is an error.
+/// Takes a trainer to the latest checkpoint that is whole; one that is not is said to be so. If none is whole, that is an error,
+/// and if there is none although steps were taken; without steps, the trainer stays at its beginning.
 pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
-    let mut last = None;
-    for path in all(&folder(run))? {
+    let checkpoints = all(&folder(run))?;
+    let none = checkpoints.is_empty();
+    for (_, path) in checkpoints {
         let loaded = read(&path).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
         let Err(error) = loaded else { return Ok(()) };
         complain(&format!("warning: {error}"));
-        last = Some(error);
     }
-    last.map_or(Ok(()), |_| Err(Error::file(folder(run), "no checkpoint is whole: the run cannot go on, train anew")))
+    match none {
+        false => Err(Error::file(folder(run), "no checkpoint is whole: the run cannot go on, train anew")),
+        // The first one is there before the metrics are.
+        true if run.file("metrics.jsonl").exists() => Err(Error::file(
+            &run.folder,
+            "has no checkpoints, as runs of earlier versions: it cannot go on, train anew",
+        )),
+        true => Ok(()),
+    }
 }
 
 /// The state in a file.
@@ -130,7 +142,7 @@ mod tests {
         for name in ["00000100.checkpoint", "20.checkpoint", "x.checkpoint", "00000200.tmp"] {
             fs::write(folder.path().join(name), b"").unwrap();
         }
-        let names = |path: PathBuf| path.file_name().unwrap().to_str().unwrap().to_owned();
+        let names = |(_, path): (u64, PathBuf)| path.file_name().unwrap().to_str().unwrap().to_owned();
         let found: Vec<String> = all(folder.path()).unwrap().into_iter().map(names).collect();
         assert_eq!(found, ["00000100.checkpoint", "20.checkpoint", "00000007.checkpoint"]);
         assert!(all(&folder.path().join("absent")).unwrap().is_empty());

@@ -78,7 +78,8 @@ pub struct Args {
     /// Train at 1/K of the images' size
     #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
-    /// How far the scene goes: bounded (an object before nothing), unbounded, or forward (unbounded, and all photographs look the same way) [default: found out from the photographs]
+    /// How far the scene goes: bounded (an object before nothing), unbounded, or forward (unbounded, and all photographs look
+    /// the same way) [default: found out from the photographs]
     #[arg(long)]
     scope: Option<Scope>,
     /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]

@@ -39,11 +39,14 @@ pub struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    /// Begins to watch; the untrained model is saved, so that the folder is a whole run from the start. What metrics say of steps
+    /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What metrics say of steps
     /// that are to come is cut off.
     pub fn new(run: &'a Run, trainer: &Trainer, budget: Budget, interval: Duration, preview: Preview) -> Result<Self> {
         if !run.model_file().exists() {
             trainer.model.save(run.model_file())?;
+        }
+        if !checkpoint::exists(run)? {
+            checkpoint::save(run, trainer)?;
         }
         let StepStats { step, train_seconds, .. } = trainer.stats();
         let path = run.file("metrics.jsonl");

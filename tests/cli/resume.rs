@@ -86,7 +86,7 @@ fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() 
     let said = String::from_utf8(output.stdout).unwrap();
     if output.status.code() == Some(130) {
         assert!(said.contains("to go on raygrad train --resume run\n"), "{said}");
-        assert_eq!(checkpoints(&place, "run").len(), 1, "a minute has not passed");
+        assert_eq!(checkpoints(&place, "run").len(), 2, "of the beginning and the end: a minute has not passed");
         let said = place.succeeds("train --resume run");
         assert!(said.contains("from     step ") && !said.contains("from     step 0\n"), "{said}");
     }
@@ -106,7 +106,7 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 30 --out whole {SMALL}"));
     place.succeeds(&format!("train scene --steps 30 --out run --checkpoint 0.001s {SMALL}"));
-    let [before, last] = checkpoints(&place, "run").try_into().unwrap();
+    let last = checkpoints(&place, "run").pop().unwrap();
     let bytes = std::fs::read(&last).unwrap();
     std::fs::write(&last, &bytes[..bytes.len() - 1]).unwrap();
     std::fs::write(place.path("run/checkpoints/.tmp123"), b"half").unwrap();
@@ -119,6 +119,16 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     assert!(String::from_utf8(output.stdout).unwrap().contains("from     step 29\n"));
     assert_same(&place, "whole", "run");
     assert!(!place.path("run/checkpoints/.tmp123").exists());
+    // A damaged one that says that it is later is not kept in place of one that is whole.
+    std::fs::write(place.path("run/checkpoints/00000090.checkpoint"), b"").unwrap();
+    let output = place.command("train --resume run --steps 31").output().unwrap();
+    assert!(output.status.success() && String::from_utf8(output.stdout).unwrap().contains("from     step 30\n"));
+    assert_eq!(
+        checkpoints(&place, "run"),
+        [&last, &place.path("run/checkpoints/00000031.checkpoint")].map(Clone::clone)
+    );
+    place.succeeds("train --resume run --steps 32");
+    let [before, last] = checkpoints(&place, "run").try_into().unwrap();
     // What is not whole in the metrics is written again.
     let mut text = place.bytes("run/metrics.jsonl");
     text.truncate(text.len() - 5);
@@ -135,10 +145,15 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     assert!(output.status.code() == Some(1) && message.contains("checkpoints: no checkpoint is whole"), "{message}");
     assert_eq!(message.matches("its checksum is another").count(), 2, "{message}");
     assert!(place.bytes("run/model.safetensors") == model, "nothing is lost");
-    // Without any it begins again.
+    // What earlier versions have trained is not begun again.
     std::fs::remove_dir_all(place.path("run/checkpoints")).unwrap();
+    place.fails("train --resume run", &["run: has no checkpoints", "train anew"]);
+    assert!(place.bytes("run/model.safetensors") == model);
+    // What was killed before its first step is.
+    std::fs::remove_file(place.path("run/metrics.jsonl")).unwrap();
     assert!(place.succeeds("train --resume run").contains("from     step 0\n"));
-    assert_same(&place, "whole", "run");
+    place.succeeds(&format!("train scene --steps 32 --out other {SMALL}"));
+    assert_same(&place, "other", "run");
 }
 
 #[test]
@@ -147,7 +162,8 @@ fn what_cannot_be_written_for_a_while_does_not_end_a_run() {
     place.succeeds(&format!("train scene --steps 150 --out whole {SMALL}"));
     let arguments = format!("train scene --steps 150 --out run --checkpoint 0.01s {SMALL}");
     let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    super::wait(&mut child, || place.path("run/checkpoints").exists());
+    let begun = || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0);
+    super::wait(&mut child, begun);
     // Again and again, as it makes it anew for each checkpoint.
     while std::fs::remove_dir_all(place.path("run")).is_err() {}
     let output = child.wait_with_output().unwrap();

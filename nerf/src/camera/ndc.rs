@@ -106,9 +106,11 @@ impl Ndc {
 
     /// How many pixels of a camera lie side by side across the picture at the depth of a place.
     pub fn pixels(&self, camera: &Camera, place: DVec3) -> f64 {
-        let depth = |eye: DVec3| self.axes.z_axis.dot(eye - place).max(self.near);
+        let depth = self.axes.z_axis.dot(self.eye - place).max(self.near);
+        let ahead = self.axes.z_axis.dot(self.eye - camera.pose.translation);
         let wide = (0..2).map(|axis| 2.0 * self.slopes[axis] * camera.focal[axis]).fold(0.0, f64::max);
-        wide * depth(self.eye) / depth(camera.pose.translation)
+        // A camera may stand at the place, or beyond it.
+        wide * depth / (depth - ahead).max(1e-3 * depth)
     }
 }
 
@@ -181,6 +183,11 @@ mod tests {
         assert!(ndc.eye.distance(DVec3::new(0.0, 0.1 - 0.8, 0.0)) < 1e-12, "{}", ndc.eye);
         assert!((ndc.near - 0.7).abs() < 1e-12, "{}", ndc.near);
         assert!((ndc.pixels(&row[2], DVec3::Y) - 110.0 * 1.7).abs() < 1e-9, "farther from the eye");
+        assert!(
+            (ndc.pixels(&row[2], 0.2 * DVec3::Y) - 110.0 * 4.5).abs() < 1e-9,
+            "and nearer than the near plane is to it"
+        );
+        assert!((ndc.pixels(&row[2], DVec3::ZERO) - 110.0 * 1e3).abs() < 1e-6);
         let eye = DVec3::new(0.0, f64::NAN, 0.0);
         for bad in [
             Ndc { eye, ..ndc },

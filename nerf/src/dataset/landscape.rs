@@ -28,40 +28,50 @@ const FAR: f64 = 1e4;
 pub fn landscape(split: Split, width: usize) -> Dataset {
     let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
     let bounds = eyes.fold(Landscape::new().bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
-    let bounds = [bounds[0] - 0.02, bounds[1] + 0.02];
-    Dataset { bounds, near: NEAR, scope: Scope::Unbounded, ..seen_from(walk_cameras, split, width) }
+    Dataset {
+        frames: frames(split, width, walk_cameras),
+        bounds: [bounds[0] - 0.02, bounds[1] + 0.02],
+        near: NEAR,
+        far: FAR,
+        scope: Scope::Unbounded,
+        ndc: None,
+        placement: Placement::default(),
+        skipped: vec![],
+    }
 }
 
 /// The same landscape as it is seen ahead from a window before the bulldozer: 30 views to train on, 3 to validate, 6 to test,
-/// between them. Bounds are 3 units about the bulldozer, and nothing is nearer than half a unit.
+/// between them. The bounds are 3 units about the bulldozer, and nothing is nearer than half a unit.
 ///
 /// # Panics
 /// If `width` is not a multiple of 4.
 #[track_caller]
 pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
+    let near = 0.5;
     let cameras: Vec<Camera> = Split::ALL.into_iter().flat_map(|split| window_cameras(split, 4)).collect();
-    let data = seen_from(window_cameras, split, width);
-    Dataset { ndc: Ndc::around(&cameras, data.near).ok(), ..data }
+    Dataset {
+        frames: frames(split, width, window_cameras),
+        bounds: [DVec3::splat(-1.5), DVec3::splat(1.5)],
+        near,
+        far: FAR,
+        scope: Scope::Forward,
+        // They look ahead.
+        ndc: Ndc::around(&cameras, near).ok(),
+        placement: Placement::default(),
+        skipped: vec![],
+    }
 }
 
+/// What the cameras of a split see.
 #[track_caller]
-fn seen_from(cameras: fn(Split, usize) -> Vec<Camera>, split: Split, width: usize) -> Dataset {
+fn frames(split: Split, width: usize, cameras: fn(Split, usize) -> Vec<Camera>) -> Vec<Frame> {
     assert!(width.is_multiple_of(4), "a width of {width} pixels has no whole number of rows at 4:3");
     let landscape = Landscape::new();
     let frame = |(i, camera): (usize, Camera)| {
         let image = landscape.render(&camera, SAMPLES).into();
         Frame { name: format!("{split}/{i}"), camera, image, mask: None, distances: None }
     };
-    Dataset {
-        frames: cameras(split, width).into_iter().enumerate().map(frame).collect(),
-        bounds: [DVec3::splat(-1.5), DVec3::splat(1.5)],
-        near: 0.5,
-        far: FAR,
-        scope: Scope::Forward,
-        ndc: None,
-        placement: Placement::default(),
-        skipped: vec![],
-    }
+    cameras(split, width).into_iter().enumerate().map(frame).collect()
 }
 
 /// The exact distances to what a camera sees of the [`landscape`]: one channel, along the unit ray through each pixel's

@@ -15,8 +15,9 @@ const TRAIN: [usize; 2] = [6, 5];
 /// How far apart they are taken, in scene units.
 const APART: [f64; 2] = [0.3, 0.25];
 
-/// The cameras of a split: 30 to train on, 3 to validate and 6 to test, `width` pixels wide and three quarters of that high. All
-/// look the same way, but for a hand that shakes, over the bulldozer to the hills; those that are not trained on stand between the others.
+/// The cameras of a split: 30 to train on, 3 to validate and 6 to test, `width` pixels wide and three quarters of that
+/// high. All look the same way, but for a hand that shakes, over the bulldozer to the hills; those that are not trained on
+/// stand between the others.
 pub fn window_cameras(split: Split, width: usize) -> Vec<Camera> {
     let [columns, rows] = TRAIN;
     let places: Vec<[f64; 2]> = match split {
