@@ -338,22 +338,6 @@ fn absent_images_are_skipped_with_a_warning() {
     assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is absent"), "{warned}");
 }
 
-#[test]
-fn a_run_that_diverges_ends_with_an_error_and_no_advice_to_look_at_it() {
-    let place = Place::empty();
-    let output = place
-        .command("train --preset instant --downscale 10 --steps 300 --set schedule.linear.from=1e30")
-        .output()
-        .unwrap();
-    assert_eq!(output.status.code(), Some(1), "{output:?}");
-    let [said, complained] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
-    assert!(
-        complained.contains("training has diverged") && complained.contains("schedule.linear.from"),
-        "{complained}"
-    );
-    assert!(!said.contains("raygrad render"), "{said}");
-}
-
 /// The folder of a run that was trained before files held less than the whole grid: such files load for ever.
 #[test]
 fn a_run_of_the_first_edition_loads_and_looks_the_same() {

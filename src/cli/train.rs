@@ -25,7 +25,10 @@ use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::watch::Watch;
-use super::{checkpoint, doctor, interrupt, parse};
+use super::{checkpoint, doctor, interrupt, parse, watch};
+
+/// How often a run that has diverged goes back to its last checkpoint.
+const RETREATS: u32 = 3;
 
 /// What is said of a new run alone.
 const NEW: [&str; 15] = [
@@ -222,20 +225,33 @@ fn train(
 ) -> Result<Trained> {
     let mut watch = Watch::new(&run, &trainer, budget, interval, preview)?;
     interrupt::listen();
-    trainer.run(budget, |trainer| {
-        let stops = interrupt::requested();
-        watch.step(trainer, stops);
-        if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
+    for retreats in 0.. {
+        trainer.run(budget, |trainer| {
+            let stops = interrupt::requested();
+            watch.step(trainer, stops);
+            if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        let goes_on = trainer.stats().has_diverged() && retreats < RETREATS && !interrupt::requested();
+        if !goes_on || !watch.retreat(&mut trainer) {
+            break;
+        }
+    }
     let interrupted = interrupt::requested();
+    let diverged = trainer.stats().ends_diverged();
+    let reason = if diverged { watch::reason(&trainer) } else { String::new() };
+    // Whatever came of it, the run was good until then.
+    if diverged && checkpoint::load(&run, &mut trainer).is_ok() {
+        trainer.model.finish();
+    }
     watch.finish(&trainer, !interrupted)?;
     summarise(&run, &trainer.stats(), interrupted)?;
-    let diverged = trainer.stats().ends_diverged();
     if diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
         complain(&format!(
-            "training has diverged: its numbers are no longer finite; try a lower rate with --set schedule.{}.{rate}=..",
+            "training has diverged: its numbers are no longer finite{reason}; the model is that of step {}; try a lower rate \
+             with --set schedule.{}.{rate}=..",
+            trainer.stats().step,
             schedule.name()
         ));
     }

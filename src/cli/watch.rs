@@ -20,6 +20,9 @@ const FIRST_PREVIEW: f64 = 5.0;
 /// Weight of the latest step in the PSNR that is shown: that of single steps jumps.
 const SMOOTHING: f64 = 0.05;
 
+/// What the learning rate of a run is multiplied by that has diverged and goes back.
+const SLOWER: f64 = 0.25;
+
 /// An observer of one training run.
 pub struct Watch<'a> {
     run: &'a Run,
@@ -49,12 +52,7 @@ impl<'a> Watch<'a> {
             checkpoint::save(run, trainer)?;
         }
         let StepStats { step, train_seconds, .. } = trainer.stats();
-        let path = run.file("metrics.jsonl");
-        let (kept, logged) = kept_metrics(&path, step)?;
-        write_atomic(&path, kept.as_bytes())?;
-        let metrics = File::options().append(true).open(&path);
-        let metrics = metrics.map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?;
-        let previews = std::iter::successors(Some(FIRST_PREVIEW), |time| Some(2.0 * time));
+        let (metrics, logged) = metrics(run, step)?;
         let interval = interval.as_secs_f64();
         Ok(Watch {
             run,
@@ -62,7 +60,7 @@ impl<'a> Watch<'a> {
             preview,
             metrics,
             logged,
-            next_preview: previews.into_iter().find(|time| *time > train_seconds).unwrap_or(f64::INFINITY),
+            next_preview: next_preview(train_seconds),
             interval,
             next_save: train_seconds + interval,
             psnr: None,
@@ -75,7 +73,8 @@ impl<'a> Watch<'a> {
     /// training goes on: a full disk may have room again in a minute.
     pub fn step(&mut self, trainer: &Trainer, stops: bool) {
         let stats = trainer.stats();
-        let psnr = self.psnr.map_or(stats.psnr, |psnr| psnr + SMOOTHING * (stats.psnr - psnr));
+        let before = self.psnr.filter(|psnr| psnr.is_finite());
+        let psnr = before.map_or(stats.psnr, |psnr| psnr + SMOOTHING * (stats.psnr - psnr));
         self.psnr = Some(psnr);
         if is_logged(stats.step) {
             let logged = self.log(&stats);
@@ -92,13 +91,38 @@ impl<'a> Watch<'a> {
             let shown = self.preview(trainer);
             self.warn(shown);
         }
-        // Views look at a finished model, and training goes on from one that is not.
+        // Views look at a finished model, and training goes on from one that is not; and not from one that may have diverged.
         let ends = stops || fraction >= 1.0;
-        if (ends || stats.train_seconds >= self.next_save) && !stats.has_diverged() {
+        if (ends || stats.train_seconds >= self.next_save) && stats.stuck == 0 {
             self.next_save = stats.train_seconds + self.interval;
             let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
             let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
             self.warn(saved);
+        }
+    }
+
+    /// Takes a trainer that has diverged back to the last checkpoint, from where it goes on with lower learning rates, and
+    /// says so. If that cannot be, it says why and gives `false`.
+    pub fn retreat(&mut self, trainer: &mut Trainer) -> bool {
+        let (end, reason) = (trainer.stats().step, reason(trainer));
+        let back = checkpoint::load(self.run, trainer).and_then(|()| {
+            trainer.slow_down(SLOWER);
+            checkpoint::save(self.run, trainer)?;
+            metrics(self.run, trainer.stats().step)
+        });
+        let StepStats { step, train_seconds, .. } = trainer.stats();
+        let what = format!("warning: for many steps up to {end} nothing was finite{reason}");
+        match back {
+            Ok((metrics, logged)) => {
+                (self.metrics, self.logged, self.psnr) = (metrics, logged, None);
+                (self.next_preview, self.next_save) = (next_preview(train_seconds), train_seconds + self.interval);
+                self.progress.note(&format!("raygrad: {what}; going on from step {step} at {SLOWER} times the rate"));
+                true
+            }
+            Err(error) => {
+                self.progress.note(&format!("raygrad: {what}, and the run cannot go back: {error}"));
+                false
+            }
         }
     }
 
@@ -119,7 +143,7 @@ impl<'a> Watch<'a> {
         }
         trainer.model.save(self.run.model_file())?;
         let stats = trainer.stats();
-        if stats.step != self.logged {
+        if stats.step > self.logged {
             self.log(&stats)?;
         }
         if preview { self.preview(trainer) } else { Ok(()) }
@@ -155,6 +179,26 @@ impl<'a> Watch<'a> {
             }
         }
     }
+}
+
+/// Why the numbers of a trainer are not finite, as the end of a sentence.
+pub fn reason(trainer: &Trainer) -> String {
+    trainer.first_non_finite(1.0).map_or(String::new(), |error| format!(" ({error})"))
+}
+
+/// Training time in seconds at which a preview comes next.
+fn next_preview(train_seconds: f64) -> f64 {
+    let mut previews = std::iter::successors(Some(FIRST_PREVIEW), |time| Some(2.0 * time));
+    previews.find(|time| *time > train_seconds).unwrap_or(f64::INFINITY)
+}
+
+/// The metrics of a run, cut to a step and open for more, and the last step in them.
+fn metrics(run: &Run, step: u64) -> Result<(File, u64)> {
+    let path = run.file("metrics.jsonl");
+    let (kept, logged) = kept_metrics(&path, step)?;
+    write_atomic(&path, kept.as_bytes())?;
+    let file = File::options().append(true).open(&path);
+    Ok((file.map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?, logged))
 }
 
 /// The lines of metrics in a file of steps up to this one, and the last of these steps; none if there is no file. What was

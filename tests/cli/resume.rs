@@ -200,3 +200,61 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
     std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
     place.fails("train --resume run --steps 5", &["run: ", "other photographs"]);
 }
+
+/// The words of a run on standard error, and whether it succeeded.
+fn complaints(place: &Place, arguments: &str) -> (bool, String) {
+    let output = place.command(arguments).output().unwrap();
+    assert!(output.status.success() || output.status.code() == Some(1), "{output:?}");
+    (output.status.success(), String::from_utf8(output.stderr).unwrap())
+}
+
+#[test]
+fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
+    let place = Place::empty();
+    let (succeeds, said) = complaints(
+        &place,
+        &format!("train --downscale 10 --steps 120 --out run {SMALL} --set schedule.linear.from=1e7"),
+    );
+    assert!(succeeds && said.contains("recorded at nerf/src/field/instant.rs:"), "{said}");
+    let retreats = said.matches("going on from step 0 at 0.25 times the rate").count() as i32;
+    assert!((1..=3).contains(&retreats) && !said.contains("training has diverged"), "{said}");
+    // The metrics are those of one run, all of it at the last rate.
+    let metrics = metrics(&place, "run");
+    let steps: Vec<u64> = metrics.iter().map(|line| line["step"].as_u64().unwrap()).collect();
+    assert_eq!(steps, [1, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 110, 120]);
+    let config: Value = serde_json::from_slice(&place.bytes("run/config.json")).unwrap();
+    let schedule = &config["config"]["schedule"]["linear"];
+    let [from, to, warmup] = ["from", "to", "warmup"].map(|name| schedule[name].as_f64().unwrap());
+    for line in &metrics {
+        let done = (line["step"].as_f64().unwrap() - 1.0) / 120.0;
+        let rate = (done / warmup).min(1.0) * (from + (to - from) * done) * 0.25_f64.powi(retreats);
+        assert!((line["rate"].as_f64().unwrap() - rate).abs() <= 1e-9 * rate, "{line}: {rate}");
+    }
+    // Going on with it, the rate stays as low.
+    let rate = metrics.last().unwrap()["rate"].as_f64().unwrap();
+    place.succeeds("train --resume run --steps 121");
+    let last = self::metrics(&place, "run").pop().unwrap();
+    assert!(last["step"] == 121 && (last["rate"].as_f64().unwrap() / rate - 1.0).abs() < 0.2, "{last} after {rate}");
+}
+
+#[test]
+fn a_run_that_diverges_again_and_again_ends_with_the_reason_and_its_last_good_model() {
+    let place = Place::empty();
+    // It learns, and its rate grows out of all bounds.
+    let rates = "--set schedule.linear.from=0.01 --set schedule.linear.to=1e30 --checkpoint 0.02s";
+    let output =
+        place.command(&format!("train --downscale 10 --steps 400 --out run {SMALL} {rates}")).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let [printed, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert!(!printed.contains("raygrad render"), "{printed}");
+    assert_eq!(said.matches("at 0.25 times the rate").count(), 3, "{said}");
+    let end = said.split("training has diverged").nth(1).unwrap();
+    assert!(end.contains("recorded at nerf/src/") && end.contains("schedule.linear.from"), "{end}");
+    let step: u64 = end.split("that of step ").nth(1).unwrap().split(';').next().unwrap().parse().unwrap();
+    let kept = checkpoints(&place, "run");
+    assert!(step > 0 && kept.last().unwrap().ends_with(format!("{step:08}.checkpoint")), "{step} {kept:?}");
+    // A schedule that is never too fast shows the same scene: it is a model, and not what overflowed.
+    let shown = place.succeeds("eval run --views 2 --json");
+    let report: Value = serde_json::from_str(&shown).unwrap();
+    assert!(report["psnr_mean"].as_f64().unwrap() > 5.0, "{report}");
+}

@@ -83,8 +83,15 @@ impl Groups {
         Ok(())
     }
 
-    /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them.
-    pub fn update(&mut self, params: &mut Params<f32>, grads: &[Gradient<f32>], fraction: f64) -> UpdateReport {
+    /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them, at `pace` times
+    /// the rates of their schedules.
+    pub fn update(
+        &mut self,
+        params: &mut Params<f32>,
+        grads: &[Gradient<f32>],
+        fraction: f64,
+        pace: f64,
+    ) -> UpdateReport {
         let mut report = UpdateReport::default();
         for Group { members, adam, schedule } in &mut self.0 {
             let free = params.ids().zip(&*members).filter(|(id, _)| !params.is_frozen(*id));
@@ -93,7 +100,7 @@ impl Groups {
                 false => Gradient::zero(grad.shape()),
             };
             let own: Vec<_> = free.zip(grads).map(own).collect();
-            let UpdateReport { moved, skipped, bad } = adam.update(params, &own, schedule.rate(fraction));
+            let UpdateReport { moved, skipped, bad } = adam.update(params, &own, pace * schedule.rate(fraction));
             report.moved += moved;
             report.skipped += skipped;
             report.bad.extend(bad);
@@ -128,7 +135,7 @@ mod tests {
         params.freeze(|name| name == "field.density");
         let mut groups = Groups::new(&config, &params).unwrap();
         let grads: Vec<_> = (0..3).map(|_| Gradient::from(Tensor::full(&[2, 2], 3.0))).collect();
-        let report = groups.update(&mut params, &grads, 0.0);
+        let report = groups.update(&mut params, &grads, 0.0, 1.0);
         assert_eq!((report.moved, report.skipped, groups.steps()), (12, 0, 1));
         let moved: Vec<f32> = params.values().iter().map(|value| value.as_slice()[0]).collect();
         // Adam's first step is the learning rate; what decays does so first.
@@ -141,7 +148,7 @@ mod tests {
             learned.add("poses", Tensor::full(&[1, 6], 1.0_f32));
             let config = Config { poses, groups: vec![], ..config.clone() };
             let grads = [Gradient::from(Tensor::full(&[1, 6], 3.0))];
-            let report = Groups::new(&config, &learned).unwrap().update(&mut learned, &grads, 0.0);
+            let report = Groups::new(&config, &learned).unwrap().update(&mut learned, &grads, 0.0, 1.0);
             assert_eq!(report.moved, 6);
             assert!((learned.values()[0].as_slice()[0] - expected).abs() < 1e-6, "{:?}", learned.values());
         }
@@ -165,7 +172,7 @@ mod tests {
         let mut groups = Groups::new(&config, &params).unwrap();
         for g in [1.0, -1.0] {
             let grads: Vec<_> = (0..2).map(|_| Gradient::from(Tensor::full(&[1, 1], g))).collect();
-            assert_eq!(groups.update(&mut params, &grads, 0.0).moved, 2);
+            assert_eq!(groups.update(&mut params, &grads, 0.0, 1.0).moved, 2);
         }
         let [table, weight] = [0, 1].map(|i| params.values()[i].item());
         assert!(table.abs() < 1e-6 && weight < -0.05, "{table} {weight}");

@@ -27,10 +27,17 @@ struct Counts {
     /// Rays of the next step.
     batch: usize,
     collapses: u32,
+    /// What learning rates are multiplied by.
+    #[serde(default = "one")]
+    pace: f64,
     /// How many groups of parameters there are.
     groups: usize,
     /// What was said of the parameters, in their order.
     settings: Vec<Setting>,
+}
+
+fn one() -> f64 {
+    1.0
 }
 
 /// What was said of a parameter.
@@ -73,6 +80,7 @@ impl Trainer {
             elapsed: self.elapsed,
             batch: self.batch,
             collapses: self.collapses,
+            pace: self.pace,
             groups: groups.len(),
             settings: params.ids().map(setting).collect(),
         };
@@ -122,6 +130,9 @@ impl Trainer {
         if !(1..=MOST_RAYS).contains(&counts.batch) {
             return Err(failed(format!("has steps of {} rays; use 1 to {MOST_RAYS}", counts.batch)));
         }
+        if !(counts.pace >= 0.0 && counts.pace.is_finite()) {
+            return Err(failed(format!("has learning rates times {}", counts.pace)));
+        }
         for Setting { name, frozen, lazy, rate, decay } in &counts.settings {
             let is_own = |other: &str| other == name;
             if !(*rate >= 0.0 && rate.is_finite() && *decay >= 0.0 && decay.is_finite()) {
@@ -143,8 +154,8 @@ impl Trainer {
         groups.load_state(&model.params, &remembered)?;
         model.sampler.load_state(&blobs)?;
         (self.model, self.groups) = (model, groups);
-        (self.done, self.elapsed, self.batch, self.collapses) =
-            (counts.stats, counts.elapsed, counts.batch, counts.collapses);
+        let Counts { stats, elapsed, batch, collapses, pace, .. } = counts;
+        (self.done, self.elapsed, self.batch, self.collapses, self.pace) = (stats, elapsed, batch, collapses, pace);
         Ok(())
     }
 }
@@ -168,11 +179,13 @@ mod tests {
     fn counts_come_back_before_the_first_step_too() {
         let mut trainer = trainer();
         (trainer.collapses, trainer.done.restarts, trainer.batch) = (2, 3, 512);
+        trainer.slow_down(0.5);
+        trainer.slow_down(0.25);
         trainer.elapsed = Duration::from_nanos(1_234_567_891);
         let state = trainer.state().unwrap();
         let mut later = self::trainer();
         later.load_state(&state).unwrap();
-        assert_eq!((later.collapses, later.done.restarts, later.batch), (2, 3, 512));
+        assert_eq!((later.collapses, later.done.restarts, later.batch, later.pace), (2, 3, 512, 0.125));
         assert_eq!((later.elapsed, later.done.step), (trainer.elapsed, 0));
         assert!([later.done.loss, later.done.psnr, later.done.opacity].iter().all(|x| x.is_nan()), "{:?}", later.done);
     }
@@ -195,6 +208,7 @@ mod tests {
             (written(&|counts| counts.batch = usize::MAX), "rays; use 1 to"),
             (written(&|counts| counts.settings[0].rate = -1.0), "a learning rate times -1"),
             (written(&|counts| counts.settings[1].decay = -2.0), "a decay times -2"),
+            (written(&|counts| counts.pace = -1.0), "learning rates times -1"),
             (written(&|counts| counts.groups = 9), "lacks what an optimiser remembers"),
             (written(&|counts| counts.groups = 0), "groups"),
             (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),

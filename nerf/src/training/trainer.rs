@@ -13,8 +13,8 @@ use crate::pictures::metrics::psnr_from_mse;
 use crate::random::{Jitter, stream};
 use crate::sampling::{Load, Progress};
 use crate::{Error, Result};
-use raygrad_autograd::Pool;
-use raygrad_nn::{SLOTS, Tiles};
+use raygrad_autograd::{Error as GraphError, Pool, Tape, Var};
+use raygrad_nn::{Bound, SLOTS, Tiles};
 use std::ops::{Add, ControlFlow};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -40,7 +40,38 @@ pub struct Trainer {
     pub(super) elapsed: Duration,
     /// How many models of this run have collapsed.
     pub(super) collapses: u32,
+    /// What all learning rates are multiplied by.
+    pub(super) pace: f64,
     pub(super) done: StepStats,
+}
+
+/// The rays of a step, which are drawn tile by tile.
+struct Draw<'a> {
+    model: &'a Model<f32>,
+    data: &'a Dataset,
+    seed: u64,
+    /// The number of the step.
+    number: u64,
+    fraction: f64,
+    /// Rays of the step, and of a tile.
+    total: usize,
+    tile: usize,
+}
+
+impl Draw<'_> {
+    fn tiles(&self) -> usize {
+        self.total.div_ceil(self.tile)
+    }
+
+    /// The share of a tile in the mean loss of the step, and what it took.
+    fn loss<'t>(&self, which: usize, params: &Bound<'t, f32>) -> (Var<'t, f32>, Work) {
+        let Draw { model, data, seed, number, fraction, total, tile } = *self;
+        let rng = &mut stream(seed, [number, which as u64]);
+        let count = tile.min(total - which * tile);
+        let batch = Batch::draw(data, count, model.reach(), model.config.background, rng);
+        let (loss, work) = rays_loss(model, params, &batch, fraction, &mut Jitter::Random(rng));
+        (loss * (1.0 / (3.0 * total as f64)), work)
+    }
 }
 
 impl Trainer {
@@ -116,6 +147,7 @@ impl Trainer {
             clock: Box::new(clock),
             elapsed: Duration::ZERO,
             collapses: 0,
+            pace: 1.0,
             done: StepStats { restarts, ..StepStats::default() },
         };
         trainer.prepare();
@@ -169,29 +201,18 @@ impl Trainer {
     /// One training step; `fraction` says how much of the run is done, for the schedule.
     pub fn step(&mut self, fraction: f64) -> StepStats {
         let start = (self.clock)();
-        let number = self.done.step + 1;
-        // A restart draws other rays too.
-        let seed = self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
         if self.model.config.refine.coarse > 0.0 {
             self.model.set_detail(self.model.config.refine.detail(fraction));
         }
         // Of a model that began again, from its own beginning.
-        self.update_sampler(&Progress { step: self.groups.steps() + 1, fraction, seed });
-        let tile = match self.model.sampler.load() {
-            Load::Rays { tile, .. } => tile,
-            // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
-            Load::Samples(_) => self.batch.div_ceil(SLOTS),
-        };
-        let (model, data, total, bounds) = (&self.model, &*self.data, self.batch, self.model.reach());
-        let step = self.tiles.differentiate(&model.params, total.div_ceil(tile), |which, params, ()| {
-            let rng = &mut stream(seed, [number, which as u64]);
-            let count = tile.min(total - which * tile);
-            let batch = Batch::draw(data, count, bounds, model.config.background, rng);
-            let (loss, work) = rays_loss(model, params, &batch, fraction, &mut Jitter::Random(rng));
-            (loss * (1.0 / (3.0 * total as f64)), work)
-        });
-        let report = self.groups.update(&mut self.model.params, &step.grads, fraction);
-        self.tiles.take_back(step.grads);
+        self.update_sampler(&Progress { step: self.groups.steps() + 1, fraction, seed: self.seed() });
+        let mut tiles = std::mem::take(&mut self.tiles);
+        let draw = self.draw(fraction);
+        let number = draw.number;
+        let step = tiles.differentiate(&self.model.params, draw.tiles(), |which, params, ()| draw.loss(which, params));
+        let report = self.groups.update(&mut self.model.params, &step.grads, fraction, self.pace);
+        tiles.take_back(step.grads);
+        self.tiles = tiles;
         if number.is_multiple_of(TRIM_EVERY) {
             self.tiles.trim();
             self.pool.trim();
@@ -212,7 +233,7 @@ impl Trainer {
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,
-            rate: self.model.config.schedule.rate(fraction),
+            rate: self.pace * self.model.config.schedule.rate(fraction),
             skipped: self.done.skipped + report.skipped as u64,
             // A network may turn NaN into gradients of 0, with which parameters do move.
             stuck: if report.is_stuck() || !work.loss.is_finite() { self.done.stuck + 1 } else { 0 },
@@ -223,6 +244,53 @@ impl Trainer {
             self.restart();
         }
         self.done
+    }
+
+    /// A restart draws other rays too.
+    fn seed(&self) -> u64 {
+        self.model.config.seed.wrapping_add(u64::from(self.done.restarts) << 32)
+    }
+
+    /// The rays of the next step.
+    fn draw(&self, fraction: f64) -> Draw<'_> {
+        let (number, total) = (self.done.step + 1, self.batch);
+        let tile = match self.model.sampler.load() {
+            Load::Rays { tile, .. } => tile,
+            // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
+            Load::Samples(_) => total.div_ceil(SLOTS),
+        };
+        Draw { model: &self.model, data: &self.data, seed: self.seed(), number, fraction, total, tile }
+    }
+
+    /// Multiplies the learning rates of all steps from now on by this factor, beside what schedules say; part of the
+    /// [state](Self::state).
+    ///
+    /// # Panics
+    /// If the factor is negative or not finite.
+    pub fn slow_down(&mut self, factor: f64) {
+        assert!(factor >= 0.0 && factor.is_finite(), "a rate times {factor}");
+        self.pace *= factor;
+    }
+
+    /// What would be infinite or NaN first if the next step were taken, `fraction` as in [`step`](Self::step): the operation
+    /// or the gradient, the line that recorded it and the element, as the [NaN finder](Tape::check_finite) names them.
+    /// Nothing if nothing would. Of a run that [has diverged](StepStats::has_diverged) it is the reason.
+    pub fn first_non_finite(&self, fraction: f64) -> Option<GraphError> {
+        let draw = self.draw(fraction);
+        let find = |which| {
+            let tape = Tape::with_pool(self.pool.clone());
+            tape.check_finite(true);
+            let run = || {
+                let params = self.model.params.bind(&tape);
+                let vars = params.vars();
+                let loss = draw.loss(which, &params).0.tracked();
+                if !vars.is_empty() {
+                    loss.backward(&vars);
+                }
+            };
+            tape.try_run(run).err()
+        };
+        (0..draw.tiles()).find_map(find)
     }
 
     /// Chooses the number of rays so that the next step has as many samples as it should.
@@ -274,6 +342,7 @@ mod tests {
     use crate::training::stats::STUCK;
     use crate::{FieldConfig, Preset};
     use glam::DVec3;
+    use raygrad_autograd::Tensor;
     use raygrad_nn::Schedule;
 
     #[test]
@@ -484,6 +553,50 @@ mod tests {
                 ControlFlow::Continue(())
             });
             assert!(trainer.stats().has_diverged() && trainer.stats().step == 1 + STUCK);
+        }
+    }
+
+    #[test]
+    fn what_is_not_finite_first_is_named() {
+        let data = Arc::new(embedded(Split::Train, 12));
+        for config in [tiny(), tiny_table(), tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure])]
+        {
+            let mut trainer = Trainer::new(config, data.clone()).unwrap();
+            for _ in 0..3 {
+                assert!(trainer.first_non_finite(0.5).is_none());
+                trainer.step(0.5);
+            }
+            // What comes of the last weights of the colours.
+            let ids: Vec<_> = trainer.model.params.ids().collect();
+            let last = ids.into_iter().rfind(|id| trainer.model.params.name(*id).contains("color")).unwrap();
+            trainer.model.params.get_mut(last).as_mut_slice()[0] = f32::NAN;
+            let error = trainer.first_non_finite(0.5).unwrap();
+            let GraphError::NonFinite { value, at, .. } = &error else { panic!("{error}") };
+            assert!(!value.is_finite() && at.file().ends_with(".rs") && at.line() > 0, "{error}");
+            assert!(trainer.step(0.5).stuck > 0 && trainer.first_non_finite(0.5).is_some());
+        }
+    }
+
+    #[test]
+    fn a_slower_run_moves_less() {
+        let data = Arc::new(embedded(Split::Train, 12));
+        let config = tiny_table().with_refined(&[Refined::Exposure]);
+        let [whole, half, none] = [1.0, 0.5, 0.0].map(|factor| {
+            let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
+            trainer.slow_down(factor);
+            let before = trainer.model.params.clone();
+            let rate = trainer.step(0.3).rate;
+            let after = trainer.model.params.values().iter();
+            let moved = |(a, b): (&Tensor<f32>, &Tensor<f32>)| {
+                let moves = a.as_slice().iter().zip(b.as_slice()).map(|(a, b)| f64::from(a - b).abs());
+                moves.fold(0.0, f64::max)
+            };
+            (rate, after.zip(before.values()).map(moved).collect::<Vec<f64>>())
+        });
+        assert!(whole.0 == 2.0 * half.0 && none.0 == 0.0 && whole.1.iter().all(|moved| *moved > 0.0), "{whole:?}");
+        // Adam's first step is the rate.
+        for ((whole, half), none) in whole.1.iter().zip(&half.1).zip(&none.1) {
+            assert!((half / whole - 0.5).abs() < 1e-3 && *none == 0.0, "{whole} {half} {none}");
         }
     }
 
