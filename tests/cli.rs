@@ -129,7 +129,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     assert_eq!([preview.width, preview.height], [2 * SIZE, SIZE]);
 
     let printed: Value = serde_json::from_str(&place.succeeds("eval run --json")).unwrap();
-    assert_eq!(printed, place.json("run/eval.json"));
+    assert_eq!(printed, place.json("run/eval-test.json"));
     let fields = ["split", "views", "background", "width", "height", "pixel_offset", "quantisation"];
     let values = fields.map(|field| printed[field].clone());
     assert_eq!(json!(values), json!(["test", 3, "white", SIZE, SIZE, 0.5, "none"]));
@@ -143,15 +143,43 @@ fn a_run_is_complete_and_can_be_evaluated() {
         assert!((printed[format!("{metric}_mean")].as_f64().unwrap() - mean).abs() < 1e-9);
     }
     assert!(printed["seconds_per_view"].as_f64().unwrap() > 0.0);
-    let picture = png(&place.path("run/eval/002.png"));
+    let picture = png(&place.path("run/eval-test/002.png"));
     assert_eq!([picture.width, picture.height], [4 * SIZE, SIZE]);
 
+    assert_eq!(printed["hold_out"], "as the capture's files say");
+    let model = &printed["model"];
+    let fields = ["steps", "seed", "photographs", "field", "sampler", "raygrad"].map(|field| model[field].clone());
+    assert_eq!(json!(fields), json!([3, 0, 6, "classic", "hierarchical", env!("CARGO_PKG_VERSION")]));
+    let crc = crc32fast::hash(&place.bytes("run/model.safetensors"));
+    assert!(model["crc32"] == format!("{crc:08x}") && model["budget"] == json!({ "steps": 3 }), "{model}");
+    assert!(printed["threads"].as_u64().unwrap() > 0 && !printed["processor"].as_str().unwrap().is_empty());
+    // A page shows the views, the worst first, and needs nothing but the pictures beside it.
+    let page = String::from_utf8(place.bytes("run/eval-test/index.html")).unwrap();
+    let mut order: Vec<(f64, &str)> =
+        views.iter().map(|view| (view["psnr"].as_f64().unwrap(), view["name"].as_str().unwrap())).collect();
+    order.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let places: Vec<usize> = order.iter().map(|(_, name)| page.find(&format!("alt=\"{name},")).unwrap()).collect();
+    assert!(places.is_sorted() && !page.contains("http") && page.matches("<img").count() == 3, "{page}");
+    assert!(page.contains("<tr><th>model seed</th><td>0</td></tr>"), "{page}");
+
     let table = place.succeeds("eval run --split val --views 1");
+    assert!(table.contains("worst: val/r_0 (") && table.contains("val views (as the capture's files say)"), "{table}");
     assert!(table.contains("mean of 1") && table.contains("val/r_0") && !table.contains("val/r_1"), "{table}");
     // Beside the other result, and not in its place.
     assert_eq!(place.json("run/eval-val-1.json")["split"], "val");
-    assert_eq!(place.json("run/eval.json"), printed);
+    assert_eq!(place.json("run/eval-test.json"), printed);
     assert!(place.path("run/eval-val-1/000.png").exists() && printed["skip"].is_null());
+    // Side by side with another's.
+    place.succeeds("train scene --preset small --steps 2 --seed 9 --out other");
+    place.fails("compare run other", &["other: has no results"]);
+    place.succeeds("eval other");
+    let table = place.succeeds("compare run other --only eval-test");
+    let psnr =
+        |run: &str| format!("{:.2}", place.json(&format!("{run}/eval-test.json"))["psnr_mean"].as_f64().unwrap());
+    let rows: Vec<Vec<&str>> = table.lines().take(3).map(|line| line.split_whitespace().collect()).collect();
+    assert!(rows[0].contains(&"model.seed") && rows[1][..3] == ["run", "eval-test", &psnr("run")], "{table}");
+    assert!(rows[2][..3] == ["other", "eval-test", &psnr("other")] && !table.contains("not the same"), "{table}");
+    assert!(place.succeeds("compare run").contains("not the same photographs"));
 }
 
 #[test]
@@ -218,13 +246,13 @@ fn pictures_and_animations() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("orbit holds 1 more numbered pictures, from a longer path"), "{said}");
     // Pictures of an evaluation that is replaced go; nothing else does.
-    std::fs::create_dir(place.path("run/eval")).unwrap();
+    std::fs::create_dir(place.path("run/eval-test")).unwrap();
     for name in ["007.png", "0007.png", "7.png", "notes.txt"] {
-        std::fs::write(place.path(&format!("run/eval/{name}")), "old").unwrap();
+        std::fs::write(place.path(&format!("run/eval-test/{name}")), "old").unwrap();
     }
     place.succeeds("eval run");
     let left =
-        ["007.png", "0007.png", "7.png", "notes.txt"].map(|name| place.path(&format!("run/eval/{name}")).exists());
+        ["007.png", "0007.png", "7.png", "notes.txt"].map(|name| place.path(&format!("run/eval-test/{name}")).exists());
     assert_eq!(left, [false, true, true, true]);
     place.succeeds("render run --size 20x10 --out wide.PNG --depth");
     place.succeeds("render run --size 20x10 --out single.png");
@@ -260,7 +288,7 @@ fn the_embedded_scene_needs_no_files() {
     assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
     assert_eq!(config["config"]["field"]["position_levels"], 0);
     place.succeeds("eval run --views 1");
-    assert_eq!(place.json("run/eval-1.json")["background"], "white");
+    assert_eq!(place.json("run/eval-test-1.json")["background"], "white");
     place.succeeds("render run --out one.png");
     place.fails("train --downscale 3", &["`downscale`", "200x200"]);
     place.fails("train landscape --downscale 16", &["`downscale`", "400x300"]);
@@ -363,7 +391,7 @@ fn marched_models_come_back_with_their_occupancy_grids() {
     );
     for run in ["run", "run-2"] {
         place.succeeds(&format!("eval {run} --views 1 --skip off"));
-        let report = place.json(&format!("{run}/eval-1-off.json"));
+        let report = place.json(&format!("{run}/eval-test-off-1.json"));
         assert!(report["psnr_mean"].as_f64().unwrap() > 3.0 && report["skip"]["pruning"] == 0.0, "{report}");
     }
     assert_eq!(place.json("run-2/config.json")["config"]["field"]["resolution"], 24);
@@ -410,7 +438,7 @@ fn bad_runs_are_named() {
     place.fails("eval run", &["run/model.safetensors: not a safetensors file"]);
     std::fs::remove_file(place.path("run/model.safetensors")).unwrap();
     place.fails("render run", &["run/model.safetensors: "]);
-    assert!(!place.path("run/eval.json").exists() && !place.path("run/orbit").exists());
+    assert!(!place.path("run/eval-test.json").exists() && !place.path("run/orbit").exists());
 }
 
 #[test]
@@ -429,9 +457,9 @@ fn bad_places_to_write_are_named() {
     std::fs::create_dir(place.path("folder.gif")).unwrap();
     place.fails("render run --out folder.gif", &["folder.gif: is a folder"]);
     // Where pictures should go there is a file.
-    std::fs::write(place.path("run/eval"), b"").unwrap();
-    place.fails("eval run", &["run/eval: cannot be created"]);
-    assert_eq!(place.bytes("run/eval"), b"");
+    std::fs::write(place.path("run/eval-test"), b"").unwrap();
+    place.fails("eval run", &["run/eval-test: cannot be created"]);
+    assert_eq!(place.bytes("run/eval-test"), b"");
 }
 
 #[test]
@@ -468,7 +496,7 @@ fn cameras_are_corrected_and_said_to_be() {
         place.succeeds(&format!("train scene --steps 2 --out run-{i} {small} {refine}"));
         for (split, expected) in [("test", test), ("train", train)] {
             place.succeeds(&format!("eval run-{i} --split {split}"));
-            let name = if split == "test" { "eval" } else { "eval-train" };
+            let name = if split == "test" { "eval-test-fast" } else { "eval-train-fast" };
             assert_eq!(place.json(&format!("run-{i}/{name}.json"))["cameras"], expected);
         }
     }
@@ -512,7 +540,7 @@ fn a_closed_pipe_is_no_error() {
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
-    assert!(place.path("run/eval.json").exists());
+    assert!(place.path("run/eval-test.json").exists());
 }
 
 #[cfg(unix)]

@@ -8,11 +8,13 @@ mod bench;
 mod builtin;
 mod cameras;
 mod checkpoint;
+mod compare;
 mod doctor;
 mod eval;
 mod export;
 #[cfg(test)]
 mod fuzz;
+mod html;
 mod interrupt;
 mod output;
 mod parse;
@@ -53,6 +55,7 @@ enum Command {
     Prepare(prepare::Args),
     Train(train::Args),
     Eval(eval::Args),
+    Compare(compare::Args),
     Render(render::Args),
     Doctor(doctor::Args),
     Export(export::Args),
@@ -86,6 +89,7 @@ fn run(cli: Cli) -> Result<ExitCode> {
         Some(Command::Prepare(args)) => prepare::run(&args),
         Some(Command::Export(args)) => export::run(&args),
         Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
+        Some(Command::Compare(args)) => compare::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Render(args)) => render::run(&args).map(|()| ExitCode::SUCCESS),

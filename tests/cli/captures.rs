@@ -119,14 +119,14 @@ fn photographs_are_compared_from_where_the_model_has_their_cameras() {
     assert!(apart(&first, &view(&model.other_camera(given))) < 0.01 && apart(&first, &view(given)) > 0.05);
     // Or from where each is shown best.
     place.succeeds("eval run --fit-poses --views 2");
-    let fitted = place.json("run/eval-2-poses.json");
+    let fitted = place.json("run/eval-test-fast-2-poses.json");
     assert_eq!(fitted["cameras"], "each fitted to its own photograph");
     let psnr = |value: &Value| value["per_view"][0]["psnr"].as_f64().unwrap();
     place.succeeds("eval run --views 2");
-    assert!(psnr(&fitted) > psnr(&place.json("run/eval-2.json")), "{fitted}");
+    assert!(psnr(&fitted) > psnr(&place.json("run/eval-test-fast-2.json")), "{fitted}");
     for split in [Split::Train, Split::Test] {
         place.succeeds(&format!("eval run --split {split}"));
-        let shown = rendered(&place, if split == Split::Train { "run/eval-train" } else { "run/eval" });
+        let shown = rendered(&place, if split == Split::Train { "run/eval-train-fast" } else { "run/eval-test-fast" });
         let data: Dataset = load(place.path("scene"), split, 1).unwrap();
         let given = &data.frames[0].camera;
         let right = if split == Split::Train { model.learned_camera(0, given) } else { model.other_camera(given) };
@@ -145,7 +145,7 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     place.succeeds(&format!("train scene --steps 1 --out codes {SMALL} --set field.codes=2"));
     for (run, expected) in [("plain", "none"), ("run", "mean of the training photographs")] {
         place.succeeds(&format!("eval {run}"));
-        assert_eq!(place.json(&format!("{run}/eval.json"))["appearance"], expected);
+        assert_eq!(place.json(&format!("{run}/eval-test-fast.json"))["appearance"], expected);
     }
     assert!(
         place.succeeds("eval codes --views 1").contains("exposures and codes: the mean of the training photographs'")
@@ -153,18 +153,18 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     // The mean exposure, and corners that are as dark as in all photographs.
     let mut model = model(&place, "run");
     let camera = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
-    let shown = rendered(&place, "run/eval");
+    let shown = rendered(&place, "run/eval-test-fast");
     let bright = apart(&shown, &model.view(camera, [1.0; 3]).color);
     model.vignetted = true;
     let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
     assert!(own < 0.01 && bright > 0.02, "{own} {bright}");
     // After a gain for the left half of the picture, the right half of it is compared.
     place.succeeds("eval plain --fit-half");
-    let half = place.json("plain/eval-half.json");
+    let half = place.json("plain/eval-test-fast-half.json");
     assert_eq!(half["appearance"], "gains fitted to the left half, right half compared");
-    let render = rendered(&place, "plain/eval-half");
-    assert!(apart(&render, &rendered(&place, "plain/eval")) > 0.01);
-    let truth = png(&place.path("plain/eval-half/000.png"));
+    let render = rendered(&place, "plain/eval-test-fast-half");
+    assert!(apart(&render, &rendered(&place, "plain/eval-test-fast")) > 0.01);
+    let truth = png(&place.path("plain/eval-test-fast-half/000.png"));
     let errors = (0..SIZE * SIZE).filter(|i| i % SIZE >= SIZE / 2).flat_map(|i| {
         let [a, b] = [&render, &truth].map(|image| image.pixel(i % SIZE, i / SIZE).to_vec());
         (0..3).map(move |k| f64::from(a[k] - b[k]).powi(2))
@@ -174,9 +174,9 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     assert!((psnr + 10.0 * mse.log10()).abs() < 0.05, "{psnr} {mse}");
     // What was trained on has its own exposure.
     place.succeeds("eval run --split train");
-    assert_eq!(place.json("run/eval-train.json")["appearance"], "each photograph's own");
+    assert_eq!(place.json("run/eval-train-fast.json")["appearance"], "each photograph's own");
     let camera = &load(place.path("scene"), Split::Train, 1).unwrap().frames[0].camera;
-    let shown = rendered(&place, "run/eval-train");
+    let shown = rendered(&place, "run/eval-train-fast");
     let usual = apart(&shown, &model.view(camera, [1.0; 3]).color);
     model.look = Some(0);
     let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
@@ -196,8 +196,8 @@ fn scenes_that_are_moved_to_where_models_want_them_are_seen_from_where_they_were
     place.succeeds("eval run");
     let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
     let moved = model.extent.placement.camera(given);
-    let [right, wrong] =
-        [&moved, given].map(|camera| apart(&rendered(&place, "run/eval"), &model.view(camera, [1.0; 3]).color));
+    let [right, wrong] = [&moved, given]
+        .map(|camera| apart(&rendered(&place, "run/eval-test-fast"), &model.view(camera, [1.0; 3]).color));
     assert!(right < 0.005 && wrong > 0.012, "{right} {wrong}");
 }
 

@@ -6,7 +6,7 @@ use raygrad::tensor::simd;
 pub fn describe() -> Vec<[String; 2]> {
     let row = |name: &str, value: String| [name.to_owned(), value];
     let mut rows = vec![
-        row("processor", proc_value("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned())),
+        row("processor", processor()),
         row("instruction set in use", simd::name().to_owned()),
         row("threads", rayon::current_num_threads().to_string()),
         row("system", format!("{} {}", std::env::consts::OS, std::env::consts::ARCH)),
@@ -17,6 +17,11 @@ pub fn describe() -> Vec<[String; 2]> {
     }
     rows.push(row("raygrad", env!("CARGO_PKG_VERSION").to_owned()));
     rows
+}
+
+/// The name of the processor, where the system says it.
+pub fn processor() -> String {
+    proc_value("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned())
 }
 
 /// The value after the first `name:` of a file of Linux.

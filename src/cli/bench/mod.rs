@@ -19,6 +19,7 @@ use raygrad::nerf::{Error, Result};
 use super::output::{make_folder, note, print};
 pub use draw::register_letters;
 use figure::Figure;
+pub use machine::processor;
 use table::Table;
 
 /// Measure run time against error: CSV tables, SVG and PNG plots, and one page with all of them

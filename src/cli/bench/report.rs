@@ -6,6 +6,7 @@ use raygrad::nerf::{Result, write_atomic};
 
 use super::machine;
 use super::table::Table;
+use crate::cli::html::escaped;
 
 /// What one suite contributes.
 pub struct Section {
@@ -36,16 +37,16 @@ pub fn save(path: &Path, sections: &[Section], quick: bool) -> Result<()> {
     let rows: Vec<Vec<String>> = machine::describe().into_iter().map(Vec::from).collect();
     page += &table_html(&["machine", ""], &rows);
     for section in sections {
-        page += &format!("<h2>{}</h2>\n<p><code>{}</code></p>\n", escape(&section.title), escape(&section.command));
+        page += &format!("<h2>{}</h2>\n<p><code>{}</code></p>\n", escaped(&section.title), escaped(&section.command));
         if !section.findings.is_empty() {
-            let items: String = section.findings.iter().map(|text| format!("<li>{}</li>", escape(text))).collect();
+            let items: String = section.findings.iter().map(|text| format!("<li>{}</li>", escaped(text))).collect();
             page += &format!("<ul>{items}</ul>\n");
         }
         for (svg, caption) in &section.figures {
-            page += &format!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escape(caption));
+            page += &format!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption));
         }
         for table in &section.tables {
-            let summary = format!("<details><summary>{}.csv</summary>", escape(&table.name));
+            let summary = format!("<details><summary>{}.csv</summary>", escaped(&table.name));
             page += &format!("{summary}{}</details>\n", table_html(&table.columns, &table.rows));
         }
     }
@@ -60,10 +61,6 @@ fn table_html(columns: &[&str], rows: &[Vec<String>]) -> String {
 }
 
 fn row_html<'a>(tag: &str, cells: impl Iterator<Item = &'a str>) -> String {
-    let cells: String = cells.map(|cell| format!("<{tag}>{}</{tag}>", escape(cell))).collect();
+    let cells: String = cells.map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
     format!("<tr>{cells}</tr>\n")
-}
-
-fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }

@@ -7,6 +7,7 @@ use raygrad::nerf::{Error, Result};
 use super::base64::base64;
 use super::stage::Stage;
 use super::table;
+use crate::cli::html::{escaped, filled};
 
 /// The page, with places for what is particular.
 const PAGE: &str = include_str!("page.html");
@@ -29,20 +30,7 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage) -> Result<String>
     // Within a script nothing may look like its end.
     let data = data.replace("</", "<\\/");
     let title = escaped(&report.facts.folder.display().to_string());
-    Ok(filled(&[("title", title), ("facts", facts), ("findings", findings), ("stage", data)]))
-}
-
-/// The page with these texts in their places; what a text holds is no place.
-fn filled(texts: &[(&str, String)]) -> String {
-    let mut parts = PAGE.split("{{");
-    let mut page = parts.next().unwrap_or_default().to_owned();
-    for part in parts {
-        let (place, rest) = part.split_once("}}").unwrap_or_default();
-        let text = texts.iter().find(|(name, _)| *name == place).map(|(_, text)| text.as_str());
-        page += text.unwrap_or_default();
-        page += rest;
-    }
-    page
+    Ok(filled(PAGE, &[("title", title), ("facts", facts), ("findings", findings), ("stage", data)]))
 }
 
 fn section(capture: &Capture, finding: &Finding) -> String {
@@ -79,10 +67,6 @@ fn capitalised(text: &str) -> String {
     letters.next().map(|first| first.to_uppercase().chain(letters).collect()).unwrap_or_default()
 }
 
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -90,10 +74,9 @@ mod tests {
     #[test]
     fn the_page_has_a_place_for_everything_and_asks_nothing_of_the_network() {
         let names = ["title", "facts", "findings", "stage"];
-        let page = filled(&names.map(|name| (name, format!("<{{{{{name}}}}}>"))));
+        let page = filled(PAGE, &names.map(|name| (name, format!("<{{{{{name}}}}}>"))));
         assert!(names.iter().all(|name| page.contains(&format!("<{{{{{name}}}}}>"))), "{page}");
         assert_eq!(PAGE.matches("{{").count(), 5, "the title stands twice");
         assert!(!PAGE.contains("http") && !PAGE.contains("src="));
-        assert_eq!(escaped("<a & \"b\">"), "&lt;a &amp; &quot;b&quot;&gt;");
     }
 }

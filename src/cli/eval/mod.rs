@@ -1,33 +1,39 @@
 //! `raygrad eval`: how close a model comes to photographs.
 
+mod alignment;
+mod page;
+mod report;
+
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use raygrad::nerf::dataset::{Dataset, Frame, Split, evenly_spaced};
+use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Evaluations, Image, InstantConfig, Model, Picture, Result, fitted_cameras};
-use serde::Serialize;
+use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
 
+use super::bench::processor;
 use super::output::{depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
 use super::run::{Run, write_json};
-use super::scene::Scene;
+use super::scene::{Opened, Scene};
+use alignment::{Alignment, Appearance};
+use report::{Identity, Report, Score, table};
 
 /// Digits of the number of a picture.
 const DIGITS: usize = 3;
-/// Views of which a picture is written.
-const PICTURES: usize = 10;
 
 /// Compare a model with photographs: PSNR and SSIM
 ///
-/// Writes RUN/eval.json, and in RUN/eval/ up to 10 pictures: photograph, render, error, depth. Another split, number of
-/// views, --skip, --precision, --fit-poses or --fit-half stands in the name, as in RUN/eval-val-10-off.json, so that none replaces another's result; that
-/// of another --scene does.
+/// Writes RUN/eval-SPLIT-SKIP.json with the figures and all that they depend on, and a page to look at, RUN/eval-SPLIT-SKIP/index.html,
+/// with up to 13 pictures, the worst views among them: photograph, render, error, depth. --views, --precision, --fit-poses and
+/// --fit-half stand in the name too, as in RUN/eval-val-off-10.json, so that none replaces another's result; that of another
+/// --scene does. `raygrad compare` puts the results of several runs side by side.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -61,139 +67,34 @@ pub struct Args {
 }
 
 impl Args {
-    /// The name of the result: `eval`, and what differs from the ordinary.
-    fn name(&self) -> String {
-        let split = (self.split != Split::Test).then(|| self.split.to_string());
+    /// The name of the result: `eval`, the split, what is left out if there is a grid, and what differs from the ordinary.
+    fn name(&self, skip: Option<Skipping>) -> String {
         let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
-        let [views, skip] = [self.views.map(|n| n.to_string()), self.skip.map(|skip| skip.to_string())];
+        let views = self.views.map(|n| n.to_string());
         let half = self.fit_half.then(|| "half".to_owned());
         let poses = self.fit_poses.then(|| "poses".to_owned());
-        let others = [split, views, skip, precision, poses, half];
-        let parts = ["eval".to_owned()].into_iter().chain(others.into_iter().flatten());
+        let others = [skip.map(level), views, precision, poses, half];
+        let parts = ["eval".to_owned(), self.split.to_string()].into_iter().chain(others.into_iter().flatten());
         parts.collect::<Vec<_>>().join("-")
     }
 }
 
-/// The result: `eval.json`.
-#[derive(Serialize)]
-struct Report {
-    raygrad: &'static str,
-    scene: Scene,
-    split: Split,
-    /// Number of views.
-    views: usize,
-    width: usize,
-    height: usize,
-    downscale: usize,
-    /// What photographs with transparency are composited over.
-    background: Background,
-    /// What was left out; null where there is no occupancy grid.
-    skip: Option<Skipping>,
-    /// `f32`, or `f64` with nothing left out but empty cells.
-    precision: Precision,
-    /// Where the cameras are: as the scene has them, or as the model has found out.
-    cameras: Alignment,
-    /// As what photograph's exposure and code views are rendered.
-    appearance: Appearance,
-    /// Where in a pixel its ray passes: 0.5 is the centre.
-    pixel_offset: f64,
-    /// `none`: floating-point renders, clamped to 0..=1, are compared.
-    quantisation: &'static str,
-    /// The mean of the views' PSNR in dB; null if it is infinite.
-    psnr_mean: f64,
-    /// The mean of the views' SSIM; null if the images are smaller than its window.
-    ssim_mean: Option<f64>,
-    /// Mean rendering time of a view.
-    seconds_per_view: f64,
-    /// Evaluations of densities and of colours for each pixel, and of both if nothing in the box were skipped.
-    density_per_pixel: f64,
-    color_per_pixel: f64,
-    unskipped_per_pixel: f64,
-    per_view: Vec<Score>,
+/// What views leave out, in a word: `own` if the configuration says it number by number.
+fn level(skip: Skipping) -> String {
+    let is = |level: &Skip| {
+        let Skipping { grid, carving, .. } = skip;
+        Skipping { grid, carving, ..(*level).into() } == skip
+    };
+    [Skip::Off, Skip::Lossless, Skip::Fast].into_iter().find(is).map_or("own".to_owned(), |level| level.to_string())
 }
 
-/// From where views are rendered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-enum Alignment {
-    /// From where the scene has its cameras: the model has learned nothing of them.
-    #[serde(rename = "none")]
-    None,
-    /// From where the model has found the cameras of its photographs to be.
-    #[serde(rename = "as learned")]
-    Learned,
-    /// Focal length and lens are those that were found; poses are the scene's.
-    #[serde(rename = "focal length and lens as learned")]
-    Glass,
-    /// As well, and poses moved by the similarity that takes the training cameras from where they were given to where they
-    /// were found.
-    #[serde(rename = "similarity of the training cameras")]
-    Similarity,
-    /// From where the model shows each most nearly, found from where one of the above has them.
-    #[serde(rename = "each fitted to its own photograph")]
-    Fitted,
-}
-
-/// What is done about what photographs differ in and nobody knows of one that was held out.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-enum Appearance {
-    /// Nothing: the model takes all photographs to be alike.
-    #[serde(rename = "none")]
-    None,
-    /// Views have the mean of what was learned of the photographs that were trained on: of their codes, and of their exposures.
-    #[serde(rename = "mean of the training photographs")]
-    Mean,
-    /// Views have what was learned of the photograph itself: it was trained on.
-    #[serde(rename = "each photograph's own")]
-    Own,
-    /// As the mean, and a gain for each channel makes the left half most like the photograph's; the right half is compared.
-    #[serde(rename = "gains fitted to the left half, right half compared")]
-    Half,
-}
-
-impl Appearance {
-    fn of(model: &Model<f32>, split: Split, fit_half: bool) -> Self {
-        let has_codes = model.config.field.get::<InstantConfig>().is_some_and(|field| field.codes > 0);
-        match (fit_half, has_codes || model.config.tone.exposure.is_some()) {
-            (true, _) => Appearance::Half,
-            (_, false) => Appearance::None,
-            (_, true) if split == Split::Train => Appearance::Own,
-            (_, true) => Appearance::Mean,
-        }
+/// Who says which photographs are held out.
+fn hold_out(opened: &Opened) -> &'static str {
+    match &opened.capture {
+        None => "built in",
+        Some((capture, _)) if Capture::holds_out_every_eighth(capture) => "every eighth by name, from the first",
+        Some(_) => "as the capture's files say",
     }
-}
-
-impl Alignment {
-    /// Puts the cameras of the photographs where the model has them.
-    ///
-    /// # Errors
-    /// If a photograph is said to be one of those that were trained on, whose names are `trained`, and is not.
-    fn apply(model: &Model<f32>, trained: &[String], split: Split, data: &mut Dataset) -> Result<Self> {
-        let Some(refine) = &model.refine else { return Ok(Alignment::None) };
-        if split == Split::Train {
-            for frame in &mut data.frames {
-                let number = trained.iter().position(|name| *name == frame.name).ok_or_else(|| {
-                    let what = format!("the run was not trained on `{}`, and has not found its camera", frame.name);
-                    Error::setting("scene", what)
-                })?;
-                frame.camera = model.learned_camera(number, &frame.camera);
-            }
-            return Ok(Alignment::Learned);
-        }
-        data.frames.iter_mut().for_each(|frame| frame.camera = model.other_camera(&frame.camera));
-        Ok(match refine.placement(&model.params) {
-            Some(_) => Alignment::Similarity,
-            None if refine.has_poses() => Alignment::None,
-            None => Alignment::Glass,
-        })
-    }
-}
-
-/// The result for one view.
-#[derive(Serialize)]
-struct Score {
-    name: String,
-    psnr: f64,
-    ssim: Option<f64>,
 }
 
 /// Evaluates, writes the files and prints the result.
@@ -225,36 +126,42 @@ pub fn run(args: &Args) -> Result<()> {
         data.frames.iter_mut().zip(found).for_each(|(frame, camera)| frame.camera = camera);
         cameras = Alignment::Fitted;
     }
-    let name = args.name();
+    let identity = Identity::of(&run, &model)?;
+    let skip = model.marching().map(|marching| marching.config.occupancy.skip);
+    let name = args.name(skip);
     let pictures = run.file(&name);
     make_folder(&pictures)?;
-    let (background, span) = (model.config.background, model.extent.span);
-    let skip = model.marching().map(|marching| marching.config.occupancy.skip);
-    let mut renderer = Renderer::new(model, args.precision)?;
     let own = |frame: &Frame| {
         let number = run.config.photographs.iter().position(|name| *name == frame.name);
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
     };
-    let looks: Vec<Option<u32>> = data.frames.iter().map(own).collect();
-    let (per_view, seconds_per_view, evaluations) =
-        compare(&mut renderer, background, span, (&data, &looks), appearance, &pictures)?;
+    let looks = data.frames.iter().map(own).collect();
+    let (background, span) = (shown_background(model.config.background), model.extent.span);
+    let renderer = Renderer::new(model, args.precision)?;
+    let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance };
+    let (per_view, seconds_per_view, evaluations) = judge.all(&pictures)?;
+    let data = &judge.data;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
     let per_pixel = |count: u64| count as f64 / pixels as f64;
     let report = Report {
         raygrad: env!("CARGO_PKG_VERSION"),
         scene: scene.absolute()?,
         split: args.split,
+        hold_out: hold_out(&opened),
         views: per_view.len(),
         width: data.frames[0].image.width,
         height: data.frames[0].image.height,
         downscale: run.config.downscale,
-        background: shown_background(background),
+        background,
         skip,
         precision: args.precision,
         cameras,
         appearance,
         pixel_offset: 0.5,
         quantisation: "none",
+        model: identity,
+        threads: rayon::current_num_threads(),
+        processor: processor(),
         psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
         ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
         seconds_per_view,
@@ -265,13 +172,17 @@ pub fn run(args: &Args) -> Result<()> {
     };
     let file = run.file(&format!("{name}.json"));
     write_json(&file, &report)?;
+    let drawn = report.drawn();
+    judge.draw_others(&drawn, &pictures)?;
     // Pictures of an evaluation of other photographs under the same name would belong to no result.
-    remove(&other_numbered(&pictures, DIGITS, &drawn(report.views)));
+    remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
+    let index = pictures.join("index.html");
+    write_atomic(&index, page::page(&report).as_bytes())?;
     if args.json {
         let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(&file, e))?;
         return print(&format!("{text}\n"));
     }
-    print(&format!("{}written: {}, {}\n", table(&report), file.display(), pictures.display()))
+    print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
 }
 
 /// The background that images are compared over: a random one is for training only.
@@ -289,33 +200,62 @@ fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     sum.filter(|_| count > 0).map(|sum| sum / count as f64)
 }
 
-/// The numbers of the views of which a picture is written.
-fn drawn(views: usize) -> Vec<usize> {
-    evenly_spaced((0..views).collect(), PICTURES)
+/// Renders views and compares them with photographs.
+struct Judge {
+    renderer: Renderer,
+    background: [f32; 3],
+    span: [f64; 2],
+    data: Dataset,
+    /// The number of the photograph that each view looks like, if it does.
+    looks: Vec<Option<u32>>,
+    appearance: Appearance,
 }
 
-/// Scores all views, each with its look, and draws some; also the mean time of rendering one, in seconds, and what was evaluated for all.
-fn compare(
-    renderer: &mut Renderer,
-    background: Background,
-    span: [f64; 2],
-    (data, looks): (&Dataset, &[Option<u32>]),
-    appearance: Appearance,
-    pictures: &Path,
-) -> Result<(Vec<Score>, f64, Evaluations)> {
-    let background = background.shown();
-    let drawn = drawn(data.frames.len());
-    let mut scores = Vec::with_capacity(data.frames.len());
-    let (mut seconds, mut evaluations) = (0.0, Evaluations::default());
-    let mut progress = Progress::new();
-    for (i, (frame, look)) in data.frames.iter().zip(looks).enumerate() {
-        let start = Instant::now();
-        renderer.look_like(*look);
-        let mut picture = renderer.view(&frame.camera, background);
-        seconds += start.elapsed().as_secs_f64();
-        evaluations = evaluations + picture.evaluations;
-        let truth = frame.image.over(background);
-        let half = if appearance == Appearance::Half { truth.width / 2 } else { 0 };
+impl Judge {
+    /// The scores of all views, of which some are drawn; the mean time of rendering one, in seconds; and what was evaluated
+    /// for all.
+    fn all(&mut self, pictures: &Path) -> Result<(Vec<Score>, f64, Evaluations)> {
+        let count = self.data.frames.len();
+        let drawn = report::regular(count);
+        let (mut scores, mut seconds, mut evaluations) = (Vec::with_capacity(count), 0.0, Evaluations::default());
+        let mut progress = Progress::new();
+        for i in 0..count {
+            let start = Instant::now();
+            let picture = self.render(i);
+            seconds += start.elapsed().as_secs_f64();
+            evaluations = evaluations + picture.evaluations;
+            let (score, drawing) = self.compare(i, picture)?;
+            if drawn.contains(&i) {
+                drawing.save_png(pictures.join(numbered(i, DIGITS)))?;
+            }
+            let done = i + 1;
+            progress.set(done as f64 / count as f64, || {
+                format!("view {done} of {count}  {}  PSNR {:.2}", score.name, score.psnr)
+            });
+            scores.push(score);
+        }
+        Ok((scores, seconds / count as f64, evaluations))
+    }
+
+    /// Draws those of the views that [`all`](Self::all) has not.
+    fn draw_others(&mut self, views: &BTreeSet<usize>, pictures: &Path) -> Result<()> {
+        for &i in views.difference(&report::regular(self.data.frames.len())) {
+            let picture = self.render(i);
+            self.compare(i, picture)?.1.save_png(pictures.join(numbered(i, DIGITS)))?;
+        }
+        Ok(())
+    }
+
+    fn render(&mut self, i: usize) -> Picture {
+        self.renderer.look_like(self.looks[i]);
+        self.renderer.view(&self.data.frames[i].camera, self.background)
+    }
+
+    /// How like its photograph a view is, and a drawing of both.
+    fn compare(&self, i: usize, mut picture: Picture) -> Result<(Score, Image)> {
+        let frame = &self.data.frames[i];
+        let truth = frame.image.over(self.background);
+        let half = if self.appearance == Appearance::Half { truth.width / 2 } else { 0 };
         if half > 0 {
             if frame.mask.is_some() && used(frame, &truth, half..truth.width).data.is_empty() {
                 let what = format!("the mask of `{}` leaves nothing of its right half to compare", frame.name);
@@ -326,16 +266,8 @@ fn compare(
         }
         picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
         let score = score(frame, &picture.color, &truth, half);
-        if drawn.contains(&i) {
-            draw(&picture, &truth, span).save_png(pictures.join(numbered(i, DIGITS)))?;
-        }
-        let done = i + 1;
-        progress.set(done as f64 / data.frames.len() as f64, || {
-            format!("view {done} of {}  {}  PSNR {:.2}", data.frames.len(), score.name, score.psnr)
-        });
-        scores.push(score);
+        Ok((score, draw(&picture, &truth, self.span)))
     }
-    Ok((scores, seconds / data.frames.len() as f64, evaluations))
 }
 
 /// The pixels of these columns of an image that are [used](Frame::mask), in a row.
@@ -376,34 +308,6 @@ fn score(frame: &Frame, render: &Image, truth: &Image, half: usize) -> Score {
 fn draw(picture: &Picture, truth: &Image, span: [f64; 2]) -> Image {
     let error = colormap::error_map(&picture.color, truth);
     Image::hconcat(&[truth, &picture.color, &error, &depth_colors(picture, span)])
-}
-
-fn table(report: &Report) -> String {
-    let ssim = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
-    let mean_of = format!("mean of {}", report.views);
-    let names = report.per_view.iter().map(|score| score.name.len());
-    let width = names.chain([mean_of.len()]).max().unwrap_or(0);
-    let mut text = format!("{:width$}  {:>7}  {:>7}\n", "view", "PSNR", "SSIM");
-    for Score { name, psnr, ssim: similarity } in &report.per_view {
-        text += &format!("{name:width$}  {psnr:>7.2}  {:>7}\n", ssim(*similarity));
-    }
-    text += &format!("{mean_of:width$}  {:>7.2}  {:>7}\n", report.psnr_mean, ssim(report.ssim_mean));
-    let Report { split, background, seconds_per_view, .. } = report;
-    let size = format!("{}x{}", report.width, report.height);
-    text += &format!("{split} views of {size} over {background}, {seconds_per_view:.2} s to render each\n");
-    text += match report.appearance {
-        Appearance::None => "",
-        Appearance::Own => "exposures and codes: each photograph's own\n",
-        Appearance::Mean => "exposures and codes: the mean of the training photographs'\n",
-        Appearance::Half => "compared: right halves, after gains that were fitted to left halves\n",
-    };
-    text + match report.cameras {
-        Alignment::None => "",
-        Alignment::Learned => "cameras: as learned\n",
-        Alignment::Fitted => "cameras: each fitted to its own photograph\n",
-        Alignment::Glass => "cameras: focal length and lens as learned\n",
-        Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
-    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,208 @@
+//! `raygrad compare`: results of several runs side by side.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Error, Result};
+use serde_json::Value;
+
+use super::output::print;
+use super::run::Run;
+
+/// Conditions under which figures are figures of the same thing.
+const SAME: [&str; 13] = [
+    "scene",
+    "split",
+    "hold_out",
+    "views",
+    "width",
+    "height",
+    "downscale",
+    "background",
+    "cameras",
+    "appearance",
+    "pixel_offset",
+    "quantisation",
+    "photographs",
+];
+/// What is measured; all else in a result is a condition.
+const MEASURED: [&str; 6] =
+    ["psnr_mean", "ssim_mean", "seconds_per_view", "density_per_pixel", "color_per_pixel", "unskipped_per_pixel"];
+/// Longest result that is read, in bytes.
+const LONGEST: u64 = 1 << 28;
+
+/// Put results of `raygrad eval` side by side, with all in which they differ
+///
+/// One row for each result of each run. What all have in common stands below the table, and a warning if figures are not of the
+/// same thing: other photographs, sizes, backgrounds, cameras.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folders that `raygrad train` made
+    #[arg(required = true, value_name = "RUN")]
+    runs: Vec<PathBuf>,
+    /// Only results of this name, such as eval-test-fast [default: all]
+    #[arg(long, value_name = "NAME")]
+    only: Option<String>,
+}
+
+/// A result of a run.
+struct Row {
+    run: String,
+    name: String,
+    /// What was measured, and under which conditions.
+    fields: BTreeMap<String, String>,
+}
+
+/// Prints the table.
+pub fn run(args: &Args) -> Result<()> {
+    let mut rows = vec![];
+    for run in &args.runs {
+        let found = results(&Run::open(run)?.folder, args.only.as_deref())?;
+        if found.is_empty() {
+            let what = match &args.only {
+                Some(name) => format!("has no result {name}.json; `raygrad eval` makes them"),
+                None => "has no results; `raygrad eval` makes them".to_owned(),
+            };
+            return Err(Error::file(run, what));
+        }
+        for path in found {
+            rows.push(Row {
+                run: run.display().to_string(),
+                name: path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+                fields: read(&path)?,
+            });
+        }
+    }
+    print(&table(&rows))
+}
+
+/// The files of results in a run's folder, by name.
+fn results(folder: &Path, only: Option<&str>) -> Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder).map_err(|e| Error::file(folder, format!("cannot be read: {e}")))?;
+    let is_result = |path: &PathBuf| {
+        let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+        path.extension().is_some_and(|e| e == "json")
+            && (stem == "eval" || stem.starts_with("eval-"))
+            && only.is_none_or(|only| stem == only)
+    };
+    let mut found: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(is_result).collect();
+    found.sort();
+    Ok(found)
+}
+
+/// The fields of a result, those of the model with `model.` before them, and in place of the views how they are called.
+fn read(path: &Path) -> Result<BTreeMap<String, String>> {
+    let bad = |what: String| Error::file(path, what);
+    let length = std::fs::metadata(path).map_err(|e| bad(format!("cannot be read: {e}")))?.len();
+    if length > LONGEST {
+        return Err(bad(format!("is no result: it has {length} bytes")));
+    }
+    let text = std::fs::read_to_string(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
+    let value: Value = serde_json::from_str(&text).map_err(|e| bad(format!("is no result: {e}")))?;
+    let Value::Object(all) = value else { return Err(bad("is no result: it holds no fields".into())) };
+    if !all.contains_key("psnr_mean") {
+        return Err(bad("is no result: it has no `psnr_mean`".into()));
+    }
+    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    let mut fields = BTreeMap::new();
+    for (name, value) in &all {
+        match (name.as_str(), value) {
+            ("per_view", Value::Array(views)) => {
+                let names: Vec<String> = views.iter().map(|view| text(&view["name"])).collect();
+                fields.insert("photographs".to_owned(), names.join(", "));
+            }
+            ("model", Value::Object(model)) => {
+                fields.extend(model.iter().map(|(name, value)| (format!("model.{name}"), text(value))));
+            }
+            _ => drop(fields.insert(name.clone(), text(value))),
+        }
+    }
+    Ok(fields)
+}
+
+/// The rows, under what differs between them; then what does not.
+fn table(rows: &[Row]) -> String {
+    let mut conditions: Vec<&str> = rows.iter().flat_map(|row| row.fields.keys().map(String::as_str)).collect();
+    conditions.sort_unstable();
+    conditions.dedup();
+    conditions.retain(|name| !MEASURED.contains(name));
+    let value = |row: &Row, name: &str| row.fields.get(name).cloned().unwrap_or("-".to_owned());
+    let (common, differing): (Vec<&str>, Vec<&str>) =
+        conditions.into_iter().partition(|name| rows.iter().all(|row| value(row, name) == value(&rows[0], name)));
+    let (other, shown): (Vec<&str>, Vec<&str>) = differing.into_iter().partition(|name| SAME.contains(name));
+    let measured = |row: &Row, name: &str, digits: usize| {
+        let number = row.fields.get(name).and_then(|text| text.parse::<f64>().ok());
+        number.map_or("-".to_owned(), |number| format!("{number:.digits$}"))
+    };
+    let heads = ["run", "result", "PSNR", "SSIM", "s/view"].into_iter().chain(shown.iter().copied());
+    let mut cells: Vec<Vec<String>> = vec![heads.map(str::to_owned).collect()];
+    for row in rows {
+        let figures = [("psnr_mean", 2), ("ssim_mean", 4), ("seconds_per_view", 3)];
+        let figures = figures.map(|(name, digits)| measured(row, name, digits));
+        let shown = shown.iter().map(|name| value(row, name));
+        cells.push([row.run.clone(), row.name.clone()].into_iter().chain(figures).chain(shown).collect());
+    }
+    let widths: Vec<usize> =
+        (0..cells[0].len()).map(|i| cells.iter().map(|row| row[i].chars().count()).max().unwrap_or(0)).collect();
+    let mut text = String::new();
+    for row in &cells {
+        let padded: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
+        text += padded.join("  ").trim_end();
+        text.push('\n');
+    }
+    for name in other {
+        text += &format!("not the same {name}, so that these figures cannot be compared:\n");
+        for row in rows {
+            text += &format!("  {} {}: {}\n", row.run, row.name, value(row, name));
+        }
+    }
+    let common: Vec<String> = common.iter().map(|name| format!("{name} {}", value(&rows[0], name))).collect();
+    text + &format!("all: {}\n", common.join("; "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(run: &str, fields: &[(&str, &str)]) -> Row {
+        let fields = fields.iter().map(|(name, value)| (name.to_string(), value.to_string())).collect();
+        Row { run: run.to_owned(), name: "eval-test".to_owned(), fields }
+    }
+
+    #[test]
+    fn what_differs_is_a_column_or_a_warning_and_the_rest_is_said_once() {
+        let one = [("psnr_mean", "31.126"), ("split", "test"), ("model.seed", "0"), ("views", "8")];
+        let other = [("psnr_mean", "null"), ("split", "test"), ("model.seed", "7"), ("views", "80"), ("threads", "2")];
+        let text = table(&[row("first", &one), row("b", &other)]);
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines[0], "run    result     PSNR   SSIM  s/view  model.seed  threads");
+        assert_eq!(lines[1], "first  eval-test  31.13  -     -       0           -");
+        assert_eq!(lines[2], "b      eval-test  -      -     -       7           2");
+        assert_eq!(lines[3], "not the same views, so that these figures cannot be compared:");
+        assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "all: split test"]);
+    }
+
+    #[test]
+    fn what_is_no_result_is_an_error_that_names_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("eval-test.json");
+        for (text, expected) in [("[1]", "no fields"), ("{}", "`psnr_mean`"), ("{\"psnr", "is no result")] {
+            std::fs::write(&path, text).unwrap();
+            let error = read(&path).unwrap_err().to_string();
+            assert!(error.contains("eval-test.json") && error.contains(expected), "{error}");
+        }
+        let text =
+            r#"{"psnr_mean":3.5,"model":{"seed":4},"per_view":[{"name":"b","psnr":1},{"name":"a"}],"scene":"x"}"#;
+        std::fs::write(&path, text).unwrap();
+        let expected = [("model.seed", "4"), ("photographs", "b, a"), ("psnr_mean", "3.5"), ("scene", "x")];
+        let expected: BTreeMap<_, _> = expected.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
+        assert_eq!(read(&path).unwrap(), expected);
+        for name in ["eval.json", "evaluation.json", "eval-val.json.tmp", "eval-val.json"] {
+            std::fs::write(folder.path().join(name), "{}").unwrap();
+        }
+        let found =
+            |only| results(folder.path(), only).unwrap().into_iter().map(|path| path.file_name().unwrap().to_owned());
+        assert!(found(None).eq(["eval-test.json", "eval-val.json", "eval.json"]));
+        assert!(found(Some("eval-val")).eq(["eval-val.json"]));
+    }
+}

@@ -1,0 +1,31 @@
+//! Pages that ask nothing of the network.
+
+/// A page with these texts in their places, each `{{name}}`; what a text holds is no place.
+pub fn filled(page: &str, texts: &[(&str, String)]) -> String {
+    let mut parts = page.split("{{");
+    let mut page = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let (place, rest) = part.split_once("}}").unwrap_or_default();
+        let text = texts.iter().find(|(name, _)| *name == place).map(|(_, text)| text.as_str());
+        page += text.unwrap_or_default();
+        page += rest;
+    }
+    page
+}
+
+/// A text in which nothing is taken for markup.
+pub fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_text_holds_is_neither_a_place_nor_markup() {
+        let page = filled("a {{x}} b {{y}} {{x}}{{z}}.", &[("x", "{{y}}".to_owned()), ("y", "2".to_owned())]);
+        assert_eq!(page, "a {{y}} b 2 {{y}}.");
+        assert_eq!(escaped("<a & \"b\">"), "&lt;a &amp; &quot;b&quot;&gt;");
+    }
+}
