@@ -7,7 +7,7 @@ use raygrad_nerf::dataset::scene::{DISTANCE, Landscape, Scene, View, walk_camera
 use raygrad_nerf::dataset::{Dataset, Frame, Placement, Scope, Split};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
 use raygrad_nerf::glam::{DMat3, DVec3};
-use raygrad_nerf::pictures::metrics::psnr;
+use raygrad_nerf::pictures::metrics::{psnr, ssim};
 use raygrad_nerf::sampling::marching::MarchingConfig;
 use raygrad_nerf::space::occupancy::{OccupancyConfig, Skip};
 use raygrad_nerf::volume::quadrature::Quadrature;
@@ -33,6 +33,22 @@ fn camera(number: usize) -> Camera {
 /// Where a golden file lies.
 fn golden(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference").join(name)
+}
+
+/// `reference/metrics.py` asked scikit-image.
+#[test]
+fn psnr_and_ssim_are_those_of_scikit_image() {
+    let values: serde_json::Value = serde_json::from_slice(&std::fs::read(golden("metrics.json")).unwrap()).unwrap();
+    let values = values.as_object().unwrap();
+    assert_eq!(values.len(), 10);
+    for (name, value) in values {
+        let [a, b] = ["a", "b"].map(|which| Image::open(golden(&format!("metrics/{name}-{which}.png"))).unwrap());
+        for (a, b) in [(&a, &b), (&b, &a)] {
+            let [db, similarity] = ["psnr", "ssim"].map(|metric| value[metric].as_f64().unwrap());
+            assert!((psnr(a, b) - db).abs() < 1e-4, "{name}: {} dB, not {db}", psnr(a, b));
+            assert!((ssim(a, b) - similarity).abs() < 1e-5, "{name}: SSIM {}, not {similarity}", ssim(a, b));
+        }
+    }
 }
 
 /// All pictures that are kept: of the bulldozer alone, and of the landscape around it.
