@@ -22,6 +22,9 @@ mod export;
 mod prepare;
 
 #[cfg(unix)]
+#[path = "cli/faults.rs"]
+mod faults;
+#[cfg(unix)]
 #[path = "cli/resume.rs"]
 mod resume;
 

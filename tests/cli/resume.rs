@@ -8,7 +8,8 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Settings of a model whose steps are short.
-const SMALL: &str = "--set field.grid.log2_table=10 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
+pub const SMALL: &str =
+    "--set field.grid.log2_table=10 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
 
 /// What each line of a run's metrics says but for times, which differ.
 fn metrics(place: &Place, run: &str) -> Vec<Value> {
@@ -29,7 +30,7 @@ fn checkpoints(place: &Place, run: &str) -> Vec<PathBuf> {
     found
 }
 
-fn assert_same(place: &Place, a: &str, b: &str) {
+pub fn assert_same(place: &Place, a: &str, b: &str) {
     let model = |run: &str| place.bytes(&format!("{run}/model.safetensors"));
     assert!(model(a) == model(b), "the models of {a} and {b} differ");
     assert_eq!(metrics(place, a), metrics(place, b));
