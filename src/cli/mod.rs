@@ -16,6 +16,7 @@ mod export;
 mod fuzz;
 mod html;
 mod interrupt;
+mod memory;
 mod output;
 mod parse;
 mod precision;

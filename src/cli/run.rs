@@ -1,4 +1,4 @@
-//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `lock`, and later `eval.json` and pictures.
+//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `lock`, and later results of `raygrad eval` and pictures.
 
 use std::fs::{DirEntry, File, TryLockError};
 use std::io::ErrorKind;
@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Budget, Config, Error, Extent, Model, Result, write_atomic};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::output::{make_folder, remove};
@@ -53,7 +54,6 @@ impl Run {
         make_folder(&folder)?;
         let run = Run { folder, config };
         run.write()?;
-        make_folder(&run.file("previews"))?;
         Ok(run)
     }
 
@@ -75,8 +75,16 @@ impl Run {
             }
             _ => Error::file(&file, format!("cannot be read: {e}")),
         })?;
-        let config: RunConfig =
-            serde_json::from_str(&text).map_err(|e| Error::file(&file, format!("is not a run's: {e}")))?;
+        let config: RunConfig = serde_json::from_str(&text).map_err(|e| match later_version(&text) {
+            Some(version) => {
+                let own = env!("CARGO_PKG_VERSION");
+                Error::file(
+                    &file,
+                    format!("was made by raygrad {version}, and this is {own}: use that one, or a newer ({e})"),
+                )
+            }
+            None => Error::file(&file, format!("is not a run's: {e}")),
+        })?;
         config.check().map_err(|e| Error::file(&file, e))?;
         Ok(Run { folder: folder.into(), config })
     }
@@ -124,6 +132,16 @@ impl Run {
     pub fn model(&self) -> Result<Model<f32>> {
         Model::load(self.model_file(), self.config.config.clone(), self.config.extent)
     }
+}
+
+/// The version of raygrad that a run's configuration says it was made by, if that is later than this one.
+fn later_version(config: &str) -> Option<String> {
+    let value: Value = serde_json::from_str(config).ok()?;
+    let made_by = value.get("raygrad")?.as_str()?;
+    let parts = |version: &str| {
+        version.split(['.', '-', '+']).take(3).map(|part| part.parse().ok()).collect::<Option<Vec<u64>>>()
+    };
+    (parts(made_by)? > parts(env!("CARGO_PKG_VERSION"))?).then(|| made_by.to_owned())
 }
 
 impl RunConfig {
@@ -200,5 +218,21 @@ fn contents(folder: &Path) -> Result<Contents> {
         }),
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(Contents::Nothing),
         Err(e) => Err(Error::file(folder, format!("cannot be used as the run's folder: {e}"))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_of_later_versions_are_told_apart() {
+        let later = |text: &str| later_version(text);
+        assert_eq!(later(r#"{"raygrad":"999.0.1","new":[]}"#).as_deref(), Some("999.0.1"));
+        assert_eq!(later(r#"{"raygrad":"0.999.0-rc1"}"#).as_deref(), Some("0.999.0-rc1"));
+        for text in [r#"{"raygrad":"0.0.999"}"#, r#"{"raygrad":"x"}"#, r#"{"raygrad":3}"#, "{}", "[", "[]"] {
+            assert_eq!(later(text), None, "{text}");
+        }
+        assert_eq!(later(&format!(r#"{{"raygrad":"{}"}}"#, env!("CARGO_PKG_VERSION"))), None);
     }
 }

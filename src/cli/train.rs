@@ -25,8 +25,10 @@ use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::watch::Watch;
-use super::{checkpoint, doctor, interrupt, parse, watch};
+use super::{checkpoint, doctor, interrupt, memory, parse, watch};
 
+/// Bytes of photographs that many a computer has not, where it does not say how many it has.
+const HEAVY: f64 = 4e9;
 /// How often a run that has diverged goes back to its last checkpoint.
 const RETREATS: u32 = 3;
 
@@ -324,23 +326,38 @@ impl Args {
     }
 }
 
-/// Bytes of photographs that many a computer has not.
-const HEAVY: f64 = 4e9;
-
-/// Says what photographs will take if that is much, before they are read.
+/// Says what photographs will take if more is not free, or is not known to be, before they are read.
 fn warn_of_memory(scene: &Opened, downscale: usize) {
     let Some((capture, _)) = &scene.capture else { return };
     let pixels: f64 = capture.present().map(|view| view.camera.width as f64 * view.camera.height as f64).sum();
     let bytes = |downscale: usize| 3.0 * pixels / (downscale * downscale) as f64;
-    if bytes(downscale) > HEAVY {
-        let enough = (downscale..).find(|k| bytes(*k) <= 0.5 * HEAVY).unwrap_or(downscale);
+    let free = memory::available().unwrap_or(HEAVY);
+    if bytes(downscale) > free {
+        let enough = (downscale..).find(|k| bytes(*k) <= 0.5 * free).unwrap_or(downscale);
         complain(&format!(
-            "warning: {} photographs take about {:.0} GB of memory at this size, with --downscale {enough} {:.1} GB",
+            "warning: {} photographs take about {:.1} GB of memory at this size, of {:.1} GB that are free; with --downscale \
+             {enough} {:.1} GB",
             capture.present().count(),
             bytes(downscale) / 1e9,
+            free / 1e9,
             bytes(enough) / 1e9
         ));
     }
+}
+
+/// What training will take, and a warning if so much is not free. What is there already is not taken again.
+fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
+    let need = memory::need(trainer, data);
+    let free = memory::available().map(|free| free + memory::taken().unwrap_or(0.0));
+    if let Some(free) = free.filter(|free| need > *free) {
+        complain(&format!(
+            "warning: training takes about {:.1} GB of memory, of {:.1} GB that are free: the system may end it; say --downscale, or \
+             a smaller table or batch with --set (field.grid.log2_table, sampler.samples)",
+            need / 1e9,
+            free / 1e9
+        ));
+    }
+    print(&format!("memory   about {:.1} GB\n", need / 1e9))
 }
 
 /// Photographs before whose cameras nothing is looked for nearer than that, in the units of their files.
@@ -412,7 +429,8 @@ fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Res
         trainer.model.params.elements(),
         rayon::current_num_threads(),
         run.folder.display()
-    ))
+    ))?;
+    foresee_memory(trainer, data)
 }
 
 fn summarise(run: &Run, stats: &StepStats, interrupted: bool) -> Result<()> {

@@ -8,6 +8,7 @@ use std::time::Duration;
 use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer, write_atomic};
 
 use super::checkpoint;
+use super::output::make_folder;
 use super::preview::Preview;
 use super::progress::{Progress, spoken};
 use super::run::Run;
@@ -159,7 +160,9 @@ impl<'a> Watch<'a> {
 
     fn preview(&mut self, trainer: &Trainer) -> Result<()> {
         let stats = trainer.stats();
-        let path = self.run.file(&format!("previews/{:06}.png", stats.step));
+        let folder = self.run.file("previews");
+        make_folder(&folder)?;
+        let path = folder.join(format!("{:06}.png", stats.step));
         let psnr = self.preview.save(&trainer.model, &path)?;
         let (time, name) = (spoken(stats.train_seconds), &self.preview.name);
         self.progress.note(&format!("after {time}: {}, PSNR {psnr:.2} dB on {name}", path.display()));

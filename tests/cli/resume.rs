@@ -202,6 +202,37 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
     place.fails("train --resume run --steps 5", &["run: ", "other photographs"]);
 }
 
+/// A run that was ended after 20 steps when checkpoints were new: such files are gone on from for ever.
+#[test]
+fn a_run_with_a_checkpoint_of_the_first_version_goes_on() {
+    let place = Place::empty();
+    let stored = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference/run-checkpoint-1");
+    std::fs::create_dir_all(place.path("run/checkpoints")).unwrap();
+    for name in ["config.json", "model.safetensors", "metrics.jsonl", "checkpoints/00000020.checkpoint"] {
+        std::fs::copy(stored.join(name), place.path(&format!("run/{name}"))).unwrap();
+    }
+    let before = metrics(&place, "run");
+    let printed = place.succeeds("train --resume run --steps 40");
+    assert!(printed.contains("from     step 20"), "{printed}");
+    let after = metrics(&place, "run");
+    assert_eq!(after[..before.len()], before, "what was known stays");
+    let [first, last] = [&before[0], after.last().unwrap()].map(|line| line["loss"].as_f64().unwrap());
+    assert!(last < 0.75 * first && after.last().unwrap()["step"] == 40, "{first} {last}");
+    // It has not begun again: its counts go on.
+    assert!(after.last().unwrap()["rays"].as_f64().unwrap() > 1.5 * before.last().unwrap()["rays"].as_f64().unwrap());
+    // What a later raygrad wrote is not guessed at.
+    let path = place.path("run/checkpoints/00000040.checkpoint");
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, [b"raygrad checkpoint 2", &bytes[20..]].concat()).unwrap();
+    std::fs::remove_file(place.path("run/checkpoints/00000020.checkpoint")).unwrap();
+    let (succeeds, said) = complaints(&place, "train --resume run --steps 50");
+    assert!(!succeeds && said.contains("has version 2, and this raygrad knows 1: use the one that wrote it"), "{said}");
+    let mut config = place.json("run/config.json");
+    (config["raygrad"], config["extra"]) = ("99.0.0".into(), 1.into());
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.fails("eval run", &["run/config.json: was made by raygrad 99.0.0", "a newer"]);
+}
+
 /// The words of a run on standard error, and whether it succeeded.
 fn complaints(place: &Place, arguments: &str) -> (bool, String) {
     let output = place.command(arguments).output().unwrap();

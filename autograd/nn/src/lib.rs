@@ -26,5 +26,5 @@ pub use optim::{RowAdam, RowStats, SettingError, Sgd, SgdConfig, StateError, Upd
 pub use optim::{clip_norm, clip_value, global_norm};
 pub use params::{Bound, ParamId, ParamLayout, Params};
 #[cfg(feature = "files")]
-pub use storage::{ParamsError, Storage, stored_bytes};
+pub use storage::{ParamsError, Storage, stored_bytes, stored_words};
 pub use tiles::{SLOTS, TileSums, Tiles};

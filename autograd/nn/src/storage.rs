@@ -203,6 +203,15 @@ pub fn stored_bytes(bytes: &[u8], name: &str) -> Result<Option<Vec<u8>>, ParamsE
     Ok(found.map(|view| view.data().to_vec()))
 }
 
+/// The words under this key of what a safetensors file says of itself.
+///
+/// # Errors
+/// If it is no such file.
+pub fn stored_words(bytes: &[u8], key: &str) -> Result<Option<String>, ParamsError> {
+    let (_, header) = SafeTensors::read_metadata(bytes)?;
+    Ok(header.metadata().as_ref().and_then(|words| words.get(key).cloned()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -227,6 +236,11 @@ mod tests {
         other.values_mut()[0].as_mut_slice().fill(9.0);
         let blobs = other.load_safetensors(&bytes).unwrap();
         assert_eq!(blobs["more"], [1, 2, 3]);
+        assert_eq!(stored_words(&bytes, "version").unwrap(), None);
+        let words = HashMap::from([("version".into(), "7".into())]);
+        let bytes = params.to_safetensors(Storage::Full, words, &[]).unwrap();
+        assert_eq!(stored_words(&bytes, "version").unwrap().as_deref(), Some("7"));
+        assert!(stored_words(&bytes, "other").unwrap().is_none() && stored_words(b"none", "version").is_err());
         for (a, b) in params.values().iter().zip(other.values()) {
             let bits = |x: &Tensor<f32>| x.as_slice().iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             assert_eq!(bits(a), bits(b));

@@ -5,7 +5,7 @@ use super::{Extent, Model};
 use crate::camera::Camera;
 use crate::files::write_atomic;
 use crate::{Error, Result};
-use raygrad_nn::stored_bytes;
+use raygrad_nn::{stored_bytes, stored_words};
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -16,7 +16,7 @@ impl Model<f32> {
     /// # Errors
     /// If the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
-        let metadata = HashMap::from([("format".into(), "raygrad".into())]);
+        let metadata = HashMap::from([("format".into(), "raygrad".into()), (VERSION.0.into(), VERSION.1.to_string())]);
         let mut blobs = self.sampler.state();
         if self.detail < 1.0 {
             blobs.push((DETAIL, self.detail.to_le_bytes().to_vec()));
@@ -34,9 +34,10 @@ impl Model<f32> {
     /// A model of this configuration with the parameters of a file.
     ///
     /// # Errors
-    /// If the file cannot be read or belongs to a model of another configuration.
+    /// If the file cannot be read, is of a later version, or belongs to a model of another configuration.
     pub fn load(path: impl AsRef<Path>, config: Config, extent: Extent) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
+        check_version(&bytes).map_err(|error| Error::file(&path, error))?;
         // How many parameters there are depends on the cameras.
         let stored = stored_bytes(&bytes, CAMERAS).map_err(|error| Error::file(&path, error))?;
         let cameras = cameras(stored.as_deref()).map_err(|error| Error::file(&path, error))?;
@@ -53,6 +54,23 @@ impl Model<f32> {
         drop((bytes, state));
         model.finish();
         Ok(model)
+    }
+}
+
+/// How files are laid out: the word that says it, and the version that is written.
+const VERSION: (&str, u64) = ("version", 1);
+
+/// Whether a file is of a version that is known. The first edition did not say.
+fn check_version(bytes: &[u8]) -> std::result::Result<(), String> {
+    let (name, known) = VERSION;
+    let stored = stored_words(bytes, name).map_err(|error| error.to_string())?;
+    match stored.map(|words| words.parse::<u64>()) {
+        None => Ok(()),
+        Some(Ok(version)) if version <= known => Ok(()),
+        Some(Ok(version)) => {
+            Err(format!("has version {version}, and this raygrad knows {known}: use the one that wrote it, or a newer"))
+        }
+        Some(Err(_)) => Err("has a version that is no number".to_owned()),
     }
 }
 
@@ -95,6 +113,27 @@ mod tests {
             sampler.occupancy.resolution = 16;
         }
         config
+    }
+
+    #[test]
+    fn files_of_later_versions_are_refused() {
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
+        let model = Model::new(voxel(1), extent, 3).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.safetensors");
+        model.save(&path).unwrap();
+        let written = stored_words(&std::fs::read(&path).unwrap(), "version").unwrap();
+        assert_eq!(written.as_deref(), Some("1"));
+        let load = |words: &[(&str, &str)]| {
+            let words = words.iter().map(|(key, value)| (key.to_string(), value.to_string())).collect();
+            let bytes = model.params.to_safetensors(Storage::Full, words, &model.sampler.state()).unwrap();
+            std::fs::write(&path, bytes).unwrap();
+            Model::load(&path, voxel(1), extent).map(|_| ()).map_err(|error| error.to_string())
+        };
+        assert!(load(&[]).is_ok() && load(&[("version", "1")]).is_ok());
+        let newer = load(&[("version", "2")]).unwrap_err();
+        assert!(newer.contains("model.safetensors: has version 2, and this raygrad knows 1"), "{newer}");
+        assert!(load(&[("version", "one")]).unwrap_err().contains("no number"));
     }
 
     #[test]
