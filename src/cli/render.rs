@@ -29,15 +29,16 @@ use shown::{Layer, Show, Shown};
 
 /// Render pictures or a film of a model
 ///
-/// Pictures of the same name are replaced. Of a film, frames are written to FILE.frames/ first. After a Ctrl-C, and whatever else
-/// ends it, the same command goes on where it was.
+/// Pictures of the same name are replaced. Of a film, frames are written to FILE.frames/ first. After a Ctrl-C, and
+/// whatever else ends it, the same command goes on where it was.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
     run: PathBuf,
     #[command(flatten)]
     flight: FlightArgs,
-    /// Folder for PNG frames, or a file: FILE.png for the first frame; FILE.gif, FILE.apng or (by ffmpeg) FILE.mp4 or FILE.webm for a film [default: RUN/PATH]
+    /// Folder for PNG frames, or a file: FILE.png for the first frame; FILE.gif, FILE.apng or (by ffmpeg) FILE.mp4 or
+    /// FILE.webm for a film [default: RUN/PATH]
     #[arg(long, value_name = "DIR|FILE")]
     out: Option<PathBuf>,
     /// What frames show
@@ -199,7 +200,8 @@ fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Result<
     if beyond > 0 {
         let most = f64::from(u16::MAX) * shown.depth_unit;
         note(&format!(
-            "depths beyond {most} in {beyond} frames have no room in 16 bits and are 0: say a longer --depth-unit, or --save depth-npy"
+            "depths beyond {most} in {beyond} frames have no room in 16 bits and are 0: say a longer --depth-unit, \
+             or --save depth-npy"
         ));
     }
     Ok(true)

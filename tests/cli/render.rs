@@ -67,7 +67,7 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
     }
     assert_eq!(one("--show depth"), one("--depth"));
     // At twice the tangent of half of the angle, what was seen is in the middle, at half the size.
-    let wide = one("--size 48x48 --fov 71.6218");
+    let wide = one("--size 48x48 --fov 71.507778");
     let middle = |x: usize, y: usize| wide.pixel(12 + x, 12 + y).to_vec();
     let worst = (0..SIZE * SIZE).map(|i| {
         let (x, y) = (i % SIZE, i / SIZE);
@@ -151,8 +151,8 @@ fn what_is_saved_beside_frames_belongs_to_them() {
     assert!(output.status.success() && (said.contains("--save depth-npy") || said.is_empty()), "{said}");
 }
 
-/// The depth of each pixel along the optical axis is that along the ray times a cosine, whatever the lens; here for the reader's
-/// own convention, from outside.
+/// The depth of each pixel along the optical axis is that along the ray times a cosine, whatever the lens; here for the
+/// reader's own convention, from outside.
 #[test]
 fn depths_are_along_the_axis() {
     let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), raygrad::nerf::glam::DAffine3::IDENTITY);

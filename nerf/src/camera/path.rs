@@ -26,8 +26,9 @@ impl Key {
         Camera::from_angle(width, height, angle_x, self.pose)
     }
 
-    /// The key that is `share` of the way to another, beyond it above 1 and before this one below 0: on a straight line, by a
-    /// turn about one axis, the short way round (slerp, Shoemake 1985), and with the focal length changing by a constant factor.
+    /// The key that is `share` of the way to another, beyond it above 1 and before this one below 0: on a straight
+    /// line, by a turn about one axis, the short way round (slerp, Shoemake 1985), and with the focal length changing
+    /// by a constant factor.
     pub fn mix(&self, other: &Key, share: f64) -> Key {
         let (from, to) = (&self.pose, &other.pose);
         let turn = DQuat::from_scaled_axis(share * turn(from, to));
@@ -53,9 +54,9 @@ fn turn(from: &DAffine3, to: &DAffine3) -> DVec3 {
 /// How a path goes by its keys.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Curve {
-    /// Through each: a Catmull-Rom spline by the pyramid of Barry and Goldman (1988) of [`Key::mix`], for rotations as Schlag
-    /// (1991) has it. Speeds of moving, of turning and of zooming are continuous. From key to key a camera should turn by less than a
-    /// right angle.
+    /// Through each: a Catmull-Rom spline by the pyramid of Barry and Goldman (1988) of [`Key::mix`], for rotations as
+    /// Schlag (1991) has it. Speeds of moving, of turning and of zooming are continuous. From key to key a camera
+    /// should turn by less than a right angle.
     Through,
     /// Near each, as smooth as a uniform cubic B-spline: in the middle of a leg's end, a key counts four sixths and its
     /// neighbours one. Rotations are weighted means of quaternions. These are the paths of instant-ngp.
@@ -85,9 +86,9 @@ pub struct CameraPath {
 const LEAST_LEG: f64 = 1e-3;
 
 impl CameraPath {
-    /// Through keys, at least one, and back to the first if it is `closed`. A leg takes time as the square root of its length, in which
-    /// turning counts as much as moving does in all: the centripetal parameter, with which curves have neither loops nor cusps
-    /// between their keys (Yuksel, Schaefer and Keyser 2011).
+    /// Through keys, at least one, and back to the first if it is `closed`. A leg takes time as the square root of its
+    /// length, in which turning counts as much as moving does in all: the centripetal parameter, with which curves have
+    /// neither loops nor cusps between their keys (Yuksel, Schaefer and Keyser 2011).
     ///
     /// # Panics
     /// If there is no key.
@@ -145,7 +146,8 @@ impl CameraPath {
         }
     }
 
-    /// `count` keys along the path, evenly in time: from its beginning to its end or, of a closed one, up to where it begins again.
+    /// `count` keys along the path, evenly in time: from its beginning to its end or, of a closed one, up to where it
+    /// begins again.
     pub fn frames(&self, count: usize) -> Vec<Key> {
         let steps = if self.closed { count } else { count.saturating_sub(1).max(1) };
         (0..count).map(|i| self.at(i as f64 / steps as f64)).collect()

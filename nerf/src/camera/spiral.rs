@@ -25,8 +25,8 @@ pub struct Spiral {
 }
 
 impl Spiral {
-    /// Around the average of cameras, as far as nine in ten of them go, with a focus of 1; `None` if there are none, or they do not look the same
-    /// way, so that they have no average.
+    /// Around the average of cameras, as far as nine in ten of them go, with a focus of 1; `None` if there are none, or
+    /// they do not look the same way, so that they have no average.
     pub fn around(cameras: &[Camera]) -> Option<Self> {
         let mean = |of: fn(&Camera) -> DVec3| cameras.iter().map(of).sum::<DVec3>() / cameras.len() as f64;
         let (back, up) = (mean(|camera| camera.pose.matrix3.z_axis), mean(|camera| camera.pose.matrix3.y_axis));
@@ -41,8 +41,8 @@ impl Spiral {
         Some(Spiral { pose, radii, focus: 1.0 })
     }
 
-    /// `count` poses, all looking at the focus; the last leads to the first. With the radii `r` and an angle `a` they are at
-    /// `(r0 cos a, -r1 sin a, -r2 sin(a / 2))` along the axes of the middle.
+    /// `count` poses, all looking at the focus; the last leads to the first. With the radii `r` and an angle `a` they
+    /// are at `(r0 cos a, -r1 sin a, -r2 sin(a / 2))` along the axes of the middle.
     pub fn poses(&self, count: usize) -> Vec<DAffine3> {
         let Spiral { pose, radii: [right, up, back], focus } = *self;
         let target = pose.transform_point3(DVec3::new(0.0, 0.0, -focus));

@@ -8,10 +8,10 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
 use std::io::Cursor;
 use std::path::Path;
 
-/// Reads a file of depths along the optical axis, a PNG of integers or a `.npy` array of floats, in units of which each has
-/// the length `unit` in those of the scene: the distance along the ray through the centre of each of the camera's pixels, in
-/// scene units, and 0 where nothing was measured. Depths of another size are looked up and never averaged: halfway between
-/// what is near and what is behind it there is nothing.
+/// Reads a file of depths along the optical axis, a PNG of integers or a `.npy` array of floats, in units of which each
+/// has the length `unit` in those of the scene: the distance along the ray through the centre of each of the camera's
+/// pixels, in scene units, and 0 where nothing was measured. Depths of another size are looked up and never averaged:
+/// halfway between what is near and what is behind it there is nothing.
 pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
     let wrong = |what: String| Error::file(path, what);
     let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
@@ -49,8 +49,8 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     Ok(out)
 }
 
-/// Depths along the optical axis, as sets of photographs with depths have them: what [`View::depth`](super::View::depth) is read
-/// from, 0 where there is nothing.
+/// Depths along the optical axis, as sets of photographs with depths have them: what
+/// [`View::depth`](super::View::depth) is read from, 0 where there is nothing.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Depths {
     size: [usize; 2],
@@ -59,8 +59,8 @@ pub struct Depths {
 }
 
 impl Depths {
-    /// Of distances along the rays of a camera's pixels, as a [`Picture`](crate::Picture) has them, each multiplied by `scale`: 1 over the
-    /// [scale of the placement](super::Placement::scale) gives them in units of the capture.
+    /// Of distances along the rays of a camera's pixels, as a [`Picture`](crate::Picture) has them, each multiplied by
+    /// `scale`: 1 over the [scale of the placement](super::Placement::scale) gives them in units of the capture.
     ///
     /// # Panics
     /// If the image is not one channel of the camera's size.
@@ -78,7 +78,8 @@ impl Depths {
         Depths { size: [camera.width, camera.height], values }
     }
 
-    /// A PNG of one channel of 16 bits, in units of length `unit`, rounded; and how many depths are too great for it, of which it has 0.
+    /// A PNG of one channel of 16 bits, in units of length `unit`, rounded; and how many depths are too great for it,
+    /// of which it has 0.
     ///
     /// # Panics
     /// If it has no pixels.

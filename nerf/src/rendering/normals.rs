@@ -15,10 +15,10 @@ use rayon::prelude::*;
 const TILE: usize = 64;
 
 impl<T: Scalar> Model<T> {
-    /// The normals that are seen from a camera, three channels: along each ray the sum of weights times
-    /// `-grad sigma / |grad sigma|` (as Verbin et al. 2022, equation 3 and after), in the scene's axes. Each is as long as the pixel is
-    /// opaque where all that is seen faces one way, and shorter elsewhere. Light that is left when a ray [ends](crate::Limits) counts for
-    /// nothing.
+    /// The normals that are seen from a camera, three channels: along each ray the sum of weights times `-grad sigma /
+    /// |grad sigma|` (as Verbin et al. 2022, equation 3 and after), in the scene's axes. Each is as long as the pixel
+    /// is opaque where all that is seen faces one way, and shorter elsewhere. Light that is left when a ray
+    /// [ends](crate::Limits) counts for nothing.
     ///
     /// It takes a gradient for each sample: about as long as a step of training on as many rays.
     ///

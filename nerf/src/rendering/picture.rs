@@ -35,8 +35,8 @@ impl Picture {
         Picture { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
     }
 
-    /// The colour without the background that the picture was rendered over: RGBA, with the opacity as alpha and colours that are not
-    /// multiplied by it; where nothing is visible all 0.
+    /// The colour without the background that the picture was rendered over: RGBA, with the opacity as alpha and
+    /// colours that are not multiplied by it; where nothing is visible all 0.
     ///
     /// ```
     /// use raygrad_nerf::{Evaluations, Image, Picture};
@@ -93,8 +93,8 @@ impl Part<'_> {
 }
 
 impl<T: Scalar> Model<T> {
-    /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a tile's first
-    /// pixel, its rays and its part of `out`.
+    /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
+    /// tile's first pixel, its rays and its part of `out`.
     pub(crate) fn tiles<S: Default, P: Send>(
         &self,
         camera: &Camera,
@@ -113,8 +113,8 @@ impl<T: Scalar> Model<T> {
         tiles.reduce(Evaluations::default, |a, b| a + b)
     }
 
-    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile shows
-    /// to its part of `out`.
+    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
+    /// shows to its part of `out`.
     pub(crate) fn pixels<S: Default, P: Send>(
         &self,
         camera: &Camera,
@@ -157,9 +157,9 @@ impl Model<f32> {
         picture
     }
 
-    /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole: something
-    /// to look at while the rest is computed, for a third more work. Each picture is rendered when the iterator is asked
-    /// for it.
+    /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole:
+    /// something to look at while the rest is computed, for a third more work. Each picture is rendered when the
+    /// iterator is asked for it.
     ///
     /// # Panics
     /// If `coarsest` is not a power of two.

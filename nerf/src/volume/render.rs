@@ -151,8 +151,8 @@ impl<'t, T: Scalar> Rendered<'t, T> {
         downhill(&self.density.value.sum().grad_graph(&[&self.positions]).remove(0))
     }
 
-    /// The normals that are seen along the rays: the sums of [those of samples](Self::normals) times the weights, `[rays, 3]`,
-    /// no longer than the opacity, as numbers.
+    /// The normals that are seen along the rays: the sums of [those of samples](Self::normals) times the weights,
+    /// `[rays, 3]`, no longer than the opacity, as numbers.
     ///
     /// # Panics
     /// As [`normals`](Self::normals), or if the density does not depend on positions.

@@ -100,7 +100,8 @@ impl Film {
         command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i", &format!("%0{DIGITS}d.png")]);
         command.args(["-frames:v", &count.to_string()]);
         // Players take an unnamed matrix by the size; this is named.
-        let filter = "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int";
+        let filter = "pad=ceil(iw/2)*2:ceil(ih/2)*2,\
+                      scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int";
         command.args(["-vf", filter, "-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"]);
         command.args(["-color_trc", "iec61966-2-1", "-color_range", "tv"]);
         command.args(match self {

@@ -30,8 +30,9 @@ const SPIRAL_SHARE: f64 = 0.1;
 /// Flags about where the camera goes.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct FlightArgs {
-    /// Where the camera goes: orbit (around the scene, or to and fro where photographs are from one side), spiral (LLFF's, about the average photograph),
-    /// spline (through photographs), test (from test view to test view), or FILE.json: a camera path of nerfstudio or instant-ngp
+    /// Where the camera goes: orbit (around the scene, or to and fro where photographs are from one side), spiral
+    /// (LLFF's, about the average photograph), spline (through photographs), test (from test view to test view), or
+    /// FILE.json: a camera path of nerfstudio or instant-ngp
     #[arg(long, default_value = "orbit", value_parser = CameraPath::parse)]
     pub path: CameraPath,
     /// Number of frames [default: 60 for an orbit, 120 for other paths, or as the file says; one for each test view]
@@ -67,8 +68,8 @@ pub struct FlightArgs {
     /// Let a spline end where it begins
     #[arg(long)]
     closed: bool,
-    /// From the coordinates of a camera path's file to those of the capture: nerfstudio's dataparser_transforms.json, or for
-    /// instant-ngp the transforms.json with a scale and an offset
+    /// From the coordinates of a camera path's file to those of the capture: nerfstudio's dataparser_transforms.json,
+    /// or for instant-ngp the transforms.json with a scale and an offset
     #[arg(long, value_name = "FILE")]
     path_transform: Option<PathBuf>,
 }
@@ -239,7 +240,8 @@ impl FlightArgs {
     }
 }
 
-/// What LLFF's spiral looks at, for the nearest and the farthest depth that photographs show: a weighted mean of them in inverse depth.
+/// What LLFF's spiral looks at, for the nearest and the farthest depth that photographs show: a weighted mean of them
+/// in inverse depth.
 fn llff_focus([near, far]: [f64; 2]) -> f64 {
     let [near, far] = [0.9 * near, 5.0 * far];
     (0.25 / near + 0.75 / far).recip()
@@ -316,11 +318,35 @@ impl Photographs {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use raygrad::nerf::glam::DVec3;
 
     #[test]
     fn the_focus_of_a_spiral_is_that_of_the_published_code() {
         // close_depth, inf_depth = bds.min()*.9, bds.max()*5.; dt = .75; 1./(((1.-dt)/close_depth + dt/inf_depth))
         assert!((llff_focus([2.0, 30.0]) - 6.949806949806949).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_spiral_winds_about_photographs_from_one_side_and_about_the_orbit_of_others() {
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::new(1.0, 1.0, 3.0)], [0.5, 9.0]);
+        let view =
+            Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation: 0.3, azimuth: 0.0, reach: 0.4 };
+        let photograph = |i: usize, side: f64, bounds| {
+            let eye = DVec3::new(side * 4.0, 0.1 * i as f64 - 0.5, 1.0);
+            let pose = Camera::look_at(eye, eye - side * DVec3::X, DVec3::Z);
+            Photograph { name: String::new(), camera: Camera::from_angle(40, 30, 0.8, pose), bounds }
+        };
+        let args = FlightArgs { radius: Some(3.0), ..FlightArgs::default() };
+        let spiral = |photographs: Vec<Photograph>| args.spiral(&view, &extent, &Photographs(photographs));
+        // Its focus is as far as the middle of the box, or as LLFF has it.
+        let ahead = spiral((0..11).map(|i| photograph(i, 1.0, None)).collect());
+        assert!((ahead.focus - 4.0).abs() < 1e-12 && (ahead.radii[0] - 1.5).abs() < 1e-12, "{ahead:?}");
+        let known = spiral((0..11).map(|i| photograph(i, 1.0, Some([2.0 + i as f64, 20.0 + i as f64]))).collect());
+        assert!((known.focus - 6.949806949806949).abs() < 1e-12);
+        // From both sides: as the first camera of the orbit, a tenth of the way about it, here three.
+        let around = spiral((0..10).map(|i| photograph(i, if i % 2 == 0 { 1.0 } else { -1.0 }, None)).collect());
+        assert!(around.pose.abs_diff_eq(view.orbit(&extent, 1)[0].pose, 1e-12) && (around.focus - 4.0).abs() < 1e-12);
+        assert!(around.radii.iter().all(|radius| (radius - 1.2).abs() < 1e-12));
     }
 
     #[test]

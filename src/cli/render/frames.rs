@@ -30,8 +30,8 @@ struct Record {
 }
 
 impl Frames {
-    /// In a folder, which is made. Frames that an interrupted call has left there are kept if they are `of` the same; all others are replaced
-    /// one by one.
+    /// In a folder, which is made. Frames that an interrupted call has left there are kept if they are `of` the same;
+    /// all others are replaced one by one.
     pub fn new(folder: PathBuf, of: Value) -> Result<Self> {
         make_folder(&folder)?;
         // What cannot be read is begun again.
@@ -54,7 +54,8 @@ impl Frames {
         &self.folder
     }
 
-    /// Writes the next frame: what is to lie in folders beside it by the folder's name and the file's ending, and last the picture.
+    /// Writes the next frame: what is to lie in folders beside it by the folder's name and the file's ending, and last
+    /// the picture.
     pub fn push(&mut self, picture: &[u8], layers: &[(&str, &str, Vec<u8>)]) -> Result<()> {
         let path = self.path(self.record.done);
         for (layer, ending, bytes) in layers {

@@ -1,12 +1,13 @@
 //! Camera paths of other programs: nerfstudio's `camera_path.json`, and those that instant-ngp saves.
 //!
-//! Nerfstudio lists the camera of every frame (`camera_path`), and the key frames that it has them from (`keyframes`), which count where
-//! there is no list. Poses are camera-to-world, row by row, of a camera that looks along `-z` with `y` up; angles are vertical, in degrees.
-//! Its world is the capture's, recentred and scaled by what its `dataparser_transforms.json` says.
+//! Nerfstudio lists the camera of every frame (`camera_path`), and the key frames that it has them from (`keyframes`),
+//! which count where there is no list. Poses are camera-to-world, row by row, of a camera that looks along `-z` with
+//! `y` up; angles are vertical, in degrees. Its world is the capture's, recentred and scaled by what its
+//! `dataparser_transforms.json` says.
 //!
-//! Instant-ngp lists key frames of a cubic B-spline: quaternions `x y z w` and positions of a camera that looks along `z` with `y` down, in
-//! its unit cube, whose `x y z` are `y z x` of the capture times 0.33 and one half more, if the capture's `transforms.json` does not say
-//! another scale and offset.
+//! Instant-ngp lists key frames of a cubic B-spline: quaternions `x y z w` and positions of a camera that looks along
+//! `z` with `y` down, in its unit cube, whose `x y z` are `y z x` of the capture times 0.33 and one half more, if the
+//! capture's `transforms.json` does not say another scale and offset.
 
 use std::path::Path as File;
 
@@ -145,8 +146,8 @@ struct Cube {
     offset: [f64; 3],
 }
 
-/// Reads a path and takes it to the capture's coordinates, by what `transform` says; `applied` gives the map from coordinates of before to those
-/// of the capture's file, which nerfstudio's transform has in it.
+/// Reads a path and takes it to the capture's coordinates, by what `transform` says; `applied` gives the map from
+/// coordinates of before to those of the capture's file, which nerfstudio's transform has in it.
 pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Result<DAffine3>) -> Result<Path> {
     let document: Value = parse(file)?;
     let has = |name: &str| document.get(name).is_some_and(|value| !value.is_null());
@@ -321,7 +322,8 @@ fn from_rows(m: &[f64; 16]) -> std::result::Result<DAffine3, String> {
 }
 
 impl Dataparser {
-    /// From nerfstudio's world to the capture's. A place `x` of before the file's own transform is at `scale * (transform x)`.
+    /// From nerfstudio's world to the capture's. A place `x` of before the file's own transform is at `scale *
+    /// (transform x)`.
     fn to_capture(&self, file: &File, applied: DAffine3) -> Result<DAffine3> {
         let row = |r: usize| DVec3::from_slice(&self.transform[r][..3]);
         let matrix3 = DMat3::from_cols(row(0), row(1), row(2)).transpose();

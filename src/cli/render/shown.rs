@@ -1,7 +1,7 @@
 //! What is shown of a view, and what is saved beside it.
 
 use clap::ValueEnum;
-use raygrad::nerf::dataset::Depths;
+use raygrad::nerf::dataset::{Depths, Placement};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Extent, Image, Picture};
 use serde::Serialize;
@@ -93,22 +93,29 @@ impl Shown<'_> {
         Frame { image, layers, beyond }
     }
 
-    /// Unit normals as colours, in the capture's axes.
     fn normals(&self, camera: &Camera) -> Image {
-        let mut normals = self.renderer.normals(camera);
-        let back = self.extent.placement.rotation.transpose();
-        for pixel in normals.data.chunks_exact_mut(3) {
-            let normal = DVec3::new(pixel[0].into(), pixel[1].into(), pixel[2].into());
-            let color = 0.5 + 0.5 * (back * normal).normalize_or_zero();
-            pixel.copy_from_slice(&color.as_vec3().to_array());
-        }
-        normals
+        facing(self.renderer.normals(camera), &self.extent.placement)
     }
 
-    /// Depths of what is solid, in units of the capture.
     fn depths(&self, picture: &Picture, camera: &Camera) -> Depths {
-        Depths::new(&solid(&picture.depth, picture), camera, self.extent.placement.scale.recip())
+        depths(picture, camera, &self.extent.placement)
     }
+}
+
+/// Unit normals as colours, in the capture's axes.
+fn facing(mut normals: Image, placement: &Placement) -> Image {
+    let back = placement.rotation.transpose();
+    for pixel in normals.data.chunks_exact_mut(3) {
+        let normal = DVec3::new(pixel[0].into(), pixel[1].into(), pixel[2].into());
+        let color = 0.5 + 0.5 * (back * normal).normalize_or_zero();
+        pixel.copy_from_slice(&color.as_vec3().to_array());
+    }
+    normals
+}
+
+/// Depths of what is solid, in units of the capture.
+fn depths(picture: &Picture, camera: &Camera, placement: &Placement) -> Depths {
+    Depths::new(&solid(&picture.depth, picture), camera, placement.scale.recip())
 }
 
 /// An image with nothing where nothing is solid.
@@ -129,4 +136,40 @@ fn over(colors: &Image, opacity: &Image, background: [f32; 3]) -> Image {
         pixel.iter_mut().zip(background).for_each(|(value, behind)| *value = behind + opacity * (*value - behind));
     }
     image
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::Evaluations;
+    use raygrad::nerf::glam::{DAffine3, DMat3};
+
+    fn image(channels: usize, data: &[f32]) -> Image {
+        Image { width: data.len() / channels, height: 1, channels, data: data.to_vec() }
+    }
+
+    #[test]
+    fn normals_and_depths_are_the_captures() {
+        // What is x, y and z in the capture is y, z and x in the scene, and twice as long.
+        let rotation = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
+        let placement = Placement { rotation, scale: 2.0, origin: DVec3::ONE };
+        let colors = facing(image(3, &[0.0, 0.7, 0.0, 0.0, 0.0, -0.3, 0.0, 0.0, 0.0]), &placement);
+        assert_eq!(colors.data, [1.0, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5]);
+        let picture = Picture {
+            color: image(3, &[0.0; 9]),
+            depth: image(1, &[6.0, 6.0, 6.0]),
+            opacity: image(1, &[0.49, 0.5, 1.0]),
+            evaluations: Evaluations::default(),
+        };
+        let camera = Camera::from_angle(3, 1, 1e-6, DAffine3::IDENTITY);
+        let npy = depths(&picture, &camera, &placement).to_npy();
+        let found = npy[npy.len() - 12..].chunks_exact(4).map(|x| f32::from_le_bytes(x.try_into().unwrap()));
+        assert_eq!(found.collect::<Vec<_>>(), [0.0, 3.0, 3.0], "of what is solid, in the capture's units");
+    }
+
+    #[test]
+    fn colors_stand_before_the_background_by_their_opacity() {
+        let seen = over(&image(3, &[1.0, 0.0, 0.5, 1.0, 0.0, 0.5]), &image(1, &[0.25, 1.0]), [0.0, 1.0, 0.5]);
+        assert_eq!(seen.data, [0.25, 0.75, 0.5, 1.0, 0.0, 0.5]);
+    }
 }

@@ -70,8 +70,8 @@ fn frames_of_nerfstudio_are_taken_as_they_are() {
 
 #[test]
 fn nerfstudios_world_is_left_by_its_transform() {
-    // The pose above in a world that is turned by 0.7 about (1, 2, 3), moved by (0.1, -0.2, 0.3) and scaled by 0.4, where the capture's
-    // file had y, x and -z of before for its x, y and z, half a unit on in x. By NumPy.
+    // The pose above in a world that is turned by 0.7 about (1, 2, 3), moved by (0.1, -0.2, 0.3) and scaled by 0.4,
+    // where the capture's file had y, x and -z of before for its x, y and z, half a unit on in x. By NumPy.
     let seen = [
         0.881017145,
         -0.159466323,
