@@ -21,6 +21,9 @@ mod export;
 #[path = "cli/prepare.rs"]
 mod prepare;
 
+#[path = "cli/render.rs"]
+mod render;
+
 #[cfg(unix)]
 #[path = "cli/faults.rs"]
 mod faults;
@@ -524,7 +527,7 @@ fn bad_arguments_are_usage_errors() {
         ("eval run --split all", "must be train, val or test"),
         ("eval run --views 0", "0 is not in 1.."),
         ("render run --size 0x0", "WIDTHxHEIGHT"),
-        ("render run --path spiral", "possible values: orbit, test"),
+        ("render run --path fly", "use orbit, spiral, spline, test or a FILE.json"),
     ];
     for (arguments, expected) in bad {
         let output = place.command(arguments).output().unwrap();

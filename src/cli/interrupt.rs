@@ -14,6 +14,11 @@ pub fn listen() {
     set("stopping after this step; Ctrl-C again stops at once", "save the model");
 }
 
+/// As [`listen`], for frames that the same command goes on with.
+pub fn listen_to_go_on() {
+    set("stopping after this frame; Ctrl-C again stops at once", "let this frame be finished");
+}
+
 /// As [`listen`], for work whose unfinished result is removed.
 pub fn listen_to_remove() {
     set("stopping, and removing what is unfinished; Ctrl-C again stops at once", "remove what is unfinished");

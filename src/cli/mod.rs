@@ -3,7 +3,6 @@
 //! Exit codes: 0 done, 1 an error, 2 a command line that cannot be understood, 130 interrupted; of `doctor` also 3 and 4: it has
 //! found something of the severity of a warning, or of an error.
 
-mod animation;
 mod bench;
 mod builtin;
 mod cameras;
@@ -93,7 +92,7 @@ fn run(cli: Cli) -> Result<ExitCode> {
         Some(Command::Compare(args)) => compare::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),
-        Some(Command::Render(args)) => render::run(&args).map(|()| ExitCode::SUCCESS),
+        Some(Command::Render(args)) => render::run(&args),
     }
 }
 

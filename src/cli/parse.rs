@@ -38,6 +38,40 @@ pub fn size(text: &str) -> Result<[usize; 2], String> {
     Ok([side(width)?, side(height)?])
 }
 
+/// The proportions of an image, such as `16:9`: width over height.
+pub fn aspect(text: &str) -> Result<f64, String> {
+    let usage = || "write WIDTH:HEIGHT such as 16:9, from 1:20 to 20:1".to_owned();
+    let (width, height) = text.split_once(':').ok_or_else(usage)?;
+    let side = |text: &str| text.parse::<f64>().ok().filter(|side| *side > 0.0 && side.is_finite()).ok_or_else(usage);
+    Some(side(width)? / side(height)?).filter(|aspect| (0.05..=20.0).contains(aspect)).ok_or_else(usage)
+}
+
+/// A color: `white`, `black`, or red, green and blue from 0 to 255, such as `255,200,0`; as 0 to 1.
+pub fn color(text: &str) -> Result<[f32; 3], String> {
+    let usage = || "write white, black or R,G,B such as 255,200,0, each from 0 to 255".to_owned();
+    match text {
+        "white" => return Ok([1.0; 3]),
+        "black" => return Ok([0.0; 3]),
+        _ => {}
+    }
+    let values = text.split(',').map(|value| Some(f32::from(value.trim().parse::<u8>().ok()?) / 255.0));
+    let values: Vec<f32> = values.collect::<Option<_>>().ok_or_else(usage)?;
+    values.try_into().map_err(|_| usage())
+}
+
+/// A finite number above 0.
+pub fn above_zero(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|x: &f64| *x > 0.0 && x.is_finite()).ok_or_else(|| "write a number above 0".to_owned())
+}
+
+/// A number between two others, and none of them.
+pub fn between(least: f64, most: f64) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync + 'static {
+    move |text| {
+        let inside = |x: &f64| least < *x && *x < most;
+        text.parse().ok().filter(inside).ok_or_else(|| format!("write a number between {least} and {most}"))
+    }
+}
+
 /// `NAME=VALUE`; the value is JSON, or else a plain word.
 pub fn setting(text: &str) -> Result<(String, Value), String> {
     let (name, value) = text.split_once('=').ok_or("write NAME=VALUE")?;
@@ -73,5 +107,26 @@ mod tests {
         for bad in ["", "x", "400", "0x0", "400x0", "-1x5", "4x3x2", "16385x1", "99999999999999999999x1"] {
             assert!(size(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn proportions_and_colors_and_numbers_in_a_range() {
+        assert_eq!((aspect("16:10"), aspect("1:2.5")), (Ok(1.6), Ok(0.4)));
+        for bad in ["", "16", "16:0", ":", "-1:2", "NaN:1", "1:inf", "21:1", "1:2:3"] {
+            assert!(aspect(bad).is_err(), "{bad}");
+        }
+        assert_eq!(
+            (color("white"), color("black"), color("255, 51,0")),
+            (Ok([1.0; 3]), Ok([0.0; 3]), Ok([1.0, 0.2, 0.0]))
+        );
+        for bad in ["", "grey", "1,2", "1,2,3,4", "256,0,0", "-1,0,0", "0.5,0,0"] {
+            assert!(color(bad).is_err(), "{bad}");
+        }
+        assert_eq!((above_zero("0.5"), above_zero("0").is_err(), above_zero("NaN").is_err()), (Ok(0.5), true, true));
+        let angle = between(0.0, 180.0);
+        assert_eq!(
+            (angle("60"), angle("0").is_err(), angle("180").is_err(), angle("NaN").is_err()),
+            (Ok(60.0), true, true, true)
+        );
     }
 }

@@ -1,7 +1,7 @@
 //! Rendering in single precision, as fast as the model allows, or in double precision with nothing left out.
 
 use clap::ValueEnum;
-use raygrad::nerf::{Camera, Model, Picture, Result};
+use raygrad::nerf::{Camera, Image, Model, Picture, Result};
 use serde::Serialize;
 
 /// The arithmetic of a picture.
@@ -45,6 +45,14 @@ impl Renderer {
         match self {
             Renderer::Single(model) => model.view(camera, background),
             Renderer::Double(model) => model.dense_view(camera, background.map(f64::from), 1).picture(),
+        }
+    }
+
+    /// The normals that are seen from a camera: see [`Model::normals`].
+    pub fn normals(&self, camera: &Camera) -> Image {
+        match self {
+            Renderer::Single(model) => model.normals(camera),
+            Renderer::Double(model) => model.normals(camera),
         }
     }
 }

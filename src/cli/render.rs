@@ -1,74 +1,73 @@
 //! `raygrad render`: new views.
 
+mod animation;
+mod film;
+mod flight;
+mod frames;
+mod path_file;
+mod shown;
+
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
 
-use clap::ValueEnum;
-use raygrad::nerf::dataset::Split;
-use raygrad::nerf::dataset::scene::test_cameras;
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Camera, Error, Image, Model, Result, write_atomic};
+use raygrad::nerf::{Camera, Error, Result};
+use serde_json::{Value, json};
 
-use super::animation::Animation;
-use super::cameras::fitted;
-use super::output::{check_writable, depth_colors, make_folder, note, numbered, other_numbered, print};
-use super::parse;
+use super::output::{check_writable, note, other_numbered, print};
 use super::precision::{Precision, Renderer};
-use super::progress::Progress;
+use super::prepare::program::Stop;
+use super::progress::{Progress, spoken};
 use super::run::Run;
 use super::scene::Scene;
+use super::{interrupt, parse};
+use film::{Film, Reel, frames_of};
+use flight::{Flight, FlightArgs};
+use frames::{DIGITS, Frames};
+use shown::{Layer, Show, Shown};
 
-/// Frames of an orbit.
-const ORBIT_FRAMES: usize = 60;
-
-/// Render pictures or an animation of a model
+/// Render pictures or a film of a model
 ///
-/// Pictures of the same name are replaced.
+/// Pictures of the same name are replaced. Of a film, frames are written to FILE.frames/ first. After a Ctrl-C, and
+/// whatever else ends it, the same command goes on where it was.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
     run: PathBuf,
-    /// Where the camera goes
-    #[arg(long, value_enum, default_value_t = CameraPath::Orbit)]
-    path: CameraPath,
-    /// Number of frames [default: 60 for an orbit, one for each test view]
-    #[arg(long, value_name = "N", value_parser = parse::count(100_000))]
-    frames: Option<usize>,
-    /// Size of the pictures, such as 400x300 [default: that of the training images]
-    #[arg(long, value_name = "WxH", value_parser = parse::size)]
-    size: Option<[usize; 2]>,
-    /// Folder for PNG frames, or a file: FILE.png for the first frame, FILE.gif for an animation [default: RUN/PATH]
+    #[command(flatten)]
+    flight: FlightArgs,
+    /// Folder for PNG frames, or a file: FILE.png for the first frame; FILE.gif, FILE.apng or (by ffmpeg) FILE.mp4 or
+    /// FILE.webm for a film [default: RUN/PATH]
     #[arg(long, value_name = "DIR|FILE")]
     out: Option<PathBuf>,
+    /// What frames show
+    #[arg(long, value_enum, default_value_t)]
+    show: Show,
+    /// As --show depth
+    #[arg(long, hide = true, conflicts_with = "show")]
+    depth: bool,
+    /// What to save beside each frame in a folder of frames
+    #[arg(long, value_enum, value_name = "LAYERS", value_delimiter = ',')]
+    save: Vec<Layer>,
+    /// Length of a step of depths in 16 bits, in the capture's units: with metres, 0.001 is a millimetre [default: 0.001]
+    #[arg(long, value_name = "LENGTH", value_parser = parse::above_zero)]
+    depth_unit: Option<f64>,
+    /// What lies behind the scene: white, black or R,G,B from 0 to 255 [default: as in training]
+    #[arg(long, value_name = "COLOR", value_parser = parse::color)]
+    background: Option<[f32; 3]>,
     /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
     #[arg(long)]
     skip: Option<Skip>,
     /// Arithmetic of the pictures
     #[arg(long, value_enum, default_value_t)]
     precision: Precision,
-    /// Show depth in false colour: yellow near, violet far, black where there is nothing
+    /// Leave the frames of a film in FILE.frames/
     #[arg(long)]
-    depth: bool,
-    /// Folder of the photographs, if the test views are no longer where they were for training
+    keep_frames: bool,
+    /// Folder of the photographs, if they are no longer where they were for training
     #[arg(long)]
     scene: Option<Scene>,
-}
-
-/// Where the camera goes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum CameraPath {
-    /// Around the scene, or to and fro where photographs are from one side, at the distance and the height of the average training camera
-    Orbit,
-    /// From test view to test view
-    Test,
-}
-
-impl CameraPath {
-    fn name(self) -> &'static str {
-        match self {
-            CameraPath::Orbit => "orbit",
-            CameraPath::Test => "test",
-        }
-    }
 }
 
 impl Args {
@@ -76,77 +75,173 @@ impl Args {
     pub fn picture(run: &Path) -> Self {
         Args {
             run: run.into(),
-            path: CameraPath::Orbit,
-            frames: None,
-            size: None,
+            flight: FlightArgs::default(),
             out: Some(run.join("picture.png")),
+            show: Show::Color,
+            depth: false,
+            save: vec![],
+            depth_unit: None,
+            background: None,
             skip: None,
             precision: Precision::F32,
-            depth: false,
+            keep_frames: false,
             scene: None,
         }
+    }
+
+    /// What the output is, if the flags fit it.
+    fn kind(&self, out: &Path) -> Result<Kind> {
+        let kind = Kind::of(out);
+        let meaningless = |flag: &str, what: &str| Err(Error::setting(flag, format!("has no meaning {what}")));
+        if kind != Kind::Folder && !self.save.is_empty() {
+            return meaningless("save", "for a single file: name a folder with --out");
+        }
+        if !self.save.contains(&Layer::Depth) && self.depth_unit.is_some() {
+            return meaningless("depth-unit", "without --save depth");
+        }
+        let film = matches!(kind, Kind::Film(_));
+        if self.keep_frames && !film {
+            return meaningless("keep-frames", "without a film");
+        }
+        if self.flight.fps.is_some() && self.flight.seconds.is_none() && !film {
+            return meaningless("fps", "for pictures without --seconds");
+        }
+        Ok(kind)
     }
 }
 
 /// Renders and writes the files.
-pub fn run(args: &Args) -> Result<()> {
+pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
+    let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
+    let kind = args.kind(&out)?;
     let mut model = run.model()?;
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
-    let out = args.out.clone().unwrap_or_else(|| run.file(args.path.name()));
-    let kind = Kind::of(&out);
-    let mut cameras = cameras(args, &run, &model)?;
-    if kind == Kind::Png {
-        cameras.truncate(1);
-    }
-    let mut sink = Sink::new(kind, &out, [cameras[0].width, cameras[0].height])?;
-    let background = model.config.background.shown();
-    let span = model.extent.span;
+    let Flight { mut cameras, fps } = args.flight.cameras(&run, &model, args.scene.as_ref())?;
+    let extent = model.extent;
+    let background = args.background.unwrap_or(model.config.background.shown());
+    let show = if args.depth { Show::Depth } else { args.show };
+    let depth_unit = args.depth_unit.unwrap_or(MILLI);
     let renderer = Renderer::new(model, args.precision)?;
-    let mut progress = Progress::new();
-    for (i, camera) in cameras.iter().enumerate() {
-        let picture = renderer.view(camera, background);
-        let image = if args.depth { depth_colors(&picture, span) } else { picture.color };
-        sink.push(i, &image)?;
-        let (done, all) = (i + 1, cameras.len());
-        progress.set(done as f64 / all as f64, || format!("frame {done} of {all}"));
+    let shown = Shown { renderer: &renderer, extent, background, show, save: &args.save, depth_unit };
+    let folder = match kind {
+        Kind::Png => {
+            if out.is_dir() {
+                return Err(Error::file(&out, "is a folder, not a file"));
+            }
+            check_writable(out.parent().unwrap_or(Path::new(".")))?;
+            shown.frame(&cameras[0]).image.save_png(&out)?;
+            cameras.truncate(1);
+            return report(&cameras, &out);
+        }
+        Kind::Film(film) => {
+            film.check(&out, fps)?;
+            frames_of(&out)
+        }
+        Kind::Folder => out.clone(),
+    };
+    let mut frames = Frames::new(folder, contents(args, &run, &cameras, &shown)?)?;
+    if cameras.len() > 1 {
+        interrupt::listen_to_go_on();
     }
-    drop(progress);
-    sink.finish()?;
-    if kind == Kind::Folder {
-        let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
-        if !older.is_empty() {
-            // They may be what somebody wants to keep.
-            note(&format!("{} holds {} more numbered pictures, from a longer path", out.display(), older.len()));
+    if !render(&shown, &cameras, &mut frames)? {
+        return stopped(&frames, cameras.len());
+    }
+    match kind {
+        Kind::Film(film) => {
+            let size = [cameras[0].width, cameras[0].height];
+            let reel = Reel { folder: frames.folder(), count: cameras.len(), size, fps };
+            match film.write(&reel, &out) {
+                Ok(()) => {}
+                Err(Stop::Interrupted) => return stopped(&frames, cameras.len()),
+                Err(Stop::Failed(error)) => return Err(error),
+            }
+            if args.keep_frames { frames.keep() } else { frames.remove() }
+        }
+        _ => {
+            frames.keep();
+            let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
+            if !older.is_empty() {
+                // They may be what somebody wants to keep.
+                note(&format!("{} holds {} more numbered pictures, from a longer path", out.display(), older.len()));
+            }
         }
     }
-    let [width, height] = [cameras[0].width, cameras[0].height];
-    let frames = if cameras.len() == 1 { "frame" } else { "frames" };
-    print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))
+    report(&cameras, &out)
 }
 
-/// Digits of the number of a frame in a folder.
-const DIGITS: usize = 4;
+/// The usual step of depths in files.
+const MILLI: f64 = 1e-3;
 
-/// The cameras along the path; at least one.
-fn cameras(args: &Args, run: &Run, model: &Model<f32>) -> Result<Vec<Camera>> {
-    let config = &run.config;
-    let view = &config.viewpoint;
-    let size = args.size.unwrap_or([view.width, view.height]);
-    let frames = args.frames.unwrap_or(ORBIT_FRAMES);
-    let cameras = match (args.path, &config.scene) {
-        (CameraPath::Orbit, Scene::Embedded) => test_cameras(frames, view.width),
-        (CameraPath::Orbit, Scene::Landscape | Scene::Folder(_)) => view.orbit(&config.extent, frames),
-        (CameraPath::Test, _) => {
-            let scene = run.scene(args.scene.as_ref())?.open_for(&config.extent)?;
-            let data = scene.load(Split::Test, config.downscale, args.frames.unwrap_or(usize::MAX))?;
-            // Where the model has them, if it has learned something of cameras.
-            data.frames.iter().map(|frame| model.other_camera(&frame.camera)).collect()
+/// Renders the frames that are not there yet; says whether all are there now, or it was interrupted.
+fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Result<bool> {
+    let (start, first, all) = (Instant::now(), frames.done(), cameras.len());
+    if first > 0 {
+        note(&format!("{first} of {all} frames are there already: {}", frames.folder().display()));
+    }
+    let mut progress = Progress::new();
+    let mut beyond = 0;
+    for camera in &cameras[first..] {
+        if interrupt::requested() {
+            return Ok(false);
         }
+        let frame = shown.frame(camera);
+        frames.push(&frame.image.to_png(), &frame.layers)?;
+        beyond += usize::from(frame.beyond > 0);
+        let done = frames.done();
+        progress.set(done as f64 / all as f64, || {
+            let left = start.elapsed().as_secs_f64() * (all - done) as f64 / (done - first) as f64;
+            format!("frame {done} of {all}  {} left", spoken(left))
+        });
+    }
+    drop(progress);
+    if beyond > 0 {
+        let most = f64::from(u16::MAX) * shown.depth_unit;
+        note(&format!(
+            "depths beyond {most} in {beyond} frames have no room in 16 bits and are 0: say a longer --depth-unit, \
+             or --save depth-npy"
+        ));
+    }
+    Ok(true)
+}
+
+/// Says how to go on.
+fn stopped(frames: &Frames, all: usize) -> Result<ExitCode> {
+    let folder = frames.folder().display();
+    print(&format!("stopped  after {} of {all} frames, in {folder}: the same command goes on\n", frames.done()))?;
+    Ok(interrupt::EXIT_CODE.into())
+}
+
+fn report(cameras: &[Camera], out: &Path) -> Result<ExitCode> {
+    let [width, height] = [cameras[0].width, cameras[0].height];
+    let frames = if cameras.len() == 1 { "frame" } else { "frames" };
+    print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// All that decides what frames show.
+fn contents(args: &Args, run: &Run, cameras: &[Camera], shown: &Shown<'_>) -> Result<Value> {
+    let sum = |path: PathBuf| {
+        let bytes = std::fs::read(&path).map_err(|e| Error::file(&path, format!("cannot be read: {e}")))?;
+        Ok::<_, Error>(crc32fast::hash(&bytes))
     };
-    Ok(cameras.iter().map(|camera| fitted(camera, size)).collect())
+    let flown = serde_json::to_vec(cameras).map_err(|e| Error::setting("path", e))?;
+    Ok(json!({
+        "raygrad": env!("CARGO_PKG_VERSION"),
+        "model": sum(run.model_file())?,
+        "config": sum(run.file("config.json"))?,
+        "cameras": crc32fast::hash(&flown),
+        "frames": cameras.len(),
+        "size": [cameras[0].width, cameras[0].height],
+        "show": shown.show,
+        "save": shown.save,
+        "depth_unit": shown.depth_unit,
+        "background": shown.background,
+        "skip": args.skip.map(|skip| skip.to_string()),
+        "precision": args.precision,
+    }))
 }
 
 /// What the output is.
@@ -155,59 +250,16 @@ enum Kind {
     /// A folder of PNG files.
     Folder,
     Png,
-    Gif,
+    Film(Film),
 }
 
 impl Kind {
     fn of(out: &Path) -> Self {
-        match out.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        let ending = out.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+        match ending.as_deref() {
             Some("png") => Kind::Png,
-            Some("gif") => Kind::Gif,
-            _ => Kind::Folder,
-        }
-    }
-}
-
-/// Takes frames and leaves files.
-enum Sink<'a> {
-    Folder(&'a Path),
-    Png(&'a Path),
-    Gif(&'a Path, Box<Animation>),
-}
-
-impl<'a> Sink<'a> {
-    /// Sees to it that the files can be written before there is anything to write.
-    fn new(kind: Kind, out: &'a Path, size: [usize; 2]) -> Result<Self> {
-        if kind == Kind::Folder {
-            make_folder(out)?;
-            return Ok(Sink::Folder(out));
-        }
-        if out.is_dir() {
-            return Err(Error::file(out, "is a folder, not a file"));
-        }
-        check_writable(out.parent().unwrap_or(Path::new(".")))?;
-        if kind == Kind::Png {
-            return Ok(Sink::Png(out));
-        }
-        let animation = Animation::new(size.map(|side| side as u16)).map_err(|e| Error::file(out, e))?;
-        Ok(Sink::Gif(out, Box::new(animation)))
-    }
-
-    fn push(&mut self, index: usize, image: &Image) -> Result<()> {
-        match self {
-            Sink::Folder(folder) => image.save_png(folder.join(numbered(index, DIGITS))),
-            Sink::Png(path) => image.save_png(path),
-            Sink::Gif(path, animation) => animation.push(image).map_err(|e| Error::file(path, e)),
-        }
-    }
-
-    fn finish(self) -> Result<()> {
-        match self {
-            Sink::Folder(_) | Sink::Png(_) => Ok(()),
-            Sink::Gif(path, animation) => {
-                let bytes = animation.finish().map_err(|e| Error::file(path, e))?;
-                write_atomic(path, &bytes)
-            }
+            Some(ending) => Film::of(ending).map_or(Kind::Folder, Kind::Film),
+            None => Kind::Folder,
         }
     }
 }

@@ -1,18 +1,22 @@
-//! Cameras, their lenses and poses, and the rays through their pixels.
+//! Cameras, their lenses and poses, the paths that they fly along, and the rays through their pixels.
 
 pub(crate) mod angles;
 pub(crate) mod bounds;
 pub(crate) mod lens;
 pub(crate) mod ndc;
+pub(crate) mod path;
 pub(crate) mod pinhole;
 pub(crate) mod pose;
 pub(crate) mod rays;
 pub(crate) mod rotation;
+pub(crate) mod spiral;
 
 pub use bounds::{clip_span, intersect_box};
 pub use lens::{Lens, recorded::lens_places};
 pub use ndc::Ndc;
+pub use path::{CameraPath, Curve, Key};
 pub use pinhole::{Camera, Ray};
 pub use pose::Pose;
 pub use rays::{Rays, Samples, stratified};
 pub use rotation::{rotation_exp, rotation_log};
+pub use spiral::Spiral;

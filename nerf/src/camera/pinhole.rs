@@ -101,6 +101,11 @@ impl Camera {
         [(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1]]
     }
 
+    /// Column and row of the pixel of this number, row by row.
+    pub(crate) fn place_of(&self, pixel: usize) -> [usize; 2] {
+        [pixel % self.width, pixel / self.width]
+    }
+
     /// The ray through the centre of the pixel in column `column` and row `row`.
     pub fn pixel_ray(&self, column: usize, row: usize) -> Ray {
         self.ray(column as f64 + 0.5, row as f64 + 0.5)

@@ -1,16 +1,17 @@
-//! Depths that were measured beside photographs, and the distances along rays that follow from them.
+//! Depths along the optical axis, as files of depths have them: what was measured beside photographs, and what is rendered.
 
 use super::formats::npy;
 use super::image::Image;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
-use image::DynamicImage;
+use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
+use std::io::Cursor;
 use std::path::Path;
 
-/// Reads a file of depths along the optical axis, a PNG of integers or a `.npy` array of floats, in units of which each has
-/// the length `unit` in those of the scene: the distance along the ray through the centre of each of the camera's pixels, in
-/// scene units, and 0 where nothing was measured. Depths of another size are looked up and never averaged: halfway between
-/// what is near and what is behind it there is nothing.
+/// Reads a file of depths along the optical axis, a PNG of integers or a `.npy` array of floats, in units of which each
+/// has the length `unit` in those of the scene: the distance along the ray through the centre of each of the camera's
+/// pixels, in scene units, and 0 where nothing was measured. Depths of another size are looked up and never averaged:
+/// halfway between what is near and what is behind it there is nothing.
 pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
     let wrong = |what: String| Error::file(path, what);
     let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
@@ -48,11 +49,108 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     Ok(out)
 }
 
+/// Depths along the optical axis, as sets of photographs with depths have them: what
+/// [`View::depth`](super::View::depth) is read from, 0 where there is nothing.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Depths {
+    size: [usize; 2],
+    /// Row by row.
+    values: Vec<f32>,
+}
+
+impl Depths {
+    /// Of distances along the rays of a camera's pixels, as a [`Picture`](crate::Picture) has them, each multiplied by
+    /// `scale`: 1 over the [scale of the placement](super::Placement::scale) gives them in units of the capture.
+    ///
+    /// # Panics
+    /// If the image is not one channel of the camera's size.
+    #[track_caller]
+    pub fn new(distances: &Image, camera: &Camera, scale: f64) -> Self {
+        distances.assert_same_shape(&Image::new(camera.width, camera.height, 1));
+        let axis = -camera.pose.matrix3.z_axis;
+        let along = |(pixel, distance): (usize, &f32)| {
+            let [x, y] = camera.place_of(pixel);
+            let depth = scale * f64::from(*distance) * camera.pixel_ray(x, y).direction.dot(axis);
+            // Behind the camera, which a wide lens sees, there is no depth.
+            if depth > 0.0 { depth as f32 } else { 0.0 }
+        };
+        let values = distances.data.iter().enumerate().map(along).collect();
+        Depths { size: [camera.width, camera.height], values }
+    }
+
+    /// A PNG of one channel of 16 bits, in units of length `unit`, rounded; and how many depths are too great for it,
+    /// of which it has 0.
+    ///
+    /// # Panics
+    /// If it has no pixels.
+    #[track_caller]
+    pub fn to_png(&self, unit: f64) -> (Vec<u8>, usize) {
+        let [width, height] = self.size.map(|side| side as u32);
+        let mut beyond = 0;
+        let whole = |depth: &f32| {
+            let units = (f64::from(*depth) / unit).round();
+            if units <= f64::from(u16::MAX) {
+                return units as u16;
+            }
+            beyond += 1;
+            0
+        };
+        let values = self.values.iter().map(whole).collect();
+        let mut bytes = Cursor::new(vec![]);
+        ImageBuffer::<Luma<u16>, Vec<u16>>::from_raw(width, height, values)
+            .expect("there are as many depths as pixels")
+            .write_to(&mut bytes, ImageFormat::Png)
+            .expect("an image with pixels is written to memory");
+        (bytes.into_inner(), beyond)
+    }
+
+    /// A `.npy` file of an array `[height, width]` of f32.
+    pub fn to_npy(&self) -> Vec<u8> {
+        let [width, height] = self.size;
+        npy::write_single([height, width], &self.values)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use glam::{DAffine3, DVec3};
-    use image::{ImageBuffer, Luma, Rgb};
+    use image::Rgb;
+
+    #[test]
+    fn what_is_written_is_depth_along_the_axis_and_read_back_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
+        let camera = Camera::from_angle(5, 3, 1.4, pose);
+        // A wall at depth 4.5, seen everywhere but at two pixels; another so far away that its number has no room.
+        let wall = |depth: f64| {
+            let mut image = Image::new(5, 3, 1);
+            for pixel in 0..15 {
+                let ray = camera.pixel_ray(pixel % 5, pixel / 5);
+                image.data[pixel] = (depth / ray.direction.dot(-pose.matrix3.z_axis)) as f32;
+            }
+            (image.data[1], image.data[13]) = (0.0, 0.0);
+            image
+        };
+        let depths = Depths::new(&wall(4.5), &camera, 0.5);
+        let none = |pixel: usize| pixel == 1 || pixel == 13;
+        assert!((0..15).all(|i| (depths.values[i] - if none(i) { 0.0 } else { 2.25 }).abs() < 1e-6), "{depths:?}");
+        let (png, beyond) = depths.to_png(0.001);
+        assert_eq!(beyond, 0);
+        for (name, bytes, unit, error) in [("a.png", png, 0.002, 1e-6), ("a.npy", depths.to_npy(), 2.0, 1e-6)] {
+            let path = folder.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            let found = distances(&path, unit, &camera).unwrap();
+            let worst = found.data.iter().zip(wall(4.5).data).map(|(a, b)| (a - b).abs());
+            assert!(worst.fold(0.0, f32::max) < error && found.data[2] > 4.5, "{name}: {found:?}");
+        }
+        let pixels = |bytes: &[u8]| image::load_from_memory(bytes).unwrap().into_luma16().into_raw();
+        assert_eq!(pixels(&depths.to_png(0.001).0)[..3], [2250, 0, 2250]);
+        assert_eq!(pixels(&depths.to_png(0.004).0)[0], 563, "to the nearest");
+        let (far, beyond) = Depths::new(&wall(65.6), &camera, 1.0).to_png(0.001);
+        assert_eq!((pixels(&far), beyond), (vec![0; 15], 13));
+        assert_eq!(pixels(&Depths::new(&wall(65.535), &camera, 1.0).to_png(0.001).0)[0], u16::MAX);
+    }
 
     #[test]
     fn depths_become_distances_along_rays_and_are_never_averaged() {

@@ -27,6 +27,7 @@ pub use background::Background;
 pub use batch::Batch;
 pub use capture::{Capture, Format, Point, View};
 pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
+pub use depth::Depths;
 pub use embedded::embedded;
 pub use frames::{Dataset, Frame, Split, evenly_spaced};
 pub use landscape::{landscape, landscape_ahead, landscape_distances};

@@ -1,6 +1,7 @@
 //! Views of a model.
 
 pub(crate) mod dense;
+pub(crate) mod normals;
 pub(crate) mod picture;
 pub(crate) mod pixel;
 pub(crate) mod view;

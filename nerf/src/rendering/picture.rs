@@ -35,6 +35,34 @@ impl Picture {
         Picture { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
     }
 
+    /// The colour without the background that the picture was rendered over: RGBA, with the opacity as alpha and
+    /// colours that are not multiplied by it; where nothing is visible all 0.
+    ///
+    /// ```
+    /// use raygrad_nerf::{Evaluations, Image, Picture};
+    /// let image = |channels, values: &[f32]| Image { width: 1, height: 1, channels, data: values.to_vec() };
+    /// // A quarter of orange before blue.
+    /// let picture = Picture {
+    ///     color: image(3, &[0.25, 0.125, 0.75]),
+    ///     depth: image(1, &[3.0]),
+    ///     opacity: image(1, &[0.25]),
+    ///     evaluations: Evaluations::default(),
+    /// };
+    /// assert_eq!(picture.rgba([0.0, 0.0, 1.0]).data, [1.0, 0.5, 0.0, 0.25]);
+    /// ```
+    pub fn rgba(&self, background: [f32; 3]) -> Image {
+        let mut out = Image::new(self.color.width, self.color.height, 4);
+        let seen = self.color.data.chunks_exact(3).zip(&self.opacity.data);
+        for (out, (color, &opacity)) in out.data.chunks_exact_mut(4).zip(seen) {
+            if f64::from(opacity) > VISIBLE {
+                let own = |value: f32, behind: f32| ((value - (1.0 - opacity) * behind) / opacity).clamp(0.0, 1.0);
+                (0..3).for_each(|c| out[c] = own(color[c], background[c]));
+                out[3] = opacity;
+            }
+        }
+        out
+    }
+
     /// Its parts of `tile` pixels each, row by row.
     pub(crate) fn parts(&mut self, tile: usize) -> impl IndexedParallelIterator<Item = Part<'_>> {
         let [color, depth, opacity] = [&mut self.color, &mut self.depth, &mut self.opacity];
@@ -65,8 +93,28 @@ impl Part<'_> {
 }
 
 impl<T: Scalar> Model<T> {
-    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile shows
-    /// to its part of `out`.
+    /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
+    /// tile's first pixel, its rays and its part of `out`.
+    pub(crate) fn tiles<S: Default, P: Send>(
+        &self,
+        camera: &Camera,
+        tile: usize,
+        out: impl IndexedParallelIterator<Item = P>,
+        see: impl Fn(&mut S, usize, &Rays<T>, P) -> Evaluations + Sync,
+    ) -> Evaluations {
+        let (bounds, count) = (self.reach(), camera.width * camera.height);
+        let tiles = out.enumerate().map_init(S::default, |scratch, (which, out)| {
+            let mut rays = Rays::new();
+            for pixel in which * tile..count.min((which + 1) * tile) {
+                rays.push_pixel(camera, camera.place_of(pixel), bounds, self.extent.span);
+            }
+            parallel::serial(|| see(scratch, which * tile, &rays, out))
+        });
+        tiles.reduce(Evaluations::default, |a, b| a + b)
+    }
+
+    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
+    /// shows to its part of `out`.
     pub(crate) fn pixels<S: Default, P: Send>(
         &self,
         camera: &Camera,
@@ -75,28 +123,20 @@ impl<T: Scalar> Model<T> {
         out: impl IndexedParallelIterator<Item = P>,
         keep: impl Fn(&[Pixel], P) + Sync,
     ) -> Evaluations {
-        let (bounds, count) = (self.reach(), camera.width * camera.height);
         let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
-        let place = |pixel: usize| [pixel % camera.width, pixel / camera.width];
-        let tiles =
-            out.enumerate().map_init(Default::default, |(scratch, pixels): &mut (S, Vec<Pixel>), (which, out)| {
-                let mut rays = Rays::new();
-                for pixel in which * tile..count.min((which + 1) * tile) {
-                    rays.push_pixel(camera, place(pixel), bounds, self.extent.span);
+        self.tiles(camera, tile, out, |(scratch, pixels): &mut (S, Vec<Pixel>), first, rays, out| {
+            pixels.resize(rays.len(), Pixel::default());
+            let evaluations = see(scratch, rays, pixels);
+            if let Some(gain) = &gain {
+                for (seen, pixel) in pixels.iter_mut().zip(first..) {
+                    let gains = gain.at(camera.off_axis(camera.place_of(pixel)));
+                    let color = seen.color.iter_mut().zip(gains);
+                    color.for_each(|(color, gain)| *color = (*color * gain).min(1.0));
                 }
-                pixels.resize(rays.len(), Pixel::default());
-                let evaluations = parallel::serial(|| see(scratch, &rays, pixels));
-                if let Some(gain) = &gain {
-                    for (seen, pixel) in pixels.iter_mut().zip(which * tile..) {
-                        let gains = gain.at(camera.off_axis(place(pixel)));
-                        let color = seen.color.iter_mut().zip(gains);
-                        color.for_each(|(color, gain)| *color = (*color * gain).min(1.0));
-                    }
-                }
-                keep(pixels, out);
-                evaluations
-            });
-        tiles.reduce(Evaluations::default, |a, b| a + b)
+            }
+            keep(pixels, out);
+            evaluations
+        })
     }
 }
 
@@ -117,9 +157,9 @@ impl Model<f32> {
         picture
     }
 
-    /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole: something
-    /// to look at while the rest is computed, for a third more work. Each picture is rendered when the iterator is asked
-    /// for it.
+    /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole:
+    /// something to look at while the rest is computed, for a third more work. Each picture is rendered when the
+    /// iterator is asked for it.
     ///
     /// # Panics
     /// If `coarsest` is not a power of two.

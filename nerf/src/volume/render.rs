@@ -148,14 +148,31 @@ impl<'t, T: Scalar> Rendered<'t, T> {
     #[track_caller]
     pub fn normals(&self) -> Var<'t, T> {
         // The logarithm falls in the same direction, and does not overflow.
-        let slopes = self.density.value.sum().grad_graph(&[&self.positions]).remove(0);
-        // In units of the largest, so that no square overflows.
-        let largest = slopes.value().as_slice().chunks_exact(3);
-        let least = T::from_f64(1e-30);
-        let scales = largest.map(|x| x.iter().fold(least, |most, x| if x.abs() > most { x.abs() } else { most }));
-        let scales = Tensor::from_vec(&[self.samples.len(), 1], scales.collect());
-        let scaled = slopes / self.positions.tape().constant(scales);
-        let length = (scaled.square().sum_over(-1) + 1e-12).sqrt().reshape(&[self.samples.len(), 1]);
-        -(scaled / length)
+        downhill(&self.density.value.sum().grad_graph(&[&self.positions]).remove(0))
     }
+
+    /// The normals that are seen along the rays: the sums of [those of samples](Self::normals) times the weights,
+    /// `[rays, 3]`, no longer than the opacity, as numbers.
+    ///
+    /// # Panics
+    /// As [`normals`](Self::normals), or if the density does not depend on positions.
+    #[track_caller]
+    pub fn normals_seen(&self) -> Tensor<T> {
+        let slopes = self.density.value.sum().grad(&[&self.positions]).remove(0);
+        let tape = self.weights.tape();
+        tape.no_grad(|| self.accumulate(&downhill(&tape.constant(slopes))).into_value())
+    }
+}
+
+/// The unit vectors against slopes `[samples, 3]`, and 0 for none.
+fn downhill<'t, T: Scalar>(slopes: &Var<'t, T>) -> Var<'t, T> {
+    // In units of the largest, so that no square overflows.
+    let largest = slopes.value().as_slice().chunks_exact(3);
+    let least = T::from_f64(1e-30);
+    let scales = largest.map(|x| x.iter().fold(least, |most, x| if x.abs() > most { x.abs() } else { most }));
+    let each = &[slopes.shape()[0], 1];
+    let scales = Tensor::from_vec(each, scales.collect());
+    let scaled = slopes / slopes.tape().constant(scales);
+    let length = (scaled.square().sum_over(-1) + 1e-12).sqrt().reshape(each);
+    -(scaled / length)
 }

@@ -14,7 +14,7 @@ mod matrix;
 pub(super) mod npy;
 mod paths;
 mod ply;
-pub(crate) mod rigid;
+pub mod rigid;
 pub mod transforms;
 
 use super::capture::Capture;

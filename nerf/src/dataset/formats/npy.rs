@@ -59,19 +59,27 @@ impl Matrix {
 
     /// The bytes of a `.npy` file of version 1 with f64 numbers.
     pub fn write(&self) -> Vec<u8> {
-        let (rows, columns) = (self.rows, self.columns);
-        let mut header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
-        // The elements start at a multiple of 64 bytes, after magic, version and length: 10 bytes.
-        let padding = (10 + header.len() + 1).next_multiple_of(64) - 10 - header.len() - 1;
-        header.extend(std::iter::repeat_n(' ', padding));
-        header.push('\n');
-        let mut bytes = MAGIC.to_vec();
-        bytes.extend([1, 0]);
-        bytes.extend((header.len() as u16).to_le_bytes());
-        bytes.extend(header.as_bytes());
-        self.values.iter().for_each(|value| bytes.extend(value.to_le_bytes()));
-        bytes
+        write([self.rows, self.columns], "<f8", self.values.iter().map(|value| value.to_le_bytes()))
     }
+}
+
+/// The bytes of a `.npy` file of version 1 with f32 numbers, row by row: as many as rows times columns.
+pub(in crate::dataset) fn write_single(shape: [usize; 2], values: &[f32]) -> Vec<u8> {
+    write(shape, "<f4", values.iter().map(|value| value.to_le_bytes()))
+}
+
+fn write<const N: usize>([rows, columns]: [usize; 2], descr: &str, values: impl Iterator<Item = [u8; N]>) -> Vec<u8> {
+    let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+    // The elements start at a multiple of 64 bytes, after magic, version and length: 10 bytes.
+    let padding = (10 + header.len() + 1).next_multiple_of(64) - 10 - header.len() - 1;
+    header.extend(std::iter::repeat_n(' ', padding));
+    header.push('\n');
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend([1, 0]);
+    bytes.extend((header.len() as u16).to_le_bytes());
+    bytes.extend(header.as_bytes());
+    bytes.extend(values.flatten());
+    bytes
 }
 
 /// The header, a Python dictionary, and the elements after it.
@@ -129,6 +137,8 @@ mod tests {
         assert_eq!(Matrix::read(&columns), Ok(expected.clone()));
         let written = expected.write();
         assert_eq!((Matrix::read(&written), (written.len() - 48) % 64), (Ok(expected), 0));
+        let single = write_single([2, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.5]);
+        assert_eq!((Matrix::read(&single), single.len() % 64), (Matrix::read(&written), 24));
         let empty = file(1, "{'descr': '<f8', 'fortran_order': True, 'shape': (0, 17), }", &[]);
         assert_eq!(Matrix::read(&empty), Ok(Matrix { rows: 0, columns: 17, values: vec![] }));
     }

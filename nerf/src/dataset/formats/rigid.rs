@@ -6,7 +6,10 @@ use glam::{DAffine3, DMat3};
 pub(crate) const TOLERANCE: f64 = 1e-3;
 
 /// What is wrong with a matrix that should be a rotation, as the end of a sentence that begins with its name.
-pub(crate) fn rotation(matrix: &DMat3) -> Result<(), String> {
+///
+/// # Errors
+/// If it is none, to 1e-3.
+pub fn rotation(matrix: &DMat3) -> Result<(), String> {
     if !matrix.is_finite() {
         return Err("must be a rotation, but an entry is not a finite number".to_owned());
     }
@@ -21,7 +24,10 @@ pub(crate) fn rotation(matrix: &DMat3) -> Result<(), String> {
 }
 
 /// As [`rotation`], for a rotation and a translation.
-pub(crate) fn pose(pose: &DAffine3) -> Result<(), String> {
+///
+/// # Errors
+/// As these, or if the position is not finite.
+pub fn pose(pose: &DAffine3) -> Result<(), String> {
     rotation(&pose.matrix3)?;
     match pose.translation.is_finite() {
         true => Ok(()),

@@ -1,0 +1,66 @@
+//! Animations as GIF and as APNG files.
+
+use std::io::Write;
+
+use gif::Repeat;
+use raygrad::nerf::{Image, quantise};
+
+/// Effort of choosing 256 colours, from 1 (most) to 30.
+const QUANTISER_SPEED: i32 = 10;
+
+/// An endless animation that is written frame by frame, RGB images of one size.
+pub enum Animation<W: Write> {
+    /// Each frame has 256 colours of its own.
+    Gif {
+        /// What writes it.
+        encoder: Box<gif::Encoder<W>>,
+        /// Time that a frame is shown, in hundredths of a second.
+        delay: u16,
+    },
+    /// Every colour as it is.
+    Apng(Box<png::Writer<W>>),
+}
+
+impl<W: Write> Animation<W> {
+    /// A GIF without frames. A frame is shown for a whole number of hundredths of a second.
+    pub fn gif(to: W, [width, height]: [u16; 2], fps: f64) -> Result<Self, String> {
+        let mut encoder = gif::Encoder::new(to, width, height, &[]).map_err(|e| e.to_string())?;
+        encoder.set_repeat(Repeat::Infinite).map_err(|e| e.to_string())?;
+        Ok(Animation::Gif { encoder: Box::new(encoder), delay: (100.0 / fps).round() as u16 })
+    }
+
+    /// An APNG that is to have so many frames.
+    pub fn apng(to: W, [width, height]: [u16; 2], fps: f64, frames: u32) -> Result<Self, String> {
+        let mut encoder = png::Encoder::new(to, width.into(), height.into());
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let animated = encoder.set_animated(frames, 0);
+        // In hundredths of frames a second.
+        let animated = animated.and_then(|()| encoder.set_frame_delay(100, (100.0 * fps).round() as u16));
+        let writer = animated.and_then(|()| encoder.write_header()).map_err(|e| e.to_string())?;
+        Ok(Animation::Apng(Box::new(writer)))
+    }
+
+    /// Adds an image.
+    pub fn push(&mut self, image: &Image) -> Result<(), String> {
+        let bytes: Vec<u8> = image.data.iter().map(|&value| quantise(value)).collect();
+        match self {
+            Animation::Gif { encoder, delay } => {
+                let [width, height] = [image.width as u16, image.height as u16];
+                let frame = gif::Frame::from_rgb_speed(width, height, &bytes, QUANTISER_SPEED);
+                encoder.write_frame(&gif::Frame { delay: *delay, ..frame }).map_err(|e| e.to_string())
+            }
+            Animation::Apng(writer) => writer.write_image_data(&bytes).map_err(|e| e.to_string()),
+        }
+    }
+
+    /// Ends the file.
+    pub fn finish(self) -> Result<(), String> {
+        match self {
+            Animation::Gif { encoder, .. } => {
+                encoder.into_inner().and_then(|mut to| Ok(to.flush()?)).map_err(|e| e.to_string())
+            }
+            Animation::Apng(writer) => writer.finish().map_err(|e| e.to_string()),
+        }
+    }
+}
