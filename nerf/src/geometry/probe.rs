@@ -1,0 +1,110 @@
+//! Asking a model at places, as its pictures show them.
+
+use crate::camera::pinhole::Ray;
+use crate::camera::rays::{Rays, Samples};
+use crate::model::Model;
+use crate::pictures::quantise;
+use crate::space::occupancy::{OccupancyGrid, POINTS};
+use crate::volume::query::Query;
+use crate::volume::render::Evaluations;
+use glam::DVec3;
+use raygrad_autograd::{Pool, Segments, Tape, Tensor};
+use raygrad_tensor::parallel;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A model that is asked at places, and how often it was.
+pub(super) struct Probe<'a> {
+    model: &'a Model<f32>,
+    pool: Pool<f32>,
+    densities: AtomicU64,
+    colors: AtomicU64,
+}
+
+impl<'a> Probe<'a> {
+    pub fn new(model: &'a Model<f32>) -> Self {
+        Probe { model, pool: Pool::new(), densities: AtomicU64::new(0), colors: AtomicU64::new(0) }
+    }
+
+    /// How often the model was asked so far.
+    pub fn evaluations(&self) -> Evaluations {
+        let [density, color] = [&self.densities, &self.colors].map(|count| count.load(Ordering::Relaxed));
+        Evaluations { density, color, unskipped: 0 }
+    }
+
+    /// The densities at positions, in 1 / scene unit.
+    pub fn densities(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        self.densities.fetch_add(points.len() as u64, Ordering::Relaxed);
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = self.model.params.bind_constant(&tape);
+        let positions = tape.constant(self.pool.copy_of(&[points.len(), 3], points.as_flattened()));
+        out.copy_from_slice(self.model.field.density(&params, &positions).sigma().value().as_slice());
+    }
+
+    /// The same as pictures have it: 0 outside of the grid's box and where it is not occupied.
+    pub fn shown(&self, grid: &OccupancyGrid, bounds: [DVec3; 2], points: &[[f32; 3]], out: &mut [f32]) {
+        let [low, high] = bounds;
+        let is_shown = |point: [f32; 3]| {
+            let point = DVec3::from(point.map(f64::from));
+            point.cmpge(low).all() && point.cmple(high).all() && grid.is_occupied(point)
+        };
+        let rows: Vec<usize> = (0..points.len()).filter(|&row| is_shown(points[row])).collect();
+        out.fill(0.0);
+        if rows.is_empty() {
+            return;
+        }
+        let asked: Vec<[f32; 3]> = rows.iter().map(|&row| points[row]).collect();
+        let mut found = vec![0.0; rows.len()];
+        self.densities(&asked, &mut found);
+        rows.iter().zip(found).for_each(|(&row, sigma)| out[row] = sigma);
+    }
+
+    /// For each place the unit normal, against the slope of the density, and the colour that is seen when one looks along it
+    /// from outside, in sRGB. Where the density has no slope the normal is up.
+    pub fn look(&self, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
+        let tone = self.model.tone.as_ref();
+        let gains = tone.map_or([1.0; 3], |tone| tone.gain(&self.model.params, self.model.look, false).at(0.0));
+        let look = |places: &[DVec3]| {
+            parallel::serial(|| {
+                let normals = self.normals(places);
+                let colors = self.colors(places, &normals, gains);
+                normals.into_iter().zip(colors).collect::<Vec<_>>()
+            })
+        };
+        places.par_chunks(POINTS).flat_map_iter(look).unzip()
+    }
+
+    fn normals(&self, places: &[DVec3]) -> Vec<DVec3> {
+        self.densities.fetch_add(places.len() as u64, Ordering::Relaxed);
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = self.model.params.bind_constant(&tape);
+        let points: Vec<[f32; 3]> = places.iter().map(|place| place.as_vec3().to_array()).collect();
+        let positions = tape.leaf(self.pool.copy_of(&[points.len(), 3], points.as_flattened()));
+        // Where it is the logarithm, that falls in the same direction.
+        let value = self.model.field.density(&params, &positions).value;
+        let slopes = value.sum().grad(&[&positions]).remove(0);
+        let normal = |slope: &[f32; 3]| {
+            let slope = DVec3::from(slope.map(f64::from));
+            (-slope).try_normalize().unwrap_or(DVec3::Z)
+        };
+        slopes.as_slice().as_chunks::<3>().0.iter().map(normal).collect()
+    }
+
+    fn colors(&self, places: &[DVec3], normals: &[DVec3], gains: [f64; 3]) -> Vec<[u8; 3]> {
+        self.colors.fetch_add(places.len() as u64, Ordering::Relaxed);
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = self.model.params.bind_constant(&tape);
+        let mut rays = Rays::new();
+        for (&origin, normal) in places.iter().zip(normals) {
+            rays.push(&Ray { origin, direction: -normal }, [0.0, 1.0]);
+        }
+        let count = rays.len();
+        let (here, one) = (Tensor::zeros(&[count]), Tensor::ones(&[count]));
+        let samples = Samples::new(&rays, Segments::uniform(count, 1), here, one, &self.pool);
+        let frames = self.model.look.map(|look| vec![look; count]);
+        let query = Query { frames: frames.as_deref(), ..Query::new(&*self.model.field, &params) };
+        let color = query.color(&query.density(&samples).features, &samples);
+        let stored = |color: &[f32; 3]| std::array::from_fn(|k| quantise((f64::from(color[k]) * gains[k]) as f32));
+        color.value().as_slice().as_chunks::<3>().0.iter().map(stored).collect()
+    }
+}

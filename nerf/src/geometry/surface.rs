@@ -1,0 +1,169 @@
+//! The surface that a model's pictures show.
+
+use super::isosurface::{Lattice, isosurface};
+use super::probe::Probe;
+use super::shape::Shape;
+use super::sight::sights;
+use crate::camera::Camera;
+use crate::model::Model;
+use crate::range::check_range;
+use crate::sampling::marching::Marching;
+use crate::space::occupancy::{OccupancyConfig, OccupancyGrid};
+use crate::volume::render::Evaluations;
+use crate::{Error, Result};
+use glam::DVec3;
+use raygrad_autograd::Pool;
+use std::borrow::Cow;
+
+/// Cells of a lattice along each cell of an occupancy grid, unless it is said otherwise.
+const FINER: usize = 3;
+/// Where a sampler has no grid, one is made of cells that hold at least this share of the level.
+const FAINT: f64 = 0.1;
+/// Pixels along the longer side of the pictures that the level is found by.
+const PIXELS: usize = 64;
+
+/// Which surface of a model is made.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SurfaceConfig {
+    /// Cells of the lattice along the longest side of the box, 1 to 4096; without it three for each of the model's occupancy
+    /// grid, or of a grid of 128 cells.
+    pub resolution: Option<usize>,
+    /// The density on the surface, in 1 / scene unit, above 0; without it the one at which cameras see it.
+    pub level: Option<f64>,
+    /// Parts of less than this share of the largest one's area, 0 to 1, are left out.
+    pub parts: f64,
+    /// How many triangles there may be, at least 4, if not as many as it takes.
+    pub triangles: Option<usize>,
+    /// Whether the surface is closed where it meets the box. Otherwise it ends there.
+    pub closed: bool,
+}
+
+impl Default for SurfaceConfig {
+    fn default() -> Self {
+        SurfaceConfig { resolution: None, level: None, parts: 0.01, triangles: None, closed: true }
+    }
+}
+
+impl SurfaceConfig {
+    fn check(&self) -> Result<()> {
+        check_range("parts", self.parts, 0.0, 1.0)?;
+        if let Some(level) = self.level.filter(|level| !(*level > 0.0 && level.is_finite())) {
+            return Err(Error::setting("level", format!("is {level}; use a density above 0")));
+        }
+        self.triangles.map_or(Ok(()), |count| check_range("triangles", count, 4, u32::MAX as usize))
+    }
+}
+
+/// What is being done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// Looking for the places that cameras see.
+    Seeing,
+    /// Looking for the surface.
+    Meshing,
+    /// Making triangles fewer.
+    Simplifying,
+    /// Finding normals and colours.
+    Coloring,
+}
+
+/// A surface, and how it was made.
+#[derive(Debug, Clone)]
+pub struct Surface {
+    /// The surface, in scene units.
+    pub shape: Shape,
+    /// The density on it, in 1 / scene unit.
+    pub level: f64,
+    /// Cells of the lattice along the longest side of the box.
+    pub resolution: usize,
+    /// How many small parts were left out.
+    pub dropped: usize,
+    /// How often the model was asked.
+    pub evaluations: Evaluations,
+}
+
+impl Model<f32> {
+    /// The surface within the model's box (of a scene that goes on, the part of it where the cameras look), with normals
+    /// against the slope of the density and the colours that are seen along these.
+    ///
+    /// It is where the density has one [level](SurfaceConfig::level). If none is given, it is the median density of the
+    /// places at which half of a ray's light is blocked, over rays of the `cameras` that end in something solid: so the surface
+    /// lies where pictures show it. What pictures leave out, cells that are not occupied, counts as empty.
+    ///
+    /// `progress` is told what is being done, and what share of that is, 0 to 1.
+    ///
+    /// # Errors
+    /// If a number of the configuration is out of range, there is no surface, or it is too large.
+    pub fn surface(
+        &self,
+        cameras: &[Camera],
+        config: &SurfaceConfig,
+        progress: &mut dyn FnMut(Stage, f64),
+    ) -> Result<Surface> {
+        config.check()?;
+        let probe = Probe::new(self);
+        let mut evaluations = Evaluations::default();
+        let level = match config.level {
+            Some(level) => level,
+            None => {
+                let (level, asked) = self.level(cameras, &mut |done| progress(Stage::Seeing, done))?;
+                evaluations = asked;
+                level
+            }
+        };
+        let (bounds, asked) = (self.extent.bounds, |points: &[[f32; 3]], out: &mut [f32]| probe.densities(points, out));
+        let grid = match self.marching().map(Marching::view_grid).or_else(|| self.sampler.grid()) {
+            Some(grid) => Cow::Borrowed(grid),
+            None => {
+                let mut grid = OccupancyGrid::new(bounds, &OccupancyConfig::default())?;
+                grid.rebuild((FAINT * level) as f32, true, &asked);
+                Cow::Owned(grid)
+            }
+        };
+        let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
+        let lattice = Lattice::over(bounds, resolution, config.closed)?;
+        let shown = |points: &[[f32; 3]], out: &mut [f32]| probe.shown(&grid, bounds, points, out);
+        let mut mesh = isosurface(&lattice, level as f32, &shown, &mut |done| progress(Stage::Meshing, done))?;
+        if mesh.triangles.is_empty() {
+            return Err(Error::setting(
+                "level",
+                format!("is {level}, and there is no such density: use a smaller one"),
+            ));
+        }
+        let dropped = mesh.drop_parts(config.parts);
+        if let Some(count) = config.triangles {
+            mesh.decimate(count, &mut |done| progress(Stage::Simplifying, done));
+        }
+        progress(Stage::Coloring, 0.0);
+        let (normals, colors) = probe.look(&mesh.positions);
+        evaluations = evaluations + probe.evaluations();
+        Ok(Surface { shape: Shape { mesh, normals, colors }, level, resolution, dropped, evaluations })
+    }
+
+    /// The median density of the places within the box that cameras see.
+    fn level(&self, cameras: &[Camera], progress: &mut dyn FnMut(f64)) -> Result<(f64, Evaluations)> {
+        let (mut sigmas, mut evaluations, pool) = (vec![], Evaluations::default(), Pool::new());
+        for (i, camera) in cameras.iter().enumerate() {
+            let scale = PIXELS as f64 / camera.width.max(camera.height) as f64;
+            let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
+            let (found, asked) = sights(self, &camera.resized(width, height), &pool);
+            sigmas.extend(found.iter().filter(|sight| self.holds(sight.place)).map(|sight| sight.sigma));
+            evaluations = evaluations + asked;
+            progress((i + 1) as f64 / cameras.len() as f64);
+        }
+        let middle = sigmas.len() / 2;
+        if sigmas.is_empty() {
+            return Err(Error::setting("level", "is not known: no camera sees anything solid. Give one"));
+        }
+        Ok((*sigmas.select_nth_unstable_by(middle, f64::total_cmp).1, evaluations))
+    }
+
+    /// Whether a place is in the model's box.
+    pub(super) fn holds(&self, place: DVec3) -> bool {
+        let [low, high] = self.extent.bounds;
+        place.cmpge(low).all() && place.cmple(high).all()
+    }
+}
+
+#[cfg(test)]
+mod tests;
