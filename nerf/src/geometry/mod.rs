@@ -25,6 +25,7 @@
 mod cases;
 mod decimate;
 pub mod files;
+mod hidden;
 mod isosurface;
 mod mesh;
 mod points;

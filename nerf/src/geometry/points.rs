@@ -47,9 +47,11 @@ impl Model<f32> {
         let scale = (RAYS * count as f64 / pixels.max(1) as f64).sqrt();
         for (i, camera) in cameras.iter().enumerate() {
             let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
-            let (found, asked) = sights(self, &camera.resized(width, height), &pool);
-            places.extend(found.iter().map(|sight| sight.place).filter(|place| self.holds(*place)));
-            evaluations = evaluations + asked;
+            let seen = sights(self, &camera.resized(width, height), &pool);
+            places.extend(
+                seen.sights.iter().flatten().map(|sight| sight.place).filter(|place| self.extent.holds(*place)),
+            );
+            evaluations = evaluations + seen.evaluations;
             progress(Stage::Seeing, (i + 1) as f64 / cameras.len() as f64);
         }
         if places.is_empty() {

@@ -1,5 +1,6 @@
 //! Asking a model at places, as its pictures show them.
 
+use super::hidden::Hidden;
 use crate::camera::pinhole::Ray;
 use crate::camera::rays::{Rays, Samples};
 use crate::model::Model;
@@ -41,15 +42,16 @@ impl<'a> Probe<'a> {
         out.copy_from_slice(self.model.field.density(&params, &positions).sigma().value().as_slice());
     }
 
-    /// The same as pictures have it: 0 outside of the grid's box and where it is not occupied.
-    pub fn shown(&self, grid: &OccupancyGrid, bounds: [DVec3; 2], points: &[[f32; 3]], out: &mut [f32]) {
-        let [low, high] = bounds;
-        let is_shown = |point: [f32; 3]| {
-            let point = DVec3::from(point.map(f64::from));
-            point.cmpge(low).all() && point.cmple(high).all() && grid.is_occupied(point)
-        };
-        let rows: Vec<usize> = (0..points.len()).filter(|&row| is_shown(points[row])).collect();
+    /// The same as pictures have it: 0 outside of the model's box and where the grid is not occupied. What is hidden there has
+    /// an infinite one.
+    pub fn shown(&self, grid: &OccupancyGrid, hidden: Option<&Hidden>, points: &[[f32; 3]], out: &mut [f32]) {
+        let place = |row: usize| DVec3::from(points[row].map(f64::from));
+        let is_shown = |row: &usize| self.model.extent.holds(place(*row)) && grid.is_occupied(place(*row));
+        let rows: Vec<usize> = (0..points.len()).filter(is_shown).collect();
         out.fill(0.0);
+        let is_hidden = |row: usize| hidden.is_some_and(|hidden| hidden.holds(place(row)));
+        let (dense, rows): (Vec<usize>, Vec<usize>) = rows.into_iter().partition(|&row| is_hidden(row));
+        dense.into_iter().for_each(|row| out[row] = f32::INFINITY);
         if rows.is_empty() {
             return;
         }

@@ -24,8 +24,18 @@ const TILE: usize = 256;
 pub(super) struct Sight {
     /// The place up to which half of the light is blocked, in scene units.
     pub place: DVec3,
+    /// Its distance from where the ray starts.
+    pub distance: f64,
     /// The density there, in 1 / scene unit.
     pub sigma: f64,
+}
+
+/// What the pixels of a camera see.
+pub(super) struct Seen {
+    /// Row by row; `None` for those that see nothing solid.
+    pub sights: Vec<Option<Sight>>,
+    /// How often the model was asked.
+    pub evaluations: Evaluations,
 }
 
 /// What a ray has met so far.
@@ -37,9 +47,8 @@ struct State {
     half: Option<[f64; 2]>,
 }
 
-/// What a camera's pixels see, row by row, of those that see something solid. Distances are those of the sampler's steps for
-/// views.
-pub(super) fn sights(model: &Model<f32>, camera: &Camera, pool: &Pool<f32>) -> (Vec<Sight>, Evaluations) {
+/// What a camera's pixels see. Distances are exact to a share of the sampler's steps for views.
+pub(super) fn sights(model: &Model<f32>, camera: &Camera, pool: &Pool<f32>) -> Seen {
     let pixels = camera.width * camera.height;
     let tile = |tile: usize| {
         let (mut rays, bounds) = (Rays::new(), model.reach());
@@ -49,16 +58,12 @@ pub(super) fn sights(model: &Model<f32>, camera: &Camera, pool: &Pool<f32>) -> (
         }
         parallel::serial(|| see(model, &rays, pool))
     };
-    let tiles: Vec<_> = (0..pixels.div_ceil(TILE)).into_par_iter().map(tile).collect();
-    let mut all = (vec![], Evaluations::default());
-    for (sights, evaluations) in tiles {
-        all.0.extend(sights);
-        all.1 = all.1 + evaluations;
-    }
-    all
+    let tiles: Vec<Seen> = (0..pixels.div_ceil(TILE)).into_par_iter().map(tile).collect();
+    let evaluations = tiles.iter().fold(Evaluations::default(), |sum, tile| sum + tile.evaluations);
+    Seen { sights: tiles.into_iter().flat_map(|tile| tile.sights).collect(), evaluations }
 }
 
-fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>) -> (Vec<Sight>, Evaluations) {
+fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>) -> Seen {
     let tape = Tape::with_pool(pool.clone());
     let params = model.params.bind_constant(&tape);
     let query = &Query::new(&*model.field, &params);
@@ -83,10 +88,10 @@ fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>) -> (Vec<Sight>, E
         asked.density += part.len() as u64;
         alive.iter().map(|&ray| (-states[ray].depth).exp() > MOST_LEFT).collect()
     });
-    let found = states.iter().enumerate().filter(|(_, state)| (-state.depth).exp() <= MOST_LEFT);
     let sight = |(ray, state): (usize, &State)| {
         let [origin, direction] = [&rays.origins, &rays.directions].map(|x| DVec3::from(x[ray].map(f64::from)));
-        state.half.map(|[t, sigma]| Sight { place: origin + t * direction, sigma })
+        let [distance, sigma] = state.half.filter(|_| (-state.depth).exp() <= MOST_LEFT)?;
+        Some(Sight { place: origin + distance * direction, distance, sigma })
     };
-    (found.filter_map(sight).collect(), asked)
+    Seen { sights: states.iter().enumerate().map(sight).collect(), evaluations: asked }
 }

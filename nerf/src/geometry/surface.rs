@@ -1,9 +1,10 @@
 //! The surface that a model's pictures show.
 
+use super::hidden::Hidden;
 use super::isosurface::{Lattice, isosurface};
 use super::probe::Probe;
 use super::shape::Shape;
-use super::sight::sights;
+use super::sight::{Seen, sights};
 use crate::camera::Camera;
 use crate::model::Model;
 use crate::range::check_range;
@@ -19,8 +20,8 @@ use std::borrow::Cow;
 const FINER: usize = 3;
 /// Where a sampler has no grid, one is made of cells that hold at least this share of the level.
 const FAINT: f64 = 0.1;
-/// Pixels along the longer side of the pictures that the level is found by.
-const PIXELS: usize = 64;
+/// Pixels along the longer side of the pictures that say what is seen.
+const PIXELS: usize = 128;
 
 /// Which surface of a model is made.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,13 +35,16 @@ pub struct SurfaceConfig {
     pub parts: f64,
     /// How many triangles there may be, at least 4, if not as many as it takes.
     pub triangles: Option<usize>,
+    /// Whether what no camera sees is taken to be dense, further than a cell of the occupancy grid behind what is seen: there the
+    /// field was never judged, and holds sponges and voids. What pictures leave out stays empty.
+    pub filled: bool,
     /// Whether the surface is closed where it meets the box. Otherwise it ends there.
     pub closed: bool,
 }
 
 impl Default for SurfaceConfig {
     fn default() -> Self {
-        SurfaceConfig { resolution: None, level: None, parts: 0.01, triangles: None, closed: true }
+        SurfaceConfig { resolution: None, level: None, parts: 0.01, triangles: None, filled: true, closed: true }
     }
 }
 
@@ -101,28 +105,26 @@ impl Model<f32> {
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<Surface> {
         config.check()?;
-        let probe = Probe::new(self);
-        let mut evaluations = Evaluations::default();
-        let level = match config.level {
-            Some(level) => level,
-            None => {
-                let (level, asked) = self.level(cameras, &mut |done| progress(Stage::Seeing, done))?;
-                evaluations = asked;
-                level
-            }
+        let (probe, bounds) = (Probe::new(self), self.extent.bounds);
+        let views = if config.filled || config.level.is_none() {
+            self.views(cameras, &mut |done| progress(Stage::Seeing, done))
+        } else {
+            vec![]
         };
-        let (bounds, asked) = (self.extent.bounds, |points: &[[f32; 3]], out: &mut [f32]| probe.densities(points, out));
+        let level = config.level.map_or_else(|| self.level(&views), Ok)?;
         let grid = match self.marching().map(Marching::view_grid).or_else(|| self.sampler.grid()) {
             Some(grid) => Cow::Borrowed(grid),
             None => {
                 let mut grid = OccupancyGrid::new(bounds, &OccupancyConfig::default())?;
-                grid.rebuild((FAINT * level) as f32, true, &asked);
+                grid.rebuild((FAINT * level) as f32, true, &|points, out| probe.densities(points, out));
                 Cow::Owned(grid)
             }
         };
+        let cell = self.extent.space().side() / grid.resolution() as f64;
+        let hidden = config.filled.then(|| Hidden::new(&views, cell));
         let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
         let lattice = Lattice::over(bounds, resolution, config.closed)?;
-        let shown = |points: &[[f32; 3]], out: &mut [f32]| probe.shown(&grid, bounds, points, out);
+        let shown = |points: &[[f32; 3]], out: &mut [f32]| probe.shown(&grid, hidden.as_ref(), points, out);
         let mut mesh = isosurface(&lattice, level as f32, &shown, &mut |done| progress(Stage::Meshing, done))?;
         if mesh.triangles.is_empty() {
             return Err(Error::setting(
@@ -136,32 +138,34 @@ impl Model<f32> {
         }
         progress(Stage::Coloring, 0.0);
         let (normals, colors) = probe.look(&mesh.positions);
-        evaluations = evaluations + probe.evaluations();
+        let evaluations = views.iter().fold(probe.evaluations(), |sum, (_, seen)| sum + seen.evaluations);
         Ok(Surface { shape: Shape { mesh, normals, colors }, level, resolution, dropped, evaluations })
     }
 
-    /// The median density of the places within the box that cameras see.
-    fn level(&self, cameras: &[Camera], progress: &mut dyn FnMut(f64)) -> Result<(f64, Evaluations)> {
-        let (mut sigmas, mut evaluations, pool) = (vec![], Evaluations::default(), Pool::new());
-        for (i, camera) in cameras.iter().enumerate() {
+    /// What small pictures of these cameras see.
+    fn views(&self, cameras: &[Camera], progress: &mut dyn FnMut(f64)) -> Vec<(Camera, Seen)> {
+        let pool = Pool::new();
+        let view = |(i, camera): (usize, &Camera)| {
             let scale = PIXELS as f64 / camera.width.max(camera.height) as f64;
             let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
-            let (found, asked) = sights(self, &camera.resized(width, height), &pool);
-            sigmas.extend(found.iter().filter(|sight| self.holds(sight.place)).map(|sight| sight.sigma));
-            evaluations = evaluations + asked;
+            let camera = camera.resized(width, height);
+            let seen = sights(self, &camera, &pool);
             progress((i + 1) as f64 / cameras.len() as f64);
-        }
+            (camera, seen)
+        };
+        cameras.iter().enumerate().map(view).collect()
+    }
+
+    /// The median density of the places within the box that cameras see.
+    fn level(&self, views: &[(Camera, Seen)]) -> Result<f64> {
+        let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
+        let mut sigmas: Vec<f64> =
+            sights.filter(|sight| self.extent.holds(sight.place)).map(|sight| sight.sigma).collect();
         let middle = sigmas.len() / 2;
         if sigmas.is_empty() {
             return Err(Error::setting("level", "is not known: no camera sees anything solid. Give one"));
         }
-        Ok((*sigmas.select_nth_unstable_by(middle, f64::total_cmp).1, evaluations))
-    }
-
-    /// Whether a place is in the model's box.
-    pub(super) fn holds(&self, place: DVec3) -> bool {
-        let [low, high] = self.extent.bounds;
-        place.cmpge(low).all() && place.cmple(high).all()
+        Ok(*sigmas.select_nth_unstable_by(middle, f64::total_cmp).1)
     }
 }
 

@@ -42,6 +42,9 @@ pub struct Options {
     /// Leave out parts with less than this share, 0 to 1, of the largest one's area; 0 keeps all [default: 0.01]
     #[arg(long, value_name = "SHARE", conflicts_with = "points")]
     parts: Option<f64>,
+    /// Do not take what no view sees to be solid
+    #[arg(long, conflicts_with = "points")]
+    hollow: bool,
     /// Let the surface end at the border of the box, where it is closed otherwise
     #[arg(long, conflicts_with = "points")]
     open: bool,
@@ -56,6 +59,7 @@ impl Options {
             ("resolution", self.resolution.is_some()),
             ("level", self.level.is_some()),
             ("parts", self.parts.is_some()),
+            ("hollow", self.hollow),
             ("open", self.open),
         ];
         match given.iter().find(|(_, given)| *given) {
@@ -94,6 +98,7 @@ pub fn run(run: &Run, options: &Options, out: &Path) -> Result<()> {
                 level: options.level,
                 parts: options.parts.unwrap_or(default.parts),
                 triangles: options.triangles,
+                filled: !options.hollow,
                 closed: !options.open,
             };
             let surface = model.surface(&cameras, &config, &mut show)?;
@@ -120,7 +125,7 @@ pub fn run(run: &Run, options: &Options, out: &Path) -> Result<()> {
 /// Cameras around the scene: at the mean height of those that photographed it, lower, and higher.
 fn cameras(config: &RunConfig) -> Vec<Camera> {
     let mean = config.viewpoint.elevation;
-    let elevations = [0.4 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
+    let elevations = [0.1 * mean, 0.5 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
     let ring = |elevation| Viewpoint { elevation, ..config.viewpoint }.orbit(&config.extent, RING);
     elevations.into_iter().flat_map(ring).collect()
 }

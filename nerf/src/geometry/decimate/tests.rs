@@ -10,7 +10,7 @@ fn of(f: impl Fn(DVec3) -> f64 + Sync, closed: bool) -> Mesh {
     let density = |points: &[[f32; 3]], out: &mut [f32]| {
         points.iter().zip(out).for_each(|(x, out)| *out = f(DVec3::from(x.map(f64::from))) as f32);
     };
-    isosurface(&Lattice::over(BOX, 40, closed).unwrap(), 1.0, &density, &mut |_| ()).unwrap()
+    isosurface(&Lattice::over(BOX, 60, closed).unwrap(), 1.0, &density, &mut |_| ()).unwrap()
 }
 
 fn ball(x: DVec3) -> f64 {
@@ -35,7 +35,7 @@ fn fewer_triangles_hold_the_same() {
             assert!((last..=1.0).contains(&done));
             last = done;
         });
-        assert!(fine.triangles.len() > 5000, "{name}");
+        assert!(fine.triangles.len() > 3000, "{name}");
         assert!((999..=1000).contains(&coarse.triangles.len()), "{name}: {}", coarse.triangles.len());
         assert!(coarse.is_closed() && coarse.parts().1 == 1, "{name}");
         let euler = |mesh: &Mesh| mesh.positions.len() as i64 - mesh.triangles.len() as i64 / 2;
@@ -45,12 +45,17 @@ fn fewer_triangles_hold_the_same() {
         // Vertices stay on the surface, by far less than the edges are long (about .1).
         let off = coarse.positions.iter().map(|x| (f(*x) - 1.0).abs()).fold(0.0, f64::max);
         assert!(off < 0.012, "{name}: {off}");
-        // No triangle has turned over: of the ball, all face away from the middle.
-        let faces_out = |i: usize| {
-            let [a, b, c] = coarse.corners(i);
-            (b - a).cross(c - a).normalize().dot((a - DVec3::new(0.1, 0.3, -0.05)).normalize()) > 0.7
-        };
-        assert!(name != "ball" || (0..coarse.triangles.len()).all(faces_out));
+        // No triangle has turned over: of the ball, all face away from the middle, and most do so squarely.
+        if name == "ball" {
+            let faces_out = |i: usize| {
+                let [a, b, c] = coarse.corners(i);
+                let out = (a + b + c) / 3.0 - DVec3::new(0.1, 0.3, -0.05);
+                (b - a).cross(c - a).normalize().dot(out.normalize())
+            };
+            let faces: Vec<f64> = (0..coarse.triangles.len()).map(faces_out).collect();
+            assert!(faces.iter().all(|cosine| *cosine > 0.0), "{faces:?}");
+            assert!(faces.iter().sum::<f64>() / faces.len() as f64 > 0.98);
+        }
         let mut same = fine.clone();
         same.decimate(fine.triangles.len(), &mut |_| ());
         assert_eq!(same, fine, "{name}");

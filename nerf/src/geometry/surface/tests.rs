@@ -1,7 +1,7 @@
 //! Surfaces and points of a model whose field is known.
 
 use super::*;
-use crate::field::{Density, Field, FieldConfig, Seen, VoxelConfig};
+use crate::field::{self, Density, Field, FieldConfig, VoxelConfig};
 use crate::model::{Config, Extent, Preset};
 use crate::sampling::marching::MarchingConfig;
 use raygrad_autograd::{Tensor, Var};
@@ -25,7 +25,7 @@ impl Field<f32> for Balls {
         Density { value: deepest.unwrap(), log: true, features: positions.clone() }
     }
 
-    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &Seen<'_, 't, f32>) -> Var<'t, f32> {
+    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
         0.5 - seen.directions.segment_expand(seen.segments) * 0.5
     }
 }
@@ -67,7 +67,7 @@ fn surface(model: &Model<f32>, config: &SurfaceConfig) -> Surface {
 
 /// Of the right number of cells for the balls here.
 const CONFIG: SurfaceConfig =
-    SurfaceConfig { resolution: Some(80), level: None, parts: 0.01, triangles: None, closed: true };
+    SurfaceConfig { resolution: Some(80), level: None, parts: 0.01, triangles: None, filled: false, closed: true };
 
 #[test]
 fn the_surface_is_where_views_see_it() {
@@ -210,4 +210,37 @@ fn points_are_what_cameras_see() {
     assert!(middle.distance(CENTRE) < 0.1, "{middle}");
     let deep = mesh.positions.iter().filter(|place| place.distance(CENTRE) < deepest + 0.003).count();
     assert!(deep > count / 10, "straight on they are as deep as they can be: {deep} of {count}");
+}
+
+#[test]
+fn what_no_camera_sees_is_solid_if_it_is_to_be() {
+    // A hole in the middle of the ball: a void of radius .2, which a shell of .3 hides.
+    let mut hollow = ball();
+    hollow.field = Arc::new(Hollow);
+    hollow.finish();
+    let config = SurfaceConfig { level: Some(2.0), parts: 0.0, ..CONFIG };
+    let open = surface(&hollow, &config).shape.mesh;
+    let full = surface(&hollow, &SurfaceConfig { filled: true, ..config }).shape.mesh;
+    assert_eq!((open.parts().1, full.parts().1), (2, 1));
+    // The outside is where it was.
+    let whole = surface(&ball(), &config).shape.mesh;
+    assert!((full.volume() / whole.volume() - 1.0).abs() < 1e-4, "{} {}", full.volume(), whole.volume());
+    assert!(open.volume() < 0.95 * whole.volume() && full.is_closed());
+    // Without cameras nothing is known to be hidden.
+    let blind = hollow.surface(&[], &SurfaceConfig { filled: true, ..config }, &mut |_, _| ()).unwrap();
+    assert_eq!(blind.shape.mesh, open);
+}
+
+/// The ball with a void in its middle.
+struct Hollow;
+
+impl Field<f32> for Hollow {
+    fn density<'t>(&self, params: &Bound<'t, f32>, positions: &Var<'t, f32>) -> Density<'t, f32> {
+        let [outer, inner] = [RADIUS, 0.2].map(|radius| Balls(vec![(CENTRE, radius)]).density(params, positions));
+        Density { value: outer.value.minimum(-inner.value), ..outer }
+    }
+
+    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
+        seen.directions.segment_expand(seen.segments)
+    }
 }
