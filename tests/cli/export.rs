@@ -136,7 +136,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     place.succeeds("export run mesh.OBJ --level 1e-6 --resolution 20");
     assert!(place.bytes("mesh.OBJ").starts_with(b"# x y z red green blue"));
 
-    place.fails("export run no.ply --points", &["`points`: are none"]);
+    place.fails("export run no.ply --points=50", &["`points`: are none"]);
     place.fails("export run no.ply", &["`level`: is not known"]);
     place.fails("export run no.ply --level -1", &["`level`: is -1"]);
     place.fails("export run no.ply --level 1e30", &["`level`: is 1", "use a smaller one"]);

@@ -86,11 +86,8 @@ impl Mesh {
         const UNUSED: u32 = u32::MAX;
         let mut number = vec![UNUSED; self.positions.len()];
         self.triangles.as_flattened().iter().for_each(|&vertex| number[vertex as usize] = 0);
-        let mut count = 0;
-        for number in number.iter_mut().filter(|number| **number != UNUSED) {
-            *number = count;
-            count += 1;
-        }
+        let used = number.iter_mut().filter(|number| **number != UNUSED);
+        used.zip(0..).for_each(|(number, new)| *number = new);
         let mut numbers = number.iter();
         self.positions.retain(|_| numbers.next() != Some(&UNUSED));
         self.triangles.as_flattened_mut().iter_mut().for_each(|vertex| *vertex = number[*vertex as usize]);

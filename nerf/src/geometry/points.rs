@@ -61,7 +61,7 @@ impl Model<f32> {
         let positions = thinned(&places, count);
         progress(Stage::Coloring, 0.0);
         let probe = Probe::new(self);
-        let (normals, colors) = probe.look(&positions);
+        let (normals, colors) = probe.look(self.cells(), self.judged(self.cells()), &positions);
         let mesh = Mesh { positions, triangles: vec![] };
         evaluations = evaluations + probe.evaluations();
         Ok(PointCloud { shape: Shape { mesh, normals, colors }, sights, evaluations })

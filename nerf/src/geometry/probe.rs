@@ -42,11 +42,12 @@ impl<'a> Probe<'a> {
         out.copy_from_slice(self.model.field.density(&params, &positions).sigma().value().as_slice());
     }
 
-    /// The same as pictures have it: 0 outside of the model's box and where the grid is not occupied. What is hidden there has
-    /// an infinite one.
-    pub fn shown(&self, grid: &OccupancyGrid, hidden: Option<&Hidden>, points: &[[f32; 3]], out: &mut [f32]) {
+    /// The same as pictures have it: 0 outside of the model's box and where the grid, if there is one, is not occupied. What is
+    /// hidden there has an infinite one.
+    pub fn shown(&self, grid: Option<&OccupancyGrid>, hidden: Option<&Hidden>, points: &[[f32; 3]], out: &mut [f32]) {
         let place = |row: usize| DVec3::from(points[row].map(f64::from));
-        let is_shown = |row: &usize| self.model.extent.holds(place(*row)) && grid.is_occupied(place(*row));
+        let is_occupied = |place: DVec3| grid.is_none_or(|grid| grid.is_occupied(place));
+        let is_shown = |row: &usize| self.model.extent.holds(place(*row)) && is_occupied(place(*row));
         let rows: Vec<usize> = (0..points.len()).filter(is_shown).collect();
         out.fill(0.0);
         let is_hidden = |row: usize| hidden.is_some_and(|hidden| hidden.holds(place(row)));
@@ -61,14 +62,16 @@ impl<'a> Probe<'a> {
         rows.iter().zip(found).for_each(|(&row, sigma)| out[row] = sigma);
     }
 
-    /// For each place the unit normal, against the slope of the density, and the colour that is seen when one looks along it
-    /// from outside, in sRGB. Where the density has no slope the normal is up.
-    pub fn look(&self, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
+    /// For each place the unit normal, and the colour that is seen when one looks along it from outside, in sRGB.
+    ///
+    /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it, along each axis:
+    /// the field's own gradient is that of noise finer than a pixel. Where there is no slope the normal is up.
+    pub fn look(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
         let tone = self.model.tone.as_ref();
         let gains = tone.map_or([1.0; 3], |tone| tone.gain(&self.model.params, self.model.look, false).at(0.0));
         let look = |places: &[DVec3]| {
             parallel::serial(|| {
-                let normals = self.normals(places);
+                let normals = self.normals(grid, reach, places);
                 let colors = self.colors(places, &normals, gains);
                 normals.into_iter().zip(colors).collect::<Vec<_>>()
             })
@@ -76,20 +79,19 @@ impl<'a> Probe<'a> {
         places.par_chunks(POINTS).flat_map_iter(look).unzip()
     }
 
-    fn normals(&self, places: &[DVec3]) -> Vec<DVec3> {
-        self.densities.fetch_add(places.len() as u64, Ordering::Relaxed);
-        let tape = Tape::with_pool(self.pool.clone());
-        let params = self.model.params.bind_constant(&tape);
-        let points: Vec<[f32; 3]> = places.iter().map(|place| place.as_vec3().to_array()).collect();
-        let positions = tape.leaf(self.pool.copy_of(&[points.len(), 3], points.as_flattened()));
-        // Where it is the logarithm, that falls in the same direction.
-        let value = self.model.field.density(&params, &positions).value;
-        let slopes = value.sum().grad(&[&positions]).remove(0);
-        let normal = |slope: &[f32; 3]| {
-            let slope = DVec3::from(slope.map(f64::from));
-            (-slope).try_normalize().unwrap_or(DVec3::Z)
+    fn normals(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> Vec<DVec3> {
+        let mut around = vec![[0.0; 6]; places.len()];
+        let mut found = vec![0.0; places.len()];
+        for (k, step) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]).enumerate() {
+            let points: Vec<[f32; 3]> =
+                places.iter().map(|place| (place + reach * step).as_vec3().to_array()).collect();
+            self.shown(grid, None, &points, &mut found);
+            around.iter_mut().zip(&found).for_each(|(out, &sigma)| out[k] = (reach * f64::from(sigma)).ln_1p());
+        }
+        let normal = |[right, left, back, front, up, down]: &[f64; 6]| {
+            DVec3::new(left - right, front - back, down - up).try_normalize().unwrap_or(DVec3::Z)
         };
-        slopes.as_slice().as_chunks::<3>().0.iter().map(normal).collect()
+        around.iter().map(normal).collect()
     }
 
     fn colors(&self, places: &[DVec3], normals: &[DVec3], gains: [f64; 3]) -> Vec<[u8; 3]> {

@@ -33,7 +33,7 @@ pub struct Options {
     /// Make the mesh's triangles fewer, down to N
     #[arg(long, value_name = "N", conflicts_with = "points")]
     triangles: Option<usize>,
-    /// Cells along the longest side of the box in which the surface is looked for [default: 3 for each of the occupancy grid]
+    /// Cells along the longest side of the box in which the surface is looked for [default: 2 for each of the occupancy grid]
     #[arg(long, value_name = "N", conflicts_with = "points")]
     resolution: Option<usize>,
     /// Density on the surface, in 1 / scene unit [default: that where views see it]

@@ -4,6 +4,7 @@ use super::*;
 use crate::field::{self, Density, Field, FieldConfig, VoxelConfig};
 use crate::model::{Config, Extent, Preset};
 use crate::sampling::marching::MarchingConfig;
+use glam::DVec3;
 use raygrad_autograd::{Tensor, Var};
 use raygrad_nn::Bound;
 use std::f64::consts::{LN_2, PI};
@@ -38,7 +39,7 @@ fn model(balls: &[(DVec3, f64)], preset: Preset) -> Model<f32> {
     let mut config = Config::preset(preset);
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
-        sampler.occupancy.resolution = 16;
+        sampler.occupancy.resolution = 32;
     }
     let extent = Extent::new([DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.5, 1.2, 0.9)], [0.5, 8.0]);
     let mut model = Model::new(config, extent, 0).unwrap();
@@ -74,7 +75,8 @@ fn the_surface_is_where_views_see_it() {
     let found = surface(&ball(), &CONFIG);
     // A ray to the middle has lost half of its light where the density is 40 ln 2; one that comes in at an angle, before.
     let most = STEEPNESS * LN_2;
-    assert!((0.6 * most..most).contains(&found.level), "{} {most}", found.level);
+    // The share of rays that come in at more than an angle is its squared sine: at the lower quartile the cosine is a half.
+    assert!((0.4 * most..0.6 * most).contains(&found.level), "{} {most}", found.level);
     let radius = RADIUS - found.level.ln() / STEEPNESS;
     let Shape { mesh, normals, colors } = &found.shape;
     assert!(mesh.is_closed() && mesh.parts().1 == 1 && found.dropped == 0 && found.resolution == 80);
@@ -82,7 +84,7 @@ fn the_surface_is_where_views_see_it() {
     assert_eq!([normals.len(), colors.len()], [mesh.positions.len(); 2]);
     for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
         assert!((place.distance(CENTRE) - radius).abs() < 1e-4, "{place}");
-        assert!(normal.abs_diff_eq((place - CENTRE).normalize(), 1e-4), "{place} {normal}");
+        assert!(normal.dot((place - CENTRE).normalize()) > 0.98, "{place} {normal}");
         // Looked at along the normal: where it points to +x, red is 1.
         let expected = normal.to_array().map(|x| 255.0 * (0.5 + 0.5 * x));
         assert!((0..3).all(|k| (f64::from(color[k]) - expected[k]).abs() < 0.51), "{color:?} {expected:?}");
@@ -97,21 +99,21 @@ fn a_level_that_is_given_is_taken() {
         assert!(found.level == level && !found.shape.mesh.positions.is_empty());
         let off = |place: &DVec3| (place.distance(CENTRE) - radius).abs();
         assert!(found.shape.mesh.positions.iter().all(|place| off(place) < 1e-4), "{level}");
-        // Nothing but what is near was asked, of 82 x 69 x 56 nodes; for each vertex five times for its place, once for its
-        // normal and once for its colour.
+        // Nothing but what is near was asked, of 82 x 69 x 56 nodes; for each vertex five times for its place and six times for
+        // its normal.
         let (asked, vertices) = (found.evaluations, found.shape.mesh.positions.len() as u64);
-        assert!((6 * vertices + 5000..100_000).contains(&asked.density), "{asked:?} {vertices}");
+        assert!((11 * vertices + 5000..150_000).contains(&asked.density), "{asked:?} {vertices}");
         assert_eq!(asked.color, vertices);
     }
     let default = surface(&ball(), &SurfaceConfig { resolution: None, level: Some(1.0), ..CONFIG });
-    assert_eq!(default.resolution, 48, "three cells for each of the grid's 16");
+    assert_eq!(default.resolution, 64, "two cells for each of the grid's 32");
 }
 
 #[test]
 fn what_pictures_leave_out_is_empty() {
     let mut half = ball();
     if let Some(marching) = half.marching_mut() {
-        // Cells are of .15625: those up to x = .25 stay.
+        // Cells are of .078125: those up to x = .25 stay.
         let left = |points: &[[f32; 3]], out: &mut [f32]| {
             points.iter().zip(out).for_each(|(x, out)| *out = if x[0] < 0.25 { 1.0 } else { 0.0 });
         };
@@ -132,9 +134,9 @@ fn a_model_without_a_grid_has_the_same_surface() {
     let config = SurfaceConfig { level: Some(2.0), ..CONFIG };
     let with = surface(&ball(), &config);
     let without = surface(&model(&[(CENTRE, RADIUS)], Preset::Small), &config);
-    assert_eq!(with.shape, without.shape);
+    assert_eq!(with.shape.mesh, without.shape.mesh);
     // It was looked for in a grid first, and is not asked for everywhere on the lattice.
-    assert!(without.evaluations.density > 128 * 128 * 128 / 4 && with.evaluations.density < 250_000);
+    assert!(without.evaluations.density > 128 * 128 * 128 / 4 && with.evaluations.density < 200_000);
 }
 
 #[test]
@@ -202,7 +204,7 @@ fn points_are_what_cameras_see() {
     for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
         let radius = place.distance(CENTRE);
         assert!((deepest - 0.002..RADIUS).contains(&radius), "{radius} {deepest}");
-        assert!(normal.abs_diff_eq((place - CENTRE).normalize(), 1e-4));
+        assert!(normal.dot((place - CENTRE).normalize()) > 0.98, "{place} {normal}");
         assert!((f64::from(color[2]) - 255.0 * (0.5 + 0.5 * normal.z)).abs() < 0.51, "{color:?} {normal}");
     }
     // From all sides: the middle of the points is near that of the ball.
@@ -215,9 +217,9 @@ fn points_are_what_cameras_see() {
 #[test]
 fn what_no_camera_sees_is_solid_if_it_is_to_be() {
     // A hole in the middle of the ball: a void of radius .2, which a shell of .3 hides.
+    // The cells of the void are occupied, as those of a sponge are.
     let mut hollow = ball();
     hollow.field = Arc::new(Hollow);
-    hollow.finish();
     let config = SurfaceConfig { level: Some(2.0), parts: 0.0, ..CONFIG };
     let open = surface(&hollow, &config).shape.mesh;
     let full = surface(&hollow, &SurfaceConfig { filled: true, ..config }).shape.mesh;
@@ -242,5 +244,29 @@ impl Field<f32> for Hollow {
 
     fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
         seen.directions.segment_expand(seen.segments)
+    }
+}
+
+#[test]
+fn colors_have_the_tone_of_views() {
+    let rate = Some(raygrad_nn::Schedule::Constant { rate: 0.1 });
+    let mut config = Config::preset(Preset::Voxel);
+    config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
+    config.tone = crate::model::ToneConfig { exposure: rate, vignetting: rate };
+    let mut model = Model::new(config, Extent { frames: 2, ..ball().extent }, 0).unwrap();
+    model.field = Arc::new(Balls(vec![(CENTRE, RADIUS)]));
+    let [exposure, vignetting] = ["exposure", "vignetting"].map(|name| model.params.find(name).unwrap());
+    let gains: [[f32; 3]; 2] = [[0.5, 1.0, 0.25], [1.0, 0.25, 1.0]];
+    let numbers = gains.as_flattened().iter().map(|gain| gain.ln());
+    model.params.get_mut(exposure).as_mut_slice().iter_mut().zip(numbers).for_each(|(out, x)| *out = x);
+    model.params.get_mut(vignetting).as_mut_slice().fill(-1.0);
+    let places = [CENTRE + 0.4 * DVec3::new(0.6, 0.0, 0.8)];
+    // Of no photograph in particular, the geometric mean; in the middle of the picture, without darker corners.
+    for (look, gains) in [(Some(0), gains[0]), (Some(1), gains[1]), (None, [0.5_f32.sqrt(), 0.5, 0.5])] {
+        model.look = look;
+        let (_, colors) = Probe::new(&model).look(None, 0.02, &places);
+        for (found, expected) in colors[0].iter().zip([0.8, 0.5, 0.9].into_iter().zip(gains)) {
+            assert!((f32::from(*found) - 255.0 * expected.0 * expected.1).abs() < 1.5, "{look:?}: {colors:?}");
+        }
     }
 }
