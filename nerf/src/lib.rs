@@ -2,7 +2,7 @@
 //!
 //! There is a room for each stage that data passes, and each knows only those before it:
 //! [`camera`] → [`dataset`] → [`encoding`] → [`space`] → [`field`] → [`volume`] → [`sampling`] → [`losses`] →
-//! [`model`] → [`rendering`] → [`training`]; [`doctor`], [`pictures`] and [`analytic`] stand beside them, and [`kind`] is how a field, a
+//! [`model`] → [`rendering`] → [`geometry`] and [`training`]; [`doctor`], [`pictures`] and [`analytic`] stand beside them, and [`kind`] is how a field, a
 //! sampler or a term of the loss of one's own comes in. Each stage can be used alone.
 
 pub mod analytic;
@@ -17,6 +17,7 @@ pub mod encoding;
 mod error;
 pub mod field;
 pub(crate) mod files;
+pub mod geometry;
 pub mod kind;
 pub mod losses;
 pub mod model;

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// The rooms in the order in which data passes them. What stands in one line knows nothing of what stands in a later one.
-const ROOMS: [&str; 20] = [
+const ROOMS: [&str; 21] = [
     "error",
     "range",
     "random",
@@ -24,6 +24,7 @@ const ROOMS: [&str; 20] = [
     "analytic",
     "model",
     "rendering",
+    "geometry",
     "training",
 ];
 /// Files that only gather what others hold.

@@ -1,5 +1,7 @@
 //! `raygrad export`: what a run has found out, for other programs.
 
+mod geometry;
+
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -14,17 +16,18 @@ use super::run::Run;
 use super::scene::Scene;
 use super::{builtin, interrupt};
 
-/// Write the cameras of a run for other programs, as the run has refined them
+/// Write the cameras or the shape of a run for other programs
 ///
-/// They are in the coordinates of the photographs' own files. Where the run has learned poses, photographs that it was
+/// All is in the coordinates of the photographs' own files. Where the run has learned poses, photographs that it was
 /// trained on have the refined ones, moved as a whole to where the given ones are; of others, held-out ones, only focal length
-/// and lens follow.
+/// and lens follow. A file that ends in .ply, .obj or .glb has the surface as a mesh, or with --points as points, with normals and
+/// colours; of a scene that goes on, what is within the box where the cameras look.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
     run: PathBuf,
     /// File for the cameras, such as cameras.json, in the form of transforms.json: its paths begin at the folder of the
-    /// photographs. With --to, a folder for a whole dataset
+    /// photographs. Or one for the shape, such as mesh.ply, mesh.obj or mesh.glb. With --to, a folder for a whole dataset
     #[arg(value_name = "OUT")]
     out: PathBuf,
     /// Write a whole dataset in this format, photographs and all
@@ -33,11 +36,20 @@ pub struct Args {
     /// Folder of the photographs, if they are no longer where they were for training
     #[arg(long)]
     scene: Option<Scene>,
+    #[command(flatten)]
+    shape: geometry::Options,
 }
 
-/// Writes the cameras.
+/// Writes the cameras, or the shape.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
+    if args.to.is_none() && geometry::is_shape(&args.out) {
+        if args.scene.is_some() {
+            return Err(Error::setting("scene", "is for cameras: shapes are the model's alone"));
+        }
+        return geometry::run(&run, &args.shape, &args.out).map(|()| ExitCode::SUCCESS);
+    }
+    args.shape.check_absent()?;
     let model = run.model()?;
     let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
     let mut capture = match run.scene(args.scene.as_ref())? {

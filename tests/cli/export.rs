@@ -2,6 +2,7 @@
 
 use super::Place;
 use raygrad::nerf::dataset::{Capture, Split};
+use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Config, Extent, Model};
 use std::path::Path;
 
@@ -87,4 +88,64 @@ fn the_built_in_scene_has_cameras_too() {
     let cameras = exported(&place, "cameras.json");
     let of = |split: Split| cameras.iter().filter(|(_, given, _)| *given == Some(split)).count();
     assert_eq!((of(Split::Train), of(Split::Val), of(Split::Test)), (60, 10, 20));
+}
+
+/// The places of the vertices of a PLY file, and its text up to those.
+fn vertices(place: &Place, file: &str) -> (Vec<DVec3>, String) {
+    let bytes = place.bytes(file);
+    let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
+    let header = String::from_utf8(bytes[..end].to_vec()).unwrap();
+    let count = header.lines().find_map(|line| line.strip_prefix("element vertex ")).unwrap().parse().unwrap();
+    // Three doubles, three floats and three bytes each.
+    let number = |row: &[u8], axis: usize| f64::from_le_bytes(row[8 * axis..][..8].try_into().unwrap());
+    let rows = bytes[end..].chunks_exact(39).take(count);
+    (rows.map(|row| DVec3::new(number(row, 0), number(row, 1), number(row, 2))).collect(), header)
+}
+
+#[test]
+fn shapes_are_in_the_coordinates_of_the_capture() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    place.succeeds(&format!("train scene --steps 2 --out run --scope unbounded {small}"));
+    let extent: Extent = serde_json::from_value(place.json("run/config.json")["extent"].clone()).unwrap();
+    assert!((extent.placement.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
+    // A fog, still: at a low density its surface is the box.
+    let said = place.succeeds("export run mesh.ply --level 1e-6 --resolution 20");
+    assert!(
+        said.starts_with("exported ") && said.contains(", closed; density 0.0000 per scene unit, 20 cells"),
+        "{said}"
+    );
+    let (mesh, header) = vertices(&place, "mesh.ply");
+    assert!(header.contains("element face") && mesh.len() > 1000, "{header}");
+    let within = |places: &[DVec3], slack: f64| {
+        let [low, high] = extent.bounds;
+        let slack = DVec3::splat(slack);
+        places.iter().all(|x| {
+            let x = extent.placement.point(*x);
+            x.cmpge(low - slack).all() && x.cmple(high + slack).all()
+        })
+    };
+    let cell = extent.space().side() / 20.0;
+    assert!(within(&mesh, cell) && !within(&mesh, -cell));
+    let open = place.succeeds("export run open.ply --level 1e-6 --resolution 20 --parts 0 --open");
+    assert!(open.contains("0 small parts left out") && !open.contains(", closed"), "{open}");
+
+    let few = place.succeeds("export run few.glb --level 1e-6 --resolution 20 --triangles 500");
+    assert!(few.contains(" 500 triangles, closed"), "{few}");
+    assert_eq!(&place.bytes("few.glb")[..4], b"glTF");
+    place.succeeds("export run mesh.OBJ --level 1e-6 --resolution 20");
+    assert!(place.bytes("mesh.OBJ").starts_with(b"# x y z red green blue"));
+
+    place.fails("export run no.ply --points=50", &["`points`: are none"]);
+    place.fails("export run no.ply", &["`level`: is not known"]);
+    place.fails("export run no.ply --level -1", &["`level`: is -1"]);
+    place.fails("export run no.ply --level 1e30", &["`level`: is 1", "use a smaller one"]);
+    place.fails("export run cameras.json --triangles 9", &["`triangles`: is for shapes"]);
+    place.fails("export run cameras.json --points", &["`points`: is for shapes"]);
+    place.fails("export run no.ply --scene scene", &["`scene`: is for cameras"]);
+    place.fails("export run no.ply --to colmap --open", &["`open`: is for shapes"]);
+    place.fails("export run absent/no.ply", &["absent"]);
+    std::fs::create_dir(place.path("folder.glb")).unwrap();
+    place.fails("export run folder.glb", &["folder.glb: is a folder"]);
+    assert!(!place.path("no.ply").exists());
 }

@@ -38,6 +38,12 @@ impl Extent {
         Extent { bounds, span, unit: Space::within(bounds).unit, frames: 0, placement: Placement::default(), ndc: None }
     }
 
+    /// Whether a place (scene units) is in the box that holds the scene, its faces included.
+    pub fn holds(&self, place: DVec3) -> bool {
+        let [low, high] = self.bounds;
+        place.cmpge(low).all() && place.cmple(high).all()
+    }
+
     /// The map to the unit cube, for a scene within its box: one that goes on is `unbounded` too.
     pub fn space(&self) -> Space {
         Space { unit: self.unit, ndc: self.ndc, ..Space::within(self.bounds) }

@@ -55,25 +55,38 @@ impl Viewer {
 
 /// The view of samples that stand for an interval each.
 fn in_rounds(query: &Query<'_, '_, f32>, samples: &Samples<f32>, limits: &Limits, out: &mut [Pixel]) -> Evaluations {
-    let mut states = vec![RayState::default(); out.len()];
-    let each = (ROUND / out.len().max(1)).max(LEAST);
-    let range = |ray: usize| samples.segments.range(ray);
+    let (mut states, mut evaluations) = (vec![RayState::default(); out.len()], Evaluations::default());
     out.fill(Pixel::default());
-    let mut alive: Vec<usize> = (0..out.len()).filter(|&ray| !range(ray).is_empty()).collect();
-    let (mut evaluations, mut done) = (Evaluations::default(), 0);
-    while !alive.is_empty() {
-        let piece = |&ray: &usize| (ray, range(ray).start + done..(range(ray).start + done + each).min(range(ray).end));
-        let pieces: Vec<_> = alive.iter().map(piece).collect();
-        let part = samples.pieces(&pieces, query.tape().pool());
-        evaluations = evaluations + round(query, &part, &alive, limits, &mut states, out);
-        done += each;
-        let most = f64::from(limits.termination);
-        alive.retain(|&ray| range(ray).len() > done && (-states[ray].depth).exp() > most);
-    }
+    let most = f64::from(limits.termination);
+    front_to_back(samples, query.tape().pool(), |part, alive| {
+        evaluations = evaluations + round(query, part, alive, limits, &mut states, out);
+        alive.iter().map(|&ray| (-states[ray].depth).exp() > most).collect()
+    });
     for (out, state) in out.iter_mut().zip(&states) {
         finish(out, state, limits);
     }
     evaluations
+}
+
+/// Works on samples in rounds, front to back: `round` is given the next ones of the rays that are alive and the numbers of these
+/// rays, and says for each of them whether it still is.
+pub(crate) fn front_to_back(
+    samples: &Samples<f32>,
+    pool: &Pool<f32>,
+    mut round: impl FnMut(&Samples<f32>, &[usize]) -> Vec<bool>,
+) {
+    let rays = samples.segments.len();
+    let each = (ROUND / rays.max(1)).max(LEAST);
+    let range = |ray: usize| samples.segments.range(ray);
+    let mut alive: Vec<usize> = (0..rays).filter(|&ray| !range(ray).is_empty()).collect();
+    let mut done = 0;
+    while !alive.is_empty() {
+        let piece = |&ray: &usize| (ray, range(ray).start + done..(range(ray).start + done + each).min(range(ray).end));
+        let pieces: Vec<_> = alive.iter().map(piece).collect();
+        let mut stays = round(&samples.pieces(&pieces, pool), &alive).into_iter();
+        done += each;
+        alive.retain(|&ray| stays.next() == Some(true) && range(ray).len() > done);
+    }
 }
 
 /// The next samples of the rays that are alive.

@@ -80,6 +80,22 @@ impl Lattice {
         let cell = (high - low) / self.resolution as f64;
         [low + cell * DVec3::from(block.map(|b| (b * EDGE) as f64)), cell]
     }
+
+    /// The word and the bit of the smallest cell that holds a place; `None` if none does. Upper faces of a box belong to its last
+    /// cells.
+    pub fn holding(&self, place: DVec3) -> Option<(usize, usize)> {
+        (0..self.cascades).find_map(|cascade| {
+            let [low, high] = self.extent(cascade);
+            let share = (place - low) / (high - low);
+            if !(share.cmpge(DVec3::ZERO).all() && share.cmple(DVec3::ONE).all()) {
+                return None;
+            }
+            let cell = share.to_array().map(|x| ((x * self.resolution as f64) as usize).min(self.resolution - 1));
+            let number = |part: [usize; 3], side: usize| part[0] + side * (part[1] + side * part[2]);
+            let word = self.cascade(cascade).start + number(cell.map(|i| i / EDGE), self.side());
+            Some((word, number(cell.map(|i| i % EDGE), EDGE)))
+        })
+    }
 }
 
 /// The place of a cell in its block.

@@ -234,6 +234,11 @@ impl OccupancyGrid {
         bits::count(&self.words, &self.lattice) as f64 / self.cells() as f64
     }
 
+    /// Whether a place (scene units) is in an occupied cell: of the smallest cascade that holds it. Outside of all it is not.
+    pub fn is_occupied(&self, place: DVec3) -> bool {
+        self.lattice.holding(place).is_some_and(|(word, bit)| self.words[word] >> bit & 1 == 1)
+    }
+
     /// The box around the occupied cells in scene units; `None` if there are none.
     pub fn occupied_bounds(&self) -> Option<[DVec3; 2]> {
         bits::bounds(&self.words, &self.lattice)

@@ -51,6 +51,29 @@ fn is_occupied(grid: &OccupancyGrid, point: [f64; 3]) -> bool {
     grid.words[word] >> (inner[0] + 4 * inner[1] + 16 * inner[2]) & 1 == 1
 }
 
+#[test]
+fn a_place_is_occupied_as_its_cell_is() {
+    for cascades in [1, 3] {
+        let mut grid = random_grid(BOX, 32, cascades, 0.7, 7);
+        let [low, high] = grid.outer_bounds();
+        let cells = (grid.resolution() << (cascades - 1)) as f64;
+        let mut occupied = 0;
+        for i in 0..3000 {
+            let share =
+                DVec3::from([0.754_877_67, 0.569_840_29, 0.437_159_86].map(|x| (0.1 + x * f64::from(i)).fract()));
+            let expected = is_occupied(&grid, (share * cells).to_array());
+            assert_eq!(grid.is_occupied(low + share * (high - low)), expected, "{share}");
+            occupied += u32::from(expected);
+        }
+        assert!((100..2900).contains(&occupied), "{occupied}");
+        for outside in [low - 1e-9 * (high - low), high + DVec3::Y * 1e-6, DVec3::NAN] {
+            assert!(!grid.is_occupied(outside), "{outside}");
+        }
+        grid.words.fill(u64::MAX);
+        assert!(grid.is_occupied(low) && grid.is_occupied(high), "faces belong to the box");
+    }
+}
+
 /// The samples of one ray, each tested for itself, with the march's rounding of positions but not its skipping.
 fn brute(grid: &OccupancyGrid, rays: &Rays<f32>, step: &Step) -> Vec<f32> {
     let everything = OccupancyGrid { words: vec![u64::MAX; grid.words.len()], ..grid.clone() };

@@ -1,0 +1,136 @@
+//! How a surface passes through a cell of a lattice, for each of the 256 ways in which its corners can be dense (Lorensen and
+//! Cline 1987, "Marching cubes").
+//!
+//! Nothing is listed by hand. On each face of the cell, a piece of the outline cuts off each run of dense corners, so that two
+//! dense corners that lie across from each other are parted; that depends on the face alone, and the cells on both
+//! sides of it see the same pieces. The pieces join to loops, and loops are cut into triangles: the surface has no holes,
+//! whatever is dense.
+
+use std::collections::BTreeMap;
+
+/// An edge of a cell, by its axis and its lower corner. Bit `a` of a corner says whether it is the upper one along axis `a`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Edge {
+    pub axis: usize,
+    pub corner: usize,
+}
+
+impl Edge {
+    /// Between two neighbouring corners.
+    fn between(a: usize, b: usize) -> Self {
+        Edge { axis: (a ^ b).trailing_zeros() as usize, corner: a & b }
+    }
+
+    /// Whether there is a face that both are edges of.
+    fn shares_face(self, other: Edge) -> bool {
+        let same_side = |axis: &usize| (self.corner ^ other.corner) >> axis & 1 == 0;
+        (0..3).filter(|axis| *axis != self.axis && *axis != other.axis).any(|axis| same_side(&axis))
+    }
+}
+
+/// For each set of dense corners (bit `c` for corner `c`) the triangles, whose vertices lie on these edges, anticlockwise as
+/// seen from where it is not dense.
+pub(super) fn cases() -> Vec<Vec<[Edge; 3]>> {
+    (0..=255).map(|dense| loops(dense).iter().flat_map(|outline| fan(outline)).collect()).collect()
+}
+
+/// The corners of each face, anticlockwise as seen from outside of the cell.
+fn faces() -> [[usize; 4]; 6] {
+    std::array::from_fn(|face| {
+        let (axis, side) = (face / 2, face % 2);
+        let [u, v] = [1, 2].map(|next| 1 << ((axis + next) % 3));
+        let [a, b, c, d] = [0, u, u | v, v].map(|corner| corner | side << axis);
+        if side == 1 { [a, b, c, d] } else { [d, c, b, a] }
+    })
+}
+
+/// The outlines of the surface, each a loop of edges.
+fn loops(dense: u8) -> Vec<Vec<Edge>> {
+    let is_dense = |corner: usize| dense >> corner & 1 == 1;
+    let mut next = BTreeMap::new();
+    for face in faces() {
+        for i in 0..4 {
+            let corner = |k: usize| face[(i + k) % 4];
+            if !is_dense(corner(0)) && is_dense(corner(1)) {
+                // From where a run of dense corners begins to where it ends. On the next face, which is walked the other
+                // way along their common edge, the one that ends here begins.
+                let run = (1..4).take_while(|&k| is_dense(corner(k))).count();
+                next.insert(Edge::between(corner(0), corner(1)), Edge::between(corner(run), corner(run + 1)));
+            }
+        }
+    }
+    let mut loops = vec![];
+    while let Some((first, mut edge)) = next.pop_first() {
+        let mut outline = vec![first];
+        while let Some(after) = next.remove(&edge) {
+            outline.push(edge);
+            edge = after;
+        }
+        loops.push(outline);
+    }
+    loops
+}
+
+/// Triangles that fill a loop, all from one vertex: one from which no side of a triangle lies in a face of the cell, where the
+/// neighbour may have the same one. There always is such a vertex.
+fn fan(outline: &[Edge]) -> impl Iterator<Item = [Edge; 3]> + '_ {
+    let count = outline.len();
+    let apex = (0..count).find(|&apex| is_inside(outline, apex)).unwrap_or(0);
+    let at = move |k: usize| outline[(apex + k) % count];
+    (1..count - 1).map(move |k| [at(0), at(k), at(k + 1)])
+}
+
+/// Whether the sides of a fan from this vertex pass through the inside of the cell.
+fn is_inside(outline: &[Edge], apex: usize) -> bool {
+    let count = outline.len();
+    (2..count - 1).all(|k| !outline[apex].shares_face(outline[(apex + k) % count]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_loop_has_a_fan_that_stays_inside() {
+        let mut longest = 0;
+        for dense in 0..=255 {
+            for outline in loops(dense) {
+                assert!((0..outline.len()).any(|apex| is_inside(&outline, apex)), "{dense:#b}: {outline:?}");
+                longest = longest.max(outline.len());
+            }
+        }
+        assert_eq!(longest, 7);
+    }
+
+    #[test]
+    fn triangles_lie_on_the_edges_that_are_crossed_and_face_what_is_not_dense() {
+        let middle = |edge: Edge| {
+            let place = |axis: usize| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 };
+            glam::DVec3::new(place(0), place(1), place(2))
+        };
+        for (dense, triangles) in cases().iter().enumerate() {
+            let is_dense = |corner: usize| dense >> corner & 1 == 1;
+            let crossed = |edge: &Edge| is_dense(edge.corner) != is_dense(edge.corner | 1 << edge.axis);
+            assert!(triangles.iter().flatten().all(crossed), "{dense:#b}");
+            let mut all: Vec<Edge> = triangles.iter().flatten().copied().collect();
+            all.sort();
+            all.dedup();
+            let edges = (0..3).flat_map(|axis| (0..8).map(move |corner| Edge { axis, corner }));
+            let expected = edges.filter(|edge| edge.corner >> edge.axis & 1 == 0).filter(crossed).count();
+            assert_eq!(all.len(), expected, "{dense:#b}: each crossed edge has a vertex");
+            // One dense corner is cut off by a triangle that faces away from it, one that is not by one that faces it.
+            if [1, 7].contains(&dense.count_ones()) {
+                let alone = if dense.count_ones() == 1 { dense } else { 255 - dense }.trailing_zeros() as usize;
+                let corner = glam::DVec3::new((alone & 1) as f64, (alone >> 1 & 1) as f64, (alone >> 2) as f64);
+                let [a, b, c] = triangles[0].map(middle);
+                let faces_away = (b - a).cross(c - a).dot(a - corner) > 0.0;
+                assert_eq!((triangles.len(), faces_away), (1, dense.count_ones() == 1), "{dense:#b}");
+            }
+        }
+        // Two dense corners across a face from each other are parted; four in a face are one square.
+        assert_eq!(loops(0b0000_1001).len(), 2);
+        assert_eq!(loops(0b0000_1111).iter().map(Vec::len).collect::<Vec<_>>(), [4]);
+        // Where all but two across a face are dense, the surface joins round these, as the dense ones are parted.
+        assert_eq!(loops(0b1111_0110).iter().map(Vec::len).collect::<Vec<_>>(), [6]);
+    }
+}

@@ -1,0 +1,290 @@
+//! Fewer triangles: edges are drawn together where that moves the surface least (Garland and Heckbert 1997, "Surface
+//! simplification using quadric error metrics").
+
+use super::mesh::{Mesh, sides};
+use glam::{DMat3, DVec3};
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
+/// How many times more a border weighs than a triangle at it.
+const BORDER: f64 = 100.0;
+/// A triangle may turn until the cosine of the angle is this.
+const LEAST_COSINE: f64 = 0.2;
+/// Twice the area of a triangle, as a share of the square of its longest side, at least, unless it was as thin before.
+const THINNEST: f64 = 0.02;
+/// Below this share of its largest possible value, a determinant is that of a quadric without a lowest point.
+const FLAT: f64 = 1e-6;
+/// Of a triangle's own weight, that for staying where a vertex is: in a plane it decides.
+const STAY: f64 = 1e-6;
+/// Triangles between two reports of progress.
+const OFTEN: usize = 10_000;
+
+/// The sum of squared distances to some planes, each times a weight: `x' a x - 2 b' x + c`.
+#[derive(Debug, Clone, Copy)]
+struct Quadric {
+    a: DMat3,
+    b: DVec3,
+    c: f64,
+}
+
+impl Quadric {
+    /// To no planes.
+    const NONE: Quadric = Quadric { a: DMat3::ZERO, b: DVec3::ZERO, c: 0.0 };
+
+    /// To the plane through a point with this unit normal.
+    fn plane(normal: DVec3, point: DVec3, weight: f64) -> Self {
+        let offset = normal.dot(point);
+        let scaled = weight * normal;
+        Quadric {
+            a: DMat3::from_cols(normal.x * scaled, normal.y * scaled, normal.z * scaled),
+            b: offset * scaled,
+            c: weight * offset * offset,
+        }
+    }
+
+    /// To a point.
+    fn point(point: DVec3, weight: f64) -> Self {
+        Quadric { a: weight * DMat3::IDENTITY, b: weight * point, c: weight * point.length_squared() }
+    }
+
+    fn plus(&self, other: &Self) -> Self {
+        Quadric { a: self.a + other.a, b: self.b + other.b, c: self.c + other.c }
+    }
+
+    fn at(&self, x: DVec3) -> f64 {
+        (x.dot(self.a * x - 2.0 * self.b) + self.c).max(0.0)
+    }
+
+    /// Where it is least, if that is one place.
+    fn lowest(&self) -> Option<DVec3> {
+        let size = (self.a.x_axis.x + self.a.y_axis.y + self.a.z_axis.z) / 3.0;
+        (self.a.determinant() > FLAT * size.powi(3)).then(|| self.a.inverse() * self.b)
+    }
+}
+
+/// An edge that may be drawn together.
+struct Candidate {
+    cost: f64,
+    edge: [u32; 2],
+    /// Where both vertices go.
+    place: DVec3,
+    /// How often each had been moved when this was worked out.
+    moved: [u32; 2],
+}
+
+impl Ord for Candidate {
+    /// The one that costs least is the greatest.
+    fn cmp(&self, other: &Self) -> Ordering {
+        other.cost.total_cmp(&self.cost).then(other.edge.cmp(&self.edge))
+    }
+}
+
+impl PartialOrd for Candidate {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Candidate {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Candidate {}
+
+/// A mesh of which edges are drawn together.
+struct Work<'a> {
+    mesh: &'a mut Mesh,
+    quadrics: Vec<Quadric>,
+    /// The triangles at each vertex.
+    around: Vec<Vec<u32>>,
+    /// How often each vertex has been moved.
+    moved: Vec<u32>,
+    heap: BinaryHeap<Candidate>,
+}
+
+impl Mesh {
+    /// Makes triangles fewer until there are at most `count`, or no edge is left that can be drawn together: so that the mesh
+    /// stays closed if it is (and in any case each side of a triangle belongs to no more triangles than before), no triangle
+    /// turns over, and borders stay where they are as well as may be.
+    ///
+    /// `progress` is told what share of the work is done, 0 to 1.
+    pub fn decimate(&mut self, count: usize, progress: &mut dyn FnMut(f64)) {
+        let all = self.triangles.len();
+        if all <= count {
+            return;
+        }
+        let mut work = Work::new(self);
+        let mut left = all;
+        while left > count
+            && let Some(candidate) = work.heap.pop()
+        {
+            let gone = work.collapse(&candidate);
+            if gone > 0 && left / OFTEN != (left - gone) / OFTEN {
+                progress((all - left) as f64 / (all - count) as f64);
+            }
+            left -= gone;
+        }
+        self.triangles.retain(|triangle| *triangle != GONE);
+        self.drop_unused();
+    }
+}
+
+/// What a triangle is that is no more.
+const GONE: [u32; 3] = [u32::MAX; 3];
+
+impl<'a> Work<'a> {
+    fn new(mesh: &'a mut Mesh) -> Self {
+        let vertices = mesh.positions.len();
+        let (mut quadrics, mut around) = (vec![Quadric::NONE; vertices], vec![vec![]; vertices]);
+        for (i, triangle) in mesh.triangles.iter().enumerate() {
+            let [a, b, c] = mesh.corners(i);
+            let cross = (b - a).cross(c - a);
+            let plane = Quadric::plane(cross.normalize_or_zero(), a, 0.5 * cross.length());
+            for &vertex in triangle {
+                let stay = Quadric::point(mesh.positions[vertex as usize], STAY * 0.5 * cross.length());
+                let quadric = &mut quadrics[vertex as usize];
+                *quadric = quadric.plus(&plane).plus(&stay);
+                around[vertex as usize].push(i as u32);
+            }
+        }
+        let (moved, heap) = (vec![0; vertices], BinaryHeap::new());
+        let mut work = Work { mesh, quadrics, around, moved, heap };
+        for i in 0..work.mesh.triangles.len() {
+            for [from, to] in sides(&work.mesh.triangles[i]) {
+                if work.common(from, to).count() == 1 {
+                    work.keep_border(i, [from, to]);
+                }
+            }
+        }
+        for i in 0..work.mesh.triangles.len() {
+            for [from, to] in sides(&work.mesh.triangles[i]) {
+                // Once for each edge, and those of borders, which are passed one way only.
+                if from < to || work.common(from, to).count() == 1 {
+                    work.consider(from, to);
+                }
+            }
+        }
+        work
+    }
+
+    /// Adds what holds a side of a triangle at the border in its place: a plane through it, upright on the triangle.
+    fn keep_border(&mut self, triangle: usize, side: [u32; 2]) {
+        let [a, b, c] = self.mesh.corners(triangle);
+        let [from, to] = side.map(|vertex| self.mesh.positions[vertex as usize]);
+        let normal = (to - from).cross((b - a).cross(c - a)).normalize_or_zero();
+        let border = Quadric::plane(normal, from, BORDER * from.distance_squared(to));
+        for vertex in side {
+            let quadric = &mut self.quadrics[vertex as usize];
+            *quadric = quadric.plus(&border);
+        }
+    }
+
+    /// The triangles that have both vertices.
+    fn common(&self, a: u32, b: u32) -> impl Iterator<Item = usize> + '_ {
+        let around = self.around[a as usize].iter().map(|&triangle| triangle as usize);
+        around.filter(move |&triangle| self.mesh.triangles[triangle].contains(&b))
+    }
+
+    /// The vertices that share a triangle with this one, in rising order.
+    fn neighbours(&self, vertex: u32) -> Vec<u32> {
+        let triangles = self.around[vertex as usize].iter().flat_map(|&i| self.mesh.triangles[i as usize]);
+        let mut neighbours: Vec<u32> = triangles.filter(|&other| other != vertex).collect();
+        neighbours.sort_unstable();
+        neighbours.dedup();
+        neighbours
+    }
+
+    /// Works out what it costs to draw an edge together.
+    fn consider(&mut self, a: u32, b: u32) {
+        let edge = [a.min(b), a.max(b)];
+        let quadric = self.quadrics[a as usize].plus(&self.quadrics[b as usize]);
+        let [from, to] = edge.map(|vertex| self.mesh.positions[vertex as usize]);
+        let middle = 0.5 * (from + to);
+        // A place far away would be one of a quadric that is nearly flat.
+        let lowest = quadric.lowest().filter(|place| place.distance(middle) < 2.0 * from.distance(to));
+        let places = [lowest.unwrap_or(middle), from, to];
+        let place = places.into_iter().min_by(|a, b| quadric.at(*a).total_cmp(&quadric.at(*b))).unwrap_or(middle);
+        let moved = edge.map(|vertex| self.moved[vertex as usize]);
+        self.heap.push(Candidate { cost: quadric.at(place), edge, place, moved });
+    }
+
+    /// Draws an edge together, if nothing has changed since it was considered and nothing speaks against it. Says how many
+    /// triangles that takes away.
+    fn collapse(&mut self, candidate: &Candidate) -> usize {
+        let Candidate { edge, place, moved, .. } = *candidate;
+        let [a, b] = edge;
+        if edge.map(|vertex| self.moved[vertex as usize]) != moved || !self.may_collapse(edge, place) {
+            return 0;
+        }
+        let gone: Vec<usize> = self.common(a, b).collect();
+        for &triangle in &gone {
+            for vertex in self.mesh.triangles[triangle] {
+                self.around[vertex as usize].retain(|&other| other as usize != triangle);
+            }
+            self.mesh.triangles[triangle] = GONE;
+        }
+        for triangle in std::mem::take(&mut self.around[b as usize]) {
+            let vertices = self.mesh.triangles[triangle as usize].iter_mut();
+            vertices.filter(|vertex| **vertex == b).for_each(|vertex| *vertex = a);
+            self.around[a as usize].push(triangle);
+        }
+        self.mesh.positions[a as usize] = place;
+        self.quadrics[a as usize] = self.quadrics[a as usize].plus(&self.quadrics[b as usize]);
+        edge.iter().for_each(|&vertex| self.moved[vertex as usize] += 1);
+        for neighbour in self.neighbours(a) {
+            self.consider(a, neighbour);
+        }
+        gone.len()
+    }
+
+    /// Whether the surface stays one without its edge, and no triangle turns over or becomes a needle.
+    fn may_collapse(&self, [a, b]: [u32; 2], place: DVec3) -> bool {
+        let gone: Vec<usize> = self.common(a, b).collect();
+        let (around_a, around_b) = (self.neighbours(a), self.neighbours(b));
+        let shared = around_a.iter().filter(|vertex| around_b.binary_search(vertex).is_ok()).count();
+        // Other common neighbours would become an edge of four triangles (the link condition, Dey et al. 1999).
+        if gone.is_empty() || gone.len() > 2 || shared != gone.len() {
+            return false;
+        }
+        let is_border = |vertex: u32, neighbours: &[u32]| neighbours.len() != self.around[vertex as usize].len();
+        // From border to border across the surface there would be a vertex with two borders.
+        if gone.len() == 2 && is_border(a, &around_a) && is_border(b, &around_b) {
+            return false;
+        }
+        // A vertex of three triangles would be left with two that cover each other; one of a single one, with none.
+        let opposite = gone.iter().flat_map(|&i| self.mesh.triangles[i]).filter(|vertex| *vertex != a && *vertex != b);
+        for vertex in opposite {
+            let triangles = self.around[vertex as usize].len();
+            let least = if is_border(vertex, &self.neighbours(vertex)) { 1 } else { 3 };
+            if triangles <= least {
+                return false;
+            }
+        }
+        let stays = edge_triangles(self, a, b).chain(edge_triangles(self, b, a));
+        stays.into_iter().all(|(before, at)| {
+            let mut after = before;
+            after[at] = place;
+            let [old, new] = [before, after].map(|[a, b, c]| (b - a).cross(c - a));
+            let thinness = |[a, b, c]: [DVec3; 3], cross: DVec3| {
+                let longest = a.distance_squared(b).max(b.distance_squared(c)).max(c.distance_squared(a));
+                cross.length() / longest
+            };
+            let least = THINNEST.min(thinness(before, old));
+            old.dot(new) > LEAST_COSINE * old.length() * new.length() && thinness(after, new) >= least
+        })
+    }
+}
+
+/// The triangles at `vertex` that do not have `other`, and which of their corners `vertex` is.
+fn edge_triangles<'a>(work: &'a Work<'_>, vertex: u32, other: u32) -> impl Iterator<Item = ([DVec3; 3], usize)> + 'a {
+    work.around[vertex as usize].iter().filter_map(move |&i| {
+        let triangle = work.mesh.triangles[i as usize];
+        let at = triangle.iter().position(|corner| *corner == vertex)?;
+        (!triangle.contains(&other)).then(|| (work.mesh.corners(i as usize), at))
+    })
+}
+
+#[cfg(test)]
+mod tests;

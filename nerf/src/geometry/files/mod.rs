@@ -1,0 +1,59 @@
+//! Files of meshes and point clouds.
+
+mod glb;
+mod obj;
+mod ply;
+#[cfg(test)]
+mod tests;
+
+use super::shape::Shape;
+use crate::files::write_atomic;
+use crate::{Error, Result};
+use std::path::Path;
+
+/// The forms that a shape can be written in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Stanford's polygon format (Turk 1994), binary with the least byte first: places as doubles, normals as floats, colours as
+    /// bytes.
+    Ply,
+    /// Wavefront's OBJ, text: colours stand behind places, as many programs read them.
+    Obj,
+    /// Binary glTF 2.0 (ISO/IEC 12113:2022). Colours are light there, which do not answer to any other light
+    /// (KHR_materials_unlit). Places are floats around a middle that the node has, so that they keep their digits far from
+    /// the origin. By glTF's convention y is up and a unit is a metre: this file has the shape's own axes and units, as the
+    /// others do.
+    Glb,
+}
+
+impl Format {
+    /// By the ending of a file's name, large or small; `None` if it is that of no such file.
+    pub fn of(path: &Path) -> Option<Self> {
+        Some(match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
+            "ply" => Format::Ply,
+            "obj" => Format::Obj,
+            "glb" => Format::Glb,
+            _ => return None,
+        })
+    }
+}
+
+/// Writes a shape, in the form that the ending of the file's name says, and says how many bytes that takes.
+///
+/// # Errors
+/// If the ending is none of [`Format`]'s, the shape is too large for it or the file cannot be written.
+///
+/// # Panics
+/// If there is not a normal and a colour for each vertex.
+pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
+    let (path, vertices) = (path.as_ref(), shape.mesh.positions.len());
+    assert_eq!([shape.normals.len(), shape.colors.len()], [vertices; 2], "a normal and a colour for each vertex");
+    let bytes = match Format::of(path) {
+        Some(Format::Ply) => ply::to_bytes(shape),
+        Some(Format::Obj) => obj::to_text(shape).into_bytes(),
+        Some(Format::Glb) => glb::to_bytes(shape).map_err(|what| Error::file(path, what))?,
+        None => return Err(Error::file(path, "has an ending that is none of .ply, .obj and .glb")),
+    };
+    write_atomic(path, &bytes)?;
+    Ok(bytes.len() as u64)
+}

@@ -1,0 +1,28 @@
+//! OBJ files: text, vertices from 1.
+
+use super::super::shape::Shape;
+use std::fmt::Write;
+
+/// Digits of places, counted from the first of the largest.
+const DIGITS: i32 = 8;
+
+pub(super) fn to_text(shape: &Shape) -> String {
+    let Shape { mesh, normals, colors } = shape;
+    let largest = mesh.bounds().map_or(1.0, |[low, high]| (high - low).max_element());
+    let decimals = (DIGITS - largest.log10().ceil() as i32).clamp(0, 17) as usize;
+    let mut out = String::from("# x y z red green blue, colours in sRGB\n");
+    // Writing to a string cannot fail.
+    for (place, color) in mesh.positions.iter().zip(colors) {
+        let [x, y, z] = place.to_array();
+        let [r, g, b] = color.map(|byte| f64::from(byte) / 255.0);
+        let _ = writeln!(out, "v {x:.decimals$} {y:.decimals$} {z:.decimals$} {r:.4} {g:.4} {b:.4}");
+    }
+    for normal in normals {
+        let [x, y, z] = normal.to_array();
+        let _ = writeln!(out, "vn {x:.5} {y:.5} {z:.5}");
+    }
+    for [a, b, c] in mesh.triangles.iter().map(|triangle| triangle.map(|vertex| u64::from(vertex) + 1)) {
+        let _ = writeln!(out, "f {a}//{a} {b}//{b} {c}//{c}");
+    }
+    out
+}

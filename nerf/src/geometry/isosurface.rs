@@ -1,0 +1,184 @@
+//! The surface on which a function of positions has a value.
+
+use super::cases::cases;
+use super::mesh::Mesh;
+use crate::space::occupancy::{DensityFn, POINTS};
+use crate::{Error, Result};
+use glam::DVec3;
+use raygrad_tensor::parallel;
+use rayon::prelude::*;
+
+/// Times that the part of an edge in which the surface lies is halved.
+const HALVINGS: usize = 5;
+/// Vertices stay this share of that part away from its ends, so that no two are in one place.
+const MARGIN: f64 = 0.01;
+/// Cells along an axis, at most.
+const MOST_CELLS: usize = 4096;
+
+/// Where a surface is looked for: nodes at even distances along each axis.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lattice {
+    /// The first node.
+    low: DVec3,
+    /// The distances between nodes.
+    cell: DVec3,
+    /// The number of nodes along each axis.
+    nodes: [usize; 3],
+}
+
+impl Lattice {
+    /// Over a box (lower and upper corner), with so many cells along its longest side, 1 to 4096, and of nearly the same edge
+    /// along the others. A `closed` one goes half a cell beyond the box: of a function that is 0 there, surfaces have no border.
+    ///
+    /// # Errors
+    /// If the box is flat or not finite, or the number of cells out of range.
+    pub fn over([low, high]: [DVec3; 2], resolution: usize, closed: bool) -> Result<Self> {
+        let size = high - low;
+        if !(size.is_finite() && size.cmpgt(DVec3::ZERO).all()) {
+            return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
+        }
+        if !(1..=MOST_CELLS).contains(&resolution) {
+            return Err(Error::setting("resolution", format!("is {resolution}; use 1 to {MOST_CELLS}")));
+        }
+        let cells = (size / size.max_element() * resolution as f64).round().max(DVec3::ONE);
+        let (cell, more) = (size / cells, if closed { 2 } else { 1 });
+        let low = if closed { low - 0.5 * cell } else { low };
+        Ok(Lattice { low, cell, nodes: cells.to_array().map(|cells| cells as usize + more) })
+    }
+
+    /// The longest edge of a cell.
+    pub fn cell(&self) -> f64 {
+        self.cell.max_element()
+    }
+
+    fn node(&self, node: [usize; 3]) -> DVec3 {
+        self.low + self.cell * DVec3::from(node.map(|i| i as f64))
+    }
+}
+
+/// An edge of the lattice that the surface crosses.
+struct Crossing {
+    /// Its lower node, and its axis.
+    node: [u32; 3],
+    axis: u8,
+    /// The values at its lower and its upper end.
+    values: [f32; 2],
+}
+
+/// The nodes of one layer, and the vertices on the edges that begin there.
+struct Layer {
+    values: Vec<f32>,
+    /// By axis and node; those along z lead to the next layer. Where there is none the number means nothing.
+    vertices: [Vec<u32>; 3],
+}
+
+/// The surface that parts places where `density` is more than `level` from all others, facing the latter: marching cubes
+/// (Lorensen and Cline 1987) with cases in which neighbouring cells agree, so that it has no holes and each side of a triangle
+/// exactly two triangles. Only at the lattice's own border it ends. On the edges of the lattice, which hold the vertices, the
+/// place where the level is passed is found by bisection.
+///
+/// Places are asked for in f32, and memory is in proportion to a layer of the lattice and to the surface. `progress` is told
+/// what share of the lattice is done, 0 to 1.
+///
+/// # Errors
+/// If there are 2^32 - 1 vertices or more.
+pub fn isosurface(
+    lattice: &Lattice,
+    level: f32,
+    density: &DensityFn<'_>,
+    progress: &mut dyn FnMut(f64),
+) -> Result<Mesh> {
+    let (cases, [width, height, layers]) = (cases(), lattice.nodes);
+    let (mut crossings, mut triangles) = (vec![], vec![]);
+    let is_dense = |value: f32| value > level;
+    let mut below: Option<Layer> = None;
+    for z in 0..layers {
+        let values = layer(lattice, z, density);
+        let unset = || vec![0; values.len()];
+        let mut above = Layer { vertices: [unset(), unset(), unset()], values };
+        let mut cross = |vertex: &mut u32, node: [usize; 3], axis: usize, values: [f32; 2]| {
+            if is_dense(values[0]) != is_dense(values[1]) {
+                *vertex = crossings.len() as u32;
+                crossings.push(Crossing { node: node.map(|i| i as u32), axis: axis as u8, values });
+            }
+        };
+        for (i, &value) in above.values.iter().enumerate() {
+            let node = [i % width, i / width, z];
+            if node[0] + 1 < width {
+                cross(&mut above.vertices[0][i], node, 0, [value, above.values[i + 1]]);
+            }
+            if node[1] + 1 < height {
+                cross(&mut above.vertices[1][i], node, 1, [value, above.values[i + width]]);
+            }
+            if let Some(below) = &mut below {
+                cross(&mut below.vertices[2][i], [node[0], node[1], z - 1], 2, [below.values[i], value]);
+            }
+        }
+        if crossings.len() >= u32::MAX as usize {
+            return Err(Error::setting("resolution", "is too fine: the surface has 2^32 vertices or more"));
+        }
+        if let Some(below) = &below {
+            let between = [below, &above];
+            for (x, y) in (0..height - 1).flat_map(|y| (0..width - 1).map(move |x| (x, y))) {
+                // Where a corner, or an edge that begins there, is in its layer.
+                let place = |corner: usize| x + (corner & 1) + width * (y + (corner >> 1 & 1));
+                let bit = |corner: usize| usize::from(is_dense(between[corner >> 2].values[place(corner)])) << corner;
+                let dense: usize = (0..8).map(bit).sum();
+                let vertex =
+                    |edge: super::cases::Edge| between[edge.corner >> 2].vertices[edge.axis][place(edge.corner)];
+                triangles.extend(cases[dense].iter().map(|edges| edges.map(vertex)));
+            }
+        }
+        below = Some(above);
+        progress((z + 1) as f64 / layers as f64);
+    }
+    Ok(Mesh { positions: places(lattice, level, density, &crossings), triangles })
+}
+
+/// The values at the nodes of a layer.
+fn layer(lattice: &Lattice, z: usize, density: &DensityFn<'_>) -> Vec<f32> {
+    let [width, height, _] = lattice.nodes;
+    let mut values = vec![0.0; width * height];
+    values.par_chunks_mut(POINTS).enumerate().for_each(|(chunk, out)| {
+        let nodes = (chunk * POINTS..).take(out.len()).map(|i| lattice.node([i % width, i / width, z]));
+        let points: Vec<[f32; 3]> = nodes.map(|place| place.as_vec3().to_array()).collect();
+        parallel::serial(|| density(&points, out));
+    });
+    values
+}
+
+/// Where the level is passed on each of these edges.
+fn places(lattice: &Lattice, level: f32, density: &DensityFn<'_>, crossings: &[Crossing]) -> Vec<DVec3> {
+    let mut places = vec![DVec3::ZERO; crossings.len()];
+    places.par_chunks_mut(POINTS).zip(crossings.par_chunks(POINTS)).for_each(|(places, crossings)| {
+        // For each edge the part, as shares of it, in which the level is passed, and the values at the ends of that.
+        let mut parts: Vec<[(f64, f32); 2]> =
+            crossings.iter().map(|c| [(0.0, c.values[0]), (1.0, c.values[1])]).collect();
+        let at = |crossing: &Crossing, share: f64| {
+            let mut place = lattice.node(crossing.node.map(|i| i as usize));
+            place[crossing.axis as usize] += share * lattice.cell[crossing.axis as usize];
+            place
+        };
+        let mut found = vec![0.0; parts.len()];
+        for _ in 0..HALVINGS {
+            let middle = |[from, to]: &[(f64, f32); 2]| 0.5 * (from.0 + to.0);
+            let points = crossings.iter().zip(&parts).map(|(crossing, part)| at(crossing, middle(part)));
+            let points: Vec<[f32; 3]> = points.map(|place| place.as_vec3().to_array()).collect();
+            parallel::serial(|| density(&points, &mut found));
+            for (part, &value) in parts.iter_mut().zip(&found) {
+                let second = (value > level) != (part[0].1 > level);
+                part[usize::from(second)] = (middle(part), value);
+            }
+        }
+        for ((place, crossing), [from, to]) in places.iter_mut().zip(crossings).zip(&parts) {
+            // The values are nearly on a line by now. Of infinite ones there is no telling.
+            let share = f64::from((level - from.1) / (to.1 - from.1));
+            let share = if share.is_nan() { 0.5 } else { share.clamp(MARGIN, 1.0 - MARGIN) };
+            *place = at(crossing, from.0 + share * (to.0 - from.0));
+        }
+    });
+    places
+}
+
+#[cfg(test)]
+mod tests;

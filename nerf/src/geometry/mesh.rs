@@ -1,0 +1,185 @@
+//! Triangle meshes: what belongs together, and what is left out.
+
+use glam::DVec3;
+use std::collections::HashMap;
+
+/// Triangles with common vertices.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Mesh {
+    /// Where the vertices are.
+    pub positions: Vec<DVec3>,
+    /// The numbers of three vertices each, anticlockwise as seen from outside. A mesh without triangles is a set of points.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl Mesh {
+    /// The places of a triangle's vertices.
+    ///
+    /// # Panics
+    /// If there is no such triangle.
+    pub fn corners(&self, triangle: usize) -> [DVec3; 3] {
+        self.triangles[triangle].map(|vertex| self.positions[vertex as usize])
+    }
+
+    /// The box around the vertices, lower and upper corner; `None` if there are none.
+    pub fn bounds(&self) -> Option<[DVec3; 2]> {
+        let first = *self.positions.first()?;
+        Some(self.positions.iter().fold([first; 2], |[low, high], &x| [low.min(x), high.max(x)]))
+    }
+
+    /// The area of all triangles, in square units.
+    pub fn area(&self) -> f64 {
+        (0..self.triangles.len()).map(|i| area(self.corners(i))).sum()
+    }
+
+    /// The volume within a closed mesh, in cubic units: negative if its triangles face inwards (the theorem of Gauss, triangle
+    /// by triangle).
+    pub fn volume(&self) -> f64 {
+        (0..self.triangles.len()).map(|i| volume(self.corners(i))).sum()
+    }
+
+    /// Whether each side of a triangle belongs to exactly one more, which passes it the other way: the surface has no border,
+    /// and everywhere an inside and an outside.
+    pub fn is_closed(&self) -> bool {
+        let mut passed = HashMap::with_capacity(3 * self.triangles.len());
+        for side in self.triangles.iter().flat_map(sides) {
+            *passed.entry(side).or_insert(0) += 1;
+        }
+        passed.iter().all(|(&[from, to], &count)| count == 1 && passed.contains_key(&[to, from]))
+    }
+
+    /// For each triangle the number of the part that it belongs to, and how many parts there are. Triangles of a part are
+    /// joined by vertices; parts are numbered in the order of their first triangles.
+    pub fn parts(&self) -> (Vec<usize>, usize) {
+        let mut leader: Vec<u32> = (0..self.positions.len() as u32).collect();
+        for &[a, b, c] in &self.triangles {
+            for other in [b, c] {
+                let (a, b) = (find(&mut leader, a), find(&mut leader, other));
+                leader[a.max(b) as usize] = a.min(b);
+            }
+        }
+        let mut numbers = HashMap::new();
+        let part = |&[first, ..]: &[u32; 3]| {
+            let next = numbers.len();
+            *numbers.entry(find(&mut leader, first)).or_insert(next)
+        };
+        let parts = self.triangles.iter().map(part).collect();
+        (parts, numbers.len())
+    }
+
+    /// Leaves out parts whose area is less than this share, 0 to 1, of that of the largest, and says how many those were. 0
+    /// leaves out none.
+    pub fn drop_parts(&mut self, share: f64) -> usize {
+        let (parts, count) = self.parts();
+        let mut areas = vec![0.0; count];
+        parts.iter().enumerate().for_each(|(i, &part)| areas[part] += area(self.corners(i)));
+        let least = share * areas.iter().copied().fold(0.0, f64::max);
+        let stays: Vec<bool> = areas.iter().map(|area| *area >= least).collect();
+        let mut parts = parts.into_iter();
+        self.triangles.retain(|_| parts.next().is_some_and(|part| stays[part]));
+        self.drop_unused();
+        stays.iter().filter(|stays| !**stays).count()
+    }
+
+    /// Leaves out vertices that no triangle has; the others keep their order.
+    pub fn drop_unused(&mut self) {
+        const UNUSED: u32 = u32::MAX;
+        let mut number = vec![UNUSED; self.positions.len()];
+        self.triangles.as_flattened().iter().for_each(|&vertex| number[vertex as usize] = 0);
+        let used = number.iter_mut().filter(|number| **number != UNUSED);
+        used.zip(0..).for_each(|(number, new)| *number = new);
+        let mut numbers = number.iter();
+        self.positions.retain(|_| numbers.next() != Some(&UNUSED));
+        self.triangles.as_flattened_mut().iter_mut().for_each(|vertex| *vertex = number[*vertex as usize]);
+    }
+}
+
+/// The sides of a triangle as it passes them.
+pub(super) fn sides(&[a, b, c]: &[u32; 3]) -> [[u32; 2]; 3] {
+    [[a, b], [b, c], [c, a]]
+}
+
+fn area([a, b, c]: [DVec3; 3]) -> f64 {
+    0.5 * (b - a).cross(c - a).length()
+}
+
+fn volume([a, b, c]: [DVec3; 3]) -> f64 {
+    a.dot(b.cross(c)) / 6.0
+}
+
+/// The first of those that are joined with a vertex; the way there is halved.
+fn find(leader: &mut [u32], mut vertex: u32) -> u32 {
+    while leader[vertex as usize] != vertex {
+        leader[vertex as usize] = leader[leader[vertex as usize] as usize];
+        vertex = leader[vertex as usize];
+    }
+    vertex
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// A tetrahedron with the corner of a right angle here.
+    pub fn tetrahedron(at: DVec3, size: f64) -> Mesh {
+        let positions = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z].map(|x| at + size * x).to_vec();
+        Mesh { positions, triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]] }
+    }
+
+    fn both(mut a: Mesh, b: &Mesh) -> Mesh {
+        let first = a.positions.len() as u32;
+        a.positions.extend(&b.positions);
+        a.triangles.extend(b.triangles.iter().map(|triangle| triangle.map(|vertex| vertex + first)));
+        a
+    }
+
+    #[test]
+    fn measures_of_a_tetrahedron() {
+        let at = DVec3::new(1.0, -2.0, 3.0);
+        let mesh = tetrahedron(at, 2.0);
+        assert!((mesh.volume() - 8.0 / 6.0).abs() < 1e-12);
+        // Three right triangles, and one with sides of length 2 sqrt 2.
+        assert!((mesh.area() - (3.0 * 2.0 + 2.0 * 3.0_f64.sqrt())).abs() < 1e-12);
+        assert_eq!(mesh.bounds(), Some([at, at + 2.0]));
+        assert_eq!(Mesh::default().bounds(), None);
+        let turned = Mesh { triangles: mesh.triangles.iter().map(|&[a, b, c]| [a, c, b]).collect(), ..mesh.clone() };
+        assert!(mesh.is_closed() && turned.is_closed() && (turned.volume() + mesh.volume()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_is_closed() {
+        let mesh = tetrahedron(DVec3::ZERO, 1.0);
+        let with = |change: &dyn Fn(&mut Vec<[u32; 3]>)| {
+            let mut mesh = mesh.clone();
+            change(&mut mesh.triangles);
+            mesh.is_closed()
+        };
+        assert!(with(&|_| ()));
+        assert!(!with(&|triangles| triangles.truncate(3)), "a hole");
+        assert!(!with(&|triangles| triangles[2].swap(0, 1)), "a triangle faces inwards");
+        assert!(!with(&|triangles| triangles.push([1, 2, 3])), "a triangle is there twice");
+        assert!(!with(&|triangles| triangles.extend([[1, 2, 3], [1, 3, 2]])), "two more at a side");
+        assert!(both(mesh.clone(), &mesh).is_closed());
+        assert!(Mesh::default().is_closed());
+    }
+
+    #[test]
+    fn small_parts_go() {
+        let sizes = [1.0, 0.5, 3.0, 0.2];
+        let all = sizes.iter().enumerate().map(|(i, &size)| tetrahedron(DVec3::splat(5.0 * i as f64), size));
+        let all = all.reduce(|a, b| both(a, &b)).unwrap();
+        let (parts, count) = all.parts();
+        assert_eq!((&parts[..], count), (&[0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3][..], 4));
+        // Areas are as squares of sizes: 1/9, 1/36, 1 and 1/225 of the largest.
+        for (share, left) in [(0.0, 4), (0.004, 4), (0.01, 3), (0.05, 2), (0.2, 1), (1.0, 1)] {
+            let mut mesh = all.clone();
+            assert_eq!(mesh.drop_parts(share), 4 - left, "{share}");
+            assert_eq!((mesh.positions.len(), mesh.triangles.len(), mesh.parts().1), (4 * left, 4 * left, left));
+            assert!(mesh.is_closed() && mesh.bounds().unwrap()[1].x > 12.0, "the largest stays");
+        }
+        let mut mesh = all;
+        mesh.drop_parts(0.05);
+        let expected = both(tetrahedron(DVec3::ZERO, 1.0), &tetrahedron(DVec3::splat(10.0), 3.0));
+        assert_eq!(mesh, expected, "the others as they were");
+    }
+}

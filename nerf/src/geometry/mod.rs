@@ -1,0 +1,41 @@
+//! What a model knows of shape: triangle meshes and point clouds.
+//!
+//! A [`Mesh`] is made of any function of positions by [`isosurface`], and of a model by
+//! [`Model::surface`](crate::Model::surface), which chooses the level of density, looks only where pictures do, leaves out
+//! small parts and says how vertices look. [`Model::point_cloud`](crate::Model::point_cloud) gives what cameras see, point by
+//! point. Either is a [`Shape`], and [`files`] writes it.
+//!
+//! ```
+//! use glam::DVec3;
+//! use raygrad_nerf::geometry::{Lattice, isosurface};
+//!
+//! // A ball of radius .5.
+//! let ball = |points: &[[f32; 3]], out: &mut [f32]| {
+//!     for (point, out) in points.iter().zip(out) {
+//!         *out = 1.0 - point.iter().map(|x| x * x).sum::<f32>().sqrt();
+//!     }
+//! };
+//! let lattice = Lattice::over([DVec3::NEG_ONE, DVec3::ONE], 40, true)?;
+//! let mesh = isosurface(&lattice, 0.5, &ball, &mut |_| ())?;
+//! assert!(mesh.is_closed());
+//! assert!((mesh.volume() / (4.0 / 3.0 * std::f64::consts::PI * 0.125) - 1.0).abs() < 0.01);
+//! # Ok::<(), raygrad_nerf::Error>(())
+//! ```
+
+mod cases;
+mod decimate;
+pub mod files;
+mod hidden;
+mod isosurface;
+mod mesh;
+mod points;
+mod probe;
+mod shape;
+mod sight;
+mod surface;
+
+pub use isosurface::{Lattice, isosurface};
+pub use mesh::Mesh;
+pub use points::PointCloud;
+pub use shape::Shape;
+pub use surface::{Stage, Surface, SurfaceConfig};

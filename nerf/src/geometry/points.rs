@@ -1,0 +1,127 @@
+//! What cameras see of a model, as points.
+
+use super::mesh::Mesh;
+use super::probe::Probe;
+use super::shape::Shape;
+use super::sight::sights;
+use super::surface::Stage;
+use crate::camera::Camera;
+use crate::model::Model;
+use crate::volume::render::Evaluations;
+use crate::{Error, Result};
+use glam::DVec3;
+use raygrad_autograd::Pool;
+use std::collections::HashMap;
+
+/// Rays for each point that is wanted: some see nothing solid, and the places of several are one point.
+const RAYS: f64 = 12.0;
+/// Times that the span of the voxels' possible edges is halved.
+const HALVINGS: usize = 30;
+
+/// A point cloud, and how it was made.
+#[derive(Debug, Clone)]
+pub struct PointCloud {
+    /// The points, in scene units.
+    pub shape: Shape,
+    /// How many places the points were chosen of.
+    pub sights: usize,
+    /// How often the model was asked.
+    pub evaluations: Evaluations,
+}
+
+impl Model<f32> {
+    /// Points that `cameras` see: the places within the model's box at which half of a ray's light is blocked, of rays that end
+    /// in something solid, with normals and colours as [`surface`](Self::surface) has them. They are thinned to at most
+    /// `count`, one in each voxel of a grid, so that they are about evenly spaced.
+    ///
+    /// # Errors
+    /// If no camera sees anything solid.
+    pub fn point_cloud(
+        &self,
+        cameras: &[Camera],
+        count: usize,
+        progress: &mut dyn FnMut(Stage, f64),
+    ) -> Result<PointCloud> {
+        let (mut places, mut evaluations, pool) = (vec![], Evaluations::default(), Pool::new());
+        let pixels: usize = cameras.iter().map(|camera| camera.width * camera.height).sum();
+        let scale = (RAYS * count as f64 / pixels.max(1) as f64).sqrt();
+        for (i, camera) in cameras.iter().enumerate() {
+            let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
+            let seen = sights(self, &camera.resized(width, height), &pool);
+            places.extend(
+                seen.sights.iter().flatten().map(|sight| sight.place).filter(|place| self.extent.holds(*place)),
+            );
+            evaluations = evaluations + seen.evaluations;
+            progress(Stage::Seeing, (i + 1) as f64 / cameras.len() as f64);
+        }
+        if places.is_empty() {
+            return Err(Error::setting("points", "are none: no camera sees anything solid"));
+        }
+        let sights = places.len();
+        let positions = thinned(&places, count);
+        progress(Stage::Coloring, 0.0);
+        let probe = Probe::new(self);
+        let (normals, colors) = probe.look(self.cells(), self.judged(self.cells()), &positions);
+        let mesh = Mesh { positions, triangles: vec![] };
+        evaluations = evaluations + probe.evaluations();
+        Ok(PointCloud { shape: Shape { mesh, normals, colors }, sights, evaluations })
+    }
+}
+
+/// At most `count` of these places, the one nearest to its middle in each voxel that has any, in voxels that are as small as
+/// that allows.
+fn thinned(places: &[DVec3], count: usize) -> Vec<DVec3> {
+    let bounds = Mesh { positions: places.to_vec(), triangles: vec![] }.bounds().unwrap_or_default();
+    let size = (bounds[1] - bounds[0]).max_element();
+    if places.len() <= count || size == 0.0 {
+        return places[..count.min(places.len())].to_vec();
+    }
+    let in_voxels = |edge: f64| {
+        let mut nearest: HashMap<[i64; 3], usize> = HashMap::new();
+        for (i, &place) in places.iter().enumerate() {
+            let voxel = ((place - bounds[0]) / edge).floor();
+            let middle = bounds[0] + edge * (voxel + 0.5);
+            let kept = nearest.entry(voxel.to_array().map(|x| x as i64)).or_insert(i);
+            if place.distance_squared(middle) < places[*kept].distance_squared(middle) {
+                *kept = i;
+            }
+        }
+        nearest
+    };
+    // One voxel that is larger than all is enough for any count, and for none are voxels needed that are smaller than this.
+    let [mut small, mut large] = [(1e-6 * size).ln(), (1.001 * size).ln()];
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (small + large);
+        *if in_voxels(middle.exp()).len() > count { &mut small } else { &mut large } = middle;
+    }
+    let mut kept: Vec<usize> = in_voxels(large.exp()).into_values().collect();
+    kept.sort_unstable();
+    kept.into_iter().map(|i| places[i]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_are_thinned_to_even_distances() {
+        // On a plane, four times as many on its left half.
+        let place = |i: usize| {
+            let (u, v) = ((i as f64 * 0.754877666).fract(), (i as f64 * 0.569840291).fract());
+            DVec3::new(if i % 5 == 0 { 1.0 + u } else { u }, 2.0 * v, 0.3)
+        };
+        let places: Vec<DVec3> = (0..20_000).map(place).collect();
+        let kept = thinned(&places, 900);
+        assert!((700..=900).contains(&kept.len()), "{}", kept.len());
+        let left = kept.iter().filter(|place| place.x < 1.0).count();
+        assert!((0.45..0.55).contains(&(left as f64 / kept.len() as f64)), "{left} of {}", kept.len());
+        assert!(kept.iter().all(|place| places.contains(place)), "they are some of those that were seen");
+        // In squares of an edge of about sqrt(4 / 900), near the middles: few are nearer to each other than half of that.
+        let near = |a: &DVec3| kept.iter().any(|b| b != a && a.distance(*b) < 0.5 * (4.0_f64 / 900.0).sqrt());
+        let crowded = kept.iter().filter(|place| near(place)).count();
+        assert!(crowded * 20 < kept.len(), "{crowded}");
+        assert_eq!(thinned(&places, 20_000), places);
+        assert_eq!(thinned(&places, 1).len(), 1);
+        assert_eq!(thinned(&[DVec3::ONE; 3], 2), [DVec3::ONE; 2], "all in one place");
+    }
+}

@@ -1,0 +1,114 @@
+//! Asking a model at places, as its pictures show them.
+
+use super::hidden::Hidden;
+use crate::camera::pinhole::Ray;
+use crate::camera::rays::{Rays, Samples};
+use crate::model::Model;
+use crate::pictures::quantise;
+use crate::space::occupancy::{OccupancyGrid, POINTS};
+use crate::volume::query::Query;
+use crate::volume::render::Evaluations;
+use glam::DVec3;
+use raygrad_autograd::{Pool, Segments, Tape, Tensor};
+use raygrad_tensor::parallel;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A model that is asked at places, and how often it was.
+pub(super) struct Probe<'a> {
+    model: &'a Model<f32>,
+    pool: Pool<f32>,
+    densities: AtomicU64,
+    colors: AtomicU64,
+}
+
+impl<'a> Probe<'a> {
+    pub fn new(model: &'a Model<f32>) -> Self {
+        Probe { model, pool: Pool::new(), densities: AtomicU64::new(0), colors: AtomicU64::new(0) }
+    }
+
+    /// How often the model was asked so far.
+    pub fn evaluations(&self) -> Evaluations {
+        let [density, color] = [&self.densities, &self.colors].map(|count| count.load(Ordering::Relaxed));
+        Evaluations { density, color, unskipped: 0 }
+    }
+
+    /// The densities at positions, in 1 / scene unit.
+    pub fn densities(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        self.densities.fetch_add(points.len() as u64, Ordering::Relaxed);
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = self.model.params.bind_constant(&tape);
+        let positions = tape.constant(self.pool.copy_of(&[points.len(), 3], points.as_flattened()));
+        out.copy_from_slice(self.model.field.density(&params, &positions).sigma().value().as_slice());
+    }
+
+    /// The same as pictures have it: 0 outside of the model's box and where the grid, if there is one, is not occupied. What is
+    /// hidden there has an infinite one.
+    pub fn shown(&self, grid: Option<&OccupancyGrid>, hidden: Option<&Hidden>, points: &[[f32; 3]], out: &mut [f32]) {
+        let place = |row: usize| DVec3::from(points[row].map(f64::from));
+        let is_occupied = |place: DVec3| grid.is_none_or(|grid| grid.is_occupied(place));
+        let is_shown = |row: &usize| self.model.extent.holds(place(*row)) && is_occupied(place(*row));
+        let rows: Vec<usize> = (0..points.len()).filter(is_shown).collect();
+        out.fill(0.0);
+        let is_hidden = |row: usize| hidden.is_some_and(|hidden| hidden.holds(place(row)));
+        let (dense, rows): (Vec<usize>, Vec<usize>) = rows.into_iter().partition(|&row| is_hidden(row));
+        dense.into_iter().for_each(|row| out[row] = f32::INFINITY);
+        if rows.is_empty() {
+            return;
+        }
+        let asked: Vec<[f32; 3]> = rows.iter().map(|&row| points[row]).collect();
+        let mut found = vec![0.0; rows.len()];
+        self.densities(&asked, &mut found);
+        rows.iter().zip(found).for_each(|(&row, sigma)| out[row] = sigma);
+    }
+
+    /// For each place the unit normal, and the colour that is seen when one looks along it from outside, in sRGB.
+    ///
+    /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it, along each axis:
+    /// the field's own gradient is that of noise finer than a pixel. Where there is no slope the normal is up.
+    pub fn look(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
+        let tone = self.model.tone.as_ref();
+        let gains = tone.map_or([1.0; 3], |tone| tone.gain(&self.model.params, self.model.look, false).at(0.0));
+        let look = |places: &[DVec3]| {
+            parallel::serial(|| {
+                let normals = self.normals(grid, reach, places);
+                let colors = self.colors(places, &normals, gains);
+                normals.into_iter().zip(colors).collect::<Vec<_>>()
+            })
+        };
+        places.par_chunks(POINTS).flat_map_iter(look).unzip()
+    }
+
+    fn normals(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> Vec<DVec3> {
+        let mut around = vec![[0.0; 6]; places.len()];
+        let mut found = vec![0.0; places.len()];
+        for (k, step) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]).enumerate() {
+            let points: Vec<[f32; 3]> =
+                places.iter().map(|place| (place + reach * step).as_vec3().to_array()).collect();
+            self.shown(grid, None, &points, &mut found);
+            around.iter_mut().zip(&found).for_each(|(out, &sigma)| out[k] = (reach * f64::from(sigma)).ln_1p());
+        }
+        let normal = |[right, left, back, front, up, down]: &[f64; 6]| {
+            DVec3::new(left - right, front - back, down - up).try_normalize().unwrap_or(DVec3::Z)
+        };
+        around.iter().map(normal).collect()
+    }
+
+    fn colors(&self, places: &[DVec3], normals: &[DVec3], gains: [f64; 3]) -> Vec<[u8; 3]> {
+        self.colors.fetch_add(places.len() as u64, Ordering::Relaxed);
+        let tape = Tape::with_pool(self.pool.clone());
+        let params = self.model.params.bind_constant(&tape);
+        let mut rays = Rays::new();
+        for (&origin, normal) in places.iter().zip(normals) {
+            rays.push(&Ray { origin, direction: -normal }, [0.0, 1.0]);
+        }
+        let count = rays.len();
+        let (here, one) = (Tensor::zeros(&[count]), Tensor::ones(&[count]));
+        let samples = Samples::new(&rays, Segments::uniform(count, 1), here, one, &self.pool);
+        let frames = self.model.look.map(|look| vec![look; count]);
+        let query = Query { frames: frames.as_deref(), ..Query::new(&*self.model.field, &params) };
+        let color = query.color(&query.density(&samples).features, &samples);
+        let stored = |color: &[f32; 3]| std::array::from_fn(|k| quantise((f64::from(color[k]) * gains[k]) as f32));
+        color.value().as_slice().as_chunks::<3>().0.iter().map(stored).collect()
+    }
+}

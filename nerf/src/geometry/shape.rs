@@ -1,0 +1,26 @@
+//! What files hold: a mesh or points, and how they look.
+
+use super::mesh::Mesh;
+use crate::dataset::Placement;
+use glam::DVec3;
+
+/// A mesh whose vertices have normals and colours; without triangles, a point cloud.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Shape {
+    /// Vertices and triangles.
+    pub mesh: Mesh,
+    /// For each vertex the unit normal, outwards.
+    pub normals: Vec<DVec3>,
+    /// For each vertex its colour in sRGB, as photographs store it.
+    pub colors: Vec<[u8; 3]>,
+}
+
+impl Shape {
+    /// The same in the coordinates of the capture, from those of the scene.
+    pub fn placed_back(mut self, placement: &Placement) -> Self {
+        self.mesh.positions.iter_mut().for_each(|place| *place = placement.point_back(*place));
+        let back = placement.rotation.transpose();
+        self.normals.iter_mut().for_each(|normal| *normal = back * *normal);
+        self
+    }
+}

@@ -1,0 +1,184 @@
+//! The surface that a model's pictures show.
+
+use super::hidden::Hidden;
+use super::isosurface::{Lattice, isosurface};
+use super::probe::Probe;
+use super::shape::Shape;
+use super::sight::{Seen, sights};
+use crate::camera::Camera;
+use crate::model::Model;
+use crate::range::check_range;
+use crate::sampling::marching::Marching;
+use crate::space::occupancy::{OccupancyConfig, OccupancyGrid};
+use crate::volume::render::Evaluations;
+use crate::{Error, Result};
+use raygrad_autograd::Pool;
+use std::borrow::Cow;
+
+/// Cells of a lattice along each cell of an occupancy grid, unless it is said otherwise.
+const FINER: usize = 2;
+/// Where a sampler has no grid, one is made of cells that hold at least this share of the level.
+const FAINT: f64 = 0.1;
+/// Pixels along the longer side of the pictures that say what is seen, at most.
+const PIXELS: usize = 128;
+
+/// Which surface of a model is made.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SurfaceConfig {
+    /// Cells of the lattice along the longest side of the box, 1 to 4096; without it two for each of the model's occupancy
+    /// grid, or of a grid of 128 cells.
+    pub resolution: Option<usize>,
+    /// The density on the surface, in 1 / scene unit, above 0; without it the one at which cameras see it.
+    pub level: Option<f64>,
+    /// Parts of less than this share of the largest one's area, 0 to 1, are left out.
+    pub parts: f64,
+    /// How many triangles there may be, at least 4, if not as many as it takes.
+    pub triangles: Option<usize>,
+    /// Whether what no camera sees is taken to be dense, further than a cell of the occupancy grid behind what is seen: there the
+    /// field was never judged, and holds sponges and voids. What pictures leave out stays empty.
+    pub filled: bool,
+    /// Whether the surface is closed where it meets the box. Otherwise it ends there.
+    pub closed: bool,
+}
+
+impl Default for SurfaceConfig {
+    fn default() -> Self {
+        SurfaceConfig { resolution: None, level: None, parts: 0.01, triangles: None, filled: true, closed: true }
+    }
+}
+
+impl SurfaceConfig {
+    fn check(&self) -> Result<()> {
+        check_range("parts", self.parts, 0.0, 1.0)?;
+        if let Some(level) = self.level.filter(|level| !(*level > 0.0 && level.is_finite())) {
+            return Err(Error::setting("level", format!("is {level}; use a density above 0")));
+        }
+        self.triangles.map_or(Ok(()), |count| check_range("triangles", count, 4, u32::MAX as usize))
+    }
+}
+
+/// What is being done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// Looking for the places that cameras see.
+    Seeing,
+    /// Looking for the surface.
+    Meshing,
+    /// Making triangles fewer.
+    Simplifying,
+    /// Finding normals and colours.
+    Coloring,
+}
+
+/// A surface, and how it was made.
+#[derive(Debug, Clone)]
+pub struct Surface {
+    /// The surface, in scene units.
+    pub shape: Shape,
+    /// The density on it, in 1 / scene unit.
+    pub level: f64,
+    /// Cells of the lattice along the longest side of the box.
+    pub resolution: usize,
+    /// How many small parts were left out.
+    pub dropped: usize,
+    /// How often the model was asked.
+    pub evaluations: Evaluations,
+}
+
+impl Model<f32> {
+    /// The surface within the model's box (of a scene that goes on, the part of it where the cameras look), with normals
+    /// against the slope of the density (over an edge of the occupancy grid's cells, as finer slopes are noise) and the colours that are seen along these.
+    ///
+    /// It is where the density has one [level](SurfaceConfig::level). If none is given, it is the lower quartile of the
+    /// densities at the places where half of a ray's light is blocked, over rays of the `cameras` that end in something solid: so
+    /// the surface lies where pictures show it, and has few holes. What pictures leave out, cells that are not occupied, counts as empty.
+    ///
+    /// `progress` is told what is being done, and what share of that is, 0 to 1.
+    ///
+    /// # Errors
+    /// If a number of the configuration is out of range, there is no surface, or it is too large.
+    pub fn surface(
+        &self,
+        cameras: &[Camera],
+        config: &SurfaceConfig,
+        progress: &mut dyn FnMut(Stage, f64),
+    ) -> Result<Surface> {
+        config.check()?;
+        let (probe, bounds) = (Probe::new(self), self.extent.bounds);
+        let views = if config.filled || config.level.is_none() {
+            self.views(cameras, &mut |done| progress(Stage::Seeing, done))
+        } else {
+            vec![]
+        };
+        let level = config.level.map_or_else(|| self.level(&views), Ok)?;
+        let grid = match self.cells() {
+            Some(grid) => Cow::Borrowed(grid),
+            None => {
+                let mut grid = OccupancyGrid::new(bounds, &OccupancyConfig::default())?;
+                grid.rebuild((FAINT * level) as f32, true, &|points, out| probe.densities(points, out));
+                Cow::Owned(grid)
+            }
+        };
+        let judged = self.judged(Some(&grid));
+        let hidden = config.filled.then(|| Hidden::new(&views, judged));
+        let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
+        let lattice = Lattice::over(bounds, resolution, config.closed)?;
+        let shown = |points: &[[f32; 3]], out: &mut [f32]| probe.shown(Some(&grid), hidden.as_ref(), points, out);
+        let mut mesh = isosurface(&lattice, level as f32, &shown, &mut |done| progress(Stage::Meshing, done))?;
+        if mesh.triangles.is_empty() {
+            return Err(Error::setting(
+                "level",
+                format!("is {level}, and there is no such density: use a smaller one"),
+            ));
+        }
+        let dropped = mesh.drop_parts(config.parts);
+        if let Some(count) = config.triangles {
+            mesh.decimate(count, &mut |done| progress(Stage::Simplifying, done));
+        }
+        progress(Stage::Coloring, 0.0);
+        let (normals, colors) = probe.look(Some(&grid), judged, &mesh.positions);
+        let evaluations = views.iter().fold(probe.evaluations(), |sum, (_, seen)| sum + seen.evaluations);
+        Ok(Surface { shape: Shape { mesh, normals, colors }, level, resolution, dropped, evaluations })
+    }
+
+    /// The cells that views look at, if they leave out any.
+    pub(super) fn cells(&self) -> Option<&OccupancyGrid> {
+        self.marching().map(Marching::view_grid).or_else(|| self.sampler.grid())
+    }
+
+    /// The length, in scene units, below which photographs hardly judged the field: an edge of a cell of the grid.
+    pub(super) fn judged(&self, grid: Option<&OccupancyGrid>) -> f64 {
+        let cells = grid.map_or_else(|| OccupancyConfig::default().resolution, OccupancyGrid::resolution);
+        self.extent.space().side() / cells as f64
+    }
+
+    /// What small pictures of these cameras see.
+    fn views(&self, cameras: &[Camera], progress: &mut dyn FnMut(f64)) -> Vec<(Camera, Seen)> {
+        let pool = Pool::new();
+        let view = |(i, camera): (usize, &Camera)| {
+            let scale = (PIXELS as f64 / camera.width.max(camera.height) as f64).min(1.0);
+            let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
+            let camera = camera.resized(width, height);
+            let seen = sights(self, &camera, &pool);
+            progress((i + 1) as f64 / cameras.len() as f64);
+            (camera, seen)
+        };
+        cameras.iter().enumerate().map(view).collect()
+    }
+
+    /// The lower quartile of the density of the places within the box that cameras see. Where the density is less the surface has
+    /// holes, and where it is more it lies but a little too far out.
+    fn level(&self, views: &[(Camera, Seen)]) -> Result<f64> {
+        let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
+        let mut sigmas: Vec<f64> =
+            sights.filter(|sight| self.extent.holds(sight.place)).map(|sight| sight.sigma).collect();
+        let quarter = sigmas.len() / 4;
+        if sigmas.is_empty() {
+            return Err(Error::setting("level", "is not known: no camera sees anything solid. Give one"));
+        }
+        Ok(*sigmas.select_nth_unstable_by(quarter, f64::total_cmp).1)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,272 @@
+//! Surfaces and points of a model whose field is known.
+
+use super::*;
+use crate::field::{self, Density, Field, FieldConfig, VoxelConfig};
+use crate::model::{Config, Extent, Preset};
+use crate::sampling::marching::MarchingConfig;
+use glam::DVec3;
+use raygrad_autograd::{Tensor, Var};
+use raygrad_nn::Bound;
+use std::f64::consts::{LN_2, PI};
+use std::sync::Arc;
+
+/// Balls whose density rises inwards by a factor of e in each 40th of a unit, from 1 at their rims. From where one looks at
+/// it against a direction d, a place has the colour (d + 1) / 2 channel by channel.
+struct Balls(Vec<(DVec3, f64)>);
+
+const STEEPNESS: f64 = 40.0;
+
+impl Field<f32> for Balls {
+    fn density<'t>(&self, _: &Bound<'t, f32>, positions: &Var<'t, f32>) -> Density<'t, f32> {
+        let depth = |(centre, radius): &(DVec3, f64)| {
+            let centre = positions.tape().constant(Tensor::from(centre.as_vec3().to_array()));
+            (*radius - (positions - centre).square().sum_over(-1).sqrt()) * STEEPNESS
+        };
+        let deepest = self.0.iter().map(depth).reduce(|a, b| a.maximum(b));
+        Density { value: deepest.unwrap(), log: true, features: positions.clone() }
+    }
+
+    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
+        0.5 - seen.directions.segment_expand(seen.segments) * 0.5
+    }
+}
+
+const CENTRE: DVec3 = DVec3::new(0.3, -0.2, 0.1);
+const RADIUS: f64 = 0.5;
+
+/// A model with this field in a box with unequal sides, with an occupancy grid or without one.
+fn model(balls: &[(DVec3, f64)], preset: Preset) -> Model<f32> {
+    let mut config = Config::preset(preset);
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
+        config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
+        sampler.occupancy.resolution = 32;
+    }
+    let extent = Extent::new([DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.5, 1.2, 0.9)], [0.5, 8.0]);
+    let mut model = Model::new(config, extent, 0).unwrap();
+    model.field = Arc::new(Balls(balls.to_vec()));
+    model.finish();
+    model
+}
+
+fn ball() -> Model<f32> {
+    model(&[(CENTRE, RADIUS)], Preset::Voxel)
+}
+
+/// Around the ball, of pictures that are not square.
+fn cameras() -> Vec<Camera> {
+    let camera = |i: usize| {
+        let (sin, cos) = (i as f64).sin_cos();
+        let eye = CENTRE + DVec3::new(3.0 * cos, 3.0 * sin, 1.0 - 0.7 * i as f64);
+        Camera::from_angle(60, 40, 0.7, Camera::look_at(eye, CENTRE, DVec3::Z))
+    };
+    (0..6).map(camera).collect()
+}
+
+fn surface(model: &Model<f32>, config: &SurfaceConfig) -> Surface {
+    model.surface(&cameras(), config, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap()
+}
+
+/// Of the right number of cells for the balls here.
+const CONFIG: SurfaceConfig =
+    SurfaceConfig { resolution: Some(80), level: None, parts: 0.01, triangles: None, filled: false, closed: true };
+
+#[test]
+fn the_surface_is_where_views_see_it() {
+    let found = surface(&ball(), &CONFIG);
+    // A ray to the middle has lost half of its light where the density is 40 ln 2; one that comes in at an angle, before.
+    let most = STEEPNESS * LN_2;
+    // The share of rays that come in at more than an angle is its squared sine: at the lower quartile the cosine is a half.
+    assert!((0.4 * most..0.6 * most).contains(&found.level), "{} {most}", found.level);
+    let radius = RADIUS - found.level.ln() / STEEPNESS;
+    let Shape { mesh, normals, colors } = &found.shape;
+    assert!(mesh.is_closed() && mesh.parts().1 == 1 && found.dropped == 0 && found.resolution == 80);
+    assert!((mesh.volume() / (4.0 / 3.0 * PI * radius.powi(3)) - 1.0).abs() < 0.01);
+    assert_eq!([normals.len(), colors.len()], [mesh.positions.len(); 2]);
+    for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
+        assert!((place.distance(CENTRE) - radius).abs() < 1e-4, "{place}");
+        assert!(normal.dot((place - CENTRE).normalize()) > 0.98, "{place} {normal}");
+        // Looked at along the normal: where it points to +x, red is 1.
+        let expected = normal.to_array().map(|x| 255.0 * (0.5 + 0.5 * x));
+        assert!((0..3).all(|k| (f64::from(color[k]) - expected[k]).abs() < 0.51), "{color:?} {expected:?}");
+    }
+}
+
+#[test]
+fn a_level_that_is_given_is_taken() {
+    for level in [1.0, 500.0] {
+        let found = surface(&ball(), &SurfaceConfig { level: Some(level), ..CONFIG });
+        let radius = RADIUS - level.ln() / STEEPNESS;
+        assert!(found.level == level && !found.shape.mesh.positions.is_empty());
+        let off = |place: &DVec3| (place.distance(CENTRE) - radius).abs();
+        assert!(found.shape.mesh.positions.iter().all(|place| off(place) < 1e-4), "{level}");
+        // Nothing but what is near was asked, of 82 x 69 x 56 nodes; for each vertex five times for its place and six times for
+        // its normal.
+        let (asked, vertices) = (found.evaluations, found.shape.mesh.positions.len() as u64);
+        assert!((11 * vertices + 5000..150_000).contains(&asked.density), "{asked:?} {vertices}");
+        assert_eq!(asked.color, vertices);
+    }
+    let default = surface(&ball(), &SurfaceConfig { resolution: None, level: Some(1.0), ..CONFIG });
+    assert_eq!(default.resolution, 64, "two cells for each of the grid's 32");
+}
+
+#[test]
+fn what_pictures_leave_out_is_empty() {
+    let mut half = ball();
+    if let Some(marching) = half.marching_mut() {
+        // Cells are of .078125: those up to x = .25 stay.
+        let left = |points: &[[f32; 3]], out: &mut [f32]| {
+            points.iter().zip(out).for_each(|(x, out)| *out = if x[0] < 0.25 { 1.0 } else { 0.0 });
+        };
+        marching.grid.rebuild(0.5, false, &left);
+    }
+    half.finish();
+    let found = surface(&half, &SurfaceConfig { level: Some(1.0), ..CONFIG });
+    let mesh = &found.shape.mesh;
+    // A cap of height RADIUS - .05, as the cut is at .25.
+    let height: f64 = RADIUS - 0.05;
+    let cap = PI * height * height * (3.0 * RADIUS - height) / 3.0;
+    assert!(mesh.is_closed() && (mesh.volume() / cap - 1.0).abs() < 0.01, "{} {cap}", mesh.volume());
+    assert!((mesh.bounds().unwrap()[1].x - 0.25).abs() < 2.5 / 80.0 / 32.0);
+}
+
+#[test]
+fn a_model_without_a_grid_has_the_same_surface() {
+    let config = SurfaceConfig { level: Some(2.0), ..CONFIG };
+    let with = surface(&ball(), &config);
+    let without = surface(&model(&[(CENTRE, RADIUS)], Preset::Small), &config);
+    assert_eq!(with.shape.mesh, without.shape.mesh);
+    // It was looked for in a grid first, and is not asked for everywhere on the lattice.
+    assert!(without.evaluations.density > 128 * 128 * 128 / 4 && with.evaluations.density < 200_000);
+}
+
+#[test]
+fn small_parts_and_triangles_too_many_are_left_out() {
+    let balls = [(CENTRE, RADIUS), (DVec3::new(-0.7, 0.8, -0.4), 0.15)];
+    let config = SurfaceConfig { level: Some(1.0), ..CONFIG };
+    // Its area is .09 of the other's.
+    for (parts, dropped) in [(0.0, 0), (0.05, 0), (0.15, 1)] {
+        let found = surface(&model(&balls, Preset::Voxel), &SurfaceConfig { parts, ..config });
+        assert_eq!((found.dropped, found.shape.mesh.parts().1), (dropped, 2 - dropped), "{parts}");
+    }
+    let few = surface(&ball(), &SurfaceConfig { triangles: Some(500), ..config });
+    let Shape { mesh, normals, .. } = &few.shape;
+    assert!(mesh.triangles.len() == 500 && mesh.is_closed() && normals.len() == mesh.positions.len());
+    assert!((mesh.volume() / (4.0 / 3.0 * PI * RADIUS.powi(3)) - 1.0).abs() < 0.02);
+}
+
+#[test]
+fn what_meets_the_box_is_closed_or_open() {
+    // Its middle is on the border of the box.
+    let model = model(&[(DVec3::new(1.5, 0.2, 0.0), RADIUS)], Preset::Voxel);
+    let config = SurfaceConfig { level: Some(1.0), ..CONFIG };
+    let [closed, open] = [true, false].map(|closed| surface(&model, &SurfaceConfig { closed, ..config }).shape.mesh);
+    let half = 2.0 / 3.0 * PI * RADIUS.powi(3);
+    assert!(closed.is_closed() && (closed.volume() / half - 1.0).abs() < 0.015, "{} {half}", closed.volume());
+    assert!(!open.is_closed() && (open.area() / (2.0 * PI * RADIUS.powi(2)) - 1.0).abs() < 0.015, "{}", open.area());
+}
+
+#[test]
+fn what_cannot_be_made_is_said() {
+    let message = |config: SurfaceConfig, cameras: &[Camera]| {
+        ball().surface(cameras, &config, &mut |_, _| ()).err().unwrap().to_string()
+    };
+    let cases = [
+        (SurfaceConfig { level: Some(-1.0), ..CONFIG }, "`level`: is -1"),
+        (SurfaceConfig { level: Some(f64::NAN), ..CONFIG }, "`level`: is NaN"),
+        (SurfaceConfig { level: Some(1e30), ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
+        (SurfaceConfig { parts: 1.5, ..CONFIG }, "`parts`: is 1.5"),
+        (SurfaceConfig { triangles: Some(3), ..CONFIG }, "`triangles`: is 3"),
+        (SurfaceConfig { resolution: Some(0), ..CONFIG }, "`resolution`: is 0"),
+    ];
+    for (config, what) in cases {
+        let said = message(config, &cameras());
+        assert!(said.starts_with(what), "{said}");
+    }
+    let away = Camera::from_angle(8, 8, 0.3, Camera::look_at(DVec3::splat(5.0), DVec3::splat(9.0), DVec3::Z));
+    for cameras in [vec![], vec![away.clone()]] {
+        let said = message(CONFIG, &cameras);
+        assert!(said.contains("`level`: is not known"), "{said}");
+        let said = ball().point_cloud(&cameras, 10, &mut |_, _| ()).err().unwrap().to_string();
+        assert!(said.contains("`points`: are none"), "{said}");
+    }
+}
+
+#[test]
+fn points_are_what_cameras_see() {
+    let model = ball();
+    let found = model.point_cloud(&cameras(), 2000, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap();
+    let Shape { mesh, normals, colors } = &found.shape;
+    let count = mesh.positions.len();
+    assert!((1500..=2000).contains(&count) && mesh.triangles.is_empty(), "{count}");
+    assert!(found.sights > 2 * count && [normals.len(), colors.len()] == [count; 2]);
+    // Straight on, light is halved where the density is 40 ln 2, and in the middle of a step; at the rim, nearer to the eye.
+    let deepest = RADIUS - (STEEPNESS * LN_2).ln() / STEEPNESS;
+    for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
+        let radius = place.distance(CENTRE);
+        assert!((deepest - 0.002..RADIUS).contains(&radius), "{radius} {deepest}");
+        assert!(normal.dot((place - CENTRE).normalize()) > 0.98, "{place} {normal}");
+        assert!((f64::from(color[2]) - 255.0 * (0.5 + 0.5 * normal.z)).abs() < 0.51, "{color:?} {normal}");
+    }
+    // From all sides: the middle of the points is near that of the ball.
+    let middle = mesh.positions.iter().sum::<DVec3>() / count as f64;
+    assert!(middle.distance(CENTRE) < 0.1, "{middle}");
+    let deep = mesh.positions.iter().filter(|place| place.distance(CENTRE) < deepest + 0.003).count();
+    assert!(deep > count / 10, "straight on they are as deep as they can be: {deep} of {count}");
+}
+
+#[test]
+fn what_no_camera_sees_is_solid_if_it_is_to_be() {
+    // A hole in the middle of the ball: a void of radius .2, which a shell of .3 hides.
+    // The cells of the void are occupied, as those of a sponge are.
+    let mut hollow = ball();
+    hollow.field = Arc::new(Hollow);
+    let config = SurfaceConfig { level: Some(2.0), parts: 0.0, ..CONFIG };
+    let open = surface(&hollow, &config).shape.mesh;
+    let full = surface(&hollow, &SurfaceConfig { filled: true, ..config }).shape.mesh;
+    assert_eq!((open.parts().1, full.parts().1), (2, 1));
+    // The outside is where it was.
+    let whole = surface(&ball(), &config).shape.mesh;
+    assert!((full.volume() / whole.volume() - 1.0).abs() < 1e-4, "{} {}", full.volume(), whole.volume());
+    assert!(open.volume() < 0.95 * whole.volume() && full.is_closed());
+    // Without cameras nothing is known to be hidden.
+    let blind = hollow.surface(&[], &SurfaceConfig { filled: true, ..config }, &mut |_, _| ()).unwrap();
+    assert_eq!(blind.shape.mesh, open);
+}
+
+/// The ball with a void in its middle.
+struct Hollow;
+
+impl Field<f32> for Hollow {
+    fn density<'t>(&self, params: &Bound<'t, f32>, positions: &Var<'t, f32>) -> Density<'t, f32> {
+        let [outer, inner] = [RADIUS, 0.2].map(|radius| Balls(vec![(CENTRE, radius)]).density(params, positions));
+        Density { value: outer.value.minimum(-inner.value), ..outer }
+    }
+
+    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
+        seen.directions.segment_expand(seen.segments)
+    }
+}
+
+#[test]
+fn colors_have_the_tone_of_views() {
+    let rate = Some(raygrad_nn::Schedule::Constant { rate: 0.1 });
+    let mut config = Config::preset(Preset::Voxel);
+    config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
+    config.tone = crate::model::ToneConfig { exposure: rate, vignetting: rate };
+    let mut model = Model::new(config, Extent { frames: 2, ..ball().extent }, 0).unwrap();
+    model.field = Arc::new(Balls(vec![(CENTRE, RADIUS)]));
+    let [exposure, vignetting] = ["exposure", "vignetting"].map(|name| model.params.find(name).unwrap());
+    let gains: [[f32; 3]; 2] = [[0.5, 1.0, 0.25], [1.0, 0.25, 1.0]];
+    let numbers = gains.as_flattened().iter().map(|gain| gain.ln());
+    model.params.get_mut(exposure).as_mut_slice().iter_mut().zip(numbers).for_each(|(out, x)| *out = x);
+    model.params.get_mut(vignetting).as_mut_slice().fill(-1.0);
+    let places = [CENTRE + 0.4 * DVec3::new(0.6, 0.0, 0.8)];
+    // Of no photograph in particular, the geometric mean; in the middle of the picture, without darker corners.
+    for (look, gains) in [(Some(0), gains[0]), (Some(1), gains[1]), (None, [0.5_f32.sqrt(), 0.5, 0.5])] {
+        model.look = look;
+        let (_, colors) = Probe::new(&model).look(None, 0.02, &places);
+        for (found, expected) in colors[0].iter().zip([0.8, 0.5, 0.9].into_iter().zip(gains)) {
+            assert!((f32::from(*found) - 255.0 * expected.0 * expected.1).abs() < 1.5, "{look:?}: {colors:?}");
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! Meshes and point clouds of a run.
+
+use std::f64::consts::FRAC_PI_2;
+use std::path::Path;
+use std::time::Instant;
+
+use raygrad::nerf::geometry::files::{self, Format};
+use raygrad::nerf::geometry::{Stage, SurfaceConfig};
+use raygrad::nerf::{Camera, Error, Result};
+
+use super::super::cameras::Viewpoint;
+use super::super::output::{check_writable, print};
+use super::super::parse;
+use super::super::progress::{Progress, spoken};
+use super::super::run::{Run, RunConfig};
+
+/// Cameras in each of the rings that look at the scene.
+const RING: usize = 12;
+
+/// What is made of a model's shape.
+#[derive(clap::Args)]
+pub struct Options {
+    /// Write a point cloud of at most N points in place of a mesh [default: 200000]
+    #[arg(
+        long,
+        value_name = "N",
+        num_args = 0..=1,
+        require_equals = true,
+        default_missing_value = "200000",
+        value_parser = parse::count(100_000_000)
+    )]
+    points: Option<usize>,
+    /// Make the mesh's triangles fewer, down to N
+    #[arg(long, value_name = "N", conflicts_with = "points")]
+    triangles: Option<usize>,
+    /// Cells along the longest side of the box in which the surface is looked for [default: 2 for each of the occupancy grid]
+    #[arg(long, value_name = "N", conflicts_with = "points")]
+    resolution: Option<usize>,
+    /// Density on the surface, in 1 / scene unit [default: that where views see it]
+    #[arg(long, value_name = "X", conflicts_with = "points")]
+    level: Option<f64>,
+    /// Leave out parts with less than this share, 0 to 1, of the largest one's area; 0 keeps all [default: 0.01]
+    #[arg(long, value_name = "SHARE", conflicts_with = "points")]
+    parts: Option<f64>,
+    /// Do not take what no view sees to be solid
+    #[arg(long, conflicts_with = "points")]
+    hollow: bool,
+    /// Let the surface end at the border of the box, where it is closed otherwise
+    #[arg(long, conflicts_with = "points")]
+    open: bool,
+}
+
+impl Options {
+    /// Whether nothing of this is asked for, which cameras have no use for.
+    pub fn check_absent(&self) -> Result<()> {
+        let given = [
+            ("points", self.points.is_some()),
+            ("triangles", self.triangles.is_some()),
+            ("resolution", self.resolution.is_some()),
+            ("level", self.level.is_some()),
+            ("parts", self.parts.is_some()),
+            ("hollow", self.hollow),
+            ("open", self.open),
+        ];
+        match given.iter().find(|(_, given)| *given) {
+            Some((name, _)) => Err(Error::setting(name, "is for shapes: name a file that ends in .ply, .obj or .glb")),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Whether a file of this name holds a shape.
+pub fn is_shape(out: &Path) -> bool {
+    Format::of(out).is_some()
+}
+
+/// Makes the shape and writes it.
+pub fn run(run: &Run, options: &Options, out: &Path) -> Result<()> {
+    if out.is_dir() {
+        return Err(Error::file(out, "is a folder, not a file"));
+    }
+    check_writable(out.parent().unwrap_or(Path::new(".")))?;
+    let model = run.model()?;
+    let cameras = cameras(&run.config);
+    let start = Instant::now();
+    let mut display = Display::new();
+    let mut show = |stage: Stage, done: f64| display.set(stage, done);
+    let (shape, said) = match options.points {
+        Some(count) => {
+            let cloud = model.point_cloud(&cameras, count, &mut show)?;
+            let points = cloud.shape.mesh.positions.len();
+            (cloud.shape, format!("{points} points, of {} places that {} views see", cloud.sights, cameras.len()))
+        }
+        None => {
+            let default = SurfaceConfig::default();
+            let config = SurfaceConfig {
+                resolution: options.resolution,
+                level: options.level,
+                parts: options.parts.unwrap_or(default.parts),
+                triangles: options.triangles,
+                filled: !options.hollow,
+                closed: !options.open,
+            };
+            let surface = model.surface(&cameras, &config, &mut show)?;
+            let mesh = &surface.shape.mesh;
+            let said = format!(
+                "{} vertices, {} triangles, {}; density {:.4} per scene unit, {} cells along the box, {} small parts left out",
+                mesh.positions.len(),
+                mesh.triangles.len(),
+                if mesh.is_closed() { "closed" } else { "not closed" },
+                surface.level,
+                surface.resolution,
+                surface.dropped
+            );
+            (surface.shape, said)
+        }
+    };
+    drop(display);
+    let bytes = files::write(&shape.placed_back(&model.extent.placement), out)?;
+    let part = if model.config.unbounded { ", of the box where the cameras look" } else { "" };
+    let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
+    print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
+}
+
+/// Cameras around the scene: at the mean height of those that photographed it, lower, and higher.
+fn cameras(config: &RunConfig) -> Vec<Camera> {
+    let mean = config.viewpoint.elevation;
+    let elevations = [0.1 * mean, 0.5 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
+    let ring = |elevation| Viewpoint { elevation, ..config.viewpoint }.orbit(&config.extent, RING);
+    elevations.into_iter().flat_map(ring).collect()
+}
+
+/// How far each stage is, and how long it may take.
+struct Display {
+    progress: Progress,
+    stage: Option<(Stage, Instant)>,
+}
+
+impl Display {
+    fn new() -> Self {
+        Display { progress: Progress::new(), stage: None }
+    }
+
+    fn set(&mut self, stage: Stage, done: f64) {
+        let since = match self.stage {
+            Some((now, since)) if now == stage => since,
+            _ => self.stage.insert((stage, Instant::now())).1,
+        };
+        let left = since.elapsed().as_secs_f64() * (1.0 - done) / done.max(f64::MIN_POSITIVE);
+        let doing = match stage {
+            Stage::Seeing => "looking at the scene",
+            Stage::Meshing => "finding the surface",
+            Stage::Simplifying => "making triangles fewer",
+            Stage::Coloring => "finding colours",
+        };
+        self.progress
+            .set(done, || if done > 0.0 { format!("{doing}, {} left", spoken(left)) } else { doing.to_owned() });
+    }
+}
