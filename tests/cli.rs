@@ -22,6 +22,10 @@ mod export;
 mod prepare;
 
 #[cfg(unix)]
+#[path = "cli/records.rs"]
+mod records;
+
+#[cfg(unix)]
 #[path = "cli/resume.rs"]
 mod resume;
 

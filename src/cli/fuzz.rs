@@ -14,7 +14,7 @@ use serde_json::Value;
 #[path = "../../tests/stability/damage.rs"]
 mod damage;
 
-fn run_config() -> RunConfig {
+pub fn run_config() -> RunConfig {
     RunConfig {
         budget: None,
         photographs: vec!["train/0".into()],

@@ -24,6 +24,7 @@ use super::preview::Preview;
 use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
+use super::summary::Ended;
 use super::watch::Watch;
 use super::{checkpoint, doctor, interrupt, parse};
 
@@ -108,6 +109,9 @@ pub struct Args {
     /// Training time between checkpoints, which --resume goes on from
     #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
     checkpoint: Duration,
+    /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
+    #[arg(long)]
+    tensorboard: bool,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -176,7 +180,7 @@ fn begin(args: &Args) -> Result<Trained> {
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
     let lock = run.lock()?;
-    train((run, lock), trainer, args.budget(), args.checkpoint, preview)
+    train((run, lock), trainer, args.budget(), args, preview)
 }
 
 /// Goes on with a run from its last checkpoint.
@@ -209,7 +213,7 @@ fn resume(args: &Args, folder: &Path) -> Result<Trained> {
     describe(&run, &trainer, &data, &scene)?;
     print(&format!("from     step {}\n", trainer.stats().step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
-    train((run, lock), trainer, budget, args.checkpoint, preview)
+    train((run, lock), trainer, budget, args, preview)
 }
 
 /// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
@@ -217,10 +221,10 @@ fn train(
     (run, _lock): (Run, File),
     mut trainer: Trainer,
     budget: Budget,
-    interval: Duration,
+    args: &Args,
     preview: Preview,
 ) -> Result<Trained> {
-    let mut watch = Watch::new(&run, &trainer, budget, interval, preview)?;
+    let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
     trainer.run(budget, |trainer| {
         let stops = interrupt::requested();
@@ -228,9 +232,14 @@ fn train(
         if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     let interrupted = interrupt::requested();
-    watch.finish(&trainer, !interrupted)?;
-    summarise(&run, &trainer.stats(), interrupted)?;
     let diverged = trainer.stats().ends_diverged();
+    let ended = match (interrupted, diverged) {
+        (true, _) => Ended::Interrupted,
+        (false, true) => Ended::Diverged,
+        (false, false) => Ended::Done,
+    };
+    watch.finish(&trainer, ended)?;
+    summarise(&run, &trainer.stats(), interrupted)?;
     if diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };

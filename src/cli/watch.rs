@@ -1,16 +1,19 @@
 //! What happens beside training: progress, metrics, previews, and saving the model.
 
-use std::fs::File;
-use std::io::{ErrorKind, Write};
+use std::collections::HashSet;
+use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
 use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer, write_atomic};
 
 use super::checkpoint;
+use super::events::Events;
+use super::journal::Journal;
 use super::preview::Preview;
 use super::progress::{Progress, spoken};
 use super::run::Run;
+use super::summary::{Account, Ended, Previewed};
 use serde_json::Value;
 
 /// Steps between lines of `metrics.jsonl`.
@@ -25,7 +28,10 @@ pub struct Watch<'a> {
     run: &'a Run,
     budget: Budget,
     preview: Preview,
-    metrics: File,
+    metrics: Journal,
+    /// What TensorBoard is told, if it is.
+    events: Option<Events>,
+    account: Account,
     /// The last step in the metrics.
     logged: u64,
     next_preview: f64,
@@ -34,41 +40,61 @@ pub struct Watch<'a> {
     next_save: f64,
     psnr: Option<f64>,
     progress: Progress,
-    /// The last words about a file that could not be written.
-    warned: String,
+    /// The words about files that could not be written.
+    warned: HashSet<String>,
 }
 
 impl<'a> Watch<'a> {
     /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What metrics say of steps
     /// that are to come is cut off.
-    pub fn new(run: &'a Run, trainer: &Trainer, budget: Budget, interval: Duration, preview: Preview) -> Result<Self> {
+    /// `tensorboard` asks for event files too; where a run has some, that is asked already.
+    pub fn new(
+        run: &'a Run,
+        trainer: &Trainer,
+        budget: Budget,
+        interval: Duration,
+        preview: Preview,
+        tensorboard: bool,
+    ) -> Result<Self> {
         if !run.model_file().exists() {
             trainer.model.save(run.model_file())?;
         }
         if !checkpoint::exists(run)? {
             checkpoint::save(run, trainer)?;
         }
-        let StepStats { step, train_seconds, .. } = trainer.stats();
+        let stats = trainer.stats();
+        let StepStats { step, train_seconds, .. } = stats;
         let path = run.file("metrics.jsonl");
         let (kept, logged) = kept_metrics(&path, step)?;
-        write_atomic(&path, kept.as_bytes())?;
-        let metrics = File::options().append(true).open(&path);
-        let metrics = metrics.map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?;
+        let metrics = Journal::begin(&path, kept.as_bytes())?;
+        let account = Account::open(run, &stats);
         let previews = std::iter::successors(Some(FIRST_PREVIEW), |time| Some(2.0 * time));
         let interval = interval.as_secs_f64();
-        Ok(Watch {
+        let mut watch = Watch {
             run,
             budget,
             preview,
             metrics,
+            events: None,
+            account,
             logged,
             next_preview: previews.into_iter().find(|time| *time > train_seconds).unwrap_or(f64::INFINITY),
             interval,
             next_save: train_seconds + interval,
             psnr: None,
             progress: Progress::new(),
-            warned: String::new(),
-        })
+            warned: HashSet::new(),
+        };
+        let summed = watch.summarise(&stats, None);
+        watch.warn(summed);
+        let folder = run.file("tensorboard");
+        if tensorboard || folder.is_dir() {
+            match Events::create(&folder, step + 1) {
+                Ok(events) => watch.events = Some(events),
+                Err(error) => watch.warn(Err(error)),
+            }
+        }
+        Ok(watch)
     }
 
     /// Called after each step; `stops` says that it is the last one, whatever the budget. What cannot be written is said, and
@@ -77,6 +103,7 @@ impl<'a> Watch<'a> {
         let stats = trainer.stats();
         let psnr = self.psnr.map_or(stats.psnr, |psnr| psnr + SMOOTHING * (stats.psnr - psnr));
         self.psnr = Some(psnr);
+        self.account.step(&stats);
         if is_logged(stats.step) {
             let logged = self.log(&stats);
             self.warn(logged);
@@ -98,22 +125,24 @@ impl<'a> Watch<'a> {
             self.next_save = stats.train_seconds + self.interval;
             let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
             let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
+            let saved = saved.and_then(|()| self.summarise(&stats, None));
             self.warn(saved);
         }
     }
 
-    /// Says what went wrong, if it was not said last.
+    /// Says what went wrong, if it was not said before.
     fn warn(&mut self, done: Result<()>) {
         let Err(error) = done else { return };
         let words = format!("raygrad: warning: {error}; training goes on");
-        if words != self.warned {
+        if !self.warned.contains(&words) {
             self.progress.note(&words);
-            self.warned = words;
+            self.warned.insert(words);
         }
     }
 
-    /// Called when training has ended; `preview` asks for a last one. A folder that was removed is made again.
-    pub fn finish(mut self, trainer: &Trainer, preview: bool) -> Result<()> {
+    /// Called when training has ended; unless somebody waits for that, there is a last preview. A folder that was removed is made
+    /// again.
+    pub fn finish(mut self, trainer: &Trainer, ended: Ended) -> Result<()> {
         if !self.run.file("config.json").exists() {
             Run::create(self.run.folder.clone(), self.run.config.clone())?;
         }
@@ -122,24 +151,46 @@ impl<'a> Watch<'a> {
         if stats.step != self.logged {
             self.log(&stats)?;
         }
-        if preview { self.preview(trainer) } else { Ok(()) }
+        let shown = if ended == Ended::Interrupted { Ok(()) } else { self.preview(trainer) };
+        shown.and(self.summarise(&stats, Some(ended)))
     }
 
     fn log(&mut self, stats: &StepStats) -> Result<()> {
         self.logged = stats.step;
-        let path = self.run.file("metrics.jsonl");
-        let mut line = serde_json::to_vec(stats).map_err(|e| Error::file(&path, e))?;
+        let failed = |e| Error::file(self.run.file("metrics.jsonl"), e);
+        let mut line = serde_json::to_vec(stats).map_err(failed)?;
+        let values = serde_json::to_value(stats).map_err(failed)?;
         line.push(b'\n');
-        self.metrics.write_all(&line).map_err(|e| Error::file(&path, format!("cannot be written: {e}")))
+        let logged = self.metrics.add(&line);
+        self.tell(|events| events.scalars(stats.step, &scalars(&values, stats)));
+        logged
     }
 
     fn preview(&mut self, trainer: &Trainer) -> Result<()> {
         let stats = trainer.stats();
         let path = self.run.file(&format!("previews/{:06}.png", stats.step));
-        let psnr = self.preview.save(&trainer.model, &path)?;
+        let (image, psnr) = self.preview.show(&trainer.model);
+        let png = image.to_png();
+        let (name, held_out) = (self.preview.name.clone(), self.preview.is_held_out());
+        self.account.preview(Previewed { name, held_out, step: stats.step, psnr: psnr.is_finite().then_some(psnr) });
+        self.tell(|events| {
+            events.scalars(stats.step, &[("preview/psnr".to_owned(), psnr)])?;
+            events.image(stats.step, "preview/picture", [image.width, image.height], &png)
+        });
+        write_atomic(&path, &png)?;
         let (time, name) = (spoken(stats.train_seconds), &self.preview.name);
         self.progress.note(&format!("after {time}: {}, PSNR {psnr:.2} dB on {name}", path.display()));
         Ok(())
+    }
+
+    /// Tells TensorBoard something, if it is told anything; what it cannot be told is said, and no more.
+    fn tell(&mut self, write: impl FnOnce(&mut Events) -> Result<()>) {
+        let told = self.events.as_mut().map_or(Ok(()), write);
+        self.warn(told);
+    }
+
+    fn summarise(&self, stats: &StepStats, ended: Option<Ended>) -> Result<()> {
+        self.account.write(self.run, stats, self.budget, ended)
     }
 
     /// Share of the run that is done, and the seconds of training that are left.
@@ -175,6 +226,15 @@ fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
         last = own;
     }
     Ok((kept, last))
+}
+
+/// What metrics say as numbers by their names, and how fast training is.
+fn scalars(values: &Value, stats: &StepStats) -> Vec<(String, f64)> {
+    let named = values.as_object().into_iter().flatten().filter(|(name, _)| *name != "step");
+    // What is not finite is null in a line of metrics.
+    let named = named.map(|(name, value)| (format!("train/{name}"), value.as_f64().unwrap_or(f64::NAN)));
+    let speed = ("train/rays_per_second".to_owned(), stats.rays as f64 / stats.train_seconds);
+    named.chain([speed]).collect()
 }
 
 /// Whether metrics have a line of a step that is not the last one.

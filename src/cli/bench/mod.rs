@@ -3,7 +3,6 @@
 mod draw;
 mod figure;
 mod kernels;
-mod machine;
 mod quadrature;
 mod render;
 mod report;

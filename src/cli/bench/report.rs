@@ -4,8 +4,8 @@ use std::path::Path;
 
 use raygrad::nerf::{Result, write_atomic};
 
-use super::machine;
 use super::table::Table;
+use crate::cli::machine;
 
 /// What one suite contributes.
 pub struct Section {

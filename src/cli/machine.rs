@@ -1,4 +1,4 @@
-//! What the figures were measured on.
+//! What figures were measured on.
 
 use raygrad::tensor::simd;
 
@@ -6,7 +6,7 @@ use raygrad::tensor::simd;
 pub fn describe() -> Vec<[String; 2]> {
     let row = |name: &str, value: String| [name.to_owned(), value];
     let mut rows = vec![
-        row("processor", proc_value("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned())),
+        row("processor", processor()),
         row("instruction set in use", simd::name().to_owned()),
         row("threads", rayon::current_num_threads().to_string()),
         row("system", format!("{} {}", std::env::consts::OS, std::env::consts::ARCH)),
@@ -17,6 +17,17 @@ pub fn describe() -> Vec<[String; 2]> {
     }
     rows.push(row("raygrad", env!("CARGO_PKG_VERSION").to_owned()));
     rows
+}
+
+/// The name of the processor, where the system says so.
+pub fn processor() -> String {
+    proc_value("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned())
+}
+
+/// The most memory that this program has had at once, in bytes, where the system says so.
+pub fn peak_memory() -> Option<u64> {
+    let kib: u64 = proc_value("/proc/self/status", "VmHWM")?.strip_suffix("kB")?.trim().parse().ok()?;
+    Some(1024 * kib)
 }
 
 /// The value after the first `name:` of a file of Linux.
@@ -41,4 +52,20 @@ pub fn caches() -> Vec<(String, u64)> {
         Some((format!("cache L{}", read(index, "level")?), 1024 * kib))
     };
     (0..8).filter_map(cache).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn memory_is_counted_in_bytes() {
+        let before = peak_memory().unwrap();
+        let block = std::hint::black_box(vec![1_u8; 1 << 28]);
+        let grown = peak_memory().unwrap() - before;
+        // The peak may have been higher than what there was before it.
+        assert!(before > 1 << 20 && before < 1 << 36 && grown <= block.len() as u64 + (1 << 26), "{before} {grown}");
+        assert!(peak_memory().unwrap() >= block.len() as u64);
+    }
 }
