@@ -16,6 +16,8 @@ mod captures;
 mod convert;
 #[path = "cli/export.rs"]
 mod export;
+#[path = "cli/outside.rs"]
+mod outside;
 // Scripts stand in for other programs.
 #[cfg(unix)]
 #[path = "cli/prepare.rs"]

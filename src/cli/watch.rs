@@ -45,9 +45,8 @@ pub struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What metrics say of steps
-    /// that are to come is cut off.
-    /// `tensorboard` asks for event files too; where a run has some, that is asked already.
+    /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What
+    /// metrics say of steps that are to come is cut off. `tensorboard` asks for event files too; a run that has some gets more.
     pub fn new(
         run: &'a Run,
         trainer: &Trainer,
