@@ -90,12 +90,15 @@ fn tensorboard_reads_what_metrics_say_and_no_more_after_a_run_went_on() {
     let speed = last["rays"].as_f64().unwrap() / last["train_seconds"].as_f64().unwrap();
     let found = &read["scalars"]["train/rays_per_second"][6];
     assert!(found[0] == 60 && (found[1].as_f64().unwrap() / speed - 1.0).abs() < 1e-6, "{found} {speed}");
-    // The preview at the end of the first part is of a step that was taken again.
-    assert_eq!(read["images"]["preview/picture"], json!([[60, 48, 24]]));
-    assert_eq!(read["shown"], json!([60]));
+    // The preview at the end of the first part is of a step that was taken again; a slow machine makes some in between.
+    let pictures = read["images"]["preview/picture"].as_array().unwrap();
+    assert_eq!(pictures.last(), Some(&json!([60, 48, 24])));
+    let steps: Vec<u64> = pictures.iter().map(|picture| picture[0].as_u64().unwrap()).collect();
+    assert!(steps.is_sorted() && !steps.contains(&40), "{steps:?}");
+    assert_eq!(read["shown"], json!(steps));
     let shown = &place.json("run/summary.json")["preview"];
     let psnr = f64::from(shown["psnr"].as_f64().unwrap() as f32);
-    assert_eq!(read["scalars"]["preview/psnr"], json!([[60, psnr]]));
+    assert_eq!(read["scalars"]["preview/psnr"].as_array().unwrap().last(), Some(&json!([60, psnr])));
 }
 
 #[test]

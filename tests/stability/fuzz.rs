@@ -294,7 +294,7 @@ fn campaign_masks_and_depths() {
 }
 
 fn picture_of(width: usize, height: usize) -> Vec<u8> {
-    Image { width, height, channels: 4, data: (0..4 * width * height).map(|i| (i % 2) as f32).collect() }.to_png()
+    Image { width, height, channels: 4, data: (0..4 * width * height).map(|i| (i / 4 % 2) as f32).collect() }.to_png()
 }
 
 #[test]
@@ -447,6 +447,10 @@ fn files_that_announce_what_no_memory_holds_are_refused_and_take_little() {
     webp[start..start + 3].fill(0xff);
     webp[start + 3] |= 0x0f;
     refused("WebP", &webp, "a.webp", little, &photo);
+    let mut lossy = LOSSY.to_vec();
+    let start = lossy.windows(4).position(|name| name == b"EXIF").unwrap() + 4;
+    lossy[start..start + 4].copy_from_slice(&0xffff_fff0_u32.to_le_bytes());
+    refused("WebP with EXIF", &lossy, "b.webp", little, &photo);
     let mut safetensors = u64::MAX.to_le_bytes().to_vec();
     let parameters = |path: &Path| said(params::<f32>().load_safetensors(&std::fs::read(path).unwrap())).map(drop);
     for length in [u64::MAX, 1 << 62, 99_999_999, 90] {

@@ -5,9 +5,9 @@ use super::background::over;
 use super::image::Image;
 use crate::error::{Error, Result};
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Seek};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 mod resample;
@@ -240,8 +240,15 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     path: &Path,
 ) -> Result<(impl ImageDecoder + use<'a, R>, [usize; 2])> {
     let bad = |what: String| Error::file(path, format!("cannot be decoded: {what}"));
-    let reader = ImageReader::new(reader).with_guessed_format();
-    let reader = reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
+    let unread = |e| Error::file(path, format!("cannot be read: {e}"));
+    let mut reader = ImageReader::new(reader).with_guessed_format().map_err(unread)?;
+    if reader.format() == Some(ImageFormat::WebP) {
+        let mut inner = reader.into_inner();
+        if !chunks_fit(&mut inner, length).map_err(unread)? {
+            return Err(bad("it ends before its last part does: was it copied completely?".into()));
+        }
+        reader = ImageReader::with_format(inner, ImageFormat::WebP);
+    }
     let decoder = reader.into_decoder().map_err(|e| bad(e.to_string()))?;
     let (width, height) = decoder.dimensions();
     let size = [width as usize, height as usize];
@@ -252,6 +259,25 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
         return Err(bad(format!("{width}x{height} pixels are more than {length} bytes can hold")));
     }
     Ok((decoder, size))
+}
+
+/// Whether the parts of a WebP file of that many bytes lie in it: what decodes it takes as much memory for one as its header says.
+/// The reader is at the beginning, before and after.
+fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<bool> {
+    // `RIFF`, the length of what follows, `WEBP`; then a name and a length before each part.
+    let mut size = [0; 4];
+    reader.seek(SeekFrom::Start(4))?;
+    reader.read_exact(&mut size)?;
+    let end = length.min(8 + u64::from(u32::from_le_bytes(size)));
+    let mut at = 12;
+    while at + 8 <= end {
+        reader.seek(SeekFrom::Start(at + 4))?;
+        reader.read_exact(&mut size)?;
+        at += 8 + u64::from(u32::from_le_bytes(size)).next_multiple_of(2);
+    }
+    reader.rewind()?;
+    // The last part of an odd length may lack what fills it up.
+    Ok(at <= length + 1)
 }
 
 #[cfg(test)]
