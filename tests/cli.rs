@@ -16,6 +16,8 @@ mod captures;
 mod convert;
 #[path = "cli/export.rs"]
 mod export;
+#[path = "cli/outside.rs"]
+mod outside;
 // Scripts stand in for other programs.
 #[cfg(unix)]
 #[path = "cli/prepare.rs"]
@@ -27,6 +29,10 @@ mod render;
 #[cfg(unix)]
 #[path = "cli/faults.rs"]
 mod faults;
+#[cfg(unix)]
+#[path = "cli/records.rs"]
+mod records;
+
 #[cfg(unix)]
 #[path = "cli/resume.rs"]
 mod resume;

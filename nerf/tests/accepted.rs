@@ -1,9 +1,10 @@
 //! Captures whose files are damaged: what is accepted can be used. A step is trained on it, and a view is rendered.
 
 use damage::{Damage, clear, damage, damaged};
+use memory::peak;
 use proptest::prelude::*;
 use raygrad_nerf::dataset::formats::{blender, colmap, llff, transforms};
-use raygrad_nerf::dataset::{Capture, Format, Image, Point, Reading, Split, View};
+use raygrad_nerf::dataset::{Capture, Format, Image, Point, Reading, Split, Survey, View};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
 use raygrad_nerf::glam::{DAffine3, DVec3};
 use raygrad_nerf::sampling::marching::MarchingConfig;
@@ -11,9 +12,14 @@ use raygrad_nerf::{Camera, Config, InstantConfig, Preset, Result, Trainer};
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use tally::{Bound, Tally, cases};
 
 #[path = "../../tests/stability/damage.rs"]
 mod damage;
+#[path = "../../tests/stability/memory.rs"]
+mod memory;
+#[path = "../../tests/stability/tally.rs"]
+mod tally;
 
 /// Photographs of a capture.
 const VIEWS: usize = 5;
@@ -57,28 +63,43 @@ fn capture(folder: &Path, prefix: &str) -> Capture {
     }
 }
 
-/// What the formats are called.
-const FORMATS: [&str; 5] = ["transforms", "blender", "colmap text", "colmap binary", "llff"];
-
-/// Writes a capture of one of the formats; gives the files that describe its cameras and points.
-fn written(which: usize, folder: &Path) -> Vec<PathBuf> {
-    let capture = capture(folder, if which < 2 { "images/" } else { "" });
-    let (done, files) = match which {
-        0 => (transforms::write(&capture, folder), vec!["transforms.json", "sparse_pc.ply"]),
-        1 => (blender::write(&capture, folder), vec!["transforms_train.json", "transforms_test.json"]),
-        2 => (
-            colmap::write(&capture, folder, colmap::Encoding::Text),
-            vec!["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"],
-        ),
-        3 => (
-            colmap::write(&capture, folder, colmap::Encoding::Binary),
-            vec!["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"],
-        ),
-        _ => (llff::write(&capture, folder), vec!["poses_bounds.npy"]),
-    };
-    done.unwrap();
-    files.into_iter().map(|file| folder.join(file)).collect()
+/// Files of a format, which are damaged one at a time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Kind {
+    Transforms,
+    Ply,
+    Blender,
+    ColmapText,
+    ColmapBinary,
+    Llff,
 }
+
+impl Kind {
+    /// Writes a capture; gives the files of this kind.
+    fn write(self, folder: &Path) -> Vec<PathBuf> {
+        let prefix = if matches!(self, Kind::Transforms | Kind::Ply | Kind::Blender) { "images/" } else { "" };
+        let capture = capture(folder, prefix);
+        let (done, files) = match self {
+            Kind::Transforms => (transforms::write(&capture, folder), vec!["transforms.json"]),
+            Kind::Ply => (transforms::write(&capture, folder), vec!["sparse_pc.ply"]),
+            Kind::Blender => (blender::write(&capture, folder), vec!["transforms_train.json", "transforms_test.json"]),
+            Kind::ColmapText => (
+                colmap::write(&capture, folder, colmap::Encoding::Text),
+                vec!["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"],
+            ),
+            Kind::ColmapBinary => (
+                colmap::write(&capture, folder, colmap::Encoding::Binary),
+                vec!["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"],
+            ),
+            Kind::Llff => (llff::write(&capture, folder), vec!["poses_bounds.npy"]),
+        };
+        done.unwrap();
+        files.into_iter().map(|file| folder.join(file)).collect()
+    }
+}
+
+/// An object of one member takes 7 bytes of a document and some 600 of memory; the rest of a capture is small.
+const BOUND: Bound = Bound { times: 256, plus: 1 << 18 };
 
 /// The smallest model.
 fn tiny() -> Config {
@@ -89,29 +110,38 @@ fn tiny() -> Config {
     config
 }
 
-/// What became of a damaged capture.
-enum Outcome {
-    /// It was trained on for a step of this loss, and this was rendered from the first of its cameras of that size.
-    Used(f64, Image, [usize; 2]),
-    /// It was read.
-    Accepted,
+/// What became of a damaged capture: it was trained on for a step, and the first of its cameras rendered.
+struct Outcome {
+    loss: f64,
+    view: Image,
+    /// That of the camera.
+    size: [usize; 2],
 }
 
-/// Reads a capture and, if it is to be `used`, trains one step on it and renders a view.
-fn tried(folder: &Path, used: bool) -> Result<Outcome> {
+impl Outcome {
+    fn is_right(&self) -> bool {
+        let whole = self.view.data.iter().all(|x| x.is_finite());
+        self.loss.is_finite() && [self.view.width, self.view.height] == self.size && whole
+    }
+}
+
+/// Where the cameras and points of a capture are, and where its scene lies.
+fn read(folder: &Path) -> Result<(Capture, Survey)> {
     let capture = Capture::read(folder)?;
     let survey = capture.survey(None)?;
-    if !used {
-        return Ok(Outcome::Accepted);
-    }
-    let data = capture.load(Split::Train, &survey, &Reading::default())?;
+    Ok((capture, survey))
+}
+
+/// Trains one step on what was read, and renders a view.
+fn used((capture, survey): &(Capture, Survey)) -> Result<Outcome> {
+    let data = capture.load(Split::Train, survey, &Reading::default())?;
     let mut config = tiny().with_scope(data.scope);
     let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
     (sampler.samples, sampler.occupancy.resolution) = (256, 16);
     let camera = data.frames[0].camera.clone();
     let mut trainer = Trainer::new(config, Arc::new(data))?;
     let loss = trainer.step(0.0).loss;
-    Ok(Outcome::Used(loss, trainer.model.view(&camera, [1.0; 3]).color, [camera.width, camera.height]))
+    Ok(Outcome { loss, view: trainer.model.view(&camera, [1.0; 3]).color, size: [camera.width, camera.height] })
 }
 
 /// Damage that leaves a file a file, as often as not: digits for digits, and other bytes.
@@ -120,60 +150,126 @@ fn light() -> impl Strategy<Value = Vec<Damage>> {
     prop::collection::vec(one.prop_map(|(at, byte)| Damage::Set(at, byte)), 1..3)
 }
 
-/// How many are tried: few, or what PROPTEST_CASES says.
-fn cases() -> ProptestConfig {
-    let cases = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(600);
-    ProptestConfig { cases, ..ProptestConfig::default() }
+/// Of more accepted captures than this one in a hundred is used, so that a million of each format can be tried in an hour.
+const ALL_USED: u64 = 5_000;
+
+/// Tries damaged files of a kind.
+fn campaign(kind: Kind) {
+    // Its memory is that of one thread.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    pool.install(|| damage_again_and_again(kind));
 }
 
-/// Of more accepted captures than this one in a hundred is used, so that a million of each format can be tried in an hour.
-const ALL_USED: u32 = 5_000;
-
-#[test]
-fn what_is_accepted_of_damaged_captures_is_trained_and_rendered() {
-    let folders: Vec<tempfile::TempDir> = FORMATS.iter().map(|_| tempfile::tempdir().unwrap()).collect();
-    let files: Vec<Vec<PathBuf>> = folders.iter().enumerate().map(|(i, folder)| written(i, folder.path())).collect();
-    let whole: Vec<Vec<Vec<u8>>> =
-        files.iter().map(|files| files.iter().map(|file| std::fs::read(file).unwrap()).collect()).collect();
-    let right = |outcome: &Outcome| match outcome {
-        Outcome::Used(loss, view, size) => {
-            loss.is_finite() && [view.width, view.height] == *size && view.data.iter().all(|x| x.is_finite())
-        }
-        Outcome::Accepted => true,
-    };
-    for (format, folder) in FORMATS.iter().zip(&folders) {
-        let outcome = tried(folder.path(), true).unwrap();
-        assert!(matches!(outcome, Outcome::Used(_, _, [8, 6])) && right(&outcome), "{format}");
-    }
-    // Of each format: tried, accepted, used.
-    let counts: [[Cell<u32>; 3]; FORMATS.len()] = Default::default();
-    let count = |which: usize, what: usize| counts[which][what].set(counts[which][what].get() + 1);
-    let strategy = (0..FORMATS.len(), any::<prop::sample::Index>(), prop_oneof![damage(), light()]);
-    proptest!(cases(), |((which, file, damage) in strategy)| {
-        let file = file.index(files[which].len());
-        std::fs::write(&files[which][file], damaged(&whole[which][file], &damage)).unwrap();
-        let accepted = counts[which][1].get();
-        let outcome = tried(folders[which].path(), accepted < ALL_USED || accepted.is_multiple_of(100));
-        std::fs::write(&files[which][file], &whole[which][file]).unwrap();
-        count(which, 0);
+fn damage_again_and_again(kind: Kind) {
+    let temporary = tempfile::tempdir().unwrap();
+    let folder = temporary.path();
+    let files = kind.write(folder);
+    let whole: Vec<Vec<u8>> = files.iter().map(|file| std::fs::read(file).unwrap()).collect();
+    let outcome = used(&read(folder).unwrap()).unwrap();
+    assert!(outcome.size == [8, 6] && outcome.is_right(), "{kind:?}");
+    let tally = Tally::new(&format!("{kind:?}"));
+    let trained = Cell::new(0_u64);
+    let which = any::<prop::sample::Index>;
+    let strategy = (which(), which(), prop_oneof![damage(), light()]);
+    proptest!(cases(), |((file, other, damage) in strategy)| {
+        let (file, other) = (file.index(files.len()), other.get(&whole));
+        let bytes = damaged(&whole[file], other, &damage);
+        std::fs::write(&files[file], &bytes).unwrap();
+        // The other files are read too.
+        let length = whole.iter().map(Vec::len).sum::<usize>() + bytes.len();
+        let captured = tally.parse(length, BOUND, || read(folder));
+        let [accepted, _] = tally.counts();
+        let outcome = match captured {
+            Ok(captured) if accepted < ALL_USED || accepted.is_multiple_of(100) => used(&captured).map(Some),
+            captured => captured.map(|_| None),
+        };
+        std::fs::write(&files[file], &whole[file]).unwrap();
         match outcome {
-            Ok(outcome) => {
-                count(which, 1);
-                if let Outcome::Used(..) = outcome {
-                    count(which, 2);
-                }
-                prop_assert!(right(&outcome), "{}", FORMATS[which]);
+            Ok(Some(outcome)) => {
+                trained.set(trained.get() + 1);
+                prop_assert!(outcome.is_right(), "{:?}", kind);
             }
+            Ok(None) => {}
             Err(error) => {
-                let folder = folders[which].path().to_str().unwrap();
+                let folder = folder.to_str().unwrap();
                 let named = error.to_string().contains(folder);
                 clear(error, if named { folder } else { "`" });
             }
         }
     });
-    let counts = counts.map(|counts| counts.map(|count| count.get()));
-    for (format, [tried, accepted, used]) in FORMATS.iter().zip(counts) {
-        println!("{format}: {tried} tried, {accepted} accepted, {used} of them used");
-        assert!(accepted > 5 && used > 5, "{format}: {accepted} of {tried} accepted");
+    let [accepted, refused] = tally.counts();
+    assert!(accepted > 5 && trained.get() > 5 && refused > 5, "{kind:?}: {accepted} accepted, {refused} refused");
+}
+
+#[test]
+fn campaign_transforms() {
+    campaign(Kind::Transforms);
+}
+
+#[test]
+fn campaign_points_in_ply_files() {
+    campaign(Kind::Ply);
+}
+
+#[test]
+fn campaign_blender() {
+    campaign(Kind::Blender);
+}
+
+#[test]
+fn campaign_colmap_text() {
+    campaign(Kind::ColmapText);
+}
+
+#[test]
+fn campaign_colmap_binary() {
+    campaign(Kind::ColmapBinary);
+}
+
+#[test]
+fn campaign_llff() {
+    campaign(Kind::Llff);
+}
+
+/// Counts and sizes that no memory holds.
+#[test]
+fn captures_that_announce_what_no_memory_holds_are_refused_and_take_little() {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let refused = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
+        let folder = tempfile::tempdir().unwrap();
+        let files = kind.write(folder.path());
+        let mut bytes = std::fs::read(&files[file]).unwrap();
+        change(&mut bytes);
+        std::fs::write(&files[file], &bytes).unwrap();
+        let (result, taken) = pool.install(|| peak(|| read(folder.path())));
+        clear(result.err().unwrap_or_else(|| panic!("{kind:?} {file} is accepted")), folder.path().to_str().unwrap());
+        assert!(taken <= 1 << 20, "{kind:?} {file}: {taken} bytes of memory");
+    };
+    let replace = |bytes: &mut Vec<u8>, from: &str, to: &str| {
+        let start = bytes.windows(from.len()).position(|part| part == from.as_bytes()).expect(from);
+        bytes.splice(start..start + from.len(), to.bytes());
+    };
+    for count in [1 << 62, u64::MAX, u64::MAX / 64 + 2, 1 << 40, 100_000] {
+        for file in 0..3 {
+            refused(Kind::ColmapBinary, file, &|bytes| bytes[..8].copy_from_slice(&count.to_le_bytes()));
+        }
+        // Observations of the first image; then a name of no end.
+        refused(Kind::ColmapBinary, 1, &|bytes| {
+            let end = 8 + 64 + bytes[72..].iter().position(|byte| *byte == 0).unwrap() + 1;
+            bytes[end..end + 8].copy_from_slice(&count.to_le_bytes());
+        });
+        refused(Kind::Ply, 0, &|bytes| replace(bytes, "element vertex 40", &format!("element vertex {count}")));
+        refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, 17)")));
+        refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, {count})")));
+        // Of some width, there may be such a photograph.
+        if count > 1 << 24 {
+            refused(Kind::Transforms, 0, &|bytes| replace(bytes, "\"w\": 8", &format!("\"w\": {count}")));
+        }
+    }
+    refused(Kind::Llff, 0, &|bytes| bytes[6..12].copy_from_slice(&[2, 0, 0xff, 0xff, 0xff, 0xff]));
+    refused(Kind::ColmapBinary, 1, &|bytes| bytes.iter_mut().skip(72).for_each(|byte| *byte |= 1));
+    for open in ["[", "{\"a\":"] {
+        refused(Kind::Transforms, 0, &|bytes| *bytes = open.repeat(20_000).into());
+        refused(Kind::Blender, 1, &|bytes| *bytes = open.repeat(20_000).into());
     }
 }

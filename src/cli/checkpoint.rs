@@ -26,15 +26,19 @@ fn folder(run: &Run) -> PathBuf {
 pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
     let folder = folder(run);
     make_folder(&folder)?;
-    let state = trainer.state()?;
-    let mut bytes = format!("{MAGIC} {VERSION} {:08x} {}\n", crc32fast::hash(&state), state.len()).into_bytes();
-    bytes.extend(state);
     let step = trainer.stats().step;
-    write_atomic(folder.join(format!("{step:08}.checkpoint")), &bytes)?;
+    write_atomic(folder.join(format!("{step:08}.checkpoint")), &framed(&trainer.state()?))?;
     // What is said to be later was damaged, and passed over.
     let (later, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
     remove(&later.into_iter().chain(others.into_iter().skip(2)).map(|(_, path)| path).collect::<Vec<_>>());
     Ok(())
+}
+
+/// The bytes of a file that holds a state.
+pub(super) fn framed(state: &[u8]) -> Vec<u8> {
+    let mut bytes = format!("{MAGIC} {VERSION} {:08x} {}\n", crc32fast::hash(state), state.len()).into_bytes();
+    bytes.extend(state);
+    bytes
 }
 
 /// Whether a run has a checkpoint, whole or not.
@@ -80,7 +84,7 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
 }
 
 /// The state in a file.
-fn read(path: &Path) -> Result<Vec<u8>> {
+pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
     let bad = |what: String| Error::file(path, what);
     let mut bytes = fs::read(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
     let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n');

@@ -1,20 +1,30 @@
 //! What the command line reads, on damaged input: an error, and never a panic.
 
 use super::cameras::Viewpoint;
+use super::checkpoint;
 use super::parse;
 use super::run::{Run, RunConfig};
 use super::scene::Scene;
 use super::train::changed;
-use damage::{clear, damage, damaged};
+use campaign::campaign;
+use damage::clear;
+use memory::peak;
 use proptest::prelude::*;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Config, Extent, Preset};
+use raygrad::nerf::{Config, Error, Extent, Preset};
 use serde_json::Value;
+use tally::{Bound, cases};
 
+#[path = "../../tests/stability/campaign.rs"]
+mod campaign;
 #[path = "../../tests/stability/damage.rs"]
 mod damage;
+#[path = "../../tests/stability/memory.rs"]
+mod memory;
+#[path = "../../tests/stability/tally.rs"]
+mod tally;
 
-fn run_config() -> RunConfig {
+pub fn run_config() -> RunConfig {
     RunConfig {
         budget: None,
         photographs: vec!["train/0".into()],
@@ -55,24 +65,7 @@ fn typed() -> impl Strategy<Value = String> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
-
-    #[test]
-    fn run_configurations(damage in damage()) {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("config.json");
-        let whole = serde_json::to_vec(&run_config()).unwrap();
-        std::fs::write(&file, &whole).unwrap();
-        prop_assert_eq!(Run::open(folder.path()).unwrap().config, run_config());
-        std::fs::write(&file, damaged(&whole, &damage)).unwrap();
-        match Run::open(folder.path()) {
-            // The path of the camera, for whatever has passed the checks.
-            Ok(run) => for camera in run.config.viewpoint.orbit(&run.config.extent, 3) {
-                prop_assert!(camera.width > 0 && camera.width <= 1 << 16 && camera.focal[0] > 0.0, "{:?}", camera);
-            },
-            Err(error) => clear(error, "config.json"),
-        }
-    }
+    #![proptest_config(cases())]
 
     #[test]
     fn settings(text in "\\PC{0,20}", which in any::<prop::sample::Index>(), typed in typed()) {
@@ -101,5 +94,50 @@ proptest! {
                 prop_assert!(width > 0 && height > 0 && width.max(height) <= 16_384);
             }
         }
+    }
+}
+
+#[test]
+fn campaign_configurations_of_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("config.json");
+    let config = |preset, scene| {
+        let config = RunConfig { config: Config::preset(preset), scene, ..run_config() };
+        serde_json::to_vec(&config).unwrap()
+    };
+    let whole =
+        [config(Preset::Instant, Scene::Embedded), config(Preset::Classic, Scene::Folder("/photographs".into()))];
+    std::fs::write(&file, &whole[0]).unwrap();
+    assert_eq!(Run::open(folder.path()).unwrap().config, run_config());
+    let parse = |bytes: &[u8]| {
+        std::fs::write(&file, bytes).unwrap();
+        let run = Run::open(folder.path())?;
+        // The path of the camera, for whatever has passed the checks.
+        for camera in run.config.viewpoint.orbit(&run.config.extent, 3) {
+            assert!(camera.width > 0 && camera.width <= 1 << 16 && camera.focal[0] > 0.0, "{camera:?}");
+        }
+        Ok::<(), Error>(())
+    };
+    // A name of a photograph takes two bytes and a comma of a document, and 24 of memory.
+    let bound = Bound { times: 256, plus: 1 << 18 };
+    campaign("run's config.json", &whole, bound, parse, |error| clear(error, "config.json"));
+}
+
+#[test]
+fn campaign_checkpoints() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("00000007.checkpoint");
+    let whole = [checkpoint::framed(b"a state of some length"), checkpoint::framed(&[])];
+    let parse = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        checkpoint::read(&path).map(drop)
+    };
+    let bound = Bound { times: 4, plus: 1 << 14 };
+    campaign("checkpoint", &whole, bound, parse, |error| clear(error, "00000007.checkpoint"));
+    for length in [u64::MAX, 1 << 63, (1 << 63) - 1, 1 << 60, 1 << 32, 23] {
+        let announced = format!("raygrad checkpoint 1 00000000 {length}\na state of some length");
+        let (result, taken) = peak(|| parse(announced.as_bytes()));
+        clear(result.unwrap_err(), "00000007.checkpoint");
+        assert!(taken < 1 << 14, "{length}: {taken} bytes of memory");
     }
 }

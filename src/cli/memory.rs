@@ -3,6 +3,8 @@
 use raygrad::nerf::dataset::{Dataset, Frame};
 use raygrad::nerf::{Load, Trainer};
 
+use super::machine;
+
 /// Bytes that the program takes whatever it does: code, threads, what the first step sets up.
 const PROGRAM: f64 = 1e8;
 /// Bytes for each parameter: itself, what the optimiser remembers of it, its gradient, and all of that once more while a checkpoint is
@@ -42,17 +44,6 @@ pub fn available() -> Option<f64> {
             |name: &str| std::fs::read_to_string(format!("/sys/fs/cgroup/{name}")).ok()?.trim().parse::<f64>().ok();
         Some(read("memory.max")? - read("memory.current")?)
     };
-    [kilobytes("/proc/meminfo", "MemAvailable:"), group()].into_iter().flatten().reduce(f64::min)
-}
-
-/// Bytes that this program takes now, where the system says it.
-pub fn taken() -> Option<f64> {
-    kilobytes("/proc/self/status", "VmRSS:")
-}
-
-/// The bytes after a name in a file of Linux, which has them in kilobytes.
-fn kilobytes(file: &str, name: &str) -> Option<f64> {
-    let text = std::fs::read_to_string(file).ok()?;
-    let line = text.lines().find_map(|line| line.strip_prefix(name))?;
-    Some(1024.0 * line.trim().strip_suffix("kB")?.trim().parse::<f64>().ok()?)
+    let machine = machine::available_memory().map(|bytes| bytes as f64);
+    [machine, group()].into_iter().flatten().reduce(f64::min)
 }

@@ -1,7 +1,4 @@
 //! Reads the command line, runs what it asks for, and turns errors into one line and an exit code.
-//!
-//! Exit codes: 0 done, 1 an error, 2 a command line that cannot be understood, 130 interrupted; of `doctor` also 3 and 4: it has
-//! found something of the severity of a warning, or of an error.
 
 mod bench;
 mod builtin;
@@ -10,11 +7,14 @@ mod checkpoint;
 mod compare;
 mod doctor;
 mod eval;
+mod events;
 mod export;
 #[cfg(test)]
 mod fuzz;
 mod html;
 mod interrupt;
+mod journal;
+mod machine;
 mod memory;
 mod output;
 mod parse;
@@ -25,6 +25,7 @@ mod progress;
 mod render;
 mod run;
 mod scene;
+mod summary;
 mod train;
 mod watch;
 
@@ -37,11 +38,21 @@ use raygrad::tensor::simd;
 
 use output::{complain, print};
 
+/// How the program ends, for scripts.
+const EXIT_CODES: &str = "\
+Exit codes:
+  0    done
+  1    an error, or training that has diverged
+  2    a command line that cannot be understood
+  3    doctor has found something to be warned of
+  4    doctor has found an error in the capture
+  130  interrupted (Ctrl-C, SIGTERM); what `train` has done is saved";
+
 /// Neural radiance fields on a CPU: photographs and camera poses in, new views out.
 ///
 /// Without a command, trains on a scene that is built in, for a minute or two, and renders a picture.
 #[derive(Parser)]
-#[command(name = "raygrad", version)]
+#[command(name = "raygrad", version, after_help = EXIT_CODES)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,

@@ -1,10 +1,8 @@
 //! Pictures of one view while a model learns.
 
-use std::path::Path;
-
 use raygrad::nerf::dataset::{Dataset, Frame, Split};
 use raygrad::nerf::pictures::metrics::psnr;
-use raygrad::nerf::{Camera, Image, Model, Result};
+use raygrad::nerf::{Camera, Image, Model};
 
 use super::output::complain;
 use super::scene::Opened;
@@ -53,16 +51,20 @@ impl Preview {
         Preview { name: frame.name.clone(), number, camera, truth, background }
     }
 
-    /// Writes what the model sees next to the photograph, and returns its PSNR in dB.
-    pub fn save(&self, model: &Model<f32>, path: &Path) -> Result<f64> {
+    /// Whether the photograph is not trained on.
+    pub fn is_held_out(&self) -> bool {
+        self.number.is_none()
+    }
+
+    /// What the model sees next to the photograph, and its PSNR in dB.
+    pub fn show(&self, model: &Model<f32>) -> (Image, f64) {
         // Where the model has found the camera to be, if it looks for it.
         let camera = match self.number {
             Some(number) => model.learned_camera(number, &self.camera),
             None => model.other_camera(&self.camera),
         };
         let color = model.view(&camera, self.background).color;
-        Image::hconcat(&[&color, &self.truth]).save_png(path)?;
-        Ok(psnr(&color, &self.truth))
+        (Image::hconcat(&[&color, &self.truth]), psnr(&color, &self.truth))
     }
 }
 

@@ -1,4 +1,5 @@
-//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `lock`, and later results of `raygrad eval` and pictures.
+//! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`, `lock`, if it
+//! was asked for `tensorboard/`, and later results of `raygrad eval` and pictures.
 
 use std::fs::{DirEntry, File, TryLockError};
 use std::io::ErrorKind;
@@ -103,7 +104,7 @@ impl Run {
 
     /// Removes what a program that was killed was about to write.
     pub fn sweep(&self) {
-        let folders = [self.folder.clone(), self.file("checkpoints"), self.file("previews")];
+        let folders = ["", "checkpoints", "previews", "tensorboard"].map(|name| self.file(name));
         let entries = folders.into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten().flatten();
         remove(&entries.filter(is_unfinished).map(|entry| entry.path()).collect::<Vec<_>>());
     }

@@ -24,8 +24,9 @@ use super::preview::Preview;
 use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
+use super::summary::Ended;
 use super::watch::Watch;
-use super::{checkpoint, doctor, interrupt, memory, parse, watch};
+use super::{checkpoint, doctor, interrupt, machine, memory, parse, watch};
 
 /// Bytes of photographs that many a computer has not, where it does not say how many it has.
 const HEAVY: f64 = 4e9;
@@ -113,6 +114,9 @@ pub struct Args {
     /// Training time between checkpoints, which --resume goes on from
     #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
     checkpoint: Duration,
+    /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
+    #[arg(long)]
+    tensorboard: bool,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -181,7 +185,7 @@ fn begin(args: &Args) -> Result<Trained> {
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
     let lock = run.lock()?;
-    train((run, lock), trainer, args.budget(), args.checkpoint, preview)
+    train((run, lock), trainer, args.budget(), args, preview)
 }
 
 /// Goes on with a run from its last checkpoint.
@@ -214,7 +218,7 @@ fn resume(args: &Args, folder: &Path) -> Result<Trained> {
     describe(&run, &trainer, &data, &scene)?;
     print(&format!("from     step {}\n", trainer.stats().step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
-    train((run, lock), trainer, budget, args.checkpoint, preview)
+    train((run, lock), trainer, budget, args, preview)
 }
 
 /// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
@@ -222,10 +226,10 @@ fn train(
     (run, _lock): (Run, File),
     mut trainer: Trainer,
     budget: Budget,
-    interval: Duration,
+    args: &Args,
     preview: Preview,
 ) -> Result<Trained> {
-    let mut watch = Watch::new(&run, &trainer, budget, interval, preview)?;
+    let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
     for retreats in 0.. {
         trainer.run(budget, |trainer| {
@@ -245,7 +249,12 @@ fn train(
     if diverged && checkpoint::load(&run, &mut trainer).is_ok() {
         trainer.model.finish();
     }
-    watch.finish(&trainer, !interrupted)?;
+    let ended = match (interrupted, diverged) {
+        (true, _) => Ended::Interrupted,
+        (false, true) => Ended::Diverged,
+        (false, false) => Ended::Done,
+    };
+    watch.finish(&trainer, ended)?;
     summarise(&run, &trainer.stats(), interrupted)?;
     if diverged {
         let schedule = trainer.model.config.schedule;
@@ -348,7 +357,7 @@ fn warn_of_memory(scene: &Opened, downscale: usize) {
 /// What training will take, and a warning if so much is not free. What is there already is not taken again.
 fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
     let need = memory::need(trainer, data);
-    let free = memory::available().map(|free| free + memory::taken().unwrap_or(0.0));
+    let free = memory::available().map(|free| free + machine::taken_memory().unwrap_or(0) as f64);
     if let Some(free) = free.filter(|free| need > *free) {
         complain(&format!(
             "warning: training takes about {:.1} GB of memory, of {:.1} GB that are free: the system may end it; say --downscale, or \

@@ -1,17 +1,20 @@
 //! What happens beside training: progress, metrics, previews, and saving the model.
 
-use std::fs::File;
-use std::io::{ErrorKind, Write};
+use std::collections::HashSet;
+use std::io::ErrorKind;
 use std::path::Path;
 use std::time::Duration;
 
 use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer, write_atomic};
 
 use super::checkpoint;
+use super::events::Events;
+use super::journal::Journal;
 use super::output::make_folder;
 use super::preview::Preview;
 use super::progress::{Progress, spoken};
 use super::run::Run;
+use super::summary::{Account, Ended, Previewed};
 use serde_json::Value;
 
 /// Steps between lines of `metrics.jsonl`.
@@ -29,7 +32,10 @@ pub struct Watch<'a> {
     run: &'a Run,
     budget: Budget,
     preview: Preview,
-    metrics: File,
+    metrics: Journal,
+    /// What TensorBoard is told, if it is.
+    events: Option<Events>,
+    account: Account,
     /// The last step in the metrics.
     logged: u64,
     next_preview: f64,
@@ -38,36 +44,65 @@ pub struct Watch<'a> {
     next_save: f64,
     psnr: Option<f64>,
     progress: Progress,
-    /// The last words about a file that could not be written.
-    warned: String,
+    /// The words about files that could not be written.
+    warned: HashSet<String>,
 }
 
 impl<'a> Watch<'a> {
-    /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What metrics say of steps
-    /// that are to come is cut off.
-    pub fn new(run: &'a Run, trainer: &Trainer, budget: Budget, interval: Duration, preview: Preview) -> Result<Self> {
+    /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What
+    /// metrics say of steps that are to come is cut off. `tensorboard` asks for event files too; a run that has some gets more.
+    pub fn new(
+        run: &'a Run,
+        trainer: &Trainer,
+        budget: Budget,
+        interval: Duration,
+        preview: Preview,
+        tensorboard: bool,
+    ) -> Result<Self> {
         if !run.model_file().exists() {
             trainer.model.save(run.model_file())?;
         }
         if !checkpoint::exists(run)? {
             checkpoint::save(run, trainer)?;
         }
-        let StepStats { step, train_seconds, .. } = trainer.stats();
+        let stats = trainer.stats();
+        let StepStats { step, train_seconds, .. } = stats;
         let (metrics, logged) = metrics(run, step)?;
+        let account = Account::open(run, &stats);
         let interval = interval.as_secs_f64();
-        Ok(Watch {
+        let mut watch = Watch {
             run,
             budget,
             preview,
             metrics,
+            events: None,
+            account,
             logged,
             next_preview: next_preview(train_seconds),
             interval,
             next_save: train_seconds + interval,
             psnr: None,
             progress: Progress::new(),
-            warned: String::new(),
-        })
+            warned: HashSet::new(),
+        };
+        let summed = watch.summarise(&stats, None);
+        watch.warn(summed);
+        if tensorboard || run.file("tensorboard").is_dir() {
+            watch.begin_events(step);
+        }
+        Ok(watch)
+    }
+
+    /// Begins an event file for the steps after this one.
+    fn begin_events(&mut self, step: u64) {
+        let events = Events::create(&self.run.file("tensorboard"), step + 1);
+        self.events = match events {
+            Ok(events) => Some(events),
+            Err(error) => {
+                self.warn(Err(error));
+                None
+            }
+        };
     }
 
     /// Called after each step; `stops` says that it is the last one, whatever the budget. What cannot be written is said, and
@@ -77,6 +112,7 @@ impl<'a> Watch<'a> {
         let before = self.psnr.filter(|psnr| psnr.is_finite());
         let psnr = before.map_or(stats.psnr, |psnr| psnr + SMOOTHING * (stats.psnr - psnr));
         self.psnr = Some(psnr);
+        self.account.step(&stats);
         if is_logged(stats.step) {
             let logged = self.log(&stats);
             self.warn(logged);
@@ -98,6 +134,7 @@ impl<'a> Watch<'a> {
             self.next_save = stats.train_seconds + self.interval;
             let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
             let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
+            let saved = saved.and_then(|()| self.summarise(&stats, None));
             self.warn(saved);
         }
     }
@@ -117,6 +154,10 @@ impl<'a> Watch<'a> {
             Ok((metrics, logged)) => {
                 (self.metrics, self.logged, self.psnr) = (metrics, logged, None);
                 (self.next_preview, self.next_save) = (next_preview(train_seconds), train_seconds + self.interval);
+                self.account.retreat(step);
+                if self.events.is_some() {
+                    self.begin_events(step);
+                }
                 self.progress.note(&format!("raygrad: {what}; going on from step {step} at {SLOWER} times the rate"));
                 true
             }
@@ -127,18 +168,19 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Says what went wrong, if it was not said last.
+    /// Says what went wrong, if it was not said before.
     fn warn(&mut self, done: Result<()>) {
         let Err(error) = done else { return };
         let words = format!("raygrad: warning: {error}; training goes on");
-        if words != self.warned {
+        if !self.warned.contains(&words) {
             self.progress.note(&words);
-            self.warned = words;
+            self.warned.insert(words);
         }
     }
 
-    /// Called when training has ended; `preview` asks for a last one. A folder that was removed is made again.
-    pub fn finish(mut self, trainer: &Trainer, preview: bool) -> Result<()> {
+    /// Called when training has ended; unless somebody waits for that, there is a last preview. A folder that was removed is made
+    /// again.
+    pub fn finish(mut self, trainer: &Trainer, ended: Ended) -> Result<()> {
         if !self.run.file("config.json").exists() {
             Run::create(self.run.folder.clone(), self.run.config.clone())?;
         }
@@ -147,26 +189,48 @@ impl<'a> Watch<'a> {
         if stats.step > self.logged {
             self.log(&stats)?;
         }
-        if preview { self.preview(trainer) } else { Ok(()) }
+        let shown = if ended == Ended::Interrupted { Ok(()) } else { self.preview(trainer) };
+        shown.and(self.summarise(&stats, Some(ended)))
     }
 
     fn log(&mut self, stats: &StepStats) -> Result<()> {
         self.logged = stats.step;
-        let path = self.run.file("metrics.jsonl");
-        let mut line = serde_json::to_vec(stats).map_err(|e| Error::file(&path, e))?;
+        let failed = |e| Error::file(self.run.file("metrics.jsonl"), e);
+        let mut line = serde_json::to_vec(stats).map_err(failed)?;
+        let values = serde_json::to_value(stats).map_err(failed)?;
         line.push(b'\n');
-        self.metrics.write_all(&line).map_err(|e| Error::file(&path, format!("cannot be written: {e}")))
+        let logged = self.metrics.add(&line);
+        self.tell(|events| events.scalars(stats.step, &scalars(&values, stats)));
+        logged
     }
 
     fn preview(&mut self, trainer: &Trainer) -> Result<()> {
         let stats = trainer.stats();
         let folder = self.run.file("previews");
-        make_folder(&folder)?;
         let path = folder.join(format!("{:06}.png", stats.step));
-        let psnr = self.preview.save(&trainer.model, &path)?;
+        let (image, psnr) = self.preview.show(&trainer.model);
+        let png = image.to_png();
+        let (name, held_out) = (self.preview.name.clone(), self.preview.is_held_out());
+        self.account.preview(Previewed { name, held_out, step: stats.step, psnr: psnr.is_finite().then_some(psnr) });
+        self.tell(|events| {
+            events.scalars(stats.step, &[("preview/psnr".to_owned(), psnr)])?;
+            events.image(stats.step, "preview/picture", [image.width, image.height], &png)
+        });
+        make_folder(&folder)?;
+        write_atomic(&path, &png)?;
         let (time, name) = (spoken(stats.train_seconds), &self.preview.name);
         self.progress.note(&format!("after {time}: {}, PSNR {psnr:.2} dB on {name}", path.display()));
         Ok(())
+    }
+
+    /// Tells TensorBoard something, if it is told anything; what it cannot be told is said, and no more.
+    fn tell(&mut self, write: impl FnOnce(&mut Events) -> Result<()>) {
+        let told = self.events.as_mut().map_or(Ok(()), write);
+        self.warn(told);
+    }
+
+    fn summarise(&self, stats: &StepStats, ended: Option<Ended>) -> Result<()> {
+        self.account.write(self.run, stats, self.budget, ended)
     }
 
     /// Share of the run that is done, and the seconds of training that are left.
@@ -195,13 +259,11 @@ fn next_preview(train_seconds: f64) -> f64 {
     previews.find(|time| *time > train_seconds).unwrap_or(f64::INFINITY)
 }
 
-/// The metrics of a run, cut to a step and open for more, and the last step in them.
-fn metrics(run: &Run, step: u64) -> Result<(File, u64)> {
+/// The metrics of a run, cut to a step, and the last step in them.
+fn metrics(run: &Run, step: u64) -> Result<(Journal, u64)> {
     let path = run.file("metrics.jsonl");
     let (kept, logged) = kept_metrics(&path, step)?;
-    write_atomic(&path, kept.as_bytes())?;
-    let file = File::options().append(true).open(&path);
-    Ok((file.map_err(|e| Error::file(&path, format!("cannot be written: {e}")))?, logged))
+    Ok((Journal::begin(&path, kept.as_bytes())?, logged))
 }
 
 /// The lines of metrics in a file of steps up to this one, and the last of these steps; none if there is no file. What was
@@ -222,6 +284,15 @@ fn kept_metrics(path: &Path, step: u64) -> Result<(String, u64)> {
         last = own;
     }
     Ok((kept, last))
+}
+
+/// What metrics say as numbers by their names, and how fast training is.
+fn scalars(values: &Value, stats: &StepStats) -> Vec<(String, f64)> {
+    let named = values.as_object().into_iter().flatten().filter(|(name, _)| *name != "step");
+    // What is not finite is null in a line of metrics.
+    let named = named.map(|(name, value)| (format!("train/{name}"), value.as_f64().unwrap_or(f64::NAN)));
+    let speed = ("train/rays_per_second".to_owned(), stats.rays as f64 / stats.train_seconds);
+    named.chain([speed]).collect()
 }
 
 /// Whether metrics have a line of a step that is not the last one.

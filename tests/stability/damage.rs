@@ -17,9 +17,31 @@ pub enum Damage {
     Remove(f64, usize),
     /// Bytes twice.
     Repeat(f64, usize),
+    /// A part twice, from a place to another.
+    Double(f64, f64),
     /// In place of the next number or word of a text.
     Token(f64, &'static str),
+    /// In place of 1, 2, 4 or 8 bytes, the least first or last.
+    Integer(f64, u64, usize, bool),
+    /// From a place on, what another whole file has from a place on.
+    Splice(f64, f64),
 }
+
+/// What counts and lengths break at.
+const INTEGERS: [u64; 12] = [
+    0,
+    1,
+    0x7f,
+    0x80,
+    0xffff,
+    0x7fff_ffff,
+    0x8000_0000,
+    0xffff_ffff,
+    1 << 60,
+    0x7fff_ffff_ffff_ffff,
+    0x8000_0000_0000_0000,
+    u64::MAX,
+];
 
 const TOKENS: [&str; 24] = [
     "0",
@@ -58,16 +80,22 @@ pub fn damage() -> impl Strategy<Value = Vec<Damage>> {
         1 => (place(), prop::collection::vec(any::<u8>(), 1..9)).prop_map(|(at, bytes)| Damage::Insert(at, bytes)),
         1 => (place(), 1..40_usize).prop_map(|(at, count)| Damage::Remove(at, count)),
         1 => (place(), 1..40_usize).prop_map(|(at, count)| Damage::Repeat(at, count)),
+        1 => (place(), place()).prop_map(|(from, to)| Damage::Double(from, to)),
         5 => (place(), 0..TOKENS.len()).prop_map(|(at, i)| Damage::Token(at, TOKENS[i])),
+        2 => (place(), 0..INTEGERS.len(), 0..4_u32, any::<bool>())
+            .prop_map(|(at, i, log2, least)| Damage::Integer(at, INTEGERS[i], 1 << log2, least)),
+        1 => (place(), place()).prop_map(|(at, from)| Damage::Splice(at, from)),
     ];
     prop::collection::vec(one, 1..5)
 }
 
-/// The file after all of that.
-pub fn damaged(bytes: &[u8], damage: &[Damage]) -> Vec<u8> {
+/// The file after all of that, beside another that is whole.
+pub fn damaged(bytes: &[u8], other: &[u8], damage: &[Damage]) -> Vec<u8> {
     let mut out = bytes.to_vec();
     for damage in damage {
-        let at = |share: f64| ((share * out.len() as f64) as usize).min(out.len().saturating_sub(1));
+        let within =
+            |share: f64, bytes: &[u8]| ((share * bytes.len() as f64) as usize).min(bytes.len().saturating_sub(1));
+        let at = |share: f64| within(share, &out);
         match damage {
             _ if out.is_empty() => {}
             Damage::Truncate(share) => out.truncate(at(*share)),
@@ -91,6 +119,23 @@ pub fn damaged(bytes: &[u8], damage: &[Damage]) -> Vec<u8> {
                 let i = at(*share);
                 let part = out[i..(i + count).min(out.len())].to_vec();
                 drop(out.splice(i..i, part));
+            }
+            Damage::Double(from, to) => {
+                let (from, to) = (at(from.min(*to)), at(from.max(*to)));
+                let part = out[from..to].to_vec();
+                drop(out.splice(to..to, part));
+            }
+            Damage::Integer(share, integer, size, least) => {
+                let i = at(*share);
+                let mut bytes = integer.to_le_bytes()[..*size].to_vec();
+                if !least {
+                    bytes.reverse();
+                }
+                drop(out.splice(i..(i + size).min(out.len()), bytes));
+            }
+            Damage::Splice(share, from) => {
+                out.truncate(at(*share));
+                out.extend(&other[within(*from, other)..]);
             }
             Damage::Token(share, token) => {
                 let is_token = |b: &u8| b.is_ascii_alphanumeric() || b"-+._\"".contains(b);

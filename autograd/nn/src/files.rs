@@ -23,3 +23,8 @@ pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     file.persist(path).map_err(|error| error.error)?;
     Ok(())
 }
+
+/// A name from a file as a message repeats it: on one line, and not all of a long one.
+pub(crate) fn shown(name: &str) -> String {
+    name.chars().take(200).flat_map(char::escape_debug).collect()
+}

@@ -3,6 +3,7 @@
 //! The crate `ndarray-npy` (0.10) is not used: it allocates what a header announces before it looks how much there is, so
 //! a file of a hundred bytes that claims 2^60 elements ends the process.
 
+use crate::files::shown;
 use crate::{Params, write_atomic};
 use rawzip::{CompressionMethod, ZipArchive, ZipArchiveWriter};
 use raygrad_tensor::{Scalar, Shape, Tensor};
@@ -30,7 +31,7 @@ pub enum NpzError {
         what: String,
     },
     /// An array of the file is damaged or does not fit the parameter of its name.
-    #[error("{}: array `{name}`: {what}", path.display())]
+    #[error("{}: array `{}`: {what}", path.display(), shown(name))]
     Array {
         /// The file.
         path: PathBuf,
@@ -40,6 +41,10 @@ pub enum NpzError {
         what: String,
     },
 }
+
+/// What the arrays of a file may take: so many bytes for each of the file, and so many whatever its length. Numbers hardly get
+/// shorter by compression, but zeros do, to a thousandth: of an archive that says so, a megabyte would fill a gigabyte.
+const MOST: [u64; 2] = [64, 1 << 28];
 
 /// What is wrong with an array, for [`NpzError::Array`].
 type What = String;
@@ -78,8 +83,7 @@ impl<T: Scalar> Params<T> {
     /// elements. Nothing changes if an array does not fit.
     ///
     /// # Errors
-    /// If the file cannot be read or is damaged, or names, shapes or number types differ from those of this store; the
-    /// error names the file and the array.
+    /// As [`read_npz`](Self::read_npz), or if names or shapes differ from those of this store.
     pub fn load_npz(&mut self, path: impl AsRef<Path>) -> Result<(), NpzError> {
         let path = path.as_ref();
         let mut arrays: Vec<(String, Option<Tensor<T>>)> =
@@ -106,8 +110,8 @@ impl<T: Scalar> Params<T> {
     /// A new store with the arrays of a `.npz` file, in the order of the file.
     ///
     /// # Errors
-    /// If the file cannot be read or is damaged, or an array has another number type; the error names the file and the
-    /// array.
+    /// If the file cannot be read or is damaged, an array has another number type, or the arrays take more than 256 MiB and 64 times
+    /// the bytes of the file; the error names the file and the array.
     pub fn read_npz(path: impl AsRef<Path>) -> Result<Self, NpzError> {
         let mut params = Params::new();
         for (name, value) in read(path.as_ref())? {
@@ -180,6 +184,7 @@ fn read<T: Scalar>(path: &Path) -> Result<Vec<(String, Tensor<T>)>, NpzError> {
     let archive = ZipArchive::from_slice(&bytes).map_err(|error| damaged(path, error))?;
     let mut entries = archive.entries();
     let (mut arrays, mut seen, mut count) = (vec![], HashSet::new(), 0);
+    let mut left = MOST[0] * bytes.len() as u64 + MOST[1];
     while let Some(entry) = entries.next_entry().map_err(|error| damaged(path, error))? {
         count += 1;
         if entry.is_dir() {
@@ -190,10 +195,15 @@ fn read<T: Scalar>(path: &Path) -> Result<Vec<(String, Tensor<T>)>, NpzError> {
         if !seen.insert(name.clone()) {
             return Err(array(path, &name, "is there twice".into()));
         }
+        let size = entry.uncompressed_size_hint();
+        left = left.checked_sub(size).ok_or_else(|| {
+            let what = format!("takes {size} bytes, which is too much in a file of {}: use numpy.savez", bytes.len());
+            array(path, &name, what)
+        })?;
         let content = archive
             .get_entry(entry.wayfinder())
             .map_err(|error| error.to_string())
-            .and_then(|content| unpack(&content, entry.compression_method(), entry.uncompressed_size_hint()));
+            .and_then(|content| unpack(&content, entry.compression_method(), size));
         let value = content.and_then(|content| parse(&content)).map_err(|what| array(path, &name, what))?;
         arrays.push((name, value));
     }
@@ -207,11 +217,12 @@ fn read<T: Scalar>(path: &Path) -> Result<Vec<(String, Tensor<T>)>, NpzError> {
 /// The bytes of a file in an archive, checked against its checksum.
 fn unpack(entry: &rawzip::ZipSliceEntry<'_>, method: CompressionMethod, size: u64) -> Result<Vec<u8>, What> {
     let mut content = vec![];
+    // No more than the archive announces, whatever comes out.
+    let most = size.saturating_add(1);
     let result = if method == CompressionMethod::STORE {
-        entry.verifying_reader(entry.data()).read_to_end(&mut content)
+        entry.verifying_reader(entry.data().take(most)).read_to_end(&mut content)
     } else if method == CompressionMethod::DEFLATE {
-        // No more than the archive announces, whatever comes out.
-        let reader = flate2::read::DeflateDecoder::new(entry.data()).take(size.saturating_add(1));
+        let reader = flate2::read::DeflateDecoder::new(entry.data()).take(most);
         entry.verifying_reader(reader).read_to_end(&mut content)
     } else {
         return Err(format!("is compressed by a method that is not supported ({method:?})"));
@@ -232,7 +243,7 @@ fn parse<T: Scalar>(bytes: &[u8]) -> Result<Tensor<T>, What> {
     let found = field(text, "descr").unwrap_or_default().trim_start_matches(['\'', '"']);
     let found = found.split(['\'', '"']).next().unwrap_or_default();
     if found != descr::<T>() {
-        return Err(format!("holds numbers of type `{found}`, the parameters are of `{}`", descr::<T>()));
+        return Err(format!("holds numbers of type `{}`, the parameters are of `{}`", shown(found), descr::<T>()));
     }
     let extents = field(text, "shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(broken)?.0;
     let extents = extents.split(',').map(str::trim).filter(|extent| !extent.is_empty());
@@ -434,6 +445,14 @@ mod tests {
         // As large as an empty array may be.
         let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 1152921504606846976), }";
         assert_eq!(parse::<f32>(&npy(header, &[])).unwrap().shape(), [0, 1 << 60]);
+    }
+
+    #[test]
+    fn names_in_messages_are_on_one_line() {
+        let message = array(Path::new("a.npz"), "x\ny\u{1b}é", "is bad".into()).to_string();
+        assert_eq!(message, "a.npz: array `x\\ny\\u{1b}é`: is bad");
+        let error = parse::<f32>(&npy("{'descr': 'a\nb', 'fortran_order': False, 'shape': ()}", &[])).unwrap_err();
+        assert!(error.contains("of type `a\\nb`"), "{error}");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Parameters in safetensors files, in full precision or in 16 bits.
 
 use crate::Params;
+use crate::files::shown;
 use half::{bf16, f16};
 use raygrad_tensor::{Scalar, Tensor};
 use safetensors::tensor::{Dtype, SafeTensors, View};
@@ -78,13 +79,13 @@ impl Storage {
 #[derive(Debug, thiserror::Error)]
 pub enum ParamsError {
     /// The bytes are not a safetensors file.
-    #[error("not a safetensors file: {0}")]
+    #[error("not a safetensors file: {}", shown(&.0.to_string()))]
     Format(#[from] safetensors::SafeTensorError),
     /// A parameter of the model is not in the file.
     #[error("`{0}` is missing: the file belongs to a model of another configuration")]
     Missing(String),
     /// The file holds a parameter that the model does not have.
-    #[error("`{0}` is not a parameter of this model: the file belongs to a model of another configuration")]
+    #[error("`{}` is not a parameter of this model: the file belongs to a model of another configuration", shown(.0))]
     Unknown(String),
     /// A parameter has another shape or number type in the file.
     #[error("`{name}` is {found} in the file and {expected} in this model")]
@@ -304,6 +305,10 @@ mod tests {
         more.add("c", Tensor::zeros(&[1]));
         assert!(matches!(more.load_safetensors(&written(&store())), Err(ParamsError::Missing(_))));
         assert!(matches!(params.load_safetensors(&written(&more)), Err(ParamsError::Unknown(_))));
+        let mut odd = store();
+        odd.add("c\nd", Tensor::zeros(&[1]));
+        let message = params.load_safetensors(&written(&odd)).unwrap_err().to_string();
+        assert!(message.starts_with("`c\\nd` is not a parameter"), "{message}");
         assert!(params.load_safetensors(b"no tensors").is_err());
     }
 }

@@ -2,6 +2,7 @@
 
 use super::formats::npy;
 use super::image::Image;
+use super::photo::decoder_of;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
@@ -19,7 +20,9 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
         let npy::Matrix { rows, columns, values } = npy::Matrix::read(&bytes).map_err(wrong)?;
         ([columns, rows], values)
     } else {
-        let decoded = image::load_from_memory(&bytes).map_err(|error| wrong(format!("cannot be decoded: {error}")))?;
+        let (decoder, _) = decoder_of(Cursor::new(&bytes), bytes.len() as u64, path)?;
+        let decoded = DynamicImage::from_decoder(decoder);
+        let decoded = decoded.map_err(|error| wrong(format!("cannot be decoded: {error}")))?;
         let size = [decoded.width() as usize, decoded.height() as usize];
         let values = match decoded {
             DynamicImage::ImageLuma8(image) => image.into_raw().into_iter().map(f64::from).collect(),

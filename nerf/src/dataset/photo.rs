@@ -5,7 +5,9 @@ use super::background::over;
 use super::image::Image;
 use crate::error::{Error, Result};
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 mod resample;
@@ -57,7 +59,8 @@ impl Photo {
     /// file's pixels as they are stored, so are the pixels: programs that find cameras look at these.
     ///
     /// # Errors
-    /// If the file cannot be read or decoded, or has more than 2^28 pixels; the error names it.
+    /// If the file cannot be read or decoded, or says that it has more than 2^28 pixels, or than 64 MiB and 16 KiB for each of its bytes;
+    /// the error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder(path)?;
@@ -218,18 +221,63 @@ fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
 
 /// More pixels than any camera has: a file that says so is damaged, and would take all memory.
 const MOST_PIXELS: usize = 1 << 28;
+/// The most bytes that a file is decoded to: so many for each of its own, and so many whatever its length. A PNG file of one bit
+/// and one colour comes to half of the former; a damaged header says anything.
+const MOST_BYTES: [u64; 2] = [1 << 14, 1 << 26];
 
 /// What decodes a file, and the size of its pixels as they are stored.
 fn decoder(path: &Path) -> Result<(impl ImageDecoder, [usize; 2])> {
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format);
-    let reader = reader.map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
-    let decoder = reader.into_decoder().map_err(|e| Error::file(path, format!("cannot be decoded: {e}")))?;
+    let bad = |e: std::io::Error| Error::file(path, format!("cannot be read: {e}"));
+    let file = File::open(path).map_err(bad)?;
+    let length = file.metadata().map_err(bad)?.len();
+    decoder_of(BufReader::new(file), length, path)
+}
+
+/// The same for what a file of `length` bytes holds.
+pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
+    reader: R,
+    length: u64,
+    path: &Path,
+) -> Result<(impl ImageDecoder + use<'a, R>, [usize; 2])> {
+    let bad = |what: String| Error::file(path, format!("cannot be decoded: {what}"));
+    let unread = |e| Error::file(path, format!("cannot be read: {e}"));
+    let mut reader = ImageReader::new(reader).with_guessed_format().map_err(unread)?;
+    if reader.format() == Some(ImageFormat::WebP) {
+        let mut inner = reader.into_inner();
+        if !chunks_fit(&mut inner, length).map_err(unread)? {
+            return Err(bad("it ends before its last part does: was it copied completely?".into()));
+        }
+        reader = ImageReader::with_format(inner, ImageFormat::WebP);
+    }
+    let decoder = reader.into_decoder().map_err(|e| bad(e.to_string()))?;
     let (width, height) = decoder.dimensions();
     let size = [width as usize, height as usize];
     if size[0].saturating_mul(size[1]) > MOST_PIXELS {
-        return Err(Error::file(path, format!("cannot be decoded: {width}x{height} pixels are more than 2^28")));
+        return Err(bad(format!("{width}x{height} pixels are more than 2^28")));
+    }
+    if decoder.total_bytes() > MOST_BYTES[0].saturating_mul(length).saturating_add(MOST_BYTES[1]) {
+        return Err(bad(format!("{width}x{height} pixels are more than {length} bytes can hold")));
     }
     Ok((decoder, size))
+}
+
+/// Whether the parts of a WebP file of that many bytes lie in it: what decodes it takes as much memory for one as its header says.
+/// The reader is at the beginning, before and after.
+fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<bool> {
+    // `RIFF`, the length of what follows, `WEBP`; then a name and a length before each part.
+    let mut size = [0; 4];
+    reader.seek(SeekFrom::Start(4))?;
+    reader.read_exact(&mut size)?;
+    let end = length.min(8 + u64::from(u32::from_le_bytes(size)));
+    let mut at = 12;
+    while at + 8 <= end {
+        reader.seek(SeekFrom::Start(at + 4))?;
+        reader.read_exact(&mut size)?;
+        at += 8 + u64::from(u32::from_le_bytes(size)).next_multiple_of(2);
+    }
+    reader.rewind()?;
+    // The last part of an odd length may lack what fills it up.
+    Ok(at <= length + 1)
 }
 
 #[cfg(test)]

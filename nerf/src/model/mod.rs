@@ -21,6 +21,7 @@ use crate::field::Field;
 use crate::kind::Site;
 use crate::losses::{Term, TermConfig};
 use crate::random::Jitter;
+use crate::range::check_range;
 use crate::sampling::marching::Marching;
 use crate::sampling::{Purpose, Sampler};
 use crate::space::cube::Space;
@@ -33,6 +34,9 @@ use raygrad_autograd::{Pool, Scalar, Tape, Tensor, Var};
 use raygrad_nn::{Bound, Params};
 use std::any::Any;
 use std::sync::Arc;
+
+/// Photographs that a model is fitted to, at most: it may have numbers of its own for each.
+const MOST_FRAMES: usize = 1 << 20;
 
 /// A field with its sampler and parameters.
 pub struct Model<T: Scalar> {
@@ -99,6 +103,7 @@ impl<T: Scalar> Model<T> {
         let space = Space { unbounded: config.unbounded, ..extent.space() };
         space.check()?;
         let (mut params, frames) = (Params::new(), extent.frames);
+        check_range("extent.frames", frames, 0, MOST_FRAMES)?;
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
         let sampler = config.sampler.build(Site { space, frames, params: &mut params, name: "sampler", rng })?;
         let field = config.field.build(Site { space, frames, params: &mut params, name: "field", rng })?;

@@ -13,9 +13,9 @@ use raygrad::{Op, Pool, Tensor};
 
 use super::Results;
 use super::figure::{Axis, Figure, Panel, Series};
-use super::machine;
 use super::stopwatch::{Timed, compare};
 use super::table::{Table, digits};
+use crate::cli::machine;
 
 /// Elements of a slice: well within the first cache.
 const ELEMENTS: usize = 2048;

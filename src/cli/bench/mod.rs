@@ -3,7 +3,6 @@
 mod draw;
 mod figure;
 mod kernels;
-mod machine;
 mod quadrature;
 mod render;
 mod report;
@@ -19,7 +18,6 @@ use raygrad::nerf::{Error, Result};
 use super::output::{make_folder, note, print};
 pub use draw::register_letters;
 use figure::Figure;
-pub use machine::processor;
 use table::Table;
 
 /// Measure run time against error: CSV tables, SVG and PNG plots, and one page with all of them

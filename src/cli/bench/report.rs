@@ -4,9 +4,9 @@ use std::path::Path;
 
 use raygrad::nerf::{Result, write_atomic};
 
-use super::machine;
 use super::table::Table;
 use crate::cli::html::escaped;
+use crate::cli::machine;
 
 /// What one suite contributes.
 pub struct Section {

@@ -15,7 +15,7 @@ use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
 
-use super::bench::processor;
+use super::machine::processor;
 use super::output::{depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};

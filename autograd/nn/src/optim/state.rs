@@ -39,7 +39,7 @@ pub struct OptimizerState<T: Scalar> {
 pub enum StateError {
     /// The bytes are not a safetensors file.
     #[cfg(feature = "files")]
-    #[error("not a safetensors file: {0}")]
+    #[error("not a safetensors file: {}", crate::files::shown(&.0.to_string()))]
     Format(#[from] safetensors::SafeTensorError),
     /// An entry is missing, unknown or of another shape or type.
     #[error("`{name}` {what}")]
@@ -53,7 +53,7 @@ pub enum StateError {
 
 impl StateError {
     fn entry(name: &str, what: impl Into<String>) -> Self {
-        StateError::Entry { name: name.to_owned(), what: what.into() }
+        StateError::Entry { name: name.escape_debug().take(200).collect(), what: what.into() }
     }
 }
 

@@ -54,7 +54,7 @@ fn averaging_does_not_enlarge() {
 fn jpeg(orientation: u8) -> Vec<u8> {
     let mut plain = vec![];
     let picture = image::RgbImage::from_fn(16, 8, |x, y| image::Rgb([if x < 8 && y < 4 { 255 } else { 0 }; 3]));
-    picture.write_to(&mut std::io::Cursor::new(&mut plain), image::ImageFormat::Jpeg).unwrap();
+    picture.write_to(&mut std::io::Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
     // An APP1 segment with one directory of one entry: tag 0x0112, a short.
     let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
     exif.extend([orientation, 0, 0, 0, 0, 0, 0]);
@@ -97,7 +97,7 @@ fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measure
 fn png_jpeg_and_webp_are_told_by_their_contents() {
     let folder = tempfile::tempdir().unwrap();
     let picture = image::RgbaImage::from_fn(5, 4, |x, y| image::Rgba([x as u8 * 50, y as u8 * 60, 7, 255 - x as u8]));
-    for format in [image::ImageFormat::Png, image::ImageFormat::WebP] {
+    for format in [ImageFormat::Png, ImageFormat::WebP] {
         let path = folder.path().join("picture.JPG");
         picture.save_with_format(&path, format).unwrap();
         let photo = Photo::open(&path, None).unwrap();

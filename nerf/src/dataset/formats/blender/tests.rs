@@ -245,7 +245,7 @@ fn damaged_files_are_errors_that_name_them() {
     });
     let config = ProptestConfig { cases: cases(), ..ProptestConfig::default() };
     proptest!(config, |(damage in damage::damage(), sized in any::<bool>())| {
-        std::fs::write(&file, damage::damaged(&whole[usize::from(sized)], &damage)).unwrap();
+        std::fs::write(&file, damage::damaged(&whole[usize::from(sized)], &whole[usize::from(!sized)], &damage)).unwrap();
         match read(folder.path()) {
             Ok(capture) => is_whole(&capture),
             Err(error) => damage::clear(error, FILE),

@@ -149,7 +149,7 @@ proptest! {
     #[test]
     fn damaged_files(damage in damage()) {
         let images = ["a.png", "b.png"].map(|name| (name.to_owned(), PathBuf::from(name))).to_vec();
-        match parse(Path::new("x"), &damaged(&npy(&ROWS), &damage), images) {
+        match parse(Path::new("x"), &damaged(&npy(&ROWS), &npy(&ROWS[..1]), &damage), images) {
             Ok(capture) => for View { camera, bounds, .. } in &capture.views {
                 prop_assert!(rigid::pose(&camera.pose).is_ok() && camera.focal[0] > 0.0, "{:?}", camera);
                 prop_assert!(bounds.is_some_and(|[near, far]| 0.0 <= near && near < far && far.is_finite()));

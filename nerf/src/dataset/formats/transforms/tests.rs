@@ -283,7 +283,7 @@ fn damaged_files_are_errors_that_name_them() {
     assert_eq!(read(folder.path()).unwrap().points, [point; 3]);
     let config = ProptestConfig { cases: cases(), ..ProptestConfig::default() };
     proptest!(config, |(damage in damage::damage(), which in 0..3_usize)| {
-        std::fs::write(&files[which], damage::damaged(&whole[which], &damage)).unwrap();
+        std::fs::write(&files[which], damage::damaged(&whole[which], &whole[0], &damage)).unwrap();
         let result = read(folder.path());
         std::fs::write(&files[which], &whole[which]).unwrap();
         match result {

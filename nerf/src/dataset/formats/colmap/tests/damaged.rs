@@ -11,7 +11,7 @@ fn parsed(encoding: Encoding, which: usize, damage: &[Damage]) -> Result<Capture
         Encoding::Binary => binary(),
         Encoding::Text => text(),
     };
-    files[which] = damaged(&files[which], damage);
+    files[which] = damaged(&files[which], &files[0], damage);
     let [cameras, images, points] = &files;
     parse(Path::new(""), encoding, &encoding.files(Path::new("")), [cameras, images], Some(points))
 }

@@ -1,4 +1,4 @@
-//! What the figures were measured on.
+//! What figures were measured on.
 
 use raygrad::tensor::simd;
 
@@ -19,9 +19,30 @@ pub fn describe() -> Vec<[String; 2]> {
     rows
 }
 
-/// The name of the processor, where the system says it.
+/// The name of the processor, where the system says so.
 pub fn processor() -> String {
     proc_value("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned())
+}
+
+/// The most memory that this program has had at once, in bytes, where the system says so.
+pub fn peak_memory() -> Option<u64> {
+    proc_bytes("/proc/self/status", "VmHWM")
+}
+
+/// The memory that it has now.
+pub fn taken_memory() -> Option<u64> {
+    proc_bytes("/proc/self/status", "VmRSS")
+}
+
+/// The memory that programs may still take.
+pub fn available_memory() -> Option<u64> {
+    proc_bytes("/proc/meminfo", "MemAvailable")
+}
+
+/// The value after the first `name:` of a file of Linux that has it in kB, in bytes.
+fn proc_bytes(file: &str, name: &str) -> Option<u64> {
+    let kib: u64 = proc_value(file, name)?.strip_suffix("kB")?.trim().parse().ok()?;
+    Some(1024 * kib)
 }
 
 /// The value after the first `name:` of a file of Linux.
@@ -46,4 +67,20 @@ pub fn caches() -> Vec<(String, u64)> {
         Some((format!("cache L{}", read(index, "level")?), 1024 * kib))
     };
     (0..8).filter_map(cache).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn memory_is_counted_in_bytes() {
+        let before = peak_memory().unwrap();
+        let block = std::hint::black_box(vec![1_u8; 1 << 28]);
+        let grown = peak_memory().unwrap() - before;
+        // The peak may have been higher than what there was before it.
+        assert!(before > 1 << 20 && before < 1 << 36 && grown <= block.len() as u64 + (1 << 26), "{before} {grown}");
+        assert!(peak_memory().unwrap() >= block.len() as u64);
+    }
 }

@@ -1,0 +1,43 @@
+//! Files that grow record by record.
+
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Error, Result, write_atomic};
+
+/// A file that holds whole records at any time. One that cannot be written, as the disk is full, waits for the next.
+pub struct Journal {
+    path: PathBuf,
+    file: File,
+    /// The bytes of all whole records in the file.
+    length: u64,
+    /// Records that are not in the file yet.
+    waiting: Vec<u8>,
+}
+
+impl Journal {
+    /// Replaces a file by one with this beginning.
+    pub fn begin(path: &Path, beginning: &[u8]) -> Result<Self> {
+        write_atomic(path, beginning)?;
+        let file = File::options().append(true).open(path).map_err(|e| failed(path, &e))?;
+        Ok(Journal { path: path.into(), file, length: beginning.len() as u64, waiting: vec![] })
+    }
+
+    /// Adds a record, after those that wait.
+    pub fn add(&mut self, record: &[u8]) -> Result<()> {
+        self.waiting.extend_from_slice(record);
+        if let Err(error) = self.file.write_all(&self.waiting) {
+            // If that fails too, nobody can do more.
+            let _ = self.file.set_len(self.length);
+            return Err(failed(&self.path, &error));
+        }
+        self.length += self.waiting.len() as u64;
+        self.waiting.clear();
+        Ok(())
+    }
+}
+
+fn failed(path: &Path, error: &std::io::Error) -> Error {
+    Error::file(path, format!("cannot be written: {error}"))
+}
