@@ -116,7 +116,7 @@ fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
         ],
     );
     // Names are kept as names: the first one is held out.
-    assert_eq!(place.json("work/run/eval.json")["per_view"][0]["name"], "../../x.png");
+    assert_eq!(place.json("work/run/eval-test-fast.json")["per_view"][0]["name"], "../../x.png");
     assert!(place.json("work/run/config.json")["photographs"].as_array().unwrap().contains(&json!("../masks/z.png")));
     // Blender's files have no masks.
     let mut plain = frames.clone();

@@ -16,7 +16,8 @@ impl Model<f32> {
     /// # Errors
     /// If the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
-        let metadata = HashMap::from([("format".into(), "raygrad".into()), (VERSION.0.into(), VERSION.1.to_string())]);
+        // One word: several have no order, and the same model is to be the same bytes.
+        let metadata = HashMap::from([(FORMAT.into(), format!("raygrad {VERSION}"))]);
         let mut blobs = self.sampler.state();
         if self.detail < 1.0 {
             blobs.push((DETAIL, self.detail.to_le_bytes().to_vec()));
@@ -57,20 +58,21 @@ impl Model<f32> {
     }
 }
 
-/// How files are laid out: the word that says it, and the version that is written.
-const VERSION: (&str, u64) = ("version", 1);
+/// What a file says of how it is laid out: `raygrad`, and the version. The first edition did not say which.
+const FORMAT: &str = "format";
+/// The version that is written.
+const VERSION: u64 = 1;
 
-/// Whether a file is of a version that is known. The first edition did not say.
+/// Whether a file is of a version that is known.
 fn check_version(bytes: &[u8]) -> std::result::Result<(), String> {
-    let (name, known) = VERSION;
-    let stored = stored_words(bytes, name).map_err(|error| error.to_string())?;
-    match stored.map(|words| words.parse::<u64>()) {
-        None => Ok(()),
-        Some(Ok(version)) if version <= known => Ok(()),
-        Some(Ok(version)) => {
-            Err(format!("has version {version}, and this raygrad knows {known}: use the one that wrote it, or a newer"))
-        }
-        Some(Err(_)) => Err("has a version that is no number".to_owned()),
+    let stored = stored_words(bytes, FORMAT).map_err(|error| error.to_string())?;
+    let Some(words) = stored.as_deref().and_then(|words| words.strip_prefix("raygrad ")) else { return Ok(()) };
+    match words.parse::<u64>() {
+        Ok(version) if version <= VERSION => Ok(()),
+        Ok(version) => Err(format!(
+            "has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer"
+        )),
+        Err(_) => Err(format!("has a version that is no number: {words:?}")),
     }
 }
 
@@ -122,18 +124,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         model.save(&path).unwrap();
-        let written = stored_words(&std::fs::read(&path).unwrap(), "version").unwrap();
-        assert_eq!(written.as_deref(), Some("1"));
-        let load = |words: &[(&str, &str)]| {
-            let words = words.iter().map(|(key, value)| (key.to_string(), value.to_string())).collect();
+        let written = stored_words(&std::fs::read(&path).unwrap(), "format").unwrap();
+        assert_eq!(written.as_deref(), Some("raygrad 1"));
+        let load = |words: Option<&str>| {
+            let words = words.map(|words| ("format".to_owned(), words.to_owned())).into_iter().collect();
             let bytes = model.params.to_safetensors(Storage::Full, words, &model.sampler.state()).unwrap();
             std::fs::write(&path, bytes).unwrap();
             Model::load(&path, voxel(1), extent).map(|_| ()).map_err(|error| error.to_string())
         };
-        assert!(load(&[]).is_ok() && load(&[("version", "1")]).is_ok());
-        let newer = load(&[("version", "2")]).unwrap_err();
+        assert!([None, Some("raygrad"), Some("raygrad 1"), Some("pt")].into_iter().all(|words| load(words).is_ok()));
+        let newer = load(Some("raygrad 2")).unwrap_err();
         assert!(newer.contains("model.safetensors: has version 2, and this raygrad knows 1"), "{newer}");
-        assert!(load(&[("version", "one")]).unwrap_err().contains("no number"));
+        assert!(load(Some("raygrad one")).unwrap_err().contains("no number"));
     }
 
     #[test]
