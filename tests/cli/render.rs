@@ -3,7 +3,6 @@
 use super::{Place, SIZE, complained, png};
 use raygrad::nerf::dataset::scene::ANGLE_X;
 use raygrad::nerf::dataset::{Depths, Split};
-use raygrad::nerf::glam::DAffine3;
 use raygrad::nerf::{Camera, Image};
 use serde_json::json;
 use std::path::Path;
@@ -156,7 +155,7 @@ fn what_is_saved_beside_frames_belongs_to_them() {
 /// reader's own convention, from outside.
 #[test]
 fn depths_are_along_the_axis() {
-    let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), DAffine3::IDENTITY);
+    let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), glam::DAffine3::IDENTITY);
     let distances = Image { width: 3, height: 1, channels: 1, data: vec![2.0; 3] };
     let npy = Depths::new(&distances, &camera, 10.0).to_npy();
     let depths: Vec<f32> =

@@ -205,7 +205,7 @@ fn near(keys: [Key; 4], u: f64) -> Key {
     let (mut rotation, mut translation, mut angle_y) = (DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0), DVec3::ZERO, 0.0);
     for (key, weight) in keys.iter().zip(weights) {
         let other = DQuat::from_mat3(&key.pose.matrix3);
-        rotation = rotation + other * (weight * if other.dot(middle) < 0.0 { -1.0 } else { 1.0 });
+        rotation += other * (weight * if other.dot(middle) < 0.0 { -1.0 } else { 1.0 });
         translation += weight * key.pose.translation;
         angle_y += weight * key.angle_y;
     }

@@ -114,6 +114,11 @@ fn a_constant_turn_stays_one_and_is_the_short_way() {
     let turned = |degrees: f64| Key { pose: DAffine3::from_rotation_y(degrees.to_radians()), angle_y: 0.8 };
     let between = turned(5.0).mix(&turned(355.0), 0.25);
     assert!(apart(&between, &turned(2.5)) < 1e-12);
+    // And one of 210 is one of 150, whatever the sign of the quaternion that a matrix gives.
+    for axis in [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y, DVec3::NEG_Z] {
+        let about = |degrees: f64| Key { pose: DAffine3::from_axis_angle(axis, degrees.to_radians()), angle_y: 0.8 };
+        assert!(apart(&about(0.0).mix(&about(210.0), 0.5), &about(-75.0)) < 1e-12, "{axis}");
+    }
 }
 
 #[test]
