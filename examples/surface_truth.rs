@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (Some(run), Some(out)) = (arguments.next(), arguments.next()) else {
         return Err("name a run and a folder: surface_truth RUN TRUTH [CELLS]".into());
     };
-    let cells: usize = arguments.next().map_or(Ok(384), |cells| cells.parse())?;
+    let cells: usize = arguments.next().map_or(Ok(256), |cells| cells.parse())?;
     let (run, out) = (Path::new(&run), Path::new(&out));
     std::fs::create_dir_all(out)?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(run.join("config.json"))?)?;

@@ -2,7 +2,7 @@
 
     raygrad train --steps 2500 --out RUN
     raygrad export RUN mesh.ply
-    cargo run --release --example surface_truth -- RUN TRUTH
+    cargo run --release --example surface_truth -- RUN TRUTH 256
     python surface.py TRUTH mesh.ply ... [--level X]        # X as raygrad has printed it: scikit-image's mesh at that level
     python surface.py --views mesh.ply PICTURE.png          # three sides of it, as they are
 
@@ -35,8 +35,6 @@ def vertices(path):
             header += file.readline()
         count = int(header.split(b"element vertex ")[1].split()[0])
         fields = [("place", "<f8", 3), ("normal", "<f4", 3), ("color", "u1", 3)]
-        rows = np.frombuffer(file.read(33 + 6), np.uint8)  # at least one vertex
-        file.seek(len(header))
         rows = np.fromfile(file, np.dtype(fields), count)
     return rows["place"], rows["normal"].astype(float)
 
@@ -117,9 +115,9 @@ def views(file, out, size=700):
         rows.append([splat(shape.vertices, shape.colors[:, :3], axis, size) for axis in range(3)])
     else:
         colors = shape.visual.vertex_colors[:, :3].astype(float)
-        light = np.abs(shape.vertex_normals @ np.array([0.3, -0.5, 0.81]))[:, None] * [230.0] * 1
+        light = np.abs(shape.vertex_normals @ np.array([0.3, -0.5, 0.81]))[:, None] * 230.0
         rows.append([rasterised(shape, colors, axis, size) for axis in range(3)])
-        rows.append([rasterised(shape, np.repeat(light[:, :1], 3, 1), axis, size) for axis in range(3)])
+        rows.append([rasterised(shape, np.repeat(light, 3, 1), axis, size) for axis in range(3)])
     Image.fromarray(np.concatenate([np.concatenate(row, 1) for row in rows])).save(out)
 
 

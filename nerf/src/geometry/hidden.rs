@@ -36,3 +36,46 @@ impl Hidden {
         behind
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::sight::Sight;
+    use super::*;
+    use crate::volume::render::Evaluations;
+
+    /// Cameras of 4 x 2 pixels that see something at a distance of 2, but in the pixel at the upper right.
+    fn from(eye: DVec3, target: DVec3) -> (Camera, Seen) {
+        let camera = Camera::from_angle(4, 2, 1.0, Camera::look_at(eye, target, DVec3::Z));
+        let sight = Sight { place: DVec3::ZERO, distance: 2.0, sigma: 1.0 };
+        let sights = (0..8).map(|pixel| (pixel != 3).then_some(sight)).collect();
+        (camera, Seen { sights, evaluations: Evaluations::default() })
+    }
+
+    #[test]
+    fn what_is_behind_what_is_seen_in_all_pictures_is_hidden() {
+        // Along +y, with +x to the right.
+        let first = from(DVec3::ZERO, DVec3::Y);
+        let alone = Hidden::new(std::slice::from_ref(&first), 0.5);
+        for (place, hidden) in [
+            ([0.1, 2.3, -0.1], false),
+            ([0.1, 2.6, -0.1], true),
+            ([-1.0, 2.6, 0.4], true),
+            ([1.0, 2.6, -0.4], true),
+            // The pixel that sees nothing.
+            ([1.0, 2.6, 0.4], false),
+            // Beside the picture, and behind the camera.
+            ([3.0, 2.6, 0.0], false),
+            ([0.1, 2.6, 1.5], false),
+            ([0.1, -2.6, 0.1], false),
+        ] {
+            assert_eq!(alone.holds(DVec3::from(place)), hidden, "{place:?}");
+        }
+        let place = DVec3::new(0.1, 2.6, -0.1);
+        // From the side it is as far as 1 from the eye.
+        let near = from(place - DVec3::X, place);
+        assert!(!Hidden::new(&[first.clone(), near], 0.5).holds(place));
+        let far = from(place - 3.0 * DVec3::X, place + DVec3::new(0.0, 0.1, -0.1));
+        assert!(Hidden::new(&[first, far], 0.5).holds(place));
+        assert!(!Hidden::new(&[], 0.5).holds(place), "in no picture");
+    }
+}

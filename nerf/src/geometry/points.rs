@@ -108,7 +108,7 @@ mod tests {
         // On a plane, four times as many on its left half.
         let place = |i: usize| {
             let (u, v) = ((i as f64 * 0.754877666).fract(), (i as f64 * 0.569840291).fract());
-            DVec3::new(if i % 5 == 0 { 1.0 + u } else { u }, 2.0 * v, 0.3)
+            DVec3::new(if i.is_multiple_of(5) { 1.0 + u } else { u }, 2.0 * v, 0.3)
         };
         let places: Vec<DVec3> = (0..20_000).map(place).collect();
         let kept = thinned(&places, 900);

@@ -110,6 +110,22 @@ fn borders_stay_where_they_are() {
 }
 
 #[test]
+fn a_ribbon_is_not_tied_off() {
+    // A row of squares, each of two triangles: all sides across it lead from border to border.
+    let squares = 30;
+    let positions = (0..2 * (squares + 1)).map(|i| DVec3::new(f64::from(i / 2), f64::from(i % 2), 0.0)).collect();
+    let square = |i: u32| [[2 * i, 2 * i + 2, 2 * i + 1], [2 * i + 1, 2 * i + 2, 2 * i + 3]];
+    let mut mesh = Mesh { positions, triangles: (0..squares as u32).flat_map(square).collect() };
+    mesh.decimate(6, &mut |_| ());
+    assert!((mesh.area() - f64::from(squares)).abs() < 0.5, "{}", mesh.area());
+    let all: Vec<[u32; 2]> = mesh.triangles.iter().flat_map(sides).collect();
+    let border = all.iter().filter(|[a, b]| !all.contains(&[*b, *a]));
+    let mut starts: Vec<u32> = border.map(|[from, _]| *from).collect();
+    starts.sort_unstable();
+    assert_eq!(starts, (0..mesh.positions.len() as u32).collect::<Vec<_>>(), "the border passes each vertex once");
+}
+
+#[test]
 fn quadrics_are_sums_of_squared_distances() {
     let (normal, point) = (DVec3::new(2.0, -1.0, 2.0) / 3.0, DVec3::new(1.0, 2.0, 3.0));
     let quadric = Quadric::plane(normal, point, 0.5).plus(&Quadric::point(point, 0.25));

@@ -132,6 +132,18 @@ fn whatever_is_dense_the_surface_has_no_holes() {
 }
 
 #[test]
+fn vertices_do_not_meet_where_a_node_has_the_level() {
+    // An octahedron with nodes on its surface: up to three edges of the lattice end in each.
+    let octahedron = of(|x| 2.0 - x.abs().element_sum());
+    let lattice = Lattice::over([DVec3::splat(-3.0), DVec3::splat(3.0)], 6, false).unwrap();
+    let mesh = isosurface(&lattice, 0.0, &octahedron, &mut |_| ()).unwrap();
+    assert!(mesh.is_closed() && mesh.positions.len() > 20);
+    for (i, a) in mesh.positions.iter().enumerate() {
+        assert!(mesh.positions[..i].iter().all(|b| a.distance(*b) > 1e-4), "{a}");
+    }
+}
+
+#[test]
 fn no_number_breaks_a_surface() {
     let strange = |x: DVec3| match x.floor().element_sum() as i64 % 5 {
         0 => f64::INFINITY,

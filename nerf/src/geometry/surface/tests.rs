@@ -270,3 +270,11 @@ fn colors_have_the_tone_of_views() {
         }
     }
 }
+
+#[test]
+fn nothing_is_outside_of_the_box() {
+    let model = model(&[(DVec3::new(1.5, 0.2, 0.0), RADIUS)], Preset::Voxel);
+    let mut found = [f32::NAN; 3];
+    Probe::new(&model).shown(None, None, &[[1.49, 0.2, 0.0], [1.51, 0.2, 0.0], [1.2, 0.2, 0.0]], &mut found);
+    assert!(found[0] > 1e6 && found[1] == 0.0 && found[2] > 100.0, "{found:?}");
+}
