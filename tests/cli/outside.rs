@@ -20,8 +20,11 @@ fn names(place: &Place) -> Vec<String> {
         .collect()
 }
 
+/// What a photograph is called, and where its camera is.
+type Named = (String, [[f64; 4]; 4]);
+
 /// A place whose folder `work/scene` has the cameras of photographs in it and around it.
-fn place() -> (Place, Vec<(String, [[f64; 4]; 4])>) {
+fn place() -> (Place, Vec<Named>) {
     let place = Place::empty();
     for folder in ["work/scene/images", "work/masks", "elsewhere"] {
         std::fs::create_dir_all(place.path(folder)).unwrap();
