@@ -3,7 +3,7 @@
 //! A line of text, `raygrad checkpoint VERSION CRC32 LENGTH`, and a [state](Trainer::state) of that length.
 
 use std::fs;
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result, Trainer, write_atomic};
@@ -62,18 +62,32 @@ fn all(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
     Ok(found)
 }
 
+/// Removes the latest checkpoint if it is of this step and there is one before it.
+pub fn step_back(run: &Run, step: Option<u64>) -> Result<()> {
+    if let [(latest, path), _, ..] = &all(&folder(run))?[..]
+        && Some(*latest) == step
+    {
+        remove(std::slice::from_ref(path));
+    }
+    Ok(())
+}
+
 /// Takes a trainer to the latest checkpoint that is whole; one that is not is said to be so. If none is whole, that is an error,
 /// and if there is none although steps were taken; without steps, the trainer stays at its beginning.
 pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     let checkpoints = all(&folder(run))?;
     let none = checkpoints.is_empty();
+    // What a later raygrad wrote is not passed over, and lost.
+    if let Some(error) = checkpoints.iter().find_map(|(_, path)| later_version(path)) {
+        return Err(error);
+    }
     for (_, path) in checkpoints {
         let loaded = read(&path).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
         let Err(error) = loaded else { return Ok(()) };
         complain(&format!("warning: {error}"));
     }
     match none {
-        false => Err(Error::file(folder(run), "no checkpoint is whole: the run cannot go on, train anew")),
+        false => Err(Error::file(folder(run), "no checkpoint can be used: the run cannot go on, train anew")),
         // The first one is there before the metrics are.
         true if run.file("metrics.jsonl").exists() => Err(Error::file(
             &run.folder,
@@ -83,9 +97,24 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     }
 }
 
+/// What is to be said of a file of a later version.
+fn later_version(path: &Path) -> Option<Error> {
+    let mut beginning = vec![];
+    fs::File::open(path).ok()?.take(LONGEST as u64).read_to_end(&mut beginning).ok()?;
+    let line = beginning.split(|byte| *byte == b'\n').next()?;
+    let version: u32 = std::str::from_utf8(line).ok()?.strip_prefix(MAGIC)?.split_whitespace().next()?.parse().ok()?;
+    (version > VERSION).then(|| {
+        let what = format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer");
+        Error::file(path, what)
+    })
+}
+
 /// The state in a file.
 pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
     let bad = |what: String| Error::file(path, what);
+    if let Some(error) = later_version(path) {
+        return Err(error);
+    }
     let mut bytes = fs::read(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
     let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n');
     let line = end.and_then(|end| std::str::from_utf8(&bytes[..end]).ok()?.strip_prefix(MAGIC));
@@ -94,11 +123,6 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
     };
     let mut words = line.split_whitespace();
     let version: Option<u32> = words.next().and_then(|word| word.parse().ok());
-    if let Some(version) = version.filter(|version| *version > VERSION) {
-        let what =
-            format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer");
-        return Err(bad(what));
-    }
     let sum = words.next().and_then(|word| u32::from_str_radix(word, 16).ok());
     let length: Option<usize> = words.next().and_then(|word| word.parse().ok());
     let (Some(_), Some(sum), Some(length)) = (version, sum, length) else {

@@ -32,9 +32,7 @@ pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
 
 /// Bytes of a photograph and of what was measured beside it.
 fn bytes(frame: &Frame) -> f64 {
-    let image = &frame.image;
-    let distances = if frame.distances.is_some() { 4 } else { 0 };
-    (image.width * image.height * (image.channels + distances)) as f64
+    (frame.image.bytes() + frame.distances.as_ref().map_or(0, |distances| 4 * distances.data.len())) as f64
 }
 
 /// Bytes that are free for programs, where the system says it: of the machine, or of the group that this one runs in.
@@ -42,8 +40,43 @@ pub fn available() -> Option<f64> {
     let group = || {
         let read =
             |name: &str| std::fs::read_to_string(format!("/sys/fs/cgroup/{name}")).ok()?.trim().parse::<f64>().ok();
-        Some(read("memory.max")? - read("memory.current")?)
+        Some((read("memory.max")? - read("memory.current")?).max(0.0))
     };
     let machine = machine::available_memory().map(|bytes| bytes as f64);
     [machine, group()].into_iter().flatten().reduce(f64::min)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::dataset::{Split, embedded};
+    use raygrad::nerf::sampling::marching::MarchingConfig;
+    use raygrad::nerf::{Config, InstantConfig, Preset};
+    use std::sync::Arc;
+
+    #[test]
+    fn what_training_takes_grows_with_all_that_is_held() {
+        let need = |width: usize, table: u32, resolution: usize, samples: usize| {
+            let mut config = Config::preset(Preset::Instant);
+            if let Some(field) = config.field.get_mut::<InstantConfig>() {
+                (field.grid.levels, field.grid.log2_table) = (2, table);
+            }
+            if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
+                (sampler.occupancy.resolution, sampler.samples) = (resolution, samples);
+            }
+            let data = Arc::new(embedded(Split::Train, width));
+            let trainer = Trainer::new(config, data.clone()).unwrap();
+            (need(&trainer, &data), trainer.model.params.elements() as f64)
+        };
+        let (least, elements) = need(8, 8, 16, 1024);
+        let least_of = |other: (f64, f64)| other.0 - least;
+        let pixels = 60.0 * (16.0 * 16.0 - 8.0 * 8.0);
+        // Opaque or not, a photograph has three or four bytes a pixel.
+        assert!((3.0..=4.0).contains(&(least_of(need(16, 8, 16, 1024)) / pixels)));
+        let (more, all) = need(8, 12, 16, 1024);
+        assert!(all > elements && (more - least - PARAMETER * (all - elements)).abs() < 1.0);
+        assert!((least_of(need(8, 8, 32, 1024)) - CELL * (32.0_f64.powi(3) - 16.0_f64.powi(3))).abs() < 1.0);
+        assert!((least_of(need(8, 8, 16, 3072)) - SAMPLE * 2048.0).abs() < 1.0);
+        assert!(least > PROGRAM && available().is_none_or(|free| free > 0.0));
+    }
 }

@@ -137,7 +137,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             return report(&cameras, &out);
         }
         Kind::Film(film) => {
-            film.check(&out, fps)?;
+            film.check(&out, fps, [cameras[0].width, cameras[0].height])?;
             frames_of(&out)
         }
         Kind::Folder => out.clone(),

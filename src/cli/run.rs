@@ -16,6 +16,9 @@ use super::scene::Scene;
 /// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
 const DEFAULT: &str = "run";
 
+/// The file by which a program keeps others out of a run.
+const LOCK: &str = "lock";
+
 /// What a run is about: `config.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -50,12 +53,19 @@ pub struct Run {
 }
 
 impl Run {
-    /// Makes the folder of a new run, which [`choose_folder`] has found to be free.
-    pub fn create(folder: PathBuf, config: RunConfig) -> Result<Run> {
+    /// Makes the folder of a new run, which [`choose_folder`] has found to be free, and [locks](Self::lock) it.
+    ///
+    /// # Errors
+    /// If it cannot be written, or another program has begun a run there meanwhile.
+    pub fn create(folder: PathBuf, config: RunConfig) -> Result<(Run, File)> {
         make_folder(&folder)?;
         let run = Run { folder, config };
+        let lock = run.lock()?;
+        if run.file("config.json").exists() {
+            return Err(holds_a_run(&run.folder));
+        }
         run.write()?;
-        Ok(run)
+        Ok((run, lock))
     }
 
     /// Writes its `config.json`.
@@ -92,7 +102,7 @@ impl Run {
 
     /// Keeps other programs from training this run, until the file is dropped or this program ends, however it does.
     pub fn lock(&self) -> Result<File> {
-        let path = self.file("lock");
+        let path = self.file(LOCK);
         let bad = |e: std::io::Error| Error::file(&path, format!("cannot be locked: {e}"));
         let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(bad)?;
         match file.try_lock() {
@@ -173,9 +183,7 @@ pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
     if let Some(folder) = wanted {
         return match contents(folder)? {
             Contents::Nothing => Ok(folder.into()),
-            Contents::Run => {
-                Err(Error::file(folder, "already holds a run: choose another --out, or remove that folder"))
-            }
+            Contents::Run => Err(holds_a_run(folder)),
             Contents::Other => Err(holds_other_files(folder)),
         };
     }
@@ -188,6 +196,10 @@ pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
         }
     }
     unreachable!("there is no end to the numbers")
+}
+
+fn holds_a_run(folder: &Path) -> Error {
+    Error::file(folder, "already holds a run: choose another --out, or remove that folder")
 }
 
 fn holds_other_files(folder: &Path) -> Error {
@@ -213,7 +225,7 @@ fn contents(folder: &Path) -> Result<Contents> {
     }
     match std::fs::read_dir(folder) {
         // What a program that was killed was about to write is nothing.
-        Ok(mut entries) => Ok(match entries.any(|entry| !entry.is_ok_and(|entry| is_unfinished(&entry))) {
+        Ok(mut entries) => Ok(match entries.any(|entry| !entry.is_ok_and(|entry| is_unfinished(&entry) || entry.file_name() == LOCK)) {
             true => Contents::Other,
             false => Contents::Nothing,
         }),

@@ -130,9 +130,13 @@ impl Account {
         }
     }
 
-    /// It has diverged, and is back at this step.
-    pub fn retreat(&mut self, step: u64) {
+    /// It goes on from a checkpoint, having diverged.
+    pub fn retreat(&mut self) {
         self.past.retreats += 1;
+    }
+
+    /// It is back at this step.
+    pub fn cut(&mut self, step: u64) {
         self.recent.clear();
         self.preview = self.preview.take().filter(|preview| preview.step <= step);
     }
@@ -229,13 +233,14 @@ mod tests {
         assert_eq!(ended["skipped_share"], json!({ "marched": 0.75, "samples": 0.8, "shaded": 0.95 }));
         assert_eq!([&ended["skipped_gradients"], &ended["restarts"]], [&json!(3), &json!(2)]);
         // It diverges, and goes back to where there was no such preview.
-        account.retreat(139);
+        account.retreat();
+        account.cut(139);
         let back = write(&account, &at(139), None);
         assert_eq!(
             [&back["retreats"], &back["preview"], &back["averaged_steps"]],
             [&json!(1), &Value::Null, &json!(0)]
         );
-        account.retreat(139);
+        account.retreat();
         assert_eq!(write(&account, &at(139), None)["retreats"], 2);
         account.preview(preview.clone());
         account.past.retreats = 0;

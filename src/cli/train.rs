@@ -178,13 +178,12 @@ fn begin(args: &Args) -> Result<Trained> {
     let config = args.config(&data)?;
     let background = config.background.shown();
     let trainer = Trainer::new(config, data.clone())?;
-    let run = Run::create(folder, args.run_config(&trainer, &data)?)?;
+    let (run, lock) = Run::create(folder, args.run_config(&trainer, &data)?)?;
     describe(&run, &trainer, &data, &scene)?;
     // Once nothing else can be wrong: an error is then the one line that is said.
     doctor::warn(&scene);
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
-    let lock = run.lock()?;
     train((run, lock), trainer, args.budget(), args, preview)
 }
 
@@ -231,32 +230,34 @@ fn train(
 ) -> Result<Trained> {
     let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
+    let mut diverged = None;
     for retreats in 0.. {
         trainer.run(budget, |trainer| {
             let stops = interrupt::requested();
             watch.step(trainer, stops);
             if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
-        let goes_on = trainer.stats().has_diverged() && retreats < RETREATS && !interrupt::requested();
-        if !goes_on || !watch.retreat(&mut trainer) {
+        if !trainer.stats().ends_diverged() {
+            break;
+        }
+        let reason = watch::reason(&trainer);
+        let tries_again = trainer.stats().has_diverged() && retreats < RETREATS && !interrupt::requested();
+        if !tries_again || !watch.retreat(&mut trainer, &reason) {
+            diverged = Some(reason);
             break;
         }
     }
     let interrupted = interrupt::requested();
-    let diverged = trainer.stats().ends_diverged();
-    let reason = if diverged { watch::reason(&trainer) } else { String::new() };
-    // Whatever came of it, the run was good until then.
-    if diverged && checkpoint::load(&run, &mut trainer).is_ok() {
-        trainer.model.finish();
-    }
-    let ended = match (interrupted, diverged) {
+    let ended = match (interrupted, &diverged) {
         (true, _) => Ended::Interrupted,
-        (false, true) => Ended::Diverged,
-        (false, false) => Ended::Done,
+        (false, Some(_)) => Ended::Diverged,
+        (false, None) => Ended::Done,
     };
-    watch.finish(&trainer, ended)?;
+    // Whatever came of it, the run was good until then.
+    let good = diverged.is_none() || watch.give_up(&mut trainer);
+    watch.finish(&trainer, ended, good)?;
     summarise(&run, &trainer.stats(), interrupted)?;
-    if diverged {
+    if let Some(reason) = &diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
         complain(&format!(
@@ -266,7 +267,7 @@ fn train(
             schedule.name()
         ));
     }
-    Ok(Trained { folder: run.folder, interrupted, diverged })
+    Ok(Trained { folder: run.folder, interrupted, diverged: diverged.is_some() })
 }
 
 impl Args {
@@ -342,7 +343,7 @@ fn warn_of_memory(scene: &Opened, downscale: usize) {
     let bytes = |downscale: usize| 3.0 * pixels / (downscale * downscale) as f64;
     let free = memory::available().unwrap_or(HEAVY);
     if bytes(downscale) > free {
-        let enough = (downscale..).find(|k| bytes(*k) <= 0.5 * free).unwrap_or(downscale);
+        let enough = (downscale..1 << 14).find(|k| bytes(*k) <= 0.5 * free).unwrap_or(downscale);
         complain(&format!(
             "warning: {} photographs take about {:.1} GB of memory at this size, of {:.1} GB that are free; with --downscale \
              {enough} {:.1} GB",
@@ -448,7 +449,7 @@ fn summarise(run: &Run, stats: &StepStats, interrupted: bool) -> Result<()> {
         "{what} {} steps in {}, {:.0} rays/s; the model is {}\n",
         stats.step,
         spoken(stats.train_seconds),
-        stats.rays as f64 / stats.train_seconds,
+        stats.rays as f64 / stats.train_seconds.max(1e-9),
         run.model_file().display()
     ))?;
     if interrupted { print(&format!("to go on raygrad train --resume {}\n", run.folder.display())) } else { Ok(()) }

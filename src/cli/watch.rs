@@ -38,6 +38,8 @@ pub struct Watch<'a> {
     account: Account,
     /// The last step in the metrics.
     logged: u64,
+    /// The step that it went back to last, having diverged.
+    back: Option<u64>,
     next_preview: f64,
     /// Training time between saves in seconds.
     interval: f64,
@@ -78,6 +80,7 @@ impl<'a> Watch<'a> {
             events: None,
             account,
             logged,
+            back: None,
             next_preview: next_preview(train_seconds),
             interval,
             next_save: train_seconds + interval,
@@ -128,9 +131,11 @@ impl<'a> Watch<'a> {
             let shown = self.preview(trainer);
             self.warn(shown);
         }
-        // Views look at a finished model, and training goes on from one that is not; and not from one that may have diverged.
+        // Views look at a finished model, and training goes on from one that is not; and not from one that may have diverged,
+        // unless there is no later one to come.
         let ends = stops || fraction >= 1.0;
-        if (ends || stats.train_seconds >= self.next_save) && stats.stuck == 0 {
+        let good = stats.stuck == 0 || (ends && !stats.ends_diverged());
+        if (ends || stats.train_seconds >= self.next_save) && good {
             self.next_save = stats.train_seconds + self.interval;
             let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
             let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
@@ -139,33 +144,50 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Takes a trainer that has diverged back to the last checkpoint, from where it goes on with lower learning rates, and
-    /// says so. If that cannot be, it says why and gives `false`.
-    pub fn retreat(&mut self, trainer: &mut Trainer) -> bool {
-        let (end, reason) = (trainer.stats().step, reason(trainer));
-        let back = checkpoint::load(self.run, trainer).and_then(|()| {
-            trainer.slow_down(SLOWER);
+    /// Takes a trainer that has diverged, for that `reason`, back to a checkpoint, from where it goes on with lower learning
+    /// rates, and says so. If that cannot be, it says why and gives `false`.
+    pub fn retreat(&mut self, trainer: &mut Trainer, reason: &str) -> bool {
+        let (end, pace) = (trainer.stats().step, trainer.pace());
+        // What was good when it was written may have been on its way out of all bounds: the second time it is the one before.
+        let back = checkpoint::step_back(self.run, self.back).and_then(|()| {
+            checkpoint::load(self.run, trainer)?;
+            trainer.set_pace(SLOWER * pace);
             checkpoint::save(self.run, trainer)?;
-            metrics(self.run, trainer.stats().step)
+            self.cut(trainer)
         });
-        let StepStats { step, train_seconds, .. } = trainer.stats();
-        let what = format!("warning: for many steps up to {end} nothing was finite{reason}");
-        match back {
-            Ok((metrics, logged)) => {
-                (self.metrics, self.logged, self.psnr) = (metrics, logged, None);
-                (self.next_preview, self.next_save) = (next_preview(train_seconds), train_seconds + self.interval);
-                self.account.retreat(step);
-                if self.events.is_some() {
-                    self.begin_events(step);
-                }
-                self.progress.note(&format!("raygrad: {what}; going on from step {step} at {SLOWER} times the rate"));
-                true
+        let step = trainer.stats().step;
+        let what = format!("raygrad: warning: for many steps up to {end} nothing was finite{reason}");
+        match &back {
+            Ok(()) => {
+                self.back = Some(step);
+                self.account.retreat();
+                self.progress.note(&format!("{what}; going on from step {step} at {SLOWER} times the rate"));
             }
-            Err(error) => {
-                self.progress.note(&format!("raygrad: {what}, and the run cannot go back: {error}"));
-                false
-            }
+            Err(error) => self.progress.note(&format!("{what}, and the run cannot go back: {error}")),
         }
+        back.is_ok()
+    }
+
+    /// Takes a trainer that has diverged for good back to the last checkpoint; says whether there is one.
+    pub fn give_up(&mut self, trainer: &mut Trainer) -> bool {
+        let back = checkpoint::load(self.run, trainer).and_then(|()| self.cut(trainer));
+        trainer.model.finish();
+        let found = back.is_ok();
+        self.warn(back);
+        found
+    }
+
+    /// Forgets what was written of steps after the one that a trainer is at.
+    fn cut(&mut self, trainer: &Trainer) -> Result<()> {
+        let StepStats { step, train_seconds, .. } = trainer.stats();
+        (self.metrics, self.logged) = metrics(self.run, step)?;
+        (self.psnr, self.next_preview) = (None, next_preview(train_seconds));
+        self.next_save = train_seconds + self.interval;
+        self.account.cut(step);
+        if self.events.is_some() {
+            self.begin_events(step);
+        }
+        Ok(())
     }
 
     /// Says what went wrong, if it was not said before.
@@ -179,15 +201,19 @@ impl<'a> Watch<'a> {
     }
 
     /// Called when training has ended; unless somebody waits for that, there is a last preview. A folder that was removed is made
-    /// again.
-    pub fn finish(mut self, trainer: &Trainer, ended: Ended) -> Result<()> {
+    /// again. The model is written if it is `good`, so that none that is not takes the place of one that is.
+    pub fn finish(mut self, trainer: &Trainer, ended: Ended, good: bool) -> Result<()> {
         if !self.run.file("config.json").exists() {
-            Run::create(self.run.folder.clone(), self.run.config.clone())?;
+            make_folder(&self.run.folder)?;
+            self.run.write()?;
         }
-        trainer.model.save(self.run.model_file())?;
+        if good {
+            trainer.model.save(self.run.model_file())?;
+        }
         let stats = trainer.stats();
         if stats.step > self.logged {
-            self.log(&stats)?;
+            let logged = self.log(&stats);
+            self.warn(logged);
         }
         let shown = if ended == Ended::Interrupted { Ok(()) } else { self.preview(trainer) };
         shown.and(self.summarise(&stats, Some(ended)))

@@ -179,8 +179,7 @@ mod tests {
     fn counts_come_back_before_the_first_step_too() {
         let mut trainer = trainer();
         (trainer.collapses, trainer.done.restarts, trainer.batch) = (2, 3, 512);
-        trainer.slow_down(0.5);
-        trainer.slow_down(0.25);
+        trainer.set_pace(0.125);
         trainer.elapsed = Duration::from_nanos(1_234_567_891);
         let state = trainer.state().unwrap();
         let mut later = self::trainer();

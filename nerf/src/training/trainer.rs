@@ -262,14 +262,18 @@ impl Trainer {
         Draw { model: &self.model, data: &self.data, seed: self.seed(), number, fraction, total, tile }
     }
 
-    /// Multiplies the learning rates of all steps from now on by this factor, beside what schedules say; part of the
-    /// [state](Self::state).
+    /// What the learning rates of all schedules are multiplied by; 1 at first.
+    pub fn pace(&self) -> f64 {
+        self.pace
+    }
+
+    /// Multiplies the learning rates of all schedules by `pace`, from the next step on; part of the [state](Self::state).
     ///
     /// # Panics
-    /// If the factor is negative or not finite.
-    pub fn slow_down(&mut self, factor: f64) {
-        assert!(factor >= 0.0 && factor.is_finite(), "a rate times {factor}");
-        self.pace *= factor;
+    /// If it is negative or not finite.
+    pub fn set_pace(&mut self, pace: f64) {
+        assert!(pace >= 0.0 && pace.is_finite(), "rates times {pace}");
+        self.pace = pace;
     }
 
     /// What would be infinite or NaN first if the next step were taken, `fraction` as in [`step`](Self::step): the operation
@@ -583,7 +587,7 @@ mod tests {
         let config = tiny_table().with_refined(&[Refined::Exposure]);
         let [whole, half, none] = [1.0, 0.5, 0.0].map(|factor| {
             let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
-            trainer.slow_down(factor);
+            trainer.set_pace(factor);
             let before = trainer.model.params.clone();
             let rate = trainer.step(0.3).rate;
             let after = trainer.model.params.values().iter();

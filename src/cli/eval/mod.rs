@@ -101,6 +101,7 @@ fn hold_out(opened: &Opened) -> &'static str {
 pub fn run(args: &Args) -> Result<()> {
     let run = Run::open(&args.run)?;
     let mut model = run.model()?;
+    let identity = Identity::of(&run, &model)?;
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
@@ -126,7 +127,6 @@ pub fn run(args: &Args) -> Result<()> {
         data.frames.iter_mut().zip(found).for_each(|(frame, camera)| frame.camera = camera);
         cameras = Alignment::Fitted;
     }
-    let identity = Identity::of(&run, &model)?;
     let skip = model.marching().map(|marching| marching.config.occupancy.skip);
     let name = args.name(skip);
     let pictures = run.file(&name);
@@ -284,8 +284,9 @@ fn gains(frame: &Frame, render: &Image, truth: &Image, half: usize) -> [f32; 3] 
     let [render, truth] = [render, truth].map(|image| used(frame, image, 0..half));
     std::array::from_fn(|channel| {
         let pairs = render.data.iter().zip(&truth.data).skip(channel).step_by(3);
-        let [both, own] = pairs.fold([0.0; 2], |[both, own], (&a, &b)| [both + a * b, own + a * a]);
-        if own > 0.0 { both / own } else { 1.0 }
+        let pairs = pairs.map(|(a, b)| (f64::from(*a), f64::from(*b)));
+        let [both, own] = pairs.fold([0.0; 2], |[both, own], (a, b)| [both + a * b, own + a * a]);
+        if own > 0.0 { (both / own) as f32 } else { 1.0 }
     })
 }
 

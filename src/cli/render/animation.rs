@@ -14,19 +14,21 @@ pub enum Animation<W: Write> {
     Gif {
         /// What writes it.
         encoder: Box<gif::Encoder<W>>,
-        /// Time that a frame is shown, in hundredths of a second.
-        delay: u16,
+        /// Frames a second.
+        fps: f64,
+        /// Frames so far.
+        frames: u32,
     },
     /// Every colour as it is.
     Apng(Box<png::Writer<W>>),
 }
 
 impl<W: Write> Animation<W> {
-    /// A GIF without frames. A frame is shown for a whole number of hundredths of a second.
+    /// A GIF without frames. A frame is shown for a whole number of hundredths of a second, and the film for as long as it should.
     pub fn gif(to: W, [width, height]: [u16; 2], fps: f64) -> Result<Self, String> {
         let mut encoder = gif::Encoder::new(to, width, height, &[]).map_err(|e| e.to_string())?;
         encoder.set_repeat(Repeat::Infinite).map_err(|e| e.to_string())?;
-        Ok(Animation::Gif { encoder: Box::new(encoder), delay: (100.0 / fps).round() as u16 })
+        Ok(Animation::Gif { encoder: Box::new(encoder), fps, frames: 0 })
     }
 
     /// An APNG that is to have so many frames.
@@ -45,10 +47,13 @@ impl<W: Write> Animation<W> {
     pub fn push(&mut self, image: &Image) -> Result<(), String> {
         let bytes: Vec<u8> = image.data.iter().map(|&value| quantise(value)).collect();
         match self {
-            Animation::Gif { encoder, delay } => {
+            Animation::Gif { encoder, fps, frames } => {
+                let end = |frames: u32| (100.0 * f64::from(frames) / *fps).round();
+                let delay = (end(*frames + 1) - end(*frames)) as u16;
+                *frames += 1;
                 let [width, height] = [image.width as u16, image.height as u16];
                 let frame = gif::Frame::from_rgb_speed(width, height, &bytes, QUANTISER_SPEED);
-                encoder.write_frame(&gif::Frame { delay: *delay, ..frame }).map_err(|e| e.to_string())
+                encoder.write_frame(&gif::Frame { delay, ..frame }).map_err(|e| e.to_string())
             }
             Animation::Apng(writer) => writer.write_image_data(&bytes).map_err(|e| e.to_string()),
         }
@@ -61,6 +66,29 @@ impl<W: Write> Animation<W> {
                 encoder.into_inner().and_then(|mut to| Ok(to.flush()?)).map_err(|e| e.to_string())
             }
             Animation::Apng(writer) => writer.finish().map_err(|e| e.to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gif_takes_as_long_as_its_frames_should() {
+        // 30 frames a second are no whole number of hundredths each.
+        for (fps, frames) in [(30.0, 60), (40.0, 7), (25.0, 5)] {
+            let mut bytes = vec![];
+            let mut animation = Animation::gif(&mut bytes, [4, 3], fps).unwrap();
+            (0..frames).for_each(|_| animation.push(&Image::new(4, 3, 3)).unwrap());
+            animation.finish().unwrap();
+            let mut decoder = gif::Decoder::new(&bytes[..]).unwrap();
+            let (mut total, mut count) = (0.0, 0);
+            while let Some(frame) = decoder.read_next_frame().unwrap() {
+                assert!((f64::from(frame.delay) - 100.0 / fps).abs() < 1.0);
+                (total, count) = (total + f64::from(frame.delay), count + 1);
+            }
+            assert!(count == frames && (total - 100.0 * f64::from(frames) / fps).abs() <= 0.5, "{fps}: {total}");
         }
     }
 }

@@ -16,6 +16,9 @@ use crate::cli::progress::Progress;
 /// A GIF shows a frame for two hundredths of a second at least: players show shorter ones for longer.
 const FASTEST_GIF: f64 = 50.0;
 
+/// The longest side of a film in pixels.
+const LONGEST_SIDE: usize = 1 << 14;
+
 /// A file that holds a film.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Film {
@@ -50,7 +53,7 @@ impl Film {
     }
 
     /// Whether it can be written, before there are frames.
-    pub fn check(self, out: &Path, fps: f64) -> Result<()> {
+    pub fn check(self, out: &Path, fps: f64, size: [usize; 2]) -> Result<()> {
         if out.is_dir() {
             return Err(Error::file(out, "is a folder, not a file"));
         }
@@ -59,6 +62,9 @@ impl Film {
             let what =
                 format!("a GIF shows {FASTEST_GIF} frames a second at most, not {fps}: name a FILE.apng or FILE.mp4");
             return Err(Error::setting("fps", what));
+        }
+        if let Some(side) = size.into_iter().find(|side| *side > LONGEST_SIDE) {
+            return Err(Error::setting("size", format!("has a side of {side} pixels, and films have {LONGEST_SIDE} at most")));
         }
         match self {
             Film::Gif | Film::Apng => Ok(()),

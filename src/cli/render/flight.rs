@@ -279,7 +279,10 @@ impl Photographs {
         let views = capture.split(split)?.into_iter().filter(|view| is_made || view.image.is_some());
         let views: Vec<&View> = views.collect();
         let learned = split == Split::Train && model.refine.is_some();
-        if views.is_empty() || (learned && views.len() != model.extent.frames) {
+        let trained = &run.config.photographs;
+        let others = views.len() != model.extent.frames
+            || !is_made && !trained.is_empty() && !views.iter().map(|view| &view.name).eq(trained);
+        if views.is_empty() || (learned && others) {
             let what = format!(
                 "has {} photographs to {split} on, and not those of the run: say with --scene where those are",
                 views.len()
