@@ -54,8 +54,8 @@ mod tests {
     #[test]
     fn what_is_behind_what_is_seen_in_all_pictures_is_hidden() {
         // Along +y, with +x to the right.
-        let first = from(DVec3::ZERO, DVec3::Y);
-        let alone = Hidden::new(std::slice::from_ref(&first), 0.5);
+        let first = || from(DVec3::ZERO, DVec3::Y);
+        let alone = Hidden::new(&[first()], 0.5);
         for (place, hidden) in [
             ([0.1, 2.3, -0.1], false),
             ([0.1, 2.6, -0.1], true),
@@ -73,9 +73,9 @@ mod tests {
         let place = DVec3::new(0.1, 2.6, -0.1);
         // From the side it is as far as 1 from the eye.
         let near = from(place - DVec3::X, place);
-        assert!(!Hidden::new(&[first.clone(), near], 0.5).holds(place));
+        assert!(!Hidden::new(&[first(), near], 0.5).holds(place));
         let far = from(place - 3.0 * DVec3::X, place + DVec3::new(0.0, 0.1, -0.1));
-        assert!(Hidden::new(&[first, far], 0.5).holds(place));
+        assert!(Hidden::new(&[first(), far], 0.5).holds(place));
         assert!(!Hidden::new(&[], 0.5).holds(place), "in no picture");
     }
 }
