@@ -140,7 +140,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let preview = png(&place.path("run/previews/000003.png"));
     assert_eq!([preview.width, preview.height], [2 * SIZE, SIZE]);
 
-    let printed: Value = serde_json::from_str(&place.succeeds("eval run --json")).unwrap();
+    let printed: Value = serde_json::from_str(&place.succeeds("--threads 3 eval run --json")).unwrap();
     assert_eq!(printed, place.json("run/eval-test.json"));
     let fields = ["split", "views", "background", "width", "height", "pixel_offset", "quantisation"];
     let values = fields.map(|field| printed[field].clone());
@@ -164,7 +164,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     assert_eq!(json!(fields), json!([3, 0, 6, "classic", "hierarchical", env!("CARGO_PKG_VERSION")]));
     let crc = crc32fast::hash(&place.bytes("run/model.safetensors"));
     assert!(model["crc32"] == format!("{crc:08x}") && model["budget"] == json!({ "steps": 3 }), "{model}");
-    assert!(printed["threads"].as_u64().unwrap() > 0 && !printed["processor"].as_str().unwrap().is_empty());
+    assert!(printed["threads"] == 3 && !printed["processor"].as_str().unwrap().is_empty());
     // A page shows the views, the worst first, and needs nothing but the pictures beside it.
     let page = String::from_utf8(place.bytes("run/eval-test/index.html")).unwrap();
     let mut order: Vec<(f64, &str)> =
@@ -301,6 +301,15 @@ fn the_embedded_scene_needs_no_files() {
     assert_eq!(config["config"]["field"]["position_levels"], 0);
     place.succeeds("eval run --views 1");
     assert_eq!(place.json("run/eval-test-1.json")["background"], "white");
+    // Of many views some are drawn, and the worst.
+    let report: Value = serde_json::from_str(&place.succeeds("eval run --split train --json")).unwrap();
+    let psnr = |view: &Value| view["psnr"].as_f64().unwrap();
+    let mut order: Vec<(usize, f64)> = report["per_view"].as_array().unwrap().iter().map(psnr).enumerate().collect();
+    order.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let drawn = |view: usize| place.path(&format!("run/eval-train/{view:03}.png")).exists();
+    assert!(order.len() == 60 && order[..3].iter().all(|(view, _)| drawn(*view)), "{order:?}");
+    let count = (0..60).filter(|view| drawn(*view)).count();
+    assert!((11..=13).contains(&count), "{count}");
     place.succeeds("render run --out one.png");
     place.fails("train --downscale 3", &["`downscale`", "200x200"]);
     place.fails("train landscape --downscale 16", &["`downscale`", "400x300"]);

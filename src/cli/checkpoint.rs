@@ -104,7 +104,8 @@ fn later_version(path: &Path) -> Option<Error> {
     let line = beginning.split(|byte| *byte == b'\n').next()?;
     let version: u32 = std::str::from_utf8(line).ok()?.strip_prefix(MAGIC)?.split_whitespace().next()?.parse().ok()?;
     (version > VERSION).then(|| {
-        let what = format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer");
+        let what =
+            format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer");
         Error::file(path, what)
     })
 }

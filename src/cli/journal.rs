@@ -41,3 +41,26 @@ impl Journal {
 fn failed(path: &Path, error: &std::io::Error) -> Error {
     Error::file(path, format!("cannot be written: {error}"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_written_waits_for_what_can() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("records");
+        let mut journal = Journal::begin(&path, b"begin\n").unwrap();
+        journal.add(b"one\n").unwrap();
+        // A file that may only be read refuses all.
+        let writable = std::mem::replace(&mut journal.file, File::open(&path).unwrap());
+        for record in [b"two\n", b"six\n"] {
+            let message = journal.add(record).unwrap_err().to_string();
+            assert!(message.contains("records: cannot be written"), "{message}");
+        }
+        journal.file = writable;
+        journal.add(b"ten\n").unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "begin\none\ntwo\nsix\nten\n");
+        assert_eq!(journal.length, std::fs::metadata(&path).unwrap().len());
+    }
+}

@@ -225,10 +225,12 @@ fn contents(folder: &Path) -> Result<Contents> {
     }
     match std::fs::read_dir(folder) {
         // What a program that was killed was about to write is nothing.
-        Ok(mut entries) => Ok(match entries.any(|entry| !entry.is_ok_and(|entry| is_unfinished(&entry) || entry.file_name() == LOCK)) {
-            true => Contents::Other,
-            false => Contents::Nothing,
-        }),
+        Ok(mut entries) => Ok(
+            match entries.any(|entry| !entry.is_ok_and(|entry| is_unfinished(&entry) || entry.file_name() == LOCK)) {
+                true => Contents::Other,
+                false => Contents::Nothing,
+            },
+        ),
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(Contents::Nothing),
         Err(e) => Err(Error::file(folder, format!("cannot be used as the run's folder: {e}"))),
     }

@@ -245,11 +245,14 @@ fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
     let place = Place::empty();
     let (succeeds, said) = complaints(
         &place,
-        &format!("train --downscale 10 --steps 120 --out run {SMALL} --set schedule.linear.from=1e7"),
+        &format!("train --downscale 10 --steps 120 --out run --tensorboard {SMALL} --set schedule.linear.from=1e7"),
     );
     assert!(succeeds && said.contains("recorded at nerf/src/field/instant.rs:"), "{said}");
     let retreats = said.matches("going on from step 0 at 0.25 times the rate").count() as i32;
     assert!((1..=3).contains(&retreats) && !said.contains("training has diverged"), "{said}");
+    // Each time TensorBoard is told to forget what was.
+    let events = std::fs::read_dir(place.path("run/tensorboard")).unwrap().count() as i32;
+    assert!(events == retreats + 1 && place.json("run/summary.json")["retreats"] == retreats, "{events}");
     // The metrics are those of one run, all of it at the last rate.
     let metrics = metrics(&place, "run");
     let steps: Vec<u64> = metrics.iter().map(|line| line["step"].as_u64().unwrap()).collect();
@@ -286,6 +289,8 @@ fn a_run_that_diverges_again_and_again_ends_with_the_reason_and_its_last_good_mo
     let step: u64 = end.split("that of step ").nth(1).unwrap().split(';').next().unwrap().parse().unwrap();
     let kept = checkpoints(&place, "run");
     assert!(step > 0 && kept.last().unwrap().ends_with(format!("{step:08}.checkpoint")), "{step} {kept:?}");
+    // Nothing speaks of later steps.
+    assert!(metrics(&place, "run").iter().all(|line| line["step"].as_u64().unwrap() <= step));
     // It is what was learned until then, and not what overflowed.
     let left = place.bytes("run/model.safetensors");
     place.succeeds(&format!("train --resume run --steps {step}"));

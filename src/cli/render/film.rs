@@ -64,7 +64,10 @@ impl Film {
             return Err(Error::setting("fps", what));
         }
         if let Some(side) = size.into_iter().find(|side| *side > LONGEST_SIDE) {
-            return Err(Error::setting("size", format!("has a side of {side} pixels, and films have {LONGEST_SIDE} at most")));
+            return Err(Error::setting(
+                "size",
+                format!("has a side of {side} pixels, and films have {LONGEST_SIDE} at most"),
+            ));
         }
         match self {
             Film::Gif | Film::Apng => Ok(()),

@@ -55,6 +55,15 @@ fn every_eighth_photograph_is_held_out_whether_others_exist_or_not() {
     lost.views.iter_mut().find(|view| view.field == "frames[5]").unwrap().image = None;
     lost.hold_out();
     assert_eq!(numbers(&lost.split(Split::Test).unwrap()), ["frames[0]", "frames[8]", "frames[16]"]);
+    // That is said of a capture in whatever order its photographs are.
+    assert!(!capture(folder.path(), 17).holds_out_every_eighth() && whole.holds_out_every_eighth());
+    whole.views.reverse();
+    assert!(whole.holds_out_every_eighth());
+    whole.views[5].split = Some(Split::Test);
+    assert!(!whole.holds_out_every_eighth());
+    let mut one = capture(folder.path(), 1);
+    one.views[0].split = Some(Split::Test);
+    assert!(!one.holds_out_every_eighth(), "there is nothing to hold it out of");
     let mut few = capture(folder.path(), 2);
     few.hold_out();
     assert!(few.split(Split::Test).is_err() && few.split(Split::Train).unwrap().len() == 2);
