@@ -141,7 +141,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     assert!(said.contains(&format!("exported {} points, of ", points.len())) && !header.contains("face"), "{said}");
     assert!((10..=50).contains(&points.len()) && within(&points, 1e-9));
     place.fails("export run no.ply --level=-1", &["`level`: is -1"]);
-    place.fails("export run no.ply --level 1e30", &["`level`: is 1", "use a smaller one"]);
+    place.fails("export run no.ply --level 1e30 --hollow", &["`level`: is 1", "use a smaller one"]);
     place.fails("export run cameras.json --triangles 9", &["`triangles`: is for shapes"]);
     place.fails("export run cameras.json --points", &["`points`: is for shapes"]);
     place.fails("export run no.ply --scene scene", &["`scene`: is for cameras"]);

@@ -116,6 +116,10 @@ fn a_ribbon_is_not_tied_off() {
     let positions = (0..2 * (squares + 1)).map(|i| DVec3::new(f64::from(i / 2), f64::from(i % 2), 0.0)).collect();
     let square = |i: u32| [[2 * i, 2 * i + 2, 2 * i + 1], [2 * i + 1, 2 * i + 2, 2 * i + 3]];
     let mut mesh = Mesh { positions, triangles: (0..squares as u32).flat_map(square).collect() };
+    let (mut same, middle) = (mesh.clone(), DVec3::new(10.0, 0.5, 0.0));
+    let work = Work::new(&mut same);
+    assert!(!work.may_collapse([20, 21], middle), "across");
+    assert!(work.may_collapse([20, 22], DVec3::new(10.5, 0.0, 0.0)), "along");
     mesh.decimate(6, &mut |_| ());
     assert!((mesh.area() - f64::from(squares)).abs() < 0.5, "{}", mesh.area());
     let all: Vec<[u32; 2]> = mesh.triangles.iter().flat_map(sides).collect();
