@@ -1,12 +1,10 @@
 //! What a run leaves beside its model: event files for TensorBoard, a summary, an exit code.
 
 use super::Place;
+use super::resume::SMALL;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
-
-/// Settings of a model whose steps are short.
-const SMALL: &str = "--set field.grid.log2_table=10 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
 
 /// Prints what TensorBoard's two readers have of a folder: of each tag the steps and values of its numbers, and the steps and
 /// sizes of its pictures.

@@ -145,7 +145,7 @@ mod tests {
             std::fs::write(&path, bytes).unwrap();
             let found = distances(&path, unit, &camera).unwrap();
             let worst = found.data.iter().zip(wall(4.5).data).map(|(a, b)| (a - b).abs());
-            assert!(worst.fold(0.0, f32::max) < error && found.data[2] > 4.5, "{name}: {found:?}");
+            assert!(worst.fold(0.0, raygrad_tensor::Real::maximum) < error && found.data[2] > 4.5, "{name}: {found:?}");
         }
         let pixels = |bytes: &[u8]| image::load_from_memory(bytes).unwrap().into_luma16().into_raw();
         assert_eq!(pixels(&depths.to_png(0.001).0)[..3], [2250, 0, 2250]);

@@ -45,8 +45,8 @@ fn a_path_passes_its_keys_with_continuous_speeds() {
         }
         for &share in if closed { &shares[1..] } else { &shares[1..4] } {
             let [before, after] = speeds(&path, share);
-            let worst = before.iter().zip(after).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-            let most = before.iter().map(|x| x.abs()).fold(0.0, f64::max);
+            let worst = before.iter().zip(after).map(|(a, b)| (a - b).abs()).fold(0.0, raygrad_tensor::Real::maximum);
+            let most = before.iter().map(|x| x.abs()).fold(0.0, raygrad_tensor::Real::maximum);
             assert!(worst < 1e-2 * most && most > 0.1, "{share}: {before:?} {after:?}");
         }
         // Where it begins again it goes on as it came.

@@ -43,7 +43,7 @@ fn fewer_triangles_hold_the_same() {
         assert!((coarse.volume() / fine.volume() - 1.0).abs() < 0.01, "{name}: {} {}", coarse.volume(), fine.volume());
         assert!((coarse.area() / fine.area() - 1.0).abs() < 0.01, "{name}: {} {}", coarse.area(), fine.area());
         // Vertices stay on the surface, by far less than the edges are long (about .1).
-        let off = coarse.positions.iter().map(|x| (f(*x) - 1.0).abs()).fold(0.0, f64::max);
+        let off = coarse.positions.iter().map(|x| (f(*x) - 1.0).abs()).fold(0.0, raygrad_tensor::Real::maximum);
         assert!(off < 0.012, "{name}: {off}");
         // No triangle has turned over: of the ball, all face away from the middle, and most do so squarely.
         if name == "ball" {

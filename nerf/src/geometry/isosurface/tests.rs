@@ -46,7 +46,8 @@ fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
             "steep" => 5e-5,
             _ => 0.05 / 32.0,
         };
-        let off = mesh.positions.iter().map(|x| (x.distance(centre) - radius).abs()).fold(0.0, f64::max);
+        let off =
+            mesh.positions.iter().map(|x| (x.distance(centre) - radius).abs()).fold(0.0, raygrad_tensor::Real::maximum);
         assert!(off < bound, "{name}: {off}");
         assert!(mesh.is_closed() && euler(&mesh) == 2 && mesh.parts().1 == 1, "{name}");
         // Triangles lie within the ball by about an eighth of a squared cell over the radius.
