@@ -191,7 +191,15 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let rows: Vec<Vec<&str>> = table.lines().take(3).map(|line| line.split_whitespace().collect()).collect();
     assert!(rows[0].contains(&"model.seed") && rows[1][..3] == ["run", "eval-test", &psnr("run")], "{table}");
     assert!(rows[2][..3] == ["other", "eval-test", &psnr("other")] && !table.contains("not the same"), "{table}");
-    assert!(place.succeeds("compare run").contains("not the same photographs"));
+    let output = place.command("compare run").output().unwrap();
+    assert!(String::from_utf8_lossy(&output.stdout).contains("not the same photographs"));
+    assert!(output.stderr.is_empty(), "{output:?}");
+    // Its figures are no longer those of its model.
+    place.succeeds("train --resume run --steps 4");
+    let output = place.command("compare run other").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    let stale = "is of a model that has been trained on since";
+    assert!(output.status.success() && said.matches(stale).count() == 2 && !said.contains("other/"), "{said}");
 }
 
 #[test]

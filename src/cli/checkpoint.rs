@@ -78,11 +78,21 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     let checkpoints = all(&folder(run))?;
     let none = checkpoints.is_empty();
     // What a later raygrad wrote is not passed over, and lost.
-    if let Some(error) = checkpoints.iter().find_map(|(_, path)| later_version(path)) {
-        return Err(error);
+    for (_, path) in &checkpoints {
+        let mut beginning = vec![];
+        // What cannot be read is said below.
+        let read = fs::File::open(path).and_then(|file| file.take(LONGEST as u64).read_to_end(&mut beginning));
+        if read.is_ok() {
+            check_version(path, &beginning)?;
+        }
     }
     for (_, path) in checkpoints {
-        let loaded = read(&path).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
+        // One that is there and cannot be read just now is not passed over either.
+        let unread =
+            |e| Error::file(&path, format!("cannot be read: {e}; without it, the checkpoint before it is taken"));
+        let bytes = fs::read(&path).map_err(unread)?;
+        let loaded =
+            parse(&path, bytes).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
         let Err(error) = loaded else { return Ok(()) };
         complain(&format!("warning: {error}"));
     }
@@ -97,26 +107,26 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     }
 }
 
-/// What is to be said of a file of a later version.
-fn later_version(path: &Path) -> Option<Error> {
-    let mut beginning = vec![];
-    fs::File::open(path).ok()?.take(LONGEST as u64).read_to_end(&mut beginning).ok()?;
-    let line = beginning.split(|byte| *byte == b'\n').next()?;
-    let version: u32 = std::str::from_utf8(line).ok()?.strip_prefix(MAGIC)?.split_whitespace().next()?.parse().ok()?;
-    (version > VERSION).then(|| {
-        let what =
-            format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer");
-        Error::file(path, what)
-    })
+/// Whether a file that begins so is not of a later version.
+fn check_version(path: &Path, beginning: &[u8]) -> Result<()> {
+    let version = || -> Option<u32> {
+        let line = beginning.iter().take(LONGEST).position(|byte| *byte == b'\n')?;
+        let words = std::str::from_utf8(&beginning[..line]).ok()?.strip_prefix(MAGIC)?;
+        words.split_whitespace().next()?.parse().ok()
+    };
+    match version().filter(|version| *version > VERSION) {
+        None => Ok(()),
+        Some(version) => Err(Error::file(
+            path,
+            format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer"),
+        )),
+    }
 }
 
-/// The state in a file.
-pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
+/// The state in the bytes of a file.
+pub(super) fn parse(path: &Path, mut bytes: Vec<u8>) -> Result<Vec<u8>> {
     let bad = |what: String| Error::file(path, what);
-    if let Some(error) = later_version(path) {
-        return Err(error);
-    }
-    let mut bytes = fs::read(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
+    check_version(path, &bytes)?;
     let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n');
     let line = end.and_then(|end| std::str::from_utf8(&bytes[..end]).ok()?.strip_prefix(MAGIC));
     let (Some(end), Some(line)) = (end, line) else {
@@ -149,10 +159,7 @@ mod tests {
         let path = folder.path().join("00000007.checkpoint");
         let state: Vec<u8> = (0..200_u8).collect();
         let whole = [format!("{MAGIC} 1 {:08x} 200\n", crc32fast::hash(&state)).as_bytes(), &state].concat();
-        let read = |bytes: &[u8]| {
-            fs::write(&path, bytes).unwrap();
-            read(&path)
-        };
+        let read = |bytes: &[u8]| parse(&path, bytes.to_vec());
         assert_eq!(read(&whole).unwrap(), state);
         for length in 0..whole.len() {
             let error = read(&whole[..length]).unwrap_err().to_string();
@@ -168,7 +175,7 @@ mod tests {
         let newer = [b"raygrad checkpoint 2 00000000 200\n".as_slice(), &state].concat();
         assert!(read(&newer).unwrap_err().to_string().contains("version 2"));
         // The latest comes first, by number and not by name; others are none.
-        for name in ["00000100.checkpoint", "20.checkpoint", "x.checkpoint", "00000200.tmp"] {
+        for name in ["00000007.checkpoint", "00000100.checkpoint", "20.checkpoint", "x.checkpoint", "00000200.tmp"] {
             fs::write(folder.path().join(name), b"").unwrap();
         }
         let names = |(_, path): (u64, PathBuf)| path.file_name().unwrap().to_str().unwrap().to_owned();

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::{Error, Result};
 use serde_json::Value;
 
-use super::output::print;
+use super::eval::model_checksum;
+use super::output::{complain, print};
 use super::run::Run;
 
 /// Conditions under which figures are figures of the same thing.
@@ -57,7 +58,10 @@ struct Row {
 pub fn run(args: &Args) -> Result<()> {
     let mut rows = vec![];
     for run in &args.runs {
-        let found = results(&Run::open(run)?.folder, args.only.as_deref())?;
+        let opened = Run::open(run)?;
+        let found = results(&opened.folder, args.only.as_deref())?;
+        // That of a run whose model is gone is what is left of it.
+        let model = model_checksum(&opened).ok();
         if found.is_empty() {
             let what = match &args.only {
                 Some(name) => format!("has no result {name}.json; `raygrad eval` makes them"),
@@ -66,11 +70,14 @@ pub fn run(args: &Args) -> Result<()> {
             return Err(Error::file(run, what));
         }
         for path in found {
-            rows.push(Row {
-                run: run.display().to_string(),
-                name: path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
-                fields: read(&path)?,
-            });
+            let fields = read(&path)?;
+            if let (Some(now), Some(then)) = (&model, fields.get("model.crc32"))
+                && now != then
+            {
+                complain(&format!("warning: {}: is of a model that has been trained on since", path.display()));
+            }
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            rows.push(Row { run: run.display().to_string(), name, fields });
         }
     }
     print(&table(&rows))
@@ -172,12 +179,12 @@ mod tests {
     #[test]
     fn what_differs_is_a_column_or_a_warning_and_the_rest_is_said_once() {
         let one = [("psnr_mean", "31.126"), ("split", "test"), ("model.seed", "0"), ("views", "8")];
-        let other = [("psnr_mean", "null"), ("split", "test"), ("model.seed", "7"), ("views", "80"), ("threads", "2")];
+        let other = [("psnr_mean", "NaN"), ("split", "test"), ("model.seed", "7"), ("views", "80"), ("threads", "2")];
         let text = table(&[row("first", &one), row("b", &other)]);
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines[0], "run    result     PSNR   SSIM  s/view  model.seed  threads");
         assert_eq!(lines[1], "first  eval-test  31.13  -     -       0           -");
-        assert_eq!(lines[2], "b      eval-test  -      -     -       7           2");
+        assert_eq!(lines[2], "b      eval-test  NaN    -     -       7           2");
         assert_eq!(lines[3], "not the same views, so that these figures cannot be compared:");
         assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "all: split test"]);
     }

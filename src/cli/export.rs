@@ -9,7 +9,8 @@ use raygrad::nerf::dataset::formats::transforms;
 use raygrad::nerf::dataset::{Capture, Split};
 use raygrad::nerf::{Error, Model, Result};
 
-use super::output::print;
+use super::output::{parent, print};
+use super::photographs::{check_trained, present};
 use super::prepare::convert::{Target, convert, relative};
 use super::prepare::program::Stop;
 use super::run::Run;
@@ -44,10 +45,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
     if args.to.is_none() && geometry::is_shape(&args.out) {
-        if args.scene.is_some() {
-            return Err(Error::setting("scene", "is for cameras: shapes are the model's alone"));
-        }
-        return geometry::run(&run, &args.shape, &args.out).map(|()| ExitCode::SUCCESS);
+        return geometry::run(&run, args.scene.as_ref(), &args.shape, &args.out).map(|()| ExitCode::SUCCESS);
     }
     args.shape.check_absent()?;
     let model = run.model()?;
@@ -56,7 +54,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         Scene::Folder(folder) => Capture::read(folder)?,
         scene => builtin::capture(scene, None, args.to.map(|_| pictures.path()))?,
     };
-    let refined = refine(&mut capture, &model, &run.config.photographs)?;
+    let refined = refine(&mut capture, &model, &run)?;
     let cameras = capture.views.len();
     match args.to {
         None => write(capture, &args.out)?,
@@ -77,28 +75,13 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 ///
 /// What cameras have done as a whole is undone, which no photograph shows: so those of other photographs, and points, stay
 /// where they belong.
-fn refine(capture: &mut Capture, model: &Model<f32>, names: &[String]) -> Result<usize> {
+fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize> {
     let Some(refine) = &model.refine else { return Ok(0) };
     let drift = refine.placement(&model.params).unwrap_or_default();
     let placement = model.extent.placement;
-    // In the order in which they were read for training, which numbers them.
-    let train = capture.split(Split::Train)?.into_iter();
-    let made = capture.present().next().is_none();
-    let train = train.filter(|view| made || view.image.is_some());
-    let (trained, named): (Vec<String>, Vec<String>) =
-        train.map(|view| (view.field.clone(), view.name.clone())).unzip();
-    if trained.len() == names.len() && !made && named != names {
-        let what = "has other photographs to train on than those that the run was trained on: say with --scene where those are";
-        return Err(Error::file(&capture.file, what));
-    }
-    if trained.len() != model.extent.frames {
-        let what = format!(
-            "has {} photographs to train on, and the run was trained on {}: say with --scene where those are",
-            trained.len(),
-            model.extent.frames
-        );
-        return Err(Error::file(&capture.file, what));
-    }
+    let views = present(capture, Split::Train)?;
+    check_trained(run, capture, &views, model.extent.frames)?;
+    let trained: Vec<String> = views.iter().map(|view| view.field.clone()).collect();
     for view in &mut capture.views {
         let given = placement.camera(&view.camera);
         let found = match trained.iter().position(|field| *field == view.field) {
@@ -123,9 +106,8 @@ fn write(mut capture: Capture, out: &Path) -> Result<()> {
     if out.is_dir() {
         return Err(Error::file(out, "is a folder: name a file such as cameras.json, or a format with --to"));
     }
-    let parent = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
-    let folder = tempfile::tempdir_in(parent).map_err(bad)?;
+    let folder = tempfile::tempdir_in(parent(out)).map_err(bad)?;
     transforms::write(&capture, folder.path())?;
     std::fs::rename(folder.path().join("transforms.json"), out).map_err(bad)
 }

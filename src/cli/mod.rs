@@ -18,6 +18,7 @@ mod machine;
 mod memory;
 mod output;
 mod parse;
+mod photographs;
 mod precision;
 mod prepare;
 mod preview;

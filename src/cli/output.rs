@@ -1,5 +1,6 @@
 //! Words to the terminal, and folders to write to.
 
+use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
@@ -25,10 +26,31 @@ pub fn complain(line: &str) {
     note(&format!("raygrad: {line}"));
 }
 
+/// The folder that a file is in.
+pub fn parent(file: &Path) -> &Path {
+    file.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Whether files can be made in a folder: asked before the work that they will hold.
 pub fn check_writable(folder: &Path) -> Result<()> {
-    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     tempfile::tempfile_in(folder).map(drop).map_err(|e| Error::file(folder, format!("cannot be written to: {e}")))
+}
+
+/// Keeps other programs out, until the file is dropped or this program ends, however it does; `busy` says what to do if one is in.
+pub fn lock(path: &Path, busy: impl FnOnce() -> Error) -> Result<File> {
+    let bad = |e: std::io::Error| Error::file(path, format!("cannot be locked: {e}"));
+    let file = File::options().create(true).truncate(false).write(true).open(path).map_err(bad)?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(busy()),
+        Err(TryLockError::Error(e)) => Err(bad(e)),
+    }
+}
+
+/// The CRC-32 of a file.
+pub fn checksum(path: &Path) -> Result<u32> {
+    let bytes = std::fs::read(path).map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
+    Ok(crc32fast::hash(&bytes))
 }
 
 /// Makes a folder and those above it, and sees that files can be made in it.

@@ -28,7 +28,16 @@ pub fn duration(text: &str) -> Result<Duration, String> {
 }
 
 /// Most pixels on a side of an image.
-const LARGEST: usize = 16384;
+pub const LARGEST: usize = 16384;
+
+/// Frames a second that files of films can say.
+pub const FPS: std::ops::RangeInclusive<f64> = 0.01..=240.0;
+
+/// Frames a second.
+pub fn fps(text: &str) -> Result<f64, String> {
+    let usage = || format!("write a number from {} to {}", FPS.start(), FPS.end());
+    text.parse().ok().filter(|fps| FPS.contains(fps)).ok_or_else(usage)
+}
 
 /// Width and height, such as `400x300`.
 pub fn size(text: &str) -> Result<[usize; 2], String> {

@@ -15,7 +15,7 @@ use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Camera, Error, Result};
 use serde_json::{Value, json};
 
-use super::output::{check_writable, note, other_numbered, print};
+use super::output::{check_writable, checksum, note, other_numbered, parent, print};
 use super::precision::{Precision, Renderer};
 use super::prepare::program::Stop;
 use super::progress::{Progress, spoken};
@@ -23,7 +23,7 @@ use super::run::Run;
 use super::scene::Scene;
 use super::{interrupt, parse};
 use film::{Film, Reel, frames_of};
-use flight::{Flight, FlightArgs};
+use flight::{CameraPath, Flight, FlightArgs};
 use frames::{DIGITS, Frames};
 use shown::{Layer, Show, Shown};
 
@@ -91,6 +91,12 @@ impl Args {
 
     /// What the output is, if the flags fit it.
     fn kind(&self, out: &Path) -> Result<Kind> {
+        if Kind::is_foreign(out) {
+            return Err(Error::file(
+                out,
+                "cannot be written: name a folder, or a FILE.png, .gif, .apng, .mp4 or .webm",
+            ));
+        }
         let kind = Kind::of(out);
         let meaningless = |flag: &str, what: &str| Err(Error::setting(flag, format!("has no meaning {what}")));
         if kind != Kind::Folder && !self.save.is_empty() {
@@ -103,7 +109,8 @@ impl Args {
         if self.keep_frames && !film {
             return meaningless("keep-frames", "without a film");
         }
-        if self.flight.fps.is_some() && self.flight.seconds.is_none() && !film {
+        let counts = self.flight.seconds.is_some() || matches!(self.flight.path, CameraPath::File(_));
+        if self.flight.fps.is_some() && !counts && !film {
             return meaningless("fps", "for pictures without --seconds");
         }
         Ok(kind)
@@ -115,6 +122,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
     let kind = args.kind(&out)?;
+    // Before it is read: should it be replaced meanwhile, frames of both are never taken for one film.
+    let stored = [checksum(&run.model_file())?, checksum(&run.file("config.json"))?];
     let mut model = run.model()?;
     if let Some(skip) = args.skip {
         model.set_skip(skip);
@@ -131,7 +140,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             if out.is_dir() {
                 return Err(Error::file(&out, "is a folder, not a file"));
             }
-            check_writable(out.parent().unwrap_or(Path::new(".")))?;
+            check_writable(parent(&out))?;
             shown.frame(&cameras[0]).image.save_png(&out)?;
             cameras.truncate(1);
             return report(&cameras, &out);
@@ -142,7 +151,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
         Kind::Folder => out.clone(),
     };
-    let mut frames = Frames::new(folder, contents(args, &run, &cameras, &shown)?)?;
+    let mut frames = Frames::new(folder, contents(args, stored, &cameras, &shown)?)?;
     if cameras.len() > 1 {
         interrupt::listen_to_go_on();
     }
@@ -171,6 +180,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     report(&cameras, &out)
 }
+
+/// Endings of pictures and films that others write.
+const FOREIGN: [&str; 13] =
+    ["mov", "avi", "mkv", "m4v", "mpg", "mpeg", "ogv", "jpg", "jpeg", "webp", "exr", "tif", "tiff"];
 
 /// The usual step of depths in files.
 const MILLI: f64 = 1e-3;
@@ -221,17 +234,13 @@ fn report(cameras: &[Camera], out: &Path) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// All that decides what frames show.
-fn contents(args: &Args, run: &Run, cameras: &[Camera], shown: &Shown<'_>) -> Result<Value> {
-    let sum = |path: PathBuf| {
-        let bytes = std::fs::read(&path).map_err(|e| Error::file(&path, format!("cannot be read: {e}")))?;
-        Ok::<_, Error>(crc32fast::hash(&bytes))
-    };
+/// All that decides what frames show, the checksums of model and configuration among it.
+fn contents(args: &Args, [model, config]: [u32; 2], cameras: &[Camera], shown: &Shown<'_>) -> Result<Value> {
     let flown = serde_json::to_vec(cameras).map_err(|e| Error::setting("path", e))?;
     Ok(json!({
         "raygrad": env!("CARGO_PKG_VERSION"),
-        "model": sum(run.model_file())?,
-        "config": sum(run.file("config.json"))?,
+        "model": model,
+        "config": config,
         "cameras": crc32fast::hash(&flown),
         "frames": cameras.len(),
         "size": [cameras[0].width, cameras[0].height],
@@ -261,5 +270,11 @@ impl Kind {
             Some(ending) => Film::of(ending).map_or(Kind::Folder, Kind::Film),
             None => Kind::Folder,
         }
+    }
+
+    /// Whether somebody who names this wants a file that cannot be written.
+    fn is_foreign(out: &Path) -> bool {
+        let ending = out.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+        ending.is_some_and(|ending| FOREIGN.contains(&ending.as_str())) && !out.is_dir()
     }
 }

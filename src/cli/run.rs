@@ -1,7 +1,7 @@
 //! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`, `lock`, if it
 //! was asked for `tensorboard/`, and later results of `raygrad eval` and pictures.
 
-use std::fs::{DirEntry, File, TryLockError};
+use std::fs::{DirEntry, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
-use super::output::{make_folder, remove};
+use super::output::{lock, make_folder, remove};
 use super::scene::Scene;
 
 /// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
@@ -102,14 +102,7 @@ impl Run {
 
     /// Keeps other programs from training this run, until the file is dropped or this program ends, however it does.
     pub fn lock(&self) -> Result<File> {
-        let path = self.file(LOCK);
-        let bad = |e: std::io::Error| Error::file(&path, format!("cannot be locked: {e}"));
-        let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(bad)?;
-        match file.try_lock() {
-            Ok(()) => Ok(file),
-            Err(TryLockError::WouldBlock) => Err(Error::file(&self.folder, "is being trained by another raygrad")),
-            Err(TryLockError::Error(e)) => Err(bad(e)),
-        }
+        lock(&self.file(LOCK), || Error::file(&self.folder, "is being trained by another raygrad"))
     }
 
     /// Removes what a program that was killed was about to write.

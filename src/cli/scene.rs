@@ -62,11 +62,16 @@ impl Scene {
         Ok(Opened::new(self, Some((capture, survey)), asked))
     }
 
-    /// The same, lying where a model has it.
-    pub fn open_for(&self, extent: &Extent) -> Result<Opened> {
+    /// The same, lying where a model has it, which may go on beyond its box.
+    pub fn open_for(&self, extent: &Extent, goes_on: bool) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
         let Extent { placement, bounds, span: [near, far], ndc, .. } = *extent;
-        let (scope, reason) = (Scope::Bounded, "as the model has it".to_owned());
+        let scope = match (goes_on, ndc) {
+            (false, _) => Scope::Bounded,
+            (true, None) => Scope::Unbounded,
+            (true, Some(_)) => Scope::Forward,
+        };
+        let reason = "as the model has it".to_owned();
         let survey = Survey { placement, scope, bounds, near, far, ndc, reason };
         Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
     }

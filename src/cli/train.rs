@@ -195,7 +195,7 @@ fn resume(args: &Args, folder: &Path) -> Result<Trained> {
         (Some(budget), _) | (None, Some(budget)) => budget,
         (None, None) => return Err(Error::setting("budget", "the run does not know its own: say --budget or --steps")),
     };
-    let mut scene = run.scene(None)?.open_for(&extent)?;
+    let mut scene = run.scene(None)?.open_for(&extent, config.unbounded)?;
     scene.depth = config.terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
     let [near, far] = extent.span;

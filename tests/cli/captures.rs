@@ -283,6 +283,11 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
     place.succeeds("render ahead --frames 2");
     place.succeeds("eval ahead");
     place.succeeds(&format!("train captured --scope unbounded --steps 1 --out around {SMALL}"));
+    // What is gone on with says how far it goes.
+    for (run, scope) in [("ahead", "forward"), ("around", "unbounded")] {
+        let said = place.succeeds(&format!("train --resume {run} --steps 2"));
+        assert!(said.contains(&format!("{scope}: as the model has it")), "{said}");
+    }
     assert_eq!(model(&place, "around").extent.ndc, None);
     place.fails(
         &format!("train scene --scope forward --steps 1 {SMALL}"),

@@ -144,7 +144,13 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     place.fails("export run no.ply --level 1e30 --hollow", &["`level`: is 1", "use a smaller one"]);
     place.fails("export run cameras.json --triangles 9", &["`triangles`: is for shapes"]);
     place.fails("export run cameras.json --points", &["`points`: is for shapes"]);
-    place.fails("export run no.ply --scene scene", &["`scene`: is for cameras"]);
+    // Those of six photographs, and four rings of twelve around the scene, which are left when it is gone.
+    assert!(said.contains("that 54 views see"), "{said}");
+    std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
+    assert!(place.succeeds("export run few.ply --points=20").contains("that 48 views see"));
+    let moved = place.succeeds("export run few.ply --points=20 --scene moved");
+    assert!(moved.contains("that 54 views see"), "{moved}");
+    place.fails("export run no.ply --scene scene", &["scene: there is no such folder"]);
     place.fails("export run no.ply --to colmap --open", &["`open`: is for shapes"]);
     place.fails("export run absent/no.ply", &["absent"]);
     std::fs::create_dir(place.path("folder.glb")).unwrap();

@@ -91,6 +91,7 @@ fn flags_that_do_not_fit_are_named() {
         ("--fps 30", ["`fps`", "--seconds"]),
         ("--fps 60 --out fast.gif", ["`fps`", "50 frames a second"]),
         ("--out absent/film.apng", ["absent", "cannot be written to"]),
+        ("--out film.MOV", ["film.MOV: cannot be written", "name a folder"]),
     ] {
         place.fails(&format!("render run {flags}"), &expected);
     }
@@ -99,8 +100,19 @@ fn flags_that_do_not_fit_are_named() {
         "camera_path": [{ "camera_to_world": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1], "fov": 50 }],
     });
     std::fs::write(place.path("path.json"), listed.to_string()).unwrap();
-    place.fails("render run --path path.json --frames 3", &["`frames`", "lists every frame"]);
-    for flags in ["--seconds 0", "--fov 180", "--elevation 90", "--aspect 4", "--background grey", "--save all"] {
+    let output = place.command("render run --path path.json --frames 3").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("`frames`: has no meaning for a file that lists every frame"), "{said}");
+    assert!(output.status.code() == Some(1) && said.contains("say --path-transform"), "{said}");
+    for flags in [
+        "--seconds 0",
+        "--seconds 2 --fps 0.009",
+        "--fov 180",
+        "--elevation 90",
+        "--aspect 4",
+        "--background grey",
+        "--save all",
+    ] {
         let output = place.command(&format!("render run {flags}")).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{flags}: {output:?}");
     }
@@ -258,6 +270,31 @@ fn without_ffmpeg_it_is_said_what_to_do_before_anything_is_rendered() {
 
 #[cfg(unix)]
 #[test]
+fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_anything_is_rendered() {
+    use std::os::unix::fs::PermissionsExt;
+    let place = Place::with_run();
+    let with = |script: &str| {
+        let ffmpeg = place.path("ffmpeg");
+        std::fs::write(&ffmpeg, format!("#!/bin/sh\n{script}\n")).unwrap();
+        std::fs::set_permissions(&ffmpeg, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let command = "render run --frames 1 --size 8x6 --out film.mp4";
+        let path = format!("{}:/usr/bin:/bin", place.path("").display());
+        place.command(command).env("PATH", path).output().unwrap()
+    };
+    let output = with("echo ' V..... libvpx-vp9  VP9'");
+    complained("no encoder", &output, &["film.mp4: needs an ffmpeg with libx264", "FILE.gif"]);
+    assert!(!place.path("film.mp4.frames").exists());
+    // It fails after it has said what is wrong and reported its progress for long.
+    let output = with(
+        "case $* in *-encoders*) echo ' V..... libx264 H.264';; *) echo 'the disk is full' >&2; sleep 0.3
+         i=0; while [ $i -lt 20 ]; do echo frame=$i; i=$((i+1)); done; exit 3;; esac",
+    );
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(said.contains("  the disk is full") && said.contains("`ffmpeg`: has failed (exit code 3)"), "{said}");
+}
+
+#[cfg(unix)]
+#[test]
 fn an_interrupted_film_goes_on_where_it_was() {
     let place = Place::with_run();
     let arguments = "render run --frames 40 --size 36x30 --out film.apng";
@@ -305,8 +342,17 @@ fn an_interrupted_film_goes_on_where_it_was() {
     assert!(said.contains("3 of 400 frames are there already"), "the speed is not in the frames: {said}");
     for flags in ["--show depth", "--background black", "--fov 30", "--skip off"] {
         kept(3);
-        assert!(!begun(flags).contains("already"), "{flags}");
+        let said = begun(flags);
+        assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");
     }
+    // One at a time.
+    let mut child = place.command("render run --frames 400 --size 36x30 --out slow.gif").stdout(Stdio::null()).spawn();
+    let child = child.as_mut().unwrap();
+    super::wait(child, || place.path("slow.gif.frames/0000.png").exists());
+    place
+        .fails("render run --frames 400 --out slow.gif", &["slow.gif.frames: is being rendered to by another raygrad"]);
+    child.kill().unwrap();
+    child.wait().unwrap();
 }
 
 /// The frames of an APNG file, in bytes.

@@ -120,6 +120,10 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
     assert!(String::from_utf8(output.stdout).unwrap().contains("from     step 29\n"));
     assert_same(&place, "whole", "run");
     assert!(!place.path("run/checkpoints/.tmp123").exists());
+    // One that is there and cannot be read is not passed over: it may be whole.
+    std::fs::create_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
+    place.fails("train --resume run", &["00000089.checkpoint: cannot be read", "the checkpoint before"]);
+    std::fs::remove_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
     // A damaged one that says that it is later is not kept in place of one that is whole.
     std::fs::write(place.path("run/checkpoints/00000090.checkpoint"), b"").unwrap();
     let output = place.command("train --resume run --steps 31").output().unwrap();

@@ -85,6 +85,9 @@ pub struct CameraPath {
 /// A leg takes at least this share of the time of the usual one: keys in one place are passed, and not skipped.
 const LEAST_LEG: f64 = 1e-3;
 
+/// A leg takes at least this share of the time of the longest, which no sum of times makes vanish.
+const LEAST_TIME: f64 = 1e-6;
+
 impl CameraPath {
     /// Through keys, at least one, and back to the first if it is `closed`. A leg takes time as the square root of its
     /// length, in which turning counts as much as moving does in all: the centripetal parameter, with which curves have
@@ -107,7 +110,8 @@ impl CameraPath {
         CameraPath::timed(keys, times, closed, Curve::Through)
     }
 
-    /// By keys, with the time that each leg takes, in any unit: one less than keys or, if the path is `closed`, as many.
+    /// By keys, with the time that each leg takes, in any unit: one less than keys or, if the path is `closed`, as many. One that
+    /// is less than a millionth of the longest counts as that.
     ///
     /// # Panics
     /// If there is no key, or not as many times, or one that is not above 0 and finite.
@@ -115,9 +119,10 @@ impl CameraPath {
         assert!(!keys.is_empty(), "a path of no keys");
         assert_eq!(times.len(), legs(&keys, closed).len(), "a time for each leg");
         assert!(times.iter().all(|time| *time > 0.0 && time.is_finite()), "times above 0");
+        let least = LEAST_TIME * times.iter().copied().fold(0.0, f64::max);
         let mut knots = vec![0.0];
         for time in times {
-            knots.push(knots[knots.len() - 1] + time);
+            knots.push(knots[knots.len() - 1] + time.max(least));
         }
         CameraPath { keys, knots, closed, curve }
     }

@@ -13,7 +13,9 @@ const HALVINGS: usize = 5;
 /// Vertices stay this share of that part away from its ends, so that no two are in one place.
 const MARGIN: f64 = 0.01;
 /// Cells along an axis, at most.
-const MOST_CELLS: usize = 4096;
+pub(super) const MOST_CELLS: usize = 4096;
+/// Vertices, at most: with what belongs to them, some gigabytes.
+const MOST_VERTICES: usize = 1 << 26;
 
 /// Where a surface is looked for: nodes at even distances along each axis.
 #[derive(Debug, Clone, PartialEq)]
@@ -81,7 +83,7 @@ struct Layer {
 /// what share of the lattice is done, 0 to 1.
 ///
 /// # Errors
-/// If there are 2^32 - 1 vertices or more.
+/// If there are more than 2^26 vertices.
 pub fn isosurface(
     lattice: &Lattice,
     level: f32,
@@ -114,8 +116,10 @@ pub fn isosurface(
                 cross(&mut below.vertices[2][i], [node[0], node[1], z - 1], 2, [below.values[i], value]);
             }
         }
-        if crossings.len() >= u32::MAX as usize {
-            return Err(Error::setting("resolution", "is too fine: the surface has 2^32 vertices or more"));
+        if crossings.len() > MOST_VERTICES {
+            let what =
+                format!("is too fine: the surface has more than {MOST_VERTICES} vertices; fog has another level");
+            return Err(Error::setting("resolution", what));
         }
         if let Some(below) = &below {
             let between = [below, &above];
@@ -173,7 +177,8 @@ fn places(lattice: &Lattice, level: f32, density: &DensityFn<'_>, crossings: &[C
         for ((place, crossing), [from, to]) in places.iter_mut().zip(crossings).zip(&parts) {
             // The values are nearly on a line by now. Of infinite ones there is no telling.
             let share = f64::from((level - from.1) / (to.1 - from.1));
-            let share = if share.is_nan() { 0.5 } else { share.clamp(MARGIN, 1.0 - MARGIN) };
+            let known = from.1.is_finite() && to.1.is_finite() && !share.is_nan();
+            let share = if known { share.clamp(MARGIN, 1.0 - MARGIN) } else { 0.5 };
             *place = at(crossing, from.0 + share * (to.0 - from.0));
         }
     });

@@ -35,7 +35,20 @@ impl Mesh {
     /// The volume within a closed mesh, in cubic units: negative if its triangles face inwards (the theorem of Gauss, triangle
     /// by triangle).
     pub fn volume(&self) -> f64 {
-        (0..self.triangles.len()).map(|i| volume(self.corners(i))).sum()
+        // Seen from a vertex, as far from the origin products lose what they differ in.
+        let from = self.positions.first().copied().unwrap_or_default();
+        (0..self.triangles.len()).map(|i| volume(self.corners(i).map(|corner| corner - from))).sum()
+    }
+
+    /// For each vertex the unit normal: the mean of those of its triangles, weighted by their areas; up where there is none.
+    pub fn normals(&self) -> Vec<DVec3> {
+        let mut normals = vec![DVec3::ZERO; self.positions.len()];
+        for (i, triangle) in self.triangles.iter().enumerate() {
+            let [a, b, c] = self.corners(i);
+            let normal = (b - a).cross(c - a);
+            triangle.iter().for_each(|&vertex| normals[vertex as usize] += normal);
+        }
+        normals.into_iter().map(|normal| normal.try_normalize().unwrap_or(DVec3::Z)).collect()
     }
 
     /// Whether each side of a triangle belongs to exactly one more, which passes it the other way: the surface has no border,
@@ -119,6 +132,21 @@ fn find(leader: &mut [u32], mut vertex: u32) -> u32 {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+
+    #[test]
+    fn a_mesh_far_from_the_origin_has_its_volume_and_every_one_its_normals() {
+        let far = tetrahedron(DVec3::new(320_000.3, 5_800_000.7, 43.1), 2.0);
+        assert!((far.volume() / (8.0 / 6.0) - 1.0).abs() < 1e-6, "{}", far.volume());
+        let corner = tetrahedron(DVec3::ONE, 3.0);
+        // At the corner of the right angles, the mean of three equal sides; at another, of two and of the slanted one.
+        let normals = corner.normals();
+        let at = |place: DVec3| normals[corner.positions.iter().position(|x| *x == place).unwrap()];
+        assert!(at(DVec3::ONE).distance(-DVec3::ONE.normalize()) < 1e-12);
+        let beside = (DVec3::ONE - DVec3::Y - DVec3::Z).normalize();
+        assert!(at(DVec3::new(4.0, 1.0, 1.0)).distance(beside) < 1e-12, "{normals:?}");
+        let lone = Mesh { positions: vec![DVec3::ZERO], triangles: vec![] };
+        assert_eq!(lone.normals(), [DVec3::Z]);
+    }
 
     /// A tetrahedron with the corner of a right angle here.
     pub fn tetrahedron(at: DVec3, size: f64) -> Mesh {

@@ -3,7 +3,7 @@
 use super::hidden::Hidden;
 use crate::camera::pinhole::Ray;
 use crate::camera::rays::{Rays, Samples};
-use crate::model::Model;
+use crate::model::{Model, densities};
 use crate::pictures::quantise;
 use crate::space::occupancy::{OccupancyGrid, POINTS};
 use crate::volume::query::Query;
@@ -36,15 +36,18 @@ impl<'a> Probe<'a> {
     /// The densities at positions, in 1 / scene unit.
     pub fn densities(&self, points: &[[f32; 3]], out: &mut [f32]) {
         self.densities.fetch_add(points.len() as u64, Ordering::Relaxed);
-        let tape = Tape::with_pool(self.pool.clone());
-        let params = self.model.params.bind_constant(&tape);
-        let positions = tape.constant(self.pool.copy_of(&[points.len(), 3], points.as_flattened()));
-        out.copy_from_slice(self.model.field.density(&params, &positions).sigma().value().as_slice());
+        densities(&*self.model.field, &self.model.params, &self.pool, points, out);
     }
 
     /// The same as pictures have it: 0 outside of the model's box and where the grid, if there is one, is not occupied. What is
-    /// hidden there has an infinite one.
-    pub fn shown(&self, grid: Option<&OccupancyGrid>, hidden: Option<&Hidden>, points: &[[f32; 3]], out: &mut [f32]) {
+    /// hidden there has an infinite one. Gives the largest of those that are not hidden.
+    pub fn shown(
+        &self,
+        grid: Option<&OccupancyGrid>,
+        hidden: Option<&Hidden>,
+        points: &[[f32; 3]],
+        out: &mut [f32],
+    ) -> f32 {
         let place = |row: usize| DVec3::from(points[row].map(f64::from));
         let is_occupied = |place: DVec3| grid.is_none_or(|grid| grid.is_occupied(place));
         let is_shown = |row: &usize| self.model.extent.holds(place(*row)) && is_occupied(place(*row));
@@ -54,12 +57,13 @@ impl<'a> Probe<'a> {
         let (dense, rows): (Vec<usize>, Vec<usize>) = rows.into_iter().partition(|&row| is_hidden(row));
         dense.into_iter().for_each(|row| out[row] = f32::INFINITY);
         if rows.is_empty() {
-            return;
+            return 0.0;
         }
         let asked: Vec<[f32; 3]> = rows.iter().map(|&row| points[row]).collect();
         let mut found = vec![0.0; rows.len()];
         self.densities(&asked, &mut found);
-        rows.iter().zip(found).for_each(|(&row, sigma)| out[row] = sigma);
+        rows.iter().zip(&found).for_each(|(&row, &sigma)| out[row] = sigma);
+        found.into_iter().fold(0.0, f32::max)
     }
 
     /// For each place the unit normal, and the colour that is seen when one looks along it from outside, in sRGB.

@@ -15,6 +15,13 @@ pub struct Shape {
     pub colors: Vec<[u8; 3]>,
 }
 
+impl From<Mesh> for Shape {
+    /// The mesh with the [normals](Mesh::normals) of its triangles, white.
+    fn from(mesh: Mesh) -> Self {
+        Shape { normals: mesh.normals(), colors: vec![[255; 3]; mesh.positions.len()], mesh }
+    }
+}
+
 impl Shape {
     /// The same in the coordinates of the capture, from those of the scene.
     pub fn placed_back(mut self, placement: &Placement) -> Self {

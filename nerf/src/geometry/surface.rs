@@ -1,7 +1,7 @@
 //! The surface that a model's pictures show.
 
 use super::hidden::Hidden;
-use super::isosurface::{Lattice, isosurface};
+use super::isosurface::{Lattice, MOST_CELLS, isosurface};
 use super::probe::Probe;
 use super::shape::Shape;
 use super::sight::{Seen, sights};
@@ -12,8 +12,10 @@ use crate::sampling::marching::Marching;
 use crate::space::occupancy::{OccupancyConfig, OccupancyGrid};
 use crate::volume::render::Evaluations;
 use crate::{Error, Result};
+use glam::DVec3;
 use raygrad_autograd::Pool;
 use std::borrow::Cow;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Cells of a lattice along each cell of an occupancy grid, unless it is said otherwise.
 const FINER: usize = 2;
@@ -50,6 +52,7 @@ impl Default for SurfaceConfig {
 impl SurfaceConfig {
     fn check(&self) -> Result<()> {
         check_range("parts", self.parts, 0.0, 1.0)?;
+        self.resolution.map_or(Ok(()), |cells| check_range("resolution", cells, 1, MOST_CELLS))?;
         if let Some(level) = self.level.filter(|level| !(*level > 0.0 && level.is_finite())) {
             return Err(Error::setting("level", format!("is {level}; use a density above 0")));
         }
@@ -122,10 +125,16 @@ impl Model<f32> {
         let judged = self.judged(Some(&grid));
         let hidden = config.filled.then(|| Hidden::new(&views, judged));
         let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
-        let lattice = Lattice::over(bounds, resolution, config.closed)?;
-        let shown = |points: &[[f32; 3]], out: &mut [f32]| probe.shown(Some(&grid), hidden.as_ref(), points, out);
+        let lattice = Lattice::over(if config.closed { bounds } else { within(bounds) }, resolution, config.closed)?;
+        // What is hidden is dense whatever the level.
+        let is_met = AtomicBool::new(false);
+        let shown = |points: &[[f32; 3]], out: &mut [f32]| {
+            if probe.shown(Some(&grid), hidden.as_ref(), points, out) > level as f32 {
+                is_met.store(true, Ordering::Relaxed);
+            }
+        };
         let mut mesh = isosurface(&lattice, level as f32, &shown, &mut |done| progress(Stage::Meshing, done))?;
-        if mesh.triangles.is_empty() {
+        if mesh.triangles.is_empty() || !is_met.into_inner() {
             return Err(Error::setting(
                 "level",
                 format!("is {level}, and there is no such density: use a smaller one"),
@@ -178,6 +187,15 @@ impl Model<f32> {
         }
         Ok(*sigmas.select_nth_unstable_by(quarter, f64::total_cmp).1)
     }
+}
+
+/// The largest box within this one whose corners are numbers in f32: places on its faces are in the box when they are asked for.
+fn within([low, high]: [DVec3; 2]) -> [DVec3; 2] {
+    let above = |x: f64| {
+        let near = x as f32;
+        f64::from(if f64::from(near) < x { near.next_up() } else { near })
+    };
+    [low.to_array().map(above).into(), high.to_array().map(|x| -above(-x)).into()]
 }
 
 #[cfg(test)]

@@ -193,7 +193,10 @@ impl Trainer {
         let start = (self.clock)();
         // What the last look at the field takes is not to stand beside what steps took.
         (self.tiles, self.pool) = (Tiles::new(), Pool::new());
-        self.model.finish();
+        // A model of numbers that are none has nothing to look at.
+        if !self.done.has_diverged() {
+            self.model.finish();
+        }
         self.count_occupied();
         self.elapsed += (self.clock)().saturating_sub(start);
     }

@@ -96,7 +96,11 @@ fn trained(scale: &Scale) -> Result<(Model<f32>, Dataset)> {
 
 fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
     let run = Run::open(folder)?;
-    let data = run.scene(None)?.open_for(&run.config.extent)?.load(Split::Test, run.config.downscale, scale.views)?;
+    let data = run.scene(None)?.open_for(&run.config.extent, run.config.config.unbounded)?.load(
+        Split::Test,
+        run.config.downscale,
+        scale.views,
+    )?;
     if data.frames.is_empty() {
         return Err(Error::file(folder, "its scene has no test views to compare with"));
     }

@@ -16,7 +16,7 @@ use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
 
 use super::machine::processor;
-use super::output::{depth_colors, make_folder, note, numbered, other_numbered, print, remove};
+use super::output::{checksum, depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
@@ -100,13 +100,15 @@ fn hold_out(opened: &Opened) -> &'static str {
 /// Evaluates, writes the files and prints the result.
 pub fn run(args: &Args) -> Result<()> {
     let run = Run::open(&args.run)?;
+    // Before it is read: should it be replaced meanwhile, the result is not taken for that of the new one.
+    let crc32 = model_checksum(&run)?;
     let mut model = run.model()?;
-    let identity = Identity::of(&run, &model)?;
+    let identity = Identity::of(&run, &model, crc32);
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
     let scene = run.scene(args.scene.as_ref())?;
-    let opened = scene.open_for(&run.config.extent)?;
+    let opened = scene.open_for(&run.config.extent, run.config.config.unbounded)?;
     let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     if args.split != Split::Train
         && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
@@ -131,6 +133,8 @@ pub fn run(args: &Args) -> Result<()> {
     let name = args.name(skip);
     let pictures = run.file(&name);
     make_folder(&pictures)?;
+    let unfinished = tempfile::Builder::new().prefix(".tmp").tempdir_in(&run.folder);
+    let unfinished = unfinished.map_err(|e| Error::file(&run.folder, format!("cannot be written to: {e}")))?;
     let own = |frame: &Frame| {
         let number = run.config.photographs.iter().position(|name| *name == frame.name);
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
@@ -139,7 +143,7 @@ pub fn run(args: &Args) -> Result<()> {
     let (background, span) = (shown_background(model.config.background), model.extent.span);
     let renderer = Renderer::new(model, args.precision)?;
     let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance };
-    let (per_view, seconds_per_view, evaluations) = judge.all(&pictures)?;
+    let (per_view, seconds_per_view, evaluations) = judge.all(unfinished.path())?;
     let data = &judge.data;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
     let per_pixel = |count: u64| count as f64 / pixels as f64;
@@ -171,9 +175,14 @@ pub fn run(args: &Args) -> Result<()> {
         per_view,
     };
     let file = run.file(&format!("{name}.json"));
-    write_json(&file, &report)?;
     let drawn = report.drawn();
-    judge.draw_others(&drawn, &pictures)?;
+    judge.draw_others(&drawn, unfinished.path())?;
+    // An evaluation that is ended before leaves the last one's result as it was.
+    write_json(&file, &report)?;
+    for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {
+        let (from, to) = (unfinished.path().join(&name), pictures.join(&name));
+        std::fs::rename(from, &to).map_err(|e| Error::file(&to, format!("cannot be written: {e}")))?;
+    }
     // Pictures of an evaluation of other photographs under the same name would belong to no result.
     remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
     let index = pictures.join("index.html");
@@ -183,6 +192,11 @@ pub fn run(args: &Args) -> Result<()> {
         return print(&format!("{text}\n"));
     }
     print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
+}
+
+/// The CRC-32 of a run's model, as results have it.
+pub fn model_checksum(run: &Run) -> Result<String> {
+    Ok(format!("{:08x}", checksum(&run.model_file())?))
 }
 
 /// The background that images are compared over: a random one is for training only.

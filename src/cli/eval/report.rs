@@ -5,8 +5,8 @@ use std::fmt;
 
 use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::space::occupancy::Skipping;
-use raygrad::nerf::{Background, Budget, Error, Model, Result, StepStats};
-use serde::Serialize;
+use raygrad::nerf::{Background, Budget, Model, StepStats};
+use serde::{Serialize, Serializer};
 
 use super::alignment::{Alignment, Appearance};
 use crate::cli::precision::Precision;
@@ -49,7 +49,8 @@ pub struct Report {
     pub model: Identity,
     pub threads: usize,
     pub processor: String,
-    /// The mean of the views' PSNR in dB; null if it is infinite.
+    /// The mean of the views' PSNR in dB; `inf` or `NaN` in words.
+    #[serde(serialize_with = "number")]
     pub psnr_mean: f64,
     /// The mean of the views' SSIM; null if the images are smaller than its window.
     pub ssim_mean: Option<f64>,
@@ -84,15 +85,13 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// That of the model in a run's file.
-    pub fn of(run: &Run, model: &Model<f32>) -> Result<Self> {
-        let file = run.model_file();
-        let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, e))?;
+    /// That of the model in a run's file, which has this checksum.
+    pub fn of(run: &Run, model: &Model<f32>, crc32: String) -> Self {
         let metrics = std::fs::read_to_string(run.file("metrics.jsonl")).unwrap_or_default();
         let last = metrics.lines().rev().find_map(|line| serde_json::from_str::<StepStats>(line).ok());
         let RunConfig { raygrad, photographs, budget, config, .. } = &run.config;
-        Ok(Identity {
-            crc32: format!("{:08x}", crc32fast::hash(&bytes)),
+        Identity {
+            crc32,
             parameters: model.params.elements(),
             field: config.field.kind().to_owned(),
             sampler: config.sampler.kind().to_owned(),
@@ -102,7 +101,7 @@ impl Identity {
             budget: *budget,
             steps: last.map(|stats| stats.step),
             train_seconds: last.map(|stats| stats.train_seconds),
-        })
+        }
     }
 }
 
@@ -137,8 +136,14 @@ impl Report {
 #[derive(Serialize)]
 pub struct Score {
     pub name: String,
+    #[serde(serialize_with = "number")]
     pub psnr: f64,
     pub ssim: Option<f64>,
+}
+
+/// A number as JSON has it, or in words what it has no number for.
+fn number<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+    if value.is_finite() { serializer.serialize_f64(*value) } else { serializer.collect_str(value) }
 }
 
 impl fmt::Display for Score {
@@ -176,5 +181,18 @@ pub fn table(report: &Report) -> String {
         Alignment::Fitted => "cameras: each fitted to its own photograph\n",
         Alignment::Glass => "cameras: focal length and lens as learned\n",
         Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_json_has_no_number_for_is_said_in_words() {
+        for (psnr, expected) in [(31.5, "31.5"), (f64::INFINITY, "\"inf\""), (f64::NAN, "\"NaN\"")] {
+            let score = serde_json::to_string(&Score { name: "a".into(), psnr, ssim: None }).unwrap();
+            assert_eq!(score, format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
+        }
     }
 }

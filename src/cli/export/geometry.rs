@@ -4,18 +4,26 @@ use std::f64::consts::FRAC_PI_2;
 use std::path::Path;
 use std::time::Instant;
 
+use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::geometry::files::{self, Format};
 use raygrad::nerf::geometry::{Stage, SurfaceConfig};
-use raygrad::nerf::{Camera, Error, Result};
+use raygrad::nerf::{Camera, Error, Model, Result};
 
 use super::super::cameras::Viewpoint;
-use super::super::output::{check_writable, print};
+use super::super::output::{check_writable, note, parent, print};
 use super::super::parse;
+use super::super::photographs::photographs;
 use super::super::progress::{Progress, spoken};
 use super::super::run::{Run, RunConfig};
+use super::super::scene::Scene;
 
 /// Cameras in each of the rings that look at the scene.
 const RING: usize = 12;
+/// Photographs whose cameras look at the scene too, at most.
+const PHOTOGRAPHS: usize = 100;
+
+/// Most points of a cloud.
+const MOST_POINTS: usize = 10_000_000;
 
 /// What is made of a model's shape.
 #[derive(clap::Args)]
@@ -27,7 +35,7 @@ pub struct Options {
         num_args = 0..=1,
         require_equals = true,
         default_missing_value = "200000",
-        value_parser = parse::count(100_000_000)
+        value_parser = parse::count(MOST_POINTS)
     )]
     points: Option<usize>,
     /// Make the mesh's triangles fewer, down to N
@@ -75,13 +83,13 @@ pub fn is_shape(out: &Path) -> bool {
 }
 
 /// Makes the shape and writes it.
-pub fn run(run: &Run, options: &Options, out: &Path) -> Result<()> {
+pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path) -> Result<()> {
     if out.is_dir() {
         return Err(Error::file(out, "is a folder, not a file"));
     }
-    check_writable(out.parent().unwrap_or(Path::new(".")))?;
+    check_writable(parent(out))?;
     let model = run.model()?;
-    let cameras = cameras(&run.config);
+    let cameras = cameras(run, &model, scene)?;
     let start = Instant::now();
     let mut display = Display::new();
     let mut show = |stage: Stage, done: f64| display.set(stage, done);
@@ -103,6 +111,12 @@ pub fn run(run: &Run, options: &Options, out: &Path) -> Result<()> {
             };
             let surface = model.surface(&cameras, &config, &mut show)?;
             let mesh = &surface.shape.mesh;
+            if let Some(most) = options.triangles.filter(|most| mesh.triangles.len() > *most) {
+                let count = mesh.triangles.len();
+                note(&format!(
+                    "the mesh keeps {count} triangles, more than {most}: with fewer it would fold or lose a part"
+                ));
+            }
             let said = format!(
                 "{} vertices, {} triangles, {}; density {:.4} per scene unit, {} cells along the box, {} small parts left out",
                 mesh.positions.len(),
@@ -122,12 +136,29 @@ pub fn run(run: &Run, options: &Options, out: &Path) -> Result<()> {
     print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
 }
 
-/// Cameras around the scene: at the mean height of those that photographed it, lower, and higher.
-fn cameras(config: &RunConfig) -> Vec<Camera> {
-    let mean = config.viewpoint.elevation;
+/// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around
+/// it, at the mean height of these, lower, and higher.
+fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<Camera>> {
+    let RunConfig { viewpoint, extent, .. } = &run.config;
+    let mean = viewpoint.elevation;
     let elevations = [0.1 * mean, 0.5 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
-    let ring = |elevation| Viewpoint { elevation, ..config.viewpoint }.orbit(&config.extent, RING);
-    elevations.into_iter().flat_map(ring).collect()
+    let ring = |elevation| Viewpoint { elevation, ..*viewpoint }.orbit(extent, RING);
+    let mut around: Vec<Camera> = vec![];
+    for camera in elevations.into_iter().flat_map(ring) {
+        // What swings to and fro comes by places twice, and rings at the horizon are one.
+        if !around.iter().any(|other| other.pose.abs_diff_eq(camera.pose, 1e-9)) {
+            around.push(camera);
+        }
+    }
+    let own = match photographs(run, model, scene, Split::Train) {
+        Ok(own) => evenly_spaced(own, PHOTOGRAPHS),
+        Err(error) if scene.is_some() => return Err(error),
+        Err(error) => {
+            note(&format!("looking from around the scene alone, as its photographs' cameras are not known: {error}"));
+            vec![]
+        }
+    };
+    Ok(own.into_iter().map(|photograph| photograph.camera).chain(around).collect())
 }
 
 /// How far each stage is, and how long it may take.

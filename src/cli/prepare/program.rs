@@ -85,6 +85,9 @@ impl Program {
                 Ok(said) => {
                     line(&said);
                     excused |= excuse.is_some_and(|words| said.contains(words));
+                    if is_count(&said) {
+                        continue;
+                    }
                     kept.push_back(said);
                     if kept.len() > KEPT {
                         kept.pop_front();
@@ -134,6 +137,12 @@ impl Program {
     }
 }
 
+/// Whether a line is one of those by which ffmpeg reports its progress, which are no last words: `out_time_us=1240000`.
+fn is_count(line: &str) -> bool {
+    line.split_once('=')
+        .is_some_and(|(name, _)| name.bytes().all(|c| c.is_ascii_lowercase() || c == b'_' || c.is_ascii_digit()))
+}
+
 /// Sends the lines of a stream, in a thread of its own: a program stops when nobody reads what it says.
 fn listen(stream: impl Read + Send + 'static, sender: Sender<String>) {
     std::thread::spawn(move || {
@@ -181,7 +190,17 @@ pub fn counted(line: &str) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::counted;
+    use super::{counted, is_count};
+
+    #[test]
+    fn progress_of_ffmpeg_is_no_last_word() {
+        for line in ["frame=12", "stream_0_0_q=-1.0", "out_time=00:00:01.2", "progress=continue"] {
+            assert!(is_count(line), "{line}");
+        }
+        for line in ["Unknown encoder 'libx264'", "[mp4 @ 0x5] crf=18 is no number", "Error: a = b", "end"] {
+            assert!(!is_count(line), "{line}");
+        }
+    }
 
     #[test]
     fn counts_of_colmap_are_read() {

@@ -37,8 +37,10 @@ impl<W: Write> Animation<W> {
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         let animated = encoder.set_animated(frames, 0);
-        // In hundredths of frames a second.
-        let animated = animated.and_then(|()| encoder.set_frame_delay(100, (100.0 * fps).round() as u16));
+        // A frame is shown for a share of a second, or for hundredths of a second.
+        let (delay, of) =
+            if fps < 1.0 { ((100.0 / fps).round() as u16, 100) } else { (100, (100.0 * fps).round() as u16) };
+        let animated = animated.and_then(|()| encoder.set_frame_delay(delay, of));
         let writer = animated.and_then(|()| encoder.write_header()).map_err(|e| e.to_string())?;
         Ok(Animation::Apng(Box::new(writer)))
     }
@@ -73,6 +75,24 @@ impl<W: Write> Animation<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn frames_of_an_apng_are_shown_for_as_long_as_they_should() {
+        for fps in [0.01, 0.015, 0.7, 1.0, 12.5, 29.97, 240.0] {
+            let mut bytes = vec![];
+            let mut animation = Animation::apng(&mut bytes, [4, 3], fps, 1).unwrap();
+            animation.push(&Image::new(4, 3, 3)).unwrap();
+            animation.finish().unwrap();
+            let at = bytes.windows(4).position(|window| window == b"fcTL").unwrap() + 4 + 20;
+            let number = |at: usize| f64::from(u16::from_be_bytes([bytes[at], bytes[at + 1]]));
+            assert!(
+                (number(at) / number(at + 2) * fps - 1.0).abs() < 1e-3,
+                "{fps}: {} / {}",
+                number(at),
+                number(at + 2)
+            );
+        }
+    }
 
     #[test]
     fn a_gif_takes_as_long_as_its_frames_should() {

@@ -9,15 +9,13 @@ use raygrad::nerf::{Error, Image, Result};
 use super::animation::Animation;
 use super::frames::DIGITS;
 use crate::cli::interrupt;
-use crate::cli::output::{check_writable, note, numbered};
+use crate::cli::output::{check_writable, note, numbered, parent};
+use crate::cli::parse::LARGEST;
 use crate::cli::prepare::program::{FFMPEG, Stop, Work};
 use crate::cli::progress::Progress;
 
 /// A GIF shows a frame for two hundredths of a second at least: players show shorter ones for longer.
 const FASTEST_GIF: f64 = 50.0;
-
-/// The longest side of a film in pixels.
-const LONGEST_SIDE: usize = 1 << 14;
 
 /// A file that holds a film.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,21 +61,38 @@ impl Film {
                 format!("a GIF shows {FASTEST_GIF} frames a second at most, not {fps}: name a FILE.apng or FILE.mp4");
             return Err(Error::setting("fps", what));
         }
-        if let Some(side) = size.into_iter().find(|side| *side > LONGEST_SIDE) {
+        if let Some(side) = size.into_iter().find(|side| *side > LARGEST) {
             return Err(Error::setting(
                 "size",
-                format!("has a side of {side} pixels, and films have {LONGEST_SIDE} at most"),
+                format!("has a side of {side} pixels, and films have {LARGEST} at most"),
             ));
         }
         match self {
             Film::Gif | Film::Apng => Ok(()),
-            Film::Mp4 | Film::Webm => FFMPEG.check().map_err(|stop| match stop {
-                Stop::Failed(error) => {
-                    Error::file(out, format!("{error}; or name a FILE.gif or FILE.apng, which need no other program"))
-                }
-                Stop::Interrupted => Error::file(out, "was interrupted"),
-            }),
+            Film::Mp4 | Film::Webm => self.check_encoder(out),
         }
+    }
+
+    /// Whether ffmpeg is there and has what this needs.
+    fn check_encoder(self, out: &Path) -> Result<()> {
+        let or = "or name a FILE.gif or FILE.apng, which need no other program";
+        let encoders = FFMPEG.ask(&["-hide_banner", "-encoders"]).map_err(|stop| match stop {
+            Stop::Failed(error) => Error::file(out, format!("{error}; {or}")),
+            Stop::Interrupted => Error::file(out, "was interrupted"),
+        })?;
+        let encoder = self.encoder();
+        if encoders.split_whitespace().any(|word| word == encoder) {
+            return Ok(());
+        }
+        Err(Error::file(
+            out,
+            format!("needs an ffmpeg with {encoder}, which the one here lacks: install another, {or}"),
+        ))
+    }
+
+    /// What ffmpeg writes it with.
+    fn encoder(self) -> &'static str {
+        if self == Film::Webm { "libvpx-vp9" } else { "libx264" }
     }
 
     /// Writes it, replacing the file as a whole.
@@ -113,15 +128,17 @@ impl Film {
                       scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int";
         command.args(["-vf", filter, "-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"]);
         command.args(["-color_trc", "iec61966-2-1", "-color_range", "tv"]);
+        command.args(["-c:v", self.encoder()]);
         command.args(match self {
-            Film::Webm => &["-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0", "-f", "webm"][..],
-            _ => &["-c:v", "libx264", "-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],
+            Film::Webm => &["-crf", "24", "-b:v", "0", "-f", "webm"][..],
+            _ => &["-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],
         });
         command.arg(file);
         let mut progress = Progress::new();
         FFMPEG.run(&mut command, None, |line| {
-            let Some(done) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
-            progress.set(done / count as f64, || format!("{done} of {count} frames in the film"));
+            if let Some(done) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) {
+                progress.set(done / count as f64, || format!("{done} of {count} frames in the film"));
+            }
         })
     }
 }
@@ -147,11 +164,6 @@ fn animate(
         });
     }
     Ok(animation.finish().map_err(bad)?)
-}
-
-/// The folder that a file is in.
-fn parent(file: &Path) -> &Path {
-    file.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// The folder of a film's frames, beside it.

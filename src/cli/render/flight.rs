@@ -4,15 +4,16 @@ use std::path::PathBuf;
 
 use raygrad::nerf::camera::{CameraPath as Spline, Key, Spiral};
 use raygrad::nerf::dataset::scene::test_cameras;
-use raygrad::nerf::dataset::{Capture, Split, View};
+use raygrad::nerf::dataset::{Capture, Split, evenly_spaced};
 use raygrad::nerf::glam::DAffine3;
 use raygrad::nerf::{Camera, Error, Extent, Model, Result};
 
 use super::path_file::{self, Motion};
 use crate::cli::cameras::{Viewpoint, fitted};
+use crate::cli::parse;
+use crate::cli::photographs::{Photograph, photographs};
 use crate::cli::run::Run;
 use crate::cli::scene::Scene;
-use crate::cli::{builtin, parse};
 
 /// Most frames of a film.
 const MOST_FRAMES: usize = 100_000;
@@ -22,8 +23,6 @@ const ORBIT_FRAMES: usize = 60;
 const FRAMES: usize = 120;
 /// Frames a second, where nothing says how many.
 const FPS: f64 = 25.0;
-/// Most frames a second.
-const MOST_FPS: f64 = 240.0;
 /// Where cameras have no average, how far a spiral goes from the orbit's first, as a share of its distance from the middle.
 const SPIRAL_SHARE: f64 = 0.1;
 
@@ -42,7 +41,7 @@ pub struct FlightArgs {
     #[arg(long, value_parser = parse::above_zero, conflicts_with = "frames")]
     pub seconds: Option<f64>,
     /// Frames a second [default: 25, or as the file says]
-    #[arg(long, value_parser = parse::between(0.0, MOST_FPS + 1.0))]
+    #[arg(long, value_parser = parse::fps)]
     pub fps: Option<f64>,
     /// Size of the pictures, such as 400x300 [default: that of the training images, or as the file says]
     #[arg(long, value_name = "WxH", value_parser = parse::size)]
@@ -126,21 +125,20 @@ impl FlightArgs {
         let (cameras, usual, fps) = match &self.path {
             CameraPath::Orbit => flight(self.orbit(view, &run.config.scene, extent, self.count(ORBIT_FRAMES, given)?))?,
             CameraPath::Spiral => {
-                let spiral = self.spiral(view, extent, &Photographs::of(run, model, scene, Split::Train)?);
+                let spiral = self.spiral(view, extent, &photographs(run, model, scene, Split::Train)?);
                 let camera = |pose: DAffine3| Camera::from_angle(view.width, view.height, view.angle_x, pose);
                 flight(spiral.poses(self.count(FRAMES, given)?).into_iter().map(camera).collect())?
             }
             CameraPath::Spline => {
                 let split = self.split.unwrap_or(Split::Train);
-                let keys = Photographs::of(run, model, scene, split)?.chosen(&self.through, split)?;
+                let keys = chosen(&photographs(run, model, scene, split)?, &self.through, split)?;
                 let keys = Spline::through(keys, self.closed).frames(self.count(FRAMES, given)?);
                 flight(keys.iter().map(|key| key.camera(usual)).collect())?
             }
             CameraPath::Test => {
-                let opened = run.scene(scene)?.open_for(extent)?;
-                let data = opened.load(Split::Test, run.config.downscale, self.frames.unwrap_or(usize::MAX))?;
-                // Where the model has them, if it has learned something of cameras.
-                flight(data.frames.iter().map(|frame| model.other_camera(&frame.camera)).collect())?
+                let all = photographs(run, model, scene, Split::Test)?;
+                let some = evenly_spaced(all, self.frames.unwrap_or(usize::MAX));
+                flight(some.into_iter().map(|photograph| photograph.camera).collect())?
             }
             CameraPath::File(file) => {
                 let path_file::Path { motion, size, fps } =
@@ -208,7 +206,8 @@ impl FlightArgs {
         let timed = self.seconds.map(|seconds| (seconds * fps).round().max(1.0) as usize);
         let count = self.frames.or(timed).unwrap_or(usual);
         if count > MOST_FRAMES {
-            return Err(Error::setting("seconds", format!("{count} frames are more than {MOST_FRAMES}")));
+            let field = if self.seconds.is_some() { "seconds" } else { "path" };
+            return Err(Error::setting(field, format!("{count} frames are more than {MOST_FRAMES}")));
         }
         Ok(count)
     }
@@ -222,13 +221,13 @@ impl FlightArgs {
         Viewpoint { distance, elevation, ..*view }.orbit(extent, count)
     }
 
-    fn spiral(&self, view: &Viewpoint, extent: &Extent, photographs: &Photographs) -> Spiral {
+    fn spiral(&self, view: &Viewpoint, extent: &Extent, photographs: &[Photograph]) -> Spiral {
         let middle = 0.5 * (extent.bounds[0] + extent.bounds[1]);
         let ahead = |pose: &DAffine3| (middle - pose.translation).dot(-pose.matrix3.z_axis);
         let times = self.radius.unwrap_or(1.0);
-        let cameras: Vec<Camera> = photographs.0.iter().map(|photograph| photograph.camera.clone()).collect();
+        let cameras: Vec<Camera> = photographs.iter().map(|photograph| photograph.camera.clone()).collect();
         if let Some(spiral) = Spiral::around(&cameras) {
-            let known = photographs.0.iter().filter_map(|photograph| photograph.bounds);
+            let known = photographs.iter().filter_map(|photograph| photograph.bounds);
             let known = known.reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]);
             let [near, _] = extent.span;
             let focus = known.map_or_else(|| ahead(&spiral.pose).max(near), llff_focus);
@@ -255,67 +254,19 @@ fn applied(scene: &Scene) -> Result<DAffine3> {
     }
 }
 
-/// The photographs of a split.
-struct Photographs(Vec<Photograph>);
-
-/// One of them, in the scene's coordinates.
-struct Photograph {
-    name: String,
-    /// Where the model has it.
-    camera: Camera,
-    /// The nearest and the farthest depth that it shows, if that is known.
-    bounds: Option<[f64; 2]>,
-}
-
-impl Photographs {
-    /// No image is read.
-    fn of(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Self> {
-        let capture = match run.scene(scene)? {
-            Scene::Folder(folder) => Capture::read(folder)?,
-            scene => builtin::capture(scene, None, None)?,
-        };
-        let placement = model.extent.placement;
-        let is_made = capture.present().next().is_none();
-        let views = capture.split(split)?.into_iter().filter(|view| is_made || view.image.is_some());
-        let views: Vec<&View> = views.collect();
-        let learned = split == Split::Train && model.refine.is_some();
-        let trained = &run.config.photographs;
-        let others = views.len() != model.extent.frames
-            || !is_made && !trained.is_empty() && !views.iter().map(|view| &view.name).eq(trained);
-        if views.is_empty() || (learned && others) {
-            let what = format!(
-                "has {} photographs to {split} on, and not those of the run: say with --scene where those are",
-                views.len()
-            );
-            return Err(Error::file(&capture.file, what));
-        }
-        let photograph = |(number, view): (usize, &&View)| {
-            let given = placement.camera(&view.camera);
-            let camera = if learned { model.learned_camera(number, &given) } else { model.other_camera(&given) };
-            Photograph {
-                name: view.name.clone(),
-                camera,
-                bounds: view.bounds.map(|ends| ends.map(|end| placement.scale * end)),
-            }
-        };
-        Ok(Photographs(views.iter().enumerate().map(photograph).collect()))
-    }
-
-    /// Those of these numbers or names.
-    fn chosen(&self, words: &[String], split: Split) -> Result<Vec<Key>> {
-        let number = |word: &String| {
-            let named = self.0.iter().position(|photograph| photograph.name == *word);
-            let numbered = || word.parse().ok().filter(|number| *number < self.0.len());
-            named.or_else(numbered).ok_or_else(|| {
-                let (last, first) = (self.0.len() - 1, &self.0[0].name);
-                let what = format!(
-                    "`{word}` is no {split} photograph: use numbers from 0 to {last}, or names such as {first}"
-                );
-                Error::setting("through", what)
-            })
-        };
-        words.iter().map(|word| Ok(Key::of(&self.0[number(word)?].camera))).collect()
-    }
+/// The photographs of these numbers or names.
+fn chosen(photographs: &[Photograph], words: &[String], split: Split) -> Result<Vec<Key>> {
+    let number = |word: &String| {
+        let named = photographs.iter().position(|photograph| photograph.name == *word);
+        let numbered = || word.parse().ok().filter(|number| *number < photographs.len());
+        named.or_else(numbered).ok_or_else(|| {
+            let (last, first) = (photographs.len() - 1, &photographs[0].name);
+            let what =
+                format!("`{word}` is no {split} photograph: use numbers from 0 to {last}, or names such as {first}");
+            Error::setting("through", what)
+        })
+    };
+    words.iter().map(|word| Ok(Key::of(&photographs[number(word)?].camera))).collect()
 }
 
 #[cfg(test)]
@@ -340,7 +291,7 @@ mod tests {
             Photograph { name: String::new(), camera: Camera::from_angle(40, 30, 0.8, pose), bounds }
         };
         let args = FlightArgs { radius: Some(3.0), ..FlightArgs::default() };
-        let spiral = |photographs: Vec<Photograph>| args.spiral(&view, &extent, &Photographs(photographs));
+        let spiral = |photographs: Vec<Photograph>| args.spiral(&view, &extent, &photographs);
         // Its focus is as far as the middle of the box, or as LLFF has it.
         let ahead = spiral((0..11).map(|i| photograph(i, 1.0, None)).collect());
         assert!((ahead.focus - 4.0).abs() < 1e-12 && (ahead.radii[0] - 1.5).abs() < 1e-12, "{ahead:?}");

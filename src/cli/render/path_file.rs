@@ -19,10 +19,13 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-/// Most pixels on a side of a film.
-const LARGEST: usize = 16384;
+use crate::cli::output::note;
+use crate::cli::parse::{FPS, LARGEST};
+
 /// Most frames and key frames.
 const MOST: usize = 100_000;
+/// The smallest angle of a picture in degrees; the largest is as far from 180.
+const SMALLEST_FOV: f64 = 0.001;
 /// The scale and the offset of instant-ngp's unit cube, where nothing is said.
 const NGP: Cube = Cube { scale: 0.33, offset: [0.5; 3] };
 /// How long nerfstudio takes from key frame to key frame, where nothing is said.
@@ -162,7 +165,14 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
         return Err(Error::file(file, what));
     }
     let to_capture = match transform {
-        None => DAffine3::IDENTITY,
+        None => {
+            note(&format!(
+                "{}: is taken to be in the capture's coordinates; nerfstudio writes its own: say --path-transform with its \
+                 dataparser_transforms.json",
+                file.display()
+            ));
+            DAffine3::IDENTITY
+        }
         Some(transform) => parse::<Dataparser>(transform)?.to_capture(transform, applied()?)?,
     };
     nerfstudio(file, whole(file, document)?, &to_capture)
@@ -189,9 +199,10 @@ fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Pa
     if path.crop.is_some() {
         return Err(bad("crop", "is not understood: scenes are shown as a whole"));
     }
-    for (name, value) in
-        [("fps", path.fps), ("seconds", path.seconds), ("default_transition_sec", path.default_transition_sec)]
-    {
+    if path.fps.is_some_and(|fps| !FPS.contains(&fps)) {
+        return Err(bad("fps", &format!("must be from {} to {}", FPS.start(), FPS.end())));
+    }
+    for (name, value) in [("seconds", path.seconds), ("default_transition_sec", path.default_transition_sec)] {
         if value.is_some_and(|value| !(value > 0.0 && value <= 1e6)) {
             return Err(bad(name, "must be above 0"));
         }
@@ -300,8 +311,8 @@ fn count(file: &File, field: &str, count: usize) -> Result<()> {
 fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3) -> Result<Key> {
     let bad = |what: String| Error::field(file, name, what);
     rigid::pose(&pose).map_err(|what| bad(format!("its pose {what}")))?;
-    if !(fov > 0.0 && fov < 180.0) {
-        return Err(bad(format!("`fov` must be between 0 and 180 degrees, is {fov}")));
+    if !(SMALLEST_FOV..=180.0 - SMALLEST_FOV).contains(&fov) {
+        return Err(bad(format!("`fov` must be from {SMALLEST_FOV} to {} degrees, is {fov}", 180.0 - SMALLEST_FOV)));
     }
     let DAffine3 { matrix3, .. } = to_capture;
     let pose = DAffine3 {

@@ -38,16 +38,21 @@ impl Format {
     }
 }
 
-/// Writes a shape, in the form that the ending of the file's name says, and says how many bytes that takes.
+/// Writes a shape, in the form that the ending of the file's name says, and says how many bytes that takes. A bare mesh is written
+/// by `write(&mesh.into(), path)`.
 ///
 /// # Errors
-/// If the ending is none of [`Format`]'s, the shape is too large for it or the file cannot be written.
-///
-/// # Panics
-/// If there is not a normal and a colour for each vertex.
+/// If the ending is none of [`Format`]'s, there is not a normal and a colour for each vertex, the shape is too large or the file
+/// cannot be written.
 pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
-    let (path, vertices) = (path.as_ref(), shape.mesh.positions.len());
-    assert_eq!([shape.normals.len(), shape.colors.len()], [vertices; 2], "a normal and a colour for each vertex");
+    let path = path.as_ref();
+    let [vertices, normals, colors] = [shape.mesh.positions.len(), shape.normals.len(), shape.colors.len()];
+    if [normals, colors] != [vertices; 2] {
+        return Err(Error::file(
+            path,
+            format!("would have {normals} normals and {colors} colours for {vertices} vertices"),
+        ));
+    }
     let bytes = match Format::of(path) {
         Some(Format::Ply) => ply::to_bytes(shape),
         Some(Format::Obj) => obj::to_text(shape).into_bytes(),

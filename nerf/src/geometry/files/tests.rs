@@ -192,3 +192,14 @@ fn other_endings_are_refused() {
     }
     assert_eq!(Format::of(Path::new("x/y.GlB")), Some(Format::Glb));
 }
+
+#[test]
+fn a_bare_mesh_is_written_white_and_half_a_shape_is_an_error() {
+    let bare = Shape::from(shape().mesh);
+    assert!(bare.normals == bare.mesh.normals() && bare.colors == [[255; 3]; 4]);
+    assert!(written(&bare, "a.ply").len() > 4 * 39);
+    for half in [Shape { normals: vec![], ..shape() }, Shape { colors: vec![[0; 3]; 3], ..shape() }] {
+        let error = write(&half, "never.ply").unwrap_err().to_string();
+        assert!(error.contains("never.ply: would have") && error.contains("for 4 vertices"), "{error}");
+    }
+}

@@ -36,13 +36,16 @@ const RADIUS: f64 = 0.5;
 
 /// A model with this field in a box with unequal sides, with an occupancy grid or without one.
 fn model(balls: &[(DVec3, f64)], preset: Preset) -> Model<f32> {
+    model_in([DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.5, 1.2, 0.9)], balls, preset)
+}
+
+fn model_in(bounds: [DVec3; 2], balls: &[(DVec3, f64)], preset: Preset) -> Model<f32> {
     let mut config = Config::preset(preset);
     if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
         config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
         sampler.occupancy.resolution = 32;
     }
-    let extent = Extent::new([DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.5, 1.2, 0.9)], [0.5, 8.0]);
-    let mut model = Model::new(config, extent, 0).unwrap();
+    let mut model = Model::new(config, Extent::new(bounds, [0.5, 8.0]), 0).unwrap();
     model.field = Arc::new(Balls(balls.to_vec()));
     model.finish();
     model
@@ -163,6 +166,16 @@ fn what_meets_the_box_is_closed_or_open() {
     let half = 2.0 / 3.0 * PI * RADIUS.powi(3);
     assert!(closed.is_closed() && (closed.volume() / half - 1.0).abs() < 0.015, "{} {half}", closed.volume());
     assert!(!open.is_closed() && (open.area() / (2.0 * PI * RADIUS.powi(2)) - 1.0).abs() < 0.015, "{}", open.area());
+    // Faces that f32 has further out, where nothing is shown: at 1.7, and at -.6.
+    for (centre, [low, high]) in
+        [(1.7, [DVec3::new(-1.0, -0.9, -0.8), DVec3::new(1.7, 1.2, 0.9)]), (-0.6, [DVec3::splat(-0.6), DVec3::ONE])]
+    {
+        assert!([low.x, high.x].map(|x| f64::from(x as f32)).into_iter().any(|x| x > high.x || x < low.x));
+        let model = model_in([low, high], &[(DVec3::new(centre, 0.2, 0.1), RADIUS)], Preset::Voxel);
+        let open = surface(&model, &SurfaceConfig { closed: false, ..config }).shape.mesh;
+        let area = 2.0 * PI * RADIUS.powi(2);
+        assert!(!open.is_closed() && (open.area() / area - 1.0).abs() < 0.015, "{centre}: {} {area}", open.area());
+    }
 }
 
 #[test]
@@ -174,6 +187,8 @@ fn what_cannot_be_made_is_said() {
         (SurfaceConfig { level: Some(-1.0), ..CONFIG }, "`level`: is -1"),
         (SurfaceConfig { level: Some(f64::NAN), ..CONFIG }, "`level`: is NaN"),
         (SurfaceConfig { level: Some(1e30), ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
+        // What is hidden is not dense enough for it.
+        (SurfaceConfig { level: Some(1e30), filled: true, ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
         (SurfaceConfig { parts: 1.5, ..CONFIG }, "`parts`: is 1.5"),
         (SurfaceConfig { triangles: Some(3), ..CONFIG }, "`triangles`: is 3"),
         (SurfaceConfig { resolution: Some(0), ..CONFIG }, "`resolution`: is 0"),

@@ -214,10 +214,12 @@ fn what_would_change_the_picture_and_is_not_understood_is_named() {
     ns("/render_width", json!(0), "`render_width`");
     ns("/render_height", json!(100_000), "`render_width`: with `render_height` must be from 1 to 16384");
     ns("/fps", json!(-1.0), "`fps`");
+    ns("/fps", json!(1000.0), "`fps`: must be from 0.01 to 240");
+    ns("/fps", json!(0.001), "`fps`: must be from 0.01 to 240");
     ns("/seconds", json!(0.0), "`seconds`");
     ns("/camera_path", json!([]), "`camera_path`");
     ns("/lens", json!(1), "unknown field `lens`");
-    ns("/camera_path/1/fov", json!(180.0), "`camera_path[1]`: `fov` must be between 0 and 180");
+    ns("/camera_path/1/fov", json!(180.0), "`camera_path[1]`: `fov` must be from 0.001 to 179.999 degrees");
     ns("/camera_path/1/fov", json!("60"), "is not of the right form");
     ns("/camera_path/0/render_time", json!(0.5), "`camera_path[0].render_time`");
     ns("/camera_path/0/camera_to_world", json!([1.0, 2.0]), "is not of the right form");

@@ -1,0 +1,65 @@
+//! The photographs of a run, without their pictures.
+
+use raygrad::nerf::dataset::{Capture, Split, View};
+use raygrad::nerf::{Camera, Error, Model, Result};
+
+use super::builtin;
+use super::run::Run;
+use super::scene::Scene;
+
+/// A photograph, in the scene's coordinates.
+pub struct Photograph {
+    pub name: String,
+    /// Where the model has it.
+    pub camera: Camera,
+    /// The nearest and the farthest depth that it shows, if that is known.
+    pub bounds: Option<[f64; 2]>,
+}
+
+/// Those of a split, at least one, in the order in which they are read. No image is read.
+///
+/// # Errors
+/// If the capture cannot be read, or has none; or none of those that the model has learned the cameras of.
+pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Vec<Photograph>> {
+    let capture = match run.scene(scene)? {
+        Scene::Folder(folder) => Capture::read(folder)?,
+        scene => builtin::capture(scene, None, None)?,
+    };
+    let views = present(&capture, split)?;
+    if views.is_empty() {
+        return Err(Error::file(&capture.file, format!("has no {split} photographs")));
+    }
+    let learned = split == Split::Train && model.refine.is_some();
+    if learned {
+        check_trained(run, &capture, &views, model.extent.frames)?;
+    }
+    let placement = model.extent.placement;
+    let photograph = |(number, view): (usize, &&View)| {
+        let given = placement.camera(&view.camera);
+        let camera = if learned { model.learned_camera(number, &given) } else { model.other_camera(&given) };
+        let bounds = view.bounds.map(|ends| ends.map(|end| placement.scale * end));
+        Photograph { name: view.name.clone(), camera, bounds }
+    };
+    Ok(views.iter().enumerate().map(photograph).collect())
+}
+
+/// The views of a split whose photographs are there, in the order in which these are read, which numbers them. Of a built-in
+/// scene all are.
+pub fn present(capture: &Capture, split: Split) -> Result<Vec<&View>> {
+    let is_made = capture.present().next().is_none();
+    Ok(capture.split(split)?.into_iter().filter(|view| is_made || view.image.is_some()).collect())
+}
+
+/// Whether these views to train on are the `count` photographs that a run was trained on.
+pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize) -> Result<()> {
+    let bad = |what: String| Err(Error::file(&capture.file, format!("{what}: say with --scene where those are")));
+    if views.len() != count {
+        return bad(format!("has {} photographs to train on, and the run was trained on {count}", views.len()));
+    }
+    let (names, is_made) = (&run.config.photographs, capture.present().next().is_none());
+    // Runs of the first edition have no names, and those of built-in scenes have others.
+    if !is_made && !names.is_empty() && !views.iter().map(|view| &view.name).eq(names) {
+        return bad("has other photographs to train on than those that the run was trained on".to_owned());
+    }
+    Ok(())
+}
