@@ -21,7 +21,7 @@ use std::path::Path;
 pub enum Backbone {
     /// AlexNet: quick. The authors' choice for comparing images.
     Alex,
-    /// VGG-16: some 40 times the work. The authors' choice for a loss.
+    /// VGG-16: some 20 times the work. The authors' choice for a loss.
     Vgg,
 }
 
