@@ -16,6 +16,8 @@ mod captures;
 mod convert;
 #[path = "cli/export.rs"]
 mod export;
+#[path = "cli/lpips.rs"]
+mod lpips;
 #[path = "cli/outside.rs"]
 mod outside;
 // Scripts stand in for other programs.

@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::{Error, Result};
 use serde_json::Value;
 
-use super::eval::model_checksum;
-use super::output::{complain, print};
+use super::output::{checksum, complain, print};
 use super::run::Run;
 
 /// Conditions under which figures are figures of the same thing.
@@ -27,8 +26,15 @@ const SAME: [&str; 13] = [
     "photographs",
 ];
 /// What is measured; all else in a result is a condition.
-const MEASURED: [&str; 6] =
-    ["psnr_mean", "ssim_mean", "seconds_per_view", "density_per_pixel", "color_per_pixel", "unskipped_per_pixel"];
+const MEASURED: [&str; 7] = [
+    "psnr_mean",
+    "ssim_mean",
+    "lpips_mean",
+    "seconds_per_view",
+    "density_per_pixel",
+    "color_per_pixel",
+    "unskipped_per_pixel",
+];
 /// Longest result that is read, in bytes.
 const LONGEST: u64 = 1 << 28;
 
@@ -61,7 +67,7 @@ pub fn run(args: &Args) -> Result<()> {
         let opened = Run::open(run)?;
         let found = results(&opened.folder, args.only.as_deref())?;
         // That of a run whose model is gone is what is left of it.
-        let model = model_checksum(&opened).ok();
+        let model = checksum(&opened.model_file()).ok();
         if found.is_empty() {
             let what = match &args.only {
                 Some(name) => format!("has no result {name}.json; `raygrad eval` makes them"),
@@ -141,11 +147,16 @@ fn table(rows: &[Row]) -> String {
         let number = row.fields.get(name).and_then(|text| text.parse::<f64>().ok());
         number.map_or("-".to_owned(), |number| format!("{number:.digits$}"))
     };
-    let heads = ["run", "result", "PSNR", "SSIM", "s/view"].into_iter().chain(shown.iter().copied());
+    let weights: Vec<&String> = rows.iter().filter_map(|row| row.fields.get("lpips_crc32")).collect();
+    let figures = [("PSNR", "psnr_mean", 2), ("SSIM", "ssim_mean", 4), ("LPIPS", "lpips_mean", 4)];
+    // Where LPIPS was asked for nowhere, there is no column of it.
+    let figures = figures.into_iter().filter(|(head, ..)| *head != "LPIPS" || !weights.is_empty());
+    let figures: Vec<_> = figures.chain([("s/view", "seconds_per_view", 3)]).collect();
+    let heads =
+        ["run", "result"].into_iter().chain(figures.iter().map(|(head, ..)| *head)).chain(shown.iter().copied());
     let mut cells: Vec<Vec<String>> = vec![heads.map(str::to_owned).collect()];
     for row in rows {
-        let figures = [("psnr_mean", 2), ("ssim_mean", 4), ("seconds_per_view", 3)];
-        let figures = figures.map(|(name, digits)| measured(row, name, digits));
+        let figures = figures.iter().map(|(_, name, digits)| measured(row, name, *digits));
         let shown = shown.iter().map(|name| value(row, name));
         cells.push([row.run.clone(), row.name.clone()].into_iter().chain(figures).chain(shown).collect());
     }
@@ -162,6 +173,9 @@ fn table(rows: &[Row]) -> String {
         for row in rows {
             text += &format!("  {} {}: {}\n", row.run, row.name, value(row, name));
         }
+    }
+    if weights.iter().any(|crc32| *crc32 != weights[0]) {
+        text += "not the same weights of LPIPS (lpips_crc32), so that these figures of it cannot be compared\n";
     }
     let common: Vec<String> = common.iter().map(|name| format!("{name} {}", value(&rows[0], name))).collect();
     text + &format!("all: {}\n", common.join("; "))
@@ -187,6 +201,24 @@ mod tests {
         assert_eq!(lines[2], "b      eval-test  NaN    -     -       7           2");
         assert_eq!(lines[3], "not the same views, so that these figures cannot be compared:");
         assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "all: split test"]);
+    }
+
+    #[test]
+    fn lpips_is_a_column_where_it_was_measured_and_of_other_weights_is_warned_of() {
+        let plain = [("psnr_mean", "31.126"), ("ssim_mean", "0.9")];
+        let with = |crc32: &'static str, backbone: &'static str| {
+            [("lpips_mean", "0.05678"), ("lpips_crc32", crc32), ("lpips_backbone", backbone)]
+        };
+        let text = table(&[row("a", &plain), row("b", &[&plain[..], &with("0a", "vgg")].concat())]);
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines[0], "run  result     PSNR   SSIM    LPIPS   s/view  lpips_backbone  lpips_crc32");
+        assert_eq!(lines[1], "a    eval-test  31.13  0.9000  -       -       -               -");
+        assert_eq!(lines[2], "b    eval-test  31.13  0.9000  0.0568  -       vgg             0a");
+        assert_eq!(lines[3..], ["all: "]);
+        let text = table(&[row("a", &with("0b", "vgg")), row("b", &plain), row("c", &with("0a", "vgg"))]);
+        assert!(text.contains("\nnot the same weights of LPIPS"), "{text}");
+        let text = table(&[row("a", &with("0a", "vgg")), row("b", &with("0a", "vgg"))]);
+        assert!(!text.contains("not the same") && text.contains("lpips_backbone vgg; lpips_crc32 0a"), "{text}");
     }
 
     #[test]

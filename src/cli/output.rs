@@ -47,10 +47,10 @@ pub fn lock(path: &Path, busy: impl FnOnce() -> Error) -> Result<File> {
     }
 }
 
-/// The CRC-32 of a file.
-pub fn checksum(path: &Path) -> Result<u32> {
+/// The CRC-32 of a file, by which records say which one it was.
+pub fn checksum(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).map_err(|e| Error::file(path, format!("cannot be read: {e}")))?;
-    Ok(crc32fast::hash(&bytes))
+    Ok(format!("{:08x}", crc32fast::hash(&bytes)))
 }
 
 /// Makes a folder and those above it, and sees that files can be made in it.

@@ -235,7 +235,7 @@ fn report(cameras: &[Camera], out: &Path) -> Result<ExitCode> {
 }
 
 /// All that decides what frames show, the checksums of model and configuration among it.
-fn contents(args: &Args, [model, config]: [u32; 2], cameras: &[Camera], shown: &Shown<'_>) -> Result<Value> {
+fn contents(args: &Args, [model, config]: [String; 2], cameras: &[Camera], shown: &Shown<'_>) -> Result<Value> {
     let flown = serde_json::to_vec(cameras).map_err(|e| Error::setting("path", e))?;
     Ok(json!({
         "raygrad": env!("CARGO_PKG_VERSION"),

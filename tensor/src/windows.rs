@@ -77,13 +77,14 @@ impl Windows {
         first.min(end)..end
     }
 
-    /// Calls `f(k, windows, first)` for each element `k` of a window and each row of windows in which some see that
-    /// element inside the image: the numbers of these windows, and where the first of them sees it. The next one sees
-    /// it `stride[1]` further on.
+    /// Calls `f(k, windows, first)` for each element `k` of a window and each row of windows, of those `among` all, in
+    /// which some see that element inside the image: the numbers of these windows, counted from the first row among
+    /// them, and where the first of these windows sees it. The next one sees it `stride[1]` further on.
     #[inline(always)]
-    fn runs(&self, mut f: impl FnMut(usize, Range<usize>, usize)) {
+    fn runs(&self, among: Range<usize>, mut f: impl FnMut(usize, Range<usize>, usize)) {
         for ki in 0..self.kernel[0] {
             let rows = self.inside(0, ki);
+            let rows = rows.start.max(among.start)..rows.end.min(among.end);
             for kj in 0..self.kernel[1] {
                 let columns = self.inside(1, kj);
                 if columns.is_empty() {
@@ -92,7 +93,7 @@ impl Windows {
                 let x = columns.start * self.stride[1] + kj * self.dilation[1] - self.padding[1];
                 for i in rows.clone() {
                     let y = i * self.stride[0] + ki * self.dilation[0] - self.padding[0];
-                    let start = i * self.output[1];
+                    let start = (i - among.start) * self.output[1];
                     f(ki * self.kernel[1] + kj, start + columns.start..start + columns.end, y * self.image[1] + x);
                 }
             }
@@ -119,7 +120,22 @@ impl Windows {
     /// If a slice has another length.
     #[track_caller]
     pub fn unfold<T: Scalar>(&self, image: &[T], out: &mut [T]) {
-        let (count, per_channel) = (self.count(), self.kernel_len() * self.count());
+        self.unfold_rows(image, 0..self.output[0], out);
+    }
+
+    /// As [`unfold`](Self::unfold), of some rows of windows only: an unfolded image is as many times as large as a window
+    /// has elements, and can be worked on piece by piece. `out` is `[channels * kernel_len, rows * output()[1]]`.
+    ///
+    /// # Panics
+    /// If a slice has another length, or there are no such rows.
+    #[track_caller]
+    pub fn unfold_rows<T: Scalar>(&self, image: &[T], rows: Range<usize>, out: &mut [T]) {
+        assert!(rows.start <= rows.end && rows.end <= self.output[0], "rows {rows:?} of windows {self:?}");
+        let count = rows.len() * self.output[1];
+        let per_channel = self.kernel_len() * count;
+        if per_channel == 0 {
+            return assert!(out.is_empty(), "{} values for no windows", out.len());
+        }
         self.check(image.len(), out.len(), per_channel);
         if out.is_empty() {
             return;
@@ -130,7 +146,7 @@ impl Windows {
                 out.fill(T::ZERO);
             }
             let image = &image[channel * pixels..][..pixels];
-            self.runs(|k, windows, first| {
+            self.runs(rows.clone(), |k, windows, first| {
                 let out = &mut out[k * count..][windows];
                 if step == 1 {
                     out.copy_from_slice(&image[first..first + out.len()]);
@@ -170,6 +186,7 @@ impl Windows {
             #[inline(always)]
             || {
                 self.runs(
+                    0..self.output[0],
                     #[inline(always)]
                     |k, windows, first| {
                         let values = values(k, windows);
@@ -200,6 +217,7 @@ impl Windows {
             #[inline(always)]
             || {
                 self.runs(
+                    0..self.output[0],
                     #[inline(always)]
                     |_, windows, first| {
                         let out = &mut out[windows];
@@ -274,6 +292,7 @@ impl Windows {
             #[inline(always)]
             || {
                 self.runs(
+                    0..self.output[0],
                     #[inline(always)]
                     |_, windows, first| {
                         let (out, best) = (&mut out[windows.clone()], &mut best[windows]);
@@ -324,6 +343,12 @@ mod tests {
             let x: Vec<f64> = (0..channels * pixels).map(|i| ((i * 37) % 11) as f64 - 5.0).collect();
             let mut columns = vec![f64::NAN; channels * w.kernel_len() * w.count()];
             w.unfold(&x, &mut columns);
+            // Some rows of windows: the columns of the whole that belong to them.
+            let (first, end) = (w.output[0] / 3, w.output[0].div_ceil(2));
+            let mut some = vec![f64::NAN; channels * w.kernel_len() * (end - first) * w.output[1]];
+            w.unfold_rows(&x, first..end, &mut some);
+            let whole = columns.chunks_exact(w.count()).map(|row| &row[first * w.output[1]..end * w.output[1]]);
+            prop_assert_eq!(some, whole.collect::<Vec<_>>().concat());
             let v: Vec<f64> = (0..columns.len()).map(|i| ((i * 17) % 7) as f64 - 3.0).collect();
             let mut back = vec![0.0; x.len()];
             w.fold(&v, &mut back);

@@ -9,6 +9,7 @@ use rawzip::{CompressionMethod, ZipArchiveWriter};
 use raygrad::nerf::dataset::{Capture, Photo, Reading, Split, embedded, load};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::pictures::lpips::Lpips;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
 use raygrad::nerf::{Background, ClassicConfig, Config, Error, Extent, Image, InstantConfig, Model, Preset, Trainer};
@@ -460,6 +461,7 @@ fn files_that_announce_what_no_memory_holds_are_refused_and_take_little() {
         safetensors
             .extend(br#"{"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,99999999999]}}    "#);
         refused("safetensors", &safetensors, "a.safetensors", little, &parameters);
+        refused("weights of LPIPS", &safetensors, "a.safetensors", little, &|path| said(Lpips::open(path)).map(drop));
     }
     let read = |path: &Path| said(Params::<f32>::read_npz(path)).map(drop);
     for size in [1 << 29, 400] {

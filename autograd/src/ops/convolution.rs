@@ -1,7 +1,7 @@
 //! 2-D convolution of images `[n, channels, height, width]`, and the two products that are its gradients: with it they
 //! form a closed set, so gradients of any order stay convolutions.
 //!
-//! Each image is unfolded to a matrix of windows ("im2col") and multiplied. Images run on rayon's threads; sums over
+//! Each image is unfolded to a matrix of windows ("im2col") and multiplied, a large one in strips. Images run on rayon's threads; sums over
 //! images are taken in a fixed number of groups, so results have the same bits at any number of threads.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
@@ -13,6 +13,10 @@ use smallvec::smallvec;
 
 /// Groups of images over which a weight's gradient is summed first.
 const SLOTS: usize = 16;
+
+/// Elements of an image that are unfolded at a time for its convolution, about: unfolded as a whole, one of 64 channels and
+/// 800x800 pixels would be 1.5 GB for a kernel of 3x3.
+const STRIP: usize = 1 << 22;
 
 /// How the kernel of a 2-D convolution moves over an image, by axis: `[rows, columns]`.
 ///
@@ -104,6 +108,21 @@ impl Sizes {
         self.n * self.o * self.rows * self.count
     }
 
+    /// Rows of windows of a strip.
+    fn strip(&self) -> usize {
+        let [rows, columns] = self.windows.output();
+        (STRIP / (self.rows * columns).max(1)).clamp(1, rows)
+    }
+
+    /// Space for an unfolded strip of an image, and for what becomes of it.
+    fn strip_scratch<T: Scalar>(&self, pool: &Pool<T>) -> [Tensor<T>; 2] {
+        let count = self.strip() * self.windows.output()[1];
+        if self.strip() == self.windows.output()[0] {
+            return [self.scratch(pool), pool.tensor(&[0])];
+        }
+        [pool.tensor(&[self.rows * count]), pool.tensor(&[self.o * count])]
+    }
+
     /// Space for an unfolded image.
     fn scratch<T: Scalar>(&self, pool: &Pool<T>) -> Tensor<T> {
         pool.tensor(&[if self.windows.are_pixels() { 0 } else { self.rows * self.count }])
@@ -152,13 +171,28 @@ impl<T: Scalar> Op<T> for Conv2d {
         let [oh, ow] = s.windows.output();
         let mut y = pool.tensor(&[s.n, s.o, oh, ow]);
         let weight = Matrix::new(x[1].as_slice(), s.o, s.rows);
-        let image = |scratch: &mut Tensor<T>, i: usize, y: &mut [T]| {
+        let product = |unfolded: Matrix<'_, T>, y: &mut [T]| {
             if let Some(bias) = x.get(2) {
-                y.chunks_exact_mut(s.count).zip(bias.as_slice()).for_each(|(y, &b)| y.fill(b));
+                y.chunks_exact_mut(unfolded.columns()).zip(bias.as_slice()).for_each(|(y, &b)| y.fill(b));
             }
-            gemm(weight, s.unfolded(x[0], i, scratch), y, x.len() > 2);
+            gemm(weight, unfolded, y, x.len() > 2);
         };
-        chunks(y.as_mut_slice(), s.o * s.count, s.work(), || s.scratch(pool), &image);
+        let image = |[scratch, part]: &mut [Tensor<T>; 2], i: usize, y: &mut [T]| {
+            if part.is_empty() {
+                return product(s.unfolded(x[0], i, scratch), y);
+            }
+            for start in (0..oh).step_by(s.strip()) {
+                let rows = start..oh.min(start + s.strip());
+                let count = rows.len() * ow;
+                let (unfolded, part) =
+                    (&mut scratch.as_mut_slice()[..s.rows * count], &mut part.as_mut_slice()[..s.o * count]);
+                s.windows.unfold_rows(&x[0].as_slice()[i * s.image..][..s.image], rows, unfolded);
+                product(Matrix::new(unfolded, s.rows, count), part);
+                let strips = y.chunks_exact_mut(s.count).map(|y| &mut y[start * ow..][..count]);
+                strips.zip(part.chunks_exact(count)).for_each(|(y, part)| y.copy_from_slice(part));
+            }
+        };
+        chunks(y.as_mut_slice(), s.o * s.count, s.work(), || s.strip_scratch(pool), &image);
         y
     }
 
@@ -318,6 +352,7 @@ mod tests {
     use super::*;
     use crate::Tape;
     use crate::check::spread;
+    use crate::s;
     use proptest::prelude::*;
 
     proptest! {
@@ -348,6 +383,30 @@ mod tests {
                 prop_assert!((y - sum).abs() < 1e-12);
             }
         }
+    }
+
+    #[test]
+    fn a_large_image_is_convolved_strip_by_strip() {
+        let (c, o, [height, width], stride) = (48, 3, [130, 171], [1, 2]);
+        let config = Conv2dConfig { stride, padding: [2, 1], dilation: [2, 1] };
+        let tape = Tape::<f64>::new();
+        let x = tape.constant(spread(&[2, c, height, width], &[-1.0..1.0], 1));
+        let w = tape.constant(spread(&[o, c, 3, 3], &[-1.0..1.0], 2));
+        let b = tape.constant(spread(&[o], &[-1.0..1.0], 3));
+        let s = Sizes::new(&config, x.shape(), w.shape());
+        let ([rows, _], strip) = (s.windows.output(), s.strip());
+        assert!(strip > 1 && rows > strip && !rows.is_multiple_of(strip), "strips of {strip} of {rows} rows");
+        let [y, plain] = [x.conv2d_bias(&w, &b, &config), x.conv2d(&w, &config)];
+        // The rows of each side of an edge, and those at the ends, from the rows of the image that they see.
+        for row in [0, strip - 1, strip, rows - 1] {
+            let first = row.max(2) - 2;
+            let seen = x.slice(s![.., .., first..height.min(row + 3)]);
+            let expected = seen.conv2d_bias(&w, &b, &config);
+            let expected = expected.slice(s![.., .., row - first..row - first + 1]);
+            assert!(y.slice(s![.., .., row..row + 1]).value().is_close(expected.value(), 1e-12, 1e-12), "row {row}");
+        }
+        let difference = y - plain - b.reshape(&[o, 1, 1]);
+        assert!(difference.abs().value().as_slice().iter().all(|x| *x <= 1e-12));
     }
 
     /// Value and gradients of a batch that is large enough for several threads.

@@ -69,6 +69,11 @@ pub enum Appearance {
 }
 
 impl Appearance {
+    /// How many columns on the left of an image are not compared.
+    pub fn fitted_columns(self, width: usize) -> usize {
+        if self == Appearance::Half { width / 2 } else { 0 }
+    }
+
     pub fn of(model: &Model<f32>, split: Split, fit_half: bool) -> Self {
         let has_codes = model.config.field.get::<InstantConfig>().is_some_and(|field| field.codes > 0);
         match (fit_half, has_codes || model.config.tone.exposure.is_some()) {

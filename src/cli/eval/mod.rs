@@ -11,6 +11,7 @@ use std::time::Instant;
 
 use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
 use raygrad::nerf::pictures::colormap;
+use raygrad::nerf::pictures::lpips::Lpips;
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
@@ -23,17 +24,19 @@ use super::progress::Progress;
 use super::run::{Run, write_json};
 use super::scene::{Opened, Scene};
 use alignment::{Alignment, Appearance};
-use report::{Identity, Report, Score, table};
+use report::{Identity, Perceived, Report, Score, table};
 
 /// Digits of the number of a picture.
 const DIGITS: usize = 3;
+/// The folder in which pictures are until all are there.
+const UNFINISHED: &str = "unfinished";
 
-/// Compare a model with photographs: PSNR and SSIM
+/// Compare a model with photographs: PSNR, SSIM and, with weights for it, LPIPS
 ///
 /// Writes RUN/eval-SPLIT-SKIP.json with the figures and all that they depend on, and a page to look at, RUN/eval-SPLIT-SKIP/index.html,
 /// with up to 13 pictures, the worst views among them: photograph, render, error, depth. --views, --precision, --fit-poses and
 /// --fit-half stand in the name too, as in RUN/eval-val-off-10.json, so that none replaces another's result; that of another
-/// --scene does. `raygrad compare` puts the results of several runs side by side.
+/// --scene does. --lpips only adds to a result. `raygrad compare` puts the results of several runs side by side.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -58,6 +61,10 @@ pub struct Args {
     /// differ in exposure, nobody can know that of one that was held out
     #[arg(long)]
     fit_half: bool,
+    /// Measure LPIPS too, with the weights of AlexNet or VGG-16 in this file: benches/peers/lpips_weights.py makes it. Figures
+    /// of one network are no measure of those of the other; published ones are mostly of VGG-16
+    #[arg(long, value_name = "FILE.safetensors")]
+    lpips: Option<PathBuf>,
     /// Arithmetic of the pictures
     #[arg(long, value_enum, default_value_t)]
     precision: Precision,
@@ -101,9 +108,11 @@ fn hold_out(opened: &Opened) -> &'static str {
 pub fn run(args: &Args) -> Result<()> {
     let run = Run::open(&args.run)?;
     // Before it is read: should it be replaced meanwhile, the result is not taken for that of the new one.
-    let crc32 = model_checksum(&run)?;
+    let crc32 = checksum(&run.model_file())?;
     let mut model = run.model()?;
     let identity = Identity::of(&run, &model, crc32);
+    let lpips = args.lpips.as_ref().map(Lpips::open).transpose()?;
+    let weights = args.lpips.as_deref().map(checksum).transpose()?;
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
@@ -120,6 +129,9 @@ pub fn run(args: &Args) -> Result<()> {
         return Err(Error::setting("scene", what));
     }
     let appearance = Appearance::of(&model, args.split, args.fit_half);
+    if let Some(lpips) = &lpips {
+        check_sizes(lpips, &data, appearance)?;
+    }
     // Corners are as dark in every photograph.
     model.vignetted = true;
     let mut cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
@@ -133,8 +145,10 @@ pub fn run(args: &Args) -> Result<()> {
     let name = args.name(skip);
     let pictures = run.file(&name);
     make_folder(&pictures)?;
-    let unfinished = tempfile::Builder::new().prefix(".tmp").tempdir_in(&run.folder);
-    let unfinished = unfinished.map_err(|e| Error::file(&run.folder, format!("cannot be written to: {e}")))?;
+    // What an evaluation that was ended before has left there is begun again.
+    let unfinished = pictures.join(UNFINISHED);
+    let _ = std::fs::remove_dir_all(&unfinished);
+    make_folder(&unfinished)?;
     let own = |frame: &Frame| {
         let number = run.config.photographs.iter().position(|name| *name == frame.name);
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
@@ -142,8 +156,8 @@ pub fn run(args: &Args) -> Result<()> {
     let looks = data.frames.iter().map(own).collect();
     let (background, span) = (shown_background(model.config.background), model.extent.span);
     let renderer = Renderer::new(model, args.precision)?;
-    let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance };
-    let (per_view, seconds_per_view, evaluations) = judge.all(unfinished.path())?;
+    let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
+    let (per_view, seconds_per_view, evaluations) = judge.all(&unfinished)?;
     let data = &judge.data;
     let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
     let per_pixel = |count: u64| count as f64 / pixels as f64;
@@ -168,6 +182,11 @@ pub fn run(args: &Args) -> Result<()> {
         processor: processor(),
         psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
         ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
+        lpips: judge.lpips.as_ref().zip(weights).map(|(lpips, crc32)| Perceived {
+            lpips_mean: mean(per_view.iter().map(|score| score.lpips)),
+            lpips_backbone: lpips.backbone(),
+            lpips_crc32: crc32,
+        }),
         seconds_per_view,
         density_per_pixel: per_pixel(evaluations.density),
         color_per_pixel: per_pixel(evaluations.color),
@@ -176,13 +195,14 @@ pub fn run(args: &Args) -> Result<()> {
     };
     let file = run.file(&format!("{name}.json"));
     let drawn = report.drawn();
-    judge.draw_others(&drawn, unfinished.path())?;
+    judge.draw_others(&drawn, &unfinished)?;
     // An evaluation that is ended before leaves the last one's result as it was.
     write_json(&file, &report)?;
     for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {
-        let (from, to) = (unfinished.path().join(&name), pictures.join(&name));
+        let (from, to) = (unfinished.join(&name), pictures.join(&name));
         std::fs::rename(from, &to).map_err(|e| Error::file(&to, format!("cannot be written: {e}")))?;
     }
+    let _ = std::fs::remove_dir(&unfinished);
     // Pictures of an evaluation of other photographs under the same name would belong to no result.
     remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
     let index = pictures.join("index.html");
@@ -194,9 +214,18 @@ pub fn run(args: &Args) -> Result<()> {
     print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
 }
 
-/// The CRC-32 of a run's model, as results have it.
-pub fn model_checksum(run: &Run) -> Result<String> {
-    Ok(format!("{:08x}", checksum(&run.model_file())?))
+/// Whether the network sees something of all views that are compared whole.
+fn check_sizes(lpips: &Lpips, data: &Dataset, appearance: Appearance) -> Result<()> {
+    let side = lpips.backbone().smallest();
+    for Frame { name, image, .. } in data.frames.iter().filter(|frame| frame.mask.is_none()) {
+        let [width, height] = [image.width - appearance.fitted_columns(image.width), image.height];
+        if width < side || height < side {
+            let backbone = lpips.backbone();
+            let what = format!("of `{name}` {width}x{height} pixels are compared, and {backbone} needs {side}x{side}");
+            return Err(Error::setting("lpips", what));
+        }
+    }
+    Ok(())
 }
 
 /// The background that images are compared over: a random one is for training only.
@@ -223,6 +252,8 @@ struct Judge {
     /// The number of the photograph that each view looks like, if it does.
     looks: Vec<Option<u32>>,
     appearance: Appearance,
+    /// Weights of LPIPS, if it is measured.
+    lpips: Option<Lpips>,
 }
 
 impl Judge {
@@ -238,9 +269,11 @@ impl Judge {
             let picture = self.render(i);
             seconds += start.elapsed().as_secs_f64();
             evaluations = evaluations + picture.evaluations;
-            let (score, drawing) = self.compare(i, picture)?;
+            let shown = self.shown(i, picture)?;
+            let Shown { picture, truth, half } = &shown;
+            let score = score(&self.data.frames[i], &picture.color, truth, *half, self.lpips.as_ref());
             if drawn.contains(&i) {
-                drawing.save_png(pictures.join(numbered(i, DIGITS)))?;
+                self.draw(&shown).save_png(pictures.join(numbered(i, DIGITS)))?;
             }
             let done = i + 1;
             progress.set(done as f64 / count as f64, || {
@@ -255,7 +288,7 @@ impl Judge {
     fn draw_others(&mut self, views: &BTreeSet<usize>, pictures: &Path) -> Result<()> {
         for &i in views.difference(&report::regular(self.data.frames.len())) {
             let picture = self.render(i);
-            self.compare(i, picture)?.1.save_png(pictures.join(numbered(i, DIGITS)))?;
+            self.draw(&self.shown(i, picture)?).save_png(pictures.join(numbered(i, DIGITS)))?;
         }
         Ok(())
     }
@@ -265,11 +298,11 @@ impl Judge {
         self.renderer.view(&self.data.frames[i].camera, self.background)
     }
 
-    /// How like its photograph a view is, and a drawing of both.
-    fn compare(&self, i: usize, mut picture: Picture) -> Result<(Score, Image)> {
+    /// A view beside its photograph, as they are compared.
+    fn shown(&self, i: usize, mut picture: Picture) -> Result<Shown> {
         let frame = &self.data.frames[i];
         let truth = frame.image.over(self.background);
-        let half = if self.appearance == Appearance::Half { truth.width / 2 } else { 0 };
+        let half = self.appearance.fitted_columns(truth.width);
         if half > 0 {
             if frame.mask.is_some() && used(frame, &truth, half..truth.width).data.is_empty() {
                 let what = format!("the mask of `{}` leaves nothing of its right half to compare", frame.name);
@@ -279,9 +312,21 @@ impl Judge {
             scale(&mut picture.color, gains);
         }
         picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
-        let score = score(frame, &picture.color, &truth, half);
-        Ok((score, draw(&picture, &truth, self.span)))
+        Ok(Shown { picture, truth, half })
     }
+
+    /// Photograph, render, error and depth, side by side.
+    fn draw(&self, Shown { picture, truth, .. }: &Shown) -> Image {
+        let error = colormap::error_map(&picture.color, truth);
+        Image::hconcat(&[truth, &picture.color, &error, &depth_colors(picture, self.span)])
+    }
+}
+
+/// A view and its photograph, of which the columns from `half` on are compared.
+struct Shown {
+    picture: Picture,
+    truth: Image,
+    half: usize,
 }
 
 /// The pixels of these columns of an image that are [used](Frame::mask), in a row.
@@ -308,21 +353,19 @@ fn scale(image: &mut Image, gains: [f32; 3]) {
     image.data.chunks_exact_mut(3).for_each(|pixel| pixel.iter_mut().zip(gains).for_each(|(x, gain)| *x *= gain));
 }
 
-/// Of the pixels from column `half` on that are used; where some are not, windows have no similarity to speak of.
-fn score(frame: &Frame, render: &Image, truth: &Image, half: usize) -> Score {
-    let name = frame.name.clone();
+/// Of the pixels from column `half` on that are used; where some are not, windows and networks see nothing to speak of.
+fn score(frame: &Frame, render: &Image, truth: &Image, half: usize, lpips: Option<&Lpips>) -> Score {
     let [seen, shown] = [render, truth].map(|image| used(frame, image, half..image.width));
     let psnr = psnr(&seen, &shown);
     let [width, height] = [truth.width - half, truth.height];
-    let whole = frame.mask.is_none() && width >= SSIM_WINDOW && height >= SSIM_WINDOW;
-    let shaped = |image: Image| Image { width, height, ..image };
-    Score { name, psnr, ssim: whole.then(|| ssim(&shaped(seen), &shaped(shown))) }
-}
-
-/// Photograph, render, error and depth, side by side.
-fn draw(picture: &Picture, truth: &Image, span: [f64; 2]) -> Image {
-    let error = colormap::error_map(&picture.color, truth);
-    Image::hconcat(&[truth, &picture.color, &error, &depth_colors(picture, span)])
+    let whole = frame.mask.is_none().then(|| [seen, shown].map(|image| Image { width, height, ..image }));
+    let windows = width >= SSIM_WINDOW && height >= SSIM_WINDOW;
+    Score {
+        name: frame.name.clone(),
+        psnr,
+        ssim: whole.as_ref().filter(|_| windows).map(|[seen, shown]| ssim(seen, shown)),
+        lpips: whole.as_ref().zip(lpips).map(|([seen, shown], lpips)| lpips.distance(seen, shown)),
+    }
 }
 
 #[cfg(test)]
@@ -341,18 +384,18 @@ mod tests {
         let found = gains(&frame, &render, &truth, 13);
         assert!(found.iter().zip([2.0, 1.25, 0.8]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
         scale(&mut render, found);
-        assert!(score(&frame, &render, &truth, 13).psnr > 100.0);
+        assert!(score(&frame, &render, &truth, 13, None).psnr > 100.0);
         render.pixel_mut(20, 7)[1] += 0.5;
         // A quarter, of 13 x 26 pixels of 3 channels; the similarity is that of the right half.
-        let off = score(&frame, &render, &truth, 13);
+        let off = score(&frame, &render, &truth, 13, None);
         assert!((off.psnr - 10.0 * (3.0 * 13.0 * 26.0 / 0.25_f64).log10()).abs() < 1e-3, "{}", off.psnr);
-        assert!(off.ssim.unwrap() < 0.999 && score(&frame, &render, &truth, 0).psnr > off.psnr + 2.9);
+        assert!(off.ssim.unwrap() < 0.999 && score(&frame, &render, &truth, 0, None).psnr > off.psnr + 2.9);
         render.pixel_mut(3, 7)[1] = 9.0;
-        assert_eq!(score(&frame, &render, &truth, 13).psnr, off.psnr, "what was fitted to is not compared");
+        assert_eq!(score(&frame, &render, &truth, 13, None).psnr, off.psnr, "what was fitted to is not compared");
         // Pixels that are not used neither fit nor count; a render of nothing has no gain.
         let mask = Mask::new(26, 26, |x, y| y != 7 || (x != 3 && x != 20));
         frame.mask = Some(Arc::new(mask));
-        let masked = score(&frame, &render, &truth, 13);
+        let masked = score(&frame, &render, &truth, 13, None);
         assert!(masked.psnr > 100.0 && masked.ssim.is_none(), "{}", masked.psnr);
         assert!(gains(&frame, &render, &truth, 13).iter().all(|gain| (gain - 1.0).abs() < 1e-5));
         assert_eq!(gains(&frame, &Image::new(26, 26, 3), &truth, 13), [1.0; 3]);

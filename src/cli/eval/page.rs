@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use super::report::{Report, Score};
+use super::report::{Report, Score, four_digits};
 use super::{DIGITS, numbered};
 use crate::cli::html::{escaped, filled};
 
@@ -15,26 +15,26 @@ pub fn page(report: &Report) -> String {
     let drawn = report.drawn();
     let pictures = order.iter().filter(|i| drawn.contains(i)).map(|&i| {
         let (score, file) = (&report.per_view[i], numbered(i, DIGITS));
-        let words = escaped(&format!("{}, PSNR {:.2} dB, SSIM {}", score.name, score.psnr, similarity(score)));
+        let lpips = score.lpips.map_or(String::new(), |lpips| format!(", LPIPS {lpips:.4}"));
+        let figures = format!("PSNR {:.2} dB, SSIM {}{lpips}", score.psnr, four_digits(score.ssim));
+        let words = escaped(&format!("{}, {figures}", score.name));
         format!(
             "<figure><a href=\"{file}\"><img alt=\"{words}\" src=\"{file}\"></a><figcaption>{words}</figcaption></figure>\n"
         )
     });
     let row = |score: &Score| {
-        let (name, psnr) = (escaped(&score.name), score.psnr);
-        format!("<tr><td>{name}</td><td>{psnr:.2}</td><td>{}</td></tr>\n", similarity(score))
+        let Score { name, psnr, ssim, lpips } = score;
+        let lpips = report.lpips.as_ref().map_or(String::new(), |_| format!("<td>{}</td>", four_digits(*lpips)));
+        format!("<tr><td>{}</td><td>{psnr:.2}</td><td>{}</td>{lpips}</tr>\n", escaped(name), four_digits(*ssim))
     };
     let views = order.iter().map(|&i| row(&report.per_view[i]));
     let title = format!("{}, {} split: {:.2} dB", report.scene, report.split, report.psnr_mean);
-    let places = [("title", escaped(&title)), ("facts", facts(report))];
+    let lpips = report.lpips.as_ref().map_or("", |_| "<th>LPIPS</th>").to_owned();
+    let places = [("title", escaped(&title)), ("facts", facts(report)), ("lpips", lpips)];
     filled(
         PAGE,
         &places.into_iter().chain([("pictures", pictures.collect()), ("views", views.collect())]).collect::<Vec<_>>(),
     )
-}
-
-fn similarity(score: &Score) -> String {
-    score.ssim.map_or("-".to_owned(), |value| format!("{value:.4}"))
 }
 
 /// All fields of the report but those of single views, as rows of a table.

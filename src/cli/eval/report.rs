@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt;
 
 use raygrad::nerf::dataset::{Split, evenly_spaced};
+use raygrad::nerf::pictures::lpips::Backbone;
 use raygrad::nerf::space::occupancy::Skipping;
 use raygrad::nerf::{Background, Budget, Model, StepStats};
 use serde::{Serialize, Serializer};
@@ -54,6 +55,8 @@ pub struct Report {
     pub psnr_mean: f64,
     /// The mean of the views' SSIM; null if the images are smaller than its window.
     pub ssim_mean: Option<f64>,
+    #[serde(flatten)]
+    pub lpips: Option<Perceived>,
     /// Mean rendering time of a view.
     pub seconds_per_view: f64,
     /// Evaluations of densities and of colours for each pixel, and of both if nothing in the box were skipped.
@@ -61,6 +64,17 @@ pub struct Report {
     pub color_per_pixel: f64,
     pub unskipped_per_pixel: f64,
     pub per_view: Vec<Score>,
+}
+
+/// LPIPS, where it was asked for, and what it depends on.
+#[derive(Serialize)]
+pub struct Perceived {
+    /// The mean of the views' LPIPS; null if some are masked.
+    pub lpips_mean: Option<f64>,
+    /// The network whose features are compared.
+    pub lpips_backbone: Backbone,
+    /// CRC-32 of the file of its weights.
+    pub lpips_crc32: String,
 }
 
 /// Which model it is, and how it came to be.
@@ -139,6 +153,8 @@ pub struct Score {
     #[serde(serialize_with = "number")]
     pub psnr: f64,
     pub ssim: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
 }
 
 /// A number as JSON has it, or in words what it has no number for.
@@ -152,23 +168,38 @@ impl fmt::Display for Score {
     }
 }
 
+/// SSIM or LPIPS, where there is one.
+pub fn four_digits(value: Option<f64>) -> String {
+    value.map_or("-".to_owned(), |value| format!("{value:.4}"))
+}
+
 /// The report as a table for a terminal.
 pub fn table(report: &Report) -> String {
-    let ssim = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.4}"));
     let mean_of = format!("mean of {}", report.views);
     let names = report.per_view.iter().map(|score| score.name.len());
     let width = names.chain([mean_of.len()]).max().unwrap_or(0);
-    let mut text = format!("{:width$}  {:>7}  {:>7}\n", "view", "PSNR", "SSIM");
-    for Score { name, psnr, ssim: similarity } in &report.per_view {
-        text += &format!("{name:width$}  {psnr:>7.2}  {:>7}\n", ssim(*similarity));
+    let row = |[name, psnr, ssim, lpips]: [&str; 4]| match report.lpips {
+        Some(_) => format!("{name:width$}  {psnr:>7}  {ssim:>7}  {lpips:>7}\n"),
+        None => format!("{name:width$}  {psnr:>7}  {ssim:>7}\n"),
+    };
+    let figures = |name: &str, psnr: f64, ssim: Option<f64>, lpips: Option<f64>| {
+        row([name, &format!("{psnr:.2}"), &four_digits(ssim), &four_digits(lpips)])
+    };
+    let mut text = row(["view", "PSNR", "SSIM", "LPIPS"]);
+    for Score { name, psnr, ssim, lpips } in &report.per_view {
+        text += &figures(name, *psnr, *ssim, *lpips);
     }
-    text += &format!("{mean_of:width$}  {:>7.2}  {:>7}\n", report.psnr_mean, ssim(report.ssim_mean));
+    let lpips_mean = report.lpips.as_ref().and_then(|lpips| lpips.lpips_mean);
+    text += &figures(&mean_of, report.psnr_mean, report.ssim_mean, lpips_mean);
     let Report { split, hold_out, background, seconds_per_view, .. } = report;
     let size = format!("{}x{}", report.width, report.height);
     text +=
         &format!("{split} views ({hold_out}) of {size} over {background}, {seconds_per_view:.2} s to render each\n");
     let worst: Vec<String> = report.worst().iter().map(|&i| report.per_view[i].to_string()).collect();
     text += &format!("worst: {}\n", worst.join(", "));
+    if let Some(Perceived { lpips_backbone, lpips_crc32, .. }) = &report.lpips {
+        text += &format!("LPIPS: {lpips_backbone}, weights with the CRC-32 {lpips_crc32}\n");
+    }
     text += match report.appearance {
         Appearance::None => "",
         Appearance::Own => "exposures and codes: each photograph's own\n",
@@ -191,7 +222,7 @@ mod tests {
     #[test]
     fn what_json_has_no_number_for_is_said_in_words() {
         for (psnr, expected) in [(31.5, "31.5"), (f64::INFINITY, "\"inf\""), (f64::NAN, "\"NaN\"")] {
-            let score = serde_json::to_string(&Score { name: "a".into(), psnr, ssim: None }).unwrap();
+            let score = serde_json::to_string(&Score { name: "a".into(), psnr, ssim: None, lpips: None }).unwrap();
             assert_eq!(score, format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
         }
     }
