@@ -200,8 +200,24 @@ fn a_run_is_complete_and_can_be_evaluated() {
     place.succeeds("train --resume run --steps 4");
     let output = place.command("compare run other").output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
+    std::fs::create_dir_all(place.path("run/eval-test/unfinished")).unwrap();
+    std::fs::write(place.path("run/eval-test/unfinished/000.png"), b"half").unwrap();
     let stale = "is of a model that has been trained on since";
     assert!(output.status.success() && said.matches(stale).count() == 2 && !said.contains("other/"), "{said}");
+    // One at a time.
+    let lock = std::fs::File::create(place.path("run/eval-test/unfinished.lock")).unwrap();
+    lock.lock().unwrap();
+    place.fails("eval run", &["run/eval-test: is being written by another raygrad"]);
+    drop(lock);
+    // What an evaluation that was killed has left is begun again; what is evaluated anew is not stale.
+    place.succeeds("eval run");
+    let left: Vec<_> =
+        std::fs::read_dir(place.path("run/eval-test")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left.len(), 4, "three pictures and a page: {left:?}");
+    // A run whose model is gone has its results still.
+    std::fs::remove_file(place.path("other/model.safetensors")).unwrap();
+    let output = place.command("compare run other --only eval-test").output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
 }
 
 #[test]

@@ -64,12 +64,16 @@ fn all(folder: &Path) -> Result<Vec<(u64, PathBuf)>> {
 
 /// Removes the latest checkpoint if it is of this step and there is one before it.
 pub fn step_back(run: &Run, step: Option<u64>) -> Result<()> {
-    if let [(latest, path), _, ..] = &all(&folder(run))?[..]
-        && Some(*latest) == step
-    {
-        remove(std::slice::from_ref(path));
-    }
+    remove(surplus(&all(&folder(run))?, step).as_slice());
     Ok(())
+}
+
+/// The first of these, the latest, if it is of this step and there is another.
+fn surplus(found: &[(u64, PathBuf)], step: Option<u64>) -> Option<PathBuf> {
+    match found {
+        [(latest, path), _, ..] if Some(*latest) == step => Some(path.clone()),
+        _ => None,
+    }
 }
 
 /// Takes a trainer to the latest checkpoint that is whole; one that is not is said to be so. If none is whole, that is an error,
@@ -89,7 +93,7 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     for (_, path) in checkpoints {
         // One that is there and cannot be read just now is not passed over either.
         let unread =
-            |e| Error::file(&path, format!("cannot be read: {e}; without it, the checkpoint before it is taken"));
+            |e| Error::file(&path, format!("cannot be read: {e}; remove it to go on from the checkpoint before it"));
         let bytes = fs::read(&path).map_err(unread)?;
         let loaded =
             parse(&path, bytes).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
@@ -172,6 +176,12 @@ mod tests {
             assert!(read(&changed).is_err() || read(&changed).unwrap() == state, "bit {bit}");
             changed[bit / 8] ^= 1 << (bit % 8);
         }
+        let found = [(20, "b".into()), (9, "a".into())];
+        assert_eq!(surplus(&found, Some(20)), Some("b".into()));
+        assert_eq!(
+            [surplus(&found, Some(9)), surplus(&found, None), surplus(&found[..1], Some(20))],
+            [None, None, None]
+        );
         let newer = [b"raygrad checkpoint 2 00000000 200\n".as_slice(), &state].concat();
         assert!(read(&newer).unwrap_err().to_string().contains("version 2"));
         // The latest comes first, by number and not by name; others are none.

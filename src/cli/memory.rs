@@ -46,6 +46,17 @@ pub fn available() -> Option<f64> {
     [machine, group()].into_iter().flatten().reduce(f64::min)
 }
 
+/// What is to be said if training needs more bytes than are free.
+pub fn shortage(need: f64, free: f64) -> Option<String> {
+    let [needed, left] = [need, free].map(|bytes| bytes / 1e9);
+    (need > free).then(|| {
+        format!(
+            "warning: training takes about {needed:.1} GB of memory, of {left:.1} GB that are free: the system may end it; say \
+             --downscale, or a smaller table or batch with --set (field.grid.log2_table, sampler.samples)"
+        )
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -53,6 +64,13 @@ mod tests {
     use raygrad::nerf::sampling::marching::MarchingConfig;
     use raygrad::nerf::{Config, InstantConfig, Preset};
     use std::sync::Arc;
+
+    #[test]
+    fn a_warning_says_what_is_missing() {
+        assert_eq!(shortage(1e9, 1e9), None);
+        let said = shortage(3.26e9, 2.5e9).unwrap();
+        assert!(said.contains("about 3.3 GB of memory, of 2.5 GB that are free"), "{said}");
+    }
 
     #[test]
     fn what_training_takes_grows_with_all_that_is_held() {

@@ -19,7 +19,7 @@ pub struct Photograph {
 /// Those of a split, at least one, in the order in which they are read. No image is read.
 ///
 /// # Errors
-/// If the capture cannot be read, or has none; or none of those that the model has learned the cameras of.
+/// If the capture cannot be read, or has none; or to train on others than the run was trained on.
 pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Vec<Photograph>> {
     let capture = match run.scene(scene)? {
         Scene::Folder(folder) => Capture::read(folder)?,
@@ -29,18 +29,22 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
     if views.is_empty() {
         return Err(Error::file(&capture.file, format!("has no {split} photographs")));
     }
-    let learned = split == Split::Train && model.refine.is_some();
-    if learned {
+    if split == Split::Train {
         check_trained(run, &capture, &views, model.extent.frames)?;
     }
+    let learned = split == Split::Train && model.refine.is_some();
     let placement = model.extent.placement;
     let photograph = |(number, view): (usize, &&View)| {
         let given = placement.camera(&view.camera);
         let camera = if learned { model.learned_camera(number, &given) } else { model.other_camera(&given) };
-        let bounds = view.bounds.map(|ends| ends.map(|end| placement.scale * end));
-        Photograph { name: view.name.clone(), camera, bounds }
+        Photograph { name: view.name.clone(), camera, bounds: bounds(view, placement.scale) }
     };
     Ok(views.iter().enumerate().map(photograph).collect())
+}
+
+/// The depths that a view shows at most, in scene units, of which one of the capture's has `scale`.
+fn bounds(view: &View, scale: f64) -> Option<[f64; 2]> {
+    view.bounds.map(|ends| ends.map(|end| scale * end))
 }
 
 /// The views of a split whose photographs are there, in the order in which these are read, which numbers them. Of a built-in
@@ -50,10 +54,10 @@ pub fn present(capture: &Capture, split: Split) -> Result<Vec<&View>> {
     Ok(capture.split(split)?.into_iter().filter(|view| is_made || view.image.is_some()).collect())
 }
 
-/// Whether these views to train on are the `count` photographs that a run was trained on.
+/// Whether these views to train on are the `count` photographs that a run was trained on; of 0, that is not known.
 pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize) -> Result<()> {
     let bad = |what: String| Err(Error::file(&capture.file, format!("{what}: say with --scene where those are")));
-    if views.len() != count {
+    if count > 0 && views.len() != count {
         return bad(format!("has {} photographs to train on, and the run was trained on {count}", views.len()));
     }
     let (names, is_made) = (&run.config.photographs, capture.present().next().is_none());
@@ -62,4 +66,18 @@ pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize
         return bad("has other photographs to train on than those that the run was trained on".to_owned());
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn depths_are_in_scene_units() {
+        let mut capture = builtin::capture(&Scene::Embedded, None, None).unwrap();
+        let mut view = capture.views.remove(0);
+        assert_eq!(bounds(&view, 3.0), None);
+        view.bounds = Some([2.0, 7.0]);
+        assert_eq!(bounds(&view, 3.0), Some([6.0, 21.0]));
+    }
 }

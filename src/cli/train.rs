@@ -359,13 +359,8 @@ fn warn_of_memory(scene: &Opened, downscale: usize) {
 fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
     let need = memory::need(trainer, data);
     let free = memory::available().map(|free| free + machine::taken_memory().unwrap_or(0) as f64);
-    if let Some(free) = free.filter(|free| need > *free) {
-        complain(&format!(
-            "warning: training takes about {:.1} GB of memory, of {:.1} GB that are free: the system may end it; say --downscale, or \
-             a smaller table or batch with --set (field.grid.log2_table, sampler.samples)",
-            need / 1e9,
-            free / 1e9
-        ));
+    if let Some(warning) = free.and_then(|free| memory::shortage(need, free)) {
+        complain(&warning);
     }
     print(&format!("memory   about {:.1} GB\n", need / 1e9))
 }

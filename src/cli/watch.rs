@@ -345,4 +345,9 @@ mod tests {
             assert_eq!(kept_metrics(&path, step).unwrap(), (lines(&expected), expected.last().copied().unwrap_or(0)));
         }
     }
+
+    #[test]
+    fn previews_come_at_twice_the_time_of_the_one_before() {
+        assert_eq!([0.0, 4.9, 5.0, 39.0, 40.0].map(next_preview), [5.0, 5.0, 10.0, 40.0, 80.0]);
+    }
 }

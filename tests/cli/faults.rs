@@ -57,6 +57,16 @@ fn about_the_run(calls: &[String], kind: &str) -> Vec<usize> {
     of_kind.enumerate().filter(|(_, line)| ours(line)).map(|(i, _)| i + 1).collect()
 }
 
+/// Whether the calls have these names on this system; says so if not.
+fn has_names(calls: &[String]) -> bool {
+    let found = CALLS.iter().all(|(call, _)| !about_the_run(calls, call).is_empty());
+    assert!(found || !cfg!(all(target_arch = "x86_64", target_env = "gnu")), "{calls:?}");
+    if !found {
+        println!("skipped: calls to this system have other names");
+    }
+    found
+}
+
 fn begin() -> String {
     format!("--threads 1 train scene --steps 12 --checkpoint 0.001s --out run {SMALL}")
 }
@@ -83,6 +93,9 @@ fn faults_that_kill_a_run_at_any_call_cost_it_nothing() {
     let place = Place::with_scene();
     let (output, calls) = traced(&place, None, &begin());
     assert!(output.status.success(), "{output:?}");
+    if !has_names(&calls) {
+        return;
+    }
     std::fs::rename(place.path("run"), place.path("whole")).unwrap();
     let mut kills = 0;
     for (call, what) in CALLS {
@@ -109,7 +122,11 @@ fn faults_of_a_disk_lose_no_run() {
         return;
     }
     let place = Place::with_scene();
-    let (_, calls) = traced(&place, None, &begin());
+    let (output, calls) = traced(&place, None, &begin());
+    assert!(output.status.success(), "{output:?}");
+    if !has_names(&calls) {
+        return;
+    }
     std::fs::rename(place.path("run"), place.path("whole")).unwrap();
     for (i, (call, what)) in CALLS.into_iter().enumerate() {
         let (mut ended, mut warned, mut silent, mut words) = (0, 0, 0, String::new());
@@ -118,13 +135,14 @@ fn faults_of_a_disk_lose_no_run() {
             // Once, or from then on.
             let (answer, more) = (ANSWERS[(i + j) % 4], if j % 2 == 0 { "+" } else { "" });
             let fault = format!("{call}:error={answer}:when={number}{more}");
-            let (output, _) = traced(&place, Some(&fault), &begin());
+            let (output, calls) = traced(&place, Some(&fault), &begin());
             let said = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(!said.contains("panicked"), "{fault}: {said}");
             let line = said.lines().find(|line| line.starts_with("raygrad: ") && !line.contains("few-photographs"));
             match (output.status.code(), line) {
                 (Some(0), Some(_)) => warned += 1,
-                (Some(0), None) => silent += 1,
+                // There may be fewer calls this time.
+                (Some(0), None) if !calls.iter().any(|call| call.contains("(INJECTED)")) => silent += 1,
                 // What cannot write cannot say so.
                 (Some(1), line) if line.is_some() || call == "write" => ended += 1,
                 _ => panic!("{fault}: {output:?}"),
@@ -135,8 +153,9 @@ fn faults_of_a_disk_lose_no_run() {
             go_on(&place);
             assert_same(&place, "whole", "run");
         }
+        assert!(ended + warned > 0, "{call}");
         println!(
-            "refused when {what} ({call}): {ended} ended with an error, {warned} with a warning, {silent} took no harm; {words}"
+            "refused when {what} ({call}): {ended} ended with an error, {warned} with a warning, {silent} had ended before; {words}"
         );
     }
 }

@@ -69,7 +69,7 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
 
     weights(&place, "vgg.safetensors", VGG);
     let table = place.succeeds("eval run --lpips vgg.safetensors");
-    let result = place.json("run/eval-test.json");
+    let result = place.json("run/eval-test-lpips-vgg.json");
     let crc = format!("{:08x}", crc32fast::hash(&place.bytes("vgg.safetensors")));
     assert_eq!(json!([result["lpips_backbone"], result["lpips_crc32"]]), json!(["vgg", crc]));
     assert!(result.get("lpips").is_none() && result["psnr_mean"] == plain["psnr_mean"]);
@@ -78,7 +78,7 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     let views = result["per_view"].as_array().unwrap();
     let figures: Vec<f64> = views.iter().map(|view| view["lpips"].as_f64().unwrap()).collect();
     for (i, figure) in figures.iter().enumerate() {
-        let drawing = png(&place.path(&format!("run/eval-test/{i:03}.png")));
+        let drawing = png(&place.path(&format!("run/eval-test-lpips-vgg/{i:03}.png")));
         let drawn = lpips.distance(&piece(&drawing, 0), &piece(&drawing, 1));
         assert!(drawn > 1e-3 && (figure - drawn).abs() < 0.02 * drawn, "{figure} {drawn}");
     }
@@ -90,13 +90,14 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     assert_eq!(lines[2].last().unwrap(), &format!("{:.4}", figures[1]), "{table}");
     assert_eq!(lines[4].last().unwrap(), &format!("{mean:.4}"), "{table}");
     assert!(table.contains(&format!("\nLPIPS: vgg, weights with the CRC-32 {crc}\n")), "{table}");
-    let page = page("eval-test");
+    let page = page("eval-test-lpips-vgg");
     assert!(
         page.contains("<th>LPIPS</th></tr>") && page.contains(&format!("<td>{:.4}</td></tr>", figures[2])),
         "{page}"
     );
     assert!(page.contains(&format!(", LPIPS {:.4}\"", figures[0])) && page.contains(&crc), "{page}");
-    let compared = place.succeeds("compare run");
+    let compared = place.succeeds("compare run --only eval-test-lpips-vgg");
+    assert_eq!(place.json("run/eval-test.json"), plain, "beside the other result");
     assert!(compared.contains("LPIPS") && compared.contains(&format!("  {mean:.4}  ")), "{compared}");
     assert!(compared.contains(&format!("lpips_backbone vgg; lpips_crc32 {crc}")), "{compared}");
 
@@ -109,7 +110,7 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     transforms["frames"][1]["mask_path"] = json!("mask.png");
     std::fs::write(place.path("scene/transforms_test.json"), transforms.to_string()).unwrap();
     let table = place.succeeds("eval run --lpips vgg.safetensors");
-    let masked = place.json("run/eval-test.json");
+    let masked = place.json("run/eval-test-lpips-vgg.json");
     let views = masked["per_view"].as_array().unwrap();
     assert_eq!([0, 1, 2].map(|i| views[i]["lpips"].as_f64()), [Some(figures[0]), None, Some(figures[2])], "{table}");
     assert!(masked["lpips_mean"].is_null() && masked["lpips_crc32"] == json!(crc), "{masked}");
@@ -127,5 +128,6 @@ fn weights_that_do_not_serve_are_refused_before_anything_is_rendered() {
     place.fails("eval run --lpips part.safetensors", &["part.safetensors: not a safetensors file", "lpips_weights.py"]);
     let model = "run/model.safetensors";
     place.fails(&format!("eval run --lpips {model}"), &[model, "has no weights of LPIPS"]);
-    assert!(!place.path("run/eval-test").exists() && !place.path("run/eval-test.json").exists());
+    let left = std::fs::read_dir(place.path("run")).unwrap().map(|entry| entry.unwrap().file_name());
+    assert!(!left.into_iter().any(|name| name.to_string_lossy().starts_with("eval")));
 }

@@ -111,6 +111,10 @@ impl Sizes {
     /// Rows of windows of a strip.
     fn strip(&self) -> usize {
         let [rows, columns] = self.windows.output();
+        if self.windows.are_pixels() {
+            // Nothing is unfolded.
+            return rows;
+        }
         (STRIP / (self.rows * columns).max(1)).clamp(1, rows)
     }
 

@@ -56,7 +56,8 @@ fn turn(from: &DAffine3, to: &DAffine3) -> DVec3 {
 pub enum Curve {
     /// Through each: a Catmull-Rom spline by the pyramid of Barry and Goldman (1988) of [`Key::mix`], for rotations as
     /// Schlag (1991) has it. Speeds of moving, of turning and of zooming are continuous. From key to key a camera
-    /// should turn by less than a right angle.
+    /// should turn by less than a right angle. How far along it a camera is at a time is a monotone cubic function (Fritsch and
+    /// Butland 1984), so that times, however uneven, move cameras to and fro nowhere. Nerfstudio's paths are such ones.
     Through,
     /// Near each, as smooth as a uniform cubic B-spline: in the middle of a leg's end, a key counts four sixths and its
     /// neighbours one. Rotations are weighted means of quaternions. These are the paths of instant-ngp.
@@ -77,6 +78,8 @@ pub enum Curve {
 pub struct CameraPath {
     keys: Vec<Key>,
     /// When each key is reached, from 0 on; of a closed path, the first once more.
+    times: Vec<f64>,
+    /// The curve's parameter there.
     knots: Vec<f64>,
     closed: bool,
     curve: Curve,
@@ -106,12 +109,12 @@ impl CameraPath {
         let moved = lengths(|from, to| from.translation.distance(to.translation));
         let turned = lengths(|from, to| turn(from, to).length());
         let times = moved.iter().zip(turned).map(|(moved, turned)| (0.5 * (moved + turned)).sqrt().max(LEAST_LEG));
-        let times = times.collect();
-        CameraPath::timed(keys, times, closed, Curve::Through)
+        let path = CameraPath::timed(keys, times.collect(), closed, Curve::Through);
+        CameraPath { knots: path.times.clone(), ..path }
     }
 
     /// By keys, with the time that each leg takes, in any unit: one less than keys or, if the path is `closed`, as many. One that
-    /// is less than a millionth of the longest counts as that.
+    /// is less than a millionth of the longest counts as that. Times do not bend the curve: its parameter rises by one in each leg.
     ///
     /// # Panics
     /// If there is no key, or not as many times, or one that is not above 0 and finite.
@@ -120,17 +123,18 @@ impl CameraPath {
         assert_eq!(times.len(), legs(&keys, closed).len(), "a time for each leg");
         assert!(times.iter().all(|time| *time > 0.0 && time.is_finite()), "times above 0");
         let least = LEAST_TIME * times.iter().copied().fold(0.0, f64::max);
-        let mut knots = vec![0.0];
+        let mut reached = vec![0.0];
         for time in times {
-            knots.push(knots[knots.len() - 1] + time.max(least));
+            reached.push(reached[reached.len() - 1] + time.max(least));
         }
-        CameraPath { keys, knots, closed, curve }
+        let knots = (0..reached.len()).map(|i| i as f64).collect();
+        CameraPath { keys, times: reached, knots, closed, curve }
     }
 
     /// Where along the path its keys are, 0 to 1.
     pub fn shares(&self) -> Vec<f64> {
         let length = self.length();
-        self.knots[..self.keys.len()].iter().map(|knot| if length > 0.0 { knot / length } else { 0.0 }).collect()
+        self.times[..self.keys.len()].iter().map(|time| if length > 0.0 { time / length } else { 0.0 }).collect()
     }
 
     /// Where a camera is that has come so far, 0 to 1: by time, and so about evenly.
@@ -139,14 +143,48 @@ impl CameraPath {
             return self.keys[0];
         }
         let time = share.clamp(0.0, 1.0) * self.length();
-        // The last knot ends the last leg.
-        let leg = self.knots[1..self.knots.len() - 1].partition_point(|knot| *knot <= time);
+        // The last key ends the last leg.
+        let leg = self.times[1..self.times.len() - 1].partition_point(|reached| *reached <= time);
         let window: [(f64, Key); 4] = std::array::from_fn(|i| self.key(leg as isize + i as isize - 1));
+        let share = (time - self.times[leg]) / self.leg(leg)[0];
         match self.curve {
-            Curve::Through => through(window, time),
-            Curve::Near => {
-                let [_, (from, _), (to, _), _] = window;
-                near(window.map(|(_, key)| key), (time - from) / (to - from))
+            Curve::Through => through(window, self.knots[leg] + self.passed(leg, share)),
+            Curve::Near => near(window.map(|(_, key)| key), share),
+        }
+    }
+
+    /// The time that a leg takes, and by how much the parameter rises in it.
+    fn leg(&self, leg: usize) -> [f64; 2] {
+        [&self.times, &self.knots].map(|of| of[leg + 1] - of[leg])
+    }
+
+    /// By how much the parameter has risen after a share of a leg's time: Hermite's polynomial.
+    fn passed(&self, leg: usize, share: f64) -> f64 {
+        let ([time, rise], left) = (self.leg(leg), 1.0 - share);
+        let [start, end] = [leg, leg + 1].map(|key| time * self.speed(key));
+        share * share * (3.0 - 2.0 * share) * rise + share * left * (left * start - share * end)
+    }
+
+    /// How fast the parameter rises at a key: the weighted harmonic mean of the legs around it, and at an end what the slope of a
+    /// parabola through three keys is, but not backwards.
+    fn speed(&self, key: usize) -> f64 {
+        let legs = self.times.len() - 1;
+        let of = |leg: usize| {
+            let [time, rise] = self.leg(leg);
+            (time, rise / time)
+        };
+        let ends = |near: usize, next: usize| {
+            let ((time, speed), (time_next, speed_next)) = (of(near), of(next));
+            (((2.0 * time + time_next) * speed - time * speed_next) / (time + time_next)).max(0.0)
+        };
+        match key {
+            _ if legs == 1 => of(0).1,
+            0 if !self.closed => ends(0, 1),
+            last if last == legs && !self.closed => ends(legs - 1, legs - 2),
+            inner => {
+                let ((before, slow), (after, fast)) = (of((inner + legs - 1) % legs), of(inner % legs));
+                let weights = [before + 2.0 * after, 2.0 * before + after];
+                (weights[0] + weights[1]) / (weights[0] / slow + weights[1] / fast)
             }
         }
     }
@@ -159,15 +197,15 @@ impl CameraPath {
     }
 
     fn length(&self) -> f64 {
-        self.knots[self.knots.len() - 1]
+        self.times[self.times.len() - 1]
     }
 
-    /// A key and its time; there are some before the first and after the last.
+    /// A key and its parameter; there are some before the first and after the last.
     fn key(&self, i: isize) -> (f64, Key) {
         let count = self.keys.len() as isize;
         if self.closed {
             let at = i.rem_euclid(count) as usize;
-            return (self.knots[at] + i.div_euclid(count) as f64 * self.length(), self.keys[at]);
+            return (self.knots[at] + i.div_euclid(count) as f64 * self.knots[self.keys.len()], self.keys[at]);
         }
         let last = i.clamp(0, count - 1);
         if last == i {
@@ -190,11 +228,11 @@ fn legs(keys: &[Key], closed: bool) -> Vec<[usize; 2]> {
     (0..count).map(|i| [i, (i + 1) % keys.len()]).collect()
 }
 
-/// The pyramid: between neighbours, between those, and between these, each by the times that it stands for.
-fn through(keys: [(f64, Key); 4], time: f64) -> Key {
-    let times = keys.map(|(time, _)| time);
+/// The pyramid: between neighbours, between those, and between these, each by the parameters that it stands for.
+fn through(keys: [(f64, Key); 4], place: f64) -> Key {
+    let knots = keys.map(|(knot, _)| knot);
     let mix = |from: &Key, to: &Key, [start, end]: [usize; 2]| {
-        from.mix(to, (time - times[start]) / (times[end] - times[start]))
+        from.mix(to, (place - knots[start]) / (knots[end] - knots[start]))
     };
     let first: [Key; 3] = std::array::from_fn(|i| mix(&keys[i].1, &keys[i + 1].1, [i, i + 1]));
     let second: [Key; 2] = std::array::from_fn(|i| mix(&first[i], &first[i + 1], [i, i + 2]));

@@ -90,6 +90,17 @@ pub fn isosurface(
     density: &DensityFn<'_>,
     progress: &mut dyn FnMut(f64),
 ) -> Result<Mesh> {
+    limited(lattice, level, density, progress, MOST_VERTICES)
+}
+
+/// The same, of at most so many vertices.
+fn limited(
+    lattice: &Lattice,
+    level: f32,
+    density: &DensityFn<'_>,
+    progress: &mut dyn FnMut(f64),
+    most: usize,
+) -> Result<Mesh> {
     let (cases, [width, height, layers]) = (cases(), lattice.nodes);
     let (mut crossings, mut triangles) = (vec![], vec![]);
     let is_dense = |value: f32| value > level;
@@ -116,9 +127,8 @@ pub fn isosurface(
                 cross(&mut below.vertices[2][i], [node[0], node[1], z - 1], 2, [below.values[i], value]);
             }
         }
-        if crossings.len() > MOST_VERTICES {
-            let what =
-                format!("is too fine: the surface has more than {MOST_VERTICES} vertices; fog has another level");
+        if crossings.len() > most {
+            let what = format!("is too fine: the surface has more than {most} vertices; fog has another level");
             return Err(Error::setting("resolution", what));
         }
         if let Some(below) = &below {

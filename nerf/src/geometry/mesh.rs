@@ -23,8 +23,7 @@ impl Mesh {
 
     /// The box around the vertices, lower and upper corner; `None` if there are none.
     pub fn bounds(&self) -> Option<[DVec3; 2]> {
-        let first = *self.positions.first()?;
-        Some(self.positions.iter().fold([first; 2], |[low, high], &x| [low.min(x), high.max(x)]))
+        bounds(&self.positions)
     }
 
     /// The area of all triangles, in square units.
@@ -54,11 +53,10 @@ impl Mesh {
     /// Whether each side of a triangle belongs to exactly one more, which passes it the other way: the surface has no border,
     /// and everywhere an inside and an outside.
     pub fn is_closed(&self) -> bool {
-        let mut passed = HashMap::with_capacity(3 * self.triangles.len());
-        for side in self.triangles.iter().flat_map(sides) {
-            *passed.entry(side).or_insert(0) += 1;
-        }
-        passed.iter().all(|(&[from, to], &count)| count == 1 && passed.contains_key(&[to, from]))
+        let mut passed: Vec<[u32; 2]> = self.triangles.iter().flat_map(sides).collect();
+        passed.sort_unstable();
+        let is_once = passed.windows(2).all(|pair| pair[0] != pair[1]);
+        is_once && passed.iter().all(|&[from, to]| passed.binary_search(&[to, from]).is_ok())
     }
 
     /// For each triangle the number of the part that it belongs to, and how many parts there are. Triangles of a part are
@@ -105,6 +103,12 @@ impl Mesh {
         self.positions.retain(|_| numbers.next() != Some(&UNUSED));
         self.triangles.as_flattened_mut().iter_mut().for_each(|vertex| *vertex = number[*vertex as usize]);
     }
+}
+
+/// The smallest box around places, lower and upper corner; `None` without any.
+pub(super) fn bounds(places: &[DVec3]) -> Option<[DVec3; 2]> {
+    let first = *places.first()?;
+    Some(places.iter().fold([first; 2], |[low, high], &x| [low.min(x), high.max(x)]))
 }
 
 /// The sides of a triangle as it passes them.

@@ -1,6 +1,6 @@
 //! What cameras see of a model, as points.
 
-use super::mesh::Mesh;
+use super::mesh::{Mesh, bounds};
 use super::probe::Probe;
 use super::shape::Shape;
 use super::sight::sights;
@@ -43,9 +43,10 @@ impl Model<f32> {
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<PointCloud> {
         let (mut places, mut evaluations, pool) = (vec![], Evaluations::default(), Pool::new());
-        let pixels: usize = cameras.iter().map(|camera| camera.width * camera.height).sum();
-        let scale = (RAYS * count as f64 / pixels.max(1) as f64).sqrt();
+        // As many for each camera, however large its photograph is.
+        let rays = RAYS * count as f64 / cameras.len().max(1) as f64;
         for (i, camera) in cameras.iter().enumerate() {
+            let scale = (rays / (camera.width * camera.height) as f64).sqrt();
             let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
             let seen = sights(self, &camera.resized(width, height), &pool);
             places.extend(
@@ -71,7 +72,7 @@ impl Model<f32> {
 /// At most `count` of these places, the one nearest to its middle in each voxel that has any, in voxels that are as small as
 /// that allows.
 fn thinned(places: &[DVec3], count: usize) -> Vec<DVec3> {
-    let bounds = Mesh { positions: places.to_vec(), triangles: vec![] }.bounds().unwrap_or_default();
+    let bounds = bounds(places).unwrap_or_default();
     let size = (bounds[1] - bounds[0]).max_element();
     if places.len() <= count || size == 0.0 {
         return places[..count.min(places.len())].to_vec();

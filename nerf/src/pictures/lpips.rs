@@ -93,6 +93,14 @@ impl Backbone {
         }
     }
 
+    /// About how many bytes of memory [`Lpips::distance`] takes for each pixel of an image.
+    pub fn bytes(self) -> f64 {
+        match self {
+            Backbone::Alex => 400.0,
+            Backbone::Vgg => 2700.0,
+        }
+    }
+
     /// A tensor that only this network has.
     fn sign(self) -> &'static str {
         match self {
@@ -233,6 +241,10 @@ impl<T: Scalar> Lpips<T> {
     pub fn distance(&self, a: &Image, b: &Image) -> f64 {
         a.assert_same_shape(b);
         assert_eq!(a.channels, SHIFT.len(), "LPIPS needs red, green and blue");
+        // AlexNet's first windows leave out up to three columns and rows at the end.
+        if a.data.iter().chain(&b.data).any(|value| value.is_nan()) {
+            return f64::NAN;
+        }
         let tape = Tape::new();
         let [a, b] = [a, b].map(|image| {
             let rows = Tensor::from_vec(&[1, image.height, image.width, image.channels], image.data.clone());
@@ -572,5 +584,14 @@ mod tests {
     fn a_file_without_end_is_not_read_to_its_end() {
         let error = Lpips::open("/dev/zero").unwrap_err().to_string();
         assert!(error.starts_with("/dev/zero: has more than 134217728 bytes"), "{error}");
+    }
+
+    #[test]
+    fn no_number_is_one_at_the_borders_too() {
+        // AlexNet's first windows end at the 33rd of 34 columns.
+        let mut image = Image::new(34, 31, 3);
+        image.pixel_mut(33, 30)[2] = f32::NAN;
+        let black = Image::new(34, 31, 3);
+        assert!(WITH_ALEX.distance(&image, &black).is_nan() && WITH_ALEX.distance(&black, &image).is_nan());
     }
 }

@@ -11,13 +11,16 @@ use std::time::Instant;
 
 use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
 use raygrad::nerf::pictures::colormap;
-use raygrad::nerf::pictures::lpips::Lpips;
+use raygrad::nerf::pictures::lpips::{Backbone, Lpips};
 use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
 
 use super::machine::processor;
-use super::output::{checksum, depth_colors, make_folder, note, numbered, other_numbered, print, remove};
+use super::memory;
+use super::output::{
+    checksum, complain, depth_colors, lock, make_folder, note, numbered, other_numbered, print, remove,
+};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
@@ -30,13 +33,15 @@ use report::{Identity, Perceived, Report, Score, table};
 const DIGITS: usize = 3;
 /// The folder in which pictures are until all are there.
 const UNFINISHED: &str = "unfinished";
+/// The file by which an evaluation keeps others from writing there.
+const LOCK: &str = "unfinished.lock";
 
 /// Compare a model with photographs: PSNR, SSIM and, with weights for it, LPIPS
 ///
 /// Writes RUN/eval-SPLIT-SKIP.json with the figures and all that they depend on, and a page to look at, RUN/eval-SPLIT-SKIP/index.html,
 /// with up to 13 pictures, the worst views among them: photograph, render, error, depth. --views, --precision, --fit-poses and
 /// --fit-half stand in the name too, as in RUN/eval-val-off-10.json, so that none replaces another's result; that of another
-/// --scene does. --lpips only adds to a result. `raygrad compare` puts the results of several runs side by side.
+/// --scene does. `raygrad compare` puts the results of several runs side by side.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -75,12 +80,13 @@ pub struct Args {
 
 impl Args {
     /// The name of the result: `eval`, the split, what is left out if there is a grid, and what differs from the ordinary.
-    fn name(&self, skip: Option<Skipping>) -> String {
+    fn name(&self, skip: Option<Skipping>, lpips: Option<Backbone>) -> String {
         let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
         let views = self.views.map(|n| n.to_string());
         let half = self.fit_half.then(|| "half".to_owned());
         let poses = self.fit_poses.then(|| "poses".to_owned());
-        let others = [skip.map(level), views, precision, poses, half];
+        let lpips = lpips.map(|backbone| format!("lpips-{backbone}"));
+        let others = [skip.map(level), views, precision, poses, half, lpips];
         let parts = ["eval".to_owned(), self.split.to_string()].into_iter().chain(others.into_iter().flatten());
         parts.collect::<Vec<_>>().join("-")
     }
@@ -130,7 +136,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let appearance = Appearance::of(&model, args.split, args.fit_half);
     if let Some(lpips) = &lpips {
-        check_sizes(lpips, &data, appearance)?;
+        check_seen(lpips.backbone(), &data, appearance)?;
     }
     // Corners are as dark in every photograph.
     model.vignetted = true;
@@ -142,9 +148,11 @@ pub fn run(args: &Args) -> Result<()> {
         cameras = Alignment::Fitted;
     }
     let skip = model.marching().map(|marching| marching.config.occupancy.skip);
-    let name = args.name(skip);
+    let name = args.name(skip, lpips.as_ref().map(Lpips::backbone));
     let pictures = run.file(&name);
     make_folder(&pictures)?;
+    let busy = || Error::file(&pictures, "is being written by another raygrad");
+    let _lock = lock(&pictures.join(LOCK), busy)?;
     // What an evaluation that was ended before has left there is begun again.
     let unfinished = pictures.join(UNFINISHED);
     let _ = std::fs::remove_dir_all(&unfinished);
@@ -203,6 +211,7 @@ pub fn run(args: &Args) -> Result<()> {
         std::fs::rename(from, &to).map_err(|e| Error::file(&to, format!("cannot be written: {e}")))?;
     }
     let _ = std::fs::remove_dir(&unfinished);
+    let _ = std::fs::remove_file(pictures.join(LOCK));
     // Pictures of an evaluation of other photographs under the same name would belong to no result.
     remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
     let index = pictures.join("index.html");
@@ -214,16 +223,35 @@ pub fn run(args: &Args) -> Result<()> {
     print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
 }
 
-/// Whether the network sees something of all views that are compared whole.
-fn check_sizes(lpips: &Lpips, data: &Dataset, appearance: Appearance) -> Result<()> {
-    let side = lpips.backbone().smallest();
-    for Frame { name, image, .. } in data.frames.iter().filter(|frame| frame.mask.is_none()) {
+/// Whether the network sees something of all views that are compared whole, and there are any; a word about those that are not,
+/// and about its memory.
+fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Result<()> {
+    let bad = |what: String| Err(Error::setting("lpips", what));
+    let (side, mut largest, mut masked) = (backbone.smallest(), 0, 0);
+    for Frame { name, image, mask, .. } in &data.frames {
         let [width, height] = [image.width - appearance.fitted_columns(image.width), image.height];
-        if width < side || height < side {
-            let backbone = lpips.backbone();
-            let what = format!("of `{name}` {width}x{height} pixels are compared, and {backbone} needs {side}x{side}");
-            return Err(Error::setting("lpips", what));
+        masked += usize::from(mask.is_some());
+        if mask.is_none() && (width < side || height < side) {
+            return bad(format!(
+                "of `{name}` {width}x{height} pixels are compared, and {backbone} needs {side}x{side}"
+            ));
         }
+        largest = largest.max(if mask.is_some() { 0 } else { width * height });
+    }
+    if masked == data.frames.len() {
+        return bad(
+            "is of whole images, and all of these have masks, drawn or of corners that a lens leaves dark".into()
+        );
+    }
+    if masked > 0 {
+        note(&format!("LPIPS is of whole images: {masked} of {} have masks, and none", data.frames.len()));
+    }
+    let need = largest as f64 * backbone.bytes();
+    if let Some(free) = memory::available().filter(|free| need > *free) {
+        let [need, free] = [need, free].map(|bytes| bytes / 1e9);
+        complain(&format!(
+            "warning: LPIPS of these images takes about {need:.1} GB of memory, of {free:.1} GB that are free"
+        ));
     }
     Ok(())
 }
@@ -399,5 +427,23 @@ mod tests {
         assert!(masked.psnr > 100.0 && masked.ssim.is_none(), "{}", masked.psnr);
         assert!(gains(&frame, &render, &truth, 13).iter().all(|gain| (gain - 1.0).abs() < 1e-5));
         assert_eq!(gains(&frame, &Image::new(26, 26, 3), &truth, 13), [1.0; 3]);
+    }
+
+    #[test]
+    fn lpips_is_refused_where_it_would_see_nothing() {
+        let mut data = embedded(Split::Test, 26);
+        data.frames.truncate(2);
+        let check =
+            |data: &Dataset, appearance| check_seen(Backbone::Vgg, data, appearance).map_err(|error| error.to_string());
+        assert!(check(&data, Appearance::None).is_ok());
+        assert!(check(&data, Appearance::Half).unwrap_err().contains("13x26 pixels are compared, and vgg needs 16x16"));
+        // Too low, in a photograph that counts.
+        let low = data.frames[0].image.clone();
+        data.frames[1].image = Image::new(40, 15, 3).into();
+        assert!(check(&data, Appearance::None).unwrap_err().contains("40x15"));
+        data.frames[1].mask = Some(Arc::new(Mask::new(40, 15, |_, _| true)));
+        assert!(check(&data, Appearance::None).is_ok());
+        data.frames[0].mask = Some(Arc::new(Mask::new(low.width, low.height, |x, _| x > 3)));
+        assert!(check(&data, Appearance::None).unwrap_err().contains("all of these have masks"));
     }
 }

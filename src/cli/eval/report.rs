@@ -54,6 +54,7 @@ pub struct Report {
     #[serde(serialize_with = "number")]
     pub psnr_mean: f64,
     /// The mean of the views' SSIM; null if the images are smaller than its window.
+    #[serde(serialize_with = "some")]
     pub ssim_mean: Option<f64>,
     #[serde(flatten)]
     pub lpips: Option<Perceived>,
@@ -70,6 +71,7 @@ pub struct Report {
 #[derive(Serialize)]
 pub struct Perceived {
     /// The mean of the views' LPIPS; null if some are masked.
+    #[serde(serialize_with = "some")]
     pub lpips_mean: Option<f64>,
     /// The network whose features are compared.
     pub lpips_backbone: Backbone,
@@ -152,9 +154,18 @@ pub struct Score {
     pub name: String,
     #[serde(serialize_with = "number")]
     pub psnr: f64,
+    #[serde(serialize_with = "some")]
     pub ssim: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "some")]
     pub lpips: Option<f64>,
+}
+
+/// The same of one that there may not be.
+fn some<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+    match value {
+        Some(value) => number(value, serializer),
+        None => serializer.serialize_none(),
+    }
 }
 
 /// A number as JSON has it, or in words what it has no number for.
@@ -221,9 +232,12 @@ mod tests {
 
     #[test]
     fn what_json_has_no_number_for_is_said_in_words() {
+        let of =
+            |psnr: f64, ssim, lpips| serde_json::to_string(&Score { name: "a".into(), psnr, ssim, lpips }).unwrap();
         for (psnr, expected) in [(31.5, "31.5"), (f64::INFINITY, "\"inf\""), (f64::NAN, "\"NaN\"")] {
-            let score = serde_json::to_string(&Score { name: "a".into(), psnr, ssim: None, lpips: None }).unwrap();
-            assert_eq!(score, format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
+            assert_eq!(of(psnr, None, None), format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
+            let all = format!("{{\"name\":\"a\",\"psnr\":1.0,\"ssim\":{expected},\"lpips\":{expected}}}");
+            assert_eq!(of(1.0, Some(psnr), Some(psnr)), all);
         }
     }
 }

@@ -7,14 +7,14 @@ use std::time::Instant;
 use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::geometry::files::{self, Format};
 use raygrad::nerf::geometry::{Stage, SurfaceConfig};
-use raygrad::nerf::{Camera, Error, Model, Result};
+use raygrad::nerf::{Camera, Error, Extent, Model, Result};
 
 use super::super::cameras::Viewpoint;
 use super::super::output::{check_writable, note, parent, print};
 use super::super::parse;
 use super::super::photographs::photographs;
 use super::super::progress::{Progress, spoken};
-use super::super::run::{Run, RunConfig};
+use super::super::run::Run;
 use super::super::scene::Scene;
 
 /// Cameras in each of the rings that look at the scene.
@@ -136,10 +136,22 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path) -> R
     print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
 }
 
-/// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around
-/// it, at the mean height of these, lower, and higher.
+/// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around it.
 fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<Camera>> {
-    let RunConfig { viewpoint, extent, .. } = &run.config;
+    let around = rings(&run.config.viewpoint, &run.config.extent);
+    let own = match photographs(run, model, scene, Split::Train) {
+        Ok(own) => evenly_spaced(own, PHOTOGRAPHS),
+        Err(error) if scene.is_some() => return Err(error),
+        Err(error) => {
+            note(&format!("looking from around the scene alone, as its photographs' cameras are not known: {error}"));
+            vec![]
+        }
+    };
+    Ok(own.into_iter().map(|photograph| photograph.camera).chain(around).collect())
+}
+
+/// Cameras around the scene, at the mean height of its photographs, lower, and higher.
+fn rings(viewpoint: &Viewpoint, extent: &Extent) -> Vec<Camera> {
     let mean = viewpoint.elevation;
     let elevations = [0.1 * mean, 0.5 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
     let ring = |elevation| Viewpoint { elevation, ..*viewpoint }.orbit(extent, RING);
@@ -150,15 +162,7 @@ fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<C
             around.push(camera);
         }
     }
-    let own = match photographs(run, model, scene, Split::Train) {
-        Ok(own) => evenly_spaced(own, PHOTOGRAPHS),
-        Err(error) if scene.is_some() => return Err(error),
-        Err(error) => {
-            note(&format!("looking from around the scene alone, as its photographs' cameras are not known: {error}"));
-            vec![]
-        }
-    };
-    Ok(own.into_iter().map(|photograph| photograph.camera).chain(around).collect())
+    around
 }
 
 /// How far each stage is, and how long it may take.
@@ -186,5 +190,25 @@ impl Display {
         };
         self.progress
             .set(done, || if done > 0.0 { format!("{doing}, {} left", spoken(left)) } else { doing.to_owned() });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::glam::DVec3;
+    use std::f64::consts::PI;
+
+    #[test]
+    fn no_camera_around_a_scene_is_there_twice() {
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::new(1.0, 2.0, 1.0)], [0.5, 9.0]);
+        let count = |elevation: f64, reach: f64| {
+            let view = Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation, azimuth: 0.2, reach };
+            rings(&view, &extent).len()
+        };
+        // A swing of twelve cameras is at seven places.
+        assert_eq!([count(0.4, PI), count(-0.4, PI), count(0.4, 0.6)], [48, 48, 28]);
+        // At the horizon, and half way up.
+        assert_eq!([count(0.0, PI), count(0.0, 0.6)], [24, 14]);
     }
 }

@@ -85,10 +85,9 @@ impl Program {
                 Ok(said) => {
                     line(&said);
                     excused |= excuse.is_some_and(|words| said.contains(words));
-                    if is_count(&said) {
-                        continue;
+                    if !is_count(&said) {
+                        kept.push_back(said);
                     }
-                    kept.push_back(said);
                     if kept.len() > KEPT {
                         kept.pop_front();
                     }

@@ -138,7 +138,10 @@ impl FlightArgs {
             CameraPath::Test => {
                 let all = photographs(run, model, scene, Split::Test)?;
                 let some = evenly_spaced(all, self.frames.unwrap_or(usize::MAX));
-                flight(some.into_iter().map(|photograph| photograph.camera).collect())?
+                // Of the size that they were read in, to the pixel.
+                let small = |side: usize| ((side as f64 / run.config.downscale as f64).round() as usize).max(1);
+                let camera = |camera: Camera| camera.resized(small(camera.width), small(camera.height));
+                flight(some.into_iter().map(|photograph| camera(photograph.camera)).collect())?
             }
             CameraPath::File(file) => {
                 let path_file::Path { motion, size, fps } =

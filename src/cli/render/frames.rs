@@ -21,8 +21,6 @@ const LOCK: &str = "unfinished.lock";
 pub struct Frames {
     folder: PathBuf,
     record: Record,
-    /// Whether pictures by number were there before, which no record says to be frames of an interrupted call.
-    strange: bool,
     _lock: File,
 }
 
@@ -33,6 +31,9 @@ struct Record {
     of: Value,
     /// How many are there, from the first.
     done: usize,
+    /// Whether pictures by number were there before the first frame, which somebody may want to keep.
+    #[serde(default)]
+    strange: bool,
 }
 
 impl Frames {
@@ -47,14 +48,17 @@ impl Frames {
         // What cannot be read is begun again.
         let left =
             std::fs::read(folder.join(RECORD)).ok().and_then(|text| serde_json::from_slice::<Record>(&text).ok());
-        let strange = left.is_none() && !other_numbered(&folder, DIGITS, &[]).is_empty();
+        let strange = match &left {
+            Some(left) => left.strange,
+            None => !other_numbered(&folder, DIGITS, &[]).is_empty(),
+        };
         let others = left.as_ref().filter(|left| left.of != of && left.done > 0);
-        if let Some(Record { of: before, done }) = others {
+        if let Some(Record { of: before, done, .. }) = others {
             let others = differing(before, &of).join(", ");
             note(&format!("{}: {done} frames are replaced, which were of another {others}", folder.display()));
         }
         let done = left.filter(|left| left.of == of).map_or(0, |left| left.done);
-        let mut frames = Frames { folder, record: Record { of, done: 0 }, strange, _lock: lock };
+        let mut frames = Frames { folder, record: Record { of, done: 0, strange }, _lock: lock };
         frames.record.done = (0..done).take_while(|&frame| frames.path(frame).is_file()).count();
         frames.write()?;
         Ok(frames)
@@ -93,7 +97,7 @@ impl Frames {
     /// Removes all frames, and the folder unless there is something else in it. If pictures were there before that somebody may
     /// want to keep, all stay.
     pub fn remove(self) {
-        if self.strange {
+        if self.record.strange {
             note(&format!("{}: held pictures before, and is not removed", self.folder.display()));
             return self.keep();
         }
@@ -158,7 +162,14 @@ mod tests {
         Frames::new(folder(), json!({})).unwrap().remove();
         assert!(folder().join("0002.png").exists());
         assert_eq!(std::fs::read_dir(folder()).unwrap().count(), 3, "nothing but the frames");
+        // After an interruption too.
         drop(Frames::new(folder(), json!({})).unwrap());
+        Frames::new(folder(), json!({})).unwrap().remove();
+        assert!(folder().join("0002.png").exists());
+        std::fs::remove_dir_all(folder()).unwrap();
+        let mut frames = Frames::new(folder(), json!({})).unwrap();
+        frames.push(&[1], &[]).unwrap();
+        drop(frames);
         Frames::new(folder(), json!({})).unwrap().remove();
         assert!(!folder().exists());
     }

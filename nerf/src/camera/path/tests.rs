@@ -183,3 +183,52 @@ fn short_paths_and_keys_in_one_place_do_no_harm() {
     let frames = CameraPath::through(vec![a, b], false).frames(5);
     assert!(apart(&frames[4], &b) < 1e-12 && apart(&frames[1], &a.mix(&b, 0.25)) < 1e-12);
 }
+
+#[test]
+fn legs_of_no_time_to_speak_of_are_passed() {
+    for (times, closed) in [(vec![1e-300, 1e6, 1.0, 1e-300], false), (vec![1e6, 1e-300, 1e-9, 1e6, 1e-300], true)] {
+        for curve in [Curve::Through, Curve::Near] {
+            let path = CameraPath::timed(keys(), times.clone(), closed, curve);
+            assert!(path.shares().windows(2).all(|pair| pair[0] < pair[1]), "{:?}", path.shares());
+            for key in path.frames(101) {
+                assert!(key.pose.is_finite() && key.angle_y > 0.0, "{key:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn times_move_cameras_along_a_curve_that_they_do_not_bend() {
+    // Equal steps along x, of which a curve through them makes x its parameter.
+    let key = |x: f64| Key { pose: DAffine3::from_translation(DVec3::new(x, 1.0, 2.0)), angle_y: 0.8 };
+    let keys: Vec<Key> = (0..5).map(|i| key(f64::from(i))).collect();
+    let along = |path: &CameraPath, time: f64, all: f64| path.at(time / all).pose.translation.x;
+    // scipy.interpolate.PchipInterpolator([0, 1, 3, 3.5, 5], [0, 1, 2, 3, 4])
+    let open = CameraPath::timed(keys.clone(), vec![1.0, 2.0, 0.5, 1.5], false, Curve::Through);
+    for (time, x) in [
+        (0.3, 0.3438846153846154),
+        (0.9, 0.9264230769230769),
+        (1.5, 1.2657342657342658),
+        (2.9, 1.9139930069930067),
+        (3.2, 2.3650909090909096),
+        (4.1, 3.5876363636363635),
+        (4.8, 3.9766195286195285),
+    ] {
+        assert!((along(&open, time, 5.0) - x).abs() < 1e-12, "{time}");
+    }
+    // The same of what goes on and on, and the parameter of the leg that leads from the second key to the third.
+    let closed = CameraPath::timed(keys[..4].to_vec(), vec![1.0, 2.0, 0.5, 1.5], true, Curve::Through);
+    assert_eq!(closed.shares(), [0.0, 0.2, 0.6, 0.7]);
+    for (time, leg, share) in
+        [(0.3, 0, 0.29157380457380455), (1.5, 1, 0.2657342657342658), (4.8, 3, 0.8548177268177266)]
+    {
+        let start = [0.0, 1.0, 3.0, 3.5][leg];
+        let found = closed.passed(leg, (time - start) / closed.leg(leg)[0]);
+        assert!((found - share).abs() < 1e-12, "{time}: {found}");
+    }
+    // Nor does it go back before a leg that is much quicker.
+    let hasty = CameraPath::timed(keys.clone(), vec![10.0, 0.1, 7.0, 0.01], false, Curve::Through);
+    assert!(hasty.frames(1000).windows(2).all(|pair| pair[0].pose.translation.x <= pair[1].pose.translation.x + 1e-12));
+    let two = CameraPath::timed(keys[..2].to_vec(), vec![3.0], false, Curve::Through);
+    assert!((along(&two, 1.2, 3.0) - 0.4).abs() < 1e-12);
+}

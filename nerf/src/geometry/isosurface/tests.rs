@@ -183,3 +183,26 @@ fn lattices_have_cells_of_nearly_one_edge() {
         assert!(message.contains(what), "{message}");
     }
 }
+
+#[test]
+fn of_densities_without_end_the_border_is_in_the_same_place_from_both_sides() {
+    // What is hidden has them: at the lower end of edges in one case, at the upper end in the other.
+    let border = |above: bool| {
+        let hidden = of(move |x: DVec3| if (x.x > 0.31) == above { f64::INFINITY } else { 0.0 });
+        isosurface(&Lattice::over(BOX, 30, false).unwrap(), 3.0, &hidden, &mut |_| ()).unwrap()
+    };
+    let [above, below] = [true, false].map(border);
+    assert!(!above.positions.is_empty() && above.positions == below.positions);
+    assert!(above.positions.iter().all(|place| (place.x - 0.31).abs() <= 0.5 * 0.1 / 32.0 + 1e-6));
+}
+
+#[test]
+fn a_surface_of_too_many_vertices_is_an_error() {
+    // Fields in all three directions: every edge of the lattice is crossed, 3 x 9 x 10 x 10 of them.
+    let sponge = of(|x: DVec3| x.round().element_sum().rem_euclid(2.0));
+    let lattice = Lattice { low: DVec3::ZERO, cell: DVec3::ONE, nodes: [10; 3] };
+    let of_at_most = |most: usize| limited(&lattice, 0.5, &sponge, &mut |_| (), most);
+    assert_eq!(of_at_most(2700).unwrap().positions.len(), 2700);
+    let error = of_at_most(2699).unwrap_err().to_string();
+    assert!(error.contains("`resolution`: is too fine: the surface has more than 2699 vertices"), "{error}");
+}
