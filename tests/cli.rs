@@ -201,7 +201,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let output = place.command("compare run other").output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     std::fs::create_dir_all(place.path("run/eval-test/unfinished")).unwrap();
-    std::fs::write(place.path("run/eval-test/unfinished/000.png"), b"half").unwrap();
+    std::fs::write(place.path("run/eval-test/unfinished/999.png"), b"half").unwrap();
     let stale = "is of a model that has been trained on since";
     assert!(output.status.success() && said.matches(stale).count() == 2 && !said.contains("other/"), "{said}");
     // One at a time.
@@ -218,6 +218,28 @@ fn a_run_is_complete_and_can_be_evaluated() {
     std::fs::remove_file(place.path("other/model.safetensors")).unwrap();
     let output = place.command("compare run other --only eval-test").output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+}
+
+/// Of many views ten are drawn, evenly spaced, and the three worst.
+#[test]
+fn the_worst_of_many_views_are_drawn_too() {
+    let place = Place::empty();
+    place.succeeds("train --downscale 20 --steps 1 --out run --set field.grid.log2_table=8 --set sampler.samples=512");
+    place.succeeds("eval run --split train");
+    let views = place.json("run/eval-train-fast.json")["per_view"].as_array().unwrap().clone();
+    assert_eq!(views.len(), 60);
+    let mut order: Vec<usize> = (0..60).collect();
+    order.sort_by(|&a, &b| views[a]["psnr"].as_f64().unwrap().total_cmp(&views[b]["psnr"].as_f64().unwrap()));
+    let mut expected: Vec<String> =
+        (0..10).map(|i| 6 * i).chain(order[..3].iter().copied()).map(|i| format!("{i:03}.png")).collect();
+    expected.sort();
+    expected.dedup();
+    assert!(expected.len() > 10, "the test is of views that are drawn because they are the worst: {order:?}");
+    let found = std::fs::read_dir(place.path("run/eval-train-fast")).unwrap();
+    let found = found.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned());
+    let mut found: Vec<String> = found.filter(|name| name.ends_with(".png")).collect();
+    found.sort();
+    assert_eq!(found, expected);
 }
 
 #[test]

@@ -117,6 +117,14 @@ fn photographs_are_compared_from_where_the_model_has_their_cameras() {
     let first = png(&place.path("way/0000.png"));
     let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
     assert!(apart(&first, &view(&model.other_camera(given))) < 0.01 && apart(&first, &view(given)) > 0.05);
+    let trained = &load(place.path("scene"), Split::Train, 1).unwrap().frames[2].camera;
+    place.succeeds("render run --path spline --through 2 --frames 1 --out through");
+    let through = png(&place.path("through/0000.png"));
+    assert!(apart(&through, &view(&model.other_camera(trained))) > 0.02);
+    // A path's cameras have square pixels, and the vertical angle of the photograph's.
+    let learned = model.learned_camera(2, trained);
+    let learned = Camera { focal: [learned.focal[1]; 2], ..learned };
+    assert!(apart(&through, &view(&learned)) < 0.01);
     // Or from where each is shown best.
     place.succeeds("eval run --fit-poses --views 2");
     let fitted = place.json("run/eval-test-fast-2-poses.json");
@@ -241,6 +249,8 @@ fn what_was_trained_on_is_no_test() {
     place.write_transforms(Split::Train, &rest);
     place.fails("eval run", &["holds out the test photograph `train/r_3`", "was trained on"]);
     place.fails("eval run --split val --scene absent", &["absent"]);
+    // A path from photograph to photograph is by those that were trained on.
+    place.fails("render run --path spline --through 0", &["trained on 6", "say with --scene"]);
     // Nor has one that was not trained on a camera that was learned.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL} --refine poses"));

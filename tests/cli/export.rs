@@ -132,6 +132,10 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
 
     let few = place.succeeds("export run few.glb --level 1e-6 --resolution 20 --triangles 500");
     assert!(few.contains(" 500 triangles, closed"), "{few}");
+    // Four are too few for a closed surface with holes or corners in it, which is said.
+    let output = place.command("export run few.ply --level 1e-6 --resolution 20 --triangles 4").output().unwrap();
+    let [said, noted] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert_eq!(!said.contains(" 4 triangles"), noted.contains("triangles, more than 4:"), "{said} {noted}");
     assert_eq!(&place.bytes("few.glb")[..4], b"glTF");
     place.succeeds("export run mesh.OBJ --level 1e-6 --resolution 20");
     assert!(place.bytes("mesh.OBJ").starts_with(b"# x y z red green blue"));

@@ -19,6 +19,7 @@ fn apart(a: &Image, b: &Image) -> f32 {
 #[test]
 fn paths_go_where_photographs_were_taken_and_where_files_say() {
     let place = Place::with_run();
+    assert!(place.succeeds("render run --path test --frames 2 --out two").contains("rendered 2 frames"));
     place.succeeds("render run --path test --out test");
     let test = [0, 1, 2].map(|i| png(&place.path(&format!("test/000{i}.png"))));
     assert!(apart(&test[0], &test[1]) > 3.0 && apart(&test[1], &test[2]) > 3.0);
@@ -102,6 +103,24 @@ fn paths_lie_where_the_scene_does() {
     std::fs::write(place.path("path.json"), path.to_string()).unwrap();
     place.succeeds("render run --path path.json --out path");
     assert!(apart(&png(&place.path("path/0000.png")), &expected) <= 1.0);
+}
+
+/// At the size that photographs were read in, whose sides may have been rounded apart: 28 x 21 to 14 x 11.
+#[test]
+fn test_views_are_seen_as_they_are_compared() {
+    let place = Place::empty();
+    place.succeeds("prepare landscape --to nerfstudio --size 28 --out scene");
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    place.succeeds(&format!("train scene --downscale 2 --steps 20 --out run {small}"));
+    place.succeeds("eval run --views 1");
+    place.succeeds("render run --path test --frames 1 --out test");
+    let [seen, drawing] = ["test/0000.png", "run/eval-test-fast-1/000.png"].map(|file| png(&place.path(file)));
+    assert_eq!([seen.width, seen.height, drawing.width, drawing.height], [14, 11, 4 * 14, 11]);
+    // Photograph, render, error and depth stand side by side.
+    for (x, y) in (0..14).flat_map(|x| (0..11).map(move |y| (x, y))) {
+        let apart = seen.pixel(x, y).iter().zip(drawing.pixel(14 + x, y)).map(|(a, b)| (a - b).abs());
+        assert!(255.0 * apart.fold(0.0, raygrad::Real::maximum) <= 1.0, "{x} {y}");
+    }
 }
 
 #[test]
@@ -367,9 +386,10 @@ fn an_interrupted_film_goes_on_where_it_was() {
         let mut record = place.json("film.gif.frames/unfinished.json");
         record["done"] = json!(done);
         std::fs::write(place.path("film.gif.frames/unfinished.json"), record.to_string()).unwrap();
-        std::fs::remove_file(place.path("film.gif.frames/0003.png")).unwrap();
     };
     let begun = |flags: &str| {
+        // When it is there again, it is this call's.
+        let _ = std::fs::remove_file(place.path("film.gif.frames/0003.png"));
         let mut child = place.command(&format!("render run --frames 400 --size 36x30 --out film.gif {flags}"));
         let mut child = child.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         super::wait(&mut child, || place.path("film.gif.frames/0003.png").exists());
@@ -381,6 +401,8 @@ fn an_interrupted_film_goes_on_where_it_was() {
     let said = begun("--fps 5");
     assert!(said.contains("3 of 400 frames are there already"), "the speed is not in the frames: {said}");
     for flags in ["--show depth", "--background black", "--fov 30", "--skip off"] {
+        // From the same frames each time.
+        begun("");
         kept(3);
         let said = begun(flags);
         assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");

@@ -18,8 +18,6 @@ const FLAT: f64 = 1e-6;
 const STAY: f64 = 1e-6;
 /// Triangles between two reports of progress.
 const OFTEN: usize = 10_000;
-/// All edges are looked at once more if that made triangles fewer by more than this share.
-const LEAST_GAIN: f64 = 0.01;
 
 /// The sum of squared distances to some planes, each times a weight: `x' a x - 2 b' x + c`.
 #[derive(Debug, Clone, Copy)]
@@ -119,22 +117,14 @@ impl Mesh {
         }
         let mut work = Work::new(self);
         let mut left = all;
-        loop {
-            let before = left;
-            work.consider_all();
-            while left > count
-                && let Some(candidate) = work.heap.pop()
-            {
-                let gone = work.collapse(&candidate);
-                if gone > 0 && left / OFTEN != (left - gone) / OFTEN {
-                    progress((all - left) as f64 / (all - count) as f64);
-                }
-                left -= gone;
+        while left > count
+            && let Some(candidate) = work.heap.pop()
+        {
+            let gone = work.collapse(&candidate);
+            if gone > 0 && left / OFTEN != (left - gone) / OFTEN {
+                progress((all - left) as f64 / (all - count) as f64);
             }
-            // An edge that could not be drawn together may be now that others near it have been.
-            if left <= count || (before - left) as f64 <= LEAST_GAIN * before as f64 {
-                break;
-            }
+            left -= gone;
         }
         self.triangles.retain(|triangle| *triangle != GONE);
         self.drop_unused();
@@ -168,23 +158,15 @@ impl<'a> Work<'a> {
                 }
             }
         }
-        work
-    }
-
-    /// Works out what it costs to draw each edge together.
-    fn consider_all(&mut self) {
-        for i in 0..self.mesh.triangles.len() {
-            let triangle = self.mesh.triangles[i];
-            if triangle == GONE {
-                continue;
-            }
-            for [from, to] in sides(&triangle) {
+        for i in 0..work.mesh.triangles.len() {
+            for [from, to] in sides(&work.mesh.triangles[i]) {
                 // Once for each edge, and those of borders, which are passed one way only.
-                if from < to || self.common(from, to).count() == 1 {
-                    self.consider(from, to);
+                if from < to || work.common(from, to).count() == 1 {
+                    work.consider(from, to);
                 }
             }
         }
+        work
     }
 
     /// Adds what holds a side of a triangle at the border in its place: a plane through it, upright on the triangle.

@@ -202,10 +202,17 @@ mod tests {
     #[test]
     fn no_camera_around_a_scene_is_there_twice() {
         let extent = Extent::new([DVec3::NEG_ONE, DVec3::new(1.0, 2.0, 1.0)], [0.5, 9.0]);
-        let count = |elevation: f64, reach: f64| {
+        let around = |elevation: f64, reach: f64| {
             let view = Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation, azimuth: 0.2, reach };
-            rings(&view, &extent).len()
+            rings(&view, &extent)
         };
+        let count = |elevation: f64, reach: f64| around(elevation, reach).len();
+        // Low, lower, as the photographs are, and half way from there to the pole; the middle of the box is at 0.
+        for sign in [1.0, -1.0] {
+            let heights = around(0.4 * sign, PI).into_iter().step_by(12).map(|camera| camera.pose.translation.z);
+            let expected = [0.04_f64, 0.2, 0.4, 0.2 + PI / 4.0].map(|angle| sign * 4.0 * angle.sin());
+            assert!(heights.zip(expected).all(|(height, expected)| (height - expected).abs() < 1e-12), "{sign}");
+        }
         // A swing of twelve cameras is at seven places.
         assert_eq!([count(0.4, PI), count(-0.4, PI), count(0.4, 0.6)], [48, 48, 28]);
         // At the horizon, and half way up.

@@ -142,12 +142,3 @@ fn quadrics_are_sums_of_squared_distances() {
     assert!(corner.lowest().unwrap().abs_diff_eq(point, 1e-12));
     assert_eq!(planes[0].plus(&planes[1]).lowest(), None, "a line");
 }
-
-#[test]
-fn an_edge_that_could_not_be_drawn_together_is_looked_at_again() {
-    // Lumps, of which some edges are in the way of others at first.
-    let lumps = of(|x: DVec3| ball(x) + 0.2 * (17.0 * x.x).sin() * (19.0 * x.y).sin() * (23.0 * x.z).sin(), true);
-    let mut mesh = lumps.clone();
-    mesh.decimate(4, &mut |_| ());
-    println!("COUNT {} of {} parts {}", mesh.triangles.len(), lumps.triangles.len(), lumps.parts().1);
-}
