@@ -294,6 +294,9 @@ fn ffmpeg_writes_films_whose_colors_are_those_of_the_frames() {
         let output = command.arg(&film).output().unwrap();
         assert!(output.status.success(), "{film}: {output:?}");
         assert!(String::from_utf8_lossy(&output.stderr).contains("black is added, to 64x42"), "{output:?}");
+        let bytes = place.bytes(&film);
+        let is_webm = bytes.starts_with(&[0x1a, 0x45, 0xdf, 0xa3]);
+        assert!(if film.ends_with("webm") { is_webm } else { &bytes[4..8] == b"ftyp" }, "{film}: {:x?}", &bytes[..12]);
         let first = place.path("first.png");
         let taken = Command::new("ffmpeg")
             .args(["-y", "-loglevel", "error", "-i"])

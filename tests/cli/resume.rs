@@ -263,6 +263,13 @@ fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
     // Each time TensorBoard is told to forget what was.
     let events = std::fs::read_dir(place.path("run/tensorboard")).unwrap().count() as i32;
     assert!(events == retreats + 1 && place.json("run/summary.json")["retreats"] == retreats, "{events}");
+    // Each begins with a version and with the first step that it is of: a time and, in a byte, the number 1.
+    for file in std::fs::read_dir(place.path("run/tensorboard")).unwrap() {
+        let bytes = std::fs::read(file.unwrap().path()).unwrap();
+        let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        let start = &bytes[length + 16..][12..];
+        assert_eq!([start[0], start[9], start[10]], [0x09, 0x10, 1], "{:x?}", &start[..11]);
+    }
     // The metrics are those of one run, all of it at the last rate.
     let metrics = metrics(&place, "run");
     let steps: Vec<u64> = metrics.iter().map(|line| line["step"].as_u64().unwrap()).collect();

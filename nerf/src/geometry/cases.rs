@@ -91,6 +91,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn edges_share_a_face_where_their_middles_do() {
+        let middle = |edge: Edge| [0, 1, 2].map(|axis| (axis != edge.axis).then_some(edge.corner >> axis & 1));
+        let edges = (0..3).flat_map(|axis| (0..8).map(move |corner| Edge { axis, corner }));
+        let edges: Vec<Edge> = edges.filter(|edge| edge.corner >> edge.axis & 1 == 0).collect();
+        for (&a, &b) in edges.iter().flat_map(|a| edges.iter().map(move |b| (a, b))) {
+            let expected = middle(a).iter().zip(middle(b)).any(|(a, b)| a.is_some() && *a == b);
+            assert_eq!(a.shares_face(b), expected, "{a:?} {b:?}");
+        }
+    }
+
+    #[test]
     fn every_loop_has_a_fan_that_stays_inside() {
         let mut longest = 0;
         for dense in 0..=255 {

@@ -65,6 +65,8 @@ mod tests {
             ([1.0, 2.6, 0.4], false),
             // Beside the picture, and behind the camera.
             ([3.0, 2.6, 0.0], false),
+            ([-3.0, 2.6, 0.0], false),
+            ([0.1, 2.6, -1.5], false),
             ([0.1, 2.6, 1.5], false),
             ([0.1, -2.6, 0.1], false),
         ] {
