@@ -15,7 +15,7 @@ import lpips
 from safetensors.torch import save_file
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-parser.add_argument("net", choices=["vgg", "alex"], help="the network: published figures of NeRFs are mostly of vgg")
+parser.add_argument("net", choices=["vgg", "alex"], help="the network: figures of one are no measure of those of the other")
 parser.add_argument("--out", type=Path, help="the file (default: lpips-NET.safetensors)")
 args = parser.parse_args()
 out = args.out or Path(f"lpips-{args.net}.safetensors")

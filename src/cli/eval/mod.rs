@@ -67,7 +67,7 @@ pub struct Args {
     #[arg(long)]
     fit_half: bool,
     /// Measure LPIPS too, with the weights of AlexNet or VGG-16 in this file: benches/peers/lpips_weights.py makes it. Figures
-    /// of one network are no measure of those of the other; published ones are mostly of VGG-16
+    /// of one network are no measure of those of the other
     #[arg(long, value_name = "FILE.safetensors")]
     lpips: Option<PathBuf>,
     /// Arithmetic of the pictures
