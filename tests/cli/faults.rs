@@ -81,22 +81,25 @@ fn go_on(place: &Place) -> &'static str {
     "the run: went on"
 }
 
+/// A place with an undisturbed run in `whole`, and its calls; nothing, which it says, where faults cannot be made.
+fn undisturbed() -> Option<(Place, Vec<String>)> {
+    if !has_strace() {
+        return None;
+    }
+    let place = Place::with_scene();
+    let (output, calls) = traced(&place, None, &begin());
+    assert!(output.status.success(), "{output:?}");
+    std::fs::rename(place.path("run"), place.path("whole")).unwrap();
+    has_names(&calls).then_some((place, calls))
+}
+
 fn forget(place: &Place) {
     let _ = std::fs::remove_dir_all(place.path("run"));
 }
 
 #[test]
 fn faults_that_kill_a_run_at_any_call_cost_it_nothing() {
-    if !has_strace() {
-        return;
-    }
-    let place = Place::with_scene();
-    let (output, calls) = traced(&place, None, &begin());
-    assert!(output.status.success(), "{output:?}");
-    if !has_names(&calls) {
-        return;
-    }
-    std::fs::rename(place.path("run"), place.path("whole")).unwrap();
+    let Some((place, calls)) = undisturbed() else { return };
     let mut kills = 0;
     for (call, what) in CALLS {
         let (mut anew, mut on) = (0, 0);
@@ -118,16 +121,7 @@ fn faults_that_kill_a_run_at_any_call_cost_it_nothing() {
 
 #[test]
 fn faults_of_a_disk_lose_no_run() {
-    if !has_strace() {
-        return;
-    }
-    let place = Place::with_scene();
-    let (output, calls) = traced(&place, None, &begin());
-    assert!(output.status.success(), "{output:?}");
-    if !has_names(&calls) {
-        return;
-    }
-    std::fs::rename(place.path("run"), place.path("whole")).unwrap();
+    let Some((place, calls)) = undisturbed() else { return };
     for (i, (call, what)) in CALLS.into_iter().enumerate() {
         let (mut ended, mut warned, mut silent, mut words) = (0, 0, 0, String::new());
         for (j, number) in about_the_run(&calls, call).into_iter().step_by(stride()).enumerate() {

@@ -3,6 +3,7 @@
 use super::{Place, SIZE, complained, png};
 use raygrad::nerf::dataset::scene::ANGLE_X;
 use raygrad::nerf::dataset::{Capture, Depths, Split};
+use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::{Camera, Config, Extent, Image, Model};
 use serde_json::json;
 use std::path::Path;
@@ -103,6 +104,32 @@ fn paths_lie_where_the_scene_does() {
     std::fs::write(place.path("path.json"), path.to_string()).unwrap();
     place.succeeds("render run --path path.json --out path");
     assert!(apart(&png(&place.path("path/0000.png")), &expected) <= 1.0);
+
+    // In nerfstudio's own coordinates, of a file whose coordinates are not those of before either.
+    place.succeeds("prepare scene --to nerfstudio --out captured");
+    let mut transforms = place.json("captured/transforms.json");
+    let before = DAffine3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.5, 0.2, -0.3]);
+    let rows = |map: DAffine3| {
+        [0, 1, 2].map(|r| [map.matrix3.row(r).x, map.matrix3.row(r).y, map.matrix3.row(r).z, map.translation[r]])
+    };
+    transforms["applied_transform"] = json!(rows(before));
+    transforms["applied_scale"] = json!(2.0);
+    std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
+    let own = DAffine3 { translation: DVec3::new(-0.4, 0.1, 0.7), ..DAffine3::from_rotation_z(0.6) };
+    let shrunk = 0.25;
+    let dataparser = json!({ "transform": rows(own * before), "scale": 2.0 * shrunk });
+    std::fs::write(place.path("dataparser_transforms.json"), dataparser.to_string()).unwrap();
+    let moved = own * given.pose;
+    let moved = DAffine3 { translation: shrunk * moved.translation, ..moved };
+    let flat = [rows(moved).concat(), vec![0.0, 0.0, 0.0, 1.0]].concat();
+    let path = json!({
+        "render_width": SIZE, "render_height": SIZE,
+        "camera_path": [{ "camera_to_world": flat, "fov": ANGLE_X.to_degrees() }],
+    });
+    std::fs::write(place.path("moved.json"), path.to_string()).unwrap();
+    let flags = "--scene captured --path moved.json --path-transform dataparser_transforms.json";
+    place.succeeds(&format!("render run {flags} --out moved"));
+    assert!(apart(&png(&place.path("moved/0000.png")), &expected) <= 1.0);
 }
 
 /// At the size that photographs were read in, whose sides may have been rounded apart: 28 x 21 to 14 x 11.
@@ -226,7 +253,7 @@ fn what_is_saved_beside_frames_belongs_to_them() {
 /// reader's own convention, from outside.
 #[test]
 fn depths_are_along_the_axis() {
-    let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), glam::DAffine3::IDENTITY);
+    let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), DAffine3::IDENTITY);
     let distances = Image { width: 3, height: 1, channels: 1, data: vec![2.0; 3] };
     let npy = Depths::new(&distances, &camera, 10.0).to_npy();
     let depths: Vec<f32> =
