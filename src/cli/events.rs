@@ -176,6 +176,25 @@ mod tests {
     }
 
     #[test]
+    fn numbers_are_written_in_groups_of_seven_bits() {
+        let full = [[0xff; 9].as_slice(), &[1]].concat();
+        let cases: [(u64, &[u8]); 7] = [
+            (0, &[0]),
+            (127, &[0x7f]),
+            (128, &[0x80, 1]),
+            (150, &[0x96, 1]),
+            (300, &[0xac, 2]),
+            (0xff80, &[0x80, 0xff, 3]),
+            (u64::MAX, &full),
+        ];
+        for (value, expected) in cases {
+            let mut message = Message::default();
+            message.varint(value);
+            assert_eq!(message.0, expected, "{value}");
+        }
+    }
+
+    #[test]
     fn a_later_file_has_a_later_name_whatever_the_clock_says() {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path().join("made");

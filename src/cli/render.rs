@@ -205,8 +205,10 @@ fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Result<
         beyond += usize::from(frame.beyond > 0);
         let done = frames.done();
         progress.set(done as f64 / all as f64, || {
-            let left = start.elapsed().as_secs_f64() * (all - done) as f64 / (done - first) as f64;
-            format!("frame {done} of {all}  {} left", spoken(left))
+            format!(
+                "frame {done} of {all}  {} left",
+                spoken(time_left(start.elapsed().as_secs_f64(), [first, done, all]))
+            )
         });
     }
     drop(progress);
@@ -218,6 +220,11 @@ fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Result<
         ));
     }
     Ok(true)
+}
+
+/// The seconds that are left if it took so many from the `first` frame to here.
+fn time_left(seconds: f64, [first, done, all]: [usize; 3]) -> f64 {
+    seconds * (all - done) as f64 / (done - first) as f64
 }
 
 /// Says how to go on.
@@ -276,5 +283,14 @@ impl Kind {
     fn is_foreign(out: &Path) -> bool {
         let ending = out.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
         ending.is_some_and(|ending| FOREIGN.contains(&ending.as_str())) && !out.is_dir()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn what_was_there_before_took_no_time() {
+        assert_eq!(super::time_left(6.0, [20, 22, 100]), 234.0);
+        assert_eq!(super::time_left(6.0, [0, 3, 3]), 0.0);
     }
 }

@@ -251,6 +251,13 @@ fn what_was_trained_on_is_no_test() {
     place.fails("eval run --split val --scene absent", &["absent"]);
     // A path from photograph to photograph is by those that were trained on.
     place.fails("render run --path spline --through 0", &["trained on 6", "say with --scene"]);
+    // A run of the first edition does not know the names of its photographs.
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
+    let mut config = place.json("run/config.json");
+    config["photographs"] = json!([]);
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.succeeds("render run --path spline --through 0,3 --frames 2 --size 4x4");
     // Nor has one that was not trained on a camera that was learned.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL} --refine poses"));

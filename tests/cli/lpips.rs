@@ -68,7 +68,9 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     assert!(!plain.to_string().contains("lpips") && !page("eval-test").to_lowercase().contains("lpips"));
 
     weights(&place, "vgg.safetensors", VGG);
-    let table = place.succeeds("eval run --lpips vgg.safetensors");
+    let output = place.command("eval run --lpips vgg.safetensors").output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "nothing to warn of: {output:?}");
+    let table = String::from_utf8(output.stdout).unwrap();
     let result = place.json("run/eval-test-lpips-vgg.json");
     let crc = format!("{:08x}", crc32fast::hash(&place.bytes("vgg.safetensors")));
     assert_eq!(json!([result["lpips_backbone"], result["lpips_crc32"]]), json!(["vgg", crc]));
@@ -109,7 +111,9 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     mask.save_png(place.path("scene/mask.png")).unwrap();
     transforms["frames"][1]["mask_path"] = json!("mask.png");
     std::fs::write(place.path("scene/transforms_test.json"), transforms.to_string()).unwrap();
-    let table = place.succeeds("eval run --lpips vgg.safetensors");
+    let output = place.command("eval run --lpips vgg.safetensors").output().unwrap();
+    assert!(String::from_utf8_lossy(&output.stderr).contains("1 of 3 have masks"), "{output:?}");
+    let table = String::from_utf8(output.stdout).unwrap();
     let masked = place.json("run/eval-test-lpips-vgg.json");
     let views = masked["per_view"].as_array().unwrap();
     assert_eq!([0, 1, 2].map(|i| views[i]["lpips"].as_f64()), [Some(figures[0]), None, Some(figures[2])], "{table}");

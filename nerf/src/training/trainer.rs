@@ -433,6 +433,24 @@ mod tests {
     }
 
     #[test]
+    fn the_last_tile_of_a_step_has_the_rays_that_are_left() {
+        let mut data = embedded(Split::Train, 8);
+        data.frames.truncate(2);
+        let data = Arc::new(data);
+        let marched = |batch: usize| {
+            let mut config = tiny();
+            config.sampler.get_mut::<HierarchicalConfig>().unwrap().batch = batch;
+            let mut trainer = Trainer::new(config, data.clone()).unwrap();
+            let stats = trainer.step(0.0);
+            assert_eq!(stats.rays, batch as u64);
+            stats.marched
+        };
+        assert!(marched(8) > 0);
+        // Every ray takes as many steps; tiles are of eight.
+        assert_eq!(8 * marched(21), 21 * marched(8));
+    }
+
+    #[test]
     fn a_restart_keeps_what_was_said_of_parameters() {
         let mut data = embedded(Split::Train, 8);
         data.frames.truncate(2);
