@@ -418,6 +418,9 @@ mod tests {
         let off = score(&frame, &render, &truth, 13, None);
         assert!((off.psnr - 10.0 * (3.0 * 13.0 * 26.0 / 0.25_f64).log10()).abs() < 1e-3, "{}", off.psnr);
         assert!(off.ssim.unwrap() < 0.999 && score(&frame, &render, &truth, 0, None).psnr > off.psnr + 2.9);
+        // Structures are of windows of 11 x 11.
+        let ssim = |half: usize| score(&frame, &render, &truth, half, None).ssim;
+        assert!(ssim(15).is_some() && ssim(16).is_none());
         render.pixel_mut(3, 7)[1] = 9.0;
         assert_eq!(score(&frame, &render, &truth, 13, None).psnr, off.psnr, "what was fitted to is not compared");
         // Pixels that are not used neither fit nor count; a render of nothing has no gain.
