@@ -49,7 +49,7 @@ pub use losses::{Loss, Term, TermConfig, Terms};
 pub use model::{Config, Extent, GroupConfig, Model, Preset};
 pub use pictures::quantise;
 pub use random::Jitter;
-pub use rendering::{DenseView, Picture};
+pub use rendering::{DenseView, Picture, Viewing};
 pub use sampling::{Limits, Load, Progress, Purpose, Sampled, Sampler, SamplerConfig, Samplers};
 pub use space::{Contraction, Space, contract};
 pub use training::{Budget, StepStats, Trainer, fitted_cameras};

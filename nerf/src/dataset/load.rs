@@ -172,6 +172,15 @@ impl Capture {
         Survey::new(self, empty, asked)
     }
 
+    /// Reads one photograph, in its own size, as its camera has taken it.
+    ///
+    /// # Errors
+    /// If its image does not exist, cannot be decoded or is of another shape than its camera.
+    pub fn photo(&self, view: &View) -> Result<Photo> {
+        let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
+        self.named(view, open(path, &view.camera))
+    }
+
     /// Reads the photographs of a split, in parallel, and puts their cameras where the survey says.
     ///
     /// # Errors

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 
@@ -36,6 +37,30 @@ impl Image {
             .write_image(&bytes, self.width as u32, self.height as u32, colour)
             .expect("the shape is checked above, and writing to memory does not fail");
         png
+    }
+
+    /// The image as a JPEG file in memory: grey or RGB by its channels, each value [quantised](quantise). `quality` is from 1 to
+    /// 100.
+    ///
+    /// # Panics
+    /// If the image has no pixels or more than 65535 on a side, has another number of channels than 1 or 3, or holds another
+    /// number of values than its size says.
+    #[track_caller]
+    pub fn to_jpeg(&self, quality: u8) -> Vec<u8> {
+        let colour = match self.channels {
+            1 => ExtendedColorType::L8,
+            3 => ExtendedColorType::Rgb8,
+            other => panic!("a JPEG has 1 or 3 channels, not {other}"),
+        };
+        let sides = 1..=usize::from(u16::MAX);
+        let fits = sides.contains(&self.width) && sides.contains(&self.height);
+        assert!(fits, "a {}x{} image is no JPEG", self.width, self.height);
+        let bytes: Vec<u8> = self.data.iter().map(|&value| quantise(value)).collect();
+        let mut jpeg = Vec::new();
+        JpegEncoder::new_with_quality(&mut jpeg, quality)
+            .write_image(&bytes, self.width as u32, self.height as u32, colour)
+            .expect("the shape is checked above, and writing to memory does not fail");
+        jpeg
     }
 
     /// Writes the image to the file `path` as [PNG](Self::to_png), replacing it [as a whole](write_atomic).

@@ -1,6 +1,6 @@
 //! Views in which nothing is left out, in any precision: what others are measured against.
 
-use super::picture::Picture;
+use super::picture::{Picture, Viewing};
 use super::pixel::Pixel;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
@@ -45,7 +45,9 @@ impl<T: Scalar> Model<T> {
         let keep = |seen: &[Pixel], out: &mut [Pixel]| {
             out.iter_mut().zip(seen).for_each(|(out, pixel)| *out = pixel.over(background));
         };
-        let evaluations = self.pixels(camera, TILE, see, pixels.par_chunks_mut(TILE), keep);
+        let all = Viewing::over(background.map(|value| value as f32));
+        let evaluations = self.pixels(camera, &all, TILE, see, pixels.par_chunks_mut(TILE), keep);
+        let evaluations = evaluations.expect("nobody stops it");
         DenseView { width: camera.width, height: camera.height, pixels, evaluations }
     }
 

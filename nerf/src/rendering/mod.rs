@@ -7,5 +7,5 @@ pub(crate) mod pixel;
 pub(crate) mod view;
 
 pub use dense::DenseView;
-pub use picture::Picture;
+pub use picture::{Picture, Viewing};
 pub use pixel::Pixel;

@@ -5,6 +5,7 @@ use crate::camera::rays::Rays;
 use crate::dataset::image::Image;
 use crate::model::Model;
 use crate::random::Jitter;
+use crate::rendering::picture::Viewing;
 use crate::sampling::Purpose;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
@@ -26,11 +27,21 @@ impl<T: Scalar> Model<T> {
     /// If the field's density does not depend on positions through operations of the tape.
     #[inline(never)]
     pub fn normals(&self, camera: &Camera) -> Image {
+        self.normals_while(camera, &Viewing::over([0.0; 3])).expect("nobody stops it")
+    }
+
+    /// As [`normals`](Self::normals), of what lies in a box, for as long as somebody wants it: nothing if it was not to
+    /// [go on](Viewing::goes_on).
+    ///
+    /// # Panics
+    /// As [`normals`](Self::normals).
+    #[inline(never)]
+    pub fn normals_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Image> {
         let mut image = Image::new(camera.width, camera.height, 3);
-        self.tiles(camera, TILE, image.data.par_chunks_mut(3 * TILE), |pool: &mut Pool<T>, _, rays, out| {
-            self.normals_along(rays, pool, out)
-        });
-        image
+        let out = image.data.par_chunks_mut(3 * TILE);
+        let see = |pool: &mut Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, pool, out);
+        self.tiles(camera, viewing, TILE, out, see)?;
+        Some(image)
     }
 
     fn normals_along(&self, rays: &Rays<T>, pool: &Pool<T>, out: &mut [f32]) -> Evaluations {

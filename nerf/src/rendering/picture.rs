@@ -8,6 +8,7 @@ use crate::dataset::image::Image;
 use crate::model::Model;
 use crate::sampling::Limits;
 use crate::volume::render::Evaluations;
+use glam::DVec3;
 use raygrad_autograd::Scalar;
 use raygrad_tensor::parallel;
 use rayon::prelude::*;
@@ -92,39 +93,71 @@ impl Part<'_> {
     }
 }
 
+/// How a view is rendered that is looked at while it changes.
+#[derive(Clone, Copy)]
+pub struct Viewing<'a> {
+    /// What lies behind the scene, RGB in 0..=1. Normals have nothing behind them.
+    pub background: [f32; 3],
+    /// What may be left out; without it what goes with the configuration.
+    pub limits: Option<Limits>,
+    /// The box, lower and upper corner in scene units, beyond which nothing is shown: infinite for all.
+    pub within: [DVec3; 2],
+    /// Asked before each tile, on any thread: once it says `false`, no more is rendered.
+    pub goes_on: &'a (dyn Fn() -> bool + Sync),
+}
+
+impl Viewing<'_> {
+    /// All of a scene, to the end, over a background.
+    pub fn over(background: [f32; 3]) -> Self {
+        Viewing { background, limits: None, within: EVERYWHERE, goes_on: &|| true }
+    }
+}
+
+/// The box that holds everything.
+const EVERYWHERE: [DVec3; 2] = [DVec3::NEG_INFINITY, DVec3::INFINITY];
+
 impl<T: Scalar> Model<T> {
     /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
-    /// tile's first pixel, its rays and its part of `out`.
+    /// tile's first pixel, its rays and its part of `out`. Nothing if it was not to go on.
     pub(crate) fn tiles<S: Default, P: Send>(
         &self,
         camera: &Camera,
+        viewing: &Viewing<'_>,
         tile: usize,
         out: impl IndexedParallelIterator<Item = P>,
         see: impl Fn(&mut S, usize, &Rays<T>, P) -> Evaluations + Sync,
-    ) -> Evaluations {
-        let (bounds, count) = (self.reach(), camera.width * camera.height);
+    ) -> Option<Evaluations> {
+        let ([lower, upper], [from, to]) = (self.reach(), viewing.within);
+        let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
+        let [near, far] = self.extent.span;
+        // Which corner is which is nothing to a ray.
+        let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
         let tiles = out.enumerate().map_init(S::default, |scratch, (which, out)| {
+            if !(viewing.goes_on)() {
+                return None;
+            }
             let mut rays = Rays::new();
             for pixel in which * tile..count.min((which + 1) * tile) {
-                rays.push_pixel(camera, camera.place_of(pixel), bounds, self.extent.span);
+                rays.push_pixel(camera, camera.place_of(pixel), bounds, span);
             }
-            parallel::serial(|| see(scratch, which * tile, &rays, out))
+            Some(parallel::serial(|| see(scratch, which * tile, &rays, out)))
         });
-        tiles.reduce(Evaluations::default, |a, b| a + b)
+        tiles.try_reduce(Evaluations::default, |a, b| Some(a + b))
     }
 
     /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
-    /// shows to its part of `out`.
+    /// shows to its part of `out`. Nothing if it was not to go on.
     pub(crate) fn pixels<S: Default, P: Send>(
         &self,
         camera: &Camera,
+        viewing: &Viewing<'_>,
         tile: usize,
         see: impl Fn(&mut S, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
         out: impl IndexedParallelIterator<Item = P>,
         keep: impl Fn(&[Pixel], P) + Sync,
-    ) -> Evaluations {
+    ) -> Option<Evaluations> {
         let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
-        self.tiles(camera, tile, out, |(scratch, pixels): &mut (S, Vec<Pixel>), first, rays, out| {
+        self.tiles(camera, viewing, tile, out, |(scratch, pixels): &mut (S, Vec<Pixel>), first, rays, out| {
             pixels.resize(rays.len(), Pixel::default());
             let evaluations = see(scratch, rays, pixels);
             if let Some(gain) = &gain {
@@ -144,17 +177,42 @@ impl Model<f32> {
     /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
     /// time, on any number of threads.
     pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
-        self.view_within(camera, background, &self.sampler.limits())
+        self.whole_view(camera, &Viewing::over(background))
     }
 
     /// As [`view`](Self::view), with these limits in place of those that go with the configuration.
     pub fn view_within(&self, camera: &Camera, background: [f32; 3], limits: &Limits) -> Picture {
-        let see = |viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [Pixel]| viewer.see(self, rays, limits, out);
+        self.whole_view(camera, &Viewing { limits: Some(*limits), ..Viewing::over(background) })
+    }
+
+    /// As [`view`](Self::view), of what lies in a box, for as long as somebody wants it: nothing if it was not to
+    /// [go on](Viewing::goes_on).
+    ///
+    /// ```
+    /// use raygrad_nerf::glam::{DAffine3, DVec3};
+    /// use raygrad_nerf::{Camera, Config, Extent, Model, Preset, Viewing};
+    /// let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
+    /// let model = Model::new(Config::preset(Preset::Voxel), extent, 0)?;
+    /// let camera = Camera::from_angle(8, 6, 0.7, DAffine3::from_translation(3.0 * DVec3::Z));
+    /// let lower_half = Viewing { within: [DVec3::NEG_ONE, DVec3::new(1.0, 0.0, 1.0)], ..Viewing::over([1.0; 3]) };
+    /// let picture = model.view_while(&camera, &lower_half).expect("it was not stopped");
+    /// assert_eq!(picture.color.pixel(4, 0), [1.0; 3]);
+    /// assert!(model.view_while(&camera, &Viewing { goes_on: &|| false, ..lower_half }).is_none());
+    /// # Ok::<_, raygrad_nerf::Error>(())
+    /// ```
+    pub fn view_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Picture> {
+        let limits = viewing.limits.unwrap_or_else(|| self.sampler.limits());
+        let see = |viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [Pixel]| viewer.see(self, rays, &limits, out);
         let (mut picture, tile) = (Picture::new([camera.width, camera.height]), self.sampler.view_tile());
-        let background = background.map(f64::from);
+        let background = viewing.background.map(f64::from);
         let keep = |pixels: &[Pixel], out: Part<'_>| out.fill(pixels.iter().map(|pixel| pixel.over(background)));
-        picture.evaluations = self.pixels(camera, tile, see, picture.parts(tile), keep);
-        picture
+        picture.evaluations = self.pixels(camera, viewing, tile, see, picture.parts(tile), keep)?;
+        Some(picture)
+    }
+
+    /// A view that nobody stops.
+    fn whole_view(&self, camera: &Camera, viewing: &Viewing<'_>) -> Picture {
+        self.view_while(camera, viewing).expect("nobody stops it")
     }
 
     /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole:
@@ -183,7 +241,58 @@ mod tests {
     use super::*;
     use crate::model::Extent;
     use crate::model::config::{Config, Preset};
-    use glam::DVec3;
+
+    fn model() -> Model<f32> {
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
+        Model::new(Config::preset(Preset::Small), extent, 0).unwrap()
+    }
+
+    fn camera(width: usize, height: usize) -> Camera {
+        Camera::from_angle(width, height, 0.6, Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y))
+    }
+
+    #[test]
+    fn what_lies_outside_of_a_box_is_not_seen() {
+        let (model, camera) = (model(), camera(17, 13));
+        let whole = model.view(&camera, [1.0; 3]);
+        let within = |lower: [f64; 3], upper: [f64; 3]| {
+            let viewing = Viewing { within: [lower.into(), upper.into()], ..Viewing::over([1.0; 3]) };
+            (model.view_while(&camera, &viewing).unwrap(), model.normals_while(&camera, &viewing).unwrap())
+        };
+        // A box that is larger than the scene changes nothing, one beside it shows nothing.
+        let (all, normals) = within([-9.0, -1.0, f64::NEG_INFINITY], [1.0, 9.0, f64::INFINITY]);
+        assert!(all.color == whole.color && normals == model.normals(&camera));
+        for upper in [[-1.5, 2.0, 2.0], [-3.0, 2.0, 2.0], [0.0, -2.0, 2.0]] {
+            let (none, normals) = within([-2.0; 3], upper);
+            // One with its corners the wrong way round too.
+            let most = |image: &Image| image.data.iter().fold(0.0_f32, |most, x| most.max(x.abs()));
+            assert_eq!([most(&none.opacity), most(&normals)], [0.0; 2]);
+        }
+        // Left of the middle: half of the picture.
+        let (left, normals) = within([-2.0; 3], [0.0, 2.0, 2.0]);
+        let columns = |image: &Image, x: std::ops::Range<usize>| {
+            x.flat_map(|x| (0..13).map(move |y| [x, y])).map(|[x, y]| image.pixel(x, y).to_vec()).collect::<Vec<_>>()
+        };
+        assert_eq!(columns(&left.color, 0..5), columns(&whole.color, 0..5));
+        assert!(columns(&left.opacity, 0..5).concat().iter().any(|x| *x > 0.0));
+        assert!(columns(&left.opacity, 12..17).concat().iter().all(|x| *x == 0.0));
+        assert!(columns(&normals, 12..17).concat().iter().all(|x| *x == 0.0));
+    }
+
+    #[test]
+    fn a_view_ends_when_nobody_wants_it() {
+        use std::sync::atomic::{AtomicUsize, Ordering};
+        let (model, camera) = (model(), camera(64, 64));
+        let asked = AtomicUsize::new(0);
+        let goes_on = || asked.fetch_add(1, Ordering::Relaxed) < 3;
+        let viewing = Viewing { goes_on: &goes_on, ..Viewing::over([1.0; 3]) };
+        assert!(model.view_while(&camera, &viewing).is_none());
+        let tiles = (64 * 64_usize).div_ceil(model.sampler.view_tile());
+        assert!((4..tiles).contains(&asked.load(Ordering::Relaxed)), "{asked:?} of {tiles}");
+        assert!(model.normals_while(&camera, &viewing).is_none());
+        let whole = model.view_while(&camera, &Viewing { goes_on: &|| true, ..viewing }).unwrap();
+        assert_eq!(whole.color, model.view(&camera, [1.0; 3]).color);
+    }
 
     #[test]
     fn a_progressive_view_ends_with_the_view_itself() {
