@@ -10,6 +10,9 @@ use raygrad::nerf::dataset::{Split, embedded, evenly_spaced};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+#[cfg(unix)]
+#[path = "cli/browser.rs"]
+mod browser;
 #[path = "cli/captures.rs"]
 mod captures;
 #[path = "cli/convert.rs"]
@@ -38,6 +41,9 @@ mod records;
 #[cfg(unix)]
 #[path = "cli/resume.rs"]
 mod resume;
+#[cfg(unix)]
+#[path = "cli/view.rs"]
+mod view;
 
 /// Width and height of the test images.
 const SIZE: usize = 24;

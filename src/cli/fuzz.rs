@@ -8,13 +8,14 @@ use super::parse;
 use super::run::{Run, RunConfig};
 use super::scene::Scene;
 use super::train::changed;
+use super::view::messages::{Ask, Eye, View};
 use campaign::campaign;
 use damage::clear;
 use memory::peak;
 use proptest::prelude::*;
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Config, Error, Extent, Preset};
-use serde_json::Value;
+use serde_json::{Value, json};
 use tally::{Bound, cases};
 
 #[path = "../../tests/stability/campaign.rs"]
@@ -123,6 +124,32 @@ fn campaign_configurations_of_runs() {
     // A name of a photograph takes two bytes and a comma of a document, and 24 of memory.
     let bound = Bound { times: 256, plus: 1 << 18 };
     campaign("run's config.json", &whole, bound, parse, |error| clear(error, "config.json"));
+}
+
+#[test]
+fn campaign_messages_of_pages() {
+    let pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 1.0]];
+    let free = json!({ "ask": "view", "id": 7, "view": { "eye": { "free": { "pose": pose, "fov": 40.5 } },
+        "size": [640, 480], "show": "normals", "background": [255, 0, 7], "within": [[-1, -1, -1], [1, 1, 1]], "exact": true } });
+    let kept = json!({ "ask": "save", "view": { "eye": { "photograph": 3 }, "size": [8, 8] } });
+    let others =
+        [json!({ "ask": "share", "share": 0.3 }), json!({ "ask": "stop" }), json!({ "ask": "pause", "pause": true })];
+    let whole: Vec<Vec<u8>> =
+        [free, kept].iter().chain(&others).map(|message| message.to_string().into_bytes()).collect();
+    let parse = |bytes: &[u8]| {
+        // What is no text is closed before.
+        let ask = Ask::read(std::str::from_utf8(bytes).map_err(|e| e.to_string())?)?;
+        if let Ask::View { view, .. } | Ask::Save { view } = &ask {
+            let [width, height] = view.size.map(|side| side as usize);
+            assert!((1..=1 << 22).contains(&(width * height)), "{width} {height}");
+            if let Eye::Free { pose, fov } = &view.eye {
+                let camera = View::camera(pose, *fov, [width, height]);
+                assert!(camera.pose.is_finite() && camera.focal[0] > 0.0 && camera.focal[0].is_finite(), "{camera:?}");
+            }
+        }
+        Ok::<(), String>(())
+    };
+    campaign("page's message", &whole, Bound { times: 64, plus: 1 << 14 }, parse, |error| clear(error, ""));
 }
 
 #[test]

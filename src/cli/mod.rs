@@ -28,6 +28,7 @@ mod run;
 mod scene;
 mod summary;
 mod train;
+mod view;
 mod watch;
 
 use std::path::Path;
@@ -69,6 +70,7 @@ enum Command {
     Eval(eval::Args),
     Compare(compare::Args),
     Render(render::Args),
+    View(view::Args),
     Doctor(doctor::Args),
     Export(export::Args),
     Bench(bench::Args),
@@ -105,6 +107,7 @@ fn run(cli: Cli) -> Result<ExitCode> {
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),
         Some(Command::Render(args)) => render::run(&args),
+        Some(Command::View(args)) => view::run(&args),
     }
 }
 
@@ -125,6 +128,7 @@ fn suggest(folder: &Path) -> Result<()> {
     let folder = folder.display();
     print(&format!(
         "next     raygrad render {folder} --out {folder}/orbit.gif   to fly around the scene\n         \
+         raygrad view {folder} --open   to look around in a browser\n         \
          raygrad eval {folder}   to measure it on views it has not seen\n"
     ))
 }

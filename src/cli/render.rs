@@ -5,7 +5,7 @@ mod film;
 mod flight;
 mod frames;
 mod path_file;
-mod shown;
+pub mod shown;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -25,6 +25,7 @@ use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::summary::Ended;
+use super::view::{PlaceArgs, Window};
 use super::watch::Watch;
 use super::{checkpoint, doctor, interrupt, machine, memory, parse, watch};
 
@@ -117,6 +118,11 @@ pub struct Args {
     /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
     #[arg(long)]
     tensorboard: bool,
+    /// Serve a page to look at the scene while it is trained; see also `raygrad view`
+    #[arg(long)]
+    view: bool,
+    #[command(flatten)]
+    place: PlaceArgs,
     /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
     #[arg(long, value_name = "RUN")]
     out: Option<PathBuf>,
@@ -158,6 +164,9 @@ impl Trained {
 
 /// Trains and leaves the model in a new folder, or goes on with a run.
 pub fn run(args: &Args) -> Result<Trained> {
+    if !args.view && args.place.are_given() {
+        return Err(Error::setting("host", "with --port has no meaning without --view"));
+    }
     match &args.resume {
         None => begin(args),
         Some(folder) => resume(args, folder),
@@ -228,13 +237,18 @@ fn train(
     args: &Args,
     preview: Preview,
 ) -> Result<Trained> {
+    let mut window = args.view.then(|| Window::open(&args.place, &run, &trainer)).transpose()?;
     let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
-    let mut diverged = None;
+    let (mut diverged, mut ended_by_page) = (None, false);
     for retreats in 0.. {
         trainer.run(budget, |trainer| {
-            let stops = interrupt::requested();
+            let stops = interrupt::requested() || ended_by_page;
             watch.step(trainer, stops);
+            if let Some(window) = window.as_mut().filter(|_| !stops) {
+                let (psnr, left) = watch.shown(trainer);
+                ended_by_page = window.step(trainer, psnr, left);
+            }
             if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
         if !trainer.stats().ends_diverged() {
@@ -248,7 +262,7 @@ fn train(
         }
     }
     let interrupted = interrupt::requested();
-    let ended = match (interrupted, &diverged) {
+    let ended = match (interrupted || ended_by_page, &diverged) {
         (true, _) => Ended::Interrupted,
         (false, Some(_)) => Ended::Diverged,
         (false, None) => Ended::Done,
@@ -256,7 +270,10 @@ fn train(
     // Whatever came of it, the run was good until then.
     let good = diverged.is_none() || watch.give_up(&mut trainer);
     watch.finish(&trainer, ended, good)?;
-    summarise(&run, &trainer.stats(), interrupted)?;
+    if let Some(window) = &mut window {
+        window.end(&trainer, ended);
+    }
+    summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
     if let Some(reason) = &diverged {
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };

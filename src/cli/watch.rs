@@ -259,6 +259,12 @@ impl<'a> Watch<'a> {
         self.account.write(self.run, stats, self.budget, ended)
     }
 
+    /// The PSNR that is shown, and the seconds of training that are left.
+    pub fn shown(&self, trainer: &Trainer) -> (f64, f64) {
+        let stats = trainer.stats();
+        (self.psnr.unwrap_or(stats.psnr), self.remaining(&stats).1)
+    }
+
     /// Share of the run that is done, and the seconds of training that are left.
     fn remaining(&self, stats: &StepStats) -> (f64, f64) {
         match self.budget {

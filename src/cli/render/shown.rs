@@ -103,7 +103,7 @@ impl Shown<'_> {
 }
 
 /// Unit normals as colours, in the capture's axes.
-fn facing(mut normals: Image, placement: &Placement) -> Image {
+pub fn facing(mut normals: Image, placement: &Placement) -> Image {
     let back = placement.rotation.transpose();
     for pixel in normals.data.chunks_exact_mut(3) {
         let normal = DVec3::new(pixel[0].into(), pixel[1].into(), pixel[2].into());
@@ -130,7 +130,7 @@ fn solid(image: &Image, picture: &Picture) -> Image {
 }
 
 /// Colours over a background, by the opacity.
-fn over(colors: &Image, opacity: &Image, background: [f32; 3]) -> Image {
+pub fn over(colors: &Image, opacity: &Image, background: [f32; 3]) -> Image {
     let mut image = colors.clone();
     for (pixel, opacity) in image.data.chunks_exact_mut(3).zip(&opacity.data) {
         pixel.iter_mut().zip(background).for_each(|(value, behind)| *value = behind + opacity * (*value - behind));

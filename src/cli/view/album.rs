@@ -1,0 +1,142 @@
+//! The photographs of a run, one at a time.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use raygrad::nerf::dataset::{Capture, Dataset, Photo, Point, Split, View, embedded, landscape};
+use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::{Camera, Error, Model, Result};
+
+use super::messages::{AboutPhotograph, rows};
+use crate::cli::builtin;
+use crate::cli::photographs::{check_trained, present};
+use crate::cli::run::Run;
+use crate::cli::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
+
+/// Photographs that are kept in memory.
+const KEPT: usize = 8;
+/// Most points that a page is told of.
+const MOST_POINTS: usize = 4000;
+
+/// The photographs of all splits, by number.
+pub struct Album {
+    capture: Capture,
+    scene: Scene,
+    entries: Vec<Entry>,
+    kept: Mutex<VecDeque<(usize, Arc<Photo>)>>,
+}
+
+struct Entry {
+    split: Split,
+    /// Which of its split it is.
+    number: usize,
+    view: View,
+    /// The camera as the files have it, in the scene.
+    given: Camera,
+}
+
+impl Album {
+    /// Those that a run was trained on and those that were held out. No image is read.
+    ///
+    /// # Errors
+    /// If the capture cannot be read, or those to train on are others.
+    pub fn open(run: &Run, scene: Option<&Scene>) -> Result<Self> {
+        let scene = run.scene(scene)?.clone();
+        let capture = match &scene {
+            Scene::Folder(folder) => Capture::read(folder)?,
+            made => builtin::capture(made, None, None)?,
+        };
+        let placement = run.config.extent.placement;
+        let mut entries = vec![];
+        for split in Split::ALL {
+            // A capture need not have all of them.
+            let Ok(views) = present(&capture, split) else { continue };
+            if split == Split::Train {
+                check_trained(run, &capture, &views, run.config.extent.frames)?;
+            }
+            entries.extend(views.into_iter().enumerate().map(|(number, view)| {
+                let given = placement.camera(&view.camera);
+                Entry { split, number, view: view.clone(), given }
+            }));
+        }
+        Ok(Album { capture, scene, entries, kept: Mutex::default() })
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// The camera of a photograph, where a model has it.
+    pub fn camera(&self, number: usize, model: &Model<f32>) -> Option<Camera> {
+        let Entry { split, number, given, .. } = self.entries.get(number)?;
+        let learned = *split == Split::Train && model.refine.is_some();
+        Some(if learned { model.learned_camera(*number, given) } else { model.other_camera(given) })
+    }
+
+    /// The photograph that was taken nearest to where a camera is, looking the way it looks.
+    pub fn nearest(&self, camera: &Camera, model: &Model<f32>) -> Option<usize> {
+        let middle = 0.5 * (model.extent.bounds[0] + model.extent.bounds[1]);
+        let reach = camera.pose.translation.distance(middle).max(1e-6);
+        let apart = |number: &usize| {
+            let own = self.camera(*number, model).unwrap_or_else(|| camera.clone());
+            let away = own.pose.translation.distance(camera.pose.translation) / reach;
+            away + own.pose.matrix3.z_axis.distance(camera.pose.matrix3.z_axis)
+        };
+        (0..self.len()).map(|number| (apart(&number), number)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, i)| i)
+    }
+
+    /// A photograph.
+    ///
+    /// # Errors
+    /// If there is none of this number, or it cannot be read.
+    pub fn photo(&self, number: usize) -> Result<Arc<Photo>> {
+        let lock = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, photo)) = lock().iter().find(|(own, _)| *own == number) {
+            return Ok(photo.clone());
+        }
+        let entry = self.entries.get(number);
+        let entry = entry.ok_or_else(|| Error::setting("photograph", format!("there is no photograph {number}")))?;
+        let photo = Arc::new(match &self.scene {
+            Scene::Folder(_) => self.capture.photo(&entry.view)?,
+            made => self.made(made, entry)?,
+        });
+        let mut kept = lock();
+        kept.push_front((number, photo.clone()));
+        kept.truncate(KEPT);
+        Ok(photo)
+    }
+
+    /// A photograph of a scene that is built in.
+    fn made(&self, scene: &Scene, entry: &Entry) -> Result<Photo> {
+        let Dataset { mut frames, .. } = match scene {
+            Scene::Landscape => landscape(entry.split, LANDSCAPE_SIZE[0]),
+            _ => embedded(entry.split, EMBEDDED_SIZE),
+        };
+        Ok(frames.swap_remove(entry.number).image)
+    }
+
+    /// What a page is told of them.
+    pub fn about(&self, model: &Model<f32>) -> Vec<AboutPhotograph> {
+        let about = |(number, entry): (usize, &Entry)| {
+            let camera = self.camera(number, model).unwrap_or_else(|| entry.given.clone());
+            AboutPhotograph {
+                name: entry.view.name.clone(),
+                split: entry.split,
+                pose: rows(&camera.pose),
+                fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+                size: [camera.width, camera.height],
+            }
+        };
+        self.entries.iter().enumerate().map(about).collect()
+    }
+
+    /// Places of the scene and their colours: the best of them, if there are many.
+    pub fn points(&self, model: &Model<f32>) -> Vec<([f32; 3], [u8; 3])> {
+        let placement = model.extent.placement;
+        let mut points: Vec<&Point> = self.capture.points.iter().collect();
+        points.sort_by(|a, b| b.views.cmp(&a.views).then(a.error.total_cmp(&b.error)));
+        let place = |point: DVec3| placement.point(point).as_vec3().to_array();
+        points.into_iter().take(MOST_POINTS).map(|point| (place(point.position), point.color)).collect()
+    }
+}

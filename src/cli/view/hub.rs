@@ -1,0 +1,387 @@
+//! Where what pages ask for meets what is painted: one thread paints, and each page has tasks of its own.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::Notify;
+
+use super::messages::{File, Made, View};
+
+/// Messages that wait for a page, beside a picture: more than it can have asked for in earnest.
+const WAITING: usize = 64;
+/// Pictures to keep that wait to be painted, of one page.
+const SAVES: usize = 4;
+
+/// What a page wants to see, as long as one does: pages that want the same share it.
+#[derive(Debug)]
+pub struct Wish {
+    pub view: View,
+    last: Mutex<Option<Arc<Shot>>>,
+}
+
+/// A picture for pages.
+#[derive(Debug)]
+pub struct Shot {
+    pub made: Made,
+    pub jpeg: Vec<u8>,
+}
+
+/// What is on its way to a page.
+#[derive(Default)]
+pub struct Outbox {
+    state: Mutex<Waiting>,
+    pub changed: Notify,
+}
+
+#[derive(Default)]
+struct Waiting {
+    /// The newest picture; one that nobody has seen yet is not worth sending any more.
+    picture: Option<(u32, Arc<Shot>)>,
+    others: VecDeque<Outgoing>,
+    /// Whether a picture was sent of which nothing has been heard.
+    flying: bool,
+    overrun: bool,
+}
+
+/// A message to a page.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outgoing {
+    Text(String),
+    Bytes(Vec<u8>),
+}
+
+impl Outbox {
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Something for the page, in order.
+    pub fn post(&self, message: Outgoing) {
+        let mut waiting = self.lock();
+        waiting.overrun |= waiting.others.len() >= WAITING;
+        if !waiting.overrun {
+            waiting.others.push_back(message);
+        }
+        drop(waiting);
+        self.changed.notify_one();
+    }
+
+    fn show(&self, id: u32, shot: Arc<Shot>) {
+        self.lock().picture = Some((id, shot));
+        self.changed.notify_one();
+    }
+
+    /// What is to be sent next, if anything may be.
+    pub fn take(&self) -> Option<Outgoing> {
+        let mut waiting = self.lock();
+        if let Some(message) = waiting.others.pop_front() {
+            return Some(message);
+        }
+        if waiting.flying {
+            return None;
+        }
+        let (id, shot) = waiting.picture.take()?;
+        waiting.flying = true;
+        Some(Outgoing::Bytes(File::Picture { id, made: shot.made }.message(&shot.jpeg)))
+    }
+
+    /// Whether a picture is under way, of which the page has said nothing yet.
+    pub fn is_flying(&self) -> bool {
+        self.lock().flying
+    }
+
+    /// Whether the page does not take what it has asked for.
+    pub fn is_overrun(&self) -> bool {
+        self.lock().overrun
+    }
+
+    /// The page has the picture.
+    pub fn seen(&self) {
+        self.lock().flying = false;
+        self.changed.notify_one();
+    }
+}
+
+struct Client {
+    wish: Option<(u32, Arc<Wish>)>,
+    outbox: Arc<Outbox>,
+}
+
+/// A picture to keep.
+pub struct Save {
+    pub client: u64,
+    pub view: View,
+}
+
+#[derive(Default)]
+struct State {
+    clients: BTreeMap<u64, Client>,
+    next: u64,
+    saves: VecDeque<Save>,
+    /// Whether something was asked for since somebody last waited.
+    news: bool,
+}
+
+/// What pages and the painter share.
+#[derive(Default)]
+pub struct Hub {
+    state: Mutex<State>,
+    wake: Condvar,
+    /// How many pages there are.
+    connected: AtomicUsize,
+    paused: AtomicBool,
+    stops: AtomicBool,
+    /// The share of time that pictures get of training, as the bits of an f64.
+    share: AtomicU64,
+}
+
+impl Hub {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A page comes.
+    pub fn join(&self) -> (u64, Arc<Outbox>) {
+        let mut state = self.lock();
+        let (number, outbox) = (state.next, Arc::new(Outbox::default()));
+        state.next += 1;
+        state.clients.insert(number, Client { wish: None, outbox: outbox.clone() });
+        self.connected.store(state.clients.len(), Ordering::Release);
+        (number, outbox)
+    }
+
+    /// A page goes.
+    pub fn leave(&self, client: u64) {
+        let mut state = self.lock();
+        state.clients.remove(&client);
+        state.saves.retain(|save| save.client != client);
+        self.connected.store(state.clients.len(), Ordering::Release);
+        self.news(&mut state);
+    }
+
+    /// How many pages there are.
+    pub fn connected(&self) -> usize {
+        self.connected.load(Ordering::Acquire)
+    }
+
+    /// A page wants to see something else: what it wanted before is forgotten.
+    pub fn wish(&self, client: u64, id: u32, view: View) {
+        let mut state = self.lock();
+        let same = state.clients.values().filter_map(|other| other.wish.as_ref()).find(|(_, wish)| wish.view == view);
+        let wish = same.map(|(_, wish)| wish.clone());
+        let wish = wish.unwrap_or_else(|| Arc::new(Wish { view, last: Mutex::default() }));
+        if let Some(client) = state.clients.get_mut(&client) {
+            let last = wish.last.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            client.wish = Some((id, wish));
+            // Of what it wanted before, nothing.
+            client.outbox.lock().picture = None;
+            if let Some(shot) = last {
+                client.outbox.show(id, shot);
+            }
+        }
+        self.news(&mut state);
+    }
+
+    /// A page wants a picture to keep; says whether it may.
+    pub fn save(&self, client: u64, view: View) -> bool {
+        let mut state = self.lock();
+        let fits = state.saves.iter().filter(|save| save.client == client).count() < SAVES;
+        if fits {
+            state.saves.push_back(Save { client, view });
+            self.news(&mut state);
+        }
+        fits
+    }
+
+    /// What pages want to see, each once.
+    pub fn wishes(&self) -> Vec<Arc<Wish>> {
+        let mut wishes: Vec<Arc<Wish>> = vec![];
+        for (_, wish) in self.lock().clients.values().filter_map(|client| client.wish.as_ref()) {
+            if !wishes.iter().any(|known| Arc::ptr_eq(known, wish)) {
+                wishes.push(wish.clone());
+            }
+        }
+        wishes
+    }
+
+    /// The next picture to keep.
+    pub fn next_save(&self) -> Option<Save> {
+        self.lock().saves.pop_front()
+    }
+
+    /// Whether a page is still there.
+    pub fn is_here(&self, client: u64) -> bool {
+        self.lock().clients.contains_key(&client)
+    }
+
+    /// Whether somebody still wants to see this.
+    pub fn wants(&self, wish: &Arc<Wish>) -> bool {
+        self.lock().clients.values().filter_map(|client| client.wish.as_ref()).any(|(_, own)| Arc::ptr_eq(own, wish))
+    }
+
+    /// A picture is ready: all who want it get it.
+    pub fn show(&self, wish: &Arc<Wish>, shot: Shot) {
+        let shot = Arc::new(shot);
+        let state = self.lock();
+        *wish.last.lock().unwrap_or_else(PoisonError::into_inner) = Some(shot.clone());
+        for client in state.clients.values() {
+            if let Some((id, _)) = client.wish.as_ref().filter(|(_, own)| Arc::ptr_eq(own, wish)) {
+                client.outbox.show(*id, shot.clone());
+            }
+        }
+    }
+
+    /// A message for one page.
+    pub fn post(&self, client: u64, message: Outgoing) {
+        if let Some(client) = self.lock().clients.get(&client) {
+            client.outbox.post(message);
+        }
+    }
+
+    /// A message for all pages.
+    pub fn tell(&self, message: &Outgoing) {
+        self.lock().clients.values().for_each(|client| client.outbox.post(message.clone()));
+    }
+
+    /// Waits until something was asked for since it was called last, no longer than this.
+    pub fn wait(&self, most: Duration) {
+        let state = self.lock();
+        let waited = self.wake.wait_timeout_while(state, most, |state| !state.news);
+        waited.unwrap_or_else(PoisonError::into_inner).0.news = false;
+    }
+
+    /// Wakes who waits.
+    pub fn wake(&self) {
+        self.news(&mut self.lock());
+    }
+
+    fn news(&self, state: &mut State) {
+        state.news = true;
+        self.wake.notify_all();
+    }
+
+    /// Whether training is to wait.
+    pub fn paused(&self) -> bool {
+        self.paused.load(Ordering::Relaxed)
+    }
+
+    /// Lets training wait or go on.
+    pub fn pause(&self, pause: bool) {
+        self.paused.store(pause, Ordering::Relaxed);
+        self.wake();
+    }
+
+    /// Whether training is to end.
+    pub fn stops(&self) -> bool {
+        self.stops.load(Ordering::Relaxed)
+    }
+
+    /// Lets training end.
+    pub fn stop(&self) {
+        self.stops.store(true, Ordering::Relaxed);
+        self.wake();
+    }
+
+    /// The share of time that pictures get of training.
+    pub fn share(&self) -> f64 {
+        f64::from_bits(self.share.load(Ordering::Relaxed))
+    }
+
+    /// Sets it.
+    pub fn set_share(&self, share: f64) {
+        self.share.store(share.to_bits(), Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::view::messages::{Eye, Show};
+
+    fn view(number: usize) -> View {
+        let eye = Eye::Photograph(number);
+        View { eye, size: [8, 8], show: Show::Color, background: None, within: None, exact: false }
+    }
+
+    fn shot(halvings: u32) -> Shot {
+        Shot { made: Made { halvings, milliseconds: 1.0, compared: None, step: 0 }, jpeg: vec![halvings as u8] }
+    }
+
+    /// The last byte of the picture that is sent next.
+    fn sent(outbox: &Outbox) -> Option<u8> {
+        match outbox.take()? {
+            Outgoing::Bytes(bytes) => bytes.last().copied(),
+            Outgoing::Text(text) => panic!("{text}"),
+        }
+    }
+
+    #[test]
+    fn pages_that_want_the_same_share_it_and_the_newest_wish_counts() {
+        let hub = Hub::default();
+        let ([a, b], [from_a, from_b]) = {
+            let [(a, out), (b, other)] = [hub.join(), hub.join()];
+            ([a, b], [out, other])
+        };
+        assert_eq!(hub.connected(), 2);
+        hub.wish(a, 1, view(1));
+        hub.wish(b, 9, view(1));
+        let wishes = hub.wishes();
+        assert!(wishes.len() == 1 && hub.wants(&wishes[0]));
+        hub.show(&wishes[0], shot(2));
+        assert_eq!([sent(&from_a), sent(&from_b)], [Some(2); 2]);
+        // Until it is seen no other is sent, and then the newest.
+        hub.show(&wishes[0], shot(1));
+        hub.show(&wishes[0], shot(0));
+        assert_eq!(sent(&from_a), None);
+        from_a.seen();
+        assert_eq!([sent(&from_a), sent(&from_a)], [Some(0), None]);
+        // One that comes later gets what there is at once.
+        let (c, from_c) = hub.join();
+        hub.wish(c, 3, view(1));
+        assert_eq!(sent(&from_c), Some(0));
+        hub.leave(c);
+        // What waits of an old wish is not sent any more.
+        hub.wish(b, 10, view(2));
+        from_b.seen();
+        assert_eq!(sent(&from_b), None);
+        assert_eq!(hub.wishes().len(), 2);
+        hub.wish(a, 2, view(2));
+        assert!(!hub.wants(&wishes[0]) && hub.wishes().len() == 1);
+        hub.leave(a);
+        hub.leave(b);
+        assert!(hub.wishes().is_empty() && hub.connected() == 0);
+    }
+
+    #[test]
+    fn a_page_has_so_much_waiting_and_no_more() {
+        let hub = Hub::default();
+        let (page, outbox) = hub.join();
+        assert!((0..SAVES).all(|i| hub.save(page, view(i))) && !hub.save(page, view(9)));
+        let (other, _) = hub.join();
+        assert!(hub.save(other, view(0)), "each its own");
+        hub.leave(page);
+        assert!(hub.next_save().is_some_and(|save| save.client == other) && hub.next_save().is_none());
+        for _ in 0..WAITING {
+            outbox.post(Outgoing::Text(String::new()));
+        }
+        assert!(!outbox.is_overrun());
+        outbox.post(Outgoing::Text(String::new()));
+        assert!(outbox.is_overrun());
+    }
+
+    #[test]
+    fn who_waits_is_woken_by_what_came_before_too() {
+        let hub = Hub::default();
+        let (page, _) = hub.join();
+        hub.wish(page, 1, view(1));
+        let start = std::time::Instant::now();
+        hub.wait(Duration::from_secs(20));
+        assert!(start.elapsed() < Duration::from_secs(10));
+        hub.wait(Duration::from_millis(30));
+        assert!(start.elapsed() >= Duration::from_millis(30), "once");
+        hub.set_share(0.25);
+        assert_eq!(hub.share(), 0.25);
+    }
+}

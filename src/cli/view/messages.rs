@@ -1,0 +1,264 @@
+//! What a page asks for and what it is told.
+
+use raygrad::nerf::dataset::{Photo, Split};
+use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
+use raygrad::nerf::{Camera, Image};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+/// Longest side of a picture.
+pub const LARGEST: u32 = 4096;
+/// Most pixels of a picture.
+const MOST_PIXELS: u32 = 1 << 22;
+/// Coordinates beyond this, in scene units, are of nothing that can be seen.
+const FARTHEST: f64 = 1e9;
+
+/// What a page says: text, one JSON object a message.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(tag = "ask", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Ask {
+    /// Pictures of this, until something else is asked for. `id` comes back with them.
+    View { id: u32, view: View },
+    /// Another may be sent: the picture that was asked for by `id` has arrived.
+    Seen { id: u32 },
+    /// The picture of this in full, as a PNG file.
+    Save { view: View },
+    /// A photograph.
+    Photograph { number: usize },
+    /// Training goes on or waits.
+    Pause { pause: bool },
+    /// Training ends here, and what it has found is saved.
+    Stop {},
+    /// The share of time that training leaves to pictures, 0 to .9.
+    Share { share: f64 },
+}
+
+impl Ask {
+    /// Reads a message.
+    pub fn read(text: &str) -> Result<Ask, String> {
+        let ask: Ask = serde_json::from_str(text).map_err(|e| e.to_string())?;
+        match &ask {
+            Ask::View { view, .. } | Ask::Save { view } => view.check()?,
+            Ask::Share { share } if !(0.0..=0.9).contains(share) => return Err("a share is from 0 to 0.9".to_owned()),
+            _ => (),
+        }
+        Ok(ask)
+    }
+}
+
+/// What is to be seen. Places are in scene units.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct View {
+    pub eye: Eye,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    #[serde(default)]
+    pub show: Show,
+    /// What lies behind the scene; as in training if nothing is said.
+    #[serde(default)]
+    pub background: Option<[u8; 3]>,
+    /// The box beyond which nothing is shown, lower and upper corner.
+    #[serde(default)]
+    pub within: Option<[[f64; 3]; 2]>,
+    /// Whether nothing is left out that hardly shows.
+    #[serde(default)]
+    pub exact: bool,
+}
+
+/// Where a picture is seen from.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Eye {
+    /// A pinhole.
+    Free {
+        /// Camera to world, three rows of four.
+        pose: [[f64; 4]; 3],
+        /// Vertical field of view in degrees.
+        fov: f64,
+    },
+    /// Where the photograph of this number was taken, by its camera.
+    Photograph(usize),
+}
+
+/// What a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Show {
+    #[default]
+    Color,
+    Depth,
+    Normals,
+    Opacity,
+    /// How far colours are from those of the nearest photograph, from where that was taken.
+    Error,
+}
+
+impl View {
+    fn check(&self) -> Result<(), String> {
+        let [width, height] = self.size;
+        let sides = 1..=LARGEST;
+        if !sides.contains(&width) || !sides.contains(&height) || width * height > MOST_PIXELS {
+            return Err(format!("{width}x{height} is no size from 1x1 to {MOST_PIXELS} pixels"));
+        }
+        if let Eye::Free { pose, fov } = &self.eye {
+            let rotation = rotation(pose);
+            let excess = rotation.transpose() * rotation - DMat3::IDENTITY;
+            let turns = excess.to_cols_array().iter().all(|x| x.abs() < 1e-3) && rotation.determinant() > 0.0;
+            if !turns || !pose.iter().all(|row| row[3].abs() <= FARTHEST) {
+                return Err("a pose is a rotation and a place".to_owned());
+            }
+            if !(1.0..=170.0).contains(fov) {
+                return Err("a field of view is from 1 to 170 degrees".to_owned());
+            }
+        }
+        let numbers = self.within.iter().flatten().flatten();
+        if !numbers.into_iter().all(|x| x.abs() <= FARTHEST) {
+            return Err("a box has two corners".to_owned());
+        }
+        Ok(())
+    }
+
+    /// The camera of a view that is free.
+    pub fn camera(pose: &[[f64; 4]; 3], fov: f64, [width, height]: [usize; 2]) -> Camera {
+        // Exactly a rotation, whatever was lost in a few digits.
+        let turn = DQuat::from_mat3(&rotation(pose)).normalize();
+        let pose = DAffine3 { matrix3: DMat3::from_quat(turn), translation: DVec3::from(pose.map(|row| row[3])) };
+        let focal = 0.5 * height as f64 / (0.5 * fov.to_radians()).tan();
+        Camera { focal: [focal; 2], ..Camera::from_angle(width, height, 1.0, pose) }
+    }
+}
+
+fn rotation(pose: &[[f64; 4]; 3]) -> DMat3 {
+    DMat3::from_cols_array(&std::array::from_fn(|i| pose[i % 3][i / 3]))
+}
+
+/// The rows of a pose.
+pub fn rows(pose: &DAffine3) -> [[f64; 4]; 3] {
+    [0, 1, 2].map(|r| {
+        let row = pose.matrix3.row(r);
+        [row.x, row.y, row.z, pose.translation[r]]
+    })
+}
+
+/// What a page is told of the scene, once.
+#[derive(Debug, Clone, Serialize)]
+pub struct About {
+    pub title: String,
+    /// Where to look from first.
+    pub pose: [[f64; 4]; 3],
+    /// Vertical field of view in degrees.
+    pub fov: f64,
+    /// Width and height of the photographs.
+    pub size: [usize; 2],
+    /// The middle of the scene's box, and its corners, in scene units.
+    pub bounds: [[f64; 3]; 2],
+    pub background: [f32; 3],
+    /// From the scene to the capture's own coordinates, three rows of four.
+    pub to_capture: [[f64; 4]; 3],
+    pub photographs: Vec<AboutPhotograph>,
+    /// Places of the scene that were found with the cameras, with their colours.
+    pub points: Vec<([f32; 3], [u8; 3])>,
+    /// Whether the scene is being trained.
+    pub training: bool,
+}
+
+/// What a page is told of a photograph.
+#[derive(Debug, Clone, Serialize)]
+pub struct AboutPhotograph {
+    pub name: String,
+    pub split: Split,
+    pub pose: [[f64; 4]; 3],
+    /// Vertical field of view in degrees.
+    pub fov: f64,
+    pub size: [usize; 2],
+}
+
+/// What a page is told: of these, text.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "tell", rename_all = "kebab-case")]
+pub enum Tell {
+    About(Box<About>),
+    /// How training goes.
+    Training(Value),
+    /// What was asked for cannot be had.
+    Sorry {
+        what: String,
+    },
+}
+
+/// What stands before a file in a message of bytes: how long this is, in four bytes, the least first, and this.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "file", rename_all = "kebab-case")]
+pub enum File {
+    /// A JPEG of what was asked for by `id`.
+    Picture {
+        id: u32,
+        #[serde(flatten)]
+        made: Made,
+    },
+    /// A PNG to keep.
+    Save { name: String },
+    /// A JPEG of the photograph of this number.
+    Photograph { number: usize },
+}
+
+/// How a picture was made.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Made {
+    /// How many times its size was halved; 0 is the whole.
+    pub halvings: u32,
+    /// How long it took.
+    pub milliseconds: f64,
+    /// The photograph that it is compared with, and their PSNR in dB, if it is.
+    pub compared: Option<(usize, f64)>,
+    /// The step of training.
+    pub step: u64,
+}
+
+impl File {
+    /// The message that has these bytes.
+    pub fn message(&self, bytes: &[u8]) -> Vec<u8> {
+        let head = serde_json::to_vec(self).unwrap_or_default();
+        [&(head.len() as u32).to_le_bytes(), &head[..], bytes].concat()
+    }
+}
+
+/// A photograph at this size, over a background.
+pub fn at_size(photo: &Photo, [width, height]: [usize; 2], background: [f32; 3]) -> Image {
+    let same = [photo.width, photo.height] == [width, height];
+    if same { photo.over(background) } else { photo.resized([width, height]).over(background) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_view_has_the_camera_that_is_asked_for() {
+        // Looks along +y from (0, -4, 1), half a unit to the right.
+        let pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 1.0]];
+        let camera = View::camera(&pose, 90.0, [40, 20]);
+        assert_eq!([camera.width, camera.height], [40, 20]);
+        assert!(camera.focal.iter().all(|focal| (focal - 10.0).abs() < 1e-12), "{camera:?}");
+        assert!(camera.ray(20.0, 10.0).direction.abs_diff_eq(DVec3::Y, 1e-12));
+        assert!(camera.ray(20.0, 0.0).direction.abs_diff_eq(DVec3::new(0.0, 0.5_f64.sqrt(), 0.5_f64.sqrt()), 1e-12));
+        let same = rows(&camera.pose).iter().flatten().zip(pose.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-12);
+        assert!(same, "{camera:?}");
+        // Three digits of a rotation are enough, and it is one.
+        let rough = [[0.866, -0.5, 0.0, 0.0], [0.5, 0.866, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let turn = View::camera(&rough, 50.0, [8, 8]).pose.matrix3;
+        assert!(
+            (turn.transpose() * turn).abs_diff_eq(DMat3::IDENTITY, 1e-12) && (turn.determinant() - 1.0).abs() < 1e-12
+        );
+    }
+
+    #[test]
+    fn a_file_comes_after_what_is_said_of_it() {
+        let message = File::Photograph { number: 3 }.message(&[9, 8]);
+        let length = u32::from_le_bytes(message[..4].try_into().unwrap()) as usize;
+        let head: Value = serde_json::from_slice(&message[4..4 + length]).unwrap();
+        assert_eq!(head, serde_json::json!({ "file": "photograph", "number": 3 }));
+        assert_eq!(message[4 + length..], [9, 8]);
+    }
+}

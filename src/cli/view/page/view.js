@@ -1,0 +1,652 @@
+// The page of `raygrad view`. Places are in the scene's own units, with z upwards; a pose has the camera's right, up and
+// back as columns.
+"use strict";
+
+const $ = (id) => document.getElementById(id);
+const stage = $("stage"), picture = $("picture"), photo = $("photo"), marks = $("marks");
+
+// ---- vectors ------------------------------------------------------------------------------------------------------
+const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+const times = (k, a) => [k * a[0], k * a[1], k * a[2]];
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const size = (a) => Math.hypot(a[0], a[1], a[2]);
+const unit = (a) => times(1 / (size(a) || 1), a);
+const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
+const radians = Math.PI / 180;
+
+/** A vector turned about a unit axis. */
+function turned(a, axis, angle) {
+  const [c, s] = [Math.cos(angle), Math.sin(angle)];
+  return add(add(times(c, a), times(s, cross(axis, a))), times((1 - c) * dot(axis, a), axis));
+}
+
+// ---- what the program says ------------------------------------------------------------------------------------------
+let about = null;
+let socket = null, attempts = 0;
+/** The picture that was asked for last, and the last that came. */
+let asked = 0, shown = null;
+let training = null;
+
+const view = { eye: [0, -4, 1], right: [1, 0, 0], up: [0, 0, 1], back: [0, -1, 0], pivot: [0, 0, 0], fov: 50, photograph: null };
+let keys = [];
+
+function connect() {
+  const address = new URL("messages" + location.search, location.href);
+  address.protocol = address.protocol.replace("http", "ws");
+  socket = new WebSocket(address);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => { attempts = 0; $("lost").hidden = true; };
+  socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
+  socket.onclose = (event) => {
+    $("lost").textContent = event.reason ? `The program has closed the connection: ${event.reason}. Trying again…`
+      : "The program does not answer. Trying again…";
+    $("lost").hidden = false;
+    attempts += 1;
+    setTimeout(connect, Math.min(5000, 250 * 2 ** attempts));
+  };
+}
+
+function say(message) {
+  if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+}
+
+function told(message) {
+  if (message.tell === "about") meet(message);
+  else if (message.tell === "training") follow(message);
+  else if (message.tell === "sorry") apologise(message.what);
+}
+
+function apologise(what) {
+  $("sorry").textContent = what;
+  $("sorry").hidden = false;
+  clearTimeout(apologise.timer);
+  apologise.timer = setTimeout(() => { $("sorry").hidden = true; }, 8000);
+}
+
+function brought(data) {
+  const length = new DataView(data).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const bytes = new Uint8Array(data, 4 + length);
+  if (head.file === "picture") {
+    say({ ask: "seen", id: head.id });
+    draw(head, new Blob([bytes], { type: "image/jpeg" }));
+  } else if (head.file === "save") {
+    keep(new Blob([bytes], { type: "image/png" }), head.name);
+  } else if (head.file === "photograph") {
+    overlay(head.number, new Blob([bytes], { type: "image/jpeg" }));
+  }
+}
+
+/** The scene, at first and after each time that the connection was lost. */
+function meet(message) {
+  const first = about === null;
+  about = message;
+  document.title = `${about.title} - raygrad`;
+  $("title").textContent = about.title;
+  $("photographs").hidden = about.photographs.length === 0;
+  $("training").hidden = !about.training;
+  const select = $("photograph");
+  select.replaceChildren(new Option("-", ""));
+  for (const split of ["train", "val", "test"]) {
+    const group = document.createElement("optgroup");
+    group.label = { train: "trained on", val: "validation", test: "test" }[split];
+    about.photographs.forEach((photograph, i) => {
+      if (photograph.split === split) group.append(new Option(photograph.name, String(i)));
+    });
+    if (group.children.length) select.append(group);
+  }
+  if (first) {
+    const hex = (x) => Math.round(255 * x).toString(16).padStart(2, "0");
+    $("background").value = "#" + about.background.map(hex).join("");
+    makeBox();
+    reset();
+  } else {
+    ask();
+  }
+}
+
+// ---- asking for pictures ----------------------------------------------------------------------------------------------
+let waits = false;
+
+/** Asks for the picture of what is to be seen, at most once a frame of the display. */
+function ask() {
+  marksOf();
+  if (waits || !about) return;
+  waits = true;
+  setTimeout(() => {
+    waits = false;
+    asked = (asked + 1) >>> 0;
+    say({ ask: "view", id: asked, view: wanted() });
+  }, 12);
+}
+
+function wanted() {
+  const [width, height] = sizes();
+  const eye = view.photograph === null
+    ? { free: { pose: rows(view), fov: view.fov } } : { photograph: view.photograph };
+  const answer = { eye, size: [width, height], show: mode(), exact: $("exact").checked };
+  if ($("own-background").checked) {
+    answer.background = [1, 3, 5].map((i) => parseInt($("background").value.slice(i, i + 2), 16));
+  }
+  if ($("crop").checked) answer.within = box();
+  return answer;
+}
+
+const mode = () => document.querySelector("input[name=show]:checked").value;
+const rows = (v) => [0, 1, 2].map((i) => [v.right[i], v.up[i], v.back[i], v.eye[i]]);
+
+function place(pose, fov) {
+  const column = (c) => [0, 1, 2].map((r) => pose[r][c]);
+  [view.right, view.up, view.back, view.eye] = [0, 1, 2, 3].map(column);
+  view.fov = fov;
+}
+
+/** Width and height of pictures. */
+function sizes() {
+  const area = stage.getBoundingClientRect();
+  const proportion = view.photograph === null ? area.width / area.height
+    : about.photographs[view.photograph].size[0] / about.photographs[view.photograph].size[1];
+  const high = $("size").value;
+  let height = high === "fit" ? area.height * Math.min(devicePixelRatio, 1.5) : Number(high);
+  if (proportion > area.width / area.height && high === "fit") height = (area.width * Math.min(devicePixelRatio, 1.5)) / proportion;
+  const most = Math.sqrt((1 << 22) / proportion);
+  height = clamp(Math.floor(Math.min(height, most)), 8, 4096);
+  return [clamp(Math.floor(height * proportion), 8, 4096), height];
+}
+
+/** The part of the stage that pictures fill. */
+function frame() {
+  const area = stage.getBoundingClientRect();
+  const [width, height] = shown && shown.size ? shown.size : sizes();
+  const share = Math.min(area.width / width, area.height / height);
+  const [w, h] = [width * share, height * share];
+  return { x: (area.width - w) / 2, y: (area.height - h) / 2, w, h };
+}
+
+let drawing = 0;
+async function draw(head, blob) {
+  const turn = ++drawing;
+  const bitmap = await createImageBitmap(blob);
+  // One that was decoded faster has come before.
+  if (turn < (draw.last || 0)) return;
+  draw.last = turn;
+  const whole = head.halvings === 0;
+  picture.width = bitmap.width;
+  picture.height = bitmap.height;
+  picture.getContext("2d").drawImage(bitmap, 0, 0);
+  shown = { ...head, size: [bitmap.width, bitmap.height], whole };
+  stage.dataset.shown = String(head.id);
+  stage.dataset.halvings = String(head.halvings);
+  stage.dataset.step = String(head.step);
+  layout();
+  let text = `${bitmap.width}×${bitmap.height}${whole ? "" : " (coarse)"} · ${head.milliseconds.toFixed(0)} ms`;
+  if (head.compared) {
+    const [number, psnr] = head.compared;
+    text += ` · against ${about.photographs[number].name}: ${psnr.toFixed(2)} dB`;
+  }
+  if (about.training) text += ` · step ${head.step}`;
+  $("status").textContent = text;
+}
+
+function layout() {
+  const { x, y, w, h } = frame();
+  for (const canvas of [picture, photo]) {
+    Object.assign(canvas.style, { left: `${x}px`, top: `${y}px`, width: `${w}px`, height: `${h}px` });
+  }
+  marksOf();
+}
+
+// ---- moving -------------------------------------------------------------------------------------------------------------
+function free() {
+  if (view.photograph === null) return;
+  view.photograph = null;
+  $("photograph").value = "";
+  $("blend").value = 0;
+  blend();
+}
+
+function orbit(dx, dy) {
+  free();
+  const turn = (axis, angle) => {
+    for (const name of ["right", "up", "back"]) view[name] = unit(turned(view[name], axis, angle));
+    view.eye = add(view.pivot, turned(sub(view.eye, view.pivot), axis, angle));
+  };
+  turn([0, 0, 1], -dx);
+  // Not over the poles, where left and right change places.
+  const height = Math.asin(clamp(view.back[2], -1, 1));
+  const upright = view.up[2] > 0;
+  turn(view.right, upright ? -clamp(dy, -1.5 - height, 1.5 - height) : -dy);
+  ask();
+}
+
+function pan(dx, dy) {
+  free();
+  const step = add(times(-dx, view.right), times(dy, view.up));
+  const reach = size(sub(view.eye, view.pivot)) * Math.tan(0.5 * view.fov * radians) * 2;
+  const moved = times(reach, step);
+  view.eye = add(view.eye, moved);
+  view.pivot = add(view.pivot, moved);
+  ask();
+}
+
+function zoom(factor) {
+  free();
+  const away = sub(view.eye, view.pivot);
+  view.eye = add(view.pivot, times(clamp(size(away) * factor, 1e-3 * side(), 100 * side()) / (size(away) || 1), away));
+  ask();
+}
+
+function fly(right, up, ahead) {
+  free();
+  const step = add(add(times(right, view.right), times(up, view.up)), times(-ahead, view.back));
+  const moved = times(0.25 * Math.max(0.2 * side(), size(sub(view.eye, view.pivot))), step);
+  view.eye = add(view.eye, moved);
+  view.pivot = add(view.pivot, moved);
+  ask();
+}
+
+const side = () => Math.max(...sub(about.bounds[1], about.bounds[0]));
+
+function reset() {
+  place(about.pose, about.fov);
+  view.pivot = times(0.5, add(about.bounds[0], about.bounds[1]));
+  view.photograph = null;
+  $("photograph").value = "";
+  $("fov").value = String(Math.round(view.fov));
+  photo.hidden = true;
+  $("blend").value = 0;
+  settled();
+}
+
+function settled() {
+  $("fov-out").textContent = `${view.fov.toFixed(0)}°`;
+  $("blend-out").textContent = `${$("blend").value} %`;
+  ask();
+}
+
+/** Pointers that are down, where they were last. */
+const pointers = new Map();
+stage.addEventListener("pointerdown", (event) => {
+  if (event.target.classList && event.target.classList.contains("handle")) return;
+  stage.setPointerCapture(event.pointerId);
+  pointers.set(event.pointerId, [event.clientX, event.clientY]);
+});
+stage.addEventListener("pointermove", (event) => {
+  const before = pointers.get(event.pointerId);
+  if (!before || !about) return;
+  const area = stage.getBoundingClientRect();
+  const [dx, dy] = [(event.clientX - before[0]) / area.height, (event.clientY - before[1]) / area.height];
+  if (pointers.size === 2) {
+    const other = [...pointers].find(([id]) => id !== event.pointerId)[1];
+    const distance = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+    const now = distance([event.clientX, event.clientY]);
+    if (now > 4) zoom(distance(before) / now);
+    pan(0.5 * dx, 0.5 * dy);
+  } else if (event.buttons & 2 || event.buttons & 4 || event.shiftKey) pan(dx, dy);
+  else orbit(3 * dx, 3 * dy);
+  pointers.set(event.pointerId, [event.clientX, event.clientY]);
+});
+for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
+  stage.addEventListener(name, (event) => pointers.delete(event.pointerId));
+}
+stage.addEventListener("contextmenu", (event) => event.preventDefault());
+stage.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  const lines = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
+  if (about) zoom(Math.exp(clamp(lines, -300, 300) * 0.0015));
+}, { passive: false });
+
+const modes = ["color", "depth", "normals", "opacity", "error"];
+document.addEventListener("keydown", (event) => {
+  if (!about || event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+  const step = 0.12;
+  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+  const flies = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, 1, 0], q: [0, -1, 0] }[event.key.toLowerCase()];
+  if (arrows && event.shiftKey) pan(0.3 * step * arrows[0], 0.3 * step * arrows[1]);
+  else if (arrows) orbit(step * arrows[0], step * arrows[1]);
+  else if (flies) fly(...flies.map((x) => 0.2 * x));
+  else if (event.key === "+" || event.key === "=") zoom(0.9);
+  else if (event.key === "-") zoom(1 / 0.9);
+  else if (event.key >= "1" && event.key <= "5") choose(modes[event.key - 1]);
+  else {
+    const buttons = { r: "reset", p: "save", n: "nearest", ",": "previous", ".": "next", k: "key" };
+    const button = buttons[event.key.toLowerCase()];
+    if (button) $(button).click();
+    else if (event.key === "c") { $("cameras").checked = !$("cameras").checked; marksOf(); }
+    else if (event.key === "b") { $("blend").value = Number($("blend").value) ? 0 : 50; blend(); }
+    else return;
+  }
+  event.preventDefault();
+});
+
+function choose(name) {
+  document.querySelector(`input[name=show][value=${name}]`).checked = true;
+  ask();
+}
+
+// ---- photographs ------------------------------------------------------------------------------------------------------------
+let overlaid = null;
+
+function goTo(number) {
+  if (!about.photographs[number]) return;
+  const photograph = about.photographs[number];
+  place(photograph.pose, clamp(photograph.fov, 5, 120));
+  view.photograph = number;
+  // What it looks at: as far as the middle of the scene, straight ahead.
+  const middle = times(0.5, add(about.bounds[0], about.bounds[1]));
+  const ahead = Math.max(0.05 * side(), dot(sub(view.eye, middle), view.back));
+  view.pivot = add(view.eye, times(-ahead, view.back));
+  $("photograph").value = String(number);
+  $("fov").value = String(Math.round(view.fov));
+  blend();
+  settled();
+}
+
+function nearest() {
+  const reach = Math.max(1e-6, size(sub(view.eye, view.pivot)));
+  const apart = ({ pose }) => size(sub([0, 1, 2].map((r) => pose[r][3]), view.eye)) / reach
+    + size(sub([0, 1, 2].map((r) => pose[r][2]), view.back));
+  let best = 0;
+  about.photographs.forEach((photograph, i) => { if (apart(photograph) < apart(about.photographs[best])) best = i; });
+  return best;
+}
+
+function blend() {
+  const share = Number($("blend").value) / 100;
+  $("blend-out").textContent = `${$("blend").value} %`;
+  if (share > 0 && view.photograph === null && about.photographs.length) return goTo(nearest());
+  photo.style.opacity = share;
+  photo.hidden = share === 0 || overlaid !== view.photograph;
+  if (share > 0 && overlaid !== view.photograph) say({ ask: "photograph", number: view.photograph });
+}
+
+async function overlay(number, blob) {
+  const bitmap = await createImageBitmap(blob);
+  photo.width = bitmap.width;
+  photo.height = bitmap.height;
+  photo.getContext("2d").drawImage(bitmap, 0, 0);
+  overlaid = number;
+  stage.dataset.photograph = String(number);
+  blend();
+}
+
+// ---- marks over the picture -----------------------------------------------------------------------------------------------
+/** Where a place is in the stage, or nothing if it is behind. */
+function project(point) {
+  const local = sub(point, view.eye);
+  const depth = -dot(local, view.back);
+  if (depth < 1e-3 * side()) return null;
+  const { x, y, w, h } = frame();
+  const focal = (0.5 * h) / Math.tan(0.5 * view.fov * radians);
+  return [x + 0.5 * w + (focal * dot(local, view.right)) / depth, y + 0.5 * h - (focal * dot(local, view.up)) / depth];
+}
+
+function path(points) {
+  let text = "", pen = "M";
+  for (const point of points) {
+    const at = point && project(point);
+    if (!at) { pen = "M"; continue; }
+    text += `${pen}${at[0].toFixed(1)} ${at[1].toFixed(1)}`;
+    pen = "L";
+  }
+  return text;
+}
+
+function frustum({ pose, fov, size: [width, height] }) {
+  const column = (c) => [0, 1, 2].map((r) => pose[r][c]);
+  const [right, up, back, eye] = [0, 1, 2, 3].map(column);
+  const deep = 0.06 * side();
+  const high = deep * Math.tan(0.5 * Math.min(fov, 120) * radians);
+  const wide = (high * width) / height;
+  const corner = (x, y) => add(add(eye, times(-deep, back)), add(times(x * wide, right), times(y * high, up)));
+  const corners = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
+  return path([...corners, corners[0], null, corners[0], eye, corners[1], null, corners[2], eye, corners[3]]);
+}
+
+function svg(name, attributes, parent) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  if (parent) parent.append(element);
+  return element;
+}
+
+function marksOf() {
+  if (!about) return;
+  marks.replaceChildren();
+  if ($("cameras").checked) {
+    about.photographs.forEach((photograph, i) => {
+      if (i !== view.photograph) svg("path", { d: frustum(photograph), class: `camera ${photograph.split}` }, marks);
+    });
+  }
+  if ($("points").checked) {
+    for (const [place, color] of about.points) {
+      const at = project(place);
+      if (at) svg("circle", { cx: at[0].toFixed(1), cy: at[1].toFixed(1), r: 1.5, fill: `rgb(${color})` }, marks);
+    }
+  }
+  if ($("crop").checked) boxMarks();
+  if (keys.length > 1) svg("path", { d: path(flight(64).map((key) => key.eye)), class: "path" }, marks);
+}
+
+// ---- crop box ---------------------------------------------------------------------------------------------------------------
+function makeBox() {
+  const [lower, upper] = about.bounds;
+  const holder = $("box");
+  holder.replaceChildren();
+  ["x", "y", "z"].forEach((name, axis) => {
+    holder.append(name);
+    [0, 1].forEach((end) => {
+      const input = document.createElement("input");
+      Object.assign(input, { type: "range", min: lower[axis], max: upper[axis], step: "any", value: [lower, upper][end][axis] });
+      input.id = `box-${name}-${end}`;
+      input.setAttribute("aria-label", `${end ? "upper" : "lower"} ${name}`);
+      input.addEventListener("input", ask);
+      holder.append(input);
+    });
+  });
+}
+
+function box() {
+  const end = (i) => ["x", "y", "z"].map((name) => Number($(`box-${name}-${i}`).value));
+  return [end(0), end(1)];
+}
+
+function boxMarks() {
+  const ends = box();
+  const corner = (i) => [ends[i & 1][0], ends[(i >> 1) & 1][1], ends[(i >> 2) & 1][2]];
+  for (let i = 0; i < 8; i++) {
+    for (const bit of [1, 2, 4]) {
+      if (!(i & bit)) svg("path", { d: path([corner(i), corner(i | bit)]), class: "box" }, marks);
+    }
+  }
+  const middle = times(0.5, add(...ends));
+  for (const axis of [0, 1, 2]) {
+    for (const end of [0, 1]) {
+      const place = [...middle];
+      place[axis] = ends[end][axis];
+      const at = project(place);
+      if (at) {
+        const handle = svg("circle", { cx: at[0], cy: at[1], r: 7, class: "handle" }, marks);
+        handle.addEventListener("pointerdown", (event) => dragFace(event, axis, end));
+      }
+    }
+  }
+}
+
+/** Moves a side of the box along its axis, as the pointer does in the picture. */
+function dragFace(down, axis, end) {
+  down.preventDefault();
+  down.stopPropagation();
+  const input = $(`box-${"xyz"[axis]}-${end}`);
+  const ends = box();
+  const place = times(0.5, add(...ends));
+  place[axis] = ends[end][axis];
+  const beyond = [...place];
+  const small = 1e-3 * side();
+  beyond[axis] += small;
+  const [a, b] = [project(place), project(beyond)];
+  if (!a || !b) return;
+  const along = [(b[0] - a[0]) / small, (b[1] - a[1]) / small];
+  const square = along[0] ** 2 + along[1] ** 2;
+  const from = Number(input.value);
+  const move = (event) => {
+    const moved = ((event.clientX - down.clientX) * along[0] + (event.clientY - down.clientY) * along[1]) / (square || 1);
+    const other = Number($(`box-${"xyz"[axis]}-${1 - end}`).value);
+    const value = from + moved;
+    input.value = String(end ? Math.max(value, other) : Math.min(value, other));
+    ask();
+  };
+  const up = () => { removeEventListener("pointermove", move); removeEventListener("pointerup", up); };
+  addEventListener("pointermove", move);
+  addEventListener("pointerup", up);
+}
+
+// ---- camera paths -----------------------------------------------------------------------------------------------------------
+const snapshot = () => ({ eye: [...view.eye], right: [...view.right], up: [...view.up], back: [...view.back], fov: view.fov, pivot: [...view.pivot] });
+
+function listKeys() {
+  const list = $("keys");
+  list.replaceChildren();
+  keys.forEach((key, i) => {
+    const item = document.createElement("li");
+    const go = document.createElement("button"), drop = document.createElement("button");
+    go.textContent = "go to";
+    go.setAttribute("aria-label", `Go to key frame ${i + 1}`);
+    go.addEventListener("click", () => { free(); Object.assign(view, structuredClone(key)); settled(); });
+    drop.textContent = "remove";
+    drop.setAttribute("aria-label", `Remove key frame ${i + 1}`);
+    drop.addEventListener("click", () => { keys.splice(i, 1); listKeys(); ask(); });
+    item.append(go, drop);
+    list.append(item);
+  });
+}
+
+/** The path through the key frames: a Catmull-Rom spline, to look at. */
+function flight(count) {
+  const n = keys.length, closed = $("closed").checked;
+  if (n < 2) return keys;
+  const legs = closed ? n : n - 1;
+  const at = (i) => keys[closed ? (i + n) % n : clamp(i, 0, n - 1)];
+  const mix = (name, i, t) => [0, 1, 2].map((axis) => {
+    const [a, b, c, d] = [at(i - 1), at(i), at(i + 1), at(i + 2)].map((key) => key[name][axis]);
+    return b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)));
+  });
+  return Array.from({ length: count }, (_, f) => {
+    const place = (f / Math.max(1, closed ? count : count - 1)) * legs;
+    const i = Math.min(legs - 1, Math.floor(place)), t = place - i;
+    const back = unit(mix("back", i, t));
+    const right = unit(cross(mix("up", i, t), back));
+    return { eye: mix("eye", i, t), back, right, up: cross(back, right), fov: at(i).fov + t * (at(i + 1).fov - at(i).fov), pivot: mix("pivot", i, t) };
+  });
+}
+
+function play() {
+  if (keys.length < 2) return apologise("A path needs two key frames.");
+  free();
+  const seconds = Number($("seconds").value) || 4, start = performance.now();
+  const frames = flight(Math.ceil(60 * seconds));
+  const next = (now) => {
+    const share = (now - start) / 1000 / seconds;
+    Object.assign(view, structuredClone(frames[Math.min(frames.length - 1, Math.floor(share * frames.length))]));
+    ask();
+    if (share < 1) requestAnimationFrame(next);
+  };
+  requestAnimationFrame(next);
+}
+
+/** A pose in the coordinates of the capture's files. */
+function inCapture(key) {
+  const to = about.to_capture;
+  const scale = Math.hypot(to[0][0], to[1][0], to[2][0]);
+  const turn = (a) => [0, 1, 2].map((r) => (to[r][0] * a[0] + to[r][1] * a[1] + to[r][2] * a[2]) / scale);
+  const [right, up, back] = [turn(key.right), turn(key.up), turn(key.back)];
+  const eye = [0, 1, 2].map((r) => dot(to[r], key.eye) + to[r][3]);
+  return [0, 1, 2].flatMap((r) => [right[r], up[r], back[r], eye[r]]).concat([0, 0, 0, 1]);
+}
+
+function savePath() {
+  if (keys.length < 2) return apologise("A path needs two key frames.");
+  const [width, height] = about.size;
+  const seconds = Number($("seconds").value) || 4;
+  const text = JSON.stringify({
+    keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
+    camera_type: "perspective",
+    render_width: width,
+    render_height: height,
+    is_cycle: $("closed").checked,
+    seconds,
+    fps: 25,
+    smoothness_value: 0,
+    camera_path: [],
+  }, null, 1);
+  keep(new Blob([text], { type: "application/json" }), "path.json");
+}
+
+function keep(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+// ---- training -----------------------------------------------------------------------------------------------------------------
+function follow(message) {
+  training = message;
+  const { step, loss, psnr, left, paused, share, ended } = message;
+  $("progress").textContent = ended ? `ended after ${step} steps: ${ended}`
+    : `step ${step} · loss ${loss.toPrecision(3)} · PSNR ${psnr.toFixed(2)} dB · ${paused ? "paused" : `${left} left`}`;
+  $("pause").textContent = paused ? "Go on" : "Pause";
+  $("pause").setAttribute("aria-pressed", String(Boolean(paused)));
+  for (const id of ["pause", "stop", "share"]) $(id).disabled = Boolean(ended);
+  if (document.activeElement !== $("share")) $("share").value = String(100 * share);
+  $("share-out").textContent = `${Math.round(100 * share)} %`;
+  curve("curve-loss", "loss", message.curves.loss, true);
+  curve("curve-psnr", "PSNR", message.curves.psnr, false);
+  curve("curve-speed", "rays/s", message.curves.speed, false);
+}
+
+function curve(id, name, values, logarithmic) {
+  const holder = $(id);
+  const [width, height] = [holder.clientWidth || 260, 54];
+  const known = values.filter((value) => Number.isFinite(value) && (!logarithmic || value > 0));
+  holder.replaceChildren();
+  if (known.length < 1) return;
+  const scale = logarithmic ? Math.log : (x) => x;
+  const [low, high] = [Math.min(...known), Math.max(...known)].map(scale);
+  const points = known.map((value, i) => {
+    const x = (i / Math.max(1, known.length - 1)) * (width - 4) + 2;
+    const y = height - 4 - ((scale(value) - low) / (high - low || 1)) * (height - 22);
+    return `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`;
+  });
+  svg("path", { d: points.join("") }, holder);
+  const last = known[known.length - 1];
+  svg("text", { x: 4, y: 12 }, holder).textContent = `${name} ${last >= 1000 ? Math.round(last).toLocaleString("en") : last.toPrecision(4)}`;
+}
+
+// ---- controls -----------------------------------------------------------------------------------------------------------------
+for (const input of document.querySelectorAll("input[name=show], #exact, #own-background, #size, #crop")) {
+  input.addEventListener("change", () => { $("box").hidden = !$("crop").checked; ask(); });
+}
+$("background").addEventListener("input", () => { $("own-background").checked = true; ask(); });
+$("fov").addEventListener("input", () => { free(); view.fov = Number($("fov").value); settled(); });
+$("blend").addEventListener("input", blend);
+for (const id of ["cameras", "points", "closed"]) $(id).addEventListener("change", () => { marksOf(); });
+$("reset").addEventListener("click", reset);
+$("save").addEventListener("click", () => say({ ask: "save", view: wanted() }));
+$("photograph").addEventListener("change", () => ($("photograph").value === "" ? free() : goTo(Number($("photograph").value))));
+const count = () => about.photographs.length;
+$("next").addEventListener("click", () => goTo(view.photograph === null ? nearest() : (view.photograph + 1) % count()));
+$("previous").addEventListener("click", () => goTo(view.photograph === null ? nearest() : (view.photograph + count() - 1) % count()));
+$("nearest").addEventListener("click", () => goTo(nearest()));
+$("key").addEventListener("click", () => { keys.push(snapshot()); listKeys(); marksOf(); });
+$("play").addEventListener("click", play);
+$("save-path").addEventListener("click", savePath);
+$("pause").addEventListener("click", () => say({ ask: "pause", pause: !(training && training.paused) }));
+$("stop").addEventListener("click", () => { if (confirm("End training here and save what it has found?")) say({ ask: "stop" }); });
+$("share").addEventListener("input", () => say({ ask: "share", share: Number($("share").value) / 100 }));
+new ResizeObserver(() => { if (about) { layout(); ask(); } }).observe(stage);
+
+connect();

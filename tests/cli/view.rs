@@ -1,0 +1,486 @@
+//! The page of `raygrad view` and `raygrad train --view`, as another program sees it.
+
+use std::collections::VecDeque;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::process::{Child, Stdio};
+use std::time::{Duration, Instant};
+
+use super::resume::{SMALL, assert_same};
+use super::{Place, SIZE, png};
+use raygrad::nerf::Image;
+use raygrad::nerf::pictures::metrics::psnr;
+use serde_json::{Value, json};
+use tungstenite::handshake::client::generate_key;
+use tungstenite::http::Request;
+use tungstenite::stream::MaybeTlsStream;
+use tungstenite::{Message, WebSocket};
+
+/// A program that serves a page; it ends with this.
+pub struct Server {
+    pub child: Child,
+    pub address: String,
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Starts it, and reads its link.
+pub fn serve(place: &Place, arguments: &str) -> Server {
+    let mut child = place.command(arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    let mut out = BufReader::new(child.stdout.take().unwrap());
+    let mut line = String::new();
+    while !line.starts_with("view ") {
+        line.clear();
+        assert!(out.read_line(&mut line).unwrap() > 0, "it has ended without a link");
+    }
+    // What else it prints has a reader.
+    std::thread::spawn(move || std::io::copy(&mut out, &mut std::io::sink()));
+    let address = line.split("http://").nth(1).unwrap().trim().trim_end_matches('/').to_owned();
+    Server { child, address }
+}
+
+/// What a request by hand is answered: status, head and body.
+fn request(address: &str, head: &str) -> (u16, String, String) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.write_all(format!("{head}\r\nConnection: close\r\n\r\n").as_bytes()).unwrap();
+    let mut answer = String::new();
+    stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+    stream.read_to_string(&mut answer).unwrap();
+    let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
+    (head.split(' ').nth(1).unwrap().parse().unwrap(), head.to_lowercase(), body.to_owned())
+}
+
+/// A page without a browser.
+struct Page {
+    socket: WebSocket<MaybeTlsStream<TcpStream>>,
+    /// What came and was not asked for yet.
+    texts: VecDeque<Value>,
+    files: VecDeque<(Value, Vec<u8>)>,
+}
+
+impl Page {
+    fn open(address: &str) -> (Self, Value) {
+        let request = Request::builder().uri(format!("ws://{address}/messages"));
+        let request = request.header("Host", address).header("Origin", format!("http://{address}"));
+        let request = request.header("Connection", "Upgrade").header("Upgrade", "websocket");
+        let request = request.header("Sec-WebSocket-Version", "13").header("Sec-WebSocket-Key", generate_key());
+        let (socket, _) = tungstenite::connect(request.body(()).unwrap()).unwrap();
+        if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
+            stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        }
+        let mut page = Page { socket, texts: VecDeque::new(), files: VecDeque::new() };
+        let about = page.text("about");
+        (page, about)
+    }
+
+    fn say(&mut self, message: Value) {
+        self.socket.send(Message::text(message.to_string())).unwrap();
+    }
+
+    /// Reads one message; says why it was closed if it was.
+    fn read(&mut self) -> Result<(), String> {
+        match self.socket.read() {
+            Ok(Message::Text(text)) => self.texts.push_back(serde_json::from_str(&text).unwrap()),
+            Ok(Message::Binary(bytes)) => {
+                let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
+                let head: Value = serde_json::from_slice(&bytes[4..4 + length]).unwrap();
+                if head["file"] == "picture" {
+                    self.say(json!({ "ask": "seen", "id": head["id"] }));
+                }
+                self.files.push_back((head, bytes[4 + length..].to_vec()));
+            }
+            Ok(Message::Close(frame)) => return Err(frame.map_or(String::new(), |frame| frame.reason.to_string())),
+            Ok(_) => (),
+            Err(error) => return Err(error.to_string()),
+        }
+        Ok(())
+    }
+
+    fn text(&mut self, kind: &str) -> Value {
+        loop {
+            while let Some(text) = self.texts.pop_front() {
+                if text["tell"] == kind {
+                    return text;
+                }
+            }
+            self.read().unwrap();
+        }
+    }
+
+    fn file(&mut self, kind: &str) -> (Value, Vec<u8>) {
+        loop {
+            while let Some(file) = self.files.pop_front() {
+                if file.0["file"] == kind {
+                    return file;
+                }
+            }
+            self.read().unwrap();
+        }
+    }
+
+    /// The pictures of a view from coarse to whole, and what was said of them.
+    fn look(&mut self, id: u32, view: &Value) -> Vec<(Value, Image)> {
+        self.say(json!({ "ask": "view", "id": id, "view": view }));
+        let mut pictures = vec![];
+        loop {
+            let (head, bytes) = self.file("picture");
+            if head["id"] == id {
+                let whole = head["halvings"] == 0;
+                pictures.push((head, decoded(&bytes)));
+                if whole {
+                    return pictures;
+                }
+            }
+        }
+    }
+
+    /// Why the program ends the connection.
+    fn closed(&mut self) -> String {
+        loop {
+            if let Err(reason) = self.read() {
+                return reason;
+            }
+        }
+    }
+}
+
+fn decoded(bytes: &[u8]) -> Image {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("picture");
+    std::fs::write(&path, bytes).unwrap();
+    png(&path)
+}
+
+/// With a run that pictures are quick of.
+fn trained() -> Place {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 60 --out run {SMALL}"));
+    place
+}
+
+/// From where the scene is seen at first.
+fn first(about: &Value, size: [usize; 2]) -> Value {
+    json!({ "eye": { "free": { "pose": about["pose"], "fov": about["fov"] } }, "size": size })
+}
+
+#[test]
+fn what_a_page_shows_is_what_the_program_renders() {
+    let place = trained();
+    place.succeeds("render run --frames 1 --size 96x96 --out seen");
+    let expected = png(&place.path("seen/0000.png"));
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    assert_eq!(json!([about["title"], about["training"], about["size"]]), json!(["run", false, [SIZE, SIZE]]));
+    let names: Vec<_> = about["photographs"].as_array().unwrap().iter().map(|p| p["name"].clone()).collect();
+    assert_eq!(names.len(), 11);
+    assert_eq!(json!([names[0], names[6], names[8]]), json!(["train/r_0", "val/r_0", "test/r_0"]));
+    let view = first(&about, [96, 96]);
+    let pictures = page.look(7, &view);
+    let (head, whole) = pictures.last().unwrap();
+    assert!(psnr(whole, &expected) > 40.0, "{}", psnr(whole, &expected));
+    assert!(head["milliseconds"].as_f64().unwrap() > 0.0 && head["compared"].is_null());
+    // Coarse pictures are of the same, each half as large as the next.
+    for pair in pictures.windows(2) {
+        assert_eq!(pair[0].1.width, pair[1].1.width.div_ceil(2));
+    }
+    // Nobody else has to wait for what was painted.
+    let (mut other, _) = Page::open(&server.address);
+    assert_eq!(other.look(1, &view)[0].1, *whole);
+    let shows = ["depth", "normals", "opacity"].map(|show| {
+        place.succeeds(&format!("render run --frames 1 --size 96x96 --show {show} --out {show}"));
+        let mut view = view.clone();
+        view["show"] = json!(show);
+        let seen = page.look(8, &view).pop().unwrap().1;
+        let expected = png(&place.path(&format!("{show}/0000.png")));
+        let expected = if expected.channels == 1 {
+            Image { channels: 3, data: expected.data.iter().flat_map(|x| [*x; 3]).collect(), ..expected }
+        } else {
+            expected
+        };
+        // Colours of a model of few steps jump from pixel to pixel, which JPEG does not like.
+        assert!(psnr(&seen, &expected) > 30.0, "{show}: {}", psnr(&seen, &expected));
+        seen
+    });
+    assert!(shows[0] != shows[1] && shows[1] != shows[2]);
+    // A box, a background.
+    let mut cropped = view.clone();
+    cropped["within"] = json!([[50.0, 50.0, 50.0], [51.0, 51.0, 51.0]]);
+    cropped["background"] = json!([0, 0, 255]);
+    let nothing = page.look(9, &cropped).pop().unwrap().1;
+    assert!(nothing.data.chunks(3).all(|pixel| pixel[2] > 0.97 && pixel[0] < 0.03), "blue");
+    // What is kept is exact.
+    page.say(json!({ "ask": "save", "view": view }));
+    let (head, bytes) = page.file("save");
+    assert_eq!(head["name"], "view.png");
+    assert_eq!(decoded(&bytes), expected);
+}
+
+#[test]
+fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
+    let place = trained();
+    place.succeeds("eval run --split val");
+    let scores = place.json("run/eval-val-fast.json");
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    let view = json!({ "eye": { "photograph": 7 }, "size": [SIZE, SIZE], "show": "error" });
+    let (head, _) = page.look(1, &view).pop().unwrap();
+    assert_eq!(head["compared"][0], 7);
+    let [seen, expected] = [&head["compared"][1], &scores["per_view"][1]["psnr"]].map(|x| x.as_f64().unwrap());
+    assert!((seen - expected).abs() < 0.01, "{seen} {expected}");
+    // One is not made larger to be compared, and shown whole beside others.
+    let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90], "show": "error" });
+    let (head, picture) = page.look(3, &large).pop().unwrap();
+    assert_eq!([picture.width, picture.height], [SIZE, SIZE]);
+    assert!((head["compared"][1].as_f64().unwrap() - expected).abs() < 0.01);
+    let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90] });
+    let picture = page.look(4, &large).pop().unwrap().1;
+    assert_eq!([picture.width, picture.height], [90, 90]);
+    // From elsewhere, the nearest.
+    let mut near = view.clone();
+    near["eye"] = json!({ "free": { "pose": about["photographs"][4]["pose"], "fov": 30.0 } });
+    assert_eq!(page.look(2, &near).pop().unwrap().0["compared"][0], 4);
+    page.say(json!({ "ask": "photograph", "number": 3 }));
+    let (head, bytes) = page.file("photograph");
+    let photograph = png(&place.path("scene/train/r_3.png")).over([1.0; 3]);
+    assert!(head["number"] == 3 && psnr(&decoded(&bytes), &photograph) > 30.0);
+    page.say(json!({ "ask": "photograph", "number": 99 }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("no photograph 99"));
+    // Without them the rest is there.
+    std::fs::rename(place.path("scene"), place.path("gone")).unwrap();
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    assert_eq!(about["photographs"], json!([]));
+    assert_eq!(page.look(1, &view).pop().unwrap().0["compared"], Value::Null);
+    page.say(json!({ "ask": "photograph", "number": 0 }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("not known"));
+}
+
+#[test]
+fn nobody_from_elsewhere_is_served_and_nothing_but_the_page() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let address = &server.address;
+    let port = address.rsplit(':').next().unwrap();
+    let (status, head, body) = request(address, &format!("GET / HTTP/1.1\r\nHost: {address}"));
+    assert!(status == 200 && body.contains("<title>raygrad</title>"), "{head}");
+    for header in
+        ["content-security-policy: default-src 'none'", "x-frame-options: deny", "nosniff", "same-origin", "no-store"]
+    {
+        assert!(head.contains(header), "{header}: {head}");
+    }
+    // Nothing on it is from elsewhere.
+    for file in ["/", "/view.css", "/view.js"] {
+        let (status, _, body) = request(address, &format!("GET {file} HTTP/1.1\r\nHost: localhost:{port}"));
+        let foreign = body.replace("http://www.w3.org/2000/svg", "");
+        assert!(status == 200 && !foreign.contains("//www") && !foreign.contains("https:"), "{file}");
+    }
+    for (head, expected) in [
+        (format!("GET / HTTP/1.1\r\nHost: evil.example:{port}"), 421),
+        ("GET / HTTP/1.1\r\nHost: ".to_owned(), 421),
+        (format!("GET /view.js HTTP/1.1\r\nHost: 127.0.0.1.evil.example:{port}"), 421),
+        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example"), 403),
+        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: null"), 403),
+        (format!("POST / HTTP/1.1\r\nHost: {address}\r\nContent-Length: 0"), 405),
+        (format!("GET /../Cargo.toml HTTP/1.1\r\nHost: {address}"), 404),
+        (format!("GET /..%2f..%2fetc/passwd HTTP/1.1\r\nHost: {address}"), 404),
+        (format!("GET //etc/passwd HTTP/1.1\r\nHost: {address}"), 404),
+        (format!("GET /config.json HTTP/1.1\r\nHost: {address}"), 404),
+        (format!("GET /messages HTTP/1.1\r\nHost: {address}"), 400),
+    ] {
+        let (status, _, body) = request(address, &head);
+        assert!(status == expected && !body.contains("root:"), "{head}: {status}");
+    }
+    let upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==";
+    for origin in ["", "\r\nOrigin: http://evil.example", "\r\nOrigin: http://127.0.0.1:1", "\r\nOrigin: null"] {
+        let mut stream = TcpStream::connect(address).unwrap();
+        write!(stream, "GET /messages HTTP/1.1\r\nHost: {address}{origin}\r\n{upgrade}\r\n\r\n").unwrap();
+        let mut start = [0; 12];
+        stream.read_exact(&mut start).unwrap();
+        assert_eq!(&start, b"HTTP/1.1 403", "{origin}");
+    }
+    // A port that is taken is named.
+    place.fails(&format!("view run --port {port}"), &["`host`", port, "cannot be used"]);
+    place.fails("view run --host nowhere.invalid", &["`host`", "nowhere.invalid"]);
+    place.fails("train scene --steps 1 --out other --port 1", &["`host`", "without --view"]);
+    place.fails("view absent", &["absent", "no such folder"]);
+}
+
+#[test]
+fn others_come_with_the_token_alone() {
+    let place = trained();
+    let server = serve(&place, "view run --host 0.0.0.0");
+    let (host, token) = server.address.split_once("/?token=").unwrap();
+    assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
+    let address = host.replace("0.0.0.0", "127.0.0.1");
+    let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
+    assert_eq!(status(&format!("/?token={token}")), 200);
+    for path in ["/", "/?token=", "/?token=0123", &format!("/?token={}", token.to_uppercase() + "0")] {
+        assert_eq!(status(path), 403, "{path}");
+    }
+    let upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==";
+    for (query, expected) in [("", "403"), ("?token=1", "403"), (&*format!("?token={token}"), "101")] {
+        let mut stream = TcpStream::connect(&address).unwrap();
+        write!(
+            stream,
+            "GET /messages{query} HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\n{upgrade}\r\n\r\n"
+        )
+        .unwrap();
+        let mut start = [0; 12];
+        stream.read_exact(&mut start).unwrap();
+        assert!(start.ends_with(expected.as_bytes()), "{query}");
+    }
+}
+
+#[test]
+fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let (mut good, about) = Page::open(&server.address);
+    let view = first(&about, [16, 16]);
+    let changed = |name: &str, value: Value| {
+        let mut view = view.clone();
+        view[name] = value;
+        json!({ "ask": "view", "id": 1, "view": view }).to_string()
+    };
+    let pose = |pose: Value| changed("eye", json!({ "free": { "pose": pose, "fov": 50 } }));
+    let messages = [
+        String::new(),
+        "{".into(),
+        "[]".into(),
+        "null".into(),
+        json!({ "ask": "everything" }).to_string(),
+        json!({ "ask": "view", "id": -1, "view": view }).to_string(),
+        json!({ "ask": "view", "id": 1, "view": view, "more": 1 }).to_string(),
+        json!({ "ask": "share", "share": 0.95 }).to_string(),
+        json!({ "ask": "share", "share": null }).to_string(),
+        json!({ "ask": "photograph", "number": -3 }).to_string(),
+        changed("size", json!([0, 16])),
+        changed("size", json!([4097, 1])),
+        changed("size", json!([4096, 4096])),
+        changed("size", json!([4294967295_u32, 4294967295_u32])),
+        changed("show", json!("secrets")),
+        changed("background", json!([0, 0, 256])),
+        changed("within", json!([[0, 0, 0], [1, 1, 1e10]])),
+        changed("within", json!([[0, 0, 0]])),
+        changed("eye", json!({ "free": { "pose": about["pose"], "fov": 171 } })),
+        changed("eye", json!({ "photograph": -1 })),
+        changed("eye", json!({})),
+        pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0]])),
+        pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])),
+        pose(json!([[1, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0]])),
+        pose(json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]])),
+        "[".repeat(10_000),
+    ];
+    for message in messages {
+        let (mut page, _) = Page::open(&server.address);
+        page.socket.send(Message::text(message.clone())).unwrap();
+        let reason = page.closed();
+        assert!(!reason.is_empty() && reason.len() <= 123, "{message}: {reason}");
+    }
+    for bytes in [Message::binary(vec![1, 2, 3]), Message::text("x".repeat(1 << 15))] {
+        let (mut page, _) = Page::open(&server.address);
+        page.socket.send(bytes).unwrap();
+        assert!(!page.closed().is_empty());
+    }
+    // Nor do very many.
+    let (mut page, _) = Page::open(&server.address);
+    for _ in 0..1000 {
+        if page.socket.send(Message::text(json!({ "ask": "seen", "id": 0 }).to_string())).is_err() {
+            break;
+        }
+    }
+    page.closed();
+    // A photograph of no such number is seen from somewhere, and the other page is still served.
+    assert_eq!(good.look(5, &json!({ "eye": { "photograph": 4000 }, "size": [16, 16] })).pop().unwrap().0["id"], 5);
+    assert_eq!(good.look(6, &view).pop().unwrap().0["id"], 6);
+}
+
+#[test]
+fn the_newest_camera_wins_and_a_page_that_takes_nothing_is_dropped() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    let mut view = first(&about, [300, 300]);
+    // All but the last of many are hardly painted.
+    for id in 1..=100 {
+        view["eye"]["free"]["pose"][0][3] = json!(0.01 * f64::from(id));
+        page.say(json!({ "ask": "view", "id": id, "view": view }));
+    }
+    let mut pictures = 0;
+    loop {
+        let (head, _) = page.file("picture");
+        pictures += 1;
+        if head["id"] == 100 && head["halvings"] == 0 {
+            break;
+        }
+        assert!(head["id"] == 100 || head["halvings"] != 0, "{head}");
+    }
+    assert!(pictures < 60, "{pictures}");
+    // One that never says that it has seen a picture.
+    let (mut silent, _) = Page::open(&server.address);
+    silent.say(json!({ "ask": "view", "id": 1, "view": view }));
+    let start = Instant::now();
+    let mut got = 0;
+    let reason = loop {
+        match silent.socket.read() {
+            Ok(Message::Binary(_)) => got += 1,
+            Ok(Message::Close(frame)) => break frame.unwrap().reason.to_string(),
+            Ok(_) => (),
+            Err(error) => break error.to_string(),
+        }
+    };
+    assert!(got == 1 && reason.contains("not taken"), "{got} {reason}");
+    assert!((5..60).contains(&start.elapsed().as_secs()));
+}
+
+#[test]
+fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 60 --out whole {SMALL}"));
+    let mut server = serve(&place, &format!("train scene --steps 60 --view --out run {SMALL}"));
+    let (mut page, about) = Page::open(&server.address);
+    assert_eq!(about["training"], true);
+    page.say(json!({ "ask": "pause", "pause": true }));
+    while page.text("training")["paused"] != true {}
+    let view = first(&about, [32, 32]);
+    let (head, _) = page.look(1, &view).pop().unwrap();
+    let held = head["step"].as_u64().unwrap();
+    page.texts.clear();
+    assert_eq!(page.text("training")["step"], held, "it waits");
+    page.say(json!({ "ask": "share", "share": 0.5 }));
+    while page.text("training")["share"] != 0.5 {}
+    page.say(json!({ "ask": "pause", "pause": false }));
+    // It is seen again as it learns, until it has ended.
+    let ended = loop {
+        let told = page.text("training");
+        if !told["ended"].is_null() {
+            break told;
+        }
+    };
+    assert_eq!(json!([ended["step"], ended["ended"]]), json!([60, "done"]));
+    assert!(ended["curves"]["loss"].as_array().unwrap().len() > 10, "{ended}");
+    assert_eq!(server.child.wait().unwrap().code(), Some(0));
+    assert_same(&place, "whole", "run");
+
+    // Ended from the page, it can be gone on with.
+    let mut server = serve(&place, &format!("train scene --steps 60 --view --out other {SMALL}"));
+    let (mut page, _) = Page::open(&server.address);
+    page.say(json!({ "ask": "pause", "pause": true }));
+    while page.text("training")["paused"] != true {}
+    page.say(json!({ "ask": "stop" }));
+    let ended = loop {
+        let told = page.text("training");
+        if !told["ended"].is_null() {
+            break told;
+        }
+    };
+    assert!(ended["step"].as_u64().unwrap() < 60 && ended["ended"] == "stopped, and saved", "{ended}");
+    assert_eq!(server.child.wait().unwrap().code(), Some(0));
+    place.succeeds("train --resume other");
+    assert_same(&place, "whole", "other");
+}
