@@ -25,7 +25,7 @@ use super::progress::spoken;
 use super::run::{Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::summary::Ended;
-use super::view::{PlaceArgs, Window};
+use super::view::{Listener, PlaceArgs, Window};
 use super::watch::Watch;
 use super::{checkpoint, doctor, interrupt, machine, memory, parse, watch};
 
@@ -165,16 +165,18 @@ impl Trained {
 /// Trains and leaves the model in a new folder, or goes on with a run.
 pub fn run(args: &Args) -> Result<Trained> {
     if !args.view && args.place.are_given() {
-        return Err(Error::setting("host", "with --port has no meaning without --view"));
+        return Err(Error::setting("view", "is what --host and --port are for: say it too"));
     }
+    // Before anything is made that would have to go again.
+    let listener = args.view.then(|| args.place.listen()).transpose()?;
     match &args.resume {
-        None => begin(args),
-        Some(folder) => resume(args, folder),
+        None => begin(args, listener),
+        Some(folder) => resume(args, folder, listener),
     }
 }
 
 /// Trains a new run.
-fn begin(args: &Args) -> Result<Trained> {
+fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
     let mut scene = args.scene.open(args.scope)?;
     scene.depth = args.depth.is_some() || args.term.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0);
@@ -193,11 +195,11 @@ fn begin(args: &Args) -> Result<Trained> {
     doctor::warn(&scene);
 
     let preview = Preview::choose(&scene, args.downscale, &data, background);
-    train((run, lock), trainer, args.budget(), args, preview)
+    train((run, lock), trainer, args.budget(), args, preview, listener)
 }
 
 /// Goes on with a run from its last checkpoint.
-fn resume(args: &Args, folder: &Path) -> Result<Trained> {
+fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trained> {
     let mut run = Run::open(folder)?;
     let RunConfig { extent, downscale, config, .. } = run.config.clone();
     let budget = match (args.given(), run.config.budget) {
@@ -226,7 +228,7 @@ fn resume(args: &Args, folder: &Path) -> Result<Trained> {
     describe(&run, &trainer, &data, &scene)?;
     print(&format!("from     step {}\n", trainer.stats().step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
-    train((run, lock), trainer, budget, args, preview)
+    train((run, lock), trainer, budget, args, preview, listener)
 }
 
 /// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
@@ -236,8 +238,9 @@ fn train(
     budget: Budget,
     args: &Args,
     preview: Preview,
+    listener: Option<Listener>,
 ) -> Result<Trained> {
-    let mut window = args.view.then(|| Window::open(&args.place, &run, &trainer)).transpose()?;
+    let mut window = listener.map(|listener| Window::open(listener, &run, &trainer)).transpose()?;
     let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
     let (mut diverged, mut ended_by_page) = (None, false);

@@ -39,12 +39,12 @@ impl<T: Scalar> Model<T> {
     pub fn normals_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Image> {
         let mut image = Image::new(camera.width, camera.height, 3);
         let out = image.data.par_chunks_mut(3 * TILE);
-        let see = |pool: &mut Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, pool, out);
+        let see = |pool: &mut Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, viewing, pool, out);
         self.tiles(camera, viewing, TILE, out, see)?;
         Some(image)
     }
 
-    fn normals_along(&self, rays: &Rays<T>, pool: &Pool<T>, out: &mut [f32]) -> Evaluations {
+    fn normals_along(&self, rays: &Rays<T>, viewing: &Viewing<'_>, pool: &Pool<T>, out: &mut [f32]) -> Evaluations {
         let tape = Tape::with_pool(pool.clone());
         let params = self.params.bind_constant(&tape);
         let query = Query::new(&*self.field, &params);
@@ -52,7 +52,7 @@ impl<T: Scalar> Model<T> {
         if sampled.steps.is_empty() {
             return sampled.evaluations;
         }
-        let termination = self.sampler.limits().termination.into();
+        let termination = viewing.limits.unwrap_or_else(|| self.sampler.limits()).termination.into();
         let query = Query { slopes: true, ..query };
         let seen = self.sampler.quadrature().render(&query, &sampled.steps, termination);
         let normals = seen.rendered.normals_seen();

@@ -14,7 +14,7 @@ use crate::cli::run::Run;
 use crate::cli::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
 /// Photographs that are kept in memory.
-const KEPT: usize = 8;
+const KEPT: usize = 4;
 /// Most points that a page is told of.
 const MOST_POINTS: usize = 4000;
 
@@ -51,6 +51,12 @@ impl Album {
         for split in Split::ALL {
             // A capture need not have all of them.
             let Ok(views) = present(&capture, split) else { continue };
+            // Where there are none to validate with, those are the test views.
+            let names = |views: &[&View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+            let are_tests = |tests: Vec<&View>| names(&tests) == names(&views);
+            if split == Split::Val && present(&capture, Split::Test).is_ok_and(are_tests) {
+                continue;
+            }
             if split == Split::Train {
                 check_trained(run, &capture, &views, run.config.extent.frames)?;
             }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
@@ -40,8 +40,8 @@ struct Waiting {
     /// The newest picture; one that nobody has seen yet is not worth sending any more.
     picture: Option<(u32, Arc<Shot>)>,
     others: VecDeque<Outgoing>,
-    /// Whether a picture was sent of which nothing has been heard.
-    flying: bool,
+    /// When a picture was sent of which nothing has been heard.
+    flying: Option<Instant>,
     overrun: bool,
 }
 
@@ -79,16 +79,16 @@ impl Outbox {
         if let Some(message) = waiting.others.pop_front() {
             return Some(message);
         }
-        if waiting.flying {
+        if waiting.flying.is_some() {
             return None;
         }
         let (id, shot) = waiting.picture.take()?;
-        waiting.flying = true;
+        waiting.flying = Some(Instant::now());
         Some(Outgoing::Bytes(File::Picture { id, made: shot.made }.message(&shot.jpeg)))
     }
 
-    /// Whether a picture is under way, of which the page has said nothing yet.
-    pub fn is_flying(&self) -> bool {
+    /// Since when a picture is under way of which the page has said nothing yet.
+    pub fn flying(&self) -> Option<Instant> {
         self.lock().flying
     }
 
@@ -99,7 +99,7 @@ impl Outbox {
 
     /// The page has the picture.
     pub fn seen(&self) {
-        self.lock().flying = false;
+        self.lock().flying = None;
         self.changed.notify_one();
     }
 }
@@ -182,6 +182,13 @@ impl Hub {
             }
         }
         self.news(&mut state);
+    }
+
+    /// A page wants to see nothing for now.
+    pub fn rest(&self, client: u64) {
+        if let Some(client) = self.lock().clients.get_mut(&client) {
+            client.wish = None;
+        }
     }
 
     /// A page wants a picture to keep; says whether it may.
@@ -349,6 +356,8 @@ mod tests {
         assert_eq!(hub.wishes().len(), 2);
         hub.wish(a, 2, view(2));
         assert!(!hub.wants(&wishes[0]) && hub.wishes().len() == 1);
+        hub.rest(a);
+        assert_eq!(hub.wishes().len(), 1, "that of the other");
         hub.leave(a);
         hub.leave(b);
         assert!(hub.wishes().is_empty() && hub.connected() == 0);
@@ -376,7 +385,7 @@ mod tests {
         let hub = Hub::default();
         let (page, _) = hub.join();
         hub.wish(page, 1, view(1));
-        let start = std::time::Instant::now();
+        let start = Instant::now();
         hub.wait(Duration::from_secs(20));
         assert!(start.elapsed() < Duration::from_secs(10));
         hub.wait(Duration::from_millis(30));

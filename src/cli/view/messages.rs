@@ -19,6 +19,8 @@ const FARTHEST: f64 = 1e9;
 pub enum Ask {
     /// Pictures of this, until something else is asked for. `id` comes back with them.
     View { id: u32, view: View },
+    /// Nothing is looked at for now.
+    Rest {},
     /// Another may be sent: the picture that was asked for by `id` has arrived.
     Seen { id: u32 },
     /// The picture of this in full, as a PNG file.
@@ -145,14 +147,10 @@ pub fn rows(pose: &DAffine3) -> [[f64; 4]; 3] {
 #[derive(Debug, Clone, Serialize)]
 pub struct About {
     pub title: String,
-    /// Where to look from first.
-    pub pose: [[f64; 4]; 3],
-    /// Vertical field of view in degrees.
-    pub fov: f64,
+    #[serde(flatten)]
+    pub first: FirstView,
     /// Width and height of the photographs.
     pub size: [usize; 2],
-    /// The middle of the scene's box, and its corners, in scene units.
-    pub bounds: [[f64; 3]; 2],
     pub background: [f32; 3],
     /// From the scene to the capture's own coordinates, three rows of four.
     pub to_capture: [[f64; 4]; 3],
@@ -161,6 +159,16 @@ pub struct About {
     pub points: Vec<([f32; 3], [u8; 3])>,
     /// Whether the scene is being trained.
     pub training: bool,
+}
+
+/// Where a scene is looked at from first, and where it is.
+#[derive(Debug, Clone, Serialize)]
+pub struct FirstView {
+    pub pose: [[f64; 4]; 3],
+    /// Vertical field of view in degrees.
+    pub fov: f64,
+    /// The corners of the scene's box, in scene units.
+    pub bounds: [[f64; 3]; 2],
 }
 
 /// What a page is told of a photograph.

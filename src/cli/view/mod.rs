@@ -12,6 +12,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use raygrad::nerf::dataset::Placement;
 use raygrad::nerf::glam::{DAffine3, DMat3, DVec3};
 use raygrad::nerf::{Model, Result};
 
@@ -20,11 +21,14 @@ use super::run::Run;
 use super::scene::Scene;
 use album::Album;
 use hub::Hub;
-use messages::{About, Tell, rows};
+use messages::{About, FirstView, Tell, rows};
 use painter::Painter;
-use server::Place;
 
+pub use server::Listener;
 pub use window::Window;
+
+/// What moves cameras in pages.
+pub const CAMERA: &str = include_str!("page/camera.js");
 
 /// The address of this machine that others cannot reach.
 const HOST: &str = "127.0.0.1";
@@ -49,8 +53,8 @@ pub struct Args {
 /// Where pages are served.
 #[derive(Debug, Clone, clap::Args)]
 pub struct PlaceArgs {
-    /// Address or name under which pages are served: other machines can come if it is not of this one alone, with the
-    /// token in the link
+    /// Address or name under which pages are served: 127.0.0.1 for whoever uses this machine; with another, others come too who
+    /// have the link with its token, unencrypted
     #[arg(long, default_value = HOST)]
     host: String,
     /// Port on which pages are served [default: a free one]
@@ -64,8 +68,12 @@ impl PlaceArgs {
         self.host != HOST || self.port != 0
     }
 
-    fn place(&self) -> Place {
-        Place { host: self.host.clone(), port: self.port }
+    /// Takes the port.
+    ///
+    /// # Errors
+    /// If the host is not known or the port is taken.
+    pub fn listen(&self) -> Result<Listener> {
+        Listener::bind(&self.host, self.port)
     }
 }
 
@@ -74,7 +82,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
     let model = run.model()?;
     let (hub, album) = (Arc::new(Hub::default()), album(&run, args.scene.as_ref()));
-    let link = serve(&args.place, &run, &model, &hub, album.clone(), false)?;
+    let link = serve(args.place.listen()?, &run, &model, &hub, album.clone(), false)?;
     print(&format!("view     {link}\n"))?;
     if args.open
         && let Err(error) = open::that_detached(&link)
@@ -100,9 +108,20 @@ fn album(run: &Run, scene: Option<&Scene>) -> Option<Arc<Album>> {
     }
 }
 
+/// Where a scene is looked at from first.
+pub fn first_view(run: &Run) -> FirstView {
+    let (view, extent) = (&run.config.viewpoint, &run.config.extent);
+    let camera = &view.orbit(extent, 1)[0];
+    FirstView {
+        pose: rows(&camera.pose),
+        fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+        bounds: extent.bounds.map(|corner| corner.to_array()),
+    }
+}
+
 /// Begins to serve the page of a run; gives the link.
 fn serve(
-    place: &PlaceArgs,
+    listener: Listener,
     run: &Run,
     model: &Model<f32>,
     hub: &Arc<Hub>,
@@ -110,25 +129,25 @@ fn serve(
     training: bool,
 ) -> Result<String> {
     let (view, extent) = (&run.config.viewpoint, &run.config.extent);
-    let camera = &view.orbit(extent, 1)[0];
-    let placement = extent.placement;
-    // Back: `origin + rotation^T x / scale`.
-    let back = DAffine3 {
-        matrix3: placement.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(placement.scale.recip())),
-        translation: placement.origin,
-    };
+    // As cameras of files are taken to where the model has them: where they are given, and from there by what it has learned.
+    let learned = model.refine.as_ref().and_then(|refine| refine.placement(&model.params)).unwrap_or_default();
+    let to_capture = inverse(&extent.placement) * inverse(&learned);
     let about = About {
         title: run.folder.display().to_string(),
-        pose: rows(&camera.pose),
-        fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+        first: first_view(run),
         size: [view.width, view.height],
-        bounds: extent.bounds.map(|corner| corner.to_array()),
         background: model.config.background.shown(),
-        to_capture: rows(&back),
+        to_capture: rows(&to_capture),
         photographs: album.as_ref().map_or(vec![], |album| album.about(model)),
         points: album.as_ref().map_or(vec![], |album| album.points(model)),
         training,
     };
     let hub::Outgoing::Text(about) = server::text(&Tell::About(Box::new(about))) else { unreachable!("it is text") };
-    server::serve(&place.place(), hub.clone(), album, about)
+    server::serve(listener, hub.clone(), album, about, model.config.background.shown())
+}
+
+/// From the scene to what was placed in it.
+fn inverse(placement: &Placement) -> DAffine3 {
+    let turn = placement.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(placement.scale.recip()));
+    DAffine3 { matrix3: turn, translation: placement.origin }
 }

@@ -27,8 +27,6 @@ const LATEST: f64 = 0.5;
 const MOST_HALVINGS: u32 = 5;
 /// Quality of JPEG files, 1 to 100, of coarse pictures and of whole ones.
 const QUALITY: [u8; 2] = [75, 92];
-/// What photographs that have transparency stand before.
-const WHITE: [f32; 3] = [1.0; 3];
 /// How often a picture is painted again while a model learns, at most.
 const AGAIN: Duration = Duration::from_millis(500);
 
@@ -54,7 +52,9 @@ struct Job {
     spent: Duration,
     /// When it was worked on last, in turns.
     turn: u64,
-    /// The step of training that its picture is of, if it is whole.
+    /// The step of training at which its picture was begun.
+    begun: u64,
+    /// If it rests: since which step of training, and when.
     whole: Option<(u64, Instant)>,
 }
 
@@ -70,6 +70,8 @@ struct Parts {
     truth: Option<(usize, Image)>,
     color: Image,
     rows: usize,
+    /// How many rows are painted at a time; before the first, none.
+    band: usize,
 }
 
 impl Painter {
@@ -96,16 +98,27 @@ impl Painter {
         let view = job.target.view().clone();
         let rate = self.rates.entry((view.show, view.exact)).or_insert(RATE);
         let start = Instant::now();
-        let Some(rays) = job.parts.paint(&view, model, *rate, &|| wanted.holds()) else { return true };
+        if !job.parts.paint(&view, model, *rate, &|| wanted.holds()) {
+            return true;
+        }
         let spent = start.elapsed();
         job.spent += spent;
-        let now = rays as f64 / spent.as_secs_f64().max(1e-6);
-        *rate += LATEST * (now - *rate);
+        job.parts.pace(spent);
         if job.parts.rows == job.parts.camera.height {
+            // Of the whole picture: where there is nothing, rays are quick.
+            let rays = job.parts.camera.width * job.parts.camera.height;
+            let now = rays as f64 / job.spent.as_secs_f64().max(1e-6);
+            *rate += LATEST * (now - *rate);
             job.deliver(&hub, step);
-            if job.whole.is_none() {
-                job.halvings -= 1;
-                job.begin(model, album.as_deref());
+            // While a model learns, pictures are seen again rather than made ever finer.
+            let stands = job.begun == step;
+            let soon = halvings(view.size, now, AGAIN.as_secs_f64());
+            match job.halvings {
+                finer if finer > 0 && (stands || finer > soon) => {
+                    job.halvings -= 1;
+                    job.begin(model, album.as_deref(), step);
+                }
+                _ => job.rest(step),
             }
         }
         true
@@ -122,26 +135,37 @@ impl Painter {
             let known = |job: &Job| matches!(&job.target, Target::Wish(own) if Arc::ptr_eq(own, &wish));
             if !self.jobs.iter().any(known) {
                 let rate = self.rates.get(&(wish.view.show, wish.view.exact)).copied().unwrap_or(RATE);
-                let halvings = halvings(wish.view.size, rate);
-                self.jobs.push(Job::new(Target::Wish(wish), halvings, model, self.album.as_deref()));
+                let halvings = halvings(wish.view.size, rate, FIRST);
+                self.jobs.push(Job::new(Target::Wish(wish), halvings, model, self.album.as_deref(), step));
             }
         }
-        while let Some(save) = self.hub.next_save() {
-            self.jobs.push(Job::new(Target::Save(save), 0, model, self.album.as_deref()));
+        // One after the other: each has a picture's memory.
+        if !self.jobs.iter().any(|job| matches!(job.target, Target::Save(_)))
+            && let Some(save) = self.hub.next_save()
+        {
+            self.jobs.push(Job::new(Target::Save(save), 0, model, self.album.as_deref(), step));
         }
         for job in &mut self.jobs {
-            // A model that has learned more is seen again, whole.
-            if job.whole.is_some_and(|(seen, when)| seen != step && when.elapsed() > AGAIN.max(2 * job.spent)) {
-                job.begin(model, self.album.as_deref());
+            let Some((seen, when)) = job.whole else { continue };
+            if seen == step && job.halvings > 0 {
+                // It has stopped learning.
+                job.halvings -= 1;
+                job.begin(model, self.album.as_deref(), step);
+            } else if seen != step && when.elapsed() > AGAIN.max(job.spent) {
+                // What has learned more is seen again, as fine as there is time for.
+                let view = job.target.view();
+                let rate = self.rates.get(&(view.show, view.exact)).copied().unwrap_or(RATE);
+                job.halvings = halvings(view.size, rate, AGAIN.as_secs_f64());
+                job.begin(model, self.album.as_deref(), step);
             }
         }
     }
 }
 
-/// How often a size is to be halved for a picture to be there at once.
-fn halvings([width, height]: [u32; 2], rate: f64) -> u32 {
+/// How often a size is to be halved for a picture to be there in so many seconds.
+fn halvings([width, height]: [u32; 2], rate: f64, seconds: f64) -> u32 {
     let rays = f64::from(width) * f64::from(height);
-    let needed = (rays / (rate * FIRST)).log2() / 2.0;
+    let needed = (rays / (rate * seconds)).log2() / 2.0;
     let most = u32::min(width, height).ilog2().saturating_sub(2).min(MOST_HALVINGS);
     (needed.ceil().max(0.0) as u32).min(most)
 }
@@ -170,15 +194,21 @@ impl Target {
 }
 
 impl Job {
-    fn new(target: Target, halvings: u32, model: &Model<f32>, album: Option<&Album>) -> Self {
+    fn new(target: Target, halvings: u32, model: &Model<f32>, album: Option<&Album>, step: u64) -> Self {
         let parts = Parts::new(target.view(), halvings, model, album);
-        Job { target, halvings, parts, spent: Duration::ZERO, turn: 0, whole: None }
+        Job { target, halvings, parts, spent: Duration::ZERO, turn: 0, begun: step, whole: None }
     }
 
     /// Begins a picture at the size that is next.
-    fn begin(&mut self, model: &Model<f32>, album: Option<&Album>) {
+    fn begin(&mut self, model: &Model<f32>, album: Option<&Album>, step: u64) {
         self.parts = Parts::new(self.target.view(), self.halvings, model, album);
-        (self.spent, self.whole) = (Duration::ZERO, None);
+        (self.spent, self.begun, self.whole) = (Duration::ZERO, step, None);
+    }
+
+    /// Nothing is to be done for now, and no memory is needed.
+    fn rest(&mut self, step: u64) {
+        (self.parts.color, self.parts.truth) = (Image::new(1, 1, 3), None);
+        self.whole = Some((step, Instant::now()));
     }
 
     /// Gives away a picture whose rows are all painted.
@@ -198,9 +228,6 @@ impl Job {
                 let message = File::Save { name: "view.png".to_owned() }.message(&image.to_png());
                 hub.post(save.client, Outgoing::Bytes(message));
             }
-        }
-        if self.halvings == 0 {
-            self.whole = Some((step, Instant::now()));
         }
     }
 }
@@ -226,31 +253,43 @@ impl Parts {
         let sides = [camera.width, camera.height];
         let share = (0..2).map(|i| largest[i] as f64 / sides[i] as f64).fold(f64::INFINITY, f64::min);
         let [w, h] = [0, 1].map(|i| ((sides[i] as f64 * share).round() as usize).clamp(1, largest[i]));
-        Parts::of(camera.resized(w, h), photo.map(|photo| (number, at_size(&photo, [w, h], WHITE))))
+        Parts::of(
+            camera.resized(w, h),
+            photo.map(|photo| (number, at_size(&photo, [w, h], model.config.background.shown()))),
+        )
     }
 
     fn of(camera: Camera, truth: Option<(usize, Image)>) -> Self {
         let color = Image::new(camera.width, camera.height, 3);
-        Parts { camera, truth, color, rows: 0 }
+        Parts { camera, truth, color, rows: 0, band: 0 }
     }
 
-    /// Paints as many rows as there is time for, and says how many rays that took; nothing if it is no longer wanted.
-    fn paint(
+    /// Paints as many rows as there is time for; says whether it did, and was not stopped.
+    fn paint(&mut self, view: &View, model: &Model<f32>, rate: f64, goes_on: &(dyn Fn() -> bool + Sync)) -> bool {
+        self.try_paint(view, model, rate, goes_on).is_some()
+    }
+
+    fn try_paint(
         &mut self,
         view: &View,
         model: &Model<f32>,
         rate: f64,
         goes_on: &(dyn Fn() -> bool + Sync),
-    ) -> Option<usize> {
+    ) -> Option<()> {
         let Camera { width, height, centre, .. } = self.camera;
-        let rows = ((rate * PIECE / width as f64) as usize).clamp(1, height - self.rows);
+        if self.band == 0 {
+            self.band = (rate * PIECE / width as f64) as usize;
+        }
+        self.band = self.band.clamp(1, height);
+        let rows = self.band.min(height - self.rows);
         // What is above lies outside of the picture.
         let band = Camera { height: rows, centre: [centre[0], centre[1] - self.rows as f64], ..self.camera.clone() };
         let background = match view.background {
             Some(color) => color.map(|value| f32::from(value) / 255.0),
             None => model.config.background.shown(),
         };
-        let background = if self.truth.is_some() { WHITE } else { background };
+        // As evaluations have it.
+        let background = if self.truth.is_some() { model.config.background.shown() } else { background };
         let everywhere = Viewing::over(background).within;
         let within = view.within.map_or(everywhere, |corners| corners.map(DVec3::from));
         let limits = view.exact.then_some(Limits::NONE);
@@ -265,7 +304,13 @@ impl Parts {
         let start = 3 * width * self.rows;
         self.color.data[start..start + image.data.len()].copy_from_slice(&image.data);
         self.rows += rows;
-        Some(rows * width)
+        Some(())
+    }
+
+    /// Chooses the next rows by how long the last ones took: few more than those, as they may show more.
+    fn pace(&mut self, spent: Duration) {
+        let fitting = self.band as f64 * PIECE / spent.as_secs_f64().max(1e-4);
+        self.band = (fitting as usize).clamp(1, 2 * self.band);
     }
 }
 
@@ -293,12 +338,13 @@ mod tests {
     #[test]
     fn the_first_picture_is_there_at_once() {
         for (size, rate) in [([800, 800], 1e5), ([400, 300], 1e6), ([4000, 1000], 3e4)] {
-            let times = halvings(size, rate);
+            let times = halvings(size, rate, FIRST);
             let rays = |times: u32| size.map(|side: u32| f64::from(side.div_ceil(1 << times))).iter().product::<f64>();
             assert!(rays(times) <= 1.1 * FIRST * rate || times == MOST_HALVINGS, "{size:?}: {times}");
             assert!(times == 0 || rays(times - 1) > FIRST * rate, "{size:?}: {times}");
         }
         // Nothing is smaller than a few pixels, and what is quick is whole.
-        assert_eq!([halvings([8, 8], 1.0), halvings([3, 3000], 1.0), halvings([640, 480], 1e9)], [1, 0, 0]);
+        let at_once = |size: [u32; 2], rate: f64| halvings(size, rate, FIRST);
+        assert_eq!([at_once([8, 8], 1.0), at_once([3, 3000], 1.0), at_once([640, 480], 1e9)], [1, 0, 0]);
     }
 }

@@ -19,7 +19,7 @@ use hyper_util::service::TowerToHyperService;
 use raygrad::nerf::{Error, Result};
 use serde::Deserialize;
 use tokio::sync::Semaphore;
-use tokio::time::timeout;
+use tokio::time::{timeout, timeout_at};
 
 use super::album::Album;
 use super::hub::{Hub, Outbox, Outgoing};
@@ -31,10 +31,13 @@ const CONNECTIONS: usize = 128;
 /// Bytes of a message from a page.
 const LONGEST: usize = 1 << 14;
 /// Messages a second from a page, and how many may come at once.
-const RATE: f64 = 120.0;
-const BURST: f64 = 240.0;
+const RATE: f64 = 300.0;
+const BURST: f64 = 600.0;
 /// How long a request may take to arrive, and a page to take a message or say that it has seen a picture.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// How long nothing is said before a page is asked whether it is still there, and not heard before it is taken to be gone.
+const IDLE: Duration = Duration::from_secs(10);
+const SILENCE: Duration = Duration::from_secs(30);
 /// Longest side of a photograph that is sent.
 const PHOTOGRAPH: usize = 1600;
 const QUALITY: u8 = 88;
@@ -44,17 +47,31 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 /// What is served.
-const FILES: [(&str, &str, &str); 3] = [
+const FILES: [(&str, &str, &str); 4] = [
     ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
     ("/view.css", "text/css; charset=utf-8", include_str!("page/view.css")),
+    ("/camera.js", "text/javascript; charset=utf-8", super::CAMERA),
     ("/view.js", "text/javascript; charset=utf-8", include_str!("page/view.js")),
 ];
 
-/// Where to listen, and who may come.
-#[derive(Debug, Clone)]
-pub struct Place {
-    pub host: String,
-    pub port: u16,
+/// A port that is taken, and the name of this machine that pages may use.
+pub struct Listener {
+    listener: TcpListener,
+    address: SocketAddr,
+    host: String,
+}
+
+impl Listener {
+    /// Takes a port, 0 for any that is free.
+    ///
+    /// # Errors
+    /// If the host is not known or the port is taken.
+    pub fn bind(host: &str, port: u16) -> Result<Self> {
+        let bad = |e: std::io::Error| Error::setting("host", format!("{host}:{port} cannot be used: {e}"));
+        let listener = TcpListener::bind((host, port)).map_err(bad)?;
+        listener.set_nonblocking(true).map_err(bad)?;
+        Ok(Listener { address: listener.local_addr().map_err(bad)?, listener, host: host.to_owned() })
+    }
 }
 
 /// What all connections know.
@@ -62,6 +79,8 @@ struct Served {
     hub: Arc<Hub>,
     album: Option<Arc<Album>>,
     about: String,
+    /// What photographs that have transparency stand before.
+    background: [f32; 3],
     /// The name of this machine that pages may use, beside its addresses.
     host: String,
     /// What links must have, where others than this machine can follow them.
@@ -73,15 +92,18 @@ struct Served {
 /// Begins to serve, on threads of its own; gives the link.
 ///
 /// # Errors
-/// If the host is not known or the port is taken.
-pub fn serve(place: &Place, hub: Arc<Hub>, album: Option<Arc<Album>>, about: String) -> Result<String> {
-    let bad = |e: std::io::Error| Error::setting("host", format!("{}:{} cannot be used: {e}", place.host, place.port));
-    let listener = TcpListener::bind((place.host.as_str(), place.port)).map_err(bad)?;
-    let address = listener.local_addr().map_err(bad)?;
-    listener.set_nonblocking(true).map_err(bad)?;
+/// If the system has no thread left.
+pub fn serve(
+    Listener { listener, address, host }: Listener,
+    hub: Arc<Hub>,
+    album: Option<Arc<Album>>,
+    about: String,
+    background: [f32; 3],
+) -> Result<String> {
+    let bad = |e: std::io::Error| Error::setting("host", format!("{address} cannot be served: {e}"));
     let token = (!address.ip().is_loopback()).then(|| format!("{:032x}", rand::random::<u128>()));
-    let link = link(address, &place.host, token.as_deref());
-    let served = Served { hub, album, about, host: place.host.clone(), token, readers: Semaphore::new(2) };
+    let link = link(address, &host, token.as_deref());
+    let served = Served { hub, album, about, background, host, token, readers: Semaphore::new(2) };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(bad)?;
     let run = move || {
         runtime.block_on(async move {
@@ -244,20 +266,23 @@ async fn page(socket: WebSocket, served: Arc<Served>) {
             if outbox.is_overrun() {
                 return Some("too much was asked for");
             }
-            let changed = outbox.changed.notified();
-            if outbox.is_flying() {
-                if timeout(PATIENCE, changed).await.is_err() && outbox.is_flying() {
-                    return Some("a picture was not taken");
-                }
-            } else {
-                changed.await;
+            let until = outbox.flying().map_or(Instant::now() + IDLE, |since| since + PATIENCE);
+            if timeout_at(until.into(), outbox.changed.notified()).await.is_ok() {
+                continue;
+            }
+            if outbox.flying().is_some_and(|since| since.elapsed() >= PATIENCE) {
+                return Some("a picture was not taken");
+            }
+            // Whether it is still there: a browser answers by itself.
+            if !matches!(timeout(PATIENCE, out.send(Message::Ping(Default::default()))).await, Ok(Ok(()))) {
+                return None;
             }
         }
     };
     let reader = Arc::new(Semaphore::new(1));
     let read = async {
         let (mut allowed, mut last) = (BURST, Instant::now());
-        while let Some(Ok(message)) = heard.next().await {
+        while let Ok(Some(Ok(message))) = timeout(SILENCE, heard.next()).await {
             allowed = (allowed + RATE * last.elapsed().as_secs_f64()).min(BURST) - 1.0;
             last = Instant::now();
             if allowed < 0.0 {
@@ -313,19 +338,20 @@ fn answer(ask: Ask, client: u64, outbox: &Arc<Outbox>, served: &Arc<Served>, rea
         Ask::Pause { pause } => hub.pause(pause),
         Ask::Stop {} => hub.stop(),
         Ask::Share { share } => hub.set_share(share),
+        Ask::Rest {} => hub.rest(client),
     }
 }
 
 /// A photograph as the page wants it.
 async fn photograph(number: usize, served: &Arc<Served>) -> Outgoing {
     let Ok(_permit) = served.readers.acquire().await else { return sorry("it cannot be read") };
-    let album = served.album.clone();
+    let (album, background) = (served.album.clone(), served.background);
     let read = move || -> Result<Vec<u8>> {
         let album = album.ok_or_else(|| Error::setting("photograph", "the run's photographs are not known"))?;
         let photo = album.photo(number)?;
         let share = (PHOTOGRAPH as f64 / photo.width.max(photo.height) as f64).min(1.0);
         let size = [photo.width, photo.height].map(|side| ((side as f64 * share).round() as usize).max(1));
-        Ok(File::Photograph { number }.message(&at_size(&photo, size, [1.0; 3]).to_jpeg(QUALITY)))
+        Ok(File::Photograph { number }.message(&at_size(&photo, size, background).to_jpeg(QUALITY)))
     };
     match tokio::task::spawn_blocking(read).await {
         Ok(Ok(bytes)) => Outgoing::Bytes(bytes),

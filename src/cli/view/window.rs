@@ -9,9 +9,10 @@ use serde_json::json;
 use super::hub::Hub;
 use super::messages::Tell;
 use super::painter::Painter;
-use super::{PlaceArgs, album, serve, server};
+use super::server::Listener;
+use super::{album, serve, server};
 use crate::cli::interrupt;
-use crate::cli::output::print;
+use crate::cli::output::{note, print};
 use crate::cli::progress::spoken;
 use crate::cli::run::Run;
 use crate::cli::summary::Ended;
@@ -22,6 +23,8 @@ const SHARE: f64 = 0.3;
 const MOST_CREDIT: f64 = 0.1;
 /// How often pages are told how training goes.
 const TOLD: Duration = Duration::from_millis(400);
+/// How long training that was paused waits for a page when none is there any more.
+const ALONE: Duration = Duration::from_secs(60);
 /// Points of a curve, after which every second one is dropped.
 const POINTS: usize = 240;
 
@@ -46,10 +49,10 @@ struct Curves {
 
 impl Window {
     /// Begins to serve the page of a run that is about to be trained.
-    pub fn open(place: &PlaceArgs, run: &Run, trainer: &Trainer) -> Result<Self> {
+    pub fn open(listener: Listener, run: &Run, trainer: &Trainer) -> Result<Self> {
         let (hub, album) = (Arc::new(Hub::default()), album(run, None));
         hub.set_share(SHARE);
-        let link = serve(place, run, &trainer.model, &hub, album.clone(), true)?;
+        let link = serve(listener, run, &trainer.model, &hub, album.clone(), true)?;
         print(&format!("view     {link}\n"))?;
         let (painter, now) = (Painter::new(hub.clone(), album), Instant::now());
         let curves = Curves { every: 1, loss: vec![], psnr: vec![], speed: vec![] };
@@ -66,7 +69,8 @@ impl Window {
         }
         let share = self.hub.share();
         let owed = self.since.elapsed().as_secs_f64() * share / (1.0 - share);
-        self.credit = (self.credit + owed).min(MOST_CREDIT);
+        // What was not asked for is not saved up, but for a little.
+        self.credit = self.credit.min(MOST_CREDIT) + owed;
         let step = trainer.stats().step;
         while self.credit > 0.0 {
             let start = Instant::now();
@@ -76,11 +80,18 @@ impl Window {
             self.credit -= start.elapsed().as_secs_f64();
         }
         self.tell(trainer, psnr, left, None, false);
-        let mut waits = false;
+        let (mut waits, mut alone) = (false, None);
         while self.hub.paused() && !self.hub.stops() && !interrupt::requested() {
             if !waits {
                 self.tell(trainer, psnr, left, None, true);
+                note("training waits: a page has paused it");
                 waits = true;
+            }
+            // A page that is loaded anew comes back soon.
+            alone =
+                alone.filter(|_| self.hub.connected() == 0).or_else(|| (self.hub.connected() == 0).then(Instant::now));
+            if alone.is_some_and(|since: Instant| since.elapsed() > ALONE) {
+                self.hub.pause(false);
             }
             if !self.painter.work(&trainer.model, step) {
                 self.hub.wait(Duration::from_millis(200));
@@ -88,6 +99,7 @@ impl Window {
             self.tell(trainer, psnr, left, None, false);
         }
         if waits {
+            note("training goes on");
             self.tell(trainer, psnr, left, None, true);
         }
         self.since = Instant::now();
@@ -133,6 +145,11 @@ impl Curves {
         if !stats.step.is_multiple_of(self.every) {
             return;
         }
+        // After a run went back.
+        let before = (stats.step / self.every) as usize - 1;
+        for values in [&mut self.loss, &mut self.psnr, &mut self.speed] {
+            values.truncate(before);
+        }
         self.loss.push(stats.loss);
         self.psnr.push(psnr);
         self.speed.push(stats.rays as f64 / stats.train_seconds.max(1e-9));
@@ -171,5 +188,9 @@ mod tests {
         let every = curves.every as f64;
         assert!(curves.loss.iter().enumerate().all(|(i, loss)| *loss == every * (i + 1) as f64), "{:?}", curves.loss);
         assert!(curves.speed.iter().all(|speed| (speed - 10.0).abs() < 1e-9));
+        // It went back, and takes other ways.
+        let step = 40 * curves.every;
+        curves.step(&StepStats { step, loss: 0.5, ..StepStats::default() }, 0.5);
+        assert!(curves.loss.len() == 40 && curves.loss[39] == 0.5 && curves.loss[38] == 39.0 * every);
     }
 }

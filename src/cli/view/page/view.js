@@ -1,26 +1,8 @@
-// The page of `raygrad view`. Places are in the scene's own units, with z upwards; a pose has the camera's right, up and
-// back as columns.
+// The page of `raygrad view`; camera.js comes before.
 "use strict";
 
 const $ = (id) => document.getElementById(id);
 const stage = $("stage"), picture = $("picture"), photo = $("photo"), marks = $("marks");
-
-// ---- vectors ------------------------------------------------------------------------------------------------------
-const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
-const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-const times = (k, a) => [k * a[0], k * a[1], k * a[2]];
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const size = (a) => Math.hypot(a[0], a[1], a[2]);
-const unit = (a) => times(1 / (size(a) || 1), a);
-const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
-const radians = Math.PI / 180;
-
-/** A vector turned about a unit axis. */
-function turned(a, axis, angle) {
-  const [c, s] = [Math.cos(angle), Math.sin(angle)];
-  return add(add(times(c, a), times(s, cross(axis, a))), times((1 - c) * dot(axis, a), axis));
-}
 
 // ---- what the program says ------------------------------------------------------------------------------------------
 let about = null;
@@ -29,8 +11,9 @@ let socket = null, attempts = 0;
 let asked = 0, shown = null;
 let training = null;
 
-const view = { eye: [0, -4, 1], right: [1, 0, 0], up: [0, 0, 1], back: [0, -1, 0], pivot: [0, 0, 0], fov: 50, photograph: null };
 let keys = [];
+/** Which playing of the path is under way; whatever moves the camera ends it. */
+let playing = 0;
 
 function connect() {
   const address = new URL("messages" + location.search, location.href);
@@ -59,6 +42,7 @@ function told(message) {
 }
 
 function apologise(what) {
+  requested = null;
   $("sorry").textContent = what;
   $("sorry").hidden = false;
   clearTimeout(apologise.timer);
@@ -83,6 +67,10 @@ function brought(data) {
 function meet(message) {
   const first = about === null;
   about = message;
+  if (!first && (String(bounds) !== String(about.bounds) || view.photograph >= about.photographs.length)) view.photograph = null;
+  const elsewhere = String(bounds) !== String(about.bounds);
+  bounds = about.bounds;
+  overlaid = requested = null;
   document.title = `${about.title} - raygrad`;
   $("title").textContent = about.title;
   $("photographs").hidden = about.photographs.length === 0;
@@ -100,15 +88,20 @@ function meet(message) {
   if (first) {
     const hex = (x) => Math.round(255 * x).toString(16).padStart(2, "0");
     $("background").value = "#" + about.background.map(hex).join("");
-    makeBox();
-    reset();
-  } else {
+  }
+  if (elsewhere) makeBox();
+  if (first) reset();
+  else {
+    select.value = view.photograph === null ? "" : String(view.photograph);
+    blend();
     ask();
   }
 }
 
 // ---- asking for pictures ----------------------------------------------------------------------------------------------
 let waits = false;
+/** A number, or that it is none. */
+const digits = (x, count) => (typeof x === "number" ? x.toFixed(count) : "-");
 
 /** Asks for the picture of what is to be seen, at most once a frame of the display. */
 function ask() {
@@ -119,7 +112,7 @@ function ask() {
     waits = false;
     asked = (asked + 1) >>> 0;
     say({ ask: "view", id: asked, view: wanted() });
-  }, 12);
+  }, 16);
 }
 
 function wanted() {
@@ -135,14 +128,6 @@ function wanted() {
 }
 
 const mode = () => document.querySelector("input[name=show]:checked").value;
-const rows = (v) => [0, 1, 2].map((i) => [v.right[i], v.up[i], v.back[i], v.eye[i]]);
-
-function place(pose, fov) {
-  const column = (c) => [0, 1, 2].map((r) => pose[r][c]);
-  [view.right, view.up, view.back, view.eye] = [0, 1, 2, 3].map(column);
-  view.fov = fov;
-}
-
 /** Width and height of pictures. */
 function sizes() {
   const area = stage.getBoundingClientRect();
@@ -168,23 +153,24 @@ function frame() {
 let drawing = 0;
 async function draw(head, blob) {
   const turn = ++drawing;
-  const bitmap = await createImageBitmap(blob);
+  const bitmap = await createImageBitmap(blob).catch(() => null);
   // One that was decoded faster has come before.
-  if (turn < (draw.last || 0)) return;
+  if (!bitmap || turn < (draw.last || 0)) return;
   draw.last = turn;
   const whole = head.halvings === 0;
   picture.width = bitmap.width;
   picture.height = bitmap.height;
   picture.getContext("2d").drawImage(bitmap, 0, 0);
   shown = { ...head, size: [bitmap.width, bitmap.height], whole };
+  bitmap.close();
   stage.dataset.shown = String(head.id);
   stage.dataset.halvings = String(head.halvings);
   stage.dataset.step = String(head.step);
   layout();
-  let text = `${bitmap.width}×${bitmap.height}${whole ? "" : " (coarse)"} · ${head.milliseconds.toFixed(0)} ms`;
+  let text = `${shown.size.join("×")}${whole ? "" : " (coarse)"} · ${head.milliseconds.toFixed(0)} ms`;
   if (head.compared) {
     const [number, psnr] = head.compared;
-    text += ` · against ${about.photographs[number].name}: ${psnr.toFixed(2)} dB`;
+    text += ` · against ${about.photographs[number].name}: ${digits(psnr, 2)} dB`;
   }
   if (about.training) text += ` · step ${head.step}`;
   $("status").textContent = text;
@@ -200,6 +186,7 @@ function layout() {
 
 // ---- moving -------------------------------------------------------------------------------------------------------------
 function free() {
+  playing += 1;
   if (view.photograph === null) return;
   view.photograph = null;
   $("photograph").value = "";
@@ -207,51 +194,9 @@ function free() {
   blend();
 }
 
-function orbit(dx, dy) {
-  free();
-  const turn = (axis, angle) => {
-    for (const name of ["right", "up", "back"]) view[name] = unit(turned(view[name], axis, angle));
-    view.eye = add(view.pivot, turned(sub(view.eye, view.pivot), axis, angle));
-  };
-  turn([0, 0, 1], -dx);
-  // Not over the poles, where left and right change places.
-  const height = Math.asin(clamp(view.back[2], -1, 1));
-  const upright = view.up[2] > 0;
-  turn(view.right, upright ? -clamp(dy, -1.5 - height, 1.5 - height) : -dy);
-  ask();
-}
-
-function pan(dx, dy) {
-  free();
-  const step = add(times(-dx, view.right), times(dy, view.up));
-  const reach = size(sub(view.eye, view.pivot)) * Math.tan(0.5 * view.fov * radians) * 2;
-  const moved = times(reach, step);
-  view.eye = add(view.eye, moved);
-  view.pivot = add(view.pivot, moved);
-  ask();
-}
-
-function zoom(factor) {
-  free();
-  const away = sub(view.eye, view.pivot);
-  view.eye = add(view.pivot, times(clamp(size(away) * factor, 1e-3 * side(), 100 * side()) / (size(away) || 1), away));
-  ask();
-}
-
-function fly(right, up, ahead) {
-  free();
-  const step = add(add(times(right, view.right), times(up, view.up)), times(-ahead, view.back));
-  const moved = times(0.25 * Math.max(0.2 * side(), size(sub(view.eye, view.pivot))), step);
-  view.eye = add(view.eye, moved);
-  view.pivot = add(view.pivot, moved);
-  ask();
-}
-
-const side = () => Math.max(...sub(about.bounds[1], about.bounds[0]));
-
 function reset() {
   place(about.pose, about.fov);
-  view.pivot = times(0.5, add(about.bounds[0], about.bounds[1]));
+  view.pivot = times(0.5, add(...bounds));
   view.photograph = null;
   $("photograph").value = "";
   $("fov").value = String(Math.round(view.fov));
@@ -261,54 +206,19 @@ function reset() {
 }
 
 function settled() {
+  $("fov").value = String(Math.round(view.fov));
   $("fov-out").textContent = `${view.fov.toFixed(0)}°`;
   $("blend-out").textContent = `${$("blend").value} %`;
   ask();
 }
 
-/** Pointers that are down, where they were last. */
-const pointers = new Map();
-stage.addEventListener("pointerdown", (event) => {
-  if (event.target.classList && event.target.classList.contains("handle")) return;
-  stage.setPointerCapture(event.pointerId);
-  pointers.set(event.pointerId, [event.clientX, event.clientY]);
-});
-stage.addEventListener("pointermove", (event) => {
-  const before = pointers.get(event.pointerId);
-  if (!before || !about) return;
-  const area = stage.getBoundingClientRect();
-  const [dx, dy] = [(event.clientX - before[0]) / area.height, (event.clientY - before[1]) / area.height];
-  if (pointers.size === 2) {
-    const other = [...pointers].find(([id]) => id !== event.pointerId)[1];
-    const distance = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
-    const now = distance([event.clientX, event.clientY]);
-    if (now > 4) zoom(distance(before) / now);
-    pan(0.5 * dx, 0.5 * dy);
-  } else if (event.buttons & 2 || event.buttons & 4 || event.shiftKey) pan(dx, dy);
-  else orbit(3 * dx, 3 * dy);
-  pointers.set(event.pointerId, [event.clientX, event.clientY]);
-});
-for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
-  stage.addEventListener(name, (event) => pointers.delete(event.pointerId));
-}
-stage.addEventListener("contextmenu", (event) => event.preventDefault());
-stage.addEventListener("wheel", (event) => {
-  event.preventDefault();
-  const lines = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
-  if (about) zoom(Math.exp(clamp(lines, -300, 300) * 0.0015));
-}, { passive: false });
-
 const modes = ["color", "depth", "normals", "opacity", "error"];
 document.addEventListener("keydown", (event) => {
   if (!about || event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
-  const step = 0.12;
-  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-  const flies = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, 1, 0], q: [0, -1, 0] }[event.key.toLowerCase()];
-  if (arrows && event.shiftKey) pan(0.3 * step * arrows[0], 0.3 * step * arrows[1]);
-  else if (arrows) orbit(step * arrows[0], step * arrows[1]);
-  else if (flies) fly(...flies.map((x) => 0.2 * x));
-  else if (event.key === "+" || event.key === "=") zoom(0.9);
-  else if (event.key === "-") zoom(1 / 0.9);
+  const steered = steer(event);
+  // Held down, keys move the camera and do nothing else.
+  if (!steered && event.repeat) return;
+  if (steered) { /* The camera has moved. */ }
   else if (event.key >= "1" && event.key <= "5") choose(modes[event.key - 1]);
   else {
     const buttons = { r: "reset", p: "save", n: "nearest", ",": "previous", ".": "next", k: "key" };
@@ -327,7 +237,7 @@ function choose(name) {
 }
 
 // ---- photographs ------------------------------------------------------------------------------------------------------------
-let overlaid = null;
+let overlaid = null, requested = null;
 
 function goTo(number) {
   if (!about.photographs[number]) return;
@@ -335,7 +245,7 @@ function goTo(number) {
   place(photograph.pose, clamp(photograph.fov, 5, 120));
   view.photograph = number;
   // What it looks at: as far as the middle of the scene, straight ahead.
-  const middle = times(0.5, add(about.bounds[0], about.bounds[1]));
+  const middle = times(0.5, add(...bounds));
   const ahead = Math.max(0.05 * side(), dot(sub(view.eye, middle), view.back));
   view.pivot = add(view.eye, times(-ahead, view.back));
   $("photograph").value = String(number);
@@ -359,26 +269,34 @@ function blend() {
   if (share > 0 && view.photograph === null && about.photographs.length) return goTo(nearest());
   photo.style.opacity = share;
   photo.hidden = share === 0 || overlaid !== view.photograph;
-  if (share > 0 && overlaid !== view.photograph) say({ ask: "photograph", number: view.photograph });
+  if (share > 0 && overlaid !== view.photograph && requested === null) {
+    requested = view.photograph;
+    say({ ask: "photograph", number: requested });
+  }
 }
 
 async function overlay(number, blob) {
   const bitmap = await createImageBitmap(blob);
+  requested = null;
   photo.width = bitmap.width;
   photo.height = bitmap.height;
   photo.getContext("2d").drawImage(bitmap, 0, 0);
+  bitmap.close();
   overlaid = number;
   stage.dataset.photograph = String(number);
   blend();
 }
 
 // ---- marks over the picture -----------------------------------------------------------------------------------------------
+/** The part of the stage that pictures fill, while marks are made. */
+let area = null;
+
 /** Where a place is in the stage, or nothing if it is behind. */
 function project(point) {
   const local = sub(point, view.eye);
   const depth = -dot(local, view.back);
   if (depth < 1e-3 * side()) return null;
-  const { x, y, w, h } = frame();
+  const { x, y, w, h } = area;
   const focal = (0.5 * h) / Math.tan(0.5 * view.fov * radians);
   return [x + 0.5 * w + (focal * dot(local, view.right)) / depth, y + 0.5 * h - (focal * dot(local, view.up)) / depth];
 }
@@ -414,7 +332,14 @@ function svg(name, attributes, parent) {
 
 function marksOf() {
   if (!about) return;
-  marks.replaceChildren();
+  const made = document.createDocumentFragment();
+  area = frame();
+  // The error is seen from the nearest photograph, not from here.
+  if (!(mode() === "error" && view.photograph === null)) makeMarks(made);
+  marks.replaceChildren(made);
+}
+
+function makeMarks(marks) {
   if ($("cameras").checked) {
     about.photographs.forEach((photograph, i) => {
       if (i !== view.photograph) svg("path", { d: frustum(photograph), class: `camera ${photograph.split}` }, marks);
@@ -426,7 +351,7 @@ function marksOf() {
       if (at) svg("circle", { cx: at[0].toFixed(1), cy: at[1].toFixed(1), r: 1.5, fill: `rgb(${color})` }, marks);
     }
   }
-  if ($("crop").checked) boxMarks();
+  if ($("crop").checked) boxMarks(marks);
   if (keys.length > 1) svg("path", { d: path(flight(64).map((key) => key.eye)), class: "path" }, marks);
 }
 
@@ -453,7 +378,7 @@ function box() {
   return [end(0), end(1)];
 }
 
-function boxMarks() {
+function boxMarks(marks) {
   const ends = box();
   const corner = (i) => [ends[i & 1][0], ends[(i >> 1) & 1][1], ends[(i >> 2) & 1][2]];
   for (let i = 0; i < 8; i++) {
@@ -498,9 +423,9 @@ function dragFace(down, axis, end) {
     input.value = String(end ? Math.max(value, other) : Math.min(value, other));
     ask();
   };
-  const up = () => { removeEventListener("pointermove", move); removeEventListener("pointerup", up); };
+  const up = () => ["pointerup", "pointercancel"].forEach((end) => { removeEventListener("pointermove", move); removeEventListener(end, up); });
   addEventListener("pointermove", move);
-  addEventListener("pointerup", up);
+  for (const end of ["pointerup", "pointercancel"]) addEventListener(end, up);
 }
 
 // ---- camera paths -----------------------------------------------------------------------------------------------------------
@@ -542,15 +467,20 @@ function flight(count) {
   });
 }
 
+/** How long the path takes. */
+const duration = () => clamp(Number($("seconds").value) || 4, 0.5, 600);
+
 function play() {
   if (keys.length < 2) return apologise("A path needs two key frames.");
   free();
-  const seconds = Number($("seconds").value) || 4, start = performance.now();
+  const seconds = duration(), start = performance.now(), turn = playing;
   const frames = flight(Math.ceil(60 * seconds));
   const next = (now) => {
+    // Something else moves the camera.
+    if (turn !== playing) return;
     const share = (now - start) / 1000 / seconds;
     Object.assign(view, structuredClone(frames[Math.min(frames.length - 1, Math.floor(share * frames.length))]));
-    ask();
+    settled();
     if (share < 1) requestAnimationFrame(next);
   };
   requestAnimationFrame(next);
@@ -569,7 +499,7 @@ function inCapture(key) {
 function savePath() {
   if (keys.length < 2) return apologise("A path needs two key frames.");
   const [width, height] = about.size;
-  const seconds = Number($("seconds").value) || 4;
+  const seconds = duration();
   const text = JSON.stringify({
     keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
     camera_type: "perspective",
@@ -597,7 +527,7 @@ function follow(message) {
   training = message;
   const { step, loss, psnr, left, paused, share, ended } = message;
   $("progress").textContent = ended ? `ended after ${step} steps: ${ended}`
-    : `step ${step} · loss ${loss.toPrecision(3)} · PSNR ${psnr.toFixed(2)} dB · ${paused ? "paused" : `${left} left`}`;
+    : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} left`}`;
   $("pause").textContent = paused ? "Go on" : "Pause";
   $("pause").setAttribute("aria-pressed", String(Boolean(paused)));
   for (const id of ["pause", "stop", "share"]) $(id).disabled = Boolean(ended);
@@ -636,7 +566,7 @@ $("blend").addEventListener("input", blend);
 for (const id of ["cameras", "points", "closed"]) $(id).addEventListener("change", () => { marksOf(); });
 $("reset").addEventListener("click", reset);
 $("save").addEventListener("click", () => say({ ask: "save", view: wanted() }));
-$("photograph").addEventListener("change", () => ($("photograph").value === "" ? free() : goTo(Number($("photograph").value))));
+$("photograph").addEventListener("change", () => ($("photograph").value === "" ? (free(), ask()) : goTo(Number($("photograph").value))));
 const count = () => about.photographs.length;
 $("next").addEventListener("click", () => goTo(view.photograph === null ? nearest() : (view.photograph + 1) % count()));
 $("previous").addEventListener("click", () => goTo(view.photograph === null ? nearest() : (view.photograph + count() - 1) % count()));
@@ -647,6 +577,11 @@ $("save-path").addEventListener("click", savePath);
 $("pause").addEventListener("click", () => say({ ask: "pause", pause: !(training && training.paused) }));
 $("stop").addEventListener("click", () => { if (confirm("End training here and save what it has found?")) say({ ask: "stop" }); });
 $("share").addEventListener("input", () => say({ ask: "share", share: Number($("share").value) / 100 }));
+// Some browsers keep what was chosen before the page was loaded again.
+for (const input of document.querySelectorAll("input")) [input.checked, input.value] = [input.defaultChecked, input.defaultValue];
+// What nobody sees need not be painted.
+document.addEventListener("visibilitychange", () => (document.hidden ? say({ ask: "rest" }) : ask()));
+listen(stage);
 new ResizeObserver(() => { if (about) { layout(); ask(); } }).observe(stage);
 
 connect();
