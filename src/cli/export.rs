@@ -1,6 +1,7 @@
 //! `raygrad export`: what a run has found out, for other programs.
 
 mod geometry;
+mod page;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -17,12 +18,13 @@ use super::run::Run;
 use super::scene::Scene;
 use super::{builtin, interrupt};
 
-/// Write the cameras or the shape of a run for other programs
+/// Write the cameras or the shape of a run for other programs, or the scene as a page
 ///
 /// All is in the coordinates of the photographs' own files. Where the run has learned poses, photographs that it was
 /// trained on have the refined ones, moved as a whole to where the given ones are; of others, held-out ones, only focal length
 /// and lens follow. A file that ends in .ply, .obj or .glb has the surface as a mesh, or with --points as points, with normals and
-/// colours; of a scene that goes on, what is within the box where the cameras look.
+/// colours; of a scene that goes on, what is within the box where the cameras look. One that ends in .html has the whole scene as
+/// a page that renders itself in any browser with WebGL 2, to be sent to others: it needs no server and no network.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -48,6 +50,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         return geometry::run(&run, args.scene.as_ref(), &args.shape, &args.out).map(|()| ExitCode::SUCCESS);
     }
     args.shape.check_absent()?;
+    if args.to.is_none() && page::is_page(&args.out) {
+        return page::run(&run, &args.out).map(|()| ExitCode::SUCCESS);
+    }
     let model = run.model()?;
     let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
     let mut capture = match run.scene(args.scene.as_ref())? {

@@ -1,5 +1,6 @@
 //! Reads the command line, runs what it asks for, and turns errors into one line and an exit code.
 
+mod base64;
 mod bench;
 mod builtin;
 mod cameras;

@@ -45,7 +45,9 @@ impl Browser {
             return None;
         };
         let profile = tempfile::tempdir().unwrap();
-        let flags = ["--headless=new", "--no-sandbox", "--no-first-run", "--disable-gpu", "--remote-debugging-port=0"];
+        let flags = ["--headless=new", "--no-sandbox", "--no-first-run", "--remote-debugging-port=0"];
+        // Without a graphics card.
+        let flags = flags.into_iter().chain(["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]);
         let mut command = Command::new(name);
         command.args(flags).arg(format!("--user-data-dir={}", profile.path().display())).arg("about:blank");
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
@@ -113,7 +115,7 @@ impl Browser {
         while self.value(expression) != true {
             if start.elapsed() > Duration::from_secs(40) {
                 self.shot("stuck");
-                let state = self.value("JSON.stringify([location.href, asked, shown, waits, socket.readyState])");
+                let state = self.value("JSON.stringify([document.getElementById('status').textContent, typeof asked === 'number' ? [asked, shown, waits] : [wanted, whole]])");
                 panic!("{expression} never came true: {state}; {:?}", self.complaints);
             }
             std::thread::sleep(Duration::from_millis(15));
@@ -238,7 +240,12 @@ fn a_browser_shows_the_scene_and_moves_about_it() {
     let mut seen = vec![pose(&mut browser)];
     let away = "Math.hypot(...view.eye.map((x, i) => x - view.pivot[i]))";
     let far = browser.value(away).as_f64().unwrap();
+    let azimuth = "Math.atan2(view.eye[1] - view.pivot[1], view.eye[0] - view.pivot[0])";
+    let before = browser.value(azimuth).as_f64().unwrap();
     browser.drag([60.0, 20.0], "left");
+    // The scene follows the hand: the camera goes the other way, and up.
+    let turned = (browser.value(azimuth).as_f64().unwrap() - before).sin();
+    assert!(turned < -0.05, "{turned}");
     assert!((browser.value(away).as_f64().unwrap() - far).abs() < 1e-9 * far, "an orbit keeps its distance");
     assert!(browser.value("Math.abs(view.right[2]) < 1e-9") == true, "and the horizon level");
     seen.push(pose(&mut browser));
@@ -274,7 +281,7 @@ fn a_browser_shows_the_scene_and_moves_about_it() {
     // To a photograph and back.
     browser.key("n");
     browser.rested();
-    assert!(browser.value("view.photograph !== null && !photo.hidden") == false);
+    assert!(browser.value("view.photograph !== null && photo.hidden") == true);
     browser.key("b");
     browser.until("!photo.hidden && photo.style.opacity === '0.5'");
     browser.shot("blended");
@@ -413,4 +420,45 @@ fn a_browser_shows_training_and_controls_it() {
     browser.value("window.confirm = () => true; document.getElementById('stop').click()");
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert!(place.path("run/model.safetensors").exists());
+}
+
+/// Of scenes that end, that go on, and that all photographs look ahead at.
+#[test]
+fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
+    let Some(mut browser) = Browser::open() else { return };
+    // What stands in for a graphics card is slow.
+    browser.size(60, 45, false);
+    let place = Place::with_scene();
+    place.succeeds("prepare landscape --to nerfstudio --size 32 --out around");
+    for (scene, flags, name) in [
+        ("scene", "--steps 300", "object"),
+        ("around", "--steps 100 --set field.codes=2 --refine exposure", "landscape"),
+    ] {
+        place.succeeds(&format!("train {scene} {flags} --out {name} {SMALL}"));
+        place.succeeds(&format!("export {name} {name}.html"));
+        place.succeeds(&format!("render {name} --frames 2 --size 40x30 --out seen"));
+        let url = format!("file://{}", place.path(&format!("{name}.html")).display());
+        browser.call("Page.navigate", json!({ "url": url }));
+        browser.until("typeof whole !== 'undefined' && whole === wanted && whole >= 0");
+        browser.shot(&format!("page-{name}"));
+        let [width, height] = [40, 30];
+        // From where it is looked at first, and from behind.
+        let poses = [(0, "data.view.pose"), (1, "(reset(), orbit(-Math.PI, 0), rows(view))")];
+        // Photographs of the landscape are from a part of the circle, on which an orbit swings.
+        for (frame, pose) in poses.into_iter().take(if scene == "scene" { 2 } else { 1 }) {
+            let asked = format!("render({pose}, data.view.fov, {width}, {height}).then((bytes) => Array.from(bytes))");
+            let bytes = browser.value(&asked);
+            let data = bytes
+                .as_array()
+                .unwrap()
+                .chunks(4)
+                .flat_map(|rgba| rgba[..3].iter().map(|x| x.as_u64().unwrap() as f32 / 255.0));
+            let image = Image { width, height, channels: 3, data: data.collect() };
+            let expected = png(&place.path(&format!("seen/000{frame}.png")));
+            assert!(psnr(&image, &expected) > 40.0, "{name} {frame}: {}", psnr(&image, &expected));
+        }
+    }
+    assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
+    place.succeeds("train scene --preset small --steps 1 --out other");
+    place.fails("export other other.html", &["other.html", "`instant`", "`classic`"]);
 }

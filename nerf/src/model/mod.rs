@@ -165,6 +165,12 @@ impl<T: Scalar> Model<T> {
         (&*self.sampler as &dyn Any).downcast_ref()
     }
 
+    /// What the colours of views are multiplied by, and cut off at 1: that of [`look`](Self::look), or of none in particular, where a
+    /// [`Tone`] knows how photographs differ; else 1.
+    pub fn gain(&self) -> [f64; 3] {
+        self.tone.as_ref().map_or([1.0; 3], |tone| tone.gain(&self.params, self.look, false).at(0.0))
+    }
+
     /// The sampler, to be changed, if it marches through an occupancy grid.
     pub fn marching_mut(&mut self) -> Option<&mut Marching> {
         (&mut *self.sampler as &mut dyn Any).downcast_mut()

@@ -138,6 +138,17 @@ impl Marching {
         self.length(self.config.view_step)
     }
 
+    /// How far apart the samples of views are.
+    pub fn view_spacing(&self) -> Step {
+        self.spacing(self.view_step())
+    }
+
+    /// Steps that begin with this length. Those that are shorter than the first of training are so all along the ray.
+    fn spacing(&self, length: f32) -> Step {
+        let cone = (self.config.cone as f32 * length / self.length(self.config.step)).min(1.0);
+        Step { cone, ..Step::uniform(length) }
+    }
+
     fn length(&self, share: f64) -> f32 {
         let [low, high] = self.grid.bounds();
         (share * (high - low).max_element()) as f32
@@ -186,10 +197,7 @@ impl<T: Scalar> Sampler<T> for Marching {
             Purpose::Training => (&self.grid, self.step()),
             Purpose::View { finer } => (self.view_grid(), self.view_step() / finer as f32),
         };
-        // Steps that are shorter than the first of training are so all along the ray.
-        let cone = (self.config.cone as f32 * length / self.length(self.config.step)).min(1.0);
-        let step = Step { cone, ..Step::uniform(length) };
-        let (steps, unskipped) = self.march(grid, rays, &step, jitter, query.tape().pool());
+        let (steps, unskipped) = self.march(grid, rays, &self.spacing(length), jitter, query.tape().pool());
         Sampled { evaluations: Evaluations { unskipped, ..Evaluations::default() }, ..Sampled::new(steps) }
     }
 

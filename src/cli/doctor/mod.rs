@@ -1,6 +1,5 @@
 //! `raygrad doctor`: whether a capture is good, and if not, what is wrong with it.
 
-mod base64;
 mod drawing;
 mod page;
 mod stage;

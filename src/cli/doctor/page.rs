@@ -4,9 +4,9 @@ use raygrad::nerf::dataset::{Capture, Photo};
 use raygrad::nerf::doctor::{Finding, Report};
 use raygrad::nerf::{Error, Result};
 
-use super::base64::base64;
 use super::stage::Stage;
 use super::table;
+use crate::cli::base64::base64;
 use crate::cli::html::{escaped, filled};
 
 /// The page, with places for what is particular.

@@ -234,6 +234,12 @@ impl OccupancyGrid {
         bits::count(&self.words, &self.lattice) as f64 / self.cells() as f64
     }
 
+    /// The occupied cells, a word for each block of 4 x 4 x 4 of them: blocks x fastest, then y, z and cascade; bit `x + 4 y + 16 z`
+    /// is the cell `(x, y, z)` of the block.
+    pub fn words(&self) -> &[u64] {
+        &self.words
+    }
+
     /// Whether a place (scene units) is in an occupied cell: of the smallest cascade that holds it. Outside of all it is not.
     pub fn is_occupied(&self, place: DVec3) -> bool {
         self.lattice.holding(place).is_some_and(|(word, bit)| self.words[word] >> bit & 1 == 1)
