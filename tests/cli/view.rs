@@ -533,3 +533,130 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     place.succeeds("train --resume other");
     assert_same(&place, "whole", "other");
 }
+
+/// The same view from elsewhere: turned about the vertical, in radians.
+fn turned(view: &Value, angle: f64) -> Value {
+    let (sin, cos) = angle.sin_cos();
+    let mut view = view.clone();
+    let pose = view["eye"]["free"]["pose"].clone();
+    for column in 0..4 {
+        let [x, y] = [0, 1].map(|row: usize| pose[row][column].as_f64().unwrap());
+        view["eye"]["free"]["pose"][0][column] = json!(cos * x - sin * y);
+        view["eye"]["free"]["pose"][1][column] = json!(sin * x + cos * y);
+    }
+    view
+}
+
+/// `VIEWED=RUN,RUN cargo test --release --test cli milliseconds -- --nocapture` measures runs of one's own, by their whole paths.
+#[test]
+fn milliseconds_from_a_drag_to_the_first_picture_and_to_the_whole_one() {
+    let place = trained();
+    let given = std::env::var("VIEWED").ok();
+    let runs = given.as_deref().unwrap_or("run").split(',');
+    let sizes: &[usize] = if given.is_some() { &[400, 800] } else { &[40] };
+    for (run, &side) in runs.flat_map(|run| sizes.iter().map(move |side| (run, side))) {
+        let server = serve(&place, &format!("view {run}"));
+        let (mut page, about) = Page::open(&server.address);
+        let view = first(&about, [side, side]);
+        // The first ones find out how quick this machine is.
+        page.look(0, &view);
+        let count = if given.is_some() { 15 } else { 4 };
+        let (mut firsts, mut wholes, mut coarse) = (vec![], vec![], 0);
+        for id in 1..=count {
+            let start = Instant::now();
+            page.say(json!({ "ask": "view", "id": id, "view": turned(&view, 0.07 * f64::from(id)) }));
+            let mut begun = None;
+            loop {
+                let (head, bytes) = page.file("picture");
+                if head["id"] != id {
+                    continue;
+                }
+                let milliseconds = 1e3 * start.elapsed().as_secs_f64();
+                if begun.is_none() {
+                    begun = Some(milliseconds);
+                    coarse = decoded(&bytes).width;
+                }
+                if head["halvings"] == 0 {
+                    wholes.push(milliseconds);
+                    break;
+                }
+            }
+            firsts.push(begun.unwrap());
+        }
+        // A hand that never rests: the next view as soon as a picture came.
+        let (start, mut frames) = (Instant::now(), 0);
+        let seconds = if given.is_some() { 5.0 } else { 0.5 };
+        while start.elapsed().as_secs_f64() < seconds {
+            frames += 1;
+            let id = 100 + frames;
+            page.say(json!({ "ask": "view", "id": id, "view": turned(&view, 0.02 * f64::from(frames)) }));
+            while page.file("picture").0["id"] != id {}
+        }
+        let median = |values: &mut Vec<f64>| {
+            values.sort_by(f64::total_cmp);
+            values[values.len() / 2]
+        };
+        let rate = f64::from(frames) / start.elapsed().as_secs_f64();
+        let [first, whole] = [median(&mut firsts), median(&mut wholes)];
+        println!(
+            "{run} at {side}x{side}: first picture ({coarse} wide) after {first:.0} ms, the whole after {whole:.0} ms; \
+             {rate:.1} pictures a second while dragging"
+        );
+        assert!(first > 0.0 && first <= whole && rate > 1.0, "{first} {whole} {rate}");
+    }
+}
+
+/// `LOAD=all cargo test --release --test cli many_pages -- --nocapture` is the campaign: fifty pages, ten thousand messages that are none.
+#[test]
+fn many_pages_and_much_nonsense_leave_memory_and_training_as_they_are() {
+    let all = std::env::var("LOAD").is_ok_and(|which| which == "all");
+    let (pages, nonsense, steps) = if all { (50, 10_000, 6000) } else { (6, 100, 600) };
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps {steps} --out whole {SMALL}"));
+    let mut server = serve(&place, &format!("train scene --steps {steps} --view --out run {SMALL}"));
+    let memory = {
+        let status = format!("/proc/{}/status", server.child.id());
+        move || -> Option<f64> {
+            let text = std::fs::read_to_string(&status).ok()?;
+            let line = text.lines().find(|line| line.starts_with("VmRSS:"))?;
+            line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kilobytes| kilobytes / 1e3)
+        }
+    };
+    let (mut held, about) = Page::open(&server.address);
+    held.say(json!({ "ask": "pause", "pause": true }));
+    while held.text("training")["paused"] != true {}
+    let before = memory();
+    // Every third takes nothing that it asked for; two and two look the same way.
+    let view = first(&about, [96, 96]);
+    let mut others: Vec<Page> = (0..pages).map(|_| Page::open(&server.address).0).collect();
+    for (i, page) in others.iter_mut().enumerate() {
+        page.say(json!({ "ask": "view", "id": 1, "view": turned(&view, 0.1 * (i / 2) as f64) }));
+    }
+    for (i, page) in others.iter_mut().enumerate().filter(|(i, _)| i % 3 != 0) {
+        while page.file("picture").0["halvings"] != 0 {}
+        assert!(i < pages);
+    }
+    let mut random = 7_u32;
+    let letters = br#"{}[]":,0189.eE-+"askview idpose\u0000 "#;
+    for _ in 0..nonsense {
+        let text: String = (0..40)
+            .map(|_| {
+                random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                char::from(letters[(random >> 16) as usize % letters.len()])
+            })
+            .collect();
+        let (mut page, _) = Page::open(&server.address);
+        page.socket.send(Message::text(text)).unwrap();
+        page.closed();
+    }
+    let after = memory();
+    println!("{pages} pages, {nonsense} messages that are none: {before:?} MB before, {after:?} MB after");
+    if let Some((before, after)) = before.zip(after) {
+        assert!(after - before < 200.0, "{before} MB before, {after} MB after");
+    }
+    drop(others);
+    held.say(json!({ "ask": "pause", "pause": false }));
+    while held.read().is_ok() {}
+    assert_eq!(server.child.wait().unwrap().code(), Some(0));
+    assert_same(&place, "whole", "run");
+}

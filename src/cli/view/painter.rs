@@ -147,11 +147,14 @@ impl Painter {
         }
         for job in &mut self.jobs {
             let Some((seen, when)) = job.whole else { continue };
+            if when.elapsed() <= AGAIN.max(job.spent) {
+                continue;
+            }
             if seen == step && job.halvings > 0 {
-                // It has stopped learning.
+                // It has not learned for a while: it is held.
                 job.halvings -= 1;
                 job.begin(model, self.album.as_deref(), step);
-            } else if seen != step && when.elapsed() > AGAIN.max(job.spent) {
+            } else if seen != step {
                 // What has learned more is seen again, as fine as there is time for.
                 let view = job.target.view();
                 let rate = self.rates.get(&(view.show, view.exact)).copied().unwrap_or(RATE);
