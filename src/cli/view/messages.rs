@@ -38,7 +38,7 @@ pub enum Ask {
 impl Ask {
     /// Reads a message.
     pub fn read(text: &str) -> Result<Ask, String> {
-        let ask: Ask = serde_json::from_str(text).map_err(|e| e.to_string())?;
+        let ask: Ask = serde_json::from_str(text).map_err(|e| e.to_string().replace(char::is_control, " "))?;
         match &ask {
             Ask::View { view, .. } | Ask::Save { view } => view.check()?,
             Ask::Share { share } if !(0.0..=0.9).contains(share) => return Err("a share is from 0 to 0.9".to_owned()),
