@@ -496,6 +496,11 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     let held = head["step"].as_u64().unwrap();
     page.texts.clear();
     assert_eq!(page.text("training")["step"], held, "it waits");
+    // One that only looks on is told how it goes, and asked whether it is still there.
+    let asked = Instant::now();
+    while !matches!(page.socket.read().unwrap(), Message::Ping(_)) {
+        assert!(asked.elapsed() < Duration::from_secs(25), "it would be taken to be gone");
+    }
     page.say(json!({ "ask": "share", "share": 0.5 }));
     while page.text("training")["share"] != 0.5 {}
     page.say(json!({ "ask": "pause", "pause": false }));

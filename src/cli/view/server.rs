@@ -35,8 +35,8 @@ const RATE: f64 = 300.0;
 const BURST: f64 = 600.0;
 /// How long a request may take to arrive, and a page to take a message or say that it has seen a picture.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// How long nothing is said before a page is asked whether it is still there, and not heard before it is taken to be gone.
-const IDLE: Duration = Duration::from_secs(10);
+/// How often a page is asked whether it is still there, and how long it is not heard before it is taken to be gone.
+const IDLE: Duration = Duration::from_secs(5);
 const SILENCE: Duration = Duration::from_secs(30);
 /// Longest side of a photograph that is sent.
 const PHOTOGRAPH: usize = 1600;
@@ -252,6 +252,7 @@ async fn page(socket: WebSocket, served: Arc<Served>) {
     outbox.post(Outgoing::Text(served.about.clone()));
     let (mut out, mut heard) = socket.split();
     let write = async {
+        let mut pinged = Instant::now();
         loop {
             while let Some(message) = outbox.take() {
                 let message = match message {
@@ -266,17 +267,19 @@ async fn page(socket: WebSocket, served: Arc<Served>) {
             if outbox.is_overrun() {
                 return Some("too much was asked for");
             }
-            let until = outbox.flying().map_or(Instant::now() + IDLE, |since| since + PATIENCE);
-            if timeout_at(until.into(), outbox.changed.notified()).await.is_ok() {
-                continue;
-            }
-            if outbox.flying().is_some_and(|since| since.elapsed() >= PATIENCE) {
+            let flown = outbox.flying().map(|since| since + PATIENCE);
+            if flown.is_some_and(|until| until <= Instant::now()) {
                 return Some("a picture was not taken");
             }
-            // Whether it is still there: a browser answers by itself.
-            if !matches!(timeout(PATIENCE, out.send(Message::Ping(Default::default()))).await, Ok(Ok(()))) {
-                return None;
+            // Whether it is still there: a browser answers by itself, also one that looks on and says nothing.
+            if pinged.elapsed() >= IDLE {
+                pinged = Instant::now();
+                if !matches!(timeout(PATIENCE, out.send(Message::Ping(Default::default()))).await, Ok(Ok(()))) {
+                    return None;
+                }
             }
+            let until = flown.map_or(pinged + IDLE, |until| until.min(pinged + IDLE));
+            let _ = timeout_at(until.into(), outbox.changed.notified()).await;
         }
     };
     let reader = Arc::new(Semaphore::new(1));
