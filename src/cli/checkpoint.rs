@@ -1,4 +1,4 @@
-//! What a run goes on from: `checkpoints/STEP.checkpoint`, the last two of them.
+//! What a run goes on from: `checkpoints/STEP.checkpoint`, the last two of them, or as many as are to stay.
 //!
 //! A line of text, `raygrad checkpoint VERSION CRC32 LENGTH`, and a [state](Trainer::state) of that length.
 
@@ -22,15 +22,18 @@ fn folder(run: &Run) -> PathBuf {
     run.file("checkpoints")
 }
 
-/// Writes where training is, and removes all others but the one before: if this one is damaged, there is that.
-pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
+/// How many stay if nothing is said: if the last is damaged, there is the one before.
+pub const KEPT: usize = 2;
+
+/// Writes where training is, and removes all others but the last so many with this.
+pub fn save(run: &Run, trainer: &Trainer, kept: usize) -> Result<()> {
     let folder = folder(run);
     make_folder(&folder)?;
     let step = trainer.stats().step;
     write_atomic(folder.join(format!("{step:08}.checkpoint")), &framed(&trainer.state()?))?;
     // What is said to be later was damaged, and passed over.
     let (later, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
-    remove(&later.into_iter().chain(others.into_iter().skip(2)).map(|(_, path)| path).collect::<Vec<_>>());
+    remove(&later.into_iter().chain(others.into_iter().skip(kept)).map(|(_, path)| path).collect::<Vec<_>>());
     Ok(())
 }
 
@@ -44,6 +47,22 @@ pub(super) fn framed(state: &[u8]) -> Vec<u8> {
 /// Whether a run has a checkpoint, whole or not.
 pub fn exists(run: &Run) -> Result<bool> {
     Ok(!all(&folder(run))?.is_empty())
+}
+
+/// The steps of which a run has checkpoints, whole or not, the first one first.
+pub fn steps(run: &Run) -> Result<Vec<u64>> {
+    Ok(all(&folder(run))?.into_iter().rev().map(|(step, _)| step).collect())
+}
+
+/// The state of a run at a step.
+///
+/// # Errors
+/// If there is no checkpoint of this step, or it is damaged.
+pub fn read(run: &Run, step: u64) -> Result<Vec<u8>> {
+    let found = all(&folder(run))?.into_iter().find(|(own, _)| *own == step);
+    let (_, path) = found.ok_or_else(|| Error::file(folder(run), format!("there is no checkpoint of step {step}")))?;
+    let bytes = fs::read(&path).map_err(|e| Error::file(&path, format!("cannot be read: {e}")))?;
+    parse(&path, bytes)
 }
 
 /// The checkpoints in a folder with their steps, the latest first.

@@ -130,7 +130,7 @@ fn campaign_configurations_of_runs() {
 fn campaign_messages_of_pages() {
     let pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 1.0]];
     let free = json!({ "ask": "view", "id": 7, "view": { "eye": { "free": { "pose": pose, "fov": 40.5 } },
-        "size": [640, 480], "show": "normals", "background": [255, 0, 7], "within": [[-1, -1, -1], [1, 1, 1]], "exact": true } });
+        "size": [640, 480], "show": "normals", "background": [255, 0, 7], "within": [[-1, -1, -1], [1, 1, 1]], "skip": "off", "checkpoint": 12 } });
     let kept = json!({ "ask": "save", "view": { "eye": { "photograph": 3 }, "size": [8, 8] } });
     let others =
         [json!({ "ask": "share", "share": 0.3 }), json!({ "ask": "stop" }), json!({ "ask": "pause", "pause": true })];

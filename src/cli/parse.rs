@@ -10,6 +10,11 @@ pub fn count(most: usize) -> impl TypedValueParser<Value = usize> {
     RangedU64ValueParser::<usize>::new().range(1..=most as u64)
 }
 
+/// A whole number from 2.
+pub fn at_least_two() -> impl TypedValueParser<Value = usize> {
+    RangedU64ValueParser::<usize>::new().range(2..=1 << 14)
+}
+
 /// A duration such as `90s`, `10m` or `1.5h`.
 pub fn duration(text: &str) -> Result<Duration, String> {
     let usage = || "write a number and a unit: 90s, 10m or 1.5h".to_owned();

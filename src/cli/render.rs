@@ -181,6 +181,14 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     report(&cameras, &out)
 }
 
+/// The ending of films where nobody says one: what plays everywhere, or else what needs no other program.
+pub fn film_ending() -> &'static str {
+    match Film::Mp4.check_encoder(Path::new("FILE.mp4")) {
+        Ok(()) => "mp4",
+        Err(_) => "gif",
+    }
+}
+
 /// Endings of pictures and films that others write.
 const FOREIGN: [&str; 13] =
     ["mov", "avi", "mkv", "m4v", "mpg", "mpeg", "ogv", "jpg", "jpeg", "webp", "exr", "tif", "tiff"];

@@ -44,7 +44,7 @@ pub struct RunConfig {
 }
 
 /// A run on disk.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Run {
     /// Its folder.
     pub folder: PathBuf,

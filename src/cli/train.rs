@@ -115,6 +115,9 @@ pub struct Args {
     /// Training time between checkpoints, which --resume goes on from
     #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
     checkpoint: Duration,
+    /// How many checkpoints stay; `raygrad view` goes through them
+    #[arg(long, value_name = "N", default_value_t = checkpoint::KEPT, value_parser = parse::at_least_two())]
+    keep_checkpoints: usize,
     /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
     #[arg(long)]
     tensorboard: bool,
@@ -241,7 +244,8 @@ fn train(
     listener: Option<Listener>,
 ) -> Result<Trained> {
     let mut window = listener.map(|listener| Window::open(listener, &run, &trainer)).transpose()?;
-    let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
+    let mut watch =
+        Watch::new(&run, &trainer, budget, args.checkpoint, args.keep_checkpoints, preview, args.tensorboard)?;
     interrupt::listen();
     let (mut diverged, mut ended_by_page) = (None, false);
     for retreats in 0.. {

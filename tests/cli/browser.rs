@@ -309,6 +309,27 @@ fn a_browser_shows_the_scene_and_moves_about_it() {
     assert!(moved < side - 0.05, "{moved} {side}");
     browser.rested();
     browser.shot("cropped");
+    browser.value("document.getElementById('crop').click()");
+    // The slider goes through checkpoints; letters that are typed in a control are its own.
+    let slide = |browser: &mut Browser, to: u32| {
+        let id = "document.getElementById('checkpoint')";
+        browser.value(&format!("{id}.focus(); {id}.value = {to}; {id}.dispatchEvent(new Event('input'))"));
+        browser.rested();
+    };
+    slide(&mut browser, 0);
+    assert_eq!(browser.value("[shown.step, document.getElementById('checkpoint-out').textContent].join()"), "0,step 0");
+    browser.key("3");
+    browser.key("r");
+    assert_eq!(browser.value("mode()"), "color");
+    browser.shot("checkpoint");
+    slide(&mut browser, 2);
+    assert_eq!(browser.value("document.getElementById('checkpoint-out').textContent"), "the end");
+    browser.value("document.getElementById('skip').value = 'off'; document.getElementById('skip').dispatchEvent(new Event('change'))");
+    browser.rested();
+    browser.value("stage.focus()");
+    browser.key("r");
+    browser.rested();
+    assert!(same(&browser.picture(&place)), "nothing is left out that shows");
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
 }
 
@@ -339,6 +360,15 @@ fn a_browser_keeps_pictures_and_paths_that_are_the_programs() {
     assert_eq!(browser.value("keys.length"), 2);
     browser.value("document.getElementById('save-path').click()");
     wait("path.json");
+    browser.value("document.getElementById('film').click()");
+    browser.until(
+        "document.getElementById('film-progress').textContent.endsWith('mp4: done') \
+                   || document.getElementById('film-progress').textContent.endsWith('gif: done')",
+    );
+    assert!(browser.value("document.getElementById('end-film').hidden") == true);
+    let [ours, its] = ["path.json", "run/films/film-1.json"].map(|name| place.json(name));
+    let fov = |path: &Value| path["keyframes"][1]["fov"].as_f64().unwrap();
+    assert!((fov(&ours) - fov(&its)).abs() < 1e-5 && ours["is_cycle"] == its["is_cycle"]);
     place.succeeds(&format!(
         "render run --path path.json --frames 2 --size {}x{} --out film",
         saved.width, saved.height

@@ -539,6 +539,205 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     assert_same(&place, "whole", "other");
 }
 
+#[test]
+fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 400 --checkpoint 0.05s --keep-checkpoints 500 --out run {SMALL}"));
+    assert_eq!(place.command("train scene --keep-checkpoints 1").output().unwrap().status.code(), Some(2));
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    let steps: Vec<u64> = about["checkpoints"].as_array().unwrap().iter().map(|step| step.as_u64().unwrap()).collect();
+    assert!(steps.len() > 4 && steps.is_sorted() && [steps[0], steps[steps.len() - 1]] == [0, 400], "{steps:?}");
+    let view = first(&about, [64, 64]);
+    let with = |name: &str, value: Value| {
+        let mut view = view.clone();
+        view[name] = value;
+        view
+    };
+    assert_eq!(page.look(1, &view).pop().unwrap().0["step"], 0, "the model itself");
+    let kept = |page: &mut Page, view: &Value| {
+        page.say(json!({ "ask": "save", "view": view }));
+        decoded(&page.file("save").1)
+    };
+    let last = kept(&mut page, &view);
+    // A run that is ended at a checkpoint has the model of it.
+    let earlier = *steps.iter().find(|step| **step > 30).unwrap();
+    place.succeeds(&format!("train scene --steps 400 --checkpoint 0.05s --keep-checkpoints 3 --out other {SMALL}"));
+    let checkpoints = place.path("other/checkpoints");
+    assert_eq!(std::fs::read_dir(&checkpoints).unwrap().count(), 3);
+    std::fs::remove_dir_all(&checkpoints).unwrap();
+    std::fs::create_dir(&checkpoints).unwrap();
+    let name = format!("{earlier:08}.checkpoint");
+    std::fs::copy(place.path(&format!("run/checkpoints/{name}")), checkpoints.join(name)).unwrap();
+    place.succeeds(&format!("train --resume other --steps {earlier}"));
+    place.succeeds("render other --frames 1 --size 64x64 --out earlier");
+    let at_earlier = with("checkpoint", json!(earlier));
+    assert_eq!(page.look(2, &at_earlier).pop().unwrap().0["step"], earlier);
+    let before = kept(&mut page, &at_earlier);
+    let expected = png(&place.path("earlier/0000.png"));
+    assert!(psnr(&before, &expected) > 50.0, "{}", psnr(&before, &expected));
+    assert!(psnr(&last, &expected) < 40.0, "{}", psnr(&last, &expected));
+    // The last one is what the run ended with, but for its rounding.
+    let same = kept(&mut page, &with("checkpoint", json!(400)));
+    assert!(psnr(&same, &last) > 50.0, "{}", psnr(&same, &last));
+    // More of them than are kept in memory, and back.
+    for (id, step) in (4..).zip([steps[1], steps[2], steps[3], steps[4], steps[1]]) {
+        assert_eq!(page.look(id, &with("checkpoint", json!(step))).pop().unwrap().0["step"], step);
+    }
+    for (id, skip) in (10..).zip(["off", "lossless", "fast"]) {
+        for (id, show) in [(id, "color"), (id + 10, "normals")] {
+            place.succeeds(&format!(
+                "render run --frames 1 --size 64x64 --skip {skip} --show {show} --out {skip}-{show}"
+            ));
+            let mut view = with("skip", json!(skip));
+            view["show"] = json!(show);
+            let seen = kept(&mut page, &view);
+            let expected = png(&place.path(&format!("{skip}-{show}/0000.png")));
+            assert!(psnr(&seen, &expected) > 45.0, "{skip} {show} {id}: {}", psnr(&seen, &expected));
+        }
+    }
+    let modes = ["off", "fast"].map(|skip| std::fs::read(place.path(&format!("{skip}-color/0000.png"))).unwrap());
+    assert_ne!(modes[0], modes[1]);
+    // What is not there is said, and the rest goes on.
+    for kind in ["view", "save"] {
+        page.say(
+            json!({ "ask": kind, "id": 30, "view": with("checkpoint", json!(401)) })
+                .as_object()
+                .map(|asked| {
+                    let mut asked = asked.clone();
+                    if kind == "save" {
+                        asked.remove("id");
+                    }
+                    Value::Object(asked)
+                })
+                .unwrap(),
+        );
+        let what = page.text("sorry")["what"].as_str().unwrap().to_owned();
+        assert!(what.contains("no checkpoint of step 401"), "{kind}: {what}");
+    }
+    std::fs::write(place.path(&format!("run/checkpoints/{:08}.checkpoint", steps[1])), b"nothing").unwrap();
+    for id in [32, 33] {
+        page.say(json!({ "ask": "view", "id": id, "view": with("checkpoint", json!(steps[1])) }));
+        let what = page.text("sorry")["what"].as_str().unwrap().to_owned();
+        assert!(what.contains(&format!("{:08}.checkpoint", steps[1])) && what.contains("damaged"), "{what}");
+    }
+    assert_eq!(page.look(34, &view).pop().unwrap().0["step"], 0);
+}
+
+/// A path between two key frames, as the page saves it.
+fn path(about: &Value, seconds: f64) -> Value {
+    let frame = |fov: f64| {
+        let pose = about["photographs"][0]["pose"].as_array().unwrap();
+        let mut matrix: Vec<Value> = pose.iter().flat_map(|row| row.as_array().unwrap().clone()).collect();
+        matrix.extend([0, 0, 0, 1].map(Value::from));
+        json!({ "matrix": matrix, "fov": fov })
+    };
+    json!({ "keyframes": [frame(40.0), frame(50.0)], "camera_type": "perspective", "render_width": 16, "render_height": 12,
+        "is_cycle": false, "seconds": seconds, "fps": 5, "smoothness_value": 0, "camera_path": [] })
+}
+
+#[test]
+fn films_are_made_one_at_a_time_beside_what_is_seen() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    let ended = |page: &mut Page| loop {
+        let told = page.text("film");
+        if told["ended"] == true {
+            return told;
+        }
+    };
+    page.say(json!({ "ask": "film", "path": path(&about, 0.8), "show": "depth" }));
+    let told = ended(&mut page);
+    assert_eq!(told["words"], "done");
+    let film = told["file"].as_str().unwrap();
+    assert!(
+        film.starts_with("run/films/film-1.") && std::fs::metadata(place.path(film)).unwrap().len() > 100,
+        "{film}"
+    );
+    assert!(!place.path(&format!("{film}.frames")).exists());
+    // The same by hand is the same.
+    let ending = film.rsplit('.').next().unwrap();
+    place.succeeds(&format!("render run --path run/films/film-1.json --show depth --out again.{ending}"));
+    let bytes = [film, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
+    assert!(bytes[0] == bytes[1]);
+    // One that takes long does not hold up pictures or let another begin, until it is ended.
+    page.say(json!({ "ask": "film", "path": path(&about, 600.0) }));
+    page.text("film");
+    page.say(json!({ "ask": "film", "path": path(&about, 1.0) }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("one is being made"));
+    page.look(1, &first(&about, [16, 16]));
+    page.say(json!({ "ask": "end-film" }));
+    assert_eq!(ended(&mut page)["words"], "ended");
+    assert!(!place.path(&format!("run/films/film-2.{ending}")).exists());
+    // What is no path is said by who reads it.
+    page.say(json!({ "ask": "film", "path": { "keys": [] } }));
+    let words = ended(&mut page)["words"].as_str().unwrap().to_owned();
+    assert!(words.contains("film-3.json") && words.contains("is no camera path"), "{words}");
+    page.say(json!({ "ask": "film", "path": path(&about, 1.0), "show": "error" }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("depth"));
+    page.say(json!({ "ask": "end-film" }));
+    page.look(2, &first(&about, [17, 16]));
+    let server = serve(&place, &format!("train scene --steps 100000 --view --out other {SMALL}"));
+    let (mut page, about) = Page::open(&server.address);
+    page.say(json!({ "ask": "film", "path": path(&about, 1.0) }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("training has ended"));
+    assert!(!place.path("other/films").exists());
+}
+
+#[test]
+fn pages_know_where_photographs_are_found_to_have_been_taken() {
+    let place = Place::with_scene();
+    let server = serve(&place, &format!("train scene --steps 100000 --refine poses --view --out run {SMALL}"));
+    let (mut page, about) = Page::open(&server.address);
+    let taken = page.text("taken");
+    let poses =
+        |told: &Value| told["photographs"].as_array().unwrap().iter().map(|p| p["pose"].clone()).collect::<Vec<_>>();
+    assert!(poses(&taken).len() == poses(&about).len() && poses(&taken) != poses(&about));
+    // Who comes later is told what is known by then.
+    let (_, later) = Page::open(&server.address);
+    assert_ne!(poses(&later), poses(&about));
+}
+
+#[test]
+fn photographs_that_cannot_be_read_are_named() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    std::fs::write(place.path("scene/train/r_3.png"), b"nothing").unwrap();
+    let view = json!({ "eye": { "photograph": 3 }, "size": [16, 16], "show": "error" });
+    page.say(json!({ "ask": "view", "id": 1, "view": view }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("r_3.png"));
+    page.say(json!({ "ask": "photograph", "number": 3 }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("r_3.png"));
+    page.look(2, &first(&about, [16, 16]));
+}
+
+#[test]
+fn so_many_pages_are_served_and_no_more_until_one_goes() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let mut pages: Vec<Page> = (0..64).map(|_| Page::open(&server.address).0).collect();
+    let upgrade = format!(
+        "GET /messages HTTP/1.1\r\nHost: {0}\r\nOrigin: http://{0}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n",
+        server.address
+    );
+    let status = || {
+        let mut stream = TcpStream::connect(&server.address).unwrap();
+        stream.write_all(upgrade.as_bytes()).unwrap();
+        let mut start = [0; 12];
+        stream.read_exact(&mut start).unwrap();
+        String::from_utf8_lossy(&start[9..]).into_owned()
+    };
+    assert_eq!(status(), "503");
+    pages.pop().unwrap().socket.close(None).unwrap();
+    let start = Instant::now();
+    while status() != "101" {
+        assert!(start.elapsed() < Duration::from_secs(20), "its place is free");
+    }
+}
+
 /// The same view from elsewhere: turned about the vertical, in radians.
 fn turned(view: &Value, angle: f64) -> Value {
     let (sin, cos) = angle.sin_cos();

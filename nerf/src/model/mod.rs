@@ -151,6 +151,11 @@ impl<T: Scalar> Model<T> {
         self.refine.as_ref().map_or(&[], Refine::cameras)
     }
 
+    /// The share of their detail that fields have, 0 to 1.
+    pub(crate) fn detail(&self) -> f64 {
+        self.detail
+    }
+
     /// Gives all fields that share of their detail, 0 to 1: see [`Field::with_detail`]. All parameters stay.
     pub fn set_detail(&mut self, detail: f64) {
         self.detail = detail;

@@ -4,6 +4,7 @@ use super::groups::Groups;
 use super::stats::StepStats;
 use super::trainer::Trainer;
 use crate::model::Extent;
+use crate::model::Model;
 use crate::model::config::Config;
 use crate::{Error, Result};
 use raygrad_nn::{ParamsError, Storage};
@@ -30,6 +31,9 @@ struct Counts {
     /// What learning rates are multiplied by.
     #[serde(default = "one")]
     pace: f64,
+    /// How much of its detail the field has.
+    #[serde(default = "one")]
+    detail: f64,
     /// How many groups of parameters there are.
     groups: usize,
     /// What was said of the parameters, in their order.
@@ -81,6 +85,7 @@ impl Trainer {
             batch: self.batch,
             collapses: self.collapses,
             pace: self.pace,
+            detail: self.model.detail(),
             groups: groups.len(),
             settings: params.ids().map(setting).collect(),
         };
@@ -118,15 +123,7 @@ impl Trainer {
     /// If the bytes are no such state, or one of another configuration.
     pub fn load_state(&mut self, state: &[u8]) -> Result<()> {
         let failed = |what: String| Error::setting("state", what);
-        let mut model = self.model.clone();
-        let mut blobs = model.params.load_safetensors(state).map_err(|error| failed(error.to_string()))?;
-        let Some(counts) = blobs.remove(TRAINER) else {
-            return Err(failed("holds a model, and not a run that can go on".into()));
-        };
-        let counts: Counts = serde_json::from_slice(&counts).map_err(|error| failed(error.to_string()))?;
-        if counts.config != self.model.config || counts.extent != self.model.extent {
-            return Err(failed("is that of another configuration, or of other photographs".into()));
-        }
+        let (mut model, counts, mut blobs) = self.model.restored(state)?;
         if !(1..=MOST_RAYS).contains(&counts.batch) {
             return Err(failed(format!("has steps of {} rays; use 1 to {MOST_RAYS}", counts.batch)));
         }
@@ -152,11 +149,55 @@ impl Trainer {
             (0..counts.groups).map(|i| blobs.remove(&group(i)).ok_or_else(missing)).collect::<Result<_>>()?;
         let mut groups = Groups::new(&model.config, &model.params)?;
         groups.load_state(&model.params, &remembered)?;
-        model.sampler.load_state(&blobs)?;
         (self.model, self.groups) = (model, groups);
         let Counts { stats, elapsed, batch, collapses, pace, .. } = counts;
         (self.done, self.elapsed, self.batch, self.collapses, self.pace) = (stats, elapsed, batch, collapses, pace);
         Ok(())
+    }
+}
+
+impl Model<f32> {
+    /// This model as it was when a trainer wrote a [state](Trainer::state), ready to be rendered.
+    ///
+    /// ```
+    /// use raygrad_nerf::dataset::{Split, embedded};
+    /// use raygrad_nerf::{Config, Preset, Trainer};
+    /// use std::sync::Arc;
+    /// let data = Arc::new(embedded(Split::Train, 16));
+    /// let mut trainer = Trainer::new(Config::preset(Preset::Instant), data.clone())?;
+    /// let untrained = trainer.state()?;
+    /// trainer.step(0.0);
+    /// let before = trainer.model.at_state(&untrained)?;
+    /// assert_ne!(before.params.get(before.params.ids().next().unwrap()), trainer.model.params.get(before.params.ids().next().unwrap()));
+    /// # Ok::<(), raygrad_nerf::Error>(())
+    /// ```
+    ///
+    /// # Errors
+    /// If the bytes are no such state, or one of another configuration.
+    pub fn at_state(&self, state: &[u8]) -> Result<Self> {
+        let (mut model, ..) = self.restored(state)?;
+        model.finish();
+        Ok(model)
+    }
+
+    /// The model of a state, what is said of the run beside it, and what was not used yet.
+    fn restored(&self, state: &[u8]) -> Result<(Self, Counts, HashMap<String, Vec<u8>>)> {
+        let failed = |what: String| Error::setting("state", what);
+        let mut model = self.clone();
+        let mut blobs = model.params.load_safetensors(state).map_err(|error| failed(error.to_string()))?;
+        let Some(counts) = blobs.remove(TRAINER) else {
+            return Err(failed("holds a model, and not a run that can go on".into()));
+        };
+        let counts: Counts = serde_json::from_slice(&counts).map_err(|error| failed(error.to_string()))?;
+        if counts.config != self.config || counts.extent != self.extent {
+            return Err(failed("is that of another configuration, or of other photographs".into()));
+        }
+        if !(0.0..=1.0).contains(&counts.detail) {
+            return Err(failed(format!("has a share of {} of its detail", counts.detail)));
+        }
+        model.set_detail(counts.detail);
+        model.sampler.load_state(&blobs)?;
+        Ok((model, counts, blobs))
     }
 }
 

@@ -74,7 +74,7 @@ impl Film {
     }
 
     /// Whether ffmpeg is there and has what this needs.
-    fn check_encoder(self, out: &Path) -> Result<()> {
+    pub fn check_encoder(self, out: &Path) -> Result<()> {
         let or = "or name a FILE.gif or FILE.apng, which need no other program";
         let encoders = FFMPEG.ask(&["-hide_banner", "-encoders"]).map_err(|stop| match stop {
             Stop::Failed(error) => Error::file(out, format!("{error}; {or}")),

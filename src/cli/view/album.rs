@@ -1,13 +1,14 @@
 //! The photographs of a run, one at a time.
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use raygrad::nerf::dataset::{Capture, Dataset, Photo, Point, Split, View, embedded, landscape};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Error, Model, Result};
 
+use super::hub::Hub;
 use super::messages::{AboutPhotograph, rows};
+use super::store::{Got, Store};
 use crate::cli::builtin;
 use crate::cli::photographs::{check_trained, present};
 use crate::cli::run::Run;
@@ -15,6 +16,8 @@ use crate::cli::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
 /// Photographs that are kept in memory.
 const KEPT: usize = 4;
+/// Longest side that they are kept at.
+const LONGEST: usize = 1600;
 /// Most points that a page is told of.
 const MOST_POINTS: usize = 4000;
 
@@ -23,7 +26,7 @@ pub struct Album {
     capture: Capture,
     scene: Scene,
     entries: Vec<Entry>,
-    kept: Mutex<VecDeque<(usize, Arc<Photo>)>>,
+    kept: Store<usize, Photo>,
 }
 
 struct Entry {
@@ -65,7 +68,7 @@ impl Album {
                 Entry { split, number, view: view.clone(), given }
             }));
         }
-        Ok(Album { capture, scene, entries, kept: Mutex::default() })
+        Ok(Album { capture, scene, entries, kept: Store::new(KEPT) })
     }
 
     /// How many there are.
@@ -92,25 +95,30 @@ impl Album {
         (0..self.len()).map(|number| (apart(&number), number)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, i)| i)
     }
 
-    /// A photograph.
+    /// A photograph, no larger than a page shows it.
     ///
     /// # Errors
     /// If there is none of this number, or it cannot be read.
     pub fn photo(&self, number: usize) -> Result<Arc<Photo>> {
-        let lock = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, photo)) = lock().iter().find(|(own, _)| *own == number) {
-            return Ok(photo.clone());
-        }
+        self.kept.get_now(number, || self.read(number))
+    }
+
+    /// The same, read beside all else; wakes who waits at the hub when it has come.
+    pub fn fetch(self: &Arc<Self>, number: usize, hub: &Arc<Hub>) -> Got<Photo> {
+        let (album, hub) = (self.clone(), hub.clone());
+        self.kept.get(number, move || album.read(number), move || hub.wake())
+    }
+
+    fn read(&self, number: usize) -> Result<Photo> {
         let entry = self.entries.get(number);
         let entry = entry.ok_or_else(|| Error::setting("photograph", format!("there is no photograph {number}")))?;
-        let photo = Arc::new(match &self.scene {
+        let photo = match &self.scene {
             Scene::Folder(_) => self.capture.photo(&entry.view)?,
             made => self.made(made, entry)?,
-        });
-        let mut kept = lock();
-        kept.push_front((number, photo.clone()));
-        kept.truncate(KEPT);
-        Ok(photo)
+        };
+        let share = LONGEST as f64 / photo.width.max(photo.height) as f64;
+        let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
+        Ok(if share < 1.0 { photo.resized([side(photo.width), side(photo.height)]) } else { photo })
     }
 
     /// A photograph of a scene that is built in.
@@ -131,6 +139,7 @@ impl Album {
                 split: entry.split,
                 pose: rows(&camera.pose),
                 fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+                centre: [camera.centre[0] / camera.width as f64, camera.centre[1] / camera.height as f64],
                 size: [camera.width, camera.height],
             }
         };

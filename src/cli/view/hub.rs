@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::Notify;
 
 use super::messages::{File, Made, View};
+use super::server::sorry;
 
 /// Messages that wait for a page, beside a picture: more than it can have asked for in earnest.
 const WAITING: usize = 64;
@@ -135,6 +136,8 @@ pub struct Hub {
     stops: AtomicBool,
     /// The share of time that pictures get of training, as the bits of an f64.
     share: AtomicU64,
+    /// What a page is told of the scene when it comes.
+    about: Mutex<String>,
 }
 
 impl Hub {
@@ -142,14 +145,27 @@ impl Hub {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A page comes.
-    pub fn join(&self) -> (u64, Arc<Outbox>) {
+    /// Says what pages are told of the scene when they come from now on.
+    pub fn introduce(&self, about: String) {
+        *self.about.lock().unwrap_or_else(PoisonError::into_inner) = about;
+    }
+
+    /// What a page is told of the scene when it comes.
+    pub fn about(&self) -> String {
+        self.about.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// A page comes, if there are fewer than so many.
+    pub fn join(&self, most: usize) -> Option<(u64, Arc<Outbox>)> {
         let mut state = self.lock();
+        if state.clients.len() >= most {
+            return None;
+        }
         let (number, outbox) = (state.next, Arc::new(Outbox::default()));
         state.next += 1;
         state.clients.insert(number, Client { wish: None, outbox: outbox.clone() });
         self.connected.store(state.clients.len(), Ordering::Release);
-        (number, outbox)
+        Some((number, outbox))
     }
 
     /// A page goes.
@@ -226,6 +242,15 @@ impl Hub {
     /// Whether somebody still wants to see this.
     pub fn wants(&self, wish: &Arc<Wish>) -> bool {
         self.lock().clients.values().filter_map(|client| client.wish.as_ref()).any(|(_, own)| Arc::ptr_eq(own, wish))
+    }
+
+    /// This cannot be seen: all who want it are told why, and wait for nothing.
+    pub fn refuse(&self, wish: &Arc<Wish>, what: &str) {
+        for client in self.lock().clients.values_mut() {
+            if client.wish.take_if(|(_, own)| Arc::ptr_eq(own, wish)).is_some() {
+                client.outbox.post(sorry(what));
+            }
+        }
     }
 
     /// A picture is ready: all who want it get it.
@@ -309,7 +334,7 @@ mod tests {
 
     fn view(number: usize) -> View {
         let eye = Eye::Photograph(number);
-        View { eye, size: [8, 8], show: Show::Color, background: None, within: None, exact: false }
+        View { eye, size: [8, 8], show: Show::Color, background: None, within: None, skip: None, checkpoint: None }
     }
 
     fn shot(halvings: u32) -> Shot {
@@ -328,7 +353,7 @@ mod tests {
     fn pages_that_want_the_same_share_it_and_the_newest_wish_counts() {
         let hub = Hub::default();
         let ([a, b], [from_a, from_b]) = {
-            let [(a, out), (b, other)] = [hub.join(), hub.join()];
+            let [(a, out), (b, other)] = [hub.join(9), hub.join(9)].map(Option::unwrap);
             ([a, b], [out, other])
         };
         assert_eq!(hub.connected(), 2);
@@ -345,7 +370,7 @@ mod tests {
         from_a.seen();
         assert_eq!([sent(&from_a), sent(&from_a)], [Some(0), None]);
         // One that comes later gets what there is at once.
-        let (c, from_c) = hub.join();
+        let (c, from_c) = hub.join(9).unwrap();
         hub.wish(c, 3, view(1));
         assert_eq!(sent(&from_c), Some(0));
         hub.leave(c);
@@ -356,6 +381,13 @@ mod tests {
         assert_eq!(hub.wishes().len(), 2);
         hub.wish(a, 2, view(2));
         assert!(!hub.wants(&wishes[0]) && hub.wishes().len() == 1);
+        hub.refuse(&wishes[0], "nobody wants it");
+        assert_eq!(from_a.take(), None);
+        hub.refuse(&hub.wishes()[0], "it is lost");
+        assert!(hub.wishes().is_empty());
+        assert!(matches!(from_a.take(), Some(Outgoing::Text(text)) if text.contains("it is lost")));
+        hub.wish(a, 3, view(2));
+        hub.wish(b, 11, view(2));
         hub.rest(a);
         assert_eq!(hub.wishes().len(), 1, "that of the other");
         hub.leave(a);
@@ -366,9 +398,10 @@ mod tests {
     #[test]
     fn a_page_has_so_much_waiting_and_no_more() {
         let hub = Hub::default();
-        let (page, outbox) = hub.join();
+        let (page, outbox) = hub.join(9).unwrap();
         assert!((0..SAVES).all(|i| hub.save(page, view(i))) && !hub.save(page, view(9)));
-        let (other, _) = hub.join();
+        let (other, _) = hub.join(2).unwrap();
+        assert!(hub.join(2).is_none());
         assert!(hub.save(other, view(0)), "each its own");
         hub.leave(page);
         assert!(hub.next_save().is_some_and(|save| save.client == other) && hub.next_save().is_none());
@@ -383,7 +416,7 @@ mod tests {
     #[test]
     fn who_waits_is_woken_by_what_came_before_too() {
         let hub = Hub::default();
-        let (page, _) = hub.join();
+        let (page, _) = hub.join(9).unwrap();
         hub.wish(page, 1, view(1));
         let start = Instant::now();
         hub.wait(Duration::from_secs(20));

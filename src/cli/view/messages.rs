@@ -2,6 +2,7 @@
 
 use raygrad::nerf::dataset::{Photo, Split};
 use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
+use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Camera, Image};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -33,6 +34,14 @@ pub enum Ask {
     Stop {},
     /// The share of time that training leaves to pictures, 0 to .9.
     Share { share: f64 },
+    /// A film along a camera path, as `raygrad render --path` reads it.
+    Film {
+        path: Value,
+        #[serde(default)]
+        show: Show,
+    },
+    /// The film that is being made is not wanted.
+    EndFilm {},
 }
 
 impl Ask {
@@ -63,9 +72,12 @@ pub struct View {
     /// The box beyond which nothing is shown, lower and upper corner.
     #[serde(default)]
     pub within: Option<[[f64; 3]; 2]>,
-    /// Whether nothing is left out that hardly shows.
+    /// How much that hardly shows is left out; as in training if nothing is said.
     #[serde(default)]
-    pub exact: bool,
+    pub skip: Option<Skip>,
+    /// The step of the checkpoint that is looked at; none while it is trained.
+    #[serde(default)]
+    pub checkpoint: Option<u64>,
 }
 
 /// Where a picture is seen from.
@@ -94,6 +106,19 @@ pub enum Show {
     Opacity,
     /// How far colours are from those of the nearest photograph, from where that was taken.
     Error,
+}
+
+impl Show {
+    /// What `raygrad render --show` calls it, if it does.
+    pub fn rendered(self) -> Option<&'static str> {
+        match self {
+            Show::Color => Some("color"),
+            Show::Depth => Some("depth"),
+            Show::Normals => Some("normals"),
+            Show::Opacity => Some("opacity"),
+            Show::Error => None,
+        }
+    }
 }
 
 impl View {
@@ -152,13 +177,22 @@ pub struct About {
     /// Width and height of the photographs.
     pub size: [usize; 2],
     pub background: [f32; 3],
-    /// From the scene to the capture's own coordinates, three rows of four.
-    pub to_capture: [[f64; 4]; 3],
-    pub photographs: Vec<AboutPhotograph>,
+    #[serde(flatten)]
+    pub taken: Taken,
     /// Places of the scene that were found with the cameras, with their colours.
     pub points: Vec<([f32; 3], [u8; 3])>,
     /// Whether the scene is being trained.
     pub training: bool,
+    /// The steps of which there are checkpoints to look at.
+    pub checkpoints: Vec<u64>,
+}
+
+/// Where photographs were taken, which training may learn more of.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Taken {
+    /// From the scene to the capture's own coordinates, three rows of four.
+    pub to_capture: [[f64; 4]; 3],
+    pub photographs: Vec<AboutPhotograph>,
 }
 
 /// Where a scene is looked at from first, and where it is.
@@ -172,13 +206,15 @@ pub struct FirstView {
 }
 
 /// What a page is told of a photograph.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AboutPhotograph {
     pub name: String,
     pub split: Split,
     pub pose: [[f64; 4]; 3],
     /// Vertical field of view in degrees.
     pub fov: f64,
+    /// Where its optical axis is, 0 to 1 from the left and from the top.
+    pub centre: [f64; 2],
     pub size: [usize; 2],
 }
 
@@ -189,6 +225,14 @@ pub enum Tell {
     About(Box<About>),
     /// How training goes.
     Training(Value),
+    /// Where photographs were taken, as it is known by now.
+    Taken(Taken),
+    /// How a film is getting on, and in which file.
+    Film {
+        file: String,
+        words: String,
+        ended: bool,
+    },
     /// What was asked for cannot be had.
     Sorry {
         what: String,
@@ -230,6 +274,11 @@ impl File {
         let head = serde_json::to_vec(self).unwrap_or_default();
         [&(head.len() as u32).to_le_bytes(), &head[..], bytes].concat()
     }
+}
+
+/// As text.
+pub fn text(tell: &Tell) -> String {
+    serde_json::to_string(tell).unwrap_or_default()
 }
 
 /// A photograph at this size, over a background.

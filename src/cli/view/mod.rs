@@ -5,6 +5,9 @@ mod hub;
 pub mod messages;
 mod painter;
 mod server;
+mod shelf;
+mod store;
+mod studio;
 mod window;
 
 use std::path::PathBuf;
@@ -16,13 +19,16 @@ use raygrad::nerf::dataset::Placement;
 use raygrad::nerf::glam::{DAffine3, DMat3, DVec3};
 use raygrad::nerf::{Model, Result};
 
+use super::checkpoint;
 use super::output::{complain, note, print};
 use super::run::Run;
 use super::scene::Scene;
 use album::Album;
 use hub::Hub;
-use messages::{About, FirstView, Tell, rows};
+use messages::{About, FirstView, Taken, Tell, rows};
 use painter::Painter;
+use shelf::Shelf;
+use studio::Studio;
 
 pub use server::Listener;
 pub use window::Window;
@@ -79,17 +85,20 @@ impl PlaceArgs {
 
 /// Serves until it is ended.
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let run = Run::open(&args.run)?;
-    let model = run.model()?;
+    let run = Arc::new(Run::open(&args.run)?);
+    let model = Arc::new(run.model()?);
     let (hub, album) = (Arc::new(Hub::default()), album(&run, args.scene.as_ref()));
-    let link = serve(args.place.listen()?, &run, &model, &hub, album.clone(), false)?;
+    hub.introduce(about(&run, &model, album.as_deref(), Some(checkpoint::steps(&run)?)));
+    let studio = Arc::new(Studio::new(run.clone(), args.scene.clone(), hub.clone()));
+    let background = model.config.background.shown();
+    let link = server::serve(args.place.listen()?, hub.clone(), album.clone(), Some(studio), background)?;
     print(&format!("view     {link}\n"))?;
     if args.open
         && let Err(error) = open::that_detached(&link)
     {
         complain(&format!("warning: no browser could be opened: {error}"));
     }
-    let mut painter = Painter::new(hub.clone(), album);
+    let mut painter = Painter::new(hub.clone(), album, Some(Shelf::new(run, model.clone())));
     loop {
         if !painter.work(&model, 0) {
             hub.wait(Duration::from_secs(1));
@@ -119,31 +128,30 @@ pub fn first_view(run: &Run) -> FirstView {
     }
 }
 
-/// Begins to serve the page of a run; gives the link.
-fn serve(
-    listener: Listener,
-    run: &Run,
-    model: &Model<f32>,
-    hub: &Arc<Hub>,
-    album: Option<Arc<Album>>,
-    training: bool,
-) -> Result<String> {
-    let (view, extent) = (&run.config.viewpoint, &run.config.extent);
-    // As cameras of files are taken to where the model has them: where they are given, and from there by what it has learned.
-    let learned = model.refine.as_ref().and_then(|refine| refine.placement(&model.params)).unwrap_or_default();
-    let to_capture = inverse(&extent.placement) * inverse(&learned);
+/// What pages are told of a scene; `checkpoints` are those that can be looked at, if it is not being trained.
+fn about(run: &Run, model: &Model<f32>, album: Option<&Album>, checkpoints: Option<Vec<u64>>) -> String {
+    let view = &run.config.viewpoint;
     let about = About {
         title: run.folder.display().to_string(),
         first: first_view(run),
         size: [view.width, view.height],
         background: model.config.background.shown(),
-        to_capture: rows(&to_capture),
-        photographs: album.as_ref().map_or(vec![], |album| album.about(model)),
-        points: album.as_ref().map_or(vec![], |album| album.points(model)),
-        training,
+        taken: taken(run, model, album),
+        points: album.map_or(vec![], |album| album.points(model)),
+        training: checkpoints.is_none(),
+        checkpoints: checkpoints.unwrap_or_default(),
     };
-    let hub::Outgoing::Text(about) = server::text(&Tell::About(Box::new(about))) else { unreachable!("it is text") };
-    server::serve(listener, hub.clone(), album, about, model.config.background.shown())
+    messages::text(&Tell::About(Box::new(about)))
+}
+
+/// Where photographs were taken.
+fn taken(run: &Run, model: &Model<f32>, album: Option<&Album>) -> Taken {
+    // As cameras of files are taken to where the model has them: where they are given, and from there by what it has learned.
+    let learned = model.refine.as_ref().and_then(|refine| refine.placement(&model.params)).unwrap_or_default();
+    Taken {
+        to_capture: rows(&(inverse(&run.config.extent.placement) * inverse(&learned))),
+        photographs: album.map_or(vec![], |album| album.about(model)),
+    }
 }
 
 /// From the scene to what was placed in it.

@@ -4,15 +4,19 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use raygrad::nerf::dataset::Placement;
+use raygrad::nerf::dataset::{Photo, Placement};
 use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Camera, Image, Limits, Model, Picture, Viewing};
 
 use super::album::Album;
 use super::hub::{Hub, Outgoing, Save, Shot, Wish};
 use super::messages::{Eye, File, Made, Show, View, at_size};
+use super::server::sorry;
+use super::shelf::{Shelf, Which};
+use super::store::Got;
 use crate::cli::output::depth_colors;
 use crate::cli::render::shown::{facing, over};
 
@@ -25,6 +29,9 @@ const RATE: f64 = 1e5;
 const LATEST: f64 = 0.5;
 /// At most so many times the size is halved: coarser pictures show nothing.
 const MOST_HALVINGS: u32 = 5;
+/// A picture of more pixels is large, and at most so many of them are painted in turns: each has its memory.
+const LARGE: usize = 1 << 20;
+const MOST_LARGE: usize = 4;
 /// Quality of JPEG files, 1 to 100, of coarse pictures and of whole ones.
 const QUALITY: [u8; 2] = [75, 92];
 /// How often a picture is painted again while a model learns, at most.
@@ -34,9 +41,11 @@ const AGAIN: Duration = Duration::from_millis(500);
 pub struct Painter {
     hub: Arc<Hub>,
     album: Option<Arc<Album>>,
+    /// The models that can be looked at beside the one at hand, if there are some.
+    shelf: Option<Shelf>,
     jobs: Vec<Job>,
     /// Rays a second, of what was shown lately.
-    rates: HashMap<(Show, bool), f64>,
+    rates: HashMap<(Show, Option<Skip>), f64>,
     turn: u64,
     /// Whether the last turn was that of something new.
     fresh: bool,
@@ -47,8 +56,8 @@ struct Job {
     target: Target,
     /// How often the size of what is painted now is halved.
     halvings: u32,
-    /// What there is of it so far.
-    parts: Parts,
+    /// What there is of it so far; none before it is begun, and while it rests.
+    parts: Option<Parts>,
     spent: Duration,
     /// When it was worked on last, in turns.
     turn: u64,
@@ -75,91 +84,150 @@ struct Parts {
 }
 
 impl Painter {
-    pub fn new(hub: Arc<Hub>, album: Option<Arc<Album>>) -> Self {
-        Painter { hub, album, jobs: vec![], rates: HashMap::new(), turn: 0, fresh: false }
+    pub fn new(hub: Arc<Hub>, album: Option<Arc<Album>>, shelf: Option<Shelf>) -> Self {
+        Painter { hub, album, shelf, jobs: vec![], rates: HashMap::new(), turn: 0, fresh: false }
     }
 
     /// Paints the next piece, of a model that is at this step; says whether there was anything to paint.
     pub fn work(&mut self, model: &Model<f32>, step: u64) -> bool {
-        self.sync(model, step);
+        self.sync(step);
         // What nobody has seen anything of comes first, but not again before something else had its turn.
-        let others = self.jobs.iter().any(|job| job.whole.is_none() && job.turn > 0);
-        let skips = self.fresh && others;
-        let waiting = self.jobs.iter_mut().filter(|job| job.whole.is_none() && !(skips && job.turn == 0));
-        let Some(job) = waiting.min_by_key(|job| job.turn) else { return false };
+        let mut waiting: Vec<usize> = (0..self.jobs.len()).filter(|i| self.jobs[*i].whole.is_none()).collect();
+        waiting.sort_by_key(|i| (self.fresh && self.jobs[*i].turn == 0, self.jobs[*i].turn));
+        let ready = waiting.into_iter().find_map(|i| self.prepare(i, model, step).map(|(own, step)| (i, own, step)));
+        let Some((i, own, step)) = ready else { return false };
+        let (model, job) = (own.as_deref().unwrap_or(model), &mut self.jobs[i]);
+        let Some(parts) = &mut job.parts else { return false };
         self.fresh = job.turn == 0;
         self.turn += 1;
         job.turn = self.turn;
-        let (hub, album) = (self.hub.clone(), self.album.clone());
-        let wanted = match &job.target {
-            Target::Wish(wish) => Wanted::Wish(&hub, wish.clone()),
-            Target::Save(save) => Wanted::Page(&hub, save.client),
+        let hub = &self.hub;
+        let wanted = || match &job.target {
+            Target::Wish(wish) => hub.wants(wish),
+            Target::Save(save) => hub.is_here(save.client),
         };
-        let view = job.target.view().clone();
-        let rate = self.rates.entry((view.show, view.exact)).or_insert(RATE);
+        let view = job.target.view();
+        let rate = self.rates.entry((view.show, view.skip)).or_insert(RATE);
         let start = Instant::now();
-        if !job.parts.paint(&view, model, *rate, &|| wanted.holds()) {
+        if !parts.paint(view, model, *rate, &wanted) {
             return true;
         }
         let spent = start.elapsed();
         job.spent += spent;
-        job.parts.pace(spent);
-        if job.parts.rows == job.parts.camera.height {
+        parts.pace(spent);
+        if parts.rows == parts.camera.height {
             // Of the whole picture: where there is nothing, rays are quick.
-            let rays = job.parts.camera.width * job.parts.camera.height;
+            let rays = parts.camera.width * parts.camera.height;
             let now = rays as f64 / job.spent.as_secs_f64().max(1e-6);
             *rate += LATEST * (now - *rate);
-            job.deliver(&hub, step);
             // While a model learns, pictures are seen again rather than made ever finer.
-            let stands = job.begun == step;
             let soon = halvings(view.size, now, AGAIN.as_secs_f64());
+            job.deliver(hub, step);
             match job.halvings {
-                finer if finer > 0 && (stands || finer > soon) => {
-                    job.halvings -= 1;
-                    job.begin(model, album.as_deref(), step);
-                }
+                finer if finer > 0 && (job.begun == step || finer > soon) => job.begin(finer - 1),
                 _ => job.rest(step),
             }
         }
         true
     }
 
-    /// Forgets what nobody wants any more, and begins what is new.
-    fn sync(&mut self, model: &Model<f32>, step: u64) {
+    /// Begins a picture if all that it takes is here; gives the model that it shows, if that is not the one at hand, and its step.
+    fn prepare(&mut self, i: usize, model: &Model<f32>, step: u64) -> Option<(Option<Arc<Model<f32>>>, u64)> {
+        let view = self.jobs[i].target.view();
+        let (own, step) = match (&self.shelf, Which::of(view)) {
+            (Some(shelf), which) => match shelf.get(which, &self.hub) {
+                Got::Here(own) => (Some(own), which.checkpoint.unwrap_or(step)),
+                Got::Coming => return None,
+                Got::Failed(what) => return self.refuse(i, &what),
+            },
+            (None, _) => (None, step),
+        };
+        let model = own.as_deref().unwrap_or(model);
+        if self.jobs[i].parts.is_none() {
+            let size = view.size.map(|side| (side as usize).div_ceil(1 << self.jobs[i].halvings));
+            let large = self.jobs.iter().filter_map(|job| job.parts.as_ref()).filter(|parts| parts.is_large()).count();
+            if size[0] * size[1] > LARGE && large >= MOST_LARGE {
+                return None;
+            }
+            let (number, camera) = self.camera(view, size, model);
+            let truth = match (&self.album, number.filter(|_| view.show == Show::Error)) {
+                (Some(album), Some(number)) => match album.fetch(number, &self.hub) {
+                    Got::Here(photo) => Some((number, photo)),
+                    Got::Coming => return None,
+                    Got::Failed(what) => return self.refuse(i, &what),
+                },
+                _ => None,
+            };
+            let job = &mut self.jobs[i];
+            (job.parts, job.begun) = (Some(Parts::new(camera, number.is_some(), size, truth, model)), step);
+        }
+        Some((own, step))
+    }
+
+    /// Whose camera a view is seen by, if it is a photograph's, and that camera.
+    fn camera(&self, view: &View, size: [usize; 2], model: &Model<f32>) -> (Option<usize>, Camera) {
+        let album = self.album.as_deref();
+        let (number, free) = match &view.eye {
+            Eye::Free { pose, fov } => (None, View::camera(pose, *fov, size)),
+            Eye::Photograph(number) => (Some(*number), Camera::from_angle(size[0], size[1], 1.0, DAffine3::IDENTITY)),
+        };
+        let nearest = || album.filter(|_| view.show == Show::Error).and_then(|album| album.nearest(&free, model));
+        let own = |number: usize| Some((number, album?.camera(number, model)?));
+        match number.or_else(nearest).and_then(own) {
+            Some((number, camera)) => (Some(number), camera),
+            None => (None, free),
+        }
+    }
+
+    /// Tells who wants a picture why there is none.
+    fn refuse<T>(&mut self, i: usize, what: &str) -> Option<T> {
+        match &self.jobs[i].target {
+            Target::Wish(wish) => self.hub.refuse(wish, what),
+            Target::Save(save) => self.hub.post(save.client, sorry(what)),
+        }
+        // It is forgotten with the next look at what is wanted.
+        self.jobs[i].rest(0);
+        None
+    }
+
+    /// Forgets what nobody wants any more, and takes up what is new.
+    fn sync(&mut self, step: u64) {
         let wishes = self.hub.wishes();
         self.jobs.retain(|job| match &job.target {
             Target::Wish(wish) => wishes.iter().any(|own| Arc::ptr_eq(own, wish)),
             Target::Save(save) => job.whole.is_none() && self.hub.is_here(save.client),
         });
+        let halved = |view: &View, seconds: f64| {
+            halvings(view.size, self.rates.get(&(view.show, view.skip)).copied().unwrap_or(RATE), seconds)
+        };
         for wish in wishes {
             let known = |job: &Job| matches!(&job.target, Target::Wish(own) if Arc::ptr_eq(own, &wish));
             if !self.jobs.iter().any(known) {
-                let rate = self.rates.get(&(wish.view.show, wish.view.exact)).copied().unwrap_or(RATE);
-                let halvings = halvings(wish.view.size, rate, FIRST);
-                self.jobs.push(Job::new(Target::Wish(wish), halvings, model, self.album.as_deref(), step));
+                let halvings = halved(&wish.view, FIRST);
+                self.jobs.push(Job::new(Target::Wish(wish), halvings));
             }
         }
         // One after the other: each has a picture's memory.
         if !self.jobs.iter().any(|job| matches!(job.target, Target::Save(_)))
             && let Some(save) = self.hub.next_save()
         {
-            self.jobs.push(Job::new(Target::Save(save), 0, model, self.album.as_deref(), step));
+            self.jobs.push(Job::new(Target::Save(save), 0));
         }
         for job in &mut self.jobs {
+            let view = job.target.view();
+            // What a checkpoint shows does not change.
+            let now = if self.shelf.is_some() { view.checkpoint.unwrap_or(step) } else { step };
             let Some((seen, when)) = job.whole else { continue };
             if when.elapsed() <= AGAIN.max(job.spent) {
                 continue;
             }
-            if seen == step && job.halvings > 0 {
+            if seen == now && job.halvings > 0 {
                 // It has not learned for a while: it is held.
-                job.halvings -= 1;
-                job.begin(model, self.album.as_deref(), step);
-            } else if seen != step {
+                job.begin(job.halvings - 1);
+            } else if seen != now {
                 // What has learned more is seen again, as fine as there is time for.
-                let view = job.target.view();
-                let rate = self.rates.get(&(view.show, view.exact)).copied().unwrap_or(RATE);
-                job.halvings = halvings(view.size, rate, AGAIN.as_secs_f64());
-                job.begin(model, self.album.as_deref(), step);
+                let halvings = halved(view, AGAIN.as_secs_f64());
+                job.begin(halvings);
             }
         }
     }
@@ -173,20 +241,6 @@ fn halvings([width, height]: [u32; 2], rate: f64, seconds: f64) -> u32 {
     (needed.ceil().max(0.0) as u32).min(most)
 }
 
-enum Wanted<'a> {
-    Wish(&'a Hub, Arc<Wish>),
-    Page(&'a Hub, u64),
-}
-
-impl Wanted<'_> {
-    fn holds(&self) -> bool {
-        match self {
-            Wanted::Wish(hub, wish) => hub.wants(wish),
-            Wanted::Page(hub, client) => hub.is_here(*client),
-        }
-    }
-}
-
 impl Target {
     fn view(&self) -> &View {
         match self {
@@ -197,26 +251,23 @@ impl Target {
 }
 
 impl Job {
-    fn new(target: Target, halvings: u32, model: &Model<f32>, album: Option<&Album>, step: u64) -> Self {
-        let parts = Parts::new(target.view(), halvings, model, album);
-        Job { target, halvings, parts, spent: Duration::ZERO, turn: 0, begun: step, whole: None }
+    fn new(target: Target, halvings: u32) -> Self {
+        Job { target, halvings, parts: None, spent: Duration::ZERO, turn: 0, begun: 0, whole: None }
     }
 
-    /// Begins a picture at the size that is next.
-    fn begin(&mut self, model: &Model<f32>, album: Option<&Album>, step: u64) {
-        self.parts = Parts::new(self.target.view(), self.halvings, model, album);
-        (self.spent, self.begun, self.whole) = (Duration::ZERO, step, None);
+    /// A picture of another size comes next.
+    fn begin(&mut self, halvings: u32) {
+        (self.halvings, self.parts, self.spent, self.whole) = (halvings, None, Duration::ZERO, None);
     }
 
     /// Nothing is to be done for now, and no memory is needed.
     fn rest(&mut self, step: u64) {
-        (self.parts.color, self.parts.truth) = (Image::new(1, 1, 3), None);
-        self.whole = Some((step, Instant::now()));
+        (self.parts, self.whole) = (None, Some((step, Instant::now())));
     }
 
     /// Gives away a picture whose rows are all painted.
     fn deliver(&mut self, hub: &Hub, step: u64) {
-        let Parts { truth, color, .. } = &self.parts;
+        let Some(Parts { truth, color, .. }) = &self.parts else { return };
         let compared = truth.as_ref().map(|(number, truth)| (*number, psnr(color, truth)));
         let error = truth.as_ref().map(|(_, truth)| colormap::error_map(color, truth));
         let image = error.as_ref().unwrap_or(color);
@@ -236,35 +287,27 @@ impl Job {
 }
 
 impl Parts {
-    fn new(view: &View, halvings: u32, model: &Model<f32>, album: Option<&Album>) -> Self {
-        let [width, height] = view.size.map(|side| (side as usize).div_ceil(1 << halvings));
-        let own = |number: usize| album.and_then(|album| album.camera(number, model));
-        let (number, free) = match &view.eye {
-            Eye::Free { pose, fov } => (None, View::camera(pose, *fov, [width, height])),
-            Eye::Photograph(number) => (Some(*number), Camera::from_angle(width, height, 1.0, DAffine3::IDENTITY)),
-        };
-        let nearest = || album.and_then(|album| album.nearest(&free, model));
-        let compares = view.show == Show::Error;
-        let number = number.or_else(|| if compares { nearest() } else { None });
-        let Some((number, camera)) = number.and_then(|number| Some((number, own(number)?))) else {
-            return Parts::of(free, None);
-        };
-        let photo = album.filter(|_| compares).and_then(|album| album.photo(number).ok());
-        // Photographs have proportions of their own, of which all is to be seen; and they are not made larger to be compared.
-        let largest =
-            photo.as_ref().map_or([width, height], |photo| [photo.width.min(width), photo.height.min(height)]);
+    /// Of a photograph's camera, that takes its proportions from there; beside what it is compared with, if it is.
+    fn new(
+        camera: Camera,
+        is_photograph: bool,
+        size: [usize; 2],
+        truth: Option<(usize, Arc<Photo>)>,
+        model: &Model<f32>,
+    ) -> Self {
         let sides = [camera.width, camera.height];
+        // All of it is to be seen; and photographs are not made larger to be compared.
+        let largest = truth.as_ref().map_or(size, |(_, photo)| [photo.width.min(size[0]), photo.height.min(size[1])]);
         let share = (0..2).map(|i| largest[i] as f64 / sides[i] as f64).fold(f64::INFINITY, f64::min);
-        let [w, h] = [0, 1].map(|i| ((sides[i] as f64 * share).round() as usize).clamp(1, largest[i]));
-        Parts::of(
-            camera.resized(w, h),
-            photo.map(|photo| (number, at_size(&photo, [w, h], model.config.background.shown()))),
-        )
+        let [width, height] = [0, 1].map(|i| ((sides[i] as f64 * share).round() as usize).clamp(1, largest[i]));
+        let camera = if is_photograph { camera.resized(width, height) } else { camera };
+        let background = model.config.background.shown();
+        let truth = truth.map(|(number, photo)| (number, at_size(&photo, [width, height], background)));
+        Parts { color: Image::new(camera.width, camera.height, 3), camera, truth, rows: 0, band: 0 }
     }
 
-    fn of(camera: Camera, truth: Option<(usize, Image)>) -> Self {
-        let color = Image::new(camera.width, camera.height, 3);
-        Parts { camera, truth, color, rows: 0, band: 0 }
+    fn is_large(&self) -> bool {
+        self.camera.width * self.camera.height > LARGE
     }
 
     /// Paints as many rows as there is time for; says whether it did, and was not stopped.
@@ -295,7 +338,8 @@ impl Parts {
         let background = if self.truth.is_some() { model.config.background.shown() } else { background };
         let everywhere = Viewing::over(background).within;
         let within = view.within.map_or(everywhere, |corners| corners.map(DVec3::from));
-        let limits = view.exact.then_some(Limits::NONE);
+        // A model of the shelf leaves out what it is to: this is for others too.
+        let limits = (view.skip == Some(Skip::Off)).then_some(Limits::NONE);
         let viewing = Viewing { background, limits, within, goes_on };
         let picture = model.view_while(&band, &viewing)?;
         let image = match view.show {

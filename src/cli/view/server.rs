@@ -1,6 +1,6 @@
 //! The page and its messages, over HTTP on one port, and nothing else.
 
-use std::net::{IpAddr, SocketAddr, TcpListener};
+use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -13,6 +13,7 @@ use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
@@ -23,7 +24,8 @@ use tokio::time::{timeout, timeout_at};
 
 use super::album::Album;
 use super::hub::{Hub, Outbox, Outgoing};
-use super::messages::{Ask, File, Tell, at_size};
+use super::messages::{self, Ask, File, Tell};
+use super::studio::Studio;
 
 /// Pages at a time, and connections that are no pages yet.
 const PAGES: usize = 64;
@@ -33,13 +35,14 @@ const LONGEST: usize = 1 << 14;
 /// Messages a second from a page, and how many may come at once.
 const RATE: f64 = 300.0;
 const BURST: f64 = 600.0;
-/// How long a request may take to arrive, and a page to take a message or say that it has seen a picture.
+/// How long a request may take to arrive, and a page to take a message or say that it has seen a picture, beside what its bytes
+/// take, at so many a second.
 const PATIENCE: Duration = Duration::from_secs(10);
+const SLOWEST: usize = 50_000;
 /// How often a page is asked whether it is still there, and how long it is not heard before it is taken to be gone.
 const IDLE: Duration = Duration::from_secs(5);
 const SILENCE: Duration = Duration::from_secs(30);
-/// Longest side of a photograph that is sent.
-const PHOTOGRAPH: usize = 1600;
+/// Quality of photographs as JPEG files, 1 to 100.
 const QUALITY: u8 = 88;
 
 /// Nothing from elsewhere, and nothing of it elsewhere.
@@ -78,7 +81,8 @@ impl Listener {
 struct Served {
     hub: Arc<Hub>,
     album: Option<Arc<Album>>,
-    about: String,
+    /// What makes films, if they can be made.
+    studio: Option<Arc<Studio>>,
     /// What photographs that have transparency stand before.
     background: [f32; 3],
     /// The name of this machine that pages may use, beside its addresses.
@@ -97,13 +101,13 @@ pub fn serve(
     Listener { listener, address, host }: Listener,
     hub: Arc<Hub>,
     album: Option<Arc<Album>>,
-    about: String,
+    studio: Option<Arc<Studio>>,
     background: [f32; 3],
 ) -> Result<String> {
     let bad = |e: std::io::Error| Error::setting("host", format!("{address} cannot be served: {e}"));
     let token = (!address.ip().is_loopback()).then(|| format!("{:032x}", rand::random::<u128>()));
     let link = link(address, &host, token.as_deref());
-    let served = Served { hub, album, about, background, host, token, readers: Semaphore::new(2) };
+    let served = Served { hub, album, studio, background, host, token, readers: Semaphore::new(2) };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(bad)?;
     let run = move || {
         runtime.block_on(async move {
@@ -120,11 +124,21 @@ pub fn serve(
 fn link(address: SocketAddr, host: &str, token: Option<&str>) -> String {
     let host = match address.ip() {
         ip if ip.is_loopback() => ip.to_string(),
+        ip if ip.is_unspecified() => outward(ip).unwrap_or(ip).to_string(),
         _ => host.to_owned(),
     };
     let host = if host.contains(':') { format!("[{host}]") } else { host };
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
     format!("http://{host}:{}/{token}", address.port())
+}
+
+/// The address of this machine by which it goes out, where all of them are listened to. Nothing is sent.
+fn outward(all: IpAddr) -> Option<IpAddr> {
+    // Addresses that are kept for documentation, beyond any network of one's own.
+    let beyond = if all.is_ipv4() { "192.0.2.1:9" } else { "[2001:db8::1]:9" };
+    let socket = UdpSocket::bind((all, 0)).ok()?;
+    socket.connect(beyond).ok()?;
+    Some(socket.local_addr().ok()?.ip()).filter(|ip| !ip.is_unspecified())
 }
 
 async fn accept(listener: tokio::net::TcpListener, router: Router) {
@@ -239,35 +253,71 @@ async fn messages(
     if !served.lets_in(&query) || !origin {
         return (StatusCode::FORBIDDEN, "Only the page may ask.\n").into_response();
     }
-    if served.hub.connected() >= PAGES {
+    let Some(page) = Page::join(served) else {
         return (StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open.\n").into_response();
-    }
+    };
     let upgrade = upgrade.max_message_size(LONGEST).max_frame_size(LONGEST);
-    upgrade.on_upgrade(move |socket| page(socket, served))
+    upgrade.on_upgrade(move |socket| page.talk(socket))
 }
 
 /// One page, from when it comes to when it goes.
-async fn page(socket: WebSocket, served: Arc<Served>) {
-    let (client, outbox) = served.hub.join();
-    outbox.post(Outgoing::Text(served.about.clone()));
-    let (mut out, mut heard) = socket.split();
-    let write = async {
-        let mut pinged = Instant::now();
+struct Page {
+    client: u64,
+    outbox: Arc<Outbox>,
+    served: Arc<Served>,
+    /// Whether a photograph is being read.
+    reader: Arc<Semaphore>,
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        self.served.hub.leave(self.client);
+    }
+}
+
+impl Page {
+    fn join(served: Arc<Served>) -> Option<Self> {
+        let (client, outbox) = served.hub.join(PAGES)?;
+        Some(Page { client, outbox, served, reader: Arc::new(Semaphore::new(1)) })
+    }
+
+    async fn talk(self, socket: WebSocket) {
+        self.outbox.post(Outgoing::Text(self.served.hub.about()));
+        let (mut out, mut heard) = socket.split();
+        let reason = tokio::select! {
+            reason = self.write(&mut out) => reason.map(str::to_owned),
+            reason = self.read(&mut heard) => reason,
+        };
+        drop(self);
+        if let Some(mut reason) = reason {
+            // A close frame has room for so much.
+            let room = (0..=120).rev().find(|at| reason.is_char_boundary(*at)).unwrap_or(0);
+            reason.truncate(room);
+            let close = CloseFrame { code: 1008, reason: reason.into() };
+            let _ = timeout(PATIENCE, out.send(Message::Close(Some(close)))).await;
+        }
+    }
+
+    /// Sends what there is for the page; gives why it is no longer sent anything, if it is there.
+    async fn write(&self, out: &mut SplitSink<WebSocket, Message>) -> Option<&'static str> {
+        let outbox = &self.outbox;
+        // How long what was sent last may take.
+        let (mut pinged, mut patience) = (Instant::now(), PATIENCE);
         loop {
             while let Some(message) = outbox.take() {
                 let message = match message {
                     Outgoing::Text(text) => Message::Text(text.into()),
                     Outgoing::Bytes(bytes) => Message::Binary(bytes.into()),
                 };
-                match timeout(PATIENCE, out.send(message)).await {
-                    Ok(Ok(())) => (),
-                    _ => return None,
+                patience = patience_for(&message);
+                if !matches!(timeout(patience, out.send(message)).await, Ok(Ok(()))) {
+                    return None;
                 }
             }
             if outbox.is_overrun() {
                 return Some("too much was asked for");
             }
-            let flown = outbox.flying().map(|since| since + PATIENCE);
+            let flown = outbox.flying().map(|since| since + patience);
             if flown.is_some_and(|until| until <= Instant::now()) {
                 return Some("a picture was not taken");
             }
@@ -281,9 +331,10 @@ async fn page(socket: WebSocket, served: Arc<Served>) {
             let until = flown.map_or(pinged + IDLE, |until| until.min(pinged + IDLE));
             let _ = timeout_at(until.into(), outbox.changed.notified()).await;
         }
-    };
-    let reader = Arc::new(Semaphore::new(1));
-    let read = async {
+    }
+
+    /// Takes what the page says; gives why it is listened to no longer, if it is there.
+    async fn read(&self, heard: &mut SplitStream<WebSocket>) -> Option<String> {
         let (mut allowed, mut last) = (BURST, Instant::now());
         while let Ok(Some(Ok(message))) = timeout(SILENCE, heard.next()).await {
             allowed = (allowed + RATE * last.elapsed().as_secs_f64()).min(BURST) - 1.0;
@@ -293,7 +344,7 @@ async fn page(socket: WebSocket, served: Arc<Served>) {
             }
             match message {
                 Message::Text(text) => match Ask::read(&text) {
-                    Ok(ask) => answer(ask, client, &outbox, &served, &reader),
+                    Ok(ask) => self.answer(ask),
                     Err(what) => return Some(what),
                 },
                 Message::Binary(_) => return Some("messages are text".to_owned()),
@@ -302,47 +353,60 @@ async fn page(socket: WebSocket, served: Arc<Served>) {
             }
         }
         None
-    };
-    let reason = tokio::select! {
-        reason = write => reason.map(str::to_owned),
-        reason = read => reason,
-    };
-    served.hub.leave(client);
-    if let Some(mut reason) = reason {
-        // A close frame has room for so much.
-        let room = (0..=120).rev().find(|at| reason.is_char_boundary(*at)).unwrap_or(0);
-        reason.truncate(room);
-        let close = CloseFrame { code: 1008, reason: reason.into() };
-        let _ = timeout(PATIENCE, out.send(Message::Close(Some(close)))).await;
+    }
+
+    fn answer(&self, ask: Ask) {
+        let Page { client, outbox, served, reader } = self;
+        let (client, hub) = (*client, &served.hub);
+        match ask {
+            Ask::View { id, view } => hub.wish(client, id, view),
+            Ask::Seen { .. } => outbox.seen(),
+            Ask::Save { view } => {
+                if !hub.save(client, view) {
+                    outbox.post(sorry("so many pictures are saved one after the other"));
+                }
+            }
+            Ask::Photograph { number } => match reader.clone().try_acquire_owned() {
+                Ok(permit) => {
+                    let (outbox, served) = (outbox.clone(), served.clone());
+                    tokio::spawn(async move {
+                        let photograph = photograph(number, &served).await;
+                        drop(permit);
+                        outbox.post(photograph);
+                    });
+                }
+                Err(_) => outbox.post(sorry("one photograph is read after the other")),
+            },
+            Ask::Pause { pause } => hub.pause(pause),
+            Ask::Stop {} => hub.stop(),
+            Ask::Share { share } => hub.set_share(share),
+            Ask::Rest {} => hub.rest(client),
+            Ask::Film { path, show } => {
+                let begun = match &served.studio {
+                    Some(studio) => studio.begin(&path, show).map_err(|error| error.to_string()),
+                    None => Err("films are made when training has ended".to_owned()),
+                };
+                if let Err(what) = begun {
+                    outbox.post(sorry(&what));
+                }
+            }
+            Ask::EndFilm {} => {
+                if let Some(studio) = &served.studio {
+                    studio.end();
+                }
+            }
+        }
     }
 }
 
-fn answer(ask: Ask, client: u64, outbox: &Arc<Outbox>, served: &Arc<Served>, reader: &Arc<Semaphore>) {
-    let hub = &served.hub;
-    match ask {
-        Ask::View { id, view } => hub.wish(client, id, view),
-        Ask::Seen { .. } => outbox.seen(),
-        Ask::Save { view } => {
-            if !hub.save(client, view) {
-                outbox.post(sorry("so many pictures are saved one after the other"));
-            }
-        }
-        Ask::Photograph { number } => match reader.clone().try_acquire_owned() {
-            Ok(permit) => {
-                let (outbox, served) = (outbox.clone(), served.clone());
-                tokio::spawn(async move {
-                    let photograph = photograph(number, &served).await;
-                    drop(permit);
-                    outbox.post(photograph);
-                });
-            }
-            Err(_) => outbox.post(sorry("one photograph is read after the other")),
-        },
-        Ask::Pause { pause } => hub.pause(pause),
-        Ask::Stop {} => hub.stop(),
-        Ask::Share { share } => hub.set_share(share),
-        Ask::Rest {} => hub.rest(client),
-    }
+/// How long a message may take to be sent.
+fn patience_for(message: &Message) -> Duration {
+    let bytes = match message {
+        Message::Text(text) => text.len(),
+        Message::Binary(bytes) => bytes.len(),
+        _ => 0,
+    };
+    PATIENCE + Duration::from_secs((bytes / SLOWEST) as u64)
 }
 
 /// A photograph as the page wants it.
@@ -351,10 +415,7 @@ async fn photograph(number: usize, served: &Arc<Served>) -> Outgoing {
     let (album, background) = (served.album.clone(), served.background);
     let read = move || -> Result<Vec<u8>> {
         let album = album.ok_or_else(|| Error::setting("photograph", "the run's photographs are not known"))?;
-        let photo = album.photo(number)?;
-        let share = (PHOTOGRAPH as f64 / photo.width.max(photo.height) as f64).min(1.0);
-        let size = [photo.width, photo.height].map(|side| ((side as f64 * share).round() as usize).max(1));
-        Ok(File::Photograph { number }.message(&at_size(&photo, size, background).to_jpeg(QUALITY)))
+        Ok(File::Photograph { number }.message(&album.photo(number)?.over(background).to_jpeg(QUALITY)))
     };
     match tokio::task::spawn_blocking(read).await {
         Ok(Ok(bytes)) => Outgoing::Bytes(bytes),
@@ -363,13 +424,14 @@ async fn photograph(number: usize, served: &Arc<Served>) -> Outgoing {
     }
 }
 
-fn sorry(what: &str) -> Outgoing {
+/// That something cannot be had, and why.
+pub fn sorry(what: &str) -> Outgoing {
     text(&Tell::Sorry { what: what.to_owned() })
 }
 
 /// A message of text.
 pub fn text(tell: &Tell) -> Outgoing {
-    Outgoing::Text(serde_json::to_string(tell).unwrap_or_default())
+    Outgoing::Text(messages::text(tell))
 }
 
 #[cfg(test)]
@@ -419,5 +481,15 @@ mod tests {
         assert_eq!(of("127.0.0.1:7007", "localhost", None), "http://127.0.0.1:7007/");
         assert_eq!(of("[::1]:80", "::1", None), "http://[::1]:80/");
         assert_eq!(of("10.0.0.2:80", "box.lan", Some("abc")), "http://box.lan:80/?token=abc");
+        // One that can be followed from elsewhere, if there is a network.
+        let all = of("0.0.0.0:80", "0.0.0.0", None);
+        let address = outward("0.0.0.0".parse().unwrap()).unwrap_or("0.0.0.0".parse().unwrap());
+        assert_eq!(all, format!("http://{address}:80/"));
+    }
+
+    #[test]
+    fn what_is_large_may_take_longer() {
+        let of = |bytes: usize| patience_for(&Message::Binary(vec![0; bytes].into()));
+        assert_eq!([of(0), of(1_000_000)], [PATIENCE, PATIENCE + Duration::from_secs(20)]);
     }
 }

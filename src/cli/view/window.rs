@@ -3,14 +3,15 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use raygrad::nerf::{Result, StepStats, Trainer};
+use raygrad::nerf::{Model, Result, StepStats, Trainer};
 use serde_json::json;
 
+use super::album::Album;
 use super::hub::Hub;
-use super::messages::Tell;
+use super::messages::{Taken, Tell};
 use super::painter::Painter;
 use super::server::Listener;
-use super::{album, serve, server};
+use super::{about, album, server, taken};
 use crate::cli::interrupt;
 use crate::cli::output::{note, print};
 use crate::cli::progress::spoken;
@@ -23,6 +24,8 @@ const SHARE: f64 = 0.3;
 const MOST_CREDIT: f64 = 0.1;
 /// How often pages are told how training goes.
 const TOLD: Duration = Duration::from_millis(400);
+/// How often they are told where photographs were taken, while that is learned.
+const CAMERAS: Duration = Duration::from_secs(5);
 /// How long training that was paused waits for a page when none is there any more.
 const ALONE: Duration = Duration::from_secs(60);
 /// Points of a curve, after which every second one is dropped.
@@ -30,12 +33,16 @@ const POINTS: usize = 240;
 
 /// Lets pages look at training, and takes what they say of it.
 pub struct Window {
+    run: Run,
     hub: Arc<Hub>,
+    album: Option<Arc<Album>>,
     painter: Painter,
     /// When it last let training go on, and how many seconds of painting training owes it.
     since: Instant,
     credit: f64,
     told: Instant,
+    /// Where photographs were when pages were told last, and when that was.
+    taken: (Taken, Instant),
     curves: Curves,
 }
 
@@ -52,11 +59,13 @@ impl Window {
     pub fn open(listener: Listener, run: &Run, trainer: &Trainer) -> Result<Self> {
         let (hub, album) = (Arc::new(Hub::default()), album(run, None));
         hub.set_share(SHARE);
-        let link = serve(listener, run, &trainer.model, &hub, album.clone(), true)?;
+        hub.introduce(about(run, &trainer.model, album.as_deref(), None));
+        let link = server::serve(listener, hub.clone(), album.clone(), None, trainer.model.config.background.shown())?;
         print(&format!("view     {link}\n"))?;
-        let (painter, now) = (Painter::new(hub.clone(), album), Instant::now());
+        let (painter, now) = (Painter::new(hub.clone(), album.clone(), None), Instant::now());
+        let taken = (taken(run, &trainer.model, album.as_deref()), now);
         let curves = Curves { every: 1, loss: vec![], psnr: vec![], speed: vec![] };
-        Ok(Window { hub, painter, since: now, credit: 0.0, told: now, curves })
+        Ok(Window { run: run.clone(), hub, album, painter, since: now, credit: 0.0, told: now, taken, curves })
     }
 
     /// Called after each step; `left` says how many seconds of training there are. Paints for as long as its share is, and
@@ -126,6 +135,7 @@ impl Window {
             return;
         }
         self.told = Instant::now();
+        self.tell_taken(&trainer.model);
         let (stats, Curves { loss, psnr: decibels, speed, .. }) = (trainer.stats(), &self.curves);
         self.hub.tell(&server::text(&Tell::Training(json!({
             "step": stats.step,
@@ -137,6 +147,22 @@ impl Window {
             "ended": ended,
             "curves": { "loss": loss, "psnr": decibels, "speed": speed },
         }))));
+    }
+}
+
+impl Window {
+    /// Tells pages where photographs were taken, if more of that is known by now.
+    fn tell_taken(&mut self, model: &Model<f32>) {
+        let (known, when) = &self.taken;
+        if when.elapsed() < CAMERAS {
+            return;
+        }
+        let now = taken(&self.run, model, self.album.as_deref());
+        if now != *known {
+            self.hub.introduce(about(&self.run, model, self.album.as_deref(), None));
+            self.hub.tell(&server::text(&Tell::Taken(now.clone())));
+        }
+        self.taken = (now, Instant::now());
     }
 }
 

@@ -7,7 +7,7 @@ use std::fmt;
 use std::str::FromStr;
 
 /// What a grid may skip when rendering, by what it may cost.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Skip {
     /// Nothing but what lies outside of the box.

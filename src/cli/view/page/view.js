@@ -38,6 +38,8 @@ function say(message) {
 function told(message) {
   if (message.tell === "about") meet(message);
   else if (message.tell === "training") follow(message);
+  else if (message.tell === "taken") moved(message);
+  else if (message.tell === "film") filmed(message);
   else if (message.tell === "sorry") apologise(message.what);
 }
 
@@ -61,6 +63,12 @@ function brought(data) {
   } else if (head.file === "photograph") {
     overlay(head.number, new Blob([bytes], { type: "image/jpeg" }));
   }
+}
+
+/** Photographs are found to have been taken elsewhere. */
+function moved(taken) {
+  Object.assign(about, taken);
+  ask();
 }
 
 /** The scene, at first and after each time that the connection was lost. */
@@ -89,12 +97,19 @@ function meet(message) {
     const hex = (x) => Math.round(255 * x).toString(16).padStart(2, "0");
     $("background").value = "#" + about.background.map(hex).join("");
   }
+  for (const option of $("skip").options) option.disabled = about.training && !["", "off"].includes(option.value);
+  $("film").disabled = about.training;
+  // Beyond the last checkpoint is what the run ended with.
+  const count = about.checkpoints.length, chosen = first ? count : Math.min(Number($("checkpoint").value), count);
+  $("checkpoints").hidden = count === 0;
+  $("checkpoint").max = String(count);
+  $("checkpoint").value = String(chosen);
   if (elsewhere) makeBox();
   if (first) reset();
   else {
     select.value = view.photograph === null ? "" : String(view.photograph);
     blend();
-    ask();
+    settled();
   }
 }
 
@@ -119,7 +134,10 @@ function wanted() {
   const [width, height] = sizes();
   const eye = view.photograph === null
     ? { free: { pose: rows(view), fov: view.fov } } : { photograph: view.photograph };
-  const answer = { eye, size: [width, height], show: mode(), exact: $("exact").checked };
+  const answer = { eye, size: [width, height], show: mode() };
+  if ($("skip").value) answer.skip = $("skip").value;
+  const checkpoint = about.checkpoints[Number($("checkpoint").value)];
+  if (checkpoint !== undefined) answer.checkpoint = checkpoint;
   if ($("own-background").checked) {
     answer.background = [1, 3, 5].map((i) => parseInt($("background").value.slice(i, i + 2), 16));
   }
@@ -172,7 +190,7 @@ async function draw(head, blob) {
     const [number, psnr] = head.compared;
     text += ` · against ${about.photographs[number].name}: ${digits(psnr, 2)} dB`;
   }
-  if (about.training) text += ` · step ${head.step}`;
+  if (about.training || head.step > 0) text += ` · step ${head.step}`;
   $("status").textContent = text;
 }
 
@@ -209,12 +227,15 @@ function settled() {
   $("fov").value = String(Math.round(view.fov));
   $("fov-out").textContent = `${view.fov.toFixed(0)}°`;
   $("blend-out").textContent = `${$("blend").value} %`;
+  const checkpoint = about.checkpoints[Number($("checkpoint").value)];
+  $("checkpoint-out").textContent = checkpoint === undefined ? "the end" : `step ${checkpoint}`;
   ask();
 }
 
 const modes = ["color", "depth", "normals", "opacity", "error"];
 document.addEventListener("keydown", (event) => {
-  if (!about || event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+  // What is typed among the controls is theirs.
+  if (!about || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("aside")) return;
   const steered = steer(event);
   // Held down, keys move the camera and do nothing else.
   if (!steered && event.repeat) return;
@@ -298,7 +319,9 @@ function project(point) {
   if (depth < 1e-3 * side()) return null;
   const { x, y, w, h } = area;
   const focal = (0.5 * h) / Math.tan(0.5 * view.fov * radians);
-  return [x + 0.5 * w + (focal * dot(local, view.right)) / depth, y + 0.5 * h - (focal * dot(local, view.up)) / depth];
+  // How lenses bend light is left out of marks.
+  const [across, down] = view.photograph === null ? [0.5, 0.5] : about.photographs[view.photograph].centre;
+  return [x + across * w + (focal * dot(local, view.right)) / depth, y + down * h - (focal * dot(local, view.up)) / depth];
 }
 
 function path(points) {
@@ -496,22 +519,41 @@ function inCapture(key) {
   return [0, 1, 2].flatMap((r) => [right[r], up[r], back[r], eye[r]]).concat([0, 0, 0, 1]);
 }
 
-function savePath() {
+/** The path in the form that `render` reads, if it is one. */
+function cameraPath() {
   if (keys.length < 2) return apologise("A path needs two key frames.");
   const [width, height] = about.size;
-  const seconds = duration();
-  const text = JSON.stringify({
+  return {
     keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
     camera_type: "perspective",
     render_width: width,
     render_height: height,
     is_cycle: $("closed").checked,
-    seconds,
+    seconds: duration(),
     fps: 25,
     smoothness_value: 0,
     camera_path: [],
-  }, null, 1);
-  keep(new Blob([text], { type: "application/json" }), "path.json");
+  };
+}
+
+function savePath() {
+  const path = cameraPath();
+  if (path) keep(new Blob([JSON.stringify(path, null, 1)], { type: "application/json" }), "path.json");
+}
+
+function makeFilm() {
+  const path = cameraPath();
+  if (!path) return;
+  // No more digits than single precision has.
+  const text = JSON.stringify(path, (name, value) => (typeof value === "number" ? Number(value.toPrecision(8)) : value));
+  if (text.length > 15000) return apologise("So many key frames have no room here: save the path, and render it from there.");
+  say({ ask: "film", path: JSON.parse(text), show: mode() });
+}
+
+function filmed({ file, words, ended }) {
+  $("film-progress").hidden = false;
+  $("film-progress").textContent = `${file}: ${words}`;
+  $("end-film").hidden = ended;
 }
 
 function keep(blob, name) {
@@ -557,7 +599,7 @@ function curve(id, name, values, logarithmic) {
 }
 
 // ---- controls -----------------------------------------------------------------------------------------------------------------
-for (const input of document.querySelectorAll("input[name=show], #exact, #own-background, #size, #crop")) {
+for (const input of document.querySelectorAll("input[name=show], #skip, #own-background, #size, #crop")) {
   input.addEventListener("change", () => { $("box").hidden = !$("crop").checked; ask(); });
 }
 $("background").addEventListener("input", () => { $("own-background").checked = true; ask(); });
@@ -574,6 +616,13 @@ $("nearest").addEventListener("click", () => goTo(nearest()));
 $("key").addEventListener("click", () => { keys.push(snapshot()); listKeys(); marksOf(); });
 $("play").addEventListener("click", play);
 $("save-path").addEventListener("click", savePath);
+$("film").addEventListener("click", makeFilm);
+$("end-film").addEventListener("click", () => say({ ask: "end-film" }));
+$("checkpoint").addEventListener("input", settled);
+// After a click the scene has the focus again; whoever moves by keys stays where they are.
+document.querySelector("aside").addEventListener("click", (event) => {
+  if (event.detail && event.target.closest("button")) stage.focus({ preventScroll: true });
+});
 $("pause").addEventListener("click", () => say({ ask: "pause", pause: !(training && training.paused) }));
 $("stop").addEventListener("click", () => { if (confirm("End training here and save what it has found?")) say({ ask: "stop" }); });
 $("share").addEventListener("input", () => say({ ask: "share", share: Number($("share").value) / 100 }));
