@@ -25,15 +25,21 @@ fn folder(run: &Run) -> PathBuf {
 /// How many stay if nothing is said: if the last is damaged, there is the one before.
 pub const KEPT: usize = 2;
 
-/// Writes where training is, and removes all others but the last so many with this.
-pub fn save(run: &Run, trainer: &Trainer, kept: usize) -> Result<()> {
+/// Writes where training is, and removes all others but the last, as many as the run keeps with this.
+pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
     let folder = folder(run);
     make_folder(&folder)?;
     let step = trainer.stats().step;
     write_atomic(folder.join(format!("{step:08}.checkpoint")), &framed(&trainer.state()?))?;
     // What is said to be later was damaged, and passed over.
     let (later, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
-    remove(&later.into_iter().chain(others.into_iter().skip(kept)).map(|(_, path)| path).collect::<Vec<_>>());
+    remove(
+        &later
+            .into_iter()
+            .chain(others.into_iter().skip(run.config.keep_checkpoints))
+            .map(|(_, path)| path)
+            .collect::<Vec<_>>(),
+    );
     Ok(())
 }
 

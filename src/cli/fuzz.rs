@@ -30,6 +30,7 @@ mod tally;
 pub fn run_config() -> RunConfig {
     RunConfig {
         budget: None,
+        keep_checkpoints: 2,
         photographs: vec!["train/0".into()],
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
@@ -130,10 +131,15 @@ fn campaign_configurations_of_runs() {
 fn campaign_messages_of_pages() {
     let pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 1.0]];
     let free = json!({ "ask": "view", "id": 7, "view": { "eye": { "free": { "pose": pose, "fov": 40.5 } },
-        "size": [640, 480], "show": "normals", "background": [255, 0, 7], "within": [[-1, -1, -1], [1, 1, 1]], "skip": "off", "checkpoint": 12 } });
+        "size": [640, 480], "show": "normals", "background": [255, 0, 7], "crop": [[-1, -1, -1], [1, 1, 1]], "skip": "off", "checkpoint": 12 } });
     let kept = json!({ "ask": "save", "view": { "eye": { "photograph": 3 }, "size": [8, 8] } });
-    let others =
-        [json!({ "ask": "share", "share": 0.3 }), json!({ "ask": "stop" }), json!({ "ask": "pause", "pause": true })];
+    let film = json!({ "ask": "film", "path": { "render_width": 64, "render_height": 48, "seconds": 1.5, "fps": 25 }, "skip": "fast" });
+    let others = [
+        film,
+        json!({ "ask": "share", "share": 0.3 }),
+        json!({ "ask": "stop" }),
+        json!({ "ask": "pause", "pause": true }),
+    ];
     let whole: Vec<Vec<u8>> =
         [free, kept].iter().chain(&others).map(|message| message.to_string().into_bytes()).collect();
     let parse = |bytes: &[u8]| {

@@ -24,6 +24,14 @@ pub fn listen_to_remove() {
     set("stopping, and removing what is unfinished; Ctrl-C again stops at once", "remove what is unfinished");
 }
 
+/// From now on the end of standard input counts as a Ctrl-C: of the program at its other end, whatever ends that.
+pub fn listen_to_input() {
+    std::thread::spawn(|| {
+        let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+        REQUESTED.store(true, Ordering::Relaxed);
+    });
+}
+
 fn set(said: &'static str, promise: &str) {
     let handler = move || {
         if REQUESTED.swap(true, Ordering::Relaxed) {
@@ -36,7 +44,7 @@ fn set(said: &'static str, promise: &str) {
     }
 }
 
-/// Whether there was a Ctrl-C.
+/// Whether it is to stop.
 pub fn requested() -> bool {
     REQUESTED.load(Ordering::Relaxed)
 }

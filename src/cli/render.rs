@@ -22,7 +22,8 @@ use super::progress::{Progress, spoken};
 use super::run::Run;
 use super::scene::Scene;
 use super::{interrupt, parse};
-use film::{Film, Reel, frames_of};
+pub use film::frames_of;
+use film::{Film, Reel};
 use flight::{CameraPath, Flight, FlightArgs};
 use frames::{DIGITS, Frames};
 use shown::{Layer, Show, Shown};
@@ -68,6 +69,9 @@ pub struct Args {
     /// Folder of the photographs, if they are no longer where they were for training
     #[arg(long)]
     scene: Option<Scene>,
+    /// Stop, as by a Ctrl-C, when standard input ends
+    #[arg(long, hide = true)]
+    ends_with_input: bool,
 }
 
 impl Args {
@@ -86,6 +90,7 @@ impl Args {
             precision: Precision::F32,
             keep_frames: false,
             scene: None,
+            ends_with_input: false,
         }
     }
 
@@ -154,6 +159,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut frames = Frames::new(folder, contents(args, stored, &cameras, &shown)?)?;
     if cameras.len() > 1 {
         interrupt::listen_to_go_on();
+    }
+    if args.ends_with_input {
+        interrupt::listen_to_input();
     }
     if !render(&shown, &cameras, &mut frames)? {
         return stopped(&frames, cameras.len());

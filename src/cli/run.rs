@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
+use super::checkpoint;
 use super::output::{lock, make_folder, remove};
 use super::scene::Scene;
 
@@ -39,8 +40,15 @@ pub struct RunConfig {
     /// How long it was to be trained; the first edition did not say.
     #[serde(default)]
     pub budget: Option<Budget>,
+    /// How many checkpoints stay.
+    #[serde(default = "kept")]
+    pub keep_checkpoints: usize,
     /// The model and how it is trained.
     pub config: Config,
+}
+
+fn kept() -> usize {
+    checkpoint::KEPT
 }
 
 /// A run on disk.
@@ -115,6 +123,12 @@ impl Run {
     /// The path of one of the run's files.
     pub fn file(&self, name: &str) -> PathBuf {
         self.folder.join(name)
+    }
+
+    /// What its folder is called, wherever that is.
+    pub fn name(&self) -> String {
+        let whole = self.folder.canonicalize().unwrap_or_else(|_| self.folder.clone());
+        whole.file_name().map_or_else(|| self.folder.display().to_string(), |name| name.to_string_lossy().into_owned())
     }
 
     /// The file that holds the parameters.

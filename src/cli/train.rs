@@ -115,9 +115,9 @@ pub struct Args {
     /// Training time between checkpoints, which --resume goes on from
     #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
     checkpoint: Duration,
-    /// How many checkpoints stay; `raygrad view` goes through them
-    #[arg(long, value_name = "N", default_value_t = checkpoint::KEPT, value_parser = parse::at_least_two())]
-    keep_checkpoints: usize,
+    /// How many checkpoints stay, which `raygrad view` goes through [default: 2, or as before for a run that goes on]
+    #[arg(long, value_name = "N", value_parser = parse::at_least_two())]
+    keep_checkpoints: Option<usize>,
     /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
     #[arg(long)]
     tensorboard: bool,
@@ -224,8 +224,9 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     let lock = run.lock()?;
     run.sweep();
     checkpoint::load(&run, &mut trainer)?;
-    if run.config.budget != Some(budget) {
-        run.config.budget = Some(budget);
+    let kept = args.keep_checkpoints.unwrap_or(run.config.keep_checkpoints);
+    if (run.config.budget, run.config.keep_checkpoints) != (Some(budget), kept) {
+        (run.config.budget, run.config.keep_checkpoints) = (Some(budget), kept);
         run.write()?;
     }
     describe(&run, &trainer, &data, &scene)?;
@@ -236,7 +237,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
 
 /// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
 fn train(
-    (run, _lock): (Run, File),
+    (run, lock): (Run, File),
     mut trainer: Trainer,
     budget: Budget,
     args: &Args,
@@ -244,8 +245,7 @@ fn train(
     listener: Option<Listener>,
 ) -> Result<Trained> {
     let mut window = listener.map(|listener| Window::open(listener, &run, &trainer)).transpose()?;
-    let mut watch =
-        Watch::new(&run, &trainer, budget, args.checkpoint, args.keep_checkpoints, preview, args.tensorboard)?;
+    let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
     let (mut diverged, mut ended_by_page) = (None, false);
     for retreats in 0.. {
@@ -277,9 +277,6 @@ fn train(
     // Whatever came of it, the run was good until then.
     let good = diverged.is_none() || watch.give_up(&mut trainer);
     watch.finish(&trainer, ended, good)?;
-    if let Some(window) = &mut window {
-        window.end(&trainer, ended);
-    }
     summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
     if let Some(reason) = &diverged {
         let schedule = trainer.model.config.schedule;
@@ -290,6 +287,11 @@ fn train(
             trainer.stats().step,
             schedule.name()
         ));
+    }
+    // Whoever wants to may go on with it now.
+    drop(lock);
+    if let Some(window) = &mut window {
+        window.end(&trainer, ended);
     }
     Ok(Trained { folder: run.folder, interrupted, diverged: diverged.is_some() })
 }
@@ -346,6 +348,7 @@ impl Args {
             viewpoint: Viewpoint::of(data),
             photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
             budget: Some(self.budget()),
+            keep_checkpoints: self.keep_checkpoints.unwrap_or(checkpoint::KEPT),
             config: trainer.model.config.clone(),
         })
     }

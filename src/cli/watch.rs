@@ -43,8 +43,6 @@ pub struct Watch<'a> {
     next_preview: f64,
     /// Training time between saves in seconds.
     interval: f64,
-    /// How many checkpoints stay.
-    kept: usize,
     next_save: f64,
     psnr: Option<f64>,
     progress: Progress,
@@ -60,7 +58,6 @@ impl<'a> Watch<'a> {
         trainer: &Trainer,
         budget: Budget,
         interval: Duration,
-        kept: usize,
         preview: Preview,
         tensorboard: bool,
     ) -> Result<Self> {
@@ -68,7 +65,7 @@ impl<'a> Watch<'a> {
             trainer.model.save(run.model_file())?;
         }
         if !checkpoint::exists(run)? {
-            checkpoint::save(run, trainer, kept)?;
+            checkpoint::save(run, trainer)?;
         }
         let stats = trainer.stats();
         let StepStats { step, train_seconds, .. } = stats;
@@ -86,7 +83,6 @@ impl<'a> Watch<'a> {
             back: None,
             next_preview: next_preview(train_seconds),
             interval,
-            kept,
             next_save: train_seconds + interval,
             psnr: None,
             progress: Progress::new(),
@@ -142,7 +138,7 @@ impl<'a> Watch<'a> {
         if (ends || stats.train_seconds >= self.next_save) && good {
             self.next_save = stats.train_seconds + self.interval;
             let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
-            let saved = model.and_then(|()| checkpoint::save(self.run, trainer, self.kept));
+            let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
             let saved = saved.and_then(|()| self.summarise(&stats, None));
             self.warn(saved);
         }
@@ -156,7 +152,7 @@ impl<'a> Watch<'a> {
         let back = checkpoint::step_back(self.run, self.back).and_then(|()| {
             checkpoint::load(self.run, trainer)?;
             trainer.set_pace(SLOWER * pace);
-            checkpoint::save(self.run, trainer, self.kept)?;
+            checkpoint::save(self.run, trainer)?;
             self.cut(trainer)
         });
         let step = trainer.stats().step;

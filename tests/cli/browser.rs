@@ -360,7 +360,8 @@ fn a_browser_keeps_pictures_and_paths_that_are_the_programs() {
     assert_eq!(browser.value("keys.length"), 2);
     browser.value("document.getElementById('save-path').click()");
     wait("path.json");
-    browser.value("document.getElementById('film').click()");
+    // As large as the window it would take long.
+    browser.value("freeSizes = () => [48, 12]; document.getElementById('seconds').value = 0.5; document.getElementById('film').click()");
     browser.until(
         "document.getElementById('film-progress').textContent.endsWith('mp4: done') \
                    || document.getElementById('film-progress').textContent.endsWith('gif: done')",
@@ -448,8 +449,52 @@ fn a_browser_shows_training_and_controls_it() {
     browser.value("document.getElementById('pause').click()");
     browser.until(&format!("training.step > {step}"));
     browser.value("window.confirm = () => true; document.getElementById('stop').click()");
+    browser.until("training.ended === 'stopped, and saved'");
+    browser.shot("ended");
+    browser.call("Page.navigate", json!({ "url": "about:blank" }));
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert!(place.path("run/model.safetensors").exists());
+}
+
+/// `PAGES=RUN,RUN cargo test --release --test cli ten_views -- --nocapture` measures runs of one's own, by their whole paths.
+#[test]
+fn a_page_and_the_program_agree_in_ten_views() {
+    let given = std::env::var("PAGES").ok();
+    let Some(mut browser) = Browser::open().filter(|_| given.is_some()) else { return };
+    browser.size(200, 150, false);
+    let place = Place::empty();
+    for (number, run) in given.iter().flat_map(|runs| runs.split(',')).enumerate() {
+        let page = place.path(&format!("{number}.html"));
+        place.succeeds(&format!("export {run} {}", page.display()));
+        place.succeeds(&format!("render {run} --path test --size 100x100 --out {number}"));
+        let poses = super::view::test_cameras(&place, run);
+        let start = Instant::now();
+        browser.call("Page.navigate", json!({ "url": format!("file://{}", page.display()) }));
+        browser.until("typeof whole !== 'undefined' && status.textContent.includes(' ms')");
+        let first = start.elapsed().as_secs_f64();
+        browser.until("whole === wanted");
+        let mut decibels = vec![];
+        let start = Instant::now();
+        for (i, camera) in poses.iter().take(10).enumerate() {
+            let asked =
+                format!("render({}, {}, 100, 100).then((bytes) => Array.from(bytes))", camera["pose"], camera["fov"]);
+            let bytes = browser.value(&asked);
+            let rgba = bytes.as_array().unwrap().chunks(4);
+            let data = rgba.flat_map(|rgba| rgba[..3].iter().map(|x| x.as_u64().unwrap() as f32 / 255.0)).collect();
+            let image = Image { width: 100, height: 100, channels: 3, data };
+            decibels.push(psnr(&image, &png(&place.path(&format!("{number}/{i:04}.png")))));
+        }
+        let seconds = start.elapsed().as_secs_f64() / decibels.len() as f64;
+        decibels.sort_by(f64::total_cmp);
+        println!(
+            "{run}: {:.1} MB, first picture after {first:.1} s, {seconds:.1} s a picture of 100x100; {:.1} to {:.1} dB, {} views",
+            std::fs::metadata(&page).unwrap().len() as f64 / 1e6,
+            decibels[0],
+            decibels[decibels.len() - 1],
+            decibels.len()
+        );
+        assert!(decibels.len() == 10 && decibels[0] > 40.0, "{decibels:?}");
+    }
 }
 
 /// Of scenes that end, that go on, and that all photographs look ahead at.

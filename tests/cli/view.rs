@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use super::resume::{SMALL, assert_same};
 use super::{Place, SIZE, png};
 use raygrad::nerf::Image;
+use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::pictures::metrics::psnr;
 use serde_json::{Value, json};
 use tungstenite::handshake::client::generate_key;
@@ -62,6 +63,8 @@ struct Page {
     /// What came and was not asked for yet.
     texts: VecDeque<Value>,
     files: VecDeque<(Value, Vec<u8>)>,
+    /// When something was said or opened last: an answer does not take for ever.
+    said: Instant,
 }
 
 impl Page {
@@ -74,24 +77,50 @@ impl Page {
         if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
             stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
         }
-        let mut page = Page { socket, texts: VecDeque::new(), files: VecDeque::new() };
+        let mut page = Page { socket, texts: VecDeque::new(), files: VecDeque::new(), said: Instant::now() };
         let about = page.text("about");
         (page, about)
     }
 
     fn say(&mut self, message: Value) {
+        self.said = Instant::now();
         self.socket.send(Message::text(message.to_string())).unwrap();
+    }
+
+    fn patience(&self, limit: Duration) {
+        if let MaybeTlsStream::Plain(stream) = self.socket.get_ref() {
+            stream.set_read_timeout(Some(limit)).unwrap();
+        }
+    }
+
+    /// What comes within so long, without waiting for more.
+    fn hear(&mut self, within: Duration) {
+        let start = Instant::now();
+        self.patience(Duration::from_millis(20));
+        while start.elapsed() < within {
+            let _ = self.read();
+        }
+        self.patience(Duration::from_secs(60));
+    }
+
+    /// Whether no picture comes within so long.
+    fn is_quiet(&mut self, within: Duration) -> bool {
+        self.files.clear();
+        self.hear(within);
+        self.files.is_empty()
     }
 
     /// Reads one message; says why it was closed if it was.
     fn read(&mut self) -> Result<(), String> {
+        assert!(self.said.elapsed() < Duration::from_secs(300), "no answer");
         match self.socket.read() {
             Ok(Message::Text(text)) => self.texts.push_back(serde_json::from_str(&text).unwrap()),
             Ok(Message::Binary(bytes)) => {
                 let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
                 let head: Value = serde_json::from_slice(&bytes[4..4 + length]).unwrap();
                 if head["file"] == "picture" {
-                    self.say(json!({ "ask": "seen", "id": head["id"] }));
+                    let seen = json!({ "ask": "seen", "id": head["id"] });
+                    self.socket.send(Message::text(seen.to_string())).unwrap();
                 }
                 self.files.push_back((head, bytes[4 + length..].to_vec()));
             }
@@ -100,6 +129,17 @@ impl Page {
             Err(error) => return Err(error.to_string()),
         }
         Ok(())
+    }
+
+    /// How training has ended.
+    fn ended(&mut self) -> Value {
+        loop {
+            self.said = Instant::now();
+            let told = self.text("training");
+            if !told["ended"].is_null() {
+                return told;
+            }
+        }
     }
 
     fn text(&mut self, kind: &str) -> Value {
@@ -163,6 +203,14 @@ fn decoded(bytes: &[u8]) -> Image {
     png(&path)
 }
 
+/// What pages are told of the cameras of a run's test views.
+pub fn test_cameras(place: &Place, run: &str) -> Vec<Value> {
+    let server = serve(place, &format!("view {run}"));
+    let about = Page::open(&server.address).1;
+    let photographs = about["photographs"].as_array().unwrap();
+    photographs.iter().filter(|photograph| photograph["split"] == "test").cloned().collect()
+}
+
 /// With a run that pictures are quick of.
 fn trained() -> Place {
     let place = Place::with_scene();
@@ -188,6 +236,7 @@ fn what_a_page_shows_is_what_the_program_renders() {
     assert_eq!(json!([names[0], names[6], names[8]]), json!(["train/r_0", "val/r_0", "test/r_0"]));
     let view = first(&about, [96, 96]);
     let pictures = page.look(7, &view);
+    assert!(pictures.len() > 1, "of a program that knows nothing yet, a coarse one first");
     let (head, whole) = pictures.last().unwrap();
     assert!(psnr(whole, &expected) > 40.0, "{}", psnr(whole, &expected));
     assert!(head["milliseconds"].as_f64().unwrap() > 0.0 && head["compared"].is_null());
@@ -216,7 +265,7 @@ fn what_a_page_shows_is_what_the_program_renders() {
     assert!(shows[0] != shows[1] && shows[1] != shows[2]);
     // A box, a background.
     let mut cropped = view.clone();
-    cropped["within"] = json!([[50.0, 50.0, 50.0], [51.0, 51.0, 51.0]]);
+    cropped["crop"] = json!([[50.0, 50.0, 50.0], [51.0, 51.0, 51.0]]);
     cropped["background"] = json!([0, 0, 255]);
     let nothing = page.look(9, &cropped).pop().unwrap().1;
     assert!(nothing.data.chunks(3).all(|pixel| pixel[2] > 0.97 && pixel[0] < 0.03), "blue");
@@ -232,9 +281,87 @@ fn what_a_page_shows_is_what_the_program_renders() {
     }
     page.text("sorry");
     page.file("save");
-    // Nothing is painted for who looks away.
+}
+
+#[test]
+fn a_picture_is_painted_once_and_none_for_who_looks_away() {
+    let place = Place::with_scene();
+    let server = serve(&place, &format!("train scene --steps 100000 --view --out run {SMALL}"));
+    let (mut page, about) = Page::open(&server.address);
+    // While it learns it is painted again, never as fine as would take long.
+    page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [1800, 1800]) }));
+    let shots: Vec<Value> = (0..4).map(|_| page.file("picture").0).collect();
+    assert!(shots.iter().all(|head| head["halvings"] != 0), "{shots:?}");
+    assert!(shots[3]["step"].as_u64().unwrap() > shots[0]["step"].as_u64().unwrap(), "{shots:?}");
+    let told = page.text("training");
+    assert!(told["psnr"].as_f64().unwrap() > 5.0 && told["loss"].as_f64().unwrap() < 1.0, "{told}");
+    assert!(told["left"] != "0 s" && told["curves"]["speed"][0].as_f64().unwrap() > 10.0, "{told}");
     page.say(json!({ "ask": "rest" }));
-    page.look(10, &view);
+    page.hear(Duration::from_secs(1));
+    assert!(page.is_quiet(Duration::from_millis(1500)));
+    // Checkpoints are for later.
+    let mut view = first(&about, [8, 8]);
+    view["checkpoint"] = json!(0);
+    page.say(json!({ "ask": "view", "id": 2, "view": view }));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("training has ended"));
+    // Held, it is painted as fine as it goes, once.
+    page.say(json!({ "ask": "pause", "pause": true }));
+    page.look(3, &first(&about, [64, 64]));
+    assert!(page.is_quiet(Duration::from_millis(1500)));
+}
+
+/// A scene that is no square, has no end and lies turned in its coordinates.
+#[test]
+fn captures_keep_their_proportions_and_their_places() {
+    let place = Place::empty();
+    place.succeeds("prepare landscape --to nerfstudio --size 32 --out around");
+    let point = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+                 property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n0.25 -1.5 0.75 10 20 30\n";
+    std::fs::write(place.path("around/points.ply"), point).unwrap();
+    let mut transforms = place.json("around/transforms.json");
+    transforms["ply_file_path"] = json!("points.ply");
+    std::fs::write(place.path("around/transforms.json"), transforms.to_string()).unwrap();
+    place.succeeds(&format!("train around --steps 80 --out run {SMALL}"));
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    assert_eq!(json!([about["size"], about["photographs"][0]["size"]]), json!([[32, 24], [32, 24]]));
+    assert!((about["proportion"].as_f64().unwrap() - 4.0 / 3.0).abs() < 1e-9);
+    // Back in the capture's coordinates, the point is where it was.
+    let (given, to) = (about["points"][0][0].clone(), about["to_capture"].clone());
+    let row = |r: usize| -> f64 {
+        (0..3).map(|c| to[r][c].as_f64().unwrap() * given[c].as_f64().unwrap()).sum::<f64>()
+            + to[r][3].as_f64().unwrap()
+    };
+    for (r, expected) in [0.25, -1.5, 0.75].into_iter().enumerate() {
+        assert!((row(r) - expected).abs() < 1e-3, "{} {expected}", row(r));
+    }
+    assert_eq!(about["points"][0][1], json!([10, 20, 30]));
+    assert!(row(0) != given[0].as_f64().unwrap(), "it was moved");
+    // All of a photograph is seen, in its own proportions, and its normals in the capture's axes.
+    place.succeeds("render run --path test --size 32x24 --out color");
+    place.succeeds("render run --path test --size 32x24 --show normals --out normals");
+    let photographs = about["photographs"].as_array().unwrap();
+    let first = photographs.iter().position(|photograph| photograph["split"] == "test").unwrap();
+    for (id, show) in [(1, "color"), (2, "normals")] {
+        let view = json!({ "eye": { "photograph": first + 1 }, "size": [32, 90], "show": show });
+        page.say(json!({ "ask": "save", "view": view }));
+        let (seen, expected) = (decoded(&page.file("save").1), png(&place.path(&format!("{show}/0001.png"))));
+        assert_eq!([seen.width, seen.height], [32, 24]);
+        assert!(psnr(&seen, &expected) > 40.0, "{show} {id}: {}", psnr(&seen, &expected));
+    }
+}
+
+#[test]
+fn photographs_of_scenes_that_are_built_in_are_each_their_own() {
+    let place = Place::empty();
+    place.succeeds(&format!("train embedded --downscale 20 --steps 1 --out run {SMALL}"));
+    let server = serve(&place, "view run");
+    let (mut page, _) = Page::open(&server.address);
+    let photographs = [0, 3].map(|number| {
+        page.say(json!({ "ask": "photograph", "number": number }));
+        page.file("photograph").1
+    });
+    assert_ne!(photographs[0], photographs[1]);
 }
 
 #[test]
@@ -244,13 +371,23 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     let scores = place.json("run/eval-val-fast.json");
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
-    let view = json!({ "eye": { "photograph": 7 }, "size": [SIZE, SIZE], "show": "error" });
+    let view = json!({ "eye": { "photograph": 7 }, "size": [SIZE, SIZE], "compared": true });
     let (head, _) = page.look(1, &view).pop().unwrap();
+    let errors =
+        page.look(13, &json!({ "eye": { "photograph": 9 }, "size": [SIZE, SIZE], "compared": true })).pop().unwrap().1;
+    place.succeeds(&format!("render run --path test --size {SIZE}x{SIZE} --out test"));
+    let truth = png(&place.path("scene/test/r_1.png")).over([1.0; 3]);
+    let map = colormap::error_map(&png(&place.path("test/0001.png")), &truth);
+    assert!(psnr(&errors, &map) > 25.0, "{}", psnr(&errors, &map));
+    // A box, and what else lies behind the scene, are no fault of the model's.
+    let mut cropped = view.clone();
+    (cropped["crop"], cropped["background"]) = (json!([[50, 50, 50], [51, 51, 51]]), json!([0, 0, 255]));
+    assert_eq!(page.look(11, &cropped).pop().unwrap().0["compared"], head["compared"]);
     assert_eq!(head["compared"][0], 7);
     let [seen, expected] = [&head["compared"][1], &scores["per_view"][1]["psnr"]].map(|x| x.as_f64().unwrap());
     assert!((seen - expected).abs() < 0.01, "{seen} {expected}");
     // One is not made larger to be compared, and shown whole beside others.
-    let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90], "show": "error" });
+    let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90], "compared": true });
     let (head, picture) = page.look(3, &large).pop().unwrap();
     assert_eq!([picture.width, picture.height], [SIZE, SIZE]);
     assert!((head["compared"][1].as_f64().unwrap() - expected).abs() < 0.01);
@@ -261,6 +398,14 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     let mut near = view.clone();
     near["eye"] = json!({ "free": { "pose": about["photographs"][4]["pose"], "fov": 30.0 } });
     assert_eq!(page.look(2, &near).pop().unwrap().0["compared"][0], 4);
+    // How a camera is held counts as much as where it is.
+    let [mut pose, other] = [5, 4].map(|i: usize| about["photographs"][i]["pose"].clone());
+    for row in 0..3 {
+        let [own, other] = [&pose, &other].map(|pose| pose[row][3].as_f64().unwrap());
+        pose[row][3] = json!(0.45 * own + 0.55 * other);
+    }
+    near["eye"] = json!({ "free": { "pose": pose, "fov": 30.0 } });
+    assert_eq!(page.look(12, &near).pop().unwrap().0["compared"][0], 5);
     page.say(json!({ "ask": "photograph", "number": 3 }));
     let (head, bytes) = page.file("photograph");
     let photograph = png(&place.path("scene/train/r_3.png")).over([1.0; 3]);
@@ -285,16 +430,28 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     names.sort();
     names.dedup();
     assert_eq!(names.len(), about["photographs"].as_array().unwrap().len());
-    let asked = json!({ "eye": { "photograph": numbers[0] }, "size": [SIZE, SIZE], "show": "error" });
+    let asked = json!({ "eye": { "photograph": numbers[0] }, "size": [SIZE, SIZE], "compared": true });
     let (head, _) = page.look(1, &asked).pop().unwrap();
     let [seen, expected] = [&head["compared"][1], &scores["per_view"][0]["psnr"]].map(|x| x.as_f64().unwrap());
     assert!((seen - expected).abs() < 0.02, "{seen} {expected}");
-    // Without them the rest is there.
+    // What lies behind is as in training, in photographs too.
+    let (_, seen) = page.look(2, &first(&about, [32, 32])).pop().unwrap();
+    page.say(json!({ "ask": "photograph", "number": numbers[0] }));
+    let photograph = decoded(&page.file("photograph").1);
+    assert!(seen.data[0] < 0.2 && photograph.data[0] < 0.2, "{} {}", seen.data[0], photograph.data[0]);
+    // Without them, or with others, the rest is there.
+    let server = serve(&place, "view run --scene captured");
+    assert_eq!(Page::open(&server.address).1["photographs"], json!([]));
     std::fs::rename(place.path("scene"), place.path("gone")).unwrap();
+    let server = serve(&place, "view run --scene gone");
+    assert_eq!(Page::open(&server.address).1["photographs"].as_array().unwrap().len(), 11);
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     assert_eq!(about["photographs"], json!([]));
-    assert_eq!(page.look(1, &view).pop().unwrap().0["compared"], Value::Null);
+    for (id, view) in [(1, &view), (2, &json!({ "eye": { "photograph": 0 }, "size": [8, 8] }))] {
+        page.say(json!({ "ask": "view", "id": id, "view": view }));
+        assert!(page.text("sorry")["what"].as_str().unwrap().contains("not known"));
+    }
     page.say(json!({ "ask": "photograph", "number": 0 }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("not known"));
 }
@@ -407,9 +564,11 @@ fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
         (changed("size", json!([4096, 4096])), "is no size"),
         (changed("size", json!([4294967295_u32, 4294967295_u32])), "is no size"),
         (changed("show", json!("secrets")), "unknown variant"),
+        (json!({ "ask": "save", "view": { "eye": { "photograph": 0 }, "size": [9, 9], "show": "depth", "compared": true } })
+            .to_string(), "colours are compared"),
         (changed("background", json!([0, 0, 256])), "invalid value"),
-        (changed("within", json!([[0, 0, 0], [1, 1, 1e10]])), "a box has"),
-        (changed("within", json!([[0, 0, 0]])), "invalid length"),
+        (changed("crop", json!([[0, 0, 0], [1, 1, 1e10]])), "a box has"),
+        (changed("crop", json!([[0, 0, 0]])), "invalid length"),
         (changed("eye", json!({ "free": { "pose": about["pose"], "fov": 171 } })), "a field of view is"),
         (changed("eye", json!({ "photograph": -1 })), "invalid value"),
         (changed("eye", json!({})), "expected"),
@@ -418,6 +577,13 @@ fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
         (pose(json!([[1, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0]])), "a pose is"),
         (pose(json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]])), "invalid length"),
         ("[".repeat(10_000), ""),
+        (json!({ "ask": "film", "path": { "keys": [] } }).to_string(), "`render_width`"),
+        (json!({ "ask": "film", "path": { "render_width": 4000, "render_height": 4000, "seconds": 1, "fps": 1 } }).to_string(),
+            "pixels at most"),
+        (json!({ "ask": "film", "path": { "render_width": 40, "render_height": 40, "seconds": 601, "fps": 1 } }).to_string(),
+            "`seconds`"),
+        (json!({ "ask": "film", "path": { "render_width": 40, "render_height": 40, "seconds": 1, "fps": 61 } }).to_string(),
+            "`fps`"),
     ];
     for (message, expected) in messages {
         let (mut page, _) = Page::open(&server.address);
@@ -439,8 +605,15 @@ fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
         }
     }
     page.closed();
-    // A photograph of no such number is seen from somewhere, and the other page is still served.
-    assert_eq!(good.look(5, &json!({ "eye": { "photograph": 4000 }, "size": [16, 16] })).pop().unwrap().0["id"], 5);
+    // Reasons end with a letter, however long these are.
+    for start in ["", "x"] {
+        let (mut page, _) = Page::open(&server.address);
+        page.say(json!({ "ask": format!("{start}{}", "\u{e4}".repeat(100)) }));
+        assert!(page.closed().contains("unknown variant"));
+    }
+    // A photograph of no such number is said not to be there, and the other page is still served.
+    good.say(json!({ "ask": "view", "id": 5, "view": { "eye": { "photograph": 4000 }, "size": [16, 16] } }));
+    assert!(good.text("sorry")["what"].as_str().unwrap().contains("no such photograph"));
     assert_eq!(good.look(6, &view).pop().unwrap().0["id"], 6);
 }
 
@@ -518,6 +691,11 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     assert!(again > held, "{again}");
     assert_eq!(json!([ended["step"], ended["ended"]]), json!([600, "done"]));
     assert!(ended["curves"]["loss"].as_array().unwrap().len() > 10, "{ended}");
+    // The scene is shown until the page has gone; meanwhile the run is anyone's.
+    page.say(json!({ "ask": "view", "id": 9, "view": view }));
+    while page.file("picture").0["step"] != 600 {}
+    place.succeeds("train --resume run --steps 600");
+    drop(page);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert_same(&place, "whole", "run");
 
@@ -527,13 +705,9 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     page.say(json!({ "ask": "pause", "pause": true }));
     while page.text("training")["paused"] != true {}
     page.say(json!({ "ask": "stop" }));
-    let ended = loop {
-        let told = page.text("training");
-        if !told["ended"].is_null() {
-            break told;
-        }
-    };
+    let ended = page.ended();
     assert!(ended["step"].as_u64().unwrap() < 600 && ended["ended"] == "stopped, and saved", "{ended}");
+    drop(page);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     place.succeeds("train --resume other");
     assert_same(&place, "whole", "other");
@@ -669,13 +843,46 @@ fn films_are_made_one_at_a_time_beside_what_is_seen() {
     page.look(1, &first(&about, [16, 16]));
     page.say(json!({ "ask": "end-film" }));
     assert_eq!(ended(&mut page)["words"], "ended");
-    assert!(!place.path(&format!("run/films/film-2.{ending}")).exists());
+    let films = || std::fs::read_dir(place.path("run/films")).unwrap().count();
+    assert_eq!(films(), 2, "nothing is left of it");
+    // As it is seen, with what is behind it and as much left out.
+    for (film, flags) in [
+        (json!({ "path": path(&about, 0.4), "show": "normals", "skip": "off" }), "--show normals --skip off"),
+        (json!({ "path": path(&about, 0.4), "show": "opacity" }), "--show opacity"),
+        (json!({ "path": path(&about, 0.4), "background": [0, 128, 255] }), "--background 0,128,255"),
+    ] {
+        let mut asked = film;
+        asked["ask"] = json!("film");
+        page.say(asked);
+        let told = ended(&mut page);
+        assert_eq!(told["words"], "done", "{told}");
+        let film = told["file"].as_str().unwrap().to_owned();
+        let path = film.replace(ending, "json");
+        place.succeeds(&format!("render run --path {path} {flags} --out again.{ending}"));
+        let bytes = [&*film, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
+        assert!(bytes[0] == bytes[1], "{flags}");
+    }
     // What is no path is said by who reads it.
-    page.say(json!({ "ask": "film", "path": { "keys": [] } }));
+    let mut fisheye = path(&about, 1.0);
+    fisheye["camera_type"] = json!("fisheye");
+    page.say(json!({ "ask": "film", "path": fisheye }));
     let words = ended(&mut page)["words"].as_str().unwrap().to_owned();
-    assert!(words.contains("film-3.json") && words.contains("is no camera path"), "{words}");
-    page.say(json!({ "ask": "film", "path": path(&about, 1.0), "show": "error" }));
-    assert!(page.text("sorry")["what"].as_str().unwrap().contains("depth"));
+    assert!(words.contains("film-5.json") && words.contains("perspective"), "{words}");
+    // A program that ends ends the film with it.
+    page.say(json!({ "ask": "film", "path": path(&about, 600.0) }));
+    let film = page.text("film")["file"].as_str().unwrap().to_owned();
+    let frames = place.path(&format!("{film}.frames"));
+    while std::fs::read_dir(&frames).map_or(0, |found| found.count()) < 4 {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    drop(server);
+    let count = || std::fs::read_dir(&frames).map_or(0, |found| found.count());
+    std::thread::sleep(Duration::from_millis(1500));
+    let then = count();
+    std::thread::sleep(Duration::from_millis(700));
+    assert_eq!(count(), then);
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
     page.say(json!({ "ask": "end-film" }));
     page.look(2, &first(&about, [17, 16]));
     let server = serve(&place, &format!("train scene --steps 100000 --view --out other {SMALL}"));
@@ -694,6 +901,17 @@ fn pages_know_where_photographs_are_found_to_have_been_taken() {
     let poses =
         |told: &Value| told["photographs"].as_array().unwrap().iter().map(|p| p["pose"].clone()).collect::<Vec<_>>();
     assert!(poses(&taken).len() == poses(&about).len() && poses(&taken) != poses(&about));
+    assert_ne!(taken["to_capture"], about["to_capture"]);
+    // Each near to where its own was, and not another's.
+    let apart = |a: &Value, b: &Value| -> f64 {
+        let at = |pose: &Value, row: usize| pose[row][3].as_f64().unwrap();
+        (0..3).map(|row| (at(a, row) - at(b, row)).powi(2)).sum()
+    };
+    for (i, own) in poses(&taken).iter().enumerate() {
+        let nearest =
+            poses(&about).iter().map(|other| apart(own, other)).enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+        assert_eq!(nearest.unwrap().0, i);
+    }
     // Who comes later is told what is known by then.
     let (_, later) = Page::open(&server.address);
     assert_ne!(poses(&later), poses(&about));
@@ -705,7 +923,7 @@ fn photographs_that_cannot_be_read_are_named() {
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     std::fs::write(place.path("scene/train/r_3.png"), b"nothing").unwrap();
-    let view = json!({ "eye": { "photograph": 3 }, "size": [16, 16], "show": "error" });
+    let view = json!({ "eye": { "photograph": 3 }, "size": [16, 16], "compared": true });
     page.say(json!({ "ask": "view", "id": 1, "view": view }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("r_3.png"));
     page.say(json!({ "ask": "photograph", "number": 3 }));
@@ -736,6 +954,35 @@ fn so_many_pages_are_served_and_no_more_until_one_goes() {
     while status() != "101" {
         assert!(start.elapsed() < Duration::from_secs(20), "its place is free");
     }
+    // Those that say nothing at all, not even that they are there, are taken to be gone.
+    while pages
+        .iter_mut()
+        .any(|page| page.socket.can_write() && page.socket.flush().is_ok() && start.elapsed().as_secs() < 31)
+    {
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    let held: Vec<TcpStream> = (0..64)
+        .map(|_| {
+            let mut stream = TcpStream::connect(&server.address).unwrap();
+            stream.write_all(upgrade.as_bytes()).unwrap();
+            let mut start = [0; 12];
+            stream.read_exact(&mut start).unwrap();
+            assert_eq!(&start[9..], b"101");
+            stream
+        })
+        .collect();
+    drop(held);
+}
+
+#[test]
+fn connections_that_ask_for_nothing_do_not_hold_others_up_for_long() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let idle: Vec<TcpStream> = (0..128).map(|_| TcpStream::connect(&server.address).unwrap()).collect();
+    let asked = Instant::now();
+    let (status, _, _) = request(&server.address, &format!("GET / HTTP/1.1\r\nHost: {}", server.address));
+    assert!(status == 200 && (5..20).contains(&asked.elapsed().as_secs()), "{:?}", asked.elapsed());
+    drop(idle);
 }
 
 /// The same view from elsewhere: turned about the vertical, in radians.
@@ -810,6 +1057,52 @@ fn milliseconds_from_a_drag_to_the_first_picture_and_to_the_whole_one() {
     }
 }
 
+/// `COST=SCENE cargo test --release --test cli what_pages_cost -- --nocapture` measures longer runs of a scene of one's own.
+#[test]
+fn what_pages_cost_training() {
+    let place = Place::with_scene();
+    let given = std::env::var("COST").ok();
+    let (scene, flags, rounds) = match &given {
+        Some(scene) => (&**scene, "--steps 1000", 7),
+        None => ("scene", &*format!("--steps 100 {SMALL}"), 1),
+    };
+    // How long training takes as a whole: without a page, with one that nobody looks at, with one that is looked at.
+    let seconds = |round: usize, looks: Option<bool>| {
+        let view = if looks.is_some() { "--view" } else { "" };
+        let start = Instant::now();
+        let command = format!("train {scene} {flags} {view} --out run-{round}-{looks:?}");
+        let Some(looks) = looks else {
+            place.succeeds(&command);
+            return start.elapsed().as_secs_f64();
+        };
+        let mut server = serve(&place, &command);
+        let (mut page, about) = Page::open(&server.address);
+        let asked = match looks {
+            true => json!({ "ask": "view", "id": 1, "view": first(&about, [400, 400]) }),
+            false => json!({ "ask": "rest" }),
+        };
+        page.say(asked);
+        page.ended();
+        let seconds = start.elapsed().as_secs_f64();
+        drop(page);
+        assert_eq!(server.child.wait().unwrap().code(), Some(0));
+        seconds
+    };
+    seconds(0, None);
+    let (mut idle, mut busy) = (vec![], vec![]);
+    for round in 1..=rounds {
+        let [without, rest, looks] = [None, Some(false), Some(true)].map(|looks| seconds(round, looks));
+        idle.push(rest / without);
+        busy.push(looks / without);
+    }
+    for (what, ratios) in [("that nobody looks at", &mut idle), ("that is looked at", &mut busy)] {
+        ratios.sort_by(f64::total_cmp);
+        let [least, middle, most] = [ratios[0], ratios[rounds / 2], ratios[rounds - 1]];
+        println!("a page {what} makes training take {middle:.3} times as long ({least:.3} to {most:.3} of {rounds})");
+        assert!(least > 0.1 && most < 20.0, "{ratios:?}");
+    }
+}
+
 /// `LOAD=all cargo test --release --test cli many_pages -- --nocapture` is the campaign: fifty pages, ten thousand messages that are none.
 #[test]
 fn many_pages_and_much_nonsense_leave_memory_and_training_as_they_are() {
@@ -842,7 +1135,10 @@ fn many_pages_and_much_nonsense_leave_memory_and_training_as_they_are() {
     }
     let mut random = 7_u32;
     let letters = br#"{}[]":,0189.eE-+"askview idpose\u0000 "#;
-    for _ in 0..nonsense {
+    for which in 0..nonsense {
+        if which % 100 == 0 {
+            held.hear(Duration::from_millis(50));
+        }
         let text: String = (0..40)
             .map(|_| {
                 random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -860,7 +1156,8 @@ fn many_pages_and_much_nonsense_leave_memory_and_training_as_they_are() {
     }
     drop(others);
     held.say(json!({ "ask": "pause", "pause": false }));
-    while held.read().is_ok() {}
+    held.ended();
+    drop(held);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert_same(&place, "whole", "run");
 }

@@ -172,7 +172,7 @@ impl Capture {
         Survey::new(self, empty, asked)
     }
 
-    /// Reads one photograph, in its own size, as its camera has taken it.
+    /// Reads one photograph, in its own size, as its camera has taken it: without its mask, and whatever a survey says.
     ///
     /// # Errors
     /// If its image does not exist, cannot be decoded or is of another shape than its camera.

@@ -49,6 +49,11 @@ impl Grid {
         self.grid.width()
     }
 
+    /// What the features of each level are multiplied by, if not all of them count in full.
+    pub fn weights(&self) -> Option<&[f64]> {
+        self.weights.as_deref()
+    }
+
     /// The parameter.
     pub fn table(&self) -> ParamId {
         self.table

@@ -1,7 +1,7 @@
 //! A hash grid and two small networks.
 
 use super::grid::Grid;
-use super::{Density, Field, Fields, Seen};
+use super::{Density, Field, Fields, Seen, log_density_shift};
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
 use crate::kind::{Kind, Site};
@@ -52,9 +52,6 @@ impl Kind<Fields> for InstantConfig {
     }
 }
 
-/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in its own unit.
-const LOG_DENSITY_SHIFT: f64 = 1.0;
-
 /// A field as in Mueller et al. 2022, section 5.4: a multiresolution hash grid, a density network of one hidden layer,
 /// and a colour network that sees its outputs and the direction. No layer has a bias. The density is the exponential of
 /// the first output.
@@ -77,7 +74,7 @@ impl Instant {
     /// If the configuration is out of range, or has codes and the number of photographs is not known.
     pub fn new<T: Scalar>(config: &InstantConfig, mut site: Site<'_, T>) -> Result<Self> {
         config.check()?;
-        let shift = LOG_DENSITY_SHIFT + site.space.unit.ln();
+        let shift = log_density_shift(site.space.unit);
         let grid = Grid::new(&config.grid, site.child(site.name))?;
         let Site { frames, params, name, rng, .. } = site;
         let direction = SphericalHarmonics::new(config.direction_degree);

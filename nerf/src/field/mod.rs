@@ -20,6 +20,12 @@ use std::sync::{Arc, RwLock};
 /// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
 pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
 
+/// What fields whose density is an exponential subtract from its logarithm, in a space of this unit, in scene units: a new one is a
+/// thin fog, of density about 0.4 in the space's unit.
+pub fn log_density_shift(unit: f64) -> f64 {
+    1.0 + unit.ln()
+}
+
 /// What a field says of positions alone.
 pub struct Density<'t, T: Scalar> {
     /// Density per scene unit, at least 0, or its natural logarithm, `[samples]`.

@@ -1,7 +1,7 @@
 //! A grid of voxels and no network.
 
 use super::grid::Grid;
-use super::{Density, Field, Fields, Seen};
+use super::{Density, Field, Fields, Seen, log_density_shift};
 use crate::Result;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
@@ -38,8 +38,6 @@ impl Kind<Fields> for VoxelConfig {
     }
 }
 
-/// Subtracted from the logarithm of the density: a new field is a thin fog, of density about 0.4 in its own unit.
-const LOG_DENSITY_SHIFT: f64 = 1.0;
 /// What the logarithm of the density is multiplied by: without a network before it, it moves by little more than the
 /// learning rate in a step, and has further to go than a colour.
 const LOG_DENSITY_GAIN: f64 = 10.0;
@@ -73,7 +71,7 @@ impl Voxel {
             coarsest: config.resolution,
             finest: config.resolution,
         };
-        let shift = LOG_DENSITY_SHIFT + site.space.unit.ln();
+        let shift = log_density_shift(site.space.unit);
         Ok(Voxel { grid: Grid::new(&grid, site)?, direction, shift })
     }
 

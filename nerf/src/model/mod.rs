@@ -146,6 +146,11 @@ impl<T: Scalar> Model<T> {
         self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.other_camera(&self.params, camera))
     }
 
+    /// The same of many: see [`Refine::other_cameras`].
+    pub fn other_cameras(&self, cameras: &[Camera]) -> Vec<Camera> {
+        self.refine.as_ref().map_or_else(|| cameras.to_vec(), |refine| refine.other_cameras(&self.params, cameras))
+    }
+
     /// The cameras that the model was given, if it learns something of them and was told.
     pub fn cameras(&self) -> &[Camera] {
         self.refine.as_ref().map_or(&[], Refine::cameras)
@@ -170,7 +175,7 @@ impl<T: Scalar> Model<T> {
         (&*self.sampler as &dyn Any).downcast_ref()
     }
 
-    /// What the colours of views are multiplied by, and cut off at 1: that of [`look`](Self::look), or of none in particular, where a
+    /// What the colours of views are multiplied by in a picture's middle, and cut off at 1: that of [`look`](Self::look), or of none in particular, where a
     /// [`Tone`] knows how photographs differ; else 1.
     pub fn gain(&self) -> [f64; 3] {
         self.tone.as_ref().map_or([1.0; 3], |tone| tone.gain(&self.params, self.look, false).at(0.0))

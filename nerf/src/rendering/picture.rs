@@ -101,7 +101,7 @@ pub struct Viewing<'a> {
     /// What may be left out; without it what goes with the configuration.
     pub limits: Option<Limits>,
     /// The box, lower and upper corner in scene units, beyond which nothing is shown: infinite for all.
-    pub within: [DVec3; 2],
+    pub crop: [DVec3; 2],
     /// Asked before each tile, on any thread: once it says `false`, no more is rendered.
     pub goes_on: &'a (dyn Fn() -> bool + Sync),
 }
@@ -109,7 +109,7 @@ pub struct Viewing<'a> {
 impl Viewing<'_> {
     /// All of a scene, to the end, over a background.
     pub fn over(background: [f32; 3]) -> Self {
-        Viewing { background, limits: None, within: EVERYWHERE, goes_on: &|| true }
+        Viewing { background, limits: None, crop: EVERYWHERE, goes_on: &|| true }
     }
 }
 
@@ -127,7 +127,7 @@ impl<T: Scalar> Model<T> {
         out: impl IndexedParallelIterator<Item = P>,
         see: impl Fn(&mut S, usize, &Rays<T>, P) -> Evaluations + Sync,
     ) -> Option<Evaluations> {
-        let ([lower, upper], [from, to]) = (self.reach(), viewing.within);
+        let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
         let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
         let [near, far] = self.extent.span;
         // Which corner is which is nothing to a ray.
@@ -194,7 +194,7 @@ impl Model<f32> {
     /// let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
     /// let model = Model::new(Config::preset(Preset::Voxel), extent, 0)?;
     /// let camera = Camera::from_angle(8, 6, 0.7, DAffine3::from_translation(3.0 * DVec3::Z));
-    /// let lower_half = Viewing { within: [DVec3::NEG_ONE, DVec3::new(1.0, 0.0, 1.0)], ..Viewing::over([1.0; 3]) };
+    /// let lower_half = Viewing { crop: [DVec3::NEG_ONE, DVec3::new(1.0, 0.0, 1.0)], ..Viewing::over([1.0; 3]) };
     /// let picture = model.view_while(&camera, &lower_half).expect("it was not stopped");
     /// assert_eq!(picture.color.pixel(4, 0), [1.0; 3]);
     /// assert!(model.view_while(&camera, &Viewing { goes_on: &|| false, ..lower_half }).is_none());
@@ -256,7 +256,7 @@ mod tests {
         let (model, camera) = (model(), camera(17, 13));
         let whole = model.view(&camera, [1.0; 3]);
         let within = |lower: [f64; 3], upper: [f64; 3]| {
-            let viewing = Viewing { within: [lower.into(), upper.into()], ..Viewing::over([1.0; 3]) };
+            let viewing = Viewing { crop: [lower.into(), upper.into()], ..Viewing::over([1.0; 3]) };
             (model.view_while(&camera, &viewing).unwrap(), model.normals_while(&camera, &viewing).unwrap())
         };
         // A box that is larger than the scene changes nothing, one beside it shows nothing.

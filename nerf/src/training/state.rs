@@ -231,6 +231,22 @@ mod tests {
     }
 
     #[test]
+    fn a_model_is_seen_as_it_was() {
+        let mut trainer = trainer();
+        trainer.step(0.0);
+        let state = trainer.state().unwrap();
+        let expected = trainer.model.params.clone();
+        trainer.step(0.5);
+        let earlier = trainer.model.at_state(&state).unwrap();
+        for id in expected.ids() {
+            assert_eq!(earlier.params.get(id).as_slice(), expected.get(id).as_slice());
+        }
+        trainer.model.set_detail(0.25);
+        assert_eq!(earlier.at_state(&trainer.state().unwrap()).unwrap().detail(), 0.25);
+        assert!(earlier.at_state(b"nothing").is_err());
+    }
+
+    #[test]
     fn numbers_that_no_run_has_are_refused() {
         let mut trainer = trainer();
         let written = |change: &dyn Fn(&mut Counts)| {

@@ -1,11 +1,12 @@
 //! A scene as one HTML page that renders itself: the table, the networks and the occupied cells, and a program for the graphics
 //! card that marches through them as views do.
 
+use std::any::Any;
 use std::path::Path;
 
 use half::f16;
 use raygrad::nerf::encoding::hash_grid::HashGrid;
-use raygrad::nerf::field::InstantConfig;
+use raygrad::nerf::field::{Instant, InstantConfig, log_density_shift};
 use raygrad::nerf::sampling::marching::{Marching, MarchingConfig};
 use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
@@ -74,8 +75,7 @@ fn page(run: &Run, model: &Model<f32>) -> std::result::Result<String, String> {
             "color": config.color_width,
             "depth": config.color_depth,
             "degree": config.direction_degree,
-            // As `Instant` has it: the logarithm of the density of a new field, in the space's own unit.
-            "shift": 1.0 + model.extent.unit.ln(),
+            "shift": log_density_shift(model.extent.unit),
         },
     });
     let files = json!({
@@ -84,7 +84,7 @@ fn page(run: &Run, model: &Model<f32>) -> std::result::Result<String, String> {
         "words": base64(&marching.view_grid().words().iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<u8>>()),
     });
     let texts = [
-        ("title", escaped(&run.folder.display().to_string())),
+        ("title", escaped(&run.name())),
         ("style", STYLE.to_owned()),
         ("camera", view::CAMERA.to_owned()),
         ("script", SCRIPT.to_owned()),
@@ -150,6 +150,8 @@ fn table(model: &Model<f32>) -> std::result::Result<Vec<u8>, String> {
 /// The weights of all layers, each row of outputs filled up to a multiple of four, each layer to such a number of rows; before
 /// the first layer of colours what the mean code of the photographs adds to its outputs.
 fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Vec<u8>, String> {
+    let field: &dyn Any = &*model.field;
+    let levels = field.downcast_ref::<Instant>().and_then(|field| field.grid().weights());
     let mut out: Vec<f32> = vec![];
     let mut layer = |rows: &[f32], outputs: usize| {
         for row in rows.chunks(outputs) {
@@ -161,7 +163,17 @@ fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Ve
     };
     for name in ["field.density.0.weight", "field.density.1.weight"] {
         let (values, [_, outputs]) = parameter(model, name)?;
-        layer(values, outputs);
+        match levels.filter(|_| name.contains("density.0")) {
+            // What features are multiplied by may as well be in the weights.
+            Some(levels) => {
+                let scaled = values.chunks(outputs).enumerate().flat_map(|(row, weights)| {
+                    let level = levels[row / config.grid.features] as f32;
+                    weights.iter().map(move |weight| level * weight)
+                });
+                layer(&scaled.collect::<Vec<_>>(), outputs);
+            }
+            None => layer(values, outputs),
+        }
     }
     let inputs = config.features + config.direction_degree * config.direction_degree;
     for i in 0..=config.color_depth {

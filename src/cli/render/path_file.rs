@@ -69,6 +69,9 @@ struct Nerfstudio {
     camera_path: Option<Vec<Shot>>,
     keyframes: Option<Value>,
     crop: Option<Value>,
+    /// `capture`, if it is in the capture's coordinates, which raygrad says.
+    #[serde(rename = "coordinates")]
+    _coordinates: Option<String>,
 }
 
 /// One frame.
@@ -164,7 +167,10 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
             "is no camera path: it has neither nerfstudio's `camera_path` or `keyframes` nor instant-ngp's `path`";
         return Err(Error::file(file, what));
     }
+    // As `raygrad view` writes it.
+    let own = document.get("coordinates").is_some_and(|of| of == "capture");
     let to_capture = match transform {
+        None if own => DAffine3::IDENTITY,
         None => {
             note(&format!(
                 "{}: is taken to be in the capture's coordinates; nerfstudio writes its own: say --path-transform with its \

@@ -4,13 +4,13 @@ use clap::ValueEnum;
 use raygrad::nerf::dataset::{Depths, Placement};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Extent, Image, Picture};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::cli::output::depth_colors;
 use crate::cli::precision::Renderer;
 
 /// What frames show.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Show {
     /// What a photograph would

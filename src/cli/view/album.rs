@@ -71,11 +71,6 @@ impl Album {
         Ok(Album { capture, scene, entries, kept: Store::new(KEPT) })
     }
 
-    /// How many there are.
-    pub fn len(&self) -> usize {
-        self.entries.len()
-    }
-
     /// The camera of a photograph, where a model has it.
     pub fn camera(&self, number: usize, model: &Model<f32>) -> Option<Camera> {
         let Entry { split, number, given, .. } = self.entries.get(number)?;
@@ -83,16 +78,34 @@ impl Album {
         Some(if learned { model.learned_camera(*number, given) } else { model.other_camera(given) })
     }
 
+    /// All of them.
+    fn cameras(&self, model: &Model<f32>) -> Vec<Camera> {
+        let is_learned = |entry: &&Entry| entry.split == Split::Train;
+        let others: Vec<Camera> =
+            self.entries.iter().filter(|entry| !is_learned(entry)).map(|e| e.given.clone()).collect();
+        let mut others = model.other_cameras(&others).into_iter();
+        let camera = |entry: &Entry| match is_learned(&entry) {
+            true => model.learned_camera(entry.number, &entry.given),
+            false => others.next().unwrap_or_else(|| entry.given.clone()),
+        };
+        self.entries.iter().map(camera).collect()
+    }
+
+    /// Whether a photograph has a mask, of what is not to be compared.
+    pub fn is_masked(&self, number: usize) -> bool {
+        self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some())
+    }
+
     /// The photograph that was taken nearest to where a camera is, looking the way it looks.
     pub fn nearest(&self, camera: &Camera, model: &Model<f32>) -> Option<usize> {
         let middle = 0.5 * (model.extent.bounds[0] + model.extent.bounds[1]);
         let reach = camera.pose.translation.distance(middle).max(1e-6);
-        let apart = |number: &usize| {
-            let own = self.camera(*number, model).unwrap_or_else(|| camera.clone());
+        let apart = |own: &Camera| {
             let away = own.pose.translation.distance(camera.pose.translation) / reach;
             away + own.pose.matrix3.z_axis.distance(camera.pose.matrix3.z_axis)
         };
-        (0..self.len()).map(|number| (apart(&number), number)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, i)| i)
+        let apart = self.cameras(model).iter().map(apart).enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+        apart.map(|(number, _)| number)
     }
 
     /// A photograph, no larger than a page shows it.
@@ -116,9 +129,7 @@ impl Album {
             Scene::Folder(_) => self.capture.photo(&entry.view)?,
             made => self.made(made, entry)?,
         };
-        let share = LONGEST as f64 / photo.width.max(photo.height) as f64;
-        let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
-        Ok(if share < 1.0 { photo.resized([side(photo.width), side(photo.height)]) } else { photo })
+        Ok(if photo.width.max(photo.height) > LONGEST { shrunk(&photo) } else { photo })
     }
 
     /// A photograph of a scene that is built in.
@@ -132,26 +143,46 @@ impl Album {
 
     /// What a page is told of them.
     pub fn about(&self, model: &Model<f32>) -> Vec<AboutPhotograph> {
-        let about = |(number, entry): (usize, &Entry)| {
-            let camera = self.camera(number, model).unwrap_or_else(|| entry.given.clone());
-            AboutPhotograph {
-                name: entry.view.name.clone(),
-                split: entry.split,
-                pose: rows(&camera.pose),
-                fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
-                centre: [camera.centre[0] / camera.width as f64, camera.centre[1] / camera.height as f64],
-                size: [camera.width, camera.height],
-            }
+        let about = |(entry, camera): (&Entry, Camera)| AboutPhotograph {
+            name: entry.view.name.clone(),
+            split: entry.split,
+            pose: rows(&camera.pose),
+            fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+            centre: [camera.centre[0] / camera.width as f64, camera.centre[1] / camera.height as f64],
+            size: [camera.width, camera.height],
         };
-        self.entries.iter().enumerate().map(about).collect()
+        self.entries.iter().zip(self.cameras(model)).map(about).collect()
     }
 
     /// Places of the scene and their colours: the best of them, if there are many.
     pub fn points(&self, model: &Model<f32>) -> Vec<([f32; 3], [u8; 3])> {
         let placement = model.extent.placement;
+        // With the cameras, if these are found to have been elsewhere.
+        let learned = model.refine.as_ref().and_then(|refine| refine.placement(&model.params)).unwrap_or_default();
         let mut points: Vec<&Point> = self.capture.points.iter().collect();
         points.sort_by(|a, b| b.views.cmp(&a.views).then(a.error.total_cmp(&b.error)));
-        let place = |point: DVec3| placement.point(point).as_vec3().to_array();
+        let place = |point: DVec3| learned.point(placement.point(point)).as_vec3().to_array();
         points.into_iter().take(MOST_POINTS).map(|point| (place(point.position), point.color)).collect()
+    }
+}
+
+/// A photograph whose longest side is as long as is kept.
+fn shrunk(photo: &Photo) -> Photo {
+    let share = LONGEST as f64 / photo.width.max(photo.height) as f64;
+    let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
+    photo.resized([side(photo.width), side(photo.height)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::Image;
+
+    #[test]
+    fn large_photographs_keep_their_proportions() {
+        for (size, expected) in [([3200, 100], [1600, 50]), ([20, 1700], [19, 1600]), ([1601, 1], [1600, 1])] {
+            let small = shrunk(&Photo::from(Image::new(size[0], size[1], 3)));
+            assert_eq!([small.width, small.height], expected);
+        }
     }
 }

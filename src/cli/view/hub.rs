@@ -8,11 +8,11 @@ use std::time::{Duration, Instant};
 use tokio::sync::Notify;
 
 use super::messages::{File, Made, View};
-use super::server::sorry;
+use super::server::{patience, sorry};
 
 /// Messages that wait for a page, beside a picture: more than it can have asked for in earnest.
 const WAITING: usize = 64;
-/// Pictures to keep that wait to be painted, of one page.
+/// Pictures to keep that wait to be painted or sent, of one page.
 const SAVES: usize = 4;
 
 /// What a page wants to see, as long as one does: pages that want the same share it.
@@ -41,8 +41,12 @@ struct Waiting {
     /// The newest picture; one that nobody has seen yet is not worth sending any more.
     picture: Option<(u32, Arc<Shot>)>,
     others: VecDeque<Outgoing>,
-    /// When a picture was sent of which nothing has been heard.
-    flying: Option<Instant>,
+    /// How training goes, of which the newest is enough.
+    state: Option<String>,
+    /// Which picture was sent and has not been seen, and until when it may take.
+    flying: Option<(u32, Instant)>,
+    /// How many messages of bytes are in `others`.
+    files: usize,
     overrun: bool,
 }
 
@@ -63,6 +67,7 @@ impl Outbox {
         let mut waiting = self.lock();
         waiting.overrun |= waiting.others.len() >= WAITING;
         if !waiting.overrun {
+            waiting.files += usize::from(matches!(message, Outgoing::Bytes(_)));
             waiting.others.push_back(message);
         }
         drop(waiting);
@@ -78,19 +83,33 @@ impl Outbox {
     pub fn take(&self) -> Option<Outgoing> {
         let mut waiting = self.lock();
         if let Some(message) = waiting.others.pop_front() {
+            waiting.files -= usize::from(matches!(message, Outgoing::Bytes(_)));
             return Some(message);
+        }
+        if let Some(text) = waiting.state.take() {
+            return Some(Outgoing::Text(text));
         }
         if waiting.flying.is_some() {
             return None;
         }
         let (id, shot) = waiting.picture.take()?;
-        waiting.flying = Some(Instant::now());
+        waiting.flying = Some((id, Instant::now() + patience(shot.jpeg.len())));
         Some(Outgoing::Bytes(File::Picture { id, made: shot.made }.message(&shot.jpeg)))
     }
 
-    /// Since when a picture is under way of which the page has said nothing yet.
+    /// Until when the page may take to say that it has seen the picture that is under way.
     pub fn flying(&self) -> Option<Instant> {
-        self.lock().flying
+        self.lock().flying.map(|(_, until)| until)
+    }
+
+    /// How many files wait to be sent.
+    pub fn files(&self) -> usize {
+        self.lock().files
+    }
+
+    fn tell_state(&self, text: &str) {
+        self.lock().state = Some(text.to_owned());
+        self.changed.notify_one();
     }
 
     /// Whether the page does not take what it has asked for.
@@ -99,8 +118,8 @@ impl Outbox {
     }
 
     /// The page has the picture.
-    pub fn seen(&self) {
-        self.lock().flying = None;
+    pub fn seen(&self, id: u32) {
+        self.lock().flying.take_if(|(own, _)| *own == id);
         self.changed.notify_one();
     }
 }
@@ -210,7 +229,8 @@ impl Hub {
     /// A page wants a picture to keep; says whether it may.
     pub fn save(&self, client: u64, view: View) -> bool {
         let mut state = self.lock();
-        let fits = state.saves.iter().filter(|save| save.client == client).count() < SAVES;
+        let painted = state.clients.get(&client).map_or(0, |client| client.outbox.files());
+        let fits = painted + state.saves.iter().filter(|save| save.client == client).count() < SAVES;
         if fits {
             state.saves.push_back(Save { client, view });
             self.news(&mut state);
@@ -277,6 +297,11 @@ impl Hub {
         self.lock().clients.values().for_each(|client| client.outbox.post(message.clone()));
     }
 
+    /// How training goes, for all pages.
+    pub fn tell_state(&self, text: &str) {
+        self.lock().clients.values().for_each(|client| client.outbox.tell_state(text));
+    }
+
     /// Waits until something was asked for since it was called last, no longer than this.
     pub fn wait(&self, most: Duration) {
         let state = self.lock();
@@ -330,11 +355,21 @@ impl Hub {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::view::messages::{Eye, Show};
+    use crate::cli::render::shown::Show;
+    use crate::cli::view::messages::Eye;
 
     fn view(number: usize) -> View {
         let eye = Eye::Photograph(number);
-        View { eye, size: [8, 8], show: Show::Color, background: None, within: None, skip: None, checkpoint: None }
+        View {
+            eye,
+            size: [8, 8],
+            show: Show::Color,
+            compared: false,
+            background: None,
+            crop: None,
+            skip: None,
+            checkpoint: None,
+        }
     }
 
     fn shot(halvings: u32) -> Shot {
@@ -367,7 +402,9 @@ mod tests {
         hub.show(&wishes[0], shot(1));
         hub.show(&wishes[0], shot(0));
         assert_eq!(sent(&from_a), None);
-        from_a.seen();
+        from_a.seen(7);
+        assert_eq!(sent(&from_a), None, "that was another");
+        from_a.seen(1);
         assert_eq!([sent(&from_a), sent(&from_a)], [Some(0), None]);
         // One that comes later gets what there is at once.
         let (c, from_c) = hub.join(9).unwrap();
@@ -376,7 +413,7 @@ mod tests {
         hub.leave(c);
         // What waits of an old wish is not sent any more.
         hub.wish(b, 10, view(2));
-        from_b.seen();
+        from_b.seen(9);
         assert_eq!(sent(&from_b), None);
         assert_eq!(hub.wishes().len(), 2);
         hub.wish(a, 2, view(2));
@@ -405,6 +442,23 @@ mod tests {
         assert!(hub.save(other, view(0)), "each its own");
         hub.leave(page);
         assert!(hub.next_save().is_some_and(|save| save.client == other) && hub.next_save().is_none());
+        // In the order in which they were asked for; what is painted and not sent counts.
+        let (third, files) = hub.join(9).unwrap();
+        hub.save(third, view(1));
+        hub.save(third, view(2));
+        let numbers = [(); 2].map(|()| hub.next_save().unwrap().view.eye);
+        assert_eq!(numbers, [1, 2].map(Eye::Photograph));
+        (0..SAVES).for_each(|_| files.post(Outgoing::Bytes(vec![])));
+        assert!(!hub.save(third, view(3)));
+        files.take();
+        assert!(hub.save(third, view(3)) && files.files() == SAVES - 1);
+        // Of how training goes, the newest is told.
+        hub.tell_state("one");
+        hub.tell_state("two");
+        while files.files() > 0 {
+            files.take();
+        }
+        assert_eq!([files.take(), files.take()], [Some(Outgoing::Text("two".to_owned())), None]);
         for _ in 0..WAITING {
             outbox.post(Outgoing::Text(String::new()));
         }

@@ -7,6 +7,8 @@ use raygrad::nerf::{Camera, Image};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::cli::render::shown::Show;
+
 /// Longest side of a picture.
 pub const LARGEST: u32 = 4096;
 /// Most pixels of a picture.
@@ -34,12 +36,8 @@ pub enum Ask {
     Stop {},
     /// The share of time that training leaves to pictures, 0 to .9.
     Share { share: f64 },
-    /// A film along a camera path, as `raygrad render --path` reads it.
-    Film {
-        path: Value,
-        #[serde(default)]
-        show: Show,
-    },
+    /// A film.
+    Film(Film),
     /// The film that is being made is not wanted.
     EndFilm {},
 }
@@ -50,10 +48,42 @@ impl Ask {
         let ask: Ask = serde_json::from_str(text).map_err(|e| e.to_string().replace(char::is_control, " "))?;
         match &ask {
             Ask::View { view, .. } | Ask::Save { view } => view.check()?,
+            Ask::Film(film) => film.check()?,
             Ask::Share { share } if !(0.0..=0.9).contains(share) => return Err("a share is from 0 to 0.9".to_owned()),
             _ => (),
         }
         Ok(ask)
+    }
+}
+
+/// A film along a camera path, of the run's model as a whole.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Film {
+    /// As `raygrad render --path` reads it, which says what else is wrong with it.
+    pub path: Value,
+    #[serde(default)]
+    pub show: Show,
+    /// What lies behind the scene; as in training if nothing is said.
+    #[serde(default)]
+    pub background: Option<[u8; 3]>,
+    /// How much that hardly shows is left out; as in training if nothing is said.
+    #[serde(default)]
+    pub skip: Option<Skip>,
+}
+
+impl Film {
+    fn check(&self) -> Result<(), String> {
+        let number = |name: &str, most: f64| match self.path.get(name).map(Value::as_f64) {
+            Some(Some(value)) if (0.0..=most).contains(&value) => Ok(value),
+            _ => Err(format!("a film's `{name}` is a number up to {most}")),
+        };
+        let sides = [number("render_width", LARGEST.into())?, number("render_height", LARGEST.into())?];
+        if sides[0] * sides[1] > MOST_PIXELS.into() {
+            return Err(format!("a film's pictures have {MOST_PIXELS} pixels at most"));
+        }
+        number("seconds", 600.0)?;
+        number("fps", 60.0).map(drop)
     }
 }
 
@@ -66,12 +96,15 @@ pub struct View {
     pub size: [u32; 2],
     #[serde(default)]
     pub show: Show,
+    /// Whether colours are seen as how far they are from those of the nearest photograph, from where that was taken.
+    #[serde(default)]
+    pub compared: bool,
     /// What lies behind the scene; as in training if nothing is said.
     #[serde(default)]
     pub background: Option<[u8; 3]>,
     /// The box beyond which nothing is shown, lower and upper corner.
     #[serde(default)]
-    pub within: Option<[[f64; 3]; 2]>,
+    pub crop: Option<[[f64; 3]; 2]>,
     /// How much that hardly shows is left out; as in training if nothing is said.
     #[serde(default)]
     pub skip: Option<Skip>,
@@ -95,38 +128,15 @@ pub enum Eye {
     Photograph(usize),
 }
 
-/// What a picture shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Show {
-    #[default]
-    Color,
-    Depth,
-    Normals,
-    Opacity,
-    /// How far colours are from those of the nearest photograph, from where that was taken.
-    Error,
-}
-
-impl Show {
-    /// What `raygrad render --show` calls it, if it does.
-    pub fn rendered(self) -> Option<&'static str> {
-        match self {
-            Show::Color => Some("color"),
-            Show::Depth => Some("depth"),
-            Show::Normals => Some("normals"),
-            Show::Opacity => Some("opacity"),
-            Show::Error => None,
-        }
-    }
-}
-
 impl View {
     fn check(&self) -> Result<(), String> {
         let [width, height] = self.size;
         let sides = 1..=LARGEST;
         if !sides.contains(&width) || !sides.contains(&height) || width * height > MOST_PIXELS {
             return Err(format!("{width}x{height} is no size from 1x1 to {MOST_PIXELS} pixels"));
+        }
+        if self.compared && self.show != Show::Color {
+            return Err("colours are compared, and nothing else".to_owned());
         }
         if let Eye::Free { pose, fov } = &self.eye {
             let rotation = rotation(pose);
@@ -139,7 +149,7 @@ impl View {
                 return Err("a field of view is from 1 to 170 degrees".to_owned());
             }
         }
-        let numbers = self.within.iter().flatten().flatten();
+        let numbers = self.crop.iter().flatten().flatten();
         if !numbers.into_iter().all(|x| x.abs() <= FARTHEST) {
             return Err("a box has two corners".to_owned());
         }
@@ -201,6 +211,8 @@ pub struct FirstView {
     pub pose: [[f64; 4]; 3],
     /// Vertical field of view in degrees.
     pub fov: f64,
+    /// Width through height of the picture that this is of.
+    pub proportion: f64,
     /// The corners of the scene's box, in scene units.
     pub bounds: [[f64; 3]; 2],
 }
@@ -262,8 +274,8 @@ pub struct Made {
     pub halvings: u32,
     /// How long it took.
     pub milliseconds: f64,
-    /// The photograph that it is compared with, and their PSNR in dB, if it is.
-    pub compared: Option<(usize, f64)>,
+    /// The photograph that it is compared with, if it is, and their PSNR in dB; none where evaluations would leave something out.
+    pub compared: Option<(usize, Option<f64>)>,
     /// The step of training.
     pub step: u64,
 }

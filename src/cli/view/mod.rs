@@ -124,6 +124,7 @@ pub fn first_view(run: &Run) -> FirstView {
     FirstView {
         pose: rows(&camera.pose),
         fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+        proportion: camera.width as f64 / camera.height as f64,
         bounds: extent.bounds.map(|corner| corner.to_array()),
     }
 }
@@ -132,7 +133,7 @@ pub fn first_view(run: &Run) -> FirstView {
 fn about(run: &Run, model: &Model<f32>, album: Option<&Album>, checkpoints: Option<Vec<u64>>) -> String {
     let view = &run.config.viewpoint;
     let about = About {
-        title: run.folder.display().to_string(),
+        title: run.name(),
         first: first_view(run),
         size: [view.width, view.height],
         background: model.config.background.shown(),

@@ -13,12 +13,12 @@ use raygrad::nerf::{Camera, Image, Limits, Model, Picture, Viewing};
 
 use super::album::Album;
 use super::hub::{Hub, Outgoing, Save, Shot, Wish};
-use super::messages::{Eye, File, Made, Show, View, at_size};
+use super::messages::{Eye, File, Made, View, at_size};
 use super::server::sorry;
 use super::shelf::{Shelf, Which};
 use super::store::Got;
 use crate::cli::output::depth_colors;
-use crate::cli::render::shown::{facing, over};
+use crate::cli::render::shown::{Show, facing, over};
 
 /// How long the first picture of a view may take, and a piece of a finer one, in seconds.
 const FIRST: f64 = 0.035;
@@ -63,6 +63,8 @@ struct Job {
     turn: u64,
     /// The step of training at which its picture was begun.
     begun: u64,
+    /// Whether the PSNR is that of an evaluation.
+    plain: bool,
     /// If it rests: since which step of training, and when.
     whole: Option<(u64, Instant)>,
 }
@@ -109,7 +111,7 @@ impl Painter {
         let view = job.target.view();
         let rate = self.rates.entry((view.show, view.skip)).or_insert(RATE);
         let start = Instant::now();
-        if !parts.paint(view, model, *rate, &wanted) {
+        if parts.paint(view, model, *rate, &wanted).is_none() {
             return true;
         }
         let spent = start.elapsed();
@@ -134,6 +136,17 @@ impl Painter {
     /// Begins a picture if all that it takes is here; gives the model that it shows, if that is not the one at hand, and its step.
     fn prepare(&mut self, i: usize, model: &Model<f32>, step: u64) -> Option<(Option<Arc<Model<f32>>>, u64)> {
         let view = self.jobs[i].target.view();
+        let unknown = match (&view.eye, &self.album) {
+            (Eye::Photograph(_), None) => true,
+            (Eye::Photograph(number), Some(album)) => album.camera(*number, model).is_none(),
+            (Eye::Free { .. }, album) => view.compared && album.is_none(),
+        };
+        if unknown {
+            return self.refuse(i, "there is no such photograph, or the run's photographs are not known");
+        }
+        if self.shelf.is_none() && view.checkpoint.is_some() {
+            return self.refuse(i, "checkpoints are looked at when training has ended");
+        }
         let (own, step) = match (&self.shelf, Which::of(view)) {
             (Some(shelf), which) => match shelf.get(which, &self.hub) {
                 Got::Here(own) => (Some(own), which.checkpoint.unwrap_or(step)),
@@ -150,7 +163,7 @@ impl Painter {
                 return None;
             }
             let (number, camera) = self.camera(view, size, model);
-            let truth = match (&self.album, number.filter(|_| view.show == Show::Error)) {
+            let truth = match (&self.album, number.filter(|_| view.compared)) {
                 (Some(album), Some(number)) => match album.fetch(number, &self.hub) {
                     Got::Here(photo) => Some((number, photo)),
                     Got::Coming => return None,
@@ -159,7 +172,11 @@ impl Painter {
                 _ => None,
             };
             let job = &mut self.jobs[i];
+            // Where evaluations leave out or correct something, a figure would be another than theirs.
+            let masked = number.zip(self.album.as_ref()).is_some_and(|(number, album)| album.is_masked(number));
+            let plain = !masked && model.tone.is_none();
             (job.parts, job.begun) = (Some(Parts::new(camera, number.is_some(), size, truth, model)), step);
+            job.plain = plain;
         }
         Some((own, step))
     }
@@ -171,7 +188,7 @@ impl Painter {
             Eye::Free { pose, fov } => (None, View::camera(pose, *fov, size)),
             Eye::Photograph(number) => (Some(*number), Camera::from_angle(size[0], size[1], 1.0, DAffine3::IDENTITY)),
         };
-        let nearest = || album.filter(|_| view.show == Show::Error).and_then(|album| album.nearest(&free, model));
+        let nearest = || album.filter(|_| view.compared).and_then(|album| album.nearest(&free, model));
         let own = |number: usize| Some((number, album?.camera(number, model)?));
         match number.or_else(nearest).and_then(own) {
             Some((number, camera)) => (Some(number), camera),
@@ -188,6 +205,11 @@ impl Painter {
         // It is forgotten with the next look at what is wanted.
         self.jobs[i].rest(0);
         None
+    }
+
+    /// Nobody is there who wants anything.
+    pub fn clear(&mut self) {
+        self.jobs.clear();
     }
 
     /// Forgets what nobody wants any more, and takes up what is new.
@@ -252,7 +274,7 @@ impl Target {
 
 impl Job {
     fn new(target: Target, halvings: u32) -> Self {
-        Job { target, halvings, parts: None, spent: Duration::ZERO, turn: 0, begun: 0, whole: None }
+        Job { target, halvings, parts: None, spent: Duration::ZERO, turn: 0, begun: 0, plain: true, whole: None }
     }
 
     /// A picture of another size comes next.
@@ -268,7 +290,7 @@ impl Job {
     /// Gives away a picture whose rows are all painted.
     fn deliver(&mut self, hub: &Hub, step: u64) {
         let Some(Parts { truth, color, .. }) = &self.parts else { return };
-        let compared = truth.as_ref().map(|(number, truth)| (*number, psnr(color, truth)));
+        let compared = truth.as_ref().map(|(number, truth)| (*number, self.plain.then(|| psnr(color, truth))));
         let error = truth.as_ref().map(|(_, truth)| colormap::error_map(color, truth));
         let image = error.as_ref().unwrap_or(color);
         let milliseconds = 1e3 * self.spent.as_secs_f64();
@@ -310,18 +332,8 @@ impl Parts {
         self.camera.width * self.camera.height > LARGE
     }
 
-    /// Paints as many rows as there is time for; says whether it did, and was not stopped.
-    fn paint(&mut self, view: &View, model: &Model<f32>, rate: f64, goes_on: &(dyn Fn() -> bool + Sync)) -> bool {
-        self.try_paint(view, model, rate, goes_on).is_some()
-    }
-
-    fn try_paint(
-        &mut self,
-        view: &View,
-        model: &Model<f32>,
-        rate: f64,
-        goes_on: &(dyn Fn() -> bool + Sync),
-    ) -> Option<()> {
+    /// Paints as many rows as there is time for; nothing if it was stopped.
+    fn paint(&mut self, view: &View, model: &Model<f32>, rate: f64, goes_on: &(dyn Fn() -> bool + Sync)) -> Option<()> {
         let Camera { width, height, centre, .. } = self.camera;
         if self.band == 0 {
             self.band = (rate * PIECE / width as f64) as usize;
@@ -336,14 +348,15 @@ impl Parts {
         };
         // As evaluations have it.
         let background = if self.truth.is_some() { model.config.background.shown() } else { background };
-        let everywhere = Viewing::over(background).within;
-        let within = view.within.map_or(everywhere, |corners| corners.map(DVec3::from));
+        // And photographs show all there is.
+        let crop = view.crop.filter(|_| self.truth.is_none());
+        let crop = crop.map_or(Viewing::over(background).crop, |corners| corners.map(DVec3::from));
         // A model of the shelf leaves out what it is to: this is for others too.
         let limits = (view.skip == Some(Skip::Off)).then_some(Limits::NONE);
-        let viewing = Viewing { background, limits, within, goes_on };
+        let viewing = Viewing { background, limits, crop, goes_on };
         let picture = model.view_while(&band, &viewing)?;
         let image = match view.show {
-            Show::Color | Show::Error => picture.color,
+            Show::Color => picture.color,
             Show::Depth => depth_colors(&picture, model.extent.span),
             Show::Opacity => grey(&picture),
             Show::Normals => normals(model, &band, &viewing, &picture, &model.extent.placement)?,
@@ -393,5 +406,6 @@ mod tests {
         // Nothing is smaller than a few pixels, and what is quick is whole.
         let at_once = |size: [u32; 2], rate: f64| halvings(size, rate, FIRST);
         assert_eq!([at_once([8, 8], 1.0), at_once([3, 3000], 1.0), at_once([640, 480], 1e9)], [1, 0, 0]);
+        assert_eq!(at_once([800, 800], 1e5), 4, "640 000 rays are 183 times what 35 ms have");
     }
 }

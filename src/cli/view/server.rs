@@ -2,6 +2,7 @@
 
 use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -30,6 +31,8 @@ use super::studio::Studio;
 /// Pages at a time, and connections that are no pages yet.
 const PAGES: usize = 64;
 const CONNECTIONS: usize = 128;
+/// How long one may last that does not become a page.
+const CONNECTED: Duration = Duration::from_secs(60);
 /// Bytes of a message from a page.
 const LONGEST: usize = 1 << 14;
 /// Messages a second from a page, and how many may come at once.
@@ -42,6 +45,8 @@ const SLOWEST: usize = 50_000;
 /// How often a page is asked whether it is still there, and how long it is not heard before it is taken to be gone.
 const IDLE: Duration = Duration::from_secs(5);
 const SILENCE: Duration = Duration::from_secs(30);
+/// Files that may wait for a page when it asks for a photograph.
+const MOST_FILES: usize = 4;
 /// Quality of photographs as JPEG files, 1 to 100.
 const QUALITY: u8 = 88;
 
@@ -155,8 +160,9 @@ async fn accept(listener: tokio::net::TcpListener, router: Router) {
         tokio::spawn(async move {
             let mut http = hyper::server::conn::http1::Builder::new();
             http.timer(TokioTimer::new()).header_read_timeout(PATIENCE).max_buf_size(1 << 14);
-            // A connection that is cut off is nobody's loss.
-            let _ = http.serve_connection(TokioIo::new(stream), service).with_upgrades().await;
+            // A connection that is cut off is nobody's loss; what becomes of one that is a page is no longer seen here.
+            let served = http.serve_connection(TokioIo::new(stream), service).with_upgrades();
+            let _ = timeout(CONNECTED, served).await;
             drop(permit);
         });
     }
@@ -267,6 +273,8 @@ struct Page {
     served: Arc<Served>,
     /// Whether a photograph is being read.
     reader: Arc<Semaphore>,
+    /// Whether something is being sent.
+    sending: AtomicBool,
 }
 
 impl Drop for Page {
@@ -278,7 +286,7 @@ impl Drop for Page {
 impl Page {
     fn join(served: Arc<Served>) -> Option<Self> {
         let (client, outbox) = served.hub.join(PAGES)?;
-        Some(Page { client, outbox, served, reader: Arc::new(Semaphore::new(1)) })
+        Some(Page { client, outbox, served, reader: Arc::new(Semaphore::new(1)), sending: AtomicBool::new(false) })
     }
 
     async fn talk(self, socket: WebSocket) {
@@ -301,23 +309,25 @@ impl Page {
     /// Sends what there is for the page; gives why it is no longer sent anything, if it is there.
     async fn write(&self, out: &mut SplitSink<WebSocket, Message>) -> Option<&'static str> {
         let outbox = &self.outbox;
-        // How long what was sent last may take.
-        let (mut pinged, mut patience) = (Instant::now(), PATIENCE);
+        let mut pinged = Instant::now();
         loop {
             while let Some(message) = outbox.take() {
                 let message = match message {
                     Outgoing::Text(text) => Message::Text(text.into()),
                     Outgoing::Bytes(bytes) => Message::Binary(bytes.into()),
                 };
-                patience = patience_for(&message);
-                if !matches!(timeout(patience, out.send(message)).await, Ok(Ok(()))) {
+                // Meanwhile it cannot say anything.
+                self.sending.store(true, Ordering::Relaxed);
+                let sent = timeout(patience_for(&message), out.send(message)).await;
+                self.sending.store(false, Ordering::Relaxed);
+                if !matches!(sent, Ok(Ok(()))) {
                     return None;
                 }
             }
             if outbox.is_overrun() {
                 return Some("too much was asked for");
             }
-            let flown = outbox.flying().map(|since| since + patience);
+            let flown = outbox.flying();
             if flown.is_some_and(|until| until <= Instant::now()) {
                 return Some("a picture was not taken");
             }
@@ -336,7 +346,12 @@ impl Page {
     /// Takes what the page says; gives why it is listened to no longer, if it is there.
     async fn read(&self, heard: &mut SplitStream<WebSocket>) -> Option<String> {
         let (mut allowed, mut last) = (BURST, Instant::now());
-        while let Ok(Some(Ok(message))) = timeout(SILENCE, heard.next()).await {
+        loop {
+            let message = match timeout(SILENCE, heard.next()).await {
+                Ok(Some(Ok(message))) => message,
+                Err(_) if self.sending.load(Ordering::Relaxed) => continue,
+                _ => return None,
+            };
             allowed = (allowed + RATE * last.elapsed().as_secs_f64()).min(BURST) - 1.0;
             last = Instant::now();
             if allowed < 0.0 {
@@ -352,20 +367,20 @@ impl Page {
                 Message::Ping(_) | Message::Pong(_) => (),
             }
         }
-        None
     }
 
     fn answer(&self, ask: Ask) {
-        let Page { client, outbox, served, reader } = self;
+        let Page { client, outbox, served, reader, .. } = self;
         let (client, hub) = (*client, &served.hub);
         match ask {
             Ask::View { id, view } => hub.wish(client, id, view),
-            Ask::Seen { .. } => outbox.seen(),
+            Ask::Seen { id } => outbox.seen(id),
             Ask::Save { view } => {
                 if !hub.save(client, view) {
                     outbox.post(sorry("so many pictures are saved one after the other"));
                 }
             }
+            Ask::Photograph { .. } if outbox.files() > MOST_FILES => outbox.post(sorry("so many files are not taken")),
             Ask::Photograph { number } => match reader.clone().try_acquire_owned() {
                 Ok(permit) => {
                     let (outbox, served) = (outbox.clone(), served.clone());
@@ -381,15 +396,18 @@ impl Page {
             Ask::Stop {} => hub.stop(),
             Ask::Share { share } => hub.set_share(share),
             Ask::Rest {} => hub.rest(client),
-            Ask::Film { path, show } => {
-                let begun = match &served.studio {
-                    Some(studio) => studio.begin(&path, show).map_err(|error| error.to_string()),
-                    None => Err("films are made when training has ended".to_owned()),
-                };
-                if let Err(what) = begun {
-                    outbox.post(sorry(&what));
+            Ask::Film(film) => match served.studio.clone() {
+                // It looks for what is installed.
+                Some(studio) => {
+                    let outbox = outbox.clone();
+                    tokio::task::spawn_blocking(move || {
+                        if let Err(error) = studio.begin(&film) {
+                            outbox.post(sorry(&error.to_string()));
+                        }
+                    });
                 }
-            }
+                None => outbox.post(sorry("films are made when training has ended")),
+            },
             Ask::EndFilm {} => {
                 if let Some(studio) = &served.studio {
                     studio.end();
@@ -401,11 +419,15 @@ impl Page {
 
 /// How long a message may take to be sent.
 fn patience_for(message: &Message) -> Duration {
-    let bytes = match message {
-        Message::Text(text) => text.len(),
-        Message::Binary(bytes) => bytes.len(),
-        _ => 0,
-    };
+    match message {
+        Message::Text(text) => patience(text.len()),
+        Message::Binary(bytes) => patience(bytes.len()),
+        _ => PATIENCE,
+    }
+}
+
+/// How long so many bytes may take.
+pub fn patience(bytes: usize) -> Duration {
     PATIENCE + Duration::from_secs((bytes / SLOWEST) as u64)
 }
 

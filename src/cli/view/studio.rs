@@ -3,17 +3,18 @@
 use std::fs;
 use std::io::{BufRead, BufReader, ErrorKind, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use raygrad::nerf::{Error, Result};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::hub::Hub;
-use super::messages::{Show, Tell};
+use super::messages::{Film, Tell};
 use super::server;
-use crate::cli::output::make_folder;
-use crate::cli::render::film_ending;
+use crate::cli::interrupt;
+use crate::cli::output::{make_folder, remove};
+use crate::cli::render::{film_ending, frames_of};
 use crate::cli::run::Run;
 use crate::cli::scene::Scene;
 
@@ -25,8 +26,8 @@ pub struct Studio {
     run: Arc<Run>,
     scene: Option<Scene>,
     hub: Arc<Hub>,
-    /// What makes the film that is being made.
-    at_work: Mutex<Option<Child>>,
+    /// The film that is being made goes on for as long as this is held, and ends with this program.
+    at_work: Mutex<Option<ChildStdin>>,
 }
 
 impl Studio {
@@ -34,56 +35,75 @@ impl Studio {
         Studio { run, scene, hub, at_work: Mutex::default() }
     }
 
-    /// Begins a film along a camera path, as `raygrad render --path` reads it; all pages are told how it goes.
+    fn lock(&self) -> MutexGuard<'_, Option<ChildStdin>> {
+        self.at_work.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Begins a film; all pages are told how it goes.
     ///
     /// # Errors
     /// If another is being made, or the run's folder takes no files.
-    pub fn begin(self: &Arc<Self>, path: &Value, show: Show) -> Result<()> {
-        let mut at_work = self.at_work.lock().unwrap_or_else(PoisonError::into_inner);
+    pub fn begin(self: &Arc<Self>, film: &Film) -> Result<()> {
+        let mut at_work = self.lock();
         if at_work.is_some() {
             return Err(Error::setting("film", "one is being made: wait for it, or end it"));
         }
-        let show = show.rendered().ok_or_else(|| Error::setting("film", "shows colours, depth, normals or opacity"))?;
-        let file = new_file(&self.run.file("films"), path)?;
-        let film = file.with_extension(film_ending());
-        let folder = &self.run.folder;
-        let bad = |e: std::io::Error| Error::file(folder, format!("no film can be made: {e}"));
+        let path = new_file(&self.run.file("films"), &film.path)?;
+        let out = path.with_extension(film_ending());
+        let bad = |e: std::io::Error| Error::file(&path, format!("no film can be made of it: {e}"));
         let mut command = Command::new(std::env::current_exe().map_err(bad)?);
-        command.arg("render").arg(&self.run.folder).arg("--path").arg(&file).arg("--out").arg(&film);
-        command.args(["--show", show]);
+        command.args(["--threads", &rayon::current_num_threads().to_string()]);
+        command.arg("render").arg(&self.run.folder).arg("--path").arg(&path).arg("--out").arg(&out);
+        command.arg("--show").args(json!(film.show).as_str()).arg("--ends-with-input");
         if let Some(scene) = &self.scene {
             command.arg("--scene").arg(scene.to_string());
         }
-        let mut child =
-            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(bad)?;
-        let words = child.stderr.take();
-        *at_work = Some(child);
-        let studio = self.clone();
-        let follow = move || {
-            studio.tell(&film, "begun", false);
-            let mut last = String::new();
-            for line in words.into_iter().flat_map(|words| BufReader::new(words).lines().map_while(|line| line.ok())) {
-                studio.tell(&film, line.trim(), false);
-                last = line;
-            }
-            let child = studio.at_work.lock().unwrap_or_else(PoisonError::into_inner).take();
-            match child.map(|mut child| child.wait()) {
-                Some(Ok(status)) if status.success() => studio.tell(&film, "done", true),
-                // It says itself why.
-                Some(Ok(status)) if status.code().is_some() => studio.tell(&film, &last, true),
-                _ => studio.tell(&film, "ended", true),
-            }
-        };
-        std::thread::Builder::new().name("film".into()).spawn(follow).map_err(bad)?;
+        if let Some([red, green, blue]) = film.background {
+            command.args(["--background", &format!("{red},{green},{blue}")]);
+        }
+        if let Some(skip) = film.skip {
+            command.args(["--skip", &skip.to_string()]);
+        }
+        let (input, output) = (Stdio::piped(), Stdio::null());
+        let mut child = command.stdin(input).stdout(output).stderr(Stdio::piped()).spawn().map_err(bad)?;
+        let input = child.stdin.take();
+        let (studio, path) = (self.clone(), path.clone());
+        // Without the thread the child ends with its input.
+        std::thread::Builder::new()
+            .name("film".into())
+            .spawn(move || studio.follow(child, &path, &out))
+            .map_err(bad)?;
+        *at_work = input;
         Ok(())
     }
 
-    /// Ends the film that is being made; its frames stay, for `raygrad render` to go on with.
-    pub fn end(&self) {
-        if let Some(child) = self.at_work.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
-            // One that has ended by itself is not to be ended.
-            let _ = child.kill();
+    /// Tells of a film until it has ended; of one that nobody wants any more nothing is left.
+    fn follow(&self, mut child: Child, path: &Path, out: &Path) {
+        self.tell(out, "begun", false);
+        let (words, mut last) = (child.stderr.take(), String::new());
+        for line in words.into_iter().flat_map(|words| BufReader::new(words).lines().map_while(|line| line.ok())) {
+            self.tell(out, line.trim(), false);
+            last = line;
         }
+        let ended = child.wait();
+        *self.lock() = None;
+        match ended {
+            Ok(status) if status.success() => self.tell(out, "done", true),
+            // It says itself why.
+            Ok(status) if status.code().is_some_and(|code| code != i32::from(interrupt::EXIT_CODE)) => {
+                self.tell(out, &last, true);
+            }
+            _ => {
+                let _ = fs::remove_dir_all(frames_of(out));
+                remove(&[path.to_owned()]);
+                self.tell(out, "ended", true);
+            }
+        }
+    }
+
+    /// Ends the film that is being made, with its frame.
+    pub fn end(&self) {
+        *self.lock() = None;
     }
 
     fn tell(&self, film: &Path, words: &str, ended: bool) {

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::album::Album;
 use super::hub::Hub;
-use super::messages::{Taken, Tell};
+use super::messages::{self, Taken, Tell};
 use super::painter::Painter;
 use super::server::Listener;
 use super::{about, album, server, taken};
@@ -28,6 +28,8 @@ const TOLD: Duration = Duration::from_millis(400);
 const CAMERAS: Duration = Duration::from_secs(5);
 /// How long training that was paused waits for a page when none is there any more.
 const ALONE: Duration = Duration::from_secs(60);
+/// How long a page may be gone, after training, that is loaded anew.
+const GONE: Duration = Duration::from_secs(3);
 /// Points of a curve, after which every second one is dropped.
 const POINTS: usize = 240;
 
@@ -46,12 +48,17 @@ pub struct Window {
     curves: Curves,
 }
 
-/// How training went, at even steps.
+/// How training went, at every so many steps.
 struct Curves {
     every: u64,
-    loss: Vec<f64>,
-    psnr: Vec<f64>,
-    speed: Vec<f64>,
+    points: Vec<Point>,
+}
+
+struct Point {
+    step: u64,
+    loss: f64,
+    psnr: f64,
+    speed: f64,
 }
 
 impl Window {
@@ -64,7 +71,7 @@ impl Window {
         print(&format!("view     {link}\n"))?;
         let (painter, now) = (Painter::new(hub.clone(), album.clone(), None), Instant::now());
         let taken = (taken(run, &trainer.model, album.as_deref()), now);
-        let curves = Curves { every: 1, loss: vec![], psnr: vec![], speed: vec![] };
+        let curves = Curves { every: 1, points: vec![] };
         Ok(Window { run: run.clone(), hub, album, painter, since: now, credit: 0.0, told: now, taken, curves })
     }
 
@@ -74,12 +81,10 @@ impl Window {
         self.curves.step(&trainer.stats(), psnr);
         if self.hub.connected() == 0 && !self.hub.paused() {
             self.since = Instant::now();
+            self.painter.clear();
             return self.hub.stops();
         }
-        let share = self.hub.share();
-        let owed = self.since.elapsed().as_secs_f64() * share / (1.0 - share);
-        // What was not asked for is not saved up, but for a little.
-        self.credit = self.credit.min(MOST_CREDIT) + owed;
+        self.credit = credit(self.credit, self.since.elapsed().as_secs_f64(), self.hub.share());
         let step = trainer.stats().step;
         while self.credit > 0.0 {
             let start = Instant::now();
@@ -115,18 +120,36 @@ impl Window {
         self.hub.stops()
     }
 
-    /// Tells pages that training has ended, and how.
+    /// Tells pages that training has ended, and how; and shows them the scene until the last one has gone.
     pub fn end(&mut self, trainer: &Trainer, ended: Ended) {
         let how = match ended {
             Ended::Done => "done",
             Ended::Interrupted => "stopped, and saved",
             Ended::Diverged => "diverged",
         };
-        let psnr = trainer.stats().psnr;
-        self.tell(trainer, psnr, 0.0, Some(how), true);
-        // For it to arrive before the program ends.
-        if self.hub.connected() > 0 {
+        let stats = trainer.stats();
+        self.tell(trainer, stats.psnr, 0.0, Some(how), true);
+        if self.hub.connected() == 0 {
+            return;
+        }
+        if interrupt::requested() {
+            // For it to arrive before the program ends.
             std::thread::sleep(Duration::from_millis(100));
+        } else {
+            note("the page shows the scene until it is closed; Ctrl-C ends it now");
+        }
+        let mut alone = None;
+        while !interrupt::requested() {
+            match self.hub.connected() {
+                // One that is loaded anew comes back soon.
+                0 if alone.get_or_insert_with(Instant::now).elapsed() > GONE => break,
+                0 => (),
+                _ => alone = None,
+            }
+            if alone.is_some() || !self.painter.work(&trainer.model, stats.step) {
+                self.hub.wait(Duration::from_millis(200));
+            }
+            self.tell(trainer, stats.psnr, 0.0, Some(how), false);
         }
     }
 
@@ -136,8 +159,9 @@ impl Window {
         }
         self.told = Instant::now();
         self.tell_taken(&trainer.model);
-        let (stats, Curves { loss, psnr: decibels, speed, .. }) = (trainer.stats(), &self.curves);
-        self.hub.tell(&server::text(&Tell::Training(json!({
+        let stats = trainer.stats();
+        let curve = |of: fn(&Point) -> f64| self.curves.points.iter().map(of).collect::<Vec<f64>>();
+        self.hub.tell_state(&messages::text(&Tell::Training(json!({
             "step": stats.step,
             "loss": stats.loss,
             "psnr": psnr,
@@ -145,9 +169,15 @@ impl Window {
             "share": self.hub.share(),
             "paused": self.hub.paused() && ended.is_none(),
             "ended": ended,
-            "curves": { "loss": loss, "psnr": decibels, "speed": speed },
+            "curves": { "loss": curve(|at| at.loss), "psnr": curve(|at| at.psnr), "speed": curve(|at| at.speed) },
         }))));
     }
+}
+
+/// The seconds of painting that training owes after it had so many for itself: pictures are to get their share of both. What was
+/// not asked for is not saved up, but for a little.
+fn credit(before: f64, trained: f64, share: f64) -> f64 {
+    before.min(MOST_CREDIT) + trained * share / (1.0 - share)
 }
 
 impl Window {
@@ -172,22 +202,12 @@ impl Curves {
             return;
         }
         // After a run went back.
-        let before = (stats.step / self.every) as usize - 1;
-        for values in [&mut self.loss, &mut self.psnr, &mut self.speed] {
-            values.truncate(before);
-        }
-        self.loss.push(stats.loss);
-        self.psnr.push(psnr);
-        self.speed.push(stats.rays as f64 / stats.train_seconds.max(1e-9));
-        if self.loss.len() > POINTS {
+        self.points.retain(|point| point.step < stats.step);
+        let speed = stats.rays as f64 / stats.train_seconds.max(1e-9);
+        self.points.push(Point { step: stats.step, loss: stats.loss, psnr, speed });
+        if self.points.len() > POINTS {
             self.every *= 2;
-            for values in [&mut self.loss, &mut self.psnr, &mut self.speed] {
-                let mut number = 0;
-                values.retain(|_| {
-                    number += 1;
-                    number % 2 == 0
-                });
-            }
+            self.points.retain(|point| point.step.is_multiple_of(self.every));
         }
     }
 }
@@ -197,26 +217,35 @@ mod tests {
     use super::*;
 
     #[test]
+    fn pictures_get_their_share() {
+        // Of a second of training, as much again for half of the time, and a ninth for a tenth.
+        assert_eq!(credit(0.0, 1.0, 0.5), 1.0);
+        assert!((credit(0.0, 1.0, 0.1) - 1.0 / 9.0).abs() < 1e-12);
+        assert_eq!([credit(0.0, 1.0, 0.0), credit(9.0, 0.0, 0.5), credit(-9.0, 0.0, 0.5)], [0.0, MOST_CREDIT, -9.0]);
+    }
+
+    #[test]
     fn curves_are_of_even_steps_however_long_they_get() {
-        let mut curves = Curves { every: 1, loss: vec![], psnr: vec![], speed: vec![] };
-        for step in 1..=5000 {
-            let stats = StepStats {
-                step,
-                loss: step as f64,
-                rays: 10 * step,
-                train_seconds: step as f64,
-                ..StepStats::default()
-            };
-            curves.step(&stats, 0.5);
-            assert!(curves.loss.len() <= POINTS && curves.loss.len() == curves.speed.len());
+        // Of a run that is gone on with, too.
+        for first in [1, 5000] {
+            let mut curves = Curves { every: 1, points: vec![] };
+            for step in first..first + 5000 {
+                let (loss, rays) = (step as f64, 10 * step);
+                let stats = StepStats { step, loss, rays, train_seconds: step as f64, ..StepStats::default() };
+                curves.step(&stats, 0.5);
+                assert!(curves.points.len() <= POINTS);
+            }
+            assert!(curves.points.len() > POINTS / 3);
+            for pair in curves.points.windows(2) {
+                assert_eq!(pair[1].step - pair[0].step, curves.every);
+            }
+            let last = &curves.points[curves.points.len() - 1];
+            assert!(last.step + curves.every >= first + 5000 && last.step.is_multiple_of(curves.every));
+            assert!(last.loss == last.step as f64 && last.psnr == 0.5 && (last.speed - 10.0).abs() < 1e-9);
+            // It went back, and takes other ways.
+            let (step, before) = (curves.points[40].step, curves.points[39].step);
+            curves.step(&StepStats { step, loss: 0.5, ..StepStats::default() }, 0.5);
+            assert!(curves.points.len() == 41 && curves.points[40].loss == 0.5 && curves.points[39].step == before);
         }
-        assert!(curves.loss.len() > POINTS / 3 && curves.psnr.iter().all(|psnr| *psnr == 0.5));
-        let every = curves.every as f64;
-        assert!(curves.loss.iter().enumerate().all(|(i, loss)| *loss == every * (i + 1) as f64), "{:?}", curves.loss);
-        assert!(curves.speed.iter().all(|speed| (speed - 10.0).abs() < 1e-9));
-        // It went back, and takes other ways.
-        let step = 40 * curves.every;
-        curves.step(&StepStats { step, loss: 0.5, ..StepStats::default() }, 0.5);
-        assert!(curves.loss.len() == 40 && curves.loss[39] == 0.5 && curves.loss[38] == 39.0 * every);
     }
 }

@@ -321,12 +321,22 @@ impl Refine {
     /// A camera that took none of the photographs, given beside theirs: moved as they have as a whole and, if one of them is
     /// the same but for its pose, with what was found of its focal length and lens.
     pub fn other_camera<T: Scalar>(&self, params: &Params<T>, camera: &Camera) -> Camera {
+        self.other_cameras(params, std::slice::from_ref(camera)).remove(0)
+    }
+
+    /// The same of many at once: how the photographs' cameras have moved as a whole is found out but once.
+    pub fn other_cameras<T: Scalar>(&self, params: &Params<T>, cameras: &[Camera]) -> Vec<Camera> {
+        let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
+        let similarity = self.similarity(params, &growths);
+        cameras.iter().map(|camera| self.other(params, camera, similarity.as_ref())).collect()
+    }
+
+    fn other<T: Scalar>(&self, params: &Params<T>, camera: &Camera, similarity: Option<&Placement>) -> Camera {
         let [focal, lens] = [self.focal, self.lens].map(|id| id.map(|id| params.get(id)));
         let glass = if lens.is_some() { with_glass(camera) } else { camera.clone() };
         let same = self.cameras.iter().position(|other| is_same(other, &glass)).map(|i| self.groups[i]);
         let camera = self.glass(focal, lens, same, camera);
-        let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
-        match self.similarity(params, &growths) {
+        match similarity {
             Some(similarity) => similarity.camera(&self.stepped(&camera, self.growth(params, same))),
             None => camera,
         }

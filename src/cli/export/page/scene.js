@@ -221,7 +221,7 @@ async function render(pose, fov, width, height) {
 }
 
 function reset() {
-  place(data.view.pose, data.view.fov);
+  place(data.view.pose, fitting(data.view.fov, data.view.proportion, stage.clientWidth / stage.clientHeight));
   view.pivot = times(0.5, add(...bounds));
   ask();
 }

@@ -32,6 +32,12 @@ function place(pose, fov) {
   view.fov = fov;
 }
 
+/** The vertical field of view that shows in a window what one does in a picture of these proportions, both ways. */
+function fitting(fov, own, window) {
+  const half = Math.tan(0.5 * fov * radians) * Math.max(1, own / window);
+  return clamp((2 * Math.atan(half)) / radians, 1, 120);
+}
+
 function orbit(dx, dy) {
   free();
   const turn = (axis, angle) => {

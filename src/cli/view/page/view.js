@@ -20,10 +20,10 @@ function connect() {
   address.protocol = address.protocol.replace("http", "ws");
   socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { attempts = 0; $("lost").hidden = true; };
+  socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; };
   socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
   socket.onclose = (event) => {
-    $("lost").textContent = event.reason ? `The program has closed the connection: ${event.reason}. Trying again…`
+    $("lost").textContent = training && training.ended ? "Training has ended, and the program with it: raygrad view shows the run." : event.reason ? `The program has closed the connection: ${event.reason}. Trying again…`
       : "The program does not answer. Trying again…";
     $("lost").hidden = false;
     attempts += 1;
@@ -43,8 +43,15 @@ function told(message) {
   else if (message.tell === "sorry") apologise(message.what);
 }
 
+/** What was asked for last is there, or cannot be. */
+function answered() {
+  unseen = null;
+  if (again) ask();
+}
+
 function apologise(what) {
   requested = null;
+  answered();
   $("sorry").textContent = what;
   $("sorry").hidden = false;
   clearTimeout(apologise.timer);
@@ -57,6 +64,7 @@ function brought(data) {
   const bytes = new Uint8Array(data, 4 + length);
   if (head.file === "picture") {
     say({ ask: "seen", id: head.id });
+    if (head.id === asked) answered();
     draw(head, new Blob([bytes], { type: "image/jpeg" }));
   } else if (head.file === "save") {
     keep(new Blob([bytes], { type: "image/png" }), head.name);
@@ -67,16 +75,21 @@ function brought(data) {
 
 /** Photographs are found to have been taken elsewhere. */
 function moved(taken) {
+  if (!about) return;
   Object.assign(about, taken);
   ask();
 }
 
 /** The scene, at first and after each time that the connection was lost. */
 function meet(message) {
-  const first = about === null;
+  const before = about;
+  // Another program may be there by now, with another scene.
+  const elsewhere = before === null || before.title !== message.title || String(bounds) !== String(message.bounds);
+  const first = before === null || elsewhere;
+  const checkpoint = before ? before.checkpoints[Number($("checkpoint").value)] : undefined;
   about = message;
-  if (!first && (String(bounds) !== String(about.bounds) || view.photograph >= about.photographs.length)) view.photograph = null;
-  const elsewhere = String(bounds) !== String(about.bounds);
+  if (elsewhere) keys = [];
+  if (view.photograph >= about.photographs.length) view.photograph = null;
   bounds = about.bounds;
   overlaid = requested = null;
   document.title = `${about.title} - raygrad`;
@@ -100,11 +113,13 @@ function meet(message) {
   for (const option of $("skip").options) option.disabled = about.training && !["", "off"].includes(option.value);
   $("film").disabled = about.training;
   // Beyond the last checkpoint is what the run ended with.
-  const count = about.checkpoints.length, chosen = first ? count : Math.min(Number($("checkpoint").value), count);
+  const count = about.checkpoints.length, known = about.checkpoints.indexOf(checkpoint);
+  const chosen = first || known < 0 ? count : known;
+  document.querySelector("input[name=show][value=error]").disabled = about.photographs.length === 0;
   $("checkpoints").hidden = count === 0;
   $("checkpoint").max = String(count);
   $("checkpoint").value = String(chosen);
-  if (elsewhere) makeBox();
+  if (elsewhere) { makeBox(); listKeys(); }
   if (first) reset();
   else {
     select.value = view.photograph === null ? "" : String(view.photograph);
@@ -115,6 +130,10 @@ function meet(message) {
 
 // ---- asking for pictures ----------------------------------------------------------------------------------------------
 let waits = false;
+/** Since when a view was asked for of which there is no picture yet, and whether the camera has moved since. */
+let unseen = null, again = false;
+/** How long a picture is waited for before another is asked for, in milliseconds: else a hand that does not rest would see none. */
+const PATIENCE = 1000;
 /** A number, or that it is none. */
 const digits = (x, count) => (typeof x === "number" ? x.toFixed(count) : "-");
 
@@ -122,9 +141,15 @@ const digits = (x, count) => (typeof x === "number" ? x.toFixed(count) : "-");
 function ask() {
   marksOf();
   if (waits || !about) return;
+  if (document.hidden) return;
+  if (unseen !== null && performance.now() - unseen < PATIENCE) {
+    again = true;
+    return;
+  }
   waits = true;
   setTimeout(() => {
     waits = false;
+    [unseen, again] = [performance.now(), false];
     asked = (asked + 1) >>> 0;
     say({ ask: "view", id: asked, view: wanted() });
   }, 16);
@@ -134,17 +159,19 @@ function wanted() {
   const [width, height] = sizes();
   const eye = view.photograph === null
     ? { free: { pose: rows(view), fov: view.fov } } : { photograph: view.photograph };
-  const answer = { eye, size: [width, height], show: mode() };
+  const answer = { eye, size: [width, height], ...shows() };
   if ($("skip").value) answer.skip = $("skip").value;
   const checkpoint = about.checkpoints[Number($("checkpoint").value)];
   if (checkpoint !== undefined) answer.checkpoint = checkpoint;
   if ($("own-background").checked) {
     answer.background = [1, 3, 5].map((i) => parseInt($("background").value.slice(i, i + 2), 16));
   }
-  if ($("crop").checked) answer.within = box();
+  if ($("crop").checked) answer.crop = box().map((corner, end) => corner.map((x, axis) => (x === bounds[end][axis] ? [-1, 1][end] * EVERYWHERE : x)));
   return answer;
 }
 
+/** What pictures show: of the error, colours that are compared. */
+const shows = () => (mode() === "error" ? { compared: true } : { show: mode() });
 const mode = () => document.querySelector("input[name=show]:checked").value;
 /** Width and height of pictures. */
 function sizes() {
@@ -158,6 +185,17 @@ function sizes() {
   height = clamp(Math.floor(Math.min(height, most)), 8, 4096);
   return [clamp(Math.floor(height * proportion), 8, 4096), height];
 }
+
+/** Width and height of what key frames show, 1920 pixels at most. */
+function freeSizes() {
+  const photograph = view.photograph;
+  view.photograph = null;
+  const free = sizes();
+  view.photograph = photograph;
+  const share = Math.min(1, 1920 / Math.max(...free));
+  return free.map((side) => side * share);
+}
+const evenly = (sides) => sides.map((side) => Math.max(16, 2 * Math.round(side / 2)));
 
 /** The part of the stage that pictures fill. */
 function frame() {
@@ -213,7 +251,9 @@ function free() {
 }
 
 function reset() {
-  place(about.pose, about.fov);
+  playing += 1;
+  const area = stage.getBoundingClientRect();
+  place(about.pose, fitting(about.fov, about.proportion, area.width / area.height));
   view.pivot = times(0.5, add(...bounds));
   view.photograph = null;
   $("photograph").value = "";
@@ -262,6 +302,7 @@ let overlaid = null, requested = null;
 
 function goTo(number) {
   if (!about.photographs[number]) return;
+  playing += 1;
   const photograph = about.photographs[number];
   place(photograph.pose, clamp(photograph.fov, 5, 120));
   view.photograph = number;
@@ -276,7 +317,7 @@ function goTo(number) {
 }
 
 function nearest() {
-  const reach = Math.max(1e-6, size(sub(view.eye, view.pivot)));
+  const reach = Math.max(1e-6, size(sub(view.eye, times(0.5, add(...bounds)))));
   const apart = ({ pose }) => size(sub([0, 1, 2].map((r) => pose[r][3]), view.eye)) / reach
     + size(sub([0, 1, 2].map((r) => pose[r][2]), view.back));
   let best = 0;
@@ -297,8 +338,9 @@ function blend() {
 }
 
 async function overlay(number, blob) {
-  const bitmap = await createImageBitmap(blob);
+  const bitmap = await createImageBitmap(blob).catch(() => null);
   requested = null;
+  if (!bitmap) return apologise("The photograph cannot be shown.");
   photo.width = bitmap.width;
   photo.height = bitmap.height;
   photo.getContext("2d").drawImage(bitmap, 0, 0);
@@ -312,11 +354,15 @@ async function overlay(number, blob) {
 /** The part of the stage that pictures fill, while marks are made. */
 let area = null;
 
+/** What is nearer than this share of the scene's side is not marked. */
+const NEAR = 1e-3;
+const depthOf = (point) => -dot(sub(point, view.eye), view.back);
+
 /** Where a place is in the stage, or nothing if it is behind. */
 function project(point) {
   const local = sub(point, view.eye);
-  const depth = -dot(local, view.back);
-  if (depth < 1e-3 * side()) return null;
+  const depth = depthOf(point);
+  if (depth < NEAR * side()) return null;
   const { x, y, w, h } = area;
   const focal = (0.5 * h) / Math.tan(0.5 * view.fov * radians);
   // How lenses bend light is left out of marks.
@@ -324,14 +370,19 @@ function project(point) {
   return [x + across * w + (focal * dot(local, view.right)) / depth, y + down * h - (focal * dot(local, view.up)) / depth];
 }
 
+/** Lines from each place to the next, none to or from where there is none, as far as they are before the camera. */
 function path(points) {
-  let text = "", pen = "M";
-  for (const point of points) {
-    const at = point && project(point);
-    if (!at) { pen = "M"; continue; }
-    text += `${pen}${at[0].toFixed(1)} ${at[1].toFixed(1)}`;
-    pen = "L";
-  }
+  let text = "";
+  const near = 1.01 * NEAR * side();
+  points.slice(1).forEach((to, i) => {
+    const from = points[i];
+    if (!from || !to) return;
+    const [a, b] = [depthOf(from), depthOf(to)];
+    if (a < near && b < near) return;
+    const cut = (inside, outside, deep, short) => add(inside, times((deep - near) / (deep - short), sub(outside, inside)));
+    const [start, end] = [a < near ? cut(to, from, b, a) : from, b < near ? cut(from, to, a, b) : to].map(project);
+    text += `M${start.map((x) => x.toFixed(1)).join(" ")}L${end.map((x) => x.toFixed(1)).join(" ")}`;
+  });
   return text;
 }
 
@@ -353,8 +404,17 @@ function svg(name, attributes, parent) {
   return element;
 }
 
+let marking = false;
 function marksOf() {
-  if (!about) return;
+  if (!about || marking) return;
+  marking = true;
+  requestAnimationFrame(() => {
+    marking = false;
+    markAll();
+  });
+}
+
+function markAll() {
   const made = document.createDocumentFragment();
   area = frame();
   // The error is seen from the nearest photograph, not from here.
@@ -396,6 +456,8 @@ function makeBox() {
   });
 }
 
+/** Where sliders are at their ends, nothing is left out. */
+const EVERYWHERE = 1e9;
 function box() {
   const end = (i) => ["x", "y", "z"].map((name) => Number($(`box-${name}-${i}`).value));
   return [end(0), end(1)];
@@ -476,9 +538,15 @@ function flight(count) {
   const n = keys.length, closed = $("closed").checked;
   if (n < 2) return keys;
   const legs = closed ? n : n - 1;
-  const at = (i) => keys[closed ? (i + n) % n : clamp(i, 0, n - 1)];
+  // Beyond its ends a path goes straight on.
+  const at = (i, name) => {
+    if (closed) return keys[(i + n) % n][name];
+    if (i < 0) return sub(times(2, keys[0][name]), keys[1][name]);
+    return i < n ? keys[i][name] : sub(times(2, keys[n - 1][name]), keys[n - 2][name]);
+  };
+  const lens = (i) => Math.log(Math.tan(0.5 * keys[i % n].fov * radians));
   const mix = (name, i, t) => [0, 1, 2].map((axis) => {
-    const [a, b, c, d] = [at(i - 1), at(i), at(i + 1), at(i + 2)].map((key) => key[name][axis]);
+    const [a, b, c, d] = [i - 1, i, i + 1, i + 2].map((key) => at(key, name)[axis]);
     return b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)));
   });
   return Array.from({ length: count }, (_, f) => {
@@ -486,7 +554,7 @@ function flight(count) {
     const i = Math.min(legs - 1, Math.floor(place)), t = place - i;
     const back = unit(mix("back", i, t));
     const right = unit(cross(mix("up", i, t), back));
-    return { eye: mix("eye", i, t), back, right, up: cross(back, right), fov: at(i).fov + t * (at(i + 1).fov - at(i).fov), pivot: mix("pivot", i, t) };
+    return { eye: mix("eye", i, t), back, right, up: cross(back, right), fov: 2 * Math.atan(Math.exp(lens(i) + t * (lens(i + 1) - lens(i)))) / radians, pivot: mix("pivot", i, t) };
   });
 }
 
@@ -522,8 +590,10 @@ function inCapture(key) {
 /** The path in the form that `render` reads, if it is one. */
 function cameraPath() {
   if (keys.length < 2) return apologise("A path needs two key frames.");
-  const [width, height] = about.size;
+  // The picture's own proportions, in sides that encoders take.
+  const [width, height] = evenly(freeSizes());
   return {
+    coordinates: "capture",
     keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
     camera_type: "perspective",
     render_width: width,
@@ -544,10 +614,13 @@ function savePath() {
 function makeFilm() {
   const path = cameraPath();
   if (!path) return;
-  // No more digits than single precision has.
-  const text = JSON.stringify(path, (name, value) => (typeof value === "number" ? Number(value.toPrecision(8)) : value));
+  const seen = wanted();
+  if (seen.crop || seen.checkpoint !== undefined || seen.compared) {
+    return apologise("A film shows the whole scene, as the run ended: without a box, a checkpoint, or the error.");
+  }
+  const text = JSON.stringify(path, (name, value) => (typeof value === "number" ? Number(value.toPrecision(12)) : value));
   if (text.length > 15000) return apologise("So many key frames have no room here: save the path, and render it from there.");
-  say({ ask: "film", path: JSON.parse(text), show: mode() });
+  say({ ask: "film", path: JSON.parse(text), show: seen.show, skip: seen.skip, background: seen.background });
 }
 
 function filmed({ file, words, ended }) {
@@ -571,7 +644,6 @@ function follow(message) {
   $("progress").textContent = ended ? `ended after ${step} steps: ${ended}`
     : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} left`}`;
   $("pause").textContent = paused ? "Go on" : "Pause";
-  $("pause").setAttribute("aria-pressed", String(Boolean(paused)));
   for (const id of ["pause", "stop", "share"]) $(id).disabled = Boolean(ended);
   if (document.activeElement !== $("share")) $("share").value = String(100 * share);
   $("share-out").textContent = `${Math.round(100 * share)} %`;
