@@ -121,7 +121,7 @@ impl Painter {
             // Of the whole picture: where there is nothing, rays are quick.
             let rays = parts.camera.width * parts.camera.height;
             let now = rays as f64 / job.spent.as_secs_f64().max(1e-6);
-            *rate += LATEST * (now - *rate);
+            *rate = expected(*rate, now);
             // While a model learns, pictures are seen again rather than made ever finer.
             let soon = halvings(view.size, now, AGAIN.as_secs_f64());
             job.deliver(hub, step);
@@ -253,6 +253,11 @@ impl Painter {
             }
         }
     }
+}
+
+/// Rays a second that are expected after it was `rate`, and `now` lately.
+fn expected(rate: f64, now: f64) -> f64 {
+    rate + LATEST * (now - rate)
 }
 
 /// How often a size is to be halved for a picture to be there in so many seconds.
@@ -394,6 +399,11 @@ fn normals(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_was_slow_lately_is_expected_to_be_slower() {
+        assert_eq!([expected(1e5, 3e5), expected(1e5, 1e5), expected(2e5, 1e5)], [2e5, 1e5, 1.5e5]);
+    }
 
     #[test]
     fn the_first_picture_is_there_at_once() {
