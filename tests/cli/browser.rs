@@ -219,6 +219,13 @@ fn bytes(text: &str) -> Vec<u8> {
     digits.chunks(4).flat_map(whole).collect()
 }
 
+/// The picture that a page has given as bytes, RGBA.
+fn image(bytes: &Value, [width, height]: [usize; 2]) -> Image {
+    let rgba = bytes.as_array().unwrap().chunks(4);
+    let data = rgba.flat_map(|rgba| rgba[..3].iter().map(|x| x.as_u64().unwrap() as f32 / 255.0));
+    Image { width, height, channels: 3, data: data.collect() }
+}
+
 /// Width and height of the browser's window: a program that is built for tests paints slowly.
 const WINDOW: [u32; 2] = [780, 150];
 
@@ -478,10 +485,7 @@ fn a_page_and_the_program_agree_in_ten_views() {
         for (i, camera) in poses.iter().take(10).enumerate() {
             let asked =
                 format!("render({}, {}, 100, 100).then((bytes) => Array.from(bytes))", camera["pose"], camera["fov"]);
-            let bytes = browser.value(&asked);
-            let rgba = bytes.as_array().unwrap().chunks(4);
-            let data = rgba.flat_map(|rgba| rgba[..3].iter().map(|x| x.as_u64().unwrap() as f32 / 255.0)).collect();
-            let image = Image { width: 100, height: 100, channels: 3, data };
+            let image = image(&browser.value(&asked), [100, 100]);
             decibels.push(psnr(&image, &png(&place.path(&format!("{number}/{i:04}.png")))));
         }
         let seconds = start.elapsed().as_secs_f64() / decibels.len() as f64;
@@ -522,17 +526,28 @@ fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
         // Photographs of the landscape are from a part of the circle, on which an orbit swings.
         for (frame, pose) in poses.into_iter().take(if scene == "scene" { 2 } else { 1 }) {
             let asked = format!("render({pose}, data.view.fov, {width}, {height}).then((bytes) => Array.from(bytes))");
-            let bytes = browser.value(&asked);
-            let data = bytes
-                .as_array()
-                .unwrap()
-                .chunks(4)
-                .flat_map(|rgba| rgba[..3].iter().map(|x| x.as_u64().unwrap() as f32 / 255.0));
-            let image = Image { width, height, channels: 3, data: data.collect() };
+            let image = image(&browser.value(&asked), [width, height]);
             let expected = png(&place.path(&format!("seen/000{frame}.png")));
             assert!(psnr(&image, &expected) > 40.0, "{name} {frame}: {}", psnr(&image, &expected));
         }
     }
+    // One that was ended before all of its detail had come.
+    let train = format!("train scene --steps 4000 --refine poses --out early {SMALL}");
+    let mut child = place.command(&train).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let metrics = place.path("early/metrics.jsonl");
+    while std::fs::read_to_string(&metrics).map_or(0, |lines| lines.lines().count()) < 50 {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    place.succeeds("export early early.html");
+    place.succeeds("render early --frames 1 --size 40x30 --out seen");
+    let url = format!("file://{}", place.path("early.html").display());
+    browser.call("Page.navigate", json!({ "url": url }));
+    browser.until("typeof whole !== 'undefined' && whole === wanted && whole >= 0");
+    let asked = "render(data.view.pose, data.view.fov, 40, 30).then((bytes) => Array.from(bytes))";
+    let (seen, expected) = (image(&browser.value(asked), [40, 30]), png(&place.path("seen/0000.png")));
+    assert!(psnr(&seen, &expected) > 40.0, "{}", psnr(&seen, &expected));
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
     place.succeeds("train scene --preset small --steps 1 --out other");
     place.fails("export other other.html", &["other.html", "`instant`", "`classic`"]);

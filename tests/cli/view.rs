@@ -290,12 +290,14 @@ fn a_picture_is_painted_once_and_none_for_who_looks_away() {
     let (mut page, about) = Page::open(&server.address);
     // While it learns it is painted again, never as fine as would take long.
     page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [1800, 1800]) }));
-    let mut shots: Vec<Value> = (0..2).map(|_| page.file("picture").0).collect();
-    let painted = Instant::now();
-    shots.extend((0..2).map(|_| page.file("picture").0));
-    assert!(painted.elapsed().as_secs_f64() > 0.4, "not again and again");
+    let shots: Vec<Value> = (0..4).map(|_| page.file("picture").0).collect();
     assert!(shots.iter().all(|head| head["halvings"] != 0), "{shots:?}");
     assert!(shots[3]["step"].as_u64().unwrap() > shots[0]["step"].as_u64().unwrap(), "{shots:?}");
+    // What is quick is not painted at every step either, but twice a second.
+    page.look(5, &first(&about, [24, 24]));
+    page.files.clear();
+    page.hear(Duration::from_secs(3));
+    assert!((1..=7).contains(&page.files.len()), "{}", page.files.len());
     let told = page.text("training");
     assert!(told["psnr"].as_f64().unwrap() > 5.0 && told["loss"].as_f64().unwrap() < 1.0, "{told}");
     assert!(told["left"] != "0 s" && told["curves"]["speed"][0].as_f64().unwrap() > 10.0, "{told}");
@@ -780,8 +782,13 @@ fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
             assert!(psnr(&seen, &expected) > 45.0, "{skip} {show} {id}: {}", psnr(&seen, &expected));
         }
     }
-    let modes = ["off", "fast"].map(|skip| std::fs::read(place.path(&format!("{skip}-color/0000.png"))).unwrap());
-    assert_ne!(modes[0], modes[1]);
+    // Each is its own.
+    let [off, fast] = ["off", "fast"].map(|skip| png(&place.path(&format!("{skip}-color/0000.png"))));
+    assert!(psnr(&off, &fast) < 65.0, "{}", psnr(&off, &fast));
+    for (skip, own, other) in [("off", &off, &fast), ("fast", &fast, &off)] {
+        let seen = kept(&mut page, &with("skip", json!(skip)));
+        assert!(psnr(&seen, own) > psnr(&seen, other), "{skip}: {} {}", psnr(&seen, own), psnr(&seen, other));
+    }
     // What is not there is said, and the rest goes on.
     for kind in ["view", "save"] {
         page.say(
@@ -925,6 +932,26 @@ fn pages_know_where_photographs_are_found_to_have_been_taken() {
     // Who comes later is told what is known by then.
     let (_, later) = Page::open(&server.address);
     assert_ne!(poses(&later), poses(&about));
+}
+
+#[test]
+fn a_page_at_rest_takes_no_time() {
+    let place = trained();
+    let server = serve(&place, "view run");
+    let (mut page, about) = Page::open(&server.address);
+    page.look(1, &first(&about, [32, 32]));
+    // In hundredths of a second, where the system says.
+    let taken = || -> Option<u64> {
+        let text = std::fs::read_to_string(format!("/proc/{}/stat", server.child.id())).ok()?;
+        let numbers: Vec<&str> = text.rsplit(')').next()?.split_whitespace().collect();
+        Some(numbers[11].parse::<u64>().ok()? + numbers[12].parse::<u64>().ok()?)
+    };
+    page.hear(Duration::from_secs(1));
+    let before = taken();
+    page.hear(Duration::from_secs(2));
+    if let Some((before, after)) = before.zip(taken()) {
+        assert!(after - before < 20, "{} hundredths of 200", after - before);
+    }
 }
 
 #[test]

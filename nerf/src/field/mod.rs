@@ -113,3 +113,22 @@ impl DensityActivation {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::{Config, Extent, Model, Preset};
+    use glam::DVec3;
+
+    #[test]
+    fn a_new_field_is_a_thin_fog_in_its_own_unit() {
+        for preset in [Preset::Instant, Preset::Voxel] {
+            for unit in [1.0, 4.0] {
+                let extent = Extent { unit, ..Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]) };
+                let model = Model::<f32>::new(Config::preset(preset), extent, 0).unwrap();
+                let (mut seen, expected) = ([0.0], (-1.0_f64).exp() / unit);
+                model.densities(&[[0.1, -0.2, 0.3]], &mut seen);
+                assert!((f64::from(seen[0]) / expected - 1.0).abs() < 0.05, "{preset} {unit}: {seen:?} {expected}");
+            }
+        }
+    }
+}
