@@ -164,11 +164,13 @@ impl Model<f32> {
     /// use raygrad_nerf::{Config, Preset, Trainer};
     /// use std::sync::Arc;
     /// let data = Arc::new(embedded(Split::Train, 16));
-    /// let mut trainer = Trainer::new(Config::preset(Preset::Instant), data.clone())?;
-    /// let untrained = trainer.state()?;
-    /// trainer.step(0.0);
-    /// let before = trainer.model.at_state(&untrained)?;
-    /// assert_ne!(before.params.get(before.params.ids().next().unwrap()), trainer.model.params.get(before.params.ids().next().unwrap()));
+    /// let mut trainer = Trainer::new(Config::preset(Preset::Instant), data)?;
+    /// let (state, place) = (trainer.state()?, [[0.1, 0.2, 0.3]]);
+    /// let [mut before, mut seen] = [[0.0]; 2];
+    /// trainer.model.densities(&place, &mut before);
+    /// trainer.step(0.5);
+    /// trainer.model.at_state(&state)?.densities(&place, &mut seen);
+    /// assert_eq!(seen, before);
     /// # Ok::<(), raygrad_nerf::Error>(())
     /// ```
     ///
