@@ -701,7 +701,12 @@ $("share").addEventListener("input", () => say({ ask: "share", share: Number($("
 // Some browsers keep what was chosen before the page was loaded again.
 for (const input of document.querySelectorAll("input")) [input.checked, input.value] = [input.defaultChecked, input.defaultValue];
 // What nobody sees need not be painted.
-document.addEventListener("visibilitychange", () => (document.hidden ? say({ ask: "rest" }) : ask()));
+document.addEventListener("visibilitychange", () => {
+  if (!document.hidden) return ask();
+  // The picture that was waited for does not come any more.
+  unseen = null;
+  say({ ask: "rest" });
+});
 listen(stage);
 new ResizeObserver(() => { if (about) { layout(); ask(); } }).observe(stage);
 
