@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::io::ErrorKind::{TimedOut, WouldBlock};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
-use std::process::{Child, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use super::resume::{SMALL, assert_same};
@@ -33,7 +33,11 @@ impl Drop for Server {
 
 /// Starts it, and reads its link.
 pub fn serve(place: &Place, arguments: &str) -> Server {
-    let mut child = place.command(arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    serve_with(&mut place.command(arguments))
+}
+
+fn serve_with(command: &mut Command) -> Server {
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let mut out = BufReader::new(child.stdout.take().unwrap());
     let mut line = String::new();
     while !line.starts_with("view ") {
@@ -466,6 +470,45 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     }
     page.say(json!({ "ask": "photograph", "number": 0 }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("not known"));
+}
+
+/// Each has its own in evaluations, and pages have the mean of all.
+#[test]
+fn photographs_with_codes_of_their_own_have_no_figure() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 60 --set field.codes=2 --out run {SMALL}"));
+    place.succeeds("eval run");
+    let scores = place.json("run/eval-test-fast.json");
+    let server = serve(&place, "view run");
+    let (mut page, _) = Page::open(&server.address);
+    let mut compared = |number: usize| {
+        let view = json!({ "eye": { "photograph": number }, "size": [SIZE, SIZE], "compared": true });
+        page.look(number as u32, &view).pop().unwrap().0["compared"].clone()
+    };
+    assert_eq!(compared(1), json!([1, null]));
+    let [seen, expected] = [&compared(8)[1], &scores["per_view"][0]["psnr"]].map(|x| x.as_f64().unwrap());
+    assert!((seen - expected).abs() < 0.02, "{seen} {expected}");
+}
+
+#[test]
+fn a_page_is_opened_in_the_browser() {
+    use std::os::unix::fs::PermissionsExt;
+    let place = trained();
+    let browser = place.path("xdg-open");
+    std::fs::write(&browser, format!("#!/bin/sh\necho \"$1\" > {}\n", place.path("opened").display())).unwrap();
+    std::fs::set_permissions(&browser, PermissionsExt::from_mode(0o755)).unwrap();
+    let path = format!("{}:{}", place.path("").display(), std::env::var("PATH").unwrap());
+    for (arguments, opens) in [("view run", false), ("view run --open", true)] {
+        let mut command = place.command(arguments);
+        let server = serve_with(command.env("PATH", &path));
+        let start = Instant::now();
+        let patience = Duration::from_secs(if opens { 30 } else { 1 });
+        let opened = || std::fs::read_to_string(place.path("opened")).unwrap_or_default();
+        while !opened().ends_with('\n') && start.elapsed() < patience {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        assert_eq!(opened(), if opens { format!("http://{}/\n", server.address) } else { String::new() });
+    }
 }
 
 #[test]

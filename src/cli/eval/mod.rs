@@ -1,6 +1,6 @@
 //! `raygrad eval`: how close a model comes to photographs.
 
-mod alignment;
+pub mod alignment;
 mod page;
 mod report;
 

@@ -10,6 +10,7 @@ use super::hub::Hub;
 use super::messages::{AboutPhotograph, rows};
 use super::store::{Got, Store};
 use crate::cli::builtin;
+use crate::cli::eval::alignment::Appearance;
 use crate::cli::photographs::{check_trained, present};
 use crate::cli::run::Run;
 use crate::cli::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
@@ -91,9 +92,10 @@ impl Album {
         self.entries.iter().map(camera).collect()
     }
 
-    /// Whether a photograph has a mask, of what is not to be compared.
-    pub fn is_masked(&self, number: usize) -> bool {
-        self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some())
+    /// Whether evaluations see a photograph otherwise than a page: without what its mask covers, or with what was learned of it alone.
+    pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
+        let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
+        self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some() || own(entry))
     }
 
     /// The photograph that was taken nearest to where a camera is, looking the way it looks.

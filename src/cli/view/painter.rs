@@ -172,9 +172,10 @@ impl Painter {
                 _ => None,
             };
             let job = &mut self.jobs[i];
-            // Where evaluations leave out or correct something, a figure would be another than theirs.
-            let masked = number.zip(self.album.as_ref()).is_some_and(|(number, album)| album.is_masked(number));
-            let plain = !masked && model.tone.is_none();
+            // Where evaluations leave out or correct something, or give a photograph its own code, a figure would be another than
+            // theirs.
+            let own = |number| self.album.as_ref().is_some_and(|album| album.is_special(number, model));
+            let plain = model.tone.is_none() && !number.is_some_and(own);
             (job.parts, job.begun) = (Some(Parts::new(camera, number.is_some(), size, truth, model)), step);
             job.plain = plain;
         }

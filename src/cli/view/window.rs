@@ -94,17 +94,14 @@ impl Window {
             self.credit -= start.elapsed().as_secs_f64();
         }
         self.tell(trainer, psnr, left, None, false);
-        let (mut waits, mut alone) = (false, None);
+        let (mut waits, mut alone) = (false, Alone::default());
         while self.hub.paused() && !self.hub.stops() && !interrupt::requested() {
             if !waits {
                 self.tell(trainer, psnr, left, None, true);
                 note("training waits: a page has paused it");
                 waits = true;
             }
-            // A page that is loaded anew comes back soon.
-            alone =
-                alone.filter(|_| self.hub.connected() == 0).or_else(|| (self.hub.connected() == 0).then(Instant::now));
-            if alone.is_some_and(|since: Instant| since.elapsed() > ALONE) {
+            if alone.is_longer(self.hub.connected(), ALONE) {
                 self.hub.pause(false);
             }
             if !self.painter.work(&trainer.model, step) {
@@ -138,15 +135,9 @@ impl Window {
         } else {
             note("the page shows the scene until it is closed; Ctrl-C ends it now");
         }
-        let mut alone = None;
-        while !interrupt::requested() {
-            match self.hub.connected() {
-                // One that is loaded anew comes back soon.
-                0 if alone.get_or_insert_with(Instant::now).elapsed() > GONE => break,
-                0 => (),
-                _ => alone = None,
-            }
-            if alone.is_some() || !self.painter.work(&trainer.model, stats.step) {
+        let mut alone = Alone::default();
+        while !interrupt::requested() && !alone.is_longer(self.hub.connected(), GONE) {
+            if !self.painter.work(&trainer.model, stats.step) {
                 self.hub.wait(Duration::from_millis(200));
             }
             self.tell(trainer, stats.psnr, 0.0, Some(how), false);
@@ -172,15 +163,7 @@ impl Window {
             "curves": { "loss": curve(|at| at.loss), "psnr": curve(|at| at.psnr), "speed": curve(|at| at.speed) },
         }))));
     }
-}
 
-/// The seconds of painting that training owes after it had so many for itself: pictures are to get their share of both. What was
-/// not asked for is not saved up, but for a little.
-fn credit(before: f64, trained: f64, share: f64) -> f64 {
-    before.min(MOST_CREDIT) + trained * share / (1.0 - share)
-}
-
-impl Window {
     /// Tells pages where photographs were taken, if more of that is known by now.
     fn tell_taken(&mut self, model: &Model<f32>) {
         let (known, when) = &self.taken;
@@ -194,6 +177,27 @@ impl Window {
         }
         self.taken = (now, Instant::now());
     }
+}
+
+/// Since when there is no page.
+#[derive(Default)]
+struct Alone(Option<Instant>);
+
+impl Alone {
+    /// Whether there has been none for so long; one that is loaded anew comes back soon.
+    fn is_longer(&mut self, pages: usize, limit: Duration) -> bool {
+        if pages > 0 {
+            self.0 = None;
+            return false;
+        }
+        self.0.get_or_insert_with(Instant::now).elapsed() > limit
+    }
+}
+
+/// The seconds of painting that training owes after it had so many for itself: pictures are to get their share of both. What was
+/// not asked for is not saved up, but for a little.
+fn credit(before: f64, trained: f64, share: f64) -> f64 {
+    before.min(MOST_CREDIT) + trained * share / (1.0 - share)
 }
 
 impl Curves {
@@ -222,6 +226,18 @@ mod tests {
         assert_eq!(credit(0.0, 1.0, 0.5), 1.0);
         assert!((credit(0.0, 1.0, 0.1) - 1.0 / 9.0).abs() < 1e-12);
         assert_eq!([credit(0.0, 1.0, 0.0), credit(9.0, 0.0, 0.5), credit(-9.0, 0.0, 0.5)], [0.0, MOST_CREDIT, -9.0]);
+    }
+
+    #[test]
+    fn who_is_alone_for_long_is_known_until_somebody_comes() {
+        let mut alone = Alone::default();
+        let short = Duration::from_millis(20);
+        assert!(!alone.is_longer(0, short) && !alone.is_longer(1, Duration::ZERO));
+        std::thread::sleep(2 * short);
+        assert!(!alone.is_longer(0, short), "it begins anew after a page was there");
+        std::thread::sleep(2 * short);
+        assert!(!alone.is_longer(0, Duration::from_secs(60)) && alone.is_longer(0, short));
+        assert!(!alone.is_longer(2, short) && !alone.is_longer(0, short));
     }
 
     #[test]

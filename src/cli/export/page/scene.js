@@ -37,9 +37,53 @@ function padded(array, length) {
   return out;
 }
 
+/** What a shader says of each pixel. */
+function programOf(fragment) {
+  const program = gl.createProgram();
+  const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
+  const shaders = [[gl.VERTEX_SHADER, corner], [gl.FRAGMENT_SHADER, fragment]].map(([kind, text]) => {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+    return shader;
+  });
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+    throw new Error(`The graphics card does not understand the scene: ${shaders.map((s) => gl.getShaderInfoLog(s)).join(" ")} ${gl.getProgramInfoLog(program)}`);
+  }
+  gl.useProgram(program);
+  return program;
+}
+
+/** What is said beside each picture. */
+let warning = "";
+
+/** Whether a pixel's loops end after some ten thousand rounds, as with llvmpipe, Mesa's stand-in for a card: rays have more. */
+function endsLoopsEarly() {
+  const program = programOf(`#version 300 es
+precision highp float;
+uniform int rounds;
+out vec4 result;
+void main() {
+  float count = 0.0;
+  for (int i = 0; i < rounds; i++) for (int j = 0; j < rounds; j++) count += fract(count) + 1.0;
+  result = vec4(count == float(rounds * rounds));
+}`);
+  gl.uniform1i(gl.getUniformLocation(program, "rounds"), 300);
+  targetOf(1, 1);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+  gl.viewport(0, 0, 1, 1);
+  gl.drawArrays(gl.TRIANGLES, 0, 3);
+  const pixel = new Uint8Array(4);
+  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+  return pixel[0] === 0;
+}
+
 function begin() {
   gl = picture.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
   if (!gl) throw new Error("This browser has no WebGL 2, which renders the scene.");
+  if (endsLoopsEarly()) warning = " · this browser's driver leaves parts of the scene out; another browser may show all";
   const { grid, network, space, march } = data;
   const each = grid.features, texels = Math.ceil(each / 4);
   const defines = {
@@ -48,21 +92,7 @@ function begin() {
   };
   const [version, ...rest] = document.getElementById("shader").textContent.trim().split("\n");
   const head = Object.entries(defines).map(([name, value]) => `#define ${name} ${value}`);
-  program = gl.createProgram();
-  const shader = (kind, text) => {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-    return shader;
-  };
-  const corner = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
-  const shaders = [shader(gl.VERTEX_SHADER, corner), shader(gl.FRAGMENT_SHADER, [version, ...head, ...rest].join("\n"))];
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
-    throw new Error(`The graphics card does not understand the scene: ${shaders.map((s) => gl.getShaderInfoLog(s)).join(" ")} ${gl.getProgramInfoLog(program)}`);
-  }
-  gl.useProgram(program);
+  program = programOf([version, ...head, ...rest].join("\n"));
   places = (name) => gl.getUniformLocation(program, name);
 
   // Rows of the table, four numbers to a texel, or fewer where a row has fewer.
@@ -191,12 +221,12 @@ async function work() {
       const [w, h] = [width, height].map((side) => Math.max(1, Math.floor(side * fits)));
       await paint(seen, w, h, FIRST);
       show();
-      status.textContent = `${w}×${h} · ${(performance.now() - start).toFixed(0)} ms`;
+      status.textContent = `${w}×${h} · ${(performance.now() - start).toFixed(0)} ms${warning}`;
       if (wanted !== own) continue;
       if (fits < 1) {
         if (!(await paint(seen, width, height, PIECE))) continue;
         show();
-        status.textContent = `${width}×${height} · ${(performance.now() - start).toFixed(0)} ms`;
+        status.textContent = `${width}×${height} · ${(performance.now() - start).toFixed(0)} ms${warning}`;
       }
       whole = own;
       stage.dataset.whole = String(whole);
