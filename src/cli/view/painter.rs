@@ -261,6 +261,11 @@ fn expected(rate: f64, now: f64) -> f64 {
     rate + LATEST * (now - rate)
 }
 
+/// How many rows of so many rays there is time for.
+fn rows_in(seconds: f64, rate: f64, width: usize) -> usize {
+    (rate * seconds / width as f64) as usize
+}
+
 /// How often a size is to be halved for a picture to be there in so many seconds.
 fn halvings([width, height]: [u32; 2], rate: f64, seconds: f64) -> u32 {
     let rays = f64::from(width) * f64::from(height);
@@ -342,7 +347,7 @@ impl Parts {
     fn paint(&mut self, view: &View, model: &Model<f32>, rate: f64, goes_on: &(dyn Fn() -> bool + Sync)) -> Option<()> {
         let Camera { width, height, centre, .. } = self.camera;
         if self.band == 0 {
-            self.band = (rate * PIECE / width as f64) as usize;
+            self.band = rows_in(PIECE, rate, width);
         }
         self.band = self.band.clamp(1, height);
         let rows = self.band.min(height - self.rows);
@@ -404,6 +409,20 @@ mod tests {
     #[test]
     fn what_was_slow_lately_is_expected_to_be_slower() {
         assert_eq!([expected(1e5, 3e5), expected(1e5, 1e5), expected(2e5, 1e5)], [2e5, 1e5, 1.5e5]);
+    }
+
+    #[test]
+    fn pieces_take_as_long_as_they_may() {
+        assert_eq!([rows_in(0.08, 1e5, 800), rows_in(0.08, 1e3, 800), rows_in(0.5, 1e5, 100)], [10, 0, 500]);
+        let camera = Camera::from_angle(64, 64, 1.0, DAffine3::IDENTITY);
+        let paced = |milliseconds: u64| {
+            let color = Image::new(1, 1, 3);
+            let mut parts = Parts { camera: camera.clone(), truth: None, color, rows: 0, band: 8 };
+            parts.pace(Duration::from_millis(milliseconds));
+            parts.band
+        };
+        // Twice as many at most, half as many after what took twice as long, and never none.
+        assert_eq!([paced(1), paced(80), paced(160), paced(10_000)], [16, 8, 4, 1]);
     }
 
     #[test]
