@@ -404,11 +404,39 @@ fn normals(
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
     fn what_was_slow_lately_is_expected_to_be_slower() {
         assert_eq!([expected(1e5, 3e5), expected(1e5, 1e5), expected(2e5, 1e5)], [2e5, 1e5, 1.5e5]);
+    }
+
+    #[test]
+    fn what_rests_is_seen_finer_or_again() {
+        let hub = Arc::new(Hub::default());
+        let (client, _outbox) = hub.join(1).unwrap();
+        let view = json!({ "eye": { "photograph": 0 }, "size": [800, 800], "show": "color" });
+        hub.wish(client, 1, serde_json::from_value(view).unwrap());
+        let long_ago = Instant::now().checked_sub(2 * AGAIN).unwrap();
+        // How a picture that was seen at step 7 goes on: its halvings, if it does.
+        let goes_on = |halvings: u32, when: Instant, spent: Duration, step: u64| {
+            let mut painter = Painter::new(hub.clone(), None, None);
+            painter.sync(7);
+            let job = &mut painter.jobs[0];
+            (job.halvings, job.whole, job.spent) = (halvings, Some((7, when)), spent);
+            painter.sync(step);
+            let job = &painter.jobs[0];
+            job.whole.is_none().then_some(job.halvings)
+        };
+        let none = Duration::ZERO;
+        // Held, ever finer to the whole; of what has learned more, what half a second is enough for.
+        assert_eq!([3, 1, 0].map(|halvings| goes_on(halvings, long_ago, none, 7)), [Some(2), Some(0), None]);
+        assert_eq!([3, 0].map(|halvings| goes_on(halvings, long_ago, none, 8)), [Some(2), Some(2)]);
+        // Not at once, nor what took longer than that.
+        assert_eq!([7, 8].map(|step| goes_on(3, Instant::now(), none, step)), [None, None]);
+        assert_eq!([7, 8].map(|step| goes_on(3, long_ago, 4 * AGAIN, step)), [None, None]);
     }
 
     #[test]
