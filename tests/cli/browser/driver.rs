@@ -216,6 +216,16 @@ impl Browser {
         self.rested();
     }
 
+    /// Whether it has WebGL 2, and says that it skips if not: Firefox without a display has none.
+    pub fn draws(&mut self) -> bool {
+        let draws = self.value("document.createElement('canvas').getContext('webgl2') !== null") == true;
+        assert!(draws || self.kind == Kind::Firefox);
+        if !draws {
+            println!("skipped: Firefox has no WebGL 2 here");
+        }
+        draws
+    }
+
     /// Waits for the whole picture of what was asked for last.
     #[track_caller]
     pub fn rested(&mut self) {
