@@ -404,6 +404,7 @@ fn normals(
 
 #[cfg(test)]
 mod tests {
+    use raygrad::nerf::{Config, Extent, Preset};
     use serde_json::json;
 
     use super::*;
@@ -437,6 +438,29 @@ mod tests {
         // Not at once, nor what took longer than that.
         assert_eq!([7, 8].map(|step| goes_on(3, Instant::now(), none, step)), [None, None]);
         assert_eq!([7, 8].map(|step| goes_on(3, long_ago, 4 * AGAIN, step)), [None, None]);
+    }
+
+    #[test]
+    fn pictures_are_painted_in_turns() {
+        let hub = Arc::new(Hub::default());
+        for number in 0..2 {
+            let (client, _outbox) = hub.join(2).unwrap();
+            let pose = [[1.0, 0.0, 0.0, f64::from(number)], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
+            let view = json!({ "eye": { "free": { "pose": pose, "fov": 50.0 } }, "size": [512, 512], "show": "color" });
+            hub.wish(client, 1, serde_json::from_value(view).unwrap());
+        }
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.1, 9.0]);
+        let model = Model::new(Config::preset(Preset::Instant), extent, 0).unwrap();
+        let mut painter = Painter::new(hub, None, None);
+        // So slow, as far as is known, that a piece is a row at first, and never all.
+        painter.rates.insert((Show::Color, None), 1.0);
+        let mut turns = vec![];
+        for _ in 0..5 {
+            assert!(painter.work(&model, 0));
+            turns.push([0, 1].map(|i| painter.jobs[i].turn));
+        }
+        // The second is new when the first has been, but not again before that has had its turn; then one after the other.
+        assert_eq!(turns, [[1, 0], [2, 0], [2, 3], [4, 3], [4, 5]]);
     }
 
     #[test]

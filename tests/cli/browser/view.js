@@ -272,8 +272,8 @@ const sized = (high, photograph, width = 400, height = 200) => {
   return sizes();
 };
 is("sizes", [sized("fit", null), sized("fit", 1), sized("fit", 2), sized("800", null), sized("800", 1)], [[400, 200], [100, 200], [400, 100], [1600, 800], [400, 800]]);
-is("limits", [sized("fit", null, 8000, 2000), sized("fit", null, 4, 2), sized("fit", null, 2, 8), sized("fit", null, 401, 199.7), sized("fit", null, 80000, 1000)],
-  [[4096, 1024], [16, 8], [8, 8], [399, 199], [4096, 228]]);
+is("limits", [sized("fit", null, 8000, 2000), sized("fit", null, 4, 2), sized("fit", null, 2, 8), sized("fit", null, 401, 199.7), sized("fit", null, 80000, 1000), sized("fit", null, 10, 9000)],
+  [[4096, 1024], [16, 8], [8, 8], [399, 199], [4096, 228], [8, 4096]]);
 fixed(window, "devicePixelRatio", 1.25);
 is("finer displays", [sized("fit", null), sized("fit", 2), sized("800", null)], [[500, 250], [500, 125], [1600, 800]]);
 fixed(window, "devicePixelRatio", 3);
@@ -431,6 +431,9 @@ about.training = false;
 ahead();
 area = { x: 10, y: 5, w: 200, h: 100 };
 is("project", [project([1, 2, 0.5]), project([0, -1, 0]), project([0, 0.005, 0]), project([0, 0.007, 0])], [[135, 42.5], null, null, [110, 55]]);
+view.fov = (2 * Math.atan(0.5)) / radians;
+is("project through a longer lens", [project([1, 2, 0.5]), project([0, 1, 0.1])], [[160, 30], [110, 45]]);
+view.fov = 90;
 view.photograph = 1;
 is("off the middle", project([1, 2, 0.5]), [85, 67.5]);
 view.photograph = null;
