@@ -13,9 +13,5 @@ const is = (name, found, wanted, within = 1e-9) => {
 /** Stands in for some of the page's functions: what they are called with is kept. */
 const calls = [];
 const called = () => calls.splice(0);
-/** A clock, and timers that run when they are told to. */
 let clock = 1000;
-const timers = [];
-const rest = (milliseconds) => new Promise((done) => later.call(window, done, milliseconds));
-const later = window.setTimeout;
 const fixed = (object, name, value) => Object.defineProperty(object, name, { value, configurable: true, writable: true });

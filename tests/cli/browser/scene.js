@@ -1,4 +1,5 @@
 // The parts of an exported page, against numbers worked out by hand.
+const rest = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 while (working) await rest(5);
 fixed(performance, "now", () => clock);
 fixed(stage, "clientWidth", 60);

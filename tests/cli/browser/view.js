@@ -1,8 +1,10 @@
 // The parts of the page of `raygrad view`, against numbers worked out by hand. It has no program behind it from here on.
 socket.onclose = socket.onmessage = null;
 socket.close();
-const real = { ask, say, orbit, pan, zoom, fly, draw, overlay, keep, nearest, goTo, flight };
+const real = { ask, say, orbit, pan, zoom, fly, draw, overlay, keep };
 const S = Math.SQRT1_2;
+/** Timers, which run when they are told to. */
+const timers = [];
 let room = { x: 0, y: 0, width: 400, height: 200 };
 fixed(stage, "getBoundingClientRect", () => room);
 fixed(window, "devicePixelRatio", 1);
