@@ -429,8 +429,9 @@ fn a_browser_shows_training_and_controls_it() {
     let Some(mut browser) = Browser::open(Kind::Chromium) else { return };
     let place = Place::with_scene();
     let mut server = serve(&place, &format!("train scene --steps 100000 --view --out run {SMALL}"));
-    browser.visit(&server);
-    browser.until("training !== null && training.step > 20");
+    browser.go(&format!("http://{}/", server.address));
+    // On a busy machine no whole picture comes before training is held.
+    browser.until("typeof training !== 'undefined' && training !== null && training.step > 20 && shown !== null");
     browser.until("shown.step > 10");
     browser.value("document.getElementById('pause').click()");
     browser.until("training.paused === true && document.getElementById('pause').textContent === 'Go on'");
