@@ -605,6 +605,10 @@ fn bad_arguments_are_usage_errors() {
     }
     let output = place.command("train --steps 1").env("RAYGRAD_SIMD", "avx").output().unwrap();
     complained("RAYGRAD_SIMD", &output, &["RAYGRAD_SIMD is \"avx\"", "scalar, v3 or v4"]);
+    // Nobody who asks for a page trains without one.
+    for place_of_page in ["--host ::1", "--port 7000"] {
+        place.fails(&format!("train --steps 1 {place_of_page}"), &["`view`", "--host and --port"]);
+    }
     assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 0);
 }
 

@@ -516,11 +516,11 @@ fn moves_about_a_page(browser: &mut Browser) {
     browser.key("r");
     assert_eq!(seen(browser), first);
     // As large as its window, and as fine as that shows.
-    browser.size(80, 60, false);
-    browser.until("picture.width === 80 && picture.height === 60 && target.width === 80");
+    browser.size(52, 39, false);
+    browser.until("picture.width === 52 && picture.height === 39 && target.width === 52");
     browser.until(whole);
-    browser.size(60, 45, false);
-    browser.until("picture.width === 60");
+    browser.size(40, 30, false);
+    browser.until("picture.width === 40");
     assert_eq!(seen(browser), first);
 }
 
@@ -599,7 +599,7 @@ fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
     }
     for mut browser in Browser::all() {
         // What stands in for a graphics card is slow.
-        browser.size(60, 45, false);
+        browser.size(40, 30, false);
         for (name, kind) in [("object", 0), ("slight", 0), ("landscape", 1), ("ahead", 2), ("early", 0)] {
             let url = format!("file://{}", place.path(&format!("{name}.html")).display());
             browser.go(&url);

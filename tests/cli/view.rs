@@ -744,6 +744,13 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     while !matches!(page.socket.read().unwrap(), Message::Ping(_)) {
         assert!(asked.elapsed() < Duration::from_secs(25), "it would be taken to be gone");
     }
+    // One that comes back soon, loaded anew, finds it as it was.
+    drop(page);
+    std::thread::sleep(Duration::from_millis(600));
+    let (mut page, _) = Page::open(&server.address);
+    let told = page.text("training");
+    assert_eq!(json!([told["paused"], told["step"]]), json!([true, held]));
+    page.say(json!({ "ask": "view", "id": 2, "view": view }));
     page.say(json!({ "ask": "share", "share": 0.5 }));
     while page.text("training")["share"] != 0.5 {}
     page.say(json!({ "ask": "pause", "pause": false }));

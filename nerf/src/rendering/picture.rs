@@ -280,6 +280,28 @@ mod tests {
     }
 
     #[test]
+    fn tiles_hold_every_pixel_once_and_in_order() {
+        let (model, camera) = (model(), camera(17, 13));
+        let viewing = Viewing::over([1.0; 3]);
+        let mut tiles = vec![(0, Rays::new()); 221_usize.div_ceil(50)];
+        let keep = |_: &mut (), first, rays: &Rays<f32>, tile: &mut _| {
+            *tile = (first, rays.clone());
+            Evaluations::default()
+        };
+        model.tiles(&camera, &viewing, 50, tiles.par_iter_mut(), keep).unwrap();
+        assert_eq!(
+            tiles.iter().map(|(first, rays)| [*first, rays.len()]).collect::<Vec<_>>(),
+            [[0, 50], [50, 50], [100, 50], [150, 50], [200, 21]]
+        );
+        let mut all = Rays::<f32>::new();
+        for pixel in 0..221 {
+            all.push_pixel(&camera, [pixel % 17, pixel / 17], model.reach(), model.extent.span);
+        }
+        assert_eq!(tiles.iter().flat_map(|(_, rays)| rays.directions.clone()).collect::<Vec<_>>(), all.directions);
+        assert_eq!(tiles.iter().flat_map(|(_, rays)| rays.spans.clone()).collect::<Vec<_>>(), all.spans);
+    }
+
+    #[test]
     fn a_view_ends_when_nobody_wants_it() {
         use std::sync::atomic::{AtomicUsize, Ordering};
         let (model, camera) = (model(), camera(64, 64));

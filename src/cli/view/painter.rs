@@ -478,6 +478,15 @@ mod tests {
     }
 
     #[test]
+    fn pictures_of_more_than_a_megapixel_are_large() {
+        let is_large = |width: usize, height: usize| {
+            let (camera, color) = (Camera::from_angle(width, height, 1.0, DAffine3::IDENTITY), Image::new(1, 1, 3));
+            Parts { camera, truth: None, color, rows: 0, band: 0 }.is_large()
+        };
+        assert_eq!([is_large(1024, 1024), is_large(1025, 1024), is_large(4096, 200)], [false, true, false]);
+    }
+
+    #[test]
     fn the_first_picture_is_there_at_once() {
         for (size, rate) in [([800, 800], 1e5), ([400, 300], 1e6), ([4000, 1000], 3e4)] {
             let times = halvings(size, rate, FIRST);

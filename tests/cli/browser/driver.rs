@@ -68,7 +68,7 @@ impl Browser {
         let profile = tempfile::tempdir().unwrap();
         let folder = profile.path().display();
         let (mut command, mut display) = (Command::new(name), None);
-        command.arg("--remote-debugging-port=0").env("HOME", profile.path());
+        command.arg("--remote-debugging-port=0").env("HOME", profile.path()).env("TMPDIR", profile.path());
         match kind {
             Kind::Chromium => {
                 command.args(["--headless=new", "--no-sandbox", "--no-first-run"]);
