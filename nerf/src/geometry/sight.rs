@@ -54,7 +54,7 @@ pub(super) fn sights(model: &Model<f32>, camera: &Camera, pool: &Pool<f32>) -> S
         let (mut rays, bounds) = (Rays::new(), model.reach());
         for pixel in tile * TILE..pixels.min((tile + 1) * TILE) {
             let place = [pixel % camera.width, pixel / camera.width];
-            rays.push_pixel(camera, place, bounds, model.extent.span);
+            rays.push_pixel(camera, place, bounds, model.view_span());
         }
         parallel::serial(|| see(model, &rays, pool))
     };

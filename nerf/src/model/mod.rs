@@ -37,6 +37,8 @@ use std::sync::Arc;
 
 /// Photographs that a model is fitted to, at most: it may have numbers of its own for each.
 const MOST_FRAMES: usize = 1 << 20;
+/// What is nearer to a camera than this share of the scene's side is not looked at.
+const NEAREST: f64 = 1e-2;
 
 /// A field with its sampler and parameters.
 pub struct Model<T: Scalar> {
@@ -63,6 +65,10 @@ pub struct Model<T: Scalar> {
     pub vignetted: bool,
     /// How much of their detail fields have: see [`set_detail`](Self::set_detail).
     detail: f64,
+}
+
+fn space(config: &Config, extent: &Extent) -> Space {
+    Space { unbounded: config.unbounded, ..extent.space() }
 }
 
 impl<T: Scalar> Clone for Model<T> {
@@ -100,7 +106,7 @@ impl<T: Scalar> Model<T> {
     #[inline(never)]
     pub fn with_cameras(config: Config, extent: Extent, cameras: &[Camera], seed: u64) -> Result<Self> {
         config.check()?;
-        let space = Space { unbounded: config.unbounded, ..extent.space() };
+        let space = space(&config, &extent);
         space.check()?;
         let (mut params, frames) = (Params::new(), extent.frames);
         check_range("extent.frames", frames, 0, MOST_FRAMES)?;
@@ -116,6 +122,11 @@ impl<T: Scalar> Model<T> {
         Ok(Model { config, extent, params, field, sampler, terms, refine, tone, look, vignetted, detail })
     }
 
+    /// The map from the scene to the unit cube that fields and sampler are given.
+    pub fn space(&self) -> Space {
+        space(&self.config, &self.extent)
+    }
+
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
     /// grid ends.
     pub fn reach(&self) -> [DVec3; 2] {
@@ -123,6 +134,16 @@ impl<T: Scalar> Model<T> {
             Some(grid) => grid.outer_bounds(),
             None if self.config.unbounded => [DVec3::NEG_INFINITY, DVec3::INFINITY],
             None => self.extent.bounds,
+        }
+    }
+
+    /// The nearest and the farthest distance from a camera at which views look, in scene units: in a scene that ends, at all of
+    /// it from wherever one stands; in one that goes on, as in training, which has not judged what is nearer to cameras.
+    pub fn view_span(&self) -> [f64; 2] {
+        let [near, far] = self.extent.span;
+        match self.space() {
+            Space { unbounded: true, .. } => [near, far],
+            bounded => [near.min(NEAREST * bounded.side()), f64::INFINITY],
         }
     }
 
@@ -175,8 +196,11 @@ impl<T: Scalar> Model<T> {
         (&*self.sampler as &dyn Any).downcast_ref()
     }
 
-    /// What the colours of views are multiplied by in a picture's middle, and cut off at 1: that of [`look`](Self::look), or of none in particular, where a
-    /// [`Tone`] knows how photographs differ; else 1.
+    /// What red, green and blue of views are multiplied by in a picture's middle, each above 0, and cut off at 1 after: 1, unless a
+    /// [`Tone`] knows how photographs differ. Then it is that of [`look`](Self::look), or of none in particular.
+    ///
+    /// # Panics
+    /// If `look` is no photograph.
     pub fn gain(&self) -> [f64; 3] {
         self.tone.as_ref().map_or([1.0; 3], |tone| tone.gain(&self.params, self.look, false).at(0.0))
     }

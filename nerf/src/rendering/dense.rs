@@ -45,7 +45,7 @@ impl<T: Scalar> Model<T> {
         let keep = |seen: &[Pixel], out: &mut [Pixel]| {
             out.iter_mut().zip(seen).for_each(|(out, pixel)| *out = pixel.over(background));
         };
-        let all = Viewing::over(background.map(|value| value as f32));
+        let all = Viewing::over([0.0; 3]);
         let evaluations = self.pixels(camera, &all, TILE, see, pixels.par_chunks_mut(TILE), keep);
         let evaluations = evaluations.expect("nobody stops it");
         DenseView { width: camera.width, height: camera.height, pixels, evaluations }

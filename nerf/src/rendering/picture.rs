@@ -129,7 +129,7 @@ impl<T: Scalar> Model<T> {
     ) -> Option<Evaluations> {
         let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
         let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
-        let [near, far] = self.extent.span;
+        let [near, far] = self.view_span();
         // Which corner is which is nothing to a ray.
         let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
         let tiles = out.enumerate().map_init(S::default, |scratch, (which, out)| {
@@ -280,6 +280,26 @@ mod tests {
     }
 
     #[test]
+    fn a_scene_that_ends_is_seen_from_nearer_and_from_farther_than_its_photographs() {
+        let seen = |span: [f64; 2], unbounded: bool, distance: f64| {
+            let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], span);
+            let model: Model<f32> =
+                Model::new(Config { unbounded, ..Config::preset(Preset::Small) }, extent, 0).unwrap();
+            let eye = Camera::look_at(DVec3::new(0.0, 0.0, distance), DVec3::ZERO, DVec3::Y);
+            (model.view(&Camera::from_angle(3, 3, 0.1, eye), [1.0; 3]).opacity, model.view_span())
+        };
+        for distance in [0.5, 4.0, 30.0] {
+            let (opacity, span) = seen([2.0, 6.0], false, distance);
+            // As much of it as if photographs had been taken everywhere.
+            assert_eq!(opacity, seen([0.02, 100.0], false, distance).0, "{distance}");
+            assert!(opacity.data[4] > 0.1 && span == [0.02, f64::INFINITY], "{opacity:?} {span:?}");
+        }
+        assert_eq!(seen([0.0, 6.0], false, 4.0).1, [0.0, f64::INFINITY]);
+        // One that goes on is not known where they are near.
+        assert_eq!(seen([2.0, 600.0], true, 4.0).1, [2.0, 600.0]);
+    }
+
+    #[test]
     fn tiles_hold_every_pixel_once_and_in_order() {
         let (model, camera) = (model(), camera(17, 13));
         let viewing = Viewing::over([1.0; 3]);
@@ -295,7 +315,7 @@ mod tests {
         );
         let mut all = Rays::<f32>::new();
         for pixel in 0..221 {
-            all.push_pixel(&camera, [pixel % 17, pixel / 17], model.reach(), model.extent.span);
+            all.push_pixel(&camera, [pixel % 17, pixel / 17], model.reach(), model.view_span());
         }
         assert_eq!(tiles.iter().flat_map(|(_, rays)| rays.directions.clone()).collect::<Vec<_>>(), all.directions);
         assert_eq!(tiles.iter().flat_map(|(_, rays)| rays.spans.clone()).collect::<Vec<_>>(), all.spans);
