@@ -32,14 +32,18 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
     if split == Split::Train {
         check_trained(run, &capture, &views, model.extent.frames)?;
     }
-    let learned = split == Split::Train && model.refine.is_some();
     let placement = model.extent.placement;
-    let photograph = |(number, view): (usize, &&View)| {
-        let given = placement.camera(&view.camera);
-        let camera = if learned { model.learned_camera(number, &given) } else { model.other_camera(&given) };
-        Photograph { name: view.name.clone(), camera, bounds: bounds(view, placement.scale) }
+    let given: Vec<Camera> = views.iter().map(|view| placement.camera(&view.camera)).collect();
+    let cameras = match split {
+        Split::Train => given.iter().enumerate().map(|(i, given)| model.learned_camera(i, given)).collect(),
+        _ => model.other_cameras(&given),
     };
-    Ok(views.iter().enumerate().map(photograph).collect())
+    let photograph = |(view, camera): (&&View, Camera)| Photograph {
+        name: view.name.clone(),
+        camera,
+        bounds: bounds(view, placement.scale),
+    };
+    Ok(views.iter().zip(cameras).map(photograph).collect())
 }
 
 /// The depths that a view shows at most, in scene units, of which one of the capture's has `scale`.

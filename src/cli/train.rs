@@ -116,7 +116,7 @@ pub struct Args {
     #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
     checkpoint: Duration,
     /// How many checkpoints stay, which `raygrad view` goes through [default: 2, or as before for a run that goes on]
-    #[arg(long, value_name = "N", value_parser = parse::at_least_two())]
+    #[arg(long, value_name = "N", value_parser = parse::within(checkpoint::MAY_STAY))]
     keep_checkpoints: Option<usize>,
     /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
     #[arg(long)]
@@ -262,7 +262,8 @@ fn train(
             break;
         }
         let reason = watch::reason(&trainer);
-        let tries_again = trainer.stats().has_diverged() && retreats < RETREATS && !interrupt::requested();
+        let tries_again =
+            trainer.stats().has_diverged() && retreats < RETREATS && !interrupt::requested() && !ended_by_page;
         if !tries_again || !watch.retreat(&mut trainer, &reason) {
             diverged = Some(reason);
             break;

@@ -417,7 +417,12 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90], "compared": true });
     let (head, picture) = page.look(3, &large).pop().unwrap();
     assert_eq!([picture.width, picture.height], [SIZE, SIZE]);
-    assert!((head["compared"][1].as_f64().unwrap() - expected).abs() < 0.01);
+    assert!((head["compared"][1].as_f64().unwrap() - expected).abs() < 0.01 && head["compared"][2] == true);
+    // At another size it is another figure, and coarse pictures have none.
+    let pictures = page.look(14, &json!({ "eye": { "photograph": 7 }, "size": [20, 20], "compared": true }));
+    let compared: Vec<&Value> = pictures.iter().map(|(head, _)| &head["compared"]).collect();
+    assert!(compared.last().unwrap()[1].is_f64() && compared.iter().all(|told| told[2] == false), "{compared:?}");
+    assert!(compared[..compared.len() - 1].iter().all(|told| told[1].is_null()), "{compared:?}");
     let large = json!({ "eye": { "photograph": 7 }, "size": [300, 90] });
     let picture = page.look(4, &large).pop().unwrap().1;
     assert_eq!([picture.width, picture.height], [90, 90]);
@@ -496,7 +501,7 @@ fn photographs_with_codes_of_their_own_have_no_figure() {
         let view = json!({ "eye": { "photograph": number }, "size": [SIZE, SIZE], "compared": true });
         page.look(number as u32, &view).pop().unwrap().0["compared"].clone()
     };
-    assert_eq!(compared(1), json!([1, null]));
+    assert_eq!(compared(1), json!([1, null, false]));
     let [seen, expected] = [&compared(8)[1], &scores["per_view"][0]["psnr"]].map(|x| x.as_f64().unwrap());
     assert!((seen - expected).abs() < 0.02, "{seen} {expected}");
 }

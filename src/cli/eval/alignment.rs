@@ -42,7 +42,8 @@ impl Alignment {
             }
             return Ok(Alignment::Learned);
         }
-        data.frames.iter_mut().for_each(|frame| frame.camera = model.other_camera(&frame.camera));
+        let given: Vec<_> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
+        data.frames.iter_mut().zip(model.other_cameras(&given)).for_each(|(frame, camera)| frame.camera = camera);
         Ok(match refine.placement(&model.params) {
             Some(_) => Alignment::Similarity,
             None if refine.has_poses() => Alignment::None,

@@ -158,12 +158,10 @@ impl FlightArgs {
                         path.frames(self.count(usual, fps)?)
                     }
                 };
-                let camera = |key: &Key| {
-                    let camera = extent.placement.camera(&key.camera(usual));
-                    // Where the model has found that to be, but with the lens that the file says.
-                    Camera { pose: model.other_camera(&camera).pose, ..camera }
-                };
-                (keys.iter().map(camera).collect(), usual, fps)
+                let given: Vec<Camera> = keys.iter().map(|key| extent.placement.camera(&key.camera(usual))).collect();
+                // Where the model has found that to be, but with the lens that the file says.
+                let found = model.other_cameras(&given).into_iter().zip(given);
+                (found.map(|(found, camera)| Camera { pose: found.pose, ..camera }).collect(), usual, fps)
             }
         };
         let size = match (self.size, self.aspect) {

@@ -274,8 +274,9 @@ pub struct Made {
     pub halvings: u32,
     /// How long it took.
     pub milliseconds: f64,
-    /// The photograph that it is compared with, if it is, and their PSNR in dB; none where evaluations would leave something out.
-    pub compared: Option<(usize, Option<f64>)>,
+    /// The photograph that it is compared with, if it is; their PSNR in dB at this size, of whole pictures and none where evaluations
+    /// would leave something out; and whether that is an evaluation's own.
+    pub compared: Option<(usize, Option<f64>, bool)>,
     /// The step of training.
     pub step: u64,
 }

@@ -100,9 +100,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     let mut painter = Painter::new(hub.clone(), album, Some(Shelf::new(run, model.clone())));
     loop {
-        if !painter.work(&model, 0) {
-            hub.wait(Duration::from_secs(1));
-        }
+        painter.work_or_wait(&model, 0, Duration::from_secs(1));
     }
 }
 
@@ -150,13 +148,34 @@ fn taken(run: &Run, model: &Model<f32>, album: Option<&Album>) -> Taken {
     // As cameras of files are taken to where the model has them: where they are given, and from there by what it has learned.
     let learned = model.refine.as_ref().and_then(|refine| refine.placement(&model.params)).unwrap_or_default();
     Taken {
-        to_capture: rows(&(inverse(&run.config.extent.placement) * inverse(&learned))),
+        to_capture: rows(&to_capture(&run.config.extent.placement, &learned)),
         photographs: album.map_or(vec![], |album| album.about(model)),
     }
+}
+
+/// From the scene to a capture that was placed in it and has moved since as a whole.
+fn to_capture(placement: &Placement, learned: &Placement) -> DAffine3 {
+    inverse(placement) * inverse(learned)
 }
 
 /// From the scene to what was placed in it.
 fn inverse(placement: &Placement) -> DAffine3 {
     let turn = placement.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(placement.scale.recip()));
     DAffine3 { matrix3: turn, translation: placement.origin }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_placed_and_has_moved_is_found_where_it_was() {
+        let placement =
+            Placement { rotation: DMat3::from_rotation_z(0.7), scale: 2.5, origin: DVec3::new(1.0, -2.0, 0.5) };
+        let learned =
+            Placement { rotation: DMat3::from_rotation_x(-0.3), scale: 0.8, origin: DVec3::new(0.1, 0.4, -0.2) };
+        let point = DVec3::new(3.0, 4.0, -5.0);
+        let found = to_capture(&placement, &learned).transform_point3(learned.point(placement.point(point)));
+        assert!(found.abs_diff_eq(point, 1e-12), "{found}");
+    }
 }

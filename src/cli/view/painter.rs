@@ -28,7 +28,7 @@ const RATE: f64 = 1e5;
 /// Weight of the latest piece in the rate that is expected of the next one.
 const LATEST: f64 = 0.5;
 /// At most so many times the size is halved: coarser pictures show nothing.
-const MOST_HALVINGS: u32 = 5;
+const MOST_HALVINGS: u32 = 7;
 /// A picture of more pixels is large, and at most so many of them are painted in turns: each has its memory.
 const LARGE: usize = 1 << 20;
 const MOST_LARGE: usize = 4;
@@ -63,7 +63,7 @@ struct Job {
     turn: u64,
     /// The step of training at which its picture was begun.
     begun: u64,
-    /// Whether the PSNR is that of an evaluation.
+    /// Whether evaluations compare the same.
     plain: bool,
     /// If it rests: since which step of training, and when.
     whole: Option<(u64, Instant)>,
@@ -98,7 +98,7 @@ impl Painter {
         waiting.sort_by_key(|i| (self.fresh && self.jobs[*i].turn == 0, self.jobs[*i].turn));
         let ready = waiting.into_iter().find_map(|i| self.prepare(i, model, step).map(|(own, step)| (i, own, step)));
         let Some((i, own, step)) = ready else { return false };
-        let (model, job) = (own.as_deref().unwrap_or(model), &mut self.jobs[i]);
+        let (learns, model, job) = (self.shelf.is_none(), own.as_deref().unwrap_or(model), &mut self.jobs[i]);
         let Some(parts) = &mut job.parts else { return false };
         self.fresh = job.turn == 0;
         self.turn += 1;
@@ -110,27 +110,42 @@ impl Painter {
         };
         let view = job.target.view();
         let rate = self.rates.entry((view.show, view.skip)).or_insert(RATE);
-        let start = Instant::now();
-        if parts.paint(view, model, *rate, &wanted).is_none() {
-            return true;
+        // What is kept is of one step.
+        let whole = learns && matches!(job.target, Target::Save(_));
+        loop {
+            let start = Instant::now();
+            let painted = parts.paint(view, model, *rate, &wanted);
+            let spent = start.elapsed();
+            job.spent += spent;
+            if painted.is_none() {
+                // It would have been no quicker to the end.
+                *rate = rate.min(speed(parts.asked(), job.spent));
+                return true;
+            }
+            parts.pace(spent);
+            if !whole || parts.is_whole() {
+                break;
+            }
         }
-        let spent = start.elapsed();
-        job.spent += spent;
-        parts.pace(spent);
-        if parts.rows == parts.camera.height {
+        if parts.is_whole() {
             // Of the whole picture: where there is nothing, rays are quick.
-            let rays = parts.camera.width * parts.camera.height;
-            let now = rays as f64 / job.spent.as_secs_f64().max(1e-6);
+            let now = speed(parts.camera.width * parts.camera.height, job.spent);
             *rate = expected(*rate, now);
-            // While a model learns, pictures are seen again rather than made ever finer.
             let soon = halvings(view.size, now, AGAIN.as_secs_f64());
-            job.deliver(hub, step);
-            match job.halvings {
-                finer if finer > 0 && (job.begun == step || finer > soon) => job.begin(finer - 1),
-                _ => job.rest(step),
+            job.deliver(hub, self.album.as_deref(), step);
+            match finer(job.halvings, job.begun == step, soon) {
+                Some(halvings) => job.begin(halvings),
+                None => job.rest(step),
             }
         }
         true
+    }
+
+    /// Paints the next piece, or waits for so long until something is asked for.
+    pub fn work_or_wait(&mut self, model: &Model<f32>, step: u64, most: Duration) {
+        if !self.work(model, step) {
+            self.hub.wait(most);
+        }
     }
 
     /// Begins a picture if all that it takes is here; gives the model that it shows, if that is not the one at hand, and its step.
@@ -138,7 +153,7 @@ impl Painter {
         let view = self.jobs[i].target.view();
         let unknown = match (&view.eye, &self.album) {
             (Eye::Photograph(_), None) => true,
-            (Eye::Photograph(number), Some(album)) => album.camera(*number, model).is_none(),
+            (Eye::Photograph(number), Some(album)) => !album.has(*number),
             (Eye::Free { .. }, album) => view.compared && album.is_none(),
         };
         if unknown {
@@ -146,6 +161,12 @@ impl Painter {
         }
         if self.shelf.is_none() && view.checkpoint.is_some() {
             return self.refuse(i, "checkpoints are looked at when training has ended");
+        }
+        if self.shelf.is_none() && !matches!(view.skip, None | Some(Skip::Off)) {
+            return self.refuse(
+                i,
+                "what hardly shows is left out when training has ended; until then, all is shown, or what training has",
+            );
         }
         let (own, step) = match (&self.shelf, Which::of(view)) {
             (Some(shelf), which) => match shelf.get(which, &self.hub) {
@@ -175,9 +196,8 @@ impl Painter {
             // Where evaluations leave out or correct something, or give a photograph its own code, a figure would be another than
             // theirs.
             let own = |number| self.album.as_ref().is_some_and(|album| album.is_special(number, model));
-            let plain = model.tone.is_none() && !number.is_some_and(own);
+            job.plain = model.tone.is_none() && !number.is_some_and(own);
             (job.parts, job.begun) = (Some(Parts::new(camera, number.is_some(), size, truth, model)), step);
-            job.plain = plain;
         }
         Some((own, step))
     }
@@ -256,9 +276,20 @@ impl Painter {
     }
 }
 
-/// Rays a second that are expected after it was `rate`, and `now` lately.
+/// Rays a second that are expected after it was `rate`, and `now` lately: between them by factors, as both can be far off.
 fn expected(rate: f64, now: f64) -> f64 {
-    rate + LATEST * (now - rate)
+    rate * (now / rate).powf(LATEST)
+}
+
+/// Rays a second.
+fn speed(rays: usize, spent: Duration) -> f64 {
+    rays as f64 / spent.as_secs_f64().max(1e-6)
+}
+
+/// How often the next picture's size is halved, if there is one, after one that was halved so often; of a model that learns meanwhile,
+/// none that is finer than what there is time for `soon`: it is rather seen again.
+fn finer(halvings: u32, is_still: bool, soon: u32) -> Option<u32> {
+    (halvings > 0 && (is_still || halvings > soon)).then(|| halvings - 1)
 }
 
 /// How many rows of so many rays there is time for.
@@ -299,9 +330,14 @@ impl Job {
     }
 
     /// Gives away a picture whose rows are all painted.
-    fn deliver(&mut self, hub: &Hub, step: u64) {
+    fn deliver(&mut self, hub: &Hub, album: Option<&Album>, step: u64) {
         let Some(Parts { truth, color, .. }) = &self.parts else { return };
-        let compared = truth.as_ref().map(|(number, truth)| (*number, self.plain.then(|| psnr(color, truth))));
+        // Of a picture that is whole, and of one step.
+        let plain = self.plain && self.halvings == 0 && self.begun == step;
+        let is_evaluated =
+            |number| plain && album.is_some_and(|album| album.is_evaluated_at(number, [color.width, color.height]));
+        let compared =
+            truth.as_ref().map(|(number, truth)| (*number, plain.then(|| psnr(color, truth)), is_evaluated(*number)));
         let error = truth.as_ref().map(|(_, truth)| colormap::error_map(color, truth));
         let image = error.as_ref().unwrap_or(color);
         let milliseconds = 1e3 * self.spent.as_secs_f64();
@@ -337,6 +373,15 @@ impl Parts {
         let background = model.config.background.shown();
         let truth = truth.map(|(number, photo)| (number, at_size(&photo, [width, height], background)));
         Parts { color: Image::new(camera.width, camera.height, 3), camera, truth, rows: 0, band: 0 }
+    }
+
+    /// How many rays were asked for so far, those of the rows at hand too.
+    fn asked(&self) -> usize {
+        self.camera.width * (self.rows + self.band).min(self.camera.height)
+    }
+
+    fn is_whole(&self) -> bool {
+        self.rows == self.camera.height
     }
 
     fn is_large(&self) -> bool {
@@ -404,14 +449,20 @@ fn normals(
 
 #[cfg(test)]
 mod tests {
-    use raygrad::nerf::{Config, Extent, Preset};
+    use raygrad::nerf::sampling::marching::MarchingConfig;
+    use raygrad::nerf::{Config, Extent, InstantConfig, Preset};
     use serde_json::json;
+
+    use super::super::hub::Outbox;
 
     use super::*;
 
     #[test]
     fn what_was_slow_lately_is_expected_to_be_slower() {
-        assert_eq!([expected(1e5, 3e5), expected(1e5, 1e5), expected(2e5, 1e5)], [2e5, 1e5, 1.5e5]);
+        let rates = [expected(1e5, 4e5), expected(1e5, 1e5), expected(1e5, 1e3), speed(300, Duration::from_millis(20))];
+        for (rate, wanted) in rates.into_iter().zip([2e5, 1e5, 1e4, 1.5e4]) {
+            assert!((rate / wanted - 1.0).abs() < 1e-12, "{rate} {wanted}");
+        }
     }
 
     #[test]
@@ -441,16 +492,167 @@ mod tests {
     }
 
     #[test]
+    fn what_is_quick_or_stands_still_gets_finer() {
+        // Of a model that stands still, to the whole; of one that learns, what there is time for soon.
+        let all =
+            [(3, true, 5), (1, true, 0), (0, true, 0), (3, false, 2), (3, false, 3), (3, false, 5), (0, false, 0)];
+        let expected = [Some(2), Some(0), None, Some(2), None, None, None];
+        assert_eq!(all.map(|(halvings, is_still, soon)| finer(halvings, is_still, soon)), expected);
+    }
+
+    /// From this far to the right, looking at the scene.
+    fn free(x: f64, size: [u32; 2]) -> View {
+        let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
+        serde_json::from_value(json!({ "eye": { "free": { "pose": pose, "fov": 50.0 } }, "size": size })).unwrap()
+    }
+
+    fn fog() -> Model<f32> {
+        let mut config = Config::preset(Preset::Instant);
+        config.sampler.get_mut::<MarchingConfig>().unwrap().occupancy.resolution = 16;
+        config.field.get_mut::<InstantConfig>().unwrap().grid.log2_table = 6;
+        // So thick that what is left out shows.
+        let extent = Extent { unit: 0.02, ..Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.1, 9.0]) };
+        Model::new(config, extent, 0).unwrap()
+    }
+
+    /// A painter of one page that wants to see this, and what that page gets.
+    fn painter(view: View) -> (Painter, u64, Arc<Outbox>) {
+        let hub = Arc::new(Hub::default());
+        let (client, outbox) = hub.join(9).unwrap();
+        hub.wish(client, 1, view);
+        (Painter::new(hub, None, None), client, outbox)
+    }
+
+    fn text(outbox: &Outbox) -> String {
+        match outbox.take() {
+            Some(Outgoing::Text(text)) => text,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn large_pictures_are_painted_a_few_at_a_time() {
+        let (mut painter, _, _) = painter(free(0.0, [1100, 1000]));
+        for x in 1..5 {
+            let (client, _) = painter.hub.join(9).unwrap();
+            painter.hub.wish(client, 1, free(f64::from(x), [1100, 1000]));
+        }
+        painter.rates.insert((Show::Color, None), 1e12);
+        let model = fog();
+        painter.sync(0);
+        let begun = |painter: &mut Painter| (0..5).map(|i| painter.prepare(i, &model, 0).is_some()).collect::<Vec<_>>();
+        assert_eq!(begun(&mut painter), [true, true, true, true, false]);
+        painter.jobs[1].begin(0);
+        assert!(painter.prepare(4, &model, 0).is_some() && painter.prepare(1, &model, 0).is_none());
+        // One that is small has room beside them.
+        let (client, _) = painter.hub.join(9).unwrap();
+        painter.hub.wish(client, 1, free(9.0, [1024, 1024]));
+        painter.sync(0);
+        assert!(painter.prepare(5, &model, 0).is_some());
+        painter.clear();
+        assert!(painter.jobs.is_empty());
+    }
+
+    #[test]
+    fn what_cannot_be_seen_is_said_and_the_rest_is_seen() {
+        let model = fog();
+        for (change, expected) in [
+            (json!({ "compared": true }), "no such photograph"),
+            (json!({ "eye": { "photograph": 0 } }), "no such photograph"),
+            (json!({ "checkpoint": 3 }), "training has ended"),
+            (json!({ "skip": "fast" }), "training has ended"),
+            (json!({ "skip": "lossless" }), "training has ended"),
+        ] {
+            let mut view = json!({ "eye": { "free": { "pose": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]], "fov": 50 } }, "size": [8, 8] });
+            view.as_object_mut().unwrap().extend(change.as_object().unwrap().clone());
+            let (mut painter, _, outbox) = painter(serde_json::from_value(view).unwrap());
+            assert!(!painter.work(&model, 0));
+            let said = text(&outbox);
+            assert!(said.contains(expected), "{change}: {said}");
+        }
+        for skip in [None, Some(Skip::Off)] {
+            let (mut painter, _, outbox) = painter(View { skip, ..free(0.0, [8, 8]) });
+            assert!(painter.work(&model, 0) && matches!(outbox.take(), Some(Outgoing::Bytes(_))));
+        }
+    }
+
+    #[test]
+    fn a_picture_says_how_it_was_made_and_what_is_expected_follows() {
+        let model = fog();
+        let (mut painter, _, outbox) = painter(free(0.0, [48, 36]));
+        painter.rates.insert((Show::Color, None), 1e6);
+        while painter.jobs.first().is_none_or(|job| job.whole.is_none()) {
+            assert!(painter.work(&model, 7));
+        }
+        let Some(Outgoing::Bytes(bytes)) = outbox.take() else { panic!("no picture") };
+        let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
+        let head: serde_json::Value = serde_json::from_slice(&bytes[4..4 + length]).unwrap();
+        assert_eq!(json!([head["step"], head["halvings"], head["compared"]]), json!([7, 0, null]));
+        let now = 48.0 * 36.0 / (1e-3 * head["milliseconds"].as_f64().unwrap());
+        let rate = painter.rates[&(Show::Color, None)];
+        assert!((rate / expected(1e6, now) - 1.0).abs() < 1e-9, "{rate} {now}");
+    }
+
+    #[test]
+    fn what_is_kept_while_a_model_learns_is_of_one_step() {
+        let (mut painter, client, outbox) = painter(free(0.0, [8, 8]));
+        painter.hub.rest(client);
+        painter.hub.save(client, free(0.0, [16, 64]));
+        // A row at a time, as far as is known.
+        painter.rates.insert((Show::Color, None), 1.0);
+        assert!(painter.work(&fog(), 7));
+        assert!(matches!(outbox.take(), Some(Outgoing::Bytes(_))));
+    }
+
+    #[test]
+    fn a_piece_is_as_large_as_there_is_time_for_and_shows_what_is_asked_for() {
+        let model = fog();
+        let painted = |view: &View, rate: f64| {
+            let Eye::Free { pose, fov } = &view.eye else { panic!() };
+            let camera = View::camera(pose, *fov, view.size.map(|side| side as usize));
+            let mut parts = Parts::new(camera, false, view.size.map(|side| side as usize), None, &model);
+            parts.paint(view, &model, rate, &|| true).unwrap();
+            parts
+        };
+        let view = free(0.0, [64, 48]);
+        let parts = painted(&view, 12_800.0);
+        assert_eq!((parts.rows, parts.asked(), parts.is_whole()), (16, 64 * 32, false));
+        let whole = painted(&view, 1e9);
+        assert_eq!((whole.rows, whole.asked(), whole.is_whole()), (48, 64 * 48, true));
+        assert_eq!(parts.color.data[..3 * 64 * 16], whole.color.data[..3 * 64 * 16], "the upper rows of the same");
+        // All light, where that is asked for.
+        let seen = |view: &View| painted(view, 1e9).color;
+        let (usual, all) =
+            (model.view(&whole.camera, [1.0; 3]), model.view_within(&whole.camera, [1.0; 3], &Limits::NONE));
+        assert!(usual.color == seen(&view) && all.color == seen(&View { skip: Some(Skip::Off), ..view.clone() }));
+        assert!(usual.color != all.color, "the test is of what differs");
+        let nothing = View { crop: Some([[5.0; 3], [6.0; 3]]), background: Some([255, 51, 0]), ..view };
+        assert_eq!(seen(&nothing).data[..3], [1.0, 0.2, 0.0]);
+    }
+
+    #[test]
+    fn who_paints_waits_where_there_is_nothing_to_paint() {
+        let model = fog();
+        let (mut painter, client, _outbox) = painter(free(0.0, [8, 8]));
+        let took = |painter: &mut Painter, most: u64| {
+            let start = Instant::now();
+            painter.work_or_wait(&model, 0, Duration::from_millis(most));
+            start.elapsed()
+        };
+        assert!(took(&mut painter, 60_000) < Duration::from_secs(30), "there is");
+        painter.hub.rest(client);
+        painter.hub.wait(Duration::ZERO);
+        assert!(took(&mut painter, 30) >= Duration::from_millis(30));
+    }
+
+    #[test]
     fn pictures_are_painted_in_turns() {
         let hub = Arc::new(Hub::default());
         for number in 0..2 {
             let (client, _outbox) = hub.join(2).unwrap();
-            let pose = [[1.0, 0.0, 0.0, f64::from(number)], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
-            let view = json!({ "eye": { "free": { "pose": pose, "fov": 50.0 } }, "size": [512, 512], "show": "color" });
-            hub.wish(client, 1, serde_json::from_value(view).unwrap());
+            hub.wish(client, 1, free(f64::from(number), [512, 512]));
         }
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.1, 9.0]);
-        let model = Model::new(Config::preset(Preset::Instant), extent, 0).unwrap();
+        let model = fog();
         let mut painter = Painter::new(hub, None, None);
         // So slow, as far as is known, that a piece is a row at first, and never all.
         painter.rates.insert((Show::Color, None), 1.0);

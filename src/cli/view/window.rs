@@ -30,6 +30,8 @@ const CAMERAS: Duration = Duration::from_secs(5);
 const ALONE: Duration = Duration::from_secs(60);
 /// How long a page may be gone, after training, that is loaded anew.
 const GONE: Duration = Duration::from_secs(3);
+/// How long it waits for something to paint while training is held or has ended.
+const WAIT: Duration = Duration::from_millis(200);
 /// Points of a curve, after which every second one is dropped.
 const POINTS: usize = 240;
 
@@ -39,13 +41,34 @@ pub struct Window {
     hub: Arc<Hub>,
     album: Option<Arc<Album>>,
     painter: Painter,
-    /// When it last let training go on, and how many seconds of painting training owes it.
-    since: Instant,
+    /// Seconds of training of which pictures have had their share, and how many seconds of painting training owes them.
+    trained: f64,
     credit: f64,
-    told: Instant,
-    /// Where photographs were when pages were told last, and when that was.
-    taken: (Taken, Instant),
+    told: Rhythm,
+    /// Where photographs were when pages were told last, and how often they are told.
+    taken: (Taken, Rhythm),
     curves: Curves,
+}
+
+/// What happens again and again, no sooner than after so long.
+struct Rhythm {
+    each: Duration,
+    last: Instant,
+}
+
+impl Rhythm {
+    fn new(each: Duration, last: Instant) -> Self {
+        Rhythm { each, last }
+    }
+
+    /// Whether it is to happen now: then it has.
+    fn is_due(&mut self, now: Instant) -> bool {
+        let due = now.saturating_duration_since(self.last) >= self.each;
+        if due {
+            self.last = now;
+        }
+        due
+    }
 }
 
 /// How training went, at every so many steps.
@@ -70,32 +93,35 @@ impl Window {
         let link = server::serve(listener, hub.clone(), album.clone(), None, trainer.model.config.background.shown())?;
         print(&format!("view     {link}\n"))?;
         let (painter, now) = (Painter::new(hub.clone(), album.clone(), None), Instant::now());
-        let taken = (taken(run, &trainer.model, album.as_deref()), now);
+        let taken = (taken(run, &trainer.model, album.as_deref()), Rhythm::new(CAMERAS, now));
         let curves = Curves { every: 1, points: vec![] };
-        Ok(Window { run: run.clone(), hub, album, painter, since: now, credit: 0.0, told: now, taken, curves })
+        let (trained, told) = (trainer.stats().train_seconds, Rhythm::new(TOLD, now));
+        Ok(Window { run: run.clone(), hub, album, painter, trained, credit: 0.0, told, taken, curves })
     }
 
     /// Called after each step; `left` says how many seconds of training there are. Paints for as long as its share is, and
     /// waits for as long as a page wants training to. Says whether a page wants it to end.
     pub fn step(&mut self, trainer: &Trainer, psnr: f64, left: f64) -> bool {
-        self.curves.step(&trainer.stats(), psnr);
-        if self.hub.connected() == 0 && !self.hub.paused() {
-            self.since = Instant::now();
+        let stats = trainer.stats();
+        self.curves.step(&stats, psnr);
+        // After a run went back, time has, too.
+        let trained = (stats.train_seconds - self.trained).max(0.0);
+        self.trained = stats.train_seconds;
+        if is_unseen(self.hub.connected(), self.hub.paused()) {
             self.painter.clear();
             return self.hub.stops();
         }
-        self.credit = credit(self.credit, self.since.elapsed().as_secs_f64(), self.hub.share());
-        let step = trainer.stats().step;
-        while self.credit > 0.0 {
+        self.credit = credit(self.credit, trained, self.hub.share());
+        while is_owed(self.credit) && !self.is_over() {
             let start = Instant::now();
-            if !self.painter.work(&trainer.model, step) {
+            if !self.painter.work(&trainer.model, stats.step) {
                 break;
             }
             self.credit -= start.elapsed().as_secs_f64();
         }
         self.tell(trainer, psnr, left, None, false);
         let (mut waits, mut alone) = (false, Alone::default());
-        while self.hub.paused() && !self.hub.stops() && !interrupt::requested() {
+        while self.hub.paused() && !self.is_over() {
             if !waits {
                 self.tell(trainer, psnr, left, None, true);
                 note("training waits: a page has paused it");
@@ -104,17 +130,19 @@ impl Window {
             if alone.is_longer(self.hub.connected(), ALONE) {
                 self.hub.pause(false);
             }
-            if !self.painter.work(&trainer.model, step) {
-                self.hub.wait(Duration::from_millis(200));
-            }
+            self.painter.work_or_wait(&trainer.model, stats.step, WAIT);
             self.tell(trainer, psnr, left, None, false);
         }
-        if waits {
+        if waits && !self.is_over() {
             note("training goes on");
             self.tell(trainer, psnr, left, None, true);
         }
-        self.since = Instant::now();
         self.hub.stops()
+    }
+
+    /// Whether training is to end.
+    fn is_over(&self) -> bool {
+        self.hub.stops() || interrupt::requested()
     }
 
     /// Tells pages that training has ended, and how; and shows them the scene until the last one has gone.
@@ -137,18 +165,15 @@ impl Window {
         }
         let mut alone = Alone::default();
         while !interrupt::requested() && !alone.is_longer(self.hub.connected(), GONE) {
-            if !self.painter.work(&trainer.model, stats.step) {
-                self.hub.wait(Duration::from_millis(200));
-            }
+            self.painter.work_or_wait(&trainer.model, stats.step, WAIT);
             self.tell(trainer, stats.psnr, 0.0, Some(how), false);
         }
     }
 
     fn tell(&mut self, trainer: &Trainer, psnr: f64, left: f64, ended: Option<&str>, now: bool) {
-        if !now && self.told.elapsed() < TOLD {
+        if !self.told.is_due(Instant::now()) && !now {
             return;
         }
-        self.told = Instant::now();
         self.tell_taken(&trainer.model);
         let stats = trainer.stats();
         let curve = |of: fn(&Point) -> f64| self.curves.points.iter().map(of).collect::<Vec<f64>>();
@@ -166,16 +191,16 @@ impl Window {
 
     /// Tells pages where photographs were taken, if more of that is known by now.
     fn tell_taken(&mut self, model: &Model<f32>) {
-        let (known, when) = &self.taken;
-        if when.elapsed() < CAMERAS {
+        let (known, rhythm) = &mut self.taken;
+        if model.refine.is_none() || !rhythm.is_due(Instant::now()) {
             return;
         }
         let now = taken(&self.run, model, self.album.as_deref());
         if now != *known {
             self.hub.introduce(about(&self.run, model, self.album.as_deref(), None));
             self.hub.tell(&server::text(&Tell::Taken(now.clone())));
+            *known = now;
         }
-        self.taken = (now, Instant::now());
     }
 }
 
@@ -192,6 +217,16 @@ impl Alone {
         }
         self.0.get_or_insert_with(Instant::now).elapsed() > limit
     }
+}
+
+/// Whether nobody looks, and nobody has held training.
+fn is_unseen(pages: usize, paused: bool) -> bool {
+    pages == 0 && !paused
+}
+
+/// Whether training owes pictures time.
+fn is_owed(credit: f64) -> bool {
+    credit > 0.0
 }
 
 /// The seconds of painting that training owes after it had so many for itself: pictures are to get their share of both. What was
@@ -226,6 +261,25 @@ mod tests {
         assert_eq!(credit(0.0, 1.0, 0.5), 1.0);
         assert!((credit(0.0, 1.0, 0.1) - 1.0 / 9.0).abs() < 1e-12);
         assert_eq!([credit(0.0, 1.0, 0.0), credit(9.0, 0.0, 0.5), credit(-9.0, 0.0, 0.5)], [0.0, MOST_CREDIT, -9.0]);
+    }
+
+    #[test]
+    fn nothing_is_painted_for_nobody_and_nothing_that_is_not_owed() {
+        let all = [(0, false), (0, true), (1, false), (1, true)].map(|(pages, paused)| is_unseen(pages, paused));
+        assert_eq!(all, [true, false, false, false]);
+        assert_eq!([0.0, 1e-9, -1e-9].map(is_owed), [false, true, false]);
+    }
+
+    #[test]
+    fn what_happens_again_happens_after_its_time_and_once() {
+        let begun = Instant::now();
+        let mut rhythm = Rhythm::new(Duration::from_secs(5), begun);
+        let at = |seconds: f64| begun + Duration::from_secs_f64(seconds);
+        assert_eq!(
+            [4.9, 5.0, 5.1, 9.9, 10.1].map(|seconds| rhythm.is_due(at(seconds))),
+            [false, true, false, false, true]
+        );
+        assert!(!rhythm.is_due(begun), "clocks of threads may differ a little");
     }
 
     #[test]

@@ -225,8 +225,8 @@ async function draw(head, blob) {
   layout();
   let text = `${shown.size.join("×")}${whole ? "" : " (coarse)"} · ${head.milliseconds.toFixed(0)} ms`;
   if (head.compared) {
-    const [number, psnr] = head.compared;
-    text += ` · against ${about.photographs[number].name}: ${digits(psnr, 2)} dB`;
+    const [number, psnr, evaluated] = head.compared;
+    text += ` · against ${about.photographs[number].name}: ${evaluated || psnr === null ? "" : "about "}${digits(psnr, 2)} dB`;
   }
   if (about.training || head.step > 0) text += ` · step ${head.step}`;
   $("status").textContent = text;
