@@ -4,6 +4,7 @@
 
 use std::fs;
 use std::io::{ErrorKind, Read};
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result, Trainer, write_atomic};
@@ -23,7 +24,9 @@ fn folder(run: &Run) -> PathBuf {
 }
 
 /// How many stay if nothing is said: if the last is damaged, there is the one before.
-pub const KEPT: usize = 2;
+pub const KEPT: usize = *MAY_STAY.start();
+/// How many may stay.
+pub const MAY_STAY: RangeInclusive<usize> = 2..=1 << 14;
 
 /// Writes where training is, and removes all others but the last, as many as the run keeps with this.
 pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
@@ -32,14 +35,9 @@ pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {
     let step = trainer.stats().step;
     write_atomic(folder.join(format!("{step:08}.checkpoint")), &framed(&trainer.state()?))?;
     // What is said to be later was damaged, and passed over.
-    let (later, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
-    remove(
-        &later
-            .into_iter()
-            .chain(others.into_iter().skip(run.config.keep_checkpoints))
-            .map(|(_, path)| path)
-            .collect::<Vec<_>>(),
-    );
+    let (mut surplus, others): (Vec<_>, Vec<_>) = all(&folder)?.into_iter().partition(|(own, _)| *own > step);
+    surplus.extend(others.into_iter().skip(run.config.keep_checkpoints));
+    remove(&surplus.into_iter().map(|(_, path)| path).collect::<Vec<_>>());
     Ok(())
 }
 

@@ -1,5 +1,6 @@
 //! Values on the command line: counts, durations and image sizes.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use clap::builder::{RangedU64ValueParser, TypedValueParser};
@@ -10,9 +11,9 @@ pub fn count(most: usize) -> impl TypedValueParser<Value = usize> {
     RangedU64ValueParser::<usize>::new().range(1..=most as u64)
 }
 
-/// A whole number from 2.
-pub fn at_least_two() -> impl TypedValueParser<Value = usize> {
-    RangedU64ValueParser::<usize>::new().range(2..=1 << 14)
+/// A whole number of these.
+pub fn within(numbers: RangeInclusive<usize>) -> impl TypedValueParser<Value = usize> {
+    RangedU64ValueParser::<usize>::new().range(*numbers.start() as u64..=*numbers.end() as u64)
 }
 
 /// A duration such as `90s`, `10m` or `1.5h`.
@@ -36,7 +37,7 @@ pub fn duration(text: &str) -> Result<Duration, String> {
 pub const LARGEST: usize = 16384;
 
 /// Frames a second that files of films can say.
-pub const FPS: std::ops::RangeInclusive<f64> = 0.01..=240.0;
+pub const FPS: RangeInclusive<f64> = 0.01..=240.0;
 
 /// Frames a second.
 pub fn fps(text: &str) -> Result<f64, String> {

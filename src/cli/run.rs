@@ -1,5 +1,5 @@
 //! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`, `lock`, if it
-//! was asked for `tensorboard/`, and later results of `raygrad eval` and pictures.
+//! was asked for `tensorboard/`, and later results of `raygrad eval`, pictures, and the films of `raygrad view` in `films/`.
 
 use std::fs::{DirEntry, File};
 use std::io::ErrorKind;
@@ -171,6 +171,11 @@ impl RunConfig {
         let [near, far] = self.extent.span;
         if !(near >= 0.0 && near < far && far.is_finite()) {
             return Err(Error::setting("extent.span", format!("{near} to {far} is no span")));
+        }
+        let kept = self.keep_checkpoints;
+        if !checkpoint::MAY_STAY.contains(&kept) {
+            let (fewest, most) = checkpoint::MAY_STAY.into_inner();
+            return Err(Error::setting("keep_checkpoints", format!("must be from {fewest} to {most}, is {kept}")));
         }
         self.config.check()?;
         self.viewpoint.check()

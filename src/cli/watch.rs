@@ -120,7 +120,7 @@ impl<'a> Watch<'a> {
             let logged = self.log(&stats);
             self.warn(logged);
         }
-        let (fraction, left) = self.remaining(&stats);
+        let (fraction, left) = remaining(self.budget, &stats);
         self.progress.set(fraction, || {
             let speed = stats.rays as f64 / stats.train_seconds;
             let StepStats { step, loss, .. } = stats;
@@ -262,20 +262,20 @@ impl<'a> Watch<'a> {
     /// The PSNR that is shown, and the seconds of training that are left.
     pub fn shown(&self, trainer: &Trainer) -> (f64, f64) {
         let stats = trainer.stats();
-        (self.psnr.unwrap_or(stats.psnr), self.remaining(&stats).1)
+        (self.psnr.unwrap_or(stats.psnr), remaining(self.budget, &stats).1)
     }
+}
 
-    /// Share of the run that is done, and the seconds of training that are left.
-    fn remaining(&self, stats: &StepStats) -> (f64, f64) {
-        match self.budget {
-            Budget::Time(time) => {
-                let total = time.as_secs_f64();
-                (stats.train_seconds / total, (total - stats.train_seconds).max(0.0))
-            }
-            Budget::Steps(steps) => {
-                let left = steps.saturating_sub(stats.step) as f64;
-                (stats.step as f64 / steps as f64, left * stats.train_seconds / stats.step as f64)
-            }
+/// Share of a run that is done, and the seconds of training that are left.
+fn remaining(budget: Budget, stats: &StepStats) -> (f64, f64) {
+    match budget {
+        Budget::Time(time) => {
+            let total = time.as_secs_f64();
+            (stats.train_seconds / total, (total - stats.train_seconds).max(0.0))
+        }
+        Budget::Steps(steps) => {
+            let left = steps.saturating_sub(stats.step) as f64;
+            (stats.step as f64 / steps as f64, left * stats.train_seconds / stats.step as f64)
         }
     }
 }
@@ -350,6 +350,15 @@ mod tests {
         {
             assert_eq!(kept_metrics(&path, step).unwrap(), (lines(&expected), expected.last().copied().unwrap_or(0)));
         }
+    }
+
+    #[test]
+    fn what_is_left_follows_from_what_was_done() {
+        let stats = StepStats { step: 40, train_seconds: 8.0, ..StepStats::default() };
+        assert_eq!(remaining(Budget::Steps(200), &stats), (0.2, 32.0));
+        assert_eq!(remaining(Budget::Steps(20), &stats), (2.0, 0.0));
+        assert_eq!(remaining(Budget::Time(Duration::from_secs(32)), &stats), (0.25, 24.0));
+        assert_eq!(remaining(Budget::Time(Duration::from_secs(4)), &stats), (2.0, 0.0));
     }
 
     #[test]

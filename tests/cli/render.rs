@@ -5,7 +5,7 @@ use raygrad::nerf::dataset::scene::ANGLE_X;
 use raygrad::nerf::dataset::{Capture, Depths, Split};
 use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::{Camera, Config, Extent, Image, Model};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -104,6 +104,27 @@ fn paths_lie_where_the_scene_does() {
     std::fs::write(place.path("path.json"), path.to_string()).unwrap();
     place.succeeds("render run --path path.json --out path");
     assert!(apart(&png(&place.path("path/0000.png")), &expected) <= 1.0);
+    // One that says so itself needs no word about it.
+    let said = |path: &Value, flags: &str| {
+        std::fs::write(place.path("path.json"), path.to_string()).unwrap();
+        let output = place.command(&format!("render run --path path.json {flags} --out said")).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let mut own = path.clone();
+    own["coordinates"] = json!("capture");
+    for (path, is_told) in [(&path, true), (&own, false)] {
+        let (code, said) = said(path, "");
+        assert!(code == Some(0) && said.contains("is taken to be in the capture's coordinates") == is_told, "{said}");
+        assert!(apart(&png(&place.path("said/0000.png")), &expected) <= 1.0);
+    }
+    let (code, words) = said(&own, "--path-transform path.json");
+    assert!(
+        code == Some(1) && words.contains("`coordinates`") && words.contains("leave --path-transform out"),
+        "{words}"
+    );
+    own["coordinates"] = json!("scene");
+    let (code, words) = said(&own, "");
+    assert!(code == Some(1) && words.contains("path.json") && words.contains("`scene`, expected `capture`"), "{words}");
 
     // In nerfstudio's own coordinates, of a file whose coordinates are not those of before either.
     place.succeeds("prepare scene --to nerfstudio --out captured");

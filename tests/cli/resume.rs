@@ -96,11 +96,26 @@ fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() 
     // That it is at its end is no error.
     place.succeeds("train --resume run");
     assert_same(&place, "whole", "run");
-    let said = place.succeeds("train --resume run --steps 220");
+    let kept = |place: &Place| place.json("run/config.json")["keep_checkpoints"].clone();
+    assert_eq!(kept(&place), 2);
+    let said = place.succeeds("train --resume run --steps 220 --keep-checkpoints 3");
+    assert_eq!((kept(&place), checkpoints(&place, "run").len()), (3.into(), 3));
     assert!(said.contains("from     step 200\n") && said.contains("trained  220 steps"), "{said}");
     assert_eq!(metrics(&place, "run").last().unwrap()["step"], 220);
     assert_eq!(metrics(&place, "run")[..21], metrics(&place, "whole")[..]);
     assert_eq!(place.json("run/config.json")["budget"]["steps"], 220);
+    // As many stay from then on; none at all would leave nothing to go on from.
+    place.succeeds("train --resume run --steps 221");
+    assert_eq!((kept(&place), checkpoints(&place, "run").len()), (3.into(), 3));
+    for (number, goes) in [(2, true), (16384, true), (0, false), (1, false), (16385, false)] {
+        let mut config = place.json("run/config.json");
+        config["keep_checkpoints"] = number.into();
+        std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+        match goes {
+            true => drop(place.succeeds("train --resume run")),
+            false => place.fails("train --resume run", &["config.json", "`keep_checkpoints`", "2 to 16384"]),
+        }
+    }
 }
 
 #[test]

@@ -91,6 +91,28 @@ mod tests {
     }
 
     #[test]
+    fn a_jpeg_is_of_a_size_and_channels_that_it_may_have() {
+        for channels in [1, 3] {
+            // Even areas, of which nothing is lost but the last digits.
+            let data = [0.25, 0.75].iter().flat_map(|value| vec![*value; 8 * 8 * channels]).collect();
+            let jpeg = Image { width: 8, height: 16, channels, data }.to_jpeg(95);
+            let read = image::load_from_memory_with_format(&jpeg, image::ImageFormat::Jpeg).unwrap().to_rgb8();
+            assert_eq!((read.width(), read.height()), (8, 16));
+            for (row, expected) in [(0, 64_i32), (15, 191)] {
+                assert!(read.get_pixel(3, row).0.iter().all(|x| (i32::from(*x) - expected).abs() < 4), "{channels}");
+            }
+        }
+        let refused = |[width, height]: [usize; 2], channels: usize| {
+            let image = Image { width, height, channels, data: vec![] };
+            std::panic::catch_unwind(move || image.to_jpeg(90)).unwrap_err().downcast::<String>().unwrap()
+        };
+        for size in [[0, 1], [1, 0], [1 << 16, 1], [1, 1 << 16]] {
+            assert!(refused(size, 3).contains("is no JPEG"), "{size:?}");
+        }
+        assert!(refused([1, 1], 4).contains("1 or 3 channels"));
+    }
+
+    #[test]
     fn png_round_trip_is_exact_for_bytes() {
         let folder = tempfile::tempdir().unwrap();
         for channels in [3, 4] {

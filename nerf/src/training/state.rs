@@ -157,7 +157,8 @@ impl Trainer {
 }
 
 impl Model<f32> {
-    /// This model as it was when a trainer wrote a [state](Trainer::state), ready to be rendered.
+    /// This model as it was when a trainer wrote a [state](Trainer::state), ready to be rendered, with this one's
+    /// [`look`](Self::look) and what this one's views leave out: which is found out anew, as when a model is loaded.
     ///
     /// ```
     /// use raygrad_nerf::dataset::{Split, embedded};
@@ -243,6 +244,11 @@ mod tests {
         for id in expected.ids() {
             assert_eq!(earlier.params.get(id).as_slice(), expected.get(id).as_slice());
         }
+        // Views leave out as much as of a model that is finished.
+        let occupied = |model: &Model<f32>| model.marching().unwrap().view_grid().occupied_share();
+        let mut finished = earlier.clone();
+        finished.finish();
+        assert_eq!(occupied(&earlier), occupied(&finished));
         trainer.model.set_detail(0.25);
         assert_eq!(earlier.at_state(&trainer.state().unwrap()).unwrap().detail(), 0.25);
         assert!(earlier.at_state(b"nothing").is_err());
@@ -270,13 +276,21 @@ mod tests {
             (written(&|counts| counts.groups = 9), "lacks what an optimiser remembers"),
             (written(&|counts| counts.groups = 0), "groups"),
             (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),
+            (written(&|counts| counts.detail = 1.5), "a share of 1.5"),
+            (written(&|counts| counts.detail = -1.0), "a share of -1"),
         ];
+        // What does not move is a number that a run may have.
+        let still = written(&|counts| {
+            (counts.settings[0].rate, counts.settings[1].decay, counts.pace, counts.detail) = (0.0, 0.0, 0.0, 0.0);
+        });
         let before = trainer.state().unwrap();
         for (state, expected) in &states {
             let error = trainer.load_state(state).unwrap_err().to_string();
             assert!(error.contains(expected), "{error}");
         }
         assert!(trainer.state().unwrap() == before);
+        trainer.load_state(&still).unwrap();
+        assert_eq!((trainer.pace, trainer.model.detail()), (0.0, 0.0));
         trainer.load_state(&before).unwrap();
     }
 }

@@ -69,9 +69,15 @@ struct Nerfstudio {
     camera_path: Option<Vec<Shot>>,
     keyframes: Option<Value>,
     crop: Option<Value>,
-    /// `capture`, if it is in the capture's coordinates, which raygrad says.
-    #[serde(rename = "coordinates")]
-    _coordinates: Option<String>,
+    /// What it is in, if it says, as raygrad's do.
+    coordinates: Option<Coordinates>,
+}
+
+#[derive(Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Coordinates {
+    /// The capture's own.
+    Capture,
 }
 
 /// One frame.
@@ -167,11 +173,17 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
             "is no camera path: it has neither nerfstudio's `camera_path` or `keyframes` nor instant-ngp's `path`";
         return Err(Error::file(file, what));
     }
-    // As `raygrad view` writes it.
-    let own = document.get("coordinates").is_some_and(|of| of == "capture");
-    let to_capture = match transform {
-        None if own => DAffine3::IDENTITY,
-        None => {
+    let path: Nerfstudio = whole(file, document)?;
+    let to_capture = match (transform, path.coordinates) {
+        (None, Some(Coordinates::Capture)) => DAffine3::IDENTITY,
+        (Some(_), Some(Coordinates::Capture)) => {
+            return Err(Error::field(
+                file,
+                "coordinates",
+                "says that it is in the capture's: leave --path-transform out",
+            ));
+        }
+        (None, None) => {
             note(&format!(
                 "{}: is taken to be in the capture's coordinates; nerfstudio writes its own: say --path-transform with its \
                  dataparser_transforms.json",
@@ -179,9 +191,9 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
             ));
             DAffine3::IDENTITY
         }
-        Some(transform) => parse::<Dataparser>(transform)?.to_capture(transform, applied()?)?,
+        (Some(transform), None) => parse::<Dataparser>(transform)?.to_capture(transform, applied()?)?,
     };
-    nerfstudio(file, whole(file, document)?, &to_capture)
+    nerfstudio(file, path, &to_capture)
 }
 
 fn parse<T: DeserializeOwned>(file: &File) -> Result<T> {
