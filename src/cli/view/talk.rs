@@ -336,6 +336,13 @@ mod tests {
             ask(&page, film.clone());
             assert!(later(&page).await.contains("films"), "its folder is a file");
         }
+        // One of another page, which this one may end, too.
+        page.served.studio.as_ref().unwrap().claim().unwrap();
+        ask(&page, film.clone());
+        assert!(later(&page).await.contains("one is being made: wait"));
+        page.answer(Ask::EndFilm {});
+        ask(&page, film);
+        assert!(later(&page).await.contains("ends"));
     }
 
     #[test]
