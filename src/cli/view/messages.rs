@@ -13,6 +13,8 @@ use crate::cli::render::shown::Show;
 pub const LARGEST: u32 = 4096;
 /// Most pixels of a picture.
 const MOST_PIXELS: u32 = 1 << 22;
+/// Most pixels of all pictures of a film, which are kept as files until it is made.
+const MOST_OF_A_FILM: u64 = 1 << 34;
 /// Coordinates beyond this, in scene units, are of nothing that can be seen.
 const FARTHEST: f64 = 1e9;
 
@@ -74,16 +76,38 @@ pub struct Film {
 
 impl Film {
     fn check(&self) -> Result<(), String> {
-        let number = |name: &str, most: f64| match self.path.get(name).map(Value::as_f64) {
-            Some(Some(value)) if (0.0..=most).contains(&value) => Ok(value),
-            _ => Err(format!("a film's `{name}` is a number up to {most}")),
-        };
-        let sides = [number("render_width", LARGEST.into())?, number("render_height", LARGEST.into())?];
-        if sides[0] * sides[1] > MOST_PIXELS.into() {
+        if self.pixels()? > MOST_PIXELS.into() {
             return Err(format!("a film's pictures have {MOST_PIXELS} pixels at most"));
         }
-        number("seconds", 600.0)?;
-        number("fps", 60.0).map(drop)
+        self.frames().map(drop)
+    }
+
+    /// Whether there is room for all of its frames: a page may well ask for more, and is told.
+    pub fn fits(&self) -> Result<(), String> {
+        let (pixels, frames) = (self.pixels()?, self.frames()?);
+        if pixels * frames > MOST_OF_A_FILM as f64 {
+            let most = MOST_OF_A_FILM as f64 / pixels;
+            return Err(format!(
+                "a film of this size has {most:.0} frames at most, not {frames:.0}: lower its seconds, `fps` or size"
+            ));
+        }
+        Ok(())
+    }
+
+    /// Pixels of a frame.
+    fn pixels(&self) -> Result<f64, String> {
+        Ok(self.number("render_width", LARGEST.into())? * self.number("render_height", LARGEST.into())?)
+    }
+
+    fn frames(&self) -> Result<f64, String> {
+        Ok(self.number("seconds", 600.0)? * self.number("fps", 60.0)?)
+    }
+
+    fn number(&self, name: &str, most: f64) -> Result<f64, String> {
+        match self.path.get(name).map(Value::as_f64) {
+            Some(Some(value)) if (0.0..=most).contains(&value) => Ok(value),
+            _ => Err(format!("a film's `{name}` is a number up to {most}")),
+        }
     }
 }
 
@@ -432,6 +456,46 @@ mod tests {
             let reason = sized(width, height).check().unwrap_err();
             assert!(reason.contains(&format!("{width}x{height} is no size")), "{reason}");
         }
+    }
+
+    #[test]
+    fn films_have_so_many_pixels_and_no_more() {
+        let film = |[width, height]: [u32; 2], seconds: f64, fps: f64| -> Result<Result<(), String>, String> {
+            let path = json!({ "render_width": width, "render_height": height, "seconds": seconds, "fps": fps });
+            match Ask::read(&json!({ "ask": "film", "path": path }).to_string())? {
+                Ask::Film(film) => Ok(film.fits()),
+                other => panic!("{other:?}"),
+            }
+        };
+        // The last has 2^34 in all.
+        for (size, seconds, fps) in [
+            ([640, 480], 600.0, 60.0),
+            ([4096, 1], 0.0, 0.0),
+            ([2048, 2048], 1.0, 1.0),
+            ([1920, 1080], 270.0, 30.0),
+            ([4096, 1024], 128.0, 32.0),
+        ] {
+            assert_eq!(film(size, seconds, fps), Ok(Ok(())), "{size:?} {seconds} {fps}");
+        }
+        for (size, seconds, fps, expected) in [
+            ([4097, 1], 1.0, 1.0, "`render_width` is a number up to 4096"),
+            ([1, 4097], 1.0, 1.0, "`render_height`"),
+            ([4096, 1025], 1.0, 1.0, "4194304 pixels at most"),
+            ([40, 40], 600.5, 1.0, "`seconds` is a number up to 600"),
+            ([40, 40], -0.5, 1.0, "`seconds`"),
+            ([40, 40], 1.0, 61.0, "`fps` is a number up to 60"),
+        ] {
+            let reason = film(size, seconds, fps).unwrap_err();
+            assert!(reason.contains(expected), "{reason}");
+        }
+        for (size, seconds, fps, expected) in [
+            ([4096, 1024], 128.5, 32.0, "4096 frames at most, not 4112: lower its seconds, `fps` or size"),
+            ([2048, 2048], 600.0, 60.0, "4096 frames at most, not 36000"),
+        ] {
+            let reason = film(size, seconds, fps).unwrap().unwrap_err();
+            assert!(reason.contains(expected), "{reason}");
+        }
+        assert!(Ask::read(r#"{ "ask": "film", "path": { "render_width": "8" } }"#).is_err());
     }
 
     #[test]

@@ -154,8 +154,9 @@ impl Page {
                 Some(studio) => {
                     let outbox = outbox.clone();
                     tokio::task::spawn_blocking(move || {
-                        if let Err(error) = studio.begin(&film) {
-                            outbox.post(sorry(&error.to_string()));
+                        let begun = film.fits().and_then(|()| studio.begin(&film).map_err(|e| e.to_string()));
+                        if let Err(what) = begun {
+                            outbox.post(sorry(&what));
                         }
                     });
                 }
@@ -336,6 +337,9 @@ mod tests {
             ask(&page, film.clone());
             assert!(later(&page).await.contains("films"), "its folder is a file");
         }
+        let path = json!({ "render_width": 2048, "render_height": 2048, "seconds": 600, "fps": 60 });
+        ask(&page, json!({ "ask": "film", "path": path }));
+        assert!(later(&page).await.contains("lower its seconds"));
         // One of another page, which this one may end, too.
         page.served.studio.as_ref().unwrap().claim().unwrap();
         ask(&page, film.clone());
