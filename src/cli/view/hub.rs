@@ -7,8 +7,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
-use super::messages::{File, Made, View};
-use super::server::{patience, sorry};
+use super::messages::{self, File, Made, Tell, View};
 
 /// Messages that wait for a page, beside a picture: more than it can have asked for in earnest.
 const WAITING: usize = 64;
@@ -32,7 +31,7 @@ pub struct Shot {
 /// What is on its way to a page.
 #[derive(Default)]
 pub struct Outbox {
-    state: Mutex<Waiting>,
+    waiting: Mutex<Waiting>,
     pub changed: Notify,
 }
 
@@ -42,12 +41,18 @@ struct Waiting {
     picture: Option<(u32, Arc<Shot>)>,
     others: VecDeque<Outgoing>,
     /// How training goes, of which the newest is enough.
-    state: Option<String>,
-    /// Which picture was sent and has not been seen, and until when it may take.
-    flying: Option<(u32, Instant)>,
+    told: Option<String>,
+    /// Which picture was sent and has not been seen.
+    flying: Option<Flying>,
     /// How many messages of bytes are in `others`.
     files: usize,
     overrun: bool,
+}
+
+struct Flying {
+    id: u32,
+    since: Instant,
+    bytes: usize,
 }
 
 /// A message to a page.
@@ -57,9 +62,19 @@ pub enum Outgoing {
     Bytes(Vec<u8>),
 }
 
+/// That something cannot be had, and why.
+pub fn sorry(what: &str) -> Outgoing {
+    text(&Tell::Sorry { what: what.to_owned() })
+}
+
+/// A message of text.
+pub fn text(tell: &Tell) -> Outgoing {
+    Outgoing::Text(messages::text(tell))
+}
+
 impl Outbox {
     fn lock(&self) -> MutexGuard<'_, Waiting> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Something for the page, in order.
@@ -79,6 +94,11 @@ impl Outbox {
         self.changed.notify_one();
     }
 
+    /// The picture that waits is not wanted any more.
+    fn forget(&self) {
+        self.lock().picture = None;
+    }
+
     /// What is to be sent next, if anything may be.
     pub fn take(&self) -> Option<Outgoing> {
         let mut waiting = self.lock();
@@ -86,20 +106,22 @@ impl Outbox {
             waiting.files -= usize::from(matches!(message, Outgoing::Bytes(_)));
             return Some(message);
         }
-        if let Some(text) = waiting.state.take() {
+        if let Some(text) = waiting.told.take() {
             return Some(Outgoing::Text(text));
         }
         if waiting.flying.is_some() {
             return None;
         }
         let (id, shot) = waiting.picture.take()?;
-        waiting.flying = Some((id, Instant::now() + patience(shot.jpeg.len())));
+        waiting.flying = Some(Flying { id, since: Instant::now(), bytes: shot.jpeg.len() });
+        // Nobody has to wait while it is copied.
+        drop(waiting);
         Some(Outgoing::Bytes(File::Picture { id, made: shot.made }.message(&shot.jpeg)))
     }
 
-    /// Until when the page may take to say that it has seen the picture that is under way.
-    pub fn flying(&self) -> Option<Instant> {
-        self.lock().flying.map(|(_, until)| until)
+    /// Since when a picture is under way that the page has not seen, and of how many bytes.
+    pub fn flying(&self) -> Option<(Instant, usize)> {
+        self.lock().flying.as_ref().map(|flying| (flying.since, flying.bytes))
     }
 
     /// How many files wait to be sent.
@@ -108,7 +130,7 @@ impl Outbox {
     }
 
     fn tell_state(&self, text: &str) {
-        self.lock().state = Some(text.to_owned());
+        self.lock().told = Some(text.to_owned());
         self.changed.notify_one();
     }
 
@@ -119,7 +141,7 @@ impl Outbox {
 
     /// The page has the picture.
     pub fn seen(&self, id: u32) {
-        self.lock().flying.take_if(|(own, _)| *own == id);
+        self.lock().flying.take_if(|flying| flying.id == id);
         self.changed.notify_one();
     }
 }
@@ -211,7 +233,7 @@ impl Hub {
             let last = wish.last.lock().unwrap_or_else(PoisonError::into_inner).clone();
             client.wish = Some((id, wish));
             // Of what it wanted before, nothing.
-            client.outbox.lock().picture = None;
+            client.outbox.forget();
             if let Some(shot) = last {
                 client.outbox.show(id, shot);
             }
@@ -223,6 +245,7 @@ impl Hub {
     pub fn rest(&self, client: u64) {
         if let Some(client) = self.lock().clients.get_mut(&client) {
             client.wish = None;
+            client.outbox.forget();
         }
     }
 
@@ -268,6 +291,7 @@ impl Hub {
     pub fn refuse(&self, wish: &Arc<Wish>, what: &str) {
         for client in self.lock().clients.values_mut() {
             if client.wish.take_if(|(_, own)| Arc::ptr_eq(own, wish)).is_some() {
+                client.outbox.forget();
                 client.outbox.post(sorry(what));
             }
         }
@@ -357,6 +381,7 @@ mod tests {
     use super::*;
     use crate::cli::render::shown::Show;
     use crate::cli::view::messages::Eye;
+    use futures_util::FutureExt;
 
     fn view(number: usize) -> View {
         let eye = Eye::Photograph(number);
@@ -425,6 +450,7 @@ mod tests {
         assert!(matches!(from_a.take(), Some(Outgoing::Text(text)) if text.contains("it is lost")));
         hub.wish(a, 3, view(2));
         hub.wish(b, 11, view(2));
+        assert!(hub.is_here(a) && hub.is_here(b) && !hub.is_here(c));
         hub.rest(a);
         assert_eq!(hub.wishes().len(), 1, "that of the other");
         hub.leave(a);
@@ -463,20 +489,131 @@ mod tests {
             outbox.post(Outgoing::Text(String::new()));
         }
         assert!(!outbox.is_overrun());
+        // It stays so, and what is too much is not kept.
+        for _ in 0..2 {
+            outbox.post(Outgoing::Bytes(vec![]));
+            assert!(outbox.is_overrun() && outbox.files() == 0);
+        }
+        assert_eq!(std::iter::from_fn(|| outbox.take()).count(), WAITING);
         outbox.post(Outgoing::Text(String::new()));
-        assert!(outbox.is_overrun());
+        assert!(outbox.is_overrun() && outbox.take().is_none());
     }
 
     #[test]
-    fn who_waits_is_woken_by_what_came_before_too() {
+    fn what_waits_of_an_old_wish_is_not_sent() {
         let hub = Hub::default();
-        let (page, _) = hub.join(9).unwrap();
+        let (page, outbox) = hub.join(9).unwrap();
+        let wish = |id: u32| {
+            hub.wish(page, id, view(1));
+            let wish = hub.wishes().pop().unwrap();
+            hub.show(&wish, shot(1));
+            wish
+        };
+        // A picture is under way, and another waits.
+        wish(1);
+        assert_eq!(sent(&outbox), Some(1));
+        wish(2);
+        hub.rest(page);
+        outbox.seen(1);
+        assert_eq!(sent(&outbox), None, "nothing is looked at");
+        hub.refuse(&wish(3), "it is lost");
+        assert_eq!(outbox.take(), Some(sorry("it is lost")));
+        assert_eq!(outbox.take(), None);
+        // Of how long one is under way there is a record until it is seen.
+        assert_eq!(outbox.flying(), None);
+        let before = Instant::now();
+        wish(4);
+        assert_eq!(sent(&outbox), Some(1));
+        let (since, bytes) = outbox.flying().unwrap();
+        assert!(since >= before && since <= Instant::now() && bytes == 1);
+        outbox.seen(3);
+        assert!(outbox.flying().is_some());
+        outbox.seen(4);
+        assert_eq!(outbox.flying(), None);
+    }
+
+    #[test]
+    fn who_sends_is_woken_by_all_there_is_to_send() {
+        let hub = Hub::default();
+        let (page, outbox) = hub.join(9).unwrap();
+        let is_woken = || outbox.changed.notified().now_or_never().is_some();
+        assert!(!is_woken());
         hub.wish(page, 1, view(1));
+        let shows = || hub.show(&hub.wishes()[0], shot(0));
+        let changes: [&dyn Fn(); 6] = [
+            &|| outbox.post(sorry("it is lost")),
+            &|| hub.post(page, sorry("it is lost")),
+            &|| hub.tell(&sorry("it is lost")),
+            &|| hub.tell_state("now"),
+            &shows,
+            &|| outbox.seen(1),
+        ];
+        for (i, change) in changes.into_iter().enumerate() {
+            change();
+            assert!(is_woken() && !is_woken(), "{i}");
+        }
+        assert_eq!(std::iter::from_fn(|| outbox.take()).count(), 5);
+    }
+
+    #[test]
+    fn messages_are_for_whom_they_are_for() {
+        let hub = Hub::default();
+        let [(a, from_a), (b, from_b)] = [hub.join(9), hub.join(9)].map(Option::unwrap);
+        assert_ne!(a, b);
+        let say = |text: &str| Outgoing::Text(text.to_owned());
+        hub.post(a, say("one"));
+        hub.post(7, say("nobody"));
+        hub.tell(&say("all"));
+        let heard = |outbox: &Outbox| std::iter::from_fn(|| outbox.take()).collect::<Vec<_>>();
+        assert_eq!([heard(&from_a), heard(&from_b)], [vec![say("one"), say("all")], vec![say("all")]]);
+        assert_eq!(hub.about(), "");
+        hub.introduce("a scene".to_owned());
+        assert_eq!(hub.about(), "a scene");
+    }
+
+    /// Whether something was asked for since this was called last.
+    fn is_news(hub: &Hub) -> bool {
+        std::mem::take(&mut hub.lock().news)
+    }
+
+    #[test]
+    fn who_paints_is_woken_by_all_that_changes_what_there_is_to_paint() {
+        let hub = Hub::default();
+        let (page, _outbox) = hub.join(9).unwrap();
+        assert!(!hub.paused() && !hub.stops() && !is_news(&hub));
+        let changes: [&dyn Fn(); 6] = [
+            &|| hub.wish(page, 1, view(1)),
+            &|| assert!(hub.save(page, view(1))),
+            &|| hub.pause(true),
+            &|| hub.stop(),
+            &|| hub.wake(),
+            &|| hub.leave(page),
+        ];
+        for (i, change) in changes.into_iter().enumerate() {
+            change();
+            assert!(is_news(&hub), "{i}");
+        }
+        assert!(hub.paused() && hub.stops() && !is_news(&hub), "once");
+        hub.pause(false);
+        assert!(!hub.paused());
+    }
+
+    #[test]
+    fn who_waits_is_woken_by_what_came_before_and_meanwhile() {
+        let hub = Arc::new(Hub::default());
+        hub.wake();
         let start = Instant::now();
-        hub.wait(Duration::from_secs(20));
-        assert!(start.elapsed() < Duration::from_secs(10));
+        hub.wait(Duration::from_secs(60));
+        assert!(start.elapsed() < Duration::from_secs(30));
+        let start = Instant::now();
         hub.wait(Duration::from_millis(30));
         assert!(start.elapsed() >= Duration::from_millis(30), "once");
+        let (waiting, start) = (hub.clone(), Instant::now());
+        let waits = std::thread::spawn(move || waiting.wait(Duration::from_secs(60)));
+        std::thread::sleep(Duration::from_millis(50));
+        hub.wake();
+        waits.join().unwrap();
+        assert!(start.elapsed() < Duration::from_secs(30));
         hub.set_share(0.25);
         assert_eq!(hub.share(), 0.25);
     }

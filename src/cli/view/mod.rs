@@ -1,13 +1,16 @@
 //! `raygrad view`: a window on the scene, in a browser.
 
 mod album;
+mod guard;
 mod hub;
 pub mod messages;
 mod painter;
+mod served;
 mod server;
 mod shelf;
 mod store;
 mod studio;
+mod talk;
 mod window;
 
 use std::path::PathBuf;
