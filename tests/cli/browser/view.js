@@ -109,10 +109,34 @@ for (const by of [0.3, 2]) {
   orbit(0, by);
   is("orbit upside down", view.eye, [0, 4 - 4 * Math.cos(by), -4 * Math.sin(by)]);
 }
+// Aslant: level with the first turn, but not where nearly all is below.
+ahead();
+[view.right, view.up] = [[0, 0, -1], [1, 0, 0]];
+orbit(0.5, 0);
+is("orbit of a picture on its side", [...eye(), ...axes()], [[-4 * s5, 4 - 4 * c5, 0], [0, 4, 0], [c5, -s5, 0], [0, 0, 1], [-s5, -c5, 0]]);
+const below = (tilt, dy) => {
+  const [s, c] = [Math.sin(tilt), Math.cos(tilt)];
+  Object.assign(view, { eye: [0, 0, 4], right: [c, 0, -s], up: [0, 1, 0], back: [s, 0, c], pivot: [0, 0, 0] });
+  orbit(0, dy);
+  return [view.eye, ...axes()];
+};
+const [s4, c4, sine, cosine] = [Math.sin(0.04), Math.cos(0.04), Math.sin(0.06), Math.cos(0.06)];
+is("from above", [below(0.04, 0), below(0, 0.2)], [[[0, 0, 4], [c4, 0, -s4], [0, 1, 0], [s4, 0, c4]], [[0, 0, 4], [1, 0, 0], [0, 1, 0], [0, 0, 1]]]);
+is("from nearly above", below(0.06, 0), [[0, 0, 4], [0, 1, 0], [-cosine, 0, sine], [sine, 0, cosine]]);
+is("and away from there", below(0, -0.2)[0], [0, -4 * Math.sin(0.2), 4 * Math.cos(0.2)]);
+const beyond = (dy) => {
+  Object.assign(view, { eye: [0, 0, 4], right: [1, 0, 0], up: [0, Math.cos(0.02), Math.sin(0.02)], back: [0, -Math.sin(0.02), Math.cos(0.02)], pivot: [0, 0, 0] });
+  orbit(0, dy);
+  return view.back;
+};
+is("beyond where orbits end", [beyond(0), beyond(0.3), beyond(-0.2)], [0.02, 0.02, 0.22].map((tilt) => [0, -Math.sin(tilt), Math.cos(tilt)]));
 const moves = [
   ["pan", () => pan(0.1, 0.2), [-0.8, 0, 1.6], [-0.8, 4, 1.6]],
   ["zoom", () => zoom(0.5), [0, 2, 0], [0, 4, 0]],
-  ["zoom in to the end", () => zoom(1e-9), [0, 3.994, 0], [0, 4, 0]],
+  ["zoom in to the end", () => zoom(1e-9), [0, 4 - 4e-9, 0], [0, 4.12 - 4e-9, 0]],
+  ["zoom in further", () => { view.pivot = [0, 0.12, 0]; zoom(0.5); }, [0, 0.06, 0], [0, 0.18, 0]],
+  ["zoom in from the pivot", () => { view.pivot = [0, 0, 0]; zoom(0.5); }, [0, 0, 0], [0, 0.12, 0]],
+  ["zoom out from near", () => { view.pivot = [0, 0.06, 0]; zoom(1.5); }, [0, -0.03, 0], [0, 0.09, 0]],
   ["zoom out to the end", () => zoom(1e9), [0, -596, 0], [0, 4, 0]],
   ["fly", () => fly(1, 2, 4), [1, 4, 2], [1, 8, 2]],
   ["fly when near", () => { view.pivot = [0, 0.1, 0]; fly(1, 2, 4); }, [0.3, 1.2, 0.6], [0.3, 1.3, 0.6]],
@@ -253,6 +277,9 @@ room = { x: 0, y: 0, width: 100, height: 200 };
 reset();
 const tall = (2 * Math.atan(2 * Math.tan(25 * radians))) / radians;
 is("reset in a tall window", [view.fov, view.pivot, $("fov").value, text("fov-out"), $("blend").value, photo.hidden], [tall, [0, 0, 0], "86", "86°", "0", true]);
+// Whoever stands in the middle looks at what is ahead, and comes nearer to it.
+const begins = (height) => { about.pose = along([0, 0, height]); reset(); return view.pivot; };
+is("reset in the middle", [begins(0.31), begins(-0.29), (zoom(0.5), view.eye)], [[0, 0, 0], [0, 3, -0.29], [0, 1.5, -0.29]]);
 $("fov").value = 30;
 goTo(1);
 $("fov").value = 31;

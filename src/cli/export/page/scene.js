@@ -251,8 +251,7 @@ async function render(pose, fov, width, height) {
 }
 
 function reset() {
-  place(data.view.pose, fitting(data.view.fov, data.view.proportion, stage.clientWidth / stage.clientHeight));
-  view.pivot = times(0.5, add(...bounds));
+  enter(data.view, stage.clientWidth / stage.clientHeight);
   ask();
 }
 

@@ -253,8 +253,7 @@ function free() {
 function reset() {
   playing += 1;
   const area = stage.getBoundingClientRect();
-  place(about.pose, fitting(about.fov, about.proportion, area.width / area.height));
-  view.pivot = times(0.5, add(...bounds));
+  enter(about, area.width / area.height);
   view.photograph = null;
   $("photograph").value = "";
   $("fov").value = String(Math.round(view.fov));
