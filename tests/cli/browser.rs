@@ -353,8 +353,11 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.until("!$('sorry').hidden && $('sorry').textContent.includes('without a box')");
     browser.set("crop", false);
     browser.value("document.querySelector('#keys li button:last-child').click()");
+    // It is seen from the bottom of the controls too.
+    browser.value("document.querySelector('aside').scrollTo(0, 1e6)");
     browser.click("play");
     browser.until("$('sorry').textContent.includes('two key frames')");
+    assert!(browser.sees("sorry"));
     // Nothing is painted for a page that nobody sees, and it goes on when it is seen.
     browser.click("reset");
     browser.rested();
@@ -400,6 +403,14 @@ fn a_browser_comes_back_to_a_program_that_does_and_fits_a_phone() {
     let wide = browser.value("stage.getBoundingClientRect().width").as_f64().unwrap();
     assert!((wide - 390.0).abs() < 1.0, "{wide}");
     browser.shot("phone");
+    // The scene stays in sight while its controls scroll, and what is said of them is seen there.
+    let stays = "(scrollTo(0, 1e6), (({ top, bottom }) => scrollY > 300 && Math.abs(top) < 1 && bottom < innerHeight)(stage.getBoundingClientRect()))";
+    assert_eq!(browser.value(stays), true);
+    browser.click("play");
+    browser.until("!$('sorry').hidden");
+    assert!(browser.sees("sorry"));
+    browser.shot("scrolled");
+    browser.value("scrollTo(0, 0)");
     // Two fingers that part bring it nearer.
     let away = "Math.hypot(...view.eye.map((x, i) => x - view.pivot[i]))";
     let far = browser.value(away).as_f64().unwrap();

@@ -253,6 +253,14 @@ impl Browser {
         [0, 1].map(|axis| at[axis].as_f64().unwrap())
     }
 
+    /// Whether an element is in sight, and nothing before it.
+    pub fn sees(&mut self, id: &str) -> bool {
+        self.value(&format!(
+            "(() => {{ const it = document.getElementById('{id}'), r = it.getBoundingClientRect(); \
+             return it.contains(document.elementFromPoint(r.x + r.width / 2, r.y + r.height / 2)); }})()"
+        )) == true
+    }
+
     pub fn drag_from(&mut self, from: [f64; 2], by: [f64; 2], button: &str) {
         let at = |i: u32| [0, 1].map(|axis| from[axis] + by[axis] * f64::from(i) / 5.0);
         match self.kind {

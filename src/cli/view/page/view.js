@@ -24,7 +24,9 @@ function connect() {
   socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
   socket.onclose = (event) => {
     $("lost").textContent = training && training.ended ? "Training has ended, and the program with it: raygrad view shows the run." : event.reason ? `The program has closed the connection: ${event.reason}. Trying again…`
-      : "The program does not answer. Trying again…";
+      : attempts < 3 ? "The program does not answer. Trying again…"
+      // Whether it refuses a link's token is not told.
+      : "The program does not answer. If it has been started again, this link may be an old one: the program prints the new one. Trying again…";
     $("lost").hidden = false;
     attempts += 1;
     setTimeout(connect, Math.min(5000, 250 * 2 ** attempts));
@@ -149,6 +151,7 @@ function ask() {
   waits = true;
   setTimeout(() => {
     waits = false;
+    if (document.hidden) return;
     [unseen, again] = [performance.now(), false];
     asked = (asked + 1) >>> 0;
     say({ ask: "view", id: asked, view: wanted() });
@@ -200,7 +203,9 @@ const evenly = (sides) => sides.map((side) => Math.max(16, 2 * Math.round(side /
 /** The part of the stage that pictures fill. */
 function frame() {
   const area = stage.getBoundingClientRect();
-  const [width, height] = shown && shown.size ? shown.size : sizes();
+  // Sides of coarse pictures are rounded up: they fill what the whole one will.
+  const whole = sizes(), coarse = shown && whole.map((side) => Math.ceil(side / 2 ** shown.halvings));
+  const [width, height] = shown && String(shown.size) !== String(coarse) ? shown.size : whole;
   const share = Math.min(area.width / width, area.height / height);
   const [w, h] = [width * share, height * share];
   return { x: (area.width - w) / 2, y: (area.height - h) / 2, w, h };
@@ -292,7 +297,9 @@ document.addEventListener("keydown", (event) => {
 });
 
 function choose(name) {
-  document.querySelector(`input[name=show][value=${name}]`).checked = true;
+  const input = document.querySelector(`input[name=show][value=${name}]`);
+  if (input.disabled) return;
+  input.checked = true;
   ask();
 }
 
@@ -449,7 +456,7 @@ function makeBox() {
       Object.assign(input, { type: "range", min: lower[axis], max: upper[axis], step: "any", value: [lower, upper][end][axis] });
       input.id = `box-${name}-${end}`;
       input.setAttribute("aria-label", `${end ? "upper" : "lower"} ${name}`);
-      input.addEventListener("input", ask);
+      input.addEventListener("input", () => moveSide(axis, end, Number(input.value)));
       holder.append(input);
     });
   });
@@ -462,6 +469,13 @@ function box() {
   return [end(0), end(1)];
 }
 
+/** Moves a side of the box as far as the other. */
+function moveSide(axis, end, value) {
+  const [moved, other] = [end, 1 - end].map((i) => $(`box-${"xyz"[axis]}-${i}`));
+  moved.value = String((end ? Math.max : Math.min)(value, Number(other.value)));
+  ask();
+}
+
 function boxMarks(marks) {
   const ends = box();
   const corner = (i) => [ends[i & 1][0], ends[(i >> 1) & 1][1], ends[(i >> 2) & 1][2]];
@@ -471,13 +485,15 @@ function boxMarks(marks) {
     }
   }
   const middle = times(0.5, add(...ends));
+  // A finger is wider than a mouse's pointer.
+  const r = matchMedia("(pointer: coarse)").matches ? 16 : 7;
   for (const axis of [0, 1, 2]) {
     for (const end of [0, 1]) {
       const place = [...middle];
       place[axis] = ends[end][axis];
       const at = project(place);
       if (at) {
-        const handle = svg("circle", { cx: at[0], cy: at[1], r: 7, class: "handle" }, marks);
+        const handle = svg("circle", { cx: at[0], cy: at[1], r, class: "handle" }, marks);
         handle.addEventListener("pointerdown", (event) => dragFace(event, axis, end));
       }
     }
@@ -488,7 +504,6 @@ function boxMarks(marks) {
 function dragFace(down, axis, end) {
   down.preventDefault();
   down.stopPropagation();
-  const input = $(`box-${"xyz"[axis]}-${end}`);
   const ends = box();
   const place = times(0.5, add(...ends));
   place[axis] = ends[end][axis];
@@ -499,13 +514,10 @@ function dragFace(down, axis, end) {
   if (!a || !b) return;
   const along = [(b[0] - a[0]) / small, (b[1] - a[1]) / small];
   const square = along[0] ** 2 + along[1] ** 2;
-  const from = Number(input.value);
+  const from = ends[end][axis];
   const move = (event) => {
     const moved = ((event.clientX - down.clientX) * along[0] + (event.clientY - down.clientY) * along[1]) / (square || 1);
-    const other = Number($(`box-${"xyz"[axis]}-${1 - end}`).value);
-    const value = from + moved;
-    input.value = String(end ? Math.max(value, other) : Math.min(value, other));
-    ask();
+    moveSide(axis, end, from + moved);
   };
   const up = () => ["pointerup", "pointercancel"].forEach((end) => { removeEventListener("pointermove", move); removeEventListener(end, up); });
   addEventListener("pointermove", move);
@@ -641,7 +653,7 @@ function follow(message) {
   training = message;
   const { step, loss, psnr, left, paused, share, ended } = message;
   $("progress").textContent = ended ? `ended after ${step} steps: ${ended}`
-    : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} left`}`;
+    : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} of training left`}`;
   $("pause").textContent = paused ? "Go on" : "Pause";
   for (const id of ["pause", "stop", "share"]) $(id).disabled = Boolean(ended);
   if (document.activeElement !== $("share")) $("share").value = String(100 * share);
