@@ -2,7 +2,7 @@
 "use strict";
 
 const $ = (id) => document.getElementById(id);
-const stage = $("stage"), picture = $("picture"), photo = $("photo"), marks = $("marks");
+const stage = $("stage"), picture = $("picture"), photo = $("photo"), dots = $("dots"), marks = $("marks");
 
 // ---- what the program says ------------------------------------------------------------------------------------------
 let about = null;
@@ -424,8 +424,26 @@ function markAll() {
   const made = document.createDocumentFragment();
   area = frame();
   // The error is seen from the nearest photograph, not from here.
-  if (!(mode() === "error" && view.photograph === null)) makeMarks(made);
+  const here = !(mode() === "error" && view.photograph === null);
+  if (here) makeMarks(made);
   marks.replaceChildren(made);
+  dots.hidden = !(here && $("points").checked);
+  if (!dots.hidden) drawPoints();
+}
+
+/** Thousands of them, which as marks would take longer than a frame of the display. */
+function drawPoints() {
+  const room = stage.getBoundingClientRect();
+  const fine = Math.min(devicePixelRatio, 2);
+  [dots.width, dots.height] = [room.width, room.height].map((side) => Math.max(1, Math.round(side * fine)));
+  const pen = dots.getContext("2d");
+  pen.scale(dots.width / room.width, dots.height / room.height);
+  for (const [place, color] of about.points) {
+    const at = project(place);
+    if (!at) continue;
+    pen.fillStyle = `rgb(${color})`;
+    pen.fillRect(at[0] - 1.5, at[1] - 1.5, 3, 3);
+  }
 }
 
 function makeMarks(marks) {
@@ -433,12 +451,6 @@ function makeMarks(marks) {
     about.photographs.forEach((photograph, i) => {
       if (i !== view.photograph) svg("path", { d: frustum(photograph), class: `camera ${photograph.split}` }, marks);
     });
-  }
-  if ($("points").checked) {
-    for (const [place, color] of about.points) {
-      const at = project(place);
-      if (at) svg("circle", { cx: at[0].toFixed(1), cy: at[1].toFixed(1), r: 1.5, fill: `rgb(${color})` }, marks);
-    }
   }
   if ($("crop").checked) boxMarks(marks);
   if (keys.length > 1) svg("path", { d: path(flight(64).map((key) => key.eye)), class: "path" }, marks);
