@@ -181,6 +181,22 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     let seen = browser.picture(place);
     assert!(psnr(&seen, &to) > 35.0 && psnr(&seen, &from) < psnr(&seen, &to) - 3.0, "{}", psnr(&seen, &to));
     browser.shot("path");
+    // The path is there when the page is loaded again, and comes back from its file.
+    let there = |browser: &mut Browser, path: &str| {
+        browser.value(&format!("JSON.stringify(keys) !== '[]' && size(sub(keys[1].eye, {path}.eye)) + size(sub(keys[1].back, {path}.back)) < 1e-9"))
+    };
+    let last = browser.value("window.before = true, JSON.stringify(keys[1])");
+    browser.visit(server);
+    assert_eq!(browser.value("typeof before"), "undefined");
+    assert_eq!(there(&mut browser, last.as_str().unwrap()), true);
+    browser.value("keys = [], listKeys()");
+    let file = json!(std::fs::read_to_string(place.path("path.json")).unwrap());
+    browser.value(&format!(
+        "(() => {{ const given = new DataTransfer(); given.items.add(new File([{file}], 'path.json')); \
+         $('load-path').files = given.files; $('load-path').dispatchEvent(new Event('change')); }})()"
+    ));
+    browser.until("keys.length === 2 && document.querySelectorAll('#keys li').length === 2");
+    assert_eq!(there(&mut browser, last.as_str().unwrap()), true);
     assert!(browser.complaints.is_empty(), "{:?}", browser.complaints);
 }
 

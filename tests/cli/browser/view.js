@@ -588,6 +588,64 @@ is("of the error", sorry(() => { document.querySelector("input[value=error]").ch
 const three = keys;
 is("of many", sorry(() => { keys = Array.from({ length: 400 }, () => key([0.1, 1 / 3, 0])); }, () => { keys = three; }), ["So many key frames h", []]);
 is("of one", sorry(() => { keys = three.slice(0, 1); }, () => { keys = three; }), ["A path needs two key", []]);
+// A path that was saved comes back, with what each key frame looks at straight ahead; what is none leaves all as it is.
+const given = [key([0, -4, 0]), key([3, -5, 1], { right: [S, S, 0], back: [S, -S, 0], fov: 33 }), key([1, 1, 0.1], { right: [0.6, 0, 0.8], up: [-0.8, 0, 0.6] })];
+const back = [[0, 0, 0], [-1, -1, 1], [1, 1.3, 0.1]].map((pivot, i) => ({ ...given[i], pivot }));
+keys = given;
+set("closed", true), set("seconds", "7.5");
+const kept = JSON.stringify(cameraPath());
+const load = async (words) => { $("sorry").textContent = ""; await loadPath(new File([words], "f.json")); return [keys, $("closed").checked, $("seconds").value, text("sorry").slice(0, 17)]; };
+keys = [], set("closed", false), set("seconds", "2");
+is("loaded", [await load(kept), $("keys").children.length], [[back, true, "7.5", ""], 3]);
+const spoilt = (change) => { const path = JSON.parse(kept); change(path); return JSON.stringify(path); };
+const bad = {
+  text: "none", null: "null", number: "3", list: "[]", empty: spoilt((p) => { p.keyframes = []; }), elsewhere: spoilt((p) => { p.coordinates = "scene"; }),
+  fov: spoilt((p) => { p.keyframes[1].fov = 130; }), noFov: spoilt((p) => { delete p.keyframes[1].fov; }), noKey: spoilt((p) => { p.keyframes[2] = null; }),
+  short: spoilt((p) => { p.keyframes[0].matrix.pop(); }), word: spoilt((p) => { p.keyframes[0].matrix[3] = "1"; }), far: spoilt((p) => { p.keyframes[0].matrix[3] = 1e10; }),
+  stretched: spoilt((p) => { p.keyframes[0].matrix = p.keyframes[0].matrix.map((x) => 1.1 * x); }), mirrored: spoilt((p) => { for (const i of [0, 4, 8]) p.keyframes[0].matrix[i] *= -1; }),
+  many: spoilt((p) => { p.keyframes = Array.from({ length: 1001 }, () => ({ fov: 50, matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1] })); }), long: kept + " ".repeat(1e6),
+};
+for (const [name, words] of Object.entries(bad)) is(`not loaded, ${name}`, await load(words), [back, true, "7.5", "f.json is no path"]);
+is("as many as may be", (await load(spoilt((p) => { p.keyframes = Array.from({ length: 1000 }, () => p.keyframes[0]); })))[0].length, 1000);
+is("half of it is left out", (await load(spoilt((p) => { delete p.seconds; delete p.is_cycle; }))).slice(1), [false, "7.5", ""]);
+const loader = loadPath;
+loadPath = (file) => { calls.push(file.name); };
+const carried = new DataTransfer();
+carried.items.add(new File(["x"], "g.json"));
+called();
+$("load-path").files = carried.files;
+$("load-path").dispatchEvent(new Event("change"));
+is("by its button", [called(), $("load-path").files.length], [["g.json"], 0]);
+$("load-path").dispatchEvent(new Event("change"));
+is("none is chosen", called(), []);
+loadPath = loader;
+// The path stays while the page is loaded again, and is that of its scene.
+const reload = (changes) => { about = null; meet(scene({ bounds: [[-1, -2, -3], [1, 2, 3]], ...changes })); return keys; };
+set("closed", true);
+$("closed").dispatchEvent(new Event("change"));
+keys = given;
+listKeys();
+set("closed", false);
+is("loaded again", [reload(), $("closed").checked, reload({ title: "other" }), reload({ bounds: [[-1, -2, -3], [1, 2, 4]] }), reload()], [back, true, [], [], back]);
+set("seconds", "3");
+$("seconds").dispatchEvent(new Event("change"));
+set("seconds", "9");
+is("with its time", [reload().length, $("seconds").value], [3, "3"]);
+sessionStorage.setItem(pathName(), "{");
+is("what was spoilt", reload(), []);
+keys = given;
+listKeys();
+const storage = Object.getOwnPropertyDescriptor(window, "sessionStorage");
+Object.defineProperty(window, "sessionStorage", { get() { throw new Error("no"); }, configurable: true });
+is("nothing is kept", [(listKeys(), keys.length), reload()], [3, []]);
+if (storage) Object.defineProperty(window, "sessionStorage", storage); else delete window.sessionStorage;
+keys = [];
+listKeys();
+is("nor of no key frame", [sessionStorage.getItem(pathName()), reload()], [null, []]);
+ahead();
+set("closed", true), set("seconds", "7");
+keys = three;
+called();
 listKeys();
 is("buttons", [...$("keys").querySelectorAll("button")].map((b) => [b.textContent, b.getAttribute("aria-label")]).slice(2, 4), [["go to", "Go to key frame 2"], ["remove", "Remove key frame 2"]]);
 $("keys").querySelectorAll("button")[2].click();

@@ -90,9 +90,9 @@ function meet(message) {
   const first = before === null || elsewhere;
   const checkpoint = before ? before.checkpoints[Number($("checkpoint").value)] : undefined;
   about = message;
-  if (elsewhere) keys = [];
   if (view.photograph >= about.photographs.length) view.photograph = null;
   bounds = about.bounds;
+  if (elsewhere) recall();
   overlaid = requested = null;
   document.title = `${about.title} - raygrad`;
   $("title").textContent = about.title;
@@ -312,14 +312,17 @@ function goTo(number) {
   const photograph = about.photographs[number];
   place(photograph.pose, clamp(photograph.fov, 5, 120));
   view.photograph = number;
-  // What it looks at: as far as the middle of the scene, straight ahead.
-  const middle = times(0.5, add(...bounds));
-  const ahead = Math.max(0.05 * side(), dot(sub(view.eye, middle), view.back));
-  view.pivot = add(view.eye, times(-ahead, view.back));
+  view.pivot = lookedAt(view);
   $("photograph").value = String(number);
   $("fov").value = String(Math.round(view.fov));
   blend();
   settled();
+}
+
+/** What a camera looks at: as far as the middle of the scene, straight ahead. */
+function lookedAt({ eye, back }) {
+  const middle = times(0.5, add(...bounds));
+  return sub(eye, times(Math.max(0.05 * side(), dot(sub(eye, middle), back)), back));
 }
 
 function nearest() {
@@ -554,6 +557,7 @@ function listKeys() {
     item.append(go, drop);
     list.append(item);
   });
+  remember();
 }
 
 /** The path through the key frames: a Catmull-Rom spline, to look at. */
@@ -610,19 +614,79 @@ function inCapture(key) {
   return [0, 1, 2].flatMap((r) => [right[r], up[r], back[r], eye[r]]).concat([0, 0, 0, 1]);
 }
 
+/** A key frame of a pose in those coordinates. */
+function fromCapture({ matrix, fov }) {
+  const to = about.to_capture;
+  const scale = Math.hypot(to[0][0], to[1][0], to[2][0]);
+  const turn = (a) => [0, 1, 2].map((c) => (to[0][c] * a[0] + to[1][c] * a[1] + to[2][c] * a[2]) / scale);
+  const column = (c) => [0, 1, 2].map((r) => matrix[4 * r + c]);
+  const [right, up, back] = [0, 1, 2].map((c) => turn(column(c)));
+  const eye = times(1 / scale, turn(sub(column(3), to.map((row) => row[3]))));
+  return { eye, right, up, back, fov, pivot: lookedAt({ eye, back }) };
+}
+
+/** What a path is loaded from again. */
+const saved = () => ({
+  coordinates: "capture",
+  keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
+  is_cycle: $("closed").checked,
+  seconds: duration(),
+});
+
+/** The most bytes and key frames that are loaded. */
+const LARGEST = 1e6, MOST_KEYS = 1000;
+
+/** Takes a path that was saved; says whether it is one. */
+function take(path) {
+  const among = (x, low, high) => typeof x === "number" && x >= low && x <= high;
+  const isKey = (key) => {
+    if (!key || !among(key.fov, 1, 120) || !Array.isArray(key.matrix) || key.matrix.length !== 16) return false;
+    if (!key.matrix.every((x) => among(x, -EVERYWHERE, EVERYWHERE))) return false;
+    const axes = [0, 1, 2].map((c) => [0, 1, 2].map((r) => key.matrix[4 * r + c]));
+    return axes.every((axis) => Math.abs(size(axis) - 1) < 1e-3) && dot(cross(axes[0], axes[1]), axes[2]) > 1 - 1e-3;
+  };
+  const frames = path && path.coordinates === "capture" && path.keyframes;
+  if (!Array.isArray(frames) || frames.length === 0 || frames.length > MOST_KEYS || !frames.every(isKey)) return false;
+  keys = frames.map(fromCapture);
+  $("closed").checked = path.is_cycle === true;
+  if (among(path.seconds, 0.5, 600)) $("seconds").value = String(path.seconds);
+  return true;
+}
+
+async function loadPath(file) {
+  const path = file.size > LARGEST ? null : await file.text().then(JSON.parse).catch(() => null);
+  if (!take(path)) return apologise(`${file.name} is no path that was saved here: of up to ${MOST_KEYS} key frames, and 1 MB.`);
+  listKeys();
+  marksOf();
+}
+
+/** By what name the path of this scene is remembered while the page is loaded again. */
+const pathName = () => `path of ${about.title} in ${about.bounds}`;
+
+function remember() {
+  try {
+    if (keys.length) sessionStorage.setItem(pathName(), JSON.stringify(saved()));
+    else sessionStorage.removeItem(pathName());
+  } catch { /* Some browsers keep nothing. */ }
+}
+
+function recall() {
+  keys = [];
+  try {
+    take(JSON.parse(sessionStorage.getItem(pathName())));
+  } catch { /* Nothing is kept. */ }
+}
+
 /** The path in the form that `render` reads, if it is one. */
 function cameraPath() {
   if (keys.length < 2) return apologise("A path needs two key frames.");
   // The picture's own proportions, in sides that encoders take.
   const [width, height] = evenly(freeSizes());
   return {
-    coordinates: "capture",
-    keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
+    ...saved(),
     camera_type: "perspective",
     render_width: width,
     render_height: height,
-    is_cycle: $("closed").checked,
-    seconds: duration(),
     fps: 25,
     smoothness_value: 0,
     camera_path: [],
@@ -701,6 +765,7 @@ $("background").addEventListener("input", () => { $("own-background").checked = 
 $("fov").addEventListener("input", () => { free(); view.fov = Number($("fov").value); settled(); });
 $("blend").addEventListener("input", blend);
 for (const id of ["cameras", "points", "closed"]) $(id).addEventListener("change", () => { marksOf(); });
+for (const id of ["closed", "seconds"]) $(id).addEventListener("change", remember);
 $("reset").addEventListener("click", reset);
 $("save").addEventListener("click", () => say({ ask: "save", view: wanted() }));
 $("photograph").addEventListener("change", () => ($("photograph").value === "" ? (free(), ask()) : goTo(Number($("photograph").value))));
@@ -711,6 +776,12 @@ $("nearest").addEventListener("click", () => goTo(nearest()));
 $("key").addEventListener("click", () => { keys.push(snapshot()); listKeys(); marksOf(); });
 $("play").addEventListener("click", play);
 $("save-path").addEventListener("click", savePath);
+$("load-path").addEventListener("change", () => {
+  const [file] = $("load-path").files;
+  if (file) loadPath(file);
+  // The same one may be chosen again.
+  $("load-path").value = "";
+});
 $("film").addEventListener("click", makeFilm);
 $("end-film").addEventListener("click", () => say({ ask: "end-film" }));
 $("checkpoint").addEventListener("input", settled);
