@@ -4,6 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use raygrad::nerf::Image;
@@ -14,13 +15,27 @@ use tungstenite::{Message, WebSocket};
 use super::super::view::Server;
 use super::super::{Place, png};
 
-/// Width and height of the browser's window: a program that is built for tests paints slowly.
+/// Width and height of the browser's window, and pixels of the display to each of these: a program that is built for tests paints slowly.
 const WINDOW: [u32; 2] = [780, 150];
+const FINE: f64 = 0.5;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Chromium,
     Firefox,
+}
+
+impl Kind {
+    /// By what name it is installed here, if it is.
+    fn installed(self) -> Option<&'static str> {
+        static NAMES: [OnceLock<Option<&str>>; 2] = [const { OnceLock::new() }; 2];
+        let names: &[&str] = match self {
+            Kind::Chromium => &["chromium", "chromium-browser", "google-chrome"],
+            Kind::Firefox => &["firefox-esr", "firefox"],
+        };
+        let found = |name: &&&str| Command::new(name).arg("--version").output().is_ok_and(|o| o.status.success());
+        *NAMES[self as usize].get_or_init(|| names.iter().find(found).copied())
+    }
 }
 
 /// A browser with one page.
@@ -56,12 +71,7 @@ impl Browser {
 
     /// Nothing, which it says, where there is none.
     pub fn open(kind: Kind) -> Option<Self> {
-        let names: &[&str] = match kind {
-            Kind::Chromium => &["chromium", "chromium-browser", "google-chrome"],
-            Kind::Firefox => &["firefox-esr", "firefox"],
-        };
-        let found = |name: &&&str| Command::new(name).arg("--version").output().is_ok_and(|o| o.status.success());
-        let Some(name) = names.iter().find(found) else {
+        let Some(name) = kind.installed() else {
             println!("skipped: {kind:?} is not installed");
             return None;
         };
@@ -111,7 +121,7 @@ impl Browser {
         let mut browser =
             Browser { kind, child, display, socket, page: String::new(), number: 0, complaints: vec![], profile };
         browser.begin();
-        browser.size(WINDOW[0], WINDOW[1], false);
+        browser.window(WINDOW[0], WINDOW[1], FINE, false);
         Some(browser)
     }
 
@@ -229,10 +239,9 @@ impl Browser {
     /// Waits for the whole picture of what was asked for last.
     #[track_caller]
     pub fn rested(&mut self) {
-        // What was done is asked for a moment later.
         self.until("document.readyState === 'complete' && typeof about !== 'undefined' && about !== null");
-        self.value("new Promise((done) => setTimeout(done, 60))");
-        self.until("shown !== null && !waits && shown.id === asked && shown.whole");
+        // What was done is asked for a moment later.
+        self.until("shown !== null && !waits && !again && shown.id === asked && shown.whole");
     }
 
     /// From the middle of the scene, by so many pixels.
@@ -251,6 +260,14 @@ impl Browser {
             "(() => {{ const r = {element}.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"
         ));
         [0, 1].map(|axis| at[axis].as_f64().unwrap())
+    }
+
+    /// Whether an element is in sight, and nothing before it.
+    pub fn sees(&mut self, id: &str) -> bool {
+        self.value(&format!(
+            "(() => {{ const it = document.getElementById('{id}'), r = it.getBoundingClientRect(); \
+             return it.contains(document.elementFromPoint(r.x + r.width / 2, r.y + r.height / 2)); }})()"
+        )) == true
     }
 
     pub fn drag_from(&mut self, from: [f64; 2], by: [f64; 2], button: &str) {
@@ -347,14 +364,18 @@ impl Browser {
     }
 
     pub fn size(&mut self, width: u32, height: u32, phone: bool) {
+        self.window(width, height, 1.0, phone);
+    }
+
+    fn window(&mut self, width: u32, height: u32, fine: f64, phone: bool) {
         match self.kind {
             Kind::Chromium => {
-                let metrics = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": phone });
+                let metrics = json!({ "width": width, "height": height, "deviceScaleFactor": fine, "mobile": phone });
                 self.call("Emulation.setDeviceMetricsOverride", metrics);
             }
             Kind::Firefox => {
                 let size = json!({ "width": width, "height": height });
-                let asked = json!({ "context": self.page, "viewport": size, "devicePixelRatio": 1.0 });
+                let asked = json!({ "context": self.page, "viewport": size, "devicePixelRatio": fine });
                 self.call("browsingContext.setViewport", asked);
             }
         }

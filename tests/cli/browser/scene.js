@@ -1,6 +1,7 @@
 // The parts of an exported page, against numbers worked out by hand.
 const rest = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 while (working) await rest(5);
+const real = { rowsOf, paint, show };
 fixed(performance, "now", () => clock);
 fixed(stage, "clientWidth", 60);
 fixed(stage, "clientHeight", 45);
@@ -56,9 +57,12 @@ is("the finest", (await turnTo())[0], [of(120, 90, 30), "show"]);
 fixed(window, "devicePixelRatio", 1);
 const painter = paint;
 paint = async () => { throw new Error("given up"); };
-is("an error", [await turnTo(), working], [[[], "given up"], false]);
+const told = () => [status.hidden, sorry.hidden, sorry.textContent];
+await turnTo();
+is("an error", [told(), working], [[true, false, "given up"], false]);
 paint = painter;
 await turnTo();
+is("and none", [told().slice(0, 2), status.getAttribute("aria-live"), sorry.getAttribute("role")], [[false, true], "off", "alert"]);
 // Two at a time come after each other, and none is painted for the same view again.
 ask();
 ask();
@@ -76,6 +80,27 @@ const press = (key, more) => {
 };
 is("keys", [press("w"), press("x"), press("r", { ctrlKey: true }), press("r", { altKey: true }), press("r", { metaKey: true }), press("r")], [[true, true], [false, false], [false, false], [false, false], [false, false], [true, true]]);
 is("reset", [rows(view), view.fov, view.pivot], [data.view.pose, Math.min(fov, 120), [0, 1, 2].map((i) => (data.view.bounds[0][i] + data.view.bounds[1][i]) / 2)]);
+view.eye = [9, 9, 9];
+document.getElementById("reset").click();
+is("by a button", rows(view), data.view.pose);
+const [lower, upper] = data.view.bounds, side3 = Math.max(...[0, 1, 2].map((i) => upper[i] - lower[i])), middle = [0, 1, 2].map((i) => (lower[i] + upper[i]) / 2);
+data.view.pose = [[1, 0, 0, middle[0]], [0, 0, -1, middle[1]], [0, 1, 0, middle[2]]];
+reset();
+is("from the middle", view.pivot, [middle[0], middle[1] + side3 / 2, middle[2]]);
 while (working) await rest(1);
-picture.dispatchEvent(new Event("webglcontextlost"));
-is("lost", status.textContent, "The graphics card was taken away: load the page again.");
+// What a card has no room for, and what has been taken away, is said.
+const asks = gl.getParameter.bind(gl), limits = (table, cells) => {
+  fixed(gl, "getParameter", (name) => (name === gl.MAX_TEXTURE_SIZE ? table : name === gl.MAX_3D_TEXTURE_SIZE ? cells : asks(name)));
+  bytes.files = JSON.parse(document.getElementById("files").textContent);
+  try { begin(); } catch (error) { return error.message; }
+  return "";
+};
+const sides = [Math.ceil((data.grid.rows * Math.ceil(data.grid.features / 4)) / 2048), (data.march.resolution / 4) * data.march.cascades];
+const large = "The scene is too large for this graphics card.";
+is("room", [limits(sides[0] - 1, sides[1]), limits(sides[0], sides[1] - 1), limits(...sides)], [large, large, ""]);
+({ rowsOf, paint, show } = real);
+const gone = "The graphics card was taken away: load the page again.";
+gl.getExtension("WEBGL_lose_context").loseContext();
+for (let i = 0; i < 400 && sorry.textContent !== gone; i++) await rest(5);
+await turnTo();
+is("lost", told(), [true, false, gone]);

@@ -109,10 +109,34 @@ for (const by of [0.3, 2]) {
   orbit(0, by);
   is("orbit upside down", view.eye, [0, 4 - 4 * Math.cos(by), -4 * Math.sin(by)]);
 }
+// Aslant: level with the first turn, but not where nearly all is below.
+ahead();
+[view.right, view.up] = [[0, 0, -1], [1, 0, 0]];
+orbit(0.5, 0);
+is("orbit of a picture on its side", [...eye(), ...axes()], [[-4 * s5, 4 - 4 * c5, 0], [0, 4, 0], [c5, -s5, 0], [0, 0, 1], [-s5, -c5, 0]]);
+const below = (tilt, dy) => {
+  const [s, c] = [Math.sin(tilt), Math.cos(tilt)];
+  Object.assign(view, { eye: [0, 0, 4], right: [c, 0, -s], up: [0, 1, 0], back: [s, 0, c], pivot: [0, 0, 0] });
+  orbit(0, dy);
+  return [view.eye, ...axes()];
+};
+const [s4, c4, sine, cosine] = [Math.sin(0.04), Math.cos(0.04), Math.sin(0.06), Math.cos(0.06)];
+is("from above", [below(0.04, 0), below(0, 0.2)], [[[0, 0, 4], [c4, 0, -s4], [0, 1, 0], [s4, 0, c4]], [[0, 0, 4], [1, 0, 0], [0, 1, 0], [0, 0, 1]]]);
+is("from nearly above", below(0.06, 0), [[0, 0, 4], [0, 1, 0], [-cosine, 0, sine], [sine, 0, cosine]]);
+is("and away from there", below(0, -0.2)[0], [0, -4 * Math.sin(0.2), 4 * Math.cos(0.2)]);
+const beyond = (dy) => {
+  Object.assign(view, { eye: [0, 0, 4], right: [1, 0, 0], up: [0, Math.cos(0.02), Math.sin(0.02)], back: [0, -Math.sin(0.02), Math.cos(0.02)], pivot: [0, 0, 0] });
+  orbit(0, dy);
+  return view.back;
+};
+is("beyond where orbits end", [beyond(0), beyond(0.3), beyond(-0.2)], [0.02, 0.02, 0.22].map((tilt) => [0, -Math.sin(tilt), Math.cos(tilt)]));
 const moves = [
   ["pan", () => pan(0.1, 0.2), [-0.8, 0, 1.6], [-0.8, 4, 1.6]],
   ["zoom", () => zoom(0.5), [0, 2, 0], [0, 4, 0]],
-  ["zoom in to the end", () => zoom(1e-9), [0, 3.994, 0], [0, 4, 0]],
+  ["zoom in to the end", () => zoom(1e-9), [0, 4 - 4e-9, 0], [0, 4.12 - 4e-9, 0]],
+  ["zoom in further", () => { view.pivot = [0, 0.12, 0]; zoom(0.5); }, [0, 0.06, 0], [0, 0.18, 0]],
+  ["zoom in from the pivot", () => { view.pivot = [0, 0, 0]; zoom(0.5); }, [0, 0, 0], [0, 0.12, 0]],
+  ["zoom out from near", () => { view.pivot = [0, 0.06, 0]; zoom(1.5); }, [0, -0.03, 0], [0, 0.09, 0]],
   ["zoom out to the end", () => zoom(1e9), [0, -596, 0], [0, 4, 0]],
   ["fly", () => fly(1, 2, 4), [1, 4, 2], [1, 8, 2]],
   ["fly when near", () => { view.pivot = [0, 0.1, 0]; fly(1, 2, 4); }, [0.3, 1.2, 0.6], [0.3, 1.3, 0.6]],
@@ -195,6 +219,9 @@ listKeys();
 
 // ---- photographs ------------------------------------------------------------------------------------------------------------
 const state = () => [view.eye, view.pivot, view.fov, view.photograph, $("photograph").value, $("fov").value, text("fov-out")];
+document.querySelector("input[value=error]").disabled = true;
+is("no error without photographs", [press("5"), mode()], [[true], "color"]);
+document.querySelector("input[value=error]").disabled = false;
 goTo(1);
 is("a photograph", state(), [[4, 0, 0], [0, 0, 0], 60, 1, "1", "60", "60°"]);
 goTo(2);
@@ -253,6 +280,9 @@ room = { x: 0, y: 0, width: 100, height: 200 };
 reset();
 const tall = (2 * Math.atan(2 * Math.tan(25 * radians))) / radians;
 is("reset in a tall window", [view.fov, view.pivot, $("fov").value, text("fov-out"), $("blend").value, photo.hidden], [tall, [0, 0, 0], "86", "86°", "0", true]);
+// Whoever stands in the middle looks at what is ahead, and comes nearer to it.
+const begins = (height) => { about.pose = along([0, 0, height]); reset(); return view.pivot; };
+is("reset in the middle", [begins(0.31), begins(-0.29), (zoom(0.5), view.eye)], [[0, 0, 0], [0, 3, -0.29], [0, 1.5, -0.29]]);
 $("fov").value = 30;
 goTo(1);
 $("fov").value = 31;
@@ -289,6 +319,12 @@ shown = null;
 is("the frame before a picture", frame(), { x: 0, y: 0, w: 400, h: 200 });
 shown = { size: [50, 50] };
 is("a square", frame(), { x: 100, y: 0, w: 200, h: 200 });
+room = { x: 0, y: 0, width: 401, height: 199 };
+shown = { size: [51, 25], halvings: 3 };
+is("a coarse one fills what the whole one will", frame(), { x: 0, y: 0, w: 401, h: 199 });
+shown = { size: [100, 50], halvings: 2 };
+is("one of another window", frame(), { x: 1.5, y: 0, w: 398, h: 199 });
+room = { x: 0, y: 0, width: 400, height: 200 };
 shown = { size: [800, 200] };
 layout();
 is("a band", [frame(), ...[picture, photo].map(({ style }) => [style.left, style.top, style.width, style.height])], [{ x: 0, y: 50, w: 400, h: 100 }, ["0px", "50px", "400px", "100px"], ["0px", "50px", "400px", "100px"]]);
@@ -370,6 +406,11 @@ hidden(true);
 is("hidden", [called(), unseen], [[{ ask: "rest" }], null]);
 ask();
 is("asks for nothing", timers.length, 0);
+fixed(document, "hidden", false);
+ask();
+fixed(document, "hidden", true);
+timers.pop().run();
+is("hidden in between", [called(), waits, unseen], [[], false, null]);
 hidden(false);
 is("seen", [timers.length, called()], [1, []]);
 timers.pop().run();
@@ -452,11 +493,20 @@ is("a camera", frustum(seen), lines);
 const wide = 0.36 * Math.tan(60 * radians);
 is("a wide camera", frustum({ ...seen, fov: 170, size: [100, 100] }).split("L")[0], `M${(110 - (50 * wide) / 1.36).toFixed(1)} ${(55 + (50 * wide) / 1.36).toFixed(1)}`);
 shown = { size: [400, 200] };
-const marked = (name) => [...marks.querySelectorAll(name)].map((mark) => mark.getAttribute("class") || ["cx", "cy", "r", "fill"].map((at) => mark.getAttribute(at)).join());
+const marked = (name) => [...marks.querySelectorAll(name)].map((mark) => mark.getAttribute("class"));
+const dotted = (x, y) => [...dots.getContext("2d").getImageData(x, y, 1, 1).data];
 set("cameras", true);
 set("points", true);
 markAll();
-is("marks", [marked(".camera"), marked("circle")], [["camera test", "camera train", "camera train", "camera val"], ["200.0,100.0,1.5,rgb(10,20,30)"]]);
+is("marks", marked(".camera"), ["camera test", "camera train", "camera train", "camera val"]);
+const opaque = dots.getContext("2d").getImageData(0, 0, 400, 200).data.reduce((sum, x, i) => sum + (i % 4 === 3 ? x : 0), 0);
+is("a point of two", [dots.hidden, dots.width, dots.height, dotted(200, 100)], [false, 400, 200, [10, 20, 30, 255]]);
+is("three pixels wide", opaque / 255, 9, 1.5);
+is("pointers go through", getComputedStyle(dots).pointerEvents, "none");
+fixed(window, "devicePixelRatio", 3);
+markAll();
+is("on a finer display", [dots.width, dots.height, dotted(400, 200)], [800, 400, [10, 20, 30, 255]]);
+fixed(window, "devicePixelRatio", 1);
 is("where", marks.querySelectorAll(".camera")[1].getAttribute("d"), frustum(about.photographs[1]));
 view.photograph = 1;
 markAll();
@@ -466,10 +516,12 @@ markAll();
 const ofError = marked("path").length;
 view.photograph = null;
 markAll();
-is("none over the error of another place", [ofError, marks.children.length], [3, 0]);
+is("none over the error of another place", [ofError, marks.children.length, dots.hidden], [3, 0, true]);
 document.querySelector("input[value=color]").checked = true;
 set("cameras", false);
 set("points", false);
+markAll();
+is("no points", dots.hidden, true);
 set("crop", true);
 set("box-x-0", -1), set("box-x-1", 0), set("box-y-0", 1), set("box-y-1", 2), set("box-z-0", -1), set("box-z-1", 3);
 is("the box", box(), [[-1, 1, -1], [0, 2, 3]]);
@@ -492,6 +544,10 @@ const grip = (axis, end, [x, y]) => {
 };
 // At a depth of 1.5, with a focal length of 100 pixels, a unit is 66.7 of them.
 is("moves a side", [grip(0, 1, [20, 7]), grip(0, 0, [-0.1, 0]), grip(2, 1, [5, 20]), grip(0, 0, [500, 0])], [0.3, -1, 2.7, 0.3], 1e-6);
+const drag = (id, value) => { set(id, value); $(id).dispatchEvent(new Event("input")); return Number($(id).value); };
+is("sides do not change places", [drag("box-y-0", 2), drag("box-y-0", 1), drag("box-y-1", -1), drag("box-y-1", 2)], [2, 1, 1, 2]);
+const grips = (coarse) => { fixed(window, "matchMedia", (words) => ({ matches: coarse && words === "(pointer: coarse)" })); markAll(); return marks.querySelector(".handle").getAttribute("r"); };
+is("for fingers, and a mouse", [grips(true), grips(false)], ["16", "7"]);
 is("and the camera not", [view.eye, view.photograph], [[0, 0, 0], null]);
 set("crop", false);
 
@@ -532,6 +588,64 @@ is("of the error", sorry(() => { document.querySelector("input[value=error]").ch
 const three = keys;
 is("of many", sorry(() => { keys = Array.from({ length: 400 }, () => key([0.1, 1 / 3, 0])); }, () => { keys = three; }), ["So many key frames h", []]);
 is("of one", sorry(() => { keys = three.slice(0, 1); }, () => { keys = three; }), ["A path needs two key", []]);
+// A path that was saved comes back, with what each key frame looks at straight ahead; what is none leaves all as it is.
+const given = [key([0, -4, 0]), key([3, -5, 1], { right: [S, S, 0], back: [S, -S, 0], fov: 33 }), key([1, 1, 0.1], { right: [0.6, 0, 0.8], up: [-0.8, 0, 0.6] })];
+const back = [[0, 0, 0], [-1, -1, 1], [1, 1.3, 0.1]].map((pivot, i) => ({ ...given[i], pivot }));
+keys = given;
+set("closed", true), set("seconds", "7.5");
+const kept = JSON.stringify(cameraPath());
+const load = async (words) => { $("sorry").textContent = ""; await loadPath(new File([words], "f.json")); return [keys, $("closed").checked, $("seconds").value, text("sorry").slice(0, 17)]; };
+keys = [], set("closed", false), set("seconds", "2");
+is("loaded", [await load(kept), $("keys").children.length], [[back, true, "7.5", ""], 3]);
+const spoilt = (change) => { const path = JSON.parse(kept); change(path); return JSON.stringify(path); };
+const bad = {
+  text: "none", null: "null", number: "3", list: "[]", empty: spoilt((p) => { p.keyframes = []; }), elsewhere: spoilt((p) => { p.coordinates = "scene"; }),
+  fov: spoilt((p) => { p.keyframes[1].fov = 130; }), noFov: spoilt((p) => { delete p.keyframes[1].fov; }), noKey: spoilt((p) => { p.keyframes[2] = null; }),
+  short: spoilt((p) => { p.keyframes[0].matrix.pop(); }), word: spoilt((p) => { p.keyframes[0].matrix[3] = "1"; }), far: spoilt((p) => { p.keyframes[0].matrix[3] = 1e10; }),
+  stretched: spoilt((p) => { p.keyframes[0].matrix = p.keyframes[0].matrix.map((x) => 1.1 * x); }), mirrored: spoilt((p) => { for (const i of [0, 4, 8]) p.keyframes[0].matrix[i] *= -1; }),
+  many: spoilt((p) => { p.keyframes = Array.from({ length: 1001 }, () => ({ fov: 50, matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1] })); }), long: kept + " ".repeat(1e6),
+};
+for (const [name, words] of Object.entries(bad)) is(`not loaded, ${name}`, await load(words), [back, true, "7.5", "f.json is no path"]);
+is("as many as may be", (await load(spoilt((p) => { p.keyframes = Array.from({ length: 1000 }, () => p.keyframes[0]); })))[0].length, 1000);
+is("half of it is left out", (await load(spoilt((p) => { delete p.seconds; delete p.is_cycle; }))).slice(1), [false, "7.5", ""]);
+const loader = loadPath;
+loadPath = (file) => { calls.push(file.name); };
+const carried = new DataTransfer();
+carried.items.add(new File(["x"], "g.json"));
+called();
+$("load-path").files = carried.files;
+$("load-path").dispatchEvent(new Event("change"));
+is("by its button", [called(), $("load-path").files.length], [["g.json"], 0]);
+$("load-path").dispatchEvent(new Event("change"));
+is("none is chosen", called(), []);
+loadPath = loader;
+// The path stays while the page is loaded again, and is that of its scene.
+const reload = (changes) => { about = null; meet(scene({ bounds: [[-1, -2, -3], [1, 2, 3]], ...changes })); return keys; };
+set("closed", true);
+$("closed").dispatchEvent(new Event("change"));
+keys = given;
+listKeys();
+set("closed", false);
+is("loaded again", [reload(), $("closed").checked, reload({ title: "other" }), reload({ bounds: [[-1, -2, -3], [1, 2, 4]] }), reload()], [back, true, [], [], back]);
+set("seconds", "3");
+$("seconds").dispatchEvent(new Event("change"));
+set("seconds", "9");
+is("with its time", [reload().length, $("seconds").value], [3, "3"]);
+sessionStorage.setItem(pathName(), "{");
+is("what was spoilt", reload(), []);
+keys = given;
+listKeys();
+const storage = Object.getOwnPropertyDescriptor(window, "sessionStorage");
+Object.defineProperty(window, "sessionStorage", { get() { throw new Error("no"); }, configurable: true });
+is("nothing is kept", [(listKeys(), keys.length), reload()], [3, []]);
+if (storage) Object.defineProperty(window, "sessionStorage", storage); else delete window.sessionStorage;
+keys = [];
+listKeys();
+is("nor of no key frame", [sessionStorage.getItem(pathName()), reload()], [null, []]);
+ahead();
+set("closed", true), set("seconds", "7");
+keys = three;
+called();
 listKeys();
 is("buttons", [...$("keys").querySelectorAll("button")].map((b) => [b.textContent, b.getAttribute("aria-label")]).slice(2, 4), [["go to", "Go to key frame 2"], ["remove", "Remove key frame 2"]]);
 $("keys").querySelectorAll("button")[2].click();
@@ -570,7 +684,7 @@ const going = { step: 12, loss: 0.012345, psnr: 21.456, left: "3 min", paused: f
 const curves = () => ["loss", "psnr", "speed"].map((name) => [...$(`curve-${name}`).children].map((e) => e.getAttribute("d") || e.textContent));
 document.activeElement.blur();
 follow(going);
-is("training", [text("progress"), text("pause"), $("share").value, text("share-out"), $("stop").disabled], ["step 12 · loss 0.0123 · PSNR 21.46 dB · 3 min left", "Pause", "35", "35 %", false]);
+is("training", [text("progress"), text("pause"), $("share").value, text("share-out"), $("stop").disabled], ["step 12 · loss 0.0123 · PSNR 21.46 dB · 3 min of training left", "Pause", "35", "35 %", false]);
 is("curves", curves(), [["M2.0 50.0L52.0 34.0L102.0 18.0", "loss 100.0"], ["M2.0 50.0L102.0 18.0", "PSNR 30.00"], ["M2.0 50.0", "rays/s 1,500"]]);
 $("training").hidden = false;
 $("share").focus();
@@ -599,7 +713,8 @@ const lost = (reason) => { socket.onclose({ reason }); return [text("lost"), $("
 const [words, covers, timer] = lost("");
 is("lost", [words, covers, timer.after], ["The program does not answer. Trying again…", false, 500]);
 is("why", lost("stalled")[0], "The program has closed the connection: stalled. Trying again…");
-is("more and more seldom", [lost("")[2].after, lost("")[2].after, lost("")[2].after, lost("")[2].after], [2000, 4000, 5000, 5000]);
+const seldom = [lost(""), lost(""), lost(""), lost("")].map(([words, , timer]) => [words === "The program does not answer. Trying again…", words.includes("may be an old one: the program prints the new one"), timer.after]);
+is("more and more seldom", seldom, [[true, false, 2000], [false, true, 4000], [false, true, 5000], [false, true, 5000]]);
 timer.run();
 unseen = 4;
 socket.onopen();

@@ -3,6 +3,7 @@
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const stage = document.getElementById("stage"), picture = document.getElementById("picture"), status = document.getElementById("status");
+const sorry = document.getElementById("sorry");
 
 /** How long the graphics card may be busy with a piece of a picture, in milliseconds, and the first picture of a moving camera. */
 const PIECE = 40, FIRST = 30;
@@ -15,6 +16,12 @@ function bytes(name) {
   return out;
 }
 bytes.files = JSON.parse(document.getElementById("files").textContent);
+
+/** Says what there is to say of a picture, or why there is none, which screen readers are to tell at once. */
+function tell(words, sad = false) {
+  [status.hidden, sorry.hidden] = [sad, !sad];
+  (sad ? sorry : status).textContent = words;
+}
 
 // ---- the graphics card ------------------------------------------------------------------------------------------------
 let gl = null, program = null, places = null;
@@ -98,7 +105,10 @@ function begin() {
   // Rows of the table, four numbers to a texel, or fewer where a row has fewer.
   const [format, inside] = each === 1 ? [gl.RED, gl.R16F] : each === 2 ? [gl.RG, gl.RG16F] : [gl.RGBA, gl.RGBA16F];
   const height = Math.ceil((grid.rows * texels) / TABLE_WIDTH);
-  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this graphics card.");
+  const blocks = march.resolution / 4;
+  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE) || blocks * march.cascades > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) {
+    throw new Error("The scene is too large for this graphics card.");
+  }
   texture(0, gl.TEXTURE_2D, () => {
     const values = padded(new Uint16Array(bytes("table").buffer), TABLE_WIDTH * height * Math.min(each, 4));
     gl.texImage2D(gl.TEXTURE_2D, 0, inside, TABLE_WIDTH, height, 0, format, gl.HALF_FLOAT, values);
@@ -109,7 +119,6 @@ function begin() {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, WEIGHTS_WIDTH, rows, 0, gl.RGBA, gl.FLOAT, padded(values, 4 * WEIGHTS_WIDTH * rows));
   });
   texture(2, gl.TEXTURE_3D, () => {
-    const blocks = march.resolution / 4;
     gl.texImage3D(gl.TEXTURE_3D, 0, gl.RG32UI, blocks, blocks, blocks * march.cascades, 0, gl.RG_INTEGER, gl.UNSIGNED_INT, new Uint32Array(bytes("words").buffer));
   });
   bytes.files = null;
@@ -221,18 +230,19 @@ async function work() {
       const [w, h] = [width, height].map((side) => Math.max(1, Math.floor(side * fits)));
       await paint(seen, w, h, FIRST);
       show();
-      status.textContent = `${w}×${h} · ${(performance.now() - start).toFixed(0)} ms${warning}`;
+      tell(`${w}×${h} · ${(performance.now() - start).toFixed(0)} ms${warning}`);
       if (wanted !== own) continue;
       if (fits < 1) {
         if (!(await paint(seen, width, height, PIECE))) continue;
         show();
-        status.textContent = `${width}×${height} · ${(performance.now() - start).toFixed(0)} ms${warning}`;
+        tell(`${width}×${height} · ${(performance.now() - start).toFixed(0)} ms${warning}`);
       }
       whole = own;
       stage.dataset.whole = String(whole);
     }
   } catch (error) {
-    status.textContent = error.message;
+    // Of a card that is gone nothing else is to be said.
+    if (!gl.isContextLost()) tell(error.message, true);
   }
   working = false;
 }
@@ -251,8 +261,7 @@ async function render(pose, fov, width, height) {
 }
 
 function reset() {
-  place(data.view.pose, fitting(data.view.fov, data.view.proportion, stage.clientWidth / stage.clientHeight));
-  view.pivot = times(0.5, add(...bounds));
+  enter(data.view, stage.clientWidth / stage.clientHeight);
   ask();
 }
 
@@ -266,9 +275,10 @@ try {
     else if (!steer(event)) return;
     event.preventDefault();
   });
-  picture.addEventListener("webglcontextlost", () => { status.textContent = "The graphics card was taken away: load the page again."; });
+  picture.addEventListener("webglcontextlost", () => tell("The graphics card was taken away: load the page again.", true));
+  document.getElementById("reset").addEventListener("click", reset);
   reset();
   new ResizeObserver(ask).observe(stage);
 } catch (error) {
-  status.textContent = error.message;
+  tell(error.message, true);
 }

@@ -38,17 +38,34 @@ function fitting(fov, own, window) {
   return clamp((2 * Math.atan(half)) / radians, 1, 120);
 }
 
+/** Puts the camera where a scene is looked at from first, in a window of this shape. */
+function enter({ pose, fov, proportion }, window) {
+  place(pose, fitting(fov, proportion, window));
+  view.pivot = times(0.5, add(...bounds));
+  // Whoever stands in the middle looks at what is around it.
+  if (size(sub(view.eye, view.pivot)) < 0.05 * side()) view.pivot = sub(view.eye, times(0.5 * side(), view.back));
+}
+
+/** Makes the horizon level, as it is not in a photograph that was taken aslant; whoever looks along the vertical sees none. */
+function level() {
+  const right = cross([0, 0, 1], view.back);
+  if (Math.abs(view.right[2]) < 1e-9 || size(right) < 0.05) return;
+  view.right = unit(right);
+  view.up = cross(view.back, view.right);
+}
+
 function orbit(dx, dy) {
   free();
+  level();
   const turn = (axis, angle) => {
     for (const name of ["right", "up", "back"]) view[name] = unit(turned(view[name], axis, angle));
     view.eye = add(view.pivot, turned(sub(view.eye, view.pivot), axis, angle));
   };
   turn([0, 0, 1], -dx);
-  // Not over the poles, where left and right change places.
+  // Not over the poles, where left and right change places; from beyond only back.
   const height = Math.asin(clamp(view.back[2], -1, 1));
-  const upright = view.up[2] > 0;
-  turn(view.right, upright ? -clamp(dy, -1.5 - height, 1.5 - height) : -dy);
+  const upright = view.up[2] > -1e-6;
+  turn(view.right, upright ? -clamp(dy, Math.min(0, -1.5 - height), Math.max(0, 1.5 - height)) : -dy);
   ask();
 }
 
@@ -62,10 +79,17 @@ function pan(dx, dy) {
   ask();
 }
 
+/** How near the camera comes to what it turns about, as a share of the scene's side. */
+const NEAREST = 0.02;
+
 function zoom(factor) {
   free();
   const away = sub(view.eye, view.pivot);
-  view.eye = add(view.pivot, times(clamp(size(away) * factor, 1e-3 * side(), 100 * side()) / (size(away) || 1), away));
+  const backwards = size(away) > 0 ? unit(away) : view.back;
+  const distance = Math.min(size(away) * factor, 100 * side());
+  view.eye = add(view.pivot, times(distance, backwards));
+  // Whoever is as near as that pushes it along, and gets on.
+  view.pivot = sub(view.eye, times(Math.max(distance, NEAREST * side()), backwards));
   ask();
 }
 

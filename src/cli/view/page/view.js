@@ -2,7 +2,7 @@
 "use strict";
 
 const $ = (id) => document.getElementById(id);
-const stage = $("stage"), picture = $("picture"), photo = $("photo"), marks = $("marks");
+const stage = $("stage"), picture = $("picture"), photo = $("photo"), dots = $("dots"), marks = $("marks");
 
 // ---- what the program says ------------------------------------------------------------------------------------------
 let about = null;
@@ -24,7 +24,9 @@ function connect() {
   socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
   socket.onclose = (event) => {
     $("lost").textContent = training && training.ended ? "Training has ended, and the program with it: raygrad view shows the run." : event.reason ? `The program has closed the connection: ${event.reason}. Trying again…`
-      : "The program does not answer. Trying again…";
+      : attempts < 3 ? "The program does not answer. Trying again…"
+      // Whether it refuses a link's token is not told.
+      : "The program does not answer. If it has been started again, this link may be an old one: the program prints the new one. Trying again…";
     $("lost").hidden = false;
     attempts += 1;
     setTimeout(connect, Math.min(5000, 250 * 2 ** attempts));
@@ -88,9 +90,9 @@ function meet(message) {
   const first = before === null || elsewhere;
   const checkpoint = before ? before.checkpoints[Number($("checkpoint").value)] : undefined;
   about = message;
-  if (elsewhere) keys = [];
   if (view.photograph >= about.photographs.length) view.photograph = null;
   bounds = about.bounds;
+  if (elsewhere) recall();
   overlaid = requested = null;
   document.title = `${about.title} - raygrad`;
   $("title").textContent = about.title;
@@ -149,6 +151,7 @@ function ask() {
   waits = true;
   setTimeout(() => {
     waits = false;
+    if (document.hidden) return;
     [unseen, again] = [performance.now(), false];
     asked = (asked + 1) >>> 0;
     say({ ask: "view", id: asked, view: wanted() });
@@ -200,7 +203,9 @@ const evenly = (sides) => sides.map((side) => Math.max(16, 2 * Math.round(side /
 /** The part of the stage that pictures fill. */
 function frame() {
   const area = stage.getBoundingClientRect();
-  const [width, height] = shown && shown.size ? shown.size : sizes();
+  // Sides of coarse pictures are rounded up: they fill what the whole one will.
+  const whole = sizes(), coarse = shown && whole.map((side) => Math.ceil(side / 2 ** shown.halvings));
+  const [width, height] = shown && String(shown.size) !== String(coarse) ? shown.size : whole;
   const share = Math.min(area.width / width, area.height / height);
   const [w, h] = [width * share, height * share];
   return { x: (area.width - w) / 2, y: (area.height - h) / 2, w, h };
@@ -253,8 +258,7 @@ function free() {
 function reset() {
   playing += 1;
   const area = stage.getBoundingClientRect();
-  place(about.pose, fitting(about.fov, about.proportion, area.width / area.height));
-  view.pivot = times(0.5, add(...bounds));
+  enter(about, area.width / area.height);
   view.photograph = null;
   $("photograph").value = "";
   $("fov").value = String(Math.round(view.fov));
@@ -293,7 +297,9 @@ document.addEventListener("keydown", (event) => {
 });
 
 function choose(name) {
-  document.querySelector(`input[name=show][value=${name}]`).checked = true;
+  const input = document.querySelector(`input[name=show][value=${name}]`);
+  if (input.disabled) return;
+  input.checked = true;
   ask();
 }
 
@@ -306,14 +312,17 @@ function goTo(number) {
   const photograph = about.photographs[number];
   place(photograph.pose, clamp(photograph.fov, 5, 120));
   view.photograph = number;
-  // What it looks at: as far as the middle of the scene, straight ahead.
-  const middle = times(0.5, add(...bounds));
-  const ahead = Math.max(0.05 * side(), dot(sub(view.eye, middle), view.back));
-  view.pivot = add(view.eye, times(-ahead, view.back));
+  view.pivot = lookedAt(view);
   $("photograph").value = String(number);
   $("fov").value = String(Math.round(view.fov));
   blend();
   settled();
+}
+
+/** What a camera looks at: as far as the middle of the scene, straight ahead. */
+function lookedAt({ eye, back }) {
+  const middle = times(0.5, add(...bounds));
+  return sub(eye, times(Math.max(0.05 * side(), dot(sub(eye, middle), back)), back));
 }
 
 function nearest() {
@@ -418,8 +427,26 @@ function markAll() {
   const made = document.createDocumentFragment();
   area = frame();
   // The error is seen from the nearest photograph, not from here.
-  if (!(mode() === "error" && view.photograph === null)) makeMarks(made);
+  const here = !(mode() === "error" && view.photograph === null);
+  if (here) makeMarks(made);
   marks.replaceChildren(made);
+  dots.hidden = !(here && $("points").checked);
+  if (!dots.hidden) drawPoints();
+}
+
+/** Thousands of them, which as marks would take longer than a frame of the display. */
+function drawPoints() {
+  const room = stage.getBoundingClientRect();
+  const fine = Math.min(devicePixelRatio, 2);
+  [dots.width, dots.height] = [room.width, room.height].map((side) => Math.max(1, Math.round(side * fine)));
+  const pen = dots.getContext("2d");
+  pen.scale(dots.width / room.width, dots.height / room.height);
+  for (const [place, color] of about.points) {
+    const at = project(place);
+    if (!at) continue;
+    pen.fillStyle = `rgb(${color})`;
+    pen.fillRect(at[0] - 1.5, at[1] - 1.5, 3, 3);
+  }
 }
 
 function makeMarks(marks) {
@@ -427,12 +454,6 @@ function makeMarks(marks) {
     about.photographs.forEach((photograph, i) => {
       if (i !== view.photograph) svg("path", { d: frustum(photograph), class: `camera ${photograph.split}` }, marks);
     });
-  }
-  if ($("points").checked) {
-    for (const [place, color] of about.points) {
-      const at = project(place);
-      if (at) svg("circle", { cx: at[0].toFixed(1), cy: at[1].toFixed(1), r: 1.5, fill: `rgb(${color})` }, marks);
-    }
   }
   if ($("crop").checked) boxMarks(marks);
   if (keys.length > 1) svg("path", { d: path(flight(64).map((key) => key.eye)), class: "path" }, marks);
@@ -450,7 +471,7 @@ function makeBox() {
       Object.assign(input, { type: "range", min: lower[axis], max: upper[axis], step: "any", value: [lower, upper][end][axis] });
       input.id = `box-${name}-${end}`;
       input.setAttribute("aria-label", `${end ? "upper" : "lower"} ${name}`);
-      input.addEventListener("input", ask);
+      input.addEventListener("input", () => moveSide(axis, end, Number(input.value)));
       holder.append(input);
     });
   });
@@ -463,6 +484,13 @@ function box() {
   return [end(0), end(1)];
 }
 
+/** Moves a side of the box as far as the other. */
+function moveSide(axis, end, value) {
+  const [moved, other] = [end, 1 - end].map((i) => $(`box-${"xyz"[axis]}-${i}`));
+  moved.value = String((end ? Math.max : Math.min)(value, Number(other.value)));
+  ask();
+}
+
 function boxMarks(marks) {
   const ends = box();
   const corner = (i) => [ends[i & 1][0], ends[(i >> 1) & 1][1], ends[(i >> 2) & 1][2]];
@@ -472,13 +500,15 @@ function boxMarks(marks) {
     }
   }
   const middle = times(0.5, add(...ends));
+  // A finger is wider than a mouse's pointer.
+  const r = matchMedia("(pointer: coarse)").matches ? 16 : 7;
   for (const axis of [0, 1, 2]) {
     for (const end of [0, 1]) {
       const place = [...middle];
       place[axis] = ends[end][axis];
       const at = project(place);
       if (at) {
-        const handle = svg("circle", { cx: at[0], cy: at[1], r: 7, class: "handle" }, marks);
+        const handle = svg("circle", { cx: at[0], cy: at[1], r, class: "handle" }, marks);
         handle.addEventListener("pointerdown", (event) => dragFace(event, axis, end));
       }
     }
@@ -489,7 +519,6 @@ function boxMarks(marks) {
 function dragFace(down, axis, end) {
   down.preventDefault();
   down.stopPropagation();
-  const input = $(`box-${"xyz"[axis]}-${end}`);
   const ends = box();
   const place = times(0.5, add(...ends));
   place[axis] = ends[end][axis];
@@ -500,13 +529,10 @@ function dragFace(down, axis, end) {
   if (!a || !b) return;
   const along = [(b[0] - a[0]) / small, (b[1] - a[1]) / small];
   const square = along[0] ** 2 + along[1] ** 2;
-  const from = Number(input.value);
+  const from = ends[end][axis];
   const move = (event) => {
     const moved = ((event.clientX - down.clientX) * along[0] + (event.clientY - down.clientY) * along[1]) / (square || 1);
-    const other = Number($(`box-${"xyz"[axis]}-${1 - end}`).value);
-    const value = from + moved;
-    input.value = String(end ? Math.max(value, other) : Math.min(value, other));
-    ask();
+    moveSide(axis, end, from + moved);
   };
   const up = () => ["pointerup", "pointercancel"].forEach((end) => { removeEventListener("pointermove", move); removeEventListener(end, up); });
   addEventListener("pointermove", move);
@@ -531,6 +557,7 @@ function listKeys() {
     item.append(go, drop);
     list.append(item);
   });
+  remember();
 }
 
 /** The path through the key frames: a Catmull-Rom spline, to look at. */
@@ -587,19 +614,79 @@ function inCapture(key) {
   return [0, 1, 2].flatMap((r) => [right[r], up[r], back[r], eye[r]]).concat([0, 0, 0, 1]);
 }
 
+/** A key frame of a pose in those coordinates. */
+function fromCapture({ matrix, fov }) {
+  const to = about.to_capture;
+  const scale = Math.hypot(to[0][0], to[1][0], to[2][0]);
+  const turn = (a) => [0, 1, 2].map((c) => (to[0][c] * a[0] + to[1][c] * a[1] + to[2][c] * a[2]) / scale);
+  const column = (c) => [0, 1, 2].map((r) => matrix[4 * r + c]);
+  const [right, up, back] = [0, 1, 2].map((c) => turn(column(c)));
+  const eye = times(1 / scale, turn(sub(column(3), to.map((row) => row[3]))));
+  return { eye, right, up, back, fov, pivot: lookedAt({ eye, back }) };
+}
+
+/** What a path is loaded from again. */
+const saved = () => ({
+  coordinates: "capture",
+  keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
+  is_cycle: $("closed").checked,
+  seconds: duration(),
+});
+
+/** The most bytes and key frames that are loaded. */
+const LARGEST = 1e6, MOST_KEYS = 1000;
+
+/** Takes a path that was saved; says whether it is one. */
+function take(path) {
+  const among = (x, low, high) => typeof x === "number" && x >= low && x <= high;
+  const isKey = (key) => {
+    if (!key || !among(key.fov, 1, 120) || !Array.isArray(key.matrix) || key.matrix.length !== 16) return false;
+    if (!key.matrix.every((x) => among(x, -EVERYWHERE, EVERYWHERE))) return false;
+    const axes = [0, 1, 2].map((c) => [0, 1, 2].map((r) => key.matrix[4 * r + c]));
+    return axes.every((axis) => Math.abs(size(axis) - 1) < 1e-3) && dot(cross(axes[0], axes[1]), axes[2]) > 1 - 1e-3;
+  };
+  const frames = path && path.coordinates === "capture" && path.keyframes;
+  if (!Array.isArray(frames) || frames.length === 0 || frames.length > MOST_KEYS || !frames.every(isKey)) return false;
+  keys = frames.map(fromCapture);
+  $("closed").checked = path.is_cycle === true;
+  if (among(path.seconds, 0.5, 600)) $("seconds").value = String(path.seconds);
+  return true;
+}
+
+async function loadPath(file) {
+  const path = file.size > LARGEST ? null : await file.text().then(JSON.parse).catch(() => null);
+  if (!take(path)) return apologise(`${file.name} is no path that was saved here: of up to ${MOST_KEYS} key frames, and 1 MB.`);
+  listKeys();
+  marksOf();
+}
+
+/** By what name the path of this scene is remembered while the page is loaded again. */
+const pathName = () => `path of ${about.title} in ${about.bounds}`;
+
+function remember() {
+  try {
+    if (keys.length) sessionStorage.setItem(pathName(), JSON.stringify(saved()));
+    else sessionStorage.removeItem(pathName());
+  } catch { /* Some browsers keep nothing. */ }
+}
+
+function recall() {
+  keys = [];
+  try {
+    take(JSON.parse(sessionStorage.getItem(pathName())));
+  } catch { /* Nothing is kept. */ }
+}
+
 /** The path in the form that `render` reads, if it is one. */
 function cameraPath() {
   if (keys.length < 2) return apologise("A path needs two key frames.");
   // The picture's own proportions, in sides that encoders take.
   const [width, height] = evenly(freeSizes());
   return {
-    coordinates: "capture",
-    keyframes: keys.map((key) => ({ matrix: inCapture(key), fov: key.fov })),
+    ...saved(),
     camera_type: "perspective",
     render_width: width,
     render_height: height,
-    is_cycle: $("closed").checked,
-    seconds: duration(),
     fps: 25,
     smoothness_value: 0,
     camera_path: [],
@@ -642,7 +729,7 @@ function follow(message) {
   training = message;
   const { step, loss, psnr, left, paused, share, ended } = message;
   $("progress").textContent = ended ? `ended after ${step} steps: ${ended}`
-    : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} left`}`;
+    : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} of training left`}`;
   $("pause").textContent = paused ? "Go on" : "Pause";
   for (const id of ["pause", "stop", "share"]) $(id).disabled = Boolean(ended);
   if (document.activeElement !== $("share")) $("share").value = String(100 * share);
@@ -678,6 +765,7 @@ $("background").addEventListener("input", () => { $("own-background").checked = 
 $("fov").addEventListener("input", () => { free(); view.fov = Number($("fov").value); settled(); });
 $("blend").addEventListener("input", blend);
 for (const id of ["cameras", "points", "closed"]) $(id).addEventListener("change", () => { marksOf(); });
+for (const id of ["closed", "seconds"]) $(id).addEventListener("change", remember);
 $("reset").addEventListener("click", reset);
 $("save").addEventListener("click", () => say({ ask: "save", view: wanted() }));
 $("photograph").addEventListener("change", () => ($("photograph").value === "" ? (free(), ask()) : goTo(Number($("photograph").value))));
@@ -688,6 +776,12 @@ $("nearest").addEventListener("click", () => goTo(nearest()));
 $("key").addEventListener("click", () => { keys.push(snapshot()); listKeys(); marksOf(); });
 $("play").addEventListener("click", play);
 $("save-path").addEventListener("click", savePath);
+$("load-path").addEventListener("change", () => {
+  const [file] = $("load-path").files;
+  if (file) loadPath(file);
+  // The same one may be chosen again.
+  $("load-path").value = "";
+});
 $("film").addEventListener("click", makeFilm);
 $("end-film").addEventListener("click", () => say({ ask: "end-film" }));
 $("checkpoint").addEventListener("input", settled);
