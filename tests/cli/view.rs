@@ -297,7 +297,7 @@ fn a_picture_is_painted_once_and_none_for_who_looks_away() {
     let server = serve(&place, &format!("train scene --steps 100000 --view --out run {SMALL}"));
     let (mut page, about) = Page::open(&server.address);
     // While it learns it is painted again, never as fine as would take long.
-    page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [1800, 1800]) }));
+    page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [900, 900]) }));
     let shots: Vec<Value> = (0..4).map(|_| page.file("picture").0).collect();
     assert!(shots.iter().all(|head| head["halvings"] != 0), "{shots:?}");
     assert!(shots[3]["step"].as_u64().unwrap() > shots[0]["step"].as_u64().unwrap(), "{shots:?}");
@@ -321,8 +321,8 @@ fn a_picture_is_painted_once_and_none_for_who_looks_away() {
     page.say(json!({ "ask": "view", "id": 2, "view": view }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("training has ended"));
     // Held, it is painted as fine as it goes, once.
-    page.say(json!({ "ask": "view", "id": 6, "view": first(&about, [800, 800]) }));
-    page.hear(Duration::from_secs(3));
+    page.say(json!({ "ask": "view", "id": 6, "view": first(&about, [300, 300]) }));
+    page.hear(Duration::from_secs(1));
     let is_whole = |head: &Value| head["halvings"] == 0;
     let went = page.files.drain(..).any(|(head, _)| is_whole(&head));
     page.say(json!({ "ask": "pause", "pause": true }));
@@ -343,7 +343,7 @@ fn captures_keep_their_proportions_and_their_places() {
     let mut transforms = place.json("around/transforms.json");
     transforms["ply_file_path"] = json!("points.ply");
     std::fs::write(place.path("around/transforms.json"), transforms.to_string()).unwrap();
-    place.succeeds(&format!("train around --steps 80 --out run {SMALL}"));
+    place.succeeds(&format!("train around --steps 30 --out run {SMALL}"));
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     assert_eq!(json!([about["size"], about["photographs"][0]["size"]]), json!([[32, 24], [32, 24]]));
@@ -596,8 +596,8 @@ fn the_newest_camera_wins() {
 #[test]
 fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 600 --out whole {SMALL}"));
-    let mut server = serve(&place, &format!("train scene --steps 600 --view --out run {SMALL}"));
+    place.succeeds(&format!("train scene --steps 300 --out whole {SMALL}"));
+    let mut server = serve(&place, &format!("train scene --steps 300 --view --out run {SMALL}"));
     let (mut page, about) = Page::open(&server.address);
     assert_eq!(about["training"], true);
     page.say(json!({ "ask": "pause", "pause": true }));
@@ -629,24 +629,24 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
         page.read().unwrap();
     };
     assert!(again > held, "{again}");
-    assert_eq!(json!([ended["step"], ended["ended"]]), json!([600, "done"]));
+    assert_eq!(json!([ended["step"], ended["ended"]]), json!([300, "done"]));
     assert!(ended["curves"]["loss"].as_array().unwrap().len() > 10, "{ended}");
     // The scene is shown until the page has gone; meanwhile the run is anyone's.
     page.say(json!({ "ask": "view", "id": 9, "view": view }));
-    while page.file("picture").0["step"] != 600 {}
-    place.succeeds("train --resume run --steps 600");
+    while page.file("picture").0["step"] != 300 {}
+    place.succeeds("train --resume run --steps 300");
     drop(page);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert_same(&place, "whole", "run");
 
     // Ended from the page, it can be gone on with.
-    let mut server = serve(&place, &format!("train scene --steps 600 --view --out other {SMALL}"));
+    let mut server = serve(&place, &format!("train scene --steps 300 --view --out other {SMALL}"));
     let (mut page, _) = Page::open(&server.address);
     page.say(json!({ "ask": "pause", "pause": true }));
     while page.text("training")["paused"] != true {}
     page.say(json!({ "ask": "stop" }));
     let ended = page.ended();
-    assert!(ended["step"].as_u64().unwrap() < 600 && ended["ended"] == "stopped, and saved", "{ended}");
+    assert!(ended["step"].as_u64().unwrap() < 300 && ended["ended"] == "stopped, and saved", "{ended}");
     drop(page);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     place.succeeds("train --resume other");
@@ -656,12 +656,12 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
 #[test]
 fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 400 --checkpoint 0.05s --keep-checkpoints 500 --out run {SMALL}"));
+    place.succeeds(&format!("train scene --steps 150 --checkpoint 0.02s --keep-checkpoints 500 --out run {SMALL}"));
     assert_eq!(place.command("train scene --keep-checkpoints 1").output().unwrap().status.code(), Some(2));
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     let steps: Vec<u64> = about["checkpoints"].as_array().unwrap().iter().map(|step| step.as_u64().unwrap()).collect();
-    assert!(steps.len() > 4 && steps.is_sorted() && [steps[0], steps[steps.len() - 1]] == [0, 400], "{steps:?}");
+    assert!(steps.len() > 4 && steps.is_sorted() && [steps[0], steps[steps.len() - 1]] == [0, 150], "{steps:?}");
     let view = first(&about, [64, 64]);
     let with = |name: &str, value: Value| {
         let mut view = view.clone();
@@ -676,7 +676,7 @@ fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
     let last = kept(&mut page, &view);
     // A run that is ended at a checkpoint has the model of it.
     let earlier = *steps.iter().find(|step| **step > 30).unwrap();
-    place.succeeds(&format!("train scene --steps 400 --checkpoint 0.05s --keep-checkpoints 3 --out other {SMALL}"));
+    place.succeeds(&format!("train scene --steps 150 --checkpoint 0.02s --keep-checkpoints 3 --out other {SMALL}"));
     let checkpoints = place.path("other/checkpoints");
     assert_eq!(std::fs::read_dir(&checkpoints).unwrap().count(), 3);
     std::fs::remove_dir_all(&checkpoints).unwrap();
@@ -694,7 +694,7 @@ fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
     assert!(psnr(&before, &expected) > 50.0, "{}", psnr(&before, &expected));
     assert!(psnr(&last, &expected) < 40.0, "{}", psnr(&last, &expected));
     // The last one is what the run ended with, but for its rounding.
-    let same = kept(&mut page, &with("checkpoint", json!(400)));
+    let same = kept(&mut page, &with("checkpoint", json!(150)));
     assert!(psnr(&same, &last) > 50.0, "{}", psnr(&same, &last));
     // More of them than are kept in memory, and back.
     for (id, step) in (4..).zip([steps[1], steps[2], steps[3], steps[4], steps[1]]) {
@@ -722,7 +722,7 @@ fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
     // What is not there is said, and the rest goes on.
     for kind in ["view", "save"] {
         page.say(
-            json!({ "ask": kind, "id": 30, "view": with("checkpoint", json!(401)) })
+            json!({ "ask": kind, "id": 30, "view": with("checkpoint", json!(151)) })
                 .as_object()
                 .map(|asked| {
                     let mut asked = asked.clone();
@@ -734,7 +734,7 @@ fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
                 .unwrap(),
         );
         let what = page.text("sorry")["what"].as_str().unwrap().to_owned();
-        assert!(what.contains("no checkpoint of step 401"), "{kind}: {what}");
+        assert!(what.contains("no checkpoint of step 151"), "{kind}: {what}");
     }
     std::fs::write(place.path(&format!("run/checkpoints/{:08}.checkpoint", steps[1])), b"nothing").unwrap();
     for id in [32, 33] {
@@ -977,7 +977,7 @@ fn what_pages_cost_training() {
     let given = std::env::var("COST").ok();
     let (scene, flags, rounds) = match &given {
         Some(scene) => (&**scene, "--steps 1000", 7),
-        None => ("scene", &*format!("--steps 100 {SMALL}"), 1),
+        None => ("scene", &*format!("--steps 30 {SMALL}"), 1),
     };
     // How long training takes as a whole, and the processor (clock ticks of children that have ended, those of other tests at the
     // same time, too): without a page, with one that nobody looks at, with one that is looked at.
@@ -1036,7 +1036,7 @@ fn what_pages_cost_training() {
 #[test]
 fn many_pages_and_much_nonsense_leave_memory_and_training_as_they_are() {
     let all = std::env::var("LOAD").is_ok_and(|which| which == "all");
-    let (pages, nonsense, steps) = if all { (50, 10_000, 6000) } else { (6, 100, 600) };
+    let (pages, nonsense, steps) = if all { (50, 10_000, 6000) } else { (6, 100, 300) };
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps {steps} --out whole {SMALL}"));
     let mut server = serve(&place, &format!("train scene --steps {steps} --view --out run {SMALL}"));
