@@ -465,7 +465,7 @@ coming[2](bitmap(30, 15));
 await Promise.all(drawn);
 is("the next, and one that is none", [text("status"), shown.id, shown.whole, picture.style.width], ["30×15 · 3 ms", 3, true, "400px"]);
 const status = async (more) => { const done = draw(head(9, more), null); coming.pop()(bitmap(30, 15)); await done; return text("status"); };
-is("compared", [await status({ compared: [1, 31.456] }), await status({ compared: [2, null], step: 7 })], ["30×15 · 13 ms · against b: 31.46 dB", "30×15 · 13 ms · against c: - dB · step 7"]);
+is("compared", [await status({ compared: [1, 31.456, true] }), await status({ compared: [0, 31.456, false] }), await status({ compared: [2, null, false], step: 7 })], ["30×15 · 13 ms · against b: 31.46 dB", "30×15 · 13 ms · against a: about 31.46 dB", "30×15 · 13 ms · against c: - dB · step 7"]);
 about.training = true;
 is("in training", await status({}), "30×15 · 13 ms · step 0");
 about.training = false;
