@@ -5,6 +5,7 @@ mod guard;
 mod hub;
 pub mod messages;
 mod painter;
+mod parts;
 mod served;
 mod server;
 mod shelf;
