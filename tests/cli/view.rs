@@ -33,11 +33,11 @@ impl Drop for Server {
 
 /// Starts it, and reads its link.
 pub fn serve(place: &Place, arguments: &str) -> Server {
-    serve_with(&mut place.command(arguments))
+    serve_with(place.command(arguments).stderr(Stdio::null()))
 }
 
 fn serve_with(command: &mut Command) -> Server {
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
     let mut out = BufReader::new(child.stdout.take().unwrap());
     let mut line = String::new();
     while !line.starts_with("view ") {
@@ -522,7 +522,7 @@ fn a_page_is_opened_in_the_browser() {
     let path = format!("{}:{}", place.path("").display(), std::env::var("PATH").unwrap());
     for (arguments, opens) in [("view run", false), ("view run --open", true)] {
         let mut command = place.command(arguments);
-        let server = serve_with(command.env("PATH", &path));
+        let server = serve_with(command.env("PATH", &path).stderr(Stdio::null()));
         let start = Instant::now();
         let patience = Duration::from_secs(if opens { 30 } else { 1 });
         let opened = || std::fs::read_to_string(place.path("opened")).unwrap_or_default();
@@ -597,7 +597,9 @@ fn the_newest_camera_wins() {
 fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 300 --out whole {SMALL}"));
-    let mut server = serve(&place, &format!("train scene --steps 300 --view --out run {SMALL}"));
+    let said = std::fs::File::create(place.path("said")).unwrap();
+    let mut command = place.command(&format!("train scene --steps 300 --view --out run {SMALL}"));
+    let mut server = serve_with(command.stderr(said));
     let (mut page, about) = Page::open(&server.address);
     assert_eq!(about["training"], true);
     page.say(json!({ "ask": "pause", "pause": true }));
@@ -638,6 +640,12 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     drop(page);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert_same(&place, "whole", "run");
+    let said = String::from_utf8_lossy(&place.bytes("said")).into_owned();
+    for words in
+        ["training waits: a page has paused it", "training goes on", "the page shows the scene until it is closed"]
+    {
+        assert_eq!(said.matches(words).count(), 1, "{words}: {said}");
+    }
 
     // Ended from the page, it can be gone on with.
     let mut server = serve(&place, &format!("train scene --steps 300 --view --out other {SMALL}"));
