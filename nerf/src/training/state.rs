@@ -244,11 +244,6 @@ mod tests {
         for id in expected.ids() {
             assert_eq!(earlier.params.get(id).as_slice(), expected.get(id).as_slice());
         }
-        // Views leave out as much as of a model that is finished.
-        let occupied = |model: &Model<f32>| model.marching().unwrap().view_grid().occupied_share();
-        let mut finished = earlier.clone();
-        finished.finish();
-        assert_eq!(occupied(&earlier), occupied(&finished));
         trainer.model.set_detail(0.25);
         assert_eq!(earlier.at_state(&trainer.state().unwrap()).unwrap().detail(), 0.25);
         assert!(earlier.at_state(b"nothing").is_err());
