@@ -1,7 +1,10 @@
 //! What variables share with tensors: names, axes from either end, operands of every form; and errors of the tape, at the
 //! line that asked.
 
-use raygrad_autograd::{Error, Indices, Mask, Real, Scalar, SliceInfoElem, Tape, Tensor, Var, formula, record, s};
+use raygrad_autograd::{
+    Conv2dConfig, Error, Indices, Mask, Pool2dConfig, Real, Scalar, SliceInfoElem, Tape, Tensor, Var, formula, record,
+    s,
+};
 
 /// An error, and that it names a line of this file.
 #[track_caller]
@@ -64,6 +67,22 @@ fn what_does_not_fit_is_an_error_at_the_line_that_asked() {
     refused(&tape, || x.diag_embed(isize::MAX));
     refused(&tape, || x.sum().diagonal(0));
     refused(&tape, || x.unsqueeze(0).diag(0));
+    // Sizes that wrapped to numbers that look possible.
+    let half = 1 << (usize::BITS - 1);
+    let (image, weight) = (tape.leaf(Tensor::zeros(&[1, 1, 4, 4])), tape.leaf(Tensor::zeros(&[1, 1, 3, 3])));
+    for config in [
+        Conv2dConfig { dilation: [half, 1], ..Conv2dConfig::default() },
+        Conv2dConfig { dilation: [1, half], ..Conv2dConfig::default() },
+        Conv2dConfig { padding: [half, 0], ..Conv2dConfig::default() },
+        Conv2dConfig { padding: [1 << 32; 2], stride: [1; 2], dilation: [1; 2] },
+    ] {
+        refused(&tape, || image.conv2d(&weight, &config));
+        refused(&tape, || image.conv2d_transpose(&weight, &config, [half, 3]));
+    }
+    refused(&tape, || image.max_pool2d(&Pool2dConfig { padding: [half, 0], ..Pool2dConfig::new([2, 2]) }));
+    refused(&tape, || image.avg_pool2d(&Pool2dConfig { padding: [0, half], ..Pool2dConfig::new([2, 2]) }));
+    let long = tape.leaf(Tensor::zeros(&[usize::MAX / 2, 0]));
+    refused(&tape, || Var::concat(&[&long, &long, &long], 0));
     // Methods that are made of operations hide no line.
     refused(&tape, || Var::stack(&[&x], 9));
     refused(&tape, || Var::stack(&[&x, &x.t()], 0));
@@ -71,6 +90,22 @@ fn what_does_not_fit_is_an_error_at_the_line_that_asked() {
     refused(&tape, || Var::meshgrid(&[&x]));
     refused(&tape, || Var::einsum("ij,ij,ij->", &[&x, &x, &x]));
     refused(&tape, || Var::einsum("ijk->", &[&x]));
+}
+
+#[test]
+fn clamp_limits_out_of_order_are_refused() {
+    let tape = Tape::<f64>::new();
+    let a = Tensor::from([0.0, 2.0]);
+    let x = tape.leaf(a.clone());
+    for [low, high] in [[3.0, 1.0], [f64::NAN, 1.0], [0.0, f64::NAN], [f64::INFINITY, f64::NEG_INFINITY]] {
+        refused(&tape, || x.clamp(low, high));
+        let alone = std::panic::catch_unwind(|| a.clamp(low, high));
+        let message = *alone.expect_err("nothing was refused").downcast::<String>().unwrap();
+        assert_eq!(message, format!("clamp: no number is between {low} and {high}"));
+    }
+    for [low, high] in [[1.0, 1.0], [0.5, 1.5], [f64::NEG_INFINITY, 1.0], [-0.0, 0.0]] {
+        assert_eq!(x.clamp(low, high).value(), &a.clamp(low, high));
+    }
 }
 
 #[test]

@@ -304,8 +304,13 @@ impl<T: Scalar> Tensor<T> {
         self.zip(&other.into(), |a, b| Real::minimum(a, b))
     }
 
-    /// Each element, but at least `low` and at most `high`; NaN stays NaN.
+    /// Each element limited to `low..=high`; NaN stays NaN. An infinite limit is none.
+    ///
+    /// # Panics
+    /// If `low` is not at most `high`, or one is NaN.
+    #[track_caller]
     pub fn clamp(&self, low: T, high: T) -> Self {
+        assert!(low <= high, "clamp: no number is between {low} and {high}");
         self.map(|x| Real::minimum(Real::maximum(x, low), high))
     }
 

@@ -16,7 +16,9 @@ pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> T
         let fits = part.ndim() == shape.len() && (0..shape.len()).all(same);
         assert!(fits, "concat of shapes {:?} and {:?} along axis {axis}", first.shape(), part.shape());
     }
-    shape[axis] = parts.iter().map(|part| part.shape()[axis]).sum();
+    let extent = parts.iter().try_fold(0_usize, |sum, part| sum.checked_add(part.shape()[axis]));
+    let Some(extent) = extent else { panic!("concat along axis {axis} to a tensor that is too large") };
+    shape[axis] = extent;
     pool.filled(&shape, |out| {
         let run = |shape: &[usize]| shape[axis..].iter().product::<usize>();
         let (total, mut start) = (run(&shape), 0);

@@ -1,7 +1,7 @@
 //! The windows that a 2-D convolution or pooling sees of an image. One image at a time: a batch is the caller's loop.
 
 use crate::parallel::{ELEMENT, chunks};
-use crate::{Scalar, simd};
+use crate::{Scalar, checked_len, simd};
 use std::ops::Range;
 
 /// Where the windows lie: window `(i, j)` starts at row `i * stride[0] - padding[0]` and column
@@ -22,7 +22,8 @@ impl Windows {
     /// `(image + 2 padding - span) / stride + 1` of them, rounded down, where `span = dilation (kernel - 1) + 1`.
     ///
     /// # Errors
-    /// If a kernel extent, stride or dilation is 0, or a window is larger than the padded image; in words.
+    /// If a kernel extent, stride or dilation is 0, a window is larger than the padded image, or image, padded image or
+    /// unfolded image have more elements than a buffer can hold; in words.
     pub fn new(
         image: [usize; 2],
         kernel: [usize; 2],
@@ -35,14 +36,21 @@ impl Windows {
             if kernel[axis] == 0 || stride[axis] == 0 || dilation[axis] == 0 {
                 return Err(format!("kernel {kernel:?}, stride {stride:?} and dilation {dilation:?} must be positive"));
             }
-            let (extent, span) = (image[axis] + 2 * padding[axis], dilation[axis] * (kernel[axis] - 1) + 1);
-            if span > extent {
-                return Err(format!(
-                    "a kernel {kernel:?} with dilation {dilation:?} does not fit an image {image:?} with padding \
-                     {padding:?}"
-                ));
-            }
-            output[axis] = (extent - span) / stride[axis] + 1;
+            let what = || format!("an image {image:?} with padding {padding:?}");
+            let extent = padding[axis].checked_mul(2).and_then(|padding| padding.checked_add(image[axis]));
+            let extent = extent.ok_or_else(|| format!("{} is too large", what()))?;
+            // A span beyond every number does not fit either.
+            let span = dilation[axis].checked_mul(kernel[axis] - 1).and_then(|way| way.checked_add(1));
+            let Some(rest) = span.and_then(|span| extent.checked_sub(span)) else {
+                return Err(format!("a kernel {kernel:?} with dilation {dilation:?} does not fit {}", what()));
+            };
+            output[axis] = rest / stride[axis] + 1;
+        }
+        let [unfolded, image_len] = [checked_len(&[kernel, output].concat()), checked_len(&image)];
+        if unfolded.is_none() || image_len.is_none() {
+            return Err(format!(
+                "{output:?} windows of {kernel:?} elements on an image {image:?} have too many elements"
+            ));
         }
         Ok(Windows { image, kernel, stride, padding, dilation, output })
     }
@@ -412,5 +420,26 @@ mod tests {
         assert!(Windows::new([2, 2], [2, 2], one, [0, 0], [2, 1]).unwrap_err().contains("does not fit"));
         assert!(Windows::new([2, 2], one, [0, 1], [0, 0], one).unwrap_err().contains("must be positive"));
         assert_eq!(Windows::new([5, 6], [3, 2], [2, 3], [1, 0], [1, 2]).unwrap().output(), [3, 2]);
+    }
+
+    #[test]
+    fn windows_whose_sizes_wrap_are_errors() {
+        let (one, none, half) = ([1, 1], [0, 0], 1 << (usize::BITS - 1));
+        // Each of these wrapped to numbers that look possible.
+        for (image, kernel, padding, dilation, expected) in [
+            ([4, 4], [3, 3], none, [half, 1], "does not fit"),
+            ([4, 4], [2, 2], none, [1, usize::MAX], "does not fit"),
+            ([4, 4], [half, 2], none, [2, 1], "does not fit"),
+            ([4, 4], [2, 2], [half, 0], one, "is too large"),
+            ([4, usize::MAX], [2, 2], [0, 1], one, "is too large"),
+            ([4, 4], one, [1 << 31, 1 << 31], one, "too many elements"),
+            ([1 << 32, 1 << 32], [1 << 32, 1 << 32], none, one, "too many elements"),
+            ([usize::MAX / 2, 4], [usize::MAX / 2, 4], none, one, "too many elements"),
+        ] {
+            let error = Windows::new(image, kernel, one, padding, dilation).unwrap_err();
+            assert!(error.contains(expected), "{image:?} {kernel:?} {padding:?} {dilation:?}: {error}");
+        }
+        // A stride of any length leads to one window.
+        assert_eq!(Windows::new([4, 4], one, [usize::MAX; 2], none, one).unwrap().output(), one);
     }
 }

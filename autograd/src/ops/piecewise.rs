@@ -207,10 +207,10 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// 0 beyond. An infinite limit is none.
     ///
     /// # Panics
-    /// If `low` is not at most `high`.
+    /// If `low` is not at most `high`, or one is NaN.
     #[track_caller]
     pub fn clamp(&self, low: f64, high: f64) -> Self {
-        self.fits("clamp", ensure(low <= high, || format!("between {low} and {high} is nothing")));
+        self.fits("clamp", ensure(low <= high, || format!("no number is between {low} and {high}")));
         Clamp { low, high }.on([self])
     }
 

@@ -2,7 +2,7 @@
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::parallel::chunks;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Windows};
+use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Windows, checked_len};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -25,10 +25,10 @@ impl Pool2dConfig {
 
     fn windows(&self, shape: &[usize]) -> Result<Windows, ShapeError> {
         let &[_, _, height, width] = shape else { return Err("the image must have four axes".into()) };
-        if (0..2).any(|axis| 2 * self.padding[axis] > self.kernel[axis]) {
+        if (0..2).any(|axis| self.padding[axis] > self.kernel[axis] / 2) {
             return Err(format!("padding {:?} is more than half the window {:?}", self.padding, self.kernel));
         }
-        if height * width == 0 {
+        if height == 0 || width == 0 {
             return Err("the image has no pixels".into());
         }
         Windows::new([height, width], self.kernel, self.stride, self.padding, [1, 1])
@@ -158,6 +158,9 @@ fn check_planes(x: &[usize], plane: [usize; 2], index: &[u32], scatter: bool) ->
         return Err("there must be two axes at least".into());
     }
     let out = with_plane(x, plane);
+    if checked_len(&out).is_none() {
+        return Err(format!("planes of {plane:?} have too many elements"));
+    }
     let (indexed, bound) = if scatter { (x, plane_len(&out)) } else { (&out[..], plane_len(x)) };
     if indexed.iter().product::<usize>() != index.len() {
         return Err(format!("{} indices for {indexed:?}", index.len()));
@@ -355,5 +358,25 @@ mod tests {
         assert!(error.to_string().contains("index 1 is 4, but a plane has 4 elements"), "{error}");
         let error = tape.try_apply(ScatterPlanes { index: [0, 4].into(), plane: [1, 2] }, &[&x]).unwrap_err();
         assert!(error.to_string().contains("2 indices for [1, 2, 2]"), "{error}");
+    }
+
+    #[test]
+    fn planes_whose_sizes_wrap_are_shape_errors() {
+        let tape = Tape::<f32>::new();
+        let x = tape.constant(Tensor::zeros(&[1, 2, 2]));
+        let half = 1 << (usize::BITS - 1);
+        let error = |op: &dyn Fn() -> Result<(), crate::Error>| op().unwrap_err().to_string();
+        // A plane of 2 (2^63 + 1) elements, that is of 2, and one of 2^64, that is of none.
+        let gather = GatherPlanes { index: [0, 0].into(), plane: [half + 1, 2] };
+        let scatter = ScatterPlanes { index: [0; 4].into(), plane: [1 << 32, 1 << 32] };
+        for message in [
+            error(&|| tape.try_apply(gather.clone(), &[&x]).map(drop)),
+            error(&|| tape.try_apply(scatter.clone(), &[&x]).map(drop)),
+        ] {
+            assert!(message.contains("have too many elements"), "{message}");
+        }
+        let image = tape.constant(Tensor::zeros(&[1, 1, 4, 4]));
+        let op = AvgPool2dInput { config: Pool2dConfig::new([1, 1]), image: [1 << 32, 1 << 32] };
+        assert!(tape.try_apply(op, &[&image]).unwrap_err().to_string().contains("too many elements"));
     }
 }

@@ -194,7 +194,8 @@ impl<T: Scalar> Op<T> for Concat {
                 return Err(format!("the extents differ elsewhere than along axis {}", self.axis));
             }
         }
-        shape[self.axis] = x.iter().map(|x| x[self.axis]).sum();
+        let extent = x.iter().try_fold(0_usize, |sum, x| sum.checked_add(x[self.axis]));
+        shape[self.axis] = extent.ok_or("the sum of the extents is too large")?;
         Ok(shape)
     }
 

@@ -29,12 +29,23 @@ fn block(n: usize) -> usize {
 /// What an element of a row costs: an exponential, and a few passes over what lies in cache.
 const ROW_ELEMENT: usize = 16;
 
+/// That `len` numbers are `rows` rows of `n`.
+#[track_caller]
+fn check_rows(len: usize, n: usize, rows: usize) {
+    assert_eq!(Some(len), n.checked_mul(rows), "{len} numbers are not {rows} rows of {n}");
+}
+
 /// See [`blocks`].
 type Kernel<'a, T> = &'a (dyn Fn(&mut [T], usize, &mut [T]) + Sync);
 
 /// Calls `f(scratch, start, rows)` for blocks of rows of `out`, each of `n` elements, which begin at element `start`, with
 /// `scratch` elements of space.
+///
+/// # Panics
+/// If `out` does not consist of whole rows: what follows the last whole row would keep its old values.
+#[track_caller]
 fn blocks<T: Scalar>(out: &mut [T], n: usize, scratch: usize, pool: &Pool<T>, f: Kernel<'_, T>) {
+    assert!(n > 0 && out.len().is_multiple_of(n), "{} numbers are not whole rows of {n}", out.len());
     let (len, work) = (block(n), ROW_ELEMENT * out.len());
     let each = |scratch: &mut Tensor<T>, i: usize, out: &mut [T]| f(scratch.as_mut_slice(), i * len, out);
     chunks(out, len, work, || pool.tensor(&[scratch]), &each);
@@ -137,6 +148,14 @@ mod tests {
 
     pub(super) fn matrix(rows: usize, n: usize) -> Vec<f32> {
         (0..rows * n).map(|i| ((i * 7919) % 1013) as f32 * 0.02 - 10.0).collect()
+    }
+
+    /// Asserts that `f` panics with a message that contains `expected`.
+    #[track_caller]
+    pub(super) fn assert_panics(f: impl FnOnce(), expected: &str) {
+        let error = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).expect_err("no panic");
+        let message = error.downcast_ref::<String>().map_or("", String::as_str);
+        assert!(message.contains(expected), "{message:?} instead of {expected:?}");
     }
 
     pub(super) fn assert_close(got: &[f32], expected: impl Iterator<Item = f64>, tolerance: f64) {

@@ -1,6 +1,6 @@
 //! Mean and variance of rows, and layer normalisation.
 
-use super::{ROW_ELEMENT, block, blocks, total, totals_of};
+use super::{ROW_ELEMENT, block, blocks, check_rows, total, totals_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
@@ -30,8 +30,9 @@ fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
 ///
 /// # Panics
 /// If `x` is not `out.len()` rows of `n`.
+#[track_caller]
 pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
-    assert_eq!(x.len(), n * out.len(), "{} rows of {n}", out.len());
+    check_rows(x.len(), n, out.len());
     if n == 0 {
         out.fill(T::from_f64(f64::NAN));
         return;
@@ -53,7 +54,8 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
 /// `n`.
 ///
 /// # Panics
-/// If `gain` and `bias` have different lengths or a row has another one, or `out` is shorter than `x`.
+/// If `gain` and `bias` have different lengths, `x` is not whole rows of that length, or `out` is shorter than `x`.
+#[track_caller]
 pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out: &mut [T]) {
     let n = gain.len();
     assert_eq!(bias.len(), n, "gain and bias of one length");
@@ -84,7 +86,9 @@ pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out
 /// and dbias = sum of g over the rows. These sums are carried in f64.
 ///
 /// # Panics
-/// If a slice is shorter than its counterpart.
+/// If `x` is not whole rows of the length of `gain`, `g` or `dx` is shorter than `x`, or `sums` have other lengths than
+/// `gain`.
+#[track_caller]
 pub fn layer_norm_rows_grad<T: Scalar>(
     x: &[T],
     gain: &[T],
@@ -95,6 +99,10 @@ pub fn layer_norm_rows_grad<T: Scalar>(
     pool: &Pool<T>,
 ) {
     let n = gain.len();
+    assert!(x.is_empty() || (n > 0 && x.len().is_multiple_of(n)), "{} numbers are not whole rows of {n}", x.len());
+    assert!(g.len() >= x.len(), "{} gradients of {} numbers", g.len(), x.len());
+    let fits = sums.iter().flatten().all(|sum| sum.len() == n);
+    assert!(fits, "sums of other lengths than gain and bias, {n}");
     let wanted = if sums.is_some() { 2 * n } else { 0 };
     if !x.is_empty() {
         // Of whole groups, so that what is added to what depends on the sizes alone.
@@ -175,8 +183,30 @@ fn layer_norm_grad<T: Scalar>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{LENGTHS, matrix};
+    use super::super::tests::{LENGTHS, assert_panics, matrix};
     use super::*;
+
+    #[test]
+    fn layer_norm_rows_other_lengths_panic() {
+        let pool = Pool::none();
+        assert_panics(|| variance_rows(&[0.0_f32; 7], 3, &mut [0.0; 2]), "7 numbers are not 2 rows of 3");
+        let forward = |len: usize, n: usize| {
+            layer_norm_rows(&vec![0.0; len], &vec![1.0; n], &vec![0.0; n], 1e-5, &mut [0.0_f32; 7])
+        };
+        assert_panics(|| forward(7, 3), "7 numbers are not whole rows of 3");
+        assert_panics(|| forward(7, 0), "7 numbers are not whole rows of 0");
+        let backward = |[len, n, g, gain, bias]: [usize; 5]| {
+            let (mut dgain, mut dbias) = (vec![0.0_f32; gain], vec![0.0; bias]);
+            let (x, ones, sums) = (vec![0.0; len], vec![1.0; n], Some([&mut dgain[..], &mut dbias[..]]));
+            layer_norm_rows_grad(&x, &ones, &vec![1.0; g], 1e-5, &mut [0.0; 7], sums, &pool);
+        };
+        backward([6, 3, 6, 3, 3]);
+        assert_panics(|| backward([7, 3, 7, 3, 3]), "7 numbers are not whole rows of 3");
+        assert_panics(|| backward([6, 3, 5, 3, 3]), "5 gradients of 6 numbers");
+        // What gain had no room for was written over the sums of the bias.
+        assert_panics(|| backward([6, 3, 6, 2, 4]), "sums of other lengths");
+        assert_panics(|| backward([6, 3, 6, 3, 2]), "sums of other lengths");
+    }
 
     #[test]
     fn the_variance_survives_a_large_offset() {

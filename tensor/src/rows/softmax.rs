@@ -1,6 +1,6 @@
 //! Softmax, its logarithm, the logarithm of a sum of exponentials, and cross-entropy.
 
-use super::{ROW_ELEMENT, block, blocks, fold_lanes, total, totals_of};
+use super::{ROW_ELEMENT, block, blocks, check_rows, fold_lanes, total, totals_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
@@ -52,7 +52,8 @@ fn ln_total<T: Scalar>(powers: &[T]) -> T {
 /// Softmax of each row of `n` elements: `e^(x - max) / sum e^(x - max)`.
 ///
 /// # Panics
-/// If `out` is shorter than `x`.
+/// If `x` is not whole rows of `n`, or `out` is shorter than `x`.
+#[track_caller]
 pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
     if x.is_empty() {
         return;
@@ -77,7 +78,8 @@ pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>)
 /// The gradient of softmax, from its output: `y (g - sum g y)` in each row.
 ///
 /// # Panics
-/// If `g` or `out` is shorter than `y`.
+/// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
+#[track_caller]
 pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
     if y.is_empty() {
         return;
@@ -107,7 +109,8 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
 /// The logarithm of softmax of each row: `x - max - ln sum e^(x - max)`.
 ///
 /// # Panics
-/// If `out` is shorter than `x`.
+/// If `x` is not whole rows of `n`, or `out` is shorter than `x`.
+#[track_caller]
 pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
     if x.is_empty() {
         return;
@@ -135,7 +138,8 @@ pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool
 /// The gradient of the logarithm of softmax, from its output: `g - e^y sum g` in each row.
 ///
 /// # Panics
-/// If `g` or `out` is shorter than `y`.
+/// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
+#[track_caller]
 pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
     if y.is_empty() {
         return;
@@ -162,13 +166,15 @@ pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T
 ///
 /// # Panics
 /// If `x` is not `out.len()` rows of `n`.
+#[track_caller]
 pub fn logsumexp_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>) {
     ln_sums(x, n, out, pool, |_, shift, ln| shift + ln);
 }
 
 /// `out[i] = finish(i, shift, ln sum e^(x - shift))` for row `i`.
+#[track_caller]
 fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: impl Fn(usize, T, T) -> T + Sync) {
-    assert_eq!(x.len(), n * out.len(), "{} rows of {n}", out.len());
+    check_rows(x.len(), n, out.len());
     if x.is_empty() {
         out.fill(T::from_f64(f64::NEG_INFINITY));
         return;
@@ -195,11 +201,23 @@ fn ln_sums<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>, finish: 
     });
 }
 
+/// That `len` numbers are a row of `n` for each class, and that there are these classes.
+#[track_caller]
+fn check_classes(len: usize, n: usize, classes: &[u32]) {
+    check_rows(len, n, classes.len());
+    if let Some((row, class)) = classes.iter().enumerate().find(|&(_, &class)| class as usize >= n) {
+        panic!("the class of row {row} is {class}, but there are {n} classes");
+    }
+}
+
 /// The cross-entropy of each row of `n` logits: `ln sum e^x - x[class]`.
 ///
 /// # Panics
-/// If `x` is not a row for each class, or a class is not below `n`.
+/// If `x` is not a row for each class, `out` has another length than `classes`, or a class is not below `n`.
+#[track_caller]
 pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &mut [T], pool: &Pool<T>) {
+    assert_eq!(classes.len(), out.len(), "a class for each row");
+    check_classes(x.len(), n, classes);
     // The distance from the greatest logit first: where that is the class, nothing cancels.
     ln_sums(x, n, out, pool, |row, shift, ln| (shift - x[row * n + classes[row] as usize]) + ln);
 }
@@ -208,8 +226,12 @@ pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &m
 /// added up where 1 less that of the class would lose its digits.
 ///
 /// # Panics
-/// As [`cross_entropy_rows`], or if `out` is shorter than `x`.
+/// If `x` is not a row for each class, `g` has another length than `classes`, a class is not below `n`, or `out` is
+/// shorter than `x`.
+#[track_caller]
 pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
+    assert_eq!(classes.len(), g.len(), "a class for each gradient");
+    check_classes(x.len(), n, classes);
     softmax_rows(x, n, out, pool);
     if x.is_empty() {
         return;
@@ -233,7 +255,7 @@ pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g:
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{LENGTHS, assert_close, matrix};
+    use super::super::tests::{LENGTHS, assert_close, assert_panics, matrix};
     use super::*;
 
     #[test]
@@ -273,6 +295,46 @@ mod tests {
         assert_eq!(out, [0.0, 1.0, 0.0]);
         logsumexp_rows(&[], 0, &mut out, &pool);
         assert_eq!(out, [-inf; 3]);
+    }
+
+    #[test]
+    fn cross_entropy_rows_missing_class_panics() {
+        let (pool, x) = (Pool::<f32>::none(), [0.0; 6]);
+        let loss = |x: &[f32], n, classes: &[u32], rows| {
+            cross_entropy_rows(x, n, classes, &mut vec![0.0; rows], &pool);
+        };
+        let grad = |x: &[f32], n, classes: &[u32], rows| {
+            cross_entropy_rows_grad(x, n, classes, &vec![1.0; rows], &mut [0.0; 6], &pool);
+        };
+        // Row 0 has no class 3: the loss read the first number of row 1.
+        for (n, classes, rows, expected) in [
+            (3, &[3, 0][..], 2, "the class of row 0 is 3, but there are 3 classes"),
+            (3, &[0, 3], 2, "the class of row 1 is 3, but there are 3 classes"),
+            (3, &[0], 1, "6 numbers are not 1 rows of 3"),
+            (4, &[0, 0], 2, "6 numbers are not 2 rows of 4"),
+            (3, &[0, 0], 1, "a class for each"),
+            (3, &[0, 0], 3, "a class for each"),
+        ] {
+            assert_panics(|| loss(&x, n, classes, rows), expected);
+            assert_panics(|| grad(&x, n, classes, rows), expected);
+        }
+        assert_panics(|| loss(&[], 0, &[0], 1), "but there are 0 classes");
+        loss(&[], 3, &[], 0);
+        grad(&[], 3, &[], 0);
+    }
+
+    #[test]
+    fn rows_of_another_length_panic() {
+        let (pool, x) = (Pool::<f32>::none(), [0.0; 7]);
+        // The last number belonged to no row, and its result was whatever stood there.
+        assert_panics(|| softmax_rows(&x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
+        assert_panics(|| softmax_rows_grad(&x, &x, 3, &mut [0.0; 7]), "7 numbers are not whole rows of 3");
+        assert_panics(|| log_softmax_rows(&x, 3, &mut [0.0; 7], &pool), "7 numbers are not whole rows of 3");
+        assert_panics(|| log_softmax_rows_grad(&x, &x, 3, &mut [0.0; 7]), "7 numbers are not whole rows of 3");
+        assert_panics(|| softmax_rows_grad(&x, &x, 0, &mut [0.0; 7]), "7 numbers are not whole rows of 0");
+        assert_panics(|| logsumexp_rows(&x, 3, &mut [0.0; 2], &pool), "7 numbers are not 2 rows of 3");
+        // 2^63 times 2 wraps to the 0 numbers that there are.
+        assert_panics(|| logsumexp_rows(&[], 1 << 63, &mut [0.0_f32; 2], &pool), "0 numbers are not 2 rows of");
     }
 
     #[test]
