@@ -53,9 +53,10 @@ impl Names {
     #[track_caller]
     fn add(&mut self, name: String) -> ParamId {
         static KEYS: AtomicU64 = AtomicU64::new(0);
+        // Before anything changes: whoever catches the panic has the store as it was.
+        assert!(!self.places.contains_key(&name), "there is already a parameter `{name}`");
         let (place, key) = (self.names.len(), KEYS.fetch_add(1, Ordering::Relaxed));
-        let taken = self.places.insert(name.clone(), place).is_some();
-        assert!(!taken, "there is already a parameter `{name}`");
+        self.places.insert(name.clone(), place);
         self.names.push(name);
         self.keys.push(key);
         ParamId { place, key }
@@ -345,10 +346,7 @@ impl<T: Scalar> Params<T> {
     /// If names, their order or shapes differ.
     #[track_caller]
     pub fn assign<U: Scalar>(&mut self, other: &Params<U>) {
-        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
-        for ((name, value), theirs) in self.iter().zip(&other.values) {
-            assert_eq!(value.shape(), theirs.shape(), "two parameters `{name}`");
-        }
+        self.check_fits(other);
         self.values = other.values.iter().map(Tensor::cast).collect();
         self.settings.clone_from(&other.settings);
     }
@@ -360,14 +358,22 @@ impl<T: Scalar> Params<T> {
     /// If names or shapes differ.
     #[track_caller]
     pub fn inherit(&mut self, other: &Params<T>) {
-        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
-        for (i, (value, theirs)) in self.values.iter_mut().zip(&other.values).enumerate() {
-            assert_eq!(value.shape(), theirs.shape(), "two parameters `{}`", self.names.names[i]);
-            if other.settings[i].frozen {
+        self.check_fits(other);
+        for ((value, theirs), setting) in self.values.iter_mut().zip(&other.values).zip(&other.settings) {
+            if setting.frozen {
                 value.clone_from(theirs);
             }
         }
         self.settings.clone_from(&other.settings);
+    }
+
+    /// That another store has parameters of the same names and shapes.
+    #[track_caller]
+    pub(crate) fn check_fits<U: Scalar>(&self, other: &Params<U>) {
+        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
+        for ((name, value), theirs) in self.iter().zip(&other.values) {
+            assert_eq!(value.shape(), theirs.shape(), "two parameters `{name}`");
+        }
     }
 
     /// The same parameters in another precision.
@@ -489,7 +495,6 @@ impl<'t, T: Scalar> Index<ParamId> for Bound<'t, T> {
 mod tests {
     use super::*;
     use crate::{Optimizer, Sgd, SgdConfig, Storage};
-    use std::collections::HashMap;
 
     #[test]
     fn frozen_parameters_rest_and_others_have_their_own_rates() {
@@ -520,7 +525,7 @@ mod tests {
         assert_eq!((params.rate(head), params.rate(params.find("trunk.bias").unwrap())), (1.0, 0.5));
         // Settings survive a change of precision and a load.
         let mut copy = params.cast::<f32>().cast::<f64>();
-        let bytes = params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap();
+        let bytes = params.to_safetensors(Storage::Full, &Default::default(), &[]).unwrap();
         copy.load_safetensors(&bytes).unwrap();
         assert!(copy.is_frozen(head) && copy.trainable_elements() == 4);
         copy.unfreeze(|_| true);
@@ -573,11 +578,42 @@ mod tests {
         assert!(start.elapsed().as_secs() < 10, "{:?}", start.elapsed());
     }
 
+    /// Runs `f`, which panics, and returns its message.
+    fn panic_of(f: impl FnOnce()) -> String {
+        let error = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).expect_err("no panic");
+        error.downcast_ref::<String>().cloned().unwrap_or_default()
+    }
+
     #[test]
-    #[should_panic(expected = "there is already a parameter `x`")]
-    fn a_name_is_taken_once() {
+    fn add_taken_name_panics_and_changes_nothing() {
         let mut params = Params::<f32>::new();
-        params.add("x", Tensor::zeros(&[1]));
-        params.add("x", Tensor::zeros(&[2]));
+        let x = params.add("x", Tensor::scalar(1.0));
+        params.add("y", Tensor::scalar(2.0));
+        let message = panic_of(|| assert_ne!(params.add("x", Tensor::zeros(&[2])), x));
+        assert_eq!(message, "there is already a parameter `x`");
+        assert_eq!((params.find("x"), params.len(), params.names().len()), (Some(x), 2, 2));
+        assert_eq!(params.get(x).item(), 1.0);
+        // What is added next has the place that its handle says.
+        let z = params.add("z", Tensor::scalar(3.0));
+        assert_eq!((params.find("z"), params.get(z).item(), params.name(z)), (Some(z), 3.0, "z"));
+    }
+
+    #[test]
+    fn stores_that_do_not_fit_change_nothing() {
+        let store = |a: f32, b: &[usize]| {
+            let mut params = Params::new();
+            params.add("a", Tensor::scalar(a));
+            params.add("b", Tensor::zeros(b));
+            params
+        };
+        let (mut params, mut other) = (store(1.0, &[2]), store(7.0, &[3]));
+        other.freeze(|_| true);
+        for f in
+            [(|params, other| Params::assign(params, other)) as fn(&mut Params<f32>, &Params<f32>), Params::inherit]
+        {
+            let message = panic_of(|| f(&mut params, &other));
+            assert!(message.contains("two parameters `b`"), "{message}");
+            assert_eq!((params.values()[0].item(), params.trainable_elements()), (1.0, 3), "all as before");
+        }
     }
 }

@@ -7,7 +7,7 @@ use raygrad_tensor::{Scalar, Tensor};
 use safetensors::tensor::{Dtype, SafeTensors, View};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 /// The number type in which a file holds parameters. They are rounded once, when they are written; arithmetic stays in
 /// their own type. A parameter with a number too large for the type is stored in full.
@@ -144,19 +144,22 @@ impl<T: Scalar> Params<T> {
         }
     }
 
-    /// The parameters as a safetensors file, with some words about them and further named bytes.
+    /// The parameters as a safetensors file, with `metadata` and further named bytes. Equal contents give equal bytes.
     ///
     /// # Errors
     /// If the format cannot hold them.
     pub fn to_safetensors(
         &self,
         storage: Storage,
-        metadata: HashMap<String, String>,
+        metadata: &BTreeMap<String, String>,
         blobs: &[(&str, Vec<u8>)],
     ) -> Result<Vec<u8>, ParamsError> {
         let values = self.iter().map(|(name, value)| (name, Part::Value(storage.that_fits(value.as_slice()), value)));
         let blobs = blobs.iter().map(|(name, bytes)| (*name, Part::Bytes([bytes.len()], bytes)));
-        Ok(safetensors::serialize(values.chain(blobs), Some(metadata))?)
+        let unordered = metadata.clone().into_iter().collect();
+        let mut bytes = safetensors::serialize(values.chain(blobs), Some(unordered))?;
+        sort_metadata(&mut bytes, metadata)?;
+        Ok(bytes)
     }
 
     /// Replaces every value by that of the same name in a safetensors file, and returns the further bytes that the file
@@ -184,13 +187,29 @@ impl<T: Scalar> Params<T> {
         for (name, view) in file.tensors() {
             if view.dtype() == Dtype::U8 {
                 blobs.insert(name, view.data().to_vec());
-            } else if !self.iter().any(|(own, _)| own == name) {
+            } else if self.find(&name).is_none() {
                 return Err(ParamsError::Unknown(name));
             }
         }
         self.replace(values);
         Ok(blobs)
     }
+}
+
+/// How a safetensors file with metadata begins, after the length of its header.
+const METADATA: &[u8] = b"{\"__metadata__\":";
+
+/// Puts the metadata of a safetensors file in order. The crate writes them in that of a hash map, which is another one in
+/// every run; in whatever order, they take the same bytes.
+fn sort_metadata(bytes: &mut [u8], metadata: &BTreeMap<String, String>) -> Result<(), ParamsError> {
+    let sorted = serde_json::to_vec(metadata).map_err(safetensors::SafeTensorError::from)?;
+    if let Some((start, rest)) = bytes[size_of::<u64>()..].split_at_mut_checked(METADATA.len())
+        && start == METADATA
+        && let Some(place) = rest.get_mut(..sorted.len())
+    {
+        place.copy_from_slice(&sorted);
+    }
+    Ok(())
 }
 
 /// The bytes of this name that stand beside the parameters in a safetensors file, for what has to be known before there
@@ -226,26 +245,45 @@ mod tests {
 
     /// The bytes of a store, in full.
     fn written(params: &Params<f32>) -> Vec<u8> {
-        params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap()
+        params.to_safetensors(Storage::Full, &BTreeMap::new(), &[]).unwrap()
     }
 
     #[test]
     fn a_stored_model_comes_back_bit_for_bit() {
         let params = store();
-        let bytes = params.to_safetensors(Storage::Full, HashMap::new(), &[("more", vec![1, 2, 3])]).unwrap();
+        let bytes = params.to_safetensors(Storage::Full, &BTreeMap::new(), &[("more", vec![1, 2, 3])]).unwrap();
         let mut other = params.clone();
         other.values_mut()[0].as_mut_slice().fill(9.0);
         let blobs = other.load_safetensors(&bytes).unwrap();
         assert_eq!(blobs["more"], [1, 2, 3]);
         assert_eq!(stored_words(&bytes, "version").unwrap(), None);
-        let words = HashMap::from([("version".into(), "7".into())]);
-        let bytes = params.to_safetensors(Storage::Full, words, &[]).unwrap();
+        let words = BTreeMap::from([("version".into(), "7".into())]);
+        let bytes = params.to_safetensors(Storage::Full, &words, &[]).unwrap();
         assert_eq!(stored_words(&bytes, "version").unwrap().as_deref(), Some("7"));
         assert!(stored_words(&bytes, "other").unwrap().is_none() && stored_words(b"none", "version").is_err());
         for (a, b) in params.values().iter().zip(other.values()) {
             let bits = |x: &Tensor<f32>| x.as_slice().iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             assert_eq!(bits(a), bits(b));
         }
+    }
+
+    #[test]
+    fn equal_models_have_equal_bytes() {
+        let metadata: BTreeMap<String, String> =
+            (0..40).map(|i| (format!("key\n{i}\u{e9}"), format!("\"{i}\\"))).collect();
+        let write = || store().to_safetensors(Storage::Full, &metadata, &[("more", vec![1])]).unwrap();
+        let bytes = write();
+        for _ in 0..5 {
+            assert!(write() == bytes, "the same model, other bytes");
+        }
+        let text = String::from_utf8_lossy(&bytes).into_owned();
+        let places: Vec<_> =
+            metadata.keys().map(|key| text.find(&serde_json::to_string(key).unwrap()).unwrap()).collect();
+        assert!(places.is_sorted(), "{places:?}");
+        for (key, value) in &metadata {
+            assert_eq!(stored_words(&bytes, key).unwrap().as_ref(), Some(value));
+        }
+        assert_eq!(store().load_safetensors(&bytes).unwrap()["more"], [1]);
     }
 
     /// Values, and the nearest ones in f16 and in bf16.
@@ -265,7 +303,7 @@ mod tests {
         let mut params = Params::<f32>::new();
         params.add("a", Tensor::from_vec(&[8], ROUNDED.map(|[x, ..]| x).to_vec()));
         for (which, storage) in [Storage::Full, Storage::F16, Storage::Bf16].into_iter().enumerate() {
-            let bytes = params.to_safetensors(storage, HashMap::new(), &[]).unwrap();
+            let bytes = params.to_safetensors(storage, &BTreeMap::new(), &[]).unwrap();
             let mut read = params.clone();
             read.values_mut()[0].as_mut_slice().fill(9.0);
             read.load_safetensors(&bytes).unwrap();
@@ -283,7 +321,7 @@ mod tests {
         let mut params = Params::<f64>::new();
         params.add("small", Tensor::full(&[2], 0.1));
         params.add("large", Tensor::full(&[2], 65520.1));
-        let bytes = params.to_safetensors(Storage::F16, HashMap::new(), &[]).unwrap();
+        let bytes = params.to_safetensors(Storage::F16, &BTreeMap::new(), &[]).unwrap();
         let mut read = params.clone();
         read.load_safetensors(&bytes).unwrap();
         assert_eq!(read.values()[1], params.values()[1]);

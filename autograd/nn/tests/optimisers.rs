@@ -2,7 +2,7 @@
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use raygrad_autograd::{Gradient, Pool, RowGrad, RowSums, Scalar, Tape, Tensor, Var};
+use raygrad_autograd::{Gradient, Pool, RowGrad, RowShare, RowSums, Scalar, SparseGrad, Tape, Tensor, Var};
 use raygrad_nn::{
     Adam, AdamConfig, AdamW, Bound, Ema, NonFinite, Optimizer, OptimizerState, ParamId, Params, RowAdam, Sgd, SgdConfig,
 };
@@ -351,6 +351,103 @@ fn a_lazy_parameter_stays_so() {
     params.set_lazy(|_| true, false);
     let grads = gradients(&params, ids, 1, false);
     assert!(message(|| drop(adam.update(&mut params, &grads, 0.1))).contains("`table` was lazy until now"));
+}
+
+/// A gradient of four rows of one feature in two parts, which puts sums of its own in the place of those it is given.
+struct Replaced {
+    rows: usize,
+}
+
+impl SparseGrad<f32> for Replaced {
+    fn shape(&self) -> &[usize] {
+        &[4, 1]
+    }
+    fn add_to(&self, _: &mut Tensor<f32>) {}
+    fn as_rows(&self) -> Option<&dyn RowShare<f32>> {
+        Some(self)
+    }
+}
+
+impl RowShare<f32> for Replaced {
+    fn scatter(&self, sums: &mut RowSums<f32>) {
+        *sums = RowSums::new(self.rows, 1);
+        sums.add(self.rows - 1, &[1.0]);
+    }
+    fn parts(&self) -> Vec<usize> {
+        vec![2, 2]
+    }
+}
+
+#[test]
+fn row_share_replaced_sums_panic() {
+    let mut params = Params::<f32>::new();
+    params.add("table", Tensor::zeros(&[4, 1]));
+    params.set_lazy(|_| true, true);
+    let mut update = |rows: usize, optimizer: &mut dyn Optimizer<f32>| {
+        let mut grad = Gradient::zero(&[4, 1]);
+        grad.add_sparse(Arc::new(Replaced { rows }));
+        message(|| drop(optimizer.update(&mut params, &[grad], 0.1)))
+    };
+    // Parts of two rows; the sums of three reach into the second part.
+    assert!(update(3, &mut Adam::new(AdamConfig::default())).contains("rows and features of part"));
+    assert!(update(5, &mut Sgd::new(SgdConfig::default())).contains("rows and features of `table`"));
+}
+
+#[test]
+fn load_state_lazy_and_not_lazy_is_an_error() {
+    for lazy in [false, true] {
+        let (mut params, ids) = model::<f32>(lazy);
+        let mut first = Adam::new(AdamConfig::default());
+        train(&mut first, &mut params, ids, 0, false).unwrap();
+        let state = first.state(&params);
+        params.set_lazy(|name| name == "table", !lazy);
+        let (mut second, expected) = match lazy {
+            true => {
+                (Adam::new(AdamConfig::default()), "`table.row_steps` belongs to a lazy parameter, and this one is not")
+            }
+            false => (
+                Adam::new(AdamConfig::default()),
+                "`table.step` belongs to a parameter that was not lazy, and this one is",
+            ),
+        };
+        assert_eq!(second.load_state(&params, &state).unwrap_err().to_string(), expected);
+        // Nothing has changed: it takes its first step.
+        assert_eq!(second.steps(), 0);
+        train(&mut second, &mut params, ids, 0, false).unwrap();
+        params.set_lazy(|name| name == "table", lazy);
+        second.load_state(&params, &state).unwrap();
+        train(&mut second, &mut params, ids, 1, false).unwrap();
+    }
+}
+
+#[test]
+fn state_of_impossible_size_is_an_error() {
+    let file = |dtype: &str, shape: &str, data: &[u8]| {
+        let mut header =
+            format!(r#"{{"x.first":{{"dtype":"{dtype}","shape":{shape},"data_offsets":[0,{}]}}}}"#, data.len());
+        header.extend(std::iter::repeat_n(' ', header.len().next_multiple_of(8) - header.len()));
+        [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), data].concat()
+    };
+    // Extents whose product is beyond every number, and 0 all the same.
+    for shape in ["[0,9223372036854775808,2]", "[4294967296,0,4294967296]"] {
+        let error = OptimizerState::<f32>::from_safetensors(&file("F32", shape, &[])).unwrap_err().to_string();
+        assert!(error.starts_with("`x.first` has shape [") && error.ends_with("which is too large"), "{error}");
+    }
+    for (dtype, shape) in [("F32", "[9223372036854775808,2,0]"), ("U64", "[9223372036854775808,2]")] {
+        assert!(OptimizerState::<f32>::from_safetensors(&file(dtype, shape, &[])).is_err(), "{dtype} {shape}");
+    }
+    assert!(OptimizerState::<f32>::from_safetensors(&file("F32", "[0,4294967296]", &[])).is_ok());
+    // Steps that count no further.
+    let mut params = Params::<f32>::new();
+    params.add("x", Tensor::scalar(1.0));
+    let mut adam = Adam::new(AdamConfig::default());
+    let grads = [Gradient::from(Tensor::scalar(1.0))];
+    adam.update(&mut params, &grads, 0.1).check().unwrap();
+    let mut state = adam.state(&params);
+    state.counts.values_mut().for_each(|counts| counts.fill(u64::MAX));
+    adam.load_state(&params, &state).unwrap();
+    assert_eq!(adam.update(&mut params, &grads, 0.1).check(), Ok(1));
+    assert_eq!(adam.steps(), u64::MAX);
 }
 
 #[test]

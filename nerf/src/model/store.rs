@@ -6,7 +6,7 @@ use crate::camera::Camera;
 use crate::files::write_atomic;
 use crate::{Error, Result};
 use raygrad_nn::{stored_bytes, stored_words};
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 impl Model<f32> {
@@ -16,8 +16,7 @@ impl Model<f32> {
     /// # Errors
     /// If the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
-        // One word: several have no order, and the same model is to be the same bytes.
-        let metadata = HashMap::from([(FORMAT.into(), format!("raygrad {VERSION}"))]);
+        let metadata = BTreeMap::from([(FORMAT.into(), format!("raygrad {VERSION}"))]);
         let mut blobs = self.sampler.state();
         if self.detail < 1.0 {
             blobs.push((DETAIL, self.detail.to_le_bytes().to_vec()));
@@ -27,7 +26,7 @@ impl Model<f32> {
         }
         let bytes = self
             .params
-            .to_safetensors(self.config.storage, metadata, &blobs)
+            .to_safetensors(self.config.storage, &metadata, &blobs)
             .map_err(|error| Error::file(&path, error))?;
         write_atomic(path, &bytes)
     }
@@ -128,7 +127,7 @@ mod tests {
         assert_eq!(written.as_deref(), Some("raygrad 1"));
         let load = |words: Option<&str>| {
             let words = words.map(|words| ("format".to_owned(), words.to_owned())).into_iter().collect();
-            let bytes = model.params.to_safetensors(Storage::Full, words, &model.sampler.state()).unwrap();
+            let bytes = model.params.to_safetensors(Storage::Full, &words, &model.sampler.state()).unwrap();
             std::fs::write(&path, bytes).unwrap();
             Model::load(&path, voxel(1), extent).map(|_| ()).map_err(|error| error.to_string())
         };

@@ -324,7 +324,7 @@ mod tests {
     use super::*;
     use raygrad_autograd::check::{Check, check_function};
     use raygrad_nn::{Params, Storage};
-    use std::collections::HashMap;
+    use std::collections::{BTreeMap, HashMap};
     use std::path::PathBuf;
     use std::sync::LazyLock;
 
@@ -380,7 +380,7 @@ mod tests {
     }
 
     fn bytes(params: &Params<f32>) -> Vec<u8> {
-        params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap()
+        params.to_safetensors(Storage::Full, &BTreeMap::new(), &[]).unwrap()
     }
 
     fn opened(bytes: &[u8]) -> Result<Lpips> {
@@ -558,7 +558,7 @@ mod tests {
         };
         let swapped = changed("net.slice3.6.weight", Tensor::zeros(&[192, 384, 3, 3]));
         refused(&swapped, &["`net.slice3.6.weight`: is F32[192, 384, 3, 3], not F32[384, 192, 3, 3]", "with alex"]);
-        let half = good.to_safetensors(Storage::F16, HashMap::new(), &[]).unwrap();
+        let half = good.to_safetensors(Storage::F16, &BTreeMap::new(), &[]).unwrap();
         refused(&half, &["`net.slice1.0.weight`: is F16[64, 3, 11, 11], not F32[64, 3, 11, 11]"]);
         for (name, value, expected) in [
             ("net.slice5.10.bias", f32::NAN, "holds NaN, and must be finite"),

@@ -9,7 +9,7 @@ use crate::model::config::Config;
 use crate::{Error, Result};
 use raygrad_nn::{ParamsError, Storage};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
 /// The most rays that a step may have.
@@ -94,8 +94,8 @@ impl Trainer {
         let mut blobs = self.model.sampler.training_state();
         blobs.push((TRAINER, counts));
         blobs.extend(names.iter().map(String::as_str).zip(groups));
-        let metadata = HashMap::from([("format".into(), "raygrad training".into())]);
-        let bytes = params.to_safetensors(Storage::Full, metadata, &blobs);
+        let metadata = BTreeMap::from([("format".into(), "raygrad training".into())]);
+        let bytes = params.to_safetensors(Storage::Full, &metadata, &blobs);
         bytes.map_err(|error: ParamsError| failed(error.to_string()))
     }
 
@@ -260,7 +260,7 @@ mod tests {
             change(&mut counts);
             blobs.insert(TRAINER.into(), serde_json::to_vec(&counts).unwrap());
             let blobs: Vec<_> = blobs.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
-            params.to_safetensors(Storage::Full, HashMap::new(), &blobs).unwrap()
+            params.to_safetensors(Storage::Full, &BTreeMap::new(), &blobs).unwrap()
         };
         let states = [
             (written(&|counts| counts.batch = 0), "steps of 0 rays"),

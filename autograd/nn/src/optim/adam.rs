@@ -116,7 +116,7 @@ impl<T: Scalar> Adam<T> {
     /// A step with decoupled weight decay.
     #[track_caller]
     fn decayed(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64, decay: f64) -> UpdateReport {
-        self.step += 1;
+        self.step = self.step.saturating_add(1);
         let mut report = UpdateReport::default();
         for part in params.moves(grads, rate) {
             let decay = decay * part.decay;
@@ -134,7 +134,7 @@ impl<T: Scalar> Adam<T> {
             *memory = Memory::Dense(Moments::default());
         }
         let Memory::Dense(moments) = memory else { panic!("`{}` was lazy until now", part.name) };
-        moments.step += 1;
+        moments.step = moments.step.saturating_add(1);
         let AdamConfig { beta1, beta2, epsilon } = self.config;
         // 1 - beta^t without cancellation.
         let correction = |beta: f64| -(moments.step as f64 * beta.ln()).exp_m1();
@@ -217,9 +217,14 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
         let mut reader = Reader::new(state);
         let (step, mut memory) = (reader.steps()?, vec![]);
-        for (name, value) in params.iter() {
+        for ((name, value), id) in params.iter().zip(params.ids()) {
             let (shape, config) = (value.shape(), self.config);
             let rows = shape.first().copied().unwrap_or(1);
+            // As `Params::moves` has it: an empty parameter has no rows to move.
+            match params.is_lazy(id) && !value.is_empty() {
+                true => reader.refuse(name, "step", "belongs to a parameter that was not lazy, and this one is")?,
+                false => reader.refuse(name, "row_steps", "belongs to a lazy parameter, and this one is not")?,
+            }
             memory.push(if let Some(steps) = reader.counts(name, "row_steps", rows)? {
                 let moments = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
                 let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1));

@@ -48,21 +48,16 @@ impl<T: Scalar> Ema<T> {
     /// parameter is infinite or NaN. Averages below 1e-30 (1e-300 in f64) become 0.
     ///
     /// # Panics
-    /// If the number or the size of the parameters has changed.
+    /// If names or shapes of the parameters have changed; then nothing else has.
     #[track_caller]
     pub fn update(&mut self, params: &Params<T>) -> usize {
-        assert_eq!(self.average.len(), params.len(), "the parameters that the average started with");
+        self.average.check_fits(params);
         let t = self.steps as f64;
         let decay = if self.warmup { self.decay.min((1.0 + t) / (10.0 + t)) } else { self.decay };
-        self.steps += 1;
+        self.steps = self.steps.saturating_add(1);
         let share = T::from_f64(1.0 - decay);
         let pairs = self.average.values_mut().iter_mut().zip(params.values());
-        pairs
-            .map(|(a, x)| {
-                assert_eq!(a.shape(), x.shape(), "the parameters that the average started with");
-                blend(a.as_mut_slice(), x.as_slice(), share)
-            })
-            .sum()
+        pairs.map(|(a, x)| blend(a.as_mut_slice(), x.as_slice(), share)).sum()
     }
 
     /// The averages, under the names of the parameters.
@@ -153,6 +148,17 @@ mod tests {
                 assert!((got[0] - expected).abs() < 1e-14 && (got[1] + 1.0).abs() < 1e-14, "step {t}");
             }
         }
+    }
+
+    #[test]
+    fn update_other_parameters_panics_and_changes_nothing() {
+        let mut ema = Ema::new(&store(&[1.0]), 0.5);
+        let mut others = Params::new();
+        others.add("x", Tensor::from_vec(&[1], vec![9.0]));
+        others.add("empty", Tensor::zeros(&[1, 2]));
+        let update = std::panic::AssertUnwindSafe(|| ema.update(&others));
+        assert!(std::panic::catch_unwind(update).is_err());
+        assert_eq!((ema.params().values()[0].as_slice(), ema.steps), (&[1.0][..], 0));
     }
 
     #[test]

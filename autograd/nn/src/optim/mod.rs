@@ -82,6 +82,8 @@ impl<'a, T: Scalar> Move<'a, T> {
             let dense = self.dense_grad(pool);
             dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
         }
+        // A share of somebody else's could have put others in their place.
+        assert_eq!([sums.table_rows(), sums.features()], [rows, features], "rows and features of `{}`", self.name);
         sums
     }
 }

@@ -139,7 +139,7 @@ impl<T: Scalar> RowAdam<T> {
     /// worked on side by side.
     ///
     /// # Panics
-    /// If a length is not that of this optimiser's rows.
+    /// If a length is not that of this optimiser's rows, or `fill` puts sums of another length in the place of a part's.
     #[track_caller]
     pub fn step_parts(
         &mut self,
@@ -167,13 +167,17 @@ impl<T: Scalar> RowAdam<T> {
             moments: Rows::new(self.moments.as_mut_slice()),
             steps: Rows::new(&mut self.steps),
         };
-        let firsts = parts.iter().scan(0, |end, part| {
-            *end += part.table_rows();
-            Some(*end - part.table_rows())
+        let sizes: Vec<usize> = parts.iter().map(RowSums::table_rows).collect();
+        let firsts = sizes.iter().scan(0, |end, size| {
+            *end += size;
+            Some(*end - size)
         });
         let firsts: Vec<usize> = firsts.collect();
         let step = |(part, sums): (usize, &mut RowSums<T>)| {
             fill(part, sums);
+            // The sums were the caller's for that long. Those of more rows would reach into the next part.
+            let size = [sums.table_rows(), sums.features()];
+            assert_eq!(size, [sizes[part], features], "rows and features of part {part} after `fill`");
             let chunks = sums.rows().par_chunks(CHUNK).zip(sums.sums().par_chunks(CHUNK * features));
             let stats = chunks.map(|(rows, sums)| {
                 simd::dispatch(
@@ -355,9 +359,9 @@ impl<T: Scalar> Update<'_, T> {
                 continue;
             }
             let row = first + row as usize;
-            // SAFETY: `RowSums` names each row once and below the number of its rows, and the rows of one part end where
-            // those of the next begin: so no other task and no other turn of this loop has this one.
-            // `tasks_share_a_table` and `parts_share_a_table` run it.
+            // SAFETY: `RowSums` names each row once and below the number of its rows, which `step_parts` has checked after
+            // anybody else could change it, and the rows of one part end where those of the next begin: so no other task and
+            // no other turn of this loop has this one. `tasks_share_a_table` and `parts_share_a_table` run it.
             let (x, moments, step) = unsafe {
                 let x = self.table.get(row * features, features);
                 (x, self.moments.get(2 * row * features, 2 * features), self.steps.get(row, 1))
@@ -523,6 +527,30 @@ mod tests {
             (table, adam.row_steps())
         };
         assert_eq!(run(true), run(false));
+    }
+
+    #[test]
+    fn step_parts_replaced_sums_panic() {
+        // Sums of four rows in the place of the first part's two would move the row that the second part moves.
+        let replace = |[rows, features]: [usize; 2]| {
+            let mut adam = RowAdam::<f32>::new(AdamConfig::default(), 4, 2);
+            let (mut table, mut parts) = ([1.0; 8], [RowSums::new(2, 2), RowSums::new(2, 2)]);
+            let fill = |part: usize, sums: &mut RowSums<f32>| match part {
+                0 => {
+                    *sums = RowSums::new(rows, features);
+                    sums.add(rows - 1, &vec![1.0; features]);
+                }
+                _ => sums.add(0, &[1.0; 2]),
+            };
+            adam.step_parts(&mut table, &mut parts, fill, 0.1, 0.0)
+        };
+        for other in [[4, 2], [3, 2], [1, 2], [2, 1], [2, 4]] {
+            let error = std::panic::catch_unwind(|| replace(other)).expect_err("sums of another size");
+            let message = error.downcast_ref::<String>().map_or("", String::as_str);
+            assert!(message.contains("rows and features of part 0"), "{message}");
+        }
+        // Others of the same size are as good.
+        assert_eq!(replace([2, 2]), RowStats { touched: 2, skipped: 0 });
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use crate::Params;
 #[cfg(feature = "files")]
 use crate::Storage;
-use raygrad_tensor::{Scalar, Tensor};
+use raygrad_tensor::{Scalar, Tensor, checked_len};
 #[cfg(feature = "files")]
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, BTreeSet};
@@ -101,11 +101,16 @@ impl<T: Scalar> OptimizerState<T> {
     /// The state that such a file holds.
     ///
     /// # Errors
-    /// If the bytes are no safetensors file or a number type is neither that of the parameters nor `U64`.
+    /// If the bytes are no safetensors file, a number type is neither that of the parameters nor `U64`, or a shape is of
+    /// a size that no memory holds.
     pub fn from_safetensors(bytes: &[u8]) -> Result<Self, StateError> {
         let mut state = OptimizerState { tensors: BTreeMap::new(), counts: BTreeMap::new() };
         for (name, view) in SafeTensors::deserialize(bytes)?.tensors() {
             if view.dtype() == Storage::Full.dtype::<T>() {
+                // The format takes extents beside a 0 for nothing, whatever they are.
+                if checked_len(view.shape()).is_none() {
+                    return Err(StateError::entry(&name, format!("has shape {:?}, which is too large", view.shape())));
+                }
                 let values = view.data().chunks_exact(size_of::<T>()).map(T::read_le).collect();
                 state.tensors.insert(name, Tensor::from_vec(view.shape(), values));
             } else if view.dtype() == Dtype::U64 {
@@ -155,6 +160,12 @@ impl<'a, T: Scalar> Reader<'a, T> {
             return Err(StateError::entry(&key, format!("has {} counts, and not {len}", counts.len())));
         }
         Ok(Some(counts))
+    }
+
+    /// An error with these words if there are counts that a parameter cannot have.
+    pub fn refuse(&self, name: &str, what: &str, words: &str) -> Result<(), StateError> {
+        let key = key(name, what);
+        if self.state.counts.contains_key(&key) { Err(StateError::entry(&key, words)) } else { Ok(()) }
     }
 
     /// The optimiser's own number of steps.
