@@ -3,6 +3,7 @@
 mod geometry;
 mod page;
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -86,11 +87,12 @@ fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize>
     let placement = model.extent.placement;
     let views = present(capture, Split::Train)?;
     check_trained(run, capture, &views, model.extent.frames)?;
-    let trained: Vec<String> = views.iter().map(|view| view.field.clone()).collect();
+    let trained: HashMap<String, usize> =
+        views.iter().enumerate().map(|(number, view)| (view.field.clone(), number)).collect();
     for view in &mut capture.views {
         let given = placement.camera(&view.camera);
-        let found = match trained.iter().position(|field| *field == view.field) {
-            Some(number) => model.learned_camera(number, &given),
+        let found = match trained.get(&view.field) {
+            Some(&number) => model.learned_camera(number, &given),
             None => model.other_camera(&given),
         };
         if found != given {

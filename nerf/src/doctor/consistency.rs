@@ -10,6 +10,7 @@ use crate::dataset::evenly_spaced;
 use crate::numbers::median;
 use Severity::{Error, Warning};
 use glam::DAffine3;
+use std::collections::BTreeMap;
 
 /// Photographs that are compared with their neighbours under each convention.
 const TRIED: usize = 12;
@@ -71,7 +72,9 @@ pub(super) fn examine(all: &[Compared<'_>], most: usize, findings: &mut Findings
 }
 
 fn total(pairs: &[Pair]) -> Tally {
-    pairs.iter().fold(Tally::default(), |sum, pair| sum + pair.tally)
+    let mut total = Tally::default();
+    pairs.iter().for_each(|pair| total += pair.tally);
+    total
 }
 
 /// The finding that photographs agree under another convention than the one that is read.
@@ -106,15 +109,12 @@ fn wrong_poses(all: &[Compared<'_>], pairs: &[Pair], findings: &mut Findings) {
     let mut wrong: Vec<usize> = vec![];
     // The worst first, and then without it: one wrong camera does not make those beside it wrong.
     loop {
-        let left: Vec<&Pair> =
-            pairs.iter().filter(|pair| pair.views.iter().all(|view| !wrong.contains(view))).collect();
-        let of = |view: usize| {
-            let own = left.iter().filter(|pair| pair.views.contains(&view));
-            own.fold(Tally::default(), |sum, pair| sum + pair.tally)
-        };
-        let tallies = (0..all.len()).map(|view| (view, of(view)));
-        let tallies: Vec<(usize, Tally)> = tallies.filter(|(_, tally)| tally.trials >= FEWEST).collect();
-        let usual = median(tallies.iter().map(|(_, tally)| tally.skill()));
+        let mut tallies: BTreeMap<usize, Tally> = BTreeMap::new();
+        for pair in pairs.iter().filter(|pair| pair.views.iter().all(|view| !wrong.contains(view))) {
+            pair.views.iter().for_each(|view| *tallies.entry(*view).or_default() += pair.tally);
+        }
+        tallies.retain(|_, tally| tally.trials >= FEWEST);
+        let usual = median(tallies.values().map(|tally| tally.skill()));
         let worst = tallies.into_iter().min_by(|a, b| a.1.skill().total_cmp(&b.1.skill()));
         match worst.filter(|(_, tally)| usual >= GOOD && is_wrong(*tally, usual)) {
             Some((view, _)) => wrong.push(view),

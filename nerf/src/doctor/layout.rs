@@ -1,5 +1,6 @@
 //! What can be said of all cameras together, from their poses alone.
 
+use super::nearby::Nearby;
 use super::poses::{Convention, Focus, extents};
 use super::report::{FindingKind as Kind, Findings, Severity};
 use crate::camera::{Camera, clip_span};
@@ -62,8 +63,8 @@ pub(super) fn examine(capture: &Capture, survey: Option<&Survey>, findings: &mut
             vec![],
         );
     }
-    pairs(&views, focus.map_or(size[0], |focus| focus.distance.max(size[0])), size[0], findings);
-    far_cameras(&views, findings);
+    pairs(&views, &places, focus.map_or(size[0], |focus| focus.distance.max(size[0])), size[0], findings);
+    far_cameras(&views, &places, size[0], findings);
     scale(capture, &places, size[0], findings);
     if let Some(survey) = survey {
         let up = survey.placement.rotation.transpose() * DVec3::Z;
@@ -183,37 +184,31 @@ fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Conve
     focus.is_some_and(away).then_some((Convention::OpenCv, Warning))
 }
 
-/// Pairs of photographs with one pose.
-fn pairs(views: &[&View], distance: f64, size: f64, findings: &mut Findings) {
+/// Photographs with the pose of another one; each is named once, whatever the number of others.
+fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: &mut Findings) {
     /// How near poses are that are the same: as a share of a length, and in radians.
     const SAME: [f64; 2] = [1e-6, 1e-5];
     const NEARLY: [f64; 2] = [1e-3, 3e-3];
-    let near = |a: &View, b: &View, length: f64, [share, angle]: [f64; 2]| {
-        let [a, b] = [a.camera.pose, b.camera.pose];
-        let turned = (0..3).map(|axis| a.matrix3.col(axis).distance_squared(b.matrix3.col(axis))).sum::<f64>();
-        a.translation.distance(b.translation) <= share * length && turned <= 2.0 * angle * angle
+    let is_trained = |i: usize| views[i].split == Some(Split::Train);
+    let turned = |i: usize, j: usize| {
+        let [a, b] = [i, j].map(|i| views[i].camera.pose.matrix3);
+        (0..3).map(|axis| a.col(axis).distance_squared(b.col(axis))).sum::<f64>()
     };
-    let (mut duplicates, mut leaks) = (vec![], vec![]);
-    for (i, a) in views.iter().enumerate() {
-        for b in &views[..i] {
-            let across = (a.split == Some(Split::Train)) != (b.split == Some(Split::Train));
-            if across && near(a, b, distance, NEARLY) {
-                let (held, trained) = if a.split == Some(Split::Train) { (b, a) } else { (a, b) };
-                leaks.push([held.name.clone(), trained.name.clone()]);
-            } else if !across && near(a, b, size, SAME) {
-                duplicates.push([a.name.clone(), b.name.clone()]);
-            }
-        }
-    }
+    let alike = |length: f64, [share, angle]: [f64; 2], other: &dyn Fn(usize, usize) -> bool| -> Vec<[String; 2]> {
+        let nearby = Nearby::new(places, share * length);
+        let of = |i: usize| nearby.of(i).find(|&j| other(i, j) && turned(i, j) <= 2.0 * angle * angle);
+        let pairs = (0..views.len()).filter_map(|i| Some([i, of(i)?]));
+        pairs.map(|pair| pair.map(|i| views[i].name.clone())).collect()
+    };
     findings.alike(
         Kind::DuplicatePoses,
         Warning,
-        duplicates,
+        alike(size, SAME, &|i, j| j < i && is_trained(i) == is_trained(j)),
         |count| format!("the pose of {count} is exactly that of another"),
         "Two photographs are hardly ever taken from the same place: if the images differ, one of the poses is wrong; leave it \
          out.",
     );
-    leak(leaks, findings);
+    leak(alike(distance, NEARLY, &|i, j| !is_trained(i) && is_trained(j)), findings);
 }
 
 /// The finding that these photographs are trained and tested on.
@@ -229,20 +224,18 @@ pub(super) fn leak(pairs: Vec<[String; 2]>, findings: &mut Findings) {
     );
 }
 
-fn far_cameras(views: &[&View], findings: &mut Findings) {
-    let places: Vec<DVec3> = views.iter().map(|view| view.camera.pose.translation).collect();
+fn far_cameras(views: &[&View], places: &[DVec3], size: f64, findings: &mut Findings) {
+    /// The most cameras of which the distance to the nearest other is found.
+    const ASKED: usize = 500;
     let middle = DVec3::from([0, 1, 2].map(|axis| median(places.iter().map(|place| place[axis]))));
     let usual = median(places.iter().map(|place| place.distance(middle)));
-    let nearest: Vec<f64> = places
-        .iter()
-        .enumerate()
-        .map(|(i, a)| {
-            let others = places.iter().enumerate().filter(|(j, _)| *j != i);
-            others.map(|(_, b)| a.distance(*b)).fold(f64::INFINITY, f64::min)
-        })
-        .collect();
-    let gap = median(nearest.iter().copied());
-    let far = |i: &usize| places[*i].distance(middle) > 4.0 * usual && nearest[*i] > 8.0 * gap;
+    let nearest = |i: usize| {
+        let others = places.iter().enumerate().filter(|(j, _)| *j != i);
+        others.map(|(_, other)| other.distance(places[i])).fold(f64::INFINITY, f64::min)
+    };
+    let gap = median(evenly_spaced((0..places.len()).collect(), ASKED).into_iter().map(nearest));
+    let nearby = Nearby::new(places, (8.0 * gap).max(ONE_PLACE * size));
+    let far = |i: &usize| places[*i].distance(middle) > 4.0 * usual && nearby.of(*i).all(|j| j == *i);
     let names = (0..views.len()).filter(far).map(|i| views[i].name.clone()).collect();
     findings.about(
         Kind::FarCamera,

@@ -7,6 +7,7 @@ mod agreement;
 mod consistency;
 mod layout;
 mod look;
+mod nearby;
 mod picture;
 mod pixels;
 mod poses;

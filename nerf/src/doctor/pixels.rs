@@ -7,7 +7,7 @@ use crate::dataset::{Capture, Photo, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};
 use Severity::{Error, Note, Warning};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// A photograph with what its pixels say.
 pub(super) struct Seen<'a> {
@@ -119,15 +119,19 @@ fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Opt
     let usual = median((0..seen.len()).map(|i| gap(i, 0))).max(f64::MIN_POSITIVE);
     let residual = |i: usize| {
         let own = values[i]?;
-        let mut others: Vec<(f64, f64)> = (0..seen.len())
-            .filter(|j| *j != i)
-            .filter_map(|j| {
-                let angle = pose(i).matrix3.z_axis.angle_between(pose(j).matrix3.z_axis);
-                Some((gap(i, j) / usual + angle, values[j]?))
-            })
-            .collect();
-        others.sort_by(|a, b| a.0.total_cmp(&b.0));
-        (others.len() >= 3).then(|| own - median(others.iter().take(NEIGHBOURS).map(|(_, value)| *value)))
+        // The nearest so far, the nearest first.
+        let mut others: Vec<(f64, f64)> = vec![];
+        for j in (0..seen.len()).filter(|j| *j != i) {
+            let Some(value) = values[j] else { continue };
+            let angle = pose(i).matrix3.z_axis.angle_between(pose(j).matrix3.z_axis);
+            let distance = gap(i, j) / usual + angle;
+            let place = others.partition_point(|(other, _)| other.total_cmp(&distance).is_le());
+            if place < NEIGHBOURS {
+                others.truncate(NEIGHBOURS - 1);
+                others.insert(place, (distance, value));
+            }
+        }
+        (others.len() >= 3).then(|| own - median(others.iter().map(|(_, value)| *value)))
     };
     (0..seen.len()).map(residual).collect()
 }
@@ -161,15 +165,13 @@ fn light(seen: &[Seen<'_>], findings: &mut Findings) {
         "Photograph with a fixed exposure. With photographs as they are, codes for each photograph (`--set field.codes=8`) \
          take up what differs.",
     );
-    let mut names: Vec<String> = vec![];
-    for colour in 0..2 {
+    let unbalanced = |colour: usize| {
         let balance = residuals(seen, |look| look.luminance.map(|_| look.balance[colour]));
-        for name in outliers(seen, &balance, COLOUR.ln(), f64::abs) {
-            if !names.contains(&name) {
-                names.push(name);
-            }
-        }
-    }
+        outliers(seen, &balance, COLOUR.ln(), f64::abs)
+    };
+    let mut names = unbalanced(0);
+    let known: HashSet<String> = names.iter().cloned().collect();
+    names.extend(unbalanced(1).into_iter().filter(|name| !known.contains(name)));
     findings.about(
         Kind::WhiteBalanceJump,
         Warning,

@@ -453,3 +453,44 @@ fn a_good_capture_through_a_lens_half_masked_and_lying_on_its_side_has_none_eith
     assert!(lie.middle.length() < 0.5 && lie.near < lie.far, "{lie:?}");
     assert_eq!((facts.lenses.len(), facts.points), (1, 0));
 }
+
+#[test]
+fn twenty_thousand_equal_poses_take_linear_memory() {
+    let mut planted = Planted::new();
+    let (first, other) = (planted.capture.views[0].clone(), planted.capture.views[45].clone());
+    // As frames of one file: held out and not, with the pose of another one, and one elsewhere.
+    let count = 20_000;
+    planted.capture.views = (0..count)
+        .map(|i| View {
+            name: format!("{i}.png"),
+            split: Some(if i % 8 == 0 { Split::Test } else { Split::Train }),
+            ..if i == 5 { other.clone() } else { first.clone() }
+        })
+        .collect();
+    let start = std::time::Instant::now();
+    let report = planted.cameras();
+    // Comparing all with all takes a second and more in a release build.
+    assert!(start.elapsed().as_secs() < 20, "{:?}", start.elapsed());
+    let names: usize = report.findings.iter().map(|finding| finding.views.len()).sum();
+    assert!(names <= 10 * count, "{names} names are kept");
+    let views = |kind: Kind| &report.finds(kind).unwrap().views;
+    // Each is named once: all held-out ones, which have the pose of a training one, and all that have that of an earlier one.
+    assert_eq!(views(Kind::Leak).len(), count / 8);
+    assert_eq!(views(Kind::DuplicatePoses).len(), count - 3);
+    assert!(report.finds(Kind::DuplicatePoses).unwrap().what.contains("19997 photographs is exactly"));
+    assert_eq!(*views(Kind::FarCamera), ["5.png"]);
+}
+
+#[test]
+fn each_of_several_equal_poses_is_named_once() {
+    let mut planted = Planted::new();
+    let pose = planted.capture.views[10].camera.pose;
+    for i in [11, 12, 13] {
+        planted.camera(i).pose = pose;
+    }
+    let report = planted.cameras();
+    let finding = report.finds(Kind::DuplicatePoses).unwrap();
+    assert_eq!(finding.views, ["11.png", "12.png", "13.png"]);
+    let expected = "the pose of 3 photographs is exactly that of another: `11.png` and `10.png`, and others";
+    assert_eq!(finding.what, expected);
+}

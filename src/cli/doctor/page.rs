@@ -1,6 +1,8 @@
 //! One page with facts, findings, photographs and cameras, that asks nothing of the network.
 
-use raygrad::nerf::dataset::{Capture, Photo};
+use std::collections::HashMap;
+
+use raygrad::nerf::dataset::{Capture, Photo, View};
 use raygrad::nerf::doctor::{Finding, Report};
 use raygrad::nerf::{Error, Result};
 
@@ -22,7 +24,8 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage) -> Result<String>
     let rows = table::facts(&report.facts);
     let facts: String =
         rows.iter().map(|(name, value)| format!("<tr><th>{name}</th><td>{}</td></tr>\n", escaped(value))).collect();
-    let mut findings: String = report.findings.iter().map(|finding| section(capture, finding)).collect();
+    let views: HashMap<&str, &View> = capture.views.iter().rev().map(|view| (view.name.as_str(), view)).collect();
+    let mut findings: String = report.findings.iter().map(|finding| section(&views, finding)).collect();
     if findings.is_empty() {
         findings = "<p class=\"good\">Nothing is wrong with it.</p>".to_owned();
     }
@@ -33,7 +36,8 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage) -> Result<String>
     Ok(filled(PAGE, &[("title", title), ("facts", facts), ("findings", findings), ("stage", data)]))
 }
 
-fn section(capture: &Capture, finding: &Finding) -> String {
+/// A finding, with some of the photographs that it names.
+fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
     let Finding { kind, severity, what, advice, views } = finding;
     let mut text = format!(
         "<section class=\"{severity}\"><h3><span>{severity}</span> {kind}</h3>\n<p>{}.</p><p class=\"advice\">{}</p>\n",
@@ -43,7 +47,7 @@ fn section(capture: &Capture, finding: &Finding) -> String {
     if !views.is_empty() {
         text += &format!("<p class=\"names\">{}</p>\n", escaped(&table::names(finding, NAMES)));
     }
-    let images = views.iter().filter_map(|name| Some((name, thumbnail(capture, name)?)));
+    let images = views.iter().filter_map(|name| Some((name, thumbnail(photographs.get(name.as_str())?)?)));
     let figures = images.take(SHOWN).map(|(name, png)| {
         let name = escaped(name);
         format!(
@@ -54,8 +58,7 @@ fn section(capture: &Capture, finding: &Finding) -> String {
 }
 
 /// A photograph as a small PNG; `None` if it cannot be read, which a finding says.
-fn thumbnail(capture: &Capture, name: &str) -> Option<String> {
-    let view = capture.views.iter().find(|view| view.name == name)?;
+fn thumbnail(view: &View) -> Option<String> {
     let photo = Photo::open(view.image.as_ref()?, None).ok()?;
     let share = (SIDE as f64 / photo.width.max(photo.height) as f64).min(1.0);
     let size = [photo.width, photo.height].map(|side| ((side as f64 * share).round() as usize).max(1));

@@ -1,0 +1,75 @@
+//! Which of many places are near a place, without comparing all of them with each other.
+
+use glam::DVec3;
+use std::collections::HashMap;
+
+/// Places by the cell of a cubic lattice that they lie in. Memory and time are linear in their number.
+pub(super) struct Nearby<'a> {
+    places: &'a [DVec3],
+    /// Side of a cell, and the distance up to which places are near.
+    radius: f64,
+    cells: HashMap<[i64; 3], Vec<usize>>,
+}
+
+/// The most places that are looked at for one: more of them are in one place, and say no more.
+const LOOKED_AT: usize = 500;
+
+impl<'a> Nearby<'a> {
+    /// Sorts places into cells of side `radius`, which is positive.
+    pub fn new(places: &'a [DVec3], radius: f64) -> Self {
+        let mut cells: HashMap<_, Vec<usize>> = HashMap::new();
+        for (i, place) in places.iter().enumerate() {
+            cells.entry(cell(*place, radius)).or_default().push(i);
+        }
+        Nearby { places, radius, cells }
+    }
+
+    /// The numbers of the places that are at most `radius` from place `i`, itself among them, in no order in particular; where
+    /// very many lie around it, some of them.
+    pub fn of(&self, i: usize) -> impl Iterator<Item = usize> {
+        let (place, [x, y, z]) = (self.places[i], cell(self.places[i], self.radius));
+        let steps = |at: i64| [at, at.saturating_sub(1), at.saturating_add(1)];
+        let around = steps(x).into_iter().flat_map(move |x| steps(y).into_iter().map(move |y| [x, y]));
+        let around = around.flat_map(move |[x, y]| steps(z).into_iter().map(move |z| [x, y, z]));
+        let found = around.filter_map(|cell| self.cells.get(&cell)).flatten().copied().take(LOOKED_AT);
+        found.filter(move |j| self.places[*j].distance(place) <= self.radius)
+    }
+}
+
+/// The cell that holds a place.
+fn cell(place: DVec3, side: f64) -> [i64; 3] {
+    // Beyond 2^63 cells all are the last one.
+    (place / side).floor().to_array().map(|x| x as i64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64Mcg;
+
+    #[test]
+    fn nearby_finds_what_comparing_all_finds() {
+        let mut rng = Pcg64Mcg::seed_from_u64(3);
+        let mut places: Vec<DVec3> =
+            (0..300).map(|_| DVec3::from_array(std::array::from_fn(|_| rng.random::<f64>() * 4.0 - 2.0))).collect();
+        // On the borders of cells, and at the same place.
+        places.extend([DVec3::ZERO, DVec3::X, -DVec3::X, DVec3::splat(0.5), DVec3::splat(0.5)]);
+        for radius in [0.1, 0.5, 1.0] {
+            let nearby = Nearby::new(&places, radius);
+            for i in 0..places.len() {
+                let mut found: Vec<usize> = nearby.of(i).collect();
+                found.sort_unstable();
+                let near = |j: &usize| places[*j].distance(places[i]) <= radius;
+                assert_eq!(found, (0..places.len()).filter(near).collect::<Vec<_>>(), "{i} {radius}");
+            }
+        }
+    }
+
+    #[test]
+    fn nearby_many_in_one_place_are_not_all_looked_at() {
+        let places = [vec![DVec3::ONE; 100_000], vec![DVec3::splat(1e300), DVec3::splat(-1e300)]].concat();
+        let nearby = Nearby::new(&places, 1e-6);
+        assert!((0..places.len()).all(|i| (1..=LOOKED_AT).contains(&nearby.of(i).count())));
+    }
+}
