@@ -23,6 +23,11 @@ mod export;
 mod lpips;
 #[path = "cli/outside.rs"]
 mod outside;
+#[path = "cli/overwrite.rs"]
+mod overwrite;
+#[cfg(unix)]
+#[path = "cli/owners.rs"]
+mod owners;
 // Scripts stand in for other programs.
 #[cfg(unix)]
 #[path = "cli/prepare.rs"]
@@ -41,6 +46,9 @@ mod records;
 #[cfg(unix)]
 #[path = "cli/resume.rs"]
 mod resume;
+#[cfg(unix)]
+#[path = "cli/signals.rs"]
+mod signals;
 #[cfg(unix)]
 #[path = "cli/view.rs"]
 mod view;
@@ -527,7 +535,10 @@ fn bad_places_to_write_are_named() {
         "train scene --preset small --steps 1 --out scene/transforms_test.json",
         &["transforms_test.json: cannot be used"],
     );
-    place.fails("render run --out run/config.json/frames", &["run/config.json/frames: cannot be created"]);
+    place.fails(
+        "render run --out run/config.json/frames",
+        &["run/config.json/frames: `config.json` is a part of the run"],
+    );
     place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
     std::fs::create_dir(place.path("folder.gif")).unwrap();
     place.fails("render run --out folder.gif", &["folder.gif: is a folder"]);

@@ -58,6 +58,7 @@ fn capture(folder: &Path, prefix: &str) -> Capture {
         format: Format::Transforms,
         views: (0..VIEWS).map(view).collect(),
         points: (0..40).map(point).collect(),
+        points_file: None,
         aabb_scale: None,
         applied: DAffine3::IDENTITY,
     }

@@ -65,6 +65,7 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
         format,
         views,
         points: vec![],
+        points_file: None,
         aabb_scale: None,
         applied: DAffine3::IDENTITY,
     })

@@ -9,9 +9,12 @@ use std::process::ExitCode;
 
 use raygrad::nerf::dataset::formats::transforms;
 use raygrad::nerf::dataset::{Capture, Split};
-use raygrad::nerf::{Error, Model, Result};
+use raygrad::nerf::geometry::files::Format;
+use raygrad::nerf::{Error, Model, Result, write_atomic};
+use serde_json::json;
 
 use super::output::{parent, print};
+use super::overwrite::Job;
 use super::photographs::{check_trained, present};
 use super::prepare::convert::{Target, convert, relative};
 use super::prepare::program::Stop;
@@ -25,7 +28,8 @@ use super::{builtin, interrupt};
 /// trained on have the refined ones, moved as a whole to where the given ones are; of others, held-out ones, only focal length
 /// and lens follow. A file that ends in .ply, .obj or .glb has the surface as a mesh, or with --points as points, with normals and
 /// colours; of a scene that goes on, what is within the box where the cameras look. One that ends in .html has the whole scene as
-/// a page that renders itself in any browser with WebGL 2, to be sent to others: it needs no server and no network.
+/// a page that renders itself in any browser with WebGL 2, to be sent to others: it needs no server and no network. The same
+/// command replaces its own files, and no others unless --overwrite is given.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -40,19 +44,58 @@ pub struct Args {
     /// Folder of the photographs, if they are no longer where they were for training
     #[arg(long)]
     scene: Option<Scene>,
+    /// Replace a file that another command wrote
+    #[arg(long, conflicts_with = "to")]
+    overwrite: bool,
+    /// Copy files from outside of the photographs' folder into a dataset too
+    #[arg(long, requires = "to")]
+    allow_outside: bool,
     #[command(flatten)]
     shape: geometry::Options,
+}
+
+/// What is written, by the ending of the file's name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Cameras,
+    Shape,
+    Page,
+}
+
+impl Kind {
+    fn of(out: &Path) -> Result<Self> {
+        if Format::of(out).is_some() {
+            return Ok(Kind::Shape);
+        }
+        match out.extension().and_then(|ending| ending.to_str()).map(str::to_ascii_lowercase).as_deref() {
+            Some("json") => Ok(Kind::Cameras),
+            Some("html") => Ok(Kind::Page),
+            _ => {
+                let known = "end the name in .json for cameras, .ply, .obj or .glb for the shape, .html for a page, or name a \
+                             format with --to";
+                Err(Error::file(out, format!("says by no ending what to export: {known}")))
+            }
+        }
+    }
 }
 
 /// Writes the cameras, or the shape.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
-    if args.to.is_none() && geometry::is_shape(&args.out) {
-        return geometry::run(&run, args.scene.as_ref(), &args.shape, &args.out).map(|()| ExitCode::SUCCESS);
+    let kind = if args.to.is_some() { Kind::Cameras } else { Kind::of(&args.out)? };
+    let arguments = json!({ "run": run.identity(), "shape": args.shape });
+    let job = Job::new("export", &arguments, args.overwrite);
+    if kind != Kind::Shape {
+        args.shape.check_absent()?;
     }
-    args.shape.check_absent()?;
-    if args.to.is_none() && page::is_page(&args.out) {
-        return page::run(&run, &args.out).map(|()| ExitCode::SUCCESS);
+    run.check_output(&args.out)?;
+    if args.to.is_none() {
+        job.check(&args.out)?;
+    }
+    match kind {
+        Kind::Shape => return geometry::run(&run, args.scene.as_ref(), &args.shape, &args.out, &job),
+        Kind::Page => return page::run(&run, &args.out, &job),
+        Kind::Cameras => {}
     }
     let model = run.model()?;
     let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
@@ -63,10 +106,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let refined = refine(&mut capture, &model, &run)?;
     let cameras = capture.views.len();
     match args.to {
-        None => write(capture, &args.out)?,
+        None => write(capture, &args.out, &job)?,
         Some(target) => {
             interrupt::listen_to_remove();
-            match convert(capture, target, false, &args.out) {
+            match convert(capture, target, false, args.allow_outside, &args.out) {
                 Ok(()) => {}
                 Err(Stop::Interrupted) => return Ok(interrupt::EXIT_CODE.into()),
                 Err(Stop::Failed(error)) => return Err(error),
@@ -103,18 +146,19 @@ fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize>
 }
 
 /// Writes the cameras alone.
-fn write(mut capture: Capture, out: &Path) -> Result<()> {
+fn write(mut capture: Capture, out: &Path, job: &Job) -> Result<()> {
     // Points would be a file of their own.
     capture.points.clear();
     for view in capture.views.iter_mut().filter(|view| view.image.is_some()) {
         // As masks and depths are: from the folder of the capture.
         view.name = relative(&capture.folder, view)?;
     }
-    if out.is_dir() {
-        return Err(Error::file(out, "is a folder: name a file such as cameras.json, or a format with --to"));
-    }
     let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
     let folder = tempfile::tempdir_in(parent(out)).map_err(bad)?;
     transforms::write(&capture, folder.path())?;
-    std::fs::rename(folder.path().join("transforms.json"), out).map_err(bad)
+    let text = std::fs::read_to_string(folder.path().join("transforms.json")).map_err(bad)?;
+    // Beside what the format has; programs pass over fields that they do not know.
+    let text = text.replacen('{', &format!("{{\n  \"exported_by\": \"{}\",", job.mark()), 1);
+    job.check(out)?;
+    write_atomic(out, text.as_bytes())
 }

@@ -15,9 +15,11 @@ mod fuzz;
 mod html;
 mod interrupt;
 mod journal;
+mod lock;
 mod machine;
 mod memory;
 mod output;
+mod overwrite;
 mod parse;
 mod photographs;
 mod precision;
@@ -49,7 +51,7 @@ Exit codes:
   2    a command line that cannot be understood
   3    doctor has found something to be warned of
   4    doctor has found an error in the capture
-  130  interrupted (Ctrl-C, SIGTERM); what `train` has done is saved";
+  130  interrupted (Ctrl-C, SIGTERM, hang-up); what `train` has done is saved";
 
 /// Neural radiance fields on a CPU: photographs and camera poses in, new views out.
 ///

@@ -1,19 +1,39 @@
 //! Words to the terminal, and folders to write to.
 
-use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::pictures::colormap;
 use raygrad::nerf::{Error, Image, Picture, Result};
 
-/// Writes to standard output. A reader that has gone away, as in `raygrad eval run | head -1`, is no error.
+/// Writes to standard output. A reader that has gone away, as in `raygrad eval run | head -1`, is no error, and a terminal that
+/// was closed is none.
 pub fn print(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::setting("stdout", format!("cannot be written: {e}"))),
+        Err(e) if !is_gone(&e, is_device(&out)) => Err(Error::setting("stdout", format!("cannot be written: {e}"))),
         _ => Ok(()),
     }
+}
+
+/// Whether nobody is there any more to read what is written to standard output, which may be a device.
+fn is_gone(error: &std::io::Error, is_device: bool) -> bool {
+    /// What a terminal says that was hung up, on all kinds of Unix.
+    const EIO: i32 = 5;
+    error.kind() == ErrorKind::BrokenPipe || (cfg!(unix) && is_device && error.raw_os_error() == Some(EIO))
+}
+
+/// Whether this is a device, as terminals are. That they are terminals they say no more when they are hung up.
+#[cfg(unix)]
+fn is_device(out: &impl std::os::fd::AsFd) -> bool {
+    use std::os::unix::fs::FileTypeExt;
+    let file = out.as_fd().try_clone_to_owned().map(std::fs::File::from);
+    file.and_then(|file| file.metadata()).is_ok_and(|about| about.file_type().is_char_device())
+}
+
+#[cfg(not(unix))]
+fn is_device<T>(_: &T) -> bool {
+    false
 }
 
 /// Writes a line to standard error. If that is closed there is nobody to tell; `eprintln` would panic.
@@ -34,17 +54,6 @@ pub fn parent(file: &Path) -> &Path {
 /// Whether files can be made in a folder: asked before the work that they will hold.
 pub fn check_writable(folder: &Path) -> Result<()> {
     tempfile::tempfile_in(folder).map(drop).map_err(|e| Error::file(folder, format!("cannot be written to: {e}")))
-}
-
-/// Keeps other programs out, until the file is dropped or this program ends, however it does; `busy` says what to do if one is in.
-pub fn lock(path: &Path, busy: impl FnOnce() -> Error) -> Result<File> {
-    let bad = |e: std::io::Error| Error::file(path, format!("cannot be locked: {e}"));
-    let file = File::options().create(true).truncate(false).write(true).open(path).map_err(bad)?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(busy()),
-        Err(TryLockError::Error(e)) => Err(bad(e)),
-    }
 }
 
 /// The CRC-32 of a file, by which records say which one it was.
@@ -108,4 +117,21 @@ pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
     // Shown from 1 to 2, as 0 is nothing.
     depth.data.iter_mut().filter(|depth| **depth > 0.0).for_each(|depth| *depth = 1.0 + share(*depth));
     colormap::depth_map(&depth, 1.0, 2.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn output_to_who_is_gone_is_no_error() {
+        let error = |number: i32| std::io::Error::from_raw_os_error(number);
+        // A pipe without a reader, a terminal that was hung up; a disk that fails, and one that is full.
+        for (number, is_device, gone) in [(32, false, true), (5, true, true), (5, false, false), (28, true, false)] {
+            assert_eq!(is_gone(&error(number), is_device), gone, "{number} {is_device}");
+        }
+        let device = std::fs::File::open("/dev/null").unwrap();
+        assert!(is_device(&device) && !is_device(&tempfile::tempfile().unwrap()));
+    }
 }

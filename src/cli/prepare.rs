@@ -5,6 +5,7 @@ pub mod convert;
 mod photographs;
 mod poses;
 pub mod program;
+mod root;
 mod undistort;
 mod video;
 mod workplace;
@@ -51,6 +52,9 @@ pub struct Args {
     /// The lens that the photographs were taken with
     #[arg(long, value_enum, default_value_t, conflicts_with_all = ["to", "undistort"])]
     lens: Glass,
+    /// Copy files that lie outside of the folder, or that links in it lead to, into the dataset too
+    #[arg(long)]
+    allow_outside: bool,
     /// Width in pixels of the pictures of a built-in scene, embedded or landscape, which --to writes [default: 200 and 400]
     #[arg(long, value_name = "PIXELS", value_parser = parse::count(8192), requires = "to")]
     size: Option<usize>,
@@ -88,7 +92,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
                 scene => builtin::capture(&scene, args.size, Some(pictures.path()))?,
             };
             let to = to.unwrap_or_else(|| Target::of(capture.format));
-            convert::convert(capture, to, undistort, &args.out)
+            convert::convert(capture, to, undistort, args.allow_outside, &args.out)
         }
     };
     finished(done, &args.out)
@@ -132,7 +136,7 @@ fn prepare(args: &Args) -> Work<()> {
     let place = Workplace::new(&args.out)?;
     let count = match is_video {
         true => video::frames(input, args.frames, &place)?,
-        false => photographs::copy(input, &place)?,
+        false => photographs::copy(input, args.allow_outside, &place)?,
     };
     let what = if is_video { "sharp frames of" } else { "photographs of" };
     print(&format!("images   {count} {what} {}\n", input.display()))?;
@@ -141,7 +145,7 @@ fn prepare(args: &Args) -> Work<()> {
     report(&found, count, &args.out)?;
     // The dataset is there whatever is found in it.
     let (scene, out) = (Scene::Folder(args.out.clone()), args.out.join("doctor"));
-    if let Err(error) = doctor::run(&doctor::Args { scene, scope: None, out, json: false }) {
+    if let Err(error) = doctor::run(&doctor::Args { scene, scope: None, out, overwrite: false, json: false }) {
         complain(&format!("warning: {error}"));
     }
     Ok(())

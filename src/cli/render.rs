@@ -12,10 +12,11 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Camera, Error, Result};
+use raygrad::nerf::{Camera, Error, Result, write_atomic};
 use serde_json::{Value, json};
 
 use super::output::{check_writable, checksum, note, other_numbered, parent, print};
+use super::overwrite::{Job, png_with_text};
 use super::precision::{Precision, Renderer};
 use super::prepare::program::Stop;
 use super::progress::{Progress, spoken};
@@ -30,8 +31,8 @@ use shown::{Layer, Show, Shown};
 
 /// Render pictures or a film of a model
 ///
-/// Pictures of the same name are replaced. Of a film, frames are written to FILE.frames/ first. After a Ctrl-C, and
-/// whatever else ends it, the same command goes on where it was.
+/// The same command replaces its own pictures and films, and no others unless --overwrite is given. Of a film, frames are
+/// written to FILE.frames/ first. After a Ctrl-C, and whatever else ends it, the same command goes on where it was.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made
@@ -66,6 +67,9 @@ pub struct Args {
     /// Leave the frames of a film in FILE.frames/
     #[arg(long)]
     keep_frames: bool,
+    /// Replace files that another command wrote
+    #[arg(long)]
+    overwrite: bool,
     /// Folder of the photographs, if they are no longer where they were for training
     #[arg(long)]
     scene: Option<Scene>,
@@ -89,6 +93,7 @@ impl Args {
             skip: None,
             precision: Precision::F32,
             keep_frames: false,
+            overwrite: false,
             scene: None,
             ends_with_input: false,
         }
@@ -96,13 +101,7 @@ impl Args {
 
     /// What the output is, if the flags fit it.
     fn kind(&self, out: &Path) -> Result<Kind> {
-        if Kind::is_foreign(out) {
-            return Err(Error::file(
-                out,
-                "cannot be written: name a folder, or a FILE.png, .gif, .apng, .mp4 or .webm",
-            ));
-        }
-        let kind = Kind::of(out);
+        let kind = Kind::of(out)?;
         let meaningless = |flag: &str, what: &str| Err(Error::setting(flag, format!("has no meaning {what}")));
         if kind != Kind::Folder && !self.save.is_empty() {
             return meaningless("save", "for a single file: name a folder with --out");
@@ -120,6 +119,24 @@ impl Args {
         }
         Ok(kind)
     }
+
+    /// What decides what the output shows, but for the model.
+    fn job(&self, run: &Run) -> Job {
+        let Args { flight, show, depth, save, depth_unit, background, skip, precision, .. } = self;
+        let show = if *depth { Show::Depth } else { *show };
+        let arguments = json!({
+            "run": run.identity(),
+            "flight": flight,
+            "show": show,
+            "save": save,
+            "depth_unit": depth_unit,
+            "background": background,
+            "skip": skip.map(|skip| skip.to_string()),
+            "precision": precision,
+        });
+        // Without --out, pictures go to a folder of the run's own.
+        Job::new("render", &arguments, self.overwrite || self.out.is_none())
+    }
 }
 
 /// Renders and writes the files.
@@ -127,6 +144,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let run = Run::open(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
     let kind = args.kind(&out)?;
+    let job = args.job(&run);
+    run.check_output(&out)?;
+    if kind != Kind::Folder {
+        job.check(&out)?;
+    }
     // Before it is read: should it be replaced meanwhile, frames of both are never taken for one film.
     let stored = [checksum(&run.model_file())?, checksum(&run.file("config.json"))?];
     let mut model = run.model()?;
@@ -142,11 +164,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let shown = Shown { renderer: &renderer, extent, background, show, save: &args.save, depth_unit };
     let folder = match kind {
         Kind::Png => {
-            if out.is_dir() {
-                return Err(Error::file(&out, "is a folder, not a file"));
-            }
             check_writable(parent(&out))?;
-            shown.frame(&cameras[0]).image.save_png(&out)?;
+            let picture = shown.frame(&cameras[0]).image.to_png();
+            job.check(&out)?;
+            write_atomic(&out, &png_with_text(&picture, job.mark()))?;
             cameras.truncate(1);
             return report(&cameras, &out);
         }
@@ -156,7 +177,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
         Kind::Folder => out.clone(),
     };
-    let mut frames = Frames::new(folder, contents(args, stored, &cameras, &shown)?)?;
+    let of = contents(args, stored, &cameras, &shown)?;
+    let mut frames = Frames::new(folder, of, &job, cameras.len(), &args.save)?;
     if cameras.len() > 1 {
         interrupt::listen_to_go_on();
     }
@@ -169,7 +191,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     match kind {
         Kind::Film(film) => {
             let size = [cameras[0].width, cameras[0].height];
-            let reel = Reel { folder: frames.folder(), count: cameras.len(), size, fps };
+            let reel = Reel { folder: frames.folder(), count: cameras.len(), size, fps, job: &job };
             match film.write(&reel, &out) {
                 Ok(()) => {}
                 Err(Stop::Interrupted) => return stopped(&frames, cameras.len()),
@@ -196,10 +218,6 @@ pub fn film_ending() -> &'static str {
         Err(_) => "gif",
     }
 }
-
-/// Endings of pictures and films that others write.
-const FOREIGN: [&str; 13] =
-    ["mov", "avi", "mkv", "m4v", "mpg", "mpeg", "ogv", "jpg", "jpeg", "webp", "exr", "tif", "tiff"];
 
 /// The usual step of depths in files.
 const MILLI: f64 = 1e-3;
@@ -286,27 +304,62 @@ enum Kind {
 }
 
 impl Kind {
-    fn of(out: &Path) -> Self {
-        let ending = out.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-        match ending.as_deref() {
-            Some("png") => Kind::Png,
-            Some(ending) => Film::of(ending).map_or(Kind::Folder, Kind::Film),
-            None => Kind::Folder,
+    /// By the ending of a name.
+    fn of(out: &Path) -> Result<Self> {
+        if is_named_as_folder(out) {
+            return Ok(Kind::Folder);
+        }
+        match out.extension().and_then(|ending| ending.to_str()).map(str::to_ascii_lowercase).as_deref() {
+            Some("png") => Ok(Kind::Png),
+            Some(ending) => match Film::of(ending) {
+                Some(film) => Ok(Kind::Film(film)),
+                None if out.is_dir() => Ok(Kind::Folder),
+                None => {
+                    let known = "use .png, .gif, .apng, .mp4 or .webm, or end the name of a folder with `/`";
+                    Err(Error::file(out, format!("`.{ending}` is not the ending of a picture or a film: {known}")))
+                }
+            },
+            None => Ok(Kind::Folder),
         }
     }
+}
 
-    /// Whether somebody who names this wants a file that cannot be written.
-    fn is_foreign(out: &Path) -> bool {
-        let ending = out.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-        ending.is_some_and(|ending| FOREIGN.contains(&ending.as_str())) && !out.is_dir()
-    }
+/// Whether a path ends as those of folders do.
+fn is_named_as_folder(out: &Path) -> bool {
+    out.as_os_str().to_string_lossy().ends_with(std::path::is_separator)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+
+    #[test]
+    fn endings_that_are_not_known_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let dotted = folder.path().join("orbit.2");
+        let of = |name: &str| Kind::of(&folder.path().join(name));
+        for (name, kind) in [
+            ("a.PNG", Kind::Png),
+            ("a.b.gif", Kind::Film(Film::Gif)),
+            ("orbit", Kind::Folder),
+            ("orbit.2/", Kind::Folder),
+            ("orbit.gif/", Kind::Folder),
+            (".hidden", Kind::Folder),
+        ] {
+            assert_eq!(of(name).unwrap(), kind, "{name}");
+        }
+        for name in ["walk.mkv", "walk.mov", "picture.jpg", "a.json", "orbit.2"] {
+            let message = of(name).unwrap_err().to_string();
+            let known = "use .png, .gif, .apng, .mp4 or .webm, or end the name of a folder with `/`";
+            assert!(message.contains("is not the ending") && message.ends_with(known), "{message}");
+        }
+        std::fs::create_dir(&dotted).unwrap();
+        assert_eq!(of("orbit.2").unwrap(), Kind::Folder);
+    }
+
     #[test]
     fn what_was_there_before_took_no_time() {
-        assert_eq!(super::time_left(6.0, [20, 22, 100]), 234.0);
-        assert_eq!(super::time_left(6.0, [0, 3, 3]), 0.0);
+        assert_eq!(time_left(6.0, [20, 22, 100]), 234.0);
+        assert_eq!(time_left(6.0, [0, 3, 3]), 0.0);
     }
 }

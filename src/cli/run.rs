@@ -1,7 +1,7 @@
 //! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`, `lock`, if it
 //! was asked for `tensorboard/`, and later results of `raygrad eval`, pictures, and the films of `raygrad view` in `films/`.
 
-use std::fs::{DirEntry, File};
+use std::fs::DirEntry;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,8 @@ use serde_json::Value;
 
 use super::cameras::Viewpoint;
 use super::checkpoint;
-use super::output::{lock, make_folder, remove};
+use super::lock::{Lock, State};
+use super::output::{make_folder, parent, remove};
 use super::scene::Scene;
 
 /// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
@@ -19,6 +20,18 @@ const DEFAULT: &str = "run";
 
 /// The file by which a program keeps others out of a run.
 const LOCK: &str = "lock";
+
+/// What training writes in a run's folder, and evaluations beside it (`eval-..`).
+const OWN: [&str; 8] = [
+    "config.json",
+    "model.safetensors",
+    "metrics.jsonl",
+    "summary.json",
+    LOCK,
+    "checkpoints",
+    "previews",
+    "tensorboard",
+];
 
 /// What a run is about: `config.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -65,7 +78,7 @@ impl Run {
     ///
     /// # Errors
     /// If it cannot be written, or another program has begun a run there meanwhile.
-    pub fn create(folder: PathBuf, config: RunConfig) -> Result<(Run, File)> {
+    pub fn create(folder: PathBuf, config: RunConfig) -> Result<(Run, Lock)> {
         make_folder(&folder)?;
         let run = Run { folder, config };
         let lock = run.lock()?;
@@ -108,9 +121,47 @@ impl Run {
         Ok(Run { folder: folder.into(), config })
     }
 
-    /// Keeps other programs from training this run, until the file is dropped or this program ends, however it does.
-    pub fn lock(&self) -> Result<File> {
-        lock(&self.file(LOCK), || Error::file(&self.folder, "is being trained by another raygrad"))
+    /// Keeps other programs from training this run.
+    pub fn lock(&self) -> Result<Lock> {
+        Lock::take(&self.file(LOCK), || Error::file(&self.folder, "is being trained by another raygrad"))
+    }
+
+    /// Asked before each write: whether the folder is still the one that was locked. One that was removed is made again, with
+    /// its `config.json`, and this is `true` then.
+    ///
+    /// # Errors
+    /// If another program has the folder now, or one at its path, or it cannot be made again.
+    pub fn keep(&self, lock: &mut Lock) -> Result<bool> {
+        let lost = || {
+            let what = "another raygrad trains here now, in this folder or in one that took its place: training stops and \
+                        writes nothing more; if the run was moved, `raygrad train --resume` continues it where it is";
+            Error::file(&self.folder, what)
+        };
+        match lock.state() {
+            State::Kept => return Ok(false),
+            State::Lost => return Err(lost()),
+            State::Gone => {}
+        }
+        make_folder(&self.folder)?;
+        lock.renew(lost)?;
+        self.write()?;
+        Ok(true)
+    }
+
+    /// Whether a file or a folder that is to be written is none that the run consists of.
+    ///
+    /// # Errors
+    /// If it is one: the run would be lost.
+    pub fn check_output(&self, out: &Path) -> Result<()> {
+        let folder = |path: &Path| path.canonicalize().ok();
+        let inside = folder(parent(out)).zip(folder(&self.folder)).and_then(|(parent, run)| {
+            let out = parent.join(out.file_name()?);
+            Some(out.strip_prefix(run).ok()?.components().next()?.as_os_str().to_string_lossy().to_ascii_lowercase())
+        });
+        match inside.filter(|name| OWN.contains(&name.as_str()) || name.starts_with("eval-")) {
+            Some(name) => Err(Error::file(out, format!("`{name}` is a part of the run: choose another name"))),
+            None => Ok(()),
+        }
     }
 
     /// Removes what a program that was killed was about to write.
@@ -129,6 +180,11 @@ impl Run {
     pub fn name(&self) -> String {
         let whole = self.folder.canonicalize().unwrap_or_else(|_| self.folder.clone());
         whole.file_name().map_or_else(|| self.folder.display().to_string(), |name| name.to_string_lossy().into_owned())
+    }
+
+    /// Where its folder is: what tells it from other runs.
+    pub fn identity(&self) -> String {
+        self.folder.canonicalize().unwrap_or_else(|_| self.folder.clone()).to_string_lossy().into_owned()
     }
 
     /// The file that holds the parameters.

@@ -1,6 +1,5 @@
 //! `raygrad train`: photographs to a model.
 
-use std::fs::File;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -19,6 +18,7 @@ use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
+use super::lock::Lock;
 use super::output::{complain, print};
 use super::preview::Preview;
 use super::progress::spoken;
@@ -221,9 +221,10 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     }
     let (data, background) = (Arc::new(data), config.background.shown());
     let mut trainer = Trainer::with_extent(config, data.clone(), extent)?;
-    let lock = run.lock()?;
+    let mut lock = run.lock()?;
     run.sweep();
     checkpoint::load(&run, &mut trainer)?;
+    run.keep(&mut lock)?;
     let kept = args.keep_checkpoints.unwrap_or(run.config.keep_checkpoints);
     if (run.config.budget, run.config.keep_checkpoints) != (Some(budget), kept) {
         (run.config.budget, run.config.keep_checkpoints) = (Some(budget), kept);
@@ -237,7 +238,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
 
 /// Trains to the end of the budget, and leaves what came of it in the run's folder, which is locked.
 fn train(
-    (run, lock): (Run, File),
+    (run, lock): (Run, Lock),
     mut trainer: Trainer,
     budget: Budget,
     args: &Args,
@@ -245,20 +246,23 @@ fn train(
     listener: Option<Listener>,
 ) -> Result<Trained> {
     let mut window = listener.map(|listener| Window::open(listener, &run, &trainer)).transpose()?;
-    let mut watch = Watch::new(&run, &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
+    let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
     interrupt::listen();
     let (mut diverged, mut ended_by_page) = (None, false);
     for retreats in 0.. {
         trainer.run(budget, |trainer| {
             let stops = interrupt::requested() || ended_by_page;
             watch.step(trainer, stops);
+            if watch.has_lost_its_run() {
+                return ControlFlow::Break(());
+            }
             if let Some(window) = window.as_mut().filter(|_| !stops) {
                 let (psnr, left) = watch.shown(trainer);
                 ended_by_page = window.step(trainer, psnr, left);
             }
             if stops { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
-        if !trainer.stats().ends_diverged() {
+        if !trainer.stats().ends_diverged() || watch.has_lost_its_run() {
             break;
         }
         let reason = watch::reason(&trainer);
@@ -277,6 +281,7 @@ fn train(
     };
     // Whatever came of it, the run was good until then.
     let good = diverged.is_none() || watch.give_up(&mut trainer);
+    // Whoever wants to may go on with it from here on.
     watch.finish(&trainer, ended, good)?;
     summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
     if let Some(reason) = &diverged {
@@ -289,8 +294,6 @@ fn train(
             schedule.name()
         ));
     }
-    // Whoever wants to may go on with it now.
-    drop(lock);
     if let Some(window) = &mut window {
         window.end(&trainer, ended);
     }

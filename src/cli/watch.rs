@@ -10,6 +10,7 @@ use raygrad::nerf::{Budget, Error, Result, StepStats, Trainer, write_atomic};
 use super::checkpoint;
 use super::events::Events;
 use super::journal::Journal;
+use super::lock::{Lock, State};
 use super::output::make_folder;
 use super::preview::Preview;
 use super::progress::{Progress, spoken};
@@ -30,6 +31,9 @@ const SLOWER: f64 = 0.25;
 /// An observer of one training run.
 pub struct Watch<'a> {
     run: &'a Run,
+    lock: Lock,
+    /// Whether another program has the run's folder, or one in its place: nothing is written any more.
+    lost: bool,
     budget: Budget,
     preview: Preview,
     metrics: Journal,
@@ -54,13 +58,14 @@ impl<'a> Watch<'a> {
     /// Begins to watch; the untrained model is saved and a checkpoint, so that the folder is a whole run from the start. What
     /// metrics say of steps that are to come is cut off. `tensorboard` asks for event files too; a run that has some gets more.
     pub fn new(
-        run: &'a Run,
+        (run, mut lock): (&'a Run, Lock),
         trainer: &Trainer,
         budget: Budget,
         interval: Duration,
         preview: Preview,
         tensorboard: bool,
     ) -> Result<Self> {
+        run.keep(&mut lock)?;
         if !run.model_file().exists() {
             trainer.model.save(run.model_file())?;
         }
@@ -74,6 +79,8 @@ impl<'a> Watch<'a> {
         let interval = interval.as_secs_f64();
         let mut watch = Watch {
             run,
+            lock,
+            lost: false,
             budget,
             preview,
             metrics,
@@ -94,6 +101,25 @@ impl<'a> Watch<'a> {
             watch.begin_events(step);
         }
         Ok(watch)
+    }
+
+    /// Whether another program has taken the run's folder, or one in its place: training is to stop.
+    pub fn has_lost_its_run(&self) -> bool {
+        self.lost
+    }
+
+    /// Asked before each write: whether the run's folder is still this program's. One that was removed is made again, and the
+    /// metrics begin anew in it.
+    fn keep(&mut self) -> Result<()> {
+        let kept = self.run.keep(&mut self.lock);
+        self.lost |= self.lock.state() == State::Lost;
+        if kept? {
+            self.metrics = Journal::begin(&self.run.file("metrics.jsonl"), b"")?;
+            if self.events.is_some() {
+                self.begin_events(self.logged);
+            }
+        }
+        Ok(())
     }
 
     /// Begins an event file for the steps after this one.
@@ -137,11 +163,20 @@ impl<'a> Watch<'a> {
         let good = stats.stuck == 0 || (ends && !stats.ends_diverged());
         if (ends || stats.train_seconds >= self.next_save) && good {
             self.next_save = stats.train_seconds + self.interval;
-            let model = if ends { Ok(()) } else { trainer.model.save(self.run.model_file()) };
-            let saved = model.and_then(|()| checkpoint::save(self.run, trainer));
-            let saved = saved.and_then(|()| self.summarise(&stats, None));
+            let saved = self.save(trainer, !ends);
             self.warn(saved);
         }
+    }
+
+    /// Writes a checkpoint and the summary, and the model before them if it is to be.
+    fn save(&mut self, trainer: &Trainer, model: bool) -> Result<()> {
+        self.keep()?;
+        if model {
+            trainer.model.save(self.run.model_file())?;
+        }
+        self.keep()?;
+        checkpoint::save(self.run, trainer)?;
+        self.summarise(&trainer.stats(), None)
     }
 
     /// Takes a trainer that has diverged, for that `reason`, back to a checkpoint, from where it goes on with lower learning
@@ -149,7 +184,7 @@ impl<'a> Watch<'a> {
     pub fn retreat(&mut self, trainer: &mut Trainer, reason: &str) -> bool {
         let (end, pace) = (trainer.stats().step, trainer.pace());
         // What was good when it was written may have been on its way out of all bounds: the second time it is the one before.
-        let back = checkpoint::step_back(self.run, self.back).and_then(|()| {
+        let back = self.keep().and_then(|()| checkpoint::step_back(self.run, self.back)).and_then(|()| {
             checkpoint::load(self.run, trainer)?;
             trainer.set_pace(SLOWER * pace);
             checkpoint::save(self.run, trainer)?;
@@ -170,7 +205,7 @@ impl<'a> Watch<'a> {
 
     /// Takes a trainer that has diverged for good back to the last checkpoint; says whether there is one.
     pub fn give_up(&mut self, trainer: &mut Trainer) -> bool {
-        let back = checkpoint::load(self.run, trainer).and_then(|()| self.cut(trainer));
+        let back = checkpoint::load(self.run, trainer).and_then(|()| self.keep()).and_then(|()| self.cut(trainer));
         trainer.model.finish();
         let found = back.is_ok();
         self.warn(back);
@@ -190,9 +225,12 @@ impl<'a> Watch<'a> {
         Ok(())
     }
 
-    /// Says what went wrong, if it was not said before.
+    /// Says what went wrong, if it was not said before. That the run is lost ends training, and is said then.
     fn warn(&mut self, done: Result<()>) {
         let Err(error) = done else { return };
+        if self.lost {
+            return;
+        }
         let words = format!("raygrad: warning: {error}; training goes on");
         if !self.warned.contains(&words) {
             self.progress.note(&words);
@@ -200,13 +238,13 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Called when training has ended; unless somebody waits for that, there is a last preview. A folder that was removed is made
-    /// again. The model is written if it is `good`, so that none that is not takes the place of one that is.
+    /// Called when training has ended; unless somebody waits for that, there is a last preview. The model is written if it is
+    /// `good`, so that none that is not takes the place of one that is.
+    ///
+    /// # Errors
+    /// If the run is lost, or something cannot be written.
     pub fn finish(mut self, trainer: &Trainer, ended: Ended, good: bool) -> Result<()> {
-        if !self.run.file("config.json").exists() {
-            make_folder(&self.run.folder)?;
-            self.run.write()?;
-        }
+        self.keep()?;
         if good {
             trainer.model.save(self.run.model_file())?;
         }
@@ -216,6 +254,7 @@ impl<'a> Watch<'a> {
             self.warn(logged);
         }
         let shown = if ended == Ended::Interrupted { Ok(()) } else { self.preview(trainer) };
+        self.keep()?;
         shown.and(self.summarise(&stats, Some(ended)))
     }
 
@@ -225,6 +264,7 @@ impl<'a> Watch<'a> {
         let mut line = serde_json::to_vec(stats).map_err(failed)?;
         let values = serde_json::to_value(stats).map_err(failed)?;
         line.push(b'\n');
+        self.keep()?;
         let logged = self.metrics.add(&line);
         self.tell(|events| events.scalars(stats.step, &scalars(&values, stats)));
         logged
@@ -237,6 +277,7 @@ impl<'a> Watch<'a> {
         let (image, psnr) = self.preview.show(&trainer.model);
         let png = image.to_png();
         let (name, held_out) = (self.preview.name.clone(), self.preview.is_held_out());
+        self.keep()?;
         self.account.preview(Previewed { name, held_out, step: stats.step, psnr: psnr.is_finite().then_some(psnr) });
         self.tell(|events| {
             events.scalars(stats.step, &[("preview/psnr".to_owned(), psnr)])?;

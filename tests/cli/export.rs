@@ -72,7 +72,7 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
         let path = frame["file_path"].as_str().unwrap();
         assert!(place.path(&format!("colmap/{path}")).is_file(), "{path}");
     }
-    place.fails("export run scene", &["scene: is a folder", "--to"]);
+    place.fails("export run scene", &["scene: says by no ending what to export", "--to"]);
     place.fails("export run colmap --to llff", &["colmap: holds files already"]);
     // Other photographs than those that it was trained on have no refined cameras.
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
@@ -151,8 +151,8 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     // Those of six photographs, and four rings of twelve around the scene, which are left when it is gone.
     assert!(said.contains("that 54 views see"), "{said}");
     std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
-    assert!(place.succeeds("export run few.ply --points=20").contains("that 48 views see"));
-    let moved = place.succeeds("export run few.ply --points=20 --scene moved");
+    assert!(place.succeeds("export run some.ply --points=20").contains("that 48 views see"));
+    let moved = place.succeeds("export run some.ply --points=20 --scene moved");
     assert!(moved.contains("that 54 views see"), "{moved}");
     place.fails("export run no.ply --scene scene", &["scene: there is no such folder"]);
     place.fails("export run no.ply --to colmap --open", &["`open`: is for shapes"]);

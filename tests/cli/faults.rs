@@ -53,7 +53,9 @@ fn traced(place: &Place, fault: Option<&str>, arguments: &str) -> (Output, Vec<S
 /// The numbers of the calls of this kind that are about the run, from 1 as faults count them.
 fn about_the_run(calls: &[String], kind: &str) -> Vec<usize> {
     let of_kind = calls.iter().filter(|line| line.starts_with(&format!("{kind}(")));
-    let ours = |line: &&String| line.contains("\"run") || line.contains("/run/");
+    // Whether the lock is still this program's is asked again and again: that it cannot be read for once changes nothing.
+    let asks = |line: &String| line.contains("run/lock\"") && line.contains("O_RDONLY");
+    let ours = |line: &&String| (line.contains("\"run") || line.contains("/run/")) && !asks(line);
     of_kind.enumerate().filter(|(_, line)| ours(line)).map(|(i, _)| i + 1).collect()
 }
 

@@ -1,6 +1,6 @@
 //! `raygrad eval --lpips` and what it leaves.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use super::{Place, SIZE, png};
 use raygrad::Tensor;
@@ -46,7 +46,7 @@ fn weights(place: &Place, name: &str, layers: Layers) {
         let shares = Tensor::from_fn(&[1, outputs, 1, 1], |i| 1.0 + noise(i));
         params.add(format!("lin{}.model.1.weight", slice - 1), shares);
     }
-    std::fs::write(place.path(name), params.to_safetensors(Storage::Full, HashMap::new(), &[]).unwrap()).unwrap();
+    std::fs::write(place.path(name), params.to_safetensors(Storage::Full, &BTreeMap::new(), &[]).unwrap()).unwrap();
 }
 
 /// A piece of a drawing of photograph, render, error and depth.

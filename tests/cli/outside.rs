@@ -1,4 +1,5 @@
-//! Captures whose files name places outside of them: these may be read, and nothing is written there.
+//! Captures whose files name places outside of them: these may be read, nothing is written there, and what is there is copied
+//! into a new dataset only where that is allowed.
 
 use super::Place;
 use raygrad::nerf::Image;
@@ -66,11 +67,11 @@ fn files(place: &Place, but: &[&str]) -> BTreeMap<PathBuf, Vec<u8>> {
 /// Runs commands in `work`, each of which writes `work/out` alone, or `work/run`.
 fn only_there(place: &Place, commands: &[&str]) {
     for arguments in commands {
-        let before = files(place, &["work/out", "work/run"]);
+        let before = files(place, &["work/out", "work/run", "work/out.json"]);
         let output = place.command(arguments).current_dir(place.path("work")).output().unwrap();
         // The doctor may have found something.
         assert!(matches!(output.status.code(), Some(0 | 3)), "{arguments}: {output:?}");
-        let after = files(place, &["work/out", "work/run"]);
+        let after = files(place, &["work/out", "work/run", "work/out.json"]);
         assert_eq!(before.keys().collect::<Vec<_>>(), after.keys().collect::<Vec<_>>(), "{arguments}");
         assert!(before == after, "{arguments}: a file has changed");
         let written = place.path("work/out");
@@ -80,9 +81,8 @@ fn only_there(place: &Place, commands: &[&str]) {
             let pictures = inside.filter(|path| path.extension().is_some_and(|ending| ending == "png")).count();
             assert!(!arguments.contains("--to") || pictures >= 7, "{arguments}");
             std::fs::remove_dir_all(written).unwrap();
-        } else if written.is_file() {
-            std::fs::remove_file(written).unwrap();
         }
+        let _ = std::fs::remove_file(place.path("work/out.json"));
     }
 }
 
@@ -106,15 +106,15 @@ fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
     only_there(
         &place,
         &[
-            "prepare scene --to nerfstudio --out out",
-            "prepare scene --to nerfstudio --undistort --out out",
-            "prepare scene --to colmap --undistort --out out",
-            "prepare scene --to llff --undistort --out out",
+            "prepare scene --to nerfstudio --out out --allow-outside",
+            "prepare scene --to nerfstudio --undistort --out out --allow-outside",
+            "prepare scene --to colmap --undistort --out out --allow-outside",
+            "prepare scene --to llff --undistort --out out --allow-outside",
             SMALL,
             "eval run --split train",
             "eval run --split test",
             "render run --out out",
-            "export run out",
+            "export run out.json",
             "doctor scene --out out",
         ],
     );
@@ -125,13 +125,16 @@ fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
     let mut plain = frames.clone();
     plain.iter_mut().for_each(|frame| drop(frame.as_object_mut().unwrap().remove("mask_path")));
     write(&plain);
-    only_there(&place, &["prepare scene --to blender --undistort --out out"]);
+    only_there(&place, &["prepare scene --to blender --undistort --out out --allow-outside"]);
     // Names that no file has.
     for name in ["a\0b.png", "a\nb.png"] {
         let mut frames = frames.clone();
         frames[1]["file_path"] = json!(name);
         write(&frames);
-        let output = place.command("prepare scene --to nerfstudio --out out").current_dir(place.path("work")).output();
+        let output = place
+            .command("prepare scene --to nerfstudio --out out --allow-outside")
+            .current_dir(place.path("work"))
+            .output();
         super::complained(name, &output.unwrap(), &["file_path", "without control characters"]);
     }
     // A run whose photographs are said to be elsewhere is not gone on with.
@@ -174,17 +177,97 @@ fn nothing_is_written_where_a_model_of_colmap_says_that_photographs_are() {
     only_there(
         &place,
         &[
-            "prepare scene --to nerfstudio --out out",
-            "prepare scene --to colmap-text --out out",
-            "prepare scene --to llff --undistort --out out",
-            "prepare scene --to blender --undistort --out out",
+            "prepare scene --to nerfstudio --out out --allow-outside",
+            "prepare scene --to colmap-text --out out --allow-outside",
+            "prepare scene --to llff --undistort --out out --allow-outside",
+            "prepare scene --to blender --undistort --out out --allow-outside",
             SMALL,
             "eval run --split train",
-            "export run out",
-            "export run --to nerfstudio out",
+            "export run out.json",
+            "export run --to nerfstudio out --allow-outside",
         ],
     );
     std::fs::write(place.path("work/scene/sparse/0/images.txt"), lines.replace("0.png", "a\0b.png")).unwrap();
     let output = place.command("prepare scene --to colmap --out out").current_dir(place.path("work")).output().unwrap();
     super::complained("colmap", &output, &["images.txt", "has a control character"]);
+}
+
+/// Runs a command in `work` that fails, says so, and leaves nothing.
+#[track_caller]
+fn refused(place: &Place, arguments: &str, expected: &[&str]) {
+    let before = files(place, &[]);
+    let output = place.command(arguments).current_dir(place.path("work")).output().unwrap();
+    super::complained(arguments, &output, expected);
+    assert_eq!(before, files(place, &[]), "{arguments}");
+}
+
+#[test]
+fn private_files_are_not_copied_into_a_dataset() {
+    let (place, views) = place();
+    std::fs::write(place.path("elsewhere/secret.txt"), "a private key").unwrap();
+    std::fs::write(place.path("work/scene/images/depth.npy"), "a private key").unwrap();
+    let png = |name: &str| std::fs::copy(place.path("work/scene/images/0.png"), place.path(name)).unwrap();
+    png("work/scene/images/mask.png");
+    let point = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
+    std::fs::write(place.path("elsewhere/points.ply"), point).unwrap();
+    std::fs::write(place.path("work/scene/points.ply"), point).unwrap();
+    // A file of this name leads elsewhere.
+    #[cfg(unix)]
+    std::os::unix::fs::symlink(place.path("elsewhere/absolute.png"), place.path("work/scene/images/link.png")).unwrap();
+    let write = |field: &str, value: &Value| {
+        let mut frames: Vec<Value> =
+            views[..3].iter().map(|(name, matrix)| json!({ "file_path": name, "transform_matrix": matrix })).collect();
+        let mut all = json!({ "camera_angle_x": 0.69 });
+        match field {
+            "ply_file_path" => all[field] = value.clone(),
+            _ => frames[1][field] = value.clone(),
+        }
+        all["frames"] = json!(frames);
+        std::fs::write(place.path("work/scene/transforms.json"), all.to_string()).unwrap();
+    };
+    let secret = place.path("elsewhere/secret.txt").to_str().unwrap().to_owned();
+    let convert = "prepare scene --to nerfstudio --out out";
+    // Outside, by a path or by a link; and what is no depths, mask or image, wherever it is.
+    for (field, value) in [
+        ("depth_file_path", secret.as_str()),
+        ("depth_file_path", "../../elsewhere/secret.txt"),
+        ("mask_path", "../../elsewhere/mask.png"),
+        ("file_path", "../../x.png"),
+        ("file_path", "images/../../masks/z.png"),
+        #[cfg(unix)]
+        ("file_path", "images/link.png"),
+        #[cfg(unix)]
+        ("mask_path", "images/link.png"),
+    ] {
+        write(field, &json!(value));
+        refused(&place, convert, &["transforms.json: `frames[1]`: ", "lies outside of", "add --allow-outside"]);
+        refused(&place, "prepare scene --undistort --out out", &["lies outside of"]);
+    }
+    write("ply_file_path", &json!("../../elsewhere/points.ply"));
+    refused(&place, convert, &["transforms.json: ", "points.ply lies outside of"]);
+    write("ply_file_path", &json!("points.ply"));
+    only_there_converted(&place, convert);
+    for (field, value, expected) in [
+        ("depth_file_path", secret.as_str(), "secret.txt: "),
+        ("depth_file_path", "images/depth.npy", "depth.npy: "),
+        ("mask_path", "images/depth.npy", "depth.npy: "),
+        ("file_path", "../../elsewhere/secret.txt", "secret.txt: "),
+    ] {
+        write(field, &json!(value));
+        refused(&place, &format!("{convert} --allow-outside"), &[expected]);
+    }
+    // What lies inside and is what it claims to be is copied as ever.
+    write("mask_path", &json!("images/mask.png"));
+    only_there_converted(&place, convert);
+    // Training may read what it is told to.
+    write("mask_path", &json!("../../elsewhere/mask.png"));
+    only_there(&place, &[SMALL]);
+    refused(&place, "export run --to nerfstudio out", &["lies outside of", "--allow-outside"]);
+}
+
+/// Converts, and removes what that made.
+fn only_there_converted(place: &Place, arguments: &str) {
+    let output = place.command(arguments).current_dir(place.path("work")).output().unwrap();
+    assert!(output.status.success(), "{arguments}: {output:?}");
+    std::fs::remove_dir_all(place.path("work/out")).unwrap();
 }

@@ -60,7 +60,7 @@ done
 "#;
 
 /// A folder with both scripts in `bin`, a video, and photographs in `photos`.
-fn place() -> Place {
+pub fn place() -> Place {
     let place = Place::empty();
     std::fs::create_dir(place.path("bin")).unwrap();
     for (name, script) in [("ffmpeg", FFMPEG), ("colmap", COLMAP)] {
@@ -295,4 +295,40 @@ fn of_many_photographs_each_is_compared_with_those_that_follow() {
         let noted = String::from_utf8_lossy(&output.stderr).contains("with those that follow by name alone");
         assert_eq!(noted, said);
     }
+}
+
+#[test]
+fn photographs_behind_links_are_copied_where_that_is_allowed() {
+    use std::os::unix::fs::symlink;
+    let place = place();
+    // Within the folder of photographs, whose other files are none: links that lead to its neighbours lead out of it.
+    std::fs::create_dir_all(place.path("photos/linked")).unwrap();
+    for i in 0..4 {
+        symlink(place.path(&format!("photos/{i}.JPG")), place.path(&format!("photos/linked/{i}.jpg"))).unwrap();
+    }
+    let expected = ["linked: ", "0.jpg lies outside of", "add --allow-outside"];
+    let output = run(&place, "prepare photos/linked --out made");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && expected[1..].iter().all(|part| said.contains(&part[1..])), "{said}");
+    assert_eq!(made(&place), [""; 0]);
+    succeeds(&place, "prepare photos/linked --out made --allow-outside");
+    // Nor is what is no photograph, whatever it is called.
+    std::fs::create_dir(place.path("photos/odd")).unwrap();
+    let whole = std::fs::read(place.path("photos/0.JPG")).unwrap();
+    std::fs::write(place.path("photos/odd/0.jpg"), &whole[..whole.len() / 2]).unwrap();
+    complained("cut off", &run(&place, "prepare photos/odd --out other"), &["0.jpg: cannot be decoded"]);
+}
+
+#[test]
+fn a_dataset_goes_to_where_a_link_leads() {
+    let place = place();
+    std::fs::create_dir(place.path("disk")).unwrap();
+    std::os::unix::fs::symlink(place.path("disk"), place.path("made")).unwrap();
+    succeeds(&place, "prepare photos --out made");
+    assert!(place.path("made").is_symlink() && place.path("disk/sparse/0/images.txt").exists());
+    std::fs::create_dir(place.path("converted")).unwrap();
+    succeeds(&place, "prepare made --to nerfstudio --out converted");
+    assert!(place.path("converted/transforms.json").exists());
+    let names: Vec<_> = std::fs::read_dir(place.path("converted")).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(names.len(), 2, "{names:?}");
 }

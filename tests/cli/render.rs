@@ -25,9 +25,9 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
     let test = [0, 1, 2].map(|i| png(&place.path(&format!("test/000{i}.png"))));
     assert!(apart(&test[0], &test[1]) > 3.0 && apart(&test[1], &test[2]) > 3.0);
     // A spline passes its photographs, by number and by name.
-    for through in ["2,0", "test/r_2,test/r_0"] {
-        place.succeeds(&format!("render run --path spline --through {through} --split test --frames 3 --out spline"));
-        let spline = [0, 1, 2].map(|i| png(&place.path(&format!("spline/000{i}.png"))));
+    for (out, through) in [("numbers", "2,0"), ("names", "test/r_2,test/r_0")] {
+        place.succeeds(&format!("render run --path spline --through {through} --split test --frames 3 --out {out}"));
+        let spline = [0, 1, 2].map(|i| png(&place.path(&format!("{out}/000{i}.png"))));
         assert!(apart(&spline[0], &test[2]) <= 1.0 && apart(&spline[2], &test[0]) <= 1.0);
         assert!(apart(&spline[1], &test[0]) > 3.0 && apart(&spline[1], &test[2]) > 3.0);
     }
@@ -59,7 +59,7 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
     let spiral = [0, 1].map(|i| png(&place.path(&format!("spiral/000{i}.png"))));
     assert!([spiral[0].width, spiral[0].height] == [36, 24] && apart(&spiral[0], &spiral[1]) > 3.0);
     let one = |flags: &str| {
-        place.succeeds(&format!("render run {flags} --out one.png"));
+        place.succeeds(&format!("render run {flags} --out one.png --overwrite"));
         png(&place.path("one.png"))
     };
     let usual = one("");
@@ -186,7 +186,7 @@ fn flags_that_do_not_fit_are_named() {
         ("--fps 30", ["`fps`", "--seconds"]),
         ("--fps 60 --out fast.gif", ["`fps`", "50 frames a second"]),
         ("--out absent/film.apng", ["absent", "cannot be written to"]),
-        ("--out film.MOV", ["film.MOV: cannot be written", "name a folder"]),
+        ("--out film.MOV", ["film.MOV: `.mov` is not the ending of a picture or a film", "the name of a folder"]),
     ] {
         place.fails(&format!("render run {flags}"), &expected);
     }
@@ -313,13 +313,13 @@ fn films_hold_the_frames_at_their_speed() {
     }
     // Frames are gone with the film, unless they are to stay.
     assert!(!place.path("film.gif.frames").exists() && !place.path("film.apng.frames").exists());
-    place.succeeds("render run --frames 3 --size 21x13 --out film.gif --keep-frames");
+    place.succeeds("render run --frames 3 --size 21x13 --out film.gif --keep-frames --overwrite");
     assert_eq!(png(&place.path("film.gif.frames/0002.png")), frames[2]);
     assert!(!place.path("film.gif.frames/unfinished.json").exists());
 }
 
 /// Whether ffmpeg is there; says so if not.
-fn has_ffmpeg() -> bool {
+pub fn has_ffmpeg() -> bool {
     let found = Command::new("ffmpeg").arg("-version").stdout(Stdio::null()).status().is_ok();
     if !found {
         println!("skipped: ffmpeg is not installed");
@@ -431,8 +431,13 @@ fn an_interrupted_film_goes_on_where_it_was() {
     place.succeeds("render run --frames 40 --size 36x30 --out whole.apng");
     let whole = decoded(&place.path("whole.apng"));
     assert!((0..40).all(|i| (whole[i] == frames[i]) == (i != 1)));
-    // What would show something else begins again.
+    // What would show something else begins again, where it may.
     place.succeeds("render run --frames 2 --size 36x30 --out film.gif --keep-frames");
+    let film = "render run --frames 400 --size 36x30 --out film.gif";
+    place.fails(film, &["film.gif: exists, and another command wrote it"]);
+    std::fs::remove_file(place.path("film.gif")).unwrap();
+    place.fails(film, &["film.gif.frames/0000.png: exists, and another command wrote it"]);
+    std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
     let kept = |done: usize| {
         let mut record = place.json("film.gif.frames/unfinished.json");
         record["done"] = json!(done);
@@ -441,7 +446,7 @@ fn an_interrupted_film_goes_on_where_it_was() {
     let begun = |flags: &str| {
         // When it is there again, it is this call's.
         let _ = std::fs::remove_file(place.path("film.gif.frames/0003.png"));
-        let mut child = place.command(&format!("render run --frames 400 --size 36x30 --out film.gif {flags}"));
+        let mut child = place.command(&format!("{film} {flags}"));
         let mut child = child.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         super::wait(&mut child, || place.path("film.gif.frames/0003.png").exists());
         Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
@@ -449,16 +454,18 @@ fn an_interrupted_film_goes_on_where_it_was() {
     };
     begun("");
     kept(3);
-    let said = begun("--fps 5");
+    let said = begun("--fps 5 --overwrite");
     assert!(said.contains("3 of 400 frames are there already"), "the speed is not in the frames: {said}");
     for flags in ["--show depth", "--background black", "--fov 30", "--skip off"] {
         // From the same frames each time.
-        begun("");
+        begun("--overwrite");
         kept(3);
-        let said = begun(flags);
+        place.fails(&format!("{film} {flags}"), &["film.gif.frames/0000.png: exists, and another command wrote it"]);
+        let said = begun(&format!("{flags} --overwrite"));
         assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");
     }
-    // Another model.
+    // Another model, of which the same is asked.
+    begun("--overwrite");
     kept(3);
     place.succeeds("train --resume run --steps 4");
     let said = begun("");
@@ -467,8 +474,10 @@ fn an_interrupted_film_goes_on_where_it_was() {
     let mut child = place.command("render run --frames 400 --size 36x30 --out slow.gif").stdout(Stdio::null()).spawn();
     let child = child.as_mut().unwrap();
     super::wait(child, || place.path("slow.gif.frames/0000.png").exists());
-    place
-        .fails("render run --frames 400 --out slow.gif", &["slow.gif.frames: is being rendered to by another raygrad"]);
+    place.fails(
+        "render run --frames 400 --size 36x30 --out slow.gif",
+        &["slow.gif.frames: is being rendered to by another raygrad"],
+    );
     child.kill().unwrap();
     child.wait().unwrap();
 }

@@ -787,7 +787,7 @@ fn films_are_made_one_at_a_time_beside_what_is_seen() {
     assert!(!place.path(&format!("{film}.frames")).exists());
     // The same by hand is the same.
     let ending = film.rsplit('.').next().unwrap();
-    place.succeeds(&format!("render run --path run/films/film-1.json --show depth --out again.{ending}"));
+    place.succeeds(&format!("render run --path run/films/film-1.json --show depth --overwrite --out again.{ending}"));
     let bytes = [film, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
     assert!(bytes[0] == bytes[1]);
     // One that takes long does not hold up pictures or let another begin, until it is ended.
@@ -813,7 +813,7 @@ fn films_are_made_one_at_a_time_beside_what_is_seen() {
         assert_eq!(told["words"], "done", "{told}");
         let film = told["file"].as_str().unwrap().to_owned();
         let path = film.replace(ending, "json");
-        place.succeeds(&format!("render run --path {path} {flags} --out again.{ending}"));
+        place.succeeds(&format!("render run --path {path} {flags} --overwrite --out again.{ending}"));
         let bytes = [&*film, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
         assert!(bytes[0] == bytes[1], "{flags}");
     }

@@ -14,7 +14,7 @@ use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
 use raygrad::nerf::{Background, ClassicConfig, Config, Error, Extent, Image, InstantConfig, Model, Preset, Trainer};
 use raygrad::{OptimizerState, Params, Scalar, Storage, Tensor};
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
@@ -301,8 +301,8 @@ fn picture_of(width: usize, height: usize) -> Vec<u8> {
 
 #[test]
 fn campaign_parameters_as_safetensors() {
-    let metadata = || HashMap::from([("format".to_string(), "raygrad".to_string())]);
-    let written = |storage| params::<f32>().to_safetensors(storage, metadata(), &[("blob", vec![1, 2, 3])]).unwrap();
+    let metadata = BTreeMap::from([("format".to_string(), "raygrad".to_string())]);
+    let written = |storage| params::<f32>().to_safetensors(storage, &metadata, &[("blob", vec![1, 2, 3])]).unwrap();
     let whole = [written(Storage::Full), written(Storage::F16)];
     let bound = Bound { times: 64, plus: 1 << 16 };
     alone(|| {

@@ -43,6 +43,8 @@ pub struct Capture {
     pub views: Vec<View>,
     /// Points of the scene that were found when its cameras were, if there are any.
     pub points: Vec<Point>,
+    /// The file that they were read from, if there is one.
+    pub points_file: Option<PathBuf>,
     /// Half the side of the box that holds the scene, in units of instant-ngp's unit cube, if the file says so
     /// (`aabb_scale`).
     pub aabb_scale: Option<f64>,

@@ -15,22 +15,7 @@ use std::path::Path;
 /// halfway between what is near and what is behind it there is nothing.
 pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
     let wrong = |what: String| Error::file(path, what);
-    let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
-    let ([width, height], depths): (_, Vec<f64>) = if bytes.starts_with(npy::MAGIC) {
-        let npy::Matrix { rows, columns, values } = npy::Matrix::read(&bytes).map_err(wrong)?;
-        ([columns, rows], values)
-    } else {
-        let (decoder, _) = decoder_of(Cursor::new(&bytes), bytes.len() as u64, path)?;
-        let decoded = DynamicImage::from_decoder(decoder);
-        let decoded = decoded.map_err(|error| wrong(format!("cannot be decoded: {error}")))?;
-        let size = [decoded.width() as usize, decoded.height() as usize];
-        let values = match decoded {
-            DynamicImage::ImageLuma8(image) => image.into_raw().into_iter().map(f64::from).collect(),
-            DynamicImage::ImageLuma16(image) => image.into_raw().into_iter().map(f64::from).collect(),
-            _ => return Err(wrong("has colours: depths are one channel of 8 or 16 bits, or a .npy array".into())),
-        };
-        (size, values)
-    };
+    let ([width, height], depths) = decoded(path)?;
     let Camera { width: columns, height: rows, .. } = *camera;
     // Up to the rounding of a side.
     let apart = 2 * (width * rows).abs_diff(height * columns);
@@ -52,6 +37,26 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     Ok(out)
 }
 
+/// The width and height of a file of depths, and what it holds, row by row.
+fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
+    let wrong = |what: String| Error::file(path, what);
+    let bytes = std::fs::read(path).map_err(|error| Error::file(path, error))?;
+    if bytes.starts_with(npy::MAGIC) {
+        let npy::Matrix { rows, columns, values } = npy::Matrix::read(&bytes).map_err(wrong)?;
+        return Ok(([columns, rows], values));
+    }
+    let (decoder, _) = decoder_of(Cursor::new(&bytes), bytes.len() as u64, path)?;
+    let decoded = DynamicImage::from_decoder(decoder);
+    let decoded = decoded.map_err(|error| wrong(format!("cannot be decoded: {error}")))?;
+    let size = [decoded.width() as usize, decoded.height() as usize];
+    let values = match decoded {
+        DynamicImage::ImageLuma8(image) => image.into_raw().into_iter().map(f64::from).collect(),
+        DynamicImage::ImageLuma16(image) => image.into_raw().into_iter().map(f64::from).collect(),
+        _ => return Err(wrong("has colours: depths are one channel of 8 or 16 bits, or a .npy array".into())),
+    };
+    Ok((size, values))
+}
+
 /// Depths along the optical axis, as sets of photographs with depths have them: what
 /// [`View::depth`](super::View::depth) is read from, 0 where there is nothing.
 #[derive(Debug, Clone, PartialEq)]
@@ -62,6 +67,14 @@ pub struct Depths {
 }
 
 impl Depths {
+    /// Whether a file holds depths, as training reads them.
+    ///
+    /// # Errors
+    /// If it cannot be read or decoded.
+    pub fn check_file(path: impl AsRef<Path>) -> Result<()> {
+        decoded(path.as_ref()).map(drop)
+    }
+
     /// Of distances along the rays of a camera's pixels, as a [`Picture`](crate::Picture) has them, each multiplied by
     /// `scale`: 1 over the [scale of the placement](super::Placement::scale) gives them in units of the capture.
     ///

@@ -21,8 +21,9 @@ const FAR: f64 = 5.0;
 const BLUR: f64 = 4.0;
 const BRIGHTNESS: f64 = 1.5;
 const COLOUR: f64 = 1.2;
-/// Neighbours that a photograph is compared with.
+/// Neighbours that a photograph is compared with, and how far before it and behind it in the file they are looked for.
 const NEIGHBOURS: usize = 6;
+const AROUND: usize = 1000;
 
 /// The sizes of the photographs, from the headers of their files, the most frequent first.
 pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
@@ -121,7 +122,7 @@ fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Opt
         let own = values[i]?;
         // The nearest so far, the nearest first.
         let mut others: Vec<(f64, f64)> = vec![];
-        for j in (0..seen.len()).filter(|j| *j != i) {
+        for j in (i.saturating_sub(AROUND)..seen.len().min(i + AROUND)).filter(|j| *j != i) {
             let Some(value) = values[j] else { continue };
             let angle = pose(i).matrix3.z_axis.angle_between(pose(j).matrix3.z_axis);
             let distance = gap(i, j) / usual + angle;

@@ -56,6 +56,7 @@ impl Planted {
             format: Format::Transforms,
             views: views.collect(),
             points: vec![],
+            points_file: None,
             aabb_scale: None,
             applied: DAffine3::IDENTITY,
         };

@@ -14,8 +14,10 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use raygrad::nerf::{Error, Result};
+use serde_json::Value;
 
 use super::output::{make_folder, note, print};
+use super::overwrite::Job;
 pub use draw::register_letters;
 use figure::Figure;
 use table::Table;
@@ -32,9 +34,12 @@ pub struct Args {
     /// Less of everything: two minutes on two cores
     #[arg(long)]
     quick: bool,
-    /// Folder for the results; files of the same names are replaced
+    /// Folder for the results, which replace those of an earlier benchmark
     #[arg(long, value_name = "DIR", default_value = "bench")]
     out: PathBuf,
+    /// Write to a folder that holds other files too, and replace those of the same names
+    #[arg(long)]
+    overwrite: bool,
     /// Also measure a training step of PyTorch and of JAX, if they are installed (in the repository only)
     #[arg(long)]
     peers: bool,
@@ -71,7 +76,11 @@ pub struct Results {
 
 /// Measures and writes the files.
 pub fn run(args: &Args) -> Result<()> {
+    let (job, page) = (Job::new("bench", &Value::Null, args.overwrite), args.out.join("report.html"));
+    check_folder(&args.out, &page, &job)?;
     make_folder(&args.out)?;
+    // From now on the folder is known as that of a benchmark, also if this one does not get to its end.
+    report::save(&page, &[], args.quick, job.mark())?;
     let wanted = |suite| args.suite == suite || args.suite == Suite::All;
     let mut sections = vec![];
     if wanted(Suite::Quadrature) {
@@ -95,11 +104,20 @@ pub fn run(args: &Args) -> Result<()> {
         note("train: quality against time");
         sections.push(save("Training", "--suite train", train::run(args.quick, args.peers)?, &args.out)?);
     }
-    let page = args.out.join("report.html");
-    report::save(&page, &sections, args.quick)?;
+    report::save(&page, &sections, args.quick, job.mark())?;
     let findings = sections.iter().flat_map(|section| &section.findings);
     let findings: String = findings.map(|finding| format!("{finding}\n")).collect();
     print(&format!("{findings}written: {}, and tables and plots beside it\n", page.display()))
+}
+
+/// Whether results may be written to a folder: it is new or empty, or its page is that of an earlier benchmark.
+fn check_folder(folder: &Path, page: &Path, job: &Job) -> Result<()> {
+    let is_taken = std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some());
+    if is_taken && !job.overwrites() && !job.wrote(page) {
+        let what = "holds files that are not a benchmark's: choose another --out, or add --overwrite";
+        return Err(Error::file(folder, what));
+    }
+    Ok(())
 }
 
 /// Runs `f` where no operation is spread over several threads.

@@ -27,9 +27,10 @@ const STYLE: &str = "body{font:15px/1.5 sans-serif;max-width:1250px;margin:2em a
     table{border-collapse:collapse;font-size:13px}td,th{padding:.15em .7em;text-align:right;border-bottom:1px solid #ddd}\
     td:first-child,th:first-child{text-align:left}code{background:#f2f2f2;padding:.1em .3em}details{margin:1em 0}";
 
-/// Writes the page; it needs no other file.
-pub fn save(path: &Path, sections: &[Section], quick: bool) -> Result<()> {
+/// Writes the page; it needs no other file. `mark` says what wrote it.
+pub fn save(path: &Path, sections: &[Section], quick: bool, mark: &str) -> Result<()> {
     let mut page = String::from("<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">");
+    page += &format!("<meta name=\"generator\" content=\"{mark}\">");
     page += &format!("<title>raygrad bench</title><style>{STYLE}</style></head><body>\n<h1>raygrad bench</h1>\n");
     if quick {
         page += "<p>A quick run: fewer and smaller measurements.</p>\n";

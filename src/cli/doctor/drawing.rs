@@ -1,11 +1,9 @@
 //! Cameras from above and from the side, as a picture.
 
-use std::path::Path;
-
 use glam::DVec3;
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use raygrad::nerf::{Error, Image, Result};
+use raygrad::nerf::Image;
 
 use super::super::bench::register_letters;
 use super::stage::{Pyramid, Stage};
@@ -22,17 +20,17 @@ const BOX: RGBColor = RGBColor(60, 60, 60);
 const FRAME: RGBColor = RGBColor(220, 220, 220);
 
 type Area<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
-type Drawn = std::result::Result<(), DrawingAreaErrorKind<<BitMapBackend<'static> as DrawingBackend>::ErrorType>>;
+type Drawn = Result<(), DrawingAreaErrorKind<<BitMapBackend<'static> as DrawingBackend>::ErrorType>>;
 
-/// Writes the picture.
-pub fn draw(stage: &Stage, path: &Path) -> Result<()> {
+/// The picture, or what went wrong.
+pub fn draw(stage: &Stage) -> Result<Image, String> {
     register_letters();
     let size = (2 * PANEL as u32, (PANEL + HEAD) as u32);
     let mut bytes = vec![0; 3 * size.0 as usize * size.1 as usize];
-    both(stage, &BitMapBackend::with_buffer(&mut bytes, size).into_drawing_area()).map_err(|e| Error::file(path, e))?;
+    both(stage, &BitMapBackend::with_buffer(&mut bytes, size).into_drawing_area()).map_err(|e| e.to_string())?;
     let mut image = Image::new(size.0 as usize, size.1 as usize, 3);
     image.data.iter_mut().zip(&bytes).for_each(|(value, &byte)| *value = f32::from(byte) / 255.0);
-    image.save_png(path)
+    Ok(image)
 }
 
 fn both(stage: &Stage, area: &Area<'_>) -> Drawn {

@@ -14,8 +14,10 @@ use raygrad::nerf::doctor::{Finding, FindingKind, Options, Report, Severity, exa
 use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::output::{complain, make_folder, print};
+use super::overwrite::{Job, png_with_text};
 use super::progress::Progress;
 use super::scene::{Opened, Scene};
+use serde_json::Value;
 use stage::Stage;
 
 /// Examine a capture before training on it: what is wrong, and what to do
@@ -30,9 +32,12 @@ pub struct Args {
     /// How far the scene goes: bounded, unbounded or forward [default: found out from the photographs]
     #[arg(long)]
     pub scope: Option<Scope>,
-    /// Folder for the picture and the page; files of the same names are replaced
+    /// Folder for the picture and the page, which replace those of an earlier examination
     #[arg(long, value_name = "DIR", default_value = "doctor")]
     pub out: PathBuf,
+    /// Replace files of the same names that another command wrote
+    #[arg(long)]
+    pub overwrite: bool,
     /// Print facts and findings as JSON in place of a table
     #[arg(long)]
     pub json: bool,
@@ -43,6 +48,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let Scene::Folder(folder) = &args.scene else {
         return Err(Error::setting("scene", "the scene that is built in has no files to examine; name a folder"));
     };
+    // Its folder has one name for all captures: each examination replaces the last.
+    let job = Job::new("doctor", &Value::Null, args.overwrite);
+    let files = ["cameras.png", "doctor.html"].map(|name| args.out.join(name));
+    files.iter().try_for_each(|file| job.check(file))?;
     let capture = Capture::read(folder)?;
     // A capture that has no size has none: the examination says why.
     let survey = capture.survey(args.scope).ok();
@@ -55,9 +64,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let report = examine(&capture, survey.as_ref(), &Options { progress: &show, ..Options::default() });
     drop(progress);
     let stage = Stage::new(&capture, survey.as_ref(), &report);
-    let files = ["cameras.png", "doctor.html"].map(|name| args.out.join(name));
-    drawing::draw(&stage, &files[0])?;
-    write_atomic(&files[1], page::page(&capture, &report, &stage)?.as_bytes())?;
+    let drawn = drawing::draw(&stage).map_err(|e| Error::file(&files[0], e))?;
+    let page = page::page(&capture, &report, &stage, job.mark())?;
+    files.iter().try_for_each(|file| job.check(file))?;
+    write_atomic(&files[0], &png_with_text(&drawn.to_png(), job.mark()))?;
+    write_atomic(&files[1], page.as_bytes())?;
     if args.json {
         let text = serde_json::to_string_pretty(&report).map_err(|e| Error::setting("json", e))?;
         print(&format!("{text}\n"))?;

@@ -19,8 +19,8 @@ const SIDE: usize = 180;
 /// Names that are listed with a finding.
 const NAMES: usize = 60;
 
-/// The text of the page.
-pub fn page(capture: &Capture, report: &Report, stage: &Stage) -> Result<String> {
+/// The text of the page. `mark` says what wrote it.
+pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Result<String> {
     let rows = table::facts(&report.facts);
     let facts: String =
         rows.iter().map(|(name, value)| format!("<tr><th>{name}</th><td>{}</td></tr>\n", escaped(value))).collect();
@@ -33,7 +33,9 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage) -> Result<String>
     // Within a script nothing may look like its end.
     let data = data.replace("</", "<\\/");
     let title = escaped(&report.facts.folder.display().to_string());
-    Ok(filled(PAGE, &[("title", title), ("facts", facts), ("findings", findings), ("stage", data)]))
+    let texts =
+        [("title", title), ("facts", facts), ("findings", findings), ("stage", data), ("mark", mark.to_owned())];
+    Ok(filled(PAGE, &texts))
 }
 
 /// A finding, with some of the photographs that it names.
@@ -76,10 +78,10 @@ mod tests {
 
     #[test]
     fn the_page_has_a_place_for_everything_and_asks_nothing_of_the_network() {
-        let names = ["title", "facts", "findings", "stage"];
+        let names = ["title", "facts", "findings", "stage", "mark"];
         let page = filled(PAGE, &names.map(|name| (name, format!("<{{{{{name}}}}}>"))));
         assert!(names.iter().all(|name| page.contains(&format!("<{{{{{name}}}}}>"))), "{page}");
-        assert_eq!(PAGE.matches("{{").count(), 5, "the title stands twice");
+        assert_eq!(PAGE.matches("{{").count(), 6, "the title stands twice");
         assert!(!PAGE.contains("http") && !PAGE.contains("src="));
     }
 }

@@ -16,11 +16,10 @@ use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
 use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
 
+use super::lock::{Lock, State};
 use super::machine::processor;
 use super::memory;
-use super::output::{
-    checksum, complain, depth_colors, lock, make_folder, note, numbered, other_numbered, print, remove,
-};
+use super::output::{checksum, complain, depth_colors, make_folder, note, numbered, other_numbered, print, remove};
 use super::parse;
 use super::precision::{Precision, Renderer};
 use super::progress::Progress;
@@ -152,7 +151,7 @@ pub fn run(args: &Args) -> Result<()> {
     let pictures = run.file(&name);
     make_folder(&pictures)?;
     let busy = || Error::file(&pictures, "is being written by another raygrad");
-    let _lock = lock(&pictures.join(LOCK), busy)?;
+    let lock = Lock::take(&pictures.join(LOCK), busy)?;
     // What an evaluation that was ended before has left there is begun again.
     let unfinished = pictures.join(UNFINISHED);
     let _ = std::fs::remove_dir_all(&unfinished);
@@ -204,6 +203,10 @@ pub fn run(args: &Args) -> Result<()> {
     let file = run.file(&format!("{name}.json"));
     let drawn = report.drawn();
     judge.draw_others(&drawn, &unfinished)?;
+    if lock.state() != State::Kept {
+        let what = "was removed, or another raygrad evaluates there now: nothing was written";
+        return Err(Error::file(&pictures, what));
+    }
     // An evaluation that is ended before leaves the last one's result as it was.
     write_json(&file, &report)?;
     for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {

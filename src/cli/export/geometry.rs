@@ -2,15 +2,18 @@
 
 use std::f64::consts::FRAC_PI_2;
 use std::path::Path;
+use std::process::ExitCode;
 use std::time::Instant;
 
 use raygrad::nerf::dataset::{Split, evenly_spaced};
-use raygrad::nerf::geometry::files::{self, Format};
+use raygrad::nerf::geometry::files;
 use raygrad::nerf::geometry::{Stage, SurfaceConfig};
 use raygrad::nerf::{Camera, Error, Extent, Model, Result};
+use serde::Serialize;
 
 use super::super::cameras::Viewpoint;
 use super::super::output::{check_writable, note, parent, print};
+use super::super::overwrite::Job;
 use super::super::parse;
 use super::super::photographs::photographs;
 use super::super::progress::{Progress, spoken};
@@ -26,7 +29,7 @@ const PHOTOGRAPHS: usize = 100;
 const MOST_POINTS: usize = 10_000_000;
 
 /// What is made of a model's shape.
-#[derive(clap::Args)]
+#[derive(clap::Args, Serialize)]
 pub struct Options {
     /// Write a point cloud of at most N points in place of a mesh [default: 200000]
     #[arg(
@@ -77,16 +80,8 @@ impl Options {
     }
 }
 
-/// Whether a file of this name holds a shape.
-pub fn is_shape(out: &Path) -> bool {
-    Format::of(out).is_some()
-}
-
 /// Makes the shape and writes it.
-pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path) -> Result<()> {
-    if out.is_dir() {
-        return Err(Error::file(out, "is a folder, not a file"));
-    }
+pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job: &Job) -> Result<ExitCode> {
     check_writable(parent(out))?;
     let model = run.model()?;
     let cameras = cameras(run, &model, scene)?;
@@ -130,10 +125,12 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path) -> R
         }
     };
     drop(display);
-    let bytes = files::write(&shape.placed_back(&model.extent.placement), out)?;
+    job.check(out)?;
+    let bytes = files::write_with_comment(&shape.placed_back(&model.extent.placement), out, job.mark())?;
     let part = if model.config.unbounded { ", of the box where the cameras look" } else { "" };
     let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
-    print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
+    print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around it.

@@ -3,6 +3,7 @@
 
 use std::any::Any;
 use std::path::Path;
+use std::process::ExitCode;
 
 use half::f16;
 use raygrad::nerf::encoding::hash_grid::HashGrid;
@@ -15,6 +16,7 @@ use serde_json::{Value, json};
 use crate::cli::base64::base64;
 use crate::cli::html::{escaped, filled};
 use crate::cli::output::print;
+use crate::cli::overwrite::Job;
 use crate::cli::run::Run;
 use crate::cli::view;
 
@@ -27,18 +29,15 @@ const SHADER: &str = include_str!("page/scene.frag");
 const MOST_FEATURES: usize = 16;
 const MOST_WIDTH: usize = 256;
 
-/// Whether a file is to be a page.
-pub fn is_page(out: &Path) -> bool {
-    out.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html"))
-}
-
 /// Writes the page of a run.
-pub fn run(run: &Run, out: &Path) -> Result<()> {
+pub fn run(run: &Run, out: &Path, job: &Job) -> Result<ExitCode> {
     let model = run.model()?;
-    let page = page(run, &model).map_err(|what| Error::file(out, what))?;
+    let page = page(run, &model, job.mark()).map_err(|what| Error::file(out, what))?;
+    job.check(out)?;
     write_atomic(out, page.as_bytes())?;
     let megabytes = page.len() as f64 / 1e6;
-    print(&format!("exported a page of {megabytes:.1} MB: {}\n", out.display()))
+    print(&format!("exported a page of {megabytes:.1} MB: {}\n", out.display()))?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// What a page can be made of, or why there is none.
@@ -66,8 +65,8 @@ fn check(model: &Model<f32>) -> std::result::Result<(&InstantConfig, &Marching),
     Ok((config, marching))
 }
 
-/// The text of the page, or why there is none.
-fn page(run: &Run, model: &Model<f32>) -> std::result::Result<String, String> {
+/// The text of the page, or why there is none. `mark` says what wrote it.
+fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String, String> {
     let (config, marching) = check(model)?;
     let grid = HashGrid::new(&config.grid).map_err(|error| error.to_string())?;
     let data = json!({
@@ -108,6 +107,7 @@ fn page(run: &Run, model: &Model<f32>) -> std::result::Result<String, String> {
         // Within a script nothing may look like its end.
         ("data", data.to_string().replace("</", "<\\/")),
         ("files", files.to_string()),
+        ("mark", mark.to_owned()),
     ];
     Ok(filled(PAGE, &texts))
 }

@@ -8,12 +8,13 @@ use std::sync::{Mutex, PoisonError};
 use clap::ValueEnum;
 use raygrad::nerf::dataset::formats::colmap::Encoding;
 use raygrad::nerf::dataset::formats::{blender, colmap, llff, transforms};
-use raygrad::nerf::dataset::{Capture, Format, Photo, Split, View};
+use raygrad::nerf::dataset::{Capture, Depths, Format, Photo, Split, View};
 use raygrad::nerf::{Camera, Error, Result};
 use rayon::prelude::*;
 
 use super::bounds;
 use super::program::{Stop, Work};
+use super::root::Root;
 use super::undistort;
 use super::workplace::Workplace;
 use crate::cli::interrupt;
@@ -89,8 +90,9 @@ struct Job {
     seen_by: Option<Camera>,
 }
 
-/// Writes a capture in another format to `out`, images and all.
-pub fn convert(mut capture: Capture, target: Target, undistorted: bool, out: &Path) -> Work<()> {
+/// Writes a capture in another format to `out`, images and all. Files that lie elsewhere than in the capture are copied if they
+/// are allowed to: its files may name any, and who gets the new dataset would read them.
+pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside: bool, out: &Path) -> Work<()> {
     if undistorted || target == Target::Llff {
         // Nothing can be made of images that are absent, and the format has none.
         capture.views.retain(|view| view.image.is_some());
@@ -103,6 +105,9 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, out: &Pa
         if view.image.is_some() {
             view.camera = view.camera_of_image().map_err(|e| Error::field(&capture.file, &view.field, e))?;
         }
+    }
+    if !outside {
+        check_inside(&capture)?;
     }
     let place = Workplace::new(out)?;
     let mut jobs = jobs(&capture, target, undistorted, place.folder())?;
@@ -128,6 +133,19 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, out: &Pa
         ));
     }
     Ok(())
+}
+
+/// Whether all files of a capture lie in its folder, wherever links lead.
+fn check_inside(capture: &Capture) -> Result<()> {
+    let root = Root::of_capture(&capture.folder)?;
+    for view in &capture.views {
+        let depth = view.depth.as_ref().map(|(path, _)| path);
+        for path in [view.image.as_ref(), view.mask.as_ref(), depth].into_iter().flatten() {
+            root.check(path).map_err(|what| Error::field(&capture.file, &view.field, what))?;
+        }
+    }
+    let points = capture.points_file.as_ref().map_or(Ok(()), |path| root.check(path));
+    points.map_err(|what| Error::file(&capture.file, what))
 }
 
 fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
@@ -247,8 +265,10 @@ fn copy(jobs: &[Job]) -> Work<()> {
 impl Job {
     fn run(&self) -> Result<()> {
         let Job { from, to, seen_by } = self;
-        if let (Some(from), Some(to)) = (&from.depth, &to.depth) {
-            copy_file(&from.0, &to.0)?;
+        // What is copied byte by byte is what it claims to be.
+        if let (Some((from, _)), Some((to, _))) = (&from.depth, &to.depth) {
+            Depths::check_file(from)?;
+            copy_file(from, to)?;
         }
         let (Some(source), Some(image)) = (&from.image, &to.image) else { return Ok(()) };
         if let Some(camera) = seen_by {
@@ -261,17 +281,15 @@ impl Job {
             }
             return Ok(());
         }
+        Photo::open(source, None)?;
         copy_file(source, image)?;
-        match (&from.mask, &to.mask) {
-            (Some(from), Some(to)) if from.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) => {
-                copy_file(from, to)
-            }
-            (Some(from), Some(to)) => {
-                make_parent(to)?;
-                Photo::open(from, None)?.save(to)
-            }
-            _ => Ok(()),
+        let (Some(from), Some(to)) = (&from.mask, &to.mask) else { return Ok(()) };
+        let mask = Photo::open(from, None)?;
+        if from.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+            return copy_file(from, to);
         }
+        make_parent(to)?;
+        mask.save(to)
     }
 }
 

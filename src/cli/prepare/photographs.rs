@@ -9,6 +9,7 @@ use raygrad::nerf::{Error, Result};
 use rayon::prelude::*;
 
 use super::program::{Stop, Work};
+use super::root::Root;
 use super::workplace::Workplace;
 use crate::cli::interrupt;
 use crate::cli::output::complain;
@@ -19,9 +20,14 @@ const READ: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 /// Endings of images that cannot.
 const NOT_READ: [&str; 9] = ["heic", "heif", "avif", "tif", "tiff", "dng", "cr2", "nef", "arw"];
 
-/// Copies the photographs in a folder, or in its folder `images`, to `images`, each turned as it was held.
-pub fn copy(folder: &Path, place: &Workplace) -> Work<usize> {
+/// Copies the photographs in a folder, or in its folder `images`, to `images`, each turned as it was held. Links that lead
+/// elsewhere are followed if they are allowed to.
+pub fn copy(folder: &Path, outside: bool, place: &Workplace) -> Work<usize> {
     let found = find(folder)?;
+    if !outside {
+        let root = Root::new(folder)?;
+        found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
+    }
     let to = place.make("images")?;
     let (done, total) = (AtomicUsize::new(0), found.len());
     let progress = Mutex::new(Progress::new());

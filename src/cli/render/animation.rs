@@ -24,16 +24,20 @@ pub enum Animation<W: Write> {
 }
 
 impl<W: Write> Animation<W> {
-    /// A GIF without frames. A frame is shown for a whole number of hundredths of a second, and the film for as long as it should.
-    pub fn gif(to: W, [width, height]: [u16; 2], fps: f64) -> Result<Self, String> {
+    /// A GIF without frames, with a comment. A frame is shown for a whole number of hundredths of a second, and the film for as
+    /// long as it should.
+    pub fn gif(to: W, [width, height]: [u16; 2], fps: f64, comment: &str) -> Result<Self, String> {
         let mut encoder = gif::Encoder::new(to, width, height, &[]).map_err(|e| e.to_string())?;
         encoder.set_repeat(Repeat::Infinite).map_err(|e| e.to_string())?;
+        let comment = [comment.as_bytes()];
+        encoder.write_raw_extension(gif::Extension::Comment.into(), &comment).map_err(|e| e.to_string())?;
         Ok(Animation::Gif { encoder: Box::new(encoder), fps, frames: 0 })
     }
 
-    /// An APNG that is to have so many frames.
-    pub fn apng(to: W, [width, height]: [u16; 2], fps: f64, frames: u32) -> Result<Self, String> {
+    /// An APNG that is to have so many frames, with a comment.
+    pub fn apng(to: W, [width, height]: [u16; 2], fps: f64, frames: u32, comment: &str) -> Result<Self, String> {
         let mut encoder = png::Encoder::new(to, width.into(), height.into());
+        encoder.add_text_chunk("Comment".to_owned(), comment.to_owned()).map_err(|e| e.to_string())?;
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         let animated = encoder.set_animated(frames, 0);
@@ -80,7 +84,7 @@ mod tests {
     fn frames_of_an_apng_are_shown_for_as_long_as_they_should() {
         for fps in [0.01, 0.015, 0.7, 1.0, 12.5, 29.97, 240.0] {
             let mut bytes = vec![];
-            let mut animation = Animation::apng(&mut bytes, [4, 3], fps, 1).unwrap();
+            let mut animation = Animation::apng(&mut bytes, [4, 3], fps, 1, "a comment").unwrap();
             animation.push(&Image::new(4, 3, 3)).unwrap();
             animation.finish().unwrap();
             let at = bytes.windows(4).position(|window| window == b"fcTL").unwrap() + 4 + 20;
@@ -99,7 +103,7 @@ mod tests {
         // 30 frames a second are no whole number of hundredths each.
         for (fps, frames) in [(30.0, 60), (40.0, 7), (25.0, 5)] {
             let mut bytes = vec![];
-            let mut animation = Animation::gif(&mut bytes, [4, 3], fps).unwrap();
+            let mut animation = Animation::gif(&mut bytes, [4, 3], fps, "a comment").unwrap();
             (0..frames).for_each(|_| animation.push(&Image::new(4, 3, 3)).unwrap());
             animation.finish().unwrap();
             let mut decoder = gif::Decoder::new(&bytes[..]).unwrap();

@@ -10,6 +10,7 @@ use super::animation::Animation;
 use super::frames::DIGITS;
 use crate::cli::interrupt;
 use crate::cli::output::{check_writable, note, numbered, parent};
+use crate::cli::overwrite::Job;
 use crate::cli::parse::LARGEST;
 use crate::cli::prepare::program::{FFMPEG, Stop, Work};
 use crate::cli::progress::Progress;
@@ -36,6 +37,8 @@ pub struct Reel<'a> {
     pub size: [usize; 2],
     /// How many are shown in a second.
     pub fps: f64,
+    /// What the film is of, which it says of itself.
+    pub job: &'a Job,
 }
 
 impl Film {
@@ -52,9 +55,6 @@ impl Film {
 
     /// Whether it can be written, before there are frames.
     pub fn check(self, out: &Path, fps: f64, size: [usize; 2]) -> Result<()> {
-        if out.is_dir() {
-            return Err(Error::file(out, "is a folder, not a file"));
-        }
         check_writable(parent(out))?;
         if self == Film::Gif && fps > FASTEST_GIF {
             let what =
@@ -102,16 +102,20 @@ impl Film {
         let file = std::path::absolute(place.path()).map_err(bad)?.join("film");
         let size = reel.size.map(|side| side as u16);
         match self {
-            Film::Gif => animate(reel, out, &file, |to| Animation::gif(to, size, reel.fps))?,
-            Film::Apng => animate(reel, out, &file, |to| Animation::apng(to, size, reel.fps, reel.count as u32))?,
+            Film::Gif => animate(reel, out, &file, |to| Animation::gif(to, size, reel.fps, reel.job.mark()))?,
+            Film::Apng => {
+                let count = reel.count as u32;
+                animate(reel, out, &file, |to| Animation::apng(to, size, reel.fps, count, reel.job.mark()))?;
+            }
             Film::Mp4 | Film::Webm => self.encode(reel, out, &file)?,
         }
+        reel.job.check(out)?;
         Ok(std::fs::rename(&file, out).map_err(bad)?)
     }
 
     /// By ffmpeg.
     fn encode(self, reel: &Reel<'_>, out: &Path, file: &Path) -> Work<()> {
-        let &Reel { folder, count, size, fps } = reel;
+        let &Reel { folder, count, size, fps, job } = reel;
         let even = size.map(|side| side.next_multiple_of(2));
         if even != size {
             let [width, height] = even;
@@ -128,7 +132,7 @@ impl Film {
                       scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int";
         command.args(["-vf", filter, "-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"]);
         command.args(["-color_trc", "iec61966-2-1", "-color_range", "tv"]);
-        command.args(["-c:v", self.encoder()]);
+        command.args(["-c:v", self.encoder(), "-metadata", &format!("comment={}", job.mark())]);
         command.args(match self {
             Film::Webm => &["-crf", "24", "-b:v", "0", "-f", "webm"][..],
             _ => &["-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],

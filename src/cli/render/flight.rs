@@ -7,6 +7,7 @@ use raygrad::nerf::dataset::scene::test_cameras;
 use raygrad::nerf::dataset::{Capture, Split, evenly_spaced};
 use raygrad::nerf::glam::DAffine3;
 use raygrad::nerf::{Camera, Error, Extent, Model, Result};
+use serde::Serialize;
 
 use super::path_file::{self, Motion};
 use crate::cli::cameras::{Viewpoint, fitted};
@@ -27,7 +28,7 @@ const FPS: f64 = 25.0;
 const SPIRAL_SHARE: f64 = 0.1;
 
 /// Flags about where the camera goes.
-#[derive(Debug, Clone, Default, clap::Args)]
+#[derive(Debug, Clone, Default, clap::Args, Serialize)]
 pub struct FlightArgs {
     /// Where the camera goes: orbit (around the scene, or to and fro where photographs are from one side), spiral
     /// (LLFF's, about the average photograph), spline (through photographs), test (from test view to test view), or
@@ -74,7 +75,7 @@ pub struct FlightArgs {
 }
 
 /// Where the camera goes.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub enum CameraPath {
     #[default]
     Orbit,

@@ -40,6 +40,19 @@ pub enum Layer {
     Alpha,
 }
 
+impl Layer {
+    /// The folder of its files, and their ending.
+    pub fn place(self) -> (&'static str, &'static str) {
+        match self {
+            Layer::Depth => ("depth", "png"),
+            Layer::DepthNpy => ("depth", "npy"),
+            Layer::Normals => ("normals", "png"),
+            Layer::Opacity => ("opacity", "png"),
+            Layer::Alpha => ("alpha", "png"),
+        }
+    }
+}
+
 /// Where less light is blocked there is nothing to have a depth or a normal.
 const SOLID: f32 = 0.5;
 
@@ -59,8 +72,8 @@ pub struct Shown<'a> {
 pub struct Frame {
     /// What is shown.
     pub image: Image,
-    /// What is saved beside it: folder, ending and contents of files.
-    pub layers: Vec<(&'static str, &'static str, Vec<u8>)>,
+    /// What is saved beside it: the contents of files.
+    pub layers: Vec<(Layer, Vec<u8>)>,
     /// How many depths are too great for 16 bits.
     pub beyond: usize,
 }
@@ -72,18 +85,18 @@ impl Shown<'_> {
         let faces = self.show == Show::Normals || self.save.contains(&Layer::Normals);
         let normals = faces.then(|| self.normals(camera));
         let mut beyond = 0;
-        let layers = self.save.iter().map(|layer| match layer {
+        let mut contents = |layer: Layer| match layer {
             Layer::Depth => {
                 let (png, count) = self.depths(&picture, camera).to_png(self.depth_unit);
                 beyond = count;
-                ("depth", "png", png)
+                png
             }
-            Layer::DepthNpy => ("depth", "npy", self.depths(&picture, camera).to_npy()),
-            Layer::Normals => ("normals", "png", normals.as_ref().map_or(vec![], |of| solid(of, &picture).to_png())),
-            Layer::Opacity => ("opacity", "png", picture.opacity.to_png()),
-            Layer::Alpha => ("alpha", "png", picture.rgba(self.background).to_png()),
-        });
-        let layers = layers.collect();
+            Layer::DepthNpy => self.depths(&picture, camera).to_npy(),
+            Layer::Normals => normals.as_ref().map_or(vec![], |of| solid(of, &picture).to_png()),
+            Layer::Opacity => picture.opacity.to_png(),
+            Layer::Alpha => picture.rgba(self.background).to_png(),
+        };
+        let layers = self.save.iter().map(|&layer| (layer, contents(layer))).collect();
         let image = match (self.show, normals) {
             (Show::Depth, _) => depth_colors(&picture, self.extent.span),
             (Show::Normals, Some(normals)) => over(&normals, &picture.opacity, self.background),

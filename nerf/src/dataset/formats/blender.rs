@@ -58,7 +58,16 @@ pub fn read(folder: &Path) -> Result<Capture> {
             }
             None => {
                 let (folder, format, applied) = (folder.to_owned(), Format::Blender, DAffine3::IDENTITY);
-                capture = Some(Capture { folder, file, format, views, points: vec![], aabb_scale, applied });
+                capture = Some(Capture {
+                    folder,
+                    file,
+                    format,
+                    views,
+                    points: vec![],
+                    points_file: None,
+                    aabb_scale,
+                    applied,
+                });
             }
         }
     }

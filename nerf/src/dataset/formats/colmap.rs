@@ -130,7 +130,8 @@ fn parse(
     let mut views = images.into_iter().map(view).collect::<Result<Vec<View>>>()?;
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let (folder, file, format) = (folder.to_owned(), images_file.clone(), Format::Colmap);
-    Ok(Capture { folder, file, format, views, points, aabb_scale: None, applied: DAffine3::IDENTITY })
+    let points_file = Some(points_file.clone()).filter(|_| !points.is_empty());
+    Ok(Capture { folder, file, format, views, points, points_file, aabb_scale: None, applied: DAffine3::IDENTITY })
 }
 
 /// That no two entries of a list have the same key.

@@ -89,6 +89,7 @@ pub(super) fn picture_with_camera(folder: &Path) -> Capture {
         format: Format::Transforms,
         views: vec![view],
         points: vec![],
+        points_file: None,
         aabb_scale: None,
         applied: DAffine3::IDENTITY,
     }

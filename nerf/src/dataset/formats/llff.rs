@@ -64,7 +64,16 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
     });
     let views = views.collect::<Result<_>>()?;
     let (folder, format) = (folder.to_owned(), Format::Llff);
-    Ok(Capture { folder, file, format, views, points: vec![], aabb_scale: None, applied: DAffine3::IDENTITY })
+    Ok(Capture {
+        folder,
+        file,
+        format,
+        views,
+        points: vec![],
+        points_file: None,
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
+    })
 }
 
 /// The camera of a row, and the depths that it shows.

@@ -16,7 +16,7 @@ use crate::files::write_atomic;
 use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 const FILE: &str = "transforms.json";
 
@@ -45,13 +45,15 @@ pub fn read(folder: &Path) -> Result<Capture> {
     // nerfstudio scales what it has transformed.
     let applied = DAffine3 { matrix3: scale * transform.matrix3, translation: scale * transform.translation };
     let aabb_scale = top.positive("aabb_scale")?;
-    let points = match top.get("ply_file_path") {
-        Some(path) => folder.join(paths::normal(&top, "ply_file_path", path)?),
-        None => PathBuf::new(),
+    let points_file = match top.get("ply_file_path") {
+        Some(path) => Some(folder.join(paths::normal(&top, "ply_file_path", path)?)),
+        None => None,
     };
+    let points_file = points_file.filter(|file| file.is_file());
     // Its points are in the coordinates of the file: nerfstudio has transformed them along with the cameras.
-    let points = if points.is_file() { ply::read(&points)? } else { vec![] };
-    Ok(Capture { folder: folder.to_owned(), file, format: Format::Transforms, views, points, aabb_scale, applied })
+    let points = points_file.as_deref().map_or(Ok(vec![]), ply::read)?;
+    let (folder, format) = (folder.to_owned(), Format::Transforms);
+    Ok(Capture { folder, file, format, views, points, points_file, aabb_scale, applied })
 }
 
 /// The field that lists the photographs of a split.

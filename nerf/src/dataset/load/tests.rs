@@ -32,6 +32,7 @@ fn capture(folder: &Path, count: usize) -> Capture {
         format: Format::Transforms,
         views: (0..count).rev().map(view).collect(),
         points: vec![],
+        points_file: None,
         aabb_scale: None,
         applied: DAffine3::IDENTITY,
     }

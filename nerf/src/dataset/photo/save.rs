@@ -49,7 +49,7 @@ impl Photo {
 }
 
 /// Copies an image file. Where its EXIF orientation says that it is to be turned, its pixels are, and the rest of what it
-/// says stays, such as the focal length; otherwise it is copied as it is.
+/// says stays, such as the focal length; otherwise it is copied as it is, if it can be decoded.
 ///
 /// # Errors
 /// If the file cannot be read, decoded or written.
@@ -59,6 +59,7 @@ pub fn copy_upright(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<()> 
     let (mut decoder, _) = decoder(from)?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     if turn == Orientation::NoTransforms {
+        DynamicImage::from_decoder(decoder).map_err(bad)?;
         return std::fs::copy(from, to).map(drop).map_err(|e| Error::file(to, format!("cannot be written: {e}")));
     }
     let mut about = About { exif: decoder.exif_metadata().ok().flatten(), icc: decoder.icc_profile().ok().flatten() };

@@ -24,6 +24,7 @@ fn capture(format: Format, cameras: Vec<Camera>) -> Capture {
         format,
         views: cameras.into_iter().enumerate().map(view).collect(),
         points: vec![],
+        points_file: None,
         aabb_scale: None,
         applied: DAffine3::IDENTITY,
     }

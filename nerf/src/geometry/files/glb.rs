@@ -18,7 +18,7 @@ const JSON: &[u8; 4] = b"JSON";
 const BIN: &[u8; 4] = b"BIN\0";
 
 /// The file, or what is wrong.
-pub(super) fn to_bytes(shape: &Shape) -> Result<Vec<u8>, String> {
+pub(super) fn to_bytes(shape: &Shape, generator: &str) -> Result<Vec<u8>, String> {
     let Shape { mesh, normals, colors } = shape;
     let [low, high] = mesh.bounds().ok_or("would have no vertices, which glTF does not allow")?;
     let middle = 0.5 * (low + high);
@@ -53,7 +53,7 @@ pub(super) fn to_bytes(shape: &Shape) -> Result<Vec<u8>, String> {
     }
     let plain = json!({ "metallicFactor": 0, "roughnessFactor": 1 });
     let description = json!({
-        "asset": { "version": "2.0", "generator": "raygrad" },
+        "asset": { "version": "2.0", "generator": generator },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],

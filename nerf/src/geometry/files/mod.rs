@@ -45,6 +45,16 @@ impl Format {
 /// If the ending is none of [`Format`]'s, there is not a normal and a colour for each vertex, the shape is too large or the file
 /// cannot be written.
 pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
+    write_with_comment(shape, path, "raygrad")
+}
+
+/// As [`write`], with a line of text about the file in its header: a comment in PLY and OBJ, the generator in glTF. Line breaks
+/// in it become spaces.
+///
+/// # Errors
+/// As [`write`].
+pub fn write_with_comment(shape: &Shape, path: impl AsRef<Path>, comment: &str) -> Result<u64> {
+    let comment = &comment.replace(char::is_control, " ");
     let path = path.as_ref();
     let [vertices, normals, colors] = [shape.mesh.positions.len(), shape.normals.len(), shape.colors.len()];
     if [normals, colors] != [vertices; 2] {
@@ -54,9 +64,9 @@ pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
         ));
     }
     let bytes = match Format::of(path) {
-        Some(Format::Ply) => ply::to_bytes(shape),
-        Some(Format::Obj) => obj::to_text(shape).into_bytes(),
-        Some(Format::Glb) => glb::to_bytes(shape).map_err(|what| Error::file(path, what))?,
+        Some(Format::Ply) => ply::to_bytes(shape, comment),
+        Some(Format::Obj) => obj::to_text(shape, comment).into_bytes(),
+        Some(Format::Glb) => glb::to_bytes(shape, comment).map_err(|what| Error::file(path, what))?,
         None => return Err(Error::file(path, "has an ending that is none of .ply, .obj and .glb")),
     };
     write_atomic(path, &bytes)?;

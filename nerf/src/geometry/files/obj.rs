@@ -6,13 +6,13 @@ use std::fmt::Write;
 /// Digits of places, counted from the first of the largest.
 const DIGITS: i32 = 8;
 
-pub(super) fn to_text(shape: &Shape) -> String {
+pub(super) fn to_text(shape: &Shape, comment: &str) -> String {
     let Shape { mesh, normals, colors } = shape;
     let largest = mesh.bounds().map_or(1.0, |[low, high]| (high - low).max_element());
     // One point has no extent.
     let largest = if largest > 0.0 { largest } else { 1.0 };
     let decimals = (DIGITS - largest.log10().ceil() as i32).clamp(0, 17) as usize;
-    let mut out = String::from("# x y z red green blue, colours in sRGB\n");
+    let mut out = format!("# x y z red green blue, colours in sRGB\n# {comment}\n");
     // Writing to a string cannot fail.
     for (place, color) in mesh.positions.iter().zip(colors) {
         let [x, y, z] = place.to_array();

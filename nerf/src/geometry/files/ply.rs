@@ -2,9 +2,10 @@
 
 use super::super::shape::Shape;
 
-pub(super) fn to_bytes(shape: &Shape) -> Vec<u8> {
+pub(super) fn to_bytes(shape: &Shape, comment: &str) -> Vec<u8> {
     let Shape { mesh, normals, colors } = shape;
-    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", mesh.positions.len());
+    let mut header = format!("ply\nformat binary_little_endian 1.0\ncomment {comment}\n");
+    header += &format!("element vertex {}\n", mesh.positions.len());
     for property in ["double x", "double y", "double z", "float nx", "float ny", "float nz"] {
         header += &format!("property {property}\n");
     }

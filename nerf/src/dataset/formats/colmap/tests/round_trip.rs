@@ -12,7 +12,7 @@ fn view(name: &str, lens: Lens, pose: DAffine3) -> View {
 
 fn capture(views: Vec<View>, points: Vec<Point>) -> Capture {
     let (folder, file, format) = ("scene".into(), "transforms.json".into(), Format::Transforms);
-    Capture { folder, file, format, views, points, aabb_scale: None, applied: DAffine3::IDENTITY }
+    Capture { folder, file, format, views, points, points_file: None, aabb_scale: None, applied: DAffine3::IDENTITY }
 }
 
 /// Lenses, the names of the models that hold them, and how many parameters those have.

@@ -1,0 +1,146 @@
+//! Which files a command may replace: those that it wrote itself, and with `--overwrite` all.
+//!
+//! A command writes a mark into its files, a number of all that it was asked for: so that it works again on its own output, and
+//! replaces nothing else.
+
+use std::fs::File;
+use std::io::{ErrorKind, Read};
+use std::path::Path;
+
+use crc::{CRC_64_XZ, Crc};
+use raygrad::nerf::{Error, Result};
+use serde_json::Value;
+
+/// What a command was asked for, but for where to write it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Job {
+    mark: String,
+    /// Whether everything may be replaced.
+    overwrites: bool,
+}
+
+/// Bytes at the beginning of a file in which a mark is looked for: before them come at most the tables of a long video.
+const SEARCHED: u64 = 16 << 20;
+/// Bytes that are read at a time.
+const BLOCK: usize = 1 << 16;
+
+impl Job {
+    /// Of a subcommand with these arguments.
+    pub fn new(command: &str, arguments: &Value, overwrites: bool) -> Self {
+        let number = Crc::<u64>::new(&CRC_64_XZ).checksum(arguments.to_string().as_bytes());
+        Job { mark: format!("raygrad-{command}-{number:016x}"), overwrites }
+    }
+
+    /// What stands in files that this job has written.
+    pub fn mark(&self) -> &str {
+        &self.mark
+    }
+
+    /// Whether everything may be replaced.
+    pub fn overwrites(&self) -> bool {
+        self.overwrites
+    }
+
+    /// Whether a file carries the mark.
+    pub fn wrote(&self, file: &Path) -> bool {
+        // What cannot be read is nobody's own, and a pipe is not waited for.
+        let open = || File::open(file).and_then(|file| contains(file.take(SEARCHED), self.mark.as_bytes()));
+        file.is_file() && open().unwrap_or(false)
+    }
+
+    /// Whether a file may be written: asked before the work that it will hold, and once more before it is replaced.
+    ///
+    /// # Errors
+    /// If it is a folder, or there is a file that this job has not written and may not replace.
+    pub fn check(&self, out: &Path) -> Result<()> {
+        match std::fs::symlink_metadata(out) {
+            Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
+            Err(e) => Err(Error::file(out, format!("cannot be written: {e}"))),
+            Ok(_) if out.is_dir() => Err(Error::file(out, "is a folder, not a file")),
+            Ok(_) if self.overwrites || self.wrote(out) => Ok(()),
+            Ok(_) => Err(taken(out)),
+        }
+    }
+}
+
+/// The error that a file is in the way.
+pub fn taken(file: &Path) -> Error {
+    Error::file(file, "exists, and another command wrote it: choose another name, or replace it with --overwrite")
+}
+
+/// Whether bytes hold a word.
+fn contains(mut from: impl Read, word: &[u8]) -> std::io::Result<bool> {
+    let mut bytes = vec![];
+    loop {
+        let kept = bytes.len();
+        from.by_ref().take(BLOCK as u64).read_to_end(&mut bytes)?;
+        if bytes.windows(word.len()).any(|window| window == word) {
+            return Ok(true);
+        }
+        if bytes.len() == kept {
+            return Ok(false);
+        }
+        // It may begin in one block and end in the next.
+        bytes.drain(..(bytes.len() + 1).saturating_sub(word.len()));
+    }
+}
+
+/// A PNG file with a text about it, which is Latin-1.
+pub fn png_with_text(png: &[u8], text: &str) -> Vec<u8> {
+    /// The signature and the first chunk, after which others may come.
+    const HEADER: usize = 8 + 25;
+    let body = [b"tEXtComment\0", text.as_bytes()].concat();
+    let chunk = [&((body.len() - 4) as u32).to_be_bytes(), &body[..], &crc32fast::hash(&body).to_be_bytes()].concat();
+    let (header, rest) = png.split_at(HEADER.min(png.len()));
+    [header, &chunk, rest].concat()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::Image;
+    use serde_json::json;
+
+    #[test]
+    fn contains_finds_words_across_blocks() {
+        let word = b"raygrad-render-0123456789abcdef";
+        for at in [0, 1, BLOCK - 1, BLOCK - word.len(), BLOCK - word.len() / 2, BLOCK, 3 * BLOCK - 2] {
+            let mut bytes = vec![b'r'; 3 * BLOCK + 100];
+            bytes[at..at + word.len()].copy_from_slice(word);
+            assert!(contains(&bytes[..], word).unwrap(), "at {at}");
+            bytes[at + word.len() - 1] = b'g';
+            assert!(!contains(&bytes[..], word).unwrap(), "at {at}");
+            assert!(!contains(&bytes[..at + word.len() - 1], word).unwrap(), "at {at}");
+        }
+        assert!(!contains(&b""[..], word).unwrap());
+    }
+
+    #[test]
+    fn job_replaces_its_own_files_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let job = |size: u32, overwrites: bool| Job::new("render", &json!({ "size": size }), overwrites);
+        let image = Image { width: 2, height: 1, channels: 1, data: vec![0.0, 1.0] };
+        let own = job(1, false);
+        assert!(own.check(&path).is_ok());
+        std::fs::write(&path, png_with_text(&image.to_png(), own.mark())).unwrap();
+        assert_eq!(Image::open(&path).unwrap().data, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]);
+        assert!(own.check(&path).is_ok() && job(1, false) == own);
+        // Another one's, and a photograph.
+        let refused = |job: Job| job.check(&path).unwrap_err().to_string();
+        let expected = "exists, and another command wrote it: choose another name, or replace it with --overwrite";
+        assert_eq!(refused(job(2, false)), format!("{}: {expected}", path.display()));
+        assert!(Job::new("export", &json!({ "size": 1 }), false).check(&path).is_err());
+        std::fs::write(&path, image.to_png()).unwrap();
+        assert!(refused(own.clone()).ends_with(expected));
+        assert!(job(2, true).check(&path).is_ok());
+        assert!(job(2, true).check(folder.path()).unwrap_err().to_string().ends_with("is a folder, not a file"));
+        // Nor is a link that leads nowhere replaced.
+        #[cfg(unix)]
+        {
+            let link = folder.path().join("link.png");
+            std::os::unix::fs::symlink(folder.path().join("absent"), &link).unwrap();
+            assert!(own.check(&link).is_err());
+        }
+    }
+}

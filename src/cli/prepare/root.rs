@@ -1,0 +1,76 @@
+//! The folder that the files of a dataset lie in, wherever links lead.
+
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Error, Result};
+
+/// A folder whose files may be copied into a dataset that people share.
+pub struct Root(PathBuf);
+
+impl Root {
+    /// A folder that is there.
+    pub fn new(folder: &Path) -> Result<Self> {
+        resolved(folder).map(Root).map_err(|what| Error::file(folder, what))
+    }
+
+    /// The folder of a capture: of `scene/sparse/0` and of `scene/sparse`, as COLMAP's models are called, it is `scene`.
+    pub fn of_capture(folder: &Path) -> Result<Self> {
+        let Root(whole) = Self::new(folder)?;
+        let scene = ["sparse/0", "sparse"].iter().find_map(|model| {
+            let parts = Path::new(model).components().count();
+            if whole.ends_with(model) { whole.ancestors().nth(parts) } else { None }
+        });
+        Ok(Root(scene.unwrap_or(&whole).to_owned()))
+    }
+
+    /// Whether a file lies in the folder; if not, what is wrong and what to do.
+    pub fn check(&self, file: &Path) -> std::result::Result<(), String> {
+        if resolved(file)?.starts_with(&self.0) {
+            return Ok(());
+        }
+        let (file, root) = (file.display(), self.0.display());
+        Err(format!("{file} lies outside of {root}, and would be copied: add --allow-outside if it may be"))
+    }
+}
+
+/// Where a path leads.
+fn resolved(path: &Path) -> std::result::Result<PathBuf, String> {
+    path.canonicalize().map_err(|e| format!("{} cannot be found: {e}", path.display()))
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+    use std::fs;
+    use std::os::unix::fs::symlink;
+
+    #[test]
+    fn root_holds_what_no_link_leads_out_of() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        fs::create_dir_all(path("scene/sparse/0")).unwrap();
+        fs::create_dir_all(path("scene2")).unwrap();
+        for name in ["scene/a.png", "scene2/b.png", "c.png"] {
+            fs::write(path(name), "").unwrap();
+        }
+        symlink(path("c.png"), path("scene/link.png")).unwrap();
+        symlink(path("scene/a.png"), path("scene/within.png")).unwrap();
+        symlink(path("scene2"), path("scene/folder")).unwrap();
+        symlink(path("scene"), path("named")).unwrap();
+        let inside = ["scene/a.png", "scene/within.png", "named/a.png", "scene2/../scene/a.png"];
+        let outside = ["c.png", "scene/link.png", "scene/folder/b.png", "scene/../scene2/b.png", "named/link.png"];
+        for root in ["scene", "named", "scene/sparse/0", "scene/sparse"] {
+            let root = Root::of_capture(&path(root)).unwrap();
+            assert!(inside.iter().all(|name| root.check(&path(name)).is_ok()));
+            for name in outside {
+                let message = root.check(&path(name)).unwrap_err();
+                assert!(message.contains("lies outside of") && message.contains("--allow-outside"), "{message}");
+            }
+            assert!(root.check(&path("scene/absent.png")).unwrap_err().contains("cannot be found"));
+        }
+        // Another folder is not a part for the beginning of its name.
+        assert!(Root::new(&path("scene")).unwrap().check(&path("scene2/b.png")).is_err());
+        assert!(Root::new(&path("scene/sparse/0")).unwrap().check(&path("scene/a.png")).is_err());
+        assert!(Root::new(&path("absent")).is_err());
+    }
+}

@@ -1,0 +1,179 @@
+//! Files of users are not replaced, and every command works again on its own output.
+
+use super::Place;
+use raygrad::nerf::Image;
+use std::process::Output;
+
+const SMALL: &str = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+
+/// With a run, and a photograph at the given places.
+fn place(photographs: &[&str]) -> Place {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 2 --scope unbounded --out run {SMALL}"));
+    for name in photographs {
+        std::fs::create_dir_all(place.path(name).parent().unwrap()).unwrap();
+        photograph().save_png(place.path(name)).unwrap();
+    }
+    place
+}
+
+fn photograph() -> Image {
+    Image { width: 4, height: 3, channels: 3, data: vec![0.25; 36] }
+}
+
+/// Fails because that file is in the way, and leaves it as it is.
+#[track_caller]
+fn refuses(place: &Place, arguments: &str, file: &str) {
+    let before = place.bytes(file);
+    let expected =
+        format!("{file}: exists, and another command wrote it: choose another name, or replace it with --overwrite");
+    place.fails(arguments, &[&expected]);
+    assert!(place.bytes(file) == before, "{arguments} has changed {file}");
+}
+
+#[test]
+fn outputs_of_others_are_refused_and_own_ones_replaced() {
+    let place = place(&["p/0001.png", "scene/depth/0000.png", "photo.png", "film.gif.frames/0000.png"]);
+    std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
+    std::fs::write(place.path("walk.gif"), b"footage").unwrap();
+    let transforms = "scene/transforms_train.json";
+    let frames = "--frames 2 --size 12x9";
+    for (arguments, file) in [
+        (format!("export run {transforms}"), transforms),
+        (format!("render run {frames} --out p"), "p/0001.png"),
+        (format!("render run {frames} --save normals,depth --out scene"), "scene/depth/0000.png"),
+        (format!("render run {frames} --out photo.png"), "photo.png"),
+        (format!("render run {frames} --out walk.gif"), "walk.gif"),
+        (format!("render run {frames} --out walk.mp4"), "walk.mp4"),
+        (format!("render run {frames} --out film.gif"), "film.gif.frames/0000.png"),
+    ] {
+        refuses(&place, &arguments, file);
+    }
+    assert!(
+        !place.path("p/0000.png").exists()
+            && !place.path("scene/0000.png").exists()
+            && !place.path("film.gif").exists()
+    );
+    std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
+    // Each works again on its own output, also when the model is another by then; and is refused as another job.
+    let commands =
+        |out: &str| [format!("render run {frames} --out {out}"), format!("render run {frames} --fov 30 --out {out}")];
+    let outputs = ["frames", "film.gif", "film.apng", "picture.png"];
+    for out in outputs {
+        let [command, other] = commands(out);
+        place.succeeds(&command);
+        place.succeeds(&command);
+        refuses(&place, &other, if out == "frames" { "frames/0000.png" } else { out });
+    }
+    place.succeeds(&format!("render run {frames} --save depth --out deep"));
+    let exports = [
+        "cameras.json",
+        "mesh.ply --level 1e-6 --resolution 9",
+        "mesh.obj --level 1e-6 --resolution 9",
+        "points.glb --points=9",
+        "scene.html",
+    ];
+    for export in exports {
+        place.succeeds(&format!("export run {export}"));
+    }
+    place.succeeds("train --resume run --steps 3");
+    for out in outputs {
+        let [command, other] = commands(out);
+        place.succeeds(&command);
+        place.succeeds(&format!("{other} --overwrite"));
+        place.succeeds(&format!("{command} --overwrite"));
+    }
+    place.succeeds(&format!("render run {frames} --save depth --out deep"));
+    for export in exports {
+        place.succeeds(&format!("export run {export}"));
+    }
+    refuses(&place, "export run mesh.ply --level 1e-6 --resolution 10", "mesh.ply");
+    // Another run is another job, wherever it is called from.
+    place.succeeds(&format!("train scene --steps 2 --out other {SMALL}"));
+    refuses(&place, &format!("render other {frames} --out film.gif"), "film.gif");
+    refuses(&place, "export other cameras.json", "cameras.json");
+    place.succeeds(&format!("render ./other/../run/ {frames} --out film.gif"));
+    // What is given to be replaced is.
+    place.succeeds(&format!("export run {transforms} --overwrite"));
+    assert!(place.json(transforms)["frames"].is_array());
+    // A run's own folder of pictures needs no word.
+    place.succeeds("render run --frames 1");
+    place.succeeds("render run --frames 2 --fov 30");
+}
+
+#[test]
+fn files_of_a_run_are_never_an_output() {
+    let place = place(&[]);
+    for (arguments, name) in [
+        ("export run run/config.json --overwrite", "config.json"),
+        ("export run ./run/../run/summary.json --overwrite", "summary.json"),
+        ("render run --frames 1 --out run/checkpoints --overwrite", "checkpoints"),
+        ("render run --frames 1 --out run/previews/a.png --overwrite", "previews"),
+        ("render run --frames 1 --out run/eval-test/0.png --overwrite", "eval-test"),
+        ("export run run/Lock --to colmap", "lock"),
+    ] {
+        std::fs::create_dir_all(place.path("run/eval-test")).unwrap();
+        place.fails(arguments, &[&format!("`{name}` is a part of the run: choose another name")]);
+    }
+    place.succeeds("train --resume run --steps 3");
+    // What lies beside them is.
+    place.succeeds("export run run/cameras.json");
+    place.succeeds("render run --frames 1 --out run/picture.png");
+}
+
+#[test]
+fn endings_that_are_not_known_are_named() {
+    let place = place(&[]);
+    std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
+    for out in ["walk.mp4", "cameras", "cameras.txt", "mesh.stl"] {
+        let expected = "end the name in .json for cameras, .ply, .obj or .glb for the shape, .html for a page";
+        place.fails(&format!("export run {out}"), &[&format!("{out}: says by no ending what to export: "), expected]);
+        place.fails(&format!("export run {out} --overwrite"), &[expected]);
+    }
+    assert_eq!(place.bytes("walk.mp4"), b"footage");
+    for out in ["walk.mkv", "photo.jpg", "orbit.2"] {
+        place.fails(
+            &format!("render run --out {out}"),
+            &["is not the ending of a picture or a film", ".png, .gif, .apng"],
+        );
+    }
+    place.succeeds("render run --frames 1 --out orbit.2/");
+    assert!(place.path("orbit.2/0000.png").exists());
+}
+
+#[test]
+fn doctor_and_bench_replace_their_own_files_alone() {
+    let place = place(&["scene/cameras.png", "results/plot.png"]);
+    let run = |arguments: &str| place.command(arguments).output().unwrap();
+    let said = |output: Output| String::from_utf8(output.stderr).unwrap();
+    // Warnings of a small capture are no errors of the command.
+    for out in ["", "--out again"] {
+        for _ in 0..2 {
+            assert_eq!(run(&format!("doctor scene {out}")).status.code(), Some(3), "{out}");
+        }
+    }
+    assert!(place.path("doctor/cameras.png").exists() && place.path("again/doctor.html").exists());
+    refuses(&place, "doctor scene --out scene", "scene/cameras.png");
+    assert!(!place.path("scene/doctor.html").exists());
+    assert_eq!(run("doctor scene --out scene --overwrite").status.code(), Some(3));
+    let bench = "bench --suite quadrature --quick --out";
+    place.fails(&format!("{bench} results"), &["results: holds files that are not a benchmark's", "add --overwrite"]);
+    assert_eq!(std::fs::read_dir(place.path("results")).unwrap().count(), 1);
+    place.succeeds(&format!("{bench} measured"));
+    place.succeeds(&format!("{bench} measured"));
+    assert_eq!(said(run(&format!("{bench} results --overwrite"))).lines().count(), 1);
+}
+
+#[test]
+fn films_of_ffmpeg_say_what_they_are_of() {
+    if !super::render::has_ffmpeg() {
+        return;
+    }
+    let place = place(&[]);
+    for film in ["film.mp4", "film.webm"] {
+        let command = format!("render run --frames 3 --size 12x9 --out {film}");
+        place.succeeds(&command);
+        place.succeeds(&command);
+        refuses(&place, &format!("{command} --fov 30"), film);
+    }
+}
