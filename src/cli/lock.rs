@@ -1,7 +1,7 @@
 //! Files by which a program keeps others out of a folder.
 
 use std::fs::{File, TryLockError};
-use std::io::{ErrorKind, Seek, Write};
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result};
@@ -10,8 +10,8 @@ use super::output::complain;
 
 /// A folder that this program alone writes to, until this is dropped or the program ends, however it does.
 ///
-/// The lock is on a file, and the folder can be moved and made anew with another one. So the file holds a word of its owner,
-/// and who writes to the folder asks for the [`state`](Self::state) before.
+/// The lock is on a file, and the folder can be moved and made anew with another one. So the file names its owner, and each write
+/// to the folder asks for the [`state`](Self::state) before.
 #[derive(Debug)]
 pub struct Lock {
     path: PathBuf,
@@ -55,10 +55,10 @@ impl Lock {
             )),
         }
         let owner = format!("{} {:016x}\n", std::process::id(), rand::random::<u64>());
-        file.rewind().and_then(|()| file.write_all(owner.as_bytes())).map_err(bad)?;
+        file.write_all(owner.as_bytes()).map_err(bad)?;
         file.set_len(owner.len() as u64).map_err(bad)?;
         let lock = Lock { path: path.into(), owner, _file: file };
-        // Whoever had it may have removed the file while it was being opened here, and another program has made it anew.
+        // The last owner may have removed the file while it was being opened here, and another program made it anew.
         match lock.state() {
             State::Kept => Ok(lock),
             State::Gone | State::Lost => Err(busy()),
@@ -75,12 +75,6 @@ impl Lock {
             // A lock that others respect when they read, as on Windows, or a disk that fails for a moment.
             Err(_) => State::Kept,
         }
-    }
-
-    /// Makes the file anew where it is [gone](State::Gone), in a folder that is there.
-    pub fn renew(&mut self, busy: impl Fn() -> Error) -> Result<()> {
-        *self = Self::take(&self.path, busy)?;
-        Ok(())
     }
 }
 
@@ -113,18 +107,13 @@ mod tests {
             std::fs::create_dir(&run).unwrap();
             take(&run.join("lock")).unwrap()
         };
-        let mut first = make();
+        let first = make();
         std::fs::rename(&run, folder.path().join("moved")).unwrap();
         assert_eq!(first.state(), State::Gone);
         let second = make();
         assert_eq!((first.state(), second.state()), (State::Lost, State::Kept));
-        assert!(first.renew(|| Error::setting("lock", "busy")).is_err());
         std::fs::remove_dir_all(&run).unwrap();
         assert_eq!((first.state(), second.state()), (State::Gone, State::Gone));
-        std::fs::create_dir(&run).unwrap();
-        first.renew(|| Error::setting("lock", "busy")).unwrap();
-        assert_eq!((first.state(), second.state()), (State::Kept, State::Lost));
-        std::fs::remove_dir_all(&run).unwrap();
         std::fs::write(&run, b"a file").unwrap();
         assert_eq!(first.state(), State::Gone);
     }

@@ -31,8 +31,8 @@ use shown::{Layer, Show, Shown};
 
 /// Render pictures or a film of a model
 ///
-/// The same command replaces its own pictures and films, and no others unless --overwrite is given. Of a film, frames are
-/// written to FILE.frames/ first. After a Ctrl-C, and whatever else ends it, the same command goes on where it was.
+/// The same command replaces its own images and videos, and no others unless --overwrite is given. Frames of a video are
+/// written to FILE.frames/ first: the same command resumes there after a Ctrl-C or a crash.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder that `raygrad train` made

@@ -143,7 +143,7 @@ impl Run {
             State::Gone => {}
         }
         make_folder(&self.folder)?;
-        lock.renew(lost)?;
+        *lock = Lock::take(&self.file(LOCK), lost)?;
         self.write()?;
         Ok(true)
     }

@@ -281,7 +281,7 @@ fn train(
     };
     // Whatever came of it, the run was good until then.
     let good = diverged.is_none() || watch.give_up(&mut trainer);
-    // Whoever wants to may go on with it from here on.
+    // From here on another program may resume it.
     watch.finish(&trainer, ended, good)?;
     summarise(&run, &trainer.stats(), ended == Ended::Interrupted)?;
     if let Some(reason) = &diverged {

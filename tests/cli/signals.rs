@@ -34,7 +34,7 @@ fn ignored_hang_ups_end_no_training() {
     send(&child, "INT");
     assert_eq!(child.wait().unwrap().code(), Some(0));
     assert_eq!(place.json("run/summary.json")["steps"], 150);
-    // What is not ignored is still heard.
+    // Signals that are not ignored still stop it.
     let mut child = ignoring(&place, "HUP", &format!("train scene --budget 1h --out other {SMALL}")).spawn().unwrap();
     wait(&mut child, || has_content(&place.path("other/metrics.jsonl")));
     send(&child, "HUP");

@@ -53,7 +53,7 @@ impl Names {
     #[track_caller]
     fn add(&mut self, name: String) -> ParamId {
         static KEYS: AtomicU64 = AtomicU64::new(0);
-        // Before anything changes: whoever catches the panic has the store as it was.
+        // Before anything changes: a caller that catches the panic has the store as it was.
         assert!(!self.places.contains_key(&name), "there is already a parameter `{name}`");
         let (place, key) = (self.names.len(), KEYS.fetch_add(1, Ordering::Relaxed));
         self.places.insert(name.clone(), place);

@@ -135,7 +135,7 @@ mod tests {
         }
         assert_eq!(names(folder.path()), ["a", "empty"]);
         assert_eq!(names(&folder.path().join("a")), ["new"]);
-        // Nothing is left of what is not finished.
+        // A workplace that is dropped unfinished leaves nothing.
         let gone = folder.path().join("gone");
         drop(filled(&gone));
         fs::create_dir(&gone).unwrap();
