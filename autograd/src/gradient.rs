@@ -113,9 +113,14 @@ impl<T: Scalar> Gradient<T> {
     }
 
     /// The gradient as a dense tensor: the dense share, to which the sparse ones are added in their order.
+    ///
+    /// # Panics
+    /// If a [`SparseGrad::add_to`] puts a tensor of another shape in the place of the sum.
+    #[track_caller]
     pub fn into_dense(self, pool: &Pool<T>) -> Tensor<T> {
         let mut sum = self.dense.unwrap_or_else(|| pool.full(&self.shape, T::ZERO));
         self.sparse.iter().for_each(|share| share.add_to(&mut sum));
+        assert_eq!(sum.shape(), &self.shape[..], "the shape of a gradient after `SparseGrad::add_to`");
         sum
     }
 

@@ -1,6 +1,6 @@
 //! Sums of gradients for tables of which a step touches few rows.
 
-use raygrad_tensor::{Scalar, simd};
+use raygrad_tensor::{Scalar, checked_len, simd};
 
 /// What has been added to some rows of a table: the rows that got a share, and their sums beside each other.
 ///
@@ -23,11 +23,12 @@ impl<T: Scalar> RowSums<T> {
     /// Nothing added yet to a table of `rows` rows of `features` numbers.
     ///
     /// # Panics
-    /// If `features` is 0 or there are 2^32 - 1 rows or more.
+    /// If `features` is 0, there are 2^32 - 1 rows or more, or the table is larger than memory.
     #[track_caller]
     pub fn new(rows: usize, features: usize) -> Self {
         assert!(features > 0, "rows without features");
         assert!(rows < u32::MAX as usize, "a table of {rows} rows");
+        assert!(checked_len(&[rows + 1, features]).is_some(), "a table of {rows} rows of {features} numbers");
         RowSums {
             places: vec![0; rows],
             rows: vec![0; rows + 1],
@@ -180,6 +181,12 @@ mod tests {
             sums.clear();
             assert!(sums.rows().is_empty() && sums.sums.iter().all(|&sum| sum == 0.0));
         }
+    }
+
+    #[test]
+    #[should_panic(expected = "a table of 3 rows of 4611686018427387904 numbers")]
+    fn row_sums_whose_size_wraps_are_refused() {
+        RowSums::<f32>::new(3, 1 << 62);
     }
 
     #[test]

@@ -36,6 +36,7 @@ impl<'t, T: Scalar> Sum<'t, T> {
                 if share.is_passing() {
                     let sum = dense.get_or_insert_with(|| tape.constant(tape.pool().full(shape, T::ZERO)));
                     share.add_to(&mut sum.value);
+                    assert_eq!(sum.shape(), shape, "the shape of a gradient after `SparseGrad::add_to`");
                 } else {
                     sparse.push(share);
                 }

@@ -5,7 +5,7 @@ use crate::{Indices, Pool, Scalar, Shape, Tensor};
 /// Tensors one after another along an axis; at least one.
 ///
 /// # Panics
-/// If there is none, the axis does not exist, or other extents differ.
+/// If there is none, the axis does not exist, other extents differ, or the extents add up to too much.
 #[track_caller]
 pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> Tensor<T> {
     let Some(first) = parts.first() else { panic!("concat of no tensors") };
@@ -85,7 +85,7 @@ impl<T: Scalar> Tensor<T> {
     /// Tensors one after another along `axis`.
     ///
     /// # Panics
-    /// If there is none, the axis does not exist, or other extents differ.
+    /// If there is none, the axis does not exist, other extents differ, or the extents add up to too much.
     #[track_caller]
     pub fn concat(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("concat of no tensors") };
@@ -153,6 +153,14 @@ impl<T: Scalar> From<&Indices> for Tensor<T> {
 mod tests {
     use super::*;
     use crate::s;
+
+    #[test]
+    #[should_panic(expected = "concat along axis 0 to a tensor that is too large")]
+    fn concat_extents_that_wrap_panic() {
+        // Three times this is 2^63 - 3 in 64 bits.
+        let long = Tensor::<f32>::zeros(&[usize::MAX / 2, 0]);
+        Tensor::concat(&[&long, &long, &long], 0);
+    }
 
     #[test]
     fn rules_give_what_numpy_gives() {

@@ -4,13 +4,20 @@ use crate::indices::index;
 use crate::parallel::{ELEMENT, PIECE, chunks};
 use crate::reduce::chunk;
 use crate::rows::fold_lanes;
-use crate::{Scalar, simd};
+use crate::{Scalar, checked_len, simd};
 
 /// A tensor as the kernels see it: `[outer, count, inner]`, reduced along the axis in the middle.
 pub type Middle = [usize; 3];
 
 /// Columns that one task reduces, at least: some cache lines of each row.
 const LEAST: usize = 64;
+
+/// That slices are as long as an array and its extremum.
+#[track_caller]
+fn check([outer, count, inner]: Middle, x: usize, out: usize) {
+    let fits = checked_len(&[outer, count, inner]) == Some(x) && checked_len(&[outer, inner]) == Some(out);
+    assert!(fits, "{x} and {out} numbers for an extremum of {:?}", [outer, count, inner]);
+}
 
 /// The greatest elements (the smallest ones without `greatest`) along the middle axis: `[outer, count, inner]` to
 /// `[outer, inner]`. A NaN among them is the result.
@@ -19,7 +26,7 @@ const LEAST: usize = 64;
 /// If the lengths do not fit, or `count` is 0 and `out` is not empty.
 pub fn extremum<T: Scalar>(x: &[T], middle: Middle, greatest: bool, out: &mut [T]) {
     let [outer, count, inner] = middle;
-    assert_eq!((x.len(), out.len()), (outer * count * inner, outer * inner), "extremum of {middle:?}");
+    check(middle, x.len(), out.len());
     if outer == 1 && inner > 1 {
         // One group: columns of it for each task.
         let at_once = (PIECE / count.max(1)).max(LEAST);
@@ -90,7 +97,7 @@ fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, first: usize, out: &
 /// # Panics
 /// If the lengths do not fit.
 pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]: Middle, out: &mut [T]) {
-    assert_eq!((x.len(), y.len()), (outer * count * inner, outer * inner), "extremum of {:?}", [outer, count, inner]);
+    check([outer, count, inner], x.len(), y.len());
     assert_eq!((out.len(), g.len()), (x.len(), y.len()), "gradient of an extremum");
     if x.is_empty() {
         return;
@@ -143,7 +150,7 @@ pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]
 /// # Panics
 /// If the length does not fit, `count` is 0 and the result is not empty, or `count` is above 2^32.
 pub fn arg_extremum<T: Scalar>(x: &[T], [outer, count, inner]: Middle, greatest: bool) -> Vec<u32> {
-    assert_eq!(x.len(), outer * count * inner, "extremum of {:?}", [outer, count, inner]);
+    check([outer, count, inner], x.len(), outer.saturating_mul(inner));
     assert!(count > 0 || outer * inner == 0, "extremum of no elements");
     let better = |x: T, than: T| if greatest { x > than } else { x < than };
     let mut best = vec![0; outer * inner];
@@ -213,6 +220,19 @@ mod tests {
                     assert!(dx.iter().all(|&dx| dx == 0.0));
                 }
             }
+        }
+    }
+
+    #[test]
+    fn extremum_other_lengths_panic() {
+        let panics = |f: &dyn Fn()| std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).is_err();
+        // Each product wraps to the lengths that are given.
+        let half = 1 << 63;
+        for middle in [[2, 3, 2], [half, 2, 2], [2, half, 1], [1 << 32, 1, 1 << 32]] {
+            assert!(panics(&|| extremum(&[0.0_f32; 4], middle, true, &mut [0.0; 4])), "{middle:?}");
+            assert!(panics(&|| extremum::<f32>(&[], middle, true, &mut [])), "{middle:?}");
+            assert!(panics(&|| extremum_grad::<f32>(&[], &[], &[], middle, &mut [])), "{middle:?}");
+            assert!(panics(&|| drop(arg_extremum::<f32>(&[], middle, true))), "{middle:?}");
         }
     }
 }

@@ -22,8 +22,8 @@ impl Windows {
     /// `(image + 2 padding - span) / stride + 1` of them, rounded down, where `span = dilation (kernel - 1) + 1`.
     ///
     /// # Errors
-    /// If a kernel extent, stride or dilation is 0, a window is larger than the padded image, or image, padded image or
-    /// unfolded image have more elements than a buffer can hold; in words.
+    /// If a kernel extent, stride or dilation is 0, a window is larger than the padded image, an extent of that is beyond
+    /// every number, or the image or all its windows have more elements than a buffer can hold; in words.
     pub fn new(
         image: [usize; 2],
         kernel: [usize; 2],
@@ -46,8 +46,8 @@ impl Windows {
             };
             output[axis] = rest / stride[axis] + 1;
         }
-        let [unfolded, image_len] = [checked_len(&[kernel, output].concat()), checked_len(&image)];
-        if unfolded.is_none() || image_len.is_none() {
+        let unfolded = [kernel[0], kernel[1], output[0], output[1]];
+        if checked_len(&unfolded).is_none() || checked_len(&image).is_none() {
             return Err(format!(
                 "{output:?} windows of {kernel:?} elements on an image {image:?} have too many elements"
             ));
@@ -118,7 +118,7 @@ impl Windows {
     fn check(&self, image: usize, unfolded: usize, per_channel: usize) {
         let channels = unfolded / per_channel;
         assert_eq!(channels * per_channel, unfolded, "{unfolded} values for windows {self:?}");
-        assert_eq!(image, channels * self.pixels(), "an image of {image} values for windows {self:?}");
+        assert_eq!(Some(image), channels.checked_mul(self.pixels()), "an image of {image} values for windows {self:?}");
     }
 
     /// Writes the windows of an image `[channels, height, width]` to `out` as the columns of a matrix
@@ -288,12 +288,13 @@ impl Windows {
     /// are equal, the last NaN where there is one. `best` is scratch space for the maxima.
     ///
     /// # Panics
-    /// If a slice has another length, or a window sees no pixel.
+    /// If a slice has another length, a window sees no pixel, or there are more than 2^32 - 1 pixels.
     #[track_caller]
     pub fn arg_maxima<T: Scalar>(&self, plane: &[T], best: &mut [T], out: &mut [u32]) {
         self.check(plane.len(), out.len(), self.count());
         assert_eq!(best.len(), out.len(), "scratch space for the maxima");
         const NONE: u32 = u32::MAX;
+        assert!(plane.len() <= NONE as usize, "places among {} pixels", plane.len());
         out.fill(NONE);
         let step = self.stride[1];
         simd::dispatch(
@@ -439,6 +440,12 @@ mod tests {
             let error = Windows::new(image, kernel, one, padding, dilation).unwrap_err();
             assert!(error.contains(expected), "{image:?} {kernel:?} {padding:?} {dilation:?}: {error}");
         }
+        // One window of one pixel, of an image that no memory holds.
+        let error = Windows::new([1 << 62, 4], one, [usize::MAX; 2], none, one).unwrap_err();
+        assert!(error.contains("too many elements"), "{error}");
+        // Four channels of 2^62 pixels are as many values as none.
+        let w = Windows::new([1 << 62, 1], one, [1 << 62, 1], none, one).unwrap();
+        assert!(std::panic::catch_unwind(|| w.fold(&[1.0; 4], &mut [])).is_err());
         // A stride of any length leads to one window.
         assert_eq!(Windows::new([4, 4], one, [usize::MAX; 2], none, one).unwrap().output(), one);
     }

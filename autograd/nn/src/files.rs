@@ -1,5 +1,6 @@
 //! Files that are whole or untouched.
 
+use std::collections::HashSet;
 use std::io::{Result, Write};
 use std::path::Path;
 
@@ -22,6 +23,13 @@ pub fn write_atomic(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     file.as_file().sync_all()?;
     file.persist(path).map_err(|error| error.error)?;
     Ok(())
+}
+
+/// Whether names can be those of the entries of a safetensors file; the first that cannot.
+pub(crate) fn bad_entry<'a>(names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+    let mut seen = HashSet::new();
+    // What the format calls its metadata.
+    names.into_iter().find(|name| *name == "__metadata__" || !seen.insert(*name))
 }
 
 /// A name from a file as a message repeats it: on one line, and not all of a long one.

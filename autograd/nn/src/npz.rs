@@ -7,7 +7,7 @@ use crate::files::shown;
 use crate::{Params, write_atomic};
 use rawzip::{CompressionMethod, ZipArchive, ZipArchiveWriter};
 use raygrad_tensor::{Scalar, Shape, Tensor};
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
@@ -86,12 +86,10 @@ impl<T: Scalar> Params<T> {
     /// As [`read_npz`](Self::read_npz), or if names or shapes differ from those of this store.
     pub fn load_npz(&mut self, path: impl AsRef<Path>) -> Result<(), NpzError> {
         let path = path.as_ref();
-        let mut arrays: Vec<(String, Option<Tensor<T>>)> =
-            read(path)?.into_iter().map(|(name, value)| (name, Some(value))).collect();
+        let mut arrays: BTreeMap<String, Tensor<T>> = read(path)?.into_iter().collect();
         let mut values = Vec::with_capacity(self.len());
         for (name, value) in self.iter() {
-            let found = arrays.iter_mut().find(|(other, _)| other == name).and_then(|(_, value)| value.take());
-            let Some(found) = found else {
+            let Some(found) = arrays.remove(name) else {
                 return Err(array(path, name, "is missing: the file belongs to another model".into()));
             };
             if found.shape() != value.shape() {
@@ -100,7 +98,7 @@ impl<T: Scalar> Params<T> {
             }
             values.push(found);
         }
-        if let Some((name, _)) = arrays.iter().find(|(_, value)| value.is_some()) {
+        if let Some(name) = arrays.keys().next() {
             return Err(array(path, name, "is not a parameter of this model".into()));
         }
         self.replace(values);

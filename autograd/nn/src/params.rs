@@ -84,6 +84,13 @@ struct Setting {
     lazy: bool,
 }
 
+impl Setting {
+    /// An empty parameter has no rows to move.
+    fn moves_rows<T: Scalar>(&self, value: &Tensor<T>) -> bool {
+        self.lazy && !value.is_empty()
+    }
+}
+
 impl<T: Scalar> Params<T> {
     /// An empty store.
     pub fn new() -> Self {
@@ -235,6 +242,12 @@ impl<T: Scalar> Params<T> {
         self.settings[self.names.place(id)].lazy
     }
 
+    /// Whether optimisers move only rows of a parameter: it is lazy, and not empty.
+    pub(crate) fn moves_rows(&self, id: ParamId) -> bool {
+        let place = self.names.place(id);
+        self.settings[place].moves_rows(&self.values[place])
+    }
+
     /// The factor of a parameter's learning rate.
     ///
     /// # Panics
@@ -264,12 +277,15 @@ impl<T: Scalar> Params<T> {
         assert!((0.0..=1e30).contains(&rate), "a learning rate of {rate:?}; use 0 to 1e30");
         let free = self.settings.iter().filter(|setting| !setting.frozen).count();
         assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
+        // Before anything is moved.
+        for (id, grad) in self.trainable().zip(grads) {
+            assert_eq!(self.get(id).shape(), grad.shape(), "the gradient of `{}` has its shape", self.name(id));
+        }
         let (names, values) = (&self.names.names, self.values.iter_mut());
         let parts = names.iter().zip(values).zip(&self.settings).enumerate();
         let free = parts.filter(|(_, (_, setting))| !setting.frozen);
         let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
-            assert_eq!(value.shape(), grad.shape(), "the gradient of `{name}` has its shape");
-            let lazy = setting.lazy && !value.is_empty();
+            let lazy = setting.moves_rows(value);
             Move { slot, name, value, grad, rate: rate * setting.rate, decay: setting.decay, lazy }
         });
         moves.filter(|part| !part.grad.is_zero())
@@ -370,7 +386,10 @@ impl<T: Scalar> Params<T> {
     /// That another store has parameters of the same names and shapes.
     #[track_caller]
     pub(crate) fn check_fits<U: Scalar>(&self, other: &Params<U>) {
-        assert_eq!(self.names.names, other.names.names, "parameters of the same names");
+        assert!(
+            self.names.names == other.names.names,
+            "two stores whose parameters have other names, or another order"
+        );
         for ((name, value), theirs) in self.iter().zip(&other.values) {
             assert_eq!(value.shape(), theirs.shape(), "two parameters `{name}`");
         }

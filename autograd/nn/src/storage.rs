@@ -1,7 +1,7 @@
 //! Parameters in safetensors files, in full precision or in 16 bits.
 
 use crate::Params;
-use crate::files::shown;
+use crate::files::{bad_entry, shown};
 use half::{bf16, f16};
 use raygrad_tensor::{Scalar, Tensor};
 use safetensors::tensor::{Dtype, SafeTensors, View};
@@ -81,6 +81,9 @@ pub enum ParamsError {
     /// The bytes are not a safetensors file.
     #[error("not a safetensors file: {}", shown(&.0.to_string()))]
     Format(#[from] safetensors::SafeTensorError),
+    /// Two entries of a file would have one name, or that of the format's own.
+    #[error("`{}` cannot be the name of an entry: another one has it, or the format itself", shown(.0))]
+    Name(String),
     /// A parameter of the model is not in the file.
     #[error("`{0}` is missing: the file belongs to a model of another configuration")]
     Missing(String),
@@ -147,13 +150,16 @@ impl<T: Scalar> Params<T> {
     /// The parameters as a safetensors file, with `metadata` and further named bytes. Equal contents give equal bytes.
     ///
     /// # Errors
-    /// If the format cannot hold them.
+    /// If the format cannot hold them, as two of one name, or one called `__metadata__`.
     pub fn to_safetensors(
         &self,
         storage: Storage,
         metadata: &BTreeMap<String, String>,
         blobs: &[(&str, Vec<u8>)],
     ) -> Result<Vec<u8>, ParamsError> {
+        if let Some(name) = bad_entry(self.names().chain(blobs.iter().map(|(name, _)| *name))) {
+            return Err(ParamsError::Name(name.to_owned()));
+        }
         let values = self.iter().map(|(name, value)| (name, Part::Value(storage.that_fits(value.as_slice()), value)));
         let blobs = blobs.iter().map(|(name, bytes)| (*name, Part::Bytes([bytes.len()], bytes)));
         let unordered = metadata.clone().into_iter().collect();
@@ -203,12 +209,9 @@ const METADATA: &[u8] = b"{\"__metadata__\":";
 /// every run; in whatever order, they take the same bytes.
 fn sort_metadata(bytes: &mut [u8], metadata: &BTreeMap<String, String>) -> Result<(), ParamsError> {
     let sorted = serde_json::to_vec(metadata).map_err(safetensors::SafeTensorError::from)?;
-    if let Some((start, rest)) = bytes[size_of::<u64>()..].split_at_mut_checked(METADATA.len())
-        && start == METADATA
-        && let Some(place) = rest.get_mut(..sorted.len())
-    {
-        place.copy_from_slice(&sorted);
-    }
+    let header = bytes[size_of::<u64>()..].split_at_mut_checked(METADATA.len());
+    let place = header.filter(|(start, _)| *start == METADATA).and_then(|(_, rest)| rest.get_mut(..sorted.len()));
+    place.ok_or(safetensors::SafeTensorError::InvalidHeaderLength)?.copy_from_slice(&sorted);
     Ok(())
 }
 
@@ -284,6 +287,24 @@ mod tests {
             assert_eq!(stored_words(&bytes, key).unwrap().as_ref(), Some(value));
         }
         assert_eq!(store().load_safetensors(&bytes).unwrap()["more"], [1]);
+    }
+
+    #[test]
+    fn entries_of_one_name_are_an_error() {
+        let write = |params: &Params<f32>, blobs: &[&str]| {
+            let blobs: Vec<_> = blobs.iter().map(|name| (*name, vec![1])).collect();
+            params.to_safetensors(Storage::Full, &BTreeMap::new(), &blobs).map(drop).map_err(|error| error.to_string())
+        };
+        let expected = |name: &str| {
+            Err(format!("`{name}` cannot be the name of an entry: another one has it, or the format itself"))
+        };
+        assert_eq!(write(&store(), &["a"]), expected("a"));
+        assert_eq!(write(&store(), &["c", "d", "c"]), expected("c"));
+        assert_eq!(write(&store(), &["__metadata__"]), expected("__metadata__"));
+        assert_eq!(write(&store(), &["c", "d"]), Ok(()));
+        let mut params = store();
+        params.add("__metadata__", Tensor::zeros(&[1]));
+        assert_eq!(write(&params, &[]), expected("__metadata__"));
     }
 
     /// Values, and the nearest ones in f16 and in bf16.

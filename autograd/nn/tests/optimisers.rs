@@ -299,7 +299,8 @@ fn small_numbers_of_f64_are_kept() {
 
 fn message(f: impl FnOnce()) -> String {
     let error = catch_unwind(AssertUnwindSafe(f)).expect_err("refused");
-    error.downcast::<String>().map_or_else(|_| "no words".into(), |message| *message)
+    let words = error.downcast_ref::<&str>().map(|words| (*words).to_owned());
+    words.or_else(|| error.downcast_ref::<String>().cloned()).unwrap_or_default()
 }
 
 #[test]
@@ -394,22 +395,111 @@ fn row_share_replaced_sums_panic() {
 }
 
 #[test]
+fn a_panic_leaves_nothing_for_the_next_step() {
+    /// Adds a share to row 0, and panics where it is told to.
+    struct Panics(bool);
+    impl SparseGrad<f32> for Panics {
+        fn shape(&self) -> &[usize] {
+            &[2, 1]
+        }
+        fn add_to(&self, _: &mut Tensor<f32>) {}
+        fn as_rows(&self) -> Option<&dyn RowShare<f32>> {
+            Some(self)
+        }
+    }
+    impl RowShare<f32> for Panics {
+        fn scatter(&self, sums: &mut RowSums<f32>) {
+            sums.add(0, &[1.0]);
+            assert!(!self.0, "half-way");
+        }
+    }
+    let grad = |share: Arc<dyn SparseGrad<f32>>| {
+        let mut grad = Gradient::zero(share.shape());
+        grad.add_sparse(share);
+        [grad]
+    };
+    for (name, make) in optimisers::<f32>() {
+        let run = |panics: bool| {
+            let mut params = Params::<f32>::new();
+            params.add("table", Tensor::ones(&[2, 1]));
+            params.set_lazy(|_| true, true);
+            let mut optimizer = make();
+            for _ in 0..3 {
+                if panics {
+                    let update = || drop(optimizer.update(&mut params, &grad(Arc::new(Panics(true))), 0.1));
+                    assert!(message(update).contains("half-way"));
+                }
+                optimizer.update(&mut params, &grad(Arc::new(Panics(false))), 0.1).check().unwrap();
+            }
+            bits(&params)
+        };
+        assert_eq!(run(true), run(false), "{name}");
+    }
+    // Nor do sums of another size that were refused.
+    let mut params = Params::<f32>::new();
+    params.add("table", Tensor::zeros(&[4, 1]));
+    params.set_lazy(|_| true, true);
+    for (_, make) in optimisers::<f32>() {
+        let mut optimizer = make();
+        let refused = message(|| drop(optimizer.update(&mut params, &grad(Arc::new(Replaced { rows: 5 })), 0.1)));
+        assert!(refused.contains("rows and features of"), "{refused}");
+        let honest = RowGrad::new(&[4, 1], [3].into(), Tensor::ones(&[1, 1]));
+        optimizer.update(&mut params, &grad(Arc::new(honest)), 0.1).check().unwrap();
+    }
+}
+
+#[test]
+fn update_with_a_gradient_of_another_shape_moves_nothing() {
+    for (name, make) in optimisers::<f32>() {
+        let mut params = Params::<f32>::new();
+        params.add("a", Tensor::scalar(1.0));
+        params.add("b", Tensor::zeros(&[2]));
+        let (mut optimizer, before) = (make(), bits(&params));
+        let grads = [Gradient::from(Tensor::scalar(1.0)), Gradient::from(Tensor::ones(&[3]))];
+        let refused = message(|| drop(optimizer.update(&mut params, &grads, 0.1)));
+        assert!(refused.contains("the gradient of `b` has its shape"), "{name}: {refused}");
+        assert_eq!(bits(&params), before, "{name}");
+        assert_eq!(optimizer.state(&params), make().state(&params), "{name}: no step was counted");
+    }
+}
+
+#[test]
+fn sparse_gradient_of_another_shape_panics() {
+    /// Puts another tensor in the place of the one that it is to be added to.
+    struct Other(bool);
+    impl SparseGrad<f32> for Other {
+        fn shape(&self) -> &[usize] {
+            &[4]
+        }
+        fn add_to(&self, dense: &mut Tensor<f32>) {
+            *dense = Tensor::ones(&[2]);
+        }
+        fn is_passing(&self) -> bool {
+            self.0
+        }
+    }
+    let mut grad = Gradient::zero(&[4]);
+    grad.add_sparse(Arc::new(Other(false)));
+    let mut params = Params::<f32>::new();
+    params.add("x", Tensor::zeros(&[4]));
+    let refused = message(|| drop(Sgd::new(SgdConfig::default()).update(&mut params, &[grad], 0.1)));
+    assert!(refused.contains("the shape of a gradient after `SparseGrad::add_to`"), "{refused}");
+}
+
+#[test]
 fn load_state_lazy_and_not_lazy_is_an_error() {
-    for lazy in [false, true] {
+    for (lazy, expected) in [
+        (true, "`table.row_steps` belongs to a lazy parameter, and this one is not: call Params::set_lazy as before"),
+        (
+            false,
+            "`table.step` belongs to a parameter that was not lazy, and this one is: call Params::set_lazy as before",
+        ),
+    ] {
         let (mut params, ids) = model::<f32>(lazy);
-        let mut first = Adam::new(AdamConfig::default());
+        let [mut first, mut second] = [(); 2].map(|()| Adam::new(AdamConfig::default()));
         train(&mut first, &mut params, ids, 0, false).unwrap();
         let state = first.state(&params);
         params.set_lazy(|name| name == "table", !lazy);
-        let (mut second, expected) = match lazy {
-            true => {
-                (Adam::new(AdamConfig::default()), "`table.row_steps` belongs to a lazy parameter, and this one is not")
-            }
-            false => (
-                Adam::new(AdamConfig::default()),
-                "`table.step` belongs to a parameter that was not lazy, and this one is",
-            ),
-        };
         assert_eq!(second.load_state(&params, &state).unwrap_err().to_string(), expected);
         // Nothing has changed: it takes its first step.
         assert_eq!(second.steps(), 0);
@@ -418,6 +508,14 @@ fn load_state_lazy_and_not_lazy_is_an_error() {
         second.load_state(&params, &state).unwrap();
         train(&mut second, &mut params, ids, 1, false).unwrap();
     }
+    // A lazy parameter without elements moves as others do.
+    let mut params = Params::<f32>::new();
+    params.add("empty", Tensor::zeros(&[0, 3]));
+    params.set_lazy(|_| true, true);
+    let mut adam = Adam::new(AdamConfig::default());
+    adam.update(&mut params, &[Gradient::from(Tensor::zeros(&[0, 3]))], 0.1).check().unwrap();
+    let state = adam.state(&params);
+    Adam::new(AdamConfig::default()).load_state(&params, &state).unwrap();
 }
 
 #[test]
@@ -437,7 +535,20 @@ fn state_of_impossible_size_is_an_error() {
         assert!(OptimizerState::<f32>::from_safetensors(&file(dtype, shape, &[])).is_err(), "{dtype} {shape}");
     }
     assert!(OptimizerState::<f32>::from_safetensors(&file("F32", "[0,4294967296]", &[])).is_ok());
-    // Steps that count no further.
+}
+
+#[test]
+fn states_that_cannot_be_stored_are_errors() {
+    let mut state = OptimizerState::<f32>::default();
+    state.tensors.insert("x".into(), Tensor::zeros(&[1]));
+    assert!(state.to_safetensors().is_ok());
+    state.counts.insert("x".into(), vec![1]);
+    let expected = "`x` is there twice, or has a name of the format's own";
+    assert_eq!(state.to_safetensors().unwrap_err().to_string(), expected);
+}
+
+#[test]
+fn steps_count_no_further_than_their_numbers() {
     let mut params = Params::<f32>::new();
     params.add("x", Tensor::scalar(1.0));
     let mut adam = Adam::new(AdamConfig::default());
@@ -448,6 +559,19 @@ fn state_of_impossible_size_is_an_error() {
     adam.load_state(&params, &state).unwrap();
     assert_eq!(adam.update(&mut params, &grads, 0.1).check(), Ok(1));
     assert_eq!(adam.steps(), u64::MAX);
+    let mut ema = Ema::new(&params, 0.5);
+    let mut state = ema.state();
+    state.counts.values_mut().for_each(|counts| counts.fill(u64::MAX));
+    ema.load_state(&state).unwrap();
+    ema.update(&params);
+    assert_eq!(ema.state().counts["steps"], [u64::MAX]);
+    params.set_lazy(|_| true, true);
+    let mut adam = Adam::new(AdamConfig::default());
+    adam.update(&mut params, &grads, 0.1).check().unwrap();
+    let mut state = adam.state(&params);
+    state.counts.values_mut().for_each(|counts| counts.fill(u64::MAX));
+    adam.load_state(&params, &state).unwrap();
+    assert_eq!(adam.update(&mut params, &grads, 0.1).check(), Ok(1));
 }
 
 #[test]

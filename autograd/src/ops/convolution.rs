@@ -323,7 +323,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If the shapes do not fit, the kernel is larger than the padded image, or a stride or dilation is 0.
+    /// If the shapes do not fit, the kernel is larger than the padded image, a stride or dilation is 0, or the padded image
+    /// or the result is too large.
     #[track_caller]
     pub fn conv2d(&self, weight: &Self, config: &Conv2dConfig) -> Self {
         self.tape().apply(Conv2d(*config), &[self, weight])

@@ -137,7 +137,12 @@ impl<T: Scalar> Op<T> for MaxPool2d {
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        self.0.pooled(x[0])
+        let shape = self.0.pooled(x[0])?;
+        // The gradient names places in 32 bits.
+        match plane_len(x[0]) {
+            pixels if u32::try_from(pixels).is_err() => Err(format!("an image of {pixels} pixels is too large")),
+            _ => Ok(shape),
+        }
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
@@ -314,8 +319,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If there are not four axes, the image has no pixels, a window is larger than the padded image, the padding is
-    /// more than half a window, or a stride is 0.
+    /// If there are not four axes, the image has no pixels or 2^32 and more, a window is larger than the padded image, the
+    /// padding is more than half a window, or a stride is 0.
     #[track_caller]
     pub fn max_pool2d(&self, config: &Pool2dConfig) -> Self {
         self.tape().apply(MaxPool2d(*config), &[self])
@@ -376,6 +381,11 @@ mod tests {
             assert!(message.contains("have too many elements"), "{message}");
         }
         let image = tape.constant(Tensor::zeros(&[1, 1, 4, 4]));
+        // No image at all, of pixels that 32 bits cannot count.
+        let many = tape.constant(Tensor::zeros(&[0, 1, 1 << 16, 1 << 16]));
+        let error = tape.try_apply(MaxPool2d(Pool2dConfig::new([1, 1])), &[&many]).unwrap_err().to_string();
+        assert!(error.contains("an image of 4294967296 pixels is too large"), "{error}");
+        assert!(tape.try_apply(AvgPool2d(Pool2dConfig::new([1, 1])), &[&many]).is_ok());
         let op = AvgPool2dInput { config: Pool2dConfig::new([1, 1]), image: [1 << 32, 1 << 32] };
         assert!(tape.try_apply(op, &[&image]).unwrap_err().to_string().contains("too many elements"));
     }

@@ -29,6 +29,12 @@ fn block(n: usize) -> usize {
 /// What an element of a row costs: an exponential, and a few passes over what lies in cache.
 const ROW_ELEMENT: usize = 16;
 
+/// That `len` numbers are whole rows of `n`: what follows the last whole row would keep its old values.
+#[track_caller]
+fn check_whole(len: usize, n: usize) {
+    assert!(len == 0 || (n > 0 && len.is_multiple_of(n)), "{len} numbers are not whole rows of {n}");
+}
+
 /// That `len` numbers are `rows` rows of `n`.
 #[track_caller]
 fn check_rows(len: usize, n: usize, rows: usize) {
@@ -40,12 +46,7 @@ type Kernel<'a, T> = &'a (dyn Fn(&mut [T], usize, &mut [T]) + Sync);
 
 /// Calls `f(scratch, start, rows)` for blocks of rows of `out`, each of `n` elements, which begin at element `start`, with
 /// `scratch` elements of space.
-///
-/// # Panics
-/// If `out` does not consist of whole rows: what follows the last whole row would keep its old values.
-#[track_caller]
 fn blocks<T: Scalar>(out: &mut [T], n: usize, scratch: usize, pool: &Pool<T>, f: Kernel<'_, T>) {
-    assert!(n > 0 && out.len().is_multiple_of(n), "{} numbers are not whole rows of {n}", out.len());
     let (len, work) = (block(n), ROW_ELEMENT * out.len());
     let each = |scratch: &mut Tensor<T>, i: usize, out: &mut [T]| f(scratch.as_mut_slice(), i * len, out);
     chunks(out, len, work, || pool.tensor(&[scratch]), &each);
@@ -154,7 +155,8 @@ mod tests {
     #[track_caller]
     pub(super) fn assert_panics(f: impl FnOnce(), expected: &str) {
         let error = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f)).expect_err("no panic");
-        let message = error.downcast_ref::<String>().map_or("", String::as_str);
+        let words = error.downcast_ref::<String>().map(String::as_str);
+        let message = words.or(error.downcast_ref::<&str>().copied()).unwrap_or_default();
         assert!(message.contains(expected), "{message:?} instead of {expected:?}");
     }
 

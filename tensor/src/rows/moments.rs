@@ -1,6 +1,6 @@
 //! Mean and variance of rows, and layer normalisation.
 
-use super::{ROW_ELEMENT, block, blocks, check_rows, total, totals_of};
+use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, total, totals_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
@@ -59,6 +59,7 @@ pub fn variance_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T]) {
 pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out: &mut [T]) {
     let n = gain.len();
     assert_eq!(bias.len(), n, "gain and bias of one length");
+    check_whole(x.len(), n);
     if x.is_empty() {
         return;
     }
@@ -99,7 +100,7 @@ pub fn layer_norm_rows_grad<T: Scalar>(
     pool: &Pool<T>,
 ) {
     let n = gain.len();
-    assert!(x.is_empty() || (n > 0 && x.len().is_multiple_of(n)), "{} numbers are not whole rows of {n}", x.len());
+    check_whole(x.len(), n);
     assert!(g.len() >= x.len(), "{} gradients of {} numbers", g.len(), x.len());
     let fits = sums.iter().flatten().all(|sum| sum.len() == n);
     assert!(fits, "sums of other lengths than gain and bias, {n}");

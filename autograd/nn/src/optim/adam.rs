@@ -116,9 +116,10 @@ impl<T: Scalar> Adam<T> {
     /// A step with decoupled weight decay.
     #[track_caller]
     fn decayed(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64, decay: f64) -> UpdateReport {
-        self.step = self.step.saturating_add(1);
         let mut report = UpdateReport::default();
-        for part in params.moves(grads, rate) {
+        let moves = params.moves(grads, rate);
+        self.step = self.step.saturating_add(1);
+        for part in moves {
             let decay = decay * part.decay;
             let (name, moved, skipped) = if part.lazy { self.rows(part, decay) } else { self.dense(part, decay) };
             report.count(name, moved, skipped);
@@ -169,8 +170,10 @@ impl<T: Scalar> Adam<T> {
         let Memory::Rows(table) = memory else { panic!("`{}` was not lazy until now", part.name) };
         let (shares, parts) = part.row_parts();
         let (in_parts, sizes) = (parts.is_some(), parts.unwrap_or_else(|| vec![rows]));
-        if !table.sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
-            table.sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
+        // They come back empty, or not at all: what a panic leaves in them is not for the next step.
+        let mut sums = std::mem::take(&mut table.sums);
+        if !sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
+            sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
         }
         // A gradient that does not consist of rows is added up first: then all its rows are there.
         let dense = shares.is_none().then(|| part.dense_grad(&self.pool));
@@ -182,7 +185,8 @@ impl<T: Scalar> Adam<T> {
                 dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
             }
         };
-        let stats = table.adam.step_parts(part.value.as_mut_slice(), &mut table.sums, fill, part.rate, decay);
+        let stats = table.adam.step_parts(part.value.as_mut_slice(), &mut sums, fill, part.rate, decay);
+        table.sums = sums;
         (part.name, stats.touched * features, stats.skipped * features)
     }
 }
@@ -220,11 +224,11 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
         for ((name, value), id) in params.iter().zip(params.ids()) {
             let (shape, config) = (value.shape(), self.config);
             let rows = shape.first().copied().unwrap_or(1);
-            // As `Params::moves` has it: an empty parameter has no rows to move.
-            match params.is_lazy(id) && !value.is_empty() {
-                true => reader.refuse(name, "step", "belongs to a parameter that was not lazy, and this one is")?,
-                false => reader.refuse(name, "row_steps", "belongs to a lazy parameter, and this one is not")?,
-            }
+            let (entry, what) = match params.moves_rows(id) {
+                true => ("step", "belongs to a parameter that was not lazy, and this one is"),
+                false => ("row_steps", "belongs to a lazy parameter, and this one is not"),
+            };
+            reader.refuse(name, entry, &format!("{what}: call Params::set_lazy as before"))?;
             memory.push(if let Some(steps) = reader.counts(name, "row_steps", rows)? {
                 let moments = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
                 let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1));

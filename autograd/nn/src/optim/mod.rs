@@ -73,12 +73,12 @@ impl<'a, T: Scalar> Move<'a, T> {
         (shares, agreed.then_some(first))
     }
 
-    /// The sums of the gradient's rows, which are made at the first step. A gradient that does not consist of rows is
-    /// added up first: then all its rows are there.
-    fn row_sums<'s>(&self, sums: &'s mut Option<RowSums<T>>, pool: &Pool<T>) -> &'s mut RowSums<T> {
+    /// The sums of the gradient's rows, in `sums` if there are some, which are empty. A gradient that does not consist of rows
+    /// is added up first: then all its rows are there.
+    fn row_sums(&self, sums: Option<RowSums<T>>, pool: &Pool<T>) -> RowSums<T> {
         let [rows, features] = self.table();
-        let sums = sums.get_or_insert_with(|| RowSums::new(rows, features));
-        if !self.grad.scatter(sums) {
+        let mut sums = sums.unwrap_or_else(|| RowSums::new(rows, features));
+        if !self.grad.scatter(&mut sums) {
             let dense = self.dense_grad(pool);
             dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
         }
@@ -122,8 +122,9 @@ pub trait Optimizer<T: Scalar> {
     /// Moves the parameters of a store at learning rate `rate`. An implementation goes through [`Params::moves`].
     ///
     /// # Panics
-    /// If there is not one gradient of the same shape for each parameter that is not frozen, the rate is not within 0 to
-    /// 1e30, or a parameter has another size than at its first step.
+    /// If there is not one gradient of the same shape for each parameter that is not frozen or the rate is not within 0 to
+    /// 1e30; then nothing changes. If a parameter has another size than at its first step, or is lazy and was not, or the
+    /// reverse.
     #[track_caller]
     fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport;
 
@@ -131,10 +132,11 @@ pub trait Optimizer<T: Scalar> {
     fn state(&self, params: &Params<T>) -> OptimizerState<T>;
 
     /// Remembers what [`state`](Self::state) gave, in place of everything else: the next steps then are, bit for bit,
-    /// what they would have been.
+    /// what they would have been. Parameters that were [lazy](Params::set_lazy) have to be so before.
     ///
     /// # Errors
-    /// If the state is that of another kind of optimiser or of other parameters; then nothing changes.
+    /// If the state is that of another kind of optimiser or of other parameters, or of a lazy parameter that is not lazy,
+    /// or the reverse; then nothing changes.
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError>;
 }
 

@@ -4,7 +4,7 @@ use super::limits::{flushed, limited, tiny_square};
 use super::settings::or_panic;
 use crate::AdamConfig;
 use raygrad_autograd::RowSums;
-use raygrad_tensor::{Scalar, simd};
+use raygrad_tensor::{Scalar, checked_len, simd};
 use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::ops::Add;
@@ -105,7 +105,7 @@ impl<T: Scalar> RowAdam<T> {
     /// An optimiser of `rows` rows of `features` numbers that has seen nothing.
     ///
     /// # Panics
-    /// If `features` is 0 or [`AdamConfig::check`] finds something.
+    /// If `features` is 0, the table is larger than memory, or [`AdamConfig::check`] finds something.
     #[track_caller]
     pub fn new(config: AdamConfig, rows: usize, features: usize) -> Self {
         or_panic(config.check());
@@ -116,10 +116,12 @@ impl<T: Scalar> RowAdam<T> {
     /// The same constants, shared, and nothing seen, for another range of `rows` rows of `features` numbers.
     ///
     /// # Panics
-    /// If `features` is 0.
+    /// If `features` is 0, or the table is larger than memory.
     #[track_caller]
     pub fn fresh(&self, [rows, features]: [usize; 2]) -> Self {
         assert!(features > 0, "rows without features");
+        // Rows are found by products of these.
+        assert!(checked_len(&[2, rows, features]).is_some(), "a table of {rows} rows of {features} numbers");
         RowAdam { rule: self.rule.clone(), features, moments: Lines::zeros(2 * rows * features), steps: vec![0; rows] }
     }
 
@@ -551,6 +553,12 @@ mod tests {
         }
         // Others of the same size are as good.
         assert_eq!(replace([2, 2]), RowStats { touched: 2, skipped: 0 });
+    }
+
+    #[test]
+    #[should_panic(expected = "a table of 4 rows of 4611686018427387904 numbers")]
+    fn tables_whose_size_wraps_are_refused() {
+        RowAdam::<f32>::new(AdamConfig::default(), 4, 1 << 62);
     }
 
     #[test]

@@ -85,9 +85,11 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
             let Memory { velocity, sums } = slot(&mut self.memory, part.slot);
             let velocity: &mut [T] = if self.config.momentum == 0.0 { &mut [] } else { remember(velocity, &part) };
             let (moved, skipped) = if part.lazy {
-                let sums = part.row_sums(sums, &self.pool);
-                let counts = update.rows(part.value.as_mut_slice(), sums, velocity);
-                sums.clear();
+                // They come back empty, or not at all: what a panic leaves in them is not for the next step.
+                let mut own = part.row_sums(sums.take(), &self.pool);
+                let counts = update.rows(part.value.as_mut_slice(), &own, velocity);
+                own.clear();
+                *sums = Some(own);
                 counts
             } else {
                 let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));

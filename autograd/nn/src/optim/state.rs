@@ -2,8 +2,10 @@
 
 use crate::Params;
 #[cfg(feature = "files")]
-use crate::Storage;
-use raygrad_tensor::{Scalar, Tensor, checked_len};
+use crate::{Storage, files::bad_entry};
+#[cfg(feature = "files")]
+use raygrad_tensor::checked_len;
+use raygrad_tensor::{Scalar, Tensor};
 #[cfg(feature = "files")]
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, BTreeSet};
@@ -79,8 +81,11 @@ impl<T: Scalar> OptimizerState<T> {
     /// The state as a safetensors file: tensors in their own type, counts as `U64`.
     ///
     /// # Errors
-    /// If the format cannot hold it.
+    /// If the format cannot hold it, as an entry that is among the tensors and among the counts.
     pub fn to_safetensors(&self) -> Result<Vec<u8>, StateError> {
+        if let Some(name) = bad_entry(self.tensors.keys().chain(self.counts.keys()).map(String::as_str)) {
+            return Err(StateError::entry(name, "is there twice, or has a name of the format's own"));
+        }
         let mut parts = vec![];
         for (name, value) in &self.tensors {
             let mut bytes = Vec::with_capacity(size_of_val(value.as_slice()));
