@@ -537,7 +537,7 @@ fn bad_places_to_write_are_named() {
     );
     place.fails(
         "render run --out run/config.json/frames",
-        &["run/config.json/frames: `config.json` is a part of the run"],
+        &["run/config.json/frames: `config.json` is a part of a run"],
     );
     place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
     std::fs::create_dir(place.path("folder.gif")).unwrap();

@@ -18,7 +18,7 @@ use super::overwrite::Job;
 use super::photographs::{check_trained, present};
 use super::prepare::convert::{Target, convert, relative};
 use super::prepare::program::Stop;
-use super::run::Run;
+use super::run::{Run, check_output};
 use super::scene::Scene;
 use super::{builtin, interrupt};
 
@@ -73,7 +73,7 @@ impl Kind {
             _ => {
                 let known = "end the name in .json for cameras, .ply, .obj or .glb for the shape, .html for a page, or name a \
                              format with --to";
-                Err(Error::file(out, format!("says by no ending what to export: {known}")))
+                Err(Error::file(out, format!("has no ending that says what to export: {known}")))
             }
         }
     }
@@ -88,7 +88,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if kind != Kind::Shape {
         args.shape.check_absent()?;
     }
-    run.check_output(&args.out)?;
+    check_output(&args.out)?;
     if args.to.is_none() {
         job.check(&args.out)?;
     }

@@ -1,17 +1,17 @@
-//! Files by which a program keeps others out of a folder.
+//! Locks by which a program keeps others out of a folder.
 
 use std::fs::{File, TryLockError};
-use std::io::{ErrorKind, Write};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::{Error, Result};
+use raygrad::nerf::{Error, Result, write_atomic};
 
-use super::output::complain;
+use super::output::{complain, remove};
 
 /// A folder that this program alone writes to, until this is dropped or the program ends, however it does.
 ///
-/// The lock is on a file, and the folder can be moved and made anew with another one. So the file names its owner, and each write
-/// to the folder asks for the [`state`](Self::state) before.
+/// The lock is on a file, and the folder can be moved and made anew with another one. So a second file beside it, which nobody
+/// locks, names the owner, and each write to the folder asks for the [`state`](Self::state) before.
 #[derive(Debug)]
 pub struct Lock {
     path: PathBuf,
@@ -25,10 +25,17 @@ pub struct Lock {
 pub enum State {
     /// The folder is still this program's.
     Kept,
-    /// There is no such file, or no such folder, any more.
+    /// Nothing says whose it is: the folder was removed or moved.
     Gone,
     /// Another program has the folder, or one at the same path.
     Lost,
+}
+
+/// The file that names the owner of a lock.
+pub fn owner_of(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".owner");
+    name.into()
 }
 
 impl Lock {
@@ -45,7 +52,7 @@ impl Lock {
         try_lock: impl Fn(&File) -> std::result::Result<(), TryLockError>,
     ) -> Result<Self> {
         let bad = |e: std::io::Error| Error::file(path, format!("cannot be locked: {e}"));
-        let mut file = File::options().create(true).truncate(false).write(true).open(path).map_err(bad)?;
+        let file = File::options().create(true).truncate(false).write(true).open(path).map_err(bad)?;
         match try_lock(&file) {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Err(busy()),
@@ -55,26 +62,35 @@ impl Lock {
             )),
         }
         let owner = format!("{} {:016x}\n", std::process::id(), rand::random::<u64>());
-        file.write_all(owner.as_bytes()).map_err(bad)?;
-        file.set_len(owner.len() as u64).map_err(bad)?;
+        write_atomic(owner_of(path), owner.as_bytes())?;
         let lock = Lock { path: path.into(), owner, _file: file };
         // The last owner may have removed the file while it was being opened here, and another program made it anew.
         match lock.state() {
-            State::Kept => Ok(lock),
-            State::Gone | State::Lost => Err(busy()),
+            State::Kept if path.exists() => Ok(lock),
+            _ => Err(busy()),
         }
+    }
+
+    /// Whether another program has the lock on a file.
+    pub fn is_taken(path: &Path) -> bool {
+        File::open(path).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
     }
 
     /// What has become of it.
     pub fn state(&self) -> State {
-        match std::fs::read(&self.path) {
+        match std::fs::read(owner_of(&self.path)) {
             Ok(owner) if owner == self.owner.as_bytes() => State::Kept,
             Ok(_) => State::Lost,
             // NotADirectory: a file has taken the folder's place.
             Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => State::Gone,
-            // A lock that others respect when they read, as on Windows, or a disk that fails for a moment.
+            // A disk that fails for a moment.
             Err(_) => State::Kept,
         }
+    }
+
+    /// Gives the folder back, with nothing left of the lock.
+    pub fn remove(self) {
+        remove(&[self.path.clone(), owner_of(&self.path)]);
     }
 }
 
@@ -90,17 +106,49 @@ mod tests {
     fn lock_is_one_programs_until_it_is_dropped() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lock");
-        std::fs::write(&path, "a longer word than that of an owner, of an earlier program").unwrap();
         let first = take(&path).unwrap();
         assert_eq!(first.state(), State::Kept);
         assert!(take(&path).unwrap_err().to_string().ends_with("is busy"));
+        assert!(Lock::is_taken(&path));
         assert_eq!(first.state(), State::Kept, "asking changes nothing");
         drop(first);
-        assert_eq!(take(&path).unwrap().state(), State::Kept);
+        assert!(!Lock::is_taken(&path) && !Lock::is_taken(&folder.path().join("absent")));
+        let second = take(&path).unwrap();
+        assert_eq!(second.state(), State::Kept);
+        second.remove();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]
     fn lock_of_a_folder_that_was_replaced_is_lost() {
+        let folder = tempfile::tempdir().unwrap();
+        let [run, moved] = ["run", "moved"].map(|name| folder.path().join(name));
+        std::fs::create_dir(&run).unwrap();
+        let first = take(&run.join("lock")).unwrap();
+        // Its owner file is that of another program, as in a folder that took its place.
+        let owner = owner_of(&run.join("lock"));
+        let own = std::fs::read(&owner).unwrap();
+        std::fs::write(&owner, "1 0123456789abcdef\n").unwrap();
+        assert_eq!(first.state(), State::Lost);
+        std::fs::write(&owner, own).unwrap();
+        assert_eq!(first.state(), State::Kept);
+        std::fs::remove_file(&owner).unwrap();
+        assert_eq!(first.state(), State::Gone);
+        // What cannot be read for another reason says nothing.
+        std::fs::create_dir(&owner).unwrap();
+        assert_eq!(first.state(), State::Kept);
+        drop(first);
+        std::fs::rename(&run, &moved).unwrap();
+        let first =
+            Lock { path: run.join("lock"), owner: String::new(), _file: File::open(moved.join("lock")).unwrap() };
+        assert_eq!(first.state(), State::Gone);
+        std::fs::write(&run, b"a file").unwrap();
+        assert_eq!(first.state(), State::Gone);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn lock_of_a_moved_folder_is_not_that_of_the_next() {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("run");
         let make = || {
@@ -109,13 +157,10 @@ mod tests {
         };
         let first = make();
         std::fs::rename(&run, folder.path().join("moved")).unwrap();
-        assert_eq!(first.state(), State::Gone);
         let second = make();
         assert_eq!((first.state(), second.state()), (State::Lost, State::Kept));
         std::fs::remove_dir_all(&run).unwrap();
         assert_eq!((first.state(), second.state()), (State::Gone, State::Gone));
-        std::fs::write(&run, b"a file").unwrap();
-        assert_eq!(first.state(), State::Gone);
     }
 
     #[test]
@@ -128,5 +173,19 @@ mod tests {
         assert_eq!(first.state(), State::Kept);
         let second = take();
         assert_eq!((first.state(), second.state()), (State::Lost, State::Kept));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn files_that_links_lead_to_stay_as_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let [notes, path] = ["notes.txt", "lock"].map(|name| folder.path().join(name));
+        std::fs::write(&notes, b"mine").unwrap();
+        std::os::unix::fs::symlink(&notes, &path).unwrap();
+        std::os::unix::fs::symlink(&notes, owner_of(&path)).unwrap();
+        let lock = take(&path).unwrap();
+        assert_eq!((lock.state(), std::fs::read(&notes).unwrap()), (State::Kept, b"mine".to_vec()));
+        lock.remove();
+        assert_eq!(std::fs::read(&notes).unwrap(), b"mine");
     }
 }

@@ -65,7 +65,7 @@ impl Job {
 
 /// The error that a file is in the way.
 pub fn taken(file: &Path) -> Error {
-    Error::file(file, "exists, and another command wrote it: choose another name, or replace it with --overwrite")
+    Error::file(file, "exists, and was not written by this command: choose another output, or add --overwrite")
 }
 
 /// Whether bytes hold a word.
@@ -125,16 +125,35 @@ mod tests {
         assert!(own.check(&path).is_ok());
         std::fs::write(&path, png_with_text(&image.to_png(), own.mark())).unwrap();
         assert_eq!(Image::open(&path).unwrap().data, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]);
+        let mut options = png::DecodeOptions::default();
+        options.set_skip_ancillary_crc_failures(false);
+        let file = std::io::BufReader::new(File::open(&path).unwrap());
+        let reader = png::Decoder::new_with_options(file, options).read_info().unwrap();
+        let [text] = &reader.info().uncompressed_latin1_text[..] else { panic!("one text") };
+        assert_eq!((&text.keyword[..], &text.text[..]), ("Comment", own.mark()));
         assert!(own.check(&path).is_ok() && job(1, false) == own);
         // Another one's, and a photograph.
         let refused = |job: Job| job.check(&path).unwrap_err().to_string();
-        let expected = "exists, and another command wrote it: choose another name, or replace it with --overwrite";
+        let expected = "exists, and was not written by this command: choose another output, or add --overwrite";
         assert_eq!(refused(job(2, false)), format!("{}: {expected}", path.display()));
         assert!(Job::new("export", &json!({ "size": 1 }), false).check(&path).is_err());
         std::fs::write(&path, image.to_png()).unwrap();
         assert!(refused(own.clone()).ends_with(expected));
         assert!(job(2, true).check(&path).is_ok());
         assert!(job(2, true).check(folder.path()).unwrap_err().to_string().ends_with("is a folder, not a file"));
+        // A mark may stand behind the tables of a long video, and not anywhere.
+        for (at, wrote) in [(15 << 20, true), (17 << 20, false)] {
+            let video = [vec![0; at], own.mark().as_bytes().to_vec()].concat();
+            std::fs::write(&path, video).unwrap();
+            assert_eq!(own.wrote(&path), wrote);
+        }
+        // A pipe is not waited for.
+        #[cfg(unix)]
+        {
+            let pipe = folder.path().join("pipe.png");
+            let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+            assert!(made.is_err() || own.check(&pipe).is_err());
+        }
         // Nor is a link that leads nowhere replaced.
         #[cfg(unix)]
         {

@@ -20,7 +20,7 @@ use super::overwrite::{Job, png_with_text};
 use super::precision::{Precision, Renderer};
 use super::prepare::program::Stop;
 use super::progress::{Progress, spoken};
-use super::run::Run;
+use super::run::{Run, check_output};
 use super::scene::Scene;
 use super::{interrupt, parse};
 pub use film::frames_of;
@@ -145,7 +145,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
     let kind = args.kind(&out)?;
     let job = args.job(&run);
-    run.check_output(&out)?;
+    check_output(&out)?;
     if kind != Kind::Folder {
         job.check(&out)?;
     }

@@ -18,16 +18,18 @@ use super::scene::Scene;
 /// Where a run goes that has been given no name; the next ones go to `run-2`, `run-3` ...
 const DEFAULT: &str = "run";
 
-/// The file by which a program keeps others out of a run.
+/// The file by which a program keeps others out of a run, and the one that names it ([`Lock`]).
 const LOCK: &str = "lock";
+const OWNER: &str = "lock.owner";
 
 /// What training writes in a run's folder, and evaluations beside it (`eval-..`).
-const OWN: [&str; 8] = [
+const OWN: [&str; 9] = [
     "config.json",
     "model.safetensors",
     "metrics.jsonl",
     "summary.json",
     LOCK,
+    OWNER,
     "checkpoints",
     "previews",
     "tensorboard",
@@ -126,15 +128,15 @@ impl Run {
         Lock::take(&self.file(LOCK), || Error::file(&self.folder, "is being trained by another raygrad"))
     }
 
-    /// Asked before each write: whether the folder is still the one that was locked. One that was removed is made again, with
-    /// its `config.json`, and this is `true` then.
+    /// Asked before each write: whether the folder is still the one that was locked. One that was removed or moved is made again,
+    /// with its `config.json`, and this is `true` then.
     ///
     /// # Errors
     /// If another program has the folder now, or one at its path, or it cannot be made again.
     pub fn keep(&self, lock: &mut Lock) -> Result<bool> {
         let lost = || {
-            let what = "another raygrad trains here now, in this folder or in one that took its place: training stops and \
-                        writes nothing more; if the run was moved, `raygrad train --resume` continues it where it is";
+            let what = "training stopped: another raygrad has this folder now, or one that took its place. Nothing more was \
+                        written to it. If the run was moved, resume it there with `raygrad train --resume`";
             Error::file(&self.folder, what)
         };
         match lock.state() {
@@ -144,24 +146,11 @@ impl Run {
         }
         make_folder(&self.folder)?;
         *lock = Lock::take(&self.file(LOCK), lost)?;
+        if self.file("config.json").exists() {
+            return Ok(false);
+        }
         self.write()?;
         Ok(true)
-    }
-
-    /// Whether a file or a folder that is to be written is none that the run consists of.
-    ///
-    /// # Errors
-    /// If it is one: the run would be lost.
-    pub fn check_output(&self, out: &Path) -> Result<()> {
-        let folder = |path: &Path| path.canonicalize().ok();
-        let inside = folder(parent(out)).zip(folder(&self.folder)).and_then(|(parent, run)| {
-            let out = parent.join(out.file_name()?);
-            Some(out.strip_prefix(run).ok()?.components().next()?.as_os_str().to_string_lossy().to_ascii_lowercase())
-        });
-        match inside.filter(|name| OWN.contains(&name.as_str()) || name.starts_with("eval-")) {
-            Some(name) => Err(Error::file(out, format!("`{name}` is a part of the run: choose another name"))),
-            None => Ok(()),
-        }
     }
 
     /// Removes what a program that was killed was about to write.
@@ -238,6 +227,26 @@ impl RunConfig {
     }
 }
 
+/// Whether a file or a folder that is to be written is no part of a run, be it this one or another.
+///
+/// # Errors
+/// If it is one: the run would be lost.
+pub fn check_output(out: &Path) -> Result<()> {
+    // Links in it are followed; what does not exist yet is no part of anything.
+    let Ok(folder) = parent(out).canonicalize() else { return Ok(()) };
+    let Some(name) = out.file_name() else { return Ok(()) };
+    let (mut name, mut folder) = (PathBuf::from(name), folder.as_path());
+    loop {
+        let first = name.to_string_lossy().to_ascii_lowercase();
+        let is_own = OWN.contains(&first.as_str()) || first.starts_with("eval-");
+        if is_own && ["config.json", "model.safetensors"].iter().all(|file| folder.join(file).is_file()) {
+            return Err(Error::file(out, format!("`{first}` is a part of a run: choose another name")));
+        }
+        let Some((parent, last)) = folder.parent().zip(folder.file_name()) else { return Ok(()) };
+        (name, folder) = (last.into(), parent);
+    }
+}
+
 /// Writes a value as JSON, replacing the file as a whole.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     let mut text = serde_json::to_string_pretty(value).map_err(|e| Error::file(path, e))?;
@@ -266,12 +275,23 @@ pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
     unreachable!("there is no end to the numbers")
 }
 
+/// The error for a folder that holds a run: one that is being trained would come back when it is removed.
 fn holds_a_run(folder: &Path) -> Error {
-    Error::file(folder, "already holds a run: choose another --out, or remove that folder")
+    match Lock::is_taken(&folder.join(LOCK)) {
+        true => {
+            Error::file(folder, "is being trained by another raygrad: stop that one first, or choose another --out")
+        }
+        false => Error::file(folder, "already holds a run: choose another --out, or remove that folder"),
+    }
 }
 
 fn holds_other_files(folder: &Path) -> Error {
     Error::file(folder, "holds files that are not a run's: choose another folder with --out")
+}
+
+/// Whether a file is all that a program has left that was ended before its run began.
+fn is_nothing(entry: &DirEntry) -> bool {
+    is_unfinished(entry) || [LOCK, OWNER].iter().any(|name| entry.file_name() == *name)
 }
 
 /// Whether a file is one that was about to be written and to get its name.
@@ -293,12 +313,10 @@ fn contents(folder: &Path) -> Result<Contents> {
     }
     match std::fs::read_dir(folder) {
         // What a program that was killed was about to write is nothing.
-        Ok(mut entries) => Ok(
-            match entries.any(|entry| !entry.is_ok_and(|entry| is_unfinished(&entry) || entry.file_name() == LOCK)) {
-                true => Contents::Other,
-                false => Contents::Nothing,
-            },
-        ),
+        Ok(mut entries) => Ok(match entries.any(|entry| !entry.is_ok_and(|entry| is_nothing(&entry))) {
+            true => Contents::Other,
+            false => Contents::Nothing,
+        }),
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(Contents::Nothing),
         Err(e) => Err(Error::file(folder, format!("cannot be used as the run's folder: {e}"))),
     }

@@ -108,12 +108,15 @@ impl<'a> Watch<'a> {
         self.lost
     }
 
-    /// Asked before each write: whether the run's folder is still this program's. One that was removed is made again, and the
-    /// metrics begin anew in it.
+    /// Asked before each write: whether the run's folder is still this program's. One that was removed or moved is made again,
+    /// which is said, and the metrics begin anew in it.
     fn keep(&mut self) -> Result<()> {
         let kept = self.run.keep(&mut self.lock);
-        self.lost |= self.lock.state() == State::Lost;
+        self.lost |= kept.is_err() && self.lock.state() == State::Lost;
         if kept? {
+            let folder = self.run.folder.display();
+            let what = "was removed or moved: training continues in a new folder of that name";
+            self.progress.note(&format!("raygrad: warning: {folder}: {what}"));
             self.metrics = Journal::begin(&self.run.file("metrics.jsonl"), b"")?;
             if self.events.is_some() {
                 self.begin_events(self.logged);
@@ -176,6 +179,7 @@ impl<'a> Watch<'a> {
         }
         self.keep()?;
         checkpoint::save(self.run, trainer)?;
+        self.keep()?;
         self.summarise(&trainer.stats(), None)
     }
 

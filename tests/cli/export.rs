@@ -72,7 +72,7 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
         let path = frame["file_path"].as_str().unwrap();
         assert!(place.path(&format!("colmap/{path}")).is_file(), "{path}");
     }
-    place.fails("export run scene", &["scene: says by no ending what to export", "--to"]);
+    place.fails("export run scene", &["scene: has no ending that says what to export", "--to"]);
     place.fails("export run colmap --to llff", &["colmap: holds files already"]);
     // Other photographs than those that it was trained on have no refined cameras.
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();

@@ -187,6 +187,22 @@ fn nothing_is_written_where_a_model_of_colmap_says_that_photographs_are() {
             "export run --to nerfstudio out --allow-outside",
         ],
     );
+    // Its points lead elsewhere.
+    #[cfg(unix)]
+    {
+        let points = place.path("work/scene/sparse/0/points3D.txt");
+        std::fs::write(place.path("elsewhere/points.txt"), "1 0 0 0 0 0 0 1 1 0\n").unwrap();
+        std::fs::remove_file(&points).unwrap();
+        std::os::unix::fs::symlink(place.path("elsewhere/points.txt"), &points).unwrap();
+        let inside: String = lines.split_inclusive("\n\n").take(3).collect();
+        std::fs::write(place.path("work/scene/sparse/0/images.txt"), inside).unwrap();
+        let convert = "prepare scene --to colmap --out out";
+        refused(&place, convert, &["images.txt: ", "points3D.txt lies outside of", "add --allow-outside to copy it"]);
+        only_there_converted(&place, &format!("{convert} --allow-outside"));
+        std::fs::write(place.path("elsewhere/points.txt"), "").unwrap();
+        // From the folder of the model, as from its scene.
+        only_there_converted(&place, "prepare scene/sparse/0 --to nerfstudio --out out");
+    }
     std::fs::write(place.path("work/scene/sparse/0/images.txt"), lines.replace("0.png", "a\0b.png")).unwrap();
     let output = place.command("prepare scene --to colmap --out out").current_dir(place.path("work")).output().unwrap();
     super::complained("colmap", &output, &["images.txt", "has a control character"]);
@@ -205,9 +221,16 @@ fn refused(place: &Place, arguments: &str, expected: &[&str]) {
 fn private_files_are_not_copied_into_a_dataset() {
     let (place, views) = place();
     std::fs::write(place.path("elsewhere/secret.txt"), "a private key").unwrap();
-    std::fs::write(place.path("work/scene/images/depth.npy"), "a private key").unwrap();
+    for name in ["depth.npy", "secret.png"] {
+        std::fs::write(place.path(&format!("work/scene/images/{name}")), "a private key").unwrap();
+    }
     let png = |name: &str| std::fs::copy(place.path("work/scene/images/0.png"), place.path(name)).unwrap();
     png("work/scene/images/mask.png");
+    // A picture of which all but its beginning is something else.
+    let mut cut = place.bytes("work/scene/images/0.png");
+    let half = cut.len() / 2;
+    cut[half..].fill(b'k');
+    std::fs::write(place.path("work/scene/images/cut.png"), cut).unwrap();
     let point = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
     std::fs::write(place.path("elsewhere/points.ply"), point).unwrap();
     std::fs::write(place.path("work/scene/points.ply"), point).unwrap();
@@ -240,7 +263,11 @@ fn private_files_are_not_copied_into_a_dataset() {
         ("mask_path", "images/link.png"),
     ] {
         write(field, &json!(value));
-        refused(&place, convert, &["transforms.json: `frames[1]`: ", "lies outside of", "add --allow-outside"]);
+        refused(
+            &place,
+            convert,
+            &["transforms.json: `frames[1]`: ", "lies outside of", "add --allow-outside to copy it"],
+        );
         refused(&place, "prepare scene --undistort --out out", &["lies outside of"]);
     }
     write("ply_file_path", &json!("../../elsewhere/points.ply"));
@@ -250,7 +277,10 @@ fn private_files_are_not_copied_into_a_dataset() {
     for (field, value, expected) in [
         ("depth_file_path", secret.as_str(), "secret.txt: "),
         ("depth_file_path", "images/depth.npy", "depth.npy: "),
-        ("mask_path", "images/depth.npy", "depth.npy: "),
+        ("depth_file_path", "images/secret.png", "secret.png: "),
+        ("mask_path", "images/secret.png", "secret.png: "),
+        ("mask_path", "images/cut.png", "cut.png: cannot be decoded"),
+        ("file_path", "images/cut.png", "cut.png: cannot be decoded"),
         ("file_path", "../../elsewhere/secret.txt", "secret.txt: "),
     ] {
         write(field, &json!(value));

@@ -2,7 +2,7 @@
 
 use super::Place;
 use raygrad::nerf::Image;
-use std::process::Output;
+use std::process::Stdio;
 
 const SMALL: &str = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
 
@@ -26,7 +26,7 @@ fn photograph() -> Image {
 fn refuses(place: &Place, arguments: &str, file: &str) {
     let before = place.bytes(file);
     let expected =
-        format!("{file}: exists, and another command wrote it: choose another name, or replace it with --overwrite");
+        format!("{file}: exists, and was not written by this command: choose another output, or add --overwrite");
     place.fails(arguments, &[&expected]);
     assert!(place.bytes(file) == before, "{arguments} has changed {file}");
 }
@@ -96,6 +96,13 @@ fn outputs_of_others_are_refused_and_own_ones_replaced() {
     // What is given to be replaced is.
     place.succeeds(&format!("export run {transforms} --overwrite"));
     assert!(place.json(transforms)["frames"].is_array());
+    // What a picture shows is all that its flags say.
+    for flag in ["--show depth", "--background black", "--skip off", "--precision f64", "--radius 2"] {
+        refuses(&place, &format!("render run {frames} {flag} --out picture.png"), "picture.png");
+    }
+    refuses(&place, &format!("render run {frames} --out deep"), "deep/0000.png");
+    refuses(&place, &format!("render run {frames} --save normals --out deep"), "deep/0000.png");
+    refuses(&place, &format!("render run {frames} --save depth --depth-unit 0.5 --out deep"), "deep/depth/0000.png");
     // A run's own folder of pictures needs no word.
     place.succeeds("render run --frames 1");
     place.succeeds("render run --frames 2 --fov 30");
@@ -104,6 +111,7 @@ fn outputs_of_others_are_refused_and_own_ones_replaced() {
 #[test]
 fn files_of_a_run_are_never_an_output() {
     let place = place(&[]);
+    place.succeeds(&format!("train scene --steps 2 --out other --tensorboard {SMALL}"));
     for (arguments, name) in [
         ("export run run/config.json --overwrite", "config.json"),
         ("export run ./run/../run/summary.json --overwrite", "summary.json"),
@@ -111,9 +119,12 @@ fn files_of_a_run_are_never_an_output() {
         ("render run --frames 1 --out run/previews/a.png --overwrite", "previews"),
         ("render run --frames 1 --out run/eval-test/0.png --overwrite", "eval-test"),
         ("export run run/Lock --to colmap", "lock"),
+        // Nor of another run.
+        ("export run other/config.json --overwrite", "config.json"),
+        ("render run --frames 1 --out other/tensorboard/0 --overwrite", "tensorboard"),
     ] {
         std::fs::create_dir_all(place.path("run/eval-test")).unwrap();
-        place.fails(arguments, &[&format!("`{name}` is a part of the run: choose another name")]);
+        place.fails(arguments, &[&format!("`{name}` is a part of a run: choose another name")]);
     }
     place.succeeds("train --resume run --steps 3");
     // What lies beside them is.
@@ -127,7 +138,10 @@ fn endings_that_are_not_known_are_named() {
     std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
     for out in ["walk.mp4", "cameras", "cameras.txt", "mesh.stl"] {
         let expected = "end the name in .json for cameras, .ply, .obj or .glb for the shape, .html for a page";
-        place.fails(&format!("export run {out}"), &[&format!("{out}: says by no ending what to export: "), expected]);
+        place.fails(
+            &format!("export run {out}"),
+            &[&format!("{out}: has no ending that says what to export: "), expected],
+        );
         place.fails(&format!("export run {out} --overwrite"), &[expected]);
     }
     assert_eq!(place.bytes("walk.mp4"), b"footage");
@@ -145,7 +159,6 @@ fn endings_that_are_not_known_are_named() {
 fn doctor_and_bench_replace_their_own_files_alone() {
     let place = place(&["scene/cameras.png", "results/plot.png"]);
     let run = |arguments: &str| place.command(arguments).output().unwrap();
-    let said = |output: Output| String::from_utf8(output.stderr).unwrap();
     // Warnings of a small capture are no errors of the command.
     for out in ["", "--out again"] {
         for _ in 0..2 {
@@ -159,9 +172,23 @@ fn doctor_and_bench_replace_their_own_files_alone() {
     let bench = "bench --suite quadrature --quick --out";
     place.fails(&format!("{bench} results"), &["results: holds files that are not a benchmark's", "add --overwrite"]);
     assert_eq!(std::fs::read_dir(place.path("results")).unwrap().count(), 1);
+    // One that is killed at its beginning is begun again; one that is there stays until the next has come to its end.
+    let page = || std::fs::read_to_string(place.path("measured/report.html")).unwrap_or_default();
+    let killed = || {
+        let mut child =
+            place.command(&format!("{bench} measured")).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        super::wait(&mut child, || !page().is_empty());
+        child.kill().unwrap();
+        child.wait().unwrap();
+    };
+    killed();
     place.succeeds(&format!("{bench} measured"));
-    place.succeeds(&format!("{bench} measured"));
-    assert_eq!(said(run(&format!("{bench} results --overwrite"))).lines().count(), 1);
+    let whole = page();
+    assert!(whole.contains("<svg"));
+    killed();
+    assert!(page().contains("<svg"));
+    place.succeeds(&format!("{bench} results --overwrite"));
+    assert!(place.path("results/report.html").exists() && place.path("results/plot.png").exists());
 }
 
 #[test]

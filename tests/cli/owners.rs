@@ -1,12 +1,13 @@
 //! Folders that are removed, moved or replaced while a program writes to them.
 
 use super::resume::{SMALL, assert_same};
+use super::signals::{send, stopped};
 use super::{Place, complained, wait};
 use std::process::{Child, Output, Stdio};
 
-/// Begins a long training in `run`, with many checkpoints, and waits for the first of them.
-fn begin(place: &Place) -> Child {
-    let arguments = format!("train scene --budget 1h --checkpoint 0.05s --out run {SMALL}");
+/// Begins a long training in `run`, with many checkpoints, and waits for some of them.
+fn begin(place: &Place, flags: &str) -> Child {
+    let arguments = format!("train scene --budget 1h --checkpoint 0.05s --out run {flags} {SMALL}");
     let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     wait(&mut child, || {
         let found = std::fs::read_dir(place.path("run/checkpoints"));
@@ -15,9 +16,15 @@ fn begin(place: &Place) -> Child {
     child
 }
 
-fn end(child: Child) -> Output {
-    let id = child.id().to_string();
-    let _ = std::process::Command::new("kill").args(["-TERM", &id]).status();
+/// What a program says that ends by itself, which it does within a minute.
+fn ended(mut child: Child) -> Output {
+    let start = std::time::Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if start.elapsed().as_secs() > 60 {
+            child.kill().unwrap();
+        }
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
     child.wait_with_output().unwrap()
 }
 
@@ -27,8 +34,26 @@ fn lost(what: &str, mut output: Output) {
     let said = String::from_utf8(output.stderr).unwrap();
     let last = said.lines().rfind(|line| line.starts_with("raygrad: ")).unwrap_or_default().to_owned();
     output.stderr = (last + "\n").into_bytes();
-    let expected = "run: another raygrad trains here now, in this folder or in one that took its place";
+    let expected = "run: training stopped: another raygrad has this folder now, or one that took its place";
     complained(what, &output, &[expected, "raygrad train --resume"]);
+}
+
+/// All files of a folder with what they hold.
+fn contents(place: &Place, folder: &str) -> Vec<(std::path::PathBuf, Vec<u8>)> {
+    let mut found = vec![];
+    let mut folders = vec![place.path(folder)];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                found.push((path.clone(), std::fs::read(path).unwrap()));
+            }
+        }
+    }
+    found.sort();
+    found
 }
 
 #[test]
@@ -37,25 +62,20 @@ fn a_training_whose_folder_is_replaced_stops() {
     let small = format!("train scene --steps 40 --checkpoint 0.02s {SMALL}");
     place.succeeds(&format!("{small} --out whole"));
     for moves in [false, true] {
-        let first = begin(&place);
-        if moves {
-            std::fs::rename(place.path("run"), place.path("moved")).unwrap();
-        } else {
-            std::fs::remove_dir_all(place.path("run")).unwrap();
-        }
-        // The first one may have made its folder again, and then keeps it.
-        let second = place.command(&format!("{small} --out run")).output().unwrap();
-        if second.status.success() {
-            // It stops by itself.
-            lost("the first training", first.wait_with_output().unwrap());
-            assert_same(&place, "whole", "run");
-            let left = std::fs::read_dir(place.path("run/checkpoints")).unwrap().count();
-            assert_eq!(left, 2, "the checkpoints of one run");
-        } else {
-            let said = String::from_utf8_lossy(&second.stderr).into_owned();
-            assert!(said.contains("by another raygrad") || said.contains("already holds a run"), "{said}");
-            assert_eq!(end(first).status.code(), Some(130));
-        }
+        let first = begin(&place, "");
+        // It does nothing while another one begins and ends.
+        stopped(&first, || {
+            if moves {
+                std::fs::rename(place.path("run"), place.path("moved")).unwrap();
+            } else {
+                std::fs::remove_dir_all(place.path("run")).unwrap();
+            }
+            place.succeeds(&format!("{small} --out run"));
+        });
+        let before = contents(&place, "run");
+        lost("the first training", ended(first));
+        assert_same(&place, "whole", "run");
+        assert!(contents(&place, "run") == before, "a file of the second training has changed");
         if moves {
             place.succeeds("train --resume moved --steps 1");
             std::fs::remove_dir_all(place.path("moved")).unwrap();
@@ -66,27 +86,69 @@ fn a_training_whose_folder_is_replaced_stops() {
 
 #[test]
 fn a_training_whose_run_is_taken_over_stops() {
-    // As where a file system has no locks: another program has written to the lock.
+    // As where a file system has no locks: another program has named itself.
     let place = Place::with_scene();
-    let first = begin(&place);
-    std::fs::write(place.path("run/lock"), "1 0123456789abcdef\n").unwrap();
-    lost("the first training", first.wait_with_output().unwrap());
-    let summary = place.json("run/summary.json");
-    assert_eq!(summary["ended"], serde_json::Value::Null, "nothing more was written");
-    place.succeeds("train --resume run --steps 1");
+    for flags in ["--steps 100000", "--checkpoint 1h"] {
+        let first = begin(&place, "");
+        let before = stopped(&first, || {
+            std::fs::write(place.path("run/lock.owner"), "1 0123456789abcdef\n").unwrap();
+            contents(&place, "run")
+        });
+        lost(flags, ended(first));
+        // A file that was being written in that moment is finished.
+        let written: Vec<_> = contents(&place, "run").into_iter().filter(|file| !before.contains(file)).collect();
+        assert!(written.len() <= 1, "{:?}", written.iter().map(|(path, _)| path).collect::<Vec<_>>());
+        place.succeeds("train --resume run --steps 1");
+        std::fs::remove_dir_all(place.path("run")).unwrap();
+    }
 }
 
 #[test]
 fn a_folder_that_is_removed_is_made_again() {
     let place = Place::with_scene();
-    let mut first = begin(&place);
-    std::fs::remove_dir_all(place.path("run")).unwrap();
-    wait(&mut first, || place.path("run/checkpoints").exists() && place.path("run/metrics.jsonl").exists());
-    place.fails(&format!("train scene --steps 3 --out run {SMALL}"), &["run"]);
-    let output = end(first);
+    let mut first = begin(&place, "--tensorboard");
+    stopped(&first, || std::fs::remove_dir_all(place.path("run")).unwrap());
+    let is_there = |name: &str| place.path(&format!("run/{name}")).exists();
+    wait(&mut first, || ["checkpoints", "metrics.jsonl", "tensorboard", "model.safetensors"].into_iter().all(is_there));
+    // It would come back however often one removes it.
+    place.fails(
+        &format!("train scene --steps 3 --out run {SMALL}"),
+        &["run: is being trained by another raygrad: stop"],
+    );
+    // What is left of its lock alone is no run, and nothing of the run is lost with it.
+    let metrics = || String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
+    wait(&mut first, || metrics().lines().count() > 3);
+    let before = stopped(&first, || {
+        std::fs::remove_file(place.path("run/lock")).unwrap();
+        std::fs::remove_file(place.path("run/lock.owner")).unwrap();
+        metrics()
+    });
+    wait(&mut first, || is_there("lock.owner"));
+    send(&first, "TERM");
+    let output = ended(first);
     assert_eq!(output.status.code(), Some(130), "{output:?}");
-    let metrics = String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
-    assert!(metrics.lines().count() > 0 && place.json("run/summary.json")["ended"] == "interrupted");
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(said.matches("run: was removed or moved: training continues in a new folder of that name").count(), 1);
+    assert!(metrics().starts_with(&before) && place.json("run/summary.json")["ended"] == "interrupted");
+    assert_eq!(std::fs::read_dir(place.path("run/tensorboard")).unwrap().count(), 1);
     place.succeeds("eval run --views 1");
     place.succeeds("train --resume run --steps 1");
+}
+
+#[test]
+fn an_evaluation_whose_folder_is_taken_over_stops() {
+    let place = Place::with_run();
+    for gone in [false, true] {
+        let name = place.path("run/eval-test-f64/unfinished.lock.owner");
+        let _ = std::fs::remove_file(&name);
+        let mut child = place.command("eval run --precision f64").stderr(Stdio::piped()).spawn().unwrap();
+        wait(&mut child, || name.exists());
+        stopped(&child, || match gone {
+            true => std::fs::remove_file(&name).unwrap(),
+            false => std::fs::write(&name, "1 0123456789abcdef\n").unwrap(),
+        });
+        let output = ended(child);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(1) && said.contains("another raygrad evaluates there now"), "{said}");
+    }
 }

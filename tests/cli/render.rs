@@ -434,9 +434,9 @@ fn an_interrupted_film_goes_on_where_it_was() {
     // What would show something else begins again, where it may.
     place.succeeds("render run --frames 2 --size 36x30 --out film.gif --keep-frames");
     let film = "render run --frames 400 --size 36x30 --out film.gif";
-    place.fails(film, &["film.gif: exists, and another command wrote it"]);
+    place.fails(film, &["film.gif: exists, and was not written by this command"]);
     std::fs::remove_file(place.path("film.gif")).unwrap();
-    place.fails(film, &["film.gif.frames/0000.png: exists, and another command wrote it"]);
+    place.fails(film, &["film.gif.frames"]);
     std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
     let kept = |done: usize| {
         let mut record = place.json("film.gif.frames/unfinished.json");
@@ -460,7 +460,7 @@ fn an_interrupted_film_goes_on_where_it_was() {
         // From the same frames each time.
         begun("--overwrite");
         kept(3);
-        place.fails(&format!("{film} {flags}"), &["film.gif.frames/0000.png: exists, and another command wrote it"]);
+        place.fails(&format!("{film} {flags}"), &["film.gif.frames"]);
         let said = begun(&format!("{flags} --overwrite"));
         assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");
     }

@@ -1,13 +1,22 @@
-//! Hang-ups: what was started to survive them does, and all else saves its work.
+//! Signals: what was started to survive a hang-up does, and all else saves its work.
 
 use super::resume::SMALL;
 use super::{Place, wait};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::time::Instant;
 
-fn send(child: &Child, signal: &str) {
+pub fn send(child: &Child, signal: &str) {
     let sent = Command::new("kill").args([format!("-{signal}"), child.id().to_string()]).status().unwrap();
     assert!(sent.success());
+}
+
+/// Does something while a program stands still.
+pub fn stopped<R>(child: &Child, f: impl FnOnce() -> R) -> R {
+    send(child, "STOP");
+    let result = f();
+    send(child, "CONT");
+    result
 }
 
 /// Whether a file has something in it.
@@ -25,39 +34,61 @@ fn ignoring(place: &Place, signals: &str, arguments: &str) -> Command {
 }
 
 #[test]
-fn ignored_hang_ups_end_no_training() {
+fn ignored_signals_end_no_training() {
     let place = Place::with_scene();
-    let mut child = ignoring(&place, "HUP INT", &format!("train scene --steps 150 --out run {SMALL}")).spawn().unwrap();
-    wait(&mut child, || has_content(&place.path("run/metrics.jsonl")));
-    send(&child, "HUP");
-    // As of a job that a script put in the background.
-    send(&child, "INT");
-    assert_eq!(child.wait().unwrap().code(), Some(0));
-    assert_eq!(place.json("run/summary.json")["steps"], 150);
-    // Signals that are not ignored still stop it.
-    let mut child = ignoring(&place, "HUP", &format!("train scene --budget 1h --out other {SMALL}")).spawn().unwrap();
-    wait(&mut child, || has_content(&place.path("other/metrics.jsonl")));
-    send(&child, "HUP");
-    send(&child, "TERM");
-    assert_eq!(child.wait().unwrap().code(), Some(130));
-    assert_eq!(place.json("other/summary.json")["ended"], "interrupted");
+    let train = |run: &str| format!("train scene --budget 1h --out {run} {SMALL}");
+    let length =
+        |run: &str| std::fs::metadata(place.path(&format!("{run}/metrics.jsonl"))).map_or(0, |file| file.len());
+    for (run, ignored, heard) in
+        [("a", "HUP", "TERM"), ("b", "HUP INT", "TERM"), ("c", "TERM", "HUP"), ("d", "INT", "HUP")]
+    {
+        let mut child = ignoring(&place, ignored, &train(run)).spawn().unwrap();
+        wait(&mut child, || length(run) > 0);
+        ignored.split(' ').for_each(|signal| send(&child, signal));
+        // It makes many more steps.
+        let before = length(run);
+        wait(&mut child, || length(run) > before + 2000);
+        // What is not ignored is heard.
+        send(&child, heard);
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{ignored}");
+        assert_eq!(place.json(&format!("{run}/summary.json"))["ended"], "interrupted");
+    }
 }
 
 #[test]
 fn hang_ups_save_the_model_however_often_they_come() {
     let place = Place::with_scene();
-    let mut command = place.command(&format!("train scene --budget 1h --out run {SMALL}"));
-    let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-    wait(&mut child, || has_content(&place.path("run/metrics.jsonl")));
-    let untrained = place.bytes("run/model.safetensors");
-    // A terminal that is closed hangs up for itself, and so does the shell in it.
-    for _ in 0..5 {
-        send(&child, "HUP");
+    for signal in ["HUP", "TERM"] {
+        let mut command = place.command(&format!("train scene --budget 1h --out {signal} {SMALL}"));
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        wait(&mut child, || has_content(&place.path(&format!("{signal}/metrics.jsonl"))));
+        let untrained = place.bytes(&format!("{signal}/model.safetensors"));
+        // A terminal that is closed hangs up for itself, and so does the shell in it.
+        let id = child.id().to_string();
+        while child.try_wait().unwrap().is_none() {
+            let _ = Command::new("kill").args([&format!("-{signal}"), &id]).stderr(Stdio::null()).status();
+        }
+        assert_eq!(child.wait().unwrap().code(), Some(130));
+        assert_eq!(place.json(&format!("{signal}/summary.json"))["ended"], "interrupted");
+        assert_ne!(place.bytes(&format!("{signal}/model.safetensors")), untrained);
+        place.succeeds(&format!("train --resume {signal} --steps 1"));
+    }
+}
+
+#[test]
+fn a_second_ctrl_c_ends_the_program_at_once() {
+    let place = Place::with_run();
+    // One picture of it takes minutes.
+    let render = "render run --frames 2 --size 6000x6000 --out frames";
+    let mut child = place.command(render).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    wait(&mut child, || place.path("frames/unfinished.json").exists());
+    let start = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        assert!(start.elapsed().as_secs() < 60, "it goes on");
+        send(&child, "INT");
     }
     assert_eq!(child.wait().unwrap().code(), Some(130));
-    assert_eq!(place.json("run/summary.json")["ended"], "interrupted");
-    assert_ne!(place.bytes("run/model.safetensors"), untrained);
-    place.succeeds("train --resume run --steps 1");
+    assert!(!place.path("frames/0000.png").exists(), "it finished the picture");
 }
 
 #[test]
@@ -81,7 +112,6 @@ fn programs_that_are_started_inherit_what_is_ignored() {
         assert!(sent.success());
         if survives {
             send(&child, "HUP");
-            assert!(child.try_wait().unwrap().is_none(), "the hang-up ended it");
         }
         std::fs::write(place.path("log.go"), "").unwrap();
         // It fails, as this colmap finds nothing; with the code of an interruption it would have removed its work.

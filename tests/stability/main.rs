@@ -15,6 +15,7 @@ mod color;
 mod composite;
 mod damage;
 mod distortion;
+mod doctor;
 mod encoding;
 mod fuzz;
 mod geometry;

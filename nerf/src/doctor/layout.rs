@@ -194,21 +194,27 @@ fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: 
         let [a, b] = [i, j].map(|i| views[i].camera.pose.matrix3);
         (0..3).map(|axis| a.col(axis).distance_squared(b.col(axis))).sum::<f64>()
     };
-    let alike = |length: f64, [share, angle]: [f64; 2], other: &dyn Fn(usize, usize) -> bool| -> Vec<[String; 2]> {
-        let nearby = Nearby::new(places, share * length);
-        let of = |i: usize| nearby.of(i).find(|&j| other(i, j) && turned(i, j) <= 2.0 * angle * angle);
-        let pairs = (0..views.len()).filter_map(|i| Some([i, of(i)?]));
-        pairs.map(|pair| pair.map(|i| views[i].name.clone())).collect()
+    // Of each photograph that is trained on, or held out, one that is trained on, or held out, and has its pose.
+    let alike = |of: bool, among: bool, length: f64, [share, angle]: [f64; 2]| -> Vec<[usize; 2]> {
+        let nearby = Nearby::new(places, |i| is_trained(i) == among, share * length);
+        let is_other = |i: usize, j: usize| of != among || j < i;
+        let find = |i: usize| nearby.of(i).find(|&j| is_other(i, j) && turned(i, j) <= 2.0 * angle * angle);
+        (0..views.len()).filter(|i| is_trained(*i) == of).filter_map(|i| Some([i, find(i)?])).collect()
     };
+    let named = |pairs: Vec<[usize; 2]>| -> Vec<[String; 2]> {
+        pairs.into_iter().map(|pair| pair.map(|i| views[i].name.clone())).collect()
+    };
+    let mut duplicates = [true, false].map(|trained| alike(trained, trained, size, SAME)).concat();
+    duplicates.sort_unstable();
     findings.alike(
         Kind::DuplicatePoses,
         Warning,
-        alike(size, SAME, &|i, j| j < i && is_trained(i) == is_trained(j)),
+        named(duplicates),
         |count| format!("the pose of {count} is exactly that of another"),
         "Two photographs are hardly ever taken from the same place: if the images differ, one of the poses is wrong; leave it \
          out.",
     );
-    leak(alike(distance, NEARLY, &|i, j| !is_trained(i) && is_trained(j)), findings);
+    leak(named(alike(false, true, distance, NEARLY)), findings);
 }
 
 /// The finding that these photographs are trained and tested on.
@@ -234,7 +240,7 @@ fn far_cameras(views: &[&View], places: &[DVec3], size: f64, findings: &mut Find
         others.map(|(_, other)| other.distance(places[i])).fold(f64::INFINITY, f64::min)
     };
     let gap = median(evenly_spaced((0..places.len()).collect(), ASKED).into_iter().map(nearest));
-    let nearby = Nearby::new(places, (8.0 * gap).max(ONE_PLACE * size));
+    let nearby = Nearby::new(places, |_| true, (8.0 * gap).max(ONE_PLACE * size));
     let far = |i: &usize| places[*i].distance(middle) > 4.0 * usual && nearby.of(*i).all(|j| j == *i);
     let names = (0..views.len()).filter(far).map(|i| views[i].name.clone()).collect();
     findings.about(

@@ -11,21 +11,21 @@ pub(super) struct Nearby<'a> {
     cells: HashMap<[i64; 3], Vec<usize>>,
 }
 
-/// The most places that are looked at for one: more of them are in one place, and say no more.
+/// The most places that are looked at for one: where more of them are in one place, it is most likely to be among them.
 const LOOKED_AT: usize = 500;
 
 impl<'a> Nearby<'a> {
-    /// Sorts places into cells of side `radius`, which is positive.
-    pub fn new(places: &'a [DVec3], radius: f64) -> Self {
+    /// Sorts those of the places that are `wanted` into cells of side `radius`, which is positive.
+    pub fn new(places: &'a [DVec3], wanted: impl Fn(usize) -> bool, radius: f64) -> Self {
         let mut cells: HashMap<_, Vec<usize>> = HashMap::new();
-        for (i, place) in places.iter().enumerate() {
+        for (i, place) in places.iter().enumerate().filter(|(i, _)| wanted(*i)) {
             cells.entry(cell(*place, radius)).or_default().push(i);
         }
         Nearby { places, radius, cells }
     }
 
-    /// The numbers of the places that are at most `radius` from place `i`, itself among them, in no order in particular; where
-    /// very many lie around it, some of them.
+    /// The numbers of the wanted places that are at most `radius` from place `i`, itself among them, in no order in particular;
+    /// where very many lie around it, the first of them.
     pub fn of(&self, i: usize) -> impl Iterator<Item = usize> {
         let (place, [x, y, z]) = (self.places[i], cell(self.places[i], self.radius));
         let steps = |at: i64| [at, at.saturating_sub(1), at.saturating_add(1)];
@@ -56,11 +56,11 @@ mod tests {
         // On the borders of cells, and at the same place.
         places.extend([DVec3::ZERO, DVec3::X, -DVec3::X, DVec3::splat(0.5), DVec3::splat(0.5)]);
         for radius in [0.1, 0.5, 1.0] {
-            let nearby = Nearby::new(&places, radius);
+            let nearby = Nearby::new(&places, |i| i % 3 != 1, radius);
             for i in 0..places.len() {
                 let mut found: Vec<usize> = nearby.of(i).collect();
                 found.sort_unstable();
-                let near = |j: &usize| places[*j].distance(places[i]) <= radius;
+                let near = |j: &usize| *j % 3 != 1 && places[*j].distance(places[i]) <= radius;
                 assert_eq!(found, (0..places.len()).filter(near).collect::<Vec<_>>(), "{i} {radius}");
             }
         }
@@ -69,7 +69,7 @@ mod tests {
     #[test]
     fn nearby_many_in_one_place_are_not_all_looked_at() {
         let places = [vec![DVec3::ONE; 100_000], vec![DVec3::splat(1e300), DVec3::splat(-1e300)]].concat();
-        let nearby = Nearby::new(&places, 1e-6);
+        let nearby = Nearby::new(&places, |_| true, 1e-6);
         assert!((0..places.len()).all(|i| (1..=LOOKED_AT).contains(&nearby.of(i).count())));
     }
 }

@@ -221,3 +221,60 @@ fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
         },
     );
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Camera;
+    use glam::{DAffine3, DVec3};
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64Mcg;
+
+    #[test]
+    fn residuals_are_from_the_median_of_the_nearest() {
+        let mut rng = Pcg64Mcg::seed_from_u64(5);
+        for count in [3, 4, 9, 40, 2500] {
+            let mut number = || rng.random::<f64>();
+            let views: Vec<View> = (0..count)
+                .map(|i| {
+                    let pose = Camera::look_at(DVec3::new(number(), number(), 1.0 + number()), DVec3::ZERO, DVec3::Z);
+                    let camera = Camera::from_angle(8, 8, 0.7, pose);
+                    let name = i.to_string();
+                    let field = name.clone();
+                    let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
+                    View { name, field, image, camera, split, mask, depth, sharpness, bounds }
+                })
+                .collect();
+            let looks: Vec<Look> = (0..count)
+                .map(|i| Look {
+                    transparent: None,
+                    hash: 0,
+                    sharpness: (i % 5 != 2).then(&mut number),
+                    luminance: None,
+                    balance: [0.0; 2],
+                    used: None,
+                    picture: None,
+                })
+                .collect();
+            let seen: Vec<Seen<'_>> = views.iter().zip(&looks).map(|(view, look)| Seen { view, look }).collect();
+            let pose = |i: usize| -> DAffine3 { views[i].camera.pose };
+            let gap = |i: usize, j: usize| pose(i).translation.distance(pose(j).translation);
+            let usual = median((0..count).map(|i| gap(i, 0)));
+            let found = residuals(&seen, |look| look.sharpness);
+            for i in (0..count).step_by(count.div_ceil(60)) {
+                // All that stand not too far away in the file, in order.
+                let mut others: Vec<(f64, f64)> = (0..count)
+                    .filter(|j| *j != i && i.saturating_sub(AROUND) <= *j && *j < i + AROUND)
+                    .filter_map(|j| {
+                        let angle = pose(i).matrix3.z_axis.angle_between(pose(j).matrix3.z_axis);
+                        Some((gap(i, j) / usual + angle, looks[j].sharpness?))
+                    })
+                    .collect();
+                others.sort_by(|a, b| a.0.total_cmp(&b.0));
+                let nearest = others.iter().take(6).map(|(_, value)| *value);
+                let expected = looks[i].sharpness.filter(|_| others.len() >= 3).map(|own| own - median(nearest));
+                assert_eq!(found[i], expected, "{i} of {count}");
+            }
+        }
+    }
+}

@@ -80,7 +80,9 @@ pub fn run(args: &Args) -> Result<()> {
     check_folder(&args.out, &page, &job)?;
     make_folder(&args.out)?;
     // From now on the folder is known as that of a benchmark, also if this one does not get to its end.
-    report::save(&page, &[], args.quick, job.mark())?;
+    if !job.wrote(&page) {
+        report::save(&page, &[], args.quick, job.mark())?;
+    }
     let wanted = |suite| args.suite == suite || args.suite == Suite::All;
     let mut sections = vec![];
     if wanted(Suite::Quadrature) {

@@ -214,7 +214,7 @@ pub fn run(args: &Args) -> Result<()> {
         std::fs::rename(from, &to).map_err(|e| Error::file(&to, format!("cannot be written: {e}")))?;
     }
     let _ = std::fs::remove_dir(&unfinished);
-    let _ = std::fs::remove_file(pictures.join(LOCK));
+    lock.remove();
     // Pictures of an evaluation of other photographs under the same name would belong to no result.
     remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
     let index = pictures.join("index.html");

@@ -137,7 +137,7 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
 
 /// Whether all files of a capture lie in its folder, wherever links lead.
 fn check_inside(capture: &Capture) -> Result<()> {
-    let root = Root::of_capture(&capture.folder)?;
+    let root = Root::of_capture(capture)?;
     for view in &capture.views {
         let depth = view.depth.as_ref().map(|(path, _)| path);
         for path in [view.image.as_ref(), view.mask.as_ref(), depth].into_iter().flatten() {

@@ -69,7 +69,7 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     };
     let to = place.make("sparse")?.join("0");
     std::fs::rename(&folder, &to).map_err(|e| Error::file(&to, format!("cannot be created: {e}")))?;
-    place.remove(FOLDER)?;
+    place.remove(FOLDER);
     let registered = capture.views.len();
     Ok(Found { registered, lost: lost(names, &capture), models: count })
 }

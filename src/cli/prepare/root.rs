@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use raygrad::nerf::dataset::{Capture, Format};
 use raygrad::nerf::{Error, Result};
 
 /// A folder whose files may be copied into a dataset that people share.
@@ -13,13 +14,11 @@ impl Root {
         resolved(folder).map(Root).map_err(|what| Error::file(folder, what))
     }
 
-    /// The folder of a capture: of `scene/sparse/0` and of `scene/sparse`, as COLMAP's models are called, it is `scene`.
-    pub fn of_capture(folder: &Path) -> Result<Self> {
-        let Root(whole) = Self::new(folder)?;
-        let scene = ["sparse/0", "sparse"].iter().find_map(|model| {
-            let parts = Path::new(model).components().count();
-            if whole.ends_with(model) { whole.ancestors().nth(parts) } else { None }
-        });
+    /// The folder of a capture. Of a model of COLMAP in `scene/sparse/0` or in `scene/sparse`, it is `scene`, which holds the images.
+    pub fn of_capture(capture: &Capture) -> Result<Self> {
+        let Root(whole) = Self::new(&capture.folder)?;
+        let sparse = whole.ancestors().take(2).find(|folder| folder.ends_with("sparse"));
+        let scene = sparse.and_then(Path::parent).filter(|_| capture.format == Format::Colmap);
         Ok(Root(scene.unwrap_or(&whole).to_owned()))
     }
 
@@ -29,7 +28,7 @@ impl Root {
             return Ok(());
         }
         let (file, root) = (file.display(), self.0.display());
-        Err(format!("{file} lies outside of {root}, and would be copied: add --allow-outside if it may be"))
+        Err(format!("{file} lies outside of {root}: add --allow-outside to copy it"))
     }
 }
 
@@ -59,8 +58,22 @@ mod tests {
         symlink(path("scene"), path("named")).unwrap();
         let inside = ["scene/a.png", "scene/within.png", "named/a.png", "scene2/../scene/a.png"];
         let outside = ["c.png", "scene/link.png", "scene/folder/b.png", "scene/../scene2/b.png", "named/link.png"];
+        let of = |folder: &str, format: Format| {
+            let (folder, file) = (path(folder), path("cameras"));
+            let (views, points, applied) = (vec![], vec![], Default::default());
+            Root::of_capture(&Capture {
+                folder,
+                file,
+                format,
+                views,
+                points,
+                points_file: None,
+                aabb_scale: None,
+                applied,
+            })
+        };
         for root in ["scene", "named", "scene/sparse/0", "scene/sparse"] {
-            let root = Root::of_capture(&path(root)).unwrap();
+            let root = of(root, Format::Colmap).unwrap();
             assert!(inside.iter().all(|name| root.check(&path(name)).is_ok()));
             for name in outside {
                 let message = root.check(&path(name)).unwrap_err();
@@ -70,7 +83,9 @@ mod tests {
         }
         // Another folder is not a part for the beginning of its name.
         assert!(Root::new(&path("scene")).unwrap().check(&path("scene2/b.png")).is_err());
-        assert!(Root::new(&path("scene/sparse/0")).unwrap().check(&path("scene/a.png")).is_err());
-        assert!(Root::new(&path("absent")).is_err());
+        // Only a model of COLMAP belongs to the folder above, and that by its name.
+        assert!(of("scene/sparse", Format::Transforms).unwrap().check(&path("scene/a.png")).is_err());
+        assert!(of("scene2", Format::Colmap).unwrap().check(&path("c.png")).is_err());
+        assert!(of("absent", Format::Colmap).is_err());
     }
 }

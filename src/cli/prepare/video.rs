@@ -52,7 +52,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
         return Err(Error::file(video, "has no frames: ffmpeg has written none").into());
     }
     let kept = keep_sharp(&candidates, count, &place.make("images")?, progress)?;
-    place.remove(FOLDER)?;
+    place.remove(FOLDER);
     Ok(kept)
 }
 

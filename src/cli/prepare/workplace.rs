@@ -1,9 +1,12 @@
 //! A folder that is there as a whole or not at all.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result};
 use tempfile::TempDir;
+
+use crate::cli::output::complain;
 
 /// A temporary folder on the disk of the folder that is to be. Dropped before it is [finished](Self::finish), nothing is left
 /// of it.
@@ -19,11 +22,11 @@ impl Workplace {
     /// link's target, or all that is writable there.
     pub fn new(out: &Path) -> Result<Self> {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be created: {e}"));
-        let is_inside = match std::fs::read_dir(out).map(|mut entries| entries.next().is_some()) {
-            Ok(true) => {
+        let is_inside = match others(out) {
+            Ok(others) if !others.is_empty() => {
                 return Err(Error::file(out, "holds files already: choose another --out, or remove that folder"));
             }
-            Ok(false) => true,
+            Ok(_) => true,
             Err(e) if out.is_dir() => return Err(Error::file(out, format!("cannot be read: {e}"))),
             Err(_) if out.exists() => return Err(Error::file(out, "is not a folder")),
             Err(_) if out.is_symlink() => {
@@ -38,7 +41,7 @@ impl Workplace {
         let folder = if is_inside { &absolute } else { absolute.parent().unwrap_or(&absolute) };
         std::fs::create_dir_all(folder).map_err(bad)?;
         let mut builder = tempfile::Builder::new();
-        let prefix = format!(".{}-", name.to_string_lossy());
+        let prefix = format!(".{}{PREFIX}", name.to_string_lossy());
         // Temporary folders are private by default; this one becomes an ordinary one, as far as the umask allows.
         #[cfg(unix)]
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
@@ -58,11 +61,12 @@ impl Workplace {
         Ok(folder)
     }
 
-    /// Removes a file or a folder in it that has done its work.
-    pub fn remove(&self, name: &str) -> Result<()> {
+    /// Removes a folder in it that has done its work. What cannot be removed is said, and stays: the work is worth more.
+    pub fn remove(&self, name: &str) {
         let path = self.folder().join(name);
-        let removed = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
-        removed.map_err(|e| Error::file(&path, format!("cannot be removed: {e}")))
+        if let Err(e) = std::fs::remove_dir_all(&path) {
+            complain(&format!("warning: {}: cannot be removed: {e}", path.display()));
+        }
     }
 
     /// Puts the folder where it is to be.
@@ -76,23 +80,33 @@ impl Workplace {
         let moved = if is_inside { move_up(&done, &out) } else { std::fs::rename(&done, &out) };
         moved.map_err(|e| {
             let done = done.display();
-            Error::file(
-                &out,
-                format!("cannot be written: {e}; the finished work is kept in {done}: move it from there"),
-            )
+            Error::file(&out, format!("cannot be written: {e}; the work is finished and kept: move it from {done}"))
         })
     }
 }
 
+/// What follows the name of a folder in that of its temporary one.
+const PREFIX: &str = "-unfinished-";
+/// What empty folders hold on some systems.
+const NOTHING: [&str; 2] = ["lost+found", ".DS_Store"];
+
+/// What a folder holds but for temporary ones, such as that of a program that was killed.
+fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
+    let names = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name()));
+    let is_other = |name: &OsString| {
+        let name = name.to_string_lossy();
+        !(NOTHING.contains(&&*name) || name.starts_with('.') && name.contains(PREFIX))
+    };
+    Ok(names.collect::<std::io::Result<Vec<_>>>()?.into_iter().filter(is_other).collect())
+}
+
 /// Moves all that is in a folder to the one that holds it and nothing else.
 fn move_up(from: &Path, to: &Path) -> std::io::Result<()> {
-    let names = |folder| -> std::io::Result<Vec<_>> {
-        std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name())).collect()
-    };
-    if names(to)?.iter().any(|name| Some(name.as_os_str()) != from.file_name()) {
+    if !others(to)?.is_empty() {
         return Err(std::io::Error::other("it holds files by now"));
     }
-    for name in names(from)? {
+    for entry in std::fs::read_dir(from)? {
+        let name = entry?.file_name();
         std::fs::rename(from.join(&name), to.join(&name))?;
     }
     std::fs::remove_dir(from)
@@ -120,8 +134,8 @@ mod tests {
     /// The folder that an error says the work is kept in.
     fn kept(error: &Error) -> PathBuf {
         let message = error.to_string();
-        let (_, rest) = message.split_once("is kept in ").unwrap_or_else(|| panic!("{message}"));
-        rest.strip_suffix(": move it from there").unwrap().into()
+        let (_, kept) = message.split_once("the work is finished and kept: move it from ").unwrap();
+        kept.into()
     }
 
     #[test]
@@ -135,6 +149,20 @@ mod tests {
         }
         assert_eq!(names(folder.path()), ["a", "empty"]);
         assert_eq!(names(&folder.path().join("a")), ["new"]);
+        // What cannot be removed keeps nobody from finishing.
+        let place = filled(&folder.path().join("finished"));
+        place.remove("absent");
+        place.remove("images");
+        place.finish().unwrap();
+        assert!(names(&folder.path().join("finished")).is_empty());
+        fs::remove_dir(folder.path().join("finished")).unwrap();
+        // A folder is empty that holds what its system has put there, or a killed program.
+        fs::remove_dir_all(&empty).unwrap();
+        fs::create_dir_all(empty.join("lost+found")).unwrap();
+        fs::create_dir_all(empty.join(".empty-unfinished-abc")).unwrap();
+        let other = filled(&empty);
+        filled(&empty).finish().unwrap();
+        assert_eq!(fs::read(kept(&other.finish().unwrap_err()).join("images/0.png")).unwrap(), b"work");
         // A workplace that is dropped unfinished leaves nothing.
         let gone = folder.path().join("gone");
         drop(filled(&gone));

@@ -176,3 +176,30 @@ pub fn frames_of(film: &Path) -> PathBuf {
     name.push(".frames");
     name.into()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::Value;
+
+    #[test]
+    fn a_file_that_came_meanwhile_stays() {
+        let place = tempfile::tempdir().unwrap();
+        let (folder, out) = (place.path(), place.path().join("walk.gif"));
+        Image::new(4, 3, 3).save_png(folder.join(numbered(0, DIGITS))).unwrap();
+        let write = |film: Film, overwrites: bool| {
+            let job = Job::new("render", &Value::Null, overwrites);
+            film.write(&Reel { folder, count: 1, size: [4, 3], fps: 10.0, job: &job }, &out)
+        };
+        for film in [Film::Gif, Film::Apng] {
+            std::fs::write(&out, b"footage").unwrap();
+            let Err(Stop::Failed(error)) = write(film, false) else { panic!("{film:?} is written") };
+            assert!(error.to_string().contains("walk.gif: exists, and was not written by this command"), "{error}");
+            assert_eq!(std::fs::read(&out).unwrap(), b"footage");
+            write(film, true).unwrap();
+            // Its own is replaced.
+            write(film, false).unwrap();
+        }
+        assert_eq!(std::fs::read_dir(folder).unwrap().count(), 2, "nothing is left beside it");
+    }
+}

@@ -7,7 +7,7 @@ use raygrad::nerf::dataset::scene::test_cameras;
 use raygrad::nerf::dataset::{Capture, Split, evenly_spaced};
 use raygrad::nerf::glam::DAffine3;
 use raygrad::nerf::{Camera, Error, Extent, Model, Result};
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::path_file::{self, Motion};
 use crate::cli::cameras::{Viewpoint, fitted};
@@ -71,7 +71,13 @@ pub struct FlightArgs {
     /// From the coordinates of a camera path's file to those of the capture: nerfstudio's dataparser_transforms.json,
     /// or for instant-ngp the transforms.json with a scale and an offset
     #[arg(long, value_name = "FILE")]
+    #[serde(serialize_with = "lossy")]
     path_transform: Option<PathBuf>,
+}
+
+/// A path that may not be Unicode.
+fn lossy<S: Serializer>(path: &Option<PathBuf>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    path.as_ref().map(|path| path.to_string_lossy()).serialize(serializer)
 }
 
 /// Where the camera goes.

@@ -49,7 +49,7 @@ impl Frames {
     /// # Errors
     /// If another job has written one of them, the folder cannot be written, or another program writes frames there.
     pub fn new(folder: PathBuf, of: Value, job: &Job, count: usize, save: &[Layer]) -> Result<Self> {
-        check(&folder, record(&folder).as_ref(), job, count, save)?;
+        check(&folder, record(&folder).as_ref(), &of, job, count, save)?;
         make_folder(&folder)?;
         let lock = Lock::take(&folder.join(LOCK), || Error::file(&folder, "is being rendered to by another raygrad"))?;
         let left = record(&folder);
@@ -83,6 +83,8 @@ impl Frames {
     /// Writes the next frame: what is saved beside it, and last the picture.
     pub fn push(&mut self, picture: &[u8], layers: &[(Layer, Vec<u8>)]) -> Result<()> {
         let path = self.path(self.record.done);
+        // Somebody may have put a file there meanwhile.
+        self.job.check(&path)?;
         for (layer, bytes) in layers {
             let file = beside(&self.folder, self.record.done, *layer);
             let folder = parent(&file);
@@ -100,8 +102,8 @@ impl Frames {
     fn check_lock(&self) -> Result<()> {
         let what = match self.lock.state() {
             State::Kept => return Ok(()),
-            State::Gone => "was removed while frames were written to it",
-            State::Lost => "another raygrad writes frames here now",
+            State::Gone => "was removed or moved while frames were written to it: the same command begins again",
+            State::Lost => "another raygrad writes frames here now: this one has stopped",
         };
         Err(Error::file(&self.folder, what))
     }
@@ -111,7 +113,8 @@ impl Frames {
         if self.check_lock().is_err() {
             return;
         }
-        remove(&[RECORD, LOCK].map(|name| self.folder.join(name)));
+        remove(&[self.folder.join(RECORD)]);
+        self.lock.remove();
     }
 
     /// Removes all frames, and the folder unless there is something else in it. If pictures were there before that somebody may
@@ -125,7 +128,8 @@ impl Frames {
             return self.keep();
         }
         remove(&other_numbered(&self.folder, DIGITS, &[]));
-        remove(&[RECORD, LOCK].map(|name| self.folder.join(name)));
+        remove(&[self.folder.join(RECORD)]);
+        self.lock.remove();
         if let Err(e) = std::fs::remove_dir(&self.folder) {
             complain(&format!("{}: cannot be removed: {e}", self.folder.display()));
         }
@@ -153,17 +157,23 @@ fn beside(folder: &Path, frame: usize, layer: Layer) -> PathBuf {
 }
 
 /// Whether a job may write so many frames to a folder: those that are there, and what lies beside them, are its own.
-fn check(folder: &Path, left: Option<&Record>, job: &Job, count: usize, save: &[Layer]) -> Result<()> {
-    if job.overwrites() || left.is_some_and(|left| left.job == job.mark()) {
+fn check(folder: &Path, left: Option<&Record>, of: &Value, job: &Job, count: usize, save: &[Layer]) -> Result<()> {
+    // Of the same, too, where a run was moved meanwhile.
+    if job.overwrites() || left.is_some_and(|left| left.job == job.mark() || left.of == *of) {
         return Ok(());
     }
     for frame in 0..count {
         let picture = folder.join(numbered(frame, DIGITS));
         let files = save.iter().map(|layer| beside(folder, frame, *layer)).chain([picture.clone()]);
         let there: Vec<PathBuf> = files.filter(|file| file.symlink_metadata().is_ok()).collect();
-        if let Some(file) = there.first().filter(|_| !job.wrote(&picture)) {
-            return Err(taken(file));
-        }
+        let Some(file) = there.first().filter(|_| !job.wrote(&picture)) else { continue };
+        return Err(match left {
+            Some(_) => Error::file(
+                folder,
+                "holds unfinished frames of another command: repeat that one to finish them, or add --overwrite",
+            ),
+            None => taken(file),
+        });
     }
     Ok(())
 }
@@ -250,17 +260,18 @@ mod tests {
     fn frames_of_others_are_not_replaced() {
         let place = tempfile::tempdir().unwrap();
         let folder = place.path();
-        let new = |job: &Job, save: &[Layer]| Frames::new(folder.into(), json!({}), job, 3, save).map(drop);
+        let of = |job: &Job| json!({ "job": job.mark() });
+        let new = |job: &Job, save: &[Layer]| Frames::new(folder.into(), of(job), job, 3, save).map(drop);
         let refused = |job: &Job, save: &[Layer], name: &str| {
             let error = new(job, save).unwrap_err().to_string();
             assert!(error.starts_with(&format!("{}: exists, and", folder.join(name).display())), "{error}");
-            assert!(!folder.join(RECORD).exists() && !folder.join(LOCK).exists(), "nothing is left there");
+            let left = [RECORD, LOCK].map(|name| folder.join(name).exists());
+            assert_eq!(left, [false; 2], "nothing is left there");
         };
         // Photographs by number, of which one would be replaced; those beyond are not.
         std::fs::write(folder.join("0003.png"), b"photograph").unwrap();
         new(&job(0, false), &[]).unwrap();
-        std::fs::remove_file(folder.join(RECORD)).unwrap();
-        std::fs::remove_file(folder.join(LOCK)).unwrap();
+        Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[]).unwrap().keep();
         std::fs::write(folder.join("0002.png"), b"photograph").unwrap();
         refused(&job(0, false), &[], "0002.png");
         std::fs::remove_file(folder.join("0002.png")).unwrap();
@@ -268,10 +279,10 @@ mod tests {
         std::fs::create_dir(folder.join("depth")).unwrap();
         std::fs::write(folder.join("depth/0001.png"), b"depths").unwrap();
         refused(&job(0, false), &[Layer::Normals, Layer::Depth], "depth/0001.png");
-        Frames::new(folder.into(), json!({}), &job(0, true), 3, &[Layer::Depth]).unwrap().keep();
+        Frames::new(folder.into(), of(&job(0, true)), &job(0, true), 3, &[Layer::Depth]).unwrap().keep();
         std::fs::remove_dir_all(folder.join("depth")).unwrap();
         // Finished frames of the same job are, with what lies beside them, and those of another are not.
-        let mut frames = Frames::new(folder.into(), json!({}), &job(0, false), 3, &[Layer::Depth]).unwrap();
+        let mut frames = Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[Layer::Depth]).unwrap();
         for i in 0..3_u8 {
             frames.push(&[i], &[(Layer::Depth, vec![i])]).unwrap();
         }
@@ -283,8 +294,16 @@ mod tests {
         std::fs::write(folder.join("0001.png"), b"cut off").unwrap();
         new(&job(0, false), &[Layer::Depth]).unwrap();
         let error = new(&job(1, false), &[]).unwrap_err().to_string();
-        assert!(error.contains("0001.png: exists, and"), "{error}");
+        assert!(error.ends_with(
+            "holds unfinished frames of another command: repeat that one to finish them, or add --overwrite"
+        ));
         new(&job(1, true), &[]).unwrap();
+        // What shows the same is its own, as where a run was moved; a picture that came meanwhile stays.
+        let mut frames = Frames::new(folder.into(), of(&job(1, true)), &job(2, false), 3, &[]).unwrap();
+        assert_eq!(frames.done(), 0);
+        std::fs::write(folder.join("0000.png"), b"photograph").unwrap();
+        assert!(frames.push(&[1], &[]).unwrap_err().to_string().contains("0000.png: exists"));
+        assert_eq!(std::fs::read(folder.join("0000.png")).unwrap(), b"photograph");
     }
 
     #[test]
@@ -293,7 +312,7 @@ mod tests {
         let folder = place.path().join("frames");
         let mut first = frames(&folder, 1);
         std::fs::rename(&folder, place.path().join("moved")).unwrap();
-        assert!(first.push(&[0], &[]).unwrap_err().to_string().contains("was removed while frames"));
+        assert!(first.push(&[0], &[]).unwrap_err().to_string().contains("was removed or moved while frames"));
         let mut second = frames(&folder, 2);
         for layers in [vec![], vec![(Layer::Depth, vec![1])]] {
             assert!(first.push(&[1], &layers).unwrap_err().to_string().contains("another raygrad writes frames here"));
@@ -301,8 +320,13 @@ mod tests {
         second.push(&[2], &[]).unwrap();
         // Nor is anything of the other one removed.
         first.remove();
-        frames(&place.path().join("moved"), 1).keep();
-        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 3);
+        // A picture, what is written down, and the two files of a lock.
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 4);
+        let third = frames(&place.path().join("moved"), 1);
+        let lock = crate::cli::lock::owner_of(&place.path().join("moved").join(LOCK));
+        std::fs::write(lock, "1 0123456789abcdef\n").unwrap();
+        third.keep();
+        assert_eq!(std::fs::read_dir(place.path().join("moved")).unwrap().count(), 3, "nor kept by who has lost it");
         second.keep();
     }
 }

@@ -184,6 +184,31 @@ fn shapes_go_back_to_the_coordinates_of_the_capture() {
 }
 
 #[test]
+fn comments_stay_in_their_line() {
+    let folder = tempfile::tempdir().unwrap();
+    // What ends a line in one of the formats or another, and would add to the header or the shape.
+    let comment = "by me\nend_header\rv 1 2 3\r\n\0\u{85}\"}\\";
+    for name in ["a.ply", "a.obj", "a.glb"] {
+        let [plain, path] = ["plain-", ""].map(|before| folder.path().join(format!("{before}{name}")));
+        let count = write_with_comment(&shape(), &path, comment).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        assert_eq!(count, bytes.len() as u64);
+        let text = String::from_utf8_lossy(&bytes);
+        assert!(text.contains("by me end_header v 1 2 3"), "{name}");
+        write_with_comment(&shape(), &plain, "by me").unwrap();
+        let plain = std::fs::read(&plain).unwrap();
+        let lines = |bytes: &[u8]| bytes.iter().filter(|byte| [b'\n', b'\r', 0].contains(byte)).count();
+        // Padding of the binary format aside.
+        if name != "a.glb" {
+            assert_eq!(lines(&bytes), lines(&plain), "{name}");
+        }
+    }
+    let bytes = std::fs::read(folder.path().join("a.ply")).unwrap();
+    assert_eq!(Parser::<DefaultElement>::new().read_ply(&mut &bytes[..]).unwrap().payload["vertex"].len(), 4);
+    assert!(gltf::Gltf::open(folder.path().join("a.glb")).is_ok());
+}
+
+#[test]
 fn other_endings_are_refused() {
     for name in ["a.stl", "ply", "a", "a.glb.txt"] {
         let message = write(&shape(), name).unwrap_err().to_string();
