@@ -115,7 +115,7 @@ fn a_folder_that_is_removed_is_made_again() {
         &format!("train scene --steps 3 --out run {SMALL}"),
         &["run: is being trained by another raygrad: stop"],
     );
-    // What is left of its lock alone is no run, and nothing of the run is lost with it.
+    // Without its lock the run is still there, and is kept.
     let metrics = || String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
     wait(&mut first, || metrics().lines().count() > 3);
     let before = stopped(&first, || {

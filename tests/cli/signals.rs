@@ -48,7 +48,7 @@ fn ignored_signals_end_no_training() {
         // It makes many more steps.
         let before = length(run);
         wait(&mut child, || length(run) > before + 2000);
-        // What is not ignored is heard.
+        // It hears other signals.
         send(&child, heard);
         assert_eq!(child.wait().unwrap().code(), Some(130), "{ignored}");
         assert_eq!(place.json(&format!("{run}/summary.json"))["ended"], "interrupted");
@@ -84,7 +84,7 @@ fn a_second_ctrl_c_ends_the_program_at_once() {
     wait(&mut child, || place.path("frames/unfinished.json").exists());
     let start = Instant::now();
     while child.try_wait().unwrap().is_none() {
-        assert!(start.elapsed().as_secs() < 60, "it goes on");
+        assert!(start.elapsed().as_secs() < 60, "it did not end");
         send(&child, "INT");
     }
     assert_eq!(child.wait().unwrap().code(), Some(130));
