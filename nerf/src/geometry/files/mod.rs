@@ -48,11 +48,11 @@ pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
     write_with_comment(shape, path, "raygrad")
 }
 
-/// As [`write`], with a line of text about the file in its header: a comment in PLY and OBJ, the generator in glTF. Line breaks
+/// As [`write()`], with a line of text about the file in its header: a comment in PLY and OBJ, the generator in glTF. Line breaks
 /// in it become spaces.
 ///
 /// # Errors
-/// As [`write`].
+/// As [`write()`].
 pub fn write_with_comment(shape: &Shape, path: impl AsRef<Path>, comment: &str) -> Result<u64> {
     let comment = &comment.replace(char::is_control, " ");
     let path = path.as_ref();
