@@ -43,7 +43,7 @@ fn capture(folder: &Path) -> Capture {
         format: Format::Transforms,
         views: (0..3).map(view).collect(),
         points: (0..5).map(point).collect(),
-        points_file: None,
+        points_file: Some(folder.join(POINTS)),
         aabb_scale: Some(16.0),
         applied: DAffine3 {
             matrix3: DMat3::from_rotation_z(0.4) * (1.0 / 3.0),
@@ -147,7 +147,8 @@ fn every_lens_comes_back() {
 fn little_is_written_of_little() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path());
-    (capture.points, capture.aabb_scale, capture.applied) = (vec![], None, DAffine3::IDENTITY);
+    (capture.points, capture.points_file) = (vec![], None);
+    (capture.aabb_scale, capture.applied) = (None, DAffine3::IDENTITY);
     for view in &mut capture.views {
         (view.split, view.mask, view.depth, view.sharpness) = (None, None, None, None);
     }
