@@ -348,8 +348,11 @@ mod tests {
         let tape = Tape::<f32>::new();
         let x = tape.constant(Tensor::zeros(&[1, 1, 4, 4]));
         let op = |kernel, padding| MaxPool2d(Pool2dConfig { padding, ..Pool2dConfig::new(kernel) });
-        let error = tape.try_apply(op([2, 2], [2, 1]), &[&x]).unwrap_err().to_string();
-        assert!(error.contains("more than half the window"), "{error}");
+        for (kernel, padding) in [([2, 2], [2, 1]), ([4, 3], [2, 2])] {
+            let error = tape.try_apply(op(kernel, padding), &[&x]).unwrap_err().to_string();
+            assert!(error.contains("more than half the window"), "{error}");
+        }
+        assert_eq!(tape.try_apply(op([4, 3], [2, 1]), &[&x]).unwrap().shape(), [1, 1, 2, 2]);
         assert!(tape.try_apply(op([5, 2], [0, 0]), &[&x]).unwrap_err().to_string().contains("does not fit"));
         let empty = tape.constant(Tensor::zeros(&[1, 1, 0, 4]));
         assert!(tape.try_apply(op([1, 1], [0, 0]), &[&empty]).unwrap_err().to_string().contains("no pixels"));
