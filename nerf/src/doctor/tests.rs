@@ -496,3 +496,17 @@ fn each_of_several_equal_poses_is_named_once() {
     let expected = "the pose of 3 photographs is exactly that of another: `11.png` and `10.png`, and others";
     assert_eq!(finding.what, expected);
 }
+
+#[test]
+fn photographs_from_one_place_in_other_directions_are_not_alike() {
+    let finds = |to: usize, angle: f64, kind: Kind| {
+        let mut planted = Planted::new();
+        let pose = planted.camera(8).pose;
+        planted.camera(to).pose = DAffine3 { matrix3: DMat3::from_rotation_x(angle) * pose.matrix3, ..pose };
+        planted.cameras().finds(kind).is_some()
+    };
+    for (angle, duplicate, leak) in [(0.0, true, true), (1e-4, false, true), (0.02, false, false)] {
+        assert_eq!(finds(9, angle, Kind::DuplicatePoses), duplicate, "turned by {angle}");
+        assert_eq!(finds(41, angle, Kind::Leak), leak, "turned by {angle}");
+    }
+}
