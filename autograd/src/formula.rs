@@ -301,7 +301,7 @@ macro_rules! formula {
         }
         impl $crate::Formula<{ [$(stringify!($x)),+].len() }> for Written {
             const NAME: &'static str = stringify!($y);
-            const ANGLES: bool = true;
+            const ANGLES: bool = $crate::has_angle(stringify!($y));
             #[inline(always)]
             fn f<E: $crate::Real>(&self, x: [E; [$(stringify!($x)),+].len()]) -> E {
                 let Written { $($constant,)* } = *self;

@@ -53,6 +53,8 @@ pub use number::{Number, Term};
 pub use op::{Grads, Op, Reads, Vjp};
 pub use operand::{Constant, Operand};
 pub use ops::{Activation, Conv2dConfig, Pool2dConfig, RowGrad, Segments};
+#[doc(hidden)]
+pub use raygrad_tensor::has_angle;
 pub use raygrad_tensor::{Axes, INFER, Indices, Mask, Pool, Real, Scalar, Shape, Slice, SliceInfoElem, Tensor, s};
 pub use recorded::{Recorded, record};
 pub use row_sums::{RowAdder, RowSums};

@@ -5,7 +5,7 @@
 
 use std::{hint::black_box, time::Instant};
 
-use raygrad_tensor::{Real, Scalar, lanes, lanes_either, simd, vmath};
+use raygrad_tensor::{Real, Scalar, lanes, lanes_real, simd, vmath};
 
 /// Nanoseconds an element: the fastest of several runs, which the rest of the machine disturbs least.
 fn time<T: Scalar>(x: &[T], f: impl Fn(&[T], &mut [T])) -> f64 {
@@ -75,16 +75,7 @@ macro_rules! plain {
 
 macro_rules! angle {
     ($f:ident) => {
-        |x, y| {
-            lanes_either(
-                [x],
-                y,
-                #[inline(always)]
-                |[x]| Real::$f(x),
-                #[inline(always)]
-                |[x]| Real::$f(x),
-            )
-        }
+        |x, y| lanes_real!(&[x], y, |[x]| Real::$f(x))
     };
 }
 

@@ -1,6 +1,7 @@
 //! One loop for every elementwise kernel, with broadcasting as NumPy does it.
 
-use crate::{Lane, Pool, Scalar, Shape, Tensor, map_fused, simd};
+use crate::fused::cut;
+use crate::{Block, Pool, Scalar, Shape, Tensor, map_fused, simd};
 
 /// The common shape of tensors that broadcast together: shapes are aligned at their last axis, and an axis of extent 1
 /// (or an absent one) stretches to the extent of the others. `None` if two extents disagree.
@@ -35,26 +36,10 @@ pub fn broadcast_shape(shapes: &[&[usize]]) -> Option<Shape> {
 /// If the shapes do not broadcast.
 #[track_caller]
 pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: impl Fn([T; N]) -> T + Sync) -> Tensor<T> {
-    map_block(x, pool, |x, out| lanes(x, out, &f))
+    map_block(&x, pool, &|x, out| lanes::<T, N>(std::array::from_fn(|k| x[k]), out[0], &f))
 }
 
-/// As [`map`], for a formula that is read for quick numbers and for plain ones (see [`Lane`]): sines and cosines cost a
-/// third that way, and the bits are the same. Both closures have to compute the same; [`map_real!`](crate::map_real)
-/// writes the second.
-///
-/// # Panics
-/// If the shapes do not broadcast.
-#[track_caller]
-pub fn map_either<T: Scalar, const N: usize>(
-    x: [&Tensor<T>; N],
-    pool: &Pool<T>,
-    quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true> + Sync,
-    plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false> + Sync,
-) -> Tensor<T> {
-    map_block(x, pool, |x, out| lanes_either(x, out, &quick, &plain))
-}
-
-/// [`map_either`] for a formula that is generic over [`Real`](crate::Real), written once.
+/// [`map`] for a formula that is generic over [`Real`](crate::Real), in [`lanes_real!`](crate::lanes_real).
 ///
 /// ```
 /// use raygrad_tensor::{Pool, Real, Tensor, map_real};
@@ -65,64 +50,46 @@ pub fn map_either<T: Scalar, const N: usize>(
 #[macro_export]
 macro_rules! map_real {
     ($x:expr, $pool:expr, |$arguments:pat_param| $formula:expr) => {
-        $crate::map_either(
-            $x,
-            $pool,
-            #[inline(always)]
-            |$arguments| $formula,
-            #[inline(always)]
-            |$arguments| $formula,
-        )
+        $crate::map_block(&$x, $pool, &|x, out| $crate::lanes_real!(x, out[0], |$arguments| $formula))
     };
 }
 
-/// One result of a pass over `N` tensors: see [`map_fused`].
+/// `out[i] = formula([x[0][i], x[1][i], ..])` with the best instruction set of the processor. A formula with a sine or cosine
+/// is read for quick numbers, and once more for plain ones if an angle was too large for these (see
+/// [`Lane`](crate::Lane)): it costs a third that way, and the bits are the same.
+#[macro_export]
+macro_rules! lanes_real {
+    ($x:expr, $out:expr, |$arguments:pat_param| $formula:expr) => {{
+        const ANGLES: bool = $crate::has_angle(stringify!($formula));
+        let x: &[&[_]] = $x;
+        let out: &mut [_] = $out;
+        let is_to_be_plain = !ANGLES
+            || $crate::lanes_fused::<_, true, 0, _, 1>(
+                x,
+                &mut [&mut *out],
+                #[inline(always)]
+                |[], $arguments| [$formula],
+            );
+        if is_to_be_plain {
+            $crate::lanes_fused::<_, false, 0, _, 1>(
+                x,
+                &mut [out],
+                #[inline(always)]
+                |[], $arguments| [$formula],
+            );
+        }
+    }};
+}
+
+/// One result of a pass over tensors: see [`map_fused`].
+#[doc(hidden)]
 #[track_caller]
-fn map_block<T: Scalar, const N: usize>(
-    x: [&Tensor<T>; N],
-    pool: &Pool<T>,
-    block: impl Fn([&[T]; N], &mut [T]) + Sync,
-) -> Tensor<T> {
-    let [result] = map_fused(&x, [true], pool, &|x, out| block(std::array::from_fn(|k| x[k]), out[0]));
+pub fn map_block<T: Scalar>(x: &[&Tensor<T>], pool: &Pool<T>, block: &Block<'_, T>) -> Tensor<T> {
+    let [result] = map_fused(x, [true], pool, block);
     match result {
         Some(result) => result,
         None => unreachable!("it is wanted"),
     }
-}
-
-/// The `n` elements of each slice from `start` on.
-#[inline(always)]
-fn cut<T, const N: usize>(mut x: [&[T]; N], start: usize, n: usize) -> [&[T]; N] {
-    let mut k = 0;
-    while k < N {
-        x[k] = &x[k][start..][..n];
-        k += 1;
-    }
-    x
-}
-
-/// Element `i` of each slice.
-#[inline(always)]
-fn gather<T: Scalar, const N: usize>(x: &[&[T]; N], i: usize) -> [T; N] {
-    let mut values = [T::ZERO; N];
-    let mut k = 0;
-    while k < N {
-        values[k] = x[k][i];
-        k += 1;
-    }
-    values
-}
-
-/// [`gather`] into the numbers of [`lanes_either`].
-#[inline(always)]
-fn gather_lanes<T: Scalar, const N: usize, const QUICK: bool>(x: &[&[T]; N], i: usize) -> [Lane<T, QUICK>; N] {
-    let mut values = [Lane::new(T::ZERO); N];
-    let mut k = 0;
-    while k < N {
-        values[k] = Lane::new(x[k][i]);
-        k += 1;
-    }
-    values
 }
 
 /// `out[i] = f([x[0][i], x[1][i], ..])` with the best instruction set of the processor.
@@ -135,46 +102,14 @@ pub fn lanes<T: Scalar, const N: usize>(x: [&[T]; N], out: &mut [T], f: impl Fn(
         || {
             // Cut to one length in here, where the compiler can still drop the bounds checks.
             let n = out.len();
-            let x = cut(x, 0, n);
+            let x = cut::<T, N>(&x, 0, n);
             for i in 0..n {
-                out[i] = f(gather(&x, i));
-            }
-        },
-    );
-}
-
-/// Elements that [`lanes_either`] computes before it looks whether the quick formula held for all of them.
-const BLOCK: usize = 1024;
-
-/// `out[i] = plain([x[0][i], x[1][i], ..])`, by way of `quick` where that gives the same: see [`map_either`].
-///
-/// # Panics
-/// If a slice is shorter than `out`.
-pub fn lanes_either<T: Scalar, const N: usize>(
-    x: [&[T]; N],
-    out: &mut [T],
-    quick: impl Fn([Lane<T, true>; N]) -> Lane<T, true>,
-    plain: impl Fn([Lane<T, false>; N]) -> Lane<T, false>,
-) {
-    simd::dispatch(
-        #[inline(always)]
-        || {
-            let mut start = 0;
-            for out in out.chunks_mut(BLOCK) {
-                let n = out.len();
-                let x = cut(x, start, n);
-                let mut outside = T::Flags::default();
-                for i in 0..n {
-                    let (value, flags) = quick(gather_lanes(&x, i)).parts();
-                    out[i] = value;
-                    outside = outside | flags;
+                let (mut values, mut k) = ([T::ZERO; N], 0);
+                while k < N {
+                    values[k] = x[k][i];
+                    k += 1;
                 }
-                if T::is_set(outside) {
-                    for i in 0..n {
-                        out[i] = plain(gather_lanes(&x, i)).parts().0;
-                    }
-                }
-                start += n;
+                out[i] = f(values);
             }
         },
     );
@@ -200,6 +135,8 @@ pub fn add_assign<T: Scalar>(a: &mut [T], b: &[T]) {
 mod tests {
     use super::*;
     use crate::Real;
+
+    const BLOCK: usize = 1024;
 
     #[test]
     fn broadcasting_follows_numpy() {

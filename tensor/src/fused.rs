@@ -1,9 +1,8 @@
 //! Elementwise loops of several results in one pass: a formula's value, or the gradients of all its operands.
 
 use crate::layout::{inverse, len_of};
-use crate::parallel::{ELEMENT, PIECE, is_worthwhile};
+use crate::parallel::{ELEMENT, PIECE, each_of, is_worthwhile};
 use crate::{Lane, Layout, Pool, Scalar, Shape, Tensor, broadcast_shape, simd};
-use rayon::prelude::*;
 use smallvec::SmallVec;
 use std::array::from_fn;
 use std::ops::Range;
@@ -153,14 +152,12 @@ fn run<T: Scalar>(x: &[Part<'_, T>], len: usize, out: &mut Results<'_, T>, pool:
         return piece(x, 0..len, out, pool, block);
     }
     let mut rest: SmallVec<[Option<&mut [T]>; 4]> = out.iter_mut().map(|out| out.as_deref_mut()).collect();
-    let pieces: Vec<(usize, usize, SmallVec<[_; 4]>)> = (0..len)
-        .step_by(PIECE)
-        .map(|start| {
-            let n = PIECE.min(len - start);
-            (start, n, rest.iter_mut().map(|rest| rest.as_mut().and_then(|rest| rest.split_off_mut(..n))).collect())
-        })
-        .collect();
-    pieces.into_par_iter().for_each(|(start, n, mut out)| piece(x, start..start + n, &mut out, pool, block));
+    let pieces = (0..len).step_by(PIECE).map(|start| {
+        let n = PIECE.min(len - start);
+        let out = rest.iter_mut().map(|rest| rest.as_mut().and_then(|rest| rest.split_off_mut(..n)));
+        (start..start + n, out.collect::<SmallVec<[_; 4]>>())
+    });
+    each_of(pieces, |_, (range, mut out)| piece(x, range, &mut out, pool, block));
 }
 
 /// The blocks of one thread: `out` is for the elements in `range`.
@@ -264,7 +261,7 @@ pub fn lanes_fused<T: Scalar, const QUICK: bool, const K: usize, const N: usize,
 
 /// `N` of the slices from the one numbered `first` on, each `n` long.
 #[inline(always)]
-fn cut<'a, T, const N: usize>(x: &[&'a [T]], first: usize, n: usize) -> [&'a [T]; N] {
+pub(crate) fn cut<'a, T, const N: usize>(x: &[&'a [T]], first: usize, n: usize) -> [&'a [T]; N] {
     let mut slices = [&[][..]; N];
     let mut k = 0;
     while k < N {

@@ -3,7 +3,7 @@
 use crate::{Real, Scalar};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// A number in a loop of [`map_either`](crate::map_either). With `QUICK`, its sine and cosine take the short argument
+/// A number in a loop of [`lanes_fused`](crate::lanes_fused). With `QUICK`, its sine and cosine take the short argument
 /// reduction only, and it remembers whether that was enough; without, it is just a number.
 ///
 /// The reduction for arguments of any size costs several times the rest of a sine, and hardly an argument needs it. A
@@ -32,6 +32,26 @@ impl<T: Scalar, const QUICK: bool> Lane<T, QUICK> {
     fn with(self, value: T) -> Self {
         Lane { value, ..self }
     }
+}
+
+/// Whether the text of a formula has a sine or a cosine, for which alone [`Lane`]s come in two kinds. One that is hidden in
+/// a function of another name costs time and no digit.
+pub const fn has_angle(formula: &str) -> bool {
+    let text = formula.as_bytes();
+    let (mut start, mut i) = (0, 0);
+    while i <= text.len() {
+        if i == text.len() || !(text[i].is_ascii_alphanumeric() || text[i] == b'_') {
+            let word = i - start == 3;
+            if word
+                && matches!([text[start], text[start + 1], text[start + 2]], [b's', b'i', b'n'] | [b'c', b'o', b's'])
+            {
+                return true;
+            }
+            start = i + 1;
+        }
+        i += 1;
+    }
+    false
 }
 
 macro_rules! operator {
@@ -117,5 +137,20 @@ impl<T: Scalar, const QUICK: bool> Real for Lane<T, QUICK> {
     #[inline(always)]
     fn powi(self, exponent: i32) -> Self {
         self.with(self.value.powi(exponent))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::has_angle;
+
+    #[test]
+    fn formulas_with_a_sine_or_a_cosine_are_known_by_their_words() {
+        for formula in ["x.sin()", "Real::cos(x)", "a * (x + b).sin() - 1.0", "cos", "sinh(x) + sin(x)"] {
+            assert!(has_angle(formula), "{formula}");
+        }
+        for formula in ["", "x", "x.asin()", "x.sinh() + x.cosh()", "x.sin_pi()", "x * cosine", "si * n"] {
+            assert!(!has_angle(formula), "{formula}");
+        }
     }
 }

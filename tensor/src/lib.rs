@@ -51,10 +51,12 @@ pub use ndarray::{Slice, SliceInfoElem, s};
 pub use arrange::{repeated, split_places, tiled};
 pub use axes::{Axes, Reduction, axis_of, find_axis};
 pub use create::concat;
-pub use elementwise::{add_assign, broadcast_shape, lanes, lanes_either, map, map_either};
+#[doc(hidden)]
+pub use elementwise::map_block;
+pub use elementwise::{add_assign, broadcast_shape, lanes, map};
 pub use fused::{Block, lanes_fused, map_fused};
 pub use indices::Indices;
-pub use lane::Lane;
+pub use lane::{Lane, has_angle};
 pub use layout::{INFER, Layout, checked_len, inferred};
 pub use mask::{Mask, choose};
 pub use pool::Pool;

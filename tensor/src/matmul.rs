@@ -1,8 +1,7 @@
 //! Matrix products: one function, with transposed operands by stride.
 
-use crate::parallel::{chunks, is_worthwhile};
+use crate::parallel::{chunks, each, is_worthwhile};
 use crate::{Layout, Pool, Scalar, Shape, Tensor, add_assign, broadcast_shape, sum_rows};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// A matrix in a slice: element `(i, j)` is `data[offset + i * strides[0] + j * strides[1]]`.
@@ -127,7 +126,7 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
     } else if m > 2 && n >= 2 * ROWS && is_worthwhile(work) {
         let columns = n.div_ceil((n / ROWS).min(PIECES));
         let target = Target(c.as_mut_ptr());
-        (0..n.div_ceil(columns)).into_par_iter().for_each(|i| {
+        each(n.div_ceil(columns), &|i| {
             let columns = i * columns..n.min((i + 1) * columns);
             // SAFETY: the columns of the pieces differ, and all lie in `c`, which is borrowed until all are done. Tests of
             // parallel.rs and `agrees_with_three_loops` run it.

@@ -6,6 +6,7 @@
 
 use rayon::prelude::*;
 use std::cell::Cell;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Operations below which waking other threads costs more than it saves: some 50 microseconds of work.
 const WORTHWHILE: usize = 1 << 20;
@@ -46,16 +47,75 @@ pub(crate) fn is_worthwhile(work: usize) -> bool {
     work >= WORTHWHILE && !SERIAL.get() && rayon::current_num_threads() > 1
 }
 
+/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool; operations within keep to their thread.
+///
+/// Every parallel loop is this one, and calls `f` through a pointer, so that rayon is compiled once and not for each loop.
+#[inline(never)]
+pub fn each(count: usize, f: &(dyn Fn(usize) + Sync)) {
+    match count {
+        0 => (),
+        1 => f(0),
+        _ => (0..count).into_par_iter().for_each(|i| serial(|| f(i))),
+    }
+}
+
+/// [`each`] with the parts of something that is cut, such as mutable chunks of a slice: calls `f(i, part i)`.
+pub fn each_of<P: Send>(parts: impl IntoIterator<Item = P>, f: impl Fn(usize, P) + Sync) {
+    let parts: Vec<Mutex<Option<P>>> = parts.into_iter().map(|part| Mutex::new(Some(part))).collect();
+    each(parts.len(), &|i| {
+        let part = locked(&parts[i]).take();
+        part.into_iter().for_each(|part| f(i, part));
+    });
+}
+
+/// [`each`] with results, which come in order.
+///
+/// ```
+/// assert_eq!(raygrad_tensor::parallel::collect(4, |i| i * i), [0, 1, 4, 9]);
+/// ```
+pub fn collect<R: Send>(count: usize, f: impl Fn(usize) -> R + Sync) -> Vec<R> {
+    let mut results: Vec<Option<R>> = (0..count).map(|_| None).collect();
+    each_of(&mut results, |i, result| *result = Some(f(i)));
+    results.into_iter().flatten().collect()
+}
+
+/// Scratch space for the tasks of [`each`]: as many as run at once, which take turns.
+#[derive(Debug, Default)]
+pub struct Scratch<S>(Mutex<Vec<S>>);
+
+impl<S: Default> Scratch<S> {
+    /// Calls `f` with one that nobody else uses.
+    pub fn with<R>(&self, f: impl FnOnce(&mut S) -> R) -> R {
+        self.with_new(S::default, f)
+    }
+}
+
+impl<S> Scratch<S> {
+    fn with_new<R>(&self, new: impl FnOnce() -> S, f: impl FnOnce(&mut S) -> R) -> R {
+        // Not in one line: the lock is given back before `new` and `f` are called.
+        let free = locked(&self.0).pop();
+        let mut own = free.unwrap_or_else(new);
+        let result = f(&mut own);
+        locked(&self.0).push(own);
+        result
+    }
+}
+
+/// What a mutex holds, also after a thread that held it has panicked.
+pub fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// Calls `f(scratch, i, chunk i)` for every chunk of `len` elements of `out` (the last may be shorter), each thread with
 /// scratch space of its own: on all threads if the `work` of all together, in operations of a processor, is worth it.
 ///
 /// # Panics
 /// If `len` is 0 and `out` is not empty.
-pub fn chunks<T: Send, S>(
+pub fn chunks<T: Send, S: Send>(
     out: &mut [T],
     len: usize,
     work: usize,
-    scratch: impl Fn() -> S + Send + Sync,
+    scratch: impl Fn() -> S + Sync,
     f: &(dyn Fn(&mut S, usize, &mut [T]) + Sync),
 ) {
     if out.is_empty() {
@@ -65,8 +125,8 @@ pub fn chunks<T: Send, S>(
         let mut scratch = scratch();
         out.chunks_mut(len).enumerate().for_each(|(i, chunk)| f(&mut scratch, i, chunk));
     } else {
-        let each = |scratch: &mut S, (i, chunk): (usize, &mut [T])| serial(|| f(scratch, i, chunk));
-        out.par_chunks_mut(len).enumerate().for_each_init(scratch, each);
+        let free = Scratch(Mutex::default());
+        each_of(out.chunks_mut(len), |i, chunk| free.with_new(&scratch, |scratch| f(scratch, i, chunk)));
     }
 }
 

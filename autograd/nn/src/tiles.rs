@@ -2,9 +2,9 @@
 
 use crate::{Bound, Params};
 use raygrad_autograd::{Gradient, SparseGrad, Tape, Var};
+use raygrad_tensor::parallel::locked;
 use raygrad_tensor::{Pool, Scalar, Tensor, add_assign, parallel};
-use rayon::prelude::*;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Gradients are summed within this many slots and then in slot order: fixed, so that the sums do not depend on the
 /// number of threads, and as many as threads can work at a time. Steps of so many tiles have one for each slot.
@@ -70,11 +70,6 @@ struct Slot<T: Scalar> {
     shares: Vec<Vec<Share<T>>>,
 }
 
-/// The list; it is whole at every point where a panic could strike.
-fn locked<S>(free: &Mutex<Vec<S>>) -> MutexGuard<'_, Vec<S>> {
-    free.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl<T: Scalar, S: Default + Send> Default for Tiles<T, S> {
     fn default() -> Self {
         Tiles::new()
@@ -103,7 +98,7 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
     ) -> TileSums<T, R> {
         let (free, wanted) = (&self.free, params.trainable().count());
         let used = count.min(SLOTS);
-        let work = |(index, slot): (usize, &mut Slot<T>)| {
+        let work = |index: usize, slot: &mut Slot<T>| {
             slot.begin(wanted);
             let (mut tape, mut scratch) = locked(free).pop().unwrap_or_default();
             let tiles = (index..count).step_by(SLOTS);
@@ -115,7 +110,9 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
             locked(free).push((tape, scratch));
             results
         };
-        let results: Vec<Vec<R>> = self.slots[..used].par_iter_mut().enumerate().map(work).collect();
+        let mut results: Vec<Vec<R>> = (0..used).map(|_| vec![]).collect();
+        let slots = self.slots[..used].iter_mut().zip(&mut results);
+        parallel::each_of(slots, |index, (slot, results)| *results = work(index, slot));
         // In the order of the tiles, which were dealt in turn.
         let mut results: Vec<_> = results.into_iter().map(Vec::into_iter).collect();
         let results = (0..count).filter_map(|tile| results[tile % SLOTS].next()).collect();
@@ -128,7 +125,7 @@ impl<T: Scalar, S: Default + Send> Tiles<T, S> {
         let Some((first, rest)) = self.slots[..used].split_first_mut() else {
             return shapes.into_iter().map(Gradient::zero).collect();
         };
-        first.sums.par_iter_mut().enumerate().for_each(|(i, (is_set, sum))| {
+        parallel::each_of(&mut first.sums, |i, (is_set, sum)| {
             for (_, other) in rest.iter().map(|slot| &slot.sums[i]).filter(|(is_set, _)| *is_set) {
                 match (&mut *sum, other) {
                     (Some(sum), Some(other)) if *is_set => add_assign(sum.as_mut_slice(), other.as_slice()),

@@ -10,7 +10,7 @@
 //! - Every multiply-add is written `mul_add` and rounds once, so that a result has the same bits on every instruction
 //!   set, vectorised or not. Without FMA, or outside of `dispatch`, that is a call into libm: right, but slow.
 //! - Bounds are errors against the exact value in units of the last place (ULP) of the result. Those for f32 are maxima
-//!   over all 2^32 arguments, asserted by `tests/ulp.rs`; those for f64 come from samples.
+//!   over all 2^32 arguments, asserted by `tests/testsuite/ulp.rs`; those for f64 come from samples.
 //! - Polynomials are minimax in the relative error of the result: least squares on Chebyshev nodes in 60-digit
 //!   arithmetic, reweighted until the error is level (Lawson), then the coefficients are rounded one by one from the
 //!   lowest, each time refitting those above it.

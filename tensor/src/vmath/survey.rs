@@ -1,7 +1,7 @@
 //! Every function of `vmath` with its argument range, its bound and a reference: for tests and benchmarks.
 
 use super::{f32 as single, f64 as double};
-use crate::{Real, Scalar, lanes, lanes_either};
+use crate::{Real, Scalar, lanes, lanes_real};
 use std::f64::consts::PI;
 
 /// A function as callers meet it: over slices, vectorised.
@@ -49,26 +49,8 @@ macro_rules! all {
             erf [-4.0, 4.0] 2.0 double::erf;
         };
         // As tensors call them: the short reduction where it holds.
-        all[6].apply = |x, y| {
-            lanes_either(
-                [x],
-                y,
-                #[inline(always)]
-                |[x]| Real::sin(x),
-                #[inline(always)]
-                |[x]| Real::sin(x),
-            )
-        };
-        all[7].apply = |x, y| {
-            lanes_either(
-                [x],
-                y,
-                #[inline(always)]
-                |[x]| Real::cos(x),
-                #[inline(always)]
-                |[x]| Real::cos(x),
-            )
-        };
+        all[6].apply = |x, y| lanes_real!(&[x], y, |[x]| Real::sin(x));
+        all[7].apply = |x, y| lanes_real!(&[x], y, |[x]| Real::cos(x));
         all
     }};
 }

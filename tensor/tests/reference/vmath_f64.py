@@ -1,8 +1,8 @@
-"""Writes arguments and exact values of the f64 functions of vmath, for tests/ulp.rs.
+"""Writes arguments and exact values of the f64 functions of vmath, for tests/testsuite/ulp.rs.
 
     pip install mpmath
     python vmath_f64.py                      # the committed vmath_f64.bin
-    python vmath_f64.py 50000 dense.bin # a denser sample: VMATH_F64=$PWD/dense.bin cargo test --test ulp
+    python vmath_f64.py 50000 dense.bin # a denser sample: VMATH_F64=$PWD/dense.bin cargo test --test testsuite ulp
 
 For each function COUNT records of 20 bytes, little-endian: the argument, the nearest f64 to the value, and what that one
 lacks, in units of its last place, as f32. A third of the arguments are uniform where the function is used, a third

@@ -3,11 +3,10 @@
 use super::limits::{flushed, limited, tiny, tiny_square};
 use super::settings::{check, check_rate, check_share, or_panic};
 use super::state::{Reader, memories};
-use super::{CHUNK, Move, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, remember, slot};
+use super::{CHUNK, Move, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, counted, remember, slot};
 use crate::{Params, RowAdam};
 use raygrad_autograd::{Gradient, RowSums};
 use raygrad_tensor::{Pool, Scalar, simd};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Adam (Kingma and Ba 2015, algorithm 1).
@@ -151,9 +150,9 @@ impl<T: Scalar> Adam<T> {
         let m = remember(&mut moments.first, &part);
         let v = remember(&mut moments.second, &part);
         let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
-        let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
-        let values = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(grad.as_slice().par_chunks(CHUNK));
-        let skipped = values.zip(moments).map(|((x, g), (m, v))| update.apply(x, g, m, v)).sum::<usize>();
+        let moments = m.chunks_mut(CHUNK).zip(v.chunks_mut(CHUNK));
+        let values = part.value.as_mut_slice().chunks_mut(CHUNK).zip(grad.as_slice().chunks(CHUNK));
+        let skipped = counted(values.zip(moments), |((x, g), (m, v))| update.apply(x, g, m, v));
         (part.name, len - skipped, skipped)
     }
 

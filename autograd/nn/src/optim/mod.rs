@@ -23,8 +23,9 @@ pub use state::{OptimizerState, StateError};
 
 use crate::Params;
 use raygrad_autograd::{Gradient, RowShare, RowSums};
-use raygrad_tensor::{Pool, Scalar, Tensor};
+use raygrad_tensor::{Pool, Scalar, Tensor, parallel};
 use std::borrow::Cow;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// One parameter that an optimiser is to move.
 #[derive(Debug)]
@@ -142,6 +143,15 @@ pub trait Optimizer<T: Scalar> {
 
 /// Elements that one task updates.
 const CHUNK: usize = 1 << 14;
+
+/// What `f` counts in the parts, together; parallel over them.
+fn counted<P: Send>(parts: impl Iterator<Item = P>, f: impl Fn(P) -> usize + Sync) -> usize {
+    let count = AtomicUsize::new(0);
+    parallel::each_of(parts, |_, part| {
+        count.fetch_add(f(part), Ordering::Relaxed);
+    });
+    count.into_inner()
+}
 
 /// What an optimiser keeps under a number.
 fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {

@@ -4,11 +4,10 @@ use super::limits::{flushed, limited, tiny_square};
 use super::settings::or_panic;
 use crate::AdamConfig;
 use raygrad_autograd::RowSums;
-use raygrad_tensor::{Scalar, checked_len, simd};
-use rayon::prelude::*;
+use raygrad_tensor::{Scalar, checked_len, parallel, simd};
 use std::marker::PhantomData;
 use std::ops::Add;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// What a step of [`RowAdam`] did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -175,26 +174,27 @@ impl<T: Scalar> RowAdam<T> {
             Some(*end - size)
         });
         let firsts: Vec<usize> = firsts.collect();
-        let step = |(part, sums): (usize, &mut RowSums<T>)| {
+        let stats = Mutex::new(RowStats::default());
+        let step = |part: usize, sums: &mut RowSums<T>| {
             fill(part, sums);
             // The sums were the caller's for that long. Those of more rows would reach into the next part.
             let size = [sums.table_rows(), sums.features()];
             assert_eq!(size, [sizes[part], features], "rows and features of part {part} after `fill`");
-            let chunks = sums.rows().par_chunks(CHUNK).zip(sums.sums().par_chunks(CHUNK * features));
-            let stats = chunks.map(|(rows, sums)| {
-                simd::dispatch(
-                    #[inline(always)]
-                    || update.visit(firsts[part], rows, sums),
-                )
-            });
-            let stats = stats.reduce(RowStats::default, RowStats::add);
+            parallel::each_of(
+                sums.rows().chunks(CHUNK).zip(sums.sums().chunks(CHUNK * features)),
+                |_, (rows, sums)| {
+                    let moved = simd::dispatch(
+                        #[inline(always)]
+                        || update.visit(firsts[part], rows, sums),
+                    );
+                    let mut stats = parallel::locked(&stats);
+                    *stats = stats.add(moved);
+                },
+            );
             sums.clear();
-            stats
         };
-        match parts {
-            [sums] => step((0, sums)),
-            parts => parts.par_iter_mut().enumerate().map(step).reduce(RowStats::default, RowStats::add),
-        }
+        parallel::each_of(parts, step);
+        stats.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The first and the second moments, `[rows, features]` each.

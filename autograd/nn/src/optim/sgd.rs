@@ -3,11 +3,10 @@
 use super::limits::{flushed, tiny};
 use super::settings::{check, check_rate, check_share, or_panic};
 use super::state::{Reader, memories};
-use super::{CHUNK, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, remember, slot};
+use super::{CHUNK, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, counted, remember, slot};
 use crate::Params;
 use raygrad_autograd::{Gradient, RowSums};
 use raygrad_tensor::{Pool, Scalar, simd};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Gradient descent: `h = g + decay x`, `v = momentum v + h`, `x = x - rate d`, where the direction `d` is `v`, or
@@ -93,11 +92,11 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
                 counts
             } else {
                 let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
-                let pairs = part.value.as_mut_slice().par_chunks_mut(CHUNK).zip(grad.as_slice().par_chunks(CHUNK));
+                let pairs = part.value.as_mut_slice().chunks_mut(CHUNK).zip(grad.as_slice().chunks(CHUNK));
                 let skipped = if velocity.is_empty() {
-                    pairs.map(|(x, g)| update.plain(x, g)).sum()
+                    counted(pairs, |(x, g)| update.plain(x, g))
                 } else {
-                    pairs.zip(velocity.par_chunks_mut(CHUNK)).map(|((x, g), v)| update.apply(x, g, v)).sum::<usize>()
+                    counted(pairs.zip(velocity.chunks_mut(CHUNK)), |((x, g), v)| update.apply(x, g, v))
                 };
                 (len - skipped, skipped)
             };

@@ -1,6 +1,6 @@
 //! The greatest and smallest elements along an axis, with ties and NaN.
 
-use crate::support::{around, in_both, same, values};
+use super::support::{around, in_both, same, values};
 use raygrad_tensor::Scalar;
 use raygrad_tensor::extremum::{arg_extremum, extremum, extremum_grad};
 

@@ -1,6 +1,6 @@
 //! Products of matrices: tall, wide, deep and flat, with either factor transposed.
 
-use crate::support::{in_both, summed, values, wide};
+use super::support::{in_both, summed, values, wide};
 use raygrad_tensor::Scalar;
 use raygrad_tensor::matmul::{Matrix, gemm};
 

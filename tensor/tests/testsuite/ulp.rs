@@ -76,7 +76,7 @@ fn record(name: &str, parts: &[(f64, f32)]) {
 fn known_worst_arguments_are_within_the_bounds() {
     let functions = singles();
     let mut count = 0;
-    for line in include_str!("reference/vmath_f32_worst.txt").lines().filter(|line| !line.starts_with('#')) {
+    for line in include_str!("../reference/vmath_f32_worst.txt").lines().filter(|line| !line.starts_with('#')) {
         let [name, bits, ..] = line.split(' ').collect::<Vec<_>>()[..] else { panic!("{line:?}") };
         let x = f32::from_bits(u32::from_str_radix(&bits[2..], 16).unwrap());
         let function = functions.iter().find(|function| function.name == name).unwrap();
@@ -120,7 +120,7 @@ fn every_997th_argument() {
 
 #[test]
 #[ignore = "2^32 inputs a function: minutes; \
-            run with cargo test --release -p raygrad-tensor --test ulp -- --ignored --nocapture"]
+            run with cargo test --release -p raygrad-tensor --test testsuite ulp -- --ignored --nocapture"]
 fn every_argument() {
     check(1);
 }

@@ -1,6 +1,6 @@
 //! What convolutions and poolings see of an image: large images, steps, padding and dilation.
 
-use crate::support::{in_both, same, summed, values, wide};
+use super::support::{in_both, same, summed, values, wide};
 use raygrad_tensor::{Scalar, Windows};
 
 /// Pixel that element `k` of window `w` along one axis sees.

@@ -1,6 +1,6 @@
 //! Sums of slices, of rows and over any axes.
 
-use crate::support::{around, in_both, summed, values, wide};
+use super::support::{around, in_both, summed, values, wide};
 use raygrad_tensor::{Pool, Scalar, Tensor, sum, sum_axes, sum_rows, sum_to};
 
 /// What `sum` states: `(16 + log2(n / 512))` units of the sum of sizes.

@@ -16,7 +16,7 @@ pub fn run(check: impl FnOnce() + Send) {
 /// Runs a generic check in both precisions.
 macro_rules! in_both {
     ($check:ident) => {
-        crate::support::run(|| {
+        crate::naive::support::run(|| {
             $check::<f32>();
             $check::<f64>();
         })

@@ -1,6 +1,6 @@
 //! Sorting, searching and indicator vectors.
 
-use crate::support::{around, in_both, values};
+use super::support::{around, in_both, values};
 use raygrad_tensor::{Indices, Scalar, Tensor};
 
 fn sorts<T: Scalar>() {

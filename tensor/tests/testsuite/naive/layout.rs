@@ -1,6 +1,6 @@
 //! Reading, writing and adding through layouts: permuted, sliced, flipped, diagonal and stretched.
 
-use crate::support::{in_both, same, values, wide};
+use super::support::{in_both, same, values, wide};
 use raygrad_tensor::{Layout, Scalar};
 
 /// Where the element at an index stands in a buffer.
@@ -91,7 +91,7 @@ fn walks<T: Scalar>() {
                 let pairs = expected.into_iter().zip(sizes).map(|(sum, size)| [sum, size]);
                 // Only along the innermost axis are sums pairwise: one after another, the error grows as a walk.
                 let units = 16.0 + ((count / source) as f64).sqrt();
-                crate::support::summed(&format!("added {what}"), &target, units, pairs);
+                crate::naive::support::summed(&format!("added {what}"), &target, units, pairs);
             }
         }
     }

@@ -1,7 +1,7 @@
 //! Maps with every kind of broadcast, sines in blocks of quick and other ones, lanes.
 
-use crate::support::{around, close, in_both, same, values, wide};
-use raygrad_tensor::{Pool, Real, Scalar, Tensor, add_assign, broadcast_shape, lanes, lanes_either, map, map_real};
+use super::support::{around, close, in_both, same, values, wide};
+use raygrad_tensor::{Pool, Real, Scalar, Tensor, add_assign, broadcast_shape, lanes, lanes_real, map, map_real};
 
 fn tensor<T: Scalar>(shape: &[usize], seed: usize) -> Tensor<T> {
     Tensor::from_vec(shape, values(shape.iter().product(), seed))
@@ -96,7 +96,7 @@ fn slices<T: Scalar>() {
         lanes([&a, &b], &mut out, |[a, b]| a * b - a);
         same(&what, &out, (0..n).map(|i| x[i] * y[i] - x[i]));
         out.fill(T::from_f64(f64::NAN));
-        lanes_either([&a, &b], &mut out, |[a, b]| a * b - a, |[a, b]| a * b - a);
+        lanes_real!(&[&a, &b], &mut out, |[a, b]| a * b - a);
         same(&what, &out, (0..n).map(|i| x[i] * y[i] - x[i]));
         add_assign(&mut out, &b);
         same(&what, &out, (0..n).map(|i| x[i] * y[i] - x[i] + y[i]));

@@ -1,6 +1,6 @@
 //! Softmax, logarithms of sums, cross-entropy, moments and layer normalisation of rows.
 
-use crate::support::{around, close, in_both, sum, values, wide};
+use super::support::{around, close, in_both, sum, values, wide};
 use raygrad_tensor::rows::{
     cross_entropy_rows, cross_entropy_rows_grad, layer_norm_rows, layer_norm_rows_grad, log_softmax_rows,
     log_softmax_rows_grad, logsumexp_rows, softmax_rows, softmax_rows_grad, variance_rows,

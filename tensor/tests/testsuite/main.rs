@@ -1,0 +1,5 @@
+//! What this crate promises from outside.
+
+mod naive;
+mod ulp;
+mod views;
