@@ -5,8 +5,9 @@
 //! cargo bench --bench classic_step
 //! ```
 
-use raygrad::nerf::dataset::{Split, embedded};
+use raygrad::nerf::dataset::Split;
 use raygrad::nerf::{Config, Preset, Trainer};
+use raygrad_scenes::embedded;
 use std::sync::Arc;
 use std::time::Instant;
 

@@ -10,12 +10,12 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::nerf::dataset::scene::{Scene, train_cameras};
 use raygrad::nerf::pictures::metrics;
 use raygrad::nerf::{Image, PositionalEncoding};
 use raygrad::{
     Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Optimizer, Params, Schedule, Tape, Tensor, Tiles, Var,
 };
+use raygrad_scenes::{Scene, train_cameras};
 use std::path::PathBuf;
 
 const STEPS: usize = 3000;

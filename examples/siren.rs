@@ -8,13 +8,14 @@
 //! Trains for 60 seconds on the embedded scene unless told otherwise, saves the model, loads it, and draws it.
 
 use rand::Rng;
-use raygrad::nerf::dataset::{Split, embedded};
+use raygrad::nerf::dataset::Split;
 use raygrad::nerf::pictures::metrics::psnr;
 use raygrad::nerf::{
     Budget, Config, Density, Field, FieldConfig, Fields, Image, Kind, Model, Preset, Result, Seen, Site, Space,
     SphericalHarmonics, Trainer, register,
 };
 use raygrad::{Activation, Bound, Init, Linear, ParamId, Params, Scalar, Schedule, Tensor, Var};
+use raygrad_scenes::embedded;
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
 use std::path::PathBuf;

@@ -12,9 +12,9 @@
 //! latter.
 
 use glam::DVec3;
-use raygrad::nerf::dataset::scene::{Scene, train_cameras};
 use raygrad::nerf::geometry::{Mesh, Shape, files};
 use raygrad::nerf::{Camera, Config, Extent, Model, write_atomic};
+use raygrad_scenes::{Scene, train_cameras};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::error::Error;

@@ -8,10 +8,11 @@
 //! Trains for 60 seconds unless told otherwise. The scene is the embedded bulldozer; `dataset::load(folder, split, 2)`
 //! in its place reads a NeRF-synthetic scene at half its size.
 
-use raygrad::nerf::dataset::{Split, embedded};
+use raygrad::nerf::dataset::Split;
 use raygrad::nerf::pictures::colormap::{depth_map, error_map};
 use raygrad::nerf::pictures::metrics;
 use raygrad::nerf::{Budget, Config, Image, Preset, Result, Trainer};
+use raygrad_scenes::embedded;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -10,11 +10,12 @@
 //! train` does. From a window, where all photographs look the same way, what they see can be the cube instead of all of space:
 //! normalised device coordinates (Mildenhall et al. 2020, appendix C), with the same steps. Of the views that it has not seen, near is what lies in the box.
 
-use raygrad::nerf::dataset::{Dataset, Scope, Split, evenly_spaced, landscape, landscape_ahead, landscape_distances};
+use raygrad::nerf::dataset::{Dataset, Scope, Split, evenly_spaced};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::pictures::metrics::psnr_from_mse;
 use raygrad::nerf::sampling::proposal::{ProposalConfig, Spacing};
 use raygrad::nerf::{Background, Budget, Config, Model, Preset, Result, SamplerConfig, Trainer};
+use raygrad_scenes::{landscape, landscape_ahead, landscape_distances};
 use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::time::{Duration, Instant};

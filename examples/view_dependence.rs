@@ -13,10 +13,10 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::nerf::dataset::scene::{Scene, train_cameras};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result, Seen, Site, Space};
 use raygrad::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
+use raygrad_scenes::{Scene, train_cameras};
 use std::path::PathBuf;
 
 const STEPS: usize = 6000;

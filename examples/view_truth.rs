@@ -9,9 +9,9 @@
 //! Normals are minus the gradient of the density. A hash grid's density is rough at the scale of its cells, and so are
 //! its normals: each for itself is far off, and the mean of a small patch is not.
 
-use raygrad::nerf::dataset::scene::{Scene, test_cameras};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Config, Extent, Image, Model};
+use raygrad_scenes::{Scene, test_cameras};
 use serde_json::Value;
 use std::error::Error;
 use std::path::Path;

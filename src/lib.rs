@@ -7,19 +7,22 @@
 //! * [`autograd`]: the tape, operations, gradient checks;
 //! * [`nn`]: parameters, layers, optimisers and their files;
 //!
-//! and on them [`nerf`]: cameras, datasets, encodings, fields, sampling, rendering, training. [`guide`] leads from a first
-//! gradient to an operation of one's own and a trained model.
+//! and, with the feature `nerf` (on by default), from
+//! * [`nerf`](https://docs.rs/raygrad-nerf): cameras, datasets, encodings, fields, sampling, rendering, training.
+//!
+//! [`guide`] leads from a first gradient to an operation of one's own and a trained model.
 
 pub mod guide;
 
 pub use raygrad_autograd as autograd;
 pub use raygrad_autograd::*;
+#[cfg(feature = "nerf")]
 pub use raygrad_nerf as nerf;
 pub use raygrad_nn as nn;
 pub use raygrad_nn::*;
 pub use raygrad_tensor as tensor;
 
 /// The README's examples, as tests.
-#[cfg(doctest)]
+#[cfg(all(doctest, feature = "nerf"))]
 #[doc = include_str!("../README.md")]
 pub struct Readme;

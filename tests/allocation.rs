@@ -2,9 +2,10 @@
 //!
 //! The test has a binary of its own, because it counts what the whole process allocates.
 
-use raygrad::nerf::dataset::{Split, embedded};
+use raygrad::nerf::dataset::Split;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::{ClassicConfig, Config, FieldConfig, Preset, Trainer};
+use raygrad_scenes::embedded;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};

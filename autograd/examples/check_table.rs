@@ -26,7 +26,7 @@ Written by `cargo run --release -p raygrad-autograd --example check_table`. Ever
 Not in the table, because they pass or fail: the same bits when run again and on buffers with old values; the same
 results (1e-14) from transposed and reversed views; one variable as two inputs; fused operations against their references (1e-12); formulas
 against dual numbers (1e-12); linear operations against their adjoints (1e-14); exact values and gradients at extremes.
-`autograd/tests/peers.rs` compares value, gradient and second gradient of each operation with PyTorch in f64, within 2e-14.
+`autograd/tests/testsuite/peers.rs` compares value, gradient and second gradient of each operation with PyTorch in f64, within 2e-14.
 
 ";
 

@@ -1,6 +1,6 @@
 //! This crate's operations, for the checks.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 
 /// Every operation of this crate, with the inputs it is checked on.

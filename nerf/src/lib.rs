@@ -7,7 +7,7 @@
 
 pub mod analytic;
 pub mod camera;
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 mod catalogue;
 #[doc(hidden)]
 pub mod compiled;
@@ -33,7 +33,7 @@ pub mod volume;
 
 pub use camera::{Camera, Lens, Ndc, Pose, Ray, Rays, Samples, clip_span, intersect_box};
 pub use camera::{lens_places, rotation_exp, rotation_log};
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub use catalogue::catalogue;
 pub use dataset::{Background, Image, SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use encoding::{PositionalEncoding, SphericalHarmonics};

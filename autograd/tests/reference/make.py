@@ -1,4 +1,4 @@
-"""Writes peers.npz, the reference values of tests/peers.rs: every operation of the catalogue as PyTorch does it in f64.
+"""Writes peers.npz, the reference values of tests/testsuite/peers.rs: every operation of the catalogue as PyTorch does it in f64.
 
     pip install numpy torch                  # torch 2.15, numpy 2.4 wrote the committed file
     python make.py

@@ -1,7 +1,7 @@
 //! Rotations for poses that are optimised: from and to rotation vectors, with gradients at every angle.
 
 use crate::camera::angles::{angle_over, sinc_and_cos_of_root};
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Mask, Real, Scalar, Shape, Tensor, Var, record};
 
@@ -145,7 +145,7 @@ pub fn rotation_log<'t, T: Scalar>(matrices: &Var<'t, T>) -> Var<'t, T> {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let angles = |scale: f64| Tensor::from_fn(&[6, 3], |i| scale * (((i * 7) % 13) as f64 / 6.0 - 1.0));
     let matrices = |scale: f64| {

@@ -3,7 +3,7 @@
 //! NeRF is trained, and its images are blended, in code values as they stand in files: half of white over black is .5
 //! there, where half of the light would be .735. Use these operations for a model whose colours are light.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::{Cases, Entry, Examined};
 use raygrad_autograd::{Formula, Real, Scalar, Var};
 
@@ -46,7 +46,7 @@ impl Formula<1> for SrgbEncode {
     }
 }
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 impl Examined<1> for SrgbEncode {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..1.5).domain_also(-0.5..0.001);
@@ -67,7 +67,7 @@ impl Formula<1> for SrgbDecode {
     }
 }
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 impl Examined<1> for SrgbDecode {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..1.5).domain_also(-0.5..0.03);
@@ -99,7 +99,7 @@ pub fn srgb_decode<'t, T: Scalar>(codes: &Var<'t, T>) -> Var<'t, T> {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     vec![Entry::examined(SrgbEncode), Entry::examined(SrgbDecode)]
 }

@@ -12,11 +12,12 @@ use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use crate::numbers::median;
 use glam::DVec3;
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// What the images of a part of a dataset are for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -170,7 +171,13 @@ impl Dataset {
         };
         let some = self.frames.iter().any(|frame| meets(&frame.camera, [RAYS; 2]));
         // A small box may lie between the rays.
-        if some || self.frames.par_iter().any(|Frame { camera, .. }| meets(camera, [camera.width, camera.height])) {
+        let found = AtomicBool::new(some);
+        parallel::each_of(&self.frames, |_, Frame { camera, .. }| {
+            if !found.load(Ordering::Relaxed) && meets(camera, [camera.width, camera.height]) {
+                found.store(true, Ordering::Relaxed);
+            }
+        });
+        if found.into_inner() {
             return Ok(());
         }
         let [low, high] = bounds;
@@ -199,11 +206,11 @@ pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::embedded;
+    use crate::dataset::sample::ball;
 
     #[test]
     fn footprints_are_pixels_side_by_side_where_photographs_show_the_middle() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(3);
         data.bounds = [DVec3::new(-1.0, -2.0, -1.0), DVec3::new(1.0, 2.0, 3.0)];
         // The middle is one above the origin, the longest side 4.
@@ -224,7 +231,7 @@ mod tests {
 
     #[test]
     fn a_small_box_anywhere_in_the_picture_is_found_and_one_beside_it_is_not() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(1);
         let pose = Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y);
         data.frames[0].camera = Camera::from_angle(75, 50, 0.8, pose);

@@ -13,7 +13,7 @@ use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use glam::DAffine3;
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -198,18 +198,15 @@ impl Capture {
         }
         let present = evenly_spaced(present, reading.views);
         // What headers tell is found out before anything is decoded.
-        let plans: Vec<Result<Plan<'_>>> =
-            present.par_iter().map(|view| self.named(view, Plan::new(self, view, reading.downscale))).collect();
+        let plan = |i: usize| self.named(present[i], Plan::new(self, present[i], reading.downscale));
+        let plans = parallel::collect(present.len(), plan);
         let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
         let (done, total, lit) = (AtomicUsize::new(0), plans.len(), Lit::default());
-        let frames: Vec<Result<Frame>> = plans
-            .par_iter()
-            .map(|plan| {
-                let frame = plan.frame(&survey.placement, &lit, reading.distances);
-                (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
-                self.named(plan.view, frame)
-            })
-            .collect();
+        let frames = parallel::collect(total, |i| {
+            let frame = plans[i].frame(&survey.placement, &lit, reading.distances);
+            (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+            self.named(plans[i].view, frame)
+        });
         Ok(Dataset {
             frames: frames.into_iter().collect::<Result<_>>()?,
             bounds: survey.bounds,

@@ -9,7 +9,7 @@ use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use crate::numbers::median;
 use glam::{DMat3, DVec3};
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 
 /// Where a scene is and how far it goes, in scene units, and why that is thought.
 #[derive(Debug, Clone, PartialEq)]
@@ -295,7 +295,7 @@ fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
     if trusted.len() < FEWEST {
         return None;
     }
-    let nearest = |camera: &&Camera| {
+    let nearest = |camera: &Camera| {
         let inside = |p: &&DVec3| {
             camera.pixel_of(**p).is_some_and(|[x, y]| {
                 (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y)
@@ -306,7 +306,9 @@ fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
         // The nearest of two hundred: a few are always wrong.
         depths.get(depths.len() / 200).copied()
     };
-    let mut nearest: Vec<f64> = evenly_spaced(cameras.to_vec(), ASKED[0]).par_iter().filter_map(nearest).collect();
+    let asked = evenly_spaced(cameras.to_vec(), ASKED[0]);
+    let nearest = parallel::collect(asked.len(), |i| nearest(asked[i]));
+    let mut nearest: Vec<f64> = nearest.into_iter().flatten().collect();
     nearest.sort_by(f64::total_cmp);
     nearest.get(nearest.len() / 20).copied()
 }

@@ -10,7 +10,7 @@ use super::poses::Focus;
 use crate::dataset::evenly_spaced;
 use crate::numbers::median;
 use glam::{DAffine3, DMat3, DVec3};
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 
 /// Photographs that each one is compared with.
 const NEIGHBOURS: usize = 5;
@@ -78,7 +78,7 @@ pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
         let nearest = focus.map_or(0.0, |focus| 0.25 * focus.place.distance(poses[i].translation));
         Pair { views: [i, j], tally: matched(all[i], all[j], nearest) }
     };
-    pairs.par_iter().map(one).collect()
+    parallel::collect(pairs.len(), |i| one(&pairs[i]))
 }
 
 /// The median distance of a camera from that which is the fifth nearest, of some cameras if there are many.

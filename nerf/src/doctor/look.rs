@@ -4,7 +4,7 @@ use super::picture::{Picture, grey};
 use crate::dataset::load::same_shape;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -37,12 +37,12 @@ pub(super) struct Look {
 pub(super) fn look_at_all(capture: &Capture, progress: &(dyn Fn(usize, usize) + Sync)) -> Vec<(String, Result<Look>)> {
     let views: Vec<&View> = capture.present().collect();
     let (done, total) = (AtomicUsize::new(0), views.len());
-    let one = |view: &&View| {
+    let one = |view: &View| {
         let look = look_at(view);
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
         (view.name.clone(), look)
     };
-    views.par_iter().map(one).collect()
+    parallel::collect(views.len(), |i| one(views[i]))
 }
 
 fn look_at(view: &View) -> Result<Look> {

@@ -125,6 +125,3 @@ fn range(values: Vec<f64>) -> Option<Range> {
     let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     (!values.is_empty()).then(|| Range { least, median: median(values), most })
 }
-
-#[cfg(test)]
-mod tests;

@@ -138,7 +138,7 @@ pub(super) fn extents(places: &[DVec3]) -> [f64; 3] {
 mod tests {
     use super::*;
     use crate::camera::Camera;
-    use crate::dataset::scene::train_cameras;
+    use crate::dataset::sample::cameras_around;
 
     #[test]
     fn conventions_are_undone_by_themselves() {
@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn cameras_around_a_thing_look_at_it_and_flipped_ones_away() {
-        let poses: Vec<DAffine3> = train_cameras(20, 8).into_iter().map(|camera| camera.pose).collect();
+        let poses: Vec<DAffine3> = cameras_around(20, 8).into_iter().map(|camera| camera.pose).collect();
         let focus = Focus::of(&poses).unwrap();
         assert!(focus.place.length() < 1e-9 && (focus.distance - 4.0).abs() < 1e-9 && focus.is_inward());
         let flipped: Vec<DAffine3> = poses.iter().map(|pose| Convention::OpenCv.apply(*pose)).collect();

@@ -1,6 +1,6 @@
 //! Positional encoding: sinusoids of rising frequency let a network hold fine detail.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
@@ -154,7 +154,7 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     vec![
         Entry::new(PositionalEncoding { levels: 4, input: true })

@@ -1,6 +1,6 @@
 //! Spherical harmonics: a smooth basis for what depends on the direction of view.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
@@ -172,7 +172,7 @@ impl<T: Scalar> Op<T> for SphericalHarmonics {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     (1..=4).map(|degree| Entry::new(SphericalHarmonics::new(degree)).sample(&[&[4, 3]]).sample(&[&[0, 3]])).collect()
 }

@@ -6,7 +6,6 @@ use crate::space::occupancy::{DensityFn, POINTS};
 use crate::{Error, Result};
 use glam::DVec3;
 use raygrad_tensor::parallel;
-use rayon::prelude::*;
 
 /// Times that the part of an edge in which the surface lies is halved.
 const HALVINGS: usize = 5;
@@ -153,7 +152,7 @@ fn limited(
 fn layer(lattice: &Lattice, z: usize, density: &DensityFn<'_>) -> Vec<f32> {
     let [width, height, _] = lattice.nodes;
     let mut values = vec![0.0; width * height];
-    values.par_chunks_mut(POINTS).enumerate().for_each(|(chunk, out)| {
+    parallel::each_of(values.chunks_mut(POINTS), |chunk, out| {
         let nodes = (chunk * POINTS..).take(out.len()).map(|i| lattice.node([i % width, i / width, z]));
         let points: Vec<[f32; 3]> = nodes.map(|place| place.as_vec3().to_array()).collect();
         parallel::serial(|| density(&points, out));
@@ -164,7 +163,8 @@ fn layer(lattice: &Lattice, z: usize, density: &DensityFn<'_>) -> Vec<f32> {
 /// Where the level is passed on each of these edges.
 fn places(lattice: &Lattice, level: f32, density: &DensityFn<'_>, crossings: &[Crossing]) -> Vec<DVec3> {
     let mut places = vec![DVec3::ZERO; crossings.len()];
-    places.par_chunks_mut(POINTS).zip(crossings.par_chunks(POINTS)).for_each(|(places, crossings)| {
+    let parts = places.chunks_mut(POINTS).zip(crossings.chunks(POINTS));
+    parallel::each_of(parts, |_, (places, crossings)| {
         // For each edge the part, as shares of it, in which the level is passed, and the values at the ends of that.
         let mut parts: Vec<[(f64, f32); 2]> =
             crossings.iter().map(|c| [(0.0, c.values[0]), (1.0, c.values[1])]).collect();

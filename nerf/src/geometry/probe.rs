@@ -11,7 +11,6 @@ use crate::volume::render::Evaluations;
 use glam::DVec3;
 use raygrad_autograd::{Pool, Segments, Tape, Tensor};
 use raygrad_tensor::parallel;
-use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// A model that is asked at places, and how often it was.
@@ -73,14 +72,13 @@ impl<'a> Probe<'a> {
     pub fn look(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
         let tone = self.model.tone.as_ref();
         let gains = tone.map_or([1.0; 3], |tone| tone.gain(&self.model.params, self.model.look, false).at(0.0));
-        let look = |places: &[DVec3]| {
-            parallel::serial(|| {
-                let normals = self.normals(grid, reach, places);
-                let colors = self.colors(places, &normals, gains);
-                normals.into_iter().zip(colors).collect::<Vec<_>>()
-            })
+        let chunks: Vec<&[DVec3]> = places.chunks(POINTS).collect();
+        let look = |chunk: usize| {
+            let normals = self.normals(grid, reach, chunks[chunk]);
+            let colors = self.colors(chunks[chunk], &normals, gains);
+            normals.into_iter().zip(colors)
         };
-        places.par_chunks(POINTS).flat_map_iter(look).unzip()
+        parallel::collect(chunks.len(), look).into_iter().flatten().unzip()
     }
 
     fn normals(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> Vec<DVec3> {

@@ -11,7 +11,6 @@ use crate::volume::render::Evaluations;
 use glam::DVec3;
 use raygrad_autograd::{Pool, Tape};
 use raygrad_tensor::parallel;
-use rayon::prelude::*;
 use std::f64::consts::LN_2;
 
 /// Rays that let more light through than this meet nothing.
@@ -58,7 +57,7 @@ pub(super) fn sights(model: &Model<f32>, camera: &Camera, pool: &Pool<f32>) -> S
         }
         parallel::serial(|| see(model, &rays, pool))
     };
-    let tiles: Vec<Seen> = (0..pixels.div_ceil(TILE)).into_par_iter().map(tile).collect();
+    let tiles = parallel::collect(pixels.div_ceil(TILE), tile);
     let evaluations = tiles.iter().fold(Evaluations::default(), |sum, tile| sum + tile.evaluations);
     Seen { sights: tiles.into_iter().flat_map(|tile| tile.sights).collect(), evaluations }
 }

@@ -97,7 +97,7 @@ fn cameras(stored: Option<&[u8]>) -> Result<Vec<Camera>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::scene::train_cameras;
+    use crate::dataset::sample::cameras_around;
     use crate::field::{FieldConfig, VoxelConfig};
     use crate::model::config::Preset;
     use crate::model::densities;
@@ -156,7 +156,7 @@ mod tests {
         assert_eq!(bytes([&new.grid, new.view_grid()]), bytes([&old.grid, old.view_grid()]));
         assert!(new.view_grid().occupied_share() < 0.5, "what views look at is pruned");
         assert_eq!(new.grid.occupied_share(), 1.0, "what is stored is not");
-        let camera = &train_cameras(4, 24)[1];
+        let camera = &cameras_around(4, 24)[1];
         let [seen, again] = [&model, &read].map(|model| model.view(camera, [1.0; 3]));
         assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));
         let error = Model::load(&path, voxel(3), extent).err().unwrap().to_string();
@@ -169,7 +169,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         let mut model = Model::new(Config::preset(Preset::Small), extent, 3).unwrap();
-        let camera = &train_cameras(4, 12)[1];
+        let camera = &cameras_around(4, 12)[1];
         let view = |model: &Model<f32>| model.view(camera, [1.0; 3]).color;
         let whole = view(&model);
         // Of the coarse field, which says where the other one is sampled.
@@ -194,7 +194,7 @@ mod tests {
     #[test]
     fn stored_cameras_have_to_be_some() {
         let stored = |change: fn(&mut Camera)| {
-            let mut camera = train_cameras(1, 8)[0].clone();
+            let mut camera = cameras_around(1, 8)[0].clone();
             change(&mut camera);
             cameras(Some(&serde_json::to_vec(&[camera]).unwrap()))
         };

@@ -2,7 +2,7 @@
 //!
 //! All take images of one shape with values in 0..=1, sum in f64, and give NaN when a value is NaN.
 
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 
 use crate::dataset::image::Image;
 
@@ -79,7 +79,7 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     };
     // Rows are added in order, so that the result does not depend on the number of threads.
     let places = [a.width + 1 - SSIM_WINDOW, a.height + 1 - SSIM_WINDOW];
-    let totals: Vec<f64> = (0..places[1]).into_par_iter().map(row_total).collect();
+    let totals = parallel::collect(places[1], row_total);
     totals.iter().sum::<f64>() / (places[0] * places[1] * a.channels) as f64
 }
 
@@ -102,11 +102,12 @@ fn row_moments(a: &Image, b: &Image, weights: &Weights, f: fn(f64, f64) -> f64) 
     let row_length = a.width * a.channels;
     let out_length = row_length - (SSIM_WINDOW - 1) * a.channels;
     let zeros = vec![0.0; out_length];
-    let moments = |(a_row, b_row): (&[f32], &[f32])| {
+    let moments = |y: usize| {
+        let [a_row, b_row] = [a, b].map(|image| &image.data[y * row_length..][..row_length]);
         let row: Vec<f64> = a_row.iter().zip(b_row).map(|(&a, &b)| f(a.into(), b.into())).collect();
         combine(weights, std::array::from_fn(|k| (&row[k * a.channels..][..out_length], &zeros[..])))
     };
-    a.data.par_chunks_exact(row_length).zip(b.data.par_chunks_exact(row_length)).map(moments).collect()
+    parallel::collect(a.height, moments)
 }
 
 /// Weights of the window along one axis; they sum to 1.

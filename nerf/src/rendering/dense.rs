@@ -10,7 +10,6 @@ use crate::sampling::Purpose;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Scalar, Tape, Var};
-use rayon::prelude::*;
 
 /// A view in double precision.
 #[derive(Debug, Clone)]
@@ -46,7 +45,7 @@ impl<T: Scalar> Model<T> {
             out.iter_mut().zip(seen).for_each(|(out, pixel)| *out = pixel.over(background));
         };
         let all = Viewing::over([0.0; 3]);
-        let evaluations = self.pixels(camera, &all, TILE, see, pixels.par_chunks_mut(TILE), keep);
+        let evaluations = self.pixels(camera, &all, TILE, see, pixels.chunks_mut(TILE), keep);
         let evaluations = evaluations.expect("nobody stops it");
         DenseView { width: camera.width, height: camera.height, pixels, evaluations }
     }
@@ -89,7 +88,7 @@ impl DenseView {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::scene::train_cameras;
+    use crate::dataset::sample::cameras_around;
     use crate::field::{FieldConfig, VoxelConfig};
     use crate::model::Extent;
     use crate::model::config::{Config, Preset};
@@ -112,7 +111,7 @@ mod tests {
     fn single_precision_shows_what_double_shows() {
         let model = ball();
         let double = model.cast::<f64>().unwrap();
-        let camera = &train_cameras(4, 20)[1];
+        let camera = &cameras_around(4, 20)[1];
         let [background, black] = [[0.2, 0.5, 1.0], [0.0; 3]];
         let [exact, single] = [double.dense_view(camera, background, 1), model.dense_view(camera, background, 1)];
         assert_eq!(exact.evaluations, single.evaluations);
@@ -149,7 +148,7 @@ mod tests {
     #[test]
     fn every_quadrature_shows_the_same_scene() {
         let mut model = ball();
-        let camera = &train_cameras(4, 20)[1];
+        let camera = &cameras_around(4, 20)[1];
         let reference = model.cast::<f64>().unwrap().dense_view(camera, [1.0; 3], 4).picture();
         use crate::volume::quadrature::Quadrature::*;
         // The voxels' edges are steep at the scale of a step.

@@ -10,7 +10,6 @@ use crate::sampling::Purpose;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Pool, Scalar, Tape};
-use rayon::prelude::*;
 
 /// Rays that are evaluated together: the densities of all their samples are on one tape.
 const TILE: usize = 64;
@@ -38,7 +37,7 @@ impl<T: Scalar> Model<T> {
     #[inline(never)]
     pub fn normals_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Image> {
         let mut image = Image::new(camera.width, camera.height, 3);
-        let out = image.data.par_chunks_mut(3 * TILE);
+        let out = image.data.chunks_mut(3 * TILE);
         let see = |pool: &mut Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, viewing, pool, out);
         self.tiles(camera, viewing, TILE, out, see)?;
         Some(image)

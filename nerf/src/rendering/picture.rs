@@ -10,8 +10,8 @@ use crate::sampling::Limits;
 use crate::volume::render::Evaluations;
 use glam::DVec3;
 use raygrad_autograd::Scalar;
-use raygrad_tensor::parallel;
-use rayon::prelude::*;
+use raygrad_tensor::parallel::{self, Scratch, locked};
+use std::sync::{Mutex, PoisonError};
 
 /// What a model sees from a camera.
 #[derive(Debug, Clone)]
@@ -65,10 +65,10 @@ impl Picture {
     }
 
     /// Its parts of `tile` pixels each, row by row.
-    pub(crate) fn parts(&mut self, tile: usize) -> impl IndexedParallelIterator<Item = Part<'_>> {
+    pub(crate) fn parts(&mut self, tile: usize) -> impl Iterator<Item = Part<'_>> {
         let [color, depth, opacity] = [&mut self.color, &mut self.depth, &mut self.opacity];
-        let rest = depth.data.par_chunks_mut(tile).zip(opacity.data.par_chunks_mut(tile));
-        let parts = color.data.par_chunks_mut(3 * tile).zip(rest);
+        let rest = depth.data.chunks_mut(tile).zip(opacity.data.chunks_mut(tile));
+        let parts = color.data.chunks_mut(3 * tile).zip(rest);
         parts.map(|(color, (depth, opacity))| Part { color, depth, opacity })
     }
 }
@@ -119,12 +119,12 @@ const EVERYWHERE: [DVec3; 2] = [DVec3::NEG_INFINITY, DVec3::INFINITY];
 impl<T: Scalar> Model<T> {
     /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
     /// tile's first pixel, its rays and its part of `out`. Nothing if it was not to go on.
-    pub(crate) fn tiles<S: Default, P: Send>(
+    pub(crate) fn tiles<S: Default + Send, P: Send>(
         &self,
         camera: &Camera,
         viewing: &Viewing<'_>,
         tile: usize,
-        out: impl IndexedParallelIterator<Item = P>,
+        out: impl Iterator<Item = P>,
         see: impl Fn(&mut S, usize, &Rays<T>, P) -> Evaluations + Sync,
     ) -> Option<Evaluations> {
         let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
@@ -132,28 +132,31 @@ impl<T: Scalar> Model<T> {
         let [near, far] = self.view_span();
         // Which corner is which is nothing to a ray.
         let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
-        let tiles = out.enumerate().map_init(S::default, |scratch, (which, out)| {
-            if !(viewing.goes_on)() {
-                return None;
-            }
-            let mut rays = Rays::new();
-            for pixel in which * tile..count.min((which + 1) * tile) {
-                rays.push_pixel(camera, camera.place_of(pixel), bounds, span);
-            }
-            Some(parallel::serial(|| see(scratch, which * tile, &rays, out)))
+        let (scratch, seen) = (Scratch::default(), Mutex::new(Some(Evaluations::default())));
+        parallel::each_of(out, |which, out| {
+            let goes_on = locked(&seen).is_some() && (viewing.goes_on)();
+            let evaluations = goes_on.then(|| {
+                let mut rays = Rays::new();
+                for pixel in which * tile..count.min((which + 1) * tile) {
+                    rays.push_pixel(camera, camera.place_of(pixel), bounds, span);
+                }
+                scratch.with(|scratch| parallel::serial(|| see(scratch, which * tile, &rays, out)))
+            });
+            let mut seen = locked(&seen);
+            *seen = seen.zip(evaluations).map(|(a, b)| a + b);
         });
-        tiles.try_reduce(Evaluations::default, |a, b| Some(a + b))
+        seen.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
     /// shows to its part of `out`. Nothing if it was not to go on.
-    pub(crate) fn pixels<S: Default, P: Send>(
+    pub(crate) fn pixels<S: Default + Send, P: Send>(
         &self,
         camera: &Camera,
         viewing: &Viewing<'_>,
         tile: usize,
         see: impl Fn(&mut S, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
-        out: impl IndexedParallelIterator<Item = P>,
+        out: impl Iterator<Item = P>,
         keep: impl Fn(&[Pixel], P) + Sync,
     ) -> Option<Evaluations> {
         let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
@@ -308,7 +311,7 @@ mod tests {
             *tile = (first, rays.clone());
             Evaluations::default()
         };
-        model.tiles(&camera, &viewing, 50, tiles.par_iter_mut(), keep).unwrap();
+        model.tiles(&camera, &viewing, 50, tiles.iter_mut(), keep).unwrap();
         assert_eq!(
             tiles.iter().map(|(first, rays)| [*first, rays.len()]).collect::<Vec<_>>(),
             [[0, 50], [50, 50], [100, 50], [150, 50], [200, 21]]

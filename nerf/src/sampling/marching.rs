@@ -297,7 +297,7 @@ impl Limits {
 mod tests {
     use super::*;
     use crate::analytic::{AnalyticField, scenes};
-    use crate::dataset::{Split, embedded};
+    use crate::dataset::{Split, sample::ball};
     use crate::volume::quadrature::Plan;
     use raygrad_autograd::{Tape, Tensor};
     use raygrad_nn::Params;
@@ -356,8 +356,9 @@ mod tests {
 
     #[test]
     fn what_no_photograph_shows_is_left_out_from_the_start() {
-        let mut data = embedded(Split::Train, 16);
+        let mut data = ball(Split::Train, 16);
         data.frames.truncate(1);
+        data.bounds = [DVec3::splat(-0.6), DVec3::splat(0.6)];
         let occupied = |grid: bool, data: &Dataset| {
             let mut config = MarchingConfig::default();
             (config.occupancy.resolution, config.occupancy.skip.carving, config.occupancy.skip.grid) = (16, 0, grid);

@@ -1,6 +1,6 @@
 //! Scene contraction: all of space in a ball of radius 2, for scenes without bounds.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 
@@ -142,7 +142,7 @@ pub fn contract<'t, T: Scalar>(points: &Var<'t, T>) -> Var<'t, T> {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let points = |scale: f64| Tensor::from_fn(&[5, 3], |i| scale * (((i * 7) % 11) as f64 / 5.0 - 1.0));
     vec![

@@ -43,12 +43,12 @@ pub(crate) fn carve_unseen(grid: &mut OccupancyGrid, data: &Dataset) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Split, embedded};
+    use crate::dataset::{Split, sample::ball};
     use crate::space::occupancy::OccupancyConfig;
 
     #[test]
     fn what_one_camera_sees_stays_and_nothing_else() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(1);
         let pose = Camera::look_at(DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO, DVec3::Y);
         data.frames[0].camera = Camera::from_angle(40, 30, 0.6, pose);

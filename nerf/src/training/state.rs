@@ -102,11 +102,11 @@ impl Trainer {
     /// Goes on from a [state](Self::state) of a trainer of the same configuration and photographs: the next steps are what
     /// they would have been there, bit for bit. If it fails, nothing has changed.
     ///
-    /// ```
-    /// use raygrad_nerf::dataset::{Split, embedded};
+    /// ```no_run
+    /// use raygrad_nerf::dataset::{Split, load};
     /// use raygrad_nerf::{Config, Preset, Trainer};
     /// use std::sync::Arc;
-    /// let (config, data) = (Config::preset(Preset::Instant), Arc::new(embedded(Split::Train, 16)));
+    /// let (config, data) = (Config::preset(Preset::Instant), Arc::new(load("scene", Split::Train, 4)?));
     /// let mut trainer = Trainer::new(config.clone(), data.clone())?;
     /// trainer.step(0.0);
     /// let state = trainer.state()?;
@@ -160,11 +160,11 @@ impl Model<f32> {
     /// This model as it was when a trainer wrote a [state](Trainer::state), ready to be rendered, with this one's
     /// [`look`](Self::look) and what this one's views leave out: which is found out anew, as when a model is loaded.
     ///
-    /// ```
-    /// use raygrad_nerf::dataset::{Split, embedded};
+    /// ```no_run
+    /// use raygrad_nerf::dataset::{Split, load};
     /// use raygrad_nerf::{Config, Preset, Trainer};
     /// use std::sync::Arc;
-    /// let data = Arc::new(embedded(Split::Train, 16));
+    /// let data = Arc::new(load("scene", Split::Train, 4)?);
     /// let mut trainer = Trainer::new(Config::preset(Preset::Instant), data)?;
     /// let (state, place) = (trainer.state()?, [[0.1, 0.2, 0.3]]);
     /// let [mut before, mut seen] = [[0.0]; 2];
@@ -207,7 +207,7 @@ impl Model<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Split, embedded};
+    use crate::dataset::{Split, sample::ball};
     use crate::model::Preset;
     use std::sync::Arc;
 
@@ -216,7 +216,7 @@ mod tests {
         if let Some(sampler) = config.sampler.get_mut::<crate::sampling::marching::MarchingConfig>() {
             (sampler.occupancy.resolution, sampler.samples) = (16, 512);
         }
-        Trainer::new(config, Arc::new(embedded(Split::Train, 8))).unwrap()
+        Trainer::new(config, Arc::new(ball(Split::Train, 8))).unwrap()
     }
 
     #[test]

@@ -340,12 +340,16 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Split, embedded, evenly_spaced, landscape_ahead};
+    use crate::dataset::{
+        Split,
+        sample::{ball, ball_ahead},
+    };
     use crate::encoding::hash_grid::HashGridConfig;
     use crate::field::{ClassicConfig, InstantConfig};
     use crate::model::Refined;
     use crate::sampling::SamplerConfig;
     use crate::sampling::hierarchical::HierarchicalConfig;
+    use crate::sampling::marching::MarchingConfig;
     use crate::training::stats::STUCK;
     use crate::{FieldConfig, Preset};
     use glam::DVec3;
@@ -354,7 +358,7 @@ mod tests {
 
     #[test]
     fn cameras_from_which_nothing_of_the_box_is_seen_are_an_error() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(3);
         for frame in &mut data.frames {
             frame.camera.pose.translation *= 3.0;
@@ -373,8 +377,7 @@ mod tests {
 
     #[test]
     fn fields_live_in_the_picture_of_all_that_photographs_show() {
-        let mut data = landscape_ahead(Split::Train, 8);
-        data.frames = evenly_spaced(data.frames, 4);
+        let data = ball_ahead(8);
         let ndc = data.ndc.unwrap();
         assert!(data.frames.iter().all(|frame| ndc.pixels(&frame.camera, DVec3::ZERO) < 20.0));
         assert!((data.footprints() - ndc.pixels(&data.frames[2].camera, DVec3::ZERO)).abs() < 2.0);
@@ -414,7 +417,7 @@ mod tests {
 
     #[test]
     fn what_steps_did_adds_up_and_an_error_is_of_one_of_them() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(3);
         let config = Config { background: crate::Background::White, ..tiny_table() };
         let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
@@ -434,7 +437,7 @@ mod tests {
 
     #[test]
     fn the_last_tile_of_a_step_has_the_rays_that_are_left() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(2);
         let data = Arc::new(data);
         let marched = |batch: usize| {
@@ -452,7 +455,7 @@ mod tests {
 
     #[test]
     fn a_restart_keeps_what_was_said_of_parameters() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(2);
         let mut trainer = Trainer::new(tiny(), Arc::new(data)).unwrap();
         let params = &mut trainer.model.params;
@@ -472,7 +475,7 @@ mod tests {
 
     #[test]
     fn a_restart_knows_the_cameras_that_it_corrects() {
-        let mut data = embedded(Split::Train, 8);
+        let mut data = ball(Split::Train, 8);
         data.frames.truncate(3);
         let config = tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure]);
         let mut trainer = Trainer::new(config, Arc::new(data.clone())).unwrap();
@@ -513,12 +516,15 @@ mod tests {
         if let Some(field) = config.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig { levels: 3, features: 2, log2_table: 8, coarsest: 4, finest: 16 };
         }
+        if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
+            sampler.occupancy.resolution = 16;
+        }
         config
     }
 
     #[test]
     fn frozen_parameters_rest_and_others_have_their_own_rates() {
-        let data = Arc::new(embedded(Split::Train, 12));
+        let data = Arc::new(ball(Split::Train, 12));
         for config in [tiny(), tiny_table()] {
             for round in 0..3 {
                 let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
@@ -552,7 +558,7 @@ mod tests {
 
     #[test]
     fn a_run_whose_networks_overflow_ends_although_parameters_move() {
-        let data = Arc::new(embedded(Split::Train, 12));
+        let data = Arc::new(ball(Split::Train, 12));
         let mut trainer = Trainer::new(tiny_table(), data).unwrap();
         trainer.step(0.0);
         let ids: Vec<_> = trainer.model.params.ids().collect();
@@ -568,7 +574,7 @@ mod tests {
 
     #[test]
     fn a_run_that_has_diverged_ends() {
-        let data = Arc::new(embedded(Split::Train, 12));
+        let data = Arc::new(ball(Split::Train, 12));
         for config in [tiny(), tiny_table()] {
             let mut trainer = Trainer::new(config, data.clone()).unwrap();
             trainer.step(0.0);
@@ -583,7 +589,7 @@ mod tests {
 
     #[test]
     fn what_is_not_finite_first_is_named() {
-        let data = Arc::new(embedded(Split::Train, 12));
+        let data = Arc::new(ball(Split::Train, 12));
         for config in [tiny(), tiny_table(), tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure])]
         {
             let mut trainer = Trainer::new(config, data.clone()).unwrap();
@@ -604,7 +610,7 @@ mod tests {
 
     #[test]
     fn a_slower_run_moves_less() {
-        let data = Arc::new(embedded(Split::Train, 12));
+        let data = Arc::new(ball(Split::Train, 12));
         let config = tiny_table().with_refined(&[Refined::Exposure]);
         let [whole, half, none] = [1.0, 0.5, 0.0].map(|factor| {
             let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
@@ -627,7 +633,7 @@ mod tests {
 
     #[test]
     fn steps_get_as_many_rays_as_have_the_samples_that_are_wanted() {
-        let mut trainer = Trainer::new(tiny_table(), Arc::new(embedded(Split::Train, 12))).unwrap();
+        let mut trainer = Trainer::new(tiny_table(), Arc::new(ball(Split::Train, 12))).unwrap();
         let mut next = |batch: usize, marched: u64| {
             trainer.batch = batch;
             trainer.adapt_batch(&Work { marched, ..Work::default() });
@@ -644,7 +650,7 @@ mod tests {
 
     #[test]
     fn a_restart_draws_other_rays() {
-        let data = Arc::new(embedded(Split::Train, 12));
+        let data = Arc::new(ball(Split::Train, 12));
         let [one, other] = [0, 1].map(|restarts| {
             let mut trainer = Trainer::new(tiny_table(), data.clone()).unwrap();
             trainer.done.restarts = restarts;
@@ -664,6 +670,6 @@ mod tests {
         config.adam.beta1 = 0.0;
         config.table_adam.beta2 = 2.0;
         assert!(message(&config).contains("`table_adam.beta2`: is 2.0"));
-        assert!(Trainer::new(config, Arc::new(embedded(Split::Train, 12))).is_err());
+        assert!(Trainer::new(config, Arc::new(ball(Split::Train, 12))).is_err());
     }
 }

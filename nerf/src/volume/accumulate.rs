@@ -1,6 +1,6 @@
 //! Weighted sums along rays.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 
@@ -84,7 +84,7 @@ impl<T: Scalar> Op<T> for Accumulate {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let values = |channels: usize| Tensor::from_fn(&[7, channels], |i| ((i * 29) % 17) as f64 / 17.0);
     let weights = Tensor::from_fn(&[7], |i| ((i * 5) % 7) as f64 / 9.0);

@@ -2,7 +2,7 @@
 
 use crate::field::MOST_LOG_DENSITY;
 use crate::{Error, Result};
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
@@ -157,7 +157,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
 
 /// The catalogue entries of this file. [`OpticalDepth`] holds a tensor of its own number type, so each precision has its
 /// own.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let delta = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.5, 0.125, 0.5, 1.0, 0.0, 0.375]);
     let sigma = |values: [f64; 7]| Tensor::from_vec(&[7], values.to_vec());

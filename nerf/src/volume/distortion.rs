@@ -1,6 +1,6 @@
 //! The distortion loss: pulls the weights along a ray together.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 
@@ -129,7 +129,7 @@ impl<T: Scalar> Op<T> for Distortion<T> {
 }
 
 /// The catalogue entries of this file. [`Distortion`] holds tensors of its own number type, so each precision has its own.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let midpoints = || Tensor::<f64>::from_vec(&[7], vec![0.125, 0.25, 0.75, 0.5, 0.0, 0.0, 0.875]);
     let lengths = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.125, 0.5, 0.5, 1.0, 0.0, 0.375]);

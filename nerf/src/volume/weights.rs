@@ -1,6 +1,6 @@
 //! Weights: how much of what each sample shows arrives at the eye.
 
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
@@ -154,7 +154,7 @@ impl<T: Scalar> Op<T> for Weights {
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let segments = || Segments::new([0, 3, 3, 4, 7]);
     let x = |values: [f64; 7]| Tensor::from_vec(&[7], values.to_vec());

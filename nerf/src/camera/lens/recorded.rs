@@ -2,7 +2,7 @@
 
 use crate::camera::lens::Lens;
 use raygrad_autograd::{Scalar, Var, record};
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::{Tensor, check::Entry};
 
 /// Places `[.., 2]` of directions `[.., 3]`, of any length, through a lens of the kind of `lens` with the coefficients `[n]`
@@ -44,7 +44,7 @@ fn places_of<'t, T: Scalar, const N: usize>(lens: &Lens, inputs: &[Var<'t, T>]) 
 }
 
 /// The catalogue entries of this file.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let directions = |from: f64, to: f64| {
         let wave = |i: usize| ((i * 7) % 13) as f64 / 6.0 - 1.0;

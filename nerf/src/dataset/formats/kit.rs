@@ -8,7 +8,7 @@ use glam::{DAffine3, DVec3};
 use serde_json::{Value, json};
 use std::path::Path;
 
-pub(super) use super::damage;
+pub(super) use raygrad_test_support::damage;
 
 /// A camera 4 units up the z axis that looks down at the origin.
 pub(super) fn pose() -> Value {

@@ -48,10 +48,6 @@ pub fn read(folder: &Path) -> Result<Capture> {
 #[cfg(test)]
 mod kit;
 
-#[cfg(test)]
-#[path = "../../../../tests/stability/damage.rs"]
-mod damage;
-
 /// How many damaged files a test tries: `PROPTEST_CASES`, if that is set.
 #[cfg(test)]
 fn cases(short: u32) -> proptest::prelude::ProptestConfig {

@@ -2,7 +2,7 @@
 
 use super::kernel::{BLOCK, Cells, Points};
 use super::{HashGrad, HashGrid, HashLevel};
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, RowSums, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::simd;
@@ -231,7 +231,7 @@ fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var
 }
 
 /// The catalogue entries of this file: dense and hashed levels, with positions that no check moves across a border.
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let entry = |levels, features, log2_table, coarsest, finest| {
         let config = super::HashGridConfig { levels, features, log2_table, coarsest, finest };

@@ -11,7 +11,7 @@ mod grid;
 mod kernel;
 
 pub use encode::HashEncoding;
-#[cfg(feature = "check")]
+#[cfg(any(test, feature = "check"))]
 pub(crate) use encode::entries;
 pub use gradient::HashGrad;
 pub use grid::{HashGrid, HashGridConfig, HashLevel};

@@ -3,7 +3,7 @@
 use super::lattice::{CARVED, CELLS, cell, uncarved};
 use super::{OccupancyGrid, TASK};
 use glam::DVec3;
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 use std::sync::Arc;
 
 impl OccupancyGrid {
@@ -12,7 +12,8 @@ impl OccupancyGrid {
     /// [`occupy_all_but_carved`](Self::occupy_all_but_carved).
     pub fn carve(&mut self, is_empty: &(dyn Fn(DVec3, f64) -> bool + Sync)) {
         let lattice = &self.lattice;
-        Arc::make_mut(&mut self.densities).par_chunks_mut(CELLS * TASK).enumerate().for_each(|(task, densities)| {
+        let tasks = Arc::make_mut(&mut self.densities).chunks_mut(CELLS * TASK);
+        parallel::each_of(tasks, |task, densities| {
             for (word, densities) in densities.chunks_exact_mut(CELLS).enumerate() {
                 let [corner, size] = lattice.block(task * TASK + word);
                 let mut left = uncarved(densities);

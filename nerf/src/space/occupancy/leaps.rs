@@ -1,7 +1,7 @@
 //! How far a ray may leap over empty blocks.
 
 use super::lattice::Lattice;
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 
 /// For each block and each of the eight octants of directions, the edge in blocks of the largest empty cube that has
 /// the block in its rearmost corner: a ray in one of the cube's blocks is next tested where it leaves the cube.
@@ -17,7 +17,7 @@ impl Leaps {
     /// The leaps for these words. A word of a cascade must not be 0 where a smaller cascade has an occupied cell.
     pub fn new(words: &[u64], lattice: &Lattice) -> Self {
         let mut tables = std::array::from_fn(|_| vec![0; words.len()]);
-        tables.par_iter_mut().enumerate().for_each(|(octant, table)| {
+        parallel::each_of(&mut tables, |octant, table| {
             for cascade in 0..lattice.cascades {
                 let range = lattice.cascade(cascade);
                 let beyond = if cascade + 1 == lattice.cascades { u8::MAX } else { 0 };

@@ -61,7 +61,7 @@ use crate::{Error, Result};
 use glam::DVec3;
 use lattice::{CARVED, CELLS, Lattice};
 use leaps::Leaps;
-use rayon::prelude::*;
+use raygrad_tensor::parallel;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -254,15 +254,11 @@ impl OccupancyGrid {
     /// larger than those of cascade 0; 0 if there are none. Carved cells do not count.
     pub fn mean_density(&self) -> f64 {
         // In tasks of fixed size, so that the sum has the same bits at any number of threads.
-        let sums: Vec<(f64, usize)> = self
-            .densities
-            .par_chunks(CELLS * TASK)
-            .map(|part| {
-                part.iter()
-                    .filter(|x| !x.is_nan() && **x != CARVED)
-                    .fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1))
-            })
-            .collect();
+        let parts: Vec<&[f32]> = self.densities.chunks(CELLS * TASK).collect();
+        let sums = parallel::collect(parts.len(), |i| {
+            let known = parts[i].iter().filter(|x| !x.is_nan() && **x != CARVED);
+            known.fold((0.0, 0), |(sum, n), &x| (sum + f64::from(x), n + 1))
+        });
         let (sum, count) = sums.iter().fold((0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         if count == 0 { 0.0 } else { sum / count as f64 }
     }
@@ -282,8 +278,8 @@ impl OccupancyGrid {
     /// The cells whose density is not known to be at most `limit`.
     fn exceeding(&self, limit: f32) -> Vec<u64> {
         let mut words = vec![0; self.words.len()];
-        let parts = words.par_chunks_mut(TASK).zip(self.densities.par_chunks(CELLS * TASK));
-        parts.for_each(|(words, densities)| {
+        let parts = words.chunks_mut(TASK).zip(self.densities.chunks(CELLS * TASK));
+        parallel::each_of(parts, |_, (words, densities)| {
             for (word, densities) in words.iter_mut().zip(densities.chunks_exact(CELLS)) {
                 *word = exceeding(densities, limit);
             }

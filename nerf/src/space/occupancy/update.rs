@@ -5,10 +5,10 @@ use super::{OccupancyGrid, TASK, bits, exceeding};
 use crate::random::stream;
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
-use raygrad_tensor::parallel;
-use rayon::prelude::*;
+use raygrad_tensor::parallel::{self, Scratch};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// A field's density: writes that of each position (scene units) into the slot of the same number (1 / scene unit).
 /// It is called from several threads at a time, with [`POINTS`] positions or fewer that lie close together.
@@ -184,7 +184,7 @@ impl OccupancyGrid {
     pub fn prune(&mut self, min_sigma: f32, density: &DensityFn<'_>) -> u64 {
         let (fixed, random) = (Places::middles(REBUILD), Places::random(CLOSELY));
         let (lattice, mut occupied) = (&self.lattice, self.words.clone());
-        let prune = |(waiting, found): &mut (Waiting, Vec<f32>), (task, words): (usize, &mut [u64])| {
+        let prune = |(waiting, found): &mut (Waiting, Vec<f32>), task: usize, words: &mut [u64]| {
             found.clear();
             found.resize(CELLS * words.len(), f32::NAN);
             let mut look = |places: &Places, words: &[u64], rng: Pcg64Mcg| {
@@ -200,8 +200,7 @@ impl OccupancyGrid {
             }
             count + more
         };
-        let tasks = occupied.par_chunks_mut(TASK).enumerate();
-        let count = tasks.map_init(Default::default, |scratch, task| parallel::serial(|| prune(scratch, task))).sum();
+        let count = counted(occupied.chunks_mut(TASK), prune);
         self.occupy(occupied, false);
         count
     }
@@ -216,12 +215,24 @@ impl OccupancyGrid {
         density: &DensityFn<'_>,
     ) -> u64 {
         let look = Look { lattice: &self.lattice, places, density };
-        let tasks = Arc::make_mut(&mut self.densities).par_chunks_mut(CELLS * TASK).enumerate();
-        let at = |waiting: &mut Waiting, (task, densities): (usize, &mut [f32])| {
-            parallel::serial(|| look.at(task, densities, &chosen, rng(task), &keep, waiting))
-        };
-        tasks.map_init(Waiting::default, at).sum()
+        counted(
+            Arc::make_mut(&mut self.densities).chunks_mut(CELLS * TASK),
+            |waiting: &mut Waiting, task, densities| look.at(task, densities, &chosen, rng(task), &keep, waiting),
+        )
     }
+}
+
+/// What `f` counts in the parts, together; parallel over them, with scratch space.
+fn counted<P: Send, S: Default + Send>(
+    parts: impl Iterator<Item = P>,
+    f: impl Fn(&mut S, usize, P) -> u64 + Sync,
+) -> u64 {
+    let (scratch, count) = (Scratch::default(), AtomicU64::new(0));
+    parallel::each_of(parts, |i, part| {
+        let own = scratch.with(|scratch| parallel::serial(|| f(scratch, i, part)));
+        count.fetch_add(own, Ordering::Relaxed);
+    });
+    count.into_inner()
 }
 
 /// What is looked at, and where in a cell.

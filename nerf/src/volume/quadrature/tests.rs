@@ -5,7 +5,7 @@ use crate::analytic::{AnalyticField, AnalyticScene, Integral, Layer, Layers, int
 use crate::camera::pinhole::Ray;
 use crate::camera::rays::Rays;
 use crate::camera::rays::stratified;
-use crate::dataset::{Split, embedded};
+use crate::dataset::{Split, sample::ball};
 use crate::field::{FieldConfig, VoxelConfig};
 use crate::model::config::{Config, Preset};
 use crate::pictures::metrics::psnr;
@@ -169,7 +169,7 @@ fn small(rule: Quadrature) -> Config {
 
 #[test]
 fn every_rule_trains_and_is_part_of_the_configuration() {
-    let data = Arc::new(embedded(Split::Train, 20));
+    let data = Arc::new(ball(Split::Train, 20));
     for rule in RULES.into_iter().chain([Quadrature::Adaptive { tolerance: 1e-2 }]) {
         let config = small(rule);
         let text = serde_json::to_string(&config).unwrap();

@@ -1,7 +1,7 @@
-use super::super::damage::{clear, damage, damaged};
 use super::*;
 use crate::dataset::formats::cases;
 use proptest::prelude::*;
+use raygrad_test_support::damage::{clear, damage, damaged};
 use std::fs;
 
 /// Two rows by hand: a camera at (1, 2, 3) that looks along the world's -z with +y up, and one at (0, 0, 5) that looks

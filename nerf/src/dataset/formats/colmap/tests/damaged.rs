@@ -1,9 +1,9 @@
 //! Damaged files are an error, or a capture that is sound; never a panic.
 
 use super::*;
-use crate::dataset::formats::damage::{Damage, clear, damage, damaged};
 use crate::dataset::formats::{cases, rigid};
 use proptest::prelude::*;
+use raygrad_test_support::damage::{Damage, clear, damage, damaged};
 
 /// The fixture with one of its files damaged, without a disk.
 fn parsed(encoding: Encoding, which: usize, damage: &[Damage]) -> Result<Capture> {

@@ -1,0 +1,5 @@
+//! What this crate promises from outside.
+
+mod concurrency;
+mod optim_peers;
+mod optimisers;

@@ -1,0 +1,10 @@
+//! What this crate promises from outside.
+
+mod catalogue;
+mod formula;
+mod harness;
+mod one_way;
+mod peers;
+mod random_graphs;
+mod reductions;
+mod scans;

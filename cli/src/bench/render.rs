@@ -1,0 +1,397 @@
+//! Settings of the renderer on one trained model: what each costs and what it saves.
+
+mod setting;
+
+use std::any::Any;
+use std::path::Path;
+use std::sync::Arc;
+
+use raygrad::Real;
+use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
+use raygrad::nerf::pictures::metrics::{mse, psnr, psnr_from_mse};
+use raygrad::nerf::sampling::marching::Marching;
+use raygrad::nerf::volume::quadrature::Quadrature;
+use raygrad::nerf::{Config, Error, Evaluations, Image, Instant, Model, Preset, Result, Trainer, Voxel};
+use raygrad_scenes::embedded;
+
+use super::Results;
+use super::figure::{Axis, Figure, Panel, Series};
+use super::stopwatch::{Timed, compare};
+use super::table::{Table, digits};
+use crate::output::note;
+use crate::run::Run;
+use setting::{Setting, WHITE, settings};
+
+/// How many times smaller the steps of the reference are.
+const FINER: usize = 8;
+/// Its rule, and another one that it is compared with: what they differ by is what no rule can be judged within.
+const RULES: [Quadrature; 2] = [Quadrature::Gauss2, Quadrature::Midpoint];
+/// A picture that is the reference to the last bit is shown at this PSNR.
+const PERFECT: f64 = 140.0;
+
+/// Sizes of the suite.
+struct Scale {
+    steps: u64,
+    size: usize,
+    views: usize,
+    rounds: usize,
+}
+
+/// What a setting gave.
+struct Outcome {
+    setting: Setting,
+    evaluations: Evaluations,
+    psnr: f64,
+    largest: f64,
+    truth: f64,
+    timed: Timed,
+    dominated: bool,
+}
+
+/// Measures all settings.
+pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
+    let scale = if quick {
+        Scale { steps: 600, size: 64, views: 1, rounds: 2 }
+    } else {
+        Scale { steps: 3000, size: 200, views: 4, rounds: 3 }
+    };
+    let (model, views) = match folder {
+        Some(folder) => stored(folder, &scale)?,
+        None => trained(&scale)?,
+    };
+    let Some(sampler) = model.marching() else {
+        return Err(Error::setting("run", "samples hierarchically; choose one that marches, such as preset instant"));
+    };
+    let step = sampler.config.view_step;
+    note("render: the reference in f64");
+    let Reference { images: reference, apart } = references(&model, &views)?;
+    let mut outcomes = vec![];
+    let base = Setting::base(step);
+    let baseline = base.model(&model);
+    let settings = settings(step);
+    for (i, setting) in settings.iter().enumerate() {
+        note(&format!("render: {} of {}: {} {}", i + 1, settings.len(), setting.group, setting.name));
+        outcomes.push(measure(&model, setting, (&base, &baseline), &views, &reference, scale.rounds)?);
+    }
+    mark_dominated(&mut outcomes);
+    let pixels = (reference[0].width * reference[0].height * reference.len()) as f64;
+    Ok(Results {
+        tables: vec![table(&outcomes, &model, pixels)],
+        figures: vec![figure(&outcomes, pixels, false), figure(&outcomes, pixels, true)],
+        findings: findings(&outcomes, pixels, apart),
+    })
+}
+
+/// The built-in scene, trained for some steps; its grid is as training left it.
+fn trained(scale: &Scale) -> Result<(Model<f32>, Dataset)> {
+    note(&format!("render: training for {} steps", scale.steps));
+    let data = Arc::new(embedded(Split::Train, scale.size));
+    let mut trainer = Trainer::new(Config::preset(Preset::Instant), data)?;
+    for step in 0..scale.steps {
+        trainer.step(step as f64 / scale.steps as f64);
+    }
+    let mut test = embedded(Split::Test, scale.size);
+    test.frames = evenly_spaced(test.frames, scale.views);
+    Ok((trainer.model, test))
+}
+
+fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
+    let run = Run::open(folder)?;
+    let data = run.scene(None)?.open_for(&run.config.extent, run.config.config.unbounded)?.load(
+        Split::Test,
+        run.config.downscale,
+        scale.views,
+    )?;
+    if data.frames.is_empty() {
+        return Err(Error::file(folder, "its scene has no test views to compare with"));
+    }
+    let mut model = run.model()?;
+    // What its views leave out of their own accord is for the settings to say.
+    if let Some(Marching { config, grid, .. }) = model.marching().cloned() {
+        model.sampler = Box::new(Marching::new(config, grid));
+    }
+    Ok((model, data))
+}
+
+/// What views are compared with.
+struct Reference {
+    images: Vec<Image>,
+    /// The PSNR of one of the [`RULES`] against the other, in dB.
+    apart: f64,
+}
+
+fn references(model: &Model<f32>, views: &Dataset) -> Result<Reference> {
+    let mut double = model.cast::<f64>()?;
+    let mut by = |rule: Quadrature| -> Vec<Image> {
+        if let Some(sampler) = double.marching_mut() {
+            sampler.config.quadrature = rule;
+        }
+        views.frames.iter().map(|frame| double.dense_view(&frame.camera, WHITE, FINER).picture().color).collect()
+    };
+    let [images, others] = RULES.map(&mut by);
+    let errors = images.iter().zip(&others).map(|(a, b)| mse(a, b));
+    let apart = psnr_from_mse(errors.sum::<f64>() / images.len().max(1) as f64).min(PERFECT);
+    Ok(Reference { images, apart })
+}
+
+fn measure(
+    model: &Model<f32>,
+    setting: &Setting,
+    (base, baseline): (&Setting, &Model<f32>),
+    views: &Dataset,
+    reference: &[Image],
+    rounds: usize,
+) -> Result<Outcome> {
+    let own = setting.model(model);
+    let (mut error, mut largest, mut truth, mut evaluations) = (0.0, 0.0_f64, 0.0, Evaluations::default());
+    for (frame, reference) in views.frames.iter().zip(reference) {
+        let (image, count) = setting.render(&own, &frame.camera)?;
+        evaluations = evaluations + count;
+        error += mse(&image, reference);
+        let differences = image.data.iter().zip(&reference.data).map(|(a, b)| f64::from((a - b).abs()));
+        largest = differences.fold(largest, Real::maximum);
+        truth += psnr(&image, &frame.image.over([1.0; 3]));
+    }
+    let count = reference.len() as f64;
+    let run = |setting: &Setting, model: &Model<f32>| {
+        for frame in &views.frames {
+            // What can fail has not failed above.
+            let _ = std::hint::black_box(setting.render(model, &frame.camera));
+        }
+    };
+    let mut timed = compare(rounds, || run(base, baseline), || run(setting, &own));
+    timed.seconds /= count;
+    timed.baseline /= count;
+    let psnr = psnr_from_mse(error / count).min(PERFECT);
+    let truth = truth / count;
+    Ok(Outcome { setting: setting.clone(), evaluations, psnr, largest, truth, timed, dominated: false })
+}
+
+/// Evaluations of density and of colour.
+fn work(evaluations: &Evaluations) -> u64 {
+    evaluations.density + evaluations.color
+}
+
+/// Marks settings that another one beats in work and in PSNR against the reference, in both or in one with the other equal.
+fn mark_dominated(outcomes: &mut [Outcome]) {
+    let places: Vec<(u64, f64)> = outcomes.iter().map(|o| (work(&o.evaluations), o.psnr)).collect();
+    for (outcome, own) in outcomes.iter_mut().zip(&places) {
+        outcome.dominated =
+            places.iter().any(|other| other.0 <= own.0 && other.1 >= own.1 && (other.0 < own.0 || other.1 > own.1));
+    }
+}
+
+/// Numbers that one evaluation of the density and one of the colour takes: look-ups of table rows, bytes of them, and
+/// floating-point operations of matrix products.
+fn cost(model: &Model<f32>) -> [[u64; 3]; 2] {
+    let field: &dyn Any = &*model.field;
+    let grid = field.downcast_ref::<Instant>().map(Instant::grid).or(field.downcast_ref::<Voxel>().map(Voxel::grid));
+    let (lookups, features) =
+        grid.map_or((0, 0), |grid| (8 * grid.grid().levels().len() as u64, grid.grid().features() as u64));
+    let flops = |of_color: bool| -> u64 {
+        let matrices = model.params.iter().filter(|(name, x)| {
+            let is_color = name.contains(".color") || name.contains(".view");
+            x.ndim() == 2 && name.starts_with("field.") && !name.ends_with(".table") && is_color == of_color
+        });
+        matrices.map(|(_, x)| 2 * x.len() as u64).sum()
+    };
+    [[lookups, lookups * features * 4, flops(false)], [0, 0, flops(true)]]
+}
+
+fn table(outcomes: &[Outcome], model: &Model<f32>, pixels: f64) -> Table {
+    let columns = [
+        "group",
+        "setting",
+        "densities a ray",
+        "colours a ray",
+        "look-ups a ray",
+        "table bytes a ray",
+        "FLOP a ray",
+        "ms",
+        "ratio to default",
+        "control",
+        "spread of the control",
+        "PSNR against the reference, dB",
+        "largest error",
+        "PSNR against the photographs, dB",
+        "dominated",
+    ];
+    let mut table = Table::new("render", &columns);
+    let [density, color] = cost(model);
+    for outcome in outcomes {
+        let Outcome { setting, evaluations, timed, .. } = outcome;
+        let each = |count: u64| digits(count as f64 / pixels);
+        let total = |i: usize| each(evaluations.density * density[i] + evaluations.color * color[i]);
+        table.push(vec![
+            setting.group.to_owned(),
+            setting.name.clone(),
+            each(evaluations.density),
+            each(evaluations.color),
+            total(0),
+            total(1),
+            total(2),
+            digits(1e3 * timed.seconds),
+            digits(timed.ratio),
+            digits(timed.control),
+            digits(timed.spread),
+            digits(outcome.psnr),
+            digits(outcome.largest),
+            digits(outcome.truth),
+            if outcome.dominated { "yes" } else { "no" }.to_owned(),
+        ]);
+    }
+    table
+}
+
+/// A title, the label of an axis, and what it shows of an outcome.
+type Quantity = (&'static str, &'static str, fn(&Outcome) -> f64);
+
+fn figure(outcomes: &[Outcome], pixels: f64, by_time: bool) -> Figure {
+    let x = |outcome: &Outcome| {
+        if by_time { 1e3 * outcome.timed.seconds } else { work(&outcome.evaluations) as f64 / pixels }
+    };
+    let (name, label, title) = if by_time {
+        ("render-time", "milliseconds for a view", "Error against time")
+    } else {
+        ("render-evaluations", "densities and colours a ray", "Error against evaluations")
+    };
+    let kinds: [Quantity; 3] = [
+        ("against the f64 reference", "PSNR, dB", |o| o.psnr),
+        ("largest error against the reference", "largest error of a channel", |o| o.largest),
+        ("against the photographs", "PSNR, dB", |o| o.truth),
+    ];
+    let panel = |(title, y_label, value): Quantity| {
+        let at = |outcome: &Outcome| [x(outcome), value(outcome)];
+        let mut series: Vec<Series> = vec![];
+        let mut groups: Vec<&str> = outcomes.iter().map(|outcome| outcome.setting.group).collect();
+        groups.dedup();
+        for (style, group) in groups.into_iter().enumerate() {
+            for hollow in [false, true] {
+                let own = outcomes.iter().filter(|o| o.setting.group == group && o.dominated == hollow);
+                let points: Vec<[f64; 2]> = own.map(at).collect();
+                if !points.is_empty() {
+                    series.push(Series { hollow, ..Series::marks(group, style, points) });
+                }
+            }
+        }
+        if title.contains("f64") && !by_time {
+            let mut front: Vec<[f64; 2]> = outcomes.iter().filter(|o| !o.dominated).map(at).collect();
+            front.sort_by(|a, b| a[0].total_cmp(&b[0]));
+            series.insert(0, Series::line("Pareto front", 4, front));
+        }
+        let named = outcomes.iter().filter(|o| matches!(o.setting.group, "skip" | "instant-ngp"));
+        let name = |o: &Outcome| if o.setting.group == "skip" { o.setting.name.clone() } else { "ngp".to_owned() };
+        let labels = named.map(|o| (at(o), name(o))).collect();
+        let y = if title.starts_with("largest") { Axis::log(y_label) } else { Axis::linear(y_label) };
+        Panel { title: title.to_owned(), x: Axis::log(label), y, series, labels }
+    };
+    Figure {
+        name: name.to_owned(),
+        title: format!("Rendering: {}", title.to_lowercase()),
+        caption: format!(
+            "One model, many ways to render it; each group changes one thing of the default (`fast`). The reference is in \
+             f64, by Gauss's rule at steps {FINER} times smaller, with nothing left out but the cells that training passed over. Hollow: \
+             another setting is better in evaluations and PSNR against the reference, or equal in one and better in the \
+             other. `ngp` follows the rules of instant-ngp: one random sample a cell, threshold .01, rays stop at .01."
+        ),
+        columns: 3,
+        panel: [430, 360],
+        panels: kinds.into_iter().map(panel).collect(),
+    }
+}
+
+fn findings(outcomes: &[Outcome], pixels: f64, apart: f64) -> Vec<String> {
+    let named = |group: &str, name: &str| outcomes.iter().find(|o| o.setting.group == group && o.setting.name == name);
+    let line = |what: &str, outcome: &Outcome| {
+        format!(
+            "{what}: {:.1} evaluations a ray, {:.1} dB against the reference, largest error {:.1e}, {:.2} dB against the \
+             photographs, {:.1} ms",
+            work(&outcome.evaluations) as f64 / pixels,
+            outcome.psnr,
+            outcome.largest,
+            outcome.truth,
+            1e3 * outcome.timed.seconds
+        )
+    };
+    let wanted = [("skip", "off"), ("skip", "lossless"), ("skip", "fast"), ("instant-ngp", "its rules")];
+    let [rule, other] = RULES;
+    let reference =
+        format!("reference: {rule}, {apart:.1} dB from that by {other}, beyond which differences say nothing");
+    let lines =
+        wanted.into_iter().filter_map(|(group, name)| Some(line(&format!("{group} {name}"), named(group, name)?)));
+    [reference].into_iter().chain(lines).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::Limits;
+    use raygrad::nerf::space::occupancy::Skip;
+
+    #[test]
+    fn what_another_beats_is_dominated() {
+        let outcome = |evaluations: u64, psnr: f64| Outcome {
+            setting: Setting::base(0.01),
+            evaluations: Evaluations { density: evaluations, ..Evaluations::default() },
+            psnr,
+            largest: 0.0,
+            truth: 0.0,
+            timed: Timed { seconds: 1.0, baseline: 1.0, ratio: 1.0, control: 1.0, spread: 0.0 },
+            dominated: false,
+        };
+        let mut outcomes = [(10, 40.0), (20, 60.0), (20, 50.0), (30, 60.0), (5, 30.0)].map(|(e, p)| outcome(e, p));
+        mark_dominated(&mut outcomes);
+        assert_eq!(outcomes.each_ref().map(|o| o.dominated), [false, false, true, true, false]);
+        // A panel shows them apart, hollow where they are beaten, and a line through the others, of evaluations alone.
+        let lines = |by_time: bool| {
+            let figure = figure(&outcomes, 10.0, by_time);
+            let shown = figure.panels.iter().map(|panel| {
+                let series = panel.series.iter().map(|series| (series.line, series.hollow, series.points.len()));
+                series.collect::<Vec<_>>()
+            });
+            shown.collect::<Vec<_>>()
+        };
+        let marks = vec![(false, false, 3), (false, true, 2)];
+        let front = [vec![(true, false, 3)], marks.clone()].concat();
+        assert_eq!(lines(false), [front, marks.clone(), marks.clone()]);
+        assert_eq!(lines(true), [marks.clone(), marks.clone(), marks]);
+        let front = &figure(&outcomes, 10.0, false).panels[0].series[0];
+        assert_eq!(front.points, [[0.5, 30.0], [1.0, 40.0], [2.0, 60.0]], "from few to many");
+    }
+
+    /// Gates on counts and errors, never on times.
+    #[test]
+    fn a_small_sweep_is_within_its_gates() {
+        let scale = Scale { steps: 60, size: 32, views: 1, rounds: 1 };
+        let (model, views) = trained(&scale).unwrap();
+        let Reference { images: reference, apart } = references(&model, &views).unwrap();
+        assert!(apart > 60.0 && apart < PERFECT, "the rules agree where steps are short: {apart} dB");
+        let step = 1.0 / 600.0;
+        let base = Setting::base(step);
+        let baseline = base.model(&model);
+        let all = settings(step);
+        let find = |group: &str, name: &str| {
+            let setting = all.iter().find(|s| s.group == group && s.name == name).unwrap();
+            measure(&model, setting, (&base, &baseline), &views, &reference, 1).unwrap()
+        };
+        let [off, lossless, fast] = ["off", "lossless", "fast"].map(|name| find("skip", name));
+        assert!(work(&fast.evaluations) <= work(&lossless.evaluations));
+        assert!(work(&lossless.evaluations) <= work(&off.evaluations));
+        assert!(off.psnr >= lossless.psnr - 0.01 && lossless.psnr >= 40.0, "{} {}", off.psnr, lossless.psnr);
+        // The bound is that of a fog at the threshold all along a ray, of ending early and of the colour budget.
+        let bound = |skip: Skip| {
+            let limits = Limits::of(&skip.into());
+            skip.error_bound() + f64::from(limits.termination + limits.color_budget)
+        };
+        assert!(lossless.largest <= off.largest + bound(Skip::Lossless), "{}", lossless.largest);
+        assert!(fast.largest <= off.largest + bound(Skip::Fast), "{}", fast.largest);
+        let double = find("precision", "f64");
+        assert_eq!(double.evaluations.density, off.evaluations.density);
+        assert!((double.psnr - off.psnr).abs() < 0.5, "f32 has digits enough: {} {}", double.psnr, off.psnr);
+        let gauss = find("quadrature", "gauss2 x 1");
+        assert!(gauss.psnr > 30.0 && gauss.evaluations.density > fast.evaluations.density);
+        assert!(find("step", "x 4").psnr < off.psnr);
+        let [density, color] = cost(&model);
+        assert!(density[0] > 0 && density[2] > 0 && color[2] > 0);
+    }
+}

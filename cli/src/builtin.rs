@@ -1,0 +1,73 @@
+//! The built-in scenes as captures, for other programs.
+
+use std::path::Path;
+
+use raygrad::nerf::dataset::{Capture, Dataset, Format, Frame, Split, View};
+use raygrad::nerf::glam::DAffine3;
+use raygrad::nerf::{Error, Result};
+use raygrad_scenes::{embedded, landscape};
+
+use super::output::make_folder;
+use super::progress::Progress;
+use super::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
+
+/// Width in pixels at which nothing but the cameras is of interest.
+const SMALL: usize = 8;
+
+/// The cameras of a built-in scene whose pictures are `width` pixels wide, by default as wide as those that are trained on;
+/// with the pictures in `folder`, if one is given.
+///
+/// # Errors
+/// If the scene is a folder, it has no pictures of that width, or they cannot be written.
+pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Result<Capture> {
+    let (usual, format): ([usize; 2], _) = match scene {
+        Scene::Embedded => ([EMBEDDED_SIZE; 2], Format::Blender),
+        Scene::Landscape => (LANDSCAPE_SIZE, Format::Transforms),
+        Scene::Folder(folder) => return Err(Error::file(folder, "is no scene that is built in")),
+    };
+    let width = width.unwrap_or(usual[0]);
+    let height = width * usual[1] / usual[0];
+    if height * usual[0] != width * usual[1] {
+        return Err(Error::setting("size", format!("{width}: the landscape has four columns for each three rows")));
+    }
+    let rendered = |split: Split, width: usize| -> Dataset {
+        if *scene == Scene::Embedded { embedded(split, width) } else { landscape(split, width) }
+    };
+    let mut views = vec![];
+    let mut progress = Progress::new();
+    for (i, split) in Split::ALL.into_iter().enumerate() {
+        if folder.is_some() {
+            progress.set(i as f64 / Split::ALL.len() as f64, || format!("{split} pictures"));
+        }
+        let frames = rendered(split, if folder.is_some() { width } else { SMALL }).frames;
+        for (number, Frame { camera, image, .. }) in frames.into_iter().enumerate() {
+            let name = format!("{split}/{number}");
+            let path = folder.map(|folder| folder.join(format!("{name}.png")));
+            if let Some(path) = &path {
+                path.parent().map_or(Ok(()), make_folder)?;
+                image.to_image().save_png(path)?;
+            }
+            views.push(View {
+                name: name.clone(),
+                field: name,
+                image: path,
+                camera: camera.resized(width, height),
+                split: Some(split),
+                mask: None,
+                depth: None,
+                sharpness: None,
+                bounds: None,
+            });
+        }
+    }
+    Ok(Capture {
+        folder: folder.unwrap_or(Path::new("")).into(),
+        file: scene.to_string().into(),
+        format,
+        views,
+        points: vec![],
+        points_file: None,
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
+    })
+}

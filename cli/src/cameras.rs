@@ -1,0 +1,228 @@
+//! Cameras for pictures: an orbit like the training cameras, and views at other sizes.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use glam::DVec3;
+use raygrad::nerf::dataset::Dataset;
+use raygrad::nerf::{Camera, Error, Extent, Result};
+use serde::{Deserialize, Serialize};
+
+/// The average training camera: what is needed to fly around a scene without its photographs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Viewpoint {
+    /// Width of the training images in pixels.
+    pub width: usize,
+    /// Their height.
+    pub height: usize,
+    /// Horizontal field of view in radians.
+    pub angle_x: f64,
+    /// Mean distance of the cameras from the centre of the scene's box, in scene units.
+    pub distance: f64,
+    /// Their mean angle above the horizon as seen from there, in radians.
+    pub elevation: f64,
+    /// The direction, in radians about the vertical, that cameras stand in on average, if they stand in a part of the circle.
+    #[serde(default)]
+    pub azimuth: f64,
+    /// How far on either side of it they stand, in radians; half a turn where they stand all around.
+    #[serde(default = "all_around")]
+    pub reach: f64,
+}
+
+fn all_around() -> f64 {
+    PI
+}
+
+/// Cameras leave at most this angle of a circle free, in radians, that stand all around.
+const GAP: f64 = 2.0 * PI / 3.0;
+
+/// At an elevation closer to the poles than this, in radians, there is no telling where up is.
+const FROM_POLE: f64 = 0.1;
+
+/// Cameras that are nearer to the centre, as a share of the box's side, look outwards.
+const FROM_CENTRE: f64 = 0.02;
+
+/// Most pixels on a side of a training image: more would only come from a damaged file.
+const LARGEST: usize = 1 << 16;
+
+impl Viewpoint {
+    /// The average of a dataset's cameras; it has at least one.
+    pub fn of(data: &Dataset) -> Self {
+        let camera = &data.frames[0].camera;
+        let count = data.frames.len() as f64;
+        let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
+        let offsets = || data.frames.iter().map(|frame| frame.camera.pose.translation - centre);
+        let elevation = offsets().map(|offset| offset.z.atan2(offset.truncate().length())).sum::<f64>() / count;
+        let (azimuth, reach) = arc(offsets().map(|offset| offset.y.atan2(offset.x)).collect());
+        Viewpoint {
+            azimuth,
+            reach,
+            width: camera.width,
+            height: camera.height,
+            angle_x: 2.0 * (0.5 * camera.width as f64 / camera.focal[0]).atan(),
+            distance: offsets().map(DVec3::length).sum::<f64>() / count,
+            elevation: elevation.clamp(FROM_POLE - FRAC_PI_2, FRAC_PI_2 - FROM_POLE),
+        }
+    }
+
+    /// Whether the numbers are usable.
+    pub fn check(&self) -> Result<()> {
+        let positive = |x: f64| x > 0.0 && x.is_finite();
+        let checks = [
+            ("viewpoint.width", (1..=LARGEST).contains(&self.width)),
+            ("viewpoint.height", (1..=LARGEST).contains(&self.height)),
+            ("viewpoint.angle_x", positive(self.angle_x) && self.angle_x < PI),
+            ("viewpoint.distance", self.distance >= 0.0 && self.distance.is_finite()),
+            ("viewpoint.elevation", self.elevation.abs() < FRAC_PI_2),
+            ("viewpoint.azimuth", self.azimuth.is_finite()),
+            ("viewpoint.reach", (0.0..=PI).contains(&self.reach)),
+        ];
+        match checks.iter().find(|(_, good)| !good) {
+            Some((name, _)) => Err(Error::setting(name, "is out of range")),
+            None => Ok(()),
+        }
+    }
+
+    /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards; where the photographs
+    /// are from a part of the circle, they swing to and fro on that. Those of a panorama, which was taken from the centre, stand
+    /// there and look around.
+    pub fn orbit(&self, extent: &Extent, count: usize) -> Vec<Camera> {
+        let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        let camera = |i: usize| {
+            let outwards = self.distance <= FROM_CENTRE * extent.space().side();
+            let turn = i as f64 / count as f64 * TAU;
+            let swings = self.reach < PI && !outwards;
+            let (sin, cos) = if swings { self.azimuth + self.reach * turn.sin() } else { turn }.sin_cos();
+            let (height, radius) = self.elevation.sin_cos();
+            let eye = centre + self.distance * DVec3::new(radius * cos, radius * sin, height);
+            let target = if outwards { centre + DVec3::new(radius * cos, radius * sin, height) } else { centre };
+            let pose = Camera::look_at(if outwards { centre } else { eye }, target, DVec3::Z);
+            Camera::from_angle(self.width, self.height, self.angle_x, pose)
+        };
+        (0..count).map(camera).collect()
+    }
+}
+
+/// The middle and half the width of the part of a circle that angles are in: half a turn if there is no large gap.
+fn arc(mut angles: Vec<f64>) -> (f64, f64) {
+    angles.sort_by(f64::total_cmp);
+    let next = angles.iter().skip(1).copied().chain(angles.first().map(|first| first + TAU));
+    let gaps = angles.iter().zip(next).map(|(from, to)| [*from, to]);
+    match gaps.max_by(|a, b| (a[1] - a[0]).total_cmp(&(b[1] - b[0]))) {
+        Some([from, to]) if to - from > GAP => (0.5 * (from + to) + PI, PI - 0.5 * (to - from)),
+        _ => (0.0, PI),
+    }
+}
+
+/// The view of a camera at another image size: all that it sees stays in the picture, pixels keep their shape, and a
+/// side that is longer in proportion shows more.
+pub fn fitted(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
+    let old = [camera.width as f64, camera.height as f64];
+    let new = [width as f64, height as f64];
+    let scale = (new[0] / old[0]).min(new[1] / old[1]);
+    let centre = |axis: usize| 0.5 * new[axis] + scale * (camera.centre[axis] - 0.5 * old[axis]);
+    Camera { width, height, focal: camera.focal.map(|f| f * scale), centre: [centre(0), centre(1)], ..*camera }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn a_panorama_is_looked_around_in() {
+        let viewpoint =
+            Viewpoint { width: 40, height: 30, angle_x: 1.0, distance: 0.0, elevation: 0.0, azimuth: 0.3, reach: 0.2 };
+        viewpoint.check().unwrap();
+        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 4.0]);
+        let cameras = viewpoint.orbit(&extent, 4);
+        let looks: Vec<DVec3> = cameras.iter().map(|camera| camera.ray(20.0, 15.0).direction).collect();
+        for (look, expected) in looks.iter().zip([DVec3::X, DVec3::Y, DVec3::NEG_X, DVec3::NEG_Y]) {
+            assert!(look.distance(expected) < 1e-12, "{look}");
+        }
+        assert!(cameras.iter().all(|camera| camera.pose.translation == DVec3::ZERO));
+    }
+
+    use super::*;
+    use raygrad::nerf::dataset::Split;
+    use raygrad_scenes::embedded;
+
+    fn viewpoint() -> (Viewpoint, Extent) {
+        let data = embedded(Split::Test, 8);
+        (Viewpoint::of(&data), Extent::new(data.bounds, [data.near, data.far]))
+    }
+
+    #[test]
+    fn an_orbit_keeps_distance_elevation_and_angle() {
+        let (view, extent) = viewpoint();
+        let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        for camera in view.orbit(&extent, 7) {
+            let offset = camera.pose.translation - centre;
+            assert!((offset.length() - view.distance).abs() < 1e-12);
+            assert!((offset.z - view.distance * view.elevation.sin()).abs() < 1e-12);
+            assert!(camera.ray(4.0, 4.0).at(view.distance).distance(centre) < 1e-12);
+        }
+        assert!((view.angle_x - raygrad_scenes::ANGLE_X).abs() < 1e-12);
+        view.check().unwrap();
+    }
+
+    #[test]
+    fn photographs_from_one_side_are_known_by_their_direction() {
+        let mut data = embedded(Split::Train, 8);
+        let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
+        // Within 40 degrees of the y axis.
+        data.frames.retain(|frame| {
+            let offset = frame.camera.pose.translation - centre;
+            offset.y > 0.0 && offset.x.abs() < 0.8 * offset.y
+        });
+        assert!(data.frames.len() > 5);
+        let view = Viewpoint::of(&data);
+        assert!((view.azimuth.rem_euclid(TAU) - FRAC_PI_2).abs() < 0.3 && (0.3..0.9).contains(&view.reach), "{view:?}");
+    }
+
+    #[test]
+    fn an_orbit_swings_where_photographs_are_from() {
+        assert_eq!(viewpoint().0.reach, PI, "they are from all around");
+        assert_eq!(arc((0..4).map(|i| f64::from(i) * FRAC_PI_2).collect()), (0.0, PI));
+        // Across the place where angles begin again.
+        let (middle, half) = arc(vec![3.0, -3.0, 2.5, -2.8]);
+        let ends = [2.5, TAU - 2.8];
+        assert!((half - 0.5 * (ends[1] - ends[0])).abs() < 1e-12, "{half}");
+        assert!((middle - 0.5 * (ends[0] + ends[1])).rem_euclid(TAU).min(TAU - 1e-9) < 1e-9, "{middle}");
+        let (view, extent) = viewpoint();
+        let view = Viewpoint { azimuth: 1.0, reach: 0.4, ..view };
+        let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        let angles = view.orbit(&extent, 8).into_iter().map(|camera| {
+            let offset = camera.pose.translation - centre;
+            offset.y.atan2(offset.x)
+        });
+        for (angle, expected) in angles.zip([
+            1.0,
+            1.0 + 0.4 * 0.5_f64.sqrt(),
+            1.4,
+            1.0 + 0.4 * 0.5_f64.sqrt(),
+            1.0,
+            1.0 - 0.4 * 0.5_f64.sqrt(),
+            0.6,
+        ]) {
+            assert!((angle - expected).abs() < 1e-12, "{angle} {expected}");
+        }
+    }
+
+    #[test]
+    fn a_fitted_view_keeps_what_was_seen() {
+        let (view, extent) = viewpoint();
+        let camera = &view.orbit(&extent, 1)[0];
+        assert_eq!(fitted(camera, [8, 8]), *camera);
+        let wide = fitted(camera, [32, 16]);
+        // The square in the middle of the wide picture is the old picture.
+        for (x, y) in [(0.0, 0.0), (8.0, 0.0), (3.0, 5.0)] {
+            let (old, new) = (camera.ray(x, y), wide.ray(8.0 + 2.0 * x, 2.0 * y));
+            assert!(old.direction.distance(new.direction) < 1e-12);
+        }
+    }
+
+    #[test]
+    fn nonsense_is_named() {
+        let (view, _) = viewpoint();
+        let message = Viewpoint { distance: -1.0, ..view }.check().unwrap_err().to_string();
+        assert_eq!(message, "`viewpoint.distance`: is out of range");
+    }
+}

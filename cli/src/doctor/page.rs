@@ -1,0 +1,87 @@
+//! One page with facts, findings, photographs and cameras, that asks nothing of the network.
+
+use std::collections::HashMap;
+
+use raygrad::nerf::dataset::{Capture, Photo, View};
+use raygrad::nerf::doctor::{Finding, Report};
+use raygrad::nerf::{Error, Result};
+
+use super::stage::Stage;
+use super::table;
+use crate::base64::base64;
+use crate::html::{escaped, filled};
+
+/// The page, with places for what is particular.
+const PAGE: &str = include_str!("page.html");
+/// Photographs that are shown with a finding, and their longest side.
+const SHOWN: usize = 8;
+const SIDE: usize = 180;
+/// Names that are listed with a finding.
+const NAMES: usize = 60;
+
+/// The text of the page. `mark` says what wrote it.
+pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Result<String> {
+    let rows = table::facts(&report.facts);
+    let facts: String =
+        rows.iter().map(|(name, value)| format!("<tr><th>{name}</th><td>{}</td></tr>\n", escaped(value))).collect();
+    let views: HashMap<&str, &View> = capture.views.iter().rev().map(|view| (view.name.as_str(), view)).collect();
+    let mut findings: String = report.findings.iter().map(|finding| section(&views, finding)).collect();
+    if findings.is_empty() {
+        findings = "<p class=\"good\">Nothing is wrong with it.</p>".to_owned();
+    }
+    let data = serde_json::to_string(stage).map_err(|e| Error::setting("page", e))?;
+    // Within a script nothing may look like its end.
+    let data = data.replace("</", "<\\/");
+    let title = escaped(&report.facts.folder.display().to_string());
+    let texts =
+        [("title", title), ("facts", facts), ("findings", findings), ("stage", data), ("mark", mark.to_owned())];
+    Ok(filled(PAGE, &texts))
+}
+
+/// A finding, with some of the photographs that it names.
+fn section(photographs: &HashMap<&str, &View>, finding: &Finding) -> String {
+    let Finding { kind, severity, what, advice, views } = finding;
+    let mut text = format!(
+        "<section class=\"{severity}\"><h3><span>{severity}</span> {kind}</h3>\n<p>{}.</p><p class=\"advice\">{}</p>\n",
+        escaped(&capitalised(what)),
+        escaped(advice)
+    );
+    if !views.is_empty() {
+        text += &format!("<p class=\"names\">{}</p>\n", escaped(&table::names(finding, NAMES)));
+    }
+    let images = views.iter().filter_map(|name| Some((name, thumbnail(photographs.get(name.as_str())?)?)));
+    let figures = images.take(SHOWN).map(|(name, png)| {
+        let name = escaped(name);
+        format!(
+            "<figure><img alt=\"{name}\" src=\"data:image/png;base64,{png}\"><figcaption>{name}</figcaption></figure>\n"
+        )
+    });
+    text + &figures.collect::<String>() + "</section>\n"
+}
+
+/// A photograph as a small PNG; `None` if it cannot be read, which a finding says.
+fn thumbnail(view: &View) -> Option<String> {
+    let photo = Photo::open(view.image.as_ref()?, None).ok()?;
+    let share = (SIDE as f64 / photo.width.max(photo.height) as f64).min(1.0);
+    let size = [photo.width, photo.height].map(|side| ((side as f64 * share).round() as usize).max(1));
+    Some(base64(&photo.resized(size).over([1.0; 3]).to_png()))
+}
+
+fn capitalised(text: &str) -> String {
+    let mut letters = text.chars();
+    letters.next().map(|first| first.to_uppercase().chain(letters).collect()).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_has_a_place_for_everything_and_asks_nothing_of_the_network() {
+        let names = ["title", "facts", "findings", "stage", "mark"];
+        let page = filled(PAGE, &names.map(|name| (name, format!("<{{{{{name}}}}}>"))));
+        assert!(names.iter().all(|name| page.contains(&format!("<{{{{{name}}}}}>"))), "{page}");
+        assert_eq!(PAGE.matches("{{").count(), 6, "the title stands twice");
+        assert!(!PAGE.contains("http") && !PAGE.contains("src="));
+    }
+}

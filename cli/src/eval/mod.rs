@@ -1,0 +1,456 @@
+//! `raygrad eval`: how close a model comes to photographs.
+
+pub mod alignment;
+mod page;
+mod report;
+
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
+use raygrad::nerf::pictures::colormap;
+use raygrad::nerf::pictures::lpips::{Backbone, Lpips};
+use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
+use raygrad::nerf::space::occupancy::{Skip, Skipping};
+use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
+
+use super::lock::{Lock, State};
+use super::machine::processor;
+use super::memory;
+use super::output::{checksum, complain, depth_colors, make_folder, note, numbered, other_numbered, print, remove};
+use super::parse;
+use super::precision::{Precision, Renderer};
+use super::progress::Progress;
+use super::run::{Run, write_json};
+use super::scene::{Opened, Scene};
+use alignment::{Alignment, Appearance};
+use report::{Identity, Perceived, Report, Score, table};
+
+/// Digits of the number of a picture.
+const DIGITS: usize = 3;
+/// The folder in which pictures are until all are there.
+const UNFINISHED: &str = "unfinished";
+/// The file by which an evaluation keeps others from writing there.
+const LOCK: &str = "unfinished.lock";
+
+/// Compare a model with photographs: PSNR, SSIM and, with weights for it, LPIPS
+///
+/// Writes RUN/eval-SPLIT-SKIP.json with the figures and all that they depend on, and a page to look at, RUN/eval-SPLIT-SKIP/index.html,
+/// with up to 13 pictures, the worst views among them: photograph, render, error, depth. --views, --precision, --fit-poses and
+/// --fit-half stand in the name too, as in RUN/eval-val-off-10.json, so that none replaces another's result; that of another
+/// --scene does. `raygrad compare` puts the results of several runs side by side.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder that `raygrad train` made
+    run: PathBuf,
+    /// Folder of the photographs, if they are no longer where they were for training
+    #[arg(long)]
+    scene: Option<Scene>,
+    /// Photographs to compare with: train, val or test
+    #[arg(long, default_value = "test")]
+    split: Split,
+    /// Compare with this many evenly spaced photographs [default: all]
+    #[arg(long, value_name = "N", value_parser = parse::count(usize::MAX))]
+    views: Option<usize>,
+    /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
+    #[arg(long)]
+    skip: Option<Skip>,
+    /// Move each photograph's camera to where the model shows it best, and compare then: of a model whose own cameras were
+    /// corrected, others are where they were given, which may be as wrong
+    #[arg(long)]
+    fit_poses: bool,
+    /// Fit a gain for each colour channel to the left half of each photograph, and compare the right half: where photographs
+    /// differ in exposure, nobody can know that of one that was held out
+    #[arg(long)]
+    fit_half: bool,
+    /// Measure LPIPS too, with the weights of AlexNet or VGG-16 in this file: benches/peers/lpips_weights.py makes it. Figures
+    /// of one network are no measure of those of the other
+    #[arg(long, value_name = "FILE.safetensors")]
+    lpips: Option<PathBuf>,
+    /// Arithmetic of the pictures
+    #[arg(long, value_enum, default_value_t)]
+    precision: Precision,
+    /// Print what the file holds in place of a table
+    #[arg(long)]
+    json: bool,
+}
+
+impl Args {
+    /// The name of the result: `eval`, the split, what is left out if there is a grid, and what differs from the ordinary.
+    fn name(&self, skip: Option<Skipping>, lpips: Option<Backbone>) -> String {
+        let precision = (self.precision == Precision::F64).then(|| "f64".to_owned());
+        let views = self.views.map(|n| n.to_string());
+        let half = self.fit_half.then(|| "half".to_owned());
+        let poses = self.fit_poses.then(|| "poses".to_owned());
+        let lpips = lpips.map(|backbone| format!("lpips-{backbone}"));
+        let others = [skip.map(level), views, precision, poses, half, lpips];
+        let parts = ["eval".to_owned(), self.split.to_string()].into_iter().chain(others.into_iter().flatten());
+        parts.collect::<Vec<_>>().join("-")
+    }
+}
+
+/// What views leave out, in a word: `own` if the configuration says it number by number.
+fn level(skip: Skipping) -> String {
+    let is = |level: &Skip| {
+        let Skipping { grid, carving, .. } = skip;
+        Skipping { grid, carving, ..(*level).into() } == skip
+    };
+    [Skip::Off, Skip::Lossless, Skip::Fast].into_iter().find(is).map_or("own".to_owned(), |level| level.to_string())
+}
+
+/// Who says which photographs are held out.
+fn hold_out(opened: &Opened) -> &'static str {
+    match &opened.capture {
+        None => "built in",
+        Some((capture, _)) if Capture::holds_out_every_eighth(capture) => "every eighth by name, from the first",
+        Some(_) => "as the capture's files say",
+    }
+}
+
+/// Evaluates, writes the files and prints the result.
+pub fn run(args: &Args) -> Result<()> {
+    let run = Run::open(&args.run)?;
+    // Before it is read: should it be replaced meanwhile, the result is not taken for that of the new one.
+    let crc32 = checksum(&run.model_file())?;
+    let mut model = run.model()?;
+    let identity = Identity::of(&run, &model, crc32);
+    let lpips = args.lpips.as_ref().map(Lpips::open).transpose()?;
+    let weights = args.lpips.as_deref().map(checksum).transpose()?;
+    if let Some(skip) = args.skip {
+        model.set_skip(skip);
+    }
+    let scene = run.scene(args.scene.as_ref())?;
+    let opened = scene.open_for(&run.config.extent, run.config.config.unbounded)?;
+    let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
+    if args.split != Split::Train
+        && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
+    {
+        let what = format!(
+            "holds out the {} photograph `{}`, which the run was trained on: the files have changed since",
+            args.split, frame.name
+        );
+        return Err(Error::setting("scene", what));
+    }
+    let appearance = Appearance::of(&model, args.split, args.fit_half);
+    if let Some(lpips) = &lpips {
+        check_seen(lpips.backbone(), &data, appearance)?;
+    }
+    // Corners are as dark in every photograph.
+    model.vignetted = true;
+    let mut cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
+    if args.fit_poses {
+        note("fitting poses to photographs");
+        let found = fitted_cameras(&model, data.clone())?;
+        data.frames.iter_mut().zip(found).for_each(|(frame, camera)| frame.camera = camera);
+        cameras = Alignment::Fitted;
+    }
+    let skip = model.marching().map(|marching| marching.config.occupancy.skip);
+    let name = args.name(skip, lpips.as_ref().map(Lpips::backbone));
+    let pictures = run.file(&name);
+    make_folder(&pictures)?;
+    let busy = || Error::file(&pictures, "is being written by another raygrad");
+    let lock = Lock::take(&pictures.join(LOCK), busy)?;
+    // What an evaluation that was ended before has left there is begun again.
+    let unfinished = pictures.join(UNFINISHED);
+    let _ = std::fs::remove_dir_all(&unfinished);
+    make_folder(&unfinished)?;
+    let own = |frame: &Frame| {
+        let number = run.config.photographs.iter().position(|name| *name == frame.name);
+        number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
+    };
+    let looks = data.frames.iter().map(own).collect();
+    let (background, span) = (shown_background(model.config.background), model.extent.span);
+    let renderer = Renderer::new(model, args.precision)?;
+    let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
+    let (per_view, seconds_per_view, evaluations) = judge.all(&unfinished)?;
+    let data = &judge.data;
+    let pixels: usize = data.frames.iter().map(|frame| frame.image.width * frame.image.height).sum();
+    let per_pixel = |count: u64| count as f64 / pixels as f64;
+    let report = Report {
+        raygrad: env!("CARGO_PKG_VERSION"),
+        scene: scene.absolute()?,
+        split: args.split,
+        hold_out: hold_out(&opened),
+        views: per_view.len(),
+        width: data.frames[0].image.width,
+        height: data.frames[0].image.height,
+        downscale: run.config.downscale,
+        background,
+        skip,
+        precision: args.precision,
+        cameras,
+        appearance,
+        pixel_offset: 0.5,
+        quantisation: "none",
+        model: identity,
+        threads: rayon::current_num_threads(),
+        processor: processor(),
+        psnr_mean: mean(per_view.iter().map(|score| Some(score.psnr))).unwrap_or(f64::NAN),
+        ssim_mean: mean(per_view.iter().map(|score| score.ssim)),
+        lpips: judge.lpips.as_ref().zip(weights).map(|(lpips, crc32)| Perceived {
+            lpips_mean: mean(per_view.iter().map(|score| score.lpips)),
+            lpips_backbone: lpips.backbone(),
+            lpips_crc32: crc32,
+        }),
+        seconds_per_view,
+        density_per_pixel: per_pixel(evaluations.density),
+        color_per_pixel: per_pixel(evaluations.color),
+        unskipped_per_pixel: per_pixel(evaluations.unskipped),
+        per_view,
+    };
+    let file = run.file(&format!("{name}.json"));
+    let drawn = report.drawn();
+    judge.draw_others(&drawn, &unfinished)?;
+    if lock.state() != State::Kept {
+        let what = "was removed, or another raygrad evaluates there now: nothing was written";
+        return Err(Error::file(&pictures, what));
+    }
+    // An evaluation that is ended before leaves the last one's result as it was.
+    write_json(&file, &report)?;
+    for name in drawn.iter().map(|&i| numbered(i, DIGITS)) {
+        let (from, to) = (unfinished.join(&name), pictures.join(&name));
+        std::fs::rename(from, &to).map_err(|e| Error::file(&to, format!("cannot be written: {e}")))?;
+    }
+    let _ = std::fs::remove_dir(&unfinished);
+    lock.remove();
+    // Pictures of an evaluation of other photographs under the same name would belong to no result.
+    remove(&other_numbered(&pictures, DIGITS, &drawn.iter().copied().collect::<Vec<_>>()));
+    let index = pictures.join("index.html");
+    write_atomic(&index, page::page(&report).as_bytes())?;
+    if args.json {
+        let text = serde_json::to_string_pretty(&report).map_err(|e| Error::file(&file, e))?;
+        return print(&format!("{text}\n"));
+    }
+    print(&format!("{}written: {}, {}\n", table(&report), file.display(), index.display()))
+}
+
+/// Whether the network sees something of all views that are compared whole, and there are any; a word about those that are not,
+/// and about its memory.
+fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Result<()> {
+    let bad = |what: String| Err(Error::setting("lpips", what));
+    let (side, mut largest, mut masked) = (backbone.smallest(), 0, 0);
+    for Frame { name, image, mask, .. } in &data.frames {
+        let [width, height] = [image.width - appearance.fitted_columns(image.width), image.height];
+        masked += usize::from(mask.is_some());
+        if mask.is_none() && (width < side || height < side) {
+            return bad(format!(
+                "of `{name}` {width}x{height} pixels are compared, and {backbone} needs {side}x{side}"
+            ));
+        }
+        largest = largest.max(if mask.is_some() { 0 } else { width * height });
+    }
+    if masked == data.frames.len() {
+        return bad(
+            "is of whole images, and all of these have masks, drawn or of corners that a lens leaves dark".into()
+        );
+    }
+    if masked > 0 {
+        note(&format!("LPIPS is of whole images: {masked} of {} have masks, and none", data.frames.len()));
+    }
+    let need = largest as f64 * backbone.bytes();
+    if let Some(free) = memory::available().filter(|free| need > *free) {
+        let [need, free] = [need, free].map(|bytes| bytes / 1e9);
+        complain(&format!(
+            "warning: LPIPS of these images takes about {need:.1} GB of memory, of {free:.1} GB that are free"
+        ));
+    }
+    Ok(())
+}
+
+/// The background that images are compared over: a random one is for training only.
+fn shown_background(trained: Background) -> Background {
+    match trained {
+        Background::Random => Background::White,
+        fixed => fixed,
+    }
+}
+
+/// The mean, unless there is nothing or something is missing.
+fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
+    let count = values.len();
+    let sum: Option<f64> = values.sum();
+    sum.filter(|_| count > 0).map(|sum| sum / count as f64)
+}
+
+/// Renders views and compares them with photographs.
+struct Judge {
+    renderer: Renderer,
+    background: [f32; 3],
+    span: [f64; 2],
+    data: Dataset,
+    /// The number of the photograph that each view looks like, if it does.
+    looks: Vec<Option<u32>>,
+    appearance: Appearance,
+    /// Weights of LPIPS, if it is measured.
+    lpips: Option<Lpips>,
+}
+
+impl Judge {
+    /// The scores of all views, of which some are drawn; the mean time of rendering one, in seconds; and what was evaluated
+    /// for all.
+    fn all(&mut self, pictures: &Path) -> Result<(Vec<Score>, f64, Evaluations)> {
+        let count = self.data.frames.len();
+        let drawn = report::regular(count);
+        let (mut scores, mut seconds, mut evaluations) = (Vec::with_capacity(count), 0.0, Evaluations::default());
+        let mut progress = Progress::new();
+        for i in 0..count {
+            let start = Instant::now();
+            let picture = self.render(i);
+            seconds += start.elapsed().as_secs_f64();
+            evaluations = evaluations + picture.evaluations;
+            let shown = self.shown(i, picture)?;
+            let Shown { picture, truth, half } = &shown;
+            let score = score(&self.data.frames[i], &picture.color, truth, *half, self.lpips.as_ref());
+            if drawn.contains(&i) {
+                self.draw(&shown).save_png(pictures.join(numbered(i, DIGITS)))?;
+            }
+            let done = i + 1;
+            progress.set(done as f64 / count as f64, || {
+                format!("view {done} of {count}  {}  PSNR {:.2}", score.name, score.psnr)
+            });
+            scores.push(score);
+        }
+        Ok((scores, seconds / count as f64, evaluations))
+    }
+
+    /// Draws those of the views that [`all`](Self::all) has not.
+    fn draw_others(&mut self, views: &BTreeSet<usize>, pictures: &Path) -> Result<()> {
+        for &i in views.difference(&report::regular(self.data.frames.len())) {
+            let picture = self.render(i);
+            self.draw(&self.shown(i, picture)?).save_png(pictures.join(numbered(i, DIGITS)))?;
+        }
+        Ok(())
+    }
+
+    fn render(&mut self, i: usize) -> Picture {
+        self.renderer.look_like(self.looks[i]);
+        self.renderer.view(&self.data.frames[i].camera, self.background)
+    }
+
+    /// A view beside its photograph, as they are compared.
+    fn shown(&self, i: usize, mut picture: Picture) -> Result<Shown> {
+        let frame = &self.data.frames[i];
+        let truth = frame.image.over(self.background);
+        let half = self.appearance.fitted_columns(truth.width);
+        if half > 0 {
+            if frame.mask.is_some() && used(frame, &truth, half..truth.width).data.is_empty() {
+                let what = format!("the mask of `{}` leaves nothing of its right half to compare", frame.name);
+                return Err(Error::setting("fit-half", what));
+            }
+            let gains = gains(frame, &picture.color, &truth, half);
+            scale(&mut picture.color, gains);
+        }
+        picture.color.data.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
+        Ok(Shown { picture, truth, half })
+    }
+
+    /// Photograph, render, error and depth, side by side.
+    fn draw(&self, Shown { picture, truth, .. }: &Shown) -> Image {
+        let error = colormap::error_map(&picture.color, truth);
+        Image::hconcat(&[truth, &picture.color, &error, &depth_colors(picture, self.span)])
+    }
+}
+
+/// A view and its photograph, of which the columns from `half` on are compared.
+struct Shown {
+    picture: Picture,
+    truth: Image,
+    half: usize,
+}
+
+/// The pixels of these columns of an image that are [used](Frame::mask), in a row.
+fn used(frame: &Frame, image: &Image, columns: Range<usize>) -> Image {
+    let places = (0..image.height).flat_map(|y| columns.clone().map(move |x| (x, y)));
+    let used = places.filter(|(x, y)| frame.mask.as_ref().is_none_or(|mask| mask.uses(*x, *y)));
+    let data: Vec<f32> = used.flat_map(|(x, y)| image.pixel(x, y).to_vec()).collect();
+    Image { width: data.len() / 3, height: 1, channels: 3, data }
+}
+
+/// The factors of red, green and blue that make the columns before `half` of a render most like the photograph, in the sense of least
+/// squares; 1 where there is nothing to multiply.
+fn gains(frame: &Frame, render: &Image, truth: &Image, half: usize) -> [f32; 3] {
+    let [render, truth] = [render, truth].map(|image| used(frame, image, 0..half));
+    std::array::from_fn(|channel| {
+        let pairs = render.data.iter().zip(&truth.data).skip(channel).step_by(3);
+        let pairs = pairs.map(|(a, b)| (f64::from(*a), f64::from(*b)));
+        let [both, own] = pairs.fold([0.0; 2], |[both, own], (a, b)| [both + a * b, own + a * a]);
+        if own > 0.0 { (both / own) as f32 } else { 1.0 }
+    })
+}
+
+fn scale(image: &mut Image, gains: [f32; 3]) {
+    image.data.chunks_exact_mut(3).for_each(|pixel| pixel.iter_mut().zip(gains).for_each(|(x, gain)| *x *= gain));
+}
+
+/// Of the pixels from column `half` on that are used; where some are not, windows and networks see nothing to speak of.
+fn score(frame: &Frame, render: &Image, truth: &Image, half: usize, lpips: Option<&Lpips>) -> Score {
+    let [seen, shown] = [render, truth].map(|image| used(frame, image, half..image.width));
+    let psnr = psnr(&seen, &shown);
+    let [width, height] = [truth.width - half, truth.height];
+    let whole = frame.mask.is_none().then(|| [seen, shown].map(|image| Image { width, height, ..image }));
+    let windows = width >= SSIM_WINDOW && height >= SSIM_WINDOW;
+    Score {
+        name: frame.name.clone(),
+        psnr,
+        ssim: whole.as_ref().filter(|_| windows).map(|[seen, shown]| ssim(seen, shown)),
+        lpips: whole.as_ref().zip(lpips).map(|([seen, shown], lpips)| lpips.distance(seen, shown)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::dataset::Mask;
+    use raygrad_scenes::embedded;
+    use std::sync::Arc;
+
+    #[test]
+    fn gains_make_up_for_an_exposure_and_the_other_half_is_compared() {
+        let mut frame = embedded(Split::Test, 26).frames.remove(0);
+        let truth = frame.image.over([1.0; 3]);
+        // Too dark by a factor for each channel, but for one pixel on the right.
+        let mut render = truth.clone();
+        scale(&mut render, [0.5, 0.8, 1.25]);
+        let found = gains(&frame, &render, &truth, 13);
+        assert!(found.iter().zip([2.0, 1.25, 0.8]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
+        scale(&mut render, found);
+        assert!(score(&frame, &render, &truth, 13, None).psnr > 100.0);
+        render.pixel_mut(20, 7)[1] += 0.5;
+        // A quarter, of 13 x 26 pixels of 3 channels; the similarity is that of the right half.
+        let off = score(&frame, &render, &truth, 13, None);
+        assert!((off.psnr - 10.0 * (3.0 * 13.0 * 26.0 / 0.25_f64).log10()).abs() < 1e-3, "{}", off.psnr);
+        assert!(off.ssim.unwrap() < 0.999 && score(&frame, &render, &truth, 0, None).psnr > off.psnr + 2.9);
+        // Structures are of windows of 11 x 11.
+        let ssim = |half: usize| score(&frame, &render, &truth, half, None).ssim;
+        assert!(ssim(15).is_some() && ssim(16).is_none());
+        render.pixel_mut(3, 7)[1] = 9.0;
+        assert_eq!(score(&frame, &render, &truth, 13, None).psnr, off.psnr, "what was fitted to is not compared");
+        // Pixels that are not used neither fit nor count; a render of nothing has no gain.
+        let mask = Mask::new(26, 26, |x, y| y != 7 || (x != 3 && x != 20));
+        frame.mask = Some(Arc::new(mask));
+        let masked = score(&frame, &render, &truth, 13, None);
+        assert!(masked.psnr > 100.0 && masked.ssim.is_none(), "{}", masked.psnr);
+        assert!(gains(&frame, &render, &truth, 13).iter().all(|gain| (gain - 1.0).abs() < 1e-5));
+        assert_eq!(gains(&frame, &Image::new(26, 26, 3), &truth, 13), [1.0; 3]);
+    }
+
+    #[test]
+    fn lpips_is_refused_where_it_would_see_nothing() {
+        let mut data = embedded(Split::Test, 26);
+        data.frames.truncate(2);
+        let check =
+            |data: &Dataset, appearance| check_seen(Backbone::Vgg, data, appearance).map_err(|error| error.to_string());
+        assert!(check(&data, Appearance::None).is_ok());
+        assert!(check(&data, Appearance::Half).unwrap_err().contains("13x26 pixels are compared, and vgg needs 16x16"));
+        // Too low, in a photograph that counts.
+        let low = data.frames[0].image.clone();
+        data.frames[1].image = Image::new(40, 15, 3).into();
+        assert!(check(&data, Appearance::None).unwrap_err().contains("40x15"));
+        data.frames[1].mask = Some(Arc::new(Mask::new(40, 15, |_, _| true)));
+        assert!(check(&data, Appearance::None).is_ok());
+        data.frames[0].mask = Some(Arc::new(Mask::new(low.width, low.height, |x, _| x > 3)));
+        assert!(check(&data, Appearance::None).unwrap_err().contains("all of these have masks"));
+    }
+}

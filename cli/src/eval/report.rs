@@ -1,0 +1,243 @@
+//! What an evaluation has found, and all that it depends on.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use raygrad::nerf::dataset::{Split, evenly_spaced};
+use raygrad::nerf::pictures::lpips::Backbone;
+use raygrad::nerf::space::occupancy::Skipping;
+use raygrad::nerf::{Background, Budget, Model, StepStats};
+use serde::{Serialize, Serializer};
+
+use super::alignment::{Alignment, Appearance};
+use crate::precision::Precision;
+use crate::run::{Run, RunConfig};
+use crate::scene::Scene;
+
+/// Views of which a picture is written beside those of the worst ones.
+const PICTURES: usize = 10;
+/// Views that are shown as the worst.
+const WORST: usize = 3;
+
+/// The result: `eval-SPLIT-SKIP.json`. All but what was measured is what the figures depend on.
+#[derive(Serialize)]
+pub struct Report {
+    /// The version that evaluates.
+    pub raygrad: &'static str,
+    pub scene: Scene,
+    pub split: Split,
+    /// Who says which photographs are held out.
+    pub hold_out: &'static str,
+    /// Number of views.
+    pub views: usize,
+    pub width: usize,
+    pub height: usize,
+    pub downscale: usize,
+    /// What photographs with transparency are composited over.
+    pub background: Background,
+    /// What was left out; null where there is no occupancy grid.
+    pub skip: Option<Skipping>,
+    /// `f32`, or `f64` with nothing left out but empty cells.
+    pub precision: Precision,
+    /// Where the cameras are: as the scene has them, or as the model has found out.
+    pub cameras: Alignment,
+    /// As what photograph's exposure and code views are rendered.
+    pub appearance: Appearance,
+    /// Where in a pixel its ray passes: 0.5 is the centre.
+    pub pixel_offset: f64,
+    /// `none`: floating-point renders, clamped to 0..=1, are compared.
+    pub quantisation: &'static str,
+    pub model: Identity,
+    pub threads: usize,
+    pub processor: String,
+    /// The mean of the views' PSNR in dB; `inf` or `NaN` in words.
+    #[serde(serialize_with = "number")]
+    pub psnr_mean: f64,
+    /// The mean of the views' SSIM; null if the images are smaller than its window.
+    #[serde(serialize_with = "some")]
+    pub ssim_mean: Option<f64>,
+    #[serde(flatten)]
+    pub lpips: Option<Perceived>,
+    /// Mean rendering time of a view.
+    pub seconds_per_view: f64,
+    /// Evaluations of densities and of colours for each pixel, and of both if nothing in the box were skipped.
+    pub density_per_pixel: f64,
+    pub color_per_pixel: f64,
+    pub unskipped_per_pixel: f64,
+    pub per_view: Vec<Score>,
+}
+
+/// LPIPS, where it was asked for, and what it depends on.
+#[derive(Serialize)]
+pub struct Perceived {
+    /// The mean of the views' LPIPS; null if some are masked.
+    #[serde(serialize_with = "some")]
+    pub lpips_mean: Option<f64>,
+    /// The network whose features are compared.
+    pub lpips_backbone: Backbone,
+    /// CRC-32 of the file of its weights.
+    pub lpips_crc32: String,
+}
+
+/// Which model it is, and how it came to be.
+#[derive(Serialize)]
+pub struct Identity {
+    /// CRC-32 of its file.
+    pub crc32: String,
+    pub parameters: usize,
+    /// Kinds of the field and of what samples it.
+    pub field: String,
+    pub sampler: String,
+    /// The version that trained it.
+    pub raygrad: String,
+    /// Photographs that it was trained on.
+    pub photographs: usize,
+    pub seed: u64,
+    /// How long it was to be trained.
+    pub budget: Option<Budget>,
+    /// How long it was, as far as `metrics.jsonl` has it: steps, and seconds of training.
+    pub steps: Option<u64>,
+    pub train_seconds: Option<f64>,
+}
+
+impl Identity {
+    /// That of the model in a run's file, which has this checksum.
+    pub fn of(run: &Run, model: &Model<f32>, crc32: String) -> Self {
+        let metrics = std::fs::read_to_string(run.file("metrics.jsonl")).unwrap_or_default();
+        let last = metrics.lines().rev().find_map(|line| serde_json::from_str::<StepStats>(line).ok());
+        let RunConfig { raygrad, photographs, budget, config, .. } = &run.config;
+        Identity {
+            crc32,
+            parameters: model.params.elements(),
+            field: config.field.kind().to_owned(),
+            sampler: config.sampler.kind().to_owned(),
+            raygrad: raygrad.clone(),
+            photographs: photographs.len(),
+            seed: config.seed,
+            budget: *budget,
+            steps: last.map(|stats| stats.step),
+            train_seconds: last.map(|stats| stats.train_seconds),
+        }
+    }
+}
+
+/// The numbers of some views that are evenly spaced.
+pub fn regular(views: usize) -> BTreeSet<usize> {
+    evenly_spaced((0..views).collect(), PICTURES).into_iter().collect()
+}
+
+impl Report {
+    /// The numbers of the views of which pictures are written: some that are evenly spaced, and the worst.
+    pub fn drawn(&self) -> BTreeSet<usize> {
+        regular(self.views).into_iter().chain(self.worst()).collect()
+    }
+
+    /// The numbers of the worst views, the worst first.
+    pub fn worst(&self) -> Vec<usize> {
+        let mut order = self.by_psnr();
+        order.truncate(WORST);
+        order
+    }
+
+    /// The numbers of all views, that of the lowest PSNR first; what is no number is lower still.
+    pub fn by_psnr(&self) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..self.per_view.len()).collect();
+        let psnr = |i: &usize| self.per_view[*i].psnr;
+        order.sort_by(|a, b| psnr(b).is_nan().cmp(&psnr(a).is_nan()).then(psnr(a).total_cmp(&psnr(b))));
+        order
+    }
+}
+
+/// The result for one view.
+#[derive(Serialize)]
+pub struct Score {
+    pub name: String,
+    #[serde(serialize_with = "number")]
+    pub psnr: f64,
+    #[serde(serialize_with = "some")]
+    pub ssim: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "some")]
+    pub lpips: Option<f64>,
+}
+
+/// The same of one that there may not be.
+fn some<S: Serializer>(value: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+    match value {
+        Some(value) => number(value, serializer),
+        None => serializer.serialize_none(),
+    }
+}
+
+/// A number as JSON has it, or in words what it has no number for.
+fn number<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+    if value.is_finite() { serializer.serialize_f64(*value) } else { serializer.collect_str(value) }
+}
+
+impl fmt::Display for Score {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({:.2} dB)", self.name, self.psnr)
+    }
+}
+
+/// SSIM or LPIPS, where there is one.
+pub fn four_digits(value: Option<f64>) -> String {
+    value.map_or("-".to_owned(), |value| format!("{value:.4}"))
+}
+
+/// The report as a table for a terminal.
+pub fn table(report: &Report) -> String {
+    let mean_of = format!("mean of {}", report.views);
+    let names = report.per_view.iter().map(|score| score.name.len());
+    let width = names.chain([mean_of.len()]).max().unwrap_or(0);
+    let row = |[name, psnr, ssim, lpips]: [&str; 4]| match report.lpips {
+        Some(_) => format!("{name:width$}  {psnr:>7}  {ssim:>7}  {lpips:>7}\n"),
+        None => format!("{name:width$}  {psnr:>7}  {ssim:>7}\n"),
+    };
+    let figures = |name: &str, psnr: f64, ssim: Option<f64>, lpips: Option<f64>| {
+        row([name, &format!("{psnr:.2}"), &four_digits(ssim), &four_digits(lpips)])
+    };
+    let mut text = row(["view", "PSNR", "SSIM", "LPIPS"]);
+    for Score { name, psnr, ssim, lpips } in &report.per_view {
+        text += &figures(name, *psnr, *ssim, *lpips);
+    }
+    let lpips_mean = report.lpips.as_ref().and_then(|lpips| lpips.lpips_mean);
+    text += &figures(&mean_of, report.psnr_mean, report.ssim_mean, lpips_mean);
+    let Report { split, hold_out, background, seconds_per_view, .. } = report;
+    let size = format!("{}x{}", report.width, report.height);
+    text +=
+        &format!("{split} views ({hold_out}) of {size} over {background}, {seconds_per_view:.2} s to render each\n");
+    let worst: Vec<String> = report.worst().iter().map(|&i| report.per_view[i].to_string()).collect();
+    text += &format!("worst: {}\n", worst.join(", "));
+    if let Some(Perceived { lpips_backbone, lpips_crc32, .. }) = &report.lpips {
+        text += &format!("LPIPS: {lpips_backbone}, weights with the CRC-32 {lpips_crc32}\n");
+    }
+    text += match report.appearance {
+        Appearance::None => "",
+        Appearance::Own => "exposures and codes: each photograph's own\n",
+        Appearance::Mean => "exposures and codes: the mean of the training photographs'\n",
+        Appearance::Half => "compared: right halves, after gains that were fitted to left halves\n",
+    };
+    text + match report.cameras {
+        Alignment::None => "",
+        Alignment::Learned => "cameras: as learned\n",
+        Alignment::Fitted => "cameras: each fitted to its own photograph\n",
+        Alignment::Glass => "cameras: focal length and lens as learned\n",
+        Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_json_has_no_number_for_is_said_in_words() {
+        let of =
+            |psnr: f64, ssim, lpips| serde_json::to_string(&Score { name: "a".into(), psnr, ssim, lpips }).unwrap();
+        for (psnr, expected) in [(31.5, "31.5"), (f64::INFINITY, "\"inf\""), (f64::NAN, "\"NaN\"")] {
+            assert_eq!(of(psnr, None, None), format!("{{\"name\":\"a\",\"psnr\":{expected},\"ssim\":null}}"));
+            let all = format!("{{\"name\":\"a\",\"psnr\":1.0,\"ssim\":{expected},\"lpips\":{expected}}}");
+            assert_eq!(of(1.0, Some(psnr), Some(psnr)), all);
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! What training takes of memory, said before it is taken.
+
+use raygrad::nerf::dataset::{Dataset, Frame};
+use raygrad::nerf::{Load, Trainer};
+
+use super::machine;
+
+/// Bytes that the program takes whatever it does: code, threads, what the first step sets up.
+const PROGRAM: f64 = 1e8;
+/// Bytes for each parameter: itself, what the optimiser remembers of it, its gradient, and all of that once more while a checkpoint is
+/// written.
+const PARAMETER: f64 = 40.0;
+/// Bytes for each cell of an occupancy grid.
+const CELL: f64 = 12.0;
+/// Bytes for each sample of a step, on the tape and in gradients that are not yet added up.
+const SAMPLE: f64 = 3300.0;
+
+/// About how many bytes training takes, photographs and all; `docs/benchmarks.md` has what it came to.
+pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
+    let model = &trainer.model;
+    let cells = model.sampler.grid().map_or(0, |grid| grid.cells());
+    let samples = match model.sampler.load() {
+        Load::Samples(samples) => samples,
+        // Tapes of a few rays.
+        Load::Rays { .. } => 0,
+    };
+    let photographs: f64 = data.frames.iter().map(bytes).sum();
+    let parts = [(model.params.elements(), PARAMETER), (cells, CELL), (samples, SAMPLE)]
+        .map(|(count, each)| count as f64 * each);
+    PROGRAM + photographs + parts.iter().sum::<f64>()
+}
+
+/// Bytes of a photograph and of what was measured beside it.
+fn bytes(frame: &Frame) -> f64 {
+    (frame.image.bytes() + frame.distances.as_ref().map_or(0, |distances| 4 * distances.data.len())) as f64
+}
+
+/// Bytes that are free for programs, where the system says it: of the machine, or of the group that this one runs in.
+pub fn available() -> Option<f64> {
+    let group = || {
+        let read =
+            |name: &str| std::fs::read_to_string(format!("/sys/fs/cgroup/{name}")).ok()?.trim().parse::<f64>().ok();
+        Some((read("memory.max")? - read("memory.current")?).max(0.0))
+    };
+    let machine = machine::available_memory().map(|bytes| bytes as f64);
+    [machine, group()].into_iter().flatten().reduce(f64::min)
+}
+
+/// What is to be said if training needs more bytes than are free.
+pub fn shortage(need: f64, free: f64) -> Option<String> {
+    let [needed, left] = [need, free].map(|bytes| bytes / 1e9);
+    (need > free).then(|| {
+        format!(
+            "warning: training takes about {needed:.1} GB of memory, of {left:.1} GB that are free: the system may end it; say \
+             --downscale, or a smaller table or batch with --set (field.grid.log2_table, sampler.samples)"
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::dataset::Split;
+    use raygrad::nerf::sampling::marching::MarchingConfig;
+    use raygrad::nerf::{Config, InstantConfig, Preset};
+    use raygrad_scenes::embedded;
+    use std::sync::Arc;
+
+    #[test]
+    fn a_warning_says_what_is_missing() {
+        assert_eq!(shortage(1e9, 1e9), None);
+        let said = shortage(3.26e9, 2.5e9).unwrap();
+        assert!(said.contains("about 3.3 GB of memory, of 2.5 GB that are free"), "{said}");
+    }
+
+    #[test]
+    fn what_training_takes_grows_with_all_that_is_held() {
+        let need = |width: usize, table: u32, resolution: usize, samples: usize| {
+            let mut config = Config::preset(Preset::Instant);
+            if let Some(field) = config.field.get_mut::<InstantConfig>() {
+                (field.grid.levels, field.grid.log2_table) = (2, table);
+            }
+            if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
+                (sampler.occupancy.resolution, sampler.samples) = (resolution, samples);
+            }
+            let data = Arc::new(embedded(Split::Train, width));
+            let trainer = Trainer::new(config, data.clone()).unwrap();
+            (need(&trainer, &data), trainer.model.params.elements() as f64)
+        };
+        let (least, elements) = need(8, 8, 16, 1024);
+        let least_of = |other: (f64, f64)| other.0 - least;
+        let pixels = 60.0 * (16.0 * 16.0 - 8.0 * 8.0);
+        // Four channels of single precision, as they were rendered.
+        assert!((least_of(need(16, 8, 16, 1024)) / pixels - 16.0).abs() < 0.01);
+        let (more, all) = need(8, 12, 16, 1024);
+        assert!(all > elements && (more - least - PARAMETER * (all - elements)).abs() < 1.0);
+        assert!((least_of(need(8, 8, 32, 1024)) - CELL * (32.0_f64.powi(3) - 16.0_f64.powi(3))).abs() < 1.0);
+        assert!((least_of(need(8, 8, 16, 3072)) - SAMPLE * 2048.0).abs() < 1.0);
+        assert!(least > PROGRAM && available().is_none_or(|free| free > 0.0));
+    }
+}

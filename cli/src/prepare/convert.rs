@@ -1,0 +1,330 @@
+//! A dataset in another format.
+
+use std::collections::HashSet;
+use std::path::{Component, Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use clap::ValueEnum;
+use raygrad::nerf::dataset::formats::colmap::Encoding;
+use raygrad::nerf::dataset::formats::{blender, colmap, llff, transforms};
+use raygrad::nerf::dataset::{Capture, Depths, Format, Photo, Split, View};
+use raygrad::nerf::{Camera, Error, Result};
+use raygrad::tensor::parallel;
+
+use super::bounds;
+use super::program::{Stop, Work};
+use super::root::Root;
+use super::undistort;
+use super::workplace::Workplace;
+use crate::interrupt;
+use crate::output::{complain, note, print};
+use crate::progress::Progress;
+
+/// Formats that can be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Target {
+    /// transforms.json, of nerfstudio and instant-ngp
+    Nerfstudio,
+    /// sparse/0/*.bin
+    Colmap,
+    /// sparse/0/*.txt
+    ColmapText,
+    /// poses_bounds.npy
+    Llff,
+    /// transforms_train.json and its like, of the NeRF-synthetic scenes
+    Blender,
+}
+
+impl Target {
+    /// The one that is this format.
+    pub fn of(format: Format) -> Self {
+        match format {
+            Format::Blender => Target::Blender,
+            Format::Transforms => Target::Nerfstudio,
+            Format::Colmap => Target::Colmap,
+            Format::Llff => Target::Llff,
+        }
+    }
+
+    /// Whether the format has one camera without a lens for all photographs, in whose middle is its principal point.
+    pub fn is_plain(self) -> bool {
+        matches!(self, Target::Llff | Target::Blender)
+    }
+
+    /// Where in a folder of this format an image is, and what its view is called. `inner` is its path among the images.
+    fn place(self, inner: &str, rest: &str, split: Option<Split>) -> (String, String) {
+        let flat = |name: &str| name.replace('/', "_");
+        match self {
+            Target::Nerfstudio if rest.contains('/') && rest == inner => (rest.to_owned(), rest.to_owned()),
+            Target::Nerfstudio => (format!("images/{inner}"), format!("images/{inner}")),
+            Target::Colmap | Target::ColmapText => (format!("images/{inner}"), inner.to_owned()),
+            Target::Llff => (format!("images/{}", flat(inner)), flat(inner)),
+            Target::Blender => {
+                let split = split.unwrap_or(Split::Train).name();
+                let inner = inner.strip_prefix(split).and_then(|inner| inner.strip_prefix('/')).unwrap_or(inner);
+                let name = format!("{split}/{}", flat(inner));
+                (name.clone(), name)
+            }
+        }
+    }
+
+    fn write(self, capture: &Capture, folder: &Path) -> Result<()> {
+        match self {
+            Target::Nerfstudio => transforms::write(capture, folder),
+            Target::Colmap => colmap::write(capture, folder, Encoding::Binary),
+            Target::ColmapText => colmap::write(capture, folder, Encoding::Text),
+            Target::Llff => llff::write(capture, folder),
+            Target::Blender => blender::write(capture, folder),
+        }
+    }
+}
+
+/// A photograph on its way.
+struct Job {
+    /// As it was.
+    from: View,
+    /// As it is to be; its files are in the new folder.
+    to: View,
+    /// The camera that it is seen by, if its pixels change.
+    seen_by: Option<Camera>,
+}
+
+/// Writes a capture in another format to `out`, images and all. Files that lie elsewhere than in the capture are copied if they
+/// are allowed to: its files may name any, and who gets the new dataset would read them.
+pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside: bool, out: &Path) -> Work<()> {
+    if undistorted || target == Target::Llff {
+        // Nothing can be made of images that are absent, and the format has none.
+        capture.views.retain(|view| view.image.is_some());
+    }
+    if capture.present().next().is_none() && undistorted {
+        return Err(Error::file(&capture.file, "has no photograph whose image exists").into());
+    }
+    for view in &mut capture.views {
+        // Images may be smaller than the file of the cameras says; other programs want to be told.
+        if view.image.is_some() {
+            view.camera = view.camera_of_image().map_err(|e| Error::field(&capture.file, &view.field, e))?;
+        }
+    }
+    if !outside {
+        check_inside(&capture)?;
+    }
+    let place = Workplace::new(out)?;
+    let mut jobs = jobs(&capture, target, undistorted, place.folder())?;
+    if undistorted {
+        undistort::plan(&mut jobs.iter_mut().map(|job| (&mut job.to.camera, &mut job.seen_by)), target.is_plain())?;
+    }
+    let mut guessed = 0;
+    if target == Target::Llff {
+        let bounds;
+        (bounds, guessed) = bounds::of(&capture)?;
+        jobs.iter_mut().zip(bounds).for_each(|(job, bounds)| job.to.bounds = Some(bounds));
+    }
+    let views = jobs.iter().map(|job| job.to.clone()).collect();
+    let written = Capture { folder: place.folder().into(), views, ..capture.clone() };
+    // First, so that what the format cannot hold is said before anything is copied.
+    target.write(&written, place.folder())?;
+    copy(&jobs)?;
+    place.finish()?;
+    describe(&capture, &jobs, out)?;
+    if guessed > 0 {
+        note(&format!(
+            "{guessed} photographs show too few points to tell their depths: those of the scene's box were written"
+        ));
+    }
+    Ok(())
+}
+
+/// Whether all files of a capture lie in its folder, wherever links lead.
+fn check_inside(capture: &Capture) -> Result<()> {
+    let root = Root::of_capture(capture)?;
+    for view in &capture.views {
+        let depth = view.depth.as_ref().map(|(path, _)| path);
+        for path in [view.image.as_ref(), view.mask.as_ref(), depth].into_iter().flatten() {
+            root.check(path).map_err(|what| Error::field(&capture.file, &view.field, what))?;
+        }
+    }
+    let points = capture.points_file.as_ref().map_or(Ok(()), |path| root.check(path));
+    points.map_err(|what| Error::file(&capture.file, what))
+}
+
+fn describe(capture: &Capture, jobs: &[Job], out: &Path) -> Result<()> {
+    let changed = jobs.iter().filter(|job| job.seen_by.is_some()).count();
+    let copied = jobs.iter().filter(|job| job.from.image.is_some()).count() - changed;
+    let absent = jobs.len() - changed - copied;
+    let mut parts = vec![format!("{} cameras", jobs.len())];
+    for (count, what) in [(copied, "images copied"), (changed, "images undistorted"), (absent, "images absent")] {
+        if count > 0 {
+            parts.push(format!("{count} {what}"));
+        }
+    }
+    // Of a scene that is built in, its pictures were nowhere for long.
+    let from = if capture.file.starts_with(&capture.folder) { &capture.folder } else { &capture.file };
+    print(&format!("capture  {} ({})\n", from.display(), capture.format))?;
+    if let Some(Camera { width, height, .. }) = jobs.iter().find_map(|job| job.seen_by.as_ref()) {
+        parts.push(format!("the first to {width}x{height}"));
+    }
+    print(&format!("scene    {}: {}\n", out.display(), parts.join(", ")))
+}
+
+/// What is to be done with each photograph.
+fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> Result<Vec<Job>> {
+    let has_masks = target != Target::Llff;
+    let has_depths = target == Target::Nerfstudio && !undistorted;
+    let warn = |count: usize, what: &str| {
+        if count > 0 {
+            complain(&format!("warning: {}: {count} {what}", capture.folder.display()));
+        }
+    };
+    if !has_masks {
+        warn(capture.views.iter().filter(|view| view.mask.is_some()).count(), "masks are left behind: LLFF has none");
+    }
+    if !has_depths {
+        let why = if undistorted { "they are not undistorted" } else { "the format has none" };
+        let count = capture.views.iter().filter(|view| view.depth.is_some()).count();
+        warn(count, &format!("files of depths are left behind: {why}"));
+    }
+    let mut taken = HashSet::new();
+    let mut jobs = vec![];
+    for view in &capture.views {
+        let rest = relative(&capture.folder, view)?;
+        let inner = inner(&rest);
+        let (image, name) = target.place(inner, &rest, view.split);
+        if !taken.insert(image.clone()) {
+            let what = format!("`{}` would be the file {image}, as another would: rename it", view.name);
+            return Err(Error::field(&capture.file, &view.field, what));
+        }
+        let mut to = view.clone();
+        to.image = view.image.as_ref().map(|_| folder.join(&image));
+        to.name = name;
+        // COLMAP's names.
+        to.mask = view.mask.as_ref().filter(|_| has_masks).map(|_| folder.join("masks").join(format!("{inner}.png")));
+        to.depth = view.depth.as_ref().filter(|_| has_depths).map(|(path, unit)| {
+            let ending = path.extension().unwrap_or_default();
+            (folder.join("depths").join(inner).with_extension(ending), *unit)
+        });
+        jobs.push(Job { from: view.clone(), to, seen_by: None });
+    }
+    if matches!(target, Target::Colmap | Target::Llff) {
+        let held_out =
+            capture.views.iter().filter(|view| view.split.is_some_and(|split| split != Split::Train)).count();
+        let why = "photographs are held out, which the format cannot say: whoever reads it holds out others, such as every eighth";
+        warn(held_out, why);
+    }
+    Ok(jobs)
+}
+
+/// The path of a view's image in the folder of its capture, with slashes; that of one from elsewhere is its name alone.
+pub fn relative(folder: &Path, view: &View) -> Result<String> {
+    let path = view.image.as_deref().unwrap_or(Path::new(&view.name));
+    let inside = match path.strip_prefix(folder) {
+        Ok(inside) => inside,
+        Err(_) if path.is_relative() && view.image.is_none() => path,
+        Err(_) => Path::new(path.file_name().unwrap_or_default()),
+    };
+    // What is beside the folder has its names from there on.
+    let parts = inside.components().rev().take_while(|part| !matches!(part, Component::ParentDir));
+    let parts: Option<Vec<&str>> = parts
+        .filter_map(|part| match part {
+            Component::Normal(name) => Some(name.to_str()),
+            _ => None,
+        })
+        .collect();
+    match parts {
+        Some(parts) if !parts.is_empty() => Ok(parts.into_iter().rev().collect::<Vec<_>>().join("/")),
+        _ => Err(Error::file(path, "has a name that is not Unicode: rename it")),
+    }
+}
+
+/// The part of a path in a folder of images: `0.jpg` of `images/0.jpg` and of `images_4/0.jpg`.
+fn inner(path: &str) -> &str {
+    match path.split_once('/') {
+        Some((first, rest)) if first == "images" || first.starts_with("images_") => rest,
+        _ => path,
+    }
+}
+
+/// Copies all files or makes them anew, in parallel.
+fn copy(jobs: &[Job]) -> Work<()> {
+    let progress = Mutex::new(Progress::new());
+    let (done, total) = (AtomicUsize::new(0), jobs.len());
+    let copied = parallel::collect(total, |i| {
+        if interrupt::requested() {
+            return Err(Stop::Interrupted);
+        }
+        jobs[i].run()?;
+        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        progress.set(done as f64 / total as f64, || format!("{done} of {total} images written"));
+        Ok(())
+    });
+    // All are waited for, and the first error is that of the first photograph.
+    copied.into_iter().collect()
+}
+
+impl Job {
+    fn run(&self) -> Result<()> {
+        let Job { from, to, seen_by } = self;
+        // What is copied byte by byte is what it claims to be.
+        if let (Some((from, _)), Some((to, _))) = (&from.depth, &to.depth) {
+            Depths::check_file(from)?;
+            copy_file(from, to)?;
+        }
+        let (Some(source), Some(image)) = (&from.image, &to.image) else { return Ok(()) };
+        if let Some(camera) = seen_by {
+            let (photo, mask) = from.seen_by(camera)?;
+            make_parent(image)?;
+            photo.save(image)?;
+            if let (Some(mask), Some(path)) = (mask, &to.mask) {
+                make_parent(path)?;
+                mask.save_png(path)?;
+            }
+            return Ok(());
+        }
+        Photo::open(source, None)?;
+        copy_file(source, image)?;
+        let (Some(from), Some(to)) = (&from.mask, &to.mask) else { return Ok(()) };
+        let mask = Photo::open(from, None)?;
+        if from.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+            return copy_file(from, to);
+        }
+        make_parent(to)?;
+        mask.save(to)
+    }
+}
+
+fn copy_file(from: &Path, to: &PathBuf) -> Result<()> {
+    make_parent(to)?;
+    std::fs::copy(from, to)
+        .map(drop)
+        .map_err(|e| Error::file(from, format!("cannot be copied to {}: {e}", to.display())))
+}
+
+fn make_parent(path: &Path) -> Result<()> {
+    let Some(parent) = path.parent() else { return Ok(()) };
+    std::fs::create_dir_all(parent).map_err(|e| Error::file(parent, format!("cannot be created: {e}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_go_where_their_format_has_them() {
+        let of = |target: Target, rest: &str| target.place(inner(rest), rest, Some(Split::Test));
+        let pair = |image: &str, name: &str| (image.to_owned(), name.to_owned());
+        for (rest, target, image, name) in [
+            ("images/a/0.jpg", Target::Nerfstudio, "images/a/0.jpg", "images/a/0.jpg"),
+            ("images_4/0.png", Target::Nerfstudio, "images/0.png", "images/0.png"),
+            ("test/r_0.png", Target::Nerfstudio, "test/r_0.png", "test/r_0.png"),
+            ("0.jpg", Target::Nerfstudio, "images/0.jpg", "images/0.jpg"),
+            ("images/a/0.jpg", Target::Colmap, "images/a/0.jpg", "a/0.jpg"),
+            ("test/r_0.png", Target::ColmapText, "images/test/r_0.png", "test/r_0.png"),
+            ("images/a/0.jpg", Target::Llff, "images/a_0.jpg", "a_0.jpg"),
+            ("test/r_0.png", Target::Blender, "test/r_0.png", "test/r_0.png"),
+            ("images/a/0.png", Target::Blender, "test/a_0.png", "test/a_0.png"),
+        ] {
+            assert_eq!(of(target, rest), pair(image, name), "{rest} {target:?}");
+        }
+    }
+}

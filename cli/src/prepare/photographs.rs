@@ -1,0 +1,72 @@
+//! A folder of photographs, without cameras.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use raygrad::nerf::dataset::copy_upright;
+use raygrad::nerf::{Error, Result};
+use raygrad::tensor::parallel;
+
+use super::program::{Stop, Work};
+use super::root::Root;
+use super::workplace::Workplace;
+use crate::interrupt;
+use crate::output::complain;
+use crate::progress::Progress;
+
+/// Endings of images that can be read.
+const READ: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+/// Endings of images that cannot.
+const NOT_READ: [&str; 9] = ["heic", "heif", "avif", "tif", "tiff", "dng", "cr2", "nef", "arw"];
+
+/// Copies the photographs in a folder, or in its folder `images`, to `images`, each turned as it was held. Links that lead
+/// elsewhere are followed if they are allowed to.
+pub fn copy(folder: &Path, outside: bool, place: &Workplace) -> Work<usize> {
+    let found = find(folder)?;
+    if !outside {
+        let root = Root::new(folder)?;
+        found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
+    }
+    let to = place.make("images")?;
+    let (done, total) = (AtomicUsize::new(0), found.len());
+    let progress = Mutex::new(Progress::new());
+    let copied = parallel::collect(total, |i| {
+        if interrupt::requested() {
+            return Err(Stop::Interrupted);
+        }
+        copy_upright(&found[i], to.join(found[i].file_name().unwrap_or_default()))?;
+        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        progress.set(done as f64 / total as f64, || format!("{done} of {total} photographs copied"));
+        Ok(())
+    });
+    copied.into_iter().collect::<Work<()>>()?;
+    Ok(total)
+}
+
+/// The photographs, in no order in particular. Warns of those that cannot be read.
+fn find(folder: &Path) -> Result<Vec<PathBuf>> {
+    let inner = folder.join("images");
+    for folder in [folder, &inner] {
+        let Ok(entries) = std::fs::read_dir(folder) else { continue };
+        let files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(|path| path.is_file()).collect();
+        let ends = |path: &Path, endings: &[&str]| {
+            let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+            endings.iter().any(|known| known.eq_ignore_ascii_case(ending))
+        };
+        let others = files.iter().filter(|path| ends(path, &NOT_READ)).count();
+        let found: Vec<PathBuf> = files.into_iter().filter(|path| ends(path, &READ)).collect();
+        if others > 0 {
+            let what = "images are HEIC, TIFF or raw, which are not read: convert them to JPEG or PNG";
+            if found.is_empty() {
+                return Err(Error::file(folder, format!("{others} {what}")));
+            }
+            complain(&format!("warning: {}: {others} {what}", folder.display()));
+        }
+        if !found.is_empty() {
+            return Ok(found);
+        }
+    }
+    Err(Error::file(folder, "holds no photographs: expected .jpg, .png or .webp files in it or in its folder `images`"))
+}

@@ -1,0 +1,180 @@
+//! Cameras of photographs, as COLMAP finds them.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::dataset::formats::colmap;
+use raygrad::nerf::dataset::{Capture, Photo};
+use raygrad::nerf::{Error, Result};
+
+use super::program::{COLMAP, Work, counted};
+use super::workplace::Workplace;
+use crate::output::note;
+use crate::progress::Progress;
+
+/// Photographs up to which every pair is compared, also of a video: so a walk around something closes.
+const EXHAUSTIVE: usize = 200;
+/// Where COLMAP works until it is done.
+const FOLDER: &str = "work";
+/// What it calls the processor that it should do without, in the order from new versions to old.
+const EXTRACTION: [&str; 2] = ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"];
+const MATCHING: [&str; 2] = ["FeatureMatching.use_gpu", "SiftMatching.use_gpu"];
+/// What the mapper says, with exit code 1, when there is nothing to find: [`find`] has better words for it.
+const NO_MODEL: &str = "failed to create sparse model";
+
+/// What COLMAP has found.
+#[derive(Debug, PartialEq)]
+pub struct Found {
+    /// How many photographs have a camera now.
+    pub registered: usize,
+    /// The names of the others.
+    pub lost: Vec<String>,
+    /// How many models there were, of which the largest is kept.
+    pub models: usize,
+}
+
+/// Whether COLMAP can be run.
+pub fn check() -> Work<()> {
+    COLMAP.check()
+}
+
+/// Finds the cameras of the photographs in `images` and leaves them in `sparse/0`. `sequence` says that the photographs are
+/// frames of a video, in order; `model` is COLMAP's name of a kind of camera.
+pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
+    let images = place.folder().join("images");
+    let mut names = names(&images)?;
+    names.sort();
+    let work = place.make(FOLDER)?;
+    let colmap = Colmap { database: work.join("database.db"), images };
+
+    let mut arguments = vec!["--ImageReader.camera_model", model];
+    if colmap.one_size(&names)? {
+        // One lens is known better from all photographs than each from one.
+        arguments.extend(["--ImageReader.single_camera", "1"]);
+    }
+    colmap.step("feature_extractor", Some(EXTRACTION), "features found in photographs", &arguments)?;
+    let matcher = if names.len() > EXHAUSTIVE { "sequential_matcher" } else { "exhaustive_matcher" };
+    if names.len() > EXHAUSTIVE && !sequence {
+        note(&format!("more than {EXHAUSTIVE} photographs: each is compared with those that follow by name alone"));
+    }
+    colmap.step(matcher, Some(MATCHING), "photographs compared", &[])?;
+    let found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
+    let count = found.len();
+    // Of equals, the one that was found first.
+    let largest = found.into_iter().rev().max_by_key(|(_, capture)| capture.views.len());
+    let Some((folder, capture)) = largest else {
+        let what = "has found no cameras: the photographs overlap too little, or are blurred, or show too little that can \
+                    be told apart";
+        return Err(Error::setting("colmap mapper", what).into());
+    };
+    let to = place.make("sparse")?.join("0");
+    std::fs::rename(&folder, &to).map_err(|e| Error::file(&to, format!("cannot be created: {e}")))?;
+    place.remove(FOLDER);
+    let registered = capture.views.len();
+    Ok(Found { registered, lost: lost(names, &capture), models: count })
+}
+
+/// The photographs that have no camera.
+fn lost(names: Vec<String>, capture: &Capture) -> Vec<String> {
+    names.into_iter().filter(|name| capture.views.iter().all(|view| view.name != *name)).collect()
+}
+
+fn names(folder: &Path) -> Result<Vec<String>> {
+    let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
+    let entries = std::fs::read_dir(folder).map_err(bad)?;
+    entries.map(|entry| Ok(entry.map_err(bad)?.file_name().to_string_lossy().into_owned())).collect()
+}
+
+/// The folders of COLMAP's models, by number.
+fn folders(models: &Path) -> Result<Vec<PathBuf>> {
+    let mut numbers: Vec<usize> = names(models)?.iter().filter_map(|name| name.parse().ok()).collect();
+    numbers.sort_unstable();
+    Ok(numbers.into_iter().map(|number| models.join(number.to_string())).collect())
+}
+
+struct Colmap {
+    database: PathBuf,
+    images: PathBuf,
+}
+
+impl Colmap {
+    /// Whether all photographs are of one size, as those of one camera are.
+    fn one_size(&self, names: &[String]) -> Result<bool> {
+        let mut first = None;
+        for name in names {
+            let [_, size] = Photo::size_of_file(self.images.join(name))?;
+            if *first.get_or_insert(size) != size {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Runs one of COLMAP's steps that counts what it has done.
+    fn step(&self, step: &str, gpu: Option<[&str; 2]>, words: &str, arguments: &[&str]) -> Work<()> {
+        let mut command = COLMAP.command();
+        command.arg(step).arg("--database_path").arg(&self.database);
+        if step == "feature_extractor" {
+            command.arg("--image_path").arg(&self.images);
+        }
+        command.args(arguments);
+        let help = COLMAP.ask(&[step, "-h"])?;
+        // There may be no graphics processor, or no display to use it without a window.
+        if let Some(name) = gpu.iter().flatten().find(|name| help.contains(**name)) {
+            command.arg(format!("--{name}")).arg("0");
+        }
+        let mut progress = Progress::new();
+        COLMAP.run(&mut command, None, |line| {
+            let Some(done) = counted(line) else { return };
+            progress.set(done, || format!("{:.0} % of {words}", 100.0 * done));
+        })
+    }
+
+    /// Finds the cameras, which COLMAP says one by one, and begins with none for each model that it tries: the models and their
+    /// folders in `models`.
+    fn map(&self, models: &Path, total: usize) -> Work<Vec<(PathBuf, Capture)>> {
+        let mut command = COLMAP.command();
+        let paths: [(&str, &OsStr); 3] = [
+            ("--database_path", self.database.as_os_str()),
+            ("--image_path", self.images.as_os_str()),
+            ("--output_path", models.as_os_str()),
+        ];
+        command.arg("mapper");
+        let mut most = 0;
+        for (name, path) in paths {
+            command.arg(name).arg(path);
+        }
+        let mut progress = Progress::new();
+        COLMAP.run(&mut command, Some(NO_MODEL), |line| {
+            let Some(count) = registered(line) else { return };
+            most = most.max(count);
+            progress.set(most as f64 / total as f64, || match count {
+                count if count < most => format!("{most} of {total} photographs registered; {count} in another model"),
+                _ => format!("{most} of {total} photographs registered"),
+            });
+        })?;
+        let folders = folders(models)?.into_iter();
+        Ok(folders.map(|folder| Ok((folder.clone(), colmap::read(&folder)?))).collect::<Result<_>>()?)
+    }
+}
+
+/// The count in `Registering image #12 (13)`, or `(num_reg_frames=13)` in newer versions.
+fn registered(line: &str) -> Option<usize> {
+    let (_, rest) = line.split_once("Registering image #")?;
+    let inside = rest.split_once('(')?.1.split_once(')')?.0;
+    inside.rsplit('=').next()?.trim().parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::registered;
+
+    #[test]
+    fn registrations_are_counted() {
+        assert_eq!(registered("I20240101 incremental.cc:418] Registering image #12 (13)"), Some(13));
+        assert_eq!(registered("Registering image #12 (num_reg_frames=7)"), Some(7));
+        for line in ["", "=> Image sees 120 / 300 points", "Registering image #12", "Registering image #1 (x)"] {
+            assert_eq!(registered(line), None, "{line}");
+        }
+    }
+}

@@ -1,0 +1,217 @@
+//! Other programs: where they are, what they say while they run, and how they end.
+
+use std::collections::VecDeque;
+use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{self, RecvTimeoutError, Sender};
+use std::time::Duration;
+
+use raygrad::nerf::Error;
+
+use crate::interrupt;
+use crate::output::note;
+
+/// Lines that are kept of what a program has said, and shown if it fails.
+const KEPT: usize = 12;
+/// How often it is looked whether there was a Ctrl-C.
+const INTERVAL: Duration = Duration::from_millis(100);
+
+/// Why the work ended before its end.
+#[derive(Debug)]
+pub enum Stop {
+    /// There was a Ctrl-C.
+    Interrupted,
+    /// Something is wrong.
+    Failed(Error),
+}
+
+/// What comes of work that may be interrupted.
+pub type Work<T> = Result<T, Stop>;
+
+impl From<Error> for Stop {
+    fn from(error: Error) -> Self {
+        Stop::Failed(error)
+    }
+}
+
+/// A program that is installed beside this one.
+#[derive(Debug, Clone, Copy)]
+pub struct Program {
+    /// What it is called on the command line.
+    name: &'static str,
+    /// How it is installed.
+    install: &'static str,
+}
+
+/// Takes videos apart.
+pub const FFMPEG: Program = Program {
+    name: "ffmpeg",
+    install: "`apt install ffmpeg`, `brew install ffmpeg`, `conda install -c conda-forge ffmpeg` or \
+              `winget install Gyan.FFmpeg`",
+};
+
+/// Finds out where photographs were taken from.
+pub const COLMAP: Program = Program {
+    name: "colmap",
+    install: "`apt install colmap`, `brew install colmap`, `conda install -c conda-forge colmap`, or for Windows \
+              (winget has none) from github.com/colmap/colmap/releases",
+};
+
+impl Program {
+    /// What it says to these arguments, however it ends: for questions that are answered at once.
+    pub fn ask<S: AsRef<std::ffi::OsStr>>(&self, arguments: &[S]) -> Work<String> {
+        let output = Command::new(self.name).args(arguments).stdin(Stdio::null()).output();
+        let output = output.map_err(|e| self.unusable(&e))?;
+        Ok([output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat())
+    }
+
+    /// Runs it to its end and tells every line that it says. If it fails, its last lines are shown; if there is a Ctrl-C, it
+    /// is ended. One that says the words of `excuse` has not failed, whatever its exit code.
+    pub fn run(&self, command: &mut Command, excuse: Option<&str>, mut line: impl FnMut(&str)) -> Work<()> {
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().map_err(|e| self.unusable(&e))?;
+        let (sender, lines) = mpsc::channel();
+        if let Some(out) = child.stdout.take() {
+            listen(out, sender.clone());
+        }
+        if let Some(err) = child.stderr.take() {
+            listen(err, sender.clone());
+        }
+        drop(sender);
+        let mut kept = VecDeque::new();
+        let mut excused = false;
+        loop {
+            match lines.recv_timeout(INTERVAL) {
+                Ok(said) => {
+                    line(&said);
+                    excused |= excuse.is_some_and(|words| said.contains(words));
+                    if !is_count(&said) {
+                        kept.push_back(said);
+                    }
+                    if kept.len() > KEPT {
+                        kept.pop_front();
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            if interrupt::requested() {
+                end(&mut child);
+                return Err(Stop::Interrupted);
+            }
+        }
+        let status = child.wait().map_err(|e| self.unusable(&e))?;
+        // From a terminal, Ctrl-C reaches both, and the program may end first.
+        if interrupt::requested() {
+            return Err(Stop::Interrupted);
+        }
+        if status.success() || excused {
+            return Ok(());
+        }
+        for line in &kept {
+            note(&format!("  {line}"));
+        }
+        let step = command.get_args().next().and_then(|step| step.to_str()).filter(|step| !step.starts_with('-'));
+        let name = step.map_or(self.name.to_owned(), |step| format!("{} {step}", self.name));
+        let above = if kept.is_empty() { "and said nothing" } else { "and its last words are above" };
+        Err(Error::setting(name, format!("has failed ({}), {above}", ending(status))).into())
+    }
+
+    /// A command that runs it.
+    pub fn command(&self) -> Command {
+        Command::new(self.name)
+    }
+
+    /// Whether it can be run at all.
+    pub fn check(&self) -> Work<()> {
+        self.ask(&["-h"]).map(drop)
+    }
+
+    fn unusable(&self, error: &std::io::Error) -> Stop {
+        let what = match error.kind() {
+            ErrorKind::NotFound => format!("is not on the PATH; install it: {}", self.install),
+            _ => format!("cannot be run: {error}"),
+        };
+        Error::setting(self.name, what).into()
+    }
+}
+
+/// Whether a line is one of those by which ffmpeg reports its progress, which are no last words: `out_time_us=1240000`.
+fn is_count(line: &str) -> bool {
+    line.split_once('=')
+        .is_some_and(|(name, _)| name.bytes().all(|c| c.is_ascii_lowercase() || c == b'_' || c.is_ascii_digit()))
+}
+
+/// Sends the lines of a stream, in a thread of its own: a program stops when nobody reads what it says.
+fn listen(stream: impl Read + Send + 'static, sender: Sender<String>) {
+    std::thread::spawn(move || {
+        let mut stream = BufReader::new(stream);
+        let mut bytes = vec![];
+        while matches!(stream.read_until(b'\n', &mut bytes), Ok(count) if count > 0) {
+            let text = String::from_utf8_lossy(&bytes);
+            // What a program writes over itself on a terminal counts as it was last.
+            let last = text.trim_end().rsplit('\r').next().unwrap_or_default().trim_end().to_owned();
+            bytes.clear();
+            if !last.is_empty() && sender.send(last).is_err() {
+                break;
+            }
+        }
+    });
+}
+
+/// Ends a program. That it has ended already is no error.
+fn end(child: &mut Child) {
+    let _ = child.kill();
+    let _ = child.wait();
+}
+
+fn ending(status: ExitStatus) -> String {
+    status.code().map_or_else(|| status.to_string(), |code| format!("exit code {code}"))
+}
+
+/// The last fraction `12/120` in brackets that a line has, as COLMAP counts: `[12/120]`, or `[3/8, 2/8]` of blocks of blocks.
+pub fn counted(line: &str) -> Option<f64> {
+    let inside = line.rsplit_once('[')?.1.split_once(']')?.0;
+    let mut share = 0.0;
+    let mut size = 1.0;
+    for part in inside.split(',') {
+        let (done, all) = part.split_once('/')?;
+        let (done, all): (f64, f64) = (done.trim().parse().ok()?, all.trim().parse().ok()?);
+        if !(all >= 1.0 && (0.0..=all).contains(&done)) {
+            return None;
+        }
+        // It counts from 1, and what is counted has only begun but for the last of parts.
+        share += size * (done - 1.0).max(0.0) / all;
+        size /= all;
+    }
+    Some((share + size).min(1.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{counted, is_count};
+
+    #[test]
+    fn progress_of_ffmpeg_is_no_last_word() {
+        for line in ["frame=12", "stream_0_0_q=-1.0", "out_time=00:00:01.2", "progress=continue"] {
+            assert!(is_count(line), "{line}");
+        }
+        for line in ["Unknown encoder 'libx264'", "[mp4 @ 0x5] crf=18 is no number", "Error: a = b", "end"] {
+            assert!(!is_count(line), "{line}");
+        }
+    }
+
+    #[test]
+    fn counts_of_colmap_are_read() {
+        for (line, share) in [
+            ("I1122 10:00:00 feature.cc:1] Processed file [12/120]", 0.1),
+            ("Matching block [1/2, 2/2]", 0.5),
+            ("Processing block [2/2, 2/2] in 3.1s", 1.0),
+        ] {
+            assert!(counted(line).is_some_and(|counted| (counted - share).abs() < 1e-12), "{line}");
+        }
+        for line in ["", "no count", "[a/b]", "[3/2]", "[1/0]", "[1]", "[-1/2]", "]["] {
+            assert_eq!(counted(line), None, "{line}");
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! Sharp frames of a video.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use raygrad::nerf::dataset::Photo;
+use raygrad::nerf::{Error, Result};
+use raygrad::tensor::parallel;
+
+use super::program::{FFMPEG, Stop, Work};
+use super::workplace::Workplace;
+use crate::interrupt;
+use crate::progress::Progress;
+
+/// Frames that are looked at for each that is kept.
+const CANDIDATES: usize = 3;
+/// Where those are until then.
+const FOLDER: &str = "candidates";
+
+/// What ffmpeg says of a video.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Video {
+    /// Its length in seconds.
+    seconds: f64,
+    /// Frames in a second.
+    rate: f64,
+}
+
+/// Writes about `count` sharp frames of a video to `images`: of three frames that follow one another, the sharpest.
+pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
+    let said = FFMPEG.ask(&["-hide_banner".as_ref(), "-nostdin".as_ref(), "-i".as_ref(), video.as_os_str()])?;
+    let Some(about) = Video::parse(&said) else {
+        let last = said.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("nothing").trim();
+        return Err(Error::file(video, format!("is no video that ffmpeg can read; it says: {last}")).into());
+    };
+    let rate = (CANDIDATES as f64 * count as f64 / about.seconds).min(about.rate);
+    let wanted = (rate * about.seconds).max(1.0);
+    let folder = place.make(FOLDER)?;
+    let mut progress = Progress::new();
+    let mut command = FFMPEG.command();
+    command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1", "-i"]);
+    command.arg(video).arg("-map").arg("0:v:0").arg("-vf").arg(format!("fps={rate:.6}"));
+    // The best JPEG there is: 1 is taken only where the least is 1 too.
+    command.args(["-qmin", "1", "-q:v", "1"]).arg(folder.join("%06d.jpg"));
+    FFMPEG.run(&mut command, None, |line| {
+        let Some(frame) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
+        progress.set(frame / wanted, || format!("{frame} of about {wanted:.0} frames taken from the video"));
+    })?;
+    let candidates = files(&folder)?;
+    if candidates.is_empty() {
+        return Err(Error::file(video, "has no frames: ffmpeg has written none").into());
+    }
+    let kept = keep_sharp(&candidates, count, &place.make("images")?, progress)?;
+    place.remove(FOLDER);
+    Ok(kept)
+}
+
+impl Video {
+    /// From the lines `Duration: 00:01:23.45, ..` and `Stream #0:0: Video: .., 29.97 fps, ..`.
+    fn parse(said: &str) -> Option<Video> {
+        let stream = said.lines().find(|line| line.contains(" Video: "))?;
+        let rate = stream.split(',').find_map(|part| {
+            let part = part.trim();
+            part.strip_suffix(" fps").or_else(|| part.strip_suffix(" tbr"))?.trim().parse::<f64>().ok()
+        });
+        let duration = said.lines().find_map(|line| line.trim().strip_prefix("Duration: "))?.split(',').next()?;
+        let mut parts = duration.trim().split(':').map(|part| part.parse::<f64>().ok());
+        let (hours, minutes, seconds) = (parts.next()??, parts.next()??, parts.next()??);
+        let video = Video { seconds: 3600.0 * hours + 60.0 * minutes + seconds, rate: rate.unwrap_or(30.0) };
+        let good = |x: f64| x > 0.0 && x.is_finite();
+        (good(video.seconds) && good(video.rate)).then_some(video)
+    }
+}
+
+/// The files in a folder by name.
+fn files(folder: &Path) -> Result<Vec<PathBuf>> {
+    let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
+    let entries = std::fs::read_dir(folder).map_err(bad)?;
+    let mut files = entries.map(|entry| Ok(entry.map_err(bad)?.path())).collect::<Result<Vec<_>>>()?;
+    files.sort();
+    Ok(files)
+}
+
+/// Moves the sharpest of every few candidates to a folder, and says how many those are.
+fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: Progress) -> Work<usize> {
+    // A short video has fewer frames than are asked for: no more than those are thrown away.
+    let group = ((candidates.len() as f64 / count as f64).round() as usize).clamp(1, CANDIDATES);
+    let (done, progress) = (AtomicUsize::new(0), Mutex::new(progress));
+    let sharpness = parallel::collect(candidates.len(), |i| {
+        if interrupt::requested() {
+            return Err(Stop::Interrupted);
+        }
+        let sharpness = if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() };
+        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
+        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        progress
+            .set(done as f64 / candidates.len() as f64, || format!("{done} of {} frames looked at", candidates.len()));
+        Ok(sharpness)
+    });
+    let sharpness = sharpness.into_iter().collect::<Work<Vec<f64>>>()?;
+    let mut kept = 0;
+    for (files, sharpness) in candidates.chunks(group).zip(sharpness.chunks(group)) {
+        let best = sharpness.iter().zip(files).max_by(|a, b| a.0.total_cmp(b.0));
+        let Some((_, file)) = best else { continue };
+        kept += 1;
+        let name = to.join(format!("frame_{kept:05}.jpg"));
+        std::fs::rename(file, &name).map_err(|e| Error::file(&name, format!("cannot be written: {e}")))?;
+    }
+    Ok(kept)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Video;
+
+    #[test]
+    fn what_ffmpeg_says_of_videos_is_read() {
+        let said = "Input #0, mov,mp4, from 'walk.mp4':\n  Metadata:\n    creation_time   : 2024-05-01\n  \
+                    Duration: 00:01:02.50, start: 0.000000, bitrate: 9 kb/s\n  Stream #0:1[0x2](und): Audio: aac, 2 fps\n  \
+                    Stream #0:0[0x1](und): Video: h264 (avc1 / 0x31637661), yuv420p(tv, bt709), 1920x1080, 9 kb/s, \
+                    29.97 fps, 29.97 tbr, 90k tbn (default)\nAt least one output file must be specified\n";
+        assert_eq!(Video::parse(said), Some(Video { seconds: 62.5, rate: 29.97 }));
+        let no_rate = said.replace("29.97 fps, 29.97 tbr, ", "");
+        assert_eq!(Video::parse(&no_rate), Some(Video { seconds: 62.5, rate: 30.0 }));
+        for (from, to) in [("Video:", "Data:"), ("00:01:02.50", "N/A"), ("00:01:02.50", "00:00:00.00")] {
+            assert_eq!(Video::parse(&said.replace(from, to)), None, "{to}");
+        }
+    }
+}

@@ -1,0 +1,225 @@
+//! A folder that is there as a whole or not at all.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Error, Result};
+use tempfile::TempDir;
+
+use crate::output::complain;
+
+/// A temporary folder on the disk of the folder that is to be. Dropped before it is [finished](Self::finish), nothing is left
+/// of it.
+pub struct Workplace {
+    temporary: TempDir,
+    out: PathBuf,
+    /// Whether the folder was there, empty, before: then the temporary one lies in it.
+    is_inside: bool,
+}
+
+impl Workplace {
+    /// For a folder that does not exist yet, or is empty. One that is empty stays itself: it may be a mount point, a symbolic
+    /// link's target, or all that is writable there.
+    pub fn new(out: &Path) -> Result<Self> {
+        let bad = |e: std::io::Error| Error::file(out, format!("cannot be created: {e}"));
+        let is_inside = match others(out) {
+            Ok(others) if !others.is_empty() => {
+                return Err(Error::file(out, "holds files already: choose another --out, or remove that folder"));
+            }
+            Ok(_) => true,
+            Err(e) if out.is_dir() => return Err(Error::file(out, format!("cannot be read: {e}"))),
+            Err(_) if out.exists() => return Err(Error::file(out, "is not a folder")),
+            Err(_) if out.is_symlink() => {
+                let what =
+                    "is a symbolic link to a folder that does not exist: make that folder, or choose another --out";
+                return Err(Error::file(out, what));
+            }
+            Err(_) => false,
+        };
+        let absolute = std::path::absolute(out).map_err(bad)?;
+        let name = absolute.file_name().ok_or_else(|| Error::file(out, "has no name that a folder can have"))?;
+        let folder = if is_inside { &absolute } else { absolute.parent().unwrap_or(&absolute) };
+        std::fs::create_dir_all(folder).map_err(bad)?;
+        let mut builder = tempfile::Builder::new();
+        let prefix = format!(".{}{PREFIX}", name.to_string_lossy());
+        // Temporary folders are private by default; this one becomes an ordinary one, as far as the umask allows.
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
+        let temporary = builder.prefix(&prefix).tempdir_in(folder).map_err(bad)?;
+        Ok(Workplace { temporary, out: absolute, is_inside })
+    }
+
+    /// Where to work.
+    pub fn folder(&self) -> &Path {
+        self.temporary.path()
+    }
+
+    /// Makes a folder in it.
+    pub fn make(&self, name: &str) -> Result<PathBuf> {
+        let folder = self.folder().join(name);
+        std::fs::create_dir_all(&folder).map_err(|e| Error::file(&folder, format!("cannot be created: {e}")))?;
+        Ok(folder)
+    }
+
+    /// Removes a folder in it that has done its work. What cannot be removed is said, and stays: the work is worth more.
+    pub fn remove(&self, name: &str) {
+        let path = self.folder().join(name);
+        if let Err(e) = std::fs::remove_dir_all(&path) {
+            complain(&format!("warning: {}: cannot be removed: {e}", path.display()));
+        }
+    }
+
+    /// Puts the folder where it is to be.
+    ///
+    /// # Errors
+    /// If that has come to hold files, or cannot be written any more. The finished work then stays, and the error says where.
+    pub fn finish(self) -> Result<()> {
+        let Workplace { temporary, out, is_inside } = self;
+        // From here on nothing is removed, whatever fails.
+        let done = temporary.keep();
+        let moved = if is_inside { move_up(&done, &out) } else { std::fs::rename(&done, &out) };
+        moved.map_err(|e| {
+            let done = done.display();
+            Error::file(&out, format!("cannot be written: {e}; the work is finished and kept: move it from {done}"))
+        })
+    }
+}
+
+/// What follows the name of a folder in that of its temporary one.
+const PREFIX: &str = "-unfinished-";
+/// What empty folders hold on some systems.
+const NOTHING: [&str; 2] = ["lost+found", ".DS_Store"];
+
+/// What a folder holds but for temporary ones, such as that of a program that was killed.
+fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
+    let names = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.file_name()));
+    let is_other = |name: &OsString| {
+        let name = name.to_string_lossy();
+        !(NOTHING.contains(&&*name) || name.starts_with('.') && name.contains(PREFIX))
+    };
+    Ok(names.collect::<std::io::Result<Vec<_>>>()?.into_iter().filter(is_other).collect())
+}
+
+/// Moves all that is in a folder to the one that holds it and nothing else.
+fn move_up(from: &Path, to: &Path) -> std::io::Result<()> {
+    if !others(to)?.is_empty() {
+        return Err(std::io::Error::other("it holds files by now"));
+    }
+    for entry in std::fs::read_dir(from)? {
+        let name = entry?.file_name();
+        std::fs::rename(from.join(&name), to.join(&name))?;
+    }
+    std::fs::remove_dir(from)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    /// A workplace with a file of finished work.
+    fn filled(out: &Path) -> Workplace {
+        let place = Workplace::new(out).unwrap();
+        fs::write(place.make("images").unwrap().join("0.png"), b"work").unwrap();
+        place
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        names
+    }
+
+    /// The folder that an error says the work is kept in.
+    fn kept(error: &Error) -> PathBuf {
+        let message = error.to_string();
+        let (_, kept) = message.split_once("the work is finished and kept: move it from ").unwrap();
+        kept.into()
+    }
+
+    #[test]
+    fn work_goes_to_new_and_to_empty_folders() {
+        let folder = tempfile::tempdir().unwrap();
+        let [new, empty] = ["a/new", "empty"].map(|name| folder.path().join(name));
+        fs::create_dir(&empty).unwrap();
+        for out in [&new, &empty] {
+            filled(out).finish().unwrap();
+            assert_eq!((names(out), names(&out.join("images"))), (vec!["images".to_owned()], vec!["0.png".to_owned()]));
+        }
+        assert_eq!(names(folder.path()), ["a", "empty"]);
+        assert_eq!(names(&folder.path().join("a")), ["new"]);
+        // What cannot be removed keeps nobody from finishing.
+        let place = filled(&folder.path().join("finished"));
+        place.remove("absent");
+        place.remove("images");
+        place.finish().unwrap();
+        assert!(names(&folder.path().join("finished")).is_empty());
+        fs::remove_dir(folder.path().join("finished")).unwrap();
+        // A folder is empty that holds what its system has put there, or a killed program.
+        fs::remove_dir_all(&empty).unwrap();
+        fs::create_dir_all(empty.join("lost+found")).unwrap();
+        fs::create_dir_all(empty.join(".empty-unfinished-abc")).unwrap();
+        let other = filled(&empty);
+        filled(&empty).finish().unwrap();
+        assert_eq!(fs::read(kept(&other.finish().unwrap_err()).join("images/0.png")).unwrap(), b"work");
+        // A workplace that is dropped unfinished leaves nothing.
+        let gone = folder.path().join("gone");
+        drop(filled(&gone));
+        fs::create_dir(&gone).unwrap();
+        drop(filled(&gone));
+        assert!(names(&gone).is_empty());
+        assert!(Workplace::new(&new).err().unwrap().to_string().contains("holds files already"));
+        assert!(Workplace::new(&new.join("images/0.png")).err().unwrap().to_string().contains("is not a folder"));
+        assert_eq!(names(folder.path()), ["a", "empty", "gone"]);
+    }
+
+    #[test]
+    fn work_is_kept_when_the_last_step_fails() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |kept: &Path| fs::read(kept.join("images/0.png")).unwrap();
+        // An empty folder, and one that does not exist, gain a file meanwhile.
+        for exists in [true, false] {
+            let out = folder.path().join(format!("gains-{exists}"));
+            if exists {
+                fs::create_dir(&out).unwrap();
+            }
+            let place = filled(&out);
+            fs::create_dir_all(&out).unwrap();
+            fs::write(out.join("notes.txt"), b"mine").unwrap();
+            let error = place.finish().unwrap_err();
+            assert!(error.to_string().starts_with(&format!("{}: cannot be written: ", out.display())), "{error}");
+            assert_eq!(file(&kept(&error)), b"work");
+            assert_eq!(fs::read(out.join("notes.txt")).unwrap(), b"mine");
+        }
+        // A file takes the place of the folder.
+        let out = folder.path().join("file");
+        let place = filled(&out);
+        fs::write(&out, b"mine").unwrap();
+        assert_eq!(file(&kept(&place.finish().unwrap_err())), b"work");
+        assert_eq!(fs::read(&out).unwrap(), b"mine");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn symbolic_links_are_followed_and_permissions_are_usual() {
+        use std::os::unix::fs::{PermissionsExt, symlink};
+        let folder = tempfile::tempdir().unwrap();
+        let [target, link, lost] = ["target", "link", "lost"].map(|name| folder.path().join(name));
+        fs::create_dir(&target).unwrap();
+        symlink(&target, &link).unwrap();
+        filled(&link).finish().unwrap();
+        assert!(link.is_symlink() && target.join("images/0.png").exists());
+        symlink(folder.path().join("absent"), &lost).unwrap();
+        assert!(
+            Workplace::new(&lost).err().unwrap().to_string().contains("is a symbolic link to a folder that does not")
+        );
+        assert_eq!(names(folder.path()), ["link", "lost", "target"]);
+        // As of any folder that is made here.
+        let [made, new] = ["made", "new"].map(|name| folder.path().join(name));
+        fs::create_dir(&made).unwrap();
+        filled(&new).finish().unwrap();
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode();
+        assert_eq!(mode(&new), mode(&made));
+    }
+}

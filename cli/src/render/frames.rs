@@ -1,0 +1,332 @@
+//! Frames in a folder, one file each, which another call goes on with.
+
+use std::path::{Path, PathBuf};
+
+use raygrad::nerf::{Error, Result, write_atomic};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::shown::Layer;
+use crate::lock::{Lock, State};
+use crate::output::{complain, make_folder, note, numbered, other_numbered, parent, remove};
+use crate::overwrite::{Job, png_with_text, taken};
+use crate::run::write_json;
+
+/// Digits of the number of a frame.
+pub const DIGITS: usize = 4;
+/// The file that says what the frames of a folder are pictures of, while some are to come.
+const RECORD: &str = "unfinished.json";
+/// The file by which a program keeps others from writing frames there.
+const LOCK: &str = "unfinished.lock";
+
+/// Frames of a path, some of which may be there already.
+pub struct Frames {
+    folder: PathBuf,
+    record: Record,
+    job: Job,
+    lock: Lock,
+}
+
+/// What is written down beside frames.
+#[derive(Serialize, Deserialize)]
+struct Record {
+    /// All that decides what they show.
+    of: Value,
+    /// What was asked for: the mark of the job.
+    #[serde(default)]
+    job: String,
+    /// How many are there, from the first.
+    done: usize,
+    /// Whether pictures by number were there before the first frame, which somebody may want to keep.
+    #[serde(default)]
+    strange: bool,
+}
+
+impl Frames {
+    /// `count` frames in a folder, which is made. Frames that an interrupted call has left there are kept if they are `of` the
+    /// same; all others are replaced one by one, with what is to be saved beside them.
+    ///
+    /// # Errors
+    /// If another job has written one of them, the folder cannot be written, or another program writes frames there.
+    pub fn new(folder: PathBuf, of: Value, job: &Job, count: usize, save: &[Layer]) -> Result<Self> {
+        check(&folder, record(&folder).as_ref(), &of, job, count, save)?;
+        make_folder(&folder)?;
+        let lock = Lock::take(&folder.join(LOCK), || Error::file(&folder, "is being rendered to by another raygrad"))?;
+        let left = record(&folder);
+        let strange = match &left {
+            Some(left) => left.strange,
+            None => !other_numbered(&folder, DIGITS, &[]).is_empty(),
+        };
+        let others = left.as_ref().filter(|left| left.of != of && left.done > 0);
+        if let Some(Record { of: before, done, .. }) = others {
+            let others = differing(before, &of).join(", ");
+            note(&format!("{}: {done} frames are replaced, which were of another {others}", folder.display()));
+        }
+        let done = left.filter(|left| left.of == of).map_or(0, |left| left.done);
+        let record = Record { of, job: job.mark().to_owned(), done: 0, strange };
+        let mut frames = Frames { folder, record, job: job.clone(), lock };
+        frames.record.done = (0..done).take_while(|&frame| frames.path(frame).is_file()).count();
+        frames.write()?;
+        Ok(frames)
+    }
+
+    /// How many there are, from the first.
+    pub fn done(&self) -> usize {
+        self.record.done
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Writes the next frame: what is saved beside it, and last the picture.
+    pub fn push(&mut self, picture: &[u8], layers: &[(Layer, Vec<u8>)]) -> Result<()> {
+        let path = self.path(self.record.done);
+        // Somebody may have put a file there meanwhile.
+        self.job.check(&path)?;
+        for (layer, bytes) in layers {
+            let file = beside(&self.folder, self.record.done, *layer);
+            let folder = parent(&file);
+            self.check_lock()?;
+            std::fs::create_dir_all(folder).map_err(|e| Error::file(folder, format!("cannot be created: {e}")))?;
+            write_atomic(file, bytes)?;
+        }
+        self.check_lock()?;
+        write_atomic(path, &png_with_text(picture, self.job.mark()))?;
+        self.record.done += 1;
+        self.write()
+    }
+
+    /// Whether the folder is still the one that was locked.
+    fn check_lock(&self) -> Result<()> {
+        let what = match self.lock.state() {
+            State::Kept => return Ok(()),
+            State::Gone => "was removed or moved while frames were written to it: the same command begins again",
+            State::Lost => "another raygrad writes frames here now: this one has stopped",
+        };
+        Err(Error::file(&self.folder, what))
+    }
+
+    /// Leaves the frames as they are, with nothing to go on with.
+    pub fn keep(self) {
+        if self.check_lock().is_err() {
+            return;
+        }
+        remove(&[self.folder.join(RECORD)]);
+        self.lock.remove();
+    }
+
+    /// Removes all frames, and the folder unless there is something else in it. If pictures were there before that somebody may
+    /// want to keep, all stay.
+    pub fn remove(self) {
+        if self.check_lock().is_err() {
+            return;
+        }
+        if self.record.strange {
+            note(&format!("{}: held pictures before, and is not removed", self.folder.display()));
+            return self.keep();
+        }
+        remove(&other_numbered(&self.folder, DIGITS, &[]));
+        remove(&[self.folder.join(RECORD)]);
+        self.lock.remove();
+        if let Err(e) = std::fs::remove_dir(&self.folder) {
+            complain(&format!("{}: cannot be removed: {e}", self.folder.display()));
+        }
+    }
+
+    fn path(&self, frame: usize) -> PathBuf {
+        self.folder.join(numbered(frame, DIGITS))
+    }
+
+    fn write(&self) -> Result<()> {
+        self.check_lock()?;
+        write_json(&self.folder.join(RECORD), &self.record)
+    }
+}
+
+/// What is written down in a folder; what cannot be read is nothing.
+fn record(folder: &Path) -> Option<Record> {
+    std::fs::read(folder.join(RECORD)).ok().and_then(|text| serde_json::from_slice(&text).ok())
+}
+
+/// The file of a layer of a frame.
+fn beside(folder: &Path, frame: usize, layer: Layer) -> PathBuf {
+    let (name, ending) = layer.place();
+    folder.join(name).join(numbered(frame, DIGITS)).with_extension(ending)
+}
+
+/// Whether a job may write so many frames to a folder: those that are there, and what lies beside them, are its own.
+fn check(folder: &Path, left: Option<&Record>, of: &Value, job: &Job, count: usize, save: &[Layer]) -> Result<()> {
+    // Of the same, too, where a run was moved meanwhile.
+    if job.overwrites() || left.is_some_and(|left| left.job == job.mark() || left.of == *of) {
+        return Ok(());
+    }
+    for frame in 0..count {
+        let picture = folder.join(numbered(frame, DIGITS));
+        let files = save.iter().map(|layer| beside(folder, frame, *layer)).chain([picture.clone()]);
+        let there: Vec<PathBuf> = files.filter(|file| file.symlink_metadata().is_ok()).collect();
+        let Some(file) = there.first().filter(|_| !job.wrote(&picture)) else { continue };
+        return Err(match left {
+            Some(_) => Error::file(
+                folder,
+                "holds unfinished frames of another command: repeat that one to finish them, or add --overwrite",
+            ),
+            None => taken(file),
+        });
+    }
+    Ok(())
+}
+
+/// The names of what differs between two records.
+fn differing<'a>(a: &'a Value, b: &'a Value) -> Vec<&'a str> {
+    let names = |value: &'a Value| value.as_object().into_iter().flat_map(|fields| fields.keys().map(String::as_str));
+    let mut names: Vec<&str> = names(a).chain(names(b)).filter(|name| a.get(name) != b.get(name)).collect();
+    names.sort_unstable();
+    names.dedup();
+    names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn job(number: u32, overwrites: bool) -> Job {
+        Job::new("render", &json!(number), overwrites)
+    }
+
+    /// Three frames of job 0 at most, of a model.
+    fn frames(folder: &Path, model: u32) -> Frames {
+        Frames::new(folder.into(), json!({ "model": model }), &job(0, false), 3, &[Layer::DepthNpy]).unwrap()
+    }
+
+    #[test]
+    fn frames_are_gone_on_with_if_they_are_of_the_same() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("frames");
+        let begin = |model: u32| frames(&folder, model);
+        let mut first = begin(1);
+        for i in 0..3_u8 {
+            first.push(&[i], &[(Layer::DepthNpy, vec![10 + i])]).unwrap();
+        }
+        let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+        assert_eq!((read("0002.png")[0], read("depth/0002.npy")), (2, vec![12]));
+        drop(first);
+        assert_eq!(begin(1).done(), 3);
+        // From one that is no longer there on.
+        std::fs::remove_file(folder.join("0001.png")).unwrap();
+        let mut again = begin(1);
+        assert_eq!(again.done(), 1);
+        again.push(&[7], &[]).unwrap();
+        assert_eq!(read("0001.png")[0], 7);
+        drop(again);
+        assert_eq!(begin(2).done(), 0);
+        // It was begun again: what lies there now is of another model.
+        assert_eq!(begin(1).done(), 0);
+        std::fs::write(folder.join(RECORD), "{").unwrap();
+        assert_eq!(begin(1).done(), 0);
+        begin(3).keep();
+        assert!(!folder.join(RECORD).exists() && folder.join("0000.png").exists());
+        std::fs::remove_dir_all(folder.join("depth")).unwrap();
+        // What was there before without a record stays.
+        begin(3).remove();
+        assert!(folder.join("0002.png").exists());
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 3, "nothing but the frames");
+        // After an interruption too.
+        drop(begin(3));
+        begin(3).remove();
+        assert!(folder.join("0002.png").exists());
+        std::fs::remove_dir_all(&folder).unwrap();
+        begin(3).push(&[1], &[]).unwrap();
+        begin(3).remove();
+        assert!(!folder.exists());
+    }
+
+    #[test]
+    fn frames_are_written_by_one_program_at_a_time_which_says_what_differs() {
+        let place = tempfile::tempdir().unwrap();
+        let again = || Frames::new(place.path().into(), json!({}), &job(0, false), 3, &[]);
+        let frames = again().unwrap();
+        let error = again().err().unwrap().to_string();
+        assert!(error.contains("by another raygrad"), "{error}");
+        drop(frames);
+        again().unwrap();
+        let [a, b] = [json!({"size": [1, 2], "model": 3, "only": 0}), json!({"size": [1, 2], "model": 4, "b": null})];
+        assert_eq!(differing(&a, &b), ["b", "model", "only"]);
+    }
+
+    #[test]
+    fn frames_of_others_are_not_replaced() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path();
+        let of = |job: &Job| json!({ "job": job.mark() });
+        let new = |job: &Job, save: &[Layer]| Frames::new(folder.into(), of(job), job, 3, save).map(drop);
+        let refused = |job: &Job, save: &[Layer], name: &str| {
+            let error = new(job, save).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("{}: exists, and", folder.join(name).display())), "{error}");
+            let left = [RECORD, LOCK].map(|name| folder.join(name).exists());
+            assert_eq!(left, [false; 2], "nothing is left there");
+        };
+        // Photographs by number, of which one would be replaced; those beyond are not.
+        std::fs::write(folder.join("0003.png"), b"photograph").unwrap();
+        new(&job(0, false), &[]).unwrap();
+        Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[]).unwrap().keep();
+        std::fs::write(folder.join("0002.png"), b"photograph").unwrap();
+        refused(&job(0, false), &[], "0002.png");
+        std::fs::remove_file(folder.join("0002.png")).unwrap();
+        // Depths that were measured.
+        std::fs::create_dir(folder.join("depth")).unwrap();
+        std::fs::write(folder.join("depth/0001.png"), b"depths").unwrap();
+        refused(&job(0, false), &[Layer::Normals, Layer::Depth], "depth/0001.png");
+        Frames::new(folder.into(), of(&job(0, true)), &job(0, true), 3, &[Layer::Depth]).unwrap().keep();
+        std::fs::remove_dir_all(folder.join("depth")).unwrap();
+        // Finished frames of the same job are, with what lies beside them, and those of another are not.
+        let mut frames = Frames::new(folder.into(), of(&job(0, false)), &job(0, false), 3, &[Layer::Depth]).unwrap();
+        for i in 0..3_u8 {
+            frames.push(&[i], &[(Layer::Depth, vec![i])]).unwrap();
+        }
+        frames.keep();
+        refused(&job(1, false), &[], "0000.png");
+        new(&job(0, false), &[Layer::Depth]).unwrap();
+        // So are unfinished ones.
+        std::fs::remove_file(folder.join("0000.png")).unwrap();
+        std::fs::write(folder.join("0001.png"), b"cut off").unwrap();
+        new(&job(0, false), &[Layer::Depth]).unwrap();
+        let error = new(&job(1, false), &[]).unwrap_err().to_string();
+        assert!(error.ends_with(
+            "holds unfinished frames of another command: repeat that one to finish them, or add --overwrite"
+        ));
+        new(&job(1, true), &[]).unwrap();
+        // What shows the same is its own, as where a run was moved; a picture that came meanwhile stays.
+        let mut frames = Frames::new(folder.into(), of(&job(1, true)), &job(2, false), 3, &[]).unwrap();
+        assert_eq!(frames.done(), 0);
+        std::fs::write(folder.join("0000.png"), b"photograph").unwrap();
+        assert!(frames.push(&[1], &[]).unwrap_err().to_string().contains("0000.png: exists"));
+        assert_eq!(std::fs::read(folder.join("0000.png")).unwrap(), b"photograph");
+    }
+
+    #[test]
+    fn frames_of_a_folder_that_was_replaced_stop() {
+        let place = tempfile::tempdir().unwrap();
+        let folder = place.path().join("frames");
+        let mut first = frames(&folder, 1);
+        std::fs::rename(&folder, place.path().join("moved")).unwrap();
+        assert!(first.push(&[0], &[]).unwrap_err().to_string().contains("was removed or moved while frames"));
+        let mut second = frames(&folder, 2);
+        for layers in [vec![], vec![(Layer::Depth, vec![1])]] {
+            assert!(first.push(&[1], &layers).unwrap_err().to_string().contains("another raygrad writes frames here"));
+        }
+        second.push(&[2], &[]).unwrap();
+        // Nor is anything of the other one removed.
+        first.remove();
+        // A picture, what is written down, and the two files of a lock.
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 4);
+        let third = frames(&place.path().join("moved"), 1);
+        let lock = crate::lock::owner_of(&place.path().join("moved").join(LOCK));
+        std::fs::write(lock, "1 0123456789abcdef\n").unwrap();
+        third.keep();
+        assert_eq!(std::fs::read_dir(place.path().join("moved")).unwrap().count(), 3, "nor kept by who has lost it");
+        second.keep();
+    }
+}

@@ -1,0 +1,390 @@
+//! Camera paths of other programs: nerfstudio's `camera_path.json`, and those that instant-ngp saves.
+//!
+//! Nerfstudio lists the camera of every frame (`camera_path`), and the key frames that it has them from (`keyframes`),
+//! which count where there is no list. Poses are camera-to-world, row by row, of a camera that looks along `-z` with
+//! `y` up; angles are vertical, in degrees. Its world is the capture's, recentred and scaled by what its
+//! `dataparser_transforms.json` says.
+//!
+//! Instant-ngp lists key frames of a cubic B-spline: quaternions `x y z w` and positions of a camera that looks along
+//! `z` with `y` down, in its unit cube, whose `x y z` are `y z x` of the capture times 0.33 and one half more, if the
+//! capture's `transforms.json` does not say another scale and offset.
+
+use std::path::Path as File;
+
+use raygrad::nerf::camera::{CameraPath, Curve, Key};
+use raygrad::nerf::dataset::formats::rigid;
+use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
+use raygrad::nerf::{Error, Result};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use crate::output::note;
+use crate::parse::{FPS, LARGEST};
+
+/// Most frames and key frames.
+const MOST: usize = 100_000;
+/// The smallest angle of a picture in degrees; the largest is as far from 180.
+const SMALLEST_FOV: f64 = 0.001;
+/// The scale and the offset of instant-ngp's unit cube, where nothing is said.
+const NGP: Cube = Cube { scale: 0.33, offset: [0.5; 3] };
+/// How long nerfstudio takes from key frame to key frame, where nothing is said.
+const TRANSITION: f64 = 1.0;
+
+/// A path, in the capture's coordinates.
+#[derive(Debug)]
+pub struct Path {
+    pub motion: Motion,
+    /// The size of its pictures, if the file says.
+    pub size: Option<[usize; 2]>,
+    /// Frames a second, if the file says.
+    pub fps: Option<f64>,
+}
+
+/// How cameras move.
+#[derive(Debug)]
+pub enum Motion {
+    /// Every frame is there.
+    Frames(Vec<Key>),
+    /// Between key frames, for so long, if the file says.
+    Keys { path: CameraPath, seconds: Option<f64> },
+}
+
+/// A `camera_path.json` of nerfstudio. What its viewer alone reads has no meaning here.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Nerfstudio {
+    render_width: usize,
+    render_height: usize,
+    camera_type: Option<String>,
+    fps: Option<f64>,
+    seconds: Option<f64>,
+    is_cycle: Option<bool>,
+    smoothness_value: Option<f64>,
+    #[serde(rename = "default_fov")]
+    _default_fov: Option<f64>,
+    #[serde(rename = "default_time")]
+    _default_time: Option<f64>,
+    default_transition_sec: Option<f64>,
+    camera_path: Option<Vec<Shot>>,
+    keyframes: Option<Value>,
+    crop: Option<Value>,
+    /// What it is in, if it says, as raygrad's do.
+    coordinates: Option<Coordinates>,
+}
+
+#[derive(Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Coordinates {
+    /// The capture's own.
+    Capture,
+}
+
+/// One frame.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Shot {
+    camera_to_world: [f64; 16],
+    fov: f64,
+    #[serde(rename = "aspect")]
+    _aspect: Option<f64>,
+    render_time: Option<f64>,
+}
+
+/// One key frame.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Keyframe {
+    matrix: [f64; 16],
+    fov: f64,
+    #[serde(rename = "aspect")]
+    _aspect: Option<f64>,
+    override_transition_enabled: Option<bool>,
+    override_transition_sec: Option<f64>,
+    render_time: Option<f64>,
+    #[serde(rename = "override_time_enabled")]
+    _override_time_enabled: Option<bool>,
+}
+
+/// A path of instant-ngp. Where it is being played and what its window shows have no meaning here.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Ngp {
+    path: Vec<NgpKey>,
+    #[serde(rename = "loop", default)]
+    closed: bool,
+    #[serde(rename = "time")]
+    _time: Option<f64>,
+    #[serde(rename = "duration_seconds")]
+    _duration_seconds: Option<f64>,
+    spline_order: Option<u32>,
+}
+
+/// One key frame.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NgpKey {
+    #[serde(rename = "R")]
+    rotation: [f64; 4],
+    #[serde(rename = "T")]
+    position: [f64; 3],
+    fov: f64,
+    /// With the next, where a lens is in focus, which matters with an aperture alone.
+    #[serde(rename = "slice")]
+    _slice: Option<f64>,
+    #[serde(rename = "scale")]
+    _scale: Option<f64>,
+    #[serde(alias = "dof", default)]
+    aperture_size: f64,
+    #[serde(default)]
+    glow_mode: u32,
+    #[serde(rename = "glow_y_cutoff")]
+    _glow_y_cutoff: Option<f64>,
+    timestamp: Option<f64>,
+}
+
+/// Nerfstudio's `dataparser_transforms.json`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Dataparser {
+    transform: [[f64; 4]; 3],
+    scale: f64,
+}
+
+/// What a `transforms.json` says of instant-ngp's unit cube.
+#[derive(Deserialize)]
+struct Cube {
+    scale: f64,
+    offset: [f64; 3],
+}
+
+/// Reads a path and takes it to the capture's coordinates, by what `transform` says; `applied` gives the map from
+/// coordinates of before to those of the capture's file, which nerfstudio's transform has in it.
+pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Result<DAffine3>) -> Result<Path> {
+    let document: Value = parse(file)?;
+    let has = |name: &str| document.get(name).is_some_and(|value| !value.is_null());
+    if has("path") {
+        let named = transform.unwrap_or(file);
+        let to_capture = transform.map_or(Ok(NGP), parse)?.to_capture(named)?;
+        return ngp(file, whole(file, document)?, &to_capture);
+    }
+    if !has("camera_path") && !has("keyframes") {
+        let what =
+            "is no camera path: it has neither nerfstudio's `camera_path` or `keyframes` nor instant-ngp's `path`";
+        return Err(Error::file(file, what));
+    }
+    let path: Nerfstudio = whole(file, document)?;
+    let to_capture = match (transform, path.coordinates) {
+        (None, Some(Coordinates::Capture)) => DAffine3::IDENTITY,
+        (Some(_), Some(Coordinates::Capture)) => {
+            return Err(Error::field(
+                file,
+                "coordinates",
+                "says that it is in the capture's: leave --path-transform out",
+            ));
+        }
+        (None, None) => {
+            note(&format!(
+                "{}: is taken to be in the capture's coordinates; nerfstudio writes its own: say --path-transform with its \
+                 dataparser_transforms.json",
+                file.display()
+            ));
+            DAffine3::IDENTITY
+        }
+        (Some(transform), None) => parse::<Dataparser>(transform)?.to_capture(transform, applied()?)?,
+    };
+    nerfstudio(file, path, &to_capture)
+}
+
+fn parse<T: DeserializeOwned>(file: &File) -> Result<T> {
+    let text = std::fs::read_to_string(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
+    serde_json::from_str(&text).map_err(|e| Error::file(file, format!("is not of the right form: {e}")))
+}
+
+fn whole<T: DeserializeOwned>(file: &File, document: Value) -> Result<T> {
+    serde_json::from_value(document).map_err(|e| Error::file(file, format!("is not of the right form: {e}")))
+}
+
+fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Path> {
+    let bad = |field: &str, what: &str| Error::field(file, field, what);
+    let size = [path.render_width, path.render_height];
+    if !size.iter().all(|side| (1..=LARGEST).contains(side)) {
+        return Err(bad("render_width", &format!("with `render_height` must be from 1 to {LARGEST}, is {size:?}")));
+    }
+    if path.camera_type.as_deref().is_some_and(|kind| kind != "perspective") {
+        return Err(bad("camera_type", "must be `perspective`: other lenses are not understood"));
+    }
+    if path.crop.is_some() {
+        return Err(bad("crop", "is not understood: scenes are shown as a whole"));
+    }
+    if path.fps.is_some_and(|fps| !FPS.contains(&fps)) {
+        return Err(bad("fps", &format!("must be from {} to {}", FPS.start(), FPS.end())));
+    }
+    for (name, value) in [("seconds", path.seconds), ("default_transition_sec", path.default_transition_sec)] {
+        if value.is_some_and(|value| !(value > 0.0 && value <= 1e6)) {
+            return Err(bad(name, "must be above 0"));
+        }
+    }
+    let key = |name: String, matrix: &[f64; 16], fov: f64, time: Option<f64>| {
+        if time.is_some() {
+            return Err(bad(&format!("{name}.render_time"), "is not understood: scenes stand still"));
+        }
+        key(file, &name, from_rows(matrix).map_err(|what| bad(&name, &what))?, fov, to_capture)
+    };
+    let shots = path.camera_path.unwrap_or_default();
+    let motion = match (shots.is_empty(), path.keyframes) {
+        (false, _) => {
+            count(file, "camera_path", shots.len())?;
+            let each = shots.iter().enumerate();
+            let keys = each
+                .map(|(i, shot)| key(format!("camera_path[{i}]"), &shot.camera_to_world, shot.fov, shot.render_time));
+            Motion::Frames(keys.collect::<Result<_>>()?)
+        }
+        (true, None) => return Err(bad("camera_path", "is empty")),
+        (true, Some(frames)) => {
+            if path.smoothness_value.is_some_and(|value| value != 0.0) {
+                return Err(bad(
+                    "smoothness_value",
+                    "must be 0 where there is no `camera_path`: others are not understood",
+                ));
+            }
+            let frames: Vec<Keyframe> = serde_json::from_value(frames)
+                .map_err(|e| bad("keyframes", &format!("is not of the right form: {e}")))?;
+            count(file, "keyframes", frames.len())?;
+            let each = frames.iter().enumerate();
+            let keys =
+                each.map(|(i, frame)| key(format!("keyframes[{i}]"), &frame.matrix, frame.fov, frame.render_time));
+            let keys: Vec<Key> = keys.collect::<Result<_>>()?;
+            let closed = path.is_cycle.unwrap_or(false) && keys.len() > 1;
+            // A key frame says how long it takes to get to it, the first of a cycle at its end.
+            let usual = path.default_transition_sec.unwrap_or(TRANSITION);
+            let seconds = |(i, frame): (usize, &Keyframe)| {
+                let own = frame.override_transition_sec.filter(|_| frame.override_transition_enabled.unwrap_or(false));
+                let seconds = own.unwrap_or(usual);
+                let what = || bad(&format!("keyframes[{i}].override_transition_sec"), "must be above 0");
+                if seconds > 0.0 && seconds <= 1e6 { Ok(seconds) } else { Err(what()) }
+            };
+            let mut times = frames.iter().enumerate().map(seconds).collect::<Result<Vec<f64>>>()?;
+            times.rotate_left(1);
+            times.truncate(if closed { keys.len() } else { keys.len() - 1 });
+            let seconds = path.seconds.or(Some(times.iter().sum()).filter(|sum| *sum > 0.0));
+            Motion::Keys { path: CameraPath::timed(keys, times, closed, Curve::Through), seconds }
+        }
+    };
+    Ok(Path { motion, size: Some(size), fps: path.fps })
+}
+
+fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
+    let bad = |field: &str, what: &str| Error::field(file, field, what);
+    count(file, "path", path.path.len())?;
+    if path.spline_order.is_some_and(|order| order != 3) {
+        return Err(bad("spline_order", "must be 3: splines of another order are not understood"));
+    }
+    let of = |(i, frame): (usize, &NgpKey)| {
+        let name = format!("path[{i}]");
+        let [x, y, z, w] = frame.rotation;
+        let rotation = DQuat::from_xyzw(x, y, z, w);
+        if !(1e-3..1e3).contains(&rotation.length()) {
+            return Err(bad(&format!("{name}.R"), "must be a quaternion x, y, z, w"));
+        }
+        if frame.aperture_size != 0.0 {
+            return Err(bad(
+                &format!("{name}.aperture_size"),
+                "must be 0: a lens that is out of focus is not understood",
+            ));
+        }
+        if frame.glow_mode != 0 {
+            return Err(bad(&format!("{name}.glow_mode"), "must be 0: it is not understood"));
+        }
+        // Its cameras have y down and look along z.
+        let turned = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        let matrix3 = DMat3::from_quat(rotation.normalize()) * turned;
+        let pose = DAffine3 { matrix3, translation: DVec3::from(frame.position) };
+        key(file, &name, pose, frame.fov, to_capture)
+    };
+    let keys = path.path.iter().enumerate().map(of).collect::<Result<Vec<Key>>>()?;
+    let closed = path.closed && keys.len() > 1;
+    let legs = if closed { keys.len() } else { keys.len() - 1 };
+    // A time is when the next key frame is reached. Times that do not rise count for nothing.
+    let stamps: Vec<f64> = path.path.iter().filter_map(|frame| frame.timestamp).collect();
+    let lengths = stamps.iter().scan(0.0, |before, stamp| Some(stamp - std::mem::replace(before, *stamp)));
+    let mut times: Vec<f64> = lengths.collect();
+    if times.len() != keys.len() || !times.iter().all(|time| *time > 0.0 && time.is_finite()) {
+        times = vec![1.0; keys.len()];
+    }
+    times.truncate(legs);
+    let path = CameraPath::timed(keys, times, closed, Curve::Near);
+    Ok(Path { motion: Motion::Keys { path, seconds: None }, size: None, fps: None })
+}
+
+fn count(file: &File, field: &str, count: usize) -> Result<()> {
+    match count {
+        0 => Err(Error::field(file, field, "is empty")),
+        1..=MOST => Ok(()),
+        _ => Err(Error::field(file, field, format!("has {count} frames, more than {MOST}"))),
+    }
+}
+
+/// A pose and a vertical angle in degrees, in the capture's coordinates.
+fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3) -> Result<Key> {
+    let bad = |what: String| Error::field(file, name, what);
+    rigid::pose(&pose).map_err(|what| bad(format!("its pose {what}")))?;
+    if !(SMALLEST_FOV..=180.0 - SMALLEST_FOV).contains(&fov) {
+        return Err(bad(format!("`fov` must be from {SMALLEST_FOV} to {} degrees, is {fov}", 180.0 - SMALLEST_FOV)));
+    }
+    let DAffine3 { matrix3, .. } = to_capture;
+    let pose = DAffine3 {
+        matrix3: *matrix3 * pose.matrix3 * matrix3.determinant().cbrt().recip(),
+        translation: to_capture.transform_point3(pose.translation),
+    };
+    Ok(Key { pose, angle_y: fov.to_radians() })
+}
+
+/// Sixteen numbers row by row.
+fn from_rows(m: &[f64; 16]) -> std::result::Result<DAffine3, String> {
+    let last = &m[12..];
+    if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| !((value - expected).abs() < 1e-3)) {
+        return Err(format!("its matrix must be written row by row, the last one 0 0 0 1, which is {last:?}"));
+    }
+    let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
+    Ok(DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) })
+}
+
+impl Dataparser {
+    /// From nerfstudio's world to the capture's. A place `x` of before the file's own transform is at `scale *
+    /// (transform x)`.
+    fn to_capture(&self, file: &File, applied: DAffine3) -> Result<DAffine3> {
+        let row = |r: usize| DVec3::from_slice(&self.transform[r][..3]);
+        let matrix3 = DMat3::from_cols(row(0), row(1), row(2)).transpose();
+        let translation = DVec3::from([0, 1, 2].map(|r: usize| self.transform[r][3]));
+        let transform = DAffine3 { matrix3, translation };
+        rigid::pose(&transform).map_err(|what| Error::field(file, "transform", what))?;
+        // The scale of the file's own transform is in this scale too, and not in the other transform.
+        let own = applied.matrix3.determinant().cbrt();
+        let scale = self.scale / own;
+        if !(scale > 0.0 && scale.is_finite()) {
+            return Err(Error::field(file, "scale", "must be above 0"));
+        }
+        let applied = DAffine3 { matrix3: applied.matrix3 * own.recip(), translation: applied.translation / own };
+        Ok(applied * transform.inverse() * DAffine3::from_scale(DVec3::splat(scale.recip())))
+    }
+}
+
+impl Cube {
+    /// From instant-ngp's unit cube to the capture.
+    fn to_capture(&self, file: &File) -> Result<DAffine3> {
+        if !(self.scale > 0.0 && self.scale.is_finite()) {
+            return Err(Error::field(file, "scale", "must be above 0"));
+        }
+        let offset = DVec3::from(self.offset);
+        if !offset.is_finite() {
+            return Err(Error::field(file, "offset", "must be three finite numbers"));
+        }
+        // Its x is the capture's y, its y the z, its z the x.
+        let axes = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
+        Ok(DAffine3 { matrix3: axes * self.scale.recip(), translation: -offset / self.scale })
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,147 @@
+//! Where photographs come from.
+
+use std::ffi::OsString;
+use std::fmt;
+use std::path::PathBuf;
+
+use std::sync::{Mutex, PoisonError};
+
+use raygrad::nerf::dataset::{Capture, Dataset, Frame, Reading, Scope, Split, Survey, evenly_spaced};
+use raygrad::nerf::{Error, Extent, Result};
+use raygrad_scenes::{embedded, landscape, landscape_distances};
+use serde::{Deserialize, Serialize};
+
+use super::output::complain;
+use super::progress::Progress;
+
+/// Width and height of the embedded scene's images in pixels.
+pub const EMBEDDED_SIZE: usize = 200;
+/// Width and height of the landscape's images in pixels.
+pub const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
+
+/// A folder of photographs, or a scene that needs none.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Scene {
+    /// The bulldozer that is built in.
+    Embedded,
+    /// The bulldozer in a landscape without bounds, built in too.
+    Landscape,
+    /// A dataset in this folder.
+    Folder(PathBuf),
+}
+
+impl From<OsString> for Scene {
+    /// `embedded` and `landscape` are the built-in scenes (a folder of that name is `./embedded`), anything else a folder.
+    fn from(text: OsString) -> Self {
+        match text.to_str() {
+            Some("embedded") => Scene::Embedded,
+            Some("landscape") => Scene::Landscape,
+            _ => Scene::Folder(text.into()),
+        }
+    }
+}
+
+impl fmt::Display for Scene {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Scene::Embedded => f.write_str("embedded"),
+            Scene::Landscape => f.write_str("landscape"),
+            Scene::Folder(folder) => folder.display().fmt(f),
+        }
+    }
+}
+
+impl Scene {
+    /// What the scene's files say, and where it lies; `asked` overrules how far it goes.
+    pub fn open(&self, asked: Option<Scope>) -> Result<Opened> {
+        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
+        let capture = Capture::read(folder)?;
+        let survey = capture.survey(asked)?;
+        Ok(Opened::new(self, Some((capture, survey)), asked))
+    }
+
+    /// The same, lying where a model has it, which may go on beyond its box.
+    pub fn open_for(&self, extent: &Extent, goes_on: bool) -> Result<Opened> {
+        let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
+        let Extent { placement, bounds, span: [near, far], ndc, .. } = *extent;
+        let scope = match (goes_on, ndc) {
+            (false, _) => Scope::Bounded,
+            (true, None) => Scope::Unbounded,
+            (true, Some(_)) => Scope::Forward,
+        };
+        let reason = "as the model has it".to_owned();
+        let survey = Survey { placement, scope, bounds, near, far, ndc, reason };
+        Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
+    }
+
+    /// The same scene, found from any working directory.
+    pub fn absolute(&self) -> Result<Scene> {
+        match self {
+            Scene::Embedded | Scene::Landscape => Ok(self.clone()),
+            Scene::Folder(folder) => std::path::absolute(folder).map(Scene::Folder).map_err(|e| Error::file(folder, e)),
+        }
+    }
+}
+
+/// A scene whose files have been read, but for the photographs.
+pub struct Opened {
+    /// Whether depths that were measured are read with the photographs.
+    pub depth: bool,
+    scene: Scene,
+    /// What a folder holds.
+    pub capture: Option<(Capture, Survey)>,
+    /// How far the scene is to go, if that was asked for.
+    asked: Option<Scope>,
+}
+
+impl Opened {
+    fn new(scene: &Scene, capture: Option<(Capture, Survey)>, asked: Option<Scope>) -> Self {
+        Opened { depth: false, scene: scene.clone(), capture, asked }
+    }
+
+    /// At most `views` evenly spaced photographs of a split, at `1 / downscale` of their size. Warns of absent images.
+    pub fn load(&self, split: Split, downscale: usize, views: usize) -> Result<Dataset> {
+        let data = match &self.capture {
+            None => {
+                let data = match self.scene {
+                    Scene::Landscape => {
+                        divides(downscale, LANDSCAPE_SIZE)?;
+                        let mut data = landscape(split, LANDSCAPE_SIZE[0] / downscale);
+                        if self.depth {
+                            let measure =
+                                |frame: &mut Frame| frame.distances = Some(landscape_distances(&frame.camera));
+                            data.frames.iter_mut().for_each(measure);
+                        }
+                        data
+                    }
+                    _ => {
+                        divides(downscale, [EMBEDDED_SIZE; 2])?;
+                        embedded(split, EMBEDDED_SIZE / downscale)
+                    }
+                };
+                Dataset { frames: evenly_spaced(data.frames, views), scope: self.asked.unwrap_or(data.scope), ..data }
+            }
+            Some((capture, survey)) => {
+                let progress = Mutex::new(Progress::new());
+                let show = |done: usize, total: usize| {
+                    let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+                    progress.set(done as f64 / total as f64, || format!("{done} of {total} {split} photographs read"));
+                };
+                capture.load(split, survey, &Reading { downscale, views, distances: self.depth, progress: &show })?
+            }
+        };
+        for name in &data.skipped {
+            complain(&format!("warning: {}: the {split} image `{name}` is absent and was skipped", self.scene));
+        }
+        Ok(data)
+    }
+}
+
+/// Whether images of this size can be made smaller by that factor.
+fn divides(downscale: usize, [width, height]: [usize; 2]) -> Result<()> {
+    if width.is_multiple_of(downscale) && height.is_multiple_of(downscale) {
+        return Ok(());
+    }
+    Err(Error::setting("downscale", format!("{downscale} does not divide the image size {width}x{height}")))
+}

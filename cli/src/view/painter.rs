@@ -1,0 +1,527 @@
+//! Pictures of what pages want to see: a coarse one at once, and finer ones for as long as it is wanted.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use raygrad::nerf::glam::DAffine3;
+use raygrad::nerf::pictures::colormap;
+use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::space::occupancy::Skip;
+use raygrad::nerf::{Camera, Model};
+
+use super::album::Album;
+use super::hub::{Hub, Outgoing, Save, Shot, Wish};
+use super::messages::{Eye, File, Made, View};
+use super::parts::{LARGE, Parts};
+use super::server::sorry;
+use super::shelf::{Shelf, Which};
+use super::store::Got;
+use crate::render::shown::Show;
+
+/// How long the first picture of a view may take, in seconds.
+const FIRST: f64 = 0.035;
+/// Rays a second of a model that nothing is known of.
+const RATE: f64 = 1e5;
+/// Weight of the latest piece in the rate that is expected of the next one.
+const LATEST: f64 = 0.5;
+/// At most so many times the size is halved: coarser pictures show nothing.
+const MOST_HALVINGS: u32 = 7;
+/// At most so many large pictures are painted in turns: each has its memory.
+const MOST_LARGE: usize = 4;
+/// Quality of JPEG files, 1 to 100, of coarse pictures and of whole ones.
+const QUALITY: [u8; 2] = [75, 92];
+/// How often a picture is painted again while a model learns, at most.
+const AGAIN: Duration = Duration::from_millis(500);
+
+/// Paints, a piece at a time.
+pub struct Painter {
+    hub: Arc<Hub>,
+    album: Option<Arc<Album>>,
+    /// The models that can be looked at beside the one at hand, if there are some.
+    shelf: Option<Shelf>,
+    jobs: Vec<Job>,
+    /// Rays a second, of what was shown lately.
+    rates: HashMap<(Show, Option<Skip>), f64>,
+    turn: u64,
+    /// Whether the last turn was that of something new.
+    fresh: bool,
+}
+
+/// What is being painted.
+struct Job {
+    target: Target,
+    /// How often the size of what is painted now is halved.
+    halvings: u32,
+    /// What there is of it so far; none before it is begun, and while it rests.
+    parts: Option<Parts>,
+    spent: Duration,
+    /// When it was worked on last, in turns.
+    turn: u64,
+    /// The step of training at which its picture was begun.
+    begun: u64,
+    /// Whether evaluations compare the same.
+    plain: bool,
+    /// If it rests: since which step of training, and when.
+    whole: Option<(u64, Instant)>,
+}
+
+enum Target {
+    Wish(Arc<Wish>),
+    Save(Save),
+}
+
+impl Painter {
+    pub fn new(hub: Arc<Hub>, album: Option<Arc<Album>>, shelf: Option<Shelf>) -> Self {
+        Painter { hub, album, shelf, jobs: vec![], rates: HashMap::new(), turn: 0, fresh: false }
+    }
+
+    /// Paints the next piece, of a model that is at this step; says whether there was anything to paint.
+    pub fn work(&mut self, model: &Model<f32>, step: u64) -> bool {
+        self.sync(step);
+        // What nobody has seen anything of comes first, but not again before something else had its turn.
+        let mut waiting: Vec<usize> = (0..self.jobs.len()).filter(|i| self.jobs[*i].whole.is_none()).collect();
+        waiting.sort_by_key(|i| (self.fresh && self.jobs[*i].turn == 0, self.jobs[*i].turn));
+        let ready = waiting.into_iter().find_map(|i| self.prepare(i, model, step).map(|(own, step)| (i, own, step)));
+        let Some((i, own, step)) = ready else { return false };
+        let (learns, model, job) = (self.shelf.is_none(), own.as_deref().unwrap_or(model), &mut self.jobs[i]);
+        let Some(parts) = &mut job.parts else { return false };
+        self.fresh = job.turn == 0;
+        self.turn += 1;
+        job.turn = self.turn;
+        let hub = &self.hub;
+        let wanted = || match &job.target {
+            Target::Wish(wish) => hub.wants(wish),
+            Target::Save(save) => hub.is_here(save.client),
+        };
+        let view = job.target.view();
+        let rate = self.rates.entry((view.show, view.skip)).or_insert(RATE);
+        // What is kept is of one step.
+        let whole = learns && matches!(job.target, Target::Save(_));
+        loop {
+            let start = Instant::now();
+            let painted = parts.paint(view, model, *rate, &wanted);
+            let spent = start.elapsed();
+            job.spent += spent;
+            if painted.is_none() {
+                // It would have been no quicker to the end.
+                *rate = rate.min(speed(parts.asked(), job.spent));
+                return true;
+            }
+            parts.pace(spent);
+            if !whole || parts.is_whole() {
+                break;
+            }
+        }
+        if parts.is_whole() {
+            // Of the whole picture: where there is nothing, rays are quick.
+            let now = speed(parts.camera.width * parts.camera.height, job.spent);
+            *rate = expected(*rate, now);
+            let soon = halvings(view.size, now, AGAIN.as_secs_f64());
+            job.deliver(hub, self.album.as_deref(), step);
+            match finer(job.halvings, job.begun == step, soon) {
+                Some(halvings) => job.begin(halvings),
+                None => job.rest(step),
+            }
+        }
+        true
+    }
+
+    /// Paints the next piece, or waits for so long until something is asked for.
+    pub fn work_or_wait(&mut self, model: &Model<f32>, step: u64, most: Duration) {
+        if !self.work(model, step) {
+            self.hub.wait(most);
+        }
+    }
+
+    /// Begins a picture if all that it takes is here; gives the model that it shows, if that is not the one at hand, and its step.
+    fn prepare(&mut self, i: usize, model: &Model<f32>, step: u64) -> Option<(Option<Arc<Model<f32>>>, u64)> {
+        let view = self.jobs[i].target.view();
+        let unknown = match (&view.eye, &self.album) {
+            (Eye::Photograph(_), None) => true,
+            (Eye::Photograph(number), Some(album)) => !album.has(*number),
+            (Eye::Free { .. }, album) => view.compared && album.is_none(),
+        };
+        if unknown {
+            return self.refuse(i, "there is no such photograph, or the run's photographs are not known");
+        }
+        if self.shelf.is_none() && view.checkpoint.is_some() {
+            return self.refuse(i, "checkpoints are looked at when training has ended");
+        }
+        if self.shelf.is_none() && !matches!(view.skip, None | Some(Skip::Off)) {
+            return self.refuse(
+                i,
+                "what hardly shows is left out when training has ended; until then, all is shown, or what training has",
+            );
+        }
+        let (own, step) = match (&self.shelf, Which::of(view)) {
+            (Some(shelf), which) => match shelf.get(which, &self.hub) {
+                Got::Here(own) => (Some(own), which.checkpoint.unwrap_or(step)),
+                Got::Coming => return None,
+                Got::Failed(what) => return self.refuse(i, &what),
+            },
+            (None, _) => (None, step),
+        };
+        let model = own.as_deref().unwrap_or(model);
+        if self.jobs[i].parts.is_none() {
+            let size = view.size.map(|side| (side as usize).div_ceil(1 << self.jobs[i].halvings));
+            let large = self.jobs.iter().filter_map(|job| job.parts.as_ref()).filter(|parts| parts.is_large()).count();
+            if size[0] * size[1] > LARGE && large >= MOST_LARGE {
+                return None;
+            }
+            let (number, camera) = self.camera(view, size, model);
+            let truth = match (&self.album, number.filter(|_| view.compared)) {
+                (Some(album), Some(number)) => match album.fetch(number, &self.hub) {
+                    Got::Here(photo) => Some((number, photo)),
+                    Got::Coming => return None,
+                    Got::Failed(what) => return self.refuse(i, &what),
+                },
+                _ => None,
+            };
+            let job = &mut self.jobs[i];
+            // Where evaluations leave out or correct something, or give a photograph its own code, a figure would be another than
+            // theirs.
+            let own = |number| self.album.as_ref().is_some_and(|album| album.is_special(number, model));
+            job.plain = model.tone.is_none() && !number.is_some_and(own);
+            (job.parts, job.begun) = (Some(Parts::new(camera, number.is_some(), size, truth, model)), step);
+        }
+        Some((own, step))
+    }
+
+    /// Whose camera a view is seen by, if it is a photograph's, and that camera.
+    fn camera(&self, view: &View, size: [usize; 2], model: &Model<f32>) -> (Option<usize>, Camera) {
+        let album = self.album.as_deref();
+        let (number, free) = match &view.eye {
+            Eye::Free { pose, fov } => (None, View::camera(pose, *fov, size)),
+            Eye::Photograph(number) => (Some(*number), Camera::from_angle(size[0], size[1], 1.0, DAffine3::IDENTITY)),
+        };
+        let nearest = || album.filter(|_| view.compared).and_then(|album| album.nearest(&free, model));
+        let own = |number: usize| Some((number, album?.camera(number, model)?));
+        match number.or_else(nearest).and_then(own) {
+            Some((number, camera)) => (Some(number), camera),
+            None => (None, free),
+        }
+    }
+
+    /// Tells who wants a picture why there is none.
+    fn refuse<T>(&mut self, i: usize, what: &str) -> Option<T> {
+        match &self.jobs[i].target {
+            Target::Wish(wish) => self.hub.refuse(wish, what),
+            Target::Save(save) => self.hub.post(save.client, sorry(what)),
+        }
+        // It is forgotten with the next look at what is wanted.
+        self.jobs[i].rest(0);
+        None
+    }
+
+    /// Nobody is there who wants anything.
+    pub fn clear(&mut self) {
+        self.jobs.clear();
+    }
+
+    /// Forgets what nobody wants any more, and takes up what is new.
+    fn sync(&mut self, step: u64) {
+        let wishes = self.hub.wishes();
+        self.jobs.retain(|job| match &job.target {
+            Target::Wish(wish) => wishes.iter().any(|own| Arc::ptr_eq(own, wish)),
+            Target::Save(save) => job.whole.is_none() && self.hub.is_here(save.client),
+        });
+        let halved = |view: &View, seconds: f64| {
+            halvings(view.size, self.rates.get(&(view.show, view.skip)).copied().unwrap_or(RATE), seconds)
+        };
+        for wish in wishes {
+            let known = |job: &Job| matches!(&job.target, Target::Wish(own) if Arc::ptr_eq(own, &wish));
+            if !self.jobs.iter().any(known) {
+                let halvings = halved(&wish.view, FIRST);
+                self.jobs.push(Job::new(Target::Wish(wish), halvings));
+            }
+        }
+        // One after the other: each has a picture's memory.
+        if !self.jobs.iter().any(|job| matches!(job.target, Target::Save(_)))
+            && let Some(save) = self.hub.next_save()
+        {
+            self.jobs.push(Job::new(Target::Save(save), 0));
+        }
+        for job in &mut self.jobs {
+            let view = job.target.view();
+            // What a checkpoint shows does not change.
+            let now = if self.shelf.is_some() { view.checkpoint.unwrap_or(step) } else { step };
+            let Some((seen, when)) = job.whole else { continue };
+            if when.elapsed() <= AGAIN.max(job.spent) {
+                continue;
+            }
+            if seen == now && job.halvings > 0 {
+                // It has not learned for a while: it is held.
+                job.begin(job.halvings - 1);
+            } else if seen != now {
+                // What has learned more is seen again, as fine as there is time for.
+                let halvings = halved(view, AGAIN.as_secs_f64());
+                job.begin(halvings);
+            }
+        }
+    }
+}
+
+/// Rays a second that are expected after it was `rate`, and `now` lately: between them by factors, as both can be far off.
+fn expected(rate: f64, now: f64) -> f64 {
+    rate * (now / rate).powf(LATEST)
+}
+
+/// Rays a second.
+fn speed(rays: usize, spent: Duration) -> f64 {
+    rays as f64 / spent.as_secs_f64().max(1e-6)
+}
+
+/// How often the next picture's size is halved, if there is one, after one that was halved so often; of a model that learns meanwhile,
+/// none that is finer than what there is time for `soon`: it is rather seen again.
+fn finer(halvings: u32, is_still: bool, soon: u32) -> Option<u32> {
+    (halvings > 0 && (is_still || halvings > soon)).then(|| halvings - 1)
+}
+
+/// How often a size is to be halved for a picture to be there in so many seconds.
+fn halvings([width, height]: [u32; 2], rate: f64, seconds: f64) -> u32 {
+    let rays = f64::from(width) * f64::from(height);
+    let needed = (rays / (rate * seconds)).log2() / 2.0;
+    let most = u32::min(width, height).ilog2().saturating_sub(2).min(MOST_HALVINGS);
+    (needed.ceil().max(0.0) as u32).min(most)
+}
+
+impl Target {
+    fn view(&self) -> &View {
+        match self {
+            Target::Wish(wish) => &wish.view,
+            Target::Save(save) => &save.view,
+        }
+    }
+}
+
+impl Job {
+    fn new(target: Target, halvings: u32) -> Self {
+        Job { target, halvings, parts: None, spent: Duration::ZERO, turn: 0, begun: 0, plain: true, whole: None }
+    }
+
+    /// A picture of another size comes next.
+    fn begin(&mut self, halvings: u32) {
+        (self.halvings, self.parts, self.spent, self.whole) = (halvings, None, Duration::ZERO, None);
+    }
+
+    /// Nothing is to be done for now, and no memory is needed.
+    fn rest(&mut self, step: u64) {
+        (self.parts, self.whole) = (None, Some((step, Instant::now())));
+    }
+
+    /// Gives away a picture whose rows are all painted.
+    fn deliver(&mut self, hub: &Hub, album: Option<&Album>, step: u64) {
+        let Some(Parts { truth, color, .. }) = &self.parts else { return };
+        // Of a picture that is whole, and of one step.
+        let plain = self.plain && self.halvings == 0 && self.begun == step;
+        let is_evaluated =
+            |number| plain && album.is_some_and(|album| album.is_evaluated_at(number, [color.width, color.height]));
+        let compared =
+            truth.as_ref().map(|(number, truth)| (*number, plain.then(|| psnr(color, truth)), is_evaluated(*number)));
+        let error = truth.as_ref().map(|(_, truth)| colormap::error_map(color, truth));
+        let image = error.as_ref().unwrap_or(color);
+        let milliseconds = 1e3 * self.spent.as_secs_f64();
+        let made = Made { halvings: self.halvings, milliseconds, compared, step };
+        match &self.target {
+            Target::Wish(wish) => {
+                let jpeg = image.to_jpeg(QUALITY[usize::from(self.halvings == 0)]);
+                hub.show(wish, Shot { made, jpeg });
+            }
+            Target::Save(save) => {
+                let message = File::Save { name: "view.png".to_owned() }.message(&image.to_png());
+                hub.post(save.client, Outgoing::Bytes(message));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::view::hub::Outbox;
+    use crate::view::parts::tests::{fog, free};
+
+    #[test]
+    fn what_was_slow_lately_is_expected_to_be_slower() {
+        let rates = [expected(1e5, 4e5), expected(1e5, 1e5), expected(1e5, 1e3), speed(300, Duration::from_millis(20))];
+        for (rate, wanted) in rates.into_iter().zip([2e5, 1e5, 1e4, 1.5e4]) {
+            assert!((rate / wanted - 1.0).abs() < 1e-12, "{rate} {wanted}");
+        }
+    }
+
+    #[test]
+    fn what_rests_is_seen_finer_or_again() {
+        let hub = Arc::new(Hub::default());
+        let (client, _outbox) = hub.join(1).unwrap();
+        let view = json!({ "eye": { "photograph": 0 }, "size": [800, 800], "show": "color" });
+        hub.wish(client, 1, serde_json::from_value(view).unwrap());
+        let long_ago = Instant::now().checked_sub(2 * AGAIN).unwrap();
+        // How a picture that was seen at step 7 goes on: its halvings, if it does.
+        let goes_on = |halvings: u32, when: Instant, spent: Duration, step: u64| {
+            let mut painter = Painter::new(hub.clone(), None, None);
+            painter.sync(7);
+            let job = &mut painter.jobs[0];
+            (job.halvings, job.whole, job.spent) = (halvings, Some((7, when)), spent);
+            painter.sync(step);
+            let job = &painter.jobs[0];
+            job.whole.is_none().then_some(job.halvings)
+        };
+        let none = Duration::ZERO;
+        // Held, ever finer to the whole; of what has learned more, what half a second is enough for.
+        assert_eq!([3, 1, 0].map(|halvings| goes_on(halvings, long_ago, none, 7)), [Some(2), Some(0), None]);
+        assert_eq!([3, 0].map(|halvings| goes_on(halvings, long_ago, none, 8)), [Some(2), Some(2)]);
+        // Not at once, nor what took longer than that.
+        assert_eq!([7, 8].map(|step| goes_on(3, Instant::now(), none, step)), [None, None]);
+        assert_eq!([7, 8].map(|step| goes_on(3, long_ago, 4 * AGAIN, step)), [None, None]);
+    }
+
+    #[test]
+    fn what_is_quick_or_stands_still_gets_finer() {
+        // Of a model that stands still, to the whole; of one that learns, what there is time for soon.
+        let all =
+            [(3, true, 5), (1, true, 0), (0, true, 0), (3, false, 2), (3, false, 3), (3, false, 5), (0, false, 0)];
+        let expected = [Some(2), Some(0), None, Some(2), None, None, None];
+        assert_eq!(all.map(|(halvings, is_still, soon)| finer(halvings, is_still, soon)), expected);
+    }
+
+    /// A painter of one page that wants to see this, and what that page gets.
+    fn painter(view: View) -> (Painter, u64, Arc<Outbox>) {
+        let hub = Arc::new(Hub::default());
+        let (client, outbox) = hub.join(9).unwrap();
+        hub.wish(client, 1, view);
+        (Painter::new(hub, None, None), client, outbox)
+    }
+
+    fn text(outbox: &Outbox) -> String {
+        match outbox.take() {
+            Some(Outgoing::Text(text)) => text,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn large_pictures_are_painted_a_few_at_a_time() {
+        let (mut painter, _, _) = painter(free(0.0, [1100, 1000]));
+        for x in 1..5 {
+            let (client, _) = painter.hub.join(9).unwrap();
+            painter.hub.wish(client, 1, free(f64::from(x), [1100, 1000]));
+        }
+        painter.rates.insert((Show::Color, None), 1e12);
+        let model = fog();
+        painter.sync(0);
+        let begun = |painter: &mut Painter| (0..5).map(|i| painter.prepare(i, &model, 0).is_some()).collect::<Vec<_>>();
+        assert_eq!(begun(&mut painter), [true, true, true, true, false]);
+        painter.jobs[1].begin(0);
+        assert!(painter.prepare(4, &model, 0).is_some() && painter.prepare(1, &model, 0).is_none());
+        // One that is small has room beside them.
+        let (client, _) = painter.hub.join(9).unwrap();
+        painter.hub.wish(client, 1, free(9.0, [1024, 1024]));
+        painter.sync(0);
+        assert!(painter.prepare(5, &model, 0).is_some());
+        painter.clear();
+        assert!(painter.jobs.is_empty());
+    }
+
+    #[test]
+    fn what_cannot_be_seen_is_said_and_the_rest_is_seen() {
+        let model = fog();
+        for (change, expected) in [
+            (json!({ "compared": true }), "no such photograph"),
+            (json!({ "eye": { "photograph": 0 } }), "no such photograph"),
+            (json!({ "checkpoint": 3 }), "training has ended"),
+            (json!({ "skip": "fast" }), "training has ended"),
+            (json!({ "skip": "lossless" }), "training has ended"),
+        ] {
+            let mut view = json!({ "eye": { "free": { "pose": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]], "fov": 50 } }, "size": [8, 8] });
+            view.as_object_mut().unwrap().extend(change.as_object().unwrap().clone());
+            let (mut painter, _, outbox) = painter(serde_json::from_value(view).unwrap());
+            assert!(!painter.work(&model, 0));
+            let said = text(&outbox);
+            assert!(said.contains(expected), "{change}: {said}");
+        }
+        for skip in [None, Some(Skip::Off)] {
+            let (mut painter, _, outbox) = painter(View { skip, ..free(0.0, [8, 8]) });
+            assert!(painter.work(&model, 0) && matches!(outbox.take(), Some(Outgoing::Bytes(_))));
+        }
+    }
+
+    #[test]
+    fn a_picture_says_how_it_was_made_and_what_is_expected_follows() {
+        let model = fog();
+        let (mut painter, _, outbox) = painter(free(0.0, [48, 36]));
+        painter.rates.insert((Show::Color, None), 1e6);
+        while painter.jobs.first().is_none_or(|job| job.whole.is_none()) {
+            assert!(painter.work(&model, 7));
+        }
+        let Some(Outgoing::Bytes(bytes)) = outbox.take() else { panic!("no picture") };
+        let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
+        let head: serde_json::Value = serde_json::from_slice(&bytes[4..4 + length]).unwrap();
+        assert_eq!(json!([head["step"], head["halvings"], head["compared"]]), json!([7, 0, null]));
+        let now = 48.0 * 36.0 / (1e-3 * head["milliseconds"].as_f64().unwrap());
+        let rate = painter.rates[&(Show::Color, None)];
+        assert!((rate / expected(1e6, now) - 1.0).abs() < 1e-9, "{rate} {now}");
+    }
+
+    #[test]
+    fn what_is_kept_while_a_model_learns_is_of_one_step() {
+        let (mut painter, client, outbox) = painter(free(0.0, [8, 8]));
+        painter.hub.rest(client);
+        painter.hub.save(client, free(0.0, [16, 64]));
+        // A row at a time, as far as is known.
+        painter.rates.insert((Show::Color, None), 1.0);
+        assert!(painter.work(&fog(), 7));
+        assert!(matches!(outbox.take(), Some(Outgoing::Bytes(_))));
+    }
+
+    #[test]
+    fn who_paints_waits_where_there_is_nothing_to_paint() {
+        let model = fog();
+        let (mut painter, client, _outbox) = painter(free(0.0, [8, 8]));
+        let took = |painter: &mut Painter, most: u64| {
+            let start = Instant::now();
+            painter.work_or_wait(&model, 0, Duration::from_millis(most));
+            start.elapsed()
+        };
+        assert!(took(&mut painter, 60_000) < Duration::from_secs(30), "there is");
+        painter.hub.rest(client);
+        painter.hub.wait(Duration::ZERO);
+        assert!(took(&mut painter, 30) >= Duration::from_millis(30));
+    }
+
+    #[test]
+    fn pictures_are_painted_in_turns() {
+        let hub = Arc::new(Hub::default());
+        for number in 0..2 {
+            let (client, _outbox) = hub.join(2).unwrap();
+            hub.wish(client, 1, free(f64::from(number), [512, 512]));
+        }
+        let model = fog();
+        let mut painter = Painter::new(hub, None, None);
+        // So slow, as far as is known, that a piece is a row at first, and never all.
+        painter.rates.insert((Show::Color, None), 1.0);
+        let mut turns = vec![];
+        for _ in 0..5 {
+            assert!(painter.work(&model, 0));
+            turns.push([0, 1].map(|i| painter.jobs[i].turn));
+        }
+        // The second is new when the first has been, but not again before that has had its turn; then one after the other.
+        assert_eq!(turns, [[1, 0], [2, 0], [2, 3], [4, 3], [4, 5]]);
+    }
+
+    #[test]
+    fn the_first_picture_is_there_at_once() {
+        for (size, rate) in [([800, 800], 1e5), ([400, 300], 1e6), ([4000, 1000], 3e4)] {
+            let times = halvings(size, rate, FIRST);
+            let rays = |times: u32| size.map(|side: u32| f64::from(side.div_ceil(1 << times))).iter().product::<f64>();
+            assert!(rays(times) <= 1.1 * FIRST * rate || times == MOST_HALVINGS, "{size:?}: {times}");
+            assert!(times == 0 || rays(times - 1) > FIRST * rate, "{size:?}: {times}");
+        }
+        // Nothing is smaller than a few pixels, and what is quick is whole.
+        let at_once = |size: [u32; 2], rate: f64| halvings(size, rate, FIRST);
+        assert_eq!([at_once([8, 8], 1.0), at_once([3, 3000], 1.0), at_once([640, 480], 1e9)], [1, 0, 0]);
+        assert_eq!(at_once([800, 800], 1e5), 4, "640 000 rays are 183 times what 35 ms have");
+    }
+}

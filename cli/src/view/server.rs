@@ -1,0 +1,187 @@
+//! The page and its messages, over HTTP on one port, and nothing else.
+
+use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::ws::WebSocketUpgrade;
+use axum::extract::{Query, State};
+use axum::http::header::{self, HeaderMap};
+use axum::http::{Method, StatusCode, Uri};
+use axum::middleware;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use raygrad::nerf::{Error, Result};
+use tokio::sync::Semaphore;
+use tokio::time::timeout;
+
+use super::album::Album;
+use super::guard::{Key, guard};
+use super::hub::Hub;
+use super::served::{Limits, Served};
+use super::studio::Studio;
+use super::talk::Page;
+
+pub use super::hub::{sorry, text};
+
+/// Bytes of what is asked before it is answered.
+const HEAD: usize = 1 << 14;
+
+/// What is served.
+const FILES: [(&str, &str, &str); 4] = [
+    ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
+    ("/view.css", "text/css; charset=utf-8", include_str!("page/view.css")),
+    ("/camera.js", "text/javascript; charset=utf-8", super::CAMERA),
+    ("/view.js", "text/javascript; charset=utf-8", include_str!("page/view.js")),
+];
+
+/// A port that is taken, and the name of this machine that pages may use.
+pub struct Listener {
+    listener: TcpListener,
+    address: SocketAddr,
+    host: String,
+}
+
+impl Listener {
+    /// Takes a port, 0 for any that is free.
+    ///
+    /// # Errors
+    /// If the host is not known or the port is taken.
+    pub fn bind(host: &str, port: u16) -> Result<Self> {
+        let bad = |e: std::io::Error| Error::setting("host", format!("{host}:{port} cannot be used: {e}"));
+        let listener = TcpListener::bind((host, port)).map_err(bad)?;
+        listener.set_nonblocking(true).map_err(bad)?;
+        Ok(Listener { address: listener.local_addr().map_err(bad)?, listener, host: host.to_owned() })
+    }
+}
+
+/// Begins to serve, on threads of its own; gives the link.
+///
+/// # Errors
+/// If the system has no thread left.
+pub fn serve(
+    listener: Listener,
+    hub: Arc<Hub>,
+    album: Option<Arc<Album>>,
+    studio: Option<Arc<Studio>>,
+    background: [f32; 3],
+) -> Result<String> {
+    serve_within(Limits::USUAL, listener, hub, album, studio, background)
+}
+
+fn serve_within(
+    limits: Limits,
+    Listener { listener, address, host }: Listener,
+    hub: Arc<Hub>,
+    album: Option<Arc<Album>>,
+    studio: Option<Arc<Studio>>,
+    background: [f32; 3],
+) -> Result<String> {
+    let bad = |e: std::io::Error| Error::setting("host", format!("{address} cannot be served: {e}"));
+    let token = (!address.ip().is_loopback()).then(|| format!("{:032x}", rand::random::<u128>()));
+    let link = link(address, &host, outward(address.ip(), beyond(address.ip())), token.as_deref());
+    let served = Served { hub, album, studio, background, host, token, readers: Semaphore::new(2), limits };
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(bad)?;
+    let run = move || {
+        runtime.block_on(async move {
+            match tokio::net::TcpListener::from_std(listener) {
+                Ok(listener) => accept(listener, router(Arc::new(served)), limits).await,
+                Err(error) => crate::output::complain(&format!("warning: pages cannot be served: {error}")),
+            }
+        });
+    };
+    std::thread::Builder::new().name("pages".into()).spawn(run).map_err(bad)?;
+    Ok(link)
+}
+
+/// The link to an address, under the host that it was asked for by; or where it is all of this machine's, to the one by which
+/// it goes out.
+fn link(address: SocketAddr, host: &str, outward: Option<IpAddr>, token: Option<&str>) -> String {
+    let host = match address.ip() {
+        ip if ip.is_loopback() => ip.to_string(),
+        ip if ip.is_unspecified() => outward.unwrap_or(ip).to_string(),
+        _ => host.to_owned(),
+    };
+    let host = if host.contains(':') { format!("[{host}]") } else { host };
+    let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
+    format!("http://{host}:{}/{token}", address.port())
+}
+
+/// The address of this machine by which it goes out to another. Nothing is sent.
+fn outward(own: IpAddr, other: &str) -> Option<IpAddr> {
+    let socket = UdpSocket::bind((own, 0)).ok()?;
+    socket.connect(other).ok()?;
+    Some(socket.local_addr().ok()?.ip()).filter(|ip| !ip.is_unspecified())
+}
+
+/// An address that is kept for documentation, beyond any network of one's own.
+fn beyond(own: IpAddr) -> &'static str {
+    if own.is_ipv4() { "192.0.2.1:9" } else { "[2001:db8::1]:9" }
+}
+
+async fn accept(listener: tokio::net::TcpListener, router: Router, limits: Limits) {
+    let permits = Arc::new(Semaphore::new(limits.connections));
+    loop {
+        let Ok(permit) = permits.clone().acquire_owned().await else { return };
+        let Ok((stream, _)) = listener.accept().await else {
+            // Too many files are open, say.
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            continue;
+        };
+        let _ = stream.set_nodelay(true);
+        let service = TowerToHyperService::new(router.clone());
+        tokio::spawn(async move {
+            let mut http = hyper::server::conn::http1::Builder::new();
+            http.timer(TokioTimer::new()).header_read_timeout(limits.patience).max_buf_size(HEAD);
+            // A connection that is cut off is nobody's loss; what becomes of one that is a page is no longer seen here.
+            let served = http.serve_connection(TokioIo::new(stream), service).with_upgrades();
+            let _ = timeout(limits.connected, served).await;
+            drop(permit);
+        });
+    }
+}
+
+fn router(served: Arc<Served>) -> Router {
+    let guarded = middleware::from_fn_with_state(served.clone(), guard);
+    Router::new().route("/messages", get(messages)).fallback(file).layer(guarded).with_state(served)
+}
+
+async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query: Query<Key>) -> Response {
+    let Some((path, kind, text)) = FILES.iter().find(|(path, _, _)| *path == uri.path()) else {
+        return (StatusCode::NOT_FOUND, "There is no such page.\n").into_response();
+    };
+    if method != Method::GET && method != Method::HEAD {
+        return (StatusCode::METHOD_NOT_ALLOWED, [(header::ALLOW, "GET, HEAD")]).into_response();
+    }
+    // Style and script are no secret.
+    if *path == "/" && !query.opens(served.token.as_deref()) {
+        return (StatusCode::FORBIDDEN, "The link has a token at its end, which this one has not.\n").into_response();
+    }
+    ([(header::CONTENT_TYPE, *kind)], Body::from(*text)).into_response()
+}
+
+async fn messages(
+    State(served): State<Arc<Served>>,
+    query: Query<Key>,
+    headers: HeaderMap,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    // Browsers always say where a page is from that asks for this.
+    let origin = headers.get(header::ORIGIN).is_some();
+    if !query.opens(served.token.as_deref()) || !origin {
+        return (StatusCode::FORBIDDEN, "Only the page may ask.\n").into_response();
+    }
+    let longest = served.limits.longest;
+    let Some(page) = Page::join(served) else {
+        return (StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open.\n").into_response();
+    };
+    let upgrade = upgrade.max_message_size(longest).max_frame_size(longest);
+    upgrade.on_upgrade(move |socket| page.talk(socket))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,458 @@
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::Instant;
+
+use super::*;
+use crate::render::shown::Show;
+use crate::view::hub::{Outgoing, Shot};
+use crate::view::messages::{Eye, Made, View};
+use serde_json::{Value, json};
+use tungstenite::handshake::client::generate_key;
+use tungstenite::http::Request;
+use tungstenite::protocol::WebSocketConfig;
+use tungstenite::{Message, WebSocket};
+
+/// Nothing takes as long as that.
+const LONG: Duration = Duration::from_secs(30);
+/// What a message has that no connection holds while nobody reads it.
+const HUGE: usize = 48 << 20;
+
+fn served_at(host: &str, limits: Limits) -> (String, Arc<Hub>) {
+    let hub = Arc::new(Hub::default());
+    hub.introduce(r#"{"tell":"about"}"#.to_owned());
+    let listener = Listener::bind(host, 0).unwrap();
+    let link = serve_within(limits, listener, hub.clone(), None, None, [1.0; 3]).unwrap();
+    (link.strip_prefix("http://").unwrap().to_owned(), hub)
+}
+
+/// Serves to this machine; gives the address.
+fn served(limits: Limits) -> (String, Arc<Hub>) {
+    let (link, hub) = served_at("127.0.0.1", limits);
+    (link.strip_suffix('/').unwrap().to_owned(), hub)
+}
+
+fn connect(address: &str) -> TcpStream {
+    let stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(LONG)).unwrap();
+    stream
+}
+
+/// What a request by hand is answered: status, head and body.
+fn request(address: &str, head: &str) -> (u16, String, String) {
+    let mut stream = connect(address);
+    stream.write_all(format!("{head}\r\nConnection: close\r\n\r\n").as_bytes()).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+    (head.split(' ').nth(1).unwrap().parse().unwrap(), head.to_lowercase(), body.to_owned())
+}
+
+/// One that asks to be a page, from such a one or none, and what it is answered.
+fn upgraded(address: &str, path: &str, origin: Option<&str>) -> (TcpStream, String) {
+    let origin = origin.map(|origin| format!("Origin: {origin}\r\n")).unwrap_or_default();
+    let head = format!(
+        "GET {path} HTTP/1.1\r\nHost: {address}\r\n{origin}Connection: Upgrade\r\nUpgrade: websocket\r\n\
+         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    );
+    let mut stream = connect(address);
+    stream.write_all(head.as_bytes()).unwrap();
+    let mut start = [0; 12];
+    stream.read_exact(&mut start).unwrap();
+    let status = String::from_utf8_lossy(&start[9..]).into_owned();
+    (stream, status)
+}
+
+/// The same, of a page.
+fn joined(address: &str) -> (TcpStream, String) {
+    upgraded(address, "/messages", Some(&format!("http://{address}")))
+}
+
+/// Waits until something is so.
+#[track_caller]
+fn becomes(mut so: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !so() {
+        assert!(start.elapsed() < LONG);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// A page without a browser.
+struct Client {
+    socket: WebSocket<TcpStream>,
+    opened: Instant,
+}
+
+impl Client {
+    fn open(address: &str) -> Self {
+        let mut page = Client::connect(address);
+        assert_eq!(page.text()["tell"], "about");
+        page
+    }
+
+    /// One that has not read anything.
+    fn connect(address: &str) -> Self {
+        let request = Request::builder().uri(format!("ws://{address}/messages"));
+        let request = request.header("Host", address).header("Origin", format!("http://{address}"));
+        let request = request.header("Connection", "Upgrade").header("Upgrade", "websocket");
+        let request = request.header("Sec-WebSocket-Version", "13").header("Sec-WebSocket-Key", generate_key());
+        let config = WebSocketConfig::default().max_message_size(None).max_frame_size(None);
+        let stream = connect(address);
+        let opened = Instant::now();
+        let answer = tungstenite::client::client_with_config(request.body(()).unwrap(), stream, Some(config));
+        Client { socket: answer.unwrap().0, opened }
+    }
+
+    fn say(&mut self, message: &Value) {
+        self.socket.send(Message::text(message.to_string())).unwrap();
+    }
+
+    /// What comes next; why the connection has ended, if it has.
+    #[track_caller]
+    fn read(&mut self) -> Result<Message, String> {
+        assert!(self.opened.elapsed() < 2 * LONG, "there is no end");
+        match self.socket.read() {
+            Ok(Message::Close(frame)) => Err(frame.map_or(String::new(), |frame| frame.reason.to_string())),
+            Ok(message) => Ok(message),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    /// The next of text.
+    #[track_caller]
+    fn text(&mut self) -> Value {
+        loop {
+            if let Message::Text(text) = self.read().unwrap() {
+                return serde_json::from_str(&text).unwrap();
+            }
+        }
+    }
+
+    /// How many messages of bytes come until the program ends the connection, and why it does.
+    #[track_caller]
+    fn closed(&mut self) -> (usize, String) {
+        let mut files = 0;
+        loop {
+            match self.read() {
+                Ok(message) => files += usize::from(message.is_binary()),
+                Err(reason) => return (files, reason),
+            }
+        }
+    }
+}
+
+type Result<T, E> = std::result::Result<T, E>;
+
+#[test]
+fn nobody_from_elsewhere_is_served_and_nothing_but_the_page() {
+    let listener = Listener::bind("127.0.0.1", 0).unwrap();
+    let link = serve(listener, Arc::new(Hub::default()), None, None, [1.0; 3]).unwrap();
+    let address = link.strip_prefix("http://").unwrap().strip_suffix('/').unwrap().to_owned();
+    let port = address.rsplit(':').next().unwrap();
+    let taken = Listener::bind("127.0.0.1", port.parse().unwrap()).map(drop).unwrap_err().to_string();
+    assert!(taken.contains(port) && taken.contains("cannot be used"), "{taken}");
+    let (status, head, page) = request(&address, &format!("GET / HTTP/1.1\r\nHost: {address}"));
+    assert!(status == 200 && page.contains("<title>raygrad</title>"), "{head}");
+    let told = |head: &str| {
+        for header in [
+            "content-security-policy: default-src 'none'",
+            "x-frame-options: deny",
+            "x-content-type-options: nosniff",
+            "referrer-policy: no-referrer",
+            "cache-control: no-store",
+            "cross-origin-resource-policy: same-origin",
+        ] {
+            assert!(head.contains(header), "{header}: {head}");
+        }
+    };
+    told(&head);
+    // What it is, and how long, is said without it, too.
+    let (status, head, body) = request(&address, &format!("HEAD / HTTP/1.1\r\nHost: {address}"));
+    assert!(status == 200 && body.is_empty(), "{head}");
+    assert!(
+        head.contains("content-type: text/html") && head.contains(&format!("content-length: {}", page.len())),
+        "{head}"
+    );
+    // Nothing on it is from elsewhere.
+    for (file, kind) in [("/", "html"), ("/view.css", "css"), ("/camera.js", "javascript"), ("/view.js", "javascript")]
+    {
+        let (status, head, body) = request(&address, &format!("GET {file} HTTP/1.1\r\nHost: localhost:{port}"));
+        let foreign = body.replace("http://www.w3.org/2000/svg", "");
+        assert!(status == 200 && !foreign.contains("//www") && !foreign.contains("https:"), "{file}");
+        assert!(head.contains(&format!("content-type: text/{kind}")), "{file}: {head}");
+    }
+    for (head, expected, what) in [
+        (format!("GET / HTTP/1.1\r\nHost: evil.example:{port}"), 421, "use the address, or start with --host NAME"),
+        ("GET / HTTP/1.1\r\nHost: ".to_owned(), 421, "not served under that name"),
+        (format!("GET /view.js HTTP/1.1\r\nHost: 127.0.0.1.evil.example:{port}"), 421, "not served"),
+        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example"), 403, "of elsewhere"),
+        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: null"), 403, "of elsewhere"),
+        (format!("POST / HTTP/1.1\r\nHost: {address}\r\nContent-Length: 0"), 405, ""),
+        (format!("POST /nothing HTTP/1.1\r\nHost: {address}\r\nContent-Length: 0"), 404, "no such page"),
+        (format!("GET /../Cargo.toml HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
+        (format!("GET /..%2f..%2fetc/passwd HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
+        (format!("GET //etc/passwd HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
+        (format!("GET /config.json HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
+        (format!("GET /messages HTTP/1.1\r\nHost: {address}"), 400, ""),
+    ] {
+        let (status, answered, body) = request(&address, &head);
+        assert!(status == expected && body.contains(what) && !body.contains("root:"), "{head}: {status} {body}");
+        told(&answered);
+    }
+    for origin in [None, Some("http://evil.example"), Some("http://127.0.0.1:1"), Some("null")] {
+        assert_eq!(upgraded(&address, "/messages", origin).1, "403", "{origin:?}");
+    }
+    // What asks at length is not read.
+    let long = format!("GET / HTTP/1.1\r\nHost: {address}\r\nX-Long: {}", "x".repeat(8000));
+    assert_eq!(request(&address, &long).0, 200);
+    assert_eq!(request(&address, &(long + &"x".repeat(2 * HEAD))).0, 431);
+}
+
+#[test]
+fn others_come_with_the_token_alone() {
+    let (link, hub) = served_at("0.0.0.0", Limits::USUAL);
+    let (host, token) = link.split_once("/?token=").unwrap();
+    assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
+    let address = format!("127.0.0.1:{}", host.rsplit(':').next().unwrap());
+    let status = |path: &str| request(&address, &format!("GET {path} HTTP/1.1\r\nHost: {address}")).0;
+    assert_eq!(status(&format!("/?token={token}")), 200);
+    // Style and script are no secret.
+    assert_eq!(["/view.css", "/camera.js", "/view.js"].map(status), [200; 3]);
+    let other = |digit: char| if digit == '0' { '1' } else { '0' };
+    let near = format!("{}{}", &token[..31], other(token.chars().last().unwrap()));
+    for path in ["/", "/?token=", "/?token=0123", &format!("/?token={near}"), &format!("/?token={token}0")] {
+        assert_eq!(status(path), 403, "{path}");
+    }
+    let origin = format!("http://{address}");
+    let joins = |query: &str| upgraded(&address, &format!("/messages{query}"), Some(&origin)).1;
+    assert_eq!(
+        ["", "?token=1", &format!("?token={near}"), &format!("?token={token}")].map(joins),
+        ["403", "403", "403", "101"]
+    );
+    assert_eq!(upgraded(&address, &format!("/messages?token={token}"), None).1, "403");
+    becomes(|| hub.connected() == 0);
+    // By a name it is not served, as nobody has said which it has.
+    let (status, _, body) = request(&address, &format!("GET /?token={token} HTTP/1.1\r\nHost: box.lan"));
+    assert!(status == 421 && body.contains("--host NAME"), "{body}");
+}
+
+#[test]
+fn links_lead_where_it_listens() {
+    let of = |address: &str, host, outward: Option<&str>, token| {
+        link(address.parse().unwrap(), host, outward.map(|ip| ip.parse().unwrap()), token)
+    };
+    assert_eq!(of("127.0.0.1:7007", "localhost", None, None), "http://127.0.0.1:7007/");
+    assert_eq!(of("[::1]:80", "::1", Some("10.0.0.2"), None), "http://[::1]:80/");
+    assert_eq!(of("10.0.0.2:80", "box.lan", Some("10.0.0.3"), Some("abc")), "http://box.lan:80/?token=abc");
+    // One that can be followed from elsewhere, if there is a network.
+    assert_eq!(of("0.0.0.0:80", "0.0.0.0", Some("10.0.0.2"), Some("abc")), "http://10.0.0.2:80/?token=abc");
+    assert_eq!(of("[::]:80", "::", Some("2001:db8::2"), None), "http://[2001:db8::2]:80/");
+    assert_eq!(of("0.0.0.0:80", "0.0.0.0", None, None), "http://0.0.0.0:80/");
+}
+
+#[test]
+fn it_goes_out_by_an_address_of_its_own() {
+    let ip = |text: &str| text.parse::<IpAddr>().unwrap();
+    assert_eq!(outward(ip("0.0.0.0"), "127.0.0.1:9"), Some(ip("127.0.0.1")));
+    assert_eq!(outward(ip("127.0.0.1"), "nothing"), None);
+    for own in ["0.0.0.0", "::"].map(ip) {
+        let other: SocketAddr = beyond(own).parse().unwrap();
+        assert_eq!(other.is_ipv4(), own.is_ipv4());
+    }
+}
+
+#[test]
+fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
+    let (address, hub) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
+    let mut good = Client::open(&address);
+    // Reasons end with a letter, however long these are.
+    let long = json!({ "ask": "\u{e4}".repeat(100) }).to_string();
+    for (message, expected) in [
+        (Message::text("{"), "EOF"),
+        (Message::text(long), "unknown variant"),
+        (Message::text(json!({ "ask": "share", "share": 0.95 }).to_string()), "a share is from 0 to 0.9"),
+        (Message::binary(vec![1, 2, 3]), "messages are text"),
+    ] {
+        let mut page = Client::open(&address);
+        page.socket.send(message.clone()).unwrap();
+        let (_, reason) = page.closed();
+        assert!(reason.contains(expected) && reason.len() <= 123, "{message:?}: {reason}");
+    }
+    // As many as may come at once, and one more.
+    let mut page = Client::open(&address);
+    for _ in 0..3 {
+        page.say(&json!({ "ask": "end-film" }));
+    }
+    page.say(&json!({ "ask": "share", "share": 0.5 }));
+    assert_eq!(page.closed().1, "too many messages");
+    assert_eq!(hub.share(), 0.0, "the last one is not seen to");
+    // The others are still served, and three are not too many.
+    becomes(|| hub.connected() == 1);
+    for share in [0.25, 0.5, 0.75] {
+        good.say(&json!({ "ask": "share", "share": share }));
+        becomes(|| hub.share() == share);
+    }
+    good.socket.close(None).unwrap();
+    good.closed();
+    becomes(|| hub.connected() == 0);
+}
+
+#[test]
+fn a_message_is_so_long_and_no_longer() {
+    let (address, hub) = served(Limits::USUAL);
+    let message = json!({ "ask": "share", "share": 0.5 }).to_string();
+    let mut page = Client::open(&address);
+    page.socket.send(Message::text(format!("{}{message}", " ".repeat((1 << 14) - message.len())))).unwrap();
+    becomes(|| hub.share() == 0.5);
+    hub.set_share(0.0);
+    page.socket.send(Message::text(format!("{}{message}", " ".repeat((1 << 14) + 1 - message.len())))).unwrap();
+    page.closed();
+    becomes(|| hub.connected() == 0);
+    assert_eq!(hub.share(), 0.0);
+}
+
+#[test]
+fn so_many_pages_are_served_and_no_more_until_one_goes() {
+    // Connections are for those that are no pages yet.
+    let silence = Duration::from_millis(400);
+    let (address, hub) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
+    let start = Instant::now();
+    let mut pages: Vec<_> = (0..3).map(|_| joined(&address)).collect();
+    assert!(pages.iter().all(|(_, status)| status == "101"));
+    let full = joined(&address).1;
+    assert!(full == "503" || start.elapsed() >= silence, "{full}");
+    pages.pop();
+    becomes(|| {
+        let page = joined(&address);
+        let is_in = page.1 == "101";
+        pages.extend(is_in.then_some(page));
+        is_in
+    });
+    // Those that say nothing at all, not even that they are there, are taken to be gone.
+    becomes(|| hub.connected() == 0);
+    assert!(start.elapsed() >= silence);
+}
+
+#[test]
+fn a_page_that_only_looks_on_is_asked_whether_it_is_there_and_stays() {
+    let (idle, silence) = (Duration::from_millis(100), Duration::from_secs(2));
+    let connected = Duration::from_millis(200);
+    let (address, hub) = served(Limits { idle, silence, connected, ..Limits::USUAL });
+    let start = Instant::now();
+    let mut page = Client::open(&address);
+    let mut pings = 0;
+    hub.tell_state("{}");
+    while start.elapsed() < silence + silence / 2 {
+        let message = page.read().unwrap();
+        if message.is_ping() {
+            pings += 1;
+            assert!(start.elapsed() >= pings * idle, "{pings}");
+        } else {
+            // It is told how it goes meanwhile.
+            std::thread::sleep(Duration::from_millis(20));
+            hub.tell_state("{}");
+        }
+    }
+    assert!(pings >= 3, "{pings}");
+    assert_eq!(hub.connected(), 1);
+}
+
+#[test]
+fn who_is_slow_is_not_gone_in_the_middle_of_a_message() {
+    let silence = Duration::from_millis(200);
+    let (address, hub) = served(Limits { silence, ..Limits::USUAL });
+    hub.introduce("x".repeat(HUGE));
+    let mut page = Client::connect(&address);
+    std::thread::sleep(3 * silence);
+    assert_eq!(hub.connected(), 1);
+    let message = page.read().unwrap();
+    assert!(message.is_text() && message.len() == HUGE);
+}
+
+#[test]
+fn a_message_that_is_not_taken_is_not_waited_for_for_ever() {
+    let patience = Duration::from_millis(200);
+    let (address, hub) = served(Limits { patience, slowest: 1 << 40, ..Limits::USUAL });
+    let page = Client::open(&address);
+    let start = Instant::now();
+    hub.tell(&Outgoing::Bytes(vec![7; HUGE]));
+    becomes(|| hub.connected() == 0);
+    assert!(start.elapsed() >= patience);
+    drop(page);
+}
+
+#[test]
+fn who_asks_for_too_much_is_told() {
+    let (address, hub) = served(Limits::USUAL);
+    let mut page = Client::open(&address);
+    // Nothing is sent before this has gone, however quick the other side is.
+    hub.tell(&Outgoing::Bytes(vec![7; HUGE]));
+    for _ in 0..100 {
+        hub.tell(&text(&crate::view::messages::Tell::Sorry { what: String::new() }));
+    }
+    assert_eq!(page.closed(), (1, "too much was asked for".to_owned()));
+}
+
+fn view() -> View {
+    View {
+        eye: Eye::Photograph(0),
+        size: [8, 8],
+        show: Show::Color,
+        compared: false,
+        background: None,
+        crop: None,
+        skip: None,
+        checkpoint: None,
+    }
+}
+
+#[test]
+fn a_page_that_takes_no_picture_is_dropped() {
+    let patience = Duration::from_secs(1);
+    let (address, hub) = served(Limits { patience, ..Limits::USUAL });
+    let mut page = Client::open(&address);
+    page.say(&json!({ "ask": "view", "id": 1, "view": { "eye": { "photograph": 0 }, "size": [8, 8] } }));
+    becomes(|| !hub.wishes().is_empty());
+    assert_eq!(hub.wishes()[0].view, view());
+    let show = |halvings: u32| {
+        let made = Made { halvings, milliseconds: 1.0, compared: None, step: 0 };
+        hub.show(&hub.wishes()[0], Shot { made, jpeg: vec![7; 9] });
+    };
+    // One that takes them stays, for longer than it may take.
+    let start = Instant::now();
+    for halvings in (0..3).rev() {
+        show(halvings);
+        while !page.read().unwrap().is_binary() {}
+        page.say(&json!({ "ask": "seen", "id": 1 }));
+        std::thread::sleep(2 * patience / 5);
+    }
+    assert!(start.elapsed() > patience && hub.connected() == 1);
+    let start = Instant::now();
+    show(1);
+    show(0);
+    let (pictures, reason) = page.closed();
+    assert_eq!((pictures, &*reason), (1, "a picture was not taken"));
+    assert!(start.elapsed() >= patience && start.elapsed() < LONG / 2);
+}
+
+#[test]
+fn connections_that_ask_for_nothing_do_not_hold_others_up_for_long() {
+    let patience = Duration::from_millis(300);
+    let (address, _) = served(Limits { connections: 3, patience, ..Limits::USUAL });
+    let start = Instant::now();
+    let idle: Vec<TcpStream> = (0..3).map(|_| connect(&address)).collect();
+    let (status, _, _) = request(&address, &format!("GET / HTTP/1.1\r\nHost: {address}"));
+    assert_eq!(status, 200);
+    assert!(start.elapsed() >= patience && start.elapsed() < LONG / 2, "{:?}", start.elapsed());
+    drop(idle);
+}
+
+#[test]
+fn connections_that_are_no_pages_end_after_a_while() {
+    let (address, _) = served(Limits { connected: Duration::from_millis(200), patience: 2 * LONG, ..Limits::USUAL });
+    let mut stream = connect(&address);
+    stream.write_all(format!("GET /nothing HTTP/1.1\r\nHost: {address}\r\n\r\n").as_bytes()).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    assert!(answer.starts_with("HTTP/1.1 404"), "{answer}");
+}

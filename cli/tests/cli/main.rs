@@ -1,0 +1,737 @@
+//! The command line, from outside: the built program on small folders.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+
+use raygrad::nerf::Image;
+use raygrad::nerf::dataset::{Split, evenly_spaced};
+use raygrad_scenes::ANGLE_X;
+use raygrad_scenes::embedded;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+#[cfg(unix)]
+mod browser;
+mod captures;
+mod convert;
+mod export;
+mod lpips;
+mod outside;
+mod overwrite;
+#[cfg(unix)]
+mod owners;
+// Scripts stand in for other programs.
+#[cfg(unix)]
+mod prepare;
+
+mod render;
+
+#[cfg(unix)]
+mod faults;
+#[cfg(unix)]
+mod records;
+
+#[cfg(unix)]
+mod resume;
+#[cfg(unix)]
+mod signals;
+#[cfg(unix)]
+mod view;
+
+/// Width and height of the test images.
+const SIZE: usize = 24;
+
+/// The files of a place that many tests begin with.
+struct Kept {
+    root: String,
+    files: Vec<(PathBuf, Vec<u8>)>,
+}
+
+impl Kept {
+    fn of(place: &Place) -> Self {
+        let root = place.0.path().canonicalize().unwrap();
+        let (mut folders, mut files) = (vec![root.clone()], vec![]);
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() {
+                    folders.push(path);
+                } else {
+                    files.push((path.strip_prefix(&root).unwrap().to_owned(), std::fs::read(&path).unwrap()));
+                }
+            }
+        }
+        Kept { root: root.to_str().unwrap().to_owned(), files }
+    }
+
+    /// Another place with these files; where they name their folder, they name the new one.
+    fn place(&self) -> Place {
+        let place = Place::empty();
+        let root = place.0.path().canonicalize().unwrap();
+        for (name, bytes) in &self.files {
+            let path = root.join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            match std::str::from_utf8(bytes) {
+                Ok(text) => std::fs::write(path, text.replace(&self.root, root.to_str().unwrap())).unwrap(),
+                Err(_) => std::fs::write(path, bytes).unwrap(),
+            }
+        }
+        place
+    }
+}
+
+/// A temporary folder with a dataset in `scene`; commands run there.
+struct Place(TempDir);
+
+impl Place {
+    fn empty() -> Self {
+        Place(tempfile::tempdir().unwrap())
+    }
+
+    /// With a small dataset in the Blender format: 6 views to train on, 2 to validate, 3 to test.
+    fn with_scene() -> Self {
+        static SCENE: LazyLock<Kept> = LazyLock::new(|| Kept::of(&Place::drawn()));
+        SCENE.place()
+    }
+
+    /// With a dataset and a run of a few steps in `run`.
+    fn with_run() -> Self {
+        static RUN: LazyLock<Kept> = LazyLock::new(|| {
+            let place = Place::with_scene();
+            place.succeeds("train scene --preset small --steps 3");
+            Kept::of(&place)
+        });
+        RUN.place()
+    }
+
+    /// [`with_scene`](Self::with_scene), rendered anew.
+    fn drawn() -> Self {
+        let place = Place::empty();
+        for (split, views) in [(Split::Train, 6), (Split::Val, 2), (Split::Test, 3)] {
+            std::fs::create_dir_all(place.path(&format!("scene/{split}"))).unwrap();
+            let mut frames = vec![];
+            for (i, frame) in evenly_spaced(embedded(split, SIZE).frames, views).into_iter().enumerate() {
+                let name = format!("{split}/r_{i}");
+                frame.image.to_image().save_png(place.path(&format!("scene/{name}.png"))).unwrap();
+                let (rotation, eye) = (frame.camera.pose.matrix3, frame.camera.pose.translation);
+                let row = |r: usize| [rotation.row(r).x, rotation.row(r).y, rotation.row(r).z, eye[r]];
+                let matrix = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+                frames.push(json!({ "file_path": format!("./{name}"), "transform_matrix": matrix }));
+            }
+            place.write_transforms(split, &json!({ "camera_angle_x": ANGLE_X, "frames": frames }));
+        }
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn transforms(&self, split: Split) -> Value {
+        self.json(&format!("scene/transforms_{split}.json"))
+    }
+
+    fn write_transforms(&self, split: Split, transforms: &Value) {
+        std::fs::write(self.path(&format!("scene/transforms_{split}.json")), transforms.to_string()).unwrap();
+    }
+
+    fn json(&self, name: &str) -> Value {
+        serde_json::from_slice(&self.bytes(name)).unwrap()
+    }
+
+    fn bytes(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.path(name)).unwrap()
+    }
+
+    fn command(&self, arguments: &str) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raygrad"));
+        command.args(arguments.split_whitespace()).current_dir(self.0.path());
+        command
+    }
+
+    fn succeeds(&self, arguments: &str) -> String {
+        let output = self.command(arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments}: {output:?}");
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    /// Fails with one line that starts with the program's name and holds every one of `expected`.
+    #[track_caller]
+    fn fails(&self, arguments: &str, expected: &[&str]) {
+        complained(arguments, &self.command(arguments).output().unwrap(), expected);
+    }
+}
+
+#[track_caller]
+fn complained(what: &str, output: &Output, expected: &[&str]) {
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{what}: {message}");
+    let one_line = message.starts_with("raygrad: ") && message.trim_end().lines().count() == 1;
+    assert!(one_line && expected.iter().all(|part| message.contains(part)), "{what}: {message}");
+}
+
+/// The image in a PNG file.
+fn png(path: &Path) -> Image {
+    Image::open(path).unwrap()
+}
+
+#[test]
+fn a_run_is_complete_and_can_be_evaluated() {
+    let place = Place::with_run();
+    let config = place.json("run/config.json");
+    assert_eq!(config["raygrad"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(config["downscale"], 1);
+    assert!(config["scene"]["folder"].as_str().unwrap().ends_with("scene"));
+    let metrics = String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();
+    let steps: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(steps.iter().map(|line| line["step"].as_u64().unwrap()).collect::<Vec<_>>(), [1, 3]);
+    assert!(steps.iter().all(|line| line["loss"].as_f64().unwrap() > 0.0 && line["psnr"].is_f64()));
+    let preview = png(&place.path("run/previews/000003.png"));
+    assert_eq!([preview.width, preview.height], [2 * SIZE, SIZE]);
+
+    let printed: Value = serde_json::from_str(&place.succeeds("--threads 3 eval run --json")).unwrap();
+    assert_eq!(printed, place.json("run/eval-test.json"));
+    let fields = ["split", "views", "background", "width", "height", "pixel_offset", "quantisation"];
+    let values = fields.map(|field| printed[field].clone());
+    assert_eq!(json!(values), json!(["test", 3, "white", SIZE, SIZE, 0.5, "none"]));
+    let views = printed["per_view"].as_array().unwrap();
+    assert_eq!(
+        json!(views.iter().map(|v| &v["name"]).collect::<Vec<_>>()),
+        json!(["test/r_0", "test/r_1", "test/r_2"])
+    );
+    for metric in ["psnr", "ssim"] {
+        let mean = views.iter().map(|view| view[metric].as_f64().unwrap()).sum::<f64>() / 3.0;
+        assert!((printed[format!("{metric}_mean")].as_f64().unwrap() - mean).abs() < 1e-9);
+    }
+    assert!(printed["seconds_per_view"].as_f64().unwrap() > 0.0);
+    let picture = png(&place.path("run/eval-test/002.png"));
+    assert_eq!([picture.width, picture.height], [4 * SIZE, SIZE]);
+
+    assert_eq!(printed["hold_out"], "as the capture's files say");
+    let model = &printed["model"];
+    let fields = ["steps", "seed", "photographs", "field", "sampler", "raygrad"].map(|field| model[field].clone());
+    assert_eq!(json!(fields), json!([3, 0, 6, "classic", "hierarchical", env!("CARGO_PKG_VERSION")]));
+    let crc = crc32fast::hash(&place.bytes("run/model.safetensors"));
+    assert!(model["crc32"] == format!("{crc:08x}") && model["budget"] == json!({ "steps": 3 }), "{model}");
+    assert!(printed["threads"] == 3 && !printed["processor"].as_str().unwrap().is_empty());
+    // A page shows the views, the worst first, and needs nothing but the pictures beside it.
+    let page = String::from_utf8(place.bytes("run/eval-test/index.html")).unwrap();
+    let mut order: Vec<(f64, &str)> =
+        views.iter().map(|view| (view["psnr"].as_f64().unwrap(), view["name"].as_str().unwrap())).collect();
+    order.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let places: Vec<usize> = order.iter().map(|(_, name)| page.find(&format!("alt=\"{name},")).unwrap()).collect();
+    assert!(places.is_sorted() && !page.contains("http") && page.matches("<img").count() == 3, "{page}");
+    assert!(page.contains("<tr><th>model seed</th><td>0</td></tr>"), "{page}");
+
+    let table = place.succeeds("eval run --split val --views 1");
+    assert!(table.contains("worst: val/r_0 (") && table.contains("val views (as the capture's files say)"), "{table}");
+    assert!(table.contains("mean of 1") && table.contains("val/r_0") && !table.contains("val/r_1"), "{table}");
+    // Beside the other result, and not in its place.
+    assert_eq!(place.json("run/eval-val-1.json")["split"], "val");
+    assert_eq!(place.json("run/eval-test.json"), printed);
+    assert!(place.path("run/eval-val-1/000.png").exists() && printed["skip"].is_null());
+    // Side by side with another's.
+    place.succeeds("train scene --preset small --steps 2 --seed 9 --out other");
+    place.fails("compare run other", &["other: has no results"]);
+    place.succeeds("eval other");
+    let table = place.succeeds("compare run other --only eval-test");
+    let psnr =
+        |run: &str| format!("{:.2}", place.json(&format!("{run}/eval-test.json"))["psnr_mean"].as_f64().unwrap());
+    let rows: Vec<Vec<&str>> = table.lines().take(3).map(|line| line.split_whitespace().collect()).collect();
+    assert!(rows[0].contains(&"model.seed") && rows[1][..3] == ["run", "eval-test", &psnr("run")], "{table}");
+    assert!(rows[2][..3] == ["other", "eval-test", &psnr("other")] && !table.contains("not the same"), "{table}");
+    let output = place.command("compare run").output().unwrap();
+    assert!(String::from_utf8_lossy(&output.stdout).contains("not the same photographs"));
+    assert!(output.stderr.is_empty(), "{output:?}");
+    // Its figures are no longer those of its model.
+    place.succeeds("train --resume run --steps 4");
+    let output = place.command("compare run other").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    std::fs::create_dir_all(place.path("run/eval-test/unfinished")).unwrap();
+    std::fs::write(place.path("run/eval-test/unfinished/999.png"), b"half").unwrap();
+    let stale = "is of a model that has been trained on since";
+    assert!(output.status.success() && said.matches(stale).count() == 2 && !said.contains("other/"), "{said}");
+    // One at a time.
+    let lock = std::fs::File::create(place.path("run/eval-test/unfinished.lock")).unwrap();
+    lock.lock().unwrap();
+    place.fails("eval run", &["run/eval-test: is being written by another raygrad"]);
+    drop(lock);
+    // What an evaluation that was killed has left is begun again; what is evaluated anew is not stale.
+    place.succeeds("eval run");
+    let left: Vec<_> =
+        std::fs::read_dir(place.path("run/eval-test")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left.len(), 4, "three pictures and a page: {left:?}");
+    // A run whose model is gone has its results still.
+    std::fs::remove_file(place.path("other/model.safetensors")).unwrap();
+    let output = place.command("compare run other --only eval-test").output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+}
+
+/// Of many views ten are drawn, evenly spaced, and the three worst.
+#[test]
+fn the_worst_of_many_views_are_drawn_too() {
+    let place = Place::empty();
+    place.succeeds("train --downscale 20 --steps 1 --out run --set field.grid.log2_table=8 --set sampler.samples=512");
+    place.succeeds("eval run --split train");
+    let views = place.json("run/eval-train-fast.json")["per_view"].as_array().unwrap().clone();
+    assert_eq!(views.len(), 60);
+    let mut order: Vec<usize> = (0..60).collect();
+    order.sort_by(|&a, &b| views[a]["psnr"].as_f64().unwrap().total_cmp(&views[b]["psnr"].as_f64().unwrap()));
+    let mut expected: Vec<String> =
+        (0..10).map(|i| 6 * i).chain(order[..3].iter().copied()).map(|i| format!("{i:03}.png")).collect();
+    expected.sort();
+    expected.dedup();
+    assert!(expected.len() > 10, "the test is of views that are drawn because they are the worst: {order:?}");
+    let found = std::fs::read_dir(place.path("run/eval-train-fast")).unwrap();
+    let found = found.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned());
+    let mut found: Vec<String> = found.filter(|name| name.ends_with(".png")).collect();
+    found.sort();
+    assert_eq!(found, expected);
+}
+
+#[test]
+fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
+    const SIZE: usize = 120;
+    let place = Place::empty();
+    std::fs::create_dir_all(place.path("capture/images")).unwrap();
+    let mut frames = vec![];
+    for (i, frame) in evenly_spaced(embedded(Split::Train, SIZE).frames, 40).into_iter().enumerate() {
+        let name = format!("images/{i:02}.png");
+        frame.image.to_image().save_png(place.path(&format!("capture/{name}"))).unwrap();
+        let (rotation, eye) = (frame.camera.pose.matrix3, frame.camera.pose.translation);
+        let row = |r: usize| [rotation.row(r).x, rotation.row(r).y, rotation.row(r).z, eye[r]];
+        let matrix = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+        frames.push(json!({ "file_path": name, "transform_matrix": matrix }));
+    }
+    let (side, focal) = (SIZE as f64, 0.5 * SIZE as f64 / (0.5 * ANGLE_X).tan());
+    let transforms = json!({
+        "w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "cx": 0.5 * side, "cy": 0.5 * side, "frames": frames
+    });
+    std::fs::write(place.path("capture/transforms.json"), transforms.to_string()).unwrap();
+
+    let table = place.succeeds("doctor capture");
+    assert!(table.contains("nothing is wrong") && table.contains("bounded: photographs are transparent"), "{table}");
+    assert!(
+        table.contains("  resolution     120x120\n") && table.contains("  images         35 train, 5 test\n"),
+        "{table}"
+    );
+    let picture = png(&place.path("doctor/cameras.png"));
+    assert!(picture.width > 1000 && picture.data.iter().any(|value| *value < 0.5));
+    let page = String::from_utf8(place.bytes("doctor/doctor.html")).unwrap();
+    assert!(page.contains("images/07.png") && !page.contains("{{") && !page.contains("http"));
+
+    let report = |code: i32| -> Value {
+        let output = place.command("doctor capture --json --out other").output().unwrap();
+        assert_eq!(output.status.code(), Some(code), "{output:?}");
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    assert_eq!(report(0)["findings"], json!([]));
+    std::fs::remove_file(place.path("capture/images/05.png")).unwrap();
+    let found = report(3)["findings"][0].clone();
+    assert_eq!(
+        json!([found["kind"], found["severity"], found["views"]]),
+        json!(["images-absent", "warning", ["images/05.png"]])
+    );
+    std::fs::write(place.path("capture/images/09.png"), b"no image").unwrap();
+    assert_eq!(report(4)["findings"][0]["kind"], "images-undecodable");
+    assert!(String::from_utf8(place.bytes("other/doctor.html")).unwrap().contains("images-undecodable"));
+    place.fails("doctor embedded", &["`scene`", "name a folder"]);
+    place.fails("doctor absent", &["absent: there is no such folder"]);
+}
+
+#[test]
+fn pictures_and_animations() {
+    let place = Place::with_run();
+    place.succeeds("render run --frames 2");
+    let [first, second] = ["0000", "0001"].map(|name| png(&place.path(&format!("run/orbit/{name}.png"))));
+    assert_eq!([first.width, first.height], [SIZE, SIZE]);
+    assert_ne!(first, second);
+    assert!(!place.path("run/orbit/0002.png").exists());
+    // Frames of a longer path stay, and that is said.
+    let output = place.command("render run --frames 1").output().unwrap();
+    assert!(output.status.success() && place.path("run/orbit/0001.png").exists());
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("orbit holds 1 more numbered pictures, from a longer path"), "{said}");
+    // Pictures of an evaluation that is replaced go; nothing else does.
+    std::fs::create_dir(place.path("run/eval-test")).unwrap();
+    for name in ["007.png", "0007.png", "7.png", "notes.txt"] {
+        std::fs::write(place.path(&format!("run/eval-test/{name}")), "old").unwrap();
+    }
+    place.succeeds("eval run");
+    let left =
+        ["007.png", "0007.png", "7.png", "notes.txt"].map(|name| place.path(&format!("run/eval-test/{name}")).exists());
+    assert_eq!(left, [false, true, true, true]);
+    place.succeeds("render run --size 20x10 --out wide.PNG --depth");
+    place.succeeds("render run --size 20x10 --out single.png");
+    place.succeeds("render run --size 20x10 --out double.png --precision f64");
+    let [single, double] = ["single.png", "double.png"].map(|name| png(&place.path(name)));
+    let differences = single.data.iter().zip(&double.data).map(|(a, b)| (a - b).abs());
+    assert!(differences.fold(0.0, raygrad::Real::maximum) <= 1.5 / 255.0, "both precisions show the same");
+    let wide = png(&place.path("wide.PNG"));
+    assert_eq!([wide.width, wide.height], [20, 10]);
+    place.succeeds("render run --path test --out test.gif");
+    let gif = place.bytes("test.gif");
+    let mut decoder = gif::Decoder::new(&gif[..]).unwrap();
+    let mut frames = 0;
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        assert_eq!([frame.width as usize, frame.height as usize, frame.delay as usize], [SIZE, SIZE, 4]);
+        frames += 1;
+    }
+    assert_eq!(frames, 3);
+    // An orbit needs no photographs, and where they went can be said.
+    std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
+    place.succeeds("render run --frames 1 --out one.png");
+    place.fails("eval run", &["scene: ", "--scene"]);
+    place.fails("render run --path test", &["scene: ", "--scene"]);
+    place.succeeds("eval run --scene moved --views 1");
+}
+
+#[test]
+fn the_embedded_scene_needs_no_files() {
+    let place = Place::empty();
+    let printed = place.succeeds("train --preset small --steps 1 --downscale 10 --no-encoding --background random");
+    assert!(printed.contains("embedded: 60 views of 20x20") && printed.contains("raygrad eval run"), "{printed}");
+    let config = place.json("run/config.json");
+    assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
+    assert_eq!(config["config"]["field"]["position_levels"], 0);
+    place.succeeds("eval run --views 1");
+    assert_eq!(place.json("run/eval-test-1.json")["background"], "white");
+    // Of many views some are drawn, and the worst.
+    let report: Value = serde_json::from_str(&place.succeeds("eval run --split train --json")).unwrap();
+    let psnr = |view: &Value| view["psnr"].as_f64().unwrap();
+    let mut order: Vec<(usize, f64)> = report["per_view"].as_array().unwrap().iter().map(psnr).enumerate().collect();
+    order.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let drawn = |view: usize| place.path(&format!("run/eval-train/{view:03}.png")).exists();
+    assert!(order.len() == 60 && order[..3].iter().all(|(view, _)| drawn(*view)), "{order:?}");
+    let count = (0..60).filter(|view| drawn(*view)).count();
+    assert!((11..=13).contains(&count), "{count}");
+    place.succeeds("render run --out one.png");
+    place.fails("train --downscale 3", &["`downscale`", "200x200"]);
+    place.fails("train landscape --downscale 16", &["`downscale`", "400x300"]);
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
+    let place = Place::with_scene();
+    place.succeeds("train scene --preset small --steps 4 --seed 7 --threads 1 --out one");
+    place.succeeds("train scene --preset small --steps 4 --seed 7 --threads 2 --out two");
+    place.succeeds("train scene --preset small --steps 4 --seed 8 --threads 2 --out other");
+    let [one, two, other] = ["one", "two", "other"].map(|run| place.bytes(&format!("{run}/model.safetensors")));
+    assert!(one == two && one != other);
+}
+
+#[test]
+fn nothing_is_overwritten() {
+    let place = Place::with_run();
+    let before = place.bytes("run/model.safetensors");
+    assert!(place.succeeds("train scene --preset small --steps 1").contains("run-2"));
+    assert!(place.succeeds("train scene --preset small --steps 1").contains("run-3"));
+    place.fails("train scene --preset small --steps 1 --out run", &["run: already holds a run", "--out"]);
+    place.fails("train scene --preset small --steps 1 --out scene", &["scene: holds files that are not a run's"]);
+    assert_eq!(place.bytes("run/model.safetensors"), before);
+    assert!(!place.path("scene/config.json").exists());
+    // An empty folder is as good as none.
+    std::fs::create_dir(place.path("empty")).unwrap();
+    place.succeeds("train scene --preset small --steps 1 --out empty");
+    std::fs::remove_file(place.path("run/config.json")).unwrap();
+    place.fails("train scene --preset small --steps 1", &["run: holds files that are not a run's"]);
+    assert_eq!(place.bytes("run/model.safetensors"), before);
+}
+
+#[test]
+fn bad_scenes_are_named_and_leave_no_run() {
+    let place = Place::with_scene();
+    let file = "scene/transforms_train.json";
+    let good = place.transforms(Split::Train);
+    let edited = |edit: fn(&mut Value)| {
+        let mut transforms = good.clone();
+        edit(&mut transforms);
+        transforms.to_string()
+    };
+    let no_frames = edited(|t| t["frames"] = json!([]));
+    let not_finite = edited(|t| t["frames"][2]["transform_matrix"][1][3] = json!("X")).replace("\"X\"", "NaN");
+    let not_rigid = edited(|t| t["frames"][1]["transform_matrix"][0][0] = json!(7.0));
+    let bad = [
+        ("{", ["is not valid JSON", "line 1"]),
+        (&no_frames, ["`frames`", "is empty"]),
+        (&not_finite, ["`frames[2].transform_matrix`", "not a finite number"]),
+        (&not_rigid, ["`frames[1].transform_matrix`", "must be a rotation"]),
+    ];
+    for (text, expected) in bad {
+        std::fs::write(place.path(file), text).unwrap();
+        place.fails("train scene --preset small", &[&[file][..], &expected].concat());
+    }
+    place.write_transforms(Split::Train, &good);
+    std::fs::write(place.path("scene/train/r_3.png"), b"no picture").unwrap();
+    place.fails("train scene --preset small", &["`frames[3]`", "r_3.png", "cannot be decoded"]);
+    Image::new(SIZE, SIZE + 1, 3).save_png(place.path("scene/train/r_3.png")).unwrap();
+    place.fails("train scene --preset small", &["`frames[3]`", "has 24x25 pixels"]);
+    place.fails("train scene --preset small --downscale 5", &["`frames[3]`"]);
+    place.fails("train absent", &["absent: there is no such folder"]);
+    place.fails("train .", &[".: is not a dataset"]);
+    assert!(!place.path("run").exists());
+}
+
+#[test]
+fn absent_images_are_skipped_with_a_warning() {
+    let place = Place::with_scene();
+    std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
+    let output = place.command("train scene --preset small --steps 1").output().unwrap();
+    let (printed, warned) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success() && printed.contains("5 views of 24x24"), "{printed}{warned}");
+    assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is absent"), "{warned}");
+}
+
+/// The folder of a run that was trained before files held less than the whole grid: such files load for ever.
+#[test]
+fn a_run_of_the_first_edition_loads_and_looks_the_same() {
+    let place = Place::empty();
+    std::fs::create_dir(place.path("run")).unwrap();
+    for name in ["config.json", "model.safetensors"] {
+        let stored = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/run-0.1").join(name);
+        std::fs::copy(stored, place.path(&format!("run/{name}"))).unwrap();
+    }
+    let report: Value = serde_json::from_str(&place.succeeds("eval run --views 2 --json")).unwrap();
+    for (view, expected) in report["per_view"].as_array().unwrap().iter().zip([17.708_592_9, 17.012_243_8]) {
+        assert!((view["psnr"].as_f64().unwrap() - expected).abs() < 0.01, "{report}");
+    }
+    assert_eq!(report["views"], 2);
+}
+
+#[test]
+fn marched_models_come_back_with_their_occupancy_grids() {
+    let place = Place::with_scene();
+    place.succeeds("train scene --preset instant --steps 2");
+    place.succeeds(
+        "train scene --preset voxel --set field.resolution=24 --set loss={\"huber\":{\"delta\":0.1}} --steps 2",
+    );
+    for run in ["run", "run-2"] {
+        place.succeeds(&format!("eval {run} --views 1 --skip off"));
+        let report = place.json(&format!("{run}/eval-test-off-1.json"));
+        assert!(report["psnr_mean"].as_f64().unwrap() > 3.0 && report["skip"]["pruning"] == 0.0, "{report}");
+    }
+    assert_eq!(place.json("run-2/config.json")["config"]["field"]["resolution"], 24);
+    place.fails("train scene --preset voxel --set field.resolution=513", &["`resolution`", "use 1 to 512"]);
+    let model = place.path("run/model.safetensors");
+    let bytes = std::fs::read(&model).unwrap();
+    std::fs::write(&model, &bytes[..bytes.len() / 2]).unwrap();
+    place.fails("eval run", &["run/model.safetensors"]);
+}
+
+#[test]
+fn bad_runs_are_named() {
+    let place = Place::with_run();
+    std::fs::create_dir(place.path("empty")).unwrap();
+    for command in ["eval", "render"] {
+        place.fails(&format!("{command} absent"), &["absent: there is no such folder"]);
+        place.fails(&format!("{command} empty"), &["empty: is not a run", "config.json"]);
+    }
+    let config = place.json("run/config.json");
+    let write = |config: &str| std::fs::write(place.path("run/config.json"), config).unwrap();
+    let edited = |path: &str, value: Value| {
+        let mut config = config.clone();
+        *config.pointer_mut(path).unwrap() = value;
+        config.to_string()
+    };
+    let bad = [
+        ("{ \"raygrad\": ".to_owned(), ["run/config.json", "line 1"]),
+        ("{}".to_owned(), ["run/config.json", "missing field"]),
+        (edited("/downscale", json!(0)), ["run/config.json", "`downscale`"]),
+        (edited("/extent/span", json!([6.0, 2.0])), ["run/config.json", "`extent.span`"]),
+        (edited("/extent/bounds/0/0", json!(9.0)), ["`bounds`", "is no box"]),
+        (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`"]),
+        (edited("/config/sampler/batch", json!(0)), ["run/config.json", "`batch`"]),
+        (edited("/config/field/width", json!(64)), ["run/model.safetensors", "in the file"]),
+        (edited("/config/field/depth", json!(3)), ["run/model.safetensors", "another configuration"]),
+    ];
+    for (text, expected) in bad {
+        write(&text);
+        place.fails("eval run", &expected);
+    }
+    write(&config.to_string());
+    let model = place.bytes("run/model.safetensors");
+    std::fs::write(place.path("run/model.safetensors"), &model[..model.len() / 2]).unwrap();
+    place.fails("eval run", &["run/model.safetensors: not a safetensors file"]);
+    std::fs::remove_file(place.path("run/model.safetensors")).unwrap();
+    place.fails("render run", &["run/model.safetensors: "]);
+    assert!(!place.path("run/eval-test.json").exists() && !place.path("run/orbit").exists());
+}
+
+#[test]
+fn bad_places_to_write_are_named() {
+    let place = Place::with_run();
+    place.fails(
+        "train scene --preset small --steps 1 --out scene/transforms_test.json/run",
+        &["transforms_test.json/run: cannot be"],
+    );
+    place.fails(
+        "train scene --preset small --steps 1 --out scene/transforms_test.json",
+        &["transforms_test.json: cannot be used"],
+    );
+    place.fails(
+        "render run --out run/config.json/frames",
+        &["run/config.json/frames: `config.json` is a part of a run"],
+    );
+    place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
+    std::fs::create_dir(place.path("folder.gif")).unwrap();
+    place.fails("render run --out folder.gif", &["folder.gif: is a folder"]);
+    // Where pictures should go there is a file.
+    std::fs::write(place.path("run/eval-test"), b"").unwrap();
+    place.fails("eval run", &["run/eval-test: cannot be created"]);
+    assert_eq!(place.bytes("run/eval-test"), b"");
+}
+
+#[test]
+fn how_many_masks_must_agree_can_be_said() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    for (flag, expected) in [("", 3), ("--carve 0", 0), ("--carve 5 --skip lossless", 5)] {
+        place.succeeds(&format!("train scene --steps 1 --out run-{expected} {small} {flag}"));
+        let config = place.json(&format!("run-{expected}/config.json"));
+        assert_eq!(config["config"]["sampler"]["occupancy"]["skip"]["carving"], expected, "{config}");
+    }
+    place.fails("train scene --preset small --steps 1 --carve 2", &["`carve`", "the preset small", "--skip fast"]);
+}
+
+#[test]
+fn codes_and_poses_are_trained_and_read_back() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    let learned = r#"--set field.codes=4 --set poses={"constant":{"rate":0.001}}"#;
+    place.succeeds(&format!("train scene --steps 2 --out run {small} {learned}"));
+    let config = place.json("run/config.json");
+    assert_eq!((&config["config"]["field"]["codes"], &config["extent"]["frames"]), (&4.into(), &6.into()), "{config}");
+    assert!(place.succeeds("eval run --split test --json").contains("psnr"));
+}
+
+#[test]
+fn cameras_are_corrected_and_said_to_be() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    let runs = [("", "none", "none"), ("poses,focal,lens", "similarity of the training cameras", "as learned")];
+    let glass = ("focal", "focal length and lens as learned", "as learned");
+    for (i, (parts, test, train)) in runs.into_iter().chain([glass]).enumerate() {
+        let refine = if parts.is_empty() { String::new() } else { format!("--refine {parts}") };
+        place.succeeds(&format!("train scene --steps 2 --out run-{i} {small} {refine}"));
+        for (split, expected) in [("test", test), ("train", train)] {
+            place.succeeds(&format!("eval run-{i} --split {split}"));
+            let name = if split == "test" { "eval-test-fast" } else { "eval-train-fast" };
+            assert_eq!(place.json(&format!("run-{i}/{name}.json"))["cameras"], expected);
+        }
+    }
+}
+
+#[test]
+fn bad_arguments_are_usage_errors() {
+    let place = Place::empty();
+    let bad = [
+        ("fly", "unrecognized subcommand"),
+        ("train --no-such", "unexpected argument"),
+        ("train --budget 10m --steps 5", "cannot be used with"),
+        ("train --budget 10", "90s, 10m or 1.5h"),
+        ("train --budget 0s", "more than 0"),
+        ("train --steps 0", "0 is not in 1.."),
+        ("train --downscale 0", "0 is not in 1.."),
+        ("train --threads 0", "0 is not in 1.."),
+        ("train --preset huge", "use classic, small, instant or voxel"),
+        ("train --background grey", "white, black or random"),
+        ("train --refine all", "use poses, focal, lens, exposure or vignetting"),
+        ("eval", "required arguments"),
+        ("eval run --split all", "must be train, val or test"),
+        ("eval run --views 0", "0 is not in 1.."),
+        ("render run --size 0x0", "WIDTHxHEIGHT"),
+        ("render run --path fly", "use orbit, spiral, spline, test or a FILE.json"),
+    ];
+    for (arguments, expected) in bad {
+        let output = place.command(arguments).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && message.contains(expected), "{arguments}: {message}");
+    }
+    let output = place.command("train --steps 1").env("RAYGRAD_SIMD", "avx").output().unwrap();
+    complained("RAYGRAD_SIMD", &output, &["RAYGRAD_SIMD is \"avx\"", "scalar, v3 or v4"]);
+    // Nobody who asks for a page trains without one.
+    for place_of_page in ["--host ::1", "--port 7000"] {
+        place.fails(&format!("train --steps 1 {place_of_page}"), &["`view`", "--host and --port"]);
+    }
+    assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 0);
+}
+
+#[test]
+fn a_closed_pipe_is_no_error() {
+    let place = Place::with_run();
+    let mut child = place.command("eval run").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+    assert!(place.path("run/eval-test.json").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_saves_the_model() {
+    let place = Place::with_scene();
+    let mut command = place.command("train scene --preset small --budget 1h");
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // The first line of the metrics says that training has begun.
+    wait(&mut child, || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0));
+    let untrained = place.bytes("run/model.safetensors");
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(sent.success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("stopped"), "{output:?}");
+    assert_ne!(place.bytes("run/model.safetensors"), untrained);
+    place.succeeds("eval run --views 1");
+}
+
+/// Waits until something holds, for as long as the program runs and at most a minute.
+fn wait(child: &mut Child, holds: impl Fn() -> bool) {
+    let start = Instant::now();
+    while !holds() {
+        let running = child.try_wait().unwrap().is_none() && start.elapsed() < Duration::from_secs(60);
+        if !running {
+            let _ = child.kill();
+            panic!("the program ended, or did not get there in a minute");
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn any_quadrature_can_be_chosen_and_comes_back() {
+    let place = Place::with_scene();
+    let set = "--set sampler.samples=512 --set sampler.occupancy.resolution=32 --set field.resolution=16";
+    for rule in ["left", "piecewise-linear", "gauss2", r#"{"adaptive":{"tolerance":0.01}}"#] {
+        place
+            .succeeds(&format!("train scene --preset voxel --steps 3 {set} --set sampler.quadrature={rule} --out run"));
+        let stored = place.json("run/config.json")["config"]["sampler"]["quadrature"].clone();
+        assert_eq!(stored, serde_json::from_str::<Value>(rule).unwrap_or_else(|_| json!(rule)));
+        let report: Value = serde_json::from_str(&place.succeeds("eval run --json --precision f64")).unwrap();
+        assert!(report["psnr_mean"].as_f64().unwrap() > 0.0 && report["precision"] == "f64", "{rule}: {report}");
+        std::fs::remove_dir_all(place.path("run")).unwrap();
+    }
+    let train = format!("train scene --preset voxel --steps 3 {set} --set sampler.quadrature");
+    place.fails(&format!("{train}=simpson"), &["sampler.quadrature", "simpson"]);
+    let adaptive = r#"{"adaptive":{"tolerance":7}}"#;
+    place.fails(&format!("{train}={adaptive}"), &["quadrature.adaptive.tolerance", "is 7"]);
+}
+
+#[test]
+fn the_quadrature_benchmark_leaves_tables_plots_and_a_page() {
+    let place = Place::empty();
+    let printed = place.succeeds("bench --suite quadrature --quick --out results");
+    assert!(printed.contains("in 128 evaluations") && printed.contains("report.html"), "{printed}");
+    let text = |name: &str| String::from_utf8(place.bytes(&format!("results/{name}"))).unwrap();
+    let table = text("quadrature.csv");
+    assert!(table.starts_with("scene,rule,evaluations,") && table.lines().count() > 150, "{table}");
+    let page = text("report.html");
+    assert!(page.contains("<svg") && page.contains("processor") && page.contains("quadrature-128.csv"));
+    for figure in ["quadrature-colour", "quadrature-depth", "quadrature-gradient", "quadrature-time"] {
+        assert!(text(&format!("{figure}.svg")).contains("midpoint"));
+        assert!(png(&place.path(&format!("results/{figure}.png"))).width > 1000);
+    }
+    std::fs::write(place.path("file"), "").unwrap();
+    place.fails("bench --suite quadrature --quick --out file", &["file: cannot be created"]);
+}

@@ -1,0 +1,498 @@
+//! Paths, films, and what is saved beside frames.
+
+use super::resume::SMALL;
+use super::{Place, SIZE, complained, png};
+use raygrad::nerf::dataset::{Capture, Depths, Split};
+use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad::nerf::{Camera, Config, Extent, Image, Model};
+use raygrad_scenes::ANGLE_X;
+use serde_json::{Value, json};
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// The greatest difference between two images of one size, in steps of 8 bits.
+#[track_caller]
+fn apart(a: &Image, b: &Image) -> f32 {
+    assert_eq!([a.width, a.height, a.channels], [b.width, b.height, b.channels]);
+    let worst = a.data.iter().zip(&b.data).map(|(a, b)| (a - b).abs());
+    255.0 * worst.fold(0.0, raygrad::Real::maximum)
+}
+
+#[test]
+fn paths_go_where_photographs_were_taken_and_where_files_say() {
+    let place = Place::with_run();
+    assert!(place.succeeds("render run --path test --frames 2 --out two").contains("rendered 2 frames"));
+    place.succeeds("render run --path test --out test");
+    let test = [0, 1, 2].map(|i| png(&place.path(&format!("test/000{i}.png"))));
+    assert!(apart(&test[0], &test[1]) > 3.0 && apart(&test[1], &test[2]) > 3.0);
+    // A spline passes its photographs, by number and by name.
+    for (out, through) in [("numbers", "2,0"), ("names", "test/r_2,test/r_0")] {
+        place.succeeds(&format!("render run --path spline --through {through} --split test --frames 3 --out {out}"));
+        let spline = [0, 1, 2].map(|i| png(&place.path(&format!("{out}/000{i}.png"))));
+        assert!(apart(&spline[0], &test[2]) <= 1.0 && apart(&spline[2], &test[0]) <= 1.0);
+        assert!(apart(&spline[1], &test[0]) > 3.0 && apart(&spline[1], &test[2]) > 3.0);
+    }
+    // A closed one is on its way back where an open one has arrived.
+    place.succeeds("render run --path spline --through 2,0 --split test --closed --frames 4 --out closed");
+    assert!(apart(&png(&place.path("closed/0002.png")), &test[0]) <= 1.0);
+    // The cameras of a file are in the capture's coordinates.
+    let transforms = place.transforms(Split::Test);
+    let shot = |i: usize| {
+        let rows = transforms["frames"][i]["transform_matrix"].as_array().unwrap().clone();
+        let flat: Vec<_> = rows.iter().flat_map(|row| row.as_array().unwrap().clone()).collect();
+        json!({ "camera_to_world": flat, "fov": ANGLE_X.to_degrees(), "aspect": 1.0 })
+    };
+    let path = json!({
+        "render_width": SIZE, "render_height": SIZE, "fps": 20, "seconds": 0.15, "camera_type": "perspective",
+        "camera_path": [shot(1), shot(2)],
+    });
+    std::fs::write(place.path("path.json"), path.to_string()).unwrap();
+    assert!(place.succeeds("render run --path path.json").contains("rendered 2 frames of 24x24: run/path"));
+    for i in [1, 2] {
+        assert!(apart(&png(&place.path(&format!("run/path/000{}.png", i - 1))), &test[i]) <= 1.0);
+    }
+    assert!(place.succeeds("render run --path path.json --out half.gif --size 12x12").contains("2 frames of 12x12"));
+    let gif = place.bytes("half.gif");
+    let mut decoder = gif::Decoder::new(&gif[..]).unwrap();
+    assert_eq!(decoder.read_next_frame().unwrap().unwrap().delay, 5, "20 frames a second, as the file says");
+    // Others see other things.
+    place.succeeds("render run --path spiral --frames 3 --aspect 3:2 --radius 3 --out spiral");
+    let spiral = [0, 1].map(|i| png(&place.path(&format!("spiral/000{i}.png"))));
+    assert!([spiral[0].width, spiral[0].height] == [36, 24] && apart(&spiral[0], &spiral[1]) > 3.0);
+    let one = |flags: &str| {
+        place.succeeds(&format!("render run {flags} --out one.png --overwrite"));
+        png(&place.path("one.png"))
+    };
+    let usual = one("");
+    for flags in ["--radius 2", "--elevation -20", "--fov 20", "--background 255,0,0", "--show opacity", "--show depth"]
+    {
+        assert!(apart(&one(flags), &usual) > 3.0, "{flags}");
+    }
+    assert_eq!(one("--show depth"), one("--depth"));
+    // At twice the tangent of half of the angle, what was seen is in the middle, at half the size.
+    let wide = one("--size 48x48 --fov 71.507778");
+    let middle = |x: usize, y: usize| wide.pixel(12 + x, 12 + y).to_vec();
+    let worst = (0..SIZE * SIZE).map(|i| {
+        let (x, y) = (i % SIZE, i / SIZE);
+        usual.pixel(x, y).iter().zip(middle(x, y)).map(|(a, b)| (a - b).abs()).fold(0.0, raygrad::Real::maximum)
+    });
+    assert!(255.0 * worst.fold(0.0_f32, raygrad::Real::maximum) <= 2.0);
+}
+
+/// In a scene that lies elsewhere than its capture.
+#[test]
+fn paths_lie_where_the_scene_does() {
+    let place = Place::with_scene();
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    place.succeeds(&format!("train scene --steps 30 --out run --scope unbounded {small}"));
+    let config = place.json("run/config.json");
+    let extent: Extent = serde_json::from_value(config["extent"].clone()).unwrap();
+    assert!((extent.placement.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
+    let settings: Config = serde_json::from_value(config["config"].clone()).unwrap();
+    let model = Model::<f32>::load(place.path("run/model.safetensors"), settings, extent).unwrap();
+    let capture = Capture::read(place.path("scene")).unwrap();
+    let given = &capture.split(Split::Test).unwrap()[1].camera;
+    let expected = model.view(&extent.placement.camera(given), model.config.background.shown()).color;
+    assert!(apart(&model.view(given, [1.0; 3]).color, &expected) > 6.0, "where it is matters");
+    place.succeeds("render run --path test --out test");
+    assert!(apart(&png(&place.path("test/0001.png")), &expected) <= 1.0);
+    let rows = place.transforms(Split::Test)["frames"][1]["transform_matrix"].as_array().unwrap().clone();
+    let flat: Vec<_> = rows.iter().flat_map(|row| row.as_array().unwrap().clone()).collect();
+    let path = json!({
+        "render_width": SIZE, "render_height": SIZE,
+        "camera_path": [{ "camera_to_world": flat, "fov": ANGLE_X.to_degrees() }],
+    });
+    std::fs::write(place.path("path.json"), path.to_string()).unwrap();
+    place.succeeds("render run --path path.json --out path");
+    assert!(apart(&png(&place.path("path/0000.png")), &expected) <= 1.0);
+    // One that says so itself needs no word about it.
+    let said = |path: &Value, flags: &str| {
+        std::fs::write(place.path("path.json"), path.to_string()).unwrap();
+        let output = place.command(&format!("render run --path path.json {flags} --out said")).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let mut own = path.clone();
+    own["coordinates"] = json!("capture");
+    for (path, is_told) in [(&path, true), (&own, false)] {
+        let (code, said) = said(path, "");
+        assert!(code == Some(0) && said.contains("is taken to be in the capture's coordinates") == is_told, "{said}");
+        assert!(apart(&png(&place.path("said/0000.png")), &expected) <= 1.0);
+    }
+    let (code, words) = said(&own, "--path-transform path.json");
+    assert!(
+        code == Some(1) && words.contains("`coordinates`") && words.contains("leave --path-transform out"),
+        "{words}"
+    );
+    own["coordinates"] = json!("scene");
+    let (code, words) = said(&own, "");
+    assert!(code == Some(1) && words.contains("path.json") && words.contains("`scene`, expected `capture`"), "{words}");
+
+    // In nerfstudio's own coordinates, of a file whose coordinates are not those of before either.
+    place.succeeds("prepare scene --to nerfstudio --out captured");
+    let mut transforms = place.json("captured/transforms.json");
+    let before = DAffine3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.5, 0.2, -0.3]);
+    let rows = |map: DAffine3| {
+        [0, 1, 2].map(|r| [map.matrix3.row(r).x, map.matrix3.row(r).y, map.matrix3.row(r).z, map.translation[r]])
+    };
+    transforms["applied_transform"] = json!(rows(before));
+    transforms["applied_scale"] = json!(2.0);
+    std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
+    let own = DAffine3 { translation: DVec3::new(-0.4, 0.1, 0.7), ..DAffine3::from_rotation_z(0.6) };
+    let shrunk = 0.25;
+    let dataparser = json!({ "transform": rows(own * before), "scale": 2.0 * shrunk });
+    std::fs::write(place.path("dataparser_transforms.json"), dataparser.to_string()).unwrap();
+    let moved = own * given.pose;
+    let moved = DAffine3 { translation: shrunk * moved.translation, ..moved };
+    let flat = [rows(moved).concat(), vec![0.0, 0.0, 0.0, 1.0]].concat();
+    let path = json!({
+        "render_width": SIZE, "render_height": SIZE,
+        "camera_path": [{ "camera_to_world": flat, "fov": ANGLE_X.to_degrees() }],
+    });
+    std::fs::write(place.path("moved.json"), path.to_string()).unwrap();
+    let flags = "--scene captured --path moved.json --path-transform dataparser_transforms.json";
+    place.succeeds(&format!("render run {flags} --out moved"));
+    assert!(apart(&png(&place.path("moved/0000.png")), &expected) <= 1.0);
+}
+
+/// At the size that photographs were read in, whose sides may have been rounded apart: 28 x 21 to 14 x 11.
+#[test]
+fn test_views_are_seen_as_they_are_compared() {
+    let place = Place::empty();
+    place.succeeds("prepare landscape --to nerfstudio --size 28 --out scene");
+    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
+    place.succeeds(&format!("train scene --downscale 2 --steps 20 --out run {small}"));
+    place.succeeds("eval run --views 1");
+    place.succeeds("render run --path test --frames 1 --out test");
+    let [seen, drawing] = ["test/0000.png", "run/eval-test-fast-1/000.png"].map(|file| png(&place.path(file)));
+    assert_eq!([seen.width, seen.height, drawing.width, drawing.height], [14, 11, 4 * 14, 11]);
+    // Photograph, render, error and depth stand side by side.
+    for (x, y) in (0..14).flat_map(|x| (0..11).map(move |y| (x, y))) {
+        let apart = seen.pixel(x, y).iter().zip(drawing.pixel(14 + x, y)).map(|(a, b)| (a - b).abs());
+        assert!(255.0 * apart.fold(0.0, raygrad::Real::maximum) <= 1.0, "{x} {y}");
+    }
+}
+
+#[test]
+fn flags_that_do_not_fit_are_named() {
+    let place = Place::with_run();
+    for (flags, expected) in [
+        ("--path test --radius 2", ["`radius`", "--path test"]),
+        ("--path spline", ["`through`", "0,5,9"]),
+        ("--path spline --through 0,6", ["`through`: `6` is no train photograph", "0 to 5"]),
+        ("--path absent.json", ["absent.json", "cannot be read"]),
+        ("--save depth --out one.png", ["`save`", "name a folder"]),
+        ("--save depth --out one.gif", ["`save`", "name a folder"]),
+        ("--depth-unit 0.01", ["`depth-unit`", "--save depth"]),
+        ("--keep-frames", ["`keep-frames`", "without a film"]),
+        ("--fps 30", ["`fps`", "--seconds"]),
+        ("--fps 60 --out fast.gif", ["`fps`", "50 frames a second"]),
+        ("--out absent/film.apng", ["absent", "cannot be written to"]),
+        ("--out film.MOV", ["film.MOV: `.mov` is not the ending of a picture or a film", "the name of a folder"]),
+    ] {
+        place.fails(&format!("render run {flags}"), &expected);
+    }
+    let listed = json!({
+        "render_width": 4, "render_height": 4,
+        "camera_path": [{ "camera_to_world": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1], "fov": 50 }],
+    });
+    std::fs::write(place.path("path.json"), listed.to_string()).unwrap();
+    let output = place.command("render run --path path.json --frames 3").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("`frames`: has no meaning for a file that lists every frame"), "{said}");
+    assert!(output.status.code() == Some(1) && said.contains("say --path-transform"), "{said}");
+    for flags in [
+        "--seconds 0",
+        "--seconds 2 --fps 0.009",
+        "--seconds 2 --fps 241",
+        "--fov 180",
+        "--elevation 90",
+        "--aspect 4",
+        "--background grey",
+        "--save all",
+    ] {
+        let output = place.command(&format!("render run {flags}")).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{flags}: {output:?}");
+    }
+    let left: Vec<_> = std::fs::read_dir(place.path("run")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert!(!left.iter().any(|name| name == "orbit"), "{left:?}");
+    // A folder that is there may be called what it likes; key frames of a file make as many frames as it says how fast they are.
+    std::fs::create_dir(place.path("clip.mov")).unwrap();
+    place.succeeds("render run --frames 1 --out clip.mov");
+    let key = |x: f64| json!({ "matrix": [1, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1], "fov": 50 });
+    let keys = json!({ "render_width": 4, "render_height": 4, "keyframes": [key(0.0), key(0.5)], "seconds": 0.5 });
+    std::fs::write(place.path("keys.json"), keys.to_string()).unwrap();
+    assert!(place.succeeds("render run --path keys.json --fps 10 --out keys").contains("rendered 5 frames of 4x4"));
+    let output = place.command("render run --path keys.json --fps 240 --seconds 500 --out keys").output().unwrap();
+    assert!(String::from_utf8_lossy(&output.stderr).contains("`seconds`: 120000 frames are more than 100000"));
+}
+
+#[test]
+fn what_is_saved_beside_frames_belongs_to_them() {
+    let place = Place::empty();
+    let small = "--set field.grid.log2_table=10 --set sampler.occupancy.resolution=32 --set sampler.samples=4096";
+    place.succeeds(&format!("train --downscale 5 --steps 150 --out run {small}"));
+    let save = "--save depth,depth-npy,normals,opacity,alpha --depth-unit 0.01";
+    place.succeeds(&format!("render run --frames 2 --size 20x14 --background 0,0,255 {save} --out frames"));
+    for frame in ["0000", "0001"] {
+        let seen = png(&place.path(&format!("frames/{frame}.png")));
+        let alpha = png(&place.path(&format!("frames/alpha/{frame}.png")));
+        assert_eq!([alpha.width, alpha.height, alpha.channels], [20, 14, 4]);
+        assert!(apart(&alpha.over([0.0, 0.0, 1.0]), &seen) <= 2.0);
+        let opacity = png(&place.path(&format!("frames/opacity/{frame}.png")));
+        let normals = png(&place.path(&format!("frames/normals/{frame}.png")));
+        let decoder = png::Decoder::new(std::io::Cursor::new(place.bytes(&format!("frames/depth/{frame}.png"))));
+        let mut reader = decoder.read_info().unwrap();
+        assert_eq!(reader.output_color_type(), (png::ColorType::Grayscale, png::BitDepth::Sixteen));
+        let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut bytes).unwrap();
+        let npy = place.bytes(&format!("frames/depth/{frame}.npy"));
+        let floats = npy[npy.len() - 4 * 20 * 14..].chunks_exact(4).map(|x| f32::from_le_bytes(x.try_into().unwrap()));
+        let mut solid = 0;
+        for (i, (whole, depth)) in bytes.chunks_exact(2).zip(floats).enumerate() {
+            let whole = u16::from_be_bytes([whole[0], whole[1]]);
+            assert_eq!(f32::from(whole), (depth / 0.01).round(), "hundredths, in the order of PNG");
+            let (opacity, alpha) = (opacity.data[3 * i], alpha.data[4 * i + 3]);
+            assert!((opacity - alpha).abs() < 1.5 / 255.0);
+            assert_eq!(depth > 0.0, opacity >= 127.5 / 255.0, "{i}: {opacity}");
+            assert_eq!(depth > 0.0, normals.data[3 * i..3 * i + 3].iter().any(|x| *x > 0.0));
+            if depth > 0.0 {
+                solid += 1;
+                assert!((2.0..6.0).contains(&depth), "{depth}");
+                let normal = normals.data[3 * i..3 * i + 3].iter().map(|x| (2.0 * x - 1.0).powi(2)).sum::<f32>().sqrt();
+                assert!((normal - 1.0).abs() < 0.02, "{normal}");
+            }
+        }
+        assert!(solid > 20, "{solid} pixels of {frame} are solid");
+    }
+    assert!(!place.path("frames/unfinished.json").exists());
+    // What is too far for 16 bits is said.
+    let output = place.command("render run --frames 1 --save depth --depth-unit 1e-6 --out fine").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("or --save depth-npy"), "{said}");
+}
+
+/// The depth of each pixel along the optical axis is that along the ray times a cosine, whatever the lens; here for the
+/// reader's own convention, from outside.
+#[test]
+fn depths_are_along_the_axis() {
+    let camera = Camera::from_angle(3, 1, 2.0 * 2.0_f64.atan(), DAffine3::IDENTITY);
+    let distances = Image { width: 3, height: 1, channels: 1, data: vec![2.0; 3] };
+    let npy = Depths::new(&distances, &camera, 10.0).to_npy();
+    let depths: Vec<f32> =
+        npy[npy.len() - 12..].chunks_exact(4).map(|x| f32::from_le_bytes(x.try_into().unwrap())).collect();
+    // Half a width of 1.5 pixels is two focal lengths: the outer pixel's centre lies 4/3 of one aside, at a cosine of 3/5.
+    for (found, expected) in depths.iter().zip([12.0, 20.0, 12.0]) {
+        assert!((found - expected).abs() < 1e-5, "{depths:?}");
+    }
+}
+
+#[test]
+fn films_hold_the_frames_at_their_speed() {
+    let place = Place::with_run();
+    place.succeeds("render run --frames 3 --size 21x13 --out frames");
+    let frames = [0, 1, 2].map(|i| png(&place.path(&format!("frames/000{i}.png"))));
+    place.succeeds("render run --frames 3 --size 21x13 --fps 10 --out film.gif");
+    let gif = place.bytes("film.gif");
+    let mut decoder = gif::Decoder::new(&gif[..]).unwrap();
+    let mut delays = vec![];
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        delays.push(frame.delay);
+    }
+    assert_eq!(delays, [10; 3]);
+    place.succeeds("render run --seconds 0.12 --size 21x13 --out film.apng");
+    let apng = place.bytes("film.apng");
+    let mut reader = png::Decoder::new(std::io::Cursor::new(&apng[..])).read_info().unwrap();
+    let control = *reader.info().animation_control().unwrap();
+    assert_eq!((control.num_frames, control.num_plays), (3, 0));
+    for frame in &frames {
+        let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut bytes).unwrap();
+        let control = *reader.info().frame_control().unwrap();
+        assert_eq!((control.delay_num, control.delay_den), (100, 2500), "25 frames a second");
+        let expected: Vec<u8> = frame.data.iter().map(|x| (255.0 * x).round() as u8).collect();
+        assert!(bytes == expected, "not a color is lost");
+    }
+    // Frames are gone with the film, unless they are to stay.
+    assert!(!place.path("film.gif.frames").exists() && !place.path("film.apng.frames").exists());
+    place.succeeds("render run --frames 3 --size 21x13 --out film.gif --keep-frames --overwrite");
+    assert_eq!(png(&place.path("film.gif.frames/0002.png")), frames[2]);
+    assert!(!place.path("film.gif.frames/unfinished.json").exists());
+}
+
+/// Whether ffmpeg is there; says so if not.
+pub fn has_ffmpeg() -> bool {
+    let found = Command::new("ffmpeg").arg("-version").stdout(Stdio::null()).status().is_ok();
+    if !found {
+        println!("skipped: ffmpeg is not installed");
+    }
+    found
+}
+
+#[test]
+fn ffmpeg_writes_films_whose_colors_are_those_of_the_frames() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let place = Place::with_run();
+    // A folder whose name looks like a number of frames.
+    std::fs::create_dir(place.path("a%03d b")).unwrap();
+    for film in ["film.mp4", "film.webm"] {
+        let film = format!("a%03d b/{film}");
+        let mut command =
+            place.command("render run --frames 5 --size 63x41 --fps 12.5 --background 200,30,60 --keep-frames --out");
+        let output = command.arg(&film).output().unwrap();
+        assert!(output.status.success(), "{film}: {output:?}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains("black is added, to 64x42"), "{output:?}");
+        let bytes = place.bytes(&film);
+        let is_webm = bytes.starts_with(&[0x1a, 0x45, 0xdf, 0xa3]);
+        assert!(if film.ends_with("webm") { is_webm } else { &bytes[4..8] == b"ftyp" }, "{film}: {:x?}", &bytes[..12]);
+        let first = place.path("first.png");
+        let taken = Command::new("ffmpeg")
+            .args(["-y", "-loglevel", "error", "-i"])
+            .arg(place.path(&film))
+            .args(["-vf", "select=eq(n\\,3),scale=in_color_matrix=auto:in_range=auto", "-frames:v", "1"])
+            .arg(&first)
+            .status();
+        assert!(taken.unwrap().success());
+        let (seen, frame) = (png(&first), png(&place.path(&format!("{film}.frames/0003.png"))));
+        assert_eq!([seen.width, seen.height], [64, 42]);
+        // Colors have half the resolution, brightness has all of it.
+        let bright = |x: usize| seen.pixel(x, 5).iter().zip([0.2126, 0.7152, 0.0722]).map(|(x, w)| x * w).sum::<f32>();
+        assert!(bright(63) < 0.6 * bright(62), "black is at the right: {} {}", bright(63), bright(62));
+        // In a corner there is nothing but background, which no chroma of others comes into.
+        let [corner, expected] = [seen.pixel(3, 3), frame.pixel(3, 3)];
+        let worst = corner.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, raygrad::Real::maximum);
+        assert!(255.0 * worst <= 6.0, "{film}: {corner:?} {expected:?}");
+        let said = Command::new("ffmpeg").arg("-i").arg(place.path(&film)).output().unwrap().stderr;
+        let said = String::from_utf8_lossy(&said).into_owned();
+        assert!(said.contains("12.50 fps") && said.contains("00:00:00.40") && said.contains("bt709"), "{said}");
+    }
+    let left = std::fs::read_dir(place.path("a%03d b")).unwrap().count();
+    assert_eq!(left, 4, "two films and their frames");
+}
+
+#[test]
+fn without_ffmpeg_it_is_said_what_to_do_before_anything_is_rendered() {
+    let place = Place::with_run();
+    let output = place.command("render run --out film.mp4").env("PATH", place.path("")).output().unwrap();
+    complained("no ffmpeg", &output, &["film.mp4", "`ffmpeg`: is not on the PATH", "apt install ffmpeg", "FILE.gif"]);
+    assert!(!place.path("film.mp4.frames").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_anything_is_rendered() {
+    use std::os::unix::fs::PermissionsExt;
+    let place = Place::with_run();
+    let with = |script: &str| {
+        let ffmpeg = place.path("ffmpeg");
+        std::fs::write(&ffmpeg, format!("#!/bin/sh\n{script}\n")).unwrap();
+        std::fs::set_permissions(&ffmpeg, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let command = "render run --frames 1 --size 8x6 --out film.mp4";
+        let path = format!("{}:/usr/bin:/bin", place.path("").display());
+        place.command(command).env("PATH", path).output().unwrap()
+    };
+    let output = with("echo ' V..... libvpx-vp9  VP9'");
+    complained("no encoder", &output, &["film.mp4: needs an ffmpeg with libx264", "FILE.gif"]);
+    assert!(!place.path("film.mp4.frames").exists());
+    // It fails after it has said what is wrong and reported its progress for long.
+    let output = with(
+        "case $* in *-encoders*) echo ' V..... libx264 H.264';; *) echo 'the disk is full' >&2; sleep 0.3
+         i=0; while [ $i -lt 20 ]; do echo frame=$i; i=$((i+1)); done; exit 3;; esac",
+    );
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(said.contains("  the disk is full") && said.contains("`ffmpeg`: has failed (exit code 3)"), "{said}");
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_film_goes_on_where_it_was() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 3 {SMALL}"));
+    let arguments = "render run --frames 200 --size 12x10 --out film.apng";
+    let frame = |i: usize| place.path(&format!("film.apng.frames/{i:04}.png"));
+    let mut child = place.command(arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    super::wait(&mut child, || frame(2).exists());
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(130), "{said}");
+    assert!(said.contains("of 200 frames, in film.apng.frames: the same command goes on"), "{said}");
+    let done = place.json("film.apng.frames/unfinished.json")["done"].as_u64().unwrap() as usize;
+    assert!(done >= 3 && frame(done - 1).exists() && !frame(done).exists() && !place.path("film.apng").exists());
+    // Frames that are there are not rendered again: a mark on one stays.
+    let mark = Image { width: 12, height: 10, channels: 3, data: vec![0.2; 3 * 12 * 10] };
+    mark.save_png(frame(1)).unwrap();
+    let output = place.command(arguments).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains(&format!("{done} of 200 frames are there already")), "{said}");
+    let frames = decoded(&place.path("film.apng"));
+    assert!(frames.len() == 200 && frames[1].iter().all(|x| *x == 51) && !place.path("film.apng.frames").exists());
+    // Others than those that were there are as in a film that was not interrupted.
+    place.succeeds("render run --frames 200 --size 12x10 --out whole.apng");
+    let whole = decoded(&place.path("whole.apng"));
+    assert!((0..200).all(|i| (whole[i] == frames[i]) == (i != 1)));
+    // What would show something else begins again, where it may.
+    place.succeeds("render run --frames 2 --size 12x10 --out film.gif --keep-frames");
+    let film = "render run --frames 400 --size 12x10 --out film.gif";
+    place.fails(film, &["film.gif: exists, and was not written by this command"]);
+    std::fs::remove_file(place.path("film.gif")).unwrap();
+    place.fails(film, &["film.gif.frames"]);
+    std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
+    let kept = |done: usize| {
+        let mut record = place.json("film.gif.frames/unfinished.json");
+        record["done"] = json!(done);
+        std::fs::write(place.path("film.gif.frames/unfinished.json"), record.to_string()).unwrap();
+    };
+    let begun = |flags: &str| {
+        // When it is there again, it is this call's.
+        let _ = std::fs::remove_file(place.path("film.gif.frames/0003.png"));
+        let mut child = place.command(&format!("{film} {flags}"));
+        let mut child = child.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        super::wait(&mut child, || place.path("film.gif.frames/0003.png").exists());
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+        String::from_utf8(child.wait_with_output().unwrap().stderr).unwrap()
+    };
+    begun("");
+    kept(3);
+    let said = begun("--fps 5 --overwrite");
+    assert!(said.contains("3 of 400 frames are there already"), "the speed is not in the frames: {said}");
+    for flags in ["--show depth", "--background black", "--fov 30", "--skip off"] {
+        // From the same frames each time.
+        begun("--overwrite");
+        kept(3);
+        place.fails(&format!("{film} {flags}"), &["film.gif.frames"]);
+        let said = begun(&format!("{flags} --overwrite"));
+        assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");
+    }
+    // Another model, of which the same is asked.
+    begun("--overwrite");
+    kept(3);
+    place.succeeds("train --resume run --steps 4");
+    let said = begun("");
+    assert!(said.contains("which were of another config, model"), "{said}");
+    // One at a time.
+    let mut child = place.command("render run --frames 400 --size 36x30 --out slow.gif").stdout(Stdio::null()).spawn();
+    let child = child.as_mut().unwrap();
+    super::wait(child, || place.path("slow.gif.frames/0000.png").exists());
+    place.fails(
+        "render run --frames 400 --size 36x30 --out slow.gif",
+        &["slow.gif.frames: is being rendered to by another raygrad"],
+    );
+    child.kill().unwrap();
+    child.wait().unwrap();
+}
+
+/// The frames of an APNG file, in bytes.
+fn decoded(path: &Path) -> Vec<Vec<u8>> {
+    let bytes = std::fs::read(path).unwrap();
+    let mut reader = png::Decoder::new(std::io::Cursor::new(&bytes[..])).read_info().unwrap();
+    let count = reader.info().animation_control().unwrap().num_frames;
+    let frame = |_| {
+        let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut bytes).unwrap();
+        bytes
+    };
+    (0..count).map(frame).collect()
+}

@@ -1,0 +1,338 @@
+//! Runs that end before their time, and go on.
+
+use super::Place;
+use serde_json::Value;
+use std::fs::File;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Settings of a model whose steps and views are short.
+pub const SMALL: &str = "--set field.grid.levels=6 --set field.grid.log2_table=10 --set field.density_width=16 \
+                         --set field.color_width=16 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
+
+/// What each line of a run's metrics says but for times, which differ.
+fn metrics(place: &Place, run: &str) -> Vec<Value> {
+    let text = String::from_utf8(place.bytes(&format!("{run}/metrics.jsonl"))).unwrap();
+    let line = |line: &str| {
+        let mut value: Value = serde_json::from_str(line).unwrap();
+        value.as_object_mut().unwrap().remove("train_seconds");
+        value
+    };
+    text.lines().map(line).collect()
+}
+
+/// The steps of a run's checkpoints, the earliest first.
+fn checkpoints(place: &Place, run: &str) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(place.path(&format!("{run}/checkpoints"))).unwrap();
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    found.sort();
+    found
+}
+
+pub fn assert_same(place: &Place, a: &str, b: &str) {
+    let model = |run: &str| place.bytes(&format!("{run}/model.safetensors"));
+    assert!(model(a) == model(b), "the models of {a} and {b} differ");
+    assert_eq!(metrics(place, a), metrics(place, b));
+}
+
+/// `KILLS=50 cargo test --release --test cli killed` is the campaign.
+#[test]
+fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
+    let kills: u32 = std::env::var("KILLS").map_or(4, |kills| kills.parse().unwrap());
+    let place = Place::with_scene();
+    let steps = 30 * kills.max(4);
+    let start = Instant::now();
+    place.succeeds(&format!("train scene --steps {steps} --out whole {SMALL}"));
+    let whole = start.elapsed();
+    let (mut killed, mut at) = (0, vec![]);
+    let mut arguments = format!("train scene --steps {steps} --out run --checkpoint 0.02s {SMALL}");
+    loop {
+        let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        // Somewhere in the time that is left of it, by the golden ratio; at last it is let be.
+        let share = (f64::from(killed) * 0.618).fract();
+        let until = Instant::now() + whole.mul_f64(0.1 + 0.9 * share) / kills.max(4) * 2;
+        while child.try_wait().unwrap().is_none() && (killed >= kills || Instant::now() < until) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if let Some(status) = child.try_wait().unwrap() {
+            assert!(status.success());
+            break;
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        killed += 1;
+        if place.path("run/config.json").exists() {
+            arguments = "train --resume run --checkpoint 0.02s".to_owned();
+            let found = if place.path("run/checkpoints").exists() { checkpoints(&place, "run") } else { vec![] };
+            at.push(found.into_iter().rfind(|path| path.extension().is_some_and(|e| e == "checkpoint")));
+        }
+    }
+    println!("{killed} kills, after {at:?}");
+    assert!(killed > 0, "it was too quick to be killed");
+    assert_same(&place, "whole", "run");
+    assert_eq!(checkpoints(&place, "run").len(), 2, "what was about to be written is swept away");
+}
+
+#[test]
+fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 200 --out whole {SMALL}"));
+    let arguments = format!("train scene --steps 200 --out run {SMALL}");
+    let mut child = place.command(&arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    // Two lines: it has begun, and makes steps.
+    let lines = || std::fs::read(place.path("run/metrics.jsonl")).map_or(0, |text| text.split(|b| *b == b'\n').count());
+    super::wait(&mut child, || lines() > 2);
+    Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    if output.status.code() == Some(130) {
+        assert!(said.contains("to go on raygrad train --resume run\n"), "{said}");
+        assert_eq!(checkpoints(&place, "run").len(), 2, "of the beginning and the end: a minute has not passed");
+        let said = place.succeeds("train --resume run");
+        assert!(said.contains("from     step ") && !said.contains("from     step 0\n"), "{said}");
+    }
+    assert_same(&place, "whole", "run");
+    // That it is at its end is no error.
+    place.succeeds("train --resume run");
+    assert_same(&place, "whole", "run");
+    let kept = |place: &Place| place.json("run/config.json")["keep_checkpoints"].clone();
+    assert_eq!(kept(&place), 2);
+    let said = place.succeeds("train --resume run --steps 220 --keep-checkpoints 3");
+    assert_eq!((kept(&place), checkpoints(&place, "run").len()), (3.into(), 3));
+    assert!(said.contains("from     step 200\n") && said.contains("trained  220 steps"), "{said}");
+    assert_eq!(metrics(&place, "run").last().unwrap()["step"], 220);
+    assert_eq!(metrics(&place, "run")[..21], metrics(&place, "whole")[..]);
+    assert_eq!(place.json("run/config.json")["budget"]["steps"], 220);
+    // As many stay from then on; none at all would leave nothing to go on from.
+    place.succeeds("train --resume run --steps 221");
+    assert_eq!((kept(&place), checkpoints(&place, "run").len()), (3.into(), 3));
+    for (number, goes) in [(2, true), (16384, true), (0, false), (1, false), (16385, false)] {
+        let mut config = place.json("run/config.json");
+        config["keep_checkpoints"] = number.into();
+        std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+        match goes {
+            true => drop(place.succeeds("train --resume run")),
+            false => place.fails("train --resume run", &["config.json", "`keep_checkpoints`", "2 to 16384"]),
+        }
+    }
+}
+
+#[test]
+fn what_is_damaged_leaves_the_checkpoint_before_it() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 30 --out whole {SMALL}"));
+    place.succeeds(&format!("train scene --steps 30 --out run --checkpoint 0.001s {SMALL}"));
+    let last = checkpoints(&place, "run").pop().unwrap();
+    let bytes = std::fs::read(&last).unwrap();
+    std::fs::write(&last, &bytes[..bytes.len() - 1]).unwrap();
+    std::fs::write(place.path("run/checkpoints/.tmp123"), b"half").unwrap();
+    let output = place.command("train --resume run").output().unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        output.status.success() && message.contains("warning: ") && message.contains("is damaged: it has"),
+        "{message}"
+    );
+    assert!(String::from_utf8(output.stdout).unwrap().contains("from     step 29\n"));
+    assert_same(&place, "whole", "run");
+    assert!(!place.path("run/checkpoints/.tmp123").exists());
+    // One that is there and cannot be read is not passed over: it may be whole.
+    std::fs::create_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
+    place.fails(
+        "train --resume run",
+        &["00000089.checkpoint: cannot be read", "remove it to go on from the checkpoint before"],
+    );
+    std::fs::remove_dir(place.path("run/checkpoints/00000089.checkpoint")).unwrap();
+    // A damaged one that says that it is later is not kept in place of one that is whole.
+    std::fs::write(place.path("run/checkpoints/00000090.checkpoint"), b"").unwrap();
+    let output = place.command("train --resume run --steps 31").output().unwrap();
+    assert!(output.status.success() && String::from_utf8(output.stdout).unwrap().contains("from     step 30\n"));
+    assert_eq!(
+        checkpoints(&place, "run"),
+        [&last, &place.path("run/checkpoints/00000031.checkpoint")].map(Clone::clone)
+    );
+    place.succeeds("train --resume run --steps 32");
+    let [before, last] = checkpoints(&place, "run").try_into().unwrap();
+    // What is not whole in the metrics is written again.
+    let mut text = place.bytes("run/metrics.jsonl");
+    text.truncate(text.len() - 5);
+    std::fs::write(place.path("run/metrics.jsonl"), text).unwrap();
+    for path in [&before, &last] {
+        let mut bytes = std::fs::read(path).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 4;
+        std::fs::write(path, bytes).unwrap();
+    }
+    let model = place.bytes("run/model.safetensors");
+    let output = place.command("train --resume run").output().unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.code() == Some(1) && message.contains("checkpoints: no checkpoint can be used"), "{message}");
+    assert_eq!(message.matches("its checksum is another").count(), 2, "{message}");
+    assert!(place.bytes("run/model.safetensors") == model, "nothing is lost");
+    // What earlier versions have trained is not begun again.
+    std::fs::remove_dir_all(place.path("run/checkpoints")).unwrap();
+    place.fails("train --resume run", &["run: has no checkpoints", "train anew"]);
+    assert!(place.bytes("run/model.safetensors") == model);
+    // What was killed before its first step is.
+    std::fs::remove_file(place.path("run/metrics.jsonl")).unwrap();
+    assert!(place.succeeds("train --resume run").contains("from     step 0\n"));
+    place.succeeds(&format!("train scene --steps 32 --out other {SMALL}"));
+    assert_same(&place, "other", "run");
+}
+
+#[test]
+fn what_cannot_be_written_for_a_while_does_not_end_a_run() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 150 --out whole {SMALL}"));
+    let arguments = format!("train scene --steps 150 --out run --checkpoint 0.01s {SMALL}");
+    let lost_its_folder = || {
+        let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let begun = || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0);
+        super::wait(&mut child, begun);
+        // Again and again, as it makes it anew for each checkpoint.
+        while std::fs::remove_dir_all(place.path("run")).is_err() {}
+        // A busy machine may have let it end before.
+        let ended = child.try_wait().unwrap().is_some();
+        let output = child.wait_with_output().unwrap();
+        (!ended || !output.status.success()).then_some(output)
+    };
+    let output = (0..9).find_map(|_| lost_its_folder()).expect("it ended too soon nine times");
+    let said = String::from_utf8(output.stderr).unwrap();
+    let is_said = ["training goes on", "training continues in a new folder"].iter().any(|words| said.contains(words));
+    assert!(output.status.success() && is_said, "{said}");
+    assert!(place.bytes("run/model.safetensors") == place.bytes("whole/model.safetensors"));
+    place.succeeds("eval run --views 1");
+}
+
+#[test]
+fn a_run_goes_on_alone_and_with_its_own_photographs() {
+    let place = Place::with_scene();
+    place.succeeds(&format!("train scene --steps 2 --out run --near 2.5 {SMALL}"));
+    let lock = File::options().write(true).open(place.path("run/lock")).unwrap();
+    lock.lock().unwrap();
+    place.fails("train --resume run", &["run: is being trained by another raygrad"]);
+    drop(lock);
+    place.succeeds("train --resume run --steps 4");
+    assert_eq!(place.json("run/config.json")["extent"]["span"][0], 2.5);
+    // A folder in which nothing was finished is as good as none.
+    std::fs::create_dir(place.path("begun")).unwrap();
+    std::fs::write(place.path("begun/.tmpx1"), b"{").unwrap();
+    place.succeeds(&format!("train scene --steps 1 --out begun {SMALL}"));
+    place.fails("train --resume absent", &["absent: there is no such folder"]);
+    for flag in ["scene --resume run", "--resume run --seed 3", "--resume run --set seed=3", "--resume run --out other"]
+    {
+        assert_eq!(place.command(&format!("train {flag}")).output().unwrap().status.code(), Some(2), "{flag}");
+    }
+    let mut config = place.json("run/config.json");
+    config["budget"] = Value::Null;
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.fails("train --resume run", &["`budget`", "--steps"]);
+    config["photographs"][0] = "other".into();
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.fails("train --resume run --steps 5", &["run: ", "other photographs"]);
+}
+
+/// A run that was ended after 20 steps when checkpoints were new: such files are gone on from for ever.
+#[test]
+fn a_run_with_a_checkpoint_of_the_first_version_goes_on() {
+    let place = Place::empty();
+    let stored = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference/run-checkpoint-1");
+    std::fs::create_dir_all(place.path("run/checkpoints")).unwrap();
+    for name in ["config.json", "model.safetensors", "metrics.jsonl", "checkpoints/00000020.checkpoint"] {
+        std::fs::copy(stored.join(name), place.path(&format!("run/{name}"))).unwrap();
+    }
+    let before = metrics(&place, "run");
+    let printed = place.succeeds("train --resume run --steps 40");
+    assert!(printed.contains("from     step 20"), "{printed}");
+    let after = metrics(&place, "run");
+    assert_eq!(after[..before.len()], before, "what was known stays");
+    let [first, last] = [&before[0], after.last().unwrap()].map(|line| line["loss"].as_f64().unwrap());
+    assert!(last < 0.75 * first && after.last().unwrap()["step"] == 40, "{first} {last}");
+    // It has not begun again: its counts go on.
+    assert!(after.last().unwrap()["rays"].as_f64().unwrap() > 1.5 * before.last().unwrap()["rays"].as_f64().unwrap());
+    // What a later raygrad wrote is not guessed at.
+    let path = place.path("run/checkpoints/00000040.checkpoint");
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, [b"raygrad checkpoint 2", &bytes[20..]].concat()).unwrap();
+    // Nor passed over, though the one before it is whole.
+    assert!(place.path("run/checkpoints/00000020.checkpoint").exists());
+    let (succeeds, said) = complaints(&place, "train --resume run --steps 50");
+    assert!(!succeeds && said.contains("has version 2, and this raygrad knows 1: use the one that wrote it"), "{said}");
+    assert!(!said.contains("warning") && path.exists(), "{said}");
+    let mut config = place.json("run/config.json");
+    (config["raygrad"], config["extra"]) = ("99.0.0".into(), 1.into());
+    std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
+    place.fails("eval run", &["run/config.json: was made by raygrad 99.0.0", "a newer"]);
+}
+
+/// The words of a run on standard error, and whether it succeeded.
+fn complaints(place: &Place, arguments: &str) -> (bool, String) {
+    let output = place.command(arguments).output().unwrap();
+    assert!(output.status.success() || output.status.code() == Some(1), "{output:?}");
+    (output.status.success(), String::from_utf8(output.stderr).unwrap())
+}
+
+#[test]
+fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
+    let place = Place::empty();
+    let (succeeds, said) = complaints(
+        &place,
+        &format!("train --downscale 10 --steps 120 --out run --tensorboard {SMALL} --set schedule.linear.from=1e9"),
+    );
+    assert!(succeeds && said.contains("recorded at nerf/src/field/instant.rs:"), "{said}");
+    let retreats = said.matches("going on from step 0 at 0.25 times the rate").count() as i32;
+    assert!((1..=3).contains(&retreats) && !said.contains("training has diverged"), "{said}");
+    // Each time TensorBoard is told to forget what was.
+    let events = std::fs::read_dir(place.path("run/tensorboard")).unwrap().count() as i32;
+    assert!(events == retreats + 1 && place.json("run/summary.json")["retreats"] == retreats, "{events}");
+    // Each begins with a version and with the first step that it is of: a time and, in a byte, the number 1.
+    for file in std::fs::read_dir(place.path("run/tensorboard")).unwrap() {
+        let bytes = std::fs::read(file.unwrap().path()).unwrap();
+        let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        let start = &bytes[length + 16..][12..];
+        assert_eq!([start[0], start[9], start[10]], [0x09, 0x10, 1], "{:x?}", &start[..11]);
+    }
+    // The metrics are those of one run, all of it at the last rate.
+    let metrics = metrics(&place, "run");
+    let steps: Vec<u64> = metrics.iter().map(|line| line["step"].as_u64().unwrap()).collect();
+    assert_eq!(steps, [1, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 110, 120]);
+    let config: Value = serde_json::from_slice(&place.bytes("run/config.json")).unwrap();
+    let schedule = &config["config"]["schedule"]["linear"];
+    let [from, to, warmup] = ["from", "to", "warmup"].map(|name| schedule[name].as_f64().unwrap());
+    for line in &metrics {
+        let done = (line["step"].as_f64().unwrap() - 1.0) / 120.0;
+        let rate = (done / warmup).min(1.0) * (from + (to - from) * done) * 0.25_f64.powi(retreats);
+        assert!((line["rate"].as_f64().unwrap() - rate).abs() <= 1e-9 * rate, "{line}: {rate}");
+    }
+    // Going on with it, the rate stays as low.
+    let rate = metrics.last().unwrap()["rate"].as_f64().unwrap();
+    place.succeeds("train --resume run --steps 121");
+    let last = self::metrics(&place, "run").pop().unwrap();
+    assert!(last["step"] == 121 && (last["rate"].as_f64().unwrap() / rate - 1.0).abs() < 0.2, "{last} after {rate}");
+}
+
+#[test]
+fn a_run_that_diverges_again_and_again_ends_with_the_reason_and_its_last_good_model() {
+    let place = Place::empty();
+    // It learns, until its rate leaves all bounds.
+    let schedule = r#"{"exponential":{"from":0.0001,"to":1e30,"warmup":0.0}}"#;
+    let rates = format!("--set schedule={schedule} --checkpoint 0.02s");
+    let output =
+        place.command(&format!("train --downscale 10 --steps 400 --out run {SMALL} {rates}")).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let [printed, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+    assert!(!printed.contains("raygrad render"), "{printed}");
+    assert_eq!(said.matches("at 0.25 times the rate").count(), 3, "{said}");
+    let end = said.split("training has diverged").nth(1).unwrap();
+    assert!(end.contains("recorded at nerf/src/") && end.contains("schedule.exponential.from"), "{end}");
+    let step: u64 = end.split("that of step ").nth(1).unwrap().split(';').next().unwrap().parse().unwrap();
+    let kept = checkpoints(&place, "run");
+    assert!(step > 0 && kept.last().unwrap().ends_with(format!("{step:08}.checkpoint")), "{step} {kept:?}");
+    // Nothing speaks of later steps.
+    assert!(metrics(&place, "run").iter().all(|line| line["step"].as_u64().unwrap() <= step));
+    // It is what was learned until then, and not what overflowed.
+    let left = place.bytes("run/model.safetensors");
+    place.succeeds(&format!("train --resume run --steps {step}"));
+    assert!(place.bytes("run/model.safetensors") == left);
+    place.succeeds("eval run --views 1");
+}

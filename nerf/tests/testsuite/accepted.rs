@@ -1,0 +1,269 @@
+//! Captures whose files are damaged: what is accepted can be used. A step is trained on it, and a view is rendered.
+
+use proptest::prelude::*;
+use raygrad_nerf::dataset::formats::{blender, colmap, llff, transforms};
+use raygrad_nerf::dataset::{Capture, Format, Image, Point, Reading, Split, Survey, View};
+use raygrad_nerf::encoding::hash_grid::HashGridConfig;
+use raygrad_nerf::glam::{DAffine3, DVec3};
+use raygrad_nerf::sampling::marching::MarchingConfig;
+use raygrad_nerf::{Camera, Config, InstantConfig, Preset, Result, Trainer};
+use raygrad_test_support::damage::{Damage, clear, damage, damaged};
+use raygrad_test_support::memory::peak;
+use raygrad_test_support::tally::{Bound, Tally, cases};
+use std::cell::Cell;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Photographs of a capture.
+const VIEWS: usize = 5;
+
+/// A capture of grey photographs, which are written, with names that begin like that.
+fn capture(folder: &Path, prefix: &str) -> Capture {
+    std::fs::create_dir_all(folder.join("images")).unwrap();
+    let view = |i: usize| {
+        let (name, angle) = (format!("{prefix}{i}.png"), i as f64);
+        let image = folder.join(format!("images/{i}.png"));
+        let mut picture = Image::new(8, 6, 3);
+        picture.data.iter_mut().enumerate().for_each(|(k, x)| *x = ((i + k) % 5) as f32 / 4.0);
+        picture.save_png(&image).unwrap();
+        let place = 3.0 * DVec3::new(angle.cos(), angle.sin(), 0.5);
+        View {
+            name,
+            field: format!("frames[{i}]"),
+            image: Some(image),
+            camera: Camera::from_angle(8, 6, 0.9, Camera::look_at(place, DVec3::ZERO, DVec3::Z)),
+            split: Some(if i == 0 { Split::Test } else { Split::Train }),
+            mask: None,
+            depth: None,
+            sharpness: None,
+            bounds: Some([1.0, 6.0]),
+        }
+    };
+    let point = |i: usize| Point {
+        position: DVec3::new((i % 3) as f64, (i % 5) as f64, (i % 7) as f64) / 7.0,
+        color: [6 * i as u8, 128, 255],
+        error: 0.5,
+        views: 3,
+    };
+    Capture {
+        folder: folder.into(),
+        file: folder.join("transforms.json"),
+        format: Format::Transforms,
+        views: (0..VIEWS).map(view).collect(),
+        points: (0..40).map(point).collect(),
+        points_file: None,
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
+    }
+}
+
+/// Files of a format, which are damaged one at a time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Kind {
+    Transforms,
+    Ply,
+    Blender,
+    ColmapText,
+    ColmapBinary,
+    Llff,
+}
+
+impl Kind {
+    /// Writes a capture; gives the files of this kind.
+    fn write(self, folder: &Path) -> Vec<PathBuf> {
+        let prefix = if matches!(self, Kind::Transforms | Kind::Ply | Kind::Blender) { "images/" } else { "" };
+        let capture = capture(folder, prefix);
+        let (done, files) = match self {
+            Kind::Transforms => (transforms::write(&capture, folder), vec!["transforms.json"]),
+            Kind::Ply => (transforms::write(&capture, folder), vec!["sparse_pc.ply"]),
+            Kind::Blender => (blender::write(&capture, folder), vec!["transforms_train.json", "transforms_test.json"]),
+            Kind::ColmapText => (
+                colmap::write(&capture, folder, colmap::Encoding::Text),
+                vec!["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"],
+            ),
+            Kind::ColmapBinary => (
+                colmap::write(&capture, folder, colmap::Encoding::Binary),
+                vec!["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"],
+            ),
+            Kind::Llff => (llff::write(&capture, folder), vec!["poses_bounds.npy"]),
+        };
+        done.unwrap();
+        files.into_iter().map(|file| folder.join(file)).collect()
+    }
+}
+
+/// An object of one member takes 7 bytes of a document and some 600 of memory; the rest of a capture is small.
+const BOUND: Bound = Bound { times: 256, plus: 1 << 18 };
+
+/// The smallest model.
+fn tiny() -> Config {
+    let mut config = Config::preset(Preset::Instant);
+    let field = config.field.get_mut::<InstantConfig>().unwrap();
+    field.grid = HashGridConfig { levels: 2, features: 2, log2_table: 8, coarsest: 2, finest: 8 };
+    (field.density_width, field.color_width) = (8, 8);
+    config
+}
+
+/// What became of a damaged capture: it was trained on for a step, and the first of its cameras rendered.
+struct Outcome {
+    loss: f64,
+    view: Image,
+    /// That of the camera.
+    size: [usize; 2],
+}
+
+impl Outcome {
+    fn is_right(&self) -> bool {
+        let whole = self.view.data.iter().all(|x| x.is_finite());
+        self.loss.is_finite() && [self.view.width, self.view.height] == self.size && whole
+    }
+}
+
+/// Where the cameras and points of a capture are, and where its scene lies.
+fn read(folder: &Path) -> Result<(Capture, Survey)> {
+    let capture = Capture::read(folder)?;
+    let survey = capture.survey(None)?;
+    Ok((capture, survey))
+}
+
+/// Trains one step on what was read, and renders a view.
+fn used((capture, survey): &(Capture, Survey)) -> Result<Outcome> {
+    let data = capture.load(Split::Train, survey, &Reading::default())?;
+    let mut config = tiny().with_scope(data.scope);
+    let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
+    (sampler.samples, sampler.occupancy.resolution) = (256, 16);
+    let camera = data.frames[0].camera.clone();
+    let mut trainer = Trainer::new(config, Arc::new(data))?;
+    let loss = trainer.step(0.0).loss;
+    Ok(Outcome { loss, view: trainer.model.view(&camera, [1.0; 3]).color, size: [camera.width, camera.height] })
+}
+
+/// Damage that leaves a file a file, as often as not: digits for digits, and other bytes.
+fn light() -> impl Strategy<Value = Vec<Damage>> {
+    let one = (0.0..1.0_f64, prop_oneof![4 => b'0'..=b'9', 1 => any::<u8>()]);
+    prop::collection::vec(one.prop_map(|(at, byte)| Damage::Set(at, byte)), 1..3)
+}
+
+/// Of more accepted captures than this one in a hundred is used, so that a million of each format can be tried in an hour.
+const ALL_USED: u64 = 5_000;
+
+/// Tries damaged files of a kind.
+fn campaign(kind: Kind) {
+    // Its memory is that of one thread.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    pool.install(|| damage_again_and_again(kind));
+}
+
+fn damage_again_and_again(kind: Kind) {
+    let temporary = tempfile::tempdir().unwrap();
+    let folder = temporary.path();
+    let files = kind.write(folder);
+    let whole: Vec<Vec<u8>> = files.iter().map(|file| std::fs::read(file).unwrap()).collect();
+    let outcome = used(&read(folder).unwrap()).unwrap();
+    assert!(outcome.size == [8, 6] && outcome.is_right(), "{kind:?}");
+    let tally = Tally::new(&format!("{kind:?}"));
+    let trained = Cell::new(0_u64);
+    let which = any::<prop::sample::Index>;
+    let strategy = (which(), which(), prop_oneof![damage(), light()]);
+    proptest!(cases(), |((file, other, damage) in strategy)| {
+        let (file, other) = (file.index(files.len()), other.get(&whole));
+        let bytes = damaged(&whole[file], other, &damage);
+        std::fs::write(&files[file], &bytes).unwrap();
+        // The other files are read too.
+        let length = whole.iter().map(Vec::len).sum::<usize>() + bytes.len();
+        let captured = tally.parse(length, BOUND, || read(folder));
+        let [accepted, _] = tally.counts();
+        let outcome = match captured {
+            Ok(captured) if accepted < ALL_USED || accepted.is_multiple_of(100) => used(&captured).map(Some),
+            captured => captured.map(|_| None),
+        };
+        std::fs::write(&files[file], &whole[file]).unwrap();
+        match outcome {
+            Ok(Some(outcome)) => {
+                trained.set(trained.get() + 1);
+                prop_assert!(outcome.is_right(), "{:?}", kind);
+            }
+            Ok(None) => {}
+            Err(error) => {
+                let folder = folder.to_str().unwrap();
+                let named = error.to_string().contains(folder);
+                clear(error, if named { folder } else { "`" });
+            }
+        }
+    });
+    let [accepted, refused] = tally.counts();
+    assert!(accepted > 5 && trained.get() > 5 && refused > 5, "{kind:?}: {accepted} accepted, {refused} refused");
+}
+
+#[test]
+fn campaign_transforms() {
+    campaign(Kind::Transforms);
+}
+
+#[test]
+fn campaign_points_in_ply_files() {
+    campaign(Kind::Ply);
+}
+
+#[test]
+fn campaign_blender() {
+    campaign(Kind::Blender);
+}
+
+#[test]
+fn campaign_colmap_text() {
+    campaign(Kind::ColmapText);
+}
+
+#[test]
+fn campaign_colmap_binary() {
+    campaign(Kind::ColmapBinary);
+}
+
+#[test]
+fn campaign_llff() {
+    campaign(Kind::Llff);
+}
+
+/// Counts and sizes that no memory holds.
+#[test]
+fn captures_that_announce_what_no_memory_holds_are_refused_and_take_little() {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let refused = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
+        let folder = tempfile::tempdir().unwrap();
+        let files = kind.write(folder.path());
+        let mut bytes = std::fs::read(&files[file]).unwrap();
+        change(&mut bytes);
+        std::fs::write(&files[file], &bytes).unwrap();
+        let (result, taken) = pool.install(|| peak(|| read(folder.path())));
+        clear(result.err().unwrap_or_else(|| panic!("{kind:?} {file} is accepted")), folder.path().to_str().unwrap());
+        assert!(taken <= 1 << 20, "{kind:?} {file}: {taken} bytes of memory");
+    };
+    let replace = |bytes: &mut Vec<u8>, from: &str, to: &str| {
+        let start = bytes.windows(from.len()).position(|part| part == from.as_bytes()).expect(from);
+        bytes.splice(start..start + from.len(), to.bytes());
+    };
+    for count in [1 << 62, u64::MAX, u64::MAX / 64 + 2, 1 << 40, 100_000] {
+        for file in 0..3 {
+            refused(Kind::ColmapBinary, file, &|bytes| bytes[..8].copy_from_slice(&count.to_le_bytes()));
+        }
+        // Observations of the first image; then a name of no end.
+        refused(Kind::ColmapBinary, 1, &|bytes| {
+            let end = 8 + 64 + bytes[72..].iter().position(|byte| *byte == 0).unwrap() + 1;
+            bytes[end..end + 8].copy_from_slice(&count.to_le_bytes());
+        });
+        refused(Kind::Ply, 0, &|bytes| replace(bytes, "element vertex 40", &format!("element vertex {count}")));
+        refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, 17)")));
+        refused(Kind::Llff, 0, &|bytes| replace(bytes, "(5, 17)", &format!("({count}, {count})")));
+        // Of some width, there may be such a photograph.
+        if count > 1 << 24 {
+            refused(Kind::Transforms, 0, &|bytes| replace(bytes, "\"w\": 8", &format!("\"w\": {count}")));
+        }
+    }
+    refused(Kind::Llff, 0, &|bytes| bytes[6..12].copy_from_slice(&[2, 0, 0xff, 0xff, 0xff, 0xff]));
+    refused(Kind::ColmapBinary, 1, &|bytes| bytes.iter_mut().skip(72).for_each(|byte| *byte |= 1));
+    for open in ["[", "{\"a\":"] {
+        refused(Kind::Transforms, 0, &|bytes| *bytes = open.repeat(20_000).into());
+        refused(Kind::Blender, 1, &|bytes| *bytes = open.repeat(20_000).into());
+    }
+}

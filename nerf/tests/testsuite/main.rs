@@ -1,0 +1,5 @@
+//! What this crate promises from outside.
+
+mod accepted;
+mod lenses;
+mod rooms;

@@ -1,0 +1,127 @@
+//! Scenes that need no download: a bulldozer of plastic bricks, ray-traced with exact cameras, depth and normals, and a
+//! landscape around it without bounds. [`embedded`] and [`landscape`] are their photographs as datasets.
+//!
+//! The scene stands at the origin with z up, fits the cube of +-1.5 and is seen by cameras 4 units away, like the
+//! synthetic scenes of the NeRF paper. Its plastic is glossy, so that colours depend on the viewing direction. All
+//! solids are analytic: depth is exact to rounding at any resolution, and images are the same bits on every run.
+//!
+//! - `shape`: convex solids, where a ray meets them and how far a point is from them;
+//! - `bvh`: the same questions for many solids at once;
+//! - `shade`: materials and light;
+//! - `kit` and `bulldozer`: bricks, and the model built from them;
+//! - `render`: images;
+//! - `views`: cameras for training, validation and testing.
+//!
+//! ```
+//! use raygrad_scenes::{Scene, train_cameras};
+//!
+//! let scene = Scene::bulldozer();
+//! let cameras = train_cameras(3, 32);
+//! let views: Vec<_> = cameras.iter().map(|camera| scene.render(camera, 5)).collect();
+//!
+//! // Depth is measured along the ray through the pixel's centre, so it leads back to the surface.
+//! let ray = cameras[0].pixel_ray(16, 16);
+//! let depth = views[0].depth.pixel(16, 16)[0];
+//! let hit = scene.trace(&ray).expect("the bulldozer is in the middle of every view");
+//! assert_eq!(depth, hit.distance as f32);
+//! ```
+
+mod bulldozer;
+mod bvh;
+mod dataset;
+mod form;
+mod golden;
+mod kit;
+mod landscape;
+mod noise;
+mod paint;
+mod render;
+mod scenery;
+mod shade;
+mod shape;
+mod views;
+mod walk;
+mod window;
+
+use glam::DVec3;
+
+pub use bvh::Hit;
+pub use dataset::{embedded, landscape, landscape_ahead, landscape_distances};
+pub use landscape::Landscape;
+pub use render::View;
+pub use views::{ANGLE_X, DISTANCE, test_cameras, train_cameras, val_cameras};
+pub use walk::walk_cameras;
+pub use window::window_cameras;
+
+use bvh::Bvh;
+use raygrad_nerf::Ray;
+use shade::Material;
+
+/// Solids under a fixed sun and sky.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    bvh: Bvh,
+    /// The material of each solid.
+    materials: Vec<Material>,
+}
+
+impl Scene {
+    /// A yellow bulldozer with its driver and some loose bricks on a studded base plate.
+    ///
+    /// It is about 2.3 long (x, the blade towards +x), 1.4 wide and 1.15 high.
+    pub fn bulldozer() -> Self {
+        let (shapes, materials) = bulldozer::solids().into_iter().unzip();
+        Scene { bvh: Bvh::new(shapes), materials }
+    }
+
+    /// The smallest and the largest corner of an axis-aligned box that contains everything, in scene units.
+    pub fn bounds(&self) -> [DVec3; 2] {
+        self.bvh.bounds()
+    }
+
+    /// Where a ray first meets a surface, or `None` if it leaves the scene.
+    ///
+    /// A ray that starts inside a solid meets the surface where it leaves that solid.
+    pub fn trace(&self, ray: &Ray) -> Option<Hit> {
+        self.bvh.trace(ray)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn everything_lies_within_the_bounds() {
+        let scene = Scene::bulldozer();
+        let [min, max] = scene.bounds();
+        assert!(min.min_element() > -1.5 && max.max_element() < 1.5, "{min} {max}");
+        for camera in train_cameras(10, 40) {
+            for (column, row) in (0..40).flat_map(|row| (0..40).map(move |column| (column, row))) {
+                let ray = camera.pixel_ray(column, row);
+                if let Some(hit) = scene.trace(&ray) {
+                    let point = ray.at(hit.distance);
+                    assert!(point.cmpge(min).all() && point.cmple(max).all(), "{point}");
+                    assert!(hit.normal.is_normalized() && hit.normal.dot(ray.direction) <= 0.0);
+                }
+            }
+        }
+    }
+
+    /// The same point of the cab's roof has another colour from another side.
+    #[test]
+    fn colors_depend_on_the_viewing_direction() {
+        let scene = Scene::bulldozer();
+        let above = Ray { origin: DVec3::new(-0.17, 0.056, 4.0), direction: DVec3::NEG_Z };
+        let roof = above.at(scene.trace(&above).expect("the roof").distance);
+        let color = |viewer: DVec3| {
+            let ray = Ray { origin: roof + 4.0 * viewer, direction: -viewer };
+            let hit = scene.trace(&ray).expect("the roof");
+            assert!(ray.at(hit.distance).distance(roof) < 1e-9, "something stands before the roof");
+            let material = &scene.materials[hit.solid];
+            shade::radiance(|ray| scene.bvh.occluded(ray), material, &ray, &hit, shade::sun_direction(0, 1), 1.0)
+        };
+        let (left, right) = (color(DVec3::new(0.48, 0.36, 0.8)), color(DVec3::new(-0.48, -0.36, 0.8)));
+        assert!(right.min_element() > 0.0 && (right - left).min_element() > 0.1, "{left} {right}");
+    }
+}

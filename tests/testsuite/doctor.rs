@@ -1,0 +1,514 @@
+//! Faults that are planted in a good capture are found by name, and a good capture has none.
+
+use raygrad::nerf::dataset::{Capture, Format, Point, Scope, Split, Survey, View, evenly_spaced};
+use raygrad::nerf::doctor::{
+    Finding, FindingKind as Kind, Options, Report, Resolution, Severity, examine, examine_cameras,
+};
+use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
+use raygrad::nerf::{Camera, Image, Lens};
+use raygrad_scenes::{Scene, embedded};
+use std::path::PathBuf;
+use std::sync::LazyLock;
+use tempfile::TempDir;
+
+/// Side of the images.
+const SIZE: usize = 160;
+
+/// Photographs of the embedded scene: 40 to train on, 8 to test on.
+static PHOTOGRAPHS: LazyLock<Vec<(Split, Camera, Image)>> = LazyLock::new(|| {
+    let of = |split: Split, count: usize| {
+        let frames = evenly_spaced(embedded(split, SIZE).frames, count);
+        frames.into_iter().map(move |frame| (split, frame.camera, frame.image.to_image()))
+    };
+    of(Split::Train, 40).chain(of(Split::Test, 8)).collect()
+});
+
+/// A capture in a temporary folder, to plant faults in.
+struct Planted {
+    folder: TempDir,
+    capture: Capture,
+    scope: Option<Scope>,
+}
+
+impl Planted {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let views = PHOTOGRAPHS.iter().enumerate().map(|(i, (split, camera, image))| {
+            let name = format!("{i:02}.png");
+            let path = folder.path().join(&name);
+            image.save_png(&path).unwrap();
+            View {
+                field: format!("frames[{i}]"),
+                name,
+                image: Some(path),
+                camera: camera.clone(),
+                split: Some(*split),
+                mask: None,
+                depth: None,
+                sharpness: None,
+                bounds: None,
+            }
+        });
+        let capture = Capture {
+            folder: folder.path().into(),
+            file: folder.path().join("transforms.json"),
+            format: Format::Transforms,
+            views: views.collect(),
+            points: vec![],
+            points_file: None,
+            aabb_scale: None,
+            applied: DAffine3::IDENTITY,
+        };
+        Planted { folder, capture, scope: None }
+    }
+
+    fn camera(&mut self, view: usize) -> &mut Camera {
+        &mut self.capture.views[view].camera
+    }
+
+    fn path(&self, view: usize) -> PathBuf {
+        self.capture.views[view].image.clone().unwrap()
+    }
+
+    fn redraw(&self, view: usize, change: impl Fn(&Image) -> Image) {
+        change(&PHOTOGRAPHS[view].2).save_png(self.path(view)).unwrap();
+    }
+
+    fn repose(&mut self, change: impl Fn(DAffine3) -> DAffine3) {
+        self.capture.views.iter_mut().for_each(|view| view.camera.pose = change(view.camera.pose));
+    }
+
+    fn mask(&mut self, view: usize, value: f32) {
+        let path = self.folder.path().join(format!("mask{view}.png"));
+        Image { width: SIZE, height: SIZE, channels: 1, data: vec![value; SIZE * SIZE] }.save_png(&path).unwrap();
+        self.capture.views[view].mask = Some(path);
+    }
+
+    fn survey(&self) -> Option<Survey> {
+        self.capture.survey(self.scope).ok()
+    }
+
+    fn cameras(&self) -> Report {
+        examine_cameras(&self.capture, self.survey().as_ref())
+    }
+
+    fn report(&self) -> Report {
+        examine(&self.capture, self.survey().as_ref(), &Options::default())
+    }
+}
+
+/// Of a kind, with this severity, about the views of these numbers; and nothing else is above a note but `beside`.
+#[track_caller]
+fn found(report: &Report, kind: Kind, severity: Severity, views: &[usize], beside: &[Kind]) {
+    let finding = report.finds(kind).unwrap_or_else(|| panic!("no {kind} among {:#?}", report.findings));
+    assert_eq!(finding.severity, severity, "{finding:#?}");
+    let named: Vec<usize> = finding.views.iter().map(|name| name.trim_end_matches(".png").parse().unwrap()).collect();
+    assert_eq!(named, views, "{finding:#?}");
+    let other = |finding: &&Finding| finding.severity > Note && finding.kind != kind && !beside.contains(&finding.kind);
+    let others: Vec<_> = report.findings.iter().filter(other).collect();
+    assert!(others.is_empty(), "beside {kind}: {others:#?}");
+}
+
+use Severity::{Error, Note, Warning};
+
+#[test]
+fn a_good_capture_has_no_findings() {
+    let report = Planted::new().report();
+    assert!(report.findings.is_empty(), "{:#?}", report.findings);
+    assert!(report.facts.agreement.unwrap() > 0.4, "{:?}", report.facts.agreement);
+    let parts: Vec<_> = report.facts.parts.iter().map(|part| (part.split, part.present, part.absent)).collect();
+    assert_eq!(parts, [(Split::Train, 40, 0), (Split::Test, 8, 0)]);
+    assert_eq!(report.facts.resolutions, [Resolution { width: SIZE, height: SIZE, photographs: 48 }]);
+    let again: Report = serde_json::from_str(&serde_json::to_string(&report).unwrap()).unwrap();
+    assert_eq!(again, report);
+}
+
+#[test]
+fn images_that_are_absent_broken_or_of_another_shape() {
+    let mut planted = Planted::new();
+    planted.capture.views[3].image = None;
+    found(&planted.cameras(), Kind::ImagesAbsent, Warning, &[3], &[]);
+
+    let planted = Planted::new();
+    std::fs::write(planted.path(5), b"not an image").unwrap();
+    let bytes = std::fs::read(planted.path(7)).unwrap();
+    std::fs::write(planted.path(7), &bytes[..bytes.len() / 2]).unwrap();
+    found(&planted.report(), Kind::ImagesUndecodable, Error, &[5, 7], &[]);
+
+    let planted = Planted::new();
+    let cropped =
+        |image: &Image| Image { height: SIZE - 20, data: image.data[..4 * SIZE * (SIZE - 20)].to_vec(), ..*image };
+    planted.redraw(4, cropped);
+    found(&planted.cameras(), Kind::ShapeMismatch, Error, &[4], &[]);
+
+    let planted = Planted::new();
+    planted.redraw(4, |image| image.downscaled(2));
+    let report = planted.report();
+    found(&report, Kind::MixedResolutions, Note, &[], &[]);
+    assert_eq!(report.facts.resolutions.len(), 2);
+}
+
+#[test]
+fn cameras_that_no_one_has() {
+    let mut planted = Planted::new();
+    planted.camera(2).focal = [10.0; 2];
+    found(&planted.cameras(), Kind::FieldOfView, Warning, &[2], &[]);
+    planted.camera(2).focal = [4000.0; 2];
+    found(&planted.cameras(), Kind::FieldOfView, Warning, &[2], &[]);
+    let mut planted = Planted::new();
+    planted.camera(6).focal[1] *= 1.2;
+    found(&planted.cameras(), Kind::PixelAspect, Warning, &[6], &[]);
+    let mut planted = Planted::new();
+    planted.camera(6).centre[0] = 30.0;
+    found(&planted.cameras(), Kind::PrincipalPoint, Warning, &[6], &[]);
+    let mut planted = Planted::new();
+    planted.camera(9).lens = Lens::Brown { k: [-2.0, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    found(&planted.cameras(), Kind::LensFolds, Warning, &[9], &[]);
+    planted.camera(9).lens = Lens::Brown { k: [0.02, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    assert!(planted.cameras().findings.is_empty());
+    planted.camera(9).lens = Lens::Brown { k: [2.0, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    found(&planted.cameras(), Kind::StrongDistortion, Note, &[9], &[]);
+}
+
+/// A pose as other programs would write it.
+type Convention = fn(DAffine3) -> DAffine3;
+
+/// With these signs of the camera's axes.
+fn turned(pose: DAffine3, signs: [f64; 3]) -> DAffine3 {
+    DAffine3 { matrix3: pose.matrix3 * DMat3::from_diagonal(signs.into()), ..pose }
+}
+
+/// In OpenCV's axes: y down, z ahead.
+fn opencv(pose: DAffine3) -> DAffine3 {
+    turned(pose, [1.0, -1.0, -1.0])
+}
+
+/// In a world whose x has the other sign, with a column of the rotation negated, so that it stays one.
+fn mirrored(pose: DAffine3, signs: [f64; 3]) -> DAffine3 {
+    turned(DAffine3::from_mat3(DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0))) * pose, signs)
+}
+
+#[test]
+fn conventions_are_told_apart() {
+    let conventions: [(&str, Convention, Kind); 6] = [
+        ("OpenCV", opencv, Kind::OpenCvAxes),
+        ("world to camera", |pose| pose.inverse(), Kind::WorldToCamera),
+        ("world to OpenCV camera", |pose| opencv(pose).inverse(), Kind::WorldToCamera),
+        ("mirrored", |pose| mirrored(pose, [-1.0, 1.0, 1.0]), Kind::Mirrored),
+        ("upside down", |pose| mirrored(pose, [1.0, -1.0, 1.0]), Kind::Mirrored),
+        ("backwards", |pose| mirrored(pose, [1.0, 1.0, -1.0]), Kind::Mirrored),
+    ];
+    for (name, convention, kind) in conventions {
+        let mut planted = Planted::new();
+        // Not around the origin: as most captures are.
+        let offset = DVec3::new(1.0, -2.0, 0.5);
+        planted.repose(|pose| convention(DAffine3 { translation: pose.translation + offset, ..pose }));
+        let surveyed = planted.report();
+        let settled = surveyed.finds(kind).unwrap_or_else(|| panic!("{name}: {:#?}", surveyed.findings));
+        assert_eq!(settled.severity, Error);
+        let beside = [Kind::CameraInBox, Kind::MissesBox, Kind::FarCamera, Kind::Leak];
+        found(&surveyed, kind, Error, &[], &beside);
+    }
+}
+
+#[test]
+fn poses_alone_tell_conventions_apart_too() {
+    let mut planted = Planted::new();
+    planted.repose(opencv);
+    found(&planted.cameras(), Kind::LooksAway, Warning, &[], &[Kind::CameraInBox, Kind::MissesBox]);
+    let mut planted = Planted::new();
+    planted.repose(|pose| pose.inverse());
+    found(&planted.cameras(), Kind::WorldToCamera, Warning, &[], &[]);
+    // And points prove it.
+    let points =
+        (0..100).map(|i| DVec3::new((f64::from(i) * 0.7).sin(), (f64::from(i) * 1.3).cos(), 0.01 * f64::from(i)));
+    let points: Vec<Point> = points.map(|p| Point { position: 0.5 * p, color: [0; 3], error: 0.5, views: 4 }).collect();
+    let mut planted = Planted::new();
+    planted.capture.points = points;
+    assert!(planted.cameras().findings.is_empty());
+    planted.repose(opencv);
+    found(&planted.cameras(), Kind::OpenCvAxes, Error, &[], &[Kind::CameraInBox, Kind::MissesBox]);
+}
+
+#[test]
+fn scales_that_differ_and_digits_that_are_lost() {
+    let mut planted = Planted::new();
+    planted.capture.points = vec![Point { position: DVec3::splat(5000.0), color: [0; 3], error: 0.1, views: 5 }; 20];
+    found(&planted.cameras(), Kind::Scale, Warning, &[], &[]);
+    let mut planted = Planted::new();
+    planted.capture.format = Format::Blender;
+    assert!(planted.cameras().findings.is_empty());
+    planted.repose(|pose| DAffine3 { translation: 1000.0 * pose.translation, ..pose });
+    found(&planted.cameras(), Kind::Scale, Warning, &[], &[]);
+    let mut planted = Planted::new();
+    planted.repose(|pose| DAffine3 { translation: pose.translation + DVec3::new(5e6, 0.0, 0.0), ..pose });
+    found(&planted.cameras(), Kind::FarFromOrigin, Note, &[], &[]);
+}
+
+#[test]
+fn single_poses_that_are_wrong() {
+    let mut planted = Planted::new();
+    // Looks at the same place from another side than the photograph.
+    let other = planted.camera(20).pose;
+    let turn = DMat3::from_quat(DQuat::from_rotation_z(0.6));
+    planted.camera(11).pose = DAffine3 { matrix3: turn * other.matrix3, translation: turn * other.translation };
+    // The camera is turned by 6 degrees.
+    let pose = planted.camera(30).pose;
+    planted.camera(30).pose.matrix3 = DMat3::from_quat(DQuat::from_rotation_x(0.1)) * pose.matrix3;
+    found(&planted.report(), Kind::WrongPose, Warning, &[11, 30], &[]);
+
+    let mut planted = Planted::new();
+    planted.camera(10).pose = planted.capture.views[12].camera.pose;
+    found(
+        &planted.report(),
+        Kind::DuplicatePoses,
+        Warning,
+        &[12],
+        &[Kind::WrongPose, Kind::ExposureJump, Kind::WhiteBalanceJump],
+    );
+
+    let mut planted = Planted::new();
+    planted.camera(10).pose.translation *= 12.0;
+    found(&planted.cameras(), Kind::FarCamera, Warning, &[10], &[]);
+    // In any unit.
+    planted.repose(|pose| DAffine3 { translation: 0.01 * pose.translation, ..pose });
+    assert_eq!(planted.cameras().finds(Kind::FarCamera).unwrap().views, ["10.png"]);
+
+    let mut planted = Planted::new();
+    planted.camera(10).pose.matrix3 *= DMat3::from_rotation_z(1.6);
+    found(&planted.cameras(), Kind::Roll, Note, &[10], &[]);
+
+    // Images and poses in different orders.
+    let mut planted = Planted::new();
+    let poses: Vec<DAffine3> = planted.capture.views.iter().map(|view| view.camera.pose).collect();
+    (0..48).for_each(|i| planted.camera(i).pose = poses[(i * 17 + 5) % 48]);
+    found(&planted.report(), Kind::NoAgreement, Warning, &[], &[]);
+}
+
+#[test]
+fn one_image_under_two_names() {
+    let planted = Planted::new();
+    std::fs::copy(planted.path(8), planted.path(9)).unwrap();
+    found(
+        &planted.report(),
+        Kind::DuplicateImages,
+        Warning,
+        &[9],
+        &[Kind::WrongPose, Kind::ExposureJump, Kind::WhiteBalanceJump],
+    );
+    let mut planted = Planted::new();
+    std::fs::copy(planted.path(8), planted.path(41)).unwrap();
+    planted.camera(41).pose = planted.capture.views[8].camera.pose;
+    found(&planted.report(), Kind::Leak, Warning, &[41], &[]);
+}
+
+#[test]
+fn photographs_that_are_blurred_bright_or_of_another_colour() {
+    let planted = Planted::new();
+    planted.redraw(6, |image| blurred(image, 3));
+    found(&planted.report(), Kind::Blurred, Warning, &[6], &[]);
+    let planted = Planted::new();
+    planted.redraw(6, |image| tinted(image, [0.6; 3]));
+    found(&planted.report(), Kind::ExposureJump, Warning, &[6], &[]);
+    let planted = Planted::new();
+    planted.redraw(6, |image| tinted(image, [1.0, 0.95, 0.45]));
+    found(&planted.report(), Kind::WhiteBalanceJump, Warning, &[6], &[]);
+}
+
+#[test]
+fn masks_and_alpha_that_say_nothing() {
+    let mut planted = Planted::new();
+    planted.mask(3, 0.0);
+    planted.mask(4, 1.0);
+    let report = planted.report();
+    found(&report, Kind::MaskHidesAll, Error, &[3], &[]);
+    found(&report, Kind::MaskHidesNothing, Note, &[4], &[Kind::MaskHidesAll]);
+
+    let planted = Planted::new();
+    let opaque = |image: &Image| {
+        let data = image.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], 1.0]).collect();
+        Image { data, ..*image }
+    };
+    planted.redraw(3, opaque);
+    found(
+        &planted.report(),
+        Kind::OpaqueAlpha,
+        Warning,
+        &[3],
+        &[Kind::ExposureJump, Kind::WhiteBalanceJump, Kind::Blurred],
+    );
+    (0..48).for_each(|view| planted.redraw(view, opaque));
+    found(&planted.report(), Kind::OpaqueAlpha, Note, &(0..48).collect::<Vec<_>>(), &[]);
+}
+
+#[test]
+fn places_that_give_no_depth_or_leave_gaps() {
+    let mut planted = Planted::new();
+    planted.repose(|pose| DAffine3 { translation: DVec3::ZERO, ..pose });
+    found(&planted.cameras(), Kind::OnePlace, Error, &[], &[]);
+
+    let mut planted = Planted::new();
+    let mut x = 0.0;
+    planted.capture.views.iter_mut().for_each(|view| {
+        x += 0.1;
+        let eye = DVec3::new(x - 2.5, -4.0, 1.0);
+        view.camera.pose = Camera::look_at(eye, DVec3::ZERO, DVec3::Z);
+    });
+    found(&planted.cameras(), Kind::OnALine, Warning, &[], &[]);
+
+    let mut planted = Planted::new();
+    planted.capture.views.retain(|view| view.camera.pose.translation.y > 0.5);
+    found(&planted.cameras(), Kind::CoverageGap, Note, &[], &[Kind::FewPhotographs]);
+
+    let mut planted = Planted::new();
+    planted.scope = Some(Scope::Bounded);
+    planted.camera(7).pose.translation *= 0.2;
+    planted.camera(8).pose.matrix3 *= DMat3::from_rotation_y(3.0);
+    let report = planted.cameras();
+    found(&report, Kind::CameraInBox, Warning, &[7], &[Kind::MissesBox]);
+    found(&report, Kind::MissesBox, Warning, &[8], &[Kind::CameraInBox]);
+}
+
+#[test]
+fn few_photographs_or_none_held_out() {
+    let mut planted = Planted::new();
+    planted.capture.views.retain(|view| view.split == Some(Split::Train));
+    found(&planted.cameras(), Kind::NothingHeldOut, Note, &[], &[]);
+    planted.capture.views.truncate(12);
+    found(&planted.cameras(), Kind::FewPhotographs, Warning, &[], &[]);
+    planted.capture.views.truncate(4);
+    found(&planted.cameras(), Kind::FewPhotographs, Error, &[], &[]);
+    planted.capture.views.clear();
+    let report = planted.report();
+    assert!(report.facts.lie.is_none());
+    found(&report, Kind::FewPhotographs, Error, &[], &[]);
+}
+
+#[test]
+fn every_kind_has_a_name_of_its_own() {
+    let names: std::collections::BTreeSet<_> = Kind::ALL.iter().map(|kind| kind.name()).collect();
+    assert_eq!(names.len(), Kind::ALL.len());
+    for kind in Kind::ALL {
+        assert_eq!(serde_json::to_string(kind).unwrap(), format!("\"{kind}\""));
+        assert!(kind.name().chars().all(|c| c.is_ascii_lowercase() || c == '-'));
+    }
+}
+
+/// The mean over squares of pixels.
+fn blurred(image: &Image, half: usize) -> Image {
+    let mut out = image.clone();
+    for y in 0..image.height {
+        for x in 0..image.width {
+            let columns = x.saturating_sub(half)..(x + half + 1).min(image.width);
+            let rows = y.saturating_sub(half)..(y + half + 1).min(image.height);
+            let count = (columns.len() * rows.len()) as f32;
+            for channel in 0..image.channels {
+                let values = rows.clone().flat_map(|v| columns.clone().map(move |u| (u, v)));
+                out.pixel_mut(x, y)[channel] = values.map(|(u, v)| image.pixel(u, v)[channel]).sum::<f32>() / count;
+            }
+        }
+    }
+    out
+}
+
+/// With its colours multiplied.
+fn tinted(image: &Image, factors: [f32; 3]) -> Image {
+    let mut out = image.clone();
+    for pixel in out.data.chunks_exact_mut(image.channels) {
+        (0..3).for_each(|i| pixel[i] *= factors[i]);
+    }
+    out
+}
+
+#[test]
+fn a_good_capture_through_a_lens_half_masked_and_lying_on_its_side_has_none_either() {
+    let mut planted = Planted::new();
+    let size = [200, 130];
+    let scene = Scene::bulldozer();
+    let mut mask = Image { width: size[0], height: size[1], channels: 1, data: vec![1.0; size[0] * size[1]] };
+    // The right quarter, behind the bulldozer, is hidden.
+    (0..size[1]).for_each(|y| (150..size[0]).for_each(|x| mask.pixel_mut(x, y)[0] = 0.0));
+    let hidden = planted.folder.path().join("mask.png");
+    mask.save_png(&hidden).unwrap();
+    let mut number = 0;
+    planted.capture.views.retain(|view| {
+        number += 1;
+        view.split == Some(Split::Train) || number % 2 == 0
+    });
+    let lens = Lens::Brown { k: [-0.12, 0.02, 0.0, 0.0, 0.0, 0.0], p: [0.003, -0.002] };
+    for view in &mut planted.capture.views {
+        let focal = view.camera.focal[0];
+        let (focal, centre) = ([focal, 1.04 * focal], [94.0, 70.0]);
+        view.camera = Camera { width: size[0], height: size[1], focal, centre, lens, pose: view.camera.pose };
+        view.mask = Some(hidden.clone());
+        scene.render(&view.camera, 2).color.save_png(view.image.as_ref().unwrap()).unwrap();
+    }
+    let turn = DAffine3::from_rotation_x(1.2) * DAffine3::from_rotation_z(0.5);
+    planted.repose(|pose| turn * pose);
+    let report = planted.report();
+    let above: Vec<_> = report.findings.iter().filter(|finding| finding.severity > Note).collect();
+    assert!(above.is_empty(), "{above:#?}");
+    let facts = report.facts;
+    assert!(facts.agreement.unwrap() > 0.4, "{:?}", facts.agreement);
+    assert_eq!(facts.resolutions.iter().map(|r| [r.width, r.height]).collect::<Vec<_>>(), [size]);
+    let lie = facts.lie.unwrap();
+    assert!(lie.up.dot(turn.transform_vector3(DVec3::Z)) > 0.98, "{lie:?}");
+    assert!(lie.middle.length() < 0.5 && lie.near < lie.far, "{lie:?}");
+    assert_eq!((facts.lenses.len(), facts.points), (1, 0));
+}
+
+#[test]
+fn each_of_very_many_equal_poses_is_named_once() {
+    let mut planted = Planted::new();
+    let (first, other) = (planted.capture.views[0].clone(), planted.capture.views[45].clone());
+    let count = 1200;
+    // One of eight held out, or the last ones, or the first ones, as files have them.
+    let splits: [fn(usize) -> bool; 3] = [|i| i % 8 == 0, |i| i >= 600, |i| i < 600];
+    for is_held_out in splits {
+        let held_out = (0..count).filter(|i| is_held_out(*i)).count();
+        planted.capture.views = (0..count)
+            .map(|i| View {
+                name: format!("{i}.png"),
+                split: Some(if is_held_out(i) { Split::Test } else { Split::Train }),
+                ..if i == 5 { other.clone() } else { first.clone() }
+            })
+            .collect();
+        let report = planted.cameras();
+        let views = |kind: Kind| &report.finds(kind).unwrap().views;
+        // All held-out ones have the pose of a training one, but for the one elsewhere; all but the first of each that of another.
+        assert_eq!(views(Kind::Leak).len(), held_out - usize::from(is_held_out(5)));
+        assert_eq!(views(Kind::DuplicatePoses).len(), count - 3);
+        assert!(
+            report.finds(Kind::DuplicatePoses).unwrap().what.starts_with("the pose of 1197 photographs is exactly")
+        );
+        assert_eq!(*views(Kind::FarCamera), ["5.png"]);
+    }
+}
+
+#[test]
+fn each_of_several_equal_poses_is_named_once() {
+    let mut planted = Planted::new();
+    let pose = planted.capture.views[10].camera.pose;
+    for i in [11, 12, 13] {
+        planted.camera(i).pose = pose;
+    }
+    let report = planted.cameras();
+    let finding = report.finds(Kind::DuplicatePoses).unwrap();
+    assert_eq!(finding.views, ["11.png", "12.png", "13.png"]);
+    let expected = "the pose of 3 photographs is exactly that of another: `11.png` and `10.png`, and others";
+    assert_eq!(finding.what, expected);
+}
+
+#[test]
+fn photographs_from_one_place_in_other_directions_are_not_alike() {
+    let finds = |to: usize, angle: f64, kind: Kind| {
+        let mut planted = Planted::new();
+        let pose = planted.camera(8).pose;
+        planted.camera(to).pose = DAffine3 { matrix3: DMat3::from_rotation_x(angle) * pose.matrix3, ..pose };
+        planted.cameras().finds(kind).is_some()
+    };
+    for (angle, duplicate, leak) in [(0.0, true, true), (1e-4, false, true), (0.02, false, false)] {
+        assert_eq!(finds(9, angle, Kind::DuplicatePoses), duplicate, "turned by {angle}");
+        assert_eq!(finds(41, angle, Kind::Leak), leak, "turned by {angle}");
+    }
+}

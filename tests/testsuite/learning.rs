@@ -1,0 +1,102 @@
+//! End to end: photographs and cameras go in, and views that were held out come out.
+
+use raygrad::nerf::dataset::{Dataset, Split, load};
+use raygrad::nerf::encoding::hash_grid::HashGridConfig;
+use raygrad::nerf::pictures::metrics;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
+use raygrad::nerf::sampling::marching::MarchingConfig;
+use raygrad::nerf::space::occupancy::Skip;
+use raygrad::nerf::{
+    Budget, ClassicConfig, Config, FieldConfig, Image, InstantConfig, Loss, Preset, SamplerConfig, Trainer, VoxelConfig,
+};
+use raygrad_scenes::embedded;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Networks that learn the rough shape of a scene in seconds.
+fn config() -> Config {
+    let paper = ClassicConfig::paper();
+    let fine = ClassicConfig { depth: 3, width: 48, skips: vec![], view_width: 24, position_levels: 5, ..paper };
+    let coarse = ClassicConfig { depth: 2, width: 24, position_levels: 4, ..fine.clone() };
+    let sampler = HierarchicalConfig {
+        proposal: coarse,
+        coarse: 24,
+        fine: 16,
+        batch: 256,
+        tile: 16,
+        ..HierarchicalConfig::default()
+    };
+    let (field, sampler) = (FieldConfig::new(fine), SamplerConfig::new(sampler));
+    Config { field, sampler, ..Config::preset(Preset::Small) }
+}
+
+/// A small hash grid, marched with few samples.
+fn instant() -> Config {
+    let mut config = Config::preset(Preset::Instant);
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
+        field.grid = HashGridConfig { levels: 4, log2_table: 14, finest: 128, ..field.grid };
+    }
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
+        sampler.samples = 1 << 13;
+        sampler.step = 1.0 / 100.0;
+        sampler.occupancy.resolution = 32;
+    }
+    config
+}
+
+/// A coarse grid of voxels, marched with few samples.
+fn voxel() -> Config {
+    let field = FieldConfig::new(VoxelConfig { resolution: 32, direction_degree: 2 });
+    Config { field, sampler: instant().sampler, ..Config::preset(Preset::Voxel) }
+}
+
+/// The mean PSNR, in dB, of held-out views after 200 steps on `train`, and that of blank pictures.
+fn learn(config: Config, train: Dataset, test: &Dataset) -> [f64; 2] {
+    let white = [1.0; 3];
+    let mut trainer = Trainer::new(config, Arc::new(train)).unwrap();
+    trainer.run(Budget::Steps(200), |_| ControlFlow::Continue(()));
+    assert_eq!(trainer.stats().skipped, 0, "no gradient was infinite or NaN");
+    let mut sums = [0.0; 2];
+    for frame in &test.frames {
+        let truth = frame.image.over(white);
+        let learnt = trainer.model.view(&frame.camera, white).color;
+        let blank = Image { data: vec![1.0; truth.data.len()], ..truth.clone() };
+        sums[0] += metrics::psnr(&learnt, &truth);
+        sums[1] += metrics::psnr(&blank, &truth);
+    }
+    sums.map(|sum| sum / test.frames.len() as f64)
+}
+
+#[test]
+fn the_embedded_scene_is_learnt_in_seconds() {
+    // Any field is to work with any sampler.
+    let marched = config().with_skip(Skip::Fast);
+    let huber = Config { loss: Loss::Huber { delta: 0.1 }, ..instant() };
+    let configs = [
+        ("hierarchical", config()),
+        ("marched", marched),
+        ("instant", instant()),
+        ("huber", huber),
+        ("voxel", voxel()),
+    ];
+    for (name, config) in configs {
+        let [learnt, blank] = learn(config, embedded(Split::Train, 40), &embedded(Split::Test, 40));
+        println!("{name}: {learnt:.2} dB against {blank:.2} dB of blank pictures");
+        assert!(learnt > 18.0 && learnt > blank + 8.0, "{name}: {learnt:.2} dB against {blank:.2} dB");
+    }
+}
+
+#[test]
+fn lego_is_learnt_in_seconds() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/lego");
+    if !folder.is_dir() {
+        println!("skipped: there is no folder {}", folder.display());
+        return;
+    }
+    let [train, mut test] = [Split::Train, Split::Test].map(|split| load(&folder, split, 10).unwrap());
+    test.frames.truncate(20);
+    let [learnt, blank] = learn(config(), train, &test);
+    println!("{learnt:.2} dB against {blank:.2} dB of blank pictures");
+    assert!(learnt > 14.0 && learnt > blank + 5.0, "{learnt:.2} dB against {blank:.2} dB");
+}

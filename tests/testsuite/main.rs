@@ -1,0 +1,13 @@
+//! What the crates promise together: gradients, stability, training from end to end.
+
+mod determinism;
+mod doctor;
+mod gradients;
+mod learning;
+mod parts;
+mod pictures;
+mod refine;
+mod stability;
+mod startup;
+mod tape;
+mod training;

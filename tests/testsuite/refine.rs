@@ -1,0 +1,293 @@
+//! Cameras that are corrected while a scene is trained.
+
+use raygrad::Real;
+use raygrad::Schedule;
+use raygrad::nerf::camera::Pose;
+use raygrad::nerf::dataset::{Dataset, Placement, Split};
+use raygrad::nerf::encoding::hash_grid::HashGridConfig;
+use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad::nerf::model::Refined;
+use raygrad::nerf::sampling::marching::MarchingConfig;
+use raygrad::nerf::{Camera, Config, InstantConfig, Lens, Model, Preset, Trainer, fitted_cameras};
+use raygrad_scenes::Scene;
+use raygrad_scenes::embedded;
+use std::sync::Arc;
+
+/// A small instant model.
+fn instant() -> Config {
+    let mut config = Config::preset(Preset::Instant);
+    let field = config.field.get_mut::<InstantConfig>().unwrap();
+    field.grid = HashGridConfig { levels: 6, features: 2, log2_table: 14, coarsest: 8, finest: 96 };
+    (field.density_width, field.color_width) = (16, 16);
+    let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
+    (sampler.step, sampler.view_step, sampler.samples, sampler.occupancy.resolution) = (0.02, 0.01, 8192, 32);
+    config
+}
+
+/// Photographs of the embedded scene through that lens.
+fn photographs(count: usize, size: usize, lens: Lens) -> Dataset {
+    let mut data = embedded(Split::Train, 8);
+    data.frames.truncate(count);
+    let scene = Scene::bulldozer();
+    for frame in &mut data.frames {
+        frame.camera = Camera { lens, ..frame.camera.resized(size, size) };
+        frame.image = scene.render(&frame.camera, 3).color.into();
+    }
+    data
+}
+
+/// The same with cameras that are off by so many degrees, by a share of the scene's size, and by a factor of the focal
+/// length.
+fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
+    let mut wrong = data.clone();
+    let size = (data.bounds[1] - data.bounds[0]).max_element();
+    for (i, frame) in wrong.frames.iter_mut().enumerate() {
+        let direction =
+            |k: f64| DVec3::from([1.0, 2.0, 3.0].map(|j| (k * j * (i as f64 + 1.0) + j * j).sin())).normalize();
+        let turn = Pose::from_vector((degrees.to_radians() * direction(1.7)).to_array(), [0.0; 3]);
+        frame.camera.pose.matrix3 = DAffine3::from(turn).matrix3 * frame.camera.pose.matrix3;
+        frame.camera.pose.translation += share * size * direction(2.9);
+        frame.camera.focal = frame.camera.focal.map(|focal| factor * focal);
+    }
+    wrong
+}
+
+fn train(trainer: &mut Trainer, steps: u32) {
+    for i in 0..steps {
+        trainer.step(f64::from(i) / f64::from(steps));
+    }
+}
+
+/// The mean error of the cameras that were found: degrees, and a share of the scene's size, after the similarity that
+/// nobody can know.
+fn errors(model: &Model<f32>, right: &Dataset, wrong: &Dataset) -> [f64; 2] {
+    let found: Vec<Camera> =
+        wrong.frames.iter().enumerate().map(|(i, frame)| model.learned_camera(i, &frame.camera)).collect();
+    let place = |cameras: &[Camera]| -> Vec<DVec3> { cameras.iter().map(|camera| camera.pose.translation).collect() };
+    let right_cameras: Vec<Camera> = right.frames.iter().map(|frame| frame.camera.clone()).collect();
+    let placement = Placement::between(&place(&right_cameras), &place(&found)).unwrap();
+    let size = (right.bounds[1] - right.bounds[0]).max_element();
+    let each = found.iter().zip(&right_cameras).map(|(found, right)| {
+        let right = placement.camera(right);
+        let turn = found.pose.matrix3.transpose() * right.pose.matrix3;
+        let angle = (0.5 * (turn.x_axis.x + turn.y_axis.y + turn.z_axis.z - 1.0)).clamp(-1.0, 1.0).acos();
+        [angle.to_degrees(), found.pose.translation.distance(right.pose.translation) / (placement.scale * size)]
+    });
+    let sum = each.fold([0.0; 2], |[a, b], [c, d]| [a + c, b + d]);
+    sum.map(|x| x / found.len() as f64)
+}
+
+/// A field that was trained with the right cameras and rests, and the wrong cameras that move.
+fn before_a_known_scene(config: Config, right: &Dataset, wrong: &Dataset) -> Trainer {
+    let is_camera = |name: &str| ["poses", "focal", "lens", "exposure", "vignetting"].contains(&name);
+    let mut known = Trainer::new(config.clone(), Arc::new(right.clone())).unwrap();
+    known.model.params.freeze(is_camera);
+    train(&mut known, 400);
+    let mut trainer = Trainer::new(config, Arc::new(wrong.clone())).unwrap();
+    trainer.model.params.assign(&known.model.params);
+    trainer.model.sampler = known.model.sampler.boxed();
+    trainer.model.params.freeze(|_| true);
+    trainer.model.params.unfreeze(is_camera);
+    trainer
+}
+
+#[test]
+fn poses_are_found_in_a_scene_that_is_known() {
+    let right = photographs(24, 48, Lens::Pinhole);
+    let wrong = disturbed(&right, 2.0, 0.02, 1.0);
+    let mut config = instant().with_refined(&[Refined::Poses]);
+    config.refine.coarse = 0.0;
+    config.poses = Some(Schedule::Exponential { from: 5e-3, to: 2e-5, warmup: 0.0 });
+    let mut trainer = before_a_known_scene(config, &right, &wrong);
+    let before = errors(&trainer.model, &right, &wrong);
+    train(&mut trainer, 600);
+    let after = errors(&trainer.model, &right, &wrong);
+    println!("poses {before:?} to {after:?}");
+    assert!(before[0] > 1.5 && before[1] > 0.015, "{before:?}");
+    assert!(after[0] < 0.15 * before[0] && after[1] < 0.3 * before[1], "{before:?} {after:?}");
+}
+
+#[test]
+fn a_focal_length_is_found_in_a_scene_that_is_known() {
+    let right = photographs(24, 48, Lens::Pinhole);
+    let wrong = disturbed(&right, 0.0, 0.0, 1.05);
+    let mut config = instant().with_refined(&[Refined::Focal]);
+    config.refine.focal = Some(Schedule::Exponential { from: 3e-3, to: 1e-4, warmup: 0.0 });
+    let mut trainer = before_a_known_scene(config, &right, &wrong);
+    train(&mut trainer, 300);
+    let camera = trainer.model.learned_camera(3, &wrong.frames[3].camera);
+    let off = [0, 1].map(|k| camera.focal[k] / right.frames[3].camera.focal[k] - 1.0);
+    println!("the focal length is off by {off:?}");
+    assert!(off.iter().all(|off| off.abs() < 2e-3), "{off:?}");
+}
+
+#[test]
+fn a_lens_is_found_with_the_focal_length() {
+    let glass = Lens::Brown { k: [-0.2, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
+    let right = photographs(16, 48, glass);
+    let mut wrong = disturbed(&right, 0.0, 0.0, 1.03);
+    wrong.frames.iter_mut().for_each(|frame| frame.camera.lens = Lens::Pinhole);
+    let mut config = instant().with_refined(&[Refined::Focal, Refined::Lens]);
+    config.refine.focal = Some(Schedule::Exponential { from: 2e-3, to: 1e-4, warmup: 0.0 });
+    config.refine.lens = Some(Schedule::Exponential { from: 5e-3, to: 2e-4, warmup: 0.0 });
+    let mut trainer = before_a_known_scene(config, &right, &wrong);
+    train(&mut trainer, 400);
+    let (found, right) = (trainer.model.learned_camera(2, &wrong.frames[2].camera), &right.frames[2].camera);
+    // How far pixels are from where they belong, at most, in pixels.
+    let apart = |camera: &Camera| {
+        let places =
+            (0..49).map(|i| right.ray(4.0 + f64::from(i % 7) * 40.0 / 6.0, 4.0 + f64::from(i / 7) * 40.0 / 6.0));
+        let off = places.map(|ray| {
+            let [a, b] = [camera, right].map(|camera| camera.pixel_of(ray.at(4.0)).unwrap());
+            let off = (a[0] - b[0]).hypot(a[1] - b[1]);
+            assert!(off.is_finite(), "{a:?} {b:?}");
+            off
+        });
+        off.fold(0.0, f64::max)
+    };
+    let (before, after) = (apart(&wrong.frames[2].camera), apart(&found));
+    println!("pixels are off by {before} and then by {after}: {:?}, {:?}", found.focal, found.lens);
+    assert!(before > 0.8 && after < 0.15 * before, "{before} {after}");
+}
+
+#[test]
+fn what_was_found_of_cameras_is_stored_with_the_model() {
+    let data = photographs(6, 16, Lens::Pinhole);
+    let config = instant().with_refined(&[Refined::Poses, Refined::Focal, Refined::Lens]);
+    let mut trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
+    train(&mut trainer, 10);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    trainer.model.save(&path).unwrap();
+    let read = Model::load(&path, config.clone(), trainer.model.extent).unwrap();
+    let camera = &data.frames[4].camera;
+    let [one, other] = [&trainer.model, &read].map(|model| model.learned_camera(4, camera));
+    assert!(one == other && one != *camera && one.lens != camera.lens && one.focal != camera.focal);
+    assert_eq!(read.other_camera(camera), trainer.model.other_camera(camera));
+    assert_eq!(read.cameras().len(), 6);
+    let again = read.cast::<f64>().unwrap().learned_camera(4, camera);
+    assert_eq!(again, one);
+    // A configuration from before cameras could be corrected still loads.
+    let mut value = serde_json::to_value(instant()).unwrap();
+    value.as_object_mut().unwrap().remove("refine").unwrap();
+    assert_eq!(serde_json::from_value::<Config>(value).unwrap(), instant());
+    let error = Model::<f32>::new(config, trainer.model.extent, 0).err().unwrap().to_string();
+    assert!(error.starts_with("`refine.focal`"), "{error}");
+}
+
+#[test]
+fn detail_comes_in_from_coarse_to_fine() {
+    let data = Arc::new(photographs(6, 16, Lens::Pinhole));
+    let config = instant().with_refined(&[Refined::Poses]);
+    let mut trainer = Trainer::new(config, data).unwrap();
+    let table = trainer.model.params.find("field.table").unwrap();
+    let rows = |trainer: &Trainer| trainer.model.params.get(table).as_slice().to_vec();
+    let untouched = rows(&trainer);
+    trainer.step(0.01);
+    let first = rows(&trainer);
+    // The three coarsest of six levels: the last rows belong to the finest.
+    let moved = |a: &[f32], b: &[f32]| a.iter().zip(b).rposition(|(a, b)| a != b).unwrap() as f64 / a.len() as f64;
+    let early = moved(&untouched, &first);
+    trainer.step(0.5);
+    let late = moved(&first, &rows(&trainer));
+    assert!(early < 0.5 && late > 0.9, "{early} {late}");
+    let mut model = trainer.model.clone();
+    let view = |model: &Model<f32>| model.view(&model.cameras()[0].clone(), [1.0; 3]).color;
+    let whole = view(&model);
+    model.set_detail(1.0);
+    assert!(view(&model) == whole, "after that share of the run everything is there");
+    model.set_detail(0.0);
+    assert!(view(&model) != whole);
+}
+
+#[test]
+fn exposures_and_vignetting_are_found_in_a_scene_that_is_known() {
+    let right = photographs(24, 32, Lens::Pinhole);
+    let mut seen = right.clone();
+    // From .55 to 1 times as bright, so that nothing is cut off, the red more than the blue; and corners at half of the
+    // brightness of the middle.
+    let exposure = |i: usize| {
+        let e = 0.3 * ((2.0 * i as f64 + 0.3).sin() - 1.0);
+        [e, 0.8 * e, 0.5 * e]
+    };
+    for (i, frame) in seen.frames.iter_mut().enumerate() {
+        let mut image = frame.image.to_image();
+        for (place, pixel) in image.data.chunks_exact_mut(4).enumerate() {
+            let off_axis = frame.camera.off_axis([place % 32, place / 32]);
+            pixel.iter_mut().zip(exposure(i)).for_each(|(x, e)| *x *= (e - 0.7 * off_axis).exp() as f32);
+        }
+        frame.image = image.into();
+    }
+    let mut config = instant().with_refined(&[Refined::Exposure, Refined::Vignetting]);
+    let rate = Some(Schedule::Exponential { from: 2e-2, to: 2e-4, warmup: 0.0 });
+    (config.tone.exposure, config.tone.vignetting) = (rate, rate);
+    let mut trainer = before_a_known_scene(config, &right, &seen);
+    train(&mut trainer, 300);
+    let model = &trainer.model;
+    let numbers = |name: &str| model.params.get(model.params.find(name).unwrap()).as_slice().to_vec();
+    let found = numbers("exposure");
+    for k in 0..3 {
+        let off = (0..24).map(|i| f64::from(found[3 * i + k]) - exposure(i)[k]);
+        let worst = off.map(f64::abs).reduce(Real::maximum).unwrap();
+        println!("exposures of channel {k} are off by {worst}");
+        assert!(worst < [0.03, 0.03, 0.06][k], "{k}: {worst}");
+    }
+    let vignetting = numbers("vignetting");
+    println!("vignetting {vignetting:?}");
+    // The bulldozer does not reach the corners.
+    for s in [0.1_f32, 0.2, 0.3] {
+        let falloff = s * (vignetting[0] + s * (vignetting[1] + s * vignetting[2]));
+        assert!((falloff + 0.7 * s).abs() < 0.03, "{s}: {falloff}");
+    }
+    // A view like a photograph is one; a view of one's own is as bright as all on average, to its corners.
+    let mut model = model.clone();
+    model.finish();
+    let mut error = |look: Option<u32>, vignetted: bool, truth: &Dataset| {
+        (model.look, model.vignetted) = (look, vignetted);
+        let view = model.view(&right.frames[5].camera, [0.0; 3]).color;
+        let truth = truth.frames[5].image.over([0.0; 3]);
+        let [sum, all] =
+            view.data.iter().zip(&truth.data).fold([0.0; 2], |[sum, all], (a, b)| [sum + (a - b).abs(), all + b]);
+        sum / all
+    };
+    let [own, bright_corners, usual] =
+        [error(Some(5), true, &seen), error(Some(5), false, &seen), error(None, false, &seen)];
+    println!("photograph 5 is off by {own}, {bright_corners} and {usual}");
+    assert!(own < 0.9 * bright_corners && own < 0.5 * usual, "{own} {bright_corners} {usual}");
+}
+
+#[test]
+fn photographs_that_were_not_trained_on_are_found_where_they_belong_and_nothing_else_moves() {
+    let right = photographs(30, 48, Lens::Pinhole);
+    let (mut known, mut held_out) = (right.clone(), right);
+    held_out.frames = known.frames.split_off(24);
+    let mut config = instant().with_refined(&[Refined::Exposure]);
+    config.field.get_mut::<InstantConfig>().unwrap().codes = 2;
+    let mut trainer = Trainer::new(config, Arc::new(known)).unwrap();
+    train(&mut trainer, 400);
+    trainer.model.finish();
+    let model = &trainer.model;
+    let before = model.params.values().to_vec();
+    let mut wrong = disturbed(&held_out, 1.0, 0.01, 1.0);
+    // The scene lies where the model has it.
+    wrong.bounds = wrong.bounds.map(|corner| 1.5 * corner);
+    let found = fitted_cameras(model, wrong.clone()).unwrap();
+    assert_eq!(model.params.values(), before);
+    // By how many pixels places of the scene are off, in the mean: a turn and a step to the side look alike.
+    let places: Vec<DVec3> =
+        (0..8_u8).map(|i| DVec3::from([1, 2, 4].map(|bit| if i & bit == 0 { -0.6 } else { 0.6 }))).collect();
+    let off = |cameras: &[Camera]| {
+        let each = cameras.iter().zip(&held_out.frames).flat_map(|(camera, right)| {
+            places.iter().map(move |place| {
+                let [a, b] = [camera, &right.camera].map(|camera| camera.pixel_of(*place).unwrap());
+                (a[0] - b[0]).hypot(a[1] - b[1])
+            })
+        });
+        each.sum::<f64>() / (8 * cameras.len()) as f64
+    };
+    let given: Vec<Camera> = wrong.frames.iter().map(|frame| frame.camera.clone()).collect();
+    let (before, after) = (off(&given), off(&found));
+    println!("off by {before:?} and then by {after:?}");
+    assert!(before > 0.6 && after < 0.3 * before, "{before} {after}");
+    assert!(found.iter().zip(&given).all(|(a, b)| a.focal == b.focal && a.lens == b.lens));
+}

@@ -1,0 +1,48 @@
+//! Captures of very many poses: what is said of them is bounded by their number.
+
+use raygrad::nerf::Camera;
+use raygrad::nerf::dataset::{Capture, Format, Split, View};
+use raygrad::nerf::doctor::{FindingKind, examine_cameras};
+use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad_test_support::memory::peak;
+
+/// Photographs with one pose but for the last one, every eighth held out.
+fn capture(count: usize) -> Capture {
+    let view = |i: usize| {
+        let eye = if i + 1 == count { DVec3::new(9.0, 0.0, 1.0) } else { DVec3::new(4.0, 0.0, 1.0) };
+        View {
+            name: format!("images/{i:06}.png"),
+            field: format!("frames[{i}]"),
+            image: Some(format!("absent/{i}.png").into()),
+            camera: Camera::from_angle(16, 16, 0.7, Camera::look_at(eye, DVec3::ZERO, DVec3::Z)),
+            split: Some(if i.is_multiple_of(8) { Split::Test } else { Split::Train }),
+            mask: None,
+            depth: None,
+            sharpness: None,
+            bounds: None,
+        }
+    };
+    Capture {
+        folder: "scene".into(),
+        file: "scene/transforms.json".into(),
+        format: Format::Transforms,
+        views: (0..count).map(view).collect(),
+        points: vec![],
+        points_file: None,
+        aabb_scale: None,
+        applied: DAffine3::IDENTITY,
+    }
+}
+
+#[test]
+fn doctor_takes_memory_in_proportion_to_equal_poses() {
+    // A pair of names for each pair of photographs was 8 GB of 20 000.
+    for count in [2_000, 20_000] {
+        let capture = capture(count);
+        let (report, bytes) = peak(|| examine_cameras(&capture, None));
+        assert!(bytes < 1500 * count, "{bytes} bytes for {count} photographs");
+        let named: usize = report.findings.iter().map(|finding| finding.views.len()).sum();
+        assert!(named <= 3 * count, "{named} names");
+        assert_eq!(report.finds(FindingKind::DuplicatePoses).unwrap().views.len(), count - 3);
+    }
+}

@@ -1,0 +1,30 @@
+//! The stress suite: where floating point fails, and what is right there.
+//!
+//! Each module holds the rows of the stress matrix and of the failure catalogue that belong together, in f32 and f64
+//! (`single::` and `double::`), through the public interface. Expected values that are not plain come from
+//! `reference/constants.json`, which `reference/constants.py` computes with 50 digits. docs/stability.md says which test
+//! stands for which row, and what the suite has found.
+
+#[macro_use]
+mod support;
+
+mod activations;
+mod alpha;
+mod color;
+mod composite;
+mod distortion;
+mod doctor;
+mod encoding;
+mod fuzz;
+mod geometry;
+mod hash_grid;
+mod init;
+mod march;
+mod metrics;
+mod optimiser;
+mod properties;
+mod rotation;
+mod sampling;
+mod shapes;
+mod skipping;
+mod sums;
