@@ -82,11 +82,24 @@ impl Kept {
     }
 }
 
+/// Programs that tests start inherit which signals are ignored, and a check in the background of a shell ignores some. A
+/// handler, which here does what is usual, is not inherited.
+#[cfg(unix)]
+static SIGNALS: LazyLock<()> = LazyLock::new(|| {
+    use signal_hook::consts::{SIGHUP, SIGINT};
+    for signal in [SIGINT, SIGHUP] {
+        let always = std::sync::Arc::new(true.into());
+        signal_hook::flag::register_conditional_default(signal, always).unwrap();
+    }
+});
+
 /// A temporary folder with a dataset in `scene`; commands run there.
 struct Place(TempDir);
 
 impl Place {
     fn empty() -> Self {
+        #[cfg(unix)]
+        LazyLock::force(&SIGNALS);
         Place(tempfile::tempdir().unwrap())
     }
 
