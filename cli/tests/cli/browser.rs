@@ -5,7 +5,7 @@
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use super::resume::SMALL;
+use super::SMALL;
 use super::view::{Server, serve};
 use super::{Place, png};
 use driver::{Browser, Kind};

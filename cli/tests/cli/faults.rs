@@ -4,7 +4,8 @@
 //! need `strace`, and say that they skip without it.
 
 use super::Place;
-use super::resume::{SMALL, assert_same};
+use super::SMALL;
+use super::resume::assert_same;
 use std::process::{Command, Output};
 
 /// Calls that leave something on disk, and what each is for.

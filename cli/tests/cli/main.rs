@@ -40,6 +40,10 @@ mod signals;
 #[cfg(unix)]
 mod view;
 
+/// Settings of a model whose steps and views are short.
+const SMALL: &str = "--set field.grid.levels=6 --set field.grid.log2_table=10 --set field.density_width=16 \
+                         --set field.color_width=16 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
+
 /// Width and height of the test images.
 const SIZE: usize = 24;
 

@@ -1,6 +1,7 @@
 //! Folders that are removed, moved or replaced while a program writes to them.
 
-use super::resume::{SMALL, assert_same};
+use super::SMALL;
+use super::resume::assert_same;
 use super::signals::{send, stopped};
 use super::{Place, complained, wait};
 use std::process::{Child, Output, Stdio};

@@ -1,7 +1,7 @@
 //! What a run leaves beside its model: event files for TensorBoard, a summary, an exit code.
 
 use super::Place;
-use super::resume::SMALL;
+use super::SMALL;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};

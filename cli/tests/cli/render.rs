@@ -1,6 +1,6 @@
 //! Paths, films, and what is saved beside frames.
 
-use super::resume::SMALL;
+use super::SMALL;
 use super::{Place, SIZE, complained, png};
 use raygrad::nerf::dataset::{Capture, Depths, Split};
 use raygrad::nerf::glam::{DAffine3, DVec3};

@@ -1,15 +1,11 @@
 //! Runs that end before their time, and go on.
 
-use super::Place;
+use super::{Place, SMALL};
 use serde_json::Value;
 use std::fs::File;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
-
-/// Settings of a model whose steps and views are short.
-pub const SMALL: &str = "--set field.grid.levels=6 --set field.grid.log2_table=10 --set field.density_width=16 \
-                         --set field.color_width=16 --set sampler.occupancy.resolution=16 --set sampler.samples=4096";
 
 /// What each line of a run's metrics says but for times, which differ.
 fn metrics(place: &Place, run: &str) -> Vec<Value> {

@@ -1,6 +1,6 @@
 //! Signals: what was started to survive a hang-up does, and all else saves its work.
 
-use super::resume::SMALL;
+use super::SMALL;
 use super::{Place, wait};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};

@@ -8,7 +8,8 @@ use std::process::{Child, Command, Stdio};
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
-use super::resume::{SMALL, assert_same};
+use super::SMALL;
+use super::resume::assert_same;
 use super::{Kept, Place, SIZE, png};
 use raygrad::nerf::Image;
 use raygrad::nerf::pictures::colormap;
