@@ -10,7 +10,7 @@
 //! and, with the feature `nerf` (on by default), from
 //! * [`nerf`](https://docs.rs/raygrad-nerf): cameras, datasets, encodings, fields, sampling, rendering, training.
 //!
-//! [`guide`] leads from a first gradient to an operation of one's own and a trained model.
+//! [`guide`] leads from a first gradient to a custom operation and a trained model.
 
 pub mod guide;
 

@@ -1,4 +1,4 @@
-//! The command line program: reads what is asked for, runs it, and turns errors into one line and an exit code. Each
+//! The command line program: parses its arguments, runs the subcommand, and turns errors into one line and an exit code. Each
 //! subcommand has a file of its own.
 
 mod base64;

@@ -135,8 +135,7 @@ pub fn add_assign<T: Scalar>(a: &mut [T], b: &[T]) {
 mod tests {
     use super::*;
     use crate::Real;
-
-    const BLOCK: usize = 1024;
+    use crate::fused::BLOCK;
 
     #[test]
     fn broadcasting_follows_numpy() {

@@ -13,7 +13,7 @@ pub type Block<'a, T> = dyn Fn(&[&[T]], &mut [&mut [T]]) + Sync + 'a;
 
 /// Elements of a block: some arrays of them fit a core's first or second cache, and what a block costs besides does not
 /// show.
-const BLOCK: usize = 4096;
+pub(crate) const BLOCK: usize = 4096;
 
 /// `M` results of one pass over tensors that broadcast together, each of the common shape. Results that are not `wanted`
 /// are computed too, since one loop computes all, but take no memory.

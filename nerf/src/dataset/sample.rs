@@ -65,7 +65,7 @@ fn frames(cameras: impl Iterator<Item = Camera>) -> Vec<Frame> {
     cameras.enumerate().map(frame).collect()
 }
 
-/// What is seen along a ray: stripes of two colours on the ball, brighter above.
+/// The colour along a ray: stripes of two colours on the ball, brighter above.
 fn color(ray: &Ray) -> Option<[f32; 3]> {
     let along = -ray.origin.dot(ray.direction);
     let half = (1.0 - (ray.origin.length_squared() - along * along)).max(-1.0);
