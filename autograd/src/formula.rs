@@ -2,7 +2,7 @@
 
 use crate::reading::Reading;
 use crate::recorded::{Recorded, Sheet};
-use crate::{Dual, Grads, Op, Reads, ShapeError, Var, Vjp};
+use crate::{Cases, Dual, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, lanes_fused, map_fused, sum_to};
 use smallvec::SmallVec;
 use std::array::from_fn;
@@ -56,6 +56,10 @@ pub trait Formula<const N: usize>: Copy + Send + Sync + 'static {
     fn vjp<E: Real>(&self, g: E, x: [E; N], _y: E) -> [E; N] {
         derived(self, g, x)
     }
+
+    /// Where checks sample the function, and exact values at extremes:
+    /// [`check::Entry::examined`](crate::check::Entry::examined) asks for them.
+    fn cases(&self, _cases: &mut Cases) {}
 
     /// The function of variables.
     ///

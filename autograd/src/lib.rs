@@ -17,6 +17,7 @@
 //! * [`Gradient`], [`SparseGrad`]: what an optimiser gets: a dense sum, and shares of a few rows beside it.
 //! * `check` (with the feature of this name): the examination that every operation here has to pass.
 
+mod cases;
 #[cfg(feature = "check")]
 pub mod check;
 mod checkpoint;
@@ -44,6 +45,7 @@ mod sweep;
 mod tape;
 mod var;
 
+pub use cases::{Cases, Extreme};
 pub use dual::Dual;
 pub use error::{Error, ShapeError};
 pub use formula::{Elementwise, Formula};

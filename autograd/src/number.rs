@@ -60,36 +60,25 @@ impl<E: Real> Neg for Number<E> {
     }
 }
 
-macro_rules! unary {
-    ($($f:ident)*) => {
-        $(
-            #[doc = concat!("See [`Real::", stringify!($f), "`].")]
-            #[inline(always)]
-            pub fn $f(self) -> Self {
-                Number(self.0.$f())
-            }
-        )*
+macro_rules! number {
+    (() unary $f:ident $doc:literal) => {
+        #[doc = $doc]
+        #[inline(always)]
+        pub fn $f(self) -> Self {
+            Number(self.0.$f())
+        }
     };
-}
-
-macro_rules! binary {
-    ($($f:ident)*) => {
-        $(
-            #[doc = concat!("See [`Real::", stringify!($f), "`].")]
-            #[inline(always)]
-            pub fn $f(self, other: impl Term<E>) -> Self {
-                Number(self.0.$f(other.term(self.0)))
-            }
-        )*
+    (() binary $f:ident $doc:literal) => {
+        #[doc = $doc]
+        #[inline(always)]
+        pub fn $f(self, other: impl Term<E>) -> Self {
+            Number(self.0.$f(other.term(self.0)))
+        }
     };
 }
 
 impl<E: Real> Number<E> {
-    unary! {
-        exp expm1 ln ln1p sin cos sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh
-        abs sign floor ceil round
-    }
-    binary! { atan2 pow maximum minimum }
+    raygrad_tensor::functions!(number());
 
     /// See [`Real::powi`].
     #[inline(always)]

@@ -54,25 +54,18 @@ impl Neg for Reading {
     }
 }
 
-macro_rules! unary {
-    ($($f:ident)*) => {
-        $(
-            #[inline(always)]
-            fn $f(self) -> Self {
-                Reading::of(self.of)
-            }
-        )*
+macro_rules! reading {
+    (() unary $f:ident $doc:literal) => {
+        #[inline(always)]
+        fn $f(self) -> Self {
+            Reading::of(self.of)
+        }
     };
-}
-
-macro_rules! binary {
-    ($($f:ident)*) => {
-        $(
-            #[inline(always)]
-            fn $f(self, other: Self) -> Self {
-                Reading::of(self.of | other.of)
-            }
-        )*
+    (() binary $f:ident $doc:literal) => {
+        #[inline(always)]
+        fn $f(self, other: Self) -> Self {
+            Reading::of(self.of | other.of)
+        }
     };
 }
 
@@ -89,9 +82,5 @@ impl Real for Reading {
     fn powi(self, _exponent: i32) -> Self {
         Reading::of(self.of)
     }
-    unary! {
-        exp expm1 ln ln1p sin cos sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh
-        abs sign floor ceil round
-    }
-    binary! { atan2 pow maximum minimum }
+    raygrad_tensor::functions!(reading());
 }

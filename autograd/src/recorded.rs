@@ -148,23 +148,16 @@ impl<T: Scalar> Neg for Recorded<'_, '_, T> {
     }
 }
 
-macro_rules! unary {
-    ($($f:ident)*) => {
-        $(
-            fn $f(self) -> Self {
-                self.unary(Var::$f)
-            }
-        )*
+macro_rules! recorded {
+    (() unary $f:ident $doc:literal) => {
+        fn $f(self) -> Self {
+            self.unary(Var::$f)
+        }
     };
-}
-
-macro_rules! binary {
-    ($($f:ident)*) => {
-        $(
-            fn $f(self, other: Self) -> Self {
-                self.binary(other, |a, b| a.$f(b))
-            }
-        )*
+    (() binary $f:ident $doc:literal) => {
+        fn $f(self, other: Self) -> Self {
+            self.binary(other, |a, b| a.$f(b))
+        }
     };
 }
 
@@ -178,11 +171,7 @@ impl<T: Scalar> Real for Recorded<'_, '_, T> {
     fn powi(self, exponent: i32) -> Self {
         self.sheet.push(Step::Powi(exponent, self.index))
     }
-    unary! {
-        exp expm1 ln ln1p sin cos sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh
-        abs sign floor ceil round
-    }
-    binary! { atan2 pow maximum minimum }
+    raygrad_tensor::functions!(recorded());
 }
 
 #[cfg(test)]

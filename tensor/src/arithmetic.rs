@@ -142,69 +142,25 @@ impl<T: Scalar, const N: usize> Index<[usize; N]> for Tensor<T> {
     }
 }
 
-/// A function of [`Real`] as a method.
-macro_rules! function {
-    ($($(#[$doc:meta])* $name:ident;)+) => {
-        impl<T: Scalar> Tensor<T> {
-            $(
-                $(#[$doc])*
-                pub fn $name(&self) -> Self {
-                    map_real!([self], &self.pool(), |[x]| Real::$name(x))
-                }
-            )+
+macro_rules! method {
+    (() unary $f:ident $doc:literal) => {
+        #[doc = concat!($doc, "\n\nOf each element.")]
+        pub fn $f(&self) -> Self {
+            map_real!([self], &self.pool(), |[x]| x.$f())
+        }
+    };
+    (() binary $f:ident $doc:literal) => {
+        #[doc = concat!($doc, "\n\nOf the elements of two tensors that broadcast together.\n\n# Panics\nIf the shapes do not broadcast.")]
+        #[track_caller]
+        pub fn $f(&self, other: impl Into<Self>) -> Self {
+            map_real!([self, &other.into()], &self.pool(), |[a, b]| a.$f(b))
         }
     };
 }
 
-function! {
-    /// `e^x` of each element.
-    exp;
-    /// `e^x - 1` of each element, accurate near 0.
-    expm1;
-    /// The natural logarithm of each element; NaN below 0.
-    ln;
-    /// `ln(1 + x)` of each element, accurate near 0.
-    ln1p;
-    /// The square root of each element; NaN below 0.
-    sqrt;
-    /// The absolute value of each element.
-    abs;
-    /// The sine of each element, an angle in radians.
-    sin;
-    /// The cosine of each element, an angle in radians.
-    cos;
-    /// The tangent of each element, an angle in radians.
-    tan;
-    /// The angle in radians, -pi/2 to pi/2, whose sine each element is; NaN beyond -1 and 1.
-    asin;
-    /// The angle in radians, 0 to pi, whose cosine each element is; NaN beyond -1 and 1.
-    acos;
-    /// The angle in radians, -pi/2 to pi/2, whose tangent each element is.
-    atan;
-    /// The hyperbolic sine of each element.
-    sinh;
-    /// The hyperbolic cosine of each element.
-    cosh;
-    /// The hyperbolic tangent of each element.
-    tanh;
-    /// The error function of each element.
-    erf;
-    /// `2^x` of each element.
-    exp2;
-    /// The logarithm to base 2 of each element; NaN below 0.
-    log2;
-    /// `ln(1 + e^x)` of each element, without overflow.
-    softplus;
-    /// 1 for positive elements, -1 for negative ones, 0 and NaN for 0 and NaN.
-    sign;
-    /// `1 / (1 + e^-x)` of each element.
-    sigmoid;
-    /// Each element rounded down to a whole number.
-    floor;
-    /// Each element rounded up to a whole number.
-    ceil;
-    /// Each element rounded to the nearest whole number, ties to the even one.
-    round;
+/// The functions of [`Real`].
+impl<T: Scalar> Tensor<T> {
+    crate::functions!(method());
 }
 
 impl<T: Scalar> Tensor<T> {
@@ -273,7 +229,7 @@ impl<T: Scalar> Tensor<T> {
 
     /// Each element to the power of a number.
     pub fn powf(&self, exponent: T) -> Self {
-        map_real!([self, &Tensor::scalar(exponent)], &self.pool(), |[x, p]| Real::pow(x, p))
+        self.pow(Tensor::scalar(exponent))
     }
 
     /// Each element to the power of a whole number.
@@ -284,24 +240,6 @@ impl<T: Scalar> Tensor<T> {
     /// Each element's square.
     pub fn square(&self) -> Self {
         self.map(|x| x * x)
-    }
-
-    /// The greater of the elements of two tensors that broadcast together; NaN if one is.
-    ///
-    /// # Panics
-    /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn maximum(&self, other: impl Into<Self>) -> Self {
-        self.zip(&other.into(), |a, b| Real::maximum(a, b))
-    }
-
-    /// The smaller of the elements of two tensors that broadcast together; NaN if one is.
-    ///
-    /// # Panics
-    /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn minimum(&self, other: impl Into<Self>) -> Self {
-        self.zip(&other.into(), |a, b| Real::minimum(a, b))
     }
 
     /// Each element limited to `low..=high`; NaN stays NaN. An infinite limit is none.

@@ -80,43 +80,34 @@ impl<T: Scalar, const QUICK: bool> Neg for Lane<T, QUICK> {
     }
 }
 
-/// The functions that have one reduction.
-macro_rules! plain {
-    ($($f:ident)+) => {
-        $(
-            #[inline(always)]
-            fn $f(self) -> Self {
+macro_rules! lane {
+    (() unary sin $doc:literal) => {
+        lane!(angle sin sin_quick);
+    };
+    (() unary cos $doc:literal) => {
+        lane!(angle cos cos_quick);
+    };
+    (angle $f:ident $quick:ident) => {
+        #[inline(always)]
+        fn $f(self) -> Self {
+            if QUICK {
+                Lane { value: self.value.$quick(), outside: self.outside | self.value.outside() }
+            } else {
                 self.with(self.value.$f())
             }
-        )+
+        }
     };
-}
-
-/// The functions that have two.
-macro_rules! angle {
-    ($($f:ident $quick:ident)+) => {
-        $(
-            #[inline(always)]
-            fn $f(self) -> Self {
-                if QUICK {
-                    Lane { value: self.value.$quick(), outside: self.outside | self.value.outside() }
-                } else {
-                    self.with(self.value.$f())
-                }
-            }
-        )+
+    (() unary $f:ident $doc:literal) => {
+        #[inline(always)]
+        fn $f(self) -> Self {
+            self.with(self.value.$f())
+        }
     };
-}
-
-/// The functions of two numbers.
-macro_rules! joined {
-    ($($f:ident)+) => {
-        $(
-            #[inline(always)]
-            fn $f(self, other: Self) -> Self {
-                Lane { value: self.value.$f(other.value), outside: self.outside | other.outside }
-            }
-        )+
+    (() binary $f:ident $doc:literal) => {
+        #[inline(always)]
+        fn $f(self, other: Self) -> Self {
+            Lane { value: self.value.$f(other.value), outside: self.outside | other.outside }
+        }
     };
 }
 
@@ -130,10 +121,7 @@ impl<T: Scalar, const QUICK: bool> Real for Lane<T, QUICK> {
         let value = self.value.if_positive(yes.value, no.value);
         Lane { value, outside: self.outside | yes.outside | no.outside }
     }
-    angle! { sin sin_quick cos cos_quick }
-    plain! { exp expm1 ln ln1p sin_pi cos_pi tanh sigmoid softplus sqrt exp2 log2 erf tan asin acos atan sinh cosh }
-    plain! { abs sign floor ceil round }
-    joined! { atan2 pow maximum minimum }
+    crate::functions!(lane());
     #[inline(always)]
     fn powi(self, exponent: i32) -> Self {
         self.with(self.value.powi(exponent))

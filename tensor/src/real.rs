@@ -3,6 +3,62 @@
 use crate::vmath;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
+/// The functions of [`Real`] in one list: `functions!(each(arguments))` writes for each of them
+/// `each! { (arguments) unary exp "`e^x`." }`, with the kind (`unary` or `binary`), the name and the documentation.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! functions {
+    ($each:ident $arguments:tt) => {
+        $crate::functions! {
+            $each $arguments
+            unary exp "`e^x`.";
+            unary expm1 "`e^x - 1`, accurate near 0.";
+            unary ln "The natural logarithm.";
+            unary ln1p "`ln(1 + x)`, accurate near 0.";
+            unary sin "Sine of an angle in radians.";
+            unary cos "Cosine of an angle in radians.";
+            unary sin_pi "`sin(pi x)`, with `x` reduced exactly first.";
+            unary cos_pi "`cos(pi x)`, with `x` reduced exactly first.";
+            unary tanh "Hyperbolic tangent.";
+            unary sigmoid "`1 / (1 + e^-x)`.";
+            unary softplus "`ln(1 + e^x)`.";
+            unary sqrt "Square root.";
+            unary exp2 "`2^x`.";
+            unary log2 "The logarithm to base 2.";
+            unary erf "The error function.";
+            unary tan "Tangent of an angle in radians.";
+            unary asin "The angle in -pi/2..=pi/2 of this sine; NaN outside -1..=1.";
+            unary acos "The angle in 0..=pi of this cosine; NaN outside -1..=1.";
+            unary atan "The angle in -pi/2..=pi/2 of this tangent.";
+            unary sinh "Hyperbolic sine.";
+            unary cosh "Hyperbolic cosine.";
+            unary abs "The absolute value.";
+            unary sign "1 for positive numbers, -1 for negative ones; zeros and NaN stay what they are. Its derivative is 0.";
+            unary floor "The next whole number below. Its derivative is 0.";
+            unary ceil "The next whole number above. Its derivative is 0.";
+            unary round "The nearest whole number, the even one of two. Its derivative is 0.";
+            binary atan2 "The angle in -pi..=pi of the vector (`x`, `self`).";
+            binary pow "`self` to a real power; NaN for a negative base and a fractional exponent.";
+            binary maximum "The greater of two numbers; NaN if one of them is.";
+            binary minimum "The smaller of two numbers; NaN if one of them is.";
+        }
+    };
+    ($each:ident $arguments:tt $($kind:ident $f:ident $doc:literal;)+) => {
+        $($each! { $arguments $kind $f $doc })+
+    };
+}
+
+macro_rules! declared {
+    (() unary $f:ident $doc:literal) => {
+        #[doc = $doc]
+        fn $f(self) -> Self;
+    };
+    (() binary $f:ident $doc:literal) => {
+        #[doc = $doc]
+        fn $f(self, other: Self) -> Self;
+    };
+}
+
 /// A real number, as an elementwise formula sees it.
 ///
 /// A formula that is generic over `Real` is read in several ways: numbers compile to one vectorised loop, dual numbers
@@ -15,80 +71,23 @@ pub trait Real:
     fn like(&self, value: f64) -> Self;
     /// `yes` where this number is greater than 0, else `no`; `no` where it is NaN. The choice itself has derivative 0.
     fn if_positive(&self, yes: Self, no: Self) -> Self;
-    /// `e^x`.
-    fn exp(self) -> Self;
-    /// `e^x - 1`, accurate near 0.
-    fn expm1(self) -> Self;
-    /// The natural logarithm.
-    fn ln(self) -> Self;
-    /// `ln(1 + x)`, accurate near 0.
-    fn ln1p(self) -> Self;
-    /// Sine of an angle in radians.
-    fn sin(self) -> Self;
-    /// Cosine of an angle in radians.
-    fn cos(self) -> Self;
-    /// `sin(pi x)`, with `x` reduced exactly first.
-    fn sin_pi(self) -> Self;
-    /// `cos(pi x)`, with `x` reduced exactly first.
-    fn cos_pi(self) -> Self;
-    /// Hyperbolic tangent.
-    fn tanh(self) -> Self;
-    /// `1 / (1 + e^-x)`.
-    fn sigmoid(self) -> Self;
-    /// `ln(1 + e^x)`.
-    fn softplus(self) -> Self;
-    /// Square root.
-    fn sqrt(self) -> Self;
-    /// `2^x`.
-    fn exp2(self) -> Self;
-    /// The logarithm to base 2.
-    fn log2(self) -> Self;
-    /// The error function.
-    fn erf(self) -> Self;
-    /// Tangent of an angle in radians.
-    fn tan(self) -> Self;
-    /// The angle in -pi/2..=pi/2 of this sine; NaN outside -1..=1.
-    fn asin(self) -> Self;
-    /// The angle in 0..=pi of this cosine; NaN outside -1..=1.
-    fn acos(self) -> Self;
-    /// The angle in -pi/2..=pi/2 of this tangent.
-    fn atan(self) -> Self;
-    /// The angle in -pi..=pi of the vector (`x`, `self`).
-    fn atan2(self, x: Self) -> Self;
-    /// Hyperbolic sine.
-    fn sinh(self) -> Self;
-    /// Hyperbolic cosine.
-    fn cosh(self) -> Self;
-    /// The power with a whole exponent; 1 for exponent 0, whatever the base.
+    crate::functions!(declared());
+    /// `self` to a whole power; 1 for exponent 0, whatever the base.
     fn powi(self, exponent: i32) -> Self;
-    /// The power with a real exponent; NaN for a negative base and a broken exponent.
-    fn pow(self, exponent: Self) -> Self;
-    /// The absolute value.
-    fn abs(self) -> Self;
-    /// 1 for positive numbers, -1 for negative ones; zeros and NaN stay what they are. Its derivative is 0.
-    fn sign(self) -> Self;
-    /// The greater of two numbers; NaN if one of them is.
-    fn maximum(self, other: Self) -> Self;
-    /// The smaller of two numbers; NaN if one of them is.
-    fn minimum(self, other: Self) -> Self;
-    /// The next whole number below. Its derivative is 0.
-    fn floor(self) -> Self;
-    /// The next whole number above. Its derivative is 0.
-    fn ceil(self) -> Self;
-    /// The nearest whole number, the even one of two. Its derivative is 0.
-    fn round(self) -> Self;
 }
 
-/// The functions whose vector version is not worth its while are the standard library's: right to an ULP or so on the
-/// usual platforms, but calls, which end vectorisation.
-macro_rules! from_std {
-    ($t:ident: $($f:ident)*) => {
-        $(
-            #[inline(always)]
-            fn $f(self) -> Self {
-                $t::$f(self)
-            }
-        )*
+macro_rules! number {
+    (($t:ident) unary $f:ident $doc:literal) => {
+        #[inline(always)]
+        fn $f(self) -> Self {
+            vmath::$t::$f(self)
+        }
+    };
+    (($t:ident) binary $f:ident $doc:literal) => {
+        #[inline(always)]
+        fn $f(self, other: Self) -> Self {
+            vmath::$t::$f(self, other)
+        }
     };
 }
 
@@ -103,85 +102,7 @@ macro_rules! real {
             fn if_positive(&self, yes: Self, no: Self) -> Self {
                 if *self > 0.0 { yes } else { no }
             }
-            #[inline(always)]
-            fn exp(self) -> Self {
-                vmath::$t::exp(self)
-            }
-            #[inline(always)]
-            fn expm1(self) -> Self {
-                vmath::$t::expm1(self)
-            }
-            #[inline(always)]
-            fn ln(self) -> Self {
-                vmath::$t::ln(self)
-            }
-            #[inline(always)]
-            fn ln1p(self) -> Self {
-                vmath::$t::ln1p(self)
-            }
-            #[inline(always)]
-            fn sin(self) -> Self {
-                vmath::$t::sin(self)
-            }
-            #[inline(always)]
-            fn cos(self) -> Self {
-                vmath::$t::cos(self)
-            }
-            #[inline(always)]
-            fn sin_pi(self) -> Self {
-                vmath::$t::sin_pi(self)
-            }
-            #[inline(always)]
-            fn cos_pi(self) -> Self {
-                vmath::$t::cos_pi(self)
-            }
-            #[inline(always)]
-            fn tanh(self) -> Self {
-                vmath::$t::tanh(self)
-            }
-            #[inline(always)]
-            fn sigmoid(self) -> Self {
-                vmath::$t::sigmoid(self)
-            }
-            #[inline(always)]
-            fn softplus(self) -> Self {
-                vmath::$t::softplus(self)
-            }
-            from_std!($t: sqrt tan asin acos atan abs floor ceil);
-            #[inline(always)]
-            fn exp2(self) -> Self {
-                vmath::$t::exp2(self)
-            }
-            #[inline(always)]
-            fn log2(self) -> Self {
-                vmath::$t::log2(self)
-            }
-            #[inline(always)]
-            fn erf(self) -> Self {
-                vmath::$t::erf(self)
-            }
-            #[inline(always)]
-            fn atan2(self, x: Self) -> Self {
-                $t::atan2(self, x)
-            }
-            /// Within 4 ULP: from `expm1` near 0, and from the square of `e^(x/2)` where `e^-x` does not matter, so
-            /// that it overflows only where it must.
-            #[inline(always)]
-            fn sinh(self) -> Self {
-                let a = $t::abs(self);
-                let t = vmath::$t::expm1(a);
-                let half = vmath::$t::exp(0.5 * a);
-                let y = if a < 20.0 { 0.5 * (t + t / (t + 1.0)) } else { 0.5 * half * half };
-                $t::copysign(y, self)
-            }
-            /// Within 4 ULP; see `sinh`.
-            #[inline(always)]
-            fn cosh(self) -> Self {
-                let a = $t::abs(self);
-                let t = vmath::$t::exp(a);
-                let half = vmath::$t::exp(0.5 * a);
-                if a < 20.0 { 0.5 * (t + 1.0 / t) } else { 0.5 * half * half }
-            }
+            crate::functions!(number($t));
             #[inline(always)]
             fn powi(self, exponent: i32) -> Self {
                 match exponent {
@@ -194,27 +115,6 @@ macro_rules! real {
                     // f64 holds every exponent, and its rounding does not show in f32.
                     _ => f64::powf(self as f64, f64::from(exponent)) as $t,
                 }
-            }
-            #[inline(always)]
-            fn pow(self, exponent: Self) -> Self {
-                $t::powf(self, exponent)
-            }
-            #[inline(always)]
-            fn sign(self) -> Self {
-                let negative = if self < 0.0 { -1.0 } else { self };
-                if self > 0.0 { 1.0 } else { negative }
-            }
-            #[inline(always)]
-            fn maximum(self, other: Self) -> Self {
-                if self > other || $t::is_nan(self) { self } else { other }
-            }
-            #[inline(always)]
-            fn minimum(self, other: Self) -> Self {
-                if self < other || $t::is_nan(self) { self } else { other }
-            }
-            #[inline(always)]
-            fn round(self) -> Self {
-                $t::round_ties_even(self)
             }
         }
     };

@@ -1,57 +1,18 @@
 //! The catalogue: every operation with the inputs it is checked on and its values at extremes.
 
+use crate::cases::Extreme;
 use crate::formula::derived;
 use crate::ops::trigonometric;
 use crate::ops::{
     Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
 };
 use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
-use crate::{Elementwise, Formula, Op};
+use crate::{Cases, Elementwise, Formula, Op};
 use raygrad_tensor::{Layout, Shape, Tensor};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Where an elementwise formula is sampled, and what it gives at extremes.
-#[derive(Debug, Clone, Default)]
-pub struct Cases {
-    linear: bool,
-    /// For each input the ranges that samples are drawn from.
-    domains: Vec<Vec<Range<f64>>>,
-    extremes: Vec<Extreme>,
-}
-
-/// The exact value and gradients at one point, chosen because naive formulas fail there.
-#[derive(Debug, Clone)]
-pub struct Extreme {
-    /// The inputs.
-    pub x: Vec<f64>,
-    /// The value; NaN if it is to be NaN.
-    pub y: f64,
-    /// The gradient of each input for a gradient of 1.
-    pub grads: Vec<f64>,
-}
-
 impl Cases {
-    /// The function is linear, which is checked too.
-    pub fn linear(&mut self) -> &mut Self {
-        self.linear = true;
-        self
-    }
-
-    /// The range of the next input.
-    pub fn domain(&mut self, range: Range<f64>) -> &mut Self {
-        self.domains.push(vec![range]);
-        self
-    }
-
-    /// A further range of the last input, for a function with a gap: samples alternate between the ranges.
-    pub fn domain_also(&mut self, range: Range<f64>) -> &mut Self {
-        if let Some(last) = self.domains.last_mut() {
-            last.push(range);
-        }
-        self
-    }
-
     /// Sets of operands.
     fn samples(&self) -> Vec<Vec<Tensor<f64>>> {
         // The shapes of one operand, and of several: taken over and over where there are more.
@@ -65,18 +26,6 @@ impl Cases {
         };
         shapes.iter().enumerate().map(set).collect()
     }
-
-    /// The value `y` and the gradients at `x`.
-    pub fn at<const N: usize>(&mut self, x: [f64; N], y: f64, grads: [f64; N]) -> &mut Self {
-        self.extremes.push(Extreme { x: x.into(), y, grads: grads.into() });
-        self
-    }
-}
-
-/// A formula that has its cases with it, as all of the catalogue's have.
-pub trait Examined<const N: usize>: Formula<N> {
-    /// Where it is sampled in checks, and exact values at extremes.
-    fn cases(&self, cases: &mut Cases);
 }
 
 /// An elementwise formula and its derivatives by dual numbers, of the operands and the gradient of the result.
@@ -92,8 +41,10 @@ pub struct Entry {
     pub samples: Vec<Vec<Tensor<f64>>>,
     /// Exact values.
     pub extremes: Vec<Extreme>,
-    pub(crate) f64: Arc<dyn Op<f64>>,
-    pub(crate) f32: Arc<dyn Op<f32>>,
+    /// The operation in double precision.
+    pub f64: Arc<dyn Op<f64>>,
+    /// The operation in single precision.
+    pub f32: Arc<dyn Op<f32>>,
     pub(crate) dual: Option<Box<DualFormula>>,
 }
 
@@ -130,11 +81,21 @@ impl Entry {
         Entry { linear: true, ..self }
     }
 
-    /// A formula, with its cases.
-    pub fn examined<const N: usize>(formula: impl Examined<N>) -> Self {
+    /// A formula, with the [cases](Formula::cases) that it has with it.
+    ///
+    /// # Panics
+    /// If there is not one domain for each operand.
+    pub fn examined<const N: usize>(formula: impl Formula<N>) -> Self {
         let mut cases = Cases::default();
         formula.cases(&mut cases);
         Entry::formula(formula, &cases)
+    }
+
+    /// [`examined`](Self::examined), of a formula that is the method `name` of [`Var`](crate::Var).
+    pub(crate) fn method<const N: usize>(name: &str, formula: impl Formula<N>) -> Self {
+        let entry = Entry::examined(formula);
+        assert_eq!(entry.name, name, "the formula of a method has its name");
+        entry
     }
 
     /// A formula, sampled in as many domains as it has operands.
@@ -178,51 +139,24 @@ pub(crate) fn spread(shape: &[usize], ranges: &[Range<f64>], salt: usize) -> Ten
 
 /// Every operation of this crate.
 pub fn catalogue() -> Vec<Entry> {
-    [core(), elementwise(), reductions(), losses()].into_iter().flatten().collect()
+    let formulas = [
+        arithmetic::entries(),
+        exponential::entries(),
+        trigonometric::entries(),
+        activation::entries(),
+        piecewise::entries(),
+        power::entries(),
+        loss::entries(),
+    ];
+    formulas.into_iter().chain([core(), choices(), reductions(), losses()]).flatten().collect()
 }
 
-/// Functions of one, two and three numbers.
-fn elementwise() -> Vec<Entry> {
-    // Powers of both signs, of 0 and of 1 have conventions of their own.
-    let powi = [0, 1, 5, -4].map(|exponent| Entry::examined(power::Powi { exponent }));
-    let powers = [
-        Entry::examined(power::ConstPowi::<2>),
-        Entry::examined(power::ConstPowi::<3>),
-        Entry::examined(power::ConstPowi::<4>),
-    ];
-    let powf = [0.0, 0.5, 1.5, 2.0, 2.5, -0.5].map(|exponent| Entry::examined(power::Powf { exponent }));
+/// What chooses between numbers, and mixes them.
+fn choices() -> Vec<Entry> {
     // Values that are equal in places, and that no step of a difference takes past each other.
     let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
     let choice = |shape: &[usize]| Entry::new(select::Where(ranks(shape, 3).gt(0.0)));
-    let rest = vec![
-        Entry::examined(exponential::Exp2),
-        Entry::examined(exponential::Log2),
-        Entry::examined(exponential::Rsqrt),
-        Entry::examined(exponential::Erf),
-        Entry::examined(trigonometric::Tan),
-        Entry::examined(trigonometric::Asin),
-        Entry::examined(trigonometric::Acos),
-        Entry::examined(trigonometric::Atan),
-        Entry::examined(trigonometric::Atan2),
-        Entry::examined(trigonometric::Sinh),
-        Entry::examined(trigonometric::Cosh),
-        Entry::examined(activation::LogSigmoid),
-        Entry::examined(activation::LeakyRelu { slope: 0.125 }),
-        Entry::examined(activation::Elu { alpha: 1.5 }),
-        Entry::examined(activation::Gelu),
-        Entry::examined(activation::GeluTanh),
-        Entry::examined(activation::Silu),
-        Entry::examined(piecewise::Abs),
-        Entry::examined(piecewise::Sign),
-        Entry::examined(piecewise::Maximum),
-        Entry::examined(piecewise::Minimum),
-        Entry::examined(piecewise::Clamp { low: -1.0, high: 2.0 }),
-        Entry::examined(piecewise::Floor),
-        Entry::examined(piecewise::Ceil),
-        Entry::examined(piecewise::Round),
-        Entry::examined(power::Reciprocal),
-        Entry::examined(power::Pow),
-        Entry::examined(power::Xlogy),
+    vec![
         choice(&[2, 3]).sample(&[&[2, 3], &[3]]),
         choice(&[3]).sample(&[&[2, 1], &[]]).sample(&[&[0, 3], &[1]]),
         choice(&[2, 1]).sample(&[&[1, 3], &[]]),
@@ -232,8 +166,7 @@ fn elementwise() -> Vec<Entry> {
             &[3],
             &[1],
         ]),
-    ];
-    powi.into_iter().chain(powers).chain(powf).chain(rest).collect()
+    ]
 }
 
 /// What makes fewer numbers out of many, and what runs along an axis.
@@ -306,12 +239,6 @@ fn reductions() -> Vec<Entry> {
 fn losses() -> Vec<Entry> {
     let cross_entropy = |classes: &[u32]| Entry::new(loss::CrossEntropy { classes: classes.into() });
     vec![
-        Entry::examined(loss::SquaredError),
-        Entry::examined(loss::AbsoluteError),
-        Entry::examined(loss::Huber { delta: 0.5 }),
-        Entry::examined(loss::SmoothL1 { beta: 0.5 }),
-        Entry::examined(loss::SmoothL1 { beta: 0.0 }),
-        Entry::examined(loss::BinaryCrossEntropy),
         cross_entropy(&[2, 0, 2]).sample(&[&[3, 4]]).sample(&[&[3, 40]]).sample(&[&[1, 3, 3]]),
         cross_entropy(&[1]).sample(&[&[2]]),
         cross_entropy(&[]).sample(&[&[0, 3]]),
@@ -328,26 +255,7 @@ fn core() -> Vec<Entry> {
     };
     let cumsum = |exclusive, reverse| segment::SegmentCumsum { segments: segments(), exclusive, reverse };
     let mut entries = vec![
-        Entry::examined(arithmetic::Add),
-        Entry::examined(arithmetic::Sub),
-        Entry::examined(arithmetic::Mul),
-        Entry::examined(arithmetic::Div),
-        Entry::examined(arithmetic::Affine { scale: -2.5, shift: 0.75 }),
-        Entry::examined(arithmetic::Alias),
         Entry::new(arithmetic::IfPositive).sample(&[&[2, 3], &[2, 3], &[3]]).sample(&[&[4], &[], &[4]]),
-        Entry::examined(exponential::Exp),
-        Entry::examined(exponential::Expm1),
-        Entry::examined(exponential::Ln),
-        Entry::examined(exponential::Ln1p),
-        Entry::examined(exponential::Sqrt),
-        Entry::examined(trigonometric::Sin),
-        Entry::examined(trigonometric::Cos),
-        Entry::examined(trigonometric::SinPi),
-        Entry::examined(trigonometric::CosPi),
-        Entry::examined(trigonometric::Tanh),
-        Entry::examined(activation::Relu),
-        Entry::examined(activation::Sigmoid),
-        Entry::examined(activation::Softplus),
         Entry::new(matmul::Matmul).sample(&[&[3, 4], &[4, 2]]).sample(&[&[0, 4], &[4, 2]]).sample(&[&[3, 0], &[0, 2]]),
         Entry::new(linear::LinearOp(Activation::Identity))
             .sample(&[&[5, 3], &[3, 4], &[4]])

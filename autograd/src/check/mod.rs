@@ -11,11 +11,8 @@ mod function;
 mod op;
 
 pub(crate) use catalogue::spread;
-/// Numbers of cases.
-pub(crate) const INF: f64 = f64::INFINITY;
-pub(crate) const NAN: f64 = f64::NAN;
-pub(crate) const PI: f64 = std::f64::consts::PI;
 
-pub use catalogue::{Cases, Entry, Examined, Extreme, catalogue};
+pub use crate::cases::{Cases, Extreme};
+pub use catalogue::{Entry, catalogue};
 pub use function::{Check, Report, check_function};
 pub use op::check_op;

@@ -1,8 +1,7 @@
 //! Activation functions.
 
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined, INF};
-use crate::{Formula, Var};
+use crate::cases::INF;
+use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 use std::f64::consts::{FRAC_1_SQRT_2, FRAC_2_SQRT_PI};
 
@@ -23,9 +22,6 @@ impl Formula<1> for Relu {
         let zero = g.like(0.0);
         [y.if_positive(g, zero)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Relu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
         c.at([0.0], 0.0, [0.0]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([f64::NAN], f64::NAN, [0.0]);
@@ -45,9 +41,6 @@ impl Formula<1> for Sigmoid {
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], y: E) -> [E; 1] {
         [g * (y * (-x).sigmoid())]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Sigmoid {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.5, [0.25]).at([-INF], 0.0, [0.0]).at([INF], 1.0, [0.0]);
         c.at([17.0], 0.999_999_958_600_600_9, [4.139_937_377e-8]).at([-89.0], 2.227_363_561e-39, [2.227_363_561e-39]);
@@ -63,9 +56,6 @@ impl Formula<1> for Softplus {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.softplus()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Softplus {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-20.0], 2.061_153_620e-9, [2.061_153_618e-9]).at([89.0], 89.0, [1.0]);
         c.at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);
@@ -81,9 +71,6 @@ impl Formula<1> for LogSigmoid {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         -(-x).softplus()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for LogSigmoid {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], -std::f64::consts::LN_2, [0.5]).at([20.0], -2.061_153_620e-9, [2.061_153_618e-9]);
         c.at([-INF], -INF, [1.0]).at([INF], 0.0, [0.0]).at([-89.0], -89.0, [1.0]);
@@ -103,9 +90,6 @@ impl Formula<1> for LeakyRelu {
         let scaled = x.like(self.slope) * x;
         x.if_positive(x, scaled)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for LeakyRelu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
         c.at([0.0], 0.0, [self.slope]).at([-INF], -INF, [self.slope]).at([INF], INF, [1.0]);
@@ -127,9 +111,6 @@ impl Formula<1> for Elu {
         let below = x.like(self.alpha) * x.if_positive(x.like(0.0), x).expm1();
         x.if_positive(x, below)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Elu {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1);
         c.at([0.0], 0.0, [self.alpha]).at([-INF], -self.alpha, [0.0]).at([INF], INF, [1.0]).at(
@@ -159,9 +140,6 @@ impl Formula<1> for Gelu {
         let density = x.like(0.5 * FRAC_2_SQRT_PI * FRAC_1_SQRT_2) * (-(half * (x * x))).exp();
         [g * (share + scaled(x, density))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Gelu {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at(
             [f64::NAN],
@@ -191,9 +169,6 @@ impl Formula<1> for GeluTanh {
         let slope = scale + scale * cubic * (x * x);
         [g * (share + scaled(x * slope, density))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for GeluTanh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]).at([1e30], 1e30, [1.0]);
         c.at([1.0], 0.841_191_990_608_276_8, [1.082964083845783]);
@@ -216,9 +191,6 @@ impl Formula<1> for Silu {
         let density = share * (-x).sigmoid();
         [g * (share + scaled(x, density))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Silu {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [0.5]).at([-INF], 0.0, [0.0]).at([INF], INF, [1.0]);
         c.at([-20.0], -4.122_307_236e-8, [-3.916_191_867e-8]).at([f64::NAN], f64::NAN, [f64::NAN]);
@@ -244,30 +216,6 @@ fn gelu_argument<E: Real>(x: E) -> E {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// `max(self, 0)`; NaN stays NaN. The gradient at 0 is 0.
-    #[track_caller]
-    pub fn relu(&self) -> Self {
-        Relu.on([self])
-    }
-
-    /// `1 / (1 + e^-self)`, accurate at both ends.
-    #[track_caller]
-    pub fn sigmoid(&self) -> Self {
-        Sigmoid.on([self])
-    }
-
-    /// `ln(1 + e^self)`, accurate at both ends.
-    #[track_caller]
-    pub fn softplus(&self) -> Self {
-        Softplus.on([self])
-    }
-
-    /// `ln(sigmoid(self))`, accurate at both ends.
-    #[track_caller]
-    pub fn log_sigmoid(&self) -> Self {
-        LogSigmoid.on([self])
-    }
-
     /// `self` where it is positive, else `slope * self`. The gradient at 0 is `slope`.
     #[track_caller]
     pub fn leaky_relu(&self, slope: f64) -> Self {
@@ -279,22 +227,22 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn elu(&self, alpha: f64) -> Self {
         Elu { alpha }.on([self])
     }
+}
 
+elementwise! {
+    /// `max(self, 0)`; NaN stays NaN. The gradient at 0 is 0.
+    relu() = Relu;
+    /// `1 / (1 + e^-self)`, accurate at both ends.
+    sigmoid() = Sigmoid;
+    /// `ln(1 + e^self)`, accurate at both ends.
+    softplus() = Softplus;
+    /// `ln(sigmoid(self))`, accurate at both ends.
+    log_sigmoid() = LogSigmoid;
     /// `self` times the normal distribution function of `self`: the exact form, by way of the error function.
-    #[track_caller]
-    pub fn gelu(&self) -> Self {
-        Gelu.on([self])
-    }
-
+    gelu() = Gelu;
     /// [`gelu`](Self::gelu) in the form with tanh, which older models were trained with; within 5e-4 of the exact one.
-    #[track_caller]
-    pub fn gelu_tanh(&self) -> Self {
-        GeluTanh.on([self])
-    }
-
+    gelu_tanh() = GeluTanh;
     /// `self * sigmoid(self)`, also called swish.
-    #[track_caller]
-    pub fn silu(&self) -> Self {
-        Silu.on([self])
-    }
+    silu() = Silu;
+    also examined: LeakyRelu { slope: 0.125 }, Elu { alpha: 1.5 };
 }

@@ -1,9 +1,7 @@
 //! The four operations, and multiplication and addition of constants.
 
 use super::power::ConstPowi;
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined};
-use crate::{Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
+use crate::{Cases, Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, map};
 
 /// y = a + b.
@@ -15,9 +13,6 @@ impl Formula<2> for Add {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a + b
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Add {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
         c.at([1e30, -1e30], 0.0, [1.0, 1.0]).at([f64::INFINITY, 1.0], f64::INFINITY, [1.0, 1.0]);
@@ -33,9 +28,6 @@ impl Formula<2> for Sub {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a - b
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Sub {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).domain(-3.0..3.0);
         c.at([1e30, 1e30], 0.0, [1.0, -1.0]).at([1.0, f64::INFINITY], f64::NEG_INFINITY, [1.0, -1.0]);
@@ -51,9 +43,6 @@ impl Formula<2> for Mul {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a * b
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Mul {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(-3.0..3.0);
         c.at([0.0, 5.0], 0.0, [5.0, 0.0]).at([f64::INFINITY, 2.0], f64::INFINITY, [2.0, f64::INFINITY]);
@@ -70,9 +59,6 @@ impl Formula<2> for Div {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a / b
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Div {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);
         c.at([0.0, 2.0], 0.0, [0.5, 0.0]).at([1.0, f64::INFINITY], 0.0, [0.0, 0.0]);
@@ -95,9 +81,6 @@ impl Formula<1> for Affine {
         let (scale, shift) = (x.like(self.scale), x.like(self.shift));
         x * scale + shift
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Affine {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], self.shift, [self.scale]);
         c.at([f64::INFINITY], f64::INFINITY * self.scale, [self.scale]);
@@ -113,9 +96,6 @@ impl Formula<1> for Alias {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Alias {
     fn cases(&self, c: &mut Cases) {
         c.linear().domain(-3.0..3.0).at([f64::INFINITY], f64::INFINITY, [1.0]);
     }
@@ -212,4 +192,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         let (yes, no) = (yes.on(self.tape()), no.on(self.tape()));
         self.tape().apply(IfPositive, &[self, &yes, &no])
     }
+}
+
+elementwise! {
+    also examined: Add, Sub, Mul, Div, Affine { scale: -2.5, shift: 0.75 }, Alias;
 }

@@ -1,11 +1,9 @@
 //! Exponentials, logarithms, square roots and the error function.
 
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined, INF};
-use crate::{Formula, Var};
-use raygrad_tensor::{Real, Scalar};
+use crate::cases::INF;
+use crate::{Cases, Formula};
+use raygrad_tensor::Real;
 use std::f64::consts::LN_2;
-#[cfg(feature = "check")]
 use std::f64::consts::{FRAC_2_SQRT_PI, LOG2_E};
 
 /// y = e^x; dx = g y.
@@ -21,9 +19,6 @@ impl Formula<1> for Exp {
     fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         [g * y]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Exp {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([-INF], 0.0, [0.0]).at([-1000.0], 0.0, [0.0]).at([INF], INF, [INF]);
     }
@@ -38,9 +33,6 @@ impl Formula<1> for Expm1 {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.expm1()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Expm1 {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([1e-20], 1e-20, [1.0]).at([-INF], -1.0, [0.0]).at([INF], INF, [INF]);
     }
@@ -55,9 +47,6 @@ impl Formula<1> for Ln {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.ln()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Ln {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([1.0], 0.0, [1.0]).at([INF], INF, [0.0]);
     }
@@ -72,9 +61,6 @@ impl Formula<1> for Ln1p {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.ln1p()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Ln1p {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.5..3.0).at([1e-20], 1e-20, [1.0]).at([-1.0], -INF, [INF]).at([INF], INF, [0.0]);
     }
@@ -94,9 +80,6 @@ impl Formula<1> for Sqrt {
         let half = g.like(0.5);
         [g * half / y]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Sqrt {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], 0.0, [INF]).at([4.0], 2.0, [0.25]).at([INF], INF, [0.0]);
     }
@@ -116,9 +99,6 @@ impl Formula<1> for Exp2 {
         let ln_2 = g.like(LN_2);
         [g * (y * ln_2)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Exp2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([3.0], 8.0, [8.0 * LN_2]).at([-INF], 0.0, [0.0]).at([INF], INF, [INF]);
     }
@@ -133,9 +113,6 @@ impl Formula<1> for Log2 {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.log2()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Log2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], -INF, [INF]).at([8.0], 3.0, [0.125 * LOG2_E]).at([INF], INF, [0.0]);
     }
@@ -156,9 +133,6 @@ impl Formula<1> for Rsqrt {
         let half = g.like(-0.5);
         [g * half * (y * y * y)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Rsqrt {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).at([0.0], INF, [-INF]).at([4.0], 0.5, [-0.0625]).at([INF], 0.0, [0.0]);
         c.at([-1.0], f64::NAN, [f64::NAN]);
@@ -174,66 +148,28 @@ impl Formula<1> for Erf {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.erf()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Erf {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [FRAC_2_SQRT_PI]).at([-INF], -1.0, [0.0]).at([30.0], 1.0, [0.0]);
     }
 }
 
-impl<'t, T: Scalar> Var<'t, T> {
+elementwise! {
     /// `e^self`.
-    #[track_caller]
-    pub fn exp(&self) -> Self {
-        Exp.on([self])
-    }
-
+    exp() = Exp;
     /// `e^self - 1`, accurate near 0.
-    #[track_caller]
-    pub fn expm1(&self) -> Self {
-        Expm1.on([self])
-    }
-
+    expm1() = Expm1;
     /// The natural logarithm: -inf at 0, NaN below.
-    #[track_caller]
-    pub fn ln(&self) -> Self {
-        Ln.on([self])
-    }
-
+    ln() = Ln;
     /// `ln(1 + self)`, accurate near 0.
-    #[track_caller]
-    pub fn ln1p(&self) -> Self {
-        Ln1p.on([self])
-    }
-
+    ln1p() = Ln1p;
     /// The square root: NaN below 0, infinite gradient at 0.
-    #[track_caller]
-    pub fn sqrt(&self) -> Self {
-        Sqrt.on([self])
-    }
-
+    sqrt() = Sqrt;
     /// `2^self`.
-    #[track_caller]
-    pub fn exp2(&self) -> Self {
-        Exp2.on([self])
-    }
-
+    exp2() = Exp2;
     /// The logarithm to base 2: -inf at 0, NaN below.
-    #[track_caller]
-    pub fn log2(&self) -> Self {
-        Log2.on([self])
-    }
-
+    log2() = Log2;
     /// `1 / sqrt(self)`: inf at 0, where the gradient is -inf; NaN below.
-    #[track_caller]
-    pub fn rsqrt(&self) -> Self {
-        Rsqrt.on([self])
-    }
-
+    rsqrt() = Rsqrt;
     /// The error function, `2/sqrt(pi) * integral from 0 to self of e^-t^2 dt`.
-    #[track_caller]
-    pub fn erf(&self) -> Self {
-        Erf.on([self])
-    }
+    erf() = Erf;
 }

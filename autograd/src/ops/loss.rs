@@ -1,9 +1,8 @@
 //! Losses: how far predictions are from their targets.
 
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined, INF};
+use crate::cases::INF;
 use crate::error::ensure;
-use crate::{Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
+use crate::{Cases, Formula, Grads, Op, Operand, ShapeError, Var, Vjp};
 use raygrad_tensor::rows::{cross_entropy_rows, cross_entropy_rows_grad};
 use raygrad_tensor::{Indices, Pool, Real, Scalar, Shape, Tensor};
 use std::sync::Arc;
@@ -18,9 +17,6 @@ impl Formula<2> for SquaredError {
         let r = a - b;
         r * r
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for SquaredError {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(-3.0..3.0).at([1.0, 1.0], 0.0, [0.0, 0.0]).at([3.0, 1.0], 4.0, [4.0, -4.0]);
     }
@@ -35,9 +31,6 @@ impl Formula<2> for AbsoluteError {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         (a - b).abs()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for AbsoluteError {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
         c.at([1.0, 1.0], 0.0, [0.0, 0.0]).at([-INF, 1.0], INF, [-1.0, 1.0]);
@@ -60,9 +53,6 @@ impl Formula<2> for Huber {
         let far = delta * (r.abs() - half * delta);
         (r.abs() - delta).if_positive(far, near)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Huber {
     fn cases(&self, c: &mut Cases) {
         let d = self.delta;
         c.domain(0.1 * d..0.9 * d).domain_also(2.5 * d..4.0 * d).domain(-0.05 * d..0.05 * d);
@@ -89,9 +79,6 @@ impl Formula<2> for SmoothL1 {
         let far = r.abs() - half * beta;
         (beta - r.abs()).if_positive(near, far)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for SmoothL1 {
     fn cases(&self, c: &mut Cases) {
         let w = self.beta.max(0.1);
         c.domain(0.1 * w..0.9 * w).domain_also(2.5 * w..4.0 * w).domain(-0.05 * w..0.05 * w);
@@ -134,9 +121,6 @@ impl Formula<2> for BinaryCrossEntropy {
         let towards = b.like(1.0) - b - p;
         [g * a.if_positive(towards, p - b), -(g * a)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for BinaryCrossEntropy {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.1..0.9).at([0.0, 1.0], std::f64::consts::LN_2, [-0.5, 0.0]);
         c.at([40.0, 1.0], 4.248_354_255_291_589e-18, [-4.248_354_255_291_589e-18, -40.0]).at(
@@ -372,4 +356,8 @@ mod tests {
         assert_eq!(x.smooth_l1_loss(&t, 2.0).item(), (2.0 + 0.0625) / 2.0);
         assert_eq!(x.smooth_l1_loss(&t, 0.0).item(), x.l1_loss(&t).item());
     }
+}
+
+elementwise! {
+    also examined: SquaredError, AbsoluteError, Huber { delta: 0.5 }, SmoothL1 { beta: 0.5 }, SmoothL1 { beta: 0.0 }, BinaryCrossEntropy;
 }

@@ -1,6 +1,33 @@
 //! The operations, each in one place: formula, derivative, documentation, sample inputs and extreme values. An
 //! operation is added by writing it in the file of its kind and listing it in `check/catalogue.rs`.
 
+/// The elementwise functions of a file: as `name(other) = Formula;` a method of [`Var`](crate::Var) for each formula of one
+/// operand or two that has no parameters, and in `entries` all of them for the catalogue, together with those `also examined`.
+macro_rules! elementwise {
+    (
+        $($(#[$doc:meta])+ $name:ident($($other:ident)?) = $formula:ident;)*
+        $(also examined: $($parametric:expr),+;)?
+    ) => {
+        impl<'t, T: raygrad_tensor::Scalar> crate::Var<'t, T> {
+            $(
+                $(#[$doc])+
+                #[track_caller]
+                pub fn $name(&self $(, $other: impl crate::Operand<'t, T>)?) -> Self {
+                    $formula.on([self $(, &$other.on(self.tape()))?])
+                }
+            )*
+        }
+
+        #[cfg(feature = "check")]
+        pub(crate) fn entries() -> Vec<crate::check::Entry> {
+            vec![
+                $(crate::check::Entry::method(stringify!($name), $formula),)*
+                $($(crate::check::Entry::examined($parametric)),+)?
+            ]
+        }
+    };
+}
+
 pub(crate) mod activation;
 pub(crate) mod arithmetic;
 pub(crate) mod arrange;

@@ -1,9 +1,8 @@
 //! Functions with kinks and steps: absolute value, sign, extremes, limits, rounding.
 
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined, INF, NAN};
+use crate::cases::{INF, NAN};
 use crate::error::ensure;
-use crate::{Formula, Operand, Var};
+use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 
 /// y = |x|; dx = g sign(x), so 0 at the kink.
@@ -15,9 +14,6 @@ impl Formula<1> for Abs {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.abs()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Abs {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1).at([0.0], 0.0, [0.0]).at([-0.0], 0.0, [0.0]).at([-INF], INF, [-1.0]);
     }
@@ -32,9 +28,6 @@ impl Formula<1> for Sign {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sign()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Sign {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain_also(-3.0..-0.1).at([0.0], 0.0, [0.0]).at([-INF], -1.0, [0.0]).at([NAN], NAN, [0.0]);
     }
@@ -49,9 +42,6 @@ impl Formula<2> for Maximum {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.maximum(b)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Maximum {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
         c.at([2.0, 2.0], 2.0, [0.5, 0.5]).at([-INF, 1.0], 1.0, [0.0, 1.0]).at([INF, INF], INF, [0.5, 0.5]);
@@ -68,9 +58,6 @@ impl Formula<2> for Minimum {
     fn f<E: Real>(&self, [a, b]: [E; 2]) -> E {
         a.minimum(b)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Minimum {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.1..3.0).domain(-3.0..-0.1).domain_also(3.1..4.0);
         c.at([2.0, 2.0], 2.0, [0.5, 0.5]).at([-INF, 1.0], -INF, [1.0, 0.0]).at([INF, INF], INF, [0.5, 0.5]);
@@ -101,9 +88,6 @@ impl Formula<1> for Clamp {
         let below = (low - x).if_positive(low, x);
         (x - high).if_positive(high, below)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Clamp {
     fn cases(&self, c: &mut Cases) {
         let (low, high) = (self.low, self.high);
         let middle = 0.5 * (low + high);
@@ -125,9 +109,6 @@ impl Formula<1> for Floor {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.floor()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Floor {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.9..-1.1).domain_also(2.1..2.9).at([-0.5], -1.0, [0.0]).at([2.0], 2.0, [0.0]).at([INF], INF, [0.0]);
     }
@@ -142,9 +123,6 @@ impl Formula<1> for Ceil {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.ceil()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Ceil {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.9..-1.1).domain_also(2.1..2.9).at([0.5], 1.0, [0.0]).at([2.0], 2.0, [0.0]).at([-INF], -INF, [0.0]);
     }
@@ -159,9 +137,6 @@ impl Formula<1> for Round {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.round()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Round {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.4..-0.6)
             .domain_also(1.6..2.4)
@@ -173,36 +148,6 @@ impl Examined<1> for Round {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The absolute value. The gradient at 0 is 0.
-    #[track_caller]
-    pub fn abs(&self) -> Self {
-        Abs.on([self])
-    }
-
-    /// 1 for positive elements, -1 for negative ones, 0 and NaN for 0 and NaN. The gradient is 0.
-    #[track_caller]
-    pub fn sign(&self) -> Self {
-        Sign.on([self])
-    }
-
-    /// The greater of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
-    ///
-    /// # Panics
-    /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn maximum(&self, other: impl Operand<'t, T>) -> Self {
-        Maximum.on([self, &other.on(self.tape())])
-    }
-
-    /// The smaller of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
-    ///
-    /// # Panics
-    /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn minimum(&self, other: impl Operand<'t, T>) -> Self {
-        Minimum.on([self, &other.on(self.tape())])
-    }
-
     /// The elements limited to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is
     /// 0 beyond. An infinite limit is none.
     ///
@@ -213,22 +158,28 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.fits("clamp", ensure(low <= high, || format!("no number is between {low} and {high}")));
         Clamp { low, high }.on([self])
     }
+}
 
+elementwise! {
+    /// The absolute value. The gradient at 0 is 0.
+    abs() = Abs;
+    /// 1 for positive elements, -1 for negative ones, 0 and NaN for 0 and NaN. The gradient is 0.
+    sign() = Sign;
+    /// The greater of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    maximum(other) = Maximum;
+    /// The smaller of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
+    minimum(other) = Minimum;
     /// The next whole number below. The gradient is 0.
-    #[track_caller]
-    pub fn floor(&self) -> Self {
-        Floor.on([self])
-    }
-
+    floor() = Floor;
     /// The next whole number above. The gradient is 0.
-    #[track_caller]
-    pub fn ceil(&self) -> Self {
-        Ceil.on([self])
-    }
-
+    ceil() = Ceil;
     /// The nearest whole number, the even one of two. The gradient is 0.
-    #[track_caller]
-    pub fn round(&self) -> Self {
-        Round.on([self])
-    }
+    round() = Round;
+    also examined: Clamp { low: -1.0, high: 2.0 };
 }

@@ -1,8 +1,7 @@
 //! Powers, reciprocals, and x ln y.
 
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined, INF, NAN};
-use crate::{Formula, Operand, Var};
+use crate::cases::{INF, NAN};
+use crate::{Cases, Formula, Var};
 use raygrad_tensor::{Real, Scalar};
 
 /// y = 1 / x; dx = -g y^2.
@@ -19,9 +18,6 @@ impl Formula<1> for Reciprocal {
     fn vjp<E: Real>(&self, g: E, [_x]: [E; 1], y: E) -> [E; 1] {
         [-(g * (y * y))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Reciprocal {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..3.0).domain_also(-3.0..-0.5).at([0.0], INF, [-INF]).at([-INF], 0.0, [0.0]).at(
             [-4.0],
@@ -43,9 +39,6 @@ impl Formula<1> for Powi {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.powi(self.exponent)
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Powi {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain_also(-2.0..-0.5);
         match self.exponent {
@@ -68,9 +61,6 @@ impl<const N: i32> Formula<1> for ConstPowi<N> {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         Powi { exponent: N }.f([x])
     }
-}
-#[cfg(feature = "check")]
-impl<const N: i32> Examined<1> for ConstPowi<N> {
     fn cases(&self, c: &mut Cases) {
         Powi { exponent: N }.cases(c);
     }
@@ -88,9 +78,6 @@ impl Formula<1> for Powf {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         if self.exponent == 0.0 { x.like(1.0) } else { x.pow(x.like(self.exponent)) }
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Powf {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0);
         match self.exponent {
@@ -117,9 +104,6 @@ impl Formula<2> for Pow {
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], y: E) -> [E; 2] {
         [g * slope_of_base(a, b), g * slope_of_exponent(a, b, y)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Pow {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.5..2.0).domain(-2.0..2.0);
         c.at([0.0, 0.0], 1.0, [0.0, 0.0]).at([0.0, 2.0], 0.0, [0.0, 0.0]).at([0.0, 1.0], 0.0, [1.0, 0.0]);
@@ -164,9 +148,6 @@ impl Formula<2> for Xlogy {
         let divisor = a.abs().if_positive(b, b.like(1.0));
         [g * b.if_positive(b, divisor).ln(), g * (a / divisor)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Xlogy {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).domain(0.5..3.0);
         c.at([0.0, 0.0], 0.0, [0.0, 0.0]).at([0.0, 2.0], 0.0, [2.0_f64.ln(), 0.0]).at([0.0, -1.0], 0.0, [0.0, 0.0]);
@@ -176,12 +157,6 @@ impl Examined<2> for Xlogy {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// `1 / self`.
-    #[track_caller]
-    pub fn reciprocal(&self) -> Self {
-        Reciprocal.on([self])
-    }
-
     /// `self` to a whole power; exponent 0 gives 1, with gradient 0, whatever the base.
     #[track_caller]
     pub fn powi(&self, exponent: i32) -> Self {
@@ -200,24 +175,26 @@ impl<'t, T: Scalar> Var<'t, T> {
     pub fn powf(&self, exponent: f64) -> Self {
         Powf { exponent }.on([self])
     }
+}
 
+elementwise! {
+    /// `1 / self`.
+    reciprocal() = Reciprocal;
     /// `self` to the power of `exponent`; broadcasts. At base 0 the gradient of the exponent is 0 unless that is
     /// negative, and for a negative base it is NaN.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn pow(&self, exponent: impl Operand<'t, T>) -> Self {
-        Pow.on([self, &exponent.on(self.tape())])
-    }
-
+    pow(exponent) = Pow;
     /// `self * ln(y)`, which is 0 where `self` is 0 even if `y` is 0 or negative; broadcasts. An entropy is
     /// `-p.xlogy(&p)`.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn xlogy(&self, y: impl Operand<'t, T>) -> Self {
-        Xlogy.on([self, &y.on(self.tape())])
-    }
+    xlogy(y) = Xlogy;
+    // Powers of both signs, of 0 and of 1 have conventions of their own.
+    also examined: Powi { exponent: 0 }, Powi { exponent: 1 }, Powi { exponent: 5 }, Powi { exponent: -4 },
+        ConstPowi::<2>, ConstPowi::<3>, ConstPowi::<4>,
+        Powf { exponent: 0.0 }, Powf { exponent: 0.5 }, Powf { exponent: 1.5 },
+        Powf { exponent: 2.0 }, Powf { exponent: 2.5 }, Powf { exponent: -0.5 };
 }

@@ -1,9 +1,8 @@
 //! Trigonometric and hyperbolic functions, and the inverse ones.
 
-#[cfg(feature = "check")]
-use crate::check::{Cases, Examined, INF, PI};
-use crate::{Formula, Operand, Var};
-use raygrad_tensor::{Real, Scalar};
+use crate::cases::{INF, PI};
+use crate::{Cases, Formula};
+use raygrad_tensor::Real;
 
 /// y = sin x; dx = g cos x.
 #[derive(Clone, Copy)]
@@ -15,9 +14,6 @@ impl Formula<1> for Sin {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sin()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Sin {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [1.0]).at([INF], f64::NAN, [f64::NAN]);
     }
@@ -33,9 +29,6 @@ impl Formula<1> for Cos {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.cos()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Cos {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([INF], f64::NAN, [f64::NAN]);
     }
@@ -50,9 +43,6 @@ impl Formula<1> for SinPi {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sin_pi()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for SinPi {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [PI]).at([0.5], 1.0, [0.0]).at([-1e6], 0.0, [PI]);
         c.at([INF], f64::NAN, [f64::NAN]);
@@ -68,9 +58,6 @@ impl Formula<1> for CosPi {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.cos_pi()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for CosPi {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([0.5], 0.0, [-PI]).at([1e6 + 1.0], -1.0, [0.0]);
         c.at([INF], f64::NAN, [f64::NAN]);
@@ -92,9 +79,6 @@ impl Formula<1> for Tanh {
         // (1 - y)(1 + y) keeps digits where y is near +-1.
         [g * ((one - y) * (one + y))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Tanh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([INF], 1.0, [0.0]).at([-INF], -1.0, [0.0]).at([300.0], 1.0, [0.0]).at([0.0], 0.0, [1.0]);
     }
@@ -114,9 +98,6 @@ impl Formula<1> for Tan {
         let one = y.like(1.0);
         [g * (one + y * y)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Tan {
     fn cases(&self, c: &mut Cases) {
         c.domain(-1.2..1.2).at([0.0], 0.0, [1.0]).at([INF], f64::NAN, [f64::NAN]);
     }
@@ -135,9 +116,6 @@ impl Formula<1> for Asin {
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         [g / complement(x)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Asin {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.8..0.8).at([0.0], 0.0, [1.0]).at([1.0], 0.5 * PI, [INF]).at([-1.0], -0.5 * PI, [INF]);
         c.at([1.5], f64::NAN, [f64::NAN]);
@@ -157,9 +135,6 @@ impl Formula<1> for Acos {
     fn vjp<E: Real>(&self, g: E, [x]: [E; 1], _y: E) -> [E; 1] {
         [-(g / complement(x))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Acos {
     fn cases(&self, c: &mut Cases) {
         c.domain(-0.8..0.8).at([0.0], 0.5 * PI, [-1.0]).at([1.0], 0.0, [-INF]).at([-1.0], PI, [-INF]);
         c.at([1.5], f64::NAN, [f64::NAN]);
@@ -180,9 +155,6 @@ impl Formula<1> for Atan {
         let one = x.like(1.0);
         [g / (one + x * x)]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Atan {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 0.0, [1.0]).at([INF], 0.5 * PI, [0.0]).at([-INF], -0.5 * PI, [0.0]);
     }
@@ -201,9 +173,6 @@ impl Formula<2> for Atan2 {
     fn vjp<E: Real>(&self, g: E, [a, b]: [E; 2], _y: E) -> [E; 2] {
         [g * turn(b, a, b), -(g * turn(a, a, b))]
     }
-}
-#[cfg(feature = "check")]
-impl Examined<2> for Atan2 {
     fn cases(&self, c: &mut Cases) {
         c.domain(0.3..3.0).domain_also(-3.0..-0.3).domain(-3.0..3.0);
         c.at([0.0, 0.0], 0.0, [0.0, 0.0]).at([0.0, -2.0], PI, [-0.5, 0.0]).at(
@@ -244,9 +213,6 @@ impl Formula<1> for Sinh {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.sinh()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Sinh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([1e-20], 1e-20, [1.0]).at([-INF], -INF, [INF]).at([-0.0], 0.0, [1.0]);
     }
@@ -261,87 +227,37 @@ impl Formula<1> for Cosh {
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
         x.cosh()
     }
-}
-#[cfg(feature = "check")]
-impl Examined<1> for Cosh {
     fn cases(&self, c: &mut Cases) {
         c.domain(-3.0..3.0).at([0.0], 1.0, [0.0]).at([-INF], INF, [-INF]);
     }
 }
 
-impl<'t, T: Scalar> Var<'t, T> {
+elementwise! {
     /// Sine of an angle in radians.
-    #[track_caller]
-    pub fn sin(&self) -> Self {
-        Sin.on([self])
-    }
-
+    sin() = Sin;
     /// Cosine of an angle in radians.
-    #[track_caller]
-    pub fn cos(&self) -> Self {
-        Cos.on([self])
-    }
-
+    cos() = Cos;
     /// `sin(pi self)`: exact reduction, so it is accurate however large the argument.
-    #[track_caller]
-    pub fn sin_pi(&self) -> Self {
-        SinPi.on([self])
-    }
-
+    sin_pi() = SinPi;
     /// `cos(pi self)`: exact reduction, so it is accurate however large the argument.
-    #[track_caller]
-    pub fn cos_pi(&self) -> Self {
-        CosPi.on([self])
-    }
-
+    cos_pi() = CosPi;
     /// Hyperbolic tangent.
-    #[track_caller]
-    pub fn tanh(&self) -> Self {
-        Tanh.on([self])
-    }
-
+    tanh() = Tanh;
     /// Tangent of an angle in radians.
-    #[track_caller]
-    pub fn tan(&self) -> Self {
-        Tan.on([self])
-    }
-
+    tan() = Tan;
     /// The angle in -pi/2..=pi/2 whose sine this is; NaN outside -1..=1. The gradient is infinite at +-1.
-    #[track_caller]
-    pub fn asin(&self) -> Self {
-        Asin.on([self])
-    }
-
+    asin() = Asin;
     /// The angle in 0..=pi whose cosine this is; NaN outside -1..=1. The gradient is infinite at +-1.
-    #[track_caller]
-    pub fn acos(&self) -> Self {
-        Acos.on([self])
-    }
-
+    acos() = Acos;
     /// The angle in -pi/2..=pi/2 whose tangent this is.
-    #[track_caller]
-    pub fn atan(&self) -> Self {
-        Atan.on([self])
-    }
-
+    atan() = Atan;
     /// The angle in -pi..=pi of the vector (`x`, `self`); both gradients are 0 at the origin.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
-    #[track_caller]
-    pub fn atan2(&self, x: impl Operand<'t, T>) -> Self {
-        Atan2.on([self, &x.on(self.tape())])
-    }
-
+    atan2(x) = Atan2;
     /// Hyperbolic sine, accurate near 0.
-    #[track_caller]
-    pub fn sinh(&self) -> Self {
-        Sinh.on([self])
-    }
-
+    sinh() = Sinh;
     /// Hyperbolic cosine.
-    #[track_caller]
-    pub fn cosh(&self) -> Self {
-        Cosh.on([self])
-    }
+    cosh() = Cosh;
 }

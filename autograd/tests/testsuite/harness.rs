@@ -1,7 +1,7 @@
 //! The gradient checker is checked: each way in which an operation can be wrong is caught, by the check that is meant
 //! to catch it.
 
-use raygrad_autograd::check::{Cases, Check, Entry, Examined, Extreme, check_op};
+use raygrad_autograd::check::{Cases, Check, Entry, Extreme, check_op};
 use raygrad_autograd::{Elementwise, Formula, Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::{broadcast_shape, map};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -200,9 +200,6 @@ impl Formula<1> for Thrice {
     fn vjp<E: Real>(&self, g: E, _x: [E; 1], _y: E) -> [E; 1] {
         [g.like(3.0 + 1e-9) * g]
     }
-}
-
-impl Examined<1> for Thrice {
     fn cases(&self, cases: &mut Cases) {
         cases.domain(-1.0..1.0);
     }

@@ -22,6 +22,7 @@
 
 pub mod f32;
 pub mod f64;
+mod plain;
 pub mod survey;
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ mod exp;
 mod log;
 mod trig;
 
+pub use super::plain::f32::*;
 pub use erf::erf;
 pub use exp::{exp, exp2, expm1, sigmoid, tanh};
 pub use log::{ln, ln1p, log2, softplus};
