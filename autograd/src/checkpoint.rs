@@ -117,7 +117,7 @@ impl<T: Scalar> Tape<T> {
         let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| x.value()).collect();
         let value = run(&f, &self.nested(), &values);
         let shape = Shape::from_slice(value.shape());
-        self.record(Checkpoint { f, shape }, inputs, value, self.line())
+        self.record(Box::new(Checkpoint { f, shape }), inputs, value, self.line())
     }
 }
 

@@ -132,29 +132,6 @@ impl<F: Formula<N>, const N: usize> Elementwise<F, N> {
         );
     }
 
-    /// [`gradients`] of single numbers, without tensors in between.
-    fn scalar_gradients<'t, T: Scalar>(
-        &self,
-        cx: &Vjp<'t, '_, T>,
-        readings: &[Reading; N],
-        wanted: [bool; N],
-        reads: u32,
-    ) -> Grads<'t, T> {
-        let g = cx.g().value().item();
-        let mut values = [T::ZERO; N];
-        if wanted.contains(&true) {
-            let x = from_fn(|i| if reads >> i & 1 == 0 { g } else { cx.input(i).item() });
-            values = self.0.vjp(g, x, if reads & Reading::OUTPUT == 0 { g } else { cx.output().item() });
-        }
-        let mut i = 0;
-        Grads::new(values.map(|value| {
-            i += 1;
-            let given = if wanted[i - 1] { value } else { g };
-            let is_given = wanted[i - 1] || cx.needs(i - 1) && readings[i - 1].is_gradient;
-            is_given.then(|| cx.constant(Tensor::full(cx.shape(i - 1), given)))
-        }))
-    }
-
     /// The values of a block.
     fn values<T: Scalar>(&self, x: &[&[T]], out: &mut [&mut [T]]) {
         if F::ANGLES {
@@ -218,9 +195,6 @@ impl<T: Scalar, F: Formula<N>, const N: usize> Op<T> for Elementwise<F, N> {
         for (i, reading) in readings.iter().enumerate() {
             wanted[i] = cx.needs(i) && !reading.is_gradient;
             reads |= if wanted[i] { reading.of } else { 0 };
-        }
-        if cx.g().value().len() == 1 {
-            return self.scalar_gradients(cx, &readings, wanted, reads);
         }
         Grads::new(gradients(cx, &readings, wanted, reads, &|x, out| self.gradients(x, out)))
     }

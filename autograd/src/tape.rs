@@ -286,12 +286,21 @@ impl<T: Scalar> Tape<T> {
     /// If an input belongs to another tape.
     #[track_caller]
     pub fn try_apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Result<Var<'t, T>, Error> {
-        let at = self.line();
-        let value = if op.is_kept() { self.run_kept(&op, inputs, at)? } else { self.run(&op, inputs, at)? };
+        self.apply_boxed(Box::new(op), inputs, self.line())
+    }
+
+    /// [`try_apply`](Self::try_apply) for any operation, so that it is compiled once.
+    fn apply_boxed<'t>(
+        &'t self,
+        op: Box<dyn Op<T>>,
+        inputs: &[&Var<'t, T>],
+        at: &'static Location<'static>,
+    ) -> Result<Var<'t, T>, Error> {
+        let value = if op.is_kept() { self.run_kept(&*op, inputs, at)? } else { self.run(&*op, inputs, at)? };
         Ok(self.record(op, inputs, value, at))
     }
 
-    /// The output of an operation, without a record. It takes any operation, so that it is compiled once.
+    /// The output of an operation, without a record.
     fn run(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Tensor<T>, Error> {
         let shape = self.check_shapes(op, inputs, at)?;
         let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
@@ -372,13 +381,13 @@ impl<T: Scalar> Tape<T> {
 
     pub(crate) fn record<'t>(
         &'t self,
-        op: impl Op<T>,
+        op: Box<dyn Op<T>>,
         inputs: &[&Var<'t, T>],
         value: Tensor<T>,
         at: &'static Location<'static>,
     ) -> Var<'t, T> {
         if self.recording.get() && inputs.iter().any(|x| x.node.is_some()) {
-            self.append(Box::new(op), inputs, value, at)
+            self.append(op, inputs, value, at)
         } else {
             self.constant(value)
         }
