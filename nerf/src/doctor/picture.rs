@@ -59,6 +59,7 @@ impl Picture {
     }
 
     /// The value at a place, between pixels; NaN outside.
+    #[inline(always)]
     pub fn at(&self, x: f64, y: f64) -> f32 {
         let [x, y] = [(x - 0.5) as f32, (y - 0.5) as f32];
         if !(x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f32 && y < (self.height - 1) as f32) {
