@@ -1,13 +1,15 @@
 //! How fast the hash grid is on one thread: nanoseconds a sample for encoding, for adding gradients to a level's table
-//! and for the optimiser (also a row that it moves), at random positions and in order along rays.
+//! and for the optimiser (also a row that it moves, with adding its gradient to none), at random positions and in order along
+//! rays.
 //!
 //! ```text
 //! cargo run --release -p raygrad-nerf --example hash_speed [levels features log2_table]
 //! ```
 
-use raygrad_autograd::{Op, Pool, RowSums, Tensor};
+use raygrad_autograd::{Gradient, Op, Pool, RowGrad, RowSums, Tensor};
 use raygrad_nerf::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
-use raygrad_nn::{AdamConfig, RowAdam};
+use raygrad_nn::{Adam, AdamConfig, Optimizer, Params};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Samples of a tile, and tiles of a step.
@@ -54,7 +56,7 @@ fn each_tile(mut work: impl FnMut(usize)) -> f64 {
 fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f64) -> raygrad_nerf::Result<()> {
     let grid = HashGrid::new(config)?;
     let pool = Pool::new();
-    let mut table = grid.init::<f32>(1);
+    let table = grid.init::<f32>(1);
     // Positions, and gradients of their features.
     let tile = |t: usize| {
         let positions = Tensor::from_fn(&[TILE, 3], |i| position(t * TILE + i / 3, i % 3) as f32);
@@ -68,23 +70,30 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
     let constants = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
     let (mut scatter, mut adam, mut moved) = (0.0, 0.0, 0);
     for (l, level) in grid.levels().iter().enumerate() {
-        let rows = level.rows.len();
-        let mut sums = RowSums::new(rows, grid.features());
-        let mut optimizer = RowAdam::<f32>::new(constants, rows, grid.features());
-        let values = &mut table.as_mut_slice()[level.rows.start * grid.features()..level.rows.end * grid.features()];
+        let shape = [level.rows.len(), grid.features()];
+        let mut sums = RowSums::new(shape[0], shape[1]);
+        let mut optimizer = Adam::<f32>::new(constants);
+        let mut params = Params::new();
+        params.add("level", table.slice_axis(0, level.rows.clone()));
+        params.set_lazy(|_| true, true);
         let mut least = [f64::INFINITY; 2];
         for run in 0..RUNS {
             let start = Instant::now();
             for (positions, d_out) in &tiles {
                 grid.scatter_level(l, positions.as_slice(), d_out.as_slice(), &mut sums);
             }
-            let middle = Instant::now();
-            let stats = optimizer.step(values, &mut sums, 1e-2, 0.0);
-            let times = [middle.duration_since(start), middle.elapsed()];
+            let scattered = start.elapsed();
+            let rows = Tensor::from_vec(&[sums.rows().len(), shape[1]], sums.sums().to_vec());
+            let mut gradient = Gradient::zero(&shape);
+            gradient.add_sparse(Arc::new(RowGrad::new(&shape, sums.rows().into(), rows)));
+            sums.clear();
+            let start = Instant::now();
+            let report = optimizer.update(&mut params, &[gradient], 1e-2);
+            let times = [scattered, start.elapsed()];
             for (least, time) in least.iter_mut().zip(times) {
                 *least = least.min(time.as_secs_f64());
             }
-            moved += if run == 0 { stats.touched } else { 0 };
+            moved += if run == 0 { report.moved / shape[1] } else { 0 };
         }
         scatter += least[0] * 1e9 / (TILE * TILES) as f64;
         adam += least[1] * 1e9;

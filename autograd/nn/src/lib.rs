@@ -2,7 +2,7 @@
 //!
 //! * [`Params`]: named parameters outside any tape; [`Bound`]: the same on one.
 //! * [`Layer`] and the layers: [`Linear`], [`Mlp`], [`Conv2d`], [`LayerNorm`], [`Dropout`], [`Embedding`], [`Sequential`].
-//! * [`Optimizer`]: [`Sgd`], [`Adam`], [`AdamW`]; [`Schedule`], [`clip_norm`], [`Ema`]; [`RowAdam`] for tables.
+//! * [`Optimizer`]: [`Sgd`], [`Adam`], [`AdamW`]; [`Schedule`], [`clip_norm`], [`Ema`].
 //! * [`OptimizerState`] and [`Params`] as files, with the feature `files`: safetensors, and NumPy's npz.
 
 #[cfg(feature = "files")]
@@ -22,8 +22,7 @@ pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp
 #[cfg(feature = "files")]
 pub use npz::NpzError;
 pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, Move, NonFinite, Optimizer, OptimizerState, Schedule};
-pub use optim::{RowAdam, RowStats, SettingError, Sgd, SgdConfig, StateError, UpdateReport};
-pub use optim::{clip_norm, clip_value, global_norm};
+pub use optim::{SettingError, Sgd, SgdConfig, StateError, UpdateReport, clip_norm, clip_value, global_norm};
 pub use params::{Bound, ParamId, ParamLayout, Params};
 #[cfg(feature = "files")]
 pub use storage::{ParamsError, Storage, stored_bytes, stored_words};

@@ -228,7 +228,7 @@ impl<T: Scalar> Params<T> {
     /// A lazy parameter is a table of which a step uses few rows, along its first axis: an embedding. Optimisers then
     /// read and move only the rows whose gradient is not zero, and what they remember of others stands still too. That is
     /// another optimiser: a row that gets one late gradient moves once, where momentum moves it over the following steps
-    /// too ([`RowAdam`](crate::RowAdam)). Choose before the first step.
+    /// too ([`Adam`](crate::Adam)). Choose before the first step.
     pub fn set_lazy(&mut self, which: impl Fn(&str) -> bool, lazy: bool) -> usize {
         self.set(which, |setting| setting.lazy = lazy)
     }
@@ -266,19 +266,24 @@ impl<T: Scalar> Params<T> {
         self.settings[self.names.place(id)].decay
     }
 
-    /// What an optimiser is to do with these gradients at learning rate `rate`: one [`Move`] for each parameter that is
-    /// not frozen and whose gradient has a share.
+    /// What an optimiser is to do with these gradients: one [`Move`] for each parameter that is not frozen and whose
+    /// gradient has a share. `rate` gives the learning rate of the parameter at a place of the store, before its factor.
     ///
     /// # Panics
-    /// If there is not one gradient of the same shape for each parameter that is not frozen, or the rate is not within 0
+    /// If there is not one gradient of the same shape for each parameter that is not frozen, or a rate is not within 0
     /// to 1e30.
     #[track_caller]
-    pub fn moves<'a>(&'a mut self, grads: &'a [Gradient<T>], rate: f64) -> impl Iterator<Item = Move<'a, T>> {
-        assert!((0.0..=1e30).contains(&rate), "a learning rate of {rate:?}; use 0 to 1e30");
+    pub fn moves<'a>(
+        &'a mut self,
+        grads: &'a [Gradient<T>],
+        rate: impl Fn(usize) -> f64,
+    ) -> impl Iterator<Item = Move<'a, T>> {
         let free = self.settings.iter().filter(|setting| !setting.frozen).count();
         assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
         // Before anything is moved.
         for (id, grad) in self.trainable().zip(grads) {
+            let rate = rate(id.place);
+            assert!((0.0..=1e30).contains(&rate), "a learning rate of {rate:?}; use 0 to 1e30");
             assert_eq!(self.get(id).shape(), grad.shape(), "the gradient of `{}` has its shape", self.name(id));
         }
         let (names, values) = (&self.names.names, self.values.iter_mut());
@@ -286,7 +291,7 @@ impl<T: Scalar> Params<T> {
         let free = parts.filter(|(_, (_, setting))| !setting.frozen);
         let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
             let lazy = setting.moves_rows(value);
-            Move { slot, name, value, grad, rate: rate * setting.rate, decay: setting.decay, lazy }
+            Move { slot, name, value, grad, rate: rate(slot) * setting.rate, decay: setting.decay, lazy }
         });
         moves.filter(|part| !part.grad.is_zero())
     }

@@ -1,25 +1,21 @@
-//! Groups of parameters, each with an optimiser, a schedule and a decay of its own.
+//! Groups of parameters, each with constants of the optimiser, a schedule and a decay of its own.
 
-use crate::model::config::{Config, GroupConfig};
+use crate::model::config::Config;
 use crate::model::{EXPOSURE, FOCAL, LENS, POSES, VIGNETTING};
 use crate::{Error, Result};
 use raygrad_autograd::Gradient;
-use raygrad_nn::{AdamW, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
+use raygrad_nn::{Adam, AdamConfig, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
 
 /// Parameters of cameras, each of which has a learning rate of its own.
 const CAMERAS: [&str; 5] = [POSES, FOCAL, LENS, EXPOSURE, VIGNETTING];
 
-/// One group.
-struct Group {
-    /// For each parameter of the store whether it belongs here.
-    members: Vec<bool>,
-    adam: AdamW<f32>,
-    schedule: Schedule,
+/// The optimiser of all parameters, which belong to groups: the first of the configuration that a name fits, and else one
+/// for each parameter of cameras, one for the tables, of which only rows are moved, and the rest.
+pub(crate) struct Groups {
+    adam: Adam<f32>,
+    /// Of each group, as the optimiser numbers them.
+    schedules: Vec<Schedule>,
 }
-
-/// All groups: a parameter belongs to the first that its name fits, and else to one of its own, if it is of cameras, to the
-/// tables, if only rows of it are moved, or to the rest.
-pub(crate) struct Groups(Vec<Group>);
 
 impl Groups {
     /// Groups of these parameters that have seen nothing.
@@ -27,60 +23,64 @@ impl Groups {
     /// # Errors
     /// If a group of the configuration has no parameter.
     pub fn new(config: &Config, params: &Params<f32>) -> Result<Self> {
-        let rest = |adam, schedule| GroupConfig { params: String::new(), adam, schedule, decay: 0.0 };
-        let cameras = CAMERAS.map(|name| rest(config.adam, config.camera_rate(name).unwrap_or(config.schedule)));
-        let others = [rest(config.table_adam, config.schedule), rest(config.adam, config.schedule)];
-        let settings: Vec<_> = config.groups.iter().cloned().chain(cameras).chain(others).collect();
-        let named = config.groups.len();
-        let place = |name: &str, lazy: bool| {
-            let fits = |group: &GroupConfig| name.starts_with(&group.params);
-            let camera = CAMERAS.iter().position(|camera| *camera == name && config.camera_rate(name).is_some());
-            let other = camera.unwrap_or(CAMERAS.len() + usize::from(!lazy));
-            config.groups.iter().position(fits).unwrap_or(named + other)
-        };
-        let places: Vec<usize> = params.ids().map(|id| place(params.name(id), params.is_lazy(id))).collect();
-        let group = |(i, GroupConfig { adam, schedule, decay, .. }): (usize, GroupConfig)| Group {
-            members: places.iter().map(|&place| place == i).collect(),
-            adam: AdamW::new(adam, decay),
-            schedule,
-        };
-        if let Some(empty) = (0..named).find(|i| !places.contains(i)) {
-            let names: Vec<&str> = params.names().collect();
-            let what = format!("no parameter begins so that is in no group before it; there are {}", names.join(", "));
-            return Err(Error::setting(format!("groups.{}", config.groups[empty].params), what));
+        let mut groups = Groups { adam: Adam::new(config.adam), schedules: vec![config.schedule] };
+        for group in &config.groups {
+            let fits = |name: &str| name.starts_with(&group.params);
+            if groups.add(params, fits, group.adam, group.decay, group.schedule) == 0 {
+                let names: Vec<&str> = params.names().collect();
+                let what =
+                    format!("no parameter begins so that is in no group before it; there are {}", names.join(", "));
+                return Err(Error::setting(format!("groups.{}", group.params), what));
+            }
         }
-        let groups = settings.into_iter().enumerate().map(group).filter(|group| group.members.contains(&true));
-        Ok(Groups(groups.collect()))
+        for camera in CAMERAS {
+            if let Some(schedule) = config.camera_rate(camera) {
+                groups.add(params, |name| name == camera, config.adam, 0.0, schedule);
+            }
+        }
+        let is_table = |name: &str| params.find(name).is_some_and(|id| params.is_lazy(id));
+        groups.add(params, is_table, config.table_adam, 0.0, config.schedule);
+        Ok(groups)
+    }
+
+    /// A further group of those parameters that `which` chooses and that are in none yet; returns how many these are.
+    fn add(
+        &mut self,
+        params: &Params<f32>,
+        which: impl Fn(&str) -> bool,
+        adam: AdamConfig,
+        decay: f64,
+        schedule: Schedule,
+    ) -> usize {
+        self.schedules.push(schedule);
+        self.adam.add_group(params, which, adam, decay)
     }
 
     /// Steps taken.
     pub fn steps(&self) -> u64 {
-        self.0.first().map_or(0, |group| group.adam.steps())
+        self.adam.steps()
     }
 
-    /// What the optimisers remember of these parameters, as bytes for each group.
+    /// What the optimiser remembers of these parameters, as bytes.
     ///
     /// # Errors
     /// If the format cannot hold it.
-    pub fn state(&self, params: &Params<f32>) -> Result<Vec<Vec<u8>>> {
-        let failed = |error: StateError| Error::setting("groups", error.to_string());
-        self.0.iter().map(|group| group.adam.state(params).to_safetensors().map_err(failed)).collect()
+    pub fn state(&self, params: &Params<f32>) -> Result<Vec<u8>> {
+        self.adam.state(params).to_safetensors().map_err(failed)
     }
 
-    /// Takes back what [`state`](Self::state) gave.
+    /// Takes back what [`state`](Self::state) gave, as it is or in parts: earlier versions had one for each group.
     ///
     /// # Errors
-    /// If it is that of other groups or of other parameters.
-    pub fn load_state(&mut self, params: &Params<f32>, state: &[Vec<u8>]) -> Result<()> {
-        if state.len() != self.0.len() {
-            let what = format!("are {}, and the optimisers' states are {}", self.0.len(), state.len());
-            return Err(Error::setting("groups", what));
+    /// If it is that of other parameters.
+    pub fn load_state(&mut self, params: &Params<f32>, parts: &[Vec<u8>]) -> Result<()> {
+        let mut state = OptimizerState::default();
+        for part in parts {
+            let OptimizerState { tensors, counts } = OptimizerState::from_safetensors(part).map_err(failed)?;
+            state.tensors.extend(tensors);
+            state.counts.extend(counts);
         }
-        for (group, bytes) in self.0.iter_mut().zip(state) {
-            let load = OptimizerState::from_safetensors(bytes).and_then(|state| group.adam.load_state(params, &state));
-            load.map_err(|error| Error::setting("groups", error.to_string()))?;
-        }
-        Ok(())
+        self.adam.load_state(params, &state).map_err(failed)
     }
 
     /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them, at `pace` times
@@ -92,29 +92,19 @@ impl Groups {
         fraction: f64,
         pace: f64,
     ) -> UpdateReport {
-        let mut report = UpdateReport::default();
-        for Group { members, adam, schedule } in &mut self.0 {
-            let free = params.ids().zip(&*members).filter(|(id, _)| !params.is_frozen(*id));
-            let own = |((_, member), grad): ((_, &bool), &Gradient<f32>)| match member {
-                true => grad.clone(),
-                false => Gradient::zero(grad.shape()),
-            };
-            let own: Vec<_> = free.zip(grads).map(own).collect();
-            let UpdateReport { moved, skipped, bad } = adam.update(params, &own, pace * schedule.rate(fraction));
-            report.moved += moved;
-            report.skipped += skipped;
-            report.bad.extend(bad);
-        }
-        report
+        self.adam.update_groups(params, grads, |group| pace * self.schedules[group].rate(fraction))
     }
+}
+
+fn failed(error: StateError) -> Error {
+    Error::setting("groups", error.to_string())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::config::Preset;
+    use crate::model::config::{GroupConfig, Preset};
     use raygrad_autograd::Tensor;
-    use raygrad_nn::AdamConfig;
 
     #[test]
     fn each_group_has_its_rate_and_decay_and_each_parameter_one_group() {

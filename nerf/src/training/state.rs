@@ -17,7 +17,7 @@ const MOST_RAYS: usize = 1 << 20;
 /// The name of the trainer's own numbers in the bytes.
 const TRAINER: &str = "trainer";
 
-/// What a trainer knows beside the model and the optimisers. There is no random state: every random number is a function of
+/// What a trainer knows beside the model and the optimiser. There is no random state: every random number is a function of
 /// the seed, the number of the step and that of the tile.
 #[derive(Serialize, Deserialize)]
 struct Counts {
@@ -34,7 +34,7 @@ struct Counts {
     /// How much of its detail the field has.
     #[serde(default = "one")]
     detail: f64,
-    /// How many groups of parameters there are.
+    /// How many parts the optimiser's state has: one. Earlier versions had one for each group of parameters.
     groups: usize,
     /// What was said of the parameters, in their order.
     settings: Vec<Setting>,
@@ -54,14 +54,14 @@ struct Setting {
     decay: f64,
 }
 
-/// The name of the state of the optimiser of a group.
-fn group(number: usize) -> String {
+/// The name of a part of the optimiser's state.
+fn part(number: usize) -> String {
     format!("optimizer.{number}")
 }
 
 impl Trainer {
     /// All that the next steps depend on, beside the configuration and the photographs, as a safetensors file: parameters in
-    /// full and what was said of them, what the optimisers and the sampler remember, the step, the training time and the
+    /// full and what was said of them, what the optimiser and the sampler remember, the step, the training time and the
     /// number of rays. [`load_state`](Self::load_state) goes on from it.
     ///
     /// # Errors
@@ -69,7 +69,7 @@ impl Trainer {
     pub fn state(&self) -> Result<Vec<u8>> {
         let failed = |what: String| Error::setting("state", what);
         let params = &self.model.params;
-        let groups = self.groups.state(params)?;
+        let optimizer = self.groups.state(params)?;
         let setting = |id| Setting {
             name: params.name(id).to_owned(),
             frozen: params.is_frozen(id),
@@ -86,14 +86,13 @@ impl Trainer {
             collapses: self.collapses,
             pace: self.pace,
             detail: self.model.detail(),
-            groups: groups.len(),
+            groups: 1,
             settings: params.ids().map(setting).collect(),
         };
         let counts = serde_json::to_vec(&counts).map_err(|error| failed(error.to_string()))?;
-        let names: Vec<String> = (0..groups.len()).map(group).collect();
         let mut blobs = self.model.sampler.training_state();
-        blobs.push((TRAINER, counts));
-        blobs.extend(names.iter().map(String::as_str).zip(groups));
+        let name = part(0);
+        blobs.extend([(TRAINER, counts), (&name, optimizer)]);
         let metadata = BTreeMap::from([("format".into(), "raygrad training".into())]);
         let bytes = params.to_safetensors(Storage::Full, &metadata, &blobs);
         bytes.map_err(|error: ParamsError| failed(error.to_string()))
@@ -146,7 +145,7 @@ impl Trainer {
         }
         let missing = || failed("lacks what an optimiser remembers".into());
         let remembered: Vec<Vec<u8>> =
-            (0..counts.groups).map(|i| blobs.remove(&group(i)).ok_or_else(missing)).collect::<Result<_>>()?;
+            (0..counts.groups).map(|i| blobs.remove(&part(i)).ok_or_else(missing)).collect::<Result<_>>()?;
         let mut groups = Groups::new(&model.config, &model.params)?;
         groups.load_state(&model.params, &remembered)?;
         (self.model, self.groups) = (model, groups);
@@ -209,6 +208,7 @@ mod tests {
     use super::*;
     use crate::dataset::{Split, sample::ball};
     use crate::model::Preset;
+    use raygrad_nn::OptimizerState;
     use std::sync::Arc;
 
     fn trainer() -> Trainer {
@@ -287,5 +287,37 @@ mod tests {
         trainer.load_state(&still).unwrap();
         assert_eq!((trainer.pace, trainer.model.detail()), (0.0, 0.0));
         trainer.load_state(&before).unwrap();
+    }
+
+    /// Earlier versions had an optimiser for each group, and a state of each.
+    #[test]
+    fn states_in_parts_are_read() {
+        let mut trainer = trainer();
+        trainer.step(0.0);
+        let state = trainer.state().unwrap();
+        let expected = trainer.step(0.5).loss;
+        let params = &trainer.model.params;
+        let mut blobs = params.clone().load_safetensors(&state).unwrap();
+        let mut counts: Counts = serde_json::from_slice(&blobs.remove(TRAINER).unwrap()).unwrap();
+        let whole = OptimizerState::<f32>::from_safetensors(&blobs.remove(&part(0)).unwrap()).unwrap();
+        let tables: Vec<&str> = params.ids().filter(|id| params.is_lazy(*id)).map(|id| params.name(id)).collect();
+        let of = |lazy: bool| {
+            let own = |name: &String| name == "steps" || tables.iter().any(|table| name.starts_with(table)) == lazy;
+            let mut half = whole.clone();
+            half.tensors.retain(|name, _| own(name));
+            half.counts.retain(|name, _| own(name));
+            half.to_safetensors().unwrap()
+        };
+        counts.groups = 2;
+        blobs.insert(TRAINER.into(), serde_json::to_vec(&counts).unwrap());
+        blobs.extend([true, false].into_iter().enumerate().map(|(i, lazy)| (part(i), of(lazy))));
+        let blobs: Vec<_> = blobs.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
+        let mut file = params.clone();
+        file.load_safetensors(&state).unwrap();
+        let parts = file.to_safetensors(Storage::Full, &BTreeMap::new(), &blobs).unwrap();
+        let mut later = self::trainer();
+        later.load_state(&parts).unwrap();
+        assert!(later.state().unwrap() == state);
+        assert_eq!(later.step(0.5).loss, expected);
     }
 }

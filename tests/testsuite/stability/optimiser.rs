@@ -1,7 +1,7 @@
 //! Adam, dense and lazy.
 
 use super::support::*;
-use raygrad::{Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, RowAdam, RowSums, Scalar, Sgd, SgdConfig, Tensor};
+use raygrad::{Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, Scalar, Sgd, SgdConfig, Tensor};
 
 const TABLE: AdamConfig = AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 };
 
@@ -25,6 +25,18 @@ fn store<T: Scalar>(value: Tensor<T>) -> Params<T> {
     let mut params = Params::new();
     params.add("x", value);
     params
+}
+
+/// A store of one lazy table of zeros.
+fn lazy_store<T: Scalar>(shape: &[usize]) -> Params<T> {
+    let mut params = store(Tensor::zeros(shape));
+    params.set_lazy(|_| true, true);
+    params
+}
+
+/// A gradient of a table that is zero but in one row.
+fn row_of<T: Scalar>(shape: &[usize], row: usize, g: f64) -> Tensor<T> {
+    Tensor::from_fn(shape, |i| if i / shape[1] == row { T::from_f64(g) } else { T::ZERO })
 }
 
 /// A step of that parameter; returns how many elements were left alone.
@@ -187,24 +199,29 @@ fn ten_million_steps() {
 fn lazy_adam_with_pauses<T: Scalar>() {
     for every in [1, 3, 10] {
         for config in [AdamConfig::default(), TABLE] {
-            let mut adam = RowAdam::<T>::new(config, 16, 1);
-            let mut table = vec![T::ZERO; 16];
+            let mut adam = Adam::<T>::new(config);
+            let mut table = lazy_store::<T>(&[16, 1]);
             let (mut m, mut v, mut x, mut t) = (0.0, 0.0, 0.0, 0);
             for step in 0..40 * every {
-                let mut sums = RowSums::new(16, 1);
+                let mut grad = Tensor::zeros(&[16, 1]);
                 if step % every == 0 {
                     let g = round::<T>((0.3 * step as f64).sin() + 0.2);
                     t += 1;
-                    sums.add(9, &[T::from_f64(g)]);
+                    grad = row_of(&[16, 1], 9, g);
                     (m, v) =
                         (config.beta1 * m + (1.0 - config.beta1) * g, config.beta2 * v + (1.0 - config.beta2) * g * g);
                     let (m, v) = (m / (1.0 - config.beta1.powi(t)), v / (1.0 - config.beta2.powi(t)));
                     x -= 0.01 * m / (v.sqrt() + config.epsilon);
                 }
-                adam.step(&mut table, &mut sums, 0.01, 0.0);
-                within(&format!("every {every}, step {step}"), table[9].to_f64(), x, by_type::<T>(2e-6, 1e-13));
+                assert_eq!(self::step(&mut adam, &mut table, grad, 0.01), 0);
+                within(
+                    &format!("every {every}, step {step}"),
+                    numbers(&table.values()[0])[9],
+                    x,
+                    by_type::<T>(2e-6, 1e-13),
+                );
             }
-            assert!(table.iter().enumerate().all(|(i, x)| i == 9 || *x == T::ZERO));
+            assert!(numbers(&table.values()[0]).iter().enumerate().all(|(i, x)| i == 9 || *x == 0.0));
         }
     }
     // One late gradient: a lazy row moves by one learning rate, where dense Adam moves by this many in all.
@@ -214,25 +231,22 @@ fn lazy_adam_with_pauses<T: Scalar>() {
     let way: f64 = -ways::<T>(TABLE, &late, 1.0).iter().map(|way| way[0]).sum::<f64>();
     let expected = constant("way / lr after one late gradient, dense Adam with beta2 = .99 in all");
     near::<T>("dense", way, expected, by_type::<T>(1e-4, 1e-7));
-    let mut adam = RowAdam::<T>::new(TABLE, 8, 1);
-    let (mut table, mut sums) = (vec![T::ZERO; 8], RowSums::new(8, 1));
-    sums.add(0, &[T::ONE]);
-    adam.step(&mut table, &mut sums, 1.0, 0.0);
-    near::<T>("lazy", -table[0].to_f64(), 1.0, 1e-6);
+    let mut table = lazy_store::<T>(&[8, 1]);
+    step(&mut Adam::new(TABLE), &mut table, row_of(&[8, 1], 0, 1.0), 1.0);
+    near::<T>("lazy", -numbers(&table.values()[0])[0], 1.0, 1e-6);
 }
 
 /// The bound holds for lazy Adam too.
 fn no_lazy_step_is_longer_than_the_bound<T: Scalar>() {
     for config in [AdamConfig::default(), TABLE] {
         for size in [1e-30, 1e-16, 1e-15, 1e-14, 1e-13, 1e-10, 1.0, 1e18, 1e20, 1e30] {
-            let mut adam = RowAdam::<T>::new(config, 8, 2);
+            let mut adam = Adam::<T>::new(config);
+            let mut table = lazy_store::<T>(&[8, 2]);
             for step in 0..200 {
-                let mut table = vec![T::ZERO; 16];
+                table.values_mut()[0].as_mut_slice().fill(T::ZERO);
                 let sign = if step % 5 == 0 { -1.0 } else { 1.0 };
-                let mut sums = RowSums::new(8, 2);
-                sums.add(3, &[T::from_f64(sign * size); 2]);
-                adam.step(&mut table, &mut sums, 1.0, 0.0);
-                let way = table[7].to_f64().abs();
+                assert_eq!(self::step(&mut adam, &mut table, row_of(&[8, 2], 3, sign * size), 1.0), 0);
+                let way = numbers(&table.values()[0])[7].abs();
                 assert!(way <= bound(&config) * (1.0 + 1e-5), "|g| {size:e}, step {step}: {way:e}");
             }
         }

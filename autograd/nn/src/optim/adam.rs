@@ -1,43 +1,45 @@
 //! Adam and AdamW.
 
 use super::limits::{flushed, limited, tiny, tiny_square};
+use super::memory::Memory;
+use super::rule::Rule;
 use super::settings::{check, check_rate, check_share, or_panic};
-use super::state::{Reader, memories};
-use super::{CHUNK, Move, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, counted, remember, slot};
-use crate::{Params, RowAdam};
-use raygrad_autograd::{Gradient, RowSums};
-use raygrad_tensor::{Pool, Scalar, simd};
+use super::state::Reader;
+use super::{Optimizer, OptimizerState, SettingError, StateError, UpdateReport};
+use crate::Params;
+use raygrad_autograd::Gradient;
+use raygrad_tensor::Scalar;
 use serde::{Deserialize, Serialize};
 
-/// Adam (Kingma and Ba 2015, algorithm 1).
+/// Adam (Kingma and Ba 2015, algorithm 1), with constants, learning rate and decoupled weight decay of their own for
+/// [groups](Self::add_group) of parameters. [`AdamW`] makes one with decay.
 ///
 /// Bias corrections are computed in f64 from an integer step count, which each parameter has for itself. First moments
 /// below 1e-30 (1e-300 in f64) and second ones below 1e-37 (1e-307) are set to 0, so that long runs without gradient do not fill memory with
 /// denormal numbers, which are slow. Gradients count as at most 1e19 (1e154 in f64), so that their squares are finite. Work
 /// is spread over the current rayon pool; the result does not depend on the number of threads.
 ///
-/// A lazy parameter ([`Params::set_lazy`]) is moved by [`RowAdam`]: rows without gradient are not read, and each counts
-/// its own steps. A step whose gradient does not consist of rows alone, because a penalty on the whole table is part of
-/// the loss, visits every row whose gradient is not zero.
+/// Of a lazy parameter ([`Params::set_lazy`], PyTorch's `SparseAdam`), rows without gradient are not read: their moments do
+/// not decay, and their bias correction stands still, because each row counts its own steps. A row that gets one late
+/// gradient moves by about one learning rate, where dense Adam, which has corrected its moments away by then, moves it over
+/// the following steps too. Where every row has a gradient in every step, the two agree. A step whose gradient does not
+/// consist of rows alone, because a penalty on the whole table is part of the loss, visits every row whose gradient is not
+/// zero.
 #[derive(Debug, Clone)]
 pub struct Adam<T: Scalar> {
-    config: AdamConfig,
-    step: u64,
-    memory: Vec<Memory<T>>,
-    /// Made for the first lazy parameter: its constants are for all.
-    rows: Option<RowAdam<T>>,
-    /// For gradients that have to be added up.
-    pool: Pool<T>,
+    /// The first is that of parameters which no other has.
+    groups: Vec<Group<T>>,
+    /// For each parameter of the store its group; those behind the end are in the first.
+    members: Vec<usize>,
+    steps: u64,
+    memory: Memory<T>,
 }
 
-/// Adam with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2): before each step a parameter is
+/// Makes [`Adam`] with decoupled weight decay (Loshchilov and Hutter 2019, algorithm 2): before each step a parameter is
 /// multiplied by `1 - rate decay`. An element whose gradient is infinite or NaN does not decay either, nor does a row of
 /// a lazy parameter without gradient.
-#[derive(Debug, Clone)]
-pub struct AdamW<T: Scalar> {
-    adam: Adam<T>,
-    decay: f64,
-}
+#[derive(Debug, Clone, Copy)]
+pub struct AdamW;
 
 /// Constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -70,30 +72,54 @@ impl AdamConfig {
     }
 }
 
-/// What Adam knows of one parameter.
-#[derive(Debug, Clone, Default)]
-enum Memory<T> {
-    /// Not moved so far.
-    #[default]
-    Nothing,
-    Dense(Moments<T>),
-    Rows(Box<Table<T>>),
-}
-
-/// Moments of a parameter that is moved as a whole.
-#[derive(Debug, Clone, Default)]
-struct Moments<T> {
-    step: u64,
-    first: Vec<T>,
-    second: Vec<T>,
-}
-
-/// A parameter of which only rows are moved.
+/// Parameters with the same constants.
 #[derive(Debug, Clone)]
-struct Table<T> {
-    adam: RowAdam<T>,
-    /// For each part that is summed by itself; nothing between steps.
-    sums: Vec<RowSums<T>>,
+struct Group<T> {
+    config: AdamConfig,
+    decay: f64,
+    /// For each step of a row, from 1 on, the factors of learning rate and epsilon that correct the moments' bias:
+    /// `sqrt(1 - beta2^t) / (1 - beta1^t)` and `sqrt(1 - beta2^t)`. The last stands for all later ones. Made for the first
+    /// lazy parameter.
+    corrections: Vec<[T; 2]>,
+}
+
+/// `1 - beta^step` of both moments, without cancellation.
+fn biases(AdamConfig { beta1, beta2, .. }: AdamConfig, step: u32) -> [f64; 2] {
+    [beta1, beta2].map(|beta| -(f64::from(step) * beta.ln()).exp_m1())
+}
+
+impl<T: Scalar> Group<T> {
+    /// Where the corrections end even if they are not yet 1, which matters to a beta2 above 0.9998 only.
+    const LONGEST: u32 = 1 << 17;
+
+    #[track_caller]
+    fn new(config: AdamConfig, decay: f64) -> Self {
+        or_panic(config.check().and(check_rate("decay", decay)));
+        Group { config, decay, corrections: vec![] }
+    }
+
+    /// Fills the corrections, if they are not.
+    fn correct_rows(&mut self) {
+        let mut step = 0;
+        while step < Self::LONGEST && self.corrections.last() != Some(&[T::ONE; 2]) {
+            step += 1;
+            let [first, second] = biases(self.config, step);
+            self.corrections.push([second.sqrt() / first, second.sqrt()].map(T::from_f64));
+        }
+    }
+
+    /// A step at this learning rate of a parameter with this factor of the decay, without correction of the bias.
+    fn update(&self, rate: f64, decay: f64) -> Update<T> {
+        let (AdamConfig { beta1, beta2, epsilon }, decay) = (self.config, self.decay * decay);
+        Update {
+            beta: [beta1, beta2].map(T::from_f64),
+            rest: [1.0 - beta1, 1.0 - beta2].map(T::from_f64),
+            rate: T::from_f64(rate),
+            epsilon: T::from_f64(epsilon),
+            keep: T::from_f64(1.0 - rate * decay),
+            tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
+        }
+    }
 }
 
 impl<T: Scalar> Adam<T> {
@@ -103,185 +129,132 @@ impl<T: Scalar> Adam<T> {
     /// If [`AdamConfig::check`] finds something.
     #[track_caller]
     pub fn new(config: AdamConfig) -> Self {
-        or_panic(config.check());
-        Adam { config, step: 0, memory: vec![], rows: None, pool: Pool::new() }
+        AdamW::new(config, 0.0)
+    }
+
+    /// Makes a further group of the parameters whose name `which` chooses and that are in none yet, as PyTorch's
+    /// `add_param_group`, and returns how many these are. Groups are numbered from 1 on; number 0 are the parameters in no
+    /// other. Call it before the first step.
+    ///
+    /// ```
+    /// use raygrad_autograd::{Gradient, Tensor};
+    /// use raygrad_nn::{Adam, AdamConfig, Params};
+    /// let mut params = Params::<f32>::new();
+    /// for name in ["trunk.weight", "trunk.bias", "head.weight"] {
+    ///     params.add(name, Tensor::scalar(1.0));
+    /// }
+    /// let mut adam = Adam::new(AdamConfig::default());
+    /// let fast = AdamConfig { beta2: 0.99, ..AdamConfig::default() };
+    /// assert_eq!(adam.add_group(&params, |name| name.starts_with("head."), fast, 0.01), 1);
+    /// let grads = [1.0, 1.0, 1.0].map(|g| Gradient::from(Tensor::scalar(g)));
+    /// adam.update_groups(&mut params, &grads, |group| [0.001, 0.1][group]).check().unwrap();
+    /// let moved: Vec<f32> = params.values().iter().map(|value| value.item()).collect();
+    /// assert!((moved[0] - 0.999).abs() < 1e-6 && (moved[2] - 0.899).abs() < 1e-6);
+    /// ```
+    ///
+    /// # Panics
+    /// If [`AdamConfig::check`] finds something, or the decay is not within 0 to 1e30.
+    #[track_caller]
+    pub fn add_group(
+        &mut self,
+        params: &Params<T>,
+        which: impl Fn(&str) -> bool,
+        config: AdamConfig,
+        decay: f64,
+    ) -> usize {
+        self.groups.push(Group::new(config, decay));
+        self.members.resize(params.len(), 0);
+        let mut count = 0;
+        for (member, _) in
+            self.members.iter_mut().zip(params.names()).filter(|(member, name)| **member == 0 && which(name))
+        {
+            *member = self.groups.len() - 1;
+            count += 1;
+        }
+        count
     }
 
     /// Number of steps taken.
     pub fn steps(&self) -> u64 {
-        self.step
+        self.steps
     }
 
-    /// A step with decoupled weight decay.
+    /// As [`update`](Optimizer::update), with a learning rate for each group: `rate` gives that of a number.
+    ///
+    /// # Panics
+    /// As there.
     #[track_caller]
-    fn decayed(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64, decay: f64) -> UpdateReport {
+    pub fn update_groups(
+        &mut self,
+        params: &mut Params<T>,
+        grads: &[Gradient<T>],
+        rate: impl Fn(usize) -> f64,
+    ) -> UpdateReport {
         let mut report = UpdateReport::default();
-        let moves = params.moves(grads, rate);
-        self.step = self.step.saturating_add(1);
+        let group = |slot: usize| self.members.get(slot).copied().unwrap_or(0);
+        let moves = params.moves(grads, |slot| rate(group(slot)));
+        self.steps = self.steps.saturating_add(1);
         for part in moves {
-            let decay = decay * part.decay;
-            let (name, moved, skipped) = if part.lazy { self.rows(part, decay) } else { self.dense(part, decay) };
-            report.count(name, moved, skipped);
+            let group = &mut self.groups[group(part.slot)];
+            if part.lazy {
+                group.correct_rows();
+            }
+            let (Group { config, corrections, .. }, rate) = (&*group, part.rate);
+            let update = group.update(rate, part.decay);
+            let whole = |step| {
+                let [first, second] = biases(*config, step);
+                let root = second.sqrt();
+                let rate = T::from_f64(rate * root / first);
+                Update { rate, epsilon: T::from_f64(config.epsilon * root), ..update }
+            };
+            let row = |step: u32| {
+                let [rate, epsilon] = corrections[(step as usize).min(corrections.len()) - 1];
+                Update { rate: update.rate * rate, epsilon: update.epsilon * epsilon, ..update }
+            };
+            self.memory.update(part, whole, row, &mut report);
         }
         report
-    }
-
-    /// Moves a parameter as a whole; returns its name and how many elements were moved and left alone.
-    #[track_caller]
-    fn dense<'a>(&mut self, part: Move<'a, T>, decay: f64) -> (&'a str, usize, usize) {
-        let memory = slot(&mut self.memory, part.slot);
-        if let Memory::Nothing = memory {
-            *memory = Memory::Dense(Moments::default());
-        }
-        let Memory::Dense(moments) = memory else { panic!("`{}` was lazy until now", part.name) };
-        moments.step = moments.step.saturating_add(1);
-        let AdamConfig { beta1, beta2, epsilon } = self.config;
-        // 1 - beta^t without cancellation.
-        let correction = |beta: f64| -(moments.step as f64 * beta.ln()).exp_m1();
-        let root = correction(beta2).sqrt();
-        let update = Update {
-            beta: [beta1, beta2].map(T::from_f64),
-            rest: [1.0 - beta1, 1.0 - beta2].map(T::from_f64),
-            rate: T::from_f64(part.rate * root / correction(beta1)),
-            epsilon: T::from_f64(epsilon * root),
-            keep: T::from_f64(1.0 - part.rate * decay),
-            tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
-        };
-        let m = remember(&mut moments.first, &part);
-        let v = remember(&mut moments.second, &part);
-        let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
-        let moments = m.chunks_mut(CHUNK).zip(v.chunks_mut(CHUNK));
-        let values = part.value.as_mut_slice().chunks_mut(CHUNK).zip(grad.as_slice().chunks(CHUNK));
-        let skipped = counted(values.zip(moments), |((x, g), (m, v))| update.apply(x, g, m, v));
-        (part.name, len - skipped, skipped)
-    }
-
-    /// Moves the rows of a table whose gradient is not zero; returns the same.
-    #[track_caller]
-    fn rows<'a>(&mut self, part: Move<'a, T>, decay: f64) -> (&'a str, usize, usize) {
-        let [rows, features] = part.table();
-        let memory = slot(&mut self.memory, part.slot);
-        if let Memory::Nothing = memory {
-            let config = self.config;
-            let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1)).fresh([rows, features]);
-            *memory = Memory::Rows(Box::new(Table { adam, sums: vec![] }));
-        }
-        let Memory::Rows(table) = memory else { panic!("`{}` was not lazy until now", part.name) };
-        let (shares, parts) = part.row_parts();
-        let (in_parts, sizes) = (parts.is_some(), parts.unwrap_or_else(|| vec![rows]));
-        // They come back empty, or not at all: what a panic leaves in them is not for the next step.
-        let mut sums = std::mem::take(&mut table.sums);
-        if !sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
-            sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
-        }
-        // A gradient that does not consist of rows is added up first: then all its rows are there.
-        let dense = shares.is_none().then(|| part.dense_grad(&self.pool));
-        let fill = |i: usize, sums: &mut RowSums<T>| {
-            for share in shares.iter().flatten() {
-                if in_parts { share.scatter_part(i, sums) } else { share.scatter(sums) }
-            }
-            if let Some(dense) = &dense {
-                dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
-            }
-        };
-        let stats = table.adam.step_parts(part.value.as_mut_slice(), &mut sums, fill, part.rate, decay);
-        table.sums = sums;
-        (part.name, stats.touched * features, stats.skipped * features)
     }
 }
 
 impl<T: Scalar> Optimizer<T> for Adam<T> {
     #[track_caller]
     fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
-        self.decayed(params, grads, rate, 0.0)
+        self.update_groups(params, grads, |_| rate)
     }
 
     fn state(&self, params: &Params<T>) -> OptimizerState<T> {
-        let mut state = OptimizerState::default();
-        state.put_counts("", "steps", vec![self.step]);
-        for (name, shape, memory) in memories(params, &self.memory) {
-            let [first, second] = match memory {
-                Memory::Nothing => continue,
-                Memory::Dense(Moments { step, first, second }) => {
-                    state.put_counts(name, "step", vec![*step]);
-                    [first.clone(), second.clone()]
-                }
-                Memory::Rows(table) => {
-                    state.put_counts(name, "row_steps", table.adam.row_steps());
-                    table.adam.moments()
-                }
-            };
-            state.put(name, "first", shape, first);
-            state.put(name, "second", shape, second);
-        }
+        let mut state = self.memory.state(params);
+        state.put_counts("", "steps", vec![self.steps]);
         state
     }
 
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
         let mut reader = Reader::new(state);
-        let (step, mut memory) = (reader.steps()?, vec![]);
-        for ((name, value), id) in params.iter().zip(params.ids()) {
-            let (shape, config) = (value.shape(), self.config);
-            let rows = shape.first().copied().unwrap_or(1);
-            let (entry, what) = match params.moves_rows(id) {
-                true => ("step", "belongs to a parameter that was not lazy, and this one is"),
-                false => ("row_steps", "belongs to a lazy parameter, and this one is not"),
-            };
-            reader.refuse(name, entry, &format!("{what}: call Params::set_lazy as before"))?;
-            memory.push(if let Some(steps) = reader.counts(name, "row_steps", rows)? {
-                let moments = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
-                let adam = self.rows.get_or_insert_with(|| RowAdam::new(config, 0, 1));
-                let mut adam = adam.fresh([rows, value.len() / rows.max(1)]);
-                adam.load(moments.each_ref().map(Vec::as_slice), steps);
-                Memory::Rows(Box::new(Table { adam, sums: vec![] }))
-            } else if let Some(steps) = reader.counts(name, "step", 1)? {
-                let [first, second] = [reader.expect(name, "first", shape)?, reader.expect(name, "second", shape)?];
-                Memory::Dense(Moments { step: steps[0], first, second })
-            } else {
-                Memory::Nothing
-            });
-        }
+        let (steps, memory) = (reader.steps()?, self.memory.loaded(params, &mut reader)?);
         reader.finish()?;
-        (self.step, self.memory) = (step, memory);
+        (self.steps, self.memory) = (steps, memory);
         Ok(())
     }
 }
 
-impl<T: Scalar> AdamW<T> {
+impl AdamW {
     /// An optimiser that has seen nothing. `decay` is the part of a parameter that goes at each step at learning rate 1,
     /// customarily 0.01; parameters can have a factor of their own, such as 0 for biases
     /// ([`Params::set_decay`](crate::Params::set_decay)).
     ///
     /// # Panics
     /// If [`AdamConfig::check`] finds something, or the decay is not within 0 to 1e30.
+    #[allow(clippy::new_ret_no_self)] // PyTorch's name, for a constructor
     #[track_caller]
-    pub fn new(config: AdamConfig, decay: f64) -> Self {
-        or_panic(check_rate("decay", decay));
-        AdamW { adam: Adam::new(config), decay }
-    }
-
-    /// Number of steps taken.
-    pub fn steps(&self) -> u64 {
-        self.adam.step
-    }
-}
-
-impl<T: Scalar> Optimizer<T> for AdamW<T> {
-    #[track_caller]
-    fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
-        self.adam.decayed(params, grads, rate, self.decay)
-    }
-
-    fn state(&self, params: &Params<T>) -> OptimizerState<T> {
-        self.adam.state(params)
-    }
-
-    fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
-        self.adam.load_state(params, state)
+    pub fn new<T: Scalar>(config: AdamConfig, decay: f64) -> Adam<T> {
+        let groups = vec![Group::new(config, decay)];
+        Adam { groups, members: vec![], steps: 0, memory: Memory::new(&["first", "second"], true) }
     }
 }
 
 /// One step's constants.
+#[derive(Clone, Copy)]
 struct Update<T> {
     beta: [T; 2],
     rest: [T; 2],
@@ -293,36 +266,22 @@ struct Update<T> {
     tiniest: T,
 }
 
-impl<T: Scalar> Update<T> {
-    fn apply(&self, x: &mut [T], g: &[T], m: &mut [T], v: &mut [T]) -> usize {
-        let n = x.len();
-        let (g, m, v) = (&g[..n], &mut m[..n], &mut v[..n]);
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                let mut skipped = 0;
-                for i in 0..n {
-                    let (finite, g) = (g[i].is_finite(), limited(g[i]));
-                    let first = flushed(self.beta[0] * m[i] + self.rest[0] * g);
-                    let second = self.beta[1] * v[i] + self.rest[1] * (g * g);
-                    let second = if second > tiny_square() { second } else { T::ZERO };
-                    let kept = x[i] * self.keep;
-                    let kept = if kept < self.tiniest && kept > -self.tiniest { T::ZERO } else { kept };
-                    let moved = kept - self.rate * first / (second.sqrt() + self.epsilon);
-                    let good = finite && moved.is_finite();
-                    m[i] = if good { first } else { m[i] };
-                    v[i] = if good { second } else { v[i] };
-                    x[i] = if good { moved } else { x[i] };
-                    skipped += usize::from(!good);
-                }
-                skipped
-            },
-        )
+impl<T: Scalar> Rule<T, 2> for Update<T> {
+    #[inline(always)]
+    fn element(&self, x: T, grad: T, [first, second]: [T; 2]) -> (T, [T; 2]) {
+        let g = limited(grad);
+        let first = flushed(self.beta[0] * first + self.rest[0] * g);
+        let second = self.beta[1] * second + self.rest[1] * (g * g);
+        let second = if second > tiny_square() { second } else { T::ZERO };
+        let kept = x * self.keep;
+        let kept = if kept < self.tiniest && kept > -self.tiniest { T::ZERO } else { kept };
+        (kept - self.rate * first / (second.sqrt() + self.epsilon), [first, second])
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::memory::CHUNK;
     use super::*;
     use raygrad_tensor::Tensor;
 
@@ -394,8 +353,8 @@ mod tests {
         for _ in 0..10_000 {
             step(&mut adam, &mut params, Tensor::zeros(&[4]), 0.1);
         }
-        let Memory::Dense(Moments { first, second, .. }) = &adam.memory[0] else { panic!("no moments") };
-        assert!(first.iter().chain(second).all(|x| *x == 0.0 || x.is_normal()), "{first:?} {second:?}");
+        let state = adam.state(&params);
+        assert!(state.tensors.values().flat_map(Tensor::as_slice).all(|x| *x == 0.0 || x.is_normal()), "{state:?}");
         assert!(params.values()[0].is_finite());
         assert!(adam.update(&mut params, &[Tensor::full(&[4], f32::NAN).into()], 0.1).is_stuck());
         assert!(!adam.update(&mut params, &[Tensor::zeros(&[4]).into()], 0.1).is_stuck());
@@ -403,7 +362,7 @@ mod tests {
 
     #[test]
     fn a_decaying_parameter_ends_at_zero_and_a_bad_gradient_stops_it() {
-        let mut adam = AdamW::<f32>::new(AdamConfig::default(), 1.0);
+        let mut adam = AdamW::new::<f32>(AdamConfig::default(), 1.0);
         let mut params = store(Tensor::from_vec(&[2], vec![1e-25_f32, 1e-25]));
         let mut skipped = 0;
         for _ in 0..300 {

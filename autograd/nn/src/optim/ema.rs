@@ -83,7 +83,7 @@ impl<T: Scalar> Ema<T> {
         let mut reader = Reader::new(state);
         let (steps, mut values) = (reader.steps()?, vec![]);
         for (name, value) in self.average.iter() {
-            values.push(Tensor::from_vec(value.shape(), reader.expect(name, "average", value.shape())?));
+            values.push(Tensor::from_vec(value.shape(), reader.expect(name, "average", value.shape())?.to_vec()));
         }
         reader.finish()?;
         self.steps = steps;

@@ -4,8 +4,9 @@ mod adam;
 mod clip;
 mod ema;
 mod limits;
+mod memory;
 mod report;
-mod rows;
+mod rule;
 mod schedule;
 mod settings;
 mod sgd;
@@ -15,17 +16,15 @@ pub use adam::{Adam, AdamConfig, AdamW};
 pub use clip::{Clipped, clip_norm, clip_value, global_norm};
 pub use ema::Ema;
 pub use report::{NonFinite, UpdateReport};
-pub use rows::{RowAdam, RowStats};
 pub use schedule::Schedule;
 pub use settings::SettingError;
 pub use sgd::{Sgd, SgdConfig};
 pub use state::{OptimizerState, StateError};
 
 use crate::Params;
-use raygrad_autograd::{Gradient, RowShare, RowSums};
-use raygrad_tensor::{Pool, Scalar, Tensor, parallel};
+use raygrad_autograd::{Gradient, RowShare};
+use raygrad_tensor::{Pool, Scalar, Tensor};
 use std::borrow::Cow;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// One parameter that an optimiser is to move.
 #[derive(Debug)]
@@ -55,10 +54,12 @@ impl<'a, T: Scalar> Move<'a, T> {
         }
     }
 
-    /// The parameter as a table `[rows, features]`, whose rows lie along the first axis.
+    /// The parameter as a table `[rows, features]`, of one row unless it is lazy.
     fn table(&self) -> [usize; 2] {
-        let shape = self.value.shape();
-        [shape.first().copied().unwrap_or(1), shape.iter().skip(1).product()]
+        match self.value.shape() {
+            [rows, row @ ..] if self.lazy => [*rows, row.iter().product()],
+            _ => [1, self.value.len()],
+        }
     }
 
     /// The shares of a gradient that consists of rows, and the rows of the parts that can be added up by themselves; `None`
@@ -73,20 +74,6 @@ impl<'a, T: Scalar> Move<'a, T> {
         let agreed = first.iter().sum::<usize>() == rows && parts.all(|other| other == first);
         (shares, agreed.then_some(first))
     }
-
-    /// The sums of the gradient's rows, in `sums` if there are some, which are empty. A gradient that does not consist of rows
-    /// is added up first: then all its rows are there.
-    fn row_sums(&self, sums: Option<RowSums<T>>, pool: &Pool<T>) -> RowSums<T> {
-        let [rows, features] = self.table();
-        let mut sums = sums.unwrap_or_else(|| RowSums::new(rows, features));
-        if !self.grad.scatter(&mut sums) {
-            let dense = self.dense_grad(pool);
-            dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
-        }
-        // A share of somebody else's could have put others in their place.
-        assert_eq!([sums.table_rows(), sums.features()], [rows, features], "rows and features of `{}`", self.name);
-        sums
-    }
 }
 
 /// Moves parameters against their gradients.
@@ -96,9 +83,9 @@ impl<'a, T: Scalar> Move<'a, T> {
 /// whose gradient has no share because nothing depends on it; others move with the learning rate and the weight decay
 /// of their own ([`Params::set_rate`], [`Params::set_decay`]).
 ///
-/// All optimisers here leave an element alone, and count it, if its gradient is infinite or NaN; set what they remember
-/// to 0 once it is below 1e-30 (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any
-/// number of threads.
+/// All optimisers here leave an element alone, with what they remember of it, and count it if its gradient is infinite or
+/// NaN or its new value would be, whether its parameter is lazy or not; set what they remember to 0 once it is below 1e-30
+/// (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any number of threads.
 ///
 /// [`Bound::backward`](crate::Bound::backward) gives the gradients and lets go of the parameters, which can then be
 /// moved in place. While a tape or a variable still holds one, an update copies it first.
@@ -139,34 +126,4 @@ pub trait Optimizer<T: Scalar> {
     /// If the state is that of another kind of optimiser or of other parameters, or of a lazy parameter that is not lazy,
     /// or the reverse; then nothing changes.
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError>;
-}
-
-/// Elements that one task updates.
-const CHUNK: usize = 1 << 14;
-
-/// What `f` counts in the parts, together; parallel over them.
-fn counted<P: Send>(parts: impl Iterator<Item = P>, f: impl Fn(P) -> usize + Sync) -> usize {
-    let count = AtomicUsize::new(0);
-    parallel::each_of(parts, |_, part| {
-        count.fetch_add(f(part), Ordering::Relaxed);
-    });
-    count.into_inner()
-}
-
-/// What an optimiser keeps under a number.
-fn slot<S: Default>(states: &mut Vec<S>, slot: usize) -> &mut S {
-    if states.len() <= slot {
-        states.resize_with(slot + 1, S::default);
-    }
-    &mut states[slot]
-}
-
-/// The memory of a parameter, made at its first step.
-#[track_caller]
-fn remember<'m, T: Scalar>(memory: &'m mut Vec<T>, part: &Move<'_, T>) -> &'m mut [T] {
-    if memory.is_empty() {
-        memory.resize(part.value.len(), T::ZERO);
-    }
-    assert_eq!(memory.len(), part.value.len(), "elements of `{}`, as at its first step", part.name);
-    memory
 }

@@ -1,35 +1,25 @@
 //! Gradient descent with momentum.
 
 use super::limits::{flushed, tiny};
+use super::memory::Memory;
+use super::rule::Rule;
 use super::settings::{check, check_rate, check_share, or_panic};
-use super::state::{Reader, memories};
-use super::{CHUNK, Optimizer, OptimizerState, SettingError, StateError, UpdateReport, counted, remember, slot};
+use super::state::Reader;
+use super::{Optimizer, OptimizerState, SettingError, StateError, UpdateReport};
 use crate::Params;
-use raygrad_autograd::{Gradient, RowSums};
-use raygrad_tensor::{Pool, Scalar, simd};
+use raygrad_autograd::Gradient;
+use raygrad_tensor::Scalar;
 use serde::{Deserialize, Serialize};
 
 /// Gradient descent: `h = g + decay x`, `v = momentum v + h`, `x = x - rate d`, where the direction `d` is `v`, or
 /// `h + momentum v` with Nesterov's look-ahead (Sutskever et al. 2013, in the form that PyTorch has).
 ///
-/// An element is left alone, and counted, if its gradient or what would come of it is infinite or NaN. Of a lazy
-/// parameter the rows without gradient stay, whatever their velocity and decay; without either, lazy or not is the same.
-/// Velocities below 1e-30 (1e-300 in f64) are set to 0.
+/// Of a lazy parameter the rows without gradient stay, whatever their velocity and decay; without either, lazy or not is
+/// the same. Velocities below 1e-30 (1e-300 in f64) are set to 0.
 #[derive(Debug, Clone)]
 pub struct Sgd<T: Scalar> {
     config: SgdConfig,
-    memory: Vec<Memory<T>>,
-    /// For gradients that have to be added up.
-    pool: Pool<T>,
-}
-
-/// What it knows of one parameter.
-#[derive(Debug, Clone, Default)]
-struct Memory<T> {
-    /// Empty without momentum and before the first step.
-    velocity: Vec<T>,
-    /// Nothing between steps.
-    sums: Option<RowSums<T>>,
+    memory: Memory<T>,
 }
 
 /// Constants of [`Sgd`].
@@ -64,7 +54,7 @@ impl<T: Scalar> Sgd<T> {
     #[track_caller]
     pub fn new(config: SgdConfig) -> Self {
         or_panic(config.check());
-        Sgd { config, memory: vec![], pool: Pool::new() }
+        Sgd { config, memory: Memory::new(if config.momentum == 0.0 { &[] } else { &["velocity"] }, false) }
     }
 }
 
@@ -72,7 +62,7 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
     #[track_caller]
     fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
         let mut report = UpdateReport::default();
-        for part in params.moves(grads, rate) {
+        for part in params.moves(grads, |_| rate) {
             let decay = self.config.decay * part.decay;
             let update = Update {
                 rate: T::from_f64(part.rate),
@@ -81,45 +71,21 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
                 decay: T::from_f64(decay),
                 tiniest: if decay == 0.0 { T::ZERO } else { tiny() },
             };
-            let Memory { velocity, sums } = slot(&mut self.memory, part.slot);
-            let velocity: &mut [T] = if self.config.momentum == 0.0 { &mut [] } else { remember(velocity, &part) };
-            let (moved, skipped) = if part.lazy {
-                // They come back empty, or not at all: what a panic leaves in them is not for the next step.
-                let mut own = part.row_sums(sums.take(), &self.pool);
-                let counts = update.rows(part.value.as_mut_slice(), &own, velocity);
-                own.clear();
-                *sums = Some(own);
-                counts
-            } else {
-                let (len, grad) = (part.value.len(), part.dense_grad(&self.pool));
-                let pairs = part.value.as_mut_slice().chunks_mut(CHUNK).zip(grad.as_slice().chunks(CHUNK));
-                let skipped = if velocity.is_empty() {
-                    counted(pairs, |(x, g)| update.plain(x, g))
-                } else {
-                    counted(pairs.zip(velocity.chunks_mut(CHUNK)), |((x, g), v)| update.apply(x, g, v))
-                };
-                (len - skipped, skipped)
-            };
-            report.count(part.name, moved, skipped);
+            match self.config.momentum {
+                0.0 => self.memory.update::<0, _>(part, |_| update, |_| update, &mut report),
+                _ => self.memory.update::<1, _>(part, |_| update, |_| update, &mut report),
+            }
         }
         report
     }
 
     fn state(&self, params: &Params<T>) -> OptimizerState<T> {
-        let mut state = OptimizerState::default();
-        for (name, shape, memory) in memories(params, &self.memory).filter(|(.., memory)| !memory.velocity.is_empty()) {
-            state.put(name, "velocity", shape, memory.velocity.clone());
-        }
-        state
+        self.memory.state(params)
     }
 
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
         let mut reader = Reader::new(state);
-        let mut memory = vec![];
-        for (name, value) in params.iter() {
-            let velocity = reader.tensor(name, "velocity", value.shape())?.unwrap_or_default();
-            memory.push(Memory { velocity, sums: None });
-        }
+        let memory = self.memory.loaded(params, &mut reader)?;
         reader.finish()?;
         self.memory = memory;
         Ok(())
@@ -127,6 +93,7 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
 }
 
 /// One step's constants.
+#[derive(Clone, Copy)]
 struct Update<T> {
     rate: T,
     momentum: T,
@@ -137,74 +104,34 @@ struct Update<T> {
 }
 
 impl<T: Scalar> Update<T> {
-    /// Moves the rows whose sum is not zero; returns how many of their elements were moved and left alone.
-    fn rows(&self, x: &mut [T], sums: &RowSums<T>, velocity: &mut [T]) -> (usize, usize) {
-        let features = sums.features();
-        let (mut visited, mut skipped) = (0, 0);
-        for (&row, sum) in sums.rows().iter().zip(sums.sums().chunks_exact(features)) {
-            if sum.iter().all(|&g| g == T::ZERO) {
-                continue;
-            }
-            let place = row as usize * features..(row as usize + 1) * features;
-            visited += features;
-            skipped += match velocity {
-                [] => self.plain(&mut x[place], sum),
-                _ => self.apply(&mut x[place.clone()], sum, &mut velocity[place]),
-            };
-        }
-        (visited - skipped, skipped)
-    }
-
-    /// The parameter after a step along `direction`, and whether all went well.
+    /// The parameter after a step along `direction`.
     #[inline(always)]
-    fn moved(&self, x: T, g: T, direction: T) -> (T, bool) {
+    fn moved(&self, x: T, direction: T) -> T {
         let moved = x - self.rate * direction;
-        let moved = if moved < self.tiniest && moved > -self.tiniest { T::ZERO } else { moved };
-        (moved, g.is_finite() && moved.is_finite())
+        if moved < self.tiniest && moved > -self.tiniest { T::ZERO } else { moved }
     }
+}
 
-    fn plain(&self, x: &mut [T], g: &[T]) -> usize {
-        let n = x.len();
-        let g = &g[..n];
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                let mut skipped = 0;
-                for i in 0..n {
-                    let (moved, good) = self.moved(x[i], g[i], g[i] + self.decay * x[i]);
-                    x[i] = if good { moved } else { x[i] };
-                    skipped += usize::from(!good);
-                }
-                skipped
-            },
-        )
+impl<T: Scalar> Rule<T, 0> for Update<T> {
+    #[inline(always)]
+    fn element(&self, x: T, grad: T, _memory: [T; 0]) -> (T, [T; 0]) {
+        (self.moved(x, grad + self.decay * x), [])
     }
+}
 
-    fn apply(&self, x: &mut [T], g: &[T], v: &mut [T]) -> usize {
-        let n = x.len();
-        let (g, v) = (&g[..n], &mut v[..n]);
-        let ahead = if self.nesterov { T::ONE } else { T::ZERO };
-        simd::dispatch(
-            #[inline(always)]
-            || {
-                let mut skipped = 0;
-                for i in 0..n {
-                    let h = g[i] + self.decay * x[i];
-                    let velocity = flushed(self.momentum * v[i] + h);
-                    let direction = if ahead > T::ZERO { h + self.momentum * velocity } else { velocity };
-                    let (moved, good) = self.moved(x[i], g[i], direction);
-                    v[i] = if good { velocity } else { v[i] };
-                    x[i] = if good { moved } else { x[i] };
-                    skipped += usize::from(!good);
-                }
-                skipped
-            },
-        )
+impl<T: Scalar> Rule<T, 1> for Update<T> {
+    #[inline(always)]
+    fn element(&self, x: T, grad: T, [velocity]: [T; 1]) -> (T, [T; 1]) {
+        let h = grad + self.decay * x;
+        let velocity = flushed(self.momentum * velocity + h);
+        let direction = if self.nesterov { h + self.momentum * velocity } else { velocity };
+        (self.moved(x, direction), [velocity])
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::memory::CHUNK;
     use super::*;
     use raygrad_tensor::Tensor;
 
@@ -276,8 +203,9 @@ mod tests {
                 assert!(params.values()[0].as_slice().iter().all(|x| !x.is_subnormal()));
             }
             assert!(params.values()[0].as_slice()[4].abs() < 4e-30, "where velocity ends, so does decay");
-            let velocity = &sgd.memory[0].velocity;
-            assert!(velocity.iter().all(|v| !v.is_subnormal()) && velocity.is_empty() == (momentum == 0.0));
+            let state = sgd.state(&params);
+            assert!(state.tensors.values().flat_map(Tensor::as_slice).all(|v| !v.is_subnormal()));
+            assert_eq!(state.tensors.is_empty(), momentum == 0.0);
         }
     }
 

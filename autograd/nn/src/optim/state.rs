@@ -1,6 +1,5 @@
 //! What an optimiser remembers, by the names of the parameters.
 
-use crate::Params;
 #[cfg(feature = "files")]
 use crate::{Storage, files::bad_entry};
 #[cfg(feature = "files")]
@@ -140,20 +139,20 @@ impl<'a, T: Scalar> Reader<'a, T> {
         Reader { state, left: state.tensors.keys().chain(state.counts.keys()).map(String::as_str).collect() }
     }
 
-    /// The numbers of a parameter, if there are any.
-    pub fn tensor(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<Option<Vec<T>>, StateError> {
+    /// Whether there are such numbers of a parameter.
+    pub fn has(&self, name: &str, what: &str) -> bool {
+        self.state.tensors.contains_key(&key(name, what))
+    }
+
+    /// The numbers of a parameter.
+    pub fn expect(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<&'a [T], StateError> {
         let key = key(name, what);
-        let Some(tensor) = self.state.tensors.get(&key) else { return Ok(None) };
+        let Some(tensor) = self.state.tensors.get(&key) else { return Err(StateError::entry(&key, "is missing")) };
         self.left.remove(key.as_str());
         if tensor.shape() != shape {
             return Err(StateError::entry(&key, format!("has the shape {:?}, and not {shape:?}", tensor.shape())));
         }
-        Ok(Some(tensor.as_slice().to_vec()))
-    }
-
-    /// As [`tensor`](Self::tensor), where there must be one.
-    pub fn expect(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<Vec<T>, StateError> {
-        self.tensor(name, what, shape)?.ok_or_else(|| StateError::entry(&key(name, what), "is missing"))
+        Ok(tensor.as_slice())
     }
 
     /// Counts of a parameter, if there are any.
@@ -183,12 +182,4 @@ impl<'a, T: Scalar> Reader<'a, T> {
         let what = "is unknown: the state belongs to another optimiser or other parameters";
         self.left.first().map_or(Ok(()), |name| Err(StateError::entry(name, what)))
     }
-}
-
-/// For each parameter of a store what an optimiser remembers of it, if anything.
-pub(crate) fn memories<'a, T: Scalar, M>(
-    params: &'a Params<T>,
-    memories: &'a [M],
-) -> impl Iterator<Item = (&'a str, &'a [usize], &'a M)> {
-    params.iter().zip(memories).map(|((name, value), memory)| (name, value.shape(), memory))
 }

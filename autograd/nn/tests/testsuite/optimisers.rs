@@ -4,7 +4,7 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Gradient, Pool, RowGrad, RowShare, RowSums, Scalar, SparseGrad, Tape, Tensor, Var};
 use raygrad_nn::{
-    Adam, AdamConfig, AdamW, Bound, Ema, NonFinite, Optimizer, OptimizerState, ParamId, Params, RowAdam, Sgd, SgdConfig,
+    Adam, AdamConfig, AdamW, Bound, Ema, NonFinite, Optimizer, OptimizerState, ParamId, Params, Sgd, SgdConfig,
 };
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -194,22 +194,7 @@ fn runs_in_f64_go_on_bit_for_bit() {
 }
 
 #[test]
-fn rows_and_averages_go_on_bit_for_bit() {
-    let config = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
-    let step = |adam: &mut RowAdam<f32>, table: &mut [f32], t: usize| {
-        let mut sums = RowSums::new(9, 2);
-        [t % 9, (3 * t) % 9].iter().for_each(|&row| sums.add(row, &[(t as f32).sin(), 0.5]));
-        adam.step(table, &mut sums, 0.1, 0.01);
-    };
-    let (mut through, mut halted) = (vec![1.0; 18], vec![1.0; 18]);
-    let [mut whole, mut first, mut second] = [(); 3].map(|()| RowAdam::new(config, 9, 2));
-    (0..20).for_each(|t| step(&mut whole, &mut through, t));
-    (0..10).for_each(|t| step(&mut first, &mut halted, t));
-    second.load(first.moments().each_ref().map(Vec::as_slice), &first.row_steps());
-    (10..20).for_each(|t| step(&mut second, &mut halted, t));
-    assert_eq!(halted, through);
-    assert!(halted.iter().all(|x| *x != 1.0));
-
+fn averages_go_on_bit_for_bit() {
     let (mut params, _) = model::<f32>(false);
     let mut whole = Ema::new(&params, 0.99).with_warmup();
     let mut second = whole.clone();
@@ -291,9 +276,12 @@ fn small_numbers_of_f64_are_kept() {
     let config = AdamConfig { epsilon: 1e-30, ..AdamConfig::default() };
     let expected = -1e-35 / (1e-35 + 1e-30);
     assert!((once(&mut Adam::new(config), 0.0, 1e-35) / expected - 1.0).abs() < 1e-12);
-    let (mut table, mut sums) = ([0.0; 2], RowSums::new(2, 1));
-    sums.add(1, &[1e-35]);
-    RowAdam::new(config, 2, 1).step(&mut table, &mut sums, 1.0, 0.0);
+    let mut params = Params::new();
+    params.add("table", Tensor::zeros(&[2, 1]));
+    params.set_lazy(|_| true, true);
+    let grad = Tensor::from_vec(&[2, 1], vec![0.0, 1e-35]).into();
+    assert_eq!(Adam::new(config).update(&mut params, &[grad], 1.0).check(), Ok(1));
+    let table = params.values()[0].as_slice();
     assert!(table[0] == 0.0 && (table[1] / expected - 1.0).abs() < 1e-12);
 }
 
@@ -314,14 +302,14 @@ fn settings_out_of_their_range_are_refused_by_name() {
     ] {
         for message in [
             message(|| drop(Adam::<f32>::new(config))),
-            message(|| drop(AdamW::<f64>::new(config, 0.0))),
-            message(|| drop(RowAdam::<f32>::new(config, 1, 1))),
+            message(|| drop(AdamW::new::<f64>(config, 0.0))),
+            message(|| assert_eq!(Adam::new(adam).add_group(&Params::<f32>::new(), |_| true, config, 0.0), 0)),
             config.check().unwrap_err().to_string(),
         ] {
             assert!(message.contains(expected), "{message} and {expected}");
         }
     }
-    assert!(message(|| drop(AdamW::<f32>::new(adam, -1.0))).contains("`decay` is -1.0; use 0 to 1e30"));
+    assert!(message(|| drop(AdamW::new::<f32>(adam, -1.0))).contains("`decay` is -1.0; use 0 to 1e30"));
     let sgd = SgdConfig::default();
     for (config, expected) in [
         (SgdConfig { momentum: 1.0, ..sgd }, "`momentum` is 1.0; use at least 0 and less than 1"),
@@ -391,7 +379,7 @@ fn row_share_replaced_sums_panic() {
     };
     // Parts of two rows; the sums of three reach into the second part.
     assert!(update(3, &mut Adam::new(AdamConfig::default())).contains("rows and features of part"));
-    assert!(update(5, &mut Sgd::new(SgdConfig::default())).contains("rows and features of `table`"));
+    assert!(update(5, &mut Sgd::new(SgdConfig::default())).contains("rows and features of part 0 of `table`"));
 }
 
 #[test]
@@ -575,17 +563,50 @@ fn steps_count_no_further_than_their_numbers() {
 }
 
 #[test]
-fn a_bad_row_of_a_lazy_table_rests_as_a_whole() {
-    let (mut params, ids) = model::<f32>(true);
-    let before = params.get(ids[0]).clone();
-    let rows = Tensor::from_vec(&[2, 3], vec![1.0, f32::NAN, 1.0, 1.0, 2.0, 3.0]);
-    let mut table = Gradient::zero(&[40, 3]);
-    table.add_sparse(Arc::new(RowGrad::new(&[40, 3], [5, 6].into(), rows)));
-    let grads = [table, Gradient::zero(&[3]), Gradient::zero(&[])];
-    let report = Adam::new(AdamConfig::default()).update(&mut params, &grads, 0.1);
-    assert_eq!((report.moved, report.skipped, report.bad), (3, 3, vec![("table".to_owned(), 3)]));
-    let moved = |row: usize| params.get(ids[0]).as_slice()[3 * row..][..3] != before.as_slice()[3 * row..][..3];
-    assert_eq!((0..40).filter(|&row| moved(row)).collect::<Vec<_>>(), [6]);
+fn bad_elements_rest_alone_lazy_or_not() {
+    for ((name, make), lazy) in optimisers::<f32>().into_iter().flat_map(|each| [(each, true), (each, false)]) {
+        let (mut params, ids) = model::<f32>(lazy);
+        let before = params.get(ids[0]).clone();
+        let rows = Tensor::from_vec(&[2, 3], vec![1.0, f32::NAN, 1.0, 1.0, 2.0, f32::NEG_INFINITY]);
+        let mut table = Gradient::zero(&[40, 3]);
+        table.add_sparse(Arc::new(RowGrad::new(&[40, 3], [5, 6].into(), rows)));
+        let grads = [table, Gradient::zero(&[3]), Gradient::zero(&[])];
+        let report = make().update(&mut params, &grads, 0.1);
+        let moved = if lazy { 4 } else { 118 };
+        assert_eq!((report.moved, report.skipped, report.bad), (moved, 2, vec![("table".to_owned(), 2)]), "{name}");
+        let (after, before) = (params.get(ids[0]).as_slice(), before.as_slice());
+        let stays = |i: &usize| after[*i].to_bits() == before[*i].to_bits();
+        assert_eq!((15..21).filter(stays).collect::<Vec<_>>(), [16, 20], "{name}, lazy: {lazy}");
+    }
+}
+
+#[test]
+fn groups_have_constants_rates_and_decay_of_their_own() {
+    let (start, ids) = model::<f64>(true);
+    let fast = AdamConfig { beta1: 0.5, beta2: 0.9, ..AdamConfig::default() };
+    let rates = [0.05, 0.1, 0.02];
+    let mut params = start.clone();
+    let mut adam = Adam::new(AdamConfig::default());
+    // Each parameter is in the first group that chooses it; one that is chosen by none has the optimiser's constants.
+    assert_eq!(adam.add_group(&params, |name| name == "table", fast, 0.0), 1);
+    assert_eq!(adam.add_group(&params, |name| name != "number", fast, 0.5), 1);
+    let alone = [(fast, 0.0, 1), (fast, 0.5, 2), (AdamConfig::default(), 0.0, 0)];
+    let mut others = alone.map(|(config, decay, group)| (AdamW::new(config, decay), start.clone(), rates[group]));
+    for step in 0..20 {
+        // All see the same gradients.
+        let grads = gradients(&start, ids, step, false);
+        assert!(adam.update_groups(&mut params, &grads, |group| rates[group]).check().is_ok());
+        for (adam, params, rate) in &mut others {
+            adam.update(params, &grads, *rate).check().unwrap();
+        }
+    }
+    for ((_, other, _), id) in others.iter().zip(ids) {
+        assert_eq!(params.get(id), other.get(id), "{}", params.name(id));
+    }
+    assert_eq!(adam.steps(), 20);
+    let grads = gradients(&start, ids, 0, false);
+    let refused = message(|| drop(adam.update_groups(&mut params, &grads, |group| [0.1, 0.1, -1.0][group])));
+    assert!(refused.contains("a learning rate of -1.0; use 0 to 1e30"), "{refused}");
 }
 
 /// A step of training leaves every parameter where it is in memory; with something that holds one, it is copied.
@@ -659,11 +680,11 @@ fn a_dense_gradient_reaches_the_optimiser_without_a_copy() {
     let mut params = Params::<f32>::new();
     params.add("x", Tensor::from([1.0, 2.0]));
     let dense = [Gradient::from(Tensor::from([3.0, 4.0]))];
-    let part = params.moves(&dense, 0.1).next().unwrap();
+    let part = params.moves(&dense, |_| 0.1).next().unwrap();
     assert!(matches!(part.dense_grad(&Pool::none()), std::borrow::Cow::Borrowed(_)));
     let mut rows = Gradient::zero(&[2]);
     rows.add_sparse(Arc::new(RowGrad::new(&[2], [1].into(), Tensor::from([5.0]))));
     let rows = [rows];
-    let part = params.moves(&rows, 0.1).next().unwrap();
+    let part = params.moves(&rows, |_| 0.1).next().unwrap();
     assert_eq!(part.dense_grad(&Pool::none()).into_owned(), Tensor::from([0.0, 5.0]));
 }

@@ -1,0 +1,265 @@
+//! What an optimiser remembers of parameters, and the steps that use it.
+
+use super::rule::{LINE, Rule, Shared, Table};
+use super::state::Reader;
+use super::{Move, OptimizerState, StateError, UpdateReport};
+use crate::Params;
+use raygrad_autograd::RowSums;
+use raygrad_tensor::{Pool, Scalar, parallel, simd};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// What an optimiser remembers of the parameters of a store.
+#[derive(Debug, Clone)]
+pub(super) struct Memory<T: Scalar> {
+    /// The names of the numbers that are remembered of each element.
+    kinds: &'static [&'static str],
+    /// Whether a state has the numbers of steps.
+    counts_steps: bool,
+    slots: Vec<Slot<T>>,
+    /// For gradients that have to be added up.
+    pool: Pool<T>,
+}
+
+/// What it remembers of one parameter. One that is moved as a whole is a table of one row.
+#[derive(Debug, Clone)]
+struct Slot<T> {
+    /// For each row the numbers of one kind after those of another.
+    numbers: Lines<T>,
+    /// Steps of each row; empty before the parameter's first step.
+    steps: Vec<u32>,
+    /// For each part of the table that is summed by itself; nothing between steps.
+    sums: Vec<RowSums<T>>,
+}
+
+/// Elements of a whole parameter that one task moves.
+pub(super) const CHUNK: usize = 1 << 14;
+
+/// Rows that one task visits: so many that the levels of a hash grid, whose sums are still in the caches of the core that
+/// added them up, are not torn apart, and so few that a large voxel grid keeps several cores busy.
+const ROWS: usize = 1 << 16;
+
+impl<T: Scalar> Memory<T> {
+    /// Nothing remembered.
+    pub fn new(kinds: &'static [&'static str], counts_steps: bool) -> Self {
+        Memory { kinds, counts_steps, slots: vec![], pool: Pool::new() }
+    }
+
+    /// Moves a parameter by the rule for its next step, counted from 1: `whole`, or `row` for each row of a lazy one. `M` is
+    /// the number of kinds.
+    ///
+    /// # Panics
+    /// If the parameter has another size than at its first step, or there is more than one kind and the parameter is lazy
+    /// and was not, or the reverse.
+    #[track_caller]
+    pub fn update<const M: usize, R: Rule<T, M>>(
+        &mut self,
+        part: Move<'_, T>,
+        whole: impl FnOnce(u32) -> R,
+        row: impl Fn(u32) -> R + Sync,
+        report: &mut UpdateReport,
+    ) {
+        if self.slots.len() <= part.slot {
+            self.slots.resize_with(part.slot + 1, || Slot::new(0, 0));
+        }
+        let (slot, name) = (&mut self.slots[part.slot], part.name);
+        let (rows, numbers) = (part.table()[0], M * part.value.len());
+        if slot.steps.is_empty() {
+            *slot = Slot::new(rows, numbers);
+        }
+        assert_eq!(slot.numbers.len, numbers, "numbers that are remembered of `{name}`, as at its first step");
+        if M < 2 {
+            // One number of each element lies at the same place, lazy or not.
+            slot.steps.resize(rows, 0);
+        }
+        assert!(slot.steps.len() == rows, "`{name}` was {}lazy until now", if part.lazy { "not " } else { "" });
+        let [moved, skipped] = match part.lazy {
+            true => slot.move_rows(part, &self.pool, row),
+            false => slot.move_whole(part, &self.pool, whole),
+        };
+        report.count(name, moved, skipped);
+    }
+
+    /// What is remembered of the parameters of this store.
+    pub fn state(&self, params: &Params<T>) -> OptimizerState<T> {
+        let mut state = OptimizerState::default();
+        for (((name, value), id), slot) in params.iter().zip(params.ids()).zip(&self.slots) {
+            if slot.steps.is_empty() {
+                continue;
+            }
+            if self.counts_steps {
+                let steps = slot.steps.iter().map(|&step| step.into()).collect();
+                state.put_counts(name, steps_name(params.moves_rows(id)), steps);
+            }
+            let features = value.len() / slot.steps.len();
+            for (k, kind) in self.kinds.iter().enumerate() {
+                let rows = slot.numbers.as_slice().chunks_exact((self.kinds.len() * features).max(1));
+                let numbers = rows.flat_map(|row| &row[k * features..][..features]).copied().collect();
+                state.put(name, kind, value.shape(), numbers);
+            }
+        }
+        state
+    }
+
+    /// The same with what a state has of the parameters of this store in place of what is remembered.
+    ///
+    /// # Errors
+    /// If an entry is missing, has another shape, or belongs to a lazy parameter that is not lazy, or the reverse.
+    pub fn loaded(&self, params: &Params<T>, state: &mut Reader<'_, T>) -> Result<Self, StateError> {
+        let mut slots = vec![];
+        for ((name, value), id) in params.iter().zip(params.ids()) {
+            let lazy = params.moves_rows(id);
+            let rows = if lazy { value.shape().first().copied().unwrap_or(1) } else { 1 };
+            let steps = if self.counts_steps {
+                let what = match lazy {
+                    true => "belongs to a parameter that was not lazy, and this one is",
+                    false => "belongs to a lazy parameter, and this one is not",
+                };
+                state.refuse(name, steps_name(!lazy), &format!("{what}: call Params::set_lazy as before"))?;
+                state.counts(name, steps_name(lazy), rows)?.map(<[u64]>::to_vec)
+            } else {
+                self.kinds.iter().any(|kind| state.has(name, kind)).then(|| vec![0; rows])
+            };
+            let Some(steps) = steps else {
+                slots.push(Slot::new(0, 0));
+                continue;
+            };
+            let mut slot = Slot::new(rows, self.kinds.len() * value.len());
+            slot.steps = steps.into_iter().map(|step| u32::try_from(step).unwrap_or(u32::MAX)).collect();
+            let features = (value.len() / rows).max(1);
+            for (k, kind) in self.kinds.iter().enumerate() {
+                let numbers = state.expect(name, kind, value.shape())?;
+                let rows = slot.numbers.as_mut_slice().chunks_exact_mut(self.kinds.len() * features);
+                for (row, numbers) in rows.zip(numbers.chunks_exact(features)) {
+                    row[k * features..][..features].copy_from_slice(numbers);
+                }
+            }
+            slots.push(slot);
+        }
+        Ok(Memory { slots, ..Memory::new(self.kinds, self.counts_steps) })
+    }
+}
+
+/// What the numbers of steps of a parameter are called in a state.
+fn steps_name(lazy: bool) -> &'static str {
+    if lazy { "row_steps" } else { "step" }
+}
+
+impl<T: Scalar> Slot<T> {
+    fn new(rows: usize, numbers: usize) -> Self {
+        Slot { numbers: Lines::zeros(numbers), steps: vec![0; rows], sums: vec![] }
+    }
+
+    /// Moves all elements; returns how many were moved and left alone.
+    #[track_caller]
+    fn move_whole<const M: usize, R: Rule<T, M>>(
+        &mut self,
+        part: Move<'_, T>,
+        pool: &Pool<T>,
+        rule: impl FnOnce(u32) -> R,
+    ) -> [usize; 2] {
+        self.steps[0] = self.steps[0].saturating_add(1);
+        let (rule, len, grad) = (rule(self.steps[0]), part.value.len(), part.dense_grad(pool));
+        let (table, grad, skipped) = (self.table(part.value.as_mut_slice(), len), grad.as_slice(), AtomicUsize::new(0));
+        parallel::each(len.div_ceil(CHUNK), &|chunk| {
+            let from = chunk * CHUNK;
+            let grad = &grad[from..len.min(from + CHUNK)];
+            let count = simd::dispatch(
+                #[inline(always)]
+                // SAFETY: chunks have no element in common.
+                || unsafe { table.move_elements::<M, 8, R>(0, from, grad, &rule) },
+            );
+            skipped.fetch_add(count, Ordering::Relaxed);
+        });
+        let skipped = skipped.into_inner();
+        [len - skipped, skipped]
+    }
+
+    /// Moves the rows whose gradient is not zero; returns how many of their elements were moved and left alone. Parts of
+    /// the table are worked on side by side, and moved while their sums are in the caches.
+    #[track_caller]
+    fn move_rows<const M: usize, R: Rule<T, M>>(
+        &mut self,
+        part: Move<'_, T>,
+        pool: &Pool<T>,
+        rule: impl Fn(u32) -> R + Sync,
+    ) -> [usize; 2] {
+        let ([rows, features], name) = (part.table(), part.name);
+        let (shares, parts) = part.row_parts();
+        let (in_parts, sizes) = (parts.is_some(), parts.unwrap_or_else(|| vec![rows]));
+        // They come back empty, or not at all: what a panic leaves in them is not for the next step.
+        let mut sums = std::mem::take(&mut self.sums);
+        if !sums.iter().map(RowSums::table_rows).eq(sizes.iter().copied()) {
+            sums = sizes.iter().map(|&rows| RowSums::new(rows, features)).collect();
+        }
+        // A gradient that does not consist of rows is added up first: then all its rows are there.
+        let dense = shares.is_none().then(|| part.dense_grad(pool));
+        let table = self.table(part.value.as_mut_slice(), features);
+        let counts = [const { AtomicUsize::new(0) }; 2];
+        parallel::each_of(&mut sums, |part, sums| {
+            for share in shares.iter().flatten() {
+                if in_parts { share.scatter_part(part, sums) } else { share.scatter(sums) }
+            }
+            if let Some(dense) = &dense {
+                dense.as_slice().chunks_exact(features).enumerate().for_each(|(row, share)| sums.add(row, share));
+            }
+            // A share of somebody else's could have put others in their place, of rows that reach into the next part.
+            let size = [sums.table_rows(), sums.features()];
+            assert_eq!(size, [sizes[part], features], "rows and features of part {part} of `{name}`");
+            let first = sizes[..part].iter().sum();
+            parallel::each_of(sums.rows().chunks(ROWS).zip(sums.sums().chunks(ROWS * features)), |_, (rows, sums)| {
+                let moved = simd::dispatch(
+                    #[inline(always)]
+                    // SAFETY: `RowSums` has each row once and below the number of its rows, which was checked after anybody
+                    // else could change it, and the rows of one part end where those of the next begin: so no other task
+                    // and no other turn of its loop has them. `tasks_share_a_table` and `parts_share_a_table` run it.
+                    || unsafe { table.move_rows(first, rows, sums, &rule) },
+                );
+                for (count, more) in counts.iter().zip(moved) {
+                    count.fetch_add(more, Ordering::Relaxed);
+                }
+            });
+            sums.clear();
+        });
+        self.sums = sums;
+        counts.map(AtomicUsize::into_inner)
+    }
+
+    /// The parameter with these values, in rows of so many elements.
+    fn table<'a>(&'a mut self, values: &'a mut [T], features: usize) -> Table<'a, T> {
+        Table {
+            features,
+            values: Shared::new(values),
+            memory: Shared::new(self.numbers.as_mut_slice()),
+            steps: Shared::new(&mut self.steps),
+        }
+    }
+}
+
+/// Numbers that begin where a line of the caches begins, so that a row of a power of two of them takes as few lines as it
+/// can. (A clone may begin elsewhere.)
+#[derive(Debug, Clone)]
+struct Lines<T> {
+    values: Vec<T>,
+    start: usize,
+    len: usize,
+}
+
+impl<T: Scalar> Lines<T> {
+    fn zeros(len: usize) -> Self {
+        let line = LINE / size_of::<T>();
+        let values = vec![T::ZERO; len + line];
+        let start = values.as_ptr().align_offset(LINE).min(line);
+        Lines { values, start, len }
+    }
+
+    fn as_slice(&self) -> &[T] {
+        &self.values[self.start..self.start + self.len]
+    }
+
+    fn as_mut_slice(&mut self) -> &mut [T] {
+        &mut self.values[self.start..self.start + self.len]
+    }
+}
+
+#[cfg(test)]
+mod tests;

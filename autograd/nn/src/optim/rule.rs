@@ -1,0 +1,203 @@
+//! How the elements of a parameter move: by one rule, whether all of them do or those of some rows.
+
+use raygrad_tensor::{Scalar, simd};
+use std::marker::PhantomData;
+
+/// How an optimiser moves one element, of which it remembers `M` numbers.
+pub(super) trait Rule<T: Scalar, const M: usize>: Sync {
+    /// The new value of an element `x` and what is remembered of it, after a step against `grad`.
+    fn element(&self, x: T, grad: T, memory: [T; M]) -> (T, [T; M]);
+}
+
+/// The rows of a parameter with what is remembered of them, for several tasks, each of which moves elements of its own.
+pub(super) struct Table<'a, T> {
+    /// Elements of a row.
+    pub features: usize,
+    pub values: Shared<'a, T>,
+    /// For each row the numbers of one kind after those of another: one place in memory to visit.
+    pub memory: Shared<'a, T>,
+    /// Steps of each row.
+    pub steps: Shared<'a, u32>,
+}
+
+/// How many rows ahead of the one that moves are prefetched: they lie at random places.
+const AHEAD: usize = 16;
+
+impl<T: Scalar> Table<'_, T> {
+    /// Moves those of `rows`, counted from `first` on, whose gradient `[rows, features]` is not zero, by the rule for
+    /// their next step. Returns how many of their elements were moved and left alone.
+    ///
+    /// # Safety
+    /// `rows` has no row twice, and nothing else accesses them meanwhile.
+    #[inline(always)]
+    pub unsafe fn move_rows<const M: usize, R: Rule<T, M>>(
+        &self,
+        first: usize,
+        rows: &[u32],
+        grads: &[T],
+        rule: &impl Fn(u32) -> R,
+    ) -> [usize; 2] {
+        // The usual widths as constants: the loops over a row then unroll into one vector.
+        // SAFETY: as the caller's.
+        unsafe {
+            match self.features {
+                1 => self.move_rows_by::<M, 1, R>(first, rows, grads, rule),
+                2 => self.move_rows_by::<M, 2, R>(first, rows, grads, rule),
+                4 => self.move_rows_by::<M, 4, R>(first, rows, grads, rule),
+                _ => self.move_rows_by::<M, 8, R>(first, rows, grads, rule),
+            }
+        }
+    }
+
+    /// As [`move_rows`](Self::move_rows), in pieces of `W` elements.
+    ///
+    /// # Safety
+    /// As there.
+    #[inline(always)]
+    unsafe fn move_rows_by<const M: usize, const W: usize, R: Rule<T, M>>(
+        &self,
+        first: usize,
+        rows: &[u32],
+        grads: &[T],
+        rule: &impl Fn(u32) -> R,
+    ) -> [usize; 2] {
+        let features = if W < 8 { W } else { self.features };
+        let (mut visited, mut skipped) = (0, 0);
+        for (place, (&row, grad)) in rows.iter().zip(grads.chunks_exact(features)).enumerate() {
+            if let Some(&later) = rows.get(place + AHEAD) {
+                let later = first + later as usize;
+                self.values.prefetch(later * features, features);
+                self.memory.prefetch(M * later * features, M * features);
+                self.steps.prefetch(later, 1);
+            }
+            let mut any = false;
+            for i in 0..features {
+                any |= grad[i] != T::ZERO;
+            }
+            if any {
+                let row = first + row as usize;
+                // SAFETY: the caller vouches that the row is this call's alone.
+                let step = unsafe { &mut self.steps.get(row, 1)[0] };
+                *step = step.saturating_add(1);
+                // SAFETY: likewise.
+                skipped += unsafe { self.move_elements::<M, W, R>(row, 0, grad, &rule(*step)) };
+                visited += features;
+            }
+        }
+        [visited - skipped, skipped]
+    }
+
+    /// Moves the elements of a row from place `from` on, as many as `grad` has, in pieces of `W`. Returns how many were
+    /// left alone.
+    ///
+    /// # Safety
+    /// Nothing else accesses these elements meanwhile.
+    #[inline(always)]
+    pub unsafe fn move_elements<const M: usize, const W: usize, R: Rule<T, M>>(
+        &self,
+        row: usize,
+        from: usize,
+        grad: &[T],
+        rule: &R,
+    ) -> usize {
+        let (pieces, rest) = grad.as_chunks::<W>();
+        let mut skipped = 0;
+        for (i, grad) in pieces.iter().enumerate() {
+            // SAFETY: as the caller's.
+            skipped += unsafe { self.move_piece(row, from + i * W, grad, rule) };
+        }
+        for (i, &grad) in rest.iter().enumerate() {
+            // SAFETY: as the caller's.
+            skipped += unsafe { self.move_piece(row, from + pieces.len() * W + i, &[grad], rule) };
+        }
+        skipped
+    }
+
+    /// Moves `W` elements of a row from place `from` on. One whose gradient or new value is infinite or NaN stays as it
+    /// is, with what is remembered of it; returns how many these are.
+    ///
+    /// # Safety
+    /// Nothing else accesses these elements meanwhile.
+    #[inline(always)]
+    unsafe fn move_piece<const M: usize, const W: usize, R: Rule<T, M>>(
+        &self,
+        row: usize,
+        from: usize,
+        grad: &[T; W],
+        rule: &R,
+    ) -> usize {
+        // SAFETY: the caller vouches for the elements, and no two places are the same.
+        let values = unsafe { self.values.get(row * self.features + from, W) };
+        // SAFETY: likewise; numbers of another kind are others.
+        let memory = |k: usize| unsafe { self.memory.get((row * M + k) * self.features + from, W) };
+        // Copies cannot overlap what is written meanwhile, so that the loop vectorises.
+        let (mut x, mut remembered, mut skipped) = ([T::ZERO; W], [[T::ZERO; W]; M], 0);
+        x.copy_from_slice(values);
+        for k in 0..M {
+            remembered[k].copy_from_slice(memory(k));
+        }
+        for i in 0..W {
+            let mut old = [T::ZERO; M];
+            for k in 0..M {
+                old[k] = remembered[k][i];
+            }
+            let (moved, new) = rule.element(x[i], grad[i], old);
+            let good = grad[i].is_finite() && moved.is_finite();
+            x[i] = if good { moved } else { x[i] };
+            for k in 0..M {
+                remembered[k][i] = if good { new[k] } else { old[k] };
+            }
+            skipped += usize::from(!good);
+        }
+        values.copy_from_slice(&x);
+        for k in 0..M {
+            memory(k).copy_from_slice(&remembered[k]);
+        }
+        skipped
+    }
+}
+
+/// Bytes of a line of the caches.
+pub(super) const LINE: usize = 64;
+
+/// A slice that several tasks write to, each to elements of its own.
+pub(super) struct Shared<'a, T> {
+    first: *mut T,
+    len: usize,
+    _borrow: PhantomData<&'a mut [T]>,
+}
+
+// SAFETY: it stands for an exclusive borrow of a slice whose parts may go to other threads; `get` leaves it to its callers
+// that no element is borrowed twice. `tasks_share_a_table` has several tasks write.
+unsafe impl<T: Send> Sync for Shared<'_, T> {}
+
+impl<'a, T> Shared<'a, T> {
+    pub fn new(slice: &'a mut [T]) -> Self {
+        Shared { first: slice.as_mut_ptr(), len: slice.len(), _borrow: PhantomData }
+    }
+
+    /// `len` elements from `start` on.
+    ///
+    /// # Safety
+    /// No other borrow of any of them may be alive.
+    ///
+    /// # Panics
+    /// If there are not as many.
+    #[inline(always)]
+    #[allow(clippy::mut_from_ref)] // that is its point
+    // SAFETY: kept by the callers, whose elements are all different.
+    unsafe fn get(&self, start: usize, len: usize) -> &mut [T] {
+        assert!(start <= self.len && len <= self.len - start, "elements beyond the table");
+        // SAFETY: the range lies within the slice that `new` borrowed, and the caller vouches that nobody else holds it.
+        unsafe { std::slice::from_raw_parts_mut(self.first.add(start), len) }
+    }
+
+    /// Asks the caches for the elements from `start` on.
+    #[inline(always)]
+    fn prefetch(&self, start: usize, len: usize) {
+        let line = LINE / size_of::<T>();
+        for at in (0..len).step_by(line).chain(len.checked_sub(1)) {
+            simd::prefetch(self.first.wrapping_add(start + at));
+        }
+    }
+}
