@@ -2,7 +2,8 @@
 
 use super::Entry;
 use super::spread;
-use crate::ops::{Conv2dConfig, Pool2dConfig, convolution, index, matmul, matrix, pooling, shape, vector};
+use crate::ops::pick::{ELEMENTS, ENTRIES, PIXELS, Pick, Places, Put, ROWS};
+use crate::ops::{Conv2dConfig, Pool2dConfig, convolution, matmul, matrix, pooling, shape, vector};
 use crate::{INFER, Slice};
 use crate::{Indices, Var};
 use raygrad_tensor::{Layout, Shape};
@@ -81,25 +82,27 @@ fn shapes() -> Vec<Entry> {
 }
 
 fn indexing() -> Vec<Entry> {
-    let gather = |axis, shape: &[usize], index: &[u32]| {
-        Entry::new(index::GatherAlong { axis, index: Indices::new(shape, index) }).linear()
-    };
-    let scatter = |axis, shape: &[usize], index: &[u32], extent| {
-        Entry::new(index::ScatterAlong { axis, index: Indices::new(shape, index), extent }).linear()
-    };
-    let select = |axis, index: &[u32]| Entry::new(index::IndexSelect { axis, index: index.into() }).linear();
-    let add = |axis, index: &[u32], extent| Entry::new(index::IndexAdd { axis, index: index.into(), extent }).linear();
+    let entries = |index: &[u32]| Places::Entries(index.into());
+    let elements = |shape: &[usize], index: &[u32]| Places::Elements(Indices::new(shape, index));
+    let pick = |method, axis, places| Entry::new(Pick { method, axis, places }).linear();
+    let put = |method, axis, places, extent| Entry::new(Put { pick: Pick { method, axis, places }, extent }).linear();
+    let pixels = elements(&[2, 3], &[3, 0, 3, 5, 1, 2]);
     vec![
-        gather(0, &[4], &[2, 0, 2, 1]).sample(&[&[3]]),
-        gather(1, &[2, 2, 2], &[0, 2, 2, 1, 1, 1, 0, 2]).sample(&[&[2, 3, 2]]),
-        gather(1, &[2, 0], &[]).sample(&[&[2, 3]]).sample(&[&[2, 0]]),
-        scatter(0, &[4], &[2, 0, 2, 1], 5).sample(&[&[4]]),
-        scatter(1, &[2, 2, 2], &[0, 2, 2, 1, 1, 1, 0, 2], 3).sample(&[&[2, 2, 2]]),
-        scatter(0, &[0, 2], &[], 3).sample(&[&[0, 2]]),
-        select(1, &[2, 0, 2]).sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]).sample(&[&[0, 4]]),
-        select(0, &[]).sample(&[&[3]]).sample(&[&[0, 2]]),
-        add(1, &[2, 0, 2], 4).sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]),
-        add(0, &[], 2).sample(&[&[0]]).sample(&[&[0, 3]]),
+        pick(ROWS, 0, entries(&[2, 0, 2, 3])).sample(&[&[4]]).sample(&[&[5, 3]]),
+        pick(ROWS, 0, entries(&[])).sample(&[&[4]]).sample(&[&[0, 3]]),
+        put(ROWS, 0, entries(&[2, 0, 2]), 4).sample(&[&[3]]).sample(&[&[3, 2]]),
+        pick(ELEMENTS, 0, elements(&[4], &[2, 0, 2, 1])).sample(&[&[3]]),
+        pick(ELEMENTS, 1, elements(&[2, 2, 2], &[0, 2, 2, 1, 1, 1, 0, 2])).sample(&[&[2, 3, 2]]),
+        pick(ELEMENTS, 1, elements(&[2, 0], &[])).sample(&[&[2, 3]]).sample(&[&[2, 0]]),
+        put(ELEMENTS, 0, elements(&[4], &[2, 0, 2, 1]), 5).sample(&[&[4]]),
+        put(ELEMENTS, 1, elements(&[2, 2, 2], &[0, 2, 2, 1, 1, 1, 0, 2]), 3).sample(&[&[2, 2, 2]]),
+        put(ELEMENTS, 0, elements(&[0, 2], &[]), 3).sample(&[&[0, 2]]),
+        pick(PIXELS, 1, pixels.clone()).sample(&[&[2, 6]]),
+        put(PIXELS, 1, pixels, 6).sample(&[&[2, 3]]),
+        pick(ENTRIES, 1, entries(&[2, 0, 2])).sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]).sample(&[&[0, 4]]),
+        pick(ENTRIES, 0, entries(&[])).sample(&[&[3]]).sample(&[&[0, 2]]),
+        put(ENTRIES, 1, entries(&[2, 0, 2]), 4).sample(&[&[2, 3]]).sample(&[&[2, 3, 2]]),
+        put(ENTRIES, 0, entries(&[]), 2).sample(&[&[0]]).sample(&[&[0, 3]]),
         function!("scatter_add", |x| x[0].scatter_add(0, Indices::new(&[3, 2], [1, 0, 1, 1, 0, 0]), &x[1]))
             .linear()
             .sample(&[&[2, 2], &[3, 2]]),
@@ -154,7 +157,6 @@ fn images() -> Vec<Entry> {
     let plain = Conv2dConfig::default();
     let uneven = Conv2dConfig { stride: [2, 1], padding: [1, 2], dilation: [1, 2] };
     let pool = Pool2dConfig { kernel: [3, 2], stride: [2, 1], padding: [1, 0] };
-    let indices = [3, 0, 3, 5, 1, 2];
     vec![
         Entry::new(convolution::Conv2d(plain))
             .sample(&[&[2, 2, 3, 4], &[3, 2, 2, 2]])
@@ -178,11 +180,6 @@ fn images() -> Vec<Entry> {
         Entry::new(pooling::MaxPool2d(pool)).sample(&[&[2, 1, 5, 4]]),
         Entry::new(pooling::AvgPool2d(pool)).linear().sample(&[&[2, 1, 5, 4]]).sample(&[&[1, 0, 3, 2]]),
         Entry::new(pooling::AvgPool2dInput { config: pool, image: [5, 4] }).linear().sample(&[&[1, 2, 3, 3]]),
-        Entry::new(pooling::GatherPlanes { index: indices.into(), plane: [1, 3] })
-            .linear()
-            .sample(&[&[2, 3, 2]])
-            .sample(&[&[1, 2, 2, 3]]),
-        Entry::new(pooling::ScatterPlanes { index: indices.into(), plane: [3, 2] }).linear().sample(&[&[2, 1, 3]]),
         function!("conv2d_transpose", |x| {
             x[0].conv2d_transpose(&x[1], &Conv2dConfig { stride: [2, 2], ..Default::default() }, [5, 6])
         })

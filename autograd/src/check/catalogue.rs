@@ -3,9 +3,7 @@
 use crate::cases::Extreme;
 use crate::formula::derived;
 use crate::ops::trigonometric;
-use crate::ops::{
-    Activation, Segments, activation, arithmetic, exponential, gather, linear, matmul, reduce, segment, shape,
-};
+use crate::ops::{Activation, Segments, activation, arithmetic, exponential, linear, matmul, reduce, segment, shape};
 use crate::ops::{extremum, layer_norm, loss, moments, piecewise, power, product, scan, select, softmax};
 use crate::{Cases, Elementwise, Formula, Op};
 use raygrad_tensor::{Layout, Shape, Tensor};
@@ -272,12 +270,6 @@ fn core() -> Vec<Entry> {
         Entry::new(view(&[4, 5], |layout| layout.sliced(1, 4, 2, -3))).linear().sample(&[&[4, 5]]),
         Entry::new(shape::Scatter(view(&[4, 5], |layout| layout.sliced(1, 1, 3, 1)))).linear().sample(&[&[4, 3]]),
         Entry::new(shape::Concat { axis: 1 }).linear().sample(&[&[2, 3], &[2, 1], &[2, 0]]).sample(&[&[2, 3]]),
-        Entry::new(gather::GatherRows { index: [2, 0, 2, 3].into() }).linear().sample(&[&[4]]).sample(&[&[5, 3]]),
-        Entry::new(gather::GatherRows { index: [].into() }).linear().sample(&[&[4]]).sample(&[&[0, 3]]),
-        Entry::new(gather::ScatterRows { index: [2, 0, 2].into(), rows: 4 })
-            .linear()
-            .sample(&[&[3]])
-            .sample(&[&[3, 2]]),
         Entry::new(segment::SegmentSum(segments())).linear().sample(&[&[7]]).sample(&[&[7, 2]]),
         Entry::new(segment::SegmentExpand(segments())).linear().sample(&[&[4]]).sample(&[&[4, 2]]),
         Entry::new(cumsum(false, false)).linear().sample(&[&[7]]).sample(&[&[7, 2]]),

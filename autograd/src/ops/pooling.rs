@@ -1,10 +1,10 @@
 //! Max and average pooling of images `[n, channels, height, width]`. Channels run on rayon's threads.
 
+use super::pick::{PIXELS, Pick, Places, Put};
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::parallel::chunks;
-use raygrad_tensor::{Pool, Scalar, Shape, Tensor, Windows, checked_len};
+use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor, Windows};
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 
 /// The windows of a 2-D pooling, by axis: `[rows, columns]`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,31 +48,13 @@ impl Pool2dConfig {
     }
 }
 
-/// y = the largest element of each window, NaN if there is one; padding does not count. dx = [`ScatterPlanes`] of g: to
-/// the first element that is the largest.
+/// y = the largest element of each window, NaN if there is one; padding does not count. dx = [`Put`] of g: to the
+/// first element that is the largest.
 #[derive(Clone, Copy)]
 pub struct MaxPool2d(
     /// The windows.
     pub Pool2dConfig,
 );
-
-/// y = the elements of each plane (the last two axes) at the positions that an index names; dx = [`ScatterPlanes`].
-#[derive(Clone)]
-pub struct GatherPlanes {
-    /// For each element of the output its position in its plane of the input, row-major.
-    pub index: Arc<[u32]>,
-    /// The last two extents of the output.
-    pub plane: [usize; 2],
-}
-
-/// The adjoint of [`GatherPlanes`]: zeros to which each element is added at its position.
-#[derive(Clone)]
-pub struct ScatterPlanes {
-    /// For each element of the input its position in its plane of the output, row-major.
-    pub index: Arc<[u32]>,
-    /// The last two extents of the output.
-    pub plane: [usize; 2],
-}
 
 /// y = the mean of each window; padding counts as 0. dx = [`AvgPool2dInput`] of g.
 #[derive(Clone, Copy)]
@@ -118,8 +100,8 @@ fn planes<T: Scalar>(
 }
 
 impl MaxPool2d {
-    /// Where the largest elements stand, for [`GatherPlanes`].
-    fn index<T: Scalar>(&self, x: &Tensor<T>) -> Arc<[u32]> {
+    /// Where the largest elements stand in each image of one channel: `[images, windows]`.
+    fn index<T: Scalar>(&self, x: &Tensor<T>) -> Indices {
         let windows = self.0.accepted(x.shape());
         let (from, to) = (plane_len(x.shape()), windows.count());
         let mut index = vec![0; x.len() / from * to];
@@ -127,7 +109,7 @@ impl MaxPool2d {
             windows.arg_maxima(&x.as_slice()[i * from..][..from], best, out);
         };
         chunks(&mut index, to, 4 * x.len(), || vec![T::ZERO; to], &each);
-        index.into()
+        Indices::new(&[x.len() / from, to], index)
     }
 }
 
@@ -151,92 +133,11 @@ impl<T: Scalar> Op<T> for MaxPool2d {
     }
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let plane = [cx.shape(0)[2], cx.shape(0)[3]];
-        Grads::one(cx.tape().apply(ScatterPlanes { index: self.index(cx.x(0).value()), plane }, &[cx.g()]))
-    }
-}
-
-/// The shape with another plane, or why the index does not fit: `elements` is what it must count, and its values lie
-/// below `bound`.
-fn check_planes(x: &[usize], plane: [usize; 2], index: &[u32], scatter: bool) -> Result<Shape, ShapeError> {
-    if x.len() < 2 {
-        return Err("there must be two axes at least".into());
-    }
-    let out = with_plane(x, plane);
-    if checked_len(&out).is_none() {
-        return Err(format!("planes of {plane:?} have too many elements"));
-    }
-    let (indexed, bound) = if scatter { (x, plane_len(&out)) } else { (&out[..], plane_len(x)) };
-    if indexed.iter().product::<usize>() != index.len() {
-        return Err(format!("{} indices for {indexed:?}", index.len()));
-    }
-    match index.iter().enumerate().find(|&(_, &position)| position as usize >= bound) {
-        None => Ok(out),
-        Some((i, position)) => Err(format!("index {i} is {position}, but a plane has {bound} elements")),
-    }
-}
-
-impl<T: Scalar> Op<T> for GatherPlanes {
-    fn name(&self) -> &'static str {
-        "gather_planes"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        check_planes(x[0], self.plane, &self.index, false)
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let mut out = pool.tensor(&with_plane(x[0].shape(), self.plane));
-        let (from, to) = (plane_len(x[0].shape()), plane_len(out.shape()).max(1));
-        let each = |_: &mut (), i: usize, out: &mut [T]| {
-            let x = &x[0].as_slice()[i * from..][..from];
-            out.iter_mut().zip(&self.index[i * to..]).for_each(|(out, &at)| *out = x[at as usize]);
-        };
-        chunks(out.as_mut_slice(), to, self.index.len(), || (), &each);
-        out
-    }
-
-    fn reads(&self) -> Reads {
-        Reads::NOTHING
-    }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let [.., height, width] = *cx.shape(0) else { unreachable!("`shape` wants two axes") };
-        let op = ScatterPlanes { index: self.index.clone(), plane: [height, width] };
-        Grads::one(cx.tape().apply(op, &[cx.g()]))
-    }
-}
-
-impl<T: Scalar> Op<T> for ScatterPlanes {
-    fn name(&self) -> &'static str {
-        "scatter_planes"
-    }
-
-    fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        check_planes(x[0], self.plane, &self.index, true)
-    }
-
-    fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let mut out = pool.tensor(&with_plane(x[0].shape(), self.plane));
-        let (from, to) = (plane_len(x[0].shape()), plane_len(out.shape()).max(1));
-        let each = |_: &mut (), i: usize, out: &mut [T]| {
-            out.fill(T::ZERO);
-            let x = &x[0].as_slice()[i * from..][..from];
-            x.iter().zip(&self.index[i * from..]).for_each(|(&x, &at)| out[at as usize] += x);
-        };
-        let work = 2 * self.index.len() + out.len();
-        chunks(out.as_mut_slice(), to, work, || (), &each);
-        out
-    }
-
-    fn reads(&self) -> Reads {
-        Reads::NOTHING
-    }
-
-    fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
-        let [.., height, width] = *cx.shape(0) else { unreachable!("`shape` wants two axes") };
-        let op = GatherPlanes { index: self.index.clone(), plane: [height, width] };
-        Grads::one(cx.tape().apply(op, &[cx.g()]))
+        let index = self.index(cx.x(0).value());
+        let g = cx.g().reshape(index.shape());
+        let pick = Pick { method: PIXELS, axis: 1, places: Places::Elements(index) };
+        let put = Put { pick, extent: plane_len(cx.shape(0)) };
+        Grads::one(cx.tape().apply(put, &[&g]).reshape(cx.shape(0)))
     }
 }
 
@@ -359,30 +260,8 @@ mod tests {
     }
 
     #[test]
-    fn an_index_beyond_the_plane_is_a_shape_error() {
+    fn images_that_are_too_large_are_shape_errors() {
         let tape = Tape::<f32>::new();
-        let x = tape.constant(Tensor::zeros(&[1, 2, 2]));
-        let error = tape.try_apply(GatherPlanes { index: [0, 4].into(), plane: [1, 2] }, &[&x]).unwrap_err();
-        assert!(error.to_string().contains("index 1 is 4, but a plane has 4 elements"), "{error}");
-        let error = tape.try_apply(ScatterPlanes { index: [0, 4].into(), plane: [1, 2] }, &[&x]).unwrap_err();
-        assert!(error.to_string().contains("2 indices for [1, 2, 2]"), "{error}");
-    }
-
-    #[test]
-    fn planes_whose_sizes_wrap_are_shape_errors() {
-        let tape = Tape::<f32>::new();
-        let x = tape.constant(Tensor::zeros(&[1, 2, 2]));
-        let half = 1 << (usize::BITS - 1);
-        let error = |op: &dyn Fn() -> Result<(), crate::Error>| op().unwrap_err().to_string();
-        // A plane of 2 (2^63 + 1) elements, that is of 2, and one of 2^64, that is of none.
-        let gather = GatherPlanes { index: [0, 0].into(), plane: [half + 1, 2] };
-        let scatter = ScatterPlanes { index: [0; 4].into(), plane: [1 << 32, 1 << 32] };
-        for message in [
-            error(&|| tape.try_apply(gather.clone(), &[&x]).map(drop)),
-            error(&|| tape.try_apply(scatter.clone(), &[&x]).map(drop)),
-        ] {
-            assert!(message.contains("have too many elements"), "{message}");
-        }
         let image = tape.constant(Tensor::zeros(&[1, 1, 4, 4]));
         // No image at all, of pixels that 32 bits cannot count.
         let many = tape.constant(Tensor::zeros(&[0, 1, 1 << 16, 1 << 16]));

@@ -48,6 +48,9 @@ fn no_operation_is_missing() {
             let method = (line.trim() == "fn name(&self) -> &'static str {").then(|| lines.peek()).flatten();
             let method = method.and_then(|line| line.trim().strip_prefix('"')?.strip_suffix('"'));
             written.extend(name.or(method).map(String::from));
+            // Those of an operation and of its adjoint.
+            let names = line.split_once("names: [\"").and_then(|(_, rest)| rest.split_once("\"]"));
+            written.extend(names.into_iter().flat_map(|(names, _)| names.split("\", \"")).map(String::from));
         }
     }
     assert!(written.len() > 20, "found only {written:?}");
