@@ -2,6 +2,7 @@
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
+use std::ops::Range;
 
 /// The order in which a scan walks an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,16 +44,7 @@ impl Walk {
             (whole..outer).for_each(|line| lines(line, &mut [start]));
             return;
         }
-        let mut states = vec![start; inner];
-        for o in 0..outer {
-            states.fill(start);
-            for step in 0..count {
-                let row = o * count + if self.reverse { count - 1 - step } else { step };
-                for (j, state) in states.iter_mut().enumerate() {
-                    f(state, row * inner + j);
-                }
-            }
-        }
+        walk_rows((0..outer).map(|o| o * count..(o + 1) * count), inner, self.reverse, start, f);
     }
 
     /// Entry `i` of the result is the entry that the walk passes before `i` (after it with `next`), and `fill` at the
@@ -69,6 +61,28 @@ impl Walk {
             Var::concat(&[&end, &x.slice_axis(axis, ..-1)], axis)
         } else {
             Var::concat(&[&x.slice_axis(axis, 1..), &end], axis)
+        }
+    }
+}
+
+/// Calls `f(state, i)` for every element of these ranges of rows of `inner` elements, from the first row of a range to its
+/// last or the `reverse`, with a state for each column that starts as `start` in every range.
+#[inline(always)]
+pub(super) fn walk_rows(
+    ranges: impl Iterator<Item = Range<usize>>,
+    inner: usize,
+    reverse: bool,
+    start: f64,
+    mut f: impl FnMut(&mut f64, usize),
+) {
+    let mut states = vec![start; inner];
+    for rows in ranges {
+        states.fill(start);
+        for step in 0..rows.len() {
+            let row = if reverse { rows.end - 1 - step } else { rows.start + step };
+            for (j, state) in states.iter_mut().enumerate() {
+                f(state, row * inner + j);
+            }
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Operations along segments: rows of a tensor that belong together, such as the samples of one ray.
 
+use super::scan::walk_rows;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::ops::Range;
@@ -184,19 +185,11 @@ impl<T: Scalar> Op<T> for SegmentCumsum {
         let mut out = pool.tensor(x[0].shape());
         let (x, y) = (x[0].as_slice(), out.as_mut_slice());
         // Sums are carried in f64: each output is then within half a unit in the last place of the exact sum.
-        let mut sums = vec![0.0_f64; width];
-        for rows in self.segments.ranges() {
-            sums.fill(0.0);
-            for step in 0..rows.len() {
-                let row = if self.reverse { rows.end - 1 - step } else { rows.start + step };
-                for (j, sum) in sums.iter_mut().enumerate() {
-                    let i = row * width + j;
-                    let before = *sum;
-                    *sum += x[i].to_f64();
-                    y[i] = T::from_f64(if self.exclusive { before } else { *sum });
-                }
-            }
-        }
+        walk_rows(self.segments.ranges(), width, self.reverse, 0.0, |sum, i| {
+            let before = *sum;
+            *sum += x[i].to_f64();
+            y[i] = T::from_f64(if self.exclusive { before } else { *sum });
+        });
         out
     }
 
