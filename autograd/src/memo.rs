@@ -3,8 +3,8 @@
 #[cfg(doc)]
 use crate::Op;
 use crate::Tape;
+use crate::tape::with_cell;
 use raygrad_tensor::{Pool, Scalar, Tensor};
-use std::cell::Cell;
 
 /// The outputs of those operations of a pass that [are worth keeping](Op::is_kept), in the order in which they ran.
 #[derive(Debug, Clone)]
@@ -116,21 +116,6 @@ impl<T: Scalar> Tape<T> {
             self.remembered.set(Some(values));
         }
     }
-}
-
-/// Runs `f` with a value in a cell, and gives what is in it at the end. The old value returns, also where `f` panics.
-fn with_cell<V, R>(cell: &Cell<Option<V>>, value: Option<V>, f: impl FnOnce() -> R) -> (R, Option<V>) {
-    struct Restore<'a, V>(&'a Cell<Option<V>>, Option<V>);
-    impl<V> Drop for Restore<'_, V> {
-        fn drop(&mut self) {
-            self.0.set(self.1.take());
-        }
-    }
-    let restore = Restore(cell, cell.replace(value));
-    let result = f();
-    let value = cell.take();
-    drop(restore);
-    (result, value)
 }
 
 #[cfg(test)]

@@ -1,34 +1,20 @@
 //! The nodes of a tape: a list that grows without moving what is in it, so that a node can be read while others are added.
 
-use crate::Op;
-use crate::op::Kept;
-use raygrad_tensor::Scalar;
-use smallvec::SmallVec;
 use std::cell::{OnceCell, RefCell};
-use std::panic::Location;
-
-/// One recorded operation, or a leaf. Which nodes its inputs are stands in [`Edges`].
-pub(crate) struct Node<T: Scalar> {
-    /// None for a leaf.
-    pub op: Option<Box<dyn Op<T>>>,
-    pub inputs: SmallVec<[Kept<T>; 2]>,
-    pub output: Kept<T>,
-    pub at: &'static Location<'static>,
-}
 
 /// Stands for an input that is no node.
 pub(crate) const CONSTANT: u32 = u32::MAX;
 
 /// Where a node lies; None after it was freed.
-type Place<T> = RefCell<Option<Node<T>>>;
+type Place<N> = RefCell<Option<N>>;
 
 /// Nodes in the first chunk; each further chunk is twice as long.
 const FIRST: usize = 16;
 const CHUNKS: usize = 29;
 
-/// What is recorded on a tape, in the order in which it ran.
-pub(crate) struct Nodes<T: Scalar> {
-    chunks: [OnceCell<Box<[Place<T>]>>; CHUNKS],
+/// Nodes in the order in which they were added, and which of them each one was computed from.
+pub(crate) struct Nodes<N> {
+    chunks: [OnceCell<Box<[Place<N>]>>; CHUNKS],
     edges: RefCell<Edges>,
 }
 
@@ -55,7 +41,7 @@ impl Edges {
     }
 }
 
-impl<T: Scalar> Nodes<T> {
+impl<N> Nodes<N> {
     pub fn new() -> Self {
         Nodes { chunks: [const { OnceCell::new() }; CHUNKS], edges: RefCell::default() }
     }
@@ -72,7 +58,7 @@ impl<T: Scalar> Nodes<T> {
 
     /// The place of a node that was added.
     #[track_caller]
-    pub fn place(&self, node: u32) -> &Place<T> {
+    pub fn place(&self, node: u32) -> &Place<N> {
         let (chunk, offset) = locate(node as usize);
         match self.chunks[chunk].get() {
             Some(chunk) => &chunk[offset],
@@ -84,7 +70,7 @@ impl<T: Scalar> Nodes<T> {
     ///
     /// # Panics
     /// If there are 2^32 - 1 nodes or inputs.
-    pub fn push(&self, node: Node<T>, inputs: impl Iterator<Item = u32>) -> u32 {
+    pub fn push(&self, node: N, inputs: impl Iterator<Item = u32>) -> u32 {
         let mut edges = self.edges.borrow_mut();
         let index = edges.len();
         let (chunk, offset) = locate(index);
@@ -106,11 +92,11 @@ impl<T: Scalar> Nodes<T> {
         }
     }
 
-    /// Frees what every operation holds, as [`free`](Self::free) does; leaves stay.
-    pub fn free_operations(&self) {
+    /// Frees what every node holds that `which` chooses, as [`free`](Self::free) does.
+    pub fn free_those(&self, which: impl Fn(&N) -> bool) {
         for node in 0..self.len() as u32 {
             if let Ok(mut place) = self.place(node).try_borrow_mut() {
-                place.take_if(|node| node.op.is_some());
+                place.take_if(|node| which(node));
             }
         }
     }

@@ -1,7 +1,6 @@
 //! The way of a sweep: the nodes that lead from a root to the variables whose gradients are wanted.
 
 use crate::nodes::{CONSTANT, Nodes};
-use raygrad_tensor::Scalar;
 
 /// The nodes that the root depends on, from the root down to the lowest wanted variable. Finding them takes time in
 /// proportion to their inputs, however long the tape is.
@@ -27,12 +26,7 @@ impl Path {
     /// gave, of the same tape, or nothing.
     ///
     /// [`into_scratch`]: Self::into_scratch
-    pub fn new<T: Scalar>(
-        nodes: &Nodes<T>,
-        scratch: Vec<u32>,
-        root: u32,
-        wanted: impl Iterator<Item = u32> + Clone,
-    ) -> Self {
+    pub fn new<N>(nodes: &Nodes<N>, scratch: Vec<u32>, root: u32, wanted: impl Iterator<Item = u32> + Clone) -> Self {
         let bottom = wanted.clone().min().unwrap_or(CONSTANT);
         let mut path = Path { nodes: vec![], marks: vec![], places: scratch };
         nodes.with_edges(|edges| {

@@ -1,10 +1,9 @@
 //! The backward sweep: from the root down the tape, through those nodes alone that lead to a wanted gradient.
 
-use crate::nodes::Node;
 use crate::op::Given;
 use crate::path::Path;
 use crate::sum::Sum;
-use crate::tape::LEAF;
+use crate::tape::{LEAF, Node};
 use crate::{Error, Grads, Op, Tape, Var, Vjp};
 use raygrad_tensor::Scalar;
 use smallvec::SmallVec;

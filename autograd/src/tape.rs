@@ -1,6 +1,6 @@
 //! The tape: a list of operations in the order in which they ran, which is a topological order.
 
-use crate::nodes::{CONSTANT, Node, Nodes};
+use crate::nodes::{CONSTANT, Nodes};
 use crate::op::Kept;
 use crate::{Error, Op, ShapeError, Var};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, checked_len};
@@ -22,7 +22,7 @@ use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
 /// assert_eq!(y.grad(&[&x])[0], [2.0, 4.0, 6.0]);
 /// ```
 pub struct Tape<T: Scalar> {
-    pub(crate) nodes: Nodes<T>,
+    pub(crate) nodes: Nodes<Node<T>>,
     /// What sweeps work with, kept from one to the next: as many as there were sweeps inside of each other.
     pub(crate) scratch: RefCell<Vec<Vec<u32>>>,
     pool: Pool<T>,
@@ -37,6 +37,15 @@ pub struct Tape<T: Scalar> {
     /// Outputs that are remembered, and those that are recalled.
     pub(crate) remembered: Cell<Option<Vec<Tensor<T>>>>,
     pub(crate) recalled: Cell<Option<std::vec::IntoIter<Tensor<T>>>>,
+}
+
+/// One recorded operation, or a leaf. The nodes that its inputs are stand in the edges of [`Nodes`].
+pub(crate) struct Node<T: Scalar> {
+    /// None for a leaf.
+    pub op: Option<Box<dyn Op<T>>>,
+    pub inputs: SmallVec<[Kept<T>; 2]>,
+    pub output: Kept<T>,
+    pub at: &'static Location<'static>,
 }
 
 impl<T: Scalar> fmt::Debug for Tape<T> {
@@ -90,7 +99,7 @@ impl<T: Scalar> Tape<T> {
     /// Frees the operations that are recorded and the values that only they hold; variables keep their values, but have no
     /// gradient any more.
     pub fn free(&self) {
-        self.nodes.free_operations();
+        self.nodes.free_those(|node| node.op.is_some());
     }
 
     /// The pool that the tensors of this tape come from.
@@ -194,7 +203,7 @@ impl<T: Scalar> Tape<T> {
     pub fn try_run<R>(&self, f: impl FnOnce() -> R) -> Result<R, Error> {
         // Nothing is left half done in the tape: cells get their values back as the stack unwinds, and a node is recorded
         // after everything that can fail.
-        catch_unwind(AssertUnwindSafe(|| with_cell(&self.trying, true, f))).or_else(|panic| {
+        catch_unwind(AssertUnwindSafe(|| with_cell(&self.trying, true, f).0)).or_else(|panic| {
             match panic.downcast::<Raised>() {
                 Ok(raised) => Err(raised.0),
                 Err(other) => resume_unwind(other),
@@ -221,12 +230,12 @@ impl<T: Scalar> Tape<T> {
     }
 
     pub(crate) fn with_recording<R>(&self, on: bool, f: impl FnOnce() -> R) -> R {
-        with_cell(&self.recording, on, f)
+        with_cell(&self.recording, on, f).0
     }
 
     /// Runs `f` as part of the gradient of what was recorded at `at`: nodes that it adds carry that line.
     pub(crate) fn differentiating<R>(&self, at: &'static Location<'static>, f: impl FnOnce() -> R) -> R {
-        with_cell(&self.differentiating, Some(at), f)
+        with_cell(&self.differentiating, Some(at), f).0
     }
 
     /// The line of the user's code that an operation belongs to.
@@ -238,7 +247,7 @@ impl<T: Scalar> Tape<T> {
     /// Runs operations that belong to the caller's line, also where closures hide it.
     #[track_caller]
     pub(crate) fn as_one<R>(&self, f: impl FnOnce() -> R) -> R {
-        with_cell(&self.within, Some(self.line()), f)
+        with_cell(&self.within, Some(self.line()), f).0
     }
 
     /// A variable that gradients can be taken with respect to.
@@ -416,16 +425,19 @@ struct Raised(Error);
 /// What errors and drawings call a node without operation.
 pub(crate) const LEAF: &str = "leaf";
 
-/// Runs `f` with another value in a cell, which gets its own back even if `f` panics.
-fn with_cell<C: Copy, R>(cell: &Cell<C>, value: C, f: impl FnOnce() -> R) -> R {
-    struct Restore<'a, C: Copy>(&'a Cell<C>, C);
-    impl<C: Copy> Drop for Restore<'_, C> {
+/// Runs `f` with another value in a cell, and gives what is in it at the end. The old value returns, even if `f` panics.
+pub(crate) fn with_cell<V: Default, R>(cell: &Cell<V>, value: V, f: impl FnOnce() -> R) -> (R, V) {
+    struct Restore<'a, V: Default>(&'a Cell<V>, V);
+    impl<V: Default> Drop for Restore<'_, V> {
         fn drop(&mut self) {
-            self.0.set(self.1);
+            self.0.set(std::mem::take(&mut self.1));
         }
     }
-    let _restore = Restore(cell, cell.replace(value));
-    f()
+    let restore = Restore(cell, cell.replace(value));
+    let result = f();
+    let value = cell.take();
+    drop(restore);
+    (result, value)
 }
 
 /// The first element that is not finite, as an error.
