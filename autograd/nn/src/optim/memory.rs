@@ -1,6 +1,6 @@
 //! What an optimiser remembers of parameters, and the steps that use it.
 
-use super::rule::{LINE, Rule, Shared, Table};
+use super::rule::{LINE, Rule, Shared, Table, move_all};
 use super::state::Reader;
 use super::{Move, OptimizerState, StateError, UpdateReport};
 use crate::Params;
@@ -159,16 +159,13 @@ impl<T: Scalar> Slot<T> {
     ) -> [usize; 2] {
         self.steps[0] = self.steps[0].saturating_add(1);
         let (rule, len, grad) = (rule(self.steps[0]), part.value.len(), part.dense_grad(pool));
-        let (table, grad, skipped) = (self.table(part.value.as_mut_slice(), len), grad.as_slice(), AtomicUsize::new(0));
-        parallel::each(len.div_ceil(CHUNK), &|chunk| {
-            let from = chunk * CHUNK;
-            let grad = &grad[from..len.min(from + CHUNK)];
-            let count = simd::dispatch(
-                #[inline(always)]
-                // SAFETY: chunks have no element in common.
-                || unsafe { table.move_elements::<M, 8, R>(0, from, grad, &rule) },
-            );
-            skipped.fetch_add(count, Ordering::Relaxed);
+        let mut kinds = self.numbers.as_mut_slice().chunks_mut(len.max(1));
+        let mut kinds = [(); M].map(|()| kinds.next().unwrap_or_default().chunks_mut(CHUNK));
+        let values = part.value.as_mut_slice().chunks_mut(CHUNK).zip(grad.as_slice().chunks(CHUNK));
+        let parts = values.map(|(x, g)| (x, g, kinds.each_mut().map(|kind| kind.next().unwrap_or_default())));
+        let skipped = AtomicUsize::new(0);
+        parallel::each_of(parts, |_, (x, grad, memory)| {
+            skipped.fetch_add(move_all(x, grad, memory, &rule), Ordering::Relaxed);
         });
         let skipped = skipped.into_inner();
         [len - skipped, skipped]
@@ -193,7 +190,12 @@ impl<T: Scalar> Slot<T> {
         }
         // A gradient that does not consist of rows is added up first: then all its rows are there.
         let dense = shares.is_none().then(|| part.dense_grad(pool));
-        let table = self.table(part.value.as_mut_slice(), features);
+        let table = Table {
+            features,
+            values: Shared::new(part.value.as_mut_slice()),
+            memory: Shared::new(self.numbers.as_mut_slice()),
+            steps: Shared::new(&mut self.steps),
+        };
         let counts = [const { AtomicUsize::new(0) }; 2];
         parallel::each_of(&mut sums, |part, sums| {
             for share in shares.iter().flatten() {
@@ -222,16 +224,6 @@ impl<T: Scalar> Slot<T> {
         });
         self.sums = sums;
         counts.map(AtomicUsize::into_inner)
-    }
-
-    /// The parameter with these values, in rows of so many elements.
-    fn table<'a>(&'a mut self, values: &'a mut [T], features: usize) -> Table<'a, T> {
-        Table {
-            features,
-            values: Shared::new(values),
-            memory: Shared::new(self.numbers.as_mut_slice()),
-            steps: Shared::new(&mut self.steps),
-        }
     }
 }
 

@@ -9,12 +9,93 @@ pub(super) trait Rule<T: Scalar, const M: usize>: Sync {
     fn element(&self, x: T, grad: T, memory: [T; M]) -> (T, [T; M]);
 }
 
-/// The rows of a parameter with what is remembered of them, for several tasks, each of which moves elements of its own.
+/// A step of one element: its new value and memory, and whether it is left alone with what is remembered of it, because its
+/// gradient or its new value is infinite or NaN.
+#[inline(always)]
+fn step<T: Scalar, const M: usize>(rule: &impl Rule<T, M>, x: T, grad: T, memory: [T; M]) -> (T, [T; M], bool) {
+    let (moved, mut new) = rule.element(x, grad, memory);
+    let good = grad.is_finite() && moved.is_finite();
+    for k in 0..M {
+        new[k] = if good { new[k] } else { memory[k] };
+    }
+    (if good { moved } else { x }, new, !good)
+}
+
+/// Moves all these elements, whose memory of each kind lies apart; returns how many were left alone.
+pub(super) fn move_all<T: Scalar, const M: usize>(
+    x: &mut [T],
+    grad: &[T],
+    memory: [&mut [T]; M],
+    rule: &impl Rule<T, M>,
+) -> usize {
+    simd::dispatch(
+        #[inline(always)]
+        || {
+            let n = x.len();
+            let (grad, mut memory, mut skipped) = (&grad[..n], memory, 0);
+            for part in &mut memory {
+                *part = &mut std::mem::take(part)[..n];
+            }
+            for i in 0..n {
+                let mut old = [T::ZERO; M];
+                for k in 0..M {
+                    old[k] = memory[k][i];
+                }
+                let (moved, new, skip) = step(rule, x[i], grad[i], old);
+                x[i] = moved;
+                for k in 0..M {
+                    memory[k][i] = new[k];
+                }
+                skipped += usize::from(skip);
+            }
+            skipped
+        },
+    )
+}
+
+/// Moves `W` elements of a row from place `at` on, whose memory of one kind lies behind that of another; returns how many
+/// were left alone.
+#[inline(always)]
+fn move_piece<T: Scalar, const M: usize, const W: usize>(
+    x: &mut [T],
+    grad: &[T],
+    memory: &mut [T],
+    at: usize,
+    rule: &impl Rule<T, M>,
+) -> usize {
+    let features = x.len();
+    // Copies cannot overlap what is written meanwhile, so that the loop vectorises.
+    let (mut values, mut g, mut kept, mut skipped) = ([T::ZERO; W], [T::ZERO; W], [[T::ZERO; W]; M], 0);
+    values.copy_from_slice(&x[at..at + W]);
+    g.copy_from_slice(&grad[at..at + W]);
+    for k in 0..M {
+        kept[k].copy_from_slice(&memory[k * features + at..][..W]);
+    }
+    for i in 0..W {
+        let mut old = [T::ZERO; M];
+        for k in 0..M {
+            old[k] = kept[k][i];
+        }
+        let (moved, new, skip) = step(rule, values[i], g[i], old);
+        values[i] = moved;
+        for k in 0..M {
+            kept[k][i] = new[k];
+        }
+        skipped += usize::from(skip);
+    }
+    x[at..at + W].copy_from_slice(&values);
+    for k in 0..M {
+        memory[k * features + at..][..W].copy_from_slice(&kept[k]);
+    }
+    skipped
+}
+
+/// A table and what is remembered of its rows, for several tasks that move rows of their own.
 pub(super) struct Table<'a, T> {
     /// Elements of a row.
     pub features: usize,
     pub values: Shared<'a, T>,
-    /// For each row the numbers of one kind after those of another: one place in memory to visit.
+    /// For each row the numbers of one kind behind those of another: one place in memory to visit.
     pub memory: Shared<'a, T>,
     /// Steps of each row.
     pub steps: Shared<'a, u32>,
@@ -74,86 +155,26 @@ impl<T: Scalar> Table<'_, T> {
             for i in 0..features {
                 any |= grad[i] != T::ZERO;
             }
-            if any {
-                let row = first + row as usize;
-                // SAFETY: the caller vouches that the row is this call's alone.
-                let step = unsafe { &mut self.steps.get(row, 1)[0] };
-                *step = step.saturating_add(1);
-                // SAFETY: likewise.
-                skipped += unsafe { self.move_elements::<M, W, R>(row, 0, grad, &rule(*step)) };
-                visited += features;
+            if !any {
+                continue;
             }
+            let row = first + row as usize;
+            // SAFETY: the caller vouches that the row is this call's alone.
+            let (x, memory, step) = unsafe {
+                let x = self.values.get(row * features, features);
+                (x, self.memory.get(M * row * features, M * features), self.steps.get(row, 1))
+            };
+            step[0] = step[0].saturating_add(1);
+            let (rule, whole) = (rule(step[0]), features - features % W);
+            for at in (0..whole).step_by(W) {
+                skipped += move_piece::<T, M, W>(x, grad, memory, at, &rule);
+            }
+            for at in whole..features {
+                skipped += move_piece::<T, M, 1>(x, grad, memory, at, &rule);
+            }
+            visited += features;
         }
         [visited - skipped, skipped]
-    }
-
-    /// Moves the elements of a row from place `from` on, as many as `grad` has, in pieces of `W`. Returns how many were
-    /// left alone.
-    ///
-    /// # Safety
-    /// Nothing else accesses these elements meanwhile.
-    #[inline(always)]
-    pub unsafe fn move_elements<const M: usize, const W: usize, R: Rule<T, M>>(
-        &self,
-        row: usize,
-        from: usize,
-        grad: &[T],
-        rule: &R,
-    ) -> usize {
-        let (pieces, rest) = grad.as_chunks::<W>();
-        let mut skipped = 0;
-        for (i, grad) in pieces.iter().enumerate() {
-            // SAFETY: as the caller's.
-            skipped += unsafe { self.move_piece(row, from + i * W, grad, rule) };
-        }
-        for (i, &grad) in rest.iter().enumerate() {
-            // SAFETY: as the caller's.
-            skipped += unsafe { self.move_piece(row, from + pieces.len() * W + i, &[grad], rule) };
-        }
-        skipped
-    }
-
-    /// Moves `W` elements of a row from place `from` on. One whose gradient or new value is infinite or NaN stays as it
-    /// is, with what is remembered of it; returns how many these are.
-    ///
-    /// # Safety
-    /// Nothing else accesses these elements meanwhile.
-    #[inline(always)]
-    unsafe fn move_piece<const M: usize, const W: usize, R: Rule<T, M>>(
-        &self,
-        row: usize,
-        from: usize,
-        grad: &[T; W],
-        rule: &R,
-    ) -> usize {
-        // SAFETY: the caller vouches for the elements, and no two places are the same.
-        let values = unsafe { self.values.get(row * self.features + from, W) };
-        // SAFETY: likewise; numbers of another kind are others.
-        let memory = |k: usize| unsafe { self.memory.get((row * M + k) * self.features + from, W) };
-        // Copies cannot overlap what is written meanwhile, so that the loop vectorises.
-        let (mut x, mut remembered, mut skipped) = ([T::ZERO; W], [[T::ZERO; W]; M], 0);
-        x.copy_from_slice(values);
-        for k in 0..M {
-            remembered[k].copy_from_slice(memory(k));
-        }
-        for i in 0..W {
-            let mut old = [T::ZERO; M];
-            for k in 0..M {
-                old[k] = remembered[k][i];
-            }
-            let (moved, new) = rule.element(x[i], grad[i], old);
-            let good = grad[i].is_finite() && moved.is_finite();
-            x[i] = if good { moved } else { x[i] };
-            for k in 0..M {
-                remembered[k][i] = if good { new[k] } else { old[k] };
-            }
-            skipped += usize::from(!good);
-        }
-        values.copy_from_slice(&x);
-        for k in 0..M {
-            memory(k).copy_from_slice(&remembered[k]);
-        }
-        skipped
     }
 }
 
