@@ -19,8 +19,6 @@ pub trait Family: Sized + 'static {
     const WHAT: &'static str;
     /// What is built.
     type Built<T: Scalar>: 'static;
-    /// What was [registered](register).
-    fn registered() -> &'static RwLock<Vec<Registered<Self>>>;
 }
 
 /// Where something is built, and with what.
@@ -209,8 +207,10 @@ impl<'de, F: Family> Deserialize<'de> for Part<F> {
             return Err(D::Error::custom(format!("a {} has a field `{KIND}`: its name", F::WHAT)));
         };
         // A copy: what is read may hold parts of its own.
-        let copy = |registered: &Registered<F>| (registered.kind, registered.read);
-        let all: Vec<_> = F::registered().read().unwrap_or_else(PoisonError::into_inner).iter().map(copy).collect();
+        let all: Vec<Registered<F>> = {
+            let registered = REGISTERED.read().unwrap_or_else(PoisonError::into_inner);
+            registered.iter().filter_map(|one| one.downcast_ref()).copied().collect()
+        };
         let Some((_, read)) = all.iter().find(|(known, _)| *known == kind) else {
             let known: Vec<_> = all.iter().map(|(known, _)| *known).collect();
             let what = format!("there is no {} `{kind}`; known are {}", F::WHAT, known.join(", "));
@@ -222,22 +222,16 @@ impl<'de, F: Family> Deserialize<'de> for Part<F> {
     }
 }
 
-/// A name, and how to read what it stands for.
-pub struct Registered<F: Family> {
-    kind: &'static str,
-    read: fn(Value) -> serde_json::Result<Part<F>>,
-}
+/// A name of a family, and how to read what it stands for.
+type Registered<F> = (&'static str, fn(Value) -> serde_json::Result<Part<F>>);
 
-impl<F: Family> Registered<F> {
-    /// Of a configuration.
-    pub const fn of<K: Kind<F>>() -> Self {
-        Registered { kind: K::KIND, read: |fields| Ok(Part::new(serde_json::from_value::<K>(fields)?)) }
-    }
-}
+/// What was [registered](register): a [`Registered`] each, of all families.
+static REGISTERED: RwLock<Vec<Box<dyn Any + Send + Sync>>> = RwLock::new(vec![]);
 
 /// Makes the name of a [`Kind`] known to whatever reads configurations in this program, beside those of this crate, which
 /// [`Config`](crate::Config) knows, and whose names stay theirs: `register::<Fields, MyFieldConfig>()`, once, before the
 /// first is read. Who only makes configurations needs it not.
 pub fn register<F: Family, K: Kind<F>>() {
-    F::registered().write().unwrap_or_else(PoisonError::into_inner).push(Registered::of::<K>());
+    let one: Registered<F> = (K::KIND, |fields| Ok(Part::new(serde_json::from_value::<K>(fields)?)));
+    REGISTERED.write().unwrap_or_else(PoisonError::into_inner).push(Box::new(one));
 }

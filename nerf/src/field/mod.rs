@@ -10,12 +10,12 @@ pub use grid::Grid;
 pub use instant::{Instant, InstantConfig};
 pub use voxel::{Voxel, VoxelConfig};
 
-use crate::kind::{Family, Part, Registered};
+use crate::kind::{Family, Part};
 use raygrad_autograd::{Scalar, Segments, Var};
 use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
 use std::any::Any;
-use std::sync::{Arc, RwLock};
+use std::sync::Arc;
 
 /// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
 pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
@@ -84,10 +84,6 @@ pub struct Fields;
 impl Family for Fields {
     const WHAT: &'static str = "field";
     type Built<T: Scalar> = Arc<dyn Field<T>>;
-    fn registered() -> &'static RwLock<Vec<Registered<Self>>> {
-        static OTHERS: RwLock<Vec<Registered<Fields>>> = RwLock::new(vec![]);
-        &OTHERS
-    }
 }
 
 /// Which field, and its size.

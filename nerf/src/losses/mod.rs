@@ -12,12 +12,12 @@ pub use terms::{DepthConfig, DistortionConfig, EntropyConfig, OrientationConfig}
 pub use variation::TotalVariationConfig;
 
 use crate::camera::rays::Rays;
-use crate::kind::{Family, Part, Registered};
+use crate::kind::{Family, Part};
 use crate::volume::render::Rendered;
 use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::Bound;
 use std::any::Any;
-use std::sync::{Arc, RwLock};
+use std::sync::Arc;
 
 /// What a term may use: what is rendered of some rays, and what photographs show along them.
 #[derive(Clone, Copy)]
@@ -69,10 +69,6 @@ pub struct Terms;
 impl Family for Terms {
     const WHAT: &'static str = "term";
     type Built<T: Scalar> = Arc<dyn Term<T>>;
-    fn registered() -> &'static RwLock<Vec<Registered<Self>>> {
-        static OTHERS: RwLock<Vec<Registered<Terms>>> = RwLock::new(vec![]);
-        &OTHERS
-    }
 }
 
 /// Which term, and its weight.

@@ -14,7 +14,7 @@ use crate::Result;
 use crate::camera::rays::{Rays, Samples};
 use crate::dataset::Dataset;
 use crate::field::Field;
-use crate::kind::{Family, Part, Registered};
+use crate::kind::{Family, Part};
 use crate::random::Jitter;
 use crate::space::occupancy::{DensityFn, OccupancyGrid};
 use crate::volume::quadrature::Quadrature;
@@ -23,7 +23,6 @@ use crate::volume::render::{Evaluations, Rendered};
 use raygrad_autograd::{Scalar, Segments, Var};
 use std::any::Any;
 use std::collections::HashMap;
-use std::sync::RwLock;
 
 /// What samples are for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -201,10 +200,6 @@ pub struct Samplers;
 impl Family for Samplers {
     const WHAT: &'static str = "sampler";
     type Built<T: Scalar> = Box<dyn Sampler<T>>;
-    fn registered() -> &'static RwLock<Vec<Registered<Self>>> {
-        static OTHERS: RwLock<Vec<Registered<Samplers>>> = RwLock::new(vec![]);
-        &OTHERS
-    }
 }
 
 /// Which sampler, and its numbers.
