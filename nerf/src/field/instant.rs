@@ -1,7 +1,6 @@
 //! A hash grid and two small networks.
 
-use super::grid::Grid;
-use super::{Density, Field, Fields, Seen, log_density_shift};
+use super::{Density, DensityNetwork, Field, Fields, Grid, Seen};
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
 use crate::kind::{Kind, Site};
@@ -57,11 +56,8 @@ impl Kind<Fields> for InstantConfig {
 /// the first output.
 #[derive(Debug, Clone)]
 pub struct Instant {
-    grid: Grid,
+    density: DensityNetwork,
     direction: SphericalHarmonics,
-    /// Subtracted from the logarithm of the density.
-    shift: f64,
-    density: [Linear; 2],
     color: Vec<Linear>,
     /// A code for each photograph, if there are codes.
     codes: Option<ParamId>,
@@ -74,24 +70,17 @@ impl Instant {
     /// If the configuration is out of range, or has codes and the number of photographs is not known.
     pub fn new<T: Scalar>(config: &InstantConfig, mut site: Site<'_, T>) -> Result<Self> {
         config.check()?;
-        let shift = log_density_shift(site.space.unit);
-        let grid = Grid::new(&config.grid, site.child(site.name))?;
+        let InstantConfig { density_width, features, color_width, color_depth, codes, .. } = *config;
+        let density = DensityNetwork::new(&config.grid, density_width, features, site.child(site.name))?;
         let Site { frames, params, name, rng, .. } = site;
         let direction = SphericalHarmonics::new(config.direction_degree);
-        let mut layer = |part: String, sizes, activation| {
-            Linear::without_bias(params, &format!("{name}.{part}"), sizes, activation, Init::He, &mut *rng)
-        };
-        let InstantConfig { density_width, features, color_width, color_depth, codes, .. } = *config;
-        let density = [
-            layer("density.0".into(), [grid.width(), density_width], Activation::Relu),
-            layer("density.1".into(), [density_width, features], Activation::Identity),
-        ];
         let mut color = Vec::with_capacity(color_depth + 1);
         for i in 0..=color_depth {
             let inputs = if i == 0 { features + direction.width() + codes } else { color_width };
             let last = i == color_depth;
             let (outputs, activation) = if last { (3, Activation::Identity) } else { (color_width, Activation::Relu) };
-            color.push(layer(format!("color.{i}"), [inputs, outputs], activation));
+            let name = format!("{name}.color.{i}");
+            color.push(Linear::without_bias(params, &name, [inputs, outputs], activation, Init::He, &mut *rng));
         }
         if codes > 0 && frames == 0 {
             return Err(Error::setting("codes", "are for photographs, and it is not known how many there are"));
@@ -103,21 +92,18 @@ impl Instant {
             params.set_lazy(|other| other == name, true);
             id
         });
-        Ok(Instant { grid, direction, shift, density, color, codes })
+        Ok(Instant { density, direction, color, codes })
     }
 
     /// The grid that positions are looked up in.
     pub fn grid(&self) -> &Grid {
-        &self.grid
+        &self.density.grid
     }
 }
 
 impl<T: Scalar> Field<T> for Instant {
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
-        let hidden = self.density[0].forward(params, &self.grid.encode(params, positions));
-        let features = self.density[1].forward(params, &hidden);
-        let raw = features.slice_axis(1, ..1).reshape(&[positions.shape()[0]]);
-        Density { value: raw - self.shift, log: true, features }
+        self.density.density(params, positions)
     }
 
     fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
@@ -139,6 +125,6 @@ impl<T: Scalar> Field<T> for Instant {
     }
 
     fn with_detail(&self, detail: f64) -> Option<Arc<dyn Field<T>>> {
-        Some(Arc::new(Instant { grid: self.grid.with_detail(detail), ..self.clone() }))
+        Some(Arc::new(Instant { density: self.density.with_detail(detail), ..self.clone() }))
     }
 }

@@ -1,11 +1,13 @@
 //! Fields: functions of position and direction that give density and colour.
 
 mod classic;
+mod density_network;
 mod grid;
 mod instant;
 mod voxel;
 
 pub use classic::{Classic, ClassicConfig};
+pub(crate) use density_network::DensityNetwork;
 pub use grid::Grid;
 pub use instant::{Instant, InstantConfig};
 pub use voxel::{Voxel, VoxelConfig};

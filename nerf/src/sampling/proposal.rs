@@ -4,16 +4,16 @@ use super::steps::{even_edges, invert_cdf};
 use super::{Level, Limits, Load, Progress, Purpose, Sampled, Sampler, Samplers};
 use crate::camera::rays::{Rays, Samples};
 use crate::encoding::hash_grid::HashGridConfig;
-use crate::field::{Density, Field, Grid, Seen};
+use crate::field::{Density, DensityNetwork, Field, Seen};
 use crate::kind::{Kind, Site};
 use crate::random::Jitter;
 use crate::range::check_range;
 use crate::space::occupancy::DensityFn;
 use crate::volume::query::Query;
-use crate::volume::render::{Evaluations, Weighted};
+use crate::volume::render::{Evaluations, weights};
 use crate::{Error, Result};
-use raygrad_autograd::{Activation, Scalar, Segments, Tensor, Var};
-use raygrad_nn::{Bound, Init, Linear};
+use raygrad_autograd::{Scalar, Segments, Tensor, Var};
+use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
 
 /// How places are spread along a ray before anything is known of it.
@@ -104,40 +104,20 @@ impl Kind<Samplers> for ProposalConfig {
     fn build<T: Scalar>(&self, mut site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
         let mut fields = vec![];
         for (i, level) in self.levels.iter().enumerate() {
-            fields.push(Proposer::new(level, site.child(&format!("proposal.{i}")))?);
+            let name = format!("proposal.{i}");
+            fields.push(Proposer(DensityNetwork::new(&level.grid, level.width, 1, site.child(&name))?));
         }
         Ok(Box::new(Proposal { config: self.clone(), fields, trust: 0.0 }))
     }
 }
 
-/// A hash grid and a small network that give a density, of which only the place matters.
+/// A density of which only the place matters.
 #[derive(Debug, Clone)]
-struct Proposer {
-    grid: Grid,
-    layers: [Linear; 2],
-    /// Subtracted from the logarithm of the density.
-    shift: f64,
-}
-
-impl Proposer {
-    fn new<T: Scalar>(level: &ProposalLevel, mut site: Site<'_, T>) -> Result<Self> {
-        let grid = Grid::new(&level.grid, site.child(site.name))?;
-        let Site { space, params, name, rng, .. } = site;
-        let mut layer = |part: usize, sizes, activation| {
-            Linear::without_bias(params, &format!("{name}.density.{part}"), sizes, activation, Init::He, &mut *rng)
-        };
-        let hidden = layer(0, [grid.width(), level.width], Activation::Relu);
-        let layers = [hidden, layer(1, [level.width, 1], Activation::Identity)];
-        Ok(Proposer { grid, layers, shift: 1.0 + space.unit.ln() })
-    }
-}
+struct Proposer(DensityNetwork);
 
 impl<T: Scalar> Field<T> for Proposer {
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T> {
-        let hidden = self.layers[0].forward(params, &self.grid.encode(params, positions));
-        let features = self.layers[1].forward(params, &hidden);
-        let value = features.reshape(&[positions.shape()[0]]) - self.shift;
-        Density { value, log: true, features }
+        self.0.density(params, positions)
     }
 
     /// A grey that nobody asks for.
@@ -185,7 +165,13 @@ impl Scale {
 impl Proposal {
     /// The bins between edges, given as shares of each ray's span, as samples in their middles, and their edges as
     /// distances.
-    fn steps<T: Scalar>(&self, rays: &Rays<T>, shares: &[f64], bins: usize, query: &Query<'_, '_, T>) -> Steps<T> {
+    fn steps<T: Scalar>(
+        &self,
+        rays: &Rays<T>,
+        shares: &[f64],
+        bins: usize,
+        query: &Query<'_, '_, T>,
+    ) -> (Samples<T>, Vec<f64>) {
         let pool = query.tape().pool();
         let segments = Segments::uniform(rays.len(), bins);
         let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
@@ -200,7 +186,7 @@ impl Proposal {
                 *delta = T::from_f64((pair[1] - pair[0]).max(0.0));
             }
         }
-        Steps { samples: Samples::new(rays, segments, t, delta, pool), edges }
+        (Samples::new(rays, segments, t, delta, pool), edges)
     }
 
     /// Edges of `bins` bins a ray, as shares of its span, around places that a histogram over `shares` says are worth it.
@@ -242,12 +228,6 @@ impl Proposal {
     }
 }
 
-/// Bins as samples, and their edges.
-struct Steps<T: Scalar> {
-    samples: Samples<T>,
-    edges: Vec<f64>,
-}
-
 impl<T: Scalar> Sampler<T> for Proposal {
     fn sample<'t>(
         &self,
@@ -261,16 +241,16 @@ impl<T: Scalar> Sampler<T> for Proposal {
         let mut shares: Vec<f64> = even_edges(self.config.levels[0].samples).repeat(rays.len());
         let (mut levels, mut asked) = (vec![], 0);
         for (i, (level, field)) in self.config.levels.iter().zip(&self.fields).enumerate() {
-            let Steps { samples, edges } = self.steps(rays, &shares, level.samples, query);
+            let (samples, edges) = self.steps(rays, &shares, level.samples, query);
             let density = query.of(field).density(&samples);
-            let weights = Weighted::new(&density, &samples.delta, &samples.segments).weights;
+            let weights = weights(&density.optical_depth(&samples.delta), &samples.segments);
             let next = self.config.levels.get(i + 1);
             let bins = [level.samples, next.map_or(self.config.samples, |next| next.samples)];
             shares = self.resampled(&shares, weights.value().as_slice(), bins, next.is_some(), jitter);
             asked += samples.len() as u64;
             levels.push(Level { edges, weights, segments: samples.segments });
         }
-        let steps = self.steps(rays, &shares, self.config.samples, query).samples;
+        let steps = self.steps(rays, &shares, self.config.samples, query).0;
         let unskipped = asked + steps.len() as u64;
         Sampled { steps, coarse: vec![], levels, evaluations: Evaluations { density: asked, color: 0, unskipped } }
     }
@@ -365,13 +345,9 @@ mod tests {
         let mut rays = Rays::new();
         let ray = crate::camera::pinhole::Ray { origin: glam::DVec3::ZERO, direction: glam::DVec3::Z };
         rays.push(&ray, [1.0, 5.0]);
-        let steps = sampler.steps(&rays, &even_edges(2), 2, &Query::new(&field, &bound));
-        assert!(
-            (steps.edges[1] - 5.0 / 3.0).abs() < 1e-12 && (steps.edges[2] - 5.0).abs() < 1e-12,
-            "{:?}",
-            steps.edges
-        );
-        assert!((steps.samples.t.as_slice()[0] - 4.0 / 3.0).abs() < 1e-12);
+        let (samples, edges) = sampler.steps(&rays, &even_edges(2), 2, &Query::new(&field, &bound));
+        assert!((edges[1] - 5.0 / 3.0).abs() < 1e-12 && (edges[2] - 5.0).abs() < 1e-12, "{edges:?}");
+        assert!((samples.t.as_slice()[0] - 4.0 / 3.0).abs() < 1e-12);
     }
 
     #[test]
