@@ -14,10 +14,10 @@ use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use crate::{Error, Result};
-use raygrad_autograd::{Pool, Scalar, Segments};
+use raygrad_autograd::{Pool, Scalar};
+use raygrad_tensor::parallel::Scratch;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
-use std::sync::{Mutex, PoisonError};
 
 /// Numbers of a [`Marching`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -110,7 +110,7 @@ pub struct Marching {
     /// How much of training is done, 0 to 1.
     pub progress: f64,
     /// What nobody marches with at the moment.
-    buffers: Mutex<Vec<MarchBuffer>>,
+    buffers: Scratch<MarchBuffer>,
 }
 
 impl Clone for Marching {
@@ -123,7 +123,7 @@ impl Clone for Marching {
 impl Marching {
     /// Marching through a grid, before training.
     pub fn new(config: MarchingConfig, grid: OccupancyGrid) -> Self {
-        Marching { config, grid, pruned: None, progress: 0.0, buffers: Mutex::default() }
+        Marching { config, grid, pruned: None, progress: 0.0, buffers: Scratch::default() }
     }
 
     /// The length of a training step in scene units, now.
@@ -169,19 +169,10 @@ impl Marching {
         jitter: &mut Jitter<'_>,
         pool: &Pool<T>,
     ) -> (Samples<T>, u64) {
-        let buffers = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut buffer = buffers().pop().unwrap_or_default();
-        grid.march(&rays.cast(), step, jitter, &mut buffer);
-        let tensor = |values: &[f32]| {
-            let mut out = pool.tensor(&[values.len()]);
-            out.as_mut_slice().iter_mut().zip(values).for_each(|(out, &x)| *out = T::from_f64(x.into()));
-            out
-        };
-        let segments = Segments::new(&buffer.offsets[..]);
-        let samples = Samples::new(rays, segments, tensor(&buffer.t), tensor(&buffer.delta), pool);
-        let steps = buffer.steps;
-        buffers().push(buffer);
-        (samples, steps)
+        self.buffers.with(|buffer| {
+            grid.march(&rays.cast(), step, jitter, buffer);
+            (buffer.samples(rays, pool), buffer.steps)
+        })
     }
 }
 
@@ -301,6 +292,7 @@ mod tests {
     use crate::volume::quadrature::Plan;
     use raygrad_autograd::{Tape, Tensor};
     use raygrad_nn::Params;
+    use std::sync::Mutex;
 
     /// A ball that lies beyond the box is seen through the outer cascades, with even steps and with growing ones.
     #[test]

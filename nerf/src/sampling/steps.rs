@@ -41,26 +41,10 @@ pub fn importance<T: Scalar>(
             drawn.copy_from_slice(&u);
         }
         let (t, delta) = (&mut t.as_mut_slice()[rows.clone()], &mut delta.as_mut_slice()[rows]);
-        // Both lists rise, so a merge keeps the order.
-        let (known, mut a, mut b) = (&coarse.t.as_slice()[own], 0, 0);
-        for t in t.iter_mut() {
-            let fresh = drawn.get(b).map(|x| T::from_f64(near + (far - near) * x));
-            *t = match (known.get(a), fresh) {
-                (Some(&known), Some(fresh)) if fresh < known => {
-                    b += 1;
-                    fresh
-                }
-                (Some(&known), _) => {
-                    a += 1;
-                    known
-                }
-                (None, Some(fresh)) => {
-                    b += 1;
-                    fresh
-                }
-                (None, None) => unreachable!("as many places as both lists hold"),
-            };
-        }
+        let (known, fresh) = t.split_at_mut(bins);
+        known.copy_from_slice(&coarse.t.as_slice()[own]);
+        fresh.iter_mut().zip(&drawn).for_each(|(t, x)| *t = T::from_f64(near + (far - near) * x));
+        t.sort_by(|a, b| a.to_f64().total_cmp(&b.to_f64()));
         voronoi(t, [T::from_f64(near), T::from_f64(far)], delta);
     }
     Samples::new(rays, segments, t, delta, pool)

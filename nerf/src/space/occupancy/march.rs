@@ -3,7 +3,7 @@
 use super::OccupancyGrid;
 use crate::camera::rays::{Rays, Samples};
 use crate::random::Jitter;
-use raygrad_autograd::{Pool, Segments};
+use raygrad_autograd::{Pool, Scalar, Segments};
 use raygrad_tensor::simd;
 
 mod frame;
@@ -32,12 +32,16 @@ pub struct MarchBuffer {
 }
 
 impl MarchBuffer {
-    /// The samples with positions and directions.
+    /// The samples with positions and directions, in any precision.
     ///
     /// # Panics
     /// If these are not the rays that were marched.
-    pub fn samples(&self, rays: &Rays<f32>, pool: &Pool<f32>) -> Samples<f32> {
-        let copy = |values: &[f32]| pool.copy_of(&[values.len()], values);
+    pub fn samples<T: Scalar>(&self, rays: &Rays<T>, pool: &Pool<T>) -> Samples<T> {
+        let copy = |values: &[f32]| {
+            let mut out = pool.tensor(&[values.len()]);
+            out.as_mut_slice().iter_mut().zip(values).for_each(|(out, &x)| *out = T::from_f64(x.into()));
+            out
+        };
         Samples::new(rays, Segments::new(&self.offsets[..]), copy(&self.t), copy(&self.delta), pool)
     }
 }
