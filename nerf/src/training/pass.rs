@@ -9,7 +9,7 @@ use crate::random::{Jitter, mixed};
 use crate::sampling::{Purpose, Sampled};
 use crate::volume::lit::Lit;
 use crate::volume::query::Query;
-use crate::volume::render::Rendered;
+use crate::volume::render::{Evaluations, Rendered};
 use raygrad_autograd::{Scalar, Var};
 use raygrad_nn::Bound;
 use std::ops::Add;
@@ -19,12 +19,8 @@ use std::ops::Add;
 pub(crate) struct Work {
     /// Samples placed on rays.
     pub marched: u64,
-    /// Evaluations of a density.
-    pub samples: u64,
-    /// Evaluations of a colour.
-    pub shaded: u64,
-    /// Samples there would be of either if nothing in the box were skipped.
-    pub unskipped: u64,
+    /// How often fields were asked.
+    pub evaluations: Evaluations,
     /// What is minimised, before the mean over rays and channels.
     pub loss: f64,
     /// Squared error of the field.
@@ -38,9 +34,7 @@ impl Add for Work {
     fn add(self, other: Work) -> Work {
         Work {
             marched: self.marched + other.marched,
-            samples: self.samples + other.samples,
-            shaded: self.shaded + other.shaded,
-            unskipped: self.unskipped + other.unskipped,
+            evaluations: self.evaluations + other.evaluations,
             loss: self.loss + other.loss,
             error: self.error + other.error,
             opacity: self.opacity + other.opacity,
@@ -93,9 +87,7 @@ pub(crate) fn rays_loss<'t>(
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());
     let work = Work {
         marched: evaluations.density + steps.len() as u64,
-        samples: evaluations.density + asked as u64,
-        shaded: evaluations.color + kept as u64,
-        unskipped: evaluations.unskipped,
+        evaluations: evaluations + Evaluations { density: asked as u64, color: kept as u64, unskipped: 0 },
         loss: f64::from(loss.item()),
         error: f64::from(error),
         opacity: batch.rays.len() as f64 - left,

@@ -1,0 +1,333 @@
+//! Steps, restarts and the ends of runs.
+
+use super::*;
+use crate::dataset::{
+    Split,
+    sample::{ball, ball_ahead},
+};
+use crate::encoding::hash_grid::HashGridConfig;
+use crate::field::{ClassicConfig, InstantConfig};
+use crate::model::Refined;
+use crate::sampling::SamplerConfig;
+use crate::sampling::hierarchical::HierarchicalConfig;
+use crate::sampling::marching::MarchingConfig;
+use crate::training::stats::STUCK;
+use crate::{FieldConfig, Preset};
+use glam::DVec3;
+use raygrad_autograd::Tensor;
+use raygrad_nn::Schedule;
+
+#[test]
+fn cameras_from_which_nothing_of_the_box_is_seen_are_an_error() {
+    let mut data = ball(Split::Train, 8);
+    data.frames.truncate(3);
+    for frame in &mut data.frames {
+        frame.camera.pose.translation *= 3.0;
+    }
+    let message = Trainer::new(tiny(), Arc::new(data.clone())).err().unwrap().to_string();
+    let expected = "no ray of the 3 photographs meets the box";
+    assert!(message.contains(expected) && message.contains("on average"), "{message}");
+    // One that sees a part is enough.
+    data.frames[2].camera.pose.translation /= 3.0;
+    Trainer::new(tiny(), Arc::new(data.clone())).unwrap();
+    // Near enough, and looking away.
+    data.frames.drain(..2);
+    data.frames[0].camera.pose.matrix3 = -data.frames[0].camera.pose.matrix3;
+    assert!(data.check_reach(data.bounds).is_err());
+}
+
+#[test]
+fn fields_live_in_the_picture_of_all_that_photographs_show() {
+    let data = ball_ahead(8);
+    let ndc = data.ndc.unwrap();
+    assert!(data.frames.iter().all(|frame| ndc.pixels(&frame.camera, DVec3::ZERO) < 20.0));
+    assert!((data.footprints() - ndc.pixels(&data.frames[2].camera, DVec3::ZERO)).abs() < 2.0);
+    let config = tiny_table().with_scope(data.scope);
+    let trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
+    assert_eq!(trainer.model.extent.ndc, Some(ndc));
+    // Before its near plane all places of a line from the eye are one, and beside it not.
+    let places = [0.5, 0.9, 1.5].map(|depth| ndc.eye - depth * ndc.near * ndc.axes.z_axis);
+    let places = places.map(|place| place.as_vec3().to_array());
+    let densities = |trainer: &Trainer| {
+        let mut densities = [0.0; 3];
+        trainer.model.densities(&places, &mut densities);
+        densities
+    };
+    let [a, b, c] = densities(&trainer);
+    assert!((a - b).abs() < 1e-7 && (a - c).abs() > 1e-6, "{a} {b} {c}");
+    let unbounded = Dataset { scope: Scope::Unbounded, ..data.clone() };
+    assert!(unbounded.footprints() != data.footprints());
+    let other = Trainer::new(config.clone(), Arc::new(unbounded)).unwrap();
+    assert_eq!(other.model.extent.ndc, None);
+    let [a, b, _] = densities(&other);
+    assert!((a - b).abs() > 1e-6, "{a} {b}");
+    let refused = |config: &Config, data: &Dataset| {
+        Trainer::new(config.clone(), Arc::new(data.clone())).err().unwrap().to_string()
+    };
+    assert!(refused(&tiny_table(), &data).contains("`unbounded`"));
+    assert!(refused(&config, &Dataset { ndc: None, ..data.clone() }).contains("Ndc::around"));
+    // The rest of its state goes with it.
+    let mut trainer = trainer;
+    trainer.step(0.0);
+    let state = trainer.state().unwrap();
+    let mut later = Trainer::new(config, Arc::new(data)).unwrap();
+    later.load_state(&state).unwrap();
+    assert_eq!(later.step(0.5).loss, trainer.step(0.5).loss);
+    assert_eq!(trainer.model.cast::<f64>().unwrap().extent.ndc, Some(ndc));
+}
+
+#[test]
+fn what_steps_did_adds_up_and_an_error_is_of_one_of_them() {
+    let mut data = ball(Split::Train, 8);
+    data.frames.truncate(3);
+    let config = Config { background: crate::Background::White, ..tiny_table() };
+    let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
+    let counts = |trainer: &mut Trainer| {
+        trainer.step(0.0);
+        let StepStats { rays, marched, samples, shaded, unskipped, moved, loss, psnr, .. } = trainer.stats();
+        assert!((psnr - psnr_from_mse(loss)).abs() < 1e-9 && psnr > 1.0, "{psnr} {loss}");
+        [rays, marched, samples, shaded, unskipped, moved]
+    };
+    let [first, second, third] = [(); 3].map(|()| counts(&mut trainer));
+    for i in 0..6 {
+        // A step is not much larger than another.
+        let [a, b, c] = [first[i], second[i] - first[i], third[i] - second[i]].map(|count| count as f64);
+        assert!(a > 0.0 && (0.5..2.0).contains(&(b / a)) && (0.5..2.0).contains(&(c / b)), "{i}: {a} {b} {c}");
+    }
+}
+
+#[test]
+fn the_last_tile_of_a_step_has_the_rays_that_are_left() {
+    let mut data = ball(Split::Train, 8);
+    data.frames.truncate(2);
+    let data = Arc::new(data);
+    let marched = |batch: usize| {
+        let mut config = tiny();
+        config.sampler.get_mut::<HierarchicalConfig>().unwrap().batch = batch;
+        let mut trainer = Trainer::new(config, data.clone()).unwrap();
+        let stats = trainer.step(0.0);
+        assert_eq!(stats.rays, batch as u64);
+        stats.marched
+    };
+    assert!(marched(8) > 0);
+    // Every ray takes as many steps; tiles are of eight.
+    assert_eq!(8 * marched(21), 21 * marched(8));
+}
+
+#[test]
+fn a_restart_keeps_what_was_said_of_parameters() {
+    let mut data = ball(Split::Train, 8);
+    data.frames.truncate(2);
+    let mut trainer = Trainer::new(tiny(), Arc::new(data)).unwrap();
+    let params = &mut trainer.model.params;
+    let ids: Vec<_> = params.ids().collect();
+    let frozen = params.name(ids[0]).to_owned();
+    params.get_mut(ids[0]).as_mut_slice().fill(0.25);
+    params.freeze(|name| name == frozen);
+    params.set_rate(|name| name != frozen, 0.5);
+    let before: Vec<_> = params.values().to_vec();
+    trainer.restart();
+    let params = &trainer.model.params;
+    let ids: Vec<_> = params.ids().collect();
+    assert!(params.is_frozen(ids[0]) && params.rate(ids[1]) == 0.5 && !params.is_frozen(ids[1]));
+    assert_eq!(params.values()[0], before[0]);
+    assert!(params.values().iter().zip(&before).skip(1).any(|(new, old)| new != old), "other numbers");
+}
+
+#[test]
+fn a_restart_knows_the_cameras_that_it_corrects() {
+    let mut data = ball(Split::Train, 8);
+    data.frames.truncate(3);
+    let config = tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure]);
+    let mut trainer = Trainer::new(config, Arc::new(data.clone())).unwrap();
+    trainer.step(0.0);
+    trainer.restart();
+    let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
+    assert_eq!(trainer.model.cameras(), cameras);
+    assert!(trainer.model.tone.is_some() && trainer.model.refine.is_some());
+    // They are as they were given, and move on.
+    let moved = |trainer: &Trainer| trainer.model.learned_camera(1, &cameras[1]) != cameras[1];
+    assert!(!moved(&trainer));
+    let before = trainer.stats().step;
+    for fraction in [0.3, 0.4, 0.5] {
+        trainer.step(fraction);
+    }
+    assert!(trainer.stats().step == before + 3 && moved(&trainer));
+}
+
+/// Two tiny networks, and few rays of few samples.
+fn tiny() -> Config {
+    let paper = ClassicConfig::paper();
+    let field = ClassicConfig { depth: 2, width: 16, skips: vec![], view_width: 8, position_levels: 3, ..paper };
+    let sampler = HierarchicalConfig {
+        proposal: field.clone(),
+        coarse: 6,
+        fine: 4,
+        batch: 16,
+        tile: 8,
+        ..HierarchicalConfig::default()
+    };
+    let (field, sampler) = (FieldConfig::new(field), SamplerConfig::new(sampler));
+    Config { field, sampler, ..Config::preset(Preset::Small) }
+}
+
+/// A small hash grid.
+fn tiny_table() -> Config {
+    let mut config = Config::preset(Preset::Instant);
+    if let Some(field) = config.field.get_mut::<InstantConfig>() {
+        field.grid = HashGridConfig { levels: 3, features: 2, log2_table: 8, coarsest: 4, finest: 16 };
+    }
+    if let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() {
+        sampler.occupancy.resolution = 16;
+    }
+    config
+}
+
+#[test]
+fn frozen_parameters_rest_and_others_have_their_own_rates() {
+    let data = Arc::new(ball(Split::Train, 12));
+    for config in [tiny(), tiny_table()] {
+        for round in 0..3 {
+            let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
+            let params = &mut trainer.model.params;
+            let names: Vec<String> = params.names().map(String::from).collect();
+            let rests = |name: &str| names.iter().position(|other| other == name).is_some_and(|i| i % 3 == round);
+            if round == 1 {
+                params.set_rate(rests, 0.0)
+            } else {
+                params.freeze(rests)
+            };
+            let before = params.clone();
+            for _ in 0..2 {
+                trainer.step(0.1);
+            }
+            assert!(trainer.stats().skipped == 0 && !trainer.stats().has_diverged());
+            for ((name, before), after) in before.iter().zip(trainer.model.params.values()) {
+                assert_eq!(before == after, rests(name), "{name}, round {round}");
+            }
+            // What was frozen is moved again.
+            trainer.model.params.unfreeze(|_| true);
+            let before = trainer.model.params.clone();
+            trainer.step(0.1);
+            let moved = |(before, after)| before != after;
+            let count = before.values().iter().zip(trainer.model.params.values()).filter(|&pair| moved(pair)).count();
+            assert_eq!(count == before.len(), round != 1, "round {round}");
+        }
+    }
+}
+
+#[test]
+fn a_run_whose_networks_overflow_ends_although_parameters_move() {
+    let data = Arc::new(ball(Split::Train, 12));
+    let mut trainer = Trainer::new(tiny_table(), data).unwrap();
+    trainer.step(0.0);
+    let ids: Vec<_> = trainer.model.params.ids().collect();
+    for id in ids {
+        if trainer.model.params.name(id).contains("color.0") {
+            let weights = trainer.model.params.get_mut(id).as_mut_slice();
+            weights.iter_mut().enumerate().for_each(|(i, x)| *x = if i % 2 == 0 { 3e38 } else { -3e38 });
+        }
+    }
+    trainer.run(Budget::Steps(1000), |_| ControlFlow::Continue(()));
+    assert!(trainer.stats().has_diverged() && trainer.stats().step < 200, "{:?}", trainer.stats());
+}
+
+#[test]
+fn a_run_that_has_diverged_ends() {
+    let data = Arc::new(ball(Split::Train, 12));
+    for config in [tiny(), tiny_table()] {
+        let mut trainer = Trainer::new(config, data.clone()).unwrap();
+        trainer.step(0.0);
+        trainer.model.params.values_mut().iter_mut().for_each(|x| x.as_mut_slice().fill(f32::NAN));
+        trainer.run(Budget::Steps(1000), |trainer| {
+            assert!(trainer.stats().stuck + 1 == trainer.stats().step && trainer.stats().skipped > 0);
+            ControlFlow::Continue(())
+        });
+        assert!(trainer.stats().has_diverged() && trainer.stats().step == 1 + STUCK);
+    }
+}
+
+#[test]
+fn what_is_not_finite_first_is_named() {
+    let data = Arc::new(ball(Split::Train, 12));
+    for config in [tiny(), tiny_table(), tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure])] {
+        let mut trainer = Trainer::new(config, data.clone()).unwrap();
+        for _ in 0..3 {
+            assert!(trainer.first_non_finite(0.5).is_none());
+            trainer.step(0.5);
+        }
+        // What comes of the last weights of the colours.
+        let ids: Vec<_> = trainer.model.params.ids().collect();
+        let last = ids.into_iter().rfind(|id| trainer.model.params.name(*id).contains("color")).unwrap();
+        trainer.model.params.get_mut(last).as_mut_slice()[0] = f32::NAN;
+        let error = trainer.first_non_finite(0.5).unwrap();
+        let GraphError::NonFinite { value, at, .. } = &error else { panic!("{error}") };
+        assert!(!value.is_finite() && at.file().ends_with(".rs") && at.line() > 0, "{error}");
+        assert!(trainer.step(0.5).stuck > 0 && trainer.first_non_finite(0.5).is_some());
+    }
+}
+
+#[test]
+fn a_slower_run_moves_less() {
+    let data = Arc::new(ball(Split::Train, 12));
+    let config = tiny_table().with_refined(&[Refined::Exposure]);
+    let [whole, half, none] = [1.0, 0.5, 0.0].map(|factor| {
+        let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
+        trainer.set_pace(factor);
+        let before = trainer.model.params.clone();
+        let rate = trainer.step(0.3).rate;
+        let after = trainer.model.params.values().iter();
+        let moved = |(a, b): (&Tensor<f32>, &Tensor<f32>)| {
+            let moves = a.as_slice().iter().zip(b.as_slice()).map(|(a, b)| f64::from(a - b).abs());
+            moves.fold(0.0, f64::max)
+        };
+        (rate, after.zip(before.values()).map(moved).collect::<Vec<f64>>())
+    });
+    assert!(whole.0 == 2.0 * half.0 && none.0 == 0.0 && whole.1.iter().all(|moved| *moved > 0.0), "{whole:?}");
+    // Adam's first step is the rate.
+    for ((whole, half), none) in whole.1.iter().zip(&half.1).zip(&none.1) {
+        assert!((half / whole - 0.5).abs() < 1e-3 && *none == 0.0, "{whole} {half} {none}");
+    }
+}
+
+#[test]
+fn steps_get_as_many_rays_as_have_the_samples_that_are_wanted() {
+    let mut trainer = Trainer::new(tiny_table(), Arc::new(ball(Split::Train, 12))).unwrap();
+    let mut next = |batch: usize, marched: u64| {
+        trainer.batch = batch;
+        trainer.adapt_batch(&Work { marched, ..Work::default() });
+        trainer.batch
+    };
+    // 24576 samples of 8 each are 3072 rays: half of the way there.
+    assert_eq!(next(1024, 8 * 1024), 2048);
+    assert_eq!(next(5120, 8 * 5120), 4096);
+    // At most twice as many, whole slots, and within bounds.
+    assert_eq!([next(1024, 1024), next(1024, 0)], [2048; 2]);
+    assert_eq!(next(1500, 8 * 1500), 2288);
+    assert_eq!(next(256, 10_000_000), 256);
+}
+
+#[test]
+fn a_restart_draws_other_rays() {
+    let data = Arc::new(ball(Split::Train, 12));
+    let [one, other] = [0, 1].map(|restarts| {
+        let mut trainer = Trainer::new(tiny_table(), data.clone()).unwrap();
+        trainer.done.restarts = restarts;
+        trainer.step(0.0).loss
+    });
+    assert!(one != other && one.is_finite() && other.is_finite(), "{one} {other}");
+}
+
+#[test]
+fn settings_of_optimisers_are_checked() {
+    let mut config = Config { schedule: Schedule::Constant { rate: 1e300 }, ..tiny() };
+    let message = |config: &Config| config.check().unwrap_err().to_string();
+    assert_eq!(message(&config), "`schedule.constant.rate`: is 1e300; use 0 to 1e30");
+    config.schedule = Schedule::Constant { rate: 0.1 };
+    config.adam.beta1 = 1.0;
+    assert_eq!(message(&config), "`adam.beta1`: is 1.0; use at least 0 and less than 1");
+    config.adam.beta1 = 0.0;
+    config.table_adam.beta2 = 2.0;
+    assert!(message(&config).contains("`table_adam.beta2`: is 2.0"));
+    assert!(Trainer::new(config, Arc::new(ball(Split::Train, 12))).is_err());
+}
