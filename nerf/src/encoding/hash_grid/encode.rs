@@ -4,7 +4,7 @@ use super::kernel::{BLOCK, Cells, Points};
 use super::{HashGrad, HashGrid, HashLevel};
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
-use raygrad_autograd::{Grads, Op, Pool, RowSums, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
+use raygrad_autograd::{Grads, Op, Pool, Real, RowSums, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::simd;
 use std::mem::swap;
 use std::sync::Arc;
@@ -202,18 +202,12 @@ fn reference_level<'t, T: Scalar>(level: &HashLevel, x: &Var<'t, T>, table: &Var
     let column = |f: &dyn Fn(T) -> T, axis: usize| {
         tape.constant(Tensor::from_fn(&[values.shape()[0], 1], |i| f(values.as_slice()[3 * i + axis])))
     };
-    let clamp = |x: T| {
-        if x < T::ZERO {
-            T::ZERO
-        } else if x > T::ONE {
-            T::ONE
-        } else {
-            x
-        }
-    };
     let scale = f64::from(level.resolution);
     // The conversion makes NaN 0.
-    let cell = |x: T| ((clamp(x) * T::from_f64(scale)).to_f64() as u32).min(level.resolution - 1);
+    let cell = |x: T| {
+        let clamped = Real::minimum(Real::maximum(x, T::ZERO), T::ONE);
+        ((clamped * T::from_f64(scale)).to_f64() as u32).min(level.resolution - 1)
+    };
     let place: [Var<'t, T>; 3] = std::array::from_fn(|axis| {
         let inside = column(&|x| if x < T::ZERO || x > T::ONE { T::ZERO } else { T::ONE }, axis);
         let clamped =

@@ -21,13 +21,9 @@ impl<T: Scalar> SparseGrad<T> for HashGrad<T> {
     }
 
     fn add_to(&self, dense: &mut Tensor<T>) {
-        let features = self.grid.features();
-        for (number, level) in self.grid.levels().iter().enumerate() {
-            let part = &mut dense.as_mut_slice()[level.rows.start * features..level.rows.end * features];
-            let mut sums = RowSums::new(level.rows.len(), features);
-            self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut sums);
-            sums.add_to(part);
-        }
+        let mut sums = RowSums::new(self.grid.rows(), self.grid.features());
+        self.scatter(&mut sums);
+        sums.add_to(dense.as_mut_slice());
     }
 
     fn as_rows(&self) -> Option<&dyn RowShare<T>> {
