@@ -70,8 +70,7 @@ impl<'a> Probe<'a> {
     /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it, along each axis:
     /// the field's own gradient is that of noise finer than a pixel. Where there is no slope the normal is up.
     pub fn look(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
-        let tone = self.model.tone.as_ref();
-        let gains = tone.map_or([1.0; 3], |tone| tone.gain(&self.model.params, self.model.look, false).at(0.0));
+        let gains = self.model.gain();
         let chunks: Vec<&[DVec3]> = places.chunks(POINTS).collect();
         let look = |chunk: usize| {
             let normals = self.normals(grid, reach, chunks[chunk]);

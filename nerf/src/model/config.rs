@@ -16,7 +16,7 @@ use crate::sampling::proposal::{ProposalConfig, Spacing};
 use crate::space::occupancy::Skip;
 use crate::volume::quadrature::Quadrature;
 use crate::{Error, Result};
-use raygrad_nn::{AdamConfig, Schedule, Storage};
+use raygrad_nn::{AdamConfig, Schedule, SettingError, Storage};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -65,13 +65,10 @@ pub enum Preset {
 impl FromStr for Preset {
     type Err = Error;
     fn from_str(name: &str) -> Result<Self> {
-        match name {
-            "classic" => Ok(Preset::Classic),
-            "small" => Ok(Preset::Small),
-            "instant" => Ok(Preset::Instant),
-            "voxel" => Ok(Preset::Voxel),
-            _ => Err(Error::setting("preset", format!("there is no `{name}`; use classic, small, instant or voxel"))),
-        }
+        let all = [Preset::Classic, Preset::Small, Preset::Instant, Preset::Voxel];
+        all.into_iter().find(|preset| preset.to_string() == name).ok_or_else(|| {
+            Error::setting("preset", format!("there is no `{name}`; use classic, small, instant or voxel"))
+        })
     }
 }
 
@@ -325,25 +322,20 @@ impl Config {
     /// If one is out of range.
     pub fn check(&self) -> Result<()> {
         self.loss.check()?;
-        let schedule = format!("schedule.{}", self.schedule.name());
-        let checked = [
-            (schedule.as_str(), self.schedule.check()),
-            ("adam", self.adam.check()),
-            ("table_adam", self.table_adam.check()),
-        ];
-        for (part, checked) in checked {
-            checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))?;
-        }
+        let named = |part: &str, checked: std::result::Result<(), SettingError>| {
+            checked.map_err(|error| Error::setting(format!("{part}.{}", error.name), error.what))
+        };
+        check_schedule("schedule", Some(self.schedule))?;
+        named("adam", self.adam.check())?;
+        named("table_adam", self.table_adam.check())?;
         check_schedule(POSES, self.poses)?;
         self.refine.check()?;
         self.tone.check()?;
         check_range("near_gradients", self.near_gradients, 0.0, 1e6)?;
         for group in &self.groups {
-            let parts = [group.schedule.check(), group.adam.check()];
-            for checked in parts {
-                checked
-                    .map_err(|error| Error::setting(format!("groups.{}.{}", group.params, error.name), error.what))?;
-            }
+            let part = format!("groups.{}", group.params);
+            named(&part, group.schedule.check())?;
+            named(&part, group.adam.check())?;
             check_range("groups.decay", group.decay, 0.0, 1e30)?;
         }
         if let Some(marching) = self.sampler.get::<MarchingConfig>() {

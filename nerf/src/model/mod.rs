@@ -41,6 +41,7 @@ const MOST_FRAMES: usize = 1 << 20;
 const NEAREST: f64 = 1e-2;
 
 /// A field with its sampler and parameters.
+#[derive(Clone)]
 pub struct Model<T: Scalar> {
     /// How it was made.
     pub config: Config,
@@ -69,24 +70,6 @@ pub struct Model<T: Scalar> {
 
 fn space(config: &Config, extent: &Extent) -> Space {
     Space { unbounded: config.unbounded, ..extent.space() }
-}
-
-impl<T: Scalar> Clone for Model<T> {
-    fn clone(&self) -> Self {
-        Model {
-            config: self.config.clone(),
-            extent: self.extent,
-            params: self.params.clone(),
-            field: self.field.clone(),
-            sampler: self.sampler.boxed(),
-            terms: self.terms.clone(),
-            refine: self.refine.clone(),
-            tone: self.tone.clone(),
-            look: self.look,
-            vignetted: self.vignetted,
-            detail: self.detail,
-        }
-    }
 }
 
 impl<T: Scalar> Model<T> {

@@ -194,6 +194,12 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
     }
 }
 
+impl<T: Scalar> Clone for Box<dyn Sampler<T>> {
+    fn clone(&self) -> Self {
+        (**self).boxed()
+    }
+}
+
 /// The family of samplers.
 pub struct Samplers;
 

@@ -178,10 +178,10 @@ impl Refine {
         assert_eq!([frames.len(), pixels.len()], [rays.len(); 2], "one photograph and one pixel for each ray");
         let (tape, count) = (params.tape(), rays.len());
         let rows = |values: &[[T; 3]]| tape.constant(Tensor::from_vec(&[count, 3], values.as_flattened().to_vec()));
+        let groups = || frames.iter().map(|&frame| self.groups[frame as usize]).collect::<Vec<u32>>();
         let mut directions = match (self.focal, self.lens) {
             (None, None) => rows(&rays.directions),
             (focal, lens) => {
-                let groups: Vec<u32> = frames.iter().map(|&frame| self.groups[frame as usize]).collect();
                 let [focal, lens] = [focal, lens].map(|id| id.map(|id| &params[id]));
                 let value = |var: Option<&Var<'t, T>>| var.map(|var| var.value().clone());
                 let (grown, added) = (value(focal), value(lens));
@@ -194,7 +194,7 @@ impl Refine {
                     .zip(pixels)
                     .map(|(&i, pixel)| (&self.cameras[i as usize], &now[i as usize], pixel.map(|x| f64::from(x) + 0.5)))
                     .collect();
-                let [focal, lens] = [focal, lens].map(|var| var.map(|var| var.gather_rows(&groups[..])));
+                let [focal, lens] = [focal, lens].map(|var| var.map(|var| var.gather_rows(groups())));
                 newton::directions(tape, &pixels, focal.as_ref(), lens.as_ref())
             }
         };
@@ -211,8 +211,7 @@ impl Refine {
             let middle = tape.constant(Tensor::from_vec(&[3], self.middle().to_array().map(T::from_f64).to_vec()));
             let mut arms = origins - &middle;
             if let Some(focal) = self.focal {
-                let groups: Vec<u32> = frames.iter().map(|&frame| self.groups[frame as usize]).collect();
-                arms *= params[focal].mean_over(1).exp().unsqueeze(1).gather_rows(groups);
+                arms *= params[focal].mean_over(1).exp().unsqueeze(1).gather_rows(groups());
             }
             origins = arms + middle + corrections.slice_axis(1, 3..);
         }
@@ -268,7 +267,7 @@ impl Refine {
         let grown = self.groups.get(number).map_or(1.0, |group| self.growth(params, Some(*group)));
         let pose = DAffine3 {
             matrix3: turn * camera.pose.matrix3,
-            translation: self.middle() + grown * (camera.pose.translation - self.middle()) + DVec3::new(a, b, c),
+            translation: self.stepped(&camera, grown).pose.translation + DVec3::new(a, b, c),
         };
         Camera { pose, ..camera }
     }
@@ -328,18 +327,17 @@ impl Refine {
     pub fn other_cameras<T: Scalar>(&self, params: &Params<T>, cameras: &[Camera]) -> Vec<Camera> {
         let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
         let similarity = self.similarity(params, &growths);
-        cameras.iter().map(|camera| self.other(params, camera, similarity.as_ref())).collect()
-    }
-
-    fn other<T: Scalar>(&self, params: &Params<T>, camera: &Camera, similarity: Option<&Placement>) -> Camera {
         let [focal, lens] = [self.focal, self.lens].map(|id| id.map(|id| params.get(id)));
-        let glass = if lens.is_some() { with_glass(camera) } else { camera.clone() };
-        let same = self.cameras.iter().position(|other| is_same(other, &glass)).map(|i| self.groups[i]);
-        let camera = self.glass(focal, lens, same, camera);
-        match similarity {
-            Some(similarity) => similarity.camera(&self.stepped(&camera, self.growth(params, same))),
-            None => camera,
-        }
+        let other = |camera: &Camera| {
+            let glass = if lens.is_some() { with_glass(camera) } else { camera.clone() };
+            let same = self.cameras.iter().position(|other| is_same(other, &glass)).map(|i| self.groups[i]);
+            let camera = self.glass(focal, lens, same, camera);
+            match &similarity {
+                Some(similarity) => similarity.camera(&self.stepped(&camera, self.growth(params, same))),
+                None => camera,
+            }
+        };
+        cameras.iter().map(other).collect()
     }
 }
 

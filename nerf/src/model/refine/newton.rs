@@ -103,9 +103,6 @@ pub(super) fn directions<'t, T: Scalar>(
         let slopes = table(6, &|sight, i| if of(sight) { sight.slopes[i % 2][i / 2] } else { 0.0 });
         (slopes.reshape(&[count, 3, 2]) * miss.reshape(&[count, 1, 2])).sum_over(-1)
     };
-    let Some(lens) = lens else {
-        return start - step(table(2, &|sight, i| sight.place[i]) - target, &|_| true);
-    };
     // A formula for each kind of lens that there is; rays of other kinds are held at its axis, and do not take its step.
     let mut kinds: Vec<(Discriminant<Lens>, Lens)> = vec![];
     for (given, now, _) in pixels {
@@ -119,9 +116,7 @@ pub(super) fn directions<'t, T: Scalar>(
         let axis = |sight: &Sight, i: usize| if own(sight) { sight.local[i] } else { [0.0, 0.0, 1.0][i] };
         let moved = corrected(&given);
         let width = given.coefficients().len();
-        let places = if moved.is_empty() {
-            table(2, &|sight, i| sight.place[i])
-        } else {
+        let places = if let Some(lens) = lens.filter(|_| !moved.is_empty()) {
             let base = Tensor::from_fn(&[count, width], |i| {
                 let (given, now, _) = pixels[i / width];
                 T::from_f64(if discriminant(&now.lens) == kind { given.lens.coefficients()[i % width] } else { 0.0 })
@@ -131,6 +126,8 @@ pub(super) fn directions<'t, T: Scalar>(
             });
             let coefficients = tape.constant(base) + lens.matmul(tape.constant(spread));
             lens_places(&given, &coefficients, &table(3, &axis))
+        } else {
+            table(2, &|sight, i| sight.place[i])
         };
         found - step(places - &target, &own)
     })

@@ -64,17 +64,11 @@ pub enum Refined {
 impl FromStr for Refined {
     type Err = Error;
     fn from_str(name: &str) -> Result<Self> {
-        match name {
-            POSES => Ok(Refined::Poses),
-            FOCAL => Ok(Refined::Focal),
-            LENS => Ok(Refined::Lens),
-            EXPOSURE => Ok(Refined::Exposure),
-            VIGNETTING => Ok(Refined::Vignetting),
-            _ => {
-                let what = format!("there is no `{name}`; use poses, focal, lens, exposure or vignetting");
-                Err(Error::setting("refine", what))
-            }
-        }
+        let all = [Refined::Poses, Refined::Focal, Refined::Lens, Refined::Exposure, Refined::Vignetting];
+        all.into_iter().find(|part| part.to_string() == name).ok_or_else(|| {
+            let what = format!("there is no `{name}`; use poses, focal, lens, exposure or vignetting");
+            Error::setting("refine", what)
+        })
     }
 }
 
