@@ -2,12 +2,12 @@
 
 use std::hint::black_box;
 
-use raygrad::nerf::Density;
-use raygrad::nerf::Rays;
 use raygrad::nerf::analytic::{AnalyticScene, scenes};
 use raygrad::nerf::analytic::{Integral, integrate};
+use raygrad::nerf::camera::stratified;
 use raygrad::nerf::volume::accumulate;
 use raygrad::nerf::volume::quadrature::Quadrature;
+use raygrad::nerf::{Density, Jitter, Rays, Samples};
 use raygrad::{Pool, Real, Tape, Tensor, Var};
 
 use super::Results;
@@ -102,7 +102,8 @@ struct Cost {
 
 /// Compositing of rays with a rule: densities, colours, and what to do with them.
 struct Work {
-    plan: raygrad::nerf::volume::quadrature::Plan<f32>,
+    rule: Quadrature,
+    nodes: Samples<f32>,
     density: Tensor<f32>,
     color: Tensor<f32>,
 }
@@ -111,16 +112,16 @@ impl Work {
     fn new(scene: &AnalyticScene, rule: Quadrature, size: usize) -> Self {
         let mut rays = Rays::<f32>::new();
         (0..RAYS).for_each(|_| rays.push(&scene.ray, [0.0, scene.length]));
-        let plan = rule.even(&rays, size, &Pool::new());
-        let at: Vec<[f64; 2]> = plan.samples.t.as_slice().iter().map(|&t| scene.at(t.into())).collect();
+        let nodes = rule.nodes(&stratified(&rays, rule.intervals(size), &mut Jitter::Middle, &Pool::new()));
+        let at: Vec<[f64; 2]> = nodes.t.as_slice().iter().map(|&t| scene.at(t.into())).collect();
         let density = Tensor::from_fn(&[at.len()], |i| at[i][0] as f32);
         let color = Tensor::from_fn(&[at.len(), 3], |i| at[i / 3][1] as f32);
-        Work { plan, density, color }
+        Work { rule, nodes, density, color }
     }
 
     fn color<'t>(&self, value: Var<'t, f32>, features: &Var<'t, f32>) -> Var<'t, f32> {
-        let weights = self.plan.weighted(&Density { value, log: false, features: features.clone() }).weights;
-        accumulate(&weights, features, &self.plan.samples.segments)
+        let density = Density { value, log: false, features: features.clone() };
+        accumulate(&self.rule.weighted(&density, &self.nodes).weights, features, &self.nodes.segments)
     }
 
     fn forward(&self, tape: &Tape<f32>) {

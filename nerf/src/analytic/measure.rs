@@ -4,7 +4,8 @@ use super::{AnalyticField, AnalyticScene};
 use crate::camera::rays::Rays;
 use crate::camera::rays::stratified;
 use crate::random::Jitter;
-use crate::volume::quadrature::{Quadrature, refine};
+use crate::volume::lit::Lit;
+use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use raygrad_autograd::{Scalar, Tape, Var};
 use raygrad_nn::Params;
@@ -37,19 +38,8 @@ pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations
     let tape = Tape::new();
     let bound = params.bind(&tape);
     let query = Query::new(&field, &bound);
-    let (plan, evaluations) = match rule {
-        Quadrature::Adaptive { tolerance } => {
-            let steps = stratified(&rays, evaluations.max(1), &mut Jitter::Middle, tape.pool());
-            let refined = refine(&query, &steps, tolerance, 0.0);
-            (refined.plan, refined.evaluations)
-        }
-        _ => {
-            let plan = rule.even(&rays, evaluations, tape.pool());
-            let evaluations = plan.len();
-            (plan, evaluations)
-        }
-    };
-    let seen = plan.render(&query);
+    let steps = stratified(&rays, rule.intervals(evaluations), &mut Jitter::Middle, tape.pool());
+    let Lit { rendered: seen, asked: evaluations, .. } = rule.render(&query, &steps, 0.0);
     let color = seen.color.slice_axis(1, 1..2).sum() + seen.transmittance().sum() * scene.background;
     let depth = seen.depth().sum();
     let gradient = |value: &Var<'_, T>| value.grad(&bound.vars())[0].as_slice().iter().map(|x| x.to_f64()).collect();

@@ -4,7 +4,7 @@ use super::*;
 use crate::camera::rays::stratified;
 use crate::camera::rays::{Rays, Samples};
 use crate::random::Jitter;
-use crate::volume::quadrature::Plan;
+use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use raygrad_autograd::{Pool, Tape};
 use raygrad_nn::Params;
@@ -94,7 +94,7 @@ fn as_fields_they_are_rendered_and_differentiated_like_any_other() {
         let samples: Samples<f64> = stratified(&rays, 1 << 15, &mut Jitter::Middle, &Pool::new());
         let tape = Tape::new();
         let bound = params.bind(&tape);
-        let seen = Plan { samples, intervals: None }.render(&Query::new(&field, &bound));
+        let seen = Quadrature::Midpoint.render_nodes(&Query::new(&field, &bound), samples);
         let (left, depth) = (seen.transmittance().sum(), seen.depth().sum());
         let color = seen.color.slice_axis(1, 1..2).sum() + &left * scene.background;
         let opacity = seen.opacity().item();

@@ -3,14 +3,13 @@
 use super::mesh::{Mesh, bounds};
 use super::probe::Probe;
 use super::shape::Shape;
-use super::sight::sights;
+use super::sight::views;
 use super::surface::Stage;
 use crate::camera::Camera;
 use crate::model::Model;
 use crate::volume::render::Evaluations;
 use crate::{Error, Result};
 use glam::DVec3;
-use raygrad_autograd::Pool;
 use std::collections::HashMap;
 
 /// Rays for each point that is wanted: some see nothing solid, and the places of several are one point.
@@ -42,19 +41,12 @@ impl Model<f32> {
         count: usize,
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<PointCloud> {
-        let (mut places, mut evaluations, pool) = (vec![], Evaluations::default(), Pool::new());
         // As many for each camera, however large its photograph is.
         let rays = RAYS * count as f64 / cameras.len().max(1) as f64;
-        for (i, camera) in cameras.iter().enumerate() {
-            let scale = (rays / (camera.width * camera.height) as f64).sqrt();
-            let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
-            let seen = sights(self, &camera.resized(width, height), &pool);
-            places.extend(
-                seen.sights.iter().flatten().map(|sight| sight.place).filter(|place| self.extent.holds(*place)),
-            );
-            evaluations = evaluations + seen.evaluations;
-            progress(Stage::Seeing, (i + 1) as f64 / cameras.len() as f64);
-        }
+        let scale = |camera: &Camera| (rays / (camera.width * camera.height) as f64).sqrt();
+        let views = views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done));
+        let seen = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten().map(|sight| sight.place));
+        let places: Vec<DVec3> = seen.filter(|place| self.extent.holds(*place)).collect();
         if places.is_empty() {
             return Err(Error::setting("points", "are none: no camera sees anything solid"));
         }
@@ -64,7 +56,7 @@ impl Model<f32> {
         let probe = Probe::new(self);
         let (normals, colors) = probe.look(self.cells(), self.judged(self.cells()), &positions);
         let mesh = Mesh { positions, triangles: vec![] };
-        evaluations = evaluations + probe.evaluations();
+        let evaluations = views.iter().fold(probe.evaluations(), |sum, (_, seen)| sum + seen.evaluations);
         Ok(PointCloud { shape: Shape { mesh, normals, colors }, sights, evaluations })
     }
 }

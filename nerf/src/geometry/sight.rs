@@ -3,14 +3,11 @@
 use crate::camera::Camera;
 use crate::camera::rays::Rays;
 use crate::model::Model;
-use crate::random::Jitter;
-use crate::rendering::view::front_to_back;
-use crate::sampling::Purpose;
-use crate::volume::query::Query;
+use crate::rendering::picture::Viewing;
 use crate::volume::render::Evaluations;
+use crate::volume::rounds::{FrontToBack, Part};
 use glam::DVec3;
-use raygrad_autograd::{Pool, Tape};
-use raygrad_tensor::parallel;
+use raygrad_autograd::Pool;
 use std::f64::consts::LN_2;
 
 /// Rays that let more light through than this meet nothing.
@@ -37,60 +34,55 @@ pub(super) struct Seen {
     pub evaluations: Evaluations,
 }
 
-/// What a ray has met so far.
-#[derive(Clone, Copy, Default)]
-struct State {
-    /// Optical depth.
-    depth: f64,
-    /// The distance at which that was ln 2, and the density there.
-    half: Option<[f64; 2]>,
+/// What cameras see in pictures of `scale` times their size, and these cameras. `progress` is told what share of them is done.
+pub(super) fn views(
+    model: &Model<f32>,
+    cameras: &[Camera],
+    scale: impl Fn(&Camera) -> f64,
+    progress: &mut dyn FnMut(f64),
+) -> Vec<(Camera, Seen)> {
+    let view = |(i, camera): (usize, &Camera)| {
+        let [width, height] = [camera.width, camera.height].map(|side| (scale(camera) * side as f64).ceil() as usize);
+        let camera = camera.resized(width, height);
+        let seen = sights(model, &camera);
+        progress((i + 1) as f64 / cameras.len() as f64);
+        (camera, seen)
+    };
+    cameras.iter().enumerate().map(view).collect()
 }
 
 /// What a camera's pixels see. Distances are exact to a share of the sampler's steps for views.
-pub(super) fn sights(model: &Model<f32>, camera: &Camera, pool: &Pool<f32>) -> Seen {
-    let pixels = camera.width * camera.height;
-    let tile = |tile: usize| {
-        let (mut rays, bounds) = (Rays::new(), model.reach());
-        for pixel in tile * TILE..pixels.min((tile + 1) * TILE) {
-            let place = [pixel % camera.width, pixel / camera.width];
-            rays.push_pixel(camera, place, bounds, model.view_span());
-        }
-        parallel::serial(|| see(model, &rays, pool))
-    };
-    let tiles = parallel::collect(pixels.div_ceil(TILE), tile);
-    let evaluations = tiles.iter().fold(Evaluations::default(), |sum, tile| sum + tile.evaluations);
-    Seen { sights: tiles.into_iter().flat_map(|tile| tile.sights).collect(), evaluations }
+fn sights(model: &Model<f32>, camera: &Camera) -> Seen {
+    let mut sights = vec![None; camera.width * camera.height];
+    let see = |pool: &Pool<f32>, _, rays: &Rays<f32>, out: &mut [Option<Sight>]| see(model, rays, pool, out);
+    let evaluations = model.tiles(camera, &Viewing::over([0.0; 3]), TILE, sights.chunks_mut(TILE), see);
+    Seen { sights, evaluations: evaluations.expect("nobody stops it") }
 }
 
-fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>) -> Seen {
-    let tape = Tape::with_pool(pool.clone());
-    let params = model.params.bind_constant(&tape);
-    let query = &Query::new(&*model.field, &params);
-    let sampled = model.sampler.sample(query, rays, Purpose::View { finer: 1 }, &mut Jitter::Middle);
-    let mut states = vec![State::default(); rays.len()];
-    let mut asked = sampled.evaluations;
-    front_to_back(&sampled.steps, pool, |part, alive| {
-        let depth = query.density(part).optical_depth(&part.delta);
-        let (t, delta, x) = (part.t.as_slice(), part.delta.as_slice(), depth.value().as_slice());
-        for (rows, &ray) in part.segments.ranges().zip(alive) {
-            let state = &mut states[ray];
-            for row in rows {
-                let (before, x, delta) = (state.depth, f64::from(x[row]), f64::from(delta[row]));
-                state.depth += x;
-                if state.half.is_none() && state.depth >= LN_2 {
-                    // Within a step the density is one.
-                    let start = f64::from(t[row]) - 0.5 * delta;
-                    state.half = Some([start + delta * (LN_2 - before) / x, x / delta]);
+fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>, out: &mut [Option<Sight>]) -> Evaluations {
+    model.along(rays, 1, pool, |query, sampled| {
+        let (mut asked, mut followed) = (sampled.evaluations, FrontToBack::new(&sampled.steps, MOST_LEFT));
+        // The distance at which the optical depth of each ray is ln 2, and the density there.
+        let mut halves: Vec<Option<[f64; 2]>> = vec![None; rays.len()];
+        while let Some(round) = followed.round(query, followed.round_size()) {
+            let (Part { samples, pieces }, x) = (&round.part, round.optical_depth.value().as_slice());
+            for (rows, (ray, _)) in samples.segments.ranges().zip(pieces) {
+                for row in rows {
+                    let [t, delta, x] = [samples.t.as_slice(), samples.delta.as_slice(), x].map(|x| f64::from(x[row]));
+                    let before = round.in_front[row];
+                    if halves[*ray].is_none() && before + x >= LN_2 {
+                        // Within a step the density is one.
+                        halves[*ray] = Some([t - 0.5 * delta + delta * (LN_2 - before) / x, x / delta]);
+                    }
                 }
             }
+            asked.density += samples.len() as u64;
         }
-        asked.density += part.len() as u64;
-        alive.iter().map(|&ray| (-states[ray].depth).exp() > MOST_LEFT).collect()
-    });
-    let sight = |(ray, state): (usize, &State)| {
-        let [origin, direction] = [&rays.origins, &rays.directions].map(|x| DVec3::from(x[ray].map(f64::from)));
-        let [distance, sigma] = state.half.filter(|_| (-state.depth).exp() <= MOST_LEFT)?;
-        Some(Sight { place: origin + distance * direction, distance, sigma })
-    };
-    Seen { sights: states.iter().enumerate().map(sight).collect(), evaluations: asked }
+        for (ray, out) in out.iter_mut().enumerate() {
+            let [origin, direction] = [&rays.origins, &rays.directions].map(|x| DVec3::from(x[ray].map(f64::from)));
+            let half = halves[ray].filter(|_| !followed.has_light(followed.depths[ray]));
+            *out = half.map(|[distance, sigma]| Sight { place: origin + distance * direction, distance, sigma });
+        }
+        asked
+    })
 }

@@ -4,7 +4,7 @@ use super::hidden::Hidden;
 use super::isosurface::{Lattice, MOST_CELLS, isosurface};
 use super::probe::Probe;
 use super::shape::Shape;
-use super::sight::{Seen, sights};
+use super::sight::{Seen, views};
 use crate::camera::Camera;
 use crate::model::Model;
 use crate::range::check_range;
@@ -13,7 +13,6 @@ use crate::space::occupancy::{OccupancyConfig, OccupancyGrid};
 use crate::volume::render::Evaluations;
 use crate::{Error, Result};
 use glam::DVec3;
-use raygrad_autograd::Pool;
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -22,7 +21,7 @@ const FINER: usize = 2;
 /// Where a sampler has no grid, one is made of cells that hold at least this share of the level.
 const FAINT: f64 = 0.1;
 /// Pixels along the longer side of the pictures that say what is seen, at most.
-const PIXELS: usize = 128;
+const PIXELS: f64 = 128.0;
 
 /// Which surface of a model is made.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -109,7 +108,8 @@ impl Model<f32> {
         config.check()?;
         let (probe, bounds) = (Probe::new(self), self.extent.bounds);
         let views = if config.filled || config.level.is_none() {
-            self.views(cameras, &mut |done| progress(Stage::Seeing, done))
+            let scale = |camera: &Camera| (PIXELS / camera.width.max(camera.height) as f64).min(1.0);
+            views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done))
         } else {
             vec![]
         };
@@ -159,20 +159,6 @@ impl Model<f32> {
     pub(super) fn judged(&self, grid: Option<&OccupancyGrid>) -> f64 {
         let cells = grid.map_or_else(|| OccupancyConfig::default().resolution, OccupancyGrid::resolution);
         self.extent.space().side() / cells as f64
-    }
-
-    /// What small pictures of these cameras see.
-    fn views(&self, cameras: &[Camera], progress: &mut dyn FnMut(f64)) -> Vec<(Camera, Seen)> {
-        let pool = Pool::new();
-        let view = |(i, camera): (usize, &Camera)| {
-            let scale = (PIXELS as f64 / camera.width.max(camera.height) as f64).min(1.0);
-            let [width, height] = [camera.width, camera.height].map(|side| (scale * side as f64).ceil() as usize);
-            let camera = camera.resized(width, height);
-            let seen = sights(self, &camera, &pool);
-            progress((i + 1) as f64 / cameras.len() as f64);
-            (camera, seen)
-        };
-        cameras.iter().enumerate().map(view).collect()
     }
 
     /// The lower quartile of the density of the places within the box that cameras see. Where the density is less the surface has

@@ -196,7 +196,7 @@ mod tests {
     use crate::field::{Density, Field, Seen};
     use crate::random::Jitter;
     use crate::space::cube::Space;
-    use crate::volume::quadrature::Plan;
+    use crate::volume::quadrature::Quadrature;
     use crate::volume::query::Query;
     use glam::DVec3;
     use rand::SeedableRng;
@@ -236,7 +236,7 @@ mod tests {
         }
         let samples = stratified(&rays, 5, &mut Jitter::Middle, &Pool::new());
         let query = Query { slopes: term.reads_normals(), ..Query::new(&Slope, &bound) };
-        let rendered = &Plan { samples, intervals: None }.render(&query);
+        let rendered = &Quadrature::Midpoint.render_nodes(&query, samples);
         let nothing = &Tensor::zeros(&[2, 3]);
         let (params, rays, frames, pixels) = (&bound, &rays, &[0, 0][..], &[[0, 0]; 2][..]);
         let distances = &[distance as f32, 0.0][..];
@@ -340,7 +340,7 @@ mod tests {
         rays.push(&Ray { origin: DVec3::new(0.1, -0.2, 0.3), direction: DVec3::new(0.6, 0.0, 0.8) }, [0.5, 2.0]);
         let samples = stratified(&rays, 5, &mut Jitter::Middle, &Pool::new());
         let rendered =
-            &Plan { samples, intervals: None }.render(&Query { slopes: true, ..Query::new(&Tilted, &bound) });
+            &Quadrature::Midpoint.render_nodes(&Query { slopes: true, ..Query::new(&Tilted, &bound) }, samples);
         let nothing = &Tensor::zeros(&[1, 3]);
         let seen = Outputs {
             params: &bound,

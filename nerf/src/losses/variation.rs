@@ -123,7 +123,7 @@ mod tests {
     use crate::camera::rays::{Rays, stratified};
     use crate::random::Jitter;
     use crate::space::cube::Space;
-    use crate::volume::quadrature::Plan;
+    use crate::volume::quadrature::Quadrature;
     use crate::volume::query::Query;
     use glam::DVec3;
     use rand::SeedableRng;
@@ -150,7 +150,7 @@ mod tests {
         let field = crate::analytic::AnalyticField::new(medium, &mut own);
         let bound = own.bind_constant(params.tape());
         let samples = stratified(&rays, 1, &mut Jitter::Middle, &Pool::new());
-        let rendered = &Plan { samples, intervals: None }.render(&Query::new(&field, &bound));
+        let rendered = &Quadrature::Midpoint.render_nodes(&Query::new(&field, &bound), samples);
         let nothing = &Tensor::zeros(&[count, 3]);
         term.loss(&Outputs {
             params,

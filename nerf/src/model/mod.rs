@@ -218,9 +218,8 @@ impl<T: Scalar> Model<T> {
         let fields = self.fields();
         assert!(samples.len() <= fields.len(), "one set of samples for each field");
         let error = |(field, samples): (&dyn Field<T>, &Samples<T>)| {
-            let plan = self.sampler.quadrature().plan_for(&Query::new(field, params), samples, 0.0).plan;
-            let seen = plan.render(&Query::new(field, params));
-            self.config.loss.sum(&seen.over(background), target)
+            let seen = self.sampler.quadrature().render(&Query::new(field, params), samples, 0.0);
+            self.config.loss.sum(&seen.rendered.over(background), target)
         };
         let errors = fields[fields.len() - samples.len()..].iter().copied().zip(samples).map(error);
         errors.reduce(|sum, error| sum + error).unwrap_or_else(|| params.tape().constant(Tensor::scalar(T::ZERO)))

@@ -5,11 +5,9 @@ use super::pixel::Pixel;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::model::Model;
-use crate::random::Jitter;
-use crate::sampling::Purpose;
-use crate::volume::query::Query;
+use crate::volume::lit::Lit;
 use crate::volume::render::Evaluations;
-use raygrad_autograd::{Scalar, Tape, Var};
+use raygrad_autograd::{Pool, Scalar, Var};
 
 /// A view in double precision.
 #[derive(Debug, Clone)]
@@ -39,7 +37,7 @@ impl<T: Scalar> Model<T> {
     #[inline(never)]
     pub fn dense_view(&self, camera: &Camera, background: [f64; 3], finer: usize) -> DenseView {
         assert!(finer > 0, "steps that are 0 times smaller");
-        let see = |_: &mut (), rays: &Rays<T>, out: &mut [Pixel]| self.dense_rays(rays, finer, out);
+        let see = |pool: &Pool<T>, rays: &Rays<T>, out: &mut [Pixel]| self.dense_rays(rays, finer, pool, out);
         let mut pixels = vec![Pixel::default(); camera.width * camera.height];
         let keep = |seen: &[Pixel], out: &mut [Pixel]| {
             out.iter_mut().zip(seen).for_each(|(out, pixel)| *out = pixel.over(background));
@@ -50,24 +48,19 @@ impl<T: Scalar> Model<T> {
         DenseView { width: camera.width, height: camera.height, pixels, evaluations }
     }
 
-    fn dense_rays(&self, rays: &Rays<T>, finer: usize, out: &mut [Pixel]) -> Evaluations {
-        let tape = Tape::new();
-        let params = self.params.bind_constant(&tape);
-        let frames = self.look.map(|look| vec![look; rays.len()]);
-        let query = &Query { frames: frames.as_deref(), ..Query::new(&*self.field, &params) };
-        let sampled = self.sampler.sample(query, rays, Purpose::View { finer }, &mut Jitter::Middle);
-        let seen = self.sampler.quadrature().plan_for(query, &sampled.steps, 0.0);
-        let rendered = seen.plan.render(query);
-        let [color, depth, left] = [&rendered.color, &rendered.depth(), &rendered.transmittance()].map(numbers);
-        for (i, out) in out.iter_mut().enumerate() {
-            *out = Pixel {
-                color: [color[3 * i], color[3 * i + 1], color[3 * i + 2]],
-                depth: depth[i],
-                transmittance: left[i],
-            };
-        }
-        let asked = seen.evaluations as u64;
-        sampled.evaluations + Evaluations { density: asked, color: asked, unskipped: 0 }
+    fn dense_rays(&self, rays: &Rays<T>, finer: usize, pool: &Pool<T>, out: &mut [Pixel]) -> Evaluations {
+        self.along(rays, finer, pool, |query, sampled| {
+            let Lit { rendered, asked, .. } = self.sampler.quadrature().render(query, &sampled.steps, 0.0);
+            let [color, depth, left] = [&rendered.color, &rendered.depth(), &rendered.transmittance()].map(numbers);
+            for (i, out) in out.iter_mut().enumerate() {
+                *out = Pixel {
+                    color: [color[3 * i], color[3 * i + 1], color[3 * i + 2]],
+                    depth: depth[i],
+                    transmittance: left[i],
+                };
+            }
+            sampled.evaluations + Evaluations { density: asked as u64, color: asked as u64, unskipped: 0 }
+        })
     }
 }
 

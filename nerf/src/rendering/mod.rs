@@ -4,7 +4,8 @@ pub(crate) mod dense;
 pub(crate) mod normals;
 pub(crate) mod picture;
 pub(crate) mod pixel;
-pub(crate) mod view;
+mod tiles;
+mod view;
 
 pub use dense::DenseView;
 pub use picture::{Picture, Viewing};

@@ -4,12 +4,10 @@ use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::dataset::image::Image;
 use crate::model::Model;
-use crate::random::Jitter;
 use crate::rendering::picture::Viewing;
-use crate::sampling::Purpose;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
-use raygrad_autograd::{Pool, Scalar, Tape};
+use raygrad_autograd::{Pool, Scalar};
 
 /// Rays that are evaluated together: the densities of all their samples are on one tape.
 const TILE: usize = 64;
@@ -38,25 +36,23 @@ impl<T: Scalar> Model<T> {
     pub fn normals_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Image> {
         let mut image = Image::new(camera.width, camera.height, 3);
         let out = image.data.chunks_mut(3 * TILE);
-        let see = |pool: &mut Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, viewing, pool, out);
+        let see = |pool: &Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, viewing, pool, out);
         self.tiles(camera, viewing, TILE, out, see)?;
         Some(image)
     }
 
     fn normals_along(&self, rays: &Rays<T>, viewing: &Viewing<'_>, pool: &Pool<T>, out: &mut [f32]) -> Evaluations {
-        let tape = Tape::with_pool(pool.clone());
-        let params = self.params.bind_constant(&tape);
-        let query = Query::new(&*self.field, &params);
-        let sampled = self.sampler.sample(&query, rays, Purpose::View { finer: 1 }, &mut Jitter::Middle);
-        if sampled.steps.is_empty() {
-            return sampled.evaluations;
-        }
-        let termination = viewing.limits.unwrap_or_else(|| self.sampler.limits()).termination.into();
-        let query = Query { slopes: true, ..query };
-        let seen = self.sampler.quadrature().render(&query, &sampled.steps, termination);
-        let normals = seen.rendered.normals_seen();
-        out.iter_mut().zip(normals.as_slice()).for_each(|(out, value)| *out = value.to_f64() as f32);
-        sampled.evaluations + Evaluations { density: seen.asked as u64, color: seen.kept as u64, unskipped: 0 }
+        self.along(rays, 1, pool, |query, sampled| {
+            if sampled.steps.is_empty() {
+                return sampled.evaluations;
+            }
+            let termination = viewing.limits.unwrap_or_else(|| self.sampler.limits()).termination.into();
+            let query = Query { slopes: true, ..*query };
+            let seen = self.sampler.quadrature().render(&query, &sampled.steps, termination);
+            let normals = seen.rendered.normals_seen();
+            out.iter_mut().zip(normals.as_slice()).for_each(|(out, value)| *out = value.to_f64() as f32);
+            sampled.evaluations + Evaluations { density: seen.asked as u64, color: seen.kept as u64, unskipped: 0 }
+        })
     }
 }
 

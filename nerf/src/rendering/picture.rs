@@ -1,7 +1,6 @@
-//! Rendering whole images, tile by tile on all cores.
+//! Rendering whole images.
 
 use super::pixel::Pixel;
-use super::view::Viewer;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::dataset::image::Image;
@@ -9,9 +8,7 @@ use crate::model::Model;
 use crate::sampling::Limits;
 use crate::volume::render::Evaluations;
 use glam::DVec3;
-use raygrad_autograd::Scalar;
-use raygrad_tensor::parallel::{self, Scratch, locked};
-use std::sync::{Mutex, PoisonError};
+use raygrad_autograd::Pool;
 
 /// What a model sees from a camera.
 #[derive(Debug, Clone)]
@@ -116,66 +113,6 @@ impl Viewing<'_> {
 /// The box that holds everything.
 const EVERYWHERE: [DVec3; 2] = [DVec3::NEG_INFINITY, DVec3::INFINITY];
 
-impl<T: Scalar> Model<T> {
-    /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
-    /// tile's first pixel, its rays and its part of `out`. Nothing if it was not to go on.
-    pub(crate) fn tiles<S: Default + Send, P: Send>(
-        &self,
-        camera: &Camera,
-        viewing: &Viewing<'_>,
-        tile: usize,
-        out: impl Iterator<Item = P>,
-        see: impl Fn(&mut S, usize, &Rays<T>, P) -> Evaluations + Sync,
-    ) -> Option<Evaluations> {
-        let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
-        let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
-        let [near, far] = self.view_span();
-        // Which corner is which is nothing to a ray.
-        let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
-        let (scratch, seen) = (Scratch::default(), Mutex::new(Some(Evaluations::default())));
-        parallel::each_of(out, |which, out| {
-            let goes_on = locked(&seen).is_some() && (viewing.goes_on)();
-            let evaluations = goes_on.then(|| {
-                let mut rays = Rays::new();
-                for pixel in which * tile..count.min((which + 1) * tile) {
-                    rays.push_pixel(camera, camera.place_of(pixel), bounds, span);
-                }
-                scratch.with(|scratch| parallel::serial(|| see(scratch, which * tile, &rays, out)))
-            });
-            let mut seen = locked(&seen);
-            *seen = seen.zip(evaluations).map(|(a, b)| a + b);
-        });
-        seen.into_inner().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
-    /// shows to its part of `out`. Nothing if it was not to go on.
-    pub(crate) fn pixels<S: Default + Send, P: Send>(
-        &self,
-        camera: &Camera,
-        viewing: &Viewing<'_>,
-        tile: usize,
-        see: impl Fn(&mut S, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
-        out: impl Iterator<Item = P>,
-        keep: impl Fn(&[Pixel], P) + Sync,
-    ) -> Option<Evaluations> {
-        let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
-        self.tiles(camera, viewing, tile, out, |(scratch, pixels): &mut (S, Vec<Pixel>), first, rays, out| {
-            pixels.resize(rays.len(), Pixel::default());
-            let evaluations = see(scratch, rays, pixels);
-            if let Some(gain) = &gain {
-                for (seen, pixel) in pixels.iter_mut().zip(first..) {
-                    let gains = gain.at(camera.off_axis(camera.place_of(pixel)));
-                    let color = seen.color.iter_mut().zip(gains);
-                    color.for_each(|(color, gain)| *color = (*color * gain).min(1.0));
-                }
-            }
-            keep(pixels, out);
-            evaluations
-        })
-    }
-}
-
 impl Model<f32> {
     /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
     /// time, on any number of threads.
@@ -205,7 +142,7 @@ impl Model<f32> {
     /// ```
     pub fn view_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Picture> {
         let limits = viewing.limits.unwrap_or_else(|| self.sampler.limits());
-        let see = |viewer: &mut Viewer, rays: &Rays<f32>, out: &mut [Pixel]| viewer.see(self, rays, &limits, out);
+        let see = |pool: &Pool<f32>, rays: &Rays<f32>, out: &mut [Pixel]| self.see(rays, &limits, pool, out);
         let (mut picture, tile) = (Picture::new([camera.width, camera.height]), self.sampler.view_tile());
         let background = viewing.background.map(f64::from);
         let keep = |pixels: &[Pixel], out: Part<'_>| out.fill(pixels.iter().map(|pixel| pixel.over(background)));
@@ -216,26 +153,6 @@ impl Model<f32> {
     /// A view that nobody stops.
     fn whole_view(&self, camera: &Camera, viewing: &Viewing<'_>) -> Picture {
         self.view_while(camera, viewing).expect("nobody stops it")
-    }
-
-    /// The view from `camera` at `1 / coarsest` of its size and then at twice the size each time, up to the whole:
-    /// something to look at while the rest is computed, for a third more work. Each picture is rendered when the
-    /// iterator is asked for it.
-    ///
-    /// # Panics
-    /// If `coarsest` is not a power of two.
-    pub fn progressive<'a>(
-        &'a self,
-        camera: &'a Camera,
-        background: [f32; 3],
-        coarsest: usize,
-    ) -> impl Iterator<Item = Picture> + 'a {
-        assert!(coarsest.is_power_of_two(), "{coarsest} is not a power of two");
-        let halvings = (0..=coarsest.trailing_zeros()).rev();
-        halvings.map(move |halvings| {
-            let [width, height] = [camera.width, camera.height].map(|side| side.div_ceil(1 << halvings));
-            self.view(&camera.resized(width, height), background)
-        })
     }
 }
 
@@ -307,7 +224,7 @@ mod tests {
         let (model, camera) = (model(), camera(17, 13));
         let viewing = Viewing::over([1.0; 3]);
         let mut tiles = vec![(0, Rays::new()); 221_usize.div_ceil(50)];
-        let keep = |_: &mut (), first, rays: &Rays<f32>, tile: &mut _| {
+        let keep = |_: &Pool<f32>, first, rays: &Rays<f32>, tile: &mut _| {
             *tile = (first, rays.clone());
             Evaluations::default()
         };
@@ -337,17 +254,5 @@ mod tests {
         assert!(model.normals_while(&camera, &viewing).is_none());
         let whole = model.view_while(&camera, &Viewing { goes_on: &|| true, ..viewing }).unwrap();
         assert_eq!(whole.color, model.view(&camera, [1.0; 3]).color);
-    }
-
-    #[test]
-    fn a_progressive_view_ends_with_the_view_itself() {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
-        let model = Model::new(Config::preset(Preset::Small), extent, 0).unwrap();
-        let pose = Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y);
-        let camera = Camera::from_angle(13, 9, 0.6, pose);
-        let pictures: Vec<Picture> = model.progressive(&camera, [1.0; 3], 4).collect();
-        let sizes: Vec<_> = pictures.iter().map(|p| [p.color.width, p.color.height]).collect();
-        assert_eq!(sizes, [[4, 3], [7, 5], [13, 9]]);
-        assert_eq!(pictures[2].color, model.view(&camera, [1.0; 3]).color);
     }
 }

@@ -8,7 +8,7 @@ use crate::field::{Classic, ClassicConfig, Field};
 use crate::kind::{Kind, Site};
 use crate::random::Jitter;
 use crate::range::check_range;
-use crate::volume::quadrature::Plan;
+use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::Scalar;
@@ -77,11 +77,11 @@ impl<T: Scalar> Sampler<T> for Hierarchical {
     ) -> Sampled<'t, T> {
         let HierarchicalConfig { coarse, fine, uniform_share, .. } = self.config;
         let pool = query.tape().pool();
-        let first = Plan { samples: stratified(rays, coarse, jitter, pool), intervals: None };
-        let seen = first.render(&query.of(&self.proposal));
+        let first = stratified(rays, coarse, jitter, pool);
+        let seen = Quadrature::Midpoint.render_nodes(&query.of(&self.proposal), first);
         let weights = seen.weights.value().as_slice();
-        let steps = importance(rays, &first.samples, weights, fine, uniform_share, jitter, pool);
-        let asked = first.len() as u64;
+        let steps = importance(rays, &seen.samples, weights, fine, uniform_share, jitter, pool);
+        let asked = weights.len() as u64;
         let evaluations = Evaluations { density: asked, color: asked, unskipped: asked + steps.len() as u64 };
         Sampled { steps, coarse: vec![seen], levels: vec![], evaluations }
     }

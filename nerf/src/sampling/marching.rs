@@ -289,7 +289,6 @@ mod tests {
     use super::*;
     use crate::analytic::{AnalyticField, scenes};
     use crate::dataset::{Split, sample::ball};
-    use crate::volume::quadrature::Plan;
     use raygrad_autograd::{Tape, Tensor};
     use raygrad_nn::Params;
     use std::sync::Mutex;
@@ -313,7 +312,7 @@ mod tests {
             rays.push(&scene.ray, crate::camera::bounds::clip_span(&scene.ray, reach, [0.0, scene.length]));
             let steps = sampler.sample(&query, &rays, Purpose::View { finer: 1 }, &mut Jitter::Middle).steps;
             let count = steps.len();
-            let color = Plan { samples: steps, intervals: None }.render(&query).over(&Tensor::full(&[1, 3], 1.0));
+            let color = Quadrature::Midpoint.render_nodes(&query, steps).over(&Tensor::full(&[1, 3], 1.0));
             (color.value().as_slice()[1], count)
         };
         assert_eq!(seen(1, 0.0).0, 1.0, "within the box there is nothing");

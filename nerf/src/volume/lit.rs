@@ -1,8 +1,9 @@
 //! Rendering only those samples that light reaches.
 
-use super::quadrature::{Plan, Quadrature, refine};
+use super::quadrature::{Quadrature, refine};
 use super::query::{Query, RayVars};
 use super::render::Rendered;
+use super::rounds::FrontToBack;
 use crate::camera::rays::Samples;
 use raygrad_autograd::{Memo, Pool, Scalar};
 
@@ -10,9 +11,9 @@ use raygrad_autograd::{Memo, Pool, Scalar};
 pub struct Lit<'t, T: Scalar> {
     /// What is seen.
     pub rendered: Rendered<'t, T>,
-    /// Evaluations of a density alone.
+    /// Density queries.
     pub asked: usize,
-    /// Samples that had light left in front of them, which were evaluated with colour and for gradients.
+    /// Visible samples, which were evaluated with colour and for gradients.
     pub kept: usize,
 }
 
@@ -25,94 +26,65 @@ impl Quadrature {
     /// recorded one on the samples that more than `termination` of the light reaches, which takes what was dear to work out
     /// from the first. Without a termination there is only the second, on all samples. What is left out changes a pixel by at most `termination` times the range of colours.
     pub fn render<'t, T: Scalar>(self, query: &Query<'_, 't, T>, steps: &Samples<T>, termination: f64) -> Lit<'t, T> {
-        let (tape, pool) = (query.tape(), query.tape().pool());
+        let tape = query.tape();
         if let Quadrature::Adaptive { tolerance } = self {
-            let refined = refine(query, steps, tolerance, termination);
-            let kept = refined.plan.len();
-            return Lit { rendered: refined.plan.render(query), asked: refined.evaluations, kept };
+            let (nodes, asked) = refine(query, steps, tolerance, termination);
+            return Lit { asked, kept: nodes.len(), rendered: self.render_nodes(query, nodes) };
         }
-        let plan = self.plan(steps, pool);
+        let nodes = self.nodes(steps);
         if !(termination > 0.0) {
-            return Lit { rendered: plan.render(query), asked: plan.len(), kept: plan.len() };
+            return Lit { asked: nodes.len(), kept: nodes.len(), rendered: self.render_nodes(query, nodes) };
         }
         // What is found out unrecorded needs no variables.
         let plain = &Query { rays: None, slopes: false, ..*query };
-        let (lit, memo, asked) = match &plan.intervals {
-            None => {
-                let Visible { rows, memo, asked } = tape.no_grad(|| visible(plain, &plan.samples, termination));
-                (Plan { samples: plan.samples.select(&rows, pool), intervals: None }, memo, asked)
-            }
-            Some(intervals) => {
-                let (transmittance, memo) = tape.no_grad(|| {
-                    let (density, memo) = tape.remember(|| plain.density(&plan.samples));
-                    (intervals.transmittance(&density), memo)
-                });
-                let (lit, rows) = plan.lit(intervals, &transmittance, T::from_f64(termination), pool);
+        let Visible { samples, memo, asked } = tape.no_grad(|| match self.has_intervals() {
+            false => visible(plain, &nodes, termination),
+            true => {
+                let (density, memo) = tape.remember(|| plain.density(&nodes));
+                let (samples, rows) = self.visible_nodes(&density, &nodes, termination);
                 let rows: Vec<[u32; 2]> = rows.into_iter().map(|row| [0, row]).collect();
-                (lit, gathered(vec![memo], &rows, &[plan.len()], pool), plan.len())
+                Visible { samples, memo: gathered(vec![memo], &rows, &[nodes.len()], tape.pool()), asked: nodes.len() }
             }
-        };
-        let positions = query.positions(&lit.samples);
+        });
+        let positions = query.positions(&samples);
         // Rays that are variables may be other rays than those that were marched.
         let same = |rays: &RayVars<'t, T>| {
-            rays.origins.value() == &lit.samples.origins && rays.directions.value() == &lit.samples.directions
+            rays.origins.value() == &samples.origins && rays.directions.value() == &samples.directions
         };
-        let memo = if query.rays.is_none_or(same) { memo } else { Memo::gather(&[], &[], pool) };
-        let density = tape.recall(memo, || query.density_at(&lit.samples, &positions));
-        Lit { kept: lit.len(), rendered: lit.render_density(query, positions, density), asked }
+        let memo = if query.rays.is_none_or(same) { memo } else { Memo::gather(&[], &[], tape.pool()) };
+        let density = tape.recall(memo, || query.density_at(&samples, &positions));
+        Lit { kept: samples.len(), rendered: self.render_density(query, samples, positions, density), asked }
     }
 }
 
 /// The samples that light reaches.
 struct Visible<T: Scalar> {
-    /// Their numbers, rising.
-    rows: Vec<u32>,
+    samples: Samples<T>,
     /// What was dear to work out for them.
     memo: Memo<T>,
-    /// Samples whose density was evaluated.
+    /// Density queries.
     asked: usize,
 }
 
-/// Finds the samples in front of which more than `termination` of the light is left, following the rays in rounds.
+/// The samples in front of which more than `termination` of the light is left, found in rounds.
 fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, termination: f64) -> Visible<T> {
-    let (tape, pool): (_, &Pool<T>) = (query.tape(), query.tape().pool());
-    // The optical depth behind which too little light is left.
-    let opaque = -termination.ln();
-    let ranges: Vec<_> = samples.segments.ranges().collect();
-    let mut depths = vec![0.0; ranges.len()];
-    let mut alive: Vec<usize> = (0..ranges.len()).collect();
+    let (tape, mut rays) = (query.tape(), FrontToBack::new(samples, termination));
     // Of what is found: the number of the sample, and its place among what was asked.
     let (mut found, mut memos, mut sizes) = (Vec::<(u32, [u32; 2])>::new(), vec![], vec![]);
-    let (mut done, mut size, mut asked) = (0, FIRST_ROUND, 0);
-    loop {
-        alive.retain(|&ray| ranges[ray].len() > done && depths[ray] < opaque);
-        if alive.is_empty() {
-            break;
-        }
-        let piece =
-            |&ray: &usize| (ray, ranges[ray].start + done..(ranges[ray].start + done + size).min(ranges[ray].end));
-        let pieces: Vec<_> = alive.iter().map(piece).collect();
-        let part = samples.pieces(&pieces, pool);
-        let (density, memo) = tape.remember(|| query.density(&part));
-        let depth = density.optical_depth(&part.delta);
-        let depth = depth.value().as_slice();
-        for (to, (ray, rows)) in part.segments.ranges().zip(pieces) {
-            let total = &mut depths[ray];
-            for (row, sample) in to.zip(rows) {
-                if *total < opaque {
-                    found.push((sample as u32, [memos.len() as u32, row as u32]));
-                }
-                *total += depth[row].to_f64();
+    while let (Some(round), memo) = tape.remember(|| rays.round(query, FIRST_ROUND << memos.len())) {
+        let numbers = round.part.pieces.into_iter().flat_map(|(_, rows)| rows);
+        for ((row, sample), depth) in (0..).zip(numbers).zip(&round.in_front) {
+            if rays.has_light(*depth) {
+                found.push((sample as u32, [memos.len() as u32, row]));
             }
         }
-        asked += part.len();
-        sizes.push(part.len());
+        sizes.push(round.in_front.len());
         memos.push(memo);
-        (done, size) = (done + size, 2 * size);
     }
     found.sort_unstable_by_key(|(sample, _)| *sample);
     let (rows, places): (Vec<u32>, Vec<[u32; 2]>) = found.into_iter().unzip();
-    Visible { rows, memo: gathered(memos, &places, &sizes, pool), asked }
+    let memo = gathered(memos, &places, &sizes, tape.pool());
+    Visible { samples: samples.select(&rows, tape.pool()), memo, asked: sizes.iter().sum() }
 }
 
 /// Rows of what was dear to work out for so many samples at a time; nothing if it has other rows than samples.

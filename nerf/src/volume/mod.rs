@@ -29,6 +29,7 @@ pub(crate) mod lit;
 pub mod quadrature;
 pub(crate) mod query;
 pub(crate) mod render;
+pub(crate) mod rounds;
 #[cfg(test)]
 mod tests;
 pub(crate) mod weights;

@@ -95,12 +95,6 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
         Some(samples.t.map(|t| T::from_f64((t.to_f64() / near).powi(2).min(1.0))))
     }
 
-    /// The density at samples in 1 / scene unit, `[samples]`, as numbers.
-    #[track_caller]
-    pub fn sigma(&self, samples: &Samples<T>) -> Tensor<T> {
-        self.tape().no_grad(|| self.density(samples).sigma().into_value())
-    }
-
     /// The colour of samples with these features, `[samples, 3]`.
     #[track_caller]
     pub fn color(&self, features: &Var<'t, T>, samples: &Samples<T>) -> Var<'t, T> {

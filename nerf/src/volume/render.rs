@@ -19,13 +19,6 @@ pub struct Evaluations {
     pub unskipped: u64,
 }
 
-impl Evaluations {
-    /// As many for everything.
-    pub fn all(count: u64) -> Self {
-        Evaluations { density: count, color: count, unskipped: count }
-    }
-}
-
 impl Add for Evaluations {
     type Output = Evaluations;
     fn add(self, other: Evaluations) -> Evaluations {
@@ -74,18 +67,6 @@ pub struct Weighted<'t, T: Scalar> {
     pub weights: Var<'t, T>,
     /// The optical depth of each ray, `[rays]`.
     pub optical_depth: Var<'t, T>,
-}
-
-impl<'t, T: Scalar> Weighted<'t, T> {
-    /// Of samples that stand for an interval each.
-    ///
-    /// # Panics
-    /// As [`Density::optical_depth`] and [`weights`].
-    #[track_caller]
-    pub fn new(density: &Density<'t, T>, delta: &Tensor<T>, segments: &Segments) -> Self {
-        let x = density.optical_depth(delta);
-        Weighted { weights: weights(&x, segments), optical_depth: x.segment_sum(segments) }
-    }
 }
 
 /// What is seen along rays, front to back: everything that a picture shows or a loss can use. Each may be differentiated.

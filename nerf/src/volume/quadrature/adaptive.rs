@@ -1,21 +1,13 @@
 //! Intervals that are halved until halving them changes little.
 
-use super::{Intervals, Plan, Quadrature, Share};
+use super::Quadrature;
+use super::nodes::placed;
 use crate::camera::rays::Samples;
 use crate::volume::query::Query;
-use raygrad_autograd::{Real, Scalar, Segments, Tensor};
+use raygrad_autograd::{Real, Scalar};
 
 /// No interval is halved more often.
 const MOST_HALVINGS: usize = 24;
-
-/// A plan that follows the field, and what it took to find it.
-#[derive(Debug, Clone)]
-pub struct Refined<T: Scalar> {
-    /// Nodes and intervals, without those that too little light reaches.
-    pub plan: Plan<T>,
-    /// Evaluations of density and colour.
-    pub evaluations: usize,
-}
 
 /// What the field says at one place.
 #[derive(Debug, Clone, Copy)]
@@ -29,21 +21,26 @@ struct Node {
 #[derive(Debug, Clone, Copy)]
 struct Link {
     node: Node,
-    /// Length of the interval to the next node; `None` where there is a gap.
-    length: Option<f64>,
+    /// Length of the interval to the next node; 0 where there is a gap.
+    length: f64,
     /// Whether it may have to be halved.
     open: bool,
 }
 
-/// Halves the intervals between the ends of `steps` (see [`Quadrature::plan`]) until the estimated change of the pixel by
-/// halving one is at most `tolerance`. The change is bounded over all colours in 0..=1 that may lie behind.
+/// The [nodes](Quadrature::nodes) of an adaptive rule, and how often density and colour were queried to find them: halves
+/// the intervals between the ends of `steps` until the estimated change of the pixel by halving one is at most `tolerance`.
+/// The change is bounded over all colours in 0..=1 that may lie behind.
 ///
 /// Intervals that no more light than `least` reaches are left out. Nothing is recorded: no gradient flows through the
 /// choice of places. A feature that shows at no node of `steps` is not found.
-pub fn refine<'t, T: Scalar>(query: &Query<'_, 't, T>, steps: &Samples<T>, tolerance: f64, least: f64) -> Refined<T> {
-    let first = Quadrature::PiecewiseLinear.plan(steps, query.tape().pool());
+pub(crate) fn refine<T: Scalar>(
+    query: &Query<'_, '_, T>,
+    steps: &Samples<T>,
+    tolerance: f64,
+    least: f64,
+) -> (Samples<T>, usize) {
     let mut asker = Asker { query, steps, evaluations: 0 };
-    let mut rays = asker.begin(&first);
+    let mut rays = asker.begin(&Quadrature::PiecewiseLinear.nodes(steps));
     for _ in 0..MOST_HALVINGS {
         let middles: Vec<Vec<f64>> = rays.iter().map(|links| middles::<T>(links, least)).collect();
         if middles.iter().all(Vec::is_empty) {
@@ -54,19 +51,7 @@ pub fn refine<'t, T: Scalar>(query: &Query<'_, 't, T>, steps: &Samples<T>, toler
             *links = halved(links, middles, &mut found, tolerance);
         }
     }
-    Refined { plan: asker.finish(&rays, least), evaluations: asker.evaluations }
-}
-
-impl Quadrature {
-    /// The plan for steps along rays that is made for this field: an adaptive rule asks it where to look, and leaves out
-    /// what no more light than `least` reaches.
-    pub fn plan_for<'t, T: Scalar>(self, query: &Query<'_, 't, T>, steps: &Samples<T>, least: f64) -> Refined<T> {
-        if let Quadrature::Adaptive { tolerance } = self {
-            return refine(query, steps, tolerance, least);
-        }
-        let plan = self.plan(steps, query.tape().pool());
-        Refined { evaluations: plan.len(), plan }
-    }
+    (asker.finish(&rays, least), asker.evaluations)
 }
 
 /// Places to ask at next: the middles of open intervals that light reaches and that can be halved in this precision.
@@ -74,8 +59,10 @@ fn middles<T: Scalar>(links: &[Link], least: f64) -> Vec<f64> {
     let mut depth = 0.0_f64;
     let mut out = vec![];
     for pair in links.windows(2) {
-        let Some(length) = pair[0].length else { continue };
-        let [a, b] = [pair[0].node, pair[1].node];
+        let ([a, b], length) = ([pair[0].node, pair[1].node], pair[0].length);
+        if length == 0.0 {
+            continue;
+        }
         let middle = T::from_f64(0.5 * (a.t + b.t)).to_f64();
         if pair[0].open && (-depth).exp() > least && a.t < middle && middle < b.t {
             out.push(middle);
@@ -90,7 +77,8 @@ fn halved(links: &[Link], middles: &[f64], found: &mut impl Iterator<Item = Node
     let mut out = Vec::with_capacity(links.len() + middles.len());
     let (mut next, mut depth) = (0, 0.0_f64);
     for (i, link) in links.iter().enumerate() {
-        let (Some(length), Some(end)) = (link.length, links.get(i + 1)) else {
+        let length = link.length;
+        let Some(end) = links.get(i + 1).filter(|_| length != 0.0) else {
             out.push(*link);
             continue;
         };
@@ -104,8 +92,8 @@ fn halved(links: &[Link], middles: &[f64], found: &mut impl Iterator<Item = Node
         next += 1;
         let half = 0.5 * length;
         let open = (-depth).exp() * change(a, middle, b, length) > tolerance;
-        out.push(Link { length: Some(half), open, ..*link });
-        out.push(Link { node: middle, length: Some(half), open });
+        out.push(Link { length: half, open, ..*link });
+        out.push(Link { node: middle, length: half, open });
         depth += 0.5 * half * (a.sigma + 2.0 * middle.sigma + b.sigma);
     }
     out
@@ -135,79 +123,54 @@ struct Asker<'a, 't, T: Scalar> {
 }
 
 impl<T: Scalar> Asker<'_, '_, T> {
-    /// Samples at these distances along each ray.
-    fn samples(&self, places: &[Vec<f64>]) -> Samples<T> {
-        let t: Vec<T> = places.iter().flatten().map(|&place| T::from_f64(place)).collect();
-        let ends = places.iter().scan(0, |end, places| {
-            *end += places.len() as u32;
-            Some(*end)
-        });
-        let segments = Segments::new([0].into_iter().chain(ends).collect::<Vec<_>>());
-        let count = t.len();
-        self.steps.at(segments, Tensor::from_vec(&[count], t), Tensor::zeros(&[count]))
-    }
-
     /// What the field says at these distances along each ray, ray after ray.
     fn ask(&mut self, places: &[Vec<f64>]) -> Vec<Node> {
-        let samples = self.samples(places);
+        let mut offsets = vec![0];
+        places.iter().for_each(|places| offsets.push(offsets[offsets.len() - 1] + places.len() as u32));
+        let places: Vec<f64> = places.concat();
+        let samples = placed(self.steps, offsets, places.iter().map(|&t| (T::from_f64(t), T::ZERO)).collect());
         self.evaluations += samples.len();
         self.query.tape().no_grad(|| {
             let density = self.query.density(&samples);
             let (sigma, color) = (density.sigma(), self.query.color(&density.features, &samples));
-            let places = places.iter().flatten();
-            let values = sigma.value().as_slice().iter().zip(color.value().as_slice().chunks_exact(3)).zip(places);
-            let node = |((sigma, color), &t): ((&T, &[T]), &f64)| Node {
+            let values = sigma.value().as_slice().iter().zip(color.value().as_slice().as_chunks::<3>().0);
+            let node = |((sigma, color), t): ((&T, &[T; 3]), f64)| Node {
                 t,
                 sigma: sigma.to_f64(),
-                color: [color[0], color[1], color[2]].map(T::to_f64),
+                color: color.map(T::to_f64),
             };
-            values.map(node).collect()
+            values.zip(places).map(node).collect()
         })
     }
 
-    /// The links of each ray between the nodes of a plan.
-    fn begin(&mut self, plan: &Plan<T>) -> Vec<Vec<Link>> {
-        let t = plan.samples.t.as_slice();
-        let places: Vec<Vec<f64>> =
-            plan.samples.segments.ranges().map(|rows| t[rows].iter().map(|t| t.to_f64()).collect()).collect();
-        let nodes = self.ask(&places);
-        let mut length = vec![None; nodes.len()];
-        if let Some(Intervals { nodes: [first, _], length: lengths, .. }) = &plan.intervals {
-            first.iter().zip(lengths.as_slice()).for_each(|(&a, h)| length[a as usize] = Some(h.to_f64()));
-        }
-        let link = |i: usize| Link { node: nodes[i], length: length[i], open: true };
-        plan.samples.segments.ranges().map(|rows| rows.map(link).collect()).collect()
+    /// The links of each ray between these nodes.
+    fn begin(&mut self, nodes: &Samples<T>) -> Vec<Vec<Link>> {
+        let (t, delta) = (nodes.t.as_slice(), nodes.delta.as_slice());
+        let rays = || nodes.segments.ranges();
+        let places: Vec<Vec<f64>> = rays().map(|rows| t[rows].iter().map(|t| t.to_f64()).collect()).collect();
+        let found = self.ask(&places);
+        let link = |i: usize| Link { node: found[i], length: delta[i].to_f64(), open: true };
+        rays().map(|rows| rows.map(link).collect()).collect()
     }
 
-    /// The plan of what light reaches.
-    fn finish(&self, rays: &[Vec<Link>], least: f64) -> Plan<T> {
-        let (mut places, mut ends) = (Vec::with_capacity(rays.len()), vec![0_u32]);
-        let (mut first, mut length) = (vec![], vec![]);
-        let mut total = 0_u32;
+    /// The nodes of the intervals that light reaches.
+    fn finish(&self, rays: &[Vec<Link>], least: f64) -> Samples<T> {
+        let (mut places, mut offsets) = (vec![], vec![0]);
         for links in rays {
-            let mut depth = 0.0_f64;
-            let mut last = 0;
-            for (i, pair) in links.windows(2).enumerate() {
-                let Some(h) = pair[0].length else { continue };
-                if !((-depth).exp() > least) {
-                    break;
+            let (mut depth, mut before) = (0.0_f64, 0.0);
+            for (i, link) in links.iter().enumerate() {
+                let length = if (-depth).exp() > least { link.length } else { 0.0 };
+                // Where an interval begins or ends.
+                if length != 0.0 || before != 0.0 {
+                    places.push((T::from_f64(link.node.t), T::from_f64(length)));
                 }
-                depth += 0.5 * h * (pair[0].node.sigma + pair[1].node.sigma);
-                first.push(total + i as u32);
-                length.push(T::from_f64(h));
-                last = i + 2;
+                if length != 0.0 {
+                    depth += 0.5 * length * (link.node.sigma + links[i + 1].node.sigma);
+                }
+                before = length;
             }
-            places.push(links[..last].iter().map(|link| link.node.t).collect());
-            total += last as u32;
-            ends.push(first.len() as u32);
+            offsets.push(places.len() as u32);
         }
-        let second = first.iter().map(|a| a + 1).collect();
-        let intervals = Intervals {
-            nodes: [first.into(), second],
-            length: Tensor::from_vec(&[length.len()], length),
-            segments: Segments::new(ends),
-            share: Share::Mean,
-        };
-        Plan { samples: self.samples(&places), intervals: Some(intervals) }
+        placed(self.steps, offsets, places)
     }
 }

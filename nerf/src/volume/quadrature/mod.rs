@@ -16,13 +16,13 @@
 //! the intervals of the other rules are shifted at random: errors change from step to step.
 
 mod adaptive;
-mod intervals;
-mod plan;
+mod nodes;
 mod rule;
+mod share;
 #[cfg(test)]
 mod tests;
 
-pub use adaptive::{Refined, refine};
-pub use intervals::{Intervals, Share, gauss_share};
-pub use plan::Plan;
 pub use rule::Quadrature;
+pub use share::gauss_share;
+
+pub(crate) use adaptive::refine;

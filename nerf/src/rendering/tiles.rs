@@ -1,0 +1,90 @@
+//! What all views do: ask a model along the rays of a camera's pixels, tile by tile on all cores.
+
+use super::picture::Viewing;
+use super::pixel::Pixel;
+use crate::camera::pinhole::Camera;
+use crate::camera::rays::Rays;
+use crate::model::Model;
+use crate::random::Jitter;
+use crate::sampling::{Purpose, Sampled};
+use crate::volume::query::Query;
+use crate::volume::render::Evaluations;
+use raygrad_autograd::{Pool, Scalar, Tape};
+use raygrad_tensor::parallel::{self, Scratch, locked};
+use std::sync::{Mutex, PoisonError};
+
+impl<T: Scalar> Model<T> {
+    /// Hands `see` the field with the look of the model, and where it is sampled along `rays` in views, at steps `finer`
+    /// times smaller than the configured ones.
+    pub(crate) fn along<R>(
+        &self,
+        rays: &Rays<T>,
+        finer: usize,
+        pool: &Pool<T>,
+        see: impl for<'t> FnOnce(&Query<'_, 't, T>, Sampled<'t, T>) -> R,
+    ) -> R {
+        let tape = Tape::with_pool(pool.clone());
+        let params = self.params.bind_constant(&tape);
+        let frames = self.look.map(|look| vec![look; rays.len()]);
+        let query = Query { frames: frames.as_deref(), ..Query::new(&*self.field, &params) };
+        see(&query, self.sampler.sample(&query, rays, Purpose::View { finer }, &mut Jitter::Middle))
+    }
+
+    /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
+    /// tile's first pixel, its rays and its part of `out`. Nothing if it was not to go on.
+    pub(crate) fn tiles<P: Send>(
+        &self,
+        camera: &Camera,
+        viewing: &Viewing<'_>,
+        tile: usize,
+        out: impl Iterator<Item = P>,
+        see: impl Fn(&Pool<T>, usize, &Rays<T>, P) -> Evaluations + Sync,
+    ) -> Option<Evaluations> {
+        let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
+        let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
+        let [near, far] = self.view_span();
+        // Which corner is which is nothing to a ray.
+        let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
+        let (pools, seen) = (Scratch::<Pool<T>>::default(), Mutex::new(Some(Evaluations::default())));
+        parallel::each_of(out, |which, out| {
+            let goes_on = locked(&seen).is_some() && (viewing.goes_on)();
+            let evaluations = goes_on.then(|| {
+                let mut rays = Rays::new();
+                for pixel in which * tile..count.min((which + 1) * tile) {
+                    rays.push_pixel(camera, camera.place_of(pixel), bounds, span);
+                }
+                pools.with(|pool| parallel::serial(|| see(pool, which * tile, &rays, out)))
+            });
+            let mut seen = locked(&seen);
+            *seen = seen.zip(evaluations).map(|(a, b)| a + b);
+        });
+        seen.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
+    /// shows to its part of `out`. Nothing if it was not to go on.
+    pub(crate) fn pixels<P: Send>(
+        &self,
+        camera: &Camera,
+        viewing: &Viewing<'_>,
+        tile: usize,
+        see: impl Fn(&Pool<T>, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
+        out: impl Iterator<Item = P>,
+        keep: impl Fn(&[Pixel], P) + Sync,
+    ) -> Option<Evaluations> {
+        let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
+        self.tiles(camera, viewing, tile, out, |pool, first, rays, out| {
+            let mut pixels = vec![Pixel::default(); rays.len()];
+            let evaluations = see(pool, rays, &mut pixels);
+            if let Some(gain) = &gain {
+                for (seen, pixel) in pixels.iter_mut().zip(first..) {
+                    let gains = gain.at(camera.off_axis(camera.place_of(pixel)));
+                    let color = seen.color.iter_mut().zip(gains);
+                    color.for_each(|(color, gain)| *color = (*color * gain).min(1.0));
+                }
+            }
+            keep(&pixels, out);
+            evaluations
+        })
+    }
+}
