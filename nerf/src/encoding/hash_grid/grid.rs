@@ -104,7 +104,7 @@ pub(super) const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HashGrid {
     levels: Arc<[HashLevel]>,
-    features: usize,
+    /// Rows of the table, and features in each.
     shape: [usize; 2],
 }
 
@@ -128,7 +128,7 @@ impl HashGrid {
         };
         let levels: Arc<[HashLevel]> = (0..config.levels).map(level).collect();
         check_parameters(first * config.features)?;
-        Ok(HashGrid { levels, features: config.features, shape: [first, config.features] })
+        Ok(HashGrid { levels, shape: [first, config.features] })
     }
 
     /// The levels, coarsest first.
@@ -138,17 +138,17 @@ impl HashGrid {
 
     /// Features in a row of the table.
     pub fn features(&self) -> usize {
-        self.features
+        self.shape[1]
     }
 
     /// Rows of the table.
     pub fn rows(&self) -> usize {
-        self.levels.last().map_or(0, |level| level.rows.end)
+        self.shape[0]
     }
 
     /// Features of a sample: levels times features.
     pub fn width(&self) -> usize {
-        self.levels.len() * self.features
+        self.levels.len() * self.features()
     }
 
     /// The shape of the table, `[rows, features]`.
@@ -161,6 +161,6 @@ impl HashGrid {
     #[inline(never)]
     pub fn init<T: Scalar>(&self, seed: u64) -> Tensor<T> {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        Tensor::from_fn(&[self.rows(), self.features], |_| T::from_f64(1e-4 * (2.0 * rng.random::<f64>() - 1.0)))
+        Tensor::from_fn(&self.shape, |_| T::from_f64(1e-4 * (2.0 * rng.random::<f64>() - 1.0)))
     }
 }

@@ -56,9 +56,17 @@ impl<T: Scalar> Cells<T> {
 
     /// Rows, places and weights for `points` on `level`. Every row is below the number of the level's rows, whatever the
     /// points are; a NaN coordinate counts as cell 0 and makes the weights NaN.
-    #[inline(always)]
+    ///
+    /// It is a function of its own, for all numbers of features: inlined where it is called, it was compiled thirty times.
+    #[inline(never)]
     pub(super) fn locate(&mut self, level: &HashLevel, points: &Points<T>) {
-        if level.hashed { self.locate_as(level, true, points) } else { self.locate_as(level, false, points) }
+        simd::dispatch(
+            #[inline(always)]
+            || match level.hashed {
+                true => self.locate_as(level, true, points),
+                false => self.locate_as(level, false, points),
+            },
+        )
     }
 
     #[inline(always)]
