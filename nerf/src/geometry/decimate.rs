@@ -3,7 +3,7 @@
 
 use super::mesh::{Mesh, sides};
 use glam::{DMat3, DVec3};
-use std::cmp::Ordering;
+use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 /// How many times more a border weighs than a triangle at it.
@@ -62,36 +62,9 @@ impl Quadric {
     }
 }
 
-/// An edge that may be drawn together.
-struct Candidate {
-    cost: f64,
-    edge: [u32; 2],
-    /// Where both vertices go.
-    place: DVec3,
-    /// How often each had been moved when this was worked out.
-    moved: [u32; 2],
-}
-
-impl Ord for Candidate {
-    /// The one that costs least is the greatest.
-    fn cmp(&self, other: &Self) -> Ordering {
-        other.cost.total_cmp(&self.cost).then(other.edge.cmp(&self.edge))
-    }
-}
-
-impl PartialOrd for Candidate {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Candidate {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Candidate {}
+/// An edge that may be drawn together: the bits of its cost, which is at least 0, so that they are in the same order; its
+/// vertices, and how often each had been moved when this was worked out. The one that costs least is the greatest.
+type Candidate = Reverse<(u64, [u32; 2], [u32; 2])>;
 
 /// A mesh of which edges are drawn together.
 struct Work<'a> {
@@ -118,9 +91,9 @@ impl Mesh {
         let mut work = Work::new(self);
         let mut left = all;
         while left > count
-            && let Some(candidate) = work.heap.pop()
+            && let Some(Reverse((_, edge, moved))) = work.heap.pop()
         {
-            let gone = work.collapse(&candidate);
+            let gone = work.collapse(edge, moved);
             if gone > 0 && left / OFTEN != (left - gone) / OFTEN {
                 progress((all - left) as f64 / (all - count) as f64);
             }
@@ -196,26 +169,33 @@ impl<'a> Work<'a> {
         neighbours
     }
 
-    /// Works out what it costs to draw an edge together.
-    fn consider(&mut self, a: u32, b: u32) {
-        let edge = [a.min(b), a.max(b)];
-        let quadric = self.quadrics[a as usize].plus(&self.quadrics[b as usize]);
+    /// What it costs to draw an edge together, and where both vertices go.
+    fn cheapest(&self, edge: [u32; 2]) -> (f64, DVec3) {
+        let quadric = self.quadrics[edge[0] as usize].plus(&self.quadrics[edge[1] as usize]);
         let [from, to] = edge.map(|vertex| self.mesh.positions[vertex as usize]);
         let middle = 0.5 * (from + to);
         // A place far away would be one of a quadric that is nearly flat.
         let lowest = quadric.lowest().filter(|place| place.distance(middle) < 2.0 * from.distance(to));
         let places = [lowest.unwrap_or(middle), from, to];
         let place = places.into_iter().min_by(|a, b| quadric.at(*a).total_cmp(&quadric.at(*b))).unwrap_or(middle);
-        let moved = edge.map(|vertex| self.moved[vertex as usize]);
-        self.heap.push(Candidate { cost: quadric.at(place), edge, place, moved });
+        (quadric.at(place), place)
     }
 
-    /// Draws an edge together, if nothing has changed since it was considered and nothing speaks against it. Says how many
-    /// triangles that takes away.
-    fn collapse(&mut self, candidate: &Candidate) -> usize {
-        let Candidate { edge, place, moved, .. } = *candidate;
-        let [a, b] = edge;
-        if edge.map(|vertex| self.moved[vertex as usize]) != moved || !self.may_collapse(edge, place) {
+    /// Works out what it costs to draw an edge together.
+    fn consider(&mut self, a: u32, b: u32) {
+        let edge = [a.min(b), a.max(b)];
+        let moved = edge.map(|vertex| self.moved[vertex as usize]);
+        self.heap.push(Reverse((self.cheapest(edge).0.to_bits(), edge, moved)));
+    }
+
+    /// Draws an edge together, if its vertices have been moved no more often than `moved` says and nothing speaks against it.
+    /// Says how many triangles that takes away.
+    fn collapse(&mut self, edge: [u32; 2], moved: [u32; 2]) -> usize {
+        if edge.map(|vertex| self.moved[vertex as usize]) != moved {
+            return 0;
+        }
+        let ([a, b], place) = (edge, self.cheapest(edge).1);
+        if !self.may_collapse(edge, place) {
             return 0;
         }
         let gone: Vec<usize> = self.common(a, b).collect();
