@@ -104,7 +104,14 @@ impl<F: Family> Part<F> {
     pub fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<F::Built<T>> {
         self.check()?;
         let Site { space, frames, params, name, rng } = site;
-        let built = self.0.build(space, frames, params, name, rng)?;
+        let params: &mut dyn Any = params;
+        let built: Box<dyn Any> = if let Some(params) = params.downcast_mut() {
+            Box::new(self.0.single(Site { space, frames, params, name, rng })?)
+        } else if let Some(params) = params.downcast_mut() {
+            Box::new(self.0.double(Site { space, frames, params, name, rng })?)
+        } else {
+            return Err(Error::setting(F::WHAT, "can be built in f32 and f64"));
+        };
         match built.downcast() {
             Ok(built) => Ok(*built),
             Err(_) => unreachable!("what is built is of the type of its parameters"),
@@ -118,15 +125,8 @@ trait AnyKind<F: Family>: Any + fmt::Debug + Send + Sync {
     fn check(&self) -> Result<()>;
     fn value(&self) -> serde_json::Result<Value>;
     fn boxed(&self) -> Box<dyn AnyKind<F>>;
-    /// `params` are of `f32` or `f64`, and so is what comes back: a `F::Built`.
-    fn build(
-        &self,
-        space: Space,
-        frames: usize,
-        params: &mut dyn Any,
-        name: &str,
-        rng: &mut dyn Rng,
-    ) -> Result<Box<dyn Any>>;
+    fn single(&self, site: Site<'_, f32>) -> Result<F::Built<f32>>;
+    fn double(&self, site: Site<'_, f64>) -> Result<F::Built<f64>>;
 }
 
 impl<F: Family, K: Kind<F>> AnyKind<F> for K {
@@ -146,21 +146,12 @@ impl<F: Family, K: Kind<F>> AnyKind<F> for K {
         Box::new(self.clone())
     }
 
-    fn build(
-        &self,
-        space: Space,
-        frames: usize,
-        params: &mut dyn Any,
-        name: &str,
-        rng: &mut dyn Rng,
-    ) -> Result<Box<dyn Any>> {
-        if let Some(params) = params.downcast_mut::<Params<f32>>() {
-            return Ok(Box::new(Kind::build(self, Site { space, frames, params, name, rng })?));
-        }
-        match params.downcast_mut::<Params<f64>>() {
-            Some(params) => Ok(Box::new(Kind::build(self, Site { space, frames, params, name, rng })?)),
-            None => Err(Error::setting(F::WHAT, "can be built in f32 and f64")),
-        }
+    fn single(&self, site: Site<'_, f32>) -> Result<F::Built<f32>> {
+        self.build(site)
+    }
+
+    fn double(&self, site: Site<'_, f64>) -> Result<F::Built<f64>> {
+        self.build(site)
     }
 }
 

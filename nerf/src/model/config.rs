@@ -118,7 +118,7 @@ pub struct Config {
     #[serde(default)]
     pub loss: Loss,
     /// What is minimised beside it.
-    #[serde(default, deserialize_with = "super::known::read_terms")]
+    #[serde(default, deserialize_with = "super::known::read")]
     pub terms: Vec<TermConfig>,
     /// Learning rate over the run.
     pub schedule: Schedule,

@@ -1,9 +1,9 @@
 //! The fields, samplers and terms of this crate, by name: one line for each.
 
 use crate::field::{ClassicConfig, Fields, InstantConfig, VoxelConfig};
-use crate::kind::{Family, Part, register};
+use crate::kind::register;
+use crate::losses::Terms;
 use crate::losses::{DepthConfig, DistortionConfig, EntropyConfig, OrientationConfig, TotalVariationConfig};
-use crate::losses::{TermConfig, Terms};
 use crate::sampling::Samplers;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -28,14 +28,8 @@ fn register_all() {
     });
 }
 
-/// Reads a part of a configuration, which may be one of this crate's.
-pub(super) fn read<'de, F: Family, D: Deserializer<'de>>(deserializer: D) -> Result<Part<F>, D::Error> {
+/// Reads what holds parts of a configuration, which may be of this crate.
+pub(super) fn read<'de, V: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<V, D::Error> {
     register_all();
-    Part::deserialize(deserializer)
-}
-
-/// As [`read`], for a list of terms.
-pub(super) fn read_terms<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<TermConfig>, D::Error> {
-    register_all();
-    Vec::deserialize(deserializer)
+    V::deserialize(deserializer)
 }
