@@ -18,6 +18,7 @@ use raygrad_autograd::{Pool, Scalar};
 use raygrad_tensor::parallel::Scratch;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
+use std::sync::Arc;
 
 /// Numbers of a [`Marching`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,14 +30,11 @@ pub struct MarchingConfig {
     pub step: f64,
     /// The same at the end of training, if it changes: evenly on a logarithmic scale. Long steps leave samples for more
     /// rays, short ones show fine detail as it is.
-    #[serde(default)]
     pub last_step: Option<f64>,
     /// The same in rendering. Training starts each ray at random, so it fits what finer steps show.
-    #[serde(default = "view_step")]
     pub view_step: f64,
     /// How much longer a step is for each scene unit of distance, 0 to 1: see [`Step::cone`]. 0 is even steps; 1/256 is
     /// customary where a scene goes on beyond its box.
-    #[serde(default)]
     pub cone: f64,
     /// Samples that a training step places on its rays; the number of rays follows.
     pub samples: usize,
@@ -44,13 +42,7 @@ pub struct MarchingConfig {
     /// much.
     pub termination: f64,
     /// How the integral along a ray is approximated; a step is an interval.
-    #[serde(default)]
     pub quadrature: Quadrature,
-}
-
-/// Figures are in docs/benchmarks.md, section Rendering.
-const fn view_step() -> f64 {
-    1.0 / 600.0
 }
 
 impl Default for MarchingConfig {
@@ -60,7 +52,8 @@ impl Default for MarchingConfig {
             occupancy,
             step: 1.0 / 200.0,
             last_step: None,
-            view_step: view_step(),
+            // Figures are in docs/benchmarks.md, section Rendering.
+            view_step: 1.0 / 600.0,
             cone: 0.0,
             samples: 24576,
             termination: 1e-3,
@@ -99,7 +92,7 @@ const GRID_EVERY: u64 = 16;
 const GRID: &str = "occupancy";
 
 /// The occupancy grid and the numbers.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Marching {
     /// The numbers.
     pub config: MarchingConfig,
@@ -110,20 +103,13 @@ pub struct Marching {
     /// How much of training is done, 0 to 1.
     pub progress: f64,
     /// What nobody marches with at the moment.
-    buffers: Scratch<MarchBuffer>,
-}
-
-impl Clone for Marching {
-    fn clone(&self) -> Self {
-        let (progress, pruned) = (self.progress, self.pruned.clone());
-        Marching { progress, pruned, ..Marching::new(self.config.clone(), self.grid.clone()) }
-    }
+    buffers: Arc<Scratch<MarchBuffer>>,
 }
 
 impl Marching {
     /// Marching through a grid, before training.
     pub fn new(config: MarchingConfig, grid: OccupancyGrid) -> Self {
-        Marching { config, grid, pruned: None, progress: 0.0, buffers: Scratch::default() }
+        Marching { config, grid, pruned: None, progress: 0.0, buffers: Arc::default() }
     }
 
     /// The length of a training step in scene units, now.
