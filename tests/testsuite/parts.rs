@@ -361,7 +361,8 @@ fn a_budget_of_time_is_measured_by_the_clock_that_is_given_and_not_while_others_
     let tick = clock.clone();
     // Every look at the clock takes a second.
     let now = move || Duration::from_secs(tick.fetch_add(1, Relaxed));
-    let mut trainer = Trainer::with_clock(instant(), DATA.clone(), now).unwrap();
+    let extent = Extent::new(DATA.bounds, [DATA.near, DATA.far]);
+    let mut trainer = Trainer::with_clock(instant(), DATA.clone(), extent, now).unwrap();
     let mut seen = vec![];
     trainer.run(Budget::Time(Duration::from_secs(11)), |trainer| {
         clock.fetch_add(1000, Relaxed); // an observer that takes its time

@@ -32,7 +32,7 @@ pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Ca
     };
     let photographs = Arc::new(photographs);
     // No time is measured.
-    let mut trainer = Trainer::within(config, photographs.clone(), model.extent, || Duration::ZERO)?;
+    let mut trainer = Trainer::with_clock(config, photographs.clone(), model.extent, || Duration::ZERO)?;
     let params = &mut trainer.model.params;
     let ids: Vec<_> = params.ids().filter(|id| params.name(*id) != POSES).collect();
     for id in ids {

@@ -7,7 +7,7 @@ use crate::model::Extent;
 use crate::model::Model;
 use crate::model::config::Config;
 use crate::{Error, Result};
-use raygrad_nn::{ParamsError, Storage};
+use raygrad_nn::Storage;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
@@ -59,6 +59,10 @@ fn part(number: usize) -> String {
     format!("optimizer.{number}")
 }
 
+fn failed(what: impl ToString) -> Error {
+    Error::setting("state", what)
+}
+
 impl Trainer {
     /// All that the next steps depend on, beside the configuration and the photographs, as a safetensors file: parameters in
     /// full and what was said of them, what the optimiser and the sampler remember, the step, the training time and the
@@ -67,7 +71,6 @@ impl Trainer {
     /// # Errors
     /// If the format cannot hold it.
     pub fn state(&self) -> Result<Vec<u8>> {
-        let failed = |what: String| Error::setting("state", what);
         let params = &self.model.params;
         let optimizer = self.groups.state(params)?;
         let setting = |id| Setting {
@@ -89,13 +92,13 @@ impl Trainer {
             groups: 1,
             settings: params.ids().map(setting).collect(),
         };
-        let counts = serde_json::to_vec(&counts).map_err(|error| failed(error.to_string()))?;
+        let counts = serde_json::to_vec(&counts).map_err(failed)?;
         let mut blobs = self.model.sampler.training_state();
         let name = part(0);
         blobs.extend([(TRAINER, counts), (&name, optimizer)]);
         let metadata = BTreeMap::from([("format".into(), "raygrad training".into())]);
         let bytes = params.to_safetensors(Storage::Full, &metadata, &blobs);
-        bytes.map_err(|error: ParamsError| failed(error.to_string()))
+        bytes.map_err(failed)
     }
 
     /// Goes on from a [state](Self::state) of a trainer of the same configuration and photographs: the next steps are what
@@ -121,7 +124,6 @@ impl Trainer {
     /// # Errors
     /// If the bytes are no such state, or one of another configuration.
     pub fn load_state(&mut self, state: &[u8]) -> Result<()> {
-        let failed = |what: String| Error::setting("state", what);
         let (mut model, counts, mut blobs) = self.model.restored(state)?;
         if !(1..=MOST_RAYS).contains(&counts.batch) {
             return Err(failed(format!("has steps of {} rays; use 1 to {MOST_RAYS}", counts.batch)));
@@ -143,7 +145,7 @@ impl Trainer {
             model.params.set_rate(is_own, *rate);
             model.params.set_decay(is_own, *decay);
         }
-        let missing = || failed("lacks what an optimiser remembers".into());
+        let missing = || failed("lacks what an optimiser remembers");
         let remembered: Vec<Vec<u8>> =
             (0..counts.groups).map(|i| blobs.remove(&part(i)).ok_or_else(missing)).collect::<Result<_>>()?;
         let mut groups = Groups::new(&model.config, &model.params)?;
@@ -184,15 +186,14 @@ impl Model<f32> {
 
     /// The model of a state, what is said of the run beside it, and what was not used yet.
     fn restored(&self, state: &[u8]) -> Result<(Self, Counts, HashMap<String, Vec<u8>>)> {
-        let failed = |what: String| Error::setting("state", what);
         let mut model = self.clone();
-        let mut blobs = model.params.load_safetensors(state).map_err(|error| failed(error.to_string()))?;
+        let mut blobs = model.params.load_safetensors(state).map_err(failed)?;
         let Some(counts) = blobs.remove(TRAINER) else {
-            return Err(failed("holds a model, and not a run that can go on".into()));
+            return Err(failed("holds a model, and not a run that can go on"));
         };
-        let counts: Counts = serde_json::from_slice(&counts).map_err(|error| failed(error.to_string()))?;
+        let counts: Counts = serde_json::from_slice(&counts).map_err(failed)?;
         if counts.config != self.config || counts.extent != self.extent {
-            return Err(failed("is that of another configuration, or of other photographs".into()));
+            return Err(failed("is that of another configuration, or of other photographs"));
         }
         if !(0.0..=1.0).contains(&counts.detail) {
             return Err(failed(format!("has a share of {} of its detail", counts.detail)));

@@ -81,19 +81,6 @@ impl Trainer {
     /// If the configuration is out of range or not for a scene that [goes so far](Dataset::scope), the dataset has no frame, or no
     /// ray of it [meets the scene's box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
-        let start = Instant::now();
-        Trainer::with_clock(config, data, move || start.elapsed())
-    }
-
-    /// As [`new`](Self::new), with a clock of one's own: the time since some moment, which training time is measured by.
-    ///
-    /// # Errors
-    /// As [`new`](Self::new).
-    pub fn with_clock(
-        config: Config,
-        data: Arc<Dataset>,
-        clock: impl Fn() -> Duration + Send + Sync + 'static,
-    ) -> Result<Self> {
         if data.scope.goes_on() && !config.unbounded {
             let what = "is false, and the photographs show what lies beyond the scene's box; use `Config::with_scope` with \
                         the scope of the dataset";
@@ -106,7 +93,7 @@ impl Trainer {
             return Err(Error::setting("scope", what));
         }
         let extent = Extent { placement: data.placement, ndc, ..Extent::new(data.bounds, [data.near, data.far]) };
-        Trainer::within(config, data, extent, clock)
+        Trainer::with_extent(config, data, extent)
     }
 
     /// As [`new`](Self::new), for a scene that lies as `extent` says, whatever the dataset says: to
@@ -116,11 +103,15 @@ impl Trainer {
     /// As [`new`](Self::new).
     pub fn with_extent(config: Config, data: Arc<Dataset>, extent: Extent) -> Result<Self> {
         let start = Instant::now();
-        Trainer::within(config, data, extent, move || start.elapsed())
+        Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
 
-    /// The same, with a clock.
-    pub(super) fn within(
+    /// As [`with_extent`](Self::with_extent), with a clock of one's own: the time since some moment, which training time is
+    /// measured by.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn with_clock(
         config: Config,
         data: Arc<Dataset>,
         extent: Extent,
@@ -321,11 +312,10 @@ impl Trainer {
 
     /// Begins again with other random parameters.
     fn restart(&mut self) {
-        let config = self.model.config.clone();
         self.done.restarts += 1;
         self.collapses += 1;
-        let seed = config.seed.wrapping_add(u64::from(self.done.restarts) << 32);
-        if let Ok((mut model, _)) = startup::living_model(&config, self.model.extent, self.model.cameras(), seed) {
+        let Model { config, extent, .. } = &self.model;
+        if let Ok((mut model, _)) = startup::living_model(config, *extent, self.model.cameras(), self.seed()) {
             // What was loaded and frozen is not thrown away, and rates are not forgotten.
             model.params.inherit(&self.model.params);
             self.model = model;
