@@ -145,12 +145,12 @@ impl<T: Scalar> Model<T> {
     }
 
     /// A camera that took none of the photographs and is given beside theirs, where the model would have it: see
-    /// [`Refine::other_camera`].
+    /// [`Refine::other_cameras`].
     pub fn other_camera(&self, camera: &Camera) -> Camera {
-        self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.other_camera(&self.params, camera))
+        self.other_cameras(std::slice::from_ref(camera)).remove(0)
     }
 
-    /// The same of many: see [`Refine::other_cameras`].
+    /// The same of many: how the photographs' cameras have moved as a whole is found out but once.
     pub fn other_cameras(&self, cameras: &[Camera]) -> Vec<Camera> {
         self.refine.as_ref().map_or_else(|| cameras.to_vec(), |refine| refine.other_cameras(&self.params, cameras))
     }

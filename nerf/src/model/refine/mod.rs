@@ -317,13 +317,8 @@ impl Refine {
         Some(Placement { scale: rest.scale * growth, origin, ..rest })
     }
 
-    /// A camera that took none of the photographs, given beside theirs: moved as they have as a whole and, if one of them is
+    /// Cameras that took none of the photographs, given beside theirs: moved as they have as a whole and, if one of them is
     /// the same but for its pose, with what was found of its focal length and lens.
-    pub fn other_camera<T: Scalar>(&self, params: &Params<T>, camera: &Camera) -> Camera {
-        self.other_cameras(params, std::slice::from_ref(camera)).remove(0)
-    }
-
-    /// The same of many at once: how the photographs' cameras have moved as a whole is found out but once.
     pub fn other_cameras<T: Scalar>(&self, params: &Params<T>, cameras: &[Camera]) -> Vec<Camera> {
         let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
         let similarity = self.similarity(params, &growths);

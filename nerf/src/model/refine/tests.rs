@@ -257,7 +257,7 @@ fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass(
     let pose = Camera::look_at(DVec3::new(0.0, 4.0, 1.0), DVec3::ZERO, DVec3::Z);
     // The fifth is a pinhole, and the picture is twice as large.
     let other = Camera { pose, ..around[4].resized(18, 14) };
-    let found = refine.other_camera(&params, &other);
+    let found = refine.other_cameras(&params, std::slice::from_ref(&other)).remove(0);
     // They have stepped back as well, by the mean of the factors of columns and rows.
     let expected = MIDDLE + 0.3_f64.exp() * (pose.translation - MIDDLE) + moved;
     assert!(found.pose.translation.distance(expected) < 1e-9, "{found:?}");
@@ -266,7 +266,7 @@ fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass(
     assert!(matches!(found.lens, Lens::Brown { k, p } if k[..3] == [0.01, 0.02, 0.0] && p == [0.03, 0.04]));
     // Of a camera that took none of the photographs nothing is known.
     let unknown = Camera { focal: [9.0, 9.0], ..other };
-    let found = refine.other_camera(&params, &unknown);
+    let found = refine.other_cameras(&params, std::slice::from_ref(&unknown)).remove(0);
     assert_eq!((found.focal, found.lens), (unknown.focal, unknown.lens));
 }
 
