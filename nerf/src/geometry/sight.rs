@@ -5,7 +5,7 @@ use crate::camera::rays::Rays;
 use crate::model::Model;
 use crate::rendering::picture::Viewing;
 use crate::volume::render::Evaluations;
-use crate::volume::rounds::{FrontToBack, Part};
+use crate::volume::rounds::{FrontToBack, Stretch};
 use glam::DVec3;
 use raygrad_autograd::Pool;
 use std::f64::consts::LN_2;
@@ -65,7 +65,7 @@ fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>, out: &mut [Option
         // The distance at which the optical depth of each ray is ln 2, and the density there.
         let mut halves: Vec<Option<[f64; 2]>> = vec![None; rays.len()];
         while let Some(round) = followed.round(query, followed.round_size()) {
-            let (Part { samples, pieces }, x) = (&round.part, round.optical_depth.value().as_slice());
+            let (Stretch { samples, pieces }, x) = (&round.stretch, round.optical_depth.value().as_slice());
             for (rows, (ray, _)) in samples.segments.ranges().zip(pieces) {
                 for row in rows {
                     let [t, delta, x] = [samples.t.as_slice(), samples.delta.as_slice(), x].map(|x| f64::from(x[row]));

@@ -7,7 +7,7 @@ use crate::sampling::Limits;
 use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use crate::volume::render::{Evaluations, accumulate};
-use crate::volume::rounds::{FrontToBack, Part, Round};
+use crate::volume::rounds::{FrontToBack, Round, Stretch};
 use crate::volume::weights::Weights;
 use raygrad_autograd::Pool;
 
@@ -57,7 +57,7 @@ fn shade(
     seen: &mut [Seen],
     out: &mut [Pixel],
 ) -> Evaluations {
-    let Round { part: Part { samples, pieces }, density, optical_depth, in_front } = round;
+    let Round { stretch: Stretch { samples, pieces }, density, optical_depth, in_front } = round;
     let before: Vec<f64> = samples.segments.ranges().map(|rows| in_front[rows.start]).collect();
     let weights = query.tape().apply(Weights::behind(samples.segments.clone(), before), &[optical_depth]);
     let (w, t) = (weights.value().as_slice(), samples.t.as_slice());
@@ -105,7 +105,7 @@ fn in_chunks(
 ) -> Evaluations {
     let mut evaluations = Evaluations::default();
     let mut rays = FrontToBack::new(steps, limits.termination.into());
-    while let Some(Part { samples, pieces }) = rays.take(CHUNK, query.tape().pool()) {
+    while let Some(Stretch { samples, pieces }) = rays.take(CHUNK, query.tape().pool()) {
         let seen = rule.render(&of_rays(query, pieces.len()), &samples, 0.0);
         evaluations.density += seen.asked as u64;
         evaluations.color += if let Quadrature::Adaptive { .. } = rule { seen.asked } else { seen.kept } as u64;

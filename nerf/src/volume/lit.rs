@@ -72,7 +72,7 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
     // Of what is found: the number of the sample, and its place among what was asked.
     let (mut found, mut memos, mut sizes) = (Vec::<(u32, [u32; 2])>::new(), vec![], vec![]);
     while let (Some(round), memo) = tape.remember(|| rays.round(query, FIRST_ROUND << memos.len())) {
-        let numbers = round.part.pieces.into_iter().flat_map(|(_, rows)| rows);
+        let numbers = round.stretch.pieces.into_iter().flat_map(|(_, rows)| rows);
         for ((row, sample), depth) in (0..).zip(numbers).zip(&round.in_front) {
             if rays.has_light(*depth) {
                 found.push((sample as u32, [memos.len() as u32, row]));

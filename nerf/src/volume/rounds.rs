@@ -23,16 +23,16 @@ pub(crate) struct FrontToBack<'a, T: Scalar> {
 }
 
 /// The next samples of some rays.
-pub(crate) struct Part<T: Scalar> {
+pub(crate) struct Stretch<T: Scalar> {
     /// The samples: a ray for each of `pieces`.
     pub samples: Samples<T>,
     /// For each ray that still has light its number, and those of its samples; none is empty.
     pub pieces: Vec<(usize, Range<usize>)>,
 }
 
-/// A [`Part`], and what the field says of it.
+/// A [`Stretch`], and what the field says of it.
 pub(crate) struct Round<'t, T: Scalar> {
-    pub part: Part<T>,
+    pub stretch: Stretch<T>,
     pub density: Density<'t, T>,
     /// Optical depth of each sample, `[samples]`.
     pub optical_depth: Var<'t, T>,
@@ -60,29 +60,88 @@ impl<'a, T: Scalar> FrontToBack<'a, T> {
 
     /// At most `count` samples of each ray that still has light; `None` if no ray has any. Who takes them adds their
     /// optical depth to `depths`.
-    pub fn take(&mut self, count: usize, pool: &Pool<T>) -> Option<Part<T>> {
+    pub fn take(&mut self, count: usize, pool: &Pool<T>) -> Option<Stretch<T>> {
         let piece = |(ray, rows): (usize, Range<usize>)| {
             let start = rows.start + self.passed;
             (start < rows.end && self.has_light(self.depths[ray])).then(|| (ray, start..rows.end.min(start + count)))
         };
         let pieces: Vec<_> = self.samples.segments.ranges().enumerate().filter_map(piece).collect();
         self.passed += count;
-        (!pieces.is_empty()).then(|| Part { samples: self.samples.pieces(&pieces, pool), pieces })
+        (!pieces.is_empty()).then(|| Stretch { samples: self.samples.pieces(&pieces, pool), pieces })
     }
 
     /// As [`take`](Self::take), of samples whose density the field is asked for.
     #[track_caller]
     pub fn round<'t>(&mut self, query: &Query<'_, 't, T>, count: usize) -> Option<Round<'t, T>> {
-        let part = self.take(count, query.tape().pool())?;
-        let density = query.density(&part.samples);
-        let optical_depth = density.optical_depth(&part.samples.delta);
-        let (x, mut in_front) = (optical_depth.value().as_slice(), Vec::with_capacity(part.samples.len()));
-        for (rows, (ray, _)) in part.samples.segments.ranges().zip(&part.pieces) {
+        let stretch = self.take(count, query.tape().pool())?;
+        let density = query.density(&stretch.samples);
+        let optical_depth = density.optical_depth(&stretch.samples.delta);
+        let (x, mut in_front) = (optical_depth.value().as_slice(), Vec::with_capacity(stretch.samples.len()));
+        for (rows, (ray, _)) in stretch.samples.segments.ranges().zip(&stretch.pieces) {
             for x in &x[rows] {
                 in_front.push(self.depths[*ray]);
                 self.depths[*ray] += x.to_f64();
             }
         }
-        Some(Round { part, density, optical_depth, in_front })
+        Some(Round { stretch, density, optical_depth, in_front })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::pinhole::Ray;
+    use crate::camera::rays::{Rays, stratified};
+    use crate::field::{Field, Seen};
+    use crate::random::Jitter;
+    use glam::DVec3;
+    use raygrad_autograd::{Tape, Tensor};
+    use raygrad_nn::{Bound, Params};
+
+    /// Nothing before x = 0, and a density of 1 behind.
+    struct Wall;
+
+    impl Field<f64> for Wall {
+        fn density<'t>(&self, _: &Bound<'t, f64>, positions: &Var<'t, f64>) -> Density<'t, f64> {
+            let x = positions.value().as_slice();
+            let value = Tensor::from_fn(&[x.len() / 3], |i| if x[3 * i] > 0.0 { 1.0 } else { 0.0 });
+            Density { value: positions.tape().constant(value), log: false, features: positions.clone() }
+        }
+        fn color<'t>(&self, _: &Bound<'t, f64>, features: &Var<'t, f64>, _: &Seen<'_, 't, f64>) -> Var<'t, f64> {
+            features.clone()
+        }
+    }
+
+    #[test]
+    fn rays_go_on_until_their_light_is_used_up_or_they_end() {
+        let mut rays = Rays::new();
+        for (origin, far) in [(-8.0, 1.0), (0.0, 0.0), (-3.0, 8.0), (0.0, 8.0)] {
+            rays.push(&Ray { origin: DVec3::new(origin, 0.0, 0.0), direction: DVec3::X }, [0.0, far]);
+        }
+        let tape = Tape::new();
+        let params = Params::new().bind(&tape);
+        let query = Query::new(&Wall, &params);
+        let all = stratified(&rays, 8, &mut Jitter::Middle, tape.pool());
+        // The second ray is cut to nothing.
+        let rows: Vec<u32> = (0..32).filter(|row| !(8..16).contains(row)).collect();
+        let samples = all.select(&rows, tape.pool());
+        let mut followed = FrontToBack::new(&samples, 0.02);
+        let mut rounds = vec![];
+        while let Some(round) = followed.round(&query, 3) {
+            let pieces = round.stretch.pieces;
+            rounds.push((pieces.iter().map(|(ray, rows)| (*ray, rows.len())).collect::<Vec<_>>(), round.in_front));
+        }
+        let seen = |rays: &[(usize, usize)], third: [f64; 3], fourth: &[f64]| {
+            (rays.to_vec(), [&vec![0.0; rays[0].1][..], &third[..rays[1].1], fourth].concat())
+        };
+        // A depth of 3.912 leaves a fiftieth: the fourth ray ends within its second round.
+        let expected = [
+            seen(&[(0, 3), (2, 3), (3, 3)], [0.0; 3], &[0.0, 1.0, 2.0]),
+            seen(&[(0, 3), (2, 3), (3, 3)], [0.0, 1.0, 2.0], &[3.0, 4.0, 5.0]),
+            seen(&[(0, 2), (2, 2)], [3.0, 4.0, 0.0], &[]),
+        ];
+        assert_eq!(rounds, expected);
+        assert_eq!(followed.depths, [0.0, 0.0, 5.0, 6.0]);
+        assert!(followed.has_light(3.9) && !followed.has_light(3.92));
     }
 }

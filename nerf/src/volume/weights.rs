@@ -20,14 +20,6 @@ pub struct Weights {
     before: Option<Arc<[f64]>>,
 }
 
-/// What happens to light on its way, for each sample.
-struct Light<T: Scalar> {
-    /// Light that arrives at the sample.
-    transmittance: Tensor<T>,
-    /// Share of it that the sample blocks.
-    alpha: Tensor<T>,
-}
-
 impl Weights {
     /// Of the samples of these rays.
     pub fn new(segments: Segments) -> Self {
@@ -69,16 +61,6 @@ impl Weights {
             |[tau]| (-tau).exp(),
         )
     }
-
-    fn light<T: Scalar>(&self, x: &Tensor<T>, pool: &Pool<T>) -> Light<T> {
-        let alpha = map(
-            [x],
-            pool,
-            #[inline(always)]
-            |[x]| -(-x).expm1(),
-        );
-        Light { transmittance: self.transmittance(x, pool), alpha }
-    }
 }
 
 impl<T: Scalar> Op<T> for Weights {
@@ -98,12 +80,11 @@ impl<T: Scalar> Op<T> for Weights {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let Light { transmittance, alpha } = self.light(x[0], pool);
         map(
-            [&transmittance, &alpha],
+            [&self.transmittance(x[0], pool), x[0]],
             pool,
             #[inline(always)]
-            |[t, a]| t * a,
+            |[t, x]| t * -(-x).expm1(),
         )
     }
 
@@ -113,7 +94,13 @@ impl<T: Scalar> Op<T> for Weights {
 
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (x, pool) = (cx.input(0), cx.pool());
-        let Light { transmittance, alpha } = self.light(x, pool);
+        let transmittance = self.transmittance(x, pool);
+        let alpha = map(
+            [x],
+            pool,
+            #[inline(always)]
+            |[x]| -(-x).expm1(),
+        );
         // e^-x, not 1 - alpha, which has no digits behind an opaque sample.
         let passed = map(
             [x],
