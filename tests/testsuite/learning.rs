@@ -52,7 +52,7 @@ fn voxel() -> Config {
 }
 
 /// The mean PSNR, in dB, of held-out views after so many steps on `train`, and that of blank pictures.
-fn learn(config: Config, steps: u32, train: Dataset, test: &Dataset) -> [f64; 2] {
+fn learn(config: Config, steps: u64, train: Dataset, test: &Dataset) -> [f64; 2] {
     let white = [1.0; 3];
     let mut trainer = Trainer::new(config, Arc::new(train)).unwrap();
     trainer.run(Budget::Steps(steps), |_| ControlFlow::Continue(()));
