@@ -251,6 +251,7 @@ mod tests {
     use super::super::shape::Profile;
     use super::super::{test_cameras, train_cameras, val_cameras};
     use super::*;
+    use crate::shape::Surface;
 
     #[test]
     fn every_view_shows_the_whole_scene() {

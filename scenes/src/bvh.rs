@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::shape::Shape;
+use super::shape::{Shape, Surface};
 use raygrad_nerf::Ray;
 
 /// Where a ray meets a surface.
@@ -23,26 +23,6 @@ const LEAF: usize = 2;
 /// Boxes are padded by this much. A ray within the face of a padded box (0 times infinity: NaN) then has no shape to
 /// meet there, and either answer is right.
 const PADDING: f64 = 1e-9;
-
-/// What a hierarchy asks of a shape.
-pub trait Surface {
-    /// Where a ray first crosses the surface: its distance, positive, and the outward unit normal. A ray that starts
-    /// inside meets the surface where it leaves.
-    fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)>;
-
-    /// The corners of an axis-aligned box around the shape, preferably the smallest.
-    fn bounds(&self) -> [DVec3; 2];
-}
-
-impl Surface for Shape {
-    fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)> {
-        self.intersect(ray)
-    }
-
-    fn bounds(&self) -> [DVec3; 2] {
-        self.bounds()
-    }
-}
 
 /// A binary tree of boxes over shapes, split by the surface area heuristic.
 #[derive(Debug, Clone)]

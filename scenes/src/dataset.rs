@@ -23,24 +23,12 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
         Split::Val => val_cameras(10, size),
         Split::Test => test_cameras(20, size),
     };
-    let frame = |(i, camera): (usize, Camera)| {
-        let image = scene.render(&camera, SAMPLES).color.into();
-        Frame { name: format!("{split}/{i}"), camera, image, mask: None, distances: None }
-    };
     // Room around the model, as a real capture would have it.
     let [low, high] = scene.bounds();
     let bounds = [low - 0.02, high + 0.02];
     let reach = bounds[1].max(-bounds[0]).length();
-    Dataset {
-        frames: cameras.into_iter().enumerate().map(frame).collect(),
-        bounds,
-        near: DISTANCE - reach,
-        far: DISTANCE + reach,
-        scope: Scope::Bounded,
-        ndc: None,
-        placement: Placement::default(),
-        skipped: vec![],
-    }
+    let frames = frames(split, cameras, |camera| scene.render(camera, SAMPLES).color);
+    dataset(frames, bounds, [DISTANCE - reach, DISTANCE + reach], Scope::Bounded)
 }
 
 /// The views of the procedural bulldozer in a landscape that goes out to a thousand units and has a sky: 100 to train on,
@@ -57,16 +45,8 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
 pub fn landscape(split: Split, width: usize) -> Dataset {
     let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
     let bounds = eyes.fold(Landscape::new().bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
-    Dataset {
-        frames: frames(split, width, walk_cameras),
-        bounds: [bounds[0] - 0.02, bounds[1] + 0.02],
-        near: NEAR,
-        far: FAR,
-        scope: Scope::Unbounded,
-        ndc: None,
-        placement: Placement::default(),
-        skipped: vec![],
-    }
+    let frames = outdoors(split, width, walk_cameras);
+    dataset(frames, [bounds[0] - 0.02, bounds[1] + 0.02], [NEAR, FAR], Scope::Unbounded)
 }
 
 /// The same landscape as it is seen ahead from a window before the bulldozer: 30 views to train on, 3 to validate, 6 to test,
@@ -78,29 +58,31 @@ pub fn landscape(split: Split, width: usize) -> Dataset {
 pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
     let near = 0.5;
     let cameras: Vec<Camera> = Split::ALL.into_iter().flat_map(|split| window_cameras(split, 4)).collect();
-    Dataset {
-        frames: frames(split, width, window_cameras),
-        bounds: [DVec3::splat(-1.5), DVec3::splat(1.5)],
-        near,
-        far: FAR,
-        scope: Scope::Forward,
-        // They look ahead.
-        ndc: Ndc::around(&cameras, near).ok(),
-        placement: Placement::default(),
-        skipped: vec![],
-    }
+    let frames = outdoors(split, width, window_cameras);
+    let data = dataset(frames, [DVec3::splat(-1.5), DVec3::splat(1.5)], [near, FAR], Scope::Forward);
+    // They look ahead.
+    Dataset { ndc: Ndc::around(&cameras, near).ok(), ..data }
 }
 
-/// What the cameras of a split see.
-#[track_caller]
-fn frames(split: Split, width: usize, cameras: fn(Split, usize) -> Vec<Camera>) -> Vec<Frame> {
-    assert!(width.is_multiple_of(4), "a width of {width} pixels has no whole number of rows at 4:3");
-    let landscape = Landscape::new();
+fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope: Scope) -> Dataset {
+    Dataset { frames, bounds, near, far, scope, ndc: None, placement: Placement::default(), skipped: vec![] }
+}
+
+/// What cameras of a split see.
+fn frames(split: Split, cameras: Vec<Camera>, render: impl Fn(&Camera) -> Image) -> Vec<Frame> {
     let frame = |(i, camera): (usize, Camera)| {
-        let image = landscape.render(&camera, SAMPLES).into();
+        let image = render(&camera).into();
         Frame { name: format!("{split}/{i}"), camera, image, mask: None, distances: None }
     };
-    cameras(split, width).into_iter().enumerate().map(frame).collect()
+    cameras.into_iter().enumerate().map(frame).collect()
+}
+
+/// What the cameras of a split see of the landscape.
+#[track_caller]
+fn outdoors(split: Split, width: usize, cameras: fn(Split, usize) -> Vec<Camera>) -> Vec<Frame> {
+    assert!(width.is_multiple_of(4), "a width of {width} pixels has no whole number of rows at 4:3");
+    let landscape = Landscape::new();
+    frames(split, cameras(split, width), |camera| landscape.render(camera, SAMPLES))
 }
 
 /// The exact distances to what a camera sees of the [`landscape`]: one channel, along the unit ray through each pixel's

@@ -2,8 +2,7 @@
 
 use glam::{DVec2, DVec3, Vec3Swizzles};
 
-use super::bvh::Surface;
-use super::shape::Shape;
+use super::shape::{Shape, Surface};
 use raygrad_nerf::Ray;
 
 /// A convex solid.

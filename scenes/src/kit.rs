@@ -4,10 +4,9 @@
 
 use glam::{DVec2, DVec3};
 
+use super::paint::linear;
 use super::shade::Material;
-use super::shape::{Axis, Profile, Shape};
-use raygrad_autograd::Formula;
-use raygrad_nerf::SrgbDecode;
+use super::shape::{Axis, Profile, Shape, Surface};
 
 /// Scene units in a stud pitch.
 const PITCH: f64 = 0.113;
@@ -40,8 +39,7 @@ pub const BROWN: Paint = Paint([112, 66, 36], PLASTIC);
 
 impl Paint {
     fn material(self) -> Material {
-        let albedo = self.0.map(|code| SrgbDecode.f([code as f64 / 255.0]));
-        Material { albedo: albedo.into(), roughness: self.1 }
+        Material { albedo: linear(self.0), roughness: self.1 }
     }
 }
 

@@ -130,7 +130,7 @@ impl Landscape {
             let point = ray.at(hit.distance);
             let slant = -hit.normal.dot(ray.direction);
             let (material, openness) = match self.part(&hit) {
-                Part::Bulldozer(material) => (*material, self.openness(&hit, point, &mut last)),
+                Part::Bulldozer(material) => (*material, self.bulldozer.openness(&hit, point, &mut last)),
                 Part::Thing((solid, paint)) => {
                     let footprint = hit.distance * angle / slant.max(1.0 / STEEPEST);
                     let local = solid.local(point);
@@ -144,7 +144,7 @@ impl Landscape {
                     let along = across * (1.0 / (slant * samples)).max(1.0);
                     let albedo = ground(point.xy(), ray.direction.xy().normalize_or_zero(), [along, across]);
                     let near = point.xy().length() < DIMMED;
-                    let openness = if near { self.openness(&hit, point, &mut last) } else { 1.0 };
+                    let openness = if near { self.bulldozer.openness(&hit, point, &mut last) } else { 1.0 };
                     (Material { albedo, roughness: ROUGHNESS }, openness)
                 }
             };
@@ -154,17 +154,6 @@ impl Landscape {
             sum += through_air(light, hit.distance).clamp(DVec3::ZERO, DVec3::ONE);
         }
         (sum / samples).to_array().map(|c| SrgbEncode.f([c]) as f32)
-    }
-
-    /// How much of the sky the bulldozer leaves to a place: sampled, as for the bulldozer alone, once for each run of hits
-    /// on one side of a solid, of which `last` keeps the last.
-    fn openness(&self, hit: &Hit, point: DVec3, last: &mut Option<(Hit, f64)>) -> f64 {
-        let openness = match *last {
-            Some((near, openness)) if near.solid == hit.solid && near.normal.dot(hit.normal) > 0.9 => openness,
-            _ => shade::openness(&self.bulldozer.bvh, point, hit.normal),
-        };
-        *last = Some((*hit, openness));
-        openness
     }
 }
 

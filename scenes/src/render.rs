@@ -68,11 +68,7 @@ impl Scene {
             if i == 0 {
                 centre = Some(hit);
             }
-            let openness = match last {
-                Some((near, openness)) if near.solid == hit.solid && near.normal.dot(hit.normal) > 0.9 => openness,
-                _ => shade::openness(&self.bvh, ray.at(hit.distance), hit.normal),
-            };
-            last = Some((hit, openness));
+            let openness = self.openness(&hit, ray.at(hit.distance), &mut last);
             let light =
                 shade::radiance(|ray| self.bvh.occluded(ray), &self.materials[hit.solid], &ray, &hit, sun, openness);
             // Clamped before the mean, or the edge of a highlight would stay jagged.
@@ -84,6 +80,17 @@ impl Scene {
         }
         let [r, g, b] = (sum / covered as f64).to_array().map(|c| SrgbEncode.f([c]) as f32);
         ([r, g, b, covered as f32 / pattern.0.len() as f32], centre)
+    }
+
+    /// How much of the sky the scene leaves to a place that is hit: sampled once for each run of hits on one side of a solid,
+    /// of which `last` keeps the last.
+    pub(super) fn openness(&self, hit: &Hit, point: DVec3, last: &mut Option<(Hit, f64)>) -> f64 {
+        let openness = match *last {
+            Some((near, openness)) if near.solid == hit.solid && near.normal.dot(hit.normal) > 0.9 => openness,
+            _ => shade::openness(&self.bvh, point, hit.normal),
+        };
+        *last = Some((*hit, openness));
+        openness
     }
 }
 

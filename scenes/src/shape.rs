@@ -7,6 +7,16 @@ use glam::{DVec2, DVec3, Vec3Swizzles};
 
 use raygrad_nerf::Ray;
 
+/// What a ray is traced against.
+pub trait Surface {
+    /// Where a ray first crosses the surface: its distance, positive, and the outward unit normal. A ray that starts
+    /// inside meets the surface where it leaves.
+    fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)>;
+
+    /// The corners of an axis-aligned box around the shape, preferably the smallest.
+    fn bounds(&self) -> [DVec3; 2];
+}
+
 /// A coordinate axis, along which a profile is extruded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Axis {
@@ -111,10 +121,30 @@ impl Shape {
         Shape { axis, span: [start, start + length], profile: Profile::Disc { centre, radius } }
     }
 
-    /// The point where a ray first crosses the surface: its distance, positive, and the outward unit normal.
-    ///
-    /// A ray that starts inside meets the surface where it leaves. One that runs within a face touches the solid.
-    pub fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)> {
+    /// The distance from a point to the surface, negative inside.
+    pub fn distance(&self, point: DVec3) -> f64 {
+        let (p, along) = self.axis.split(point);
+        let across = match &self.profile {
+            Profile::Rectangle { min, max } => outside(((min - p).max(p - max)).to_array()),
+            Profile::Disc { centre, radius } => p.distance(*centre) - radius,
+            Profile::Polygon(corners) => {
+                let (mut nearest, mut inside) = (f64::INFINITY, true);
+                for (a, b) in edges(corners) {
+                    let (edge, from) = (b - a, p - a);
+                    let along = (from.dot(edge) / edge.length_squared()).clamp(0.0, 1.0);
+                    nearest = nearest.min((from - along * edge).length_squared());
+                    inside &= edge.perp_dot(from) >= 0.0;
+                }
+                if inside { -nearest.sqrt() } else { nearest.sqrt() }
+            }
+        };
+        outside([across, (self.span[0] - along).max(along - self.span[1])])
+    }
+}
+
+impl Surface for Shape {
+    /// A ray that runs within a face touches the solid.
+    fn intersect(&self, ray: &Ray) -> Option<(f64, DVec3)> {
         let axis = self.axis;
         let (o, o_along) = axis.split(ray.origin);
         let (d, d_along) = axis.split(ray.direction);
@@ -162,28 +192,7 @@ impl Shape {
         (crossed && t > 0.0).then(|| (t, normal.normalize()))
     }
 
-    /// The distance from a point to the surface, negative inside.
-    pub fn distance(&self, point: DVec3) -> f64 {
-        let (p, along) = self.axis.split(point);
-        let across = match &self.profile {
-            Profile::Rectangle { min, max } => outside(((min - p).max(p - max)).to_array()),
-            Profile::Disc { centre, radius } => p.distance(*centre) - radius,
-            Profile::Polygon(corners) => {
-                let (mut nearest, mut inside) = (f64::INFINITY, true);
-                for (a, b) in edges(corners) {
-                    let (edge, from) = (b - a, p - a);
-                    let along = (from.dot(edge) / edge.length_squared()).clamp(0.0, 1.0);
-                    nearest = nearest.min((from - along * edge).length_squared());
-                    inside &= edge.perp_dot(from) >= 0.0;
-                }
-                if inside { -nearest.sqrt() } else { nearest.sqrt() }
-            }
-        };
-        outside([across, (self.span[0] - along).max(along - self.span[1])])
-    }
-
-    /// The corners of the smallest axis-aligned box around the solid.
-    pub fn bounds(&self) -> [DVec3; 2] {
+    fn bounds(&self) -> [DVec3; 2] {
         let [min, max] = match &self.profile {
             Profile::Rectangle { min, max } => [*min, *max],
             Profile::Disc { centre, radius } => [centre - radius, centre + radius],
