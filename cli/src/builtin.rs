@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use raygrad::nerf::dataset::{Capture, Dataset, Format, Frame, Split, View};
-use raygrad::nerf::glam::DAffine3;
 use raygrad::nerf::{Error, Result};
 use raygrad_scenes::{embedded, landscape};
 
@@ -47,27 +46,9 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
                 path.parent().map_or(Ok(()), make_folder)?;
                 image.to_image().save_png(path)?;
             }
-            views.push(View {
-                name: name.clone(),
-                field: name,
-                image: path,
-                camera: camera.resized(width, height),
-                split: Some(split),
-                mask: None,
-                depth: None,
-                sharpness: None,
-                bounds: None,
-            });
+            let view = View::new(name.as_str(), name.as_str(), camera.resized(width, height));
+            views.push(View { image: path, split: Some(split), ..view });
         }
     }
-    Ok(Capture {
-        folder: folder.unwrap_or(Path::new("")).into(),
-        file: scene.to_string().into(),
-        format,
-        views,
-        points: vec![],
-        points_file: None,
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    })
+    Ok(Capture::new(folder.unwrap_or(Path::new("")), scene.to_string().into(), format, views))
 }

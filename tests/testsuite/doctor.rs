@@ -23,6 +23,9 @@ static PHOTOGRAPHS: LazyLock<Vec<(Split, Camera, Image)>> = LazyLock::new(|| {
     of(Split::Train, 40).chain(of(Split::Test, 8)).collect()
 });
 
+/// The files of these.
+static FILES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| PHOTOGRAPHS.iter().map(|(.., image)| image.to_png()).collect());
+
 /// A capture in a temporary folder, to plant faults in.
 struct Planted {
     folder: TempDir,
@@ -33,32 +36,14 @@ struct Planted {
 impl Planted {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let views = PHOTOGRAPHS.iter().enumerate().map(|(i, (split, camera, image))| {
+        let views = PHOTOGRAPHS.iter().zip(&*FILES).enumerate().map(|(i, ((split, camera, _), file))| {
             let name = format!("{i:02}.png");
             let path = folder.path().join(&name);
-            image.save_png(&path).unwrap();
-            View {
-                field: format!("frames[{i}]"),
-                name,
-                image: Some(path),
-                camera: camera.clone(),
-                split: Some(*split),
-                mask: None,
-                depth: None,
-                sharpness: None,
-                bounds: None,
-            }
+            std::fs::write(&path, file).unwrap();
+            View { image: Some(path), split: Some(*split), ..View::new(name, format!("frames[{i}]"), camera.clone()) }
         });
-        let capture = Capture {
-            folder: folder.path().into(),
-            file: folder.path().join("transforms.json"),
-            format: Format::Transforms,
-            views: views.collect(),
-            points: vec![],
-            points_file: None,
-            aabb_scale: None,
-            applied: DAffine3::IDENTITY,
-        };
+        let capture =
+            Capture::new(folder.path(), folder.path().join("transforms.json"), Format::Transforms, views.collect());
         Planted { folder, capture, scope: None }
     }
 

@@ -59,18 +59,7 @@ mod tests {
         let inside = ["scene/a.png", "scene/within.png", "named/a.png", "scene2/../scene/a.png"];
         let outside = ["c.png", "scene/link.png", "scene/folder/b.png", "scene/../scene2/b.png", "named/link.png"];
         let of = |folder: &str, format: Format| {
-            let (folder, file) = (path(folder), path("cameras"));
-            let (views, points, applied) = (vec![], vec![], Default::default());
-            Root::of_capture(&Capture {
-                folder,
-                file,
-                format,
-                views,
-                points,
-                points_file: None,
-                aabb_scale: None,
-                applied,
-            })
+            Root::of_capture(&Capture::new(&path(folder), path("cameras"), format, vec![]))
         };
         for root in ["scene", "named", "scene/sparse/0", "scene/sparse"] {
             let root = of(root, Format::Colmap).unwrap();

@@ -130,6 +130,16 @@ impl Lens {
         }
     }
 
+    /// The names of the [`coefficients`](Self::coefficients), which OpenCV, COLMAP and nerfstudio share.
+    pub fn coefficient_names(&self) -> &'static [&'static str] {
+        match self {
+            Lens::Pinhole | Lens::Equirectangular => &[],
+            Lens::Brown { .. } => &["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"],
+            Lens::Fisheye { .. } => &["k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1"],
+            Lens::Fov { .. } => &["omega"],
+        }
+    }
+
     /// A lens of this kind with other [`coefficients`](Self::coefficients).
     ///
     /// # Panics

@@ -4,7 +4,7 @@ use super::Split;
 use crate::camera::pinhole::Camera;
 use glam::{DAffine3, DVec3};
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A way to write cameras and images to a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,6 +53,14 @@ pub struct Capture {
     pub applied: DAffine3,
 }
 
+impl Capture {
+    /// These photographs, and nothing else.
+    pub fn new(folder: &Path, file: PathBuf, format: Format, views: Vec<View>) -> Self {
+        let (points, points_file, aabb_scale, applied) = (vec![], None, None, DAffine3::IDENTITY);
+        Capture { folder: folder.to_owned(), file, format, views, points, points_file, aabb_scale, applied }
+    }
+}
+
 /// One photograph, not yet read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
@@ -74,6 +82,14 @@ pub struct View {
     pub sharpness: Option<f64>,
     /// The nearest and farthest depth of points that it shows, if the file says.
     pub bounds: Option<[f64; 2]>,
+}
+
+impl View {
+    /// A photograph of which nothing is known but its name, where the file speaks of it, and its camera.
+    pub fn new(name: impl Into<String>, field: impl Into<String>, camera: Camera) -> Self {
+        let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
+        View { name: name.into(), field: field.into(), image, camera, split, mask, depth, sharpness, bounds }
+    }
 }
 
 /// A point of the scene.

@@ -93,8 +93,8 @@ fn lenses() -> Vec<(Lens, bool)> {
 fn whole_images_there_and_back() {
     for (lens, filled) in lenses() {
         let (mut seen, mut dark) = (0, 0);
-        for row in (0..=2000).step_by(20) {
-            for column in (0..=1500).step_by(20) {
+        for row in (0..=2000).step_by(40) {
+            for column in (0..=1500).step_by(30) {
                 let place = [(f64::from(column) - 750.0) / FOCAL, (f64::from(row) - 1000.0) / FOCAL];
                 let nearest = lens.nearest(place);
                 assert!((nearest.length() - 1.0).abs() < 1e-12, "{lens:?} at {place:?}: {nearest}");
@@ -111,7 +111,7 @@ fn whole_images_there_and_back() {
                 assert!(distance(again, place) * FOCAL < PIXEL, "{lens:?}: {again:?} for {place:?}");
             }
         }
-        assert!((dark == 0) == filled && seen > 1000, "{lens:?}: {seen} seen, {dark} dark");
+        assert!((dark == 0) == filled && seen > 330, "{lens:?}: {seen} seen, {dark} dark");
     }
 }
 

@@ -3,35 +3,25 @@
 use raygrad::nerf::Camera;
 use raygrad::nerf::dataset::{Capture, Format, Split, View};
 use raygrad::nerf::doctor::{FindingKind, examine_cameras};
-use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad::nerf::glam::DVec3;
 use raygrad_test_support::memory::peak;
+use std::path::Path;
 
 /// Photographs with one pose but for the last one, every eighth held out.
 fn capture(count: usize) -> Capture {
     let view = |i: usize| {
         let eye = if i + 1 == count { DVec3::new(9.0, 0.0, 1.0) } else { DVec3::new(4.0, 0.0, 1.0) };
         View {
-            name: format!("images/{i:06}.png"),
-            field: format!("frames[{i}]"),
             image: Some(format!("absent/{i}.png").into()),
-            camera: Camera::from_angle(16, 16, 0.7, Camera::look_at(eye, DVec3::ZERO, DVec3::Z)),
             split: Some(if i.is_multiple_of(8) { Split::Test } else { Split::Train }),
-            mask: None,
-            depth: None,
-            sharpness: None,
-            bounds: None,
+            ..View::new(
+                format!("images/{i:06}.png"),
+                format!("frames[{i}]"),
+                Camera::from_angle(16, 16, 0.7, Camera::look_at(eye, DVec3::ZERO, DVec3::Z)),
+            )
         }
     };
-    Capture {
-        folder: "scene".into(),
-        file: "scene/transforms.json".into(),
-        format: Format::Transforms,
-        views: (0..count).map(view).collect(),
-        points: vec![],
-        points_file: None,
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    }
+    Capture::new(Path::new("scene"), "scene/transforms.json".into(), Format::Transforms, (0..count).map(view).collect())
 }
 
 #[test]

@@ -8,11 +8,11 @@ use super::frames::{Dialect, views};
 use super::json::{self, Object};
 use super::{matrix, paths};
 use crate::camera::lens::Lens;
+use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::frames::Split;
 use crate::error::{Error, Result};
-use glam::DAffine3;
-use serde_json::{Map, Value};
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
 /// How far numbers of cameras may be apart that are the same, as a share of them.
@@ -56,19 +56,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
                 capture.views.append(&mut views);
                 capture.aabb_scale = capture.aabb_scale.or(aabb_scale);
             }
-            None => {
-                let (folder, format, applied) = (folder.to_owned(), Format::Blender, DAffine3::IDENTITY);
-                capture = Some(Capture {
-                    folder,
-                    file,
-                    format,
-                    views,
-                    points: vec![],
-                    points_file: None,
-                    aabb_scale,
-                    applied,
-                });
-            }
+            None => capture = Some(Capture { aabb_scale, ..Capture::new(folder, file, Format::Blender, views) }),
         }
     }
     let what = "is not a dataset in this format: expected a file transforms_train.json, transforms_val.json or \
@@ -98,15 +86,12 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
         if frames.is_empty() {
             continue;
         }
-        let mut top = Map::new();
-        top.insert("camera_angle_x".into(), angle.into());
-        top.insert("w".into(), first.camera.width.into());
-        top.insert("h".into(), first.camera.height.into());
+        let Camera { width, height, .. } = first.camera;
+        let mut top = json!({ "camera_angle_x": angle, "w": width, "h": height, "frames": frames });
         if let Some(scale) = capture.aabb_scale {
-            top.insert("aabb_scale".into(), scale.into());
+            top["aabb_scale"] = scale.into();
         }
-        top.insert("frames".into(), frames.into());
-        json::write(&file_of(folder, split), top)?;
+        json::write(&file_of(folder, split), &top)?;
     }
     Ok(())
 }
@@ -144,10 +129,7 @@ fn frame(view: &View) -> Value {
     // Programs for this format put the ending behind the path.
     let path = path.strip_suffix(".png").unwrap_or(&path);
     let prefix = if Path::new(path).is_absolute() { "" } else { "./" };
-    let mut frame = Map::new();
-    frame.insert("file_path".into(), format!("{prefix}{path}").into());
-    frame.insert("transform_matrix".into(), matrix::to_json(view.camera.pose, 4));
-    frame.into()
+    json!({ "file_path": format!("{prefix}{path}"), "transform_matrix": matrix::to_json(view.camera.pose, 4) })
 }
 
 #[cfg(test)]

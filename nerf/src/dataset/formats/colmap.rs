@@ -20,7 +20,6 @@ use crate::dataset::capture::{Capture, Format, Point, View};
 use crate::error::{Error, Result};
 use crate::files::write_atomic;
 use entries::{ImageEntry, Place};
-use glam::DAffine3;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use table::Table;
@@ -76,12 +75,9 @@ pub fn read(folder: &Path) -> Result<Capture> {
 pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()> {
     let table = Table::new(capture, encoding)?;
     let folder = folder.join("sparse").join("0");
-    let mut others = vec!["rigs.bin", "frames.bin", "rigs.txt", "frames.txt"];
-    match encoding {
-        Encoding::Binary => others.extend(["cameras.txt", "images.txt", "points3D.txt"]),
-        Encoding::Text => others.extend(["cameras.bin", "images.bin", "points3D.bin"]),
-    }
-    if let Some(other) = others.iter().map(|name| folder.join(name)).find(|file| file.exists()) {
+    let mut others = ["rigs.bin", "frames.bin", "rigs.txt", "frames.txt"].map(|name| folder.join(name)).to_vec();
+    Encoding::ALL.iter().filter(|other| **other != encoding).for_each(|other| others.extend(other.files(&folder)));
+    if let Some(other) = others.iter().find(|file| file.exists()) {
         return Err(Error::file(other, "belongs to another model in the same folder: move that away first"));
     }
     std::fs::create_dir_all(&folder).map_err(|e| Error::file(&folder, format!("cannot be made: {e}")))?;
@@ -123,15 +119,13 @@ fn parse(
             let what = format!("is {id}, but {} has no such camera", cameras_file.display());
             return Err(place.error(images_file, "camera_id", what));
         };
-        let camera = Camera { pose, ..camera.clone() };
-        let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
-        Ok(View { name, field: place.name(), image, camera, split, mask, depth, sharpness, bounds })
+        Ok(View::new(name, place.name(), Camera { pose, ..camera.clone() }))
     };
     let mut views = images.into_iter().map(view).collect::<Result<Vec<View>>>()?;
     views.sort_by(|a, b| a.name.cmp(&b.name));
-    let (folder, file, format) = (folder.to_owned(), images_file.clone(), Format::Colmap);
     let points_file = Some(points_file.clone()).filter(|_| !points.is_empty());
-    Ok(Capture { folder, file, format, views, points, points_file, aabb_scale: None, applied: DAffine3::IDENTITY })
+    let capture = Capture::new(folder, images_file.clone(), Format::Colmap, views);
+    Ok(Capture { points, points_file, ..capture })
 }
 
 /// That no two entries of a list have the same key.

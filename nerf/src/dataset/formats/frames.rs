@@ -48,15 +48,11 @@ pub(super) fn views(top: &Object<'_>, folder: &Path, dialect: Dialect) -> Result
         };
         let camera = Layers { top, frame }.camera(pose, header, dialect == Dialect::Transforms)?;
         views.push(View {
-            name: name.clone(),
-            field: frame.path.clone(),
             image: image.clone(),
-            camera,
-            split: None,
             mask: beside(frame, folder, "mask_path", image.is_some())?,
             depth: depth(top, frame, folder, image.is_some())?,
             sharpness: frame.number("sharpness")?,
-            bounds: None,
+            ..View::new(name, &frame.path, camera)
         });
     }
     Ok(views)

@@ -15,8 +15,8 @@ pub(super) fn read(file: &Path) -> Result<Value> {
 }
 
 /// Writes a file as a whole. Finite numbers come back bit for bit.
-pub(super) fn write(file: &Path, object: Map<String, Value>) -> Result<()> {
-    let text = serde_json::to_string_pretty(&object);
+pub(super) fn write(file: &Path, object: &Value) -> Result<()> {
+    let text = serde_json::to_string_pretty(object);
     let text = text.map_err(|e| Error::file(file, format!("cannot be written: {e}")))?;
     write_atomic(file, (text + "\n").as_bytes())
 }
@@ -115,13 +115,16 @@ impl<'a> Object<'a> {
         Error::field(self.file, self.field(name), what)
     }
 
+    /// A member that must be `what`, as `read` finds out.
+    fn typed<T>(&self, name: &str, what: &str, read: impl Fn(&'a Value) -> Option<T>) -> Result<Option<T>> {
+        let Some(value) = self.get(name) else { return Ok(None) };
+        let found = read(value).ok_or_else(|| self.error(name, format!("must be {what}, is {}", shown(value))));
+        found.map(Some)
+    }
+
     /// A finite number.
     pub(super) fn number(&self, name: &str) -> Result<Option<f64>> {
-        let Some(value) = self.get(name) else { return Ok(None) };
-        match value.as_f64().filter(|x| x.is_finite()) {
-            Some(x) => Ok(Some(x)),
-            None => Err(self.error(name, format!("must be a finite number, is {}", shown(value)))),
-        }
+        self.typed(name, "a finite number", |value| value.as_f64().filter(|x| x.is_finite()))
     }
 
     /// A number above 0.
@@ -134,17 +137,12 @@ impl<'a> Object<'a> {
 
     /// A string.
     pub(super) fn text(&self, name: &str) -> Result<Option<&'a str>> {
-        let Some(value) = self.get(name) else { return Ok(None) };
-        let text = value.as_str().ok_or_else(|| self.error(name, format!("must be a string, is {}", shown(value))));
-        text.map(Some)
+        self.typed(name, "a string", Value::as_str)
     }
 
     /// Yes or no; numbers count, as in Python.
     pub(super) fn flag(&self, name: &str) -> Result<Option<bool>> {
-        let Some(value) = self.get(name) else { return Ok(None) };
-        let flag = value.as_bool().or_else(|| value.as_f64().map(|x| x != 0.0));
-        let flag = flag.ok_or_else(|| self.error(name, format!("must be true or false, is {}", shown(value))));
-        flag.map(Some)
+        self.typed(name, "true or false", |value| value.as_bool().or_else(|| value.as_f64().map(|x| x != 0.0)))
     }
 }
 

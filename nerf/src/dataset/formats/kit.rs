@@ -4,7 +4,7 @@ use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Format, View};
 use crate::dataset::image::Image;
 use crate::error::Result;
-use glam::{DAffine3, DVec3};
+use glam::DVec3;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -73,24 +73,9 @@ pub(super) fn picture_with_camera(folder: &Path) -> Capture {
     picture(&image, 8, 6);
     let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
     let view = View {
-        name: "0.png".into(),
-        field: "frames[0]".into(),
         image: Some(image),
-        camera: Camera::from_angle(8, 6, 0.9, pose),
-        split: None,
-        mask: None,
-        depth: None,
-        sharpness: None,
         bounds: Some([1.0, 2.0]),
+        ..View::new("0.png", "frames[0]", Camera::from_angle(8, 6, 0.9, pose))
     };
-    Capture {
-        folder: folder.into(),
-        file: folder.join("transforms.json"),
-        format: Format::Transforms,
-        views: vec![view],
-        points: vec![],
-        points_file: None,
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    }
+    Capture::new(folder, folder.join("transforms.json"), Format::Transforms, vec![view])
 }

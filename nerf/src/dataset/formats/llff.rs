@@ -58,22 +58,10 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
         let bad = |what| Error::field(&file, &field, what);
         let row = row.try_into().map_err(|_| bad("must have 17 numbers".into()))?;
         let (camera, bounds) = camera(row).map_err(bad)?;
-        let image = Some(path);
-        let (split, mask, depth, sharpness) = (None, None, None, None);
-        Ok(View { name, field, image, camera, split, mask, depth, sharpness, bounds: Some(bounds) })
+        Ok(View { image: Some(path), bounds: Some(bounds), ..View::new(name, field, camera) })
     });
     let views = views.collect::<Result<_>>()?;
-    let (folder, format) = (folder.to_owned(), Format::Llff);
-    Ok(Capture {
-        folder,
-        file,
-        format,
-        views,
-        points: vec![],
-        points_file: None,
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    })
+    Ok(Capture::new(folder, file, Format::Llff, views))
 }
 
 /// The camera of a row, and the depths that it shows.

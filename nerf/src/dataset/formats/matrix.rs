@@ -1,12 +1,10 @@
 //! Matrices of transforms in JSON: three or four rows of four numbers.
 
 use super::json::{Object, shown};
+use super::rigid::{TOLERANCE, is_orthonormal, rotation};
 use crate::error::Result;
 use glam::{DAffine3, DMat3, DVec3};
 use serde_json::{Value, json};
-
-/// How far an entry of a pose may be from that of a rigid motion. Files carry rounding of about 1e-6.
-const RIGID_TOLERANCE: f64 = 1e-3;
 
 /// An affine transform, whatever it does, so long as it can be undone.
 pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>> {
@@ -38,7 +36,7 @@ fn rows(matrix: &Value) -> std::result::Result<DAffine3, String> {
             m[r][c] = finite.ok_or_else(what)?;
         }
     }
-    if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| (value - expected).abs() > RIGID_TOLERANCE) {
+    if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| (value - expected).abs() > TOLERANCE) {
         return Err(format!("the last row must be 0 0 0 1, is {} {} {} {}", m[3][0], m[3][1], m[3][2], m[3][3]));
     }
     let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
@@ -48,21 +46,15 @@ fn rows(matrix: &Value) -> std::result::Result<DAffine3, String> {
 /// The transform if it is a rotation and a translation; or what is wrong with it.
 fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     let m = transform.matrix3;
-    let off =
-        |m: DMat3| (m.transpose() * m - DMat3::IDENTITY).to_cols_array().iter().any(|x| !(x.abs() <= RIGID_TOLERANCE));
-    if off(m) {
-        let scale = (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0;
-        if scale > 0.0 && scale.is_finite() && !off(m * scale.recip()) {
-            return Err(format!(
-                "the upper left 3x3 must be a rotation, but it also scales by {scale:.6}: divide these nine numbers by \
-                 that, and leave the position in the last column as it is"
-            ));
-        }
-        return Err("the upper left 3x3 must be a rotation, but its columns are not orthonormal to 1e-3".to_owned());
+    let scale = (m.x_axis.length() + m.y_axis.length() + m.z_axis.length()) / 3.0;
+    let scales = scale > 0.0 && scale.is_finite() && is_orthonormal(&(m * scale.recip()), TOLERANCE);
+    if scales && !is_orthonormal(&m, TOLERANCE) {
+        return Err(format!(
+            "the upper left 3x3 must be a rotation, but it also scales by {scale:.6}: divide these nine numbers by \
+             that, and leave the position in the last column as it is"
+        ));
     }
-    if m.determinant() < 0.0 {
-        return Err("the upper left 3x3 must be a rotation, but it mirrors: its determinant is -1".to_owned());
-    }
+    rotation(&m).map_err(|what| format!("the upper left 3x3 {what}"))?;
     Ok(transform)
 }
 

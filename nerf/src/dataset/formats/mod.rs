@@ -11,6 +11,7 @@ mod lens;
 mod limits;
 pub mod llff;
 mod matrix;
+mod models;
 pub(super) mod npy;
 mod paths;
 mod ply;

@@ -14,55 +14,39 @@ const MOST_LINES: usize = 1000;
 /// The colour of points that have none.
 const GREY: [u8; 3] = [128; 3];
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Kind {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
+/// A number of a vertex: its name, how many bytes it takes, and how their bits, the least byte first, are read.
+struct Property {
+    name: String,
+    size: usize,
+    value: fn(u64) -> f64,
+    /// Whether it is a byte without a sign, as colours are.
+    is_byte: bool,
 }
 
-impl Kind {
-    fn named(name: &str) -> Option<Self> {
-        Some(match name {
-            "char" | "int8" => Kind::I8,
-            "uchar" | "uint8" => Kind::U8,
-            "short" | "int16" => Kind::I16,
-            "ushort" | "uint16" => Kind::U16,
-            "int" | "int32" => Kind::I32,
-            "uint" | "uint32" => Kind::U32,
-            "float" | "float32" => Kind::F32,
-            "double" | "float64" => Kind::F64,
+impl Property {
+    /// Of a type of this name, if there is one.
+    fn new(name: &str, kind: &str) -> Option<Self> {
+        let (size, value): (usize, fn(u64) -> f64) = match kind {
+            "char" | "int8" => (1, |bits| f64::from(bits as i8)),
+            "short" | "int16" => (2, |bits| f64::from(bits as i16)),
+            "int" | "int32" => (4, |bits| f64::from(bits as i32)),
+            "uchar" | "uint8" => (1, |bits| bits as f64),
+            "ushort" | "uint16" => (2, |bits| bits as f64),
+            "uint" | "uint32" => (4, |bits| bits as f64),
+            "float" | "float32" => (4, |bits| f64::from(f32::from_bits(bits as u32))),
+            "double" | "float64" => (8, f64::from_bits),
             _ => return None,
-        })
+        };
+        Some(Property { name: name.to_owned(), size, value, is_byte: matches!(kind, "uchar" | "uint8") })
     }
 
-    fn size(self) -> usize {
-        match self {
-            Kind::I8 | Kind::U8 => 1,
-            Kind::I16 | Kind::U16 => 2,
-            Kind::I32 | Kind::U32 | Kind::F32 => 4,
-            Kind::F64 => 8,
-        }
-    }
-
-    /// The number in the first bytes, of which there are [`size`](Self::size).
-    fn decode(self, bytes: &[u8]) -> f64 {
+    /// The number in the first bytes, which are taken off.
+    fn take(&self, bytes: &mut &[u8]) -> f64 {
+        let (own, rest) = bytes.split_at(self.size);
+        *bytes = rest;
         let mut word = [0; 8];
-        word[..self.size()].copy_from_slice(&bytes[..self.size()]);
-        let bits = u64::from_le_bytes(word);
-        match self {
-            Kind::I8 => f64::from(bits as i8),
-            Kind::I16 => f64::from(bits as i16),
-            Kind::I32 => f64::from(bits as i32),
-            Kind::U8 | Kind::U16 | Kind::U32 => bits as f64,
-            Kind::F32 => f64::from(f32::from_bits(bits as u32)),
-            Kind::F64 => f64::from_bits(bits),
-        }
+        word[..self.size].copy_from_slice(own);
+        (self.value)(u64::from_le_bytes(word))
     }
 }
 
@@ -71,7 +55,7 @@ struct Header {
     ascii: bool,
     count: u64,
     /// What a vertex has, in order.
-    properties: Vec<(String, Kind)>,
+    properties: Vec<Property>,
 }
 
 /// A line without its end, or what is wrong.
@@ -112,8 +96,8 @@ impl Header {
                 // What comes after the vertices is not read.
                 ["element", ..] if count.is_some() => vertex = false,
                 ["element", name, ..] => return Err(format!("has `{}` before its vertices", cut(name))),
-                ["property", kind, name] if vertex => match Kind::named(kind) {
-                    Some(kind) => properties.push((name.to_owned(), kind)),
+                ["property", kind, name] if vertex => match Property::new(name, kind) {
+                    Some(property) => properties.push(property),
                     None => return Err(format!("has a property `{}` of the unknown type `{}`", cut(name), cut(kind))),
                 },
                 ["property", ..] if !vertex && count.is_some() => {}
@@ -131,7 +115,7 @@ impl Header {
     }
 
     fn index(&self, name: &str) -> Option<usize> {
-        self.properties.iter().position(|(given, _)| given == name)
+        self.properties.iter().position(|property| property.name == name)
     }
 
     /// Where `names` are among the properties: all, or `None`; or what is wrong.
@@ -164,10 +148,10 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
     let header = Header::read(reader)?;
     let position = header.all(["x", "y", "z"])?.ok_or("has no properties x, y and z of its vertices")?;
     let color = header.all(["red", "green", "blue"])?;
-    if color.is_some_and(|color| color.iter().any(|&i| header.properties[i].1 != Kind::U8)) {
+    if color.is_some_and(|color| color.iter().any(|&i| !header.properties[i].is_byte)) {
         return Err("has colours that are not of the type uchar".to_owned());
     }
-    let stride: usize = header.properties.iter().map(|(_, kind)| kind.size()).sum();
+    let stride: usize = header.properties.iter().map(|property| property.size).sum();
     // In text a number takes a character and a space.
     let least = if header.ascii { 2 * header.properties.len() } else { stride } as u64;
     if header.count.checked_mul(least).is_none_or(|bytes| bytes > length.saturating_add(1)) {
@@ -179,7 +163,7 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
         if header.ascii {
             let line = line(reader).map_err(|what| format!("{what}: after {i} of {} vertices", header.count))?;
             let mut words = line.split_whitespace();
-            for (value, (name, _)) in values.iter_mut().zip(&header.properties) {
+            for (value, Property { name, .. }) in values.iter_mut().zip(&header.properties) {
                 let number = words.next().and_then(|word| word.parse().ok());
                 *value = number.ok_or_else(|| format!("has a vertex {i} without a number for {name:.20}"))?;
             }
@@ -187,10 +171,7 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
             let whole = reader.read_exact(&mut bytes);
             whole.map_err(|e| format!("ends after {i} of {} vertices: {e}", header.count))?;
             let mut rest = &bytes[..];
-            for (value, (_, kind)) in values.iter_mut().zip(&header.properties) {
-                *value = kind.decode(rest);
-                rest = &rest[kind.size()..];
-            }
+            values.iter_mut().zip(&header.properties).for_each(|(value, property)| *value = property.take(&mut rest));
         }
         let position = DVec3::from_array(position.map(|i| values[i]));
         if !position.is_finite() {

@@ -5,6 +5,11 @@ use glam::{DAffine3, DMat3};
 /// How far an entry of `R' R` may be from that of the identity. Files carry rounding of about 1e-6.
 pub(crate) const TOLERANCE: f64 = 1e-3;
 
+/// Whether no entry of `R' R` is farther than this from that of the identity.
+pub(crate) fn is_orthonormal(matrix: &DMat3, tolerance: f64) -> bool {
+    (matrix.transpose() * *matrix - DMat3::IDENTITY).to_cols_array().iter().all(|x| x.abs() <= tolerance)
+}
+
 /// What is wrong with a matrix that should be a rotation, as the end of a sentence that begins with its name.
 ///
 /// # Errors
@@ -13,8 +18,7 @@ pub fn rotation(matrix: &DMat3) -> Result<(), String> {
     if !matrix.is_finite() {
         return Err("must be a rotation, but an entry is not a finite number".to_owned());
     }
-    let excess = matrix.transpose() * *matrix - DMat3::IDENTITY;
-    if !excess.to_cols_array().iter().all(|value| value.abs() <= TOLERANCE) {
+    if !is_orthonormal(matrix, TOLERANCE) {
         return Err("must be a rotation, but its columns are not orthonormal to 1e-3".to_owned());
     }
     if matrix.determinant() < 0.0 {

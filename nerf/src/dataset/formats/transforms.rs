@@ -52,8 +52,8 @@ pub fn read(folder: &Path) -> Result<Capture> {
     let points_file = points_file.filter(|file| file.is_file());
     // Its points are in the coordinates of the file: nerfstudio has transformed them along with the cameras.
     let points = points_file.as_deref().map_or(Ok(vec![]), ply::read)?;
-    let (folder, format) = (folder.to_owned(), Format::Transforms);
-    Ok(Capture { folder, file, format, views, points, points_file, aabb_scale, applied })
+    let capture = Capture::new(folder, file.clone(), Format::Transforms, views);
+    Ok(Capture { points, points_file, aabb_scale, applied, ..capture })
 }
 
 /// The field that lists the photographs of a split.
@@ -152,19 +152,18 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
         write_atomic(folder.join(POINTS), &ply::to_bytes(&capture.points))?;
         top.insert("ply_file_path".into(), POINTS.into());
     }
-    json::write(&file, top)
+    json::write(&file, &top.into())
 }
 
 /// # Errors
 /// If a number of the camera is not finite, or it has no size.
 fn check(view: &View, file: &Path) -> Result<()> {
     let Camera { width, height, focal, centre, lens, pose } = &view.camera;
-    let mut coefficients = Map::new();
-    lens::write(lens, lens::model(lens), &mut coefficients);
-    let numbers = focal.iter().chain(centre).all(|x| x.is_finite()) && pose.is_finite();
+    let coefficients = lens.coefficients();
+    let numbers = focal.iter().chain(centre).chain(&coefficients).all(|x| x.is_finite()) && pose.is_finite();
     let unit = view.depth.as_ref().is_none_or(|(_, unit)| unit.is_finite());
     // JSON has no other numbers than finite ones: the rest becomes null.
-    if !numbers || !unit || coefficients.values().any(Value::is_null) || *width == 0 || *height == 0 {
+    if !numbers || !unit || *width == 0 || *height == 0 {
         let what = format!("cannot be written: the camera of {} has no size or a number that is not finite", view.name);
         return Err(Error::file(file, what));
     }
@@ -227,6 +226,3 @@ fn write_splits(views: &[View], top: &mut Map<String, Value>) {
 
 #[cfg(test)]
 mod tests;
-
-#[cfg(test)]
-mod writing;

@@ -15,27 +15,11 @@ fn capture(folder: &Path, count: usize) -> Capture {
         let eye = DVec3::new(i as f64, 3.0, 1.0);
         let camera = Camera::from_angle(24, 16, 0.8, Camera::look_at(eye, DVec3::ZERO, DVec3::Z));
         View {
-            field: format!("frames[{i}]"),
             image: (i != 2).then_some(path),
-            camera: Camera { centre: [13.0, 7.0], ..camera },
-            split: None,
-            mask: None,
-            depth: None,
-            sharpness: None,
-            bounds: None,
-            name,
+            ..View::new(name, format!("frames[{i}]"), Camera { centre: [13.0, 7.0], ..camera })
         }
     };
-    Capture {
-        folder: folder.into(),
-        file: folder.join("transforms.json"),
-        format: Format::Transforms,
-        views: (0..count).rev().map(view).collect(),
-        points: vec![],
-        points_file: None,
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    }
+    Capture::new(folder, folder.join("transforms.json"), Format::Transforms, (0..count).rev().map(view).collect())
 }
 
 fn numbers(views: &[&View]) -> Vec<String> {

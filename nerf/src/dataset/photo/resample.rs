@@ -21,7 +21,7 @@ impl Photo {
     #[track_caller]
     pub fn resampled(&self, [width, height]: [usize; 2], from: impl Fn([f64; 2]) -> [f64; 2]) -> Photo {
         assert!(width > 0 && height > 0, "a {width}x{height} photograph has no pixels");
-        let places = Places::new([width, height], from);
+        let places = places([width, height], from);
         let values = match &self.values {
             Values::Bytes(values) => Values::Bytes(self.at(values, places)),
             Values::Words(values) => Values::Words(self.at(values, places)),
@@ -61,46 +61,23 @@ struct Place {
     down: [f64; 2],
 }
 
-/// The places of all pixels row by row. Each is asked for once: steps are the differences of neighbours.
-struct Places<F> {
-    from: F,
-    size: [usize; 2],
-    /// Of the row before, this and the next; each with a pixel more on either side.
-    rows: [Vec<[f64; 2]>; 3],
-    x: usize,
-    y: usize,
-}
-
-impl<F: Fn([f64; 2]) -> [f64; 2]> Places<F> {
-    fn new(size: [usize; 2], from: F) -> Self {
-        let rows = [-0.5, 0.5, 1.5].map(|y| row(&from, size[0], y));
-        Places { from, size, rows, x: 0, y: 0 }
-    }
-}
-
-/// The places of a row at this height, from the one before the first pixel to the one after the last.
-fn row(from: &impl Fn([f64; 2]) -> [f64; 2], width: usize, y: f64) -> Vec<[f64; 2]> {
-    (0..width + 2).map(|x| from([x as f64 - 0.5, y])).collect()
-}
-
-impl<F: Fn([f64; 2]) -> [f64; 2]> Iterator for Places<F> {
-    type Item = Place;
-
-    fn next(&mut self) -> Option<Place> {
-        if self.x == self.size[0] {
-            (self.x, self.y) = (0, self.y + 1);
-            self.rows.rotate_left(1);
-            self.rows[2] = row(&self.from, self.size[0], self.y as f64 + 1.5);
-        }
-        if self.y == self.size[1] {
-            return None;
-        }
-        let at = self.x + 1;
+/// The places of all pixels row by row. `from` is asked for each once: steps are the differences of neighbours.
+fn places([width, height]: [usize; 2], from: impl Fn([f64; 2]) -> [f64; 2]) -> impl Iterator<Item = Place> {
+    // From the one before the first pixel to the one after the last.
+    let row = move |y: f64| -> Vec<[f64; 2]> { (0..width + 2).map(|x| from([x as f64 - 0.5, y])).collect() };
+    let mut rows = [vec![], row(-0.5), row(0.5)];
+    (0..height).flat_map(move |y| {
+        rows.rotate_left(1);
+        rows[2] = row(y as f64 + 1.5);
         let half = |a: [f64; 2], b: [f64; 2]| [0.5 * (b[0] - a[0]), 0.5 * (b[1] - a[1])];
-        let [above, this, below] = &self.rows;
-        self.x += 1;
-        Some(Place { middle: this[at], across: half(this[at - 1], this[at + 1]), down: half(above[at], below[at]) })
-    }
+        let [above, this, below] = &rows;
+        let place = |x: usize| Place {
+            middle: this[x],
+            across: half(this[x - 1], this[x + 1]),
+            down: half(above[x], below[x]),
+        };
+        (1..=width).map(place).collect::<Vec<_>>()
+    })
 }
 
 /// Pixels with weights that may be negative.

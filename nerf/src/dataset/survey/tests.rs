@@ -1,6 +1,5 @@
 use super::*;
-use glam::DAffine3;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 fn camera(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
     Camera { focal: [500.0, 250.0], ..Camera::from_angle(400, 300, 0.8, Camera::look_at(eye, target, up)) }
@@ -8,26 +7,15 @@ fn camera(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
 
 fn capture(format: Format, cameras: Vec<Camera>) -> Capture {
     let view = |(i, camera): (usize, Camera)| View {
-        name: format!("{i}.png"),
-        field: format!("frames[{i}]"),
         image: Some(PathBuf::from(format!("{i}.png"))),
-        camera,
-        split: None,
-        mask: None,
-        depth: None,
-        sharpness: None,
-        bounds: None,
+        ..View::new(format!("{i}.png"), format!("frames[{i}]"), camera)
     };
-    Capture {
-        folder: "scene".into(),
-        file: "scene/transforms.json".into(),
+    Capture::new(
+        Path::new("scene"),
+        "scene/transforms.json".into(),
         format,
-        views: cameras.into_iter().enumerate().map(view).collect(),
-        points: vec![],
-        points_file: None,
-        aabb_scale: None,
-        applied: DAffine3::IDENTITY,
-    }
+        cameras.into_iter().enumerate().map(view).collect(),
+    )
 }
 
 const CENTRE: DVec3 = DVec3::new(10.0, 20.0, 5.0);

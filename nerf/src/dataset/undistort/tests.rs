@@ -37,17 +37,7 @@ fn taken(camera: &Camera, path: &Path) {
 }
 
 fn view(camera: Camera, path: &Path) -> View {
-    View {
-        name: "photo.png".into(),
-        field: "frames[0]".into(),
-        image: Some(path.into()),
-        camera,
-        split: None,
-        mask: None,
-        depth: None,
-        sharpness: None,
-        bounds: None,
-    }
+    View { image: Some(path.into()), ..View::new("photo.png", "frames[0]", camera) }
 }
 
 #[test]

@@ -1,7 +1,7 @@
 use super::*;
 use crate::camera::pinhole::Camera;
 use crate::dataset::formats::kit::{cases, damage, failure, frames, is_whole, picture, remove, says};
-use glam::{DMat3, DVec3};
+use glam::{DAffine3, DMat3, DVec3};
 use proptest::prelude::*;
 use serde_json::json;
 
@@ -162,15 +162,9 @@ fn capture(folder: &Path) -> Capture {
         picture(&image, 8, 6);
         let pose = DAffine3 { matrix3: DMat3::from_rotation_x(i as f64), translation: DVec3::new(0.1, 0.2, 0.3) };
         View {
-            name: format!("images/r_{i}"),
-            field: "frames[0]".into(),
             image: Some(image),
-            camera: Camera::from_angle(8, 6, 0.8, pose),
             split: Some(Split::ALL[i]),
-            mask: None,
-            depth: None,
-            sharpness: None,
-            bounds: None,
+            ..View::new(format!("images/r_{i}"), "frames[0]", Camera::from_angle(8, 6, 0.8, pose))
         }
     };
     let mut capture = good(|d| d["aabb_scale"] = json!(4));

@@ -1,7 +1,7 @@
 //! COLMAP's `.bin` files: numbers in a row, little-endian, each list after its length.
 
 use super::entries::{CameraEntry, ImageEntry, Place};
-use super::models::Model;
+use super::models;
 use super::table::Table;
 use crate::dataset::capture::Point;
 use crate::error::{Error, Result};
@@ -108,11 +108,10 @@ pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
         let place = Place::Item("cameras", index);
         let id = cursor.u32(place, "camera_id")?;
         let model = cursor.array(place, "model").map(i32::from_le_bytes)?;
-        let model = Model::by_id(model).map_err(|what| place.error(file, "model", what))?;
+        let model = models::by_id(model).map_err(|what| place.error(file, "model", what))?;
         let size = [cursor.u64(place, "width")?, cursor.u64(place, "height")?];
-        let params = model.params.iter().map(|name| cursor.number(place, name));
-        let params = params.collect::<Result<Vec<f64>>>()?;
-        let camera = model.camera(size, &params).map_err(|(member, what)| place.error(file, member, what))?;
+        let params = models::params(model).map(|name| cursor.number(place, name)).collect::<Result<Vec<f64>>>()?;
+        let camera = models::camera(model, size, &params).map_err(|(member, what)| place.error(file, member, what))?;
         cameras.push(CameraEntry { place, id, camera });
     }
     Ok(cameras)
@@ -157,7 +156,7 @@ pub(super) fn encode(table: &Table<'_>) -> [Vec<u8>; 3] {
     cameras.extend((table.cameras.len() as u64).to_le_bytes());
     for camera in &table.cameras {
         cameras.extend(camera.id.to_le_bytes());
-        cameras.extend(camera.model.id.to_le_bytes());
+        cameras.extend(camera.model.id.unwrap_or(-1).to_le_bytes());
         camera.size.iter().for_each(|side| cameras.extend(side.to_le_bytes()));
         numbers(&mut cameras, &camera.params);
     }

@@ -1,8 +1,9 @@
 //! A capture as the tables that COLMAP's files are.
 
+use super::super::models::Model;
 use super::super::rigid;
 use super::encoding::Encoding;
-use super::models::{Model, model_of};
+use super::models::{self, model_of};
 use super::pose;
 use crate::camera::pinhole::Camera;
 use crate::dataset::capture::{Capture, Point, View};
@@ -71,17 +72,17 @@ impl CameraRow {
     fn new(camera: &Camera) -> std::result::Result<Self, String> {
         let (model, params) = model_of(camera)?;
         let size = [camera.width as u64, camera.height as u64];
-        if let Some((name, value)) = model.params.iter().zip(&params).find(|(_, value)| !value.is_finite()) {
+        if let Some((name, value)) = models::params(model).zip(&params).find(|(_, value)| !value.is_finite()) {
             return Err(format!("{name}: must be a finite number, is {value}"));
         }
         // What could not be read again is not written.
-        model.camera(size, &params).map_err(|(member, what)| format!("{member}: {what}"))?;
+        models::camera(model, size, &params).map_err(|(member, what)| format!("{member}: {what}"))?;
         Ok(CameraRow { id: 0, model, size, params })
     }
 
     /// What rows share that may be one.
-    fn key(&self) -> (i32, [u64; 2], Vec<u64>) {
-        (self.model.id, self.size, self.params.iter().map(|param| param.to_bits()).collect())
+    fn key(&self) -> (&'static str, [u64; 2], Vec<u64>) {
+        (self.model.name, self.size, self.params.iter().map(|param| param.to_bits()).collect())
     }
 }
 

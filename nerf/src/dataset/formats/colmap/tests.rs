@@ -1,6 +1,6 @@
 use super::*;
 use crate::camera::lens::Lens;
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DAffine3, DMat3, DQuat, DVec3};
 use std::fs;
 
 mod damaged;

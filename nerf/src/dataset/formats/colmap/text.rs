@@ -2,7 +2,7 @@
 
 use super::super::limits::start;
 use super::entries::{CameraEntry, ImageEntry, Place};
-use super::models::Model;
+use super::models;
 use super::table::Table;
 use crate::dataset::capture::Point;
 use crate::error::{Error, Result};
@@ -71,13 +71,13 @@ fn speaks(line: &Words<'_>) -> bool {
 pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
     let camera = |mut line: Words<'_>| {
         let id = line.integer("CAMERA_ID")?;
-        let model = Model::by_name(line.word("MODEL")?).map_err(|what| line.error("MODEL", what))?;
+        let model = models::by_name(line.word("MODEL")?).map_err(|what| line.error("MODEL", what))?;
         let size = [line.integer("WIDTH")?, line.integer("HEIGHT")?];
-        let params = model.params.iter().map(|name| line.number(name)).collect::<Result<Vec<f64>>>()?;
+        let params = models::params(model).map(|name| line.number(name)).collect::<Result<Vec<f64>>>()?;
         if !line.rest.trim().is_empty() {
-            return Err(line.error("PARAMS", format!("{} has {}, here are more", model.name, model.params.len())));
+            return Err(line.error("PARAMS", format!("{} has {}, here are more", model.name, params.len())));
         }
-        let camera = model.camera(size, &params).map_err(|(member, what)| line.error(member, what))?;
+        let camera = models::camera(model, size, &params).map_err(|(member, what)| line.error(member, what))?;
         Ok(CameraEntry { place: line.place, id, camera })
     };
     lines(file, bytes)?.filter(speaks).map(camera).collect()

@@ -5,6 +5,8 @@ use glam::DVec3;
 use proptest::prelude::*;
 use serde_json::json;
 
+mod writing;
+
 fn document() -> Value {
     json!({ "fl_x": 10.0, "w": 8, "h": 6, "frames": frames(&["./images/0.png", "images/1.png", "images/2.png"]) })
 }
