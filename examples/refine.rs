@@ -14,9 +14,9 @@
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::Schedule;
-use raygrad::nerf::camera::Pose;
+use raygrad::nerf::camera::rotation_matrix;
 use raygrad::nerf::dataset::{Dataset, Placement, Split, evenly_spaced, load};
-use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::model::Refined;
 use raygrad::nerf::pictures::metrics::psnr;
 use raygrad::nerf::{Background, Budget, Camera, Config, Model, Preset, Result, Trainer};
@@ -44,8 +44,8 @@ fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
     let mut wrong = data.clone();
     let (rng, size) = (&mut StdRng::seed_from_u64(7), (data.bounds[1] - data.bounds[0]).max_element());
     for frame in &mut wrong.frames {
-        let turn = Pose::from_vector((degrees.to_radians() * direction(rng)).to_array(), [0.0; 3]);
-        frame.camera.pose.matrix3 = DAffine3::from(turn).matrix3 * frame.camera.pose.matrix3;
+        let turn = rotation_matrix(degrees.to_radians() * direction(rng));
+        frame.camera.pose.matrix3 = turn * frame.camera.pose.matrix3;
         frame.camera.pose.translation += share * size * direction(rng);
         frame.camera.focal = frame.camera.focal.map(|focal| factor * focal);
     }

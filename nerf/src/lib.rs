@@ -31,8 +31,8 @@ pub mod space;
 pub mod training;
 pub mod volume;
 
-pub use camera::{Camera, Lens, Ndc, Pose, Ray, Rays, Samples, clip_span, intersect_box};
-pub use camera::{lens_places, rotation_exp, rotation_log};
+pub use camera::{Camera, Lens, Ndc, Ray, Rays, Samples, clip_span, intersect_box};
+pub use camera::{lens_places, rotation_exp, rotation_matrix};
 #[cfg(any(test, feature = "check"))]
 pub use catalogue::catalogue;
 pub use dataset::{Background, Image, SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};

@@ -2,7 +2,16 @@
 
 use crate::{Error, Result};
 use raygrad_nn::Schedule;
+use serde::Deserialize;
+use serde::de::IntoDeserializer;
+use serde::de::value::{Error as Unknown, StrDeserializer};
 use std::fmt;
+
+/// The variant that files call by this name.
+pub(crate) fn by_name<'a, V: Deserialize<'a>>(name: &'a str) -> Option<V> {
+    let name: StrDeserializer<'a, Unknown> = name.into_deserializer();
+    V::deserialize(name).ok()
+}
 
 /// An error unless `low <= value <= high`.
 pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, low: V, high: V) -> Result<()> {

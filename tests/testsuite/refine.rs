@@ -2,10 +2,10 @@
 
 use raygrad::Real;
 use raygrad::Schedule;
-use raygrad::nerf::camera::Pose;
+use raygrad::nerf::camera::rotation_matrix;
 use raygrad::nerf::dataset::{Dataset, Placement, Split};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
-use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::model::Refined;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::{Camera, Config, InstantConfig, Lens, Model, Preset, Trainer, fitted_cameras};
@@ -44,8 +44,8 @@ fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
     for (i, frame) in wrong.frames.iter_mut().enumerate() {
         let direction =
             |k: f64| DVec3::from([1.0, 2.0, 3.0].map(|j| (k * j * (i as f64 + 1.0) + j * j).sin())).normalize();
-        let turn = Pose::from_vector((degrees.to_radians() * direction(1.7)).to_array(), [0.0; 3]);
-        frame.camera.pose.matrix3 = DAffine3::from(turn).matrix3 * frame.camera.pose.matrix3;
+        let turn = rotation_matrix(degrees.to_radians() * direction(1.7));
+        frame.camera.pose.matrix3 = turn * frame.camera.pose.matrix3;
         frame.camera.pose.translation += share * size * direction(2.9);
         frame.camera.focal = frame.camera.focal.map(|focal| factor * focal);
     }

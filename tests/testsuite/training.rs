@@ -1,10 +1,10 @@
 //! What training can be told beside the photographs: codes, poses, distances, smooth tables, and a run that goes on.
 
 use raygrad::Schedule;
-use raygrad::nerf::camera::Pose;
+use raygrad::nerf::camera::rotation_matrix;
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
-use raygrad::nerf::glam::{DAffine3, DVec3};
+use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::losses::{DepthConfig, Outputs, TotalVariationConfig};
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::sampling::proposal::ProposalConfig;
@@ -188,7 +188,7 @@ fn poses_that_are_off_are_found_in_a_scene_that_is_known() {
     let mut wrong = right.clone();
     for (i, frame) in wrong.frames.iter_mut().enumerate() {
         let [a, b, c] = [1.0, 2.0, 3.0].map(|k| (k * (i as f64 + 1.0)).sin());
-        let turn = DAffine3::from(Pose::from_vector([0.02 * a, -0.03 * b, 0.02 * c], [0.0; 3])).matrix3;
+        let turn = rotation_matrix(DVec3::new(0.02 * a, -0.03 * b, 0.02 * c));
         frame.camera.pose.matrix3 = turn * frame.camera.pose.matrix3;
         frame.camera.pose.translation += 0.04 * DVec3::new(b, c, a);
     }
@@ -236,7 +236,7 @@ fn scene_and_poses_are_learned_together() {
     let mut wrong = right.clone();
     for (i, frame) in wrong.frames.iter_mut().enumerate() {
         let [a, b, c] = [1.0, 2.0, 3.0].map(|k| (k * (i as f64 + 1.0)).sin());
-        let turn = DAffine3::from(Pose::from_vector([0.01 * a, -0.01 * b, 0.01 * c], [0.0; 3])).matrix3;
+        let turn = rotation_matrix(DVec3::new(0.01 * a, -0.01 * b, 0.01 * c));
         frame.camera.pose.matrix3 = turn * frame.camera.pose.matrix3;
     }
     let proposal = ProposalConfig { samples: 16, batch: 512, tile: 64, anneal: 50, ..ProposalConfig::default() };

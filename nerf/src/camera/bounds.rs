@@ -1,6 +1,6 @@
 //! The box that holds a scene, and the part of a ray inside it.
 
-use crate::camera::pinhole::Ray;
+use crate::camera::pinhole::{Camera, Ray};
 use glam::DVec3;
 
 /// The distances at which a ray enters and leaves the box with these lower and upper corners; `None` if it misses.
@@ -31,6 +31,19 @@ pub fn clip_span(ray: &Ray, bounds: [DVec3; 2], [near, far]: [f64; 2]) -> [f64; 
     match intersect_box(ray, bounds) {
         Some([enter, leave]) if enter.max(near) < leave.min(far) => [enter.max(near), leave.min(far)],
         _ => [near, near],
+    }
+}
+
+impl Camera {
+    /// Whether one of so many columns and rows of rays, evenly spaced over the image, meets a box, lower and upper corner,
+    /// between the distances `span`.
+    pub(crate) fn meets(&self, bounds: [DVec3; 2], span: [f64; 2], [columns, rows]: [usize; 2]) -> bool {
+        let place = |i: usize, count: usize, size: usize| (i as f64 + 0.5) / count as f64 * size as f64;
+        (0..columns * rows).any(|i| {
+            let ray = self.ray(place(i % columns, columns, self.width), place(i / columns, rows, self.height));
+            let [enter, leave] = clip_span(&ray, bounds, span);
+            enter < leave
+        })
     }
 }
 

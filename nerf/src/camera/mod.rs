@@ -16,7 +16,6 @@ pub use lens::{Lens, recorded::lens_places};
 pub use ndc::Ndc;
 pub use path::{CameraPath, Curve, Key};
 pub use pinhole::{Camera, Ray};
-pub use pose::Pose;
 pub use rays::{Rays, Samples, stratified};
-pub use rotation::{rotation_exp, rotation_log};
+pub use rotation::{rotation_exp, rotation_matrix};
 pub use spiral::Spiral;

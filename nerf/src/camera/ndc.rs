@@ -1,7 +1,7 @@
 //! Normalised device coordinates: what cameras see that all look the same way, as a cube.
 
 use super::pinhole::Camera;
-use crate::numbers::median;
+use crate::numbers::{mean, median};
 use crate::{Error, Result};
 use glam::{DMat3, DVec2, DVec3, Vec3Swizzles};
 use serde::{Deserialize, Serialize};
@@ -40,7 +40,7 @@ impl Ndc {
     /// in which all that matters is as large as in theirs.
     pub fn around<'a>(cameras: impl IntoIterator<Item = &'a Camera>, near: f64) -> Result<Self> {
         let cameras: Vec<&Camera> = cameras.into_iter().collect();
-        let mean = |of: fn(&Camera) -> DVec3| cameras.iter().map(|c| of(c)).sum::<DVec3>() / cameras.len() as f64;
+        let mean = |of: fn(&Camera) -> DVec3| mean(cameras.iter().map(|camera| of(camera)));
         let bad = |what: &str| Err(Error::setting("scope", format!("forward: {what}; use unbounded")));
         let back = mean(|camera| camera.pose.matrix3.z_axis).normalize();
         // Of a flight to and fro no side is up.

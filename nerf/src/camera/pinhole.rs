@@ -85,6 +85,12 @@ impl Camera {
         Some([x * self.focal[0] + self.centre[0], y * self.focal[1] + self.centre[1]])
     }
 
+    /// Whether a point in world coordinates is seen within the image.
+    pub(crate) fn shows(&self, point: DVec3) -> bool {
+        let [width, height] = [self.width as f64, self.height as f64];
+        self.pixel_of(point).is_some_and(|[x, y]| (0.0..width).contains(&x) && (0.0..height).contains(&y))
+    }
+
     /// Directions of rays along the border of the image, of those that light reaches; of all if it reaches none.
     pub(crate) fn border(&self) -> impl Iterator<Item = DVec3> {
         /// Places along each side.

@@ -1,6 +1,7 @@
 //! The spiral on which local light field fusion shows captures from one side (Mildenhall et al. 2019).
 
 use super::pinhole::Camera;
+use crate::numbers::mean;
 use glam::{DAffine3, DVec3};
 use std::f64::consts::TAU;
 
@@ -28,7 +29,7 @@ impl Spiral {
     /// Around the average of cameras, as far as nine in ten of them go, with a focus of 1; `None` if there are none, or
     /// they do not look the same way, so that they have no average.
     pub fn around(cameras: &[Camera]) -> Option<Self> {
-        let mean = |of: fn(&Camera) -> DVec3| cameras.iter().map(of).sum::<DVec3>() / cameras.len() as f64;
+        let mean = |of: fn(&Camera) -> DVec3| mean(cameras.iter().map(of));
         let (back, up) = (mean(|camera| camera.pose.matrix3.z_axis), mean(|camera| camera.pose.matrix3.y_axis));
         let middle = mean(|camera| camera.pose.translation);
         if !(back.length() >= LEAST_MEAN && up.length() >= LEAST_MEAN) {

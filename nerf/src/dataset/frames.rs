@@ -6,11 +6,11 @@ use super::photo::Photo;
 use super::placement::Placement;
 use super::scope::Scope;
 use crate::camera::Ndc;
-use crate::camera::bounds::clip_span;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
 use crate::numbers::median;
+use crate::range::by_name;
 use glam::DVec3;
 use raygrad_tensor::parallel;
 use serde::{Deserialize, Serialize};
@@ -55,8 +55,8 @@ impl FromStr for Split {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        let named = Split::ALL.into_iter().find(|split| split.name() == text);
-        named.ok_or_else(|| Error::setting("split", format!("must be train, val or test, is `{text}`")))
+        let wrong = || Error::setting("split", format!("must be train, val or test, is `{text}`"));
+        by_name(text).ok_or_else(wrong)
     }
 }
 
@@ -161,14 +161,7 @@ impl Dataset {
     pub fn check_reach(&self, bounds: [DVec3; 2]) -> Result<()> {
         /// Rays that are tried along each side of an image, before all.
         const RAYS: usize = 32;
-        let meets = |camera: &Camera, [columns, rows]: [usize; 2]| {
-            let place = |i: usize, n: usize, size: usize| (i as f64 + 0.5) / n as f64 * size as f64;
-            (0..columns * rows).any(|i| {
-                let [x, y] = [place(i % columns, columns, camera.width), place(i / columns, rows, camera.height)];
-                let [enter, leave] = clip_span(&camera.ray(x, y), bounds, [self.near, self.far]);
-                enter < leave
-            })
-        };
+        let meets = |camera: &Camera, rays: [usize; 2]| camera.meets(bounds, [self.near, self.far], rays);
         let some = self.frames.iter().any(|frame| meets(&frame.camera, [RAYS; 2]));
         // A small box may lie between the rays.
         let found = AtomicBool::new(some);

@@ -12,7 +12,7 @@ use std::path::Path;
 
 mod resample;
 pub(crate) mod save;
-mod sharpness;
+pub(crate) mod sharpness;
 
 /// A photograph of RGB or RGBA values. A pixel takes three or four bytes, or twice as many where the file has 16 bits.
 ///
@@ -106,9 +106,8 @@ impl Photo {
 
     /// The share of pixels that are wholly transparent.
     pub fn transparent_share(&self) -> f64 {
-        let count = self.width * self.height;
-        let clear = (0..count).filter(|pixel| self.pixel(pixel % self.width, pixel / self.width)[3] == 0.0);
-        if self.has_alpha() { clear.count() as f64 / count.max(1) as f64 } else { 0.0 }
+        let clear = self.pixels().filter(|pixel| pixel[3] == 0.0);
+        if self.has_alpha() { clear.count() as f64 / (self.width * self.height).max(1) as f64 } else { 0.0 }
     }
 
     /// How much of its border, one pixel wide, is white, up to what JPEG makes of it: 0 to 1.
@@ -138,6 +137,11 @@ impl Photo {
         }
     }
 
+    /// All [pixels](Self::pixel), row by row.
+    pub fn pixels(&self) -> impl Iterator<Item = [f32; 4]> {
+        (0..self.height).flat_map(move |y| (0..self.width).map(move |x| self.pixel(x, y)))
+    }
+
     /// Whether there is an alpha channel.
     pub fn has_alpha(&self) -> bool {
         self.channels == 4
@@ -164,8 +168,7 @@ impl Photo {
 
     /// The photograph over a background colour: RGB, of the same size.
     pub fn over(&self, background: [f32; 3]) -> Image {
-        let places = (0..self.height).flat_map(|y| (0..self.width).map(move |x| (x, y)));
-        let data = places.flat_map(|(x, y)| over(&self.pixel(x, y), background)).collect();
+        let data = self.pixels().flat_map(|pixel| over(&pixel, background)).collect();
         Image { width: self.width, height: self.height, channels: 3, data }
     }
 

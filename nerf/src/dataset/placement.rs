@@ -2,6 +2,7 @@
 
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
+use crate::numbers::{eigen, mean};
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
@@ -33,14 +34,13 @@ impl Placement {
         if from.len() < 3 || from.len() != to.len() {
             return None;
         }
-        let mean = |points: &[DVec3]| points.iter().sum::<DVec3>() / points.len() as f64;
-        let (origin, middle) = (mean(from), mean(to));
+        let [origin, middle] = [from, to].map(|points| mean(points.iter().copied()));
         let pairs = || from.iter().zip(to).map(|(a, b)| (*a - origin, *b - middle));
         // Row i, column j: the sum of products of coordinate i of `from` and j of `to`.
         let s: [[f64; 3]; 3] =
             std::array::from_fn(|i| std::array::from_fn(|j| pairs().map(|(a, b)| a[i] * b[j]).sum()));
         let [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = s;
-        let ([most, second], [w, x, y, z]) = leading([
+        let ([most, second, ..], [w, x, y, z]) = eigen([
             [xx + yy + zz, yz - zy, zx - xz, xy - yx],
             [yz - zy, xx - yy - zz, xy + yx, zx + xz],
             [zx - xz, xy + yx, yy - xx - zz, yz + zy],
@@ -89,34 +89,6 @@ impl Placement {
         let pose = DAffine3 { matrix3: self.rotation.transpose() * matrix3, translation: self.point_back(translation) };
         Camera { pose, ..camera.clone() }
     }
-}
-
-/// The two largest eigenvalues of a symmetric matrix and the eigenvector of the first, by Jacobi's rotations.
-fn leading(mut a: [[f64; 4]; 4]) -> ([f64; 2], [f64; 4]) {
-    /// Sweeps: each squares what is left beside the diagonal.
-    const SWEEPS: usize = 30;
-    let mut vectors: [[f64; 4]; 4] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
-    for _ in 0..SWEEPS {
-        for (p, q) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
-            if a[p][q] == 0.0 {
-                continue;
-            }
-            let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-            let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
-            let cos = 1.0 / t.hypot(1.0);
-            let sin = t * cos;
-            let turn =
-                |row: &mut [f64; 4]| (row[p], row[q]) = (cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]);
-            a.iter_mut().for_each(turn);
-            vectors.iter_mut().for_each(turn);
-            for k in 0..4 {
-                (a[p][k], a[q][k]) = (cos * a[p][k] - sin * a[q][k], sin * a[p][k] + cos * a[q][k]);
-            }
-        }
-    }
-    let mut order = [0, 1, 2, 3];
-    order.sort_by(|&i, &j| a[j][j].total_cmp(&a[i][i]));
-    ([a[order[0]][order[0]], a[order[1]][order[1]]], vectors.map(|row| row[order[0]]))
 }
 
 #[cfg(test)]

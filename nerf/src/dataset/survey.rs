@@ -6,9 +6,10 @@ use super::placement::Placement;
 use super::scope::Scope;
 use crate::camera::Ndc;
 use crate::camera::pinhole::Camera;
+use crate::camera::pose::{across, axes};
 use crate::error::{Error, Result};
-use crate::numbers::median;
-use glam::{DMat3, DVec3};
+use crate::numbers::{mean, median, outer};
+use glam::{DAffine3, DMat3, DVec3};
 use raygrad_tensor::parallel;
 
 /// Where a scene is and how far it goes, in scene units, and why that is thought.
@@ -170,9 +171,8 @@ impl Layout {
         if let Some(middle) = middle(cameras) {
             return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look at one place" };
         }
-        let count = cameras.len() as f64;
-        let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
-        let forward = cameras.iter().map(|camera| -camera.pose.matrix3.z_axis).sum::<DVec3>() / count;
+        let mean = average(cameras, |pose| pose.translation);
+        let forward = average(cameras, |pose| -pose.matrix3.z_axis);
         let spread = distances(mean);
         let known = points.len() >= FEWEST;
         if forward.length() > 0.8 {
@@ -190,23 +190,16 @@ impl Layout {
 /// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. `None` where
 /// they do not look at one place, as in a room or along a wall.
 fn middle(cameras: &[&Camera]) -> Option<DVec3> {
-    let count = cameras.len() as f64;
-    let mean = cameras.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / count;
+    let mean = average(cameras, |pose| pose.translation);
     let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
     let mut weights = vec![1.0; cameras.len()];
     let mut found = mean;
     // A camera that is lost is not to move it: the farther an axis passes, the less it counts.
     for _ in 0..ROUNDS {
-        let (mut matrix, mut sum, mut total) = (DMat3::ZERO, DVec3::ZERO, 0.0);
-        for (camera, weight) in cameras.iter().zip(&weights) {
-            let across = across(camera) * *weight;
-            matrix += across;
-            // Around the mean, so that coordinates far from the origin keep their digits.
-            sum += across * (camera.pose.translation - mean);
-            total += weight;
-        }
+        let (matrix, sum) = axes(cameras.iter().map(|camera| &camera.pose).zip(weights.iter().copied()), mean);
         // Axes that are nearly parallel meet nowhere in particular.
-        found = mean + (matrix + DMat3::from_diagonal(DVec3::splat(1e-3 * total))).inverse() * sum;
+        let damping = DMat3::from_diagonal(DVec3::splat(1e-3 * weights.iter().sum::<f64>()));
+        found = mean + (matrix + damping).inverse() * sum;
         let passes = passes_at(found);
         let usual = median(cameras.iter().map(&passes)).max(1e-2 * spread);
         weights = cameras.iter().map(|camera| 1.0 / (1.0 + (passes(camera) / (3.0 * usual)).powi(2))).collect();
@@ -222,32 +215,28 @@ fn middle(cameras: &[&Camera]) -> Option<DVec3> {
 
 /// How far from a place the optical axis of a camera passes.
 fn passes_at(place: DVec3) -> impl Fn(&&Camera) -> f64 {
-    move |camera| (across(camera) * (place - camera.pose.translation)).length()
+    move |camera| (across(&camera.pose) * (place - camera.pose.translation)).length()
 }
 
-/// What is left of a vector without its part along a camera's optical axis.
-fn across(camera: &Camera) -> DMat3 {
-    let axis = camera.pose.matrix3.z_axis;
-    DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z)
+/// The mean of what poses of cameras have.
+fn average(cameras: &[&Camera], of: fn(&DAffine3) -> DVec3) -> DVec3 {
+    mean(cameras.iter().map(|camera| of(&camera.pose)))
 }
 
 /// The middle of what lies ahead of cameras whose files say how near and far it is: halfway in inverse distance.
 fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
-    let places = cameras.iter().zip(depths).map(|(camera, [near, far])| {
+    mean(cameras.iter().zip(depths).map(|(camera, [near, far])| {
         camera.pose.translation - camera.pose.matrix3.z_axis * (2.0 / (1.0 / near + 1.0 / far))
-    });
-    places.sum::<DVec3>() / cameras.len() as f64
+    }))
 }
 
 /// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal axes
 /// (the least principal axis of these), on the side of their own up.
 fn upright(cameras: &[&Camera]) -> DMat3 {
-    let count = cameras.len() as f64;
-    let mean = cameras.iter().map(|camera| camera.pose.matrix3.y_axis).sum::<DVec3>() / count;
+    let mean = average(cameras, |pose| pose.matrix3.y_axis);
     let mut spread = DMat3::from_diagonal(DVec3::splat(1e-4));
     for camera in cameras {
-        let right = camera.pose.matrix3.x_axis;
-        spread += DMat3::from_cols(right * right.x, right * right.y, right * right.z) * (1.0 / count);
+        spread += outer(camera.pose.matrix3.x_axis) * (1.0 / cameras.len() as f64);
     }
     let inverse = spread.inverse();
     let mut up = if mean.length() > 1e-3 { mean.normalize() } else { DVec3::Z };
@@ -258,7 +247,7 @@ fn upright(cameras: &[&Camera]) -> DMat3 {
         return DMat3::IDENTITY;
     }
     // Of cameras that look straight down no side is up in their pictures: what they look away from is.
-    let back = cameras.iter().map(|camera| camera.pose.matrix3.z_axis).sum::<DVec3>() / count;
+    let back = average(cameras, |pose| pose.matrix3.z_axis);
     let side = if up.dot(mean).abs() > 0.1 { up.dot(mean) } else { up.dot(back) };
     let up = if side < 0.0 { -up } else { up };
     // The shortest way, so that a capture that is upright already is not turned.
@@ -296,12 +285,8 @@ fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
         return None;
     }
     let nearest = |camera: &Camera| {
-        let inside = |p: &&DVec3| {
-            camera.pixel_of(**p).is_some_and(|[x, y]| {
-                (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y)
-            })
-        };
-        let mut depths: Vec<f64> = trusted.iter().filter(inside).map(|p| p.distance(camera.pose.translation)).collect();
+        let seen = trusted.iter().filter(|point| camera.shows(**point));
+        let mut depths: Vec<f64> = seen.map(|point| point.distance(camera.pose.translation)).collect();
         depths.sort_by(f64::total_cmp);
         // The nearest of two hundred: a few are always wrong.
         depths.get(depths.len() / 200).copied()

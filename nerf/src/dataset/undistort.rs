@@ -120,8 +120,7 @@ impl View {
         let photo = moved(&open(image, &self.camera)?);
         let Some(mask) = &self.mask else { return Ok((photo, None)) };
         let mask = moved(&open(mask, &self.camera)?);
-        let pixels = (0..size[0] * size[1]).map(|i| mask.pixel(i % size[0], i / size[0])[0]);
-        let data = pixels.map(|value| f32::from(u8::from(value >= WHITE))).collect();
+        let data = mask.pixels().map(|pixel| f32::from(u8::from(pixel[0] >= WHITE))).collect();
         Ok((photo, Some(Image { width: size[0], height: size[1], channels: 1, data })))
     }
 }

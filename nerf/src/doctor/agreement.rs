@@ -5,10 +5,9 @@
 //! cameras and photographs fit: as often as any other line if they do not, nearly always if they do. No threshold on the
 //! likeness of patches decides, and what is wrong about it, such as reflections, is wrong for all lines alike.
 
+use super::nearby::usual_gap;
 use super::picture::{Patch, Picture};
 use super::poses::Focus;
-use crate::dataset::evenly_spaced;
-use crate::numbers::median;
 use glam::{DAffine3, DMat3, DVec3};
 use raygrad_tensor::parallel;
 
@@ -70,7 +69,8 @@ pub(super) struct Pair {
 pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
     let poses: Vec<DAffine3> = all.iter().map(|placed| placed.pose).collect();
     let focus = Focus::of(&poses).filter(|focus| focus.ahead > 0.75);
-    let usual = usual_gap(&poses);
+    let places: Vec<DVec3> = poses.iter().map(|pose| pose.translation).collect();
+    let usual = usual_gap(&places, NEIGHBOURS);
     let pairs: Vec<[usize; 2]> =
         of.iter().flat_map(|&i| neighbours(&poses, i, usual).into_iter().map(move |j| [i, j])).collect();
     let one = |&[i, j]: &[usize; 2]| {
@@ -79,17 +79,6 @@ pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
         Pair { views: [i, j], tally: matched(all[i], all[j], nearest) }
     };
     parallel::collect(pairs.len(), |i| one(&pairs[i]))
-}
-
-/// The median distance of a camera from that which is the fifth nearest, of some cameras if there are many.
-fn usual_gap(poses: &[DAffine3]) -> f64 {
-    /// The most cameras that are asked.
-    const ASKED: usize = 500;
-    median(evenly_spaced(poses.iter().collect(), ASKED).into_iter().map(|a| {
-        let mut gaps: Vec<f64> = poses.iter().map(|b| a.translation.distance(b.translation)).collect();
-        gaps.sort_by(f64::total_cmp);
-        gaps.get(NEIGHBOURS).or(gaps.last()).copied().unwrap_or(0.0)
-    }))
 }
 
 /// The numbers of the photographs that are most like one: near, and looking the same way, but not from the same place.

@@ -2,14 +2,12 @@
 //! wrong.
 
 use super::agreement::{Pair, Placed, Tally, compare};
-use super::layout::{opencv_axes, world_to_camera};
+use super::kinds::FindingKind as Kind;
 use super::picture::Picture;
 use super::poses::Convention;
-use super::report::{FindingKind as Kind, Findings, Severity};
-use crate::dataset::evenly_spaced;
+use super::report::Findings;
+use crate::dataset::{View, evenly_spaced};
 use crate::numbers::median;
-use Severity::{Error, Warning};
-use glam::DAffine3;
 use std::collections::BTreeMap;
 
 /// Photographs that are compared with their neighbours under each convention.
@@ -26,17 +24,11 @@ const NONE: f64 = 0.06;
 /// A camera is wrong whose agreement is a smaller share of that of the others.
 const WRONG: f64 = 0.35;
 
-/// A photograph that can be compared: its name, picture and pose.
-pub(super) struct Compared<'a> {
-    pub name: String,
-    pub picture: &'a Picture,
-    pub pose: DAffine3,
-}
-
-/// Adds what is wrong about how photographs agree with each other; returns how well they do, if there is enough to compare.
-pub(super) fn examine(all: &[Compared<'_>], most: usize, findings: &mut Findings) -> Option<f64> {
+/// Adds what is wrong about how photographs, each with its picture, agree with each other; returns how well they do, if there
+/// is enough to compare.
+pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Findings) -> Option<f64> {
     let under = |convention: Convention| -> Vec<Placed<'_>> {
-        all.iter().map(|one| Placed { picture: one.picture, pose: convention.apply(one.pose) }).collect()
+        all.iter().map(|(view, picture)| Placed { picture, pose: convention.apply(view.camera.pose) }).collect()
     };
     let tried = evenly_spaced((0..all.len()).collect(), TRIED);
     let tally = |convention: Convention| total(&compare(&under(convention), &tried));
@@ -55,19 +47,12 @@ pub(super) fn examine(all: &[Compared<'_>], most: usize, findings: &mut Findings
         return None;
     }
     if own < NONE && read.trials >= 2 * ENOUGH {
-        findings.add(
-            Kind::NoAgreement,
-            Warning,
-            "photographs agree with their cameras no better than by chance, under any convention",
-            "Are images and poses in one order, and of one capture? Is the focal length right? If photographs have little to \
-             recognise, such as walls of one colour, this may mean nothing.",
-            vec![],
-        );
+        findings.add(Kind::NoAgreement, &[]);
         return Some(own);
     }
     let of = evenly_spaced((0..all.len()).collect(), most);
     let pairs = compare(&under(Convention::AsRead), &of);
-    wrong_poses(all, &pairs, findings);
+    findings.about(Kind::WrongPose, wrong_poses(&pairs).into_iter().map(|i| all[i].0), &[]);
     Some(total(&pairs).skill())
 }
 
@@ -83,29 +68,22 @@ fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findin
     findings.0.retain(|finding| {
         !matches!(finding.kind, Kind::LooksAway | Kind::OpenCvAxes | Kind::WorldToCamera | Kind::OnePlace)
     });
-    match convention {
-        Convention::AsRead => (),
-        Convention::OpenCv => opencv_axes(findings),
-        Convention::WorldToCamera | Convention::WorldToOpenCv => world_to_camera(Error, findings),
-        Convention::Mirrored | Convention::MirroredUpsideDown | Convention::MirroredBackwards => findings.add(
-            Kind::Mirrored,
-            Error,
-            "the cameras see the world in a mirror: one axis has the wrong sign",
-            "Cameras or positions were taken to left-handed axes. Change the sign of one row of the matrices, and of one \
-             column of their rotations to keep them rotations.",
-            vec![],
-        ),
-    }
-    if let Some(finding) = findings.0.last_mut() {
-        finding.what += &format!(" (photographs agree to {other:.2} so, and to {own:.2} as it is read)");
-        if convention == Convention::WorldToOpenCv {
-            finding.advice += " Then change the signs of the second and third column: their camera axes are OpenCV's.";
+    let finding = match convention {
+        Convention::AsRead => return,
+        Convention::OpenCv => findings.add(Kind::OpenCvAxes, &[]),
+        Convention::WorldToCamera | Convention::WorldToOpenCv => findings.add(Kind::WorldToCamera, &[]),
+        Convention::Mirrored | Convention::MirroredUpsideDown | Convention::MirroredBackwards => {
+            findings.add(Kind::Mirrored, &[])
         }
+    };
+    finding.what += &format!(" (photographs agree to {other:.2} so, and to {own:.2} as it is read)");
+    if convention == Convention::WorldToOpenCv {
+        finding.advice += " Then change the signs of the second and third column: their camera axes are OpenCV's.";
     }
 }
 
-/// The photographs that do not agree with their neighbours, though these agree with each other.
-fn wrong_poses(all: &[Compared<'_>], pairs: &[Pair], findings: &mut Findings) {
+/// The numbers of the photographs that do not agree with their neighbours, though these agree with each other.
+fn wrong_poses(pairs: &[Pair]) -> Vec<usize> {
     let mut wrong: Vec<usize> = vec![];
     // The worst first, and then without it: one wrong camera does not make those beside it wrong.
     loop {
@@ -122,14 +100,7 @@ fn wrong_poses(all: &[Compared<'_>], pairs: &[Pair], findings: &mut Findings) {
         }
     }
     wrong.sort_unstable();
-    findings.about(
-        Kind::WrongPose,
-        Warning,
-        wrong.into_iter().map(|view| all[view].name.clone()).collect(),
-        |count| format!("{count} cannot be matched with their neighbours: what is seen there is not where poses put it"),
-        "Look at them: their poses are wrong, or they show something that has moved, or hardly anything. Leave them out, or \
-         have poses learned with the scene.",
-    );
+    wrong
 }
 
 /// Whether a photograph agrees far less than is usual, and that is no chance.

@@ -1,12 +1,13 @@
 //! What can be said of all cameras together, from their poses alone.
 
-use super::nearby::Nearby;
+use super::kinds::{FindingKind as Kind, Severity};
+use super::nearby::{Nearby, usual_gap};
 use super::poses::{Convention, Focus, extents};
-use super::report::{FindingKind as Kind, Findings, Severity};
-use crate::camera::{Camera, clip_span};
+use super::report::{Finding, Findings};
+use crate::camera::Camera;
 use crate::dataset::{Capture, Format, Scope, Split, Survey, View, evenly_spaced};
-use crate::numbers::median;
-use Severity::{Error, Note, Warning};
+use crate::numbers::{mean, median};
+use Severity::{Error, Warning};
 use glam::{DAffine3, DVec3};
 
 /// Fewer photographs than these are too few, and hardly enough.
@@ -34,34 +35,22 @@ pub(super) fn examine(capture: &Capture, survey: Option<&Survey>, findings: &mut
     let size = extents(&places);
     let focus = Focus::of(&poses);
     let meant = by_points(capture, &views).or_else(|| by_axes(&poses, focus, size[0]));
-    match meant {
-        Some((Convention::OpenCv, Error)) => opencv_axes(findings),
-        Some((Convention::OpenCv, _)) => looks_away(findings),
-        Some((_, severity)) => world_to_camera(severity, findings),
-        None => (),
+    if let Some((convention, severity)) = meant {
+        let kind = match (convention, severity) {
+            (Convention::OpenCv, Error) => Kind::OpenCvAxes,
+            (Convention::OpenCv, _) => Kind::LooksAway,
+            _ => Kind::WorldToCamera,
+        };
+        findings.add(kind, &[]).severity = severity;
     }
-    let apart = size[0] > ONE_PLACE * (1.0 + median(places.iter().map(|place| place.length())));
-    if !apart && !matches!(meant, Some((Convention::WorldToCamera | Convention::WorldToOpenCv, _))) {
-        findings.add(
-            Kind::OnePlace,
-            Error,
-            "all cameras stand in one place: no depth can be found",
-            "Photographs that are to give depth are taken from different places. If these were, their positions are lost: \
-             look at the last column of the matrices.",
-            vec![],
-        );
-    }
-    if !apart {
+    if !(size[0] > ONE_PLACE * (1.0 + median(places.iter().map(|place| place.length())))) {
+        if !matches!(meant, Some((Convention::WorldToCamera | Convention::WorldToOpenCv, _))) {
+            findings.add(Kind::OnePlace, &[]);
+        }
         return;
     }
     if views.len() >= 4 && size[1] < LINE * size[0] {
-        findings.add(
-            Kind::OnALine,
-            Warning,
-            "all cameras stand on a line: depth is found along it alone",
-            "Take photographs from above and below that line too; edges along it have no depth otherwise.",
-            vec![],
-        );
+        findings.add(Kind::OnALine, &[]);
     }
     pairs(&views, &places, focus.map_or(size[0], |focus| focus.distance.max(size[0])), size[0], findings);
     far_cameras(&views, &places, size[0], findings);
@@ -77,59 +66,20 @@ pub(super) fn examine(capture: &Capture, survey: Option<&Survey>, findings: &mut
 }
 
 fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
+    let what = match views.len() {
+        0 => "is no photograph",
+        1 => "is only 1 photograph",
+        count => &format!("are only {count} photographs"),
+    };
     if views.len() < FEW[1] {
-        let severity = if views.len() < FEW[0] { Error } else { Warning };
-        let what = match views.len() {
-            0 => "there is no photograph".to_owned(),
-            1 => "there is only 1 photograph".to_owned(),
-            count => format!("there are only {count} photographs"),
-        };
-        let advice = "Use 50 to 200 photographs, each part of the scene on at least three of them: more from where it has much \
-                      detail or hides things.";
-        findings.add(Kind::FewPhotographs, severity, what, advice, vec![]);
+        let finding = findings.add(Kind::FewPhotographs, &[&what]);
+        if views.len() < FEW[0] {
+            finding.severity = Error;
+        }
     }
     if !views.is_empty() && !capture.present().any(|view| view.split != Some(Split::Train)) {
-        findings.add(
-            Kind::NothingHeldOut,
-            Note,
-            "no photograph is held out: a model of this capture cannot be measured",
-            "Put some photographs, one of eight is usual, in a split to test on.",
-            vec![],
-        );
+        findings.add(Kind::NothingHeldOut, &[]);
     }
-}
-
-/// The finding that axes are OpenCV's.
-pub(super) fn opencv_axes(findings: &mut Findings) {
-    findings.add(
-        Kind::OpenCvAxes,
-        Error,
-        "the matrices have OpenCV's camera axes, looking along +z with y down, and are read as OpenGL's",
-        "Change the signs of the second and third column of each camera-to-world matrix.",
-        vec![],
-    );
-}
-
-/// The finding that matrices lead from the world to the camera.
-pub(super) fn world_to_camera(severity: Severity, findings: &mut Findings) {
-    findings.add(
-        Kind::WorldToCamera,
-        severity,
-        "the matrices seem to lead from the world to the camera: inverted, all cameras look at one place",
-        "Write the inverse of each matrix: files hold camera-to-world matrices, whose last column is where the camera is.",
-        vec![],
-    );
-}
-
-fn looks_away(findings: &mut Findings) {
-    findings.add(
-        Kind::LooksAway,
-        Warning,
-        "all cameras look away from the middle of where they stand",
-        "If they stand around a thing and look at it, the matrices have OpenCV's axes: change the signs of the second and third \
-         column. If they stand in the middle of a room and look around, this is right.",
-        vec![],
-    );
 }
 
 /// The convention, other than the one that is read, under which cameras have the points of the capture in their images.
@@ -144,7 +94,7 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity
     let share = |convention: Convention| {
         let seen = views.iter().map(|view| {
             let camera = Camera { pose: convention.apply(view.camera.pose), ..view.camera.clone() };
-            points.iter().filter(|point| is_seen(&camera, **point)).count()
+            points.iter().filter(|point| camera.shows(**point)).count()
         });
         seen.sum::<usize>() as f64 / (views.len() * points.len()) as f64
     };
@@ -155,13 +105,6 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity
     let others = [Convention::OpenCv, Convention::WorldToCamera, Convention::WorldToOpenCv].map(|c| (share(c), c));
     let (best, convention) = others.into_iter().max_by(|a, b| a.0.total_cmp(&b.0))?;
     (best > 0.2).then_some((convention, Error))
-}
-
-/// Whether a point lies in the image of a camera.
-fn is_seen(camera: &Camera, point: DVec3) -> bool {
-    camera
-        .pixel_of(point)
-        .is_some_and(|[x, y]| (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y))
 }
 
 /// The same, from what cameras look at: as those that look around in a room look away from each other too, that is no proof.
@@ -201,93 +144,50 @@ fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: 
         let find = |i: usize| nearby.of(i).find(|&j| is_other(i, j) && turned(i, j) <= 2.0 * angle * angle);
         (0..views.len()).filter(|i| is_trained(*i) == of).filter_map(|i| Some([i, find(i)?])).collect()
     };
-    let named = |pairs: Vec<[usize; 2]>| -> Vec<[String; 2]> {
-        pairs.into_iter().map(|pair| pair.map(|i| views[i].name.clone())).collect()
-    };
+    let shown =
+        |pairs: Vec<[usize; 2]>| -> Vec<[&View; 2]> { pairs.into_iter().map(|pair| pair.map(|i| views[i])).collect() };
     let mut duplicates = [true, false].map(|trained| alike(trained, trained, size, SAME)).concat();
     duplicates.sort_unstable();
-    findings.alike(
-        Kind::DuplicatePoses,
-        Warning,
-        named(duplicates),
-        |count| format!("the pose of {count} is exactly that of another"),
-        "Two photographs are hardly ever taken from the same place: if the images differ, one of the poses is wrong; leave it \
-         out.",
-    );
-    leak(named(alike(false, true, distance, NEARLY)), findings);
-}
-
-/// The finding that these photographs are trained and tested on.
-pub(super) fn leak(pairs: Vec<[String; 2]>, findings: &mut Findings) {
-    findings.alike(
-        Kind::Leak,
-        Warning,
-        pairs,
-        |count| {
-            format!("of those held out, {count} can be found among those to train on, or taken from the same place")
-        },
-        "Test on photographs from other places: what is measured on these says nothing of new views.",
-    );
+    findings.alike(Kind::DuplicatePoses, &shown(duplicates));
+    findings.alike(Kind::Leak, &shown(alike(false, true, distance, NEARLY)));
 }
 
 fn far_cameras(views: &[&View], places: &[DVec3], size: f64, findings: &mut Findings) {
-    /// The most cameras of which the distance to the nearest other is found.
-    const ASKED: usize = 500;
     let middle = DVec3::from([0, 1, 2].map(|axis| median(places.iter().map(|place| place[axis]))));
     let usual = median(places.iter().map(|place| place.distance(middle)));
-    let nearest = |i: usize| {
-        let others = places.iter().enumerate().filter(|(j, _)| *j != i);
-        others.map(|(_, other)| other.distance(places[i])).fold(f64::INFINITY, f64::min)
-    };
-    let gap = median(evenly_spaced((0..places.len()).collect(), ASKED).into_iter().map(nearest));
-    let nearby = Nearby::new(places, |_| true, (8.0 * gap).max(ONE_PLACE * size));
+    let nearby = Nearby::new(places, |_| true, (8.0 * usual_gap(places, 1)).max(ONE_PLACE * size));
     let far = |i: &usize| places[*i].distance(middle) > 4.0 * usual && nearby.of(*i).all(|j| j == *i);
-    let names = (0..views.len()).filter(far).map(|i| views[i].name.clone()).collect();
-    findings.about(
-        Kind::FarCamera,
-        Warning,
-        names,
-        |count| format!("the camera of {count} was far from all others"),
-        "Their poses are probably wrong: leave them out. A single far camera makes the scene small in its box.",
-    );
+    findings.about(Kind::FarCamera, (0..views.len()).filter(far).map(|i| views[i]), &[]);
 }
 
 fn scale(capture: &Capture, places: &[DVec3], size: f64, findings: &mut Findings) {
     /// Shares of the distance of what is seen that cameras are apart.
     const PLAUSIBLE: [f64; 2] = [3e-3, 100.0];
-    let mean = places.iter().sum::<DVec3>() / places.len() as f64;
+    let mean = mean(places.iter().copied());
     if capture.points.len() >= 10 {
         let distance = median(capture.points.iter().map(|point| point.position.distance(mean)));
         let share = size / distance;
         if !(PLAUSIBLE[0]..=PLAUSIBLE[1]).contains(&share) {
-            findings.add(
-                Kind::Scale,
-                Warning,
-                format!("cameras are {share:.1e} times as far apart as the points of the scene are from them"),
-                "Give positions of cameras and points in one unit: one of them may be in millimetres.",
-                vec![],
-            );
+            findings.add(Kind::Scale, &[&format_args!("{share:.1e}")]);
         }
     }
     let from_origin = median(places.iter().map(|place| place.length()));
     if capture.format == Format::Blender && !(1.0..=20.0).contains(&from_origin) {
-        findings.add(
-            Kind::Scale,
-            Warning,
-            format!("cameras are {from_origin:.3} units from the origin, and about 4 in other scenes of this format"),
-            "The scene's size is found out from its cameras, and not taken from the convention; scale positions if other \
-             programs are to read the files.",
-            vec![],
-        );
+        findings.0.push(Finding {
+            kind: Kind::Scale,
+            severity: Warning,
+            what: format!(
+                "cameras are {from_origin:.3} units from the origin, and about 4 in other scenes of this format"
+            ),
+            advice:
+                "The scene's size is found out from its cameras, and not taken from the convention; scale positions if \
+                     other programs are to read the files."
+                    .to_owned(),
+            views: vec![],
+        });
     }
     if mean.length() > 1e5 * size {
-        findings.add(
-            Kind::FarFromOrigin,
-            Note,
-            format!("the cameras are {:.1e} units from the origin and {size:.1e} from each other", mean.length()),
-            "The scene is moved to its own origin here; other programs may lose digits. Move the positions before writing them.",
-            vec![],
-        );
+        findings.add(Kind::FarFromOrigin, &[&format_args!("{:.1e}", mean.length()), &format_args!("{size:.1e}")]);
     }
 }
 
@@ -297,15 +197,7 @@ fn roll(views: &[&View], up: DVec3, findings: &mut Findings) {
         let level = axes.z_axis.dot(up).abs() < POLE;
         level && axes.x_axis.dot(up).atan2(axes.y_axis.dot(up)).abs().to_degrees() > ROLL
     };
-    let names: Vec<String> = views.iter().filter(turned).map(|view| view.name.clone()).collect();
-    findings.about(
-        Kind::Roll,
-        Note,
-        names,
-        |count| format!("in {count} the camera was turned by more than 30 degrees about its axis"),
-        "This is right where portrait and landscape are mixed. If not, some images are turned (EXIF) and their poses are not. \
-         Up is found from all cameras, and may be off.",
-    );
+    findings.about(Kind::Roll, views.iter().filter(turned).copied(), &[]);
 }
 
 fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) {
@@ -318,13 +210,7 @@ fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) 
     let around = first + 360.0 - last;
     let gap = azimuths.windows(2).map(|pair| pair[1] - pair[0]).fold(around, f64::max);
     if gap > GAP {
-        findings.add(
-            Kind::CoverageGap,
-            Note,
-            format!("seen from the middle, no camera stands in an angle of {gap:.0} degrees"),
-            "New views from there show what no photograph has seen. Nothing is wrong if nobody is to look from there.",
-            vec![],
-        );
+        findings.add(Kind::CoverageGap, &[&format_args!("{gap:.0}")]);
     }
 }
 
@@ -342,28 +228,9 @@ fn in_the_box(views: &[&View], survey: &Survey, findings: &mut Findings) {
     };
     let misses = |view: &&&View| {
         let camera = placed(view);
-        let place = |i: usize, rays: usize, size: usize| (i as f64 + 0.5) / rays as f64 * size as f64;
-        let past = |rays: usize| {
-            (0..rays * rays).all(|i| {
-                let ray = camera.ray(place(i % rays, rays, camera.width), place(i / rays, rays, camera.height));
-                let [enter, leave] = clip_span(&ray, survey.bounds, [survey.near, survey.far]);
-                !(enter < leave)
-            })
-        };
-        camera.width > 0 && RAYS.into_iter().all(past)
+        let meets = |rays: usize| camera.meets(survey.bounds, [survey.near, survey.far], [rays; 2]);
+        camera.width > 0 && !RAYS.into_iter().any(meets)
     };
-    findings.about(
-        Kind::CameraInBox,
-        Warning,
-        views.iter().filter(inside).map(|view| view.name.clone()).collect(),
-        |count| format!("the camera of {count} stands in the box that is to hold the scene"),
-        "A scene that ends at its box is seen from outside. If it is a room, train with `--scope unbounded`.",
-    );
-    findings.about(
-        Kind::MissesBox,
-        Warning,
-        views.iter().filter(misses).map(|view| view.name.clone()).collect(),
-        |count| format!("nothing of the box that is to hold the scene is seen in {count}"),
-        "They look past it: their poses are wrong, or they belong to another scene; leave them out.",
-    );
+    findings.about(Kind::CameraInBox, views.iter().filter(inside).copied(), &[]);
+    findings.about(Kind::MissesBox, views.iter().filter(misses).copied(), &[]);
 }

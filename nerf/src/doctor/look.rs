@@ -2,6 +2,7 @@
 
 use super::picture::{Picture, grey};
 use crate::dataset::load::same_shape;
+use crate::dataset::photo::sharpness::laplacian_variance;
 use crate::dataset::{Capture, Image, Photo, View};
 use crate::error::Result;
 use raygrad_tensor::parallel;
@@ -34,15 +35,17 @@ pub(super) struct Look {
 }
 
 /// Looks at the photographs, in parallel; the result has the order of the views, of which each has an image.
-pub(super) fn look_at_all(capture: &Capture, progress: &(dyn Fn(usize, usize) + Sync)) -> Vec<(String, Result<Look>)> {
+pub(super) fn look_at_all<'a>(
+    capture: &'a Capture,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Vec<(&'a View, Result<Look>)> {
     let views: Vec<&View> = capture.present().collect();
     let (done, total) = (AtomicUsize::new(0), views.len());
-    let one = |view: &View| {
-        let look = look_at(view);
+    parallel::collect(total, |i| {
+        let look = look_at(views[i]);
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
-        (view.name.clone(), look)
-    };
-    parallel::collect(views.len(), |i| one(views[i]))
+        (views[i], look)
+    })
 }
 
 fn look_at(view: &View) -> Result<Look> {
@@ -55,10 +58,9 @@ fn look_at(view: &View) -> Result<Look> {
     let middle = shrunk(&photo, LONGEST);
     let small = shrunk(&photo, SMALL);
     let mask = view.mask.as_ref().map(|path| Photo::open(path, None)).transpose()?;
-    let used = mask.as_ref().map(|mask| {
-        let places = (0..mask.width * mask.height).map(|i| mask.pixel(i % mask.width, i / mask.width)[0]);
-        places.filter(|value| *value >= 0.99).count() as f64 / (mask.width * mask.height) as f64
-    });
+    let used = mask
+        .as_ref()
+        .map(|mask| mask.pixels().filter(|pixel| pixel[0] >= 0.99).count() as f64 / (mask.width * mask.height) as f64);
     let mut hasher = DefaultHasher::new();
     [photo.width, photo.height].hash(&mut hasher);
     middle.to_image().data.iter().for_each(|value| value.to_bits().hash(&mut hasher));
@@ -81,11 +83,8 @@ fn sharpness(grey: &Image) -> Option<f64> {
     if width < 8 || height < 8 {
         return None;
     }
-    let at = |x: usize, y: usize| f64::from(grey.data[y * width + x]);
-    let laplacian = (1..height - 1).flat_map(|y| {
-        (1..width - 1).map(move |x| at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1) - 4.0 * at(x, y))
-    });
-    let (edges, contrast) = (variance(laplacian), variance(grey.data.iter().map(|x| f64::from(*x))));
+    let edges = laplacian_variance([width, height], |y| grey.data[y * width..(y + 1) * width].to_vec());
+    let contrast = variance(grey.data.iter().map(|x| f64::from(*x)));
     (contrast > 1e-6 && edges > 0.0).then(|| (edges / contrast).ln())
 }
 

@@ -5,6 +5,7 @@
 
 mod agreement;
 mod consistency;
+mod kinds;
 mod layout;
 mod look;
 mod nearby;
@@ -14,11 +15,11 @@ mod poses;
 mod report;
 mod single;
 
-pub use report::{Facts, Finding, FindingKind, Lie, Part, Range, Report, Resolution, Severity};
+pub use kinds::{FindingKind, Severity};
+pub use report::{Facts, Finding, Lie, Part, Range, Report, Resolution};
 
-use crate::dataset::{Capture, Split, Survey};
+use crate::dataset::{Capture, Split, Survey, View};
 use crate::numbers::median;
-use consistency::Compared;
 use glam::DVec3;
 use pixels::Seen;
 use report::Findings;
@@ -52,34 +53,22 @@ pub fn examine(capture: &Capture, survey: Option<&Survey>, options: &Options<'_>
     let mut facts = without_pixels(capture, survey, &mut findings);
     let looks = look::look_at_all(capture, options.progress);
     pixels::unreadable(&looks, &mut findings);
-    let seen: Vec<Seen<'_>> = capture
-        .present()
-        .zip(&looks)
-        .filter_map(|(view, (_, look))| Some(Seen { view, look: look.as_ref().ok()? }))
-        .collect();
+    let seen: Vec<Seen<'_>> =
+        looks.iter().filter_map(|(view, look)| Some(Seen { view, look: look.as_ref().ok()? })).collect();
     pixels::examine(&seen, &mut findings);
-    let compared: Vec<Compared<'_>> = seen
-        .iter()
-        .filter_map(|one| {
-            let picture = one.look.picture.as_ref()?;
-            Some(Compared { name: one.view.name.clone(), picture, pose: one.view.camera.pose })
-        })
-        .collect();
+    let compared = seen.iter().filter_map(|one| Some((one.view, one.look.picture.as_ref()?))).collect::<Vec<_>>();
     facts.agreement = consistency::examine(&compared, options.compared, &mut findings);
     Report { facts, findings: findings.sorted() }
 }
 
 fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Findings) -> Facts {
-    let absent: Vec<String> =
-        capture.views.iter().filter(|view| view.image.is_none()).map(|view| view.name.clone()).collect();
-    let severity = if absent.len() == capture.views.len() { Severity::Error } else { Severity::Warning };
-    findings.about(
-        FindingKind::ImagesAbsent,
-        severity,
-        absent,
-        |count| format!("there is no image of {count}; {} are listed", capture.views.len()),
-        "They are left out. If they should be there, look at the paths in the file, and at the ending of their names.",
-    );
+    let absent: Vec<&View> = capture.views.iter().filter(|view| view.image.is_none()).collect();
+    let all = absent.len() == capture.views.len();
+    if let Some(finding) = findings.about(FindingKind::ImagesAbsent, absent, &[&capture.views.len()])
+        && all
+    {
+        finding.severity = Severity::Error;
+    }
     single::examine(capture, findings);
     layout::examine(capture, survey, findings);
     let resolutions = pixels::sizes(capture, findings)

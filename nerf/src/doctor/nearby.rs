@@ -1,5 +1,7 @@
 //! Which of many places are near a place, without comparing all of them with each other.
 
+use crate::dataset::evenly_spaced;
+use crate::numbers::median;
 use glam::DVec3;
 use std::collections::HashMap;
 
@@ -34,6 +36,18 @@ impl<'a> Nearby<'a> {
         let found = around.filter_map(|cell| self.cells.get(&cell)).flatten().copied().take(LOOKED_AT);
         found.filter(move |j| self.places[*j].distance(place) <= self.radius)
     }
+}
+
+/// The median distance of a place from that which is so many places away, in the order of their distances; of some places if
+/// there are many.
+pub(super) fn usual_gap(places: &[DVec3], away: usize) -> f64 {
+    /// The most places that are asked.
+    const ASKED: usize = 500;
+    median(evenly_spaced(places.to_vec(), ASKED).into_iter().map(|place| {
+        let mut gaps: Vec<f64> = places.iter().map(|other| other.distance(place)).collect();
+        gaps.sort_by(f64::total_cmp);
+        gaps.get(away).or(gaps.last()).copied().unwrap_or(0.0)
+    }))
 }
 
 /// The cell that holds a place.

@@ -137,12 +137,10 @@ pub(super) fn grey(photo: &Photo, behind: [f32; 3]) -> Image {
 /// Makes unknown what a mask does not use.
 fn hide(image: &mut Image, mask: &Photo) {
     let Image { width, height, .. } = *image;
-    for y in 0..height {
-        for x in 0..width {
-            let [column, row] = [x * mask.width / width, y * mask.height / height];
-            if mask.pixel(column, row)[0] < 0.99 {
-                image.data[y * width + x] = f32::NAN;
-            }
+    for (i, value) in image.data.iter_mut().enumerate() {
+        let [column, row] = [i % width * mask.width / width, i / width * mask.height / height];
+        if mask.pixel(column, row)[0] < 0.99 {
+            *value = f32::NAN;
         }
     }
 }

@@ -1,12 +1,12 @@
 //! What photographs say of their own quality, and of each other's.
 
+use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
-use super::report::{FindingKind as Kind, Findings, Severity};
+use super::report::Findings;
 use crate::dataset::load::same_shape;
 use crate::dataset::{Capture, Photo, Split, View};
 use crate::error::Result;
 use crate::numbers::{median, spread};
-use Severity::{Error, Note, Warning};
 use std::collections::{HashMap, HashSet};
 
 /// A photograph with what its pixels say.
@@ -28,51 +28,34 @@ const AROUND: usize = 1000;
 /// The sizes of the photographs, from the headers of their files, the most frequent first.
 pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
     let mut counts: HashMap<[usize; 2], usize> = HashMap::new();
-    let (mut shapes, mut first) = (vec![], None);
+    let (mut shapes, mut first) = (vec![], String::new());
     for view in capture.present() {
         let Some(Ok([stored, shown])) = view.image.as_ref().map(Photo::size_of_file) else { continue };
         *counts.entry(shown).or_default() += 1;
         if view.camera.width > 0 && !same_shape(stored, &view.camera) && !same_shape(shown, &view.camera) {
-            let [w, h] = shown;
-            first.get_or_insert_with(|| format!("{w}x{h} pixels for {}x{}", view.camera.width, view.camera.height));
-            shapes.push(view.name.clone());
+            if shapes.is_empty() {
+                let [w, h] = shown;
+                first = format!("{w}x{h} pixels for {}x{}", view.camera.width, view.camera.height);
+            }
+            shapes.push(view);
         }
     }
-    let first = first.unwrap_or_default();
-    findings.about(
-        Kind::ShapeMismatch,
-        Error,
-        shapes,
-        |count| format!("the shape of {count} is not that of the camera: {first}"),
-        "Images that were cropped or turned after their cameras were measured cannot be used: take the original ones, or \
-         measure again.",
-    );
+    findings.about(Kind::ShapeMismatch, shapes, &[&first]);
     let mut counts: Vec<_> = counts.into_iter().collect();
     counts.sort_by_key(|(size, count)| (std::cmp::Reverse(*count), *size));
     if counts.len() > 1 {
         let listed: Vec<String> = counts.iter().map(|([w, h], n)| format!("{n} of {w}x{h}")).collect();
-        findings.add(
-            Kind::MixedResolutions,
-            Note,
-            format!("photographs have several resolutions: {}", listed.join(", ")),
-            "Nothing needs to be done: each is used at its own.",
-            vec![],
-        );
+        findings.add(Kind::MixedResolutions, &[&listed.join(", ")]);
     }
     counts
 }
 
 /// Adds what photographs that cannot be read say.
-pub(super) fn unreadable(looks: &[(String, Result<Look>)], findings: &mut Findings) {
-    let errors: Vec<_> = looks.iter().filter_map(|(name, look)| Some((name, look.as_ref().err()?))).collect();
-    let first = errors.first().map(|(_, error)| error.to_string()).unwrap_or_default();
-    findings.about(
-        Kind::ImagesUndecodable,
-        Error,
-        errors.iter().map(|(name, _)| (*name).clone()).collect(),
-        |count| format!("the images or masks of {count} cannot be decoded; the first: {first}"),
-        "Copy these files again, or take them out of the capture; PNG, JPEG and WebP can be read.",
-    );
+pub(super) fn unreadable(looks: &[(&View, Result<Look>)], findings: &mut Findings) {
+    let errors: Vec<_> = looks.iter().filter_map(|(view, look)| Some((*view, look.as_ref().err()?))).collect();
+    if let Some((_, first)) = errors.first() {
+        findings.about(Kind::ImagesUndecodable, errors.iter().map(|(view, _)| *view), &[first]);
+    }
 }
 
 /// Adds what is wrong with photographs that can be read.
@@ -96,19 +79,12 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
             first.insert(look.hash, view);
             continue;
         };
-        let named = [view.name.clone(), other.name.clone()];
         let across = (view.split == Some(Split::Train)) != (other.split == Some(Split::Train));
-        if across { leaks.push(named) } else { same.push(named) }
+        if across { leaks.push([*view, *other]) } else { same.push([*view, *other]) }
     }
-    findings.alike(
-        Kind::DuplicateImages,
-        Warning,
-        same,
-        |count| format!("the image of {count} is pixel by pixel that of another"),
-        "If their poses differ, one of them is wrong; if not, one photograph counts twice. Leave one out.",
-    );
-    if !leaks.is_empty() && !findings.0.iter().any(|finding| finding.kind == Kind::Leak) {
-        super::layout::leak(leaks, findings);
+    findings.alike(Kind::DuplicateImages, &same);
+    if !findings.0.iter().any(|finding| finding.kind == Kind::Leak) {
+        findings.alike(Kind::Leak, &leaks);
     }
 }
 
@@ -137,89 +113,50 @@ fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Opt
     (0..seen.len()).map(residual).collect()
 }
 
-/// The names of the photographs whose value is this far from their neighbours', and from what is usual.
-fn outliers(seen: &[Seen<'_>], residuals: &[Option<f64>], least: f64, wrong: impl Fn(f64) -> f64) -> Vec<String> {
+/// The photographs whose value is this far from their neighbours', and from what is usual.
+fn outliers<'a>(seen: &[Seen<'a>], residuals: &[Option<f64>], least: f64, wrong: impl Fn(f64) -> f64) -> Vec<&'a View> {
     let known: Vec<f64> = residuals.iter().flatten().copied().collect();
     let limit = (FAR * spread(&known)).max(least);
     let far = |residual: &Option<f64>| residual.is_some_and(|x| wrong(x) > limit);
-    residuals.iter().zip(seen).filter(|(x, _)| far(x)).map(|(_, one)| one.view.name.clone()).collect()
+    residuals.iter().zip(seen).filter(|(x, _)| far(x)).map(|(_, one)| one.view).collect()
 }
 
 fn blurred(seen: &[Seen<'_>], findings: &mut Findings) {
     let residuals = residuals(seen, |look| look.sharpness);
-    findings.about(
-        Kind::Blurred,
-        Warning,
-        outliers(seen, &residuals, BLUR.ln(), |x| -x),
-        |count| format!("the sharpness of {count} is far below that of those beside"),
-        "Leave them out if others show the same: what is blurred in a photograph becomes blurred in the scene.",
-    );
+    findings.about(Kind::Blurred, outliers(seen, &residuals, BLUR.ln(), |x| -x), &[]);
 }
 
 fn light(seen: &[Seen<'_>], findings: &mut Findings) {
     let brightness = residuals(seen, |look| look.luminance);
-    findings.about(
-        Kind::ExposureJump,
-        Warning,
-        outliers(seen, &brightness, BRIGHTNESS.ln(), f64::abs),
-        |count| format!("the brightness of {count} is far from that of those beside"),
-        "Photograph with a fixed exposure. With photographs as they are, codes for each photograph (`--set field.codes=8`) \
-         take up what differs.",
-    );
+    findings.about(Kind::ExposureJump, outliers(seen, &brightness, BRIGHTNESS.ln(), f64::abs), &[]);
     let unbalanced = |colour: usize| {
         let balance = residuals(seen, |look| look.luminance.map(|_| look.balance[colour]));
         outliers(seen, &balance, COLOUR.ln(), f64::abs)
     };
-    let mut names = unbalanced(0);
-    let known: HashSet<String> = names.iter().cloned().collect();
-    names.extend(unbalanced(1).into_iter().filter(|name| !known.contains(name)));
-    findings.about(
-        Kind::WhiteBalanceJump,
-        Warning,
-        names,
-        |count| format!("the balance of colours in {count} is far from that of those beside"),
-        "Photograph with a fixed white balance. With photographs as they are, codes for each photograph \
-         (`--set field.codes=8`) take up what differs.",
-    );
+    let mut views = unbalanced(0);
+    let known: HashSet<&str> = views.iter().map(|view| view.name.as_str()).collect();
+    views.extend(unbalanced(1).into_iter().filter(|view| !known.contains(view.name.as_str())));
+    findings.about(Kind::WhiteBalanceJump, views, &[]);
 }
 
 fn masks(seen: &[Seen<'_>], findings: &mut Findings) {
-    let with = |share: f64| -> Vec<String> {
-        seen.iter().filter(|one| one.look.used == Some(share)).map(|one| one.view.name.clone()).collect()
-    };
-    findings.about(
-        Kind::MaskHidesAll,
-        Error,
-        with(0.0),
-        |count| format!("the masks of {count} hide all of it"),
-        "Masks are white where a photograph is used: they may be the wrong way round. Leave these photographs out otherwise.",
-    );
-    findings.about(
-        Kind::MaskHidesNothing,
-        Note,
-        with(1.0),
-        |count| format!("the masks of {count} hide nothing"),
-        "Nothing needs to be done if there is nothing to hide.",
-    );
+    let with = |share: f64| seen.iter().filter(move |one| one.look.used == Some(share)).map(|one| one.view);
+    findings.about(Kind::MaskHidesAll, with(0.0), &[]);
+    findings.about(Kind::MaskHidesNothing, with(1.0), &[]);
 }
 
 fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
-    let names: Vec<String> =
-        seen.iter().filter(|one| one.look.transparent == Some(false)).map(|one| one.view.name.clone()).collect();
-    let mixed = seen.iter().any(|one| one.look.transparent == Some(true));
-    let severity = if mixed { Warning } else { Note };
-    findings.about(
-        Kind::OpaqueAlpha,
-        severity,
-        names,
-        |count| format!("the alpha channel of {count} is opaque throughout"),
-        if mixed {
-            "Others are transparent where there is nothing: these were saved without, and their background is learned as part \
-             of the scene."
-        } else {
-            "They say nothing, and the scene is taken to go on behind. If it does not, save what is transparent as such."
-        },
-    );
+    let with = |transparent| seen.iter().filter(move |one| one.look.transparent == Some(transparent));
+    let opaque = findings.about(Kind::OpaqueAlpha, with(false).map(|one| one.view), &[]);
+    if let Some(finding) = opaque
+        && with(true).next().is_some()
+    {
+        finding.severity = Severity::Warning;
+        finding.advice =
+            "Others are transparent where there is nothing: these were saved without, and their background is \
+                          learned as part of the scene."
+                .to_owned();
+    }
 }
 
 #[cfg(test)]
@@ -239,10 +176,7 @@ mod tests {
                 .map(|i| {
                     let pose = Camera::look_at(DVec3::new(number(), number(), 1.0 + number()), DVec3::ZERO, DVec3::Z);
                     let camera = Camera::from_angle(8, 8, 0.7, pose);
-                    let name = i.to_string();
-                    let field = name.clone();
-                    let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
-                    View { name, field, image, camera, split, mask, depth, sharpness, bounds }
+                    View::new(i.to_string(), i.to_string(), camera)
                 })
                 .collect();
             let looks: Vec<Look> = (0..count)

@@ -1,6 +1,7 @@
 //! Poses under several conventions, and what cameras look at under each.
 
-use crate::numbers::median;
+use crate::camera::pose::axes;
+use crate::numbers::{eigen, mean, median, outer};
 use glam::{DAffine3, DMat3, DVec3};
 
 /// A way in which the matrices of a capture may be meant.
@@ -75,14 +76,8 @@ impl Focus {
     /// Of poses in OpenGL's axes; `None` if there are fewer than two or the axes are parallel.
     pub fn of(poses: &[DAffine3]) -> Option<Focus> {
         let count = poses.len() as f64;
-        let mean = poses.iter().map(|pose| pose.translation).sum::<DVec3>() / count;
-        let (mut matrix, mut sum) = (DMat3::ZERO, DVec3::ZERO);
-        for pose in poses {
-            let axis = pose.matrix3.z_axis;
-            let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
-            matrix += across;
-            sum += across * (pose.translation - mean);
-        }
+        let mean = mean(poses.iter().map(|pose| pose.translation));
+        let (matrix, sum) = axes(poses.iter().map(|pose| (pose, 1.0)), mean);
         // Directions that differ by less than about 3 degrees meet nowhere in particular.
         if poses.len() < 2 || !(matrix.determinant() > 1e-3 * count.powi(3)) {
             return None;
@@ -104,34 +99,10 @@ impl Focus {
 /// How far places are from one another: the root of the mean square of their distance from their mean, along the principal
 /// axes, the greatest first.
 pub(super) fn extents(places: &[DVec3]) -> [f64; 3] {
-    let count = places.len().max(1) as f64;
-    let mean = places.iter().sum::<DVec3>() / count;
+    let mean = mean(places.iter().copied());
     let mut scatter = DMat3::ZERO;
-    for place in places {
-        let d = *place - mean;
-        scatter += DMat3::from_cols(d * d.x, d * d.y, d * d.z) * (1.0 / count);
-    }
-    let mut out = [0.0; 3];
-    for extent in &mut out {
-        // Power iteration from the axis that is moved farthest, and then without what was found.
-        let columns = [scatter.x_axis, scatter.y_axis, scatter.z_axis];
-        let mut axis = columns.into_iter().max_by(|a, b| a.length().total_cmp(&b.length())).unwrap_or(DVec3::X);
-        if !(axis.length() > 0.0) {
-            break;
-        }
-        for _ in 0..100 {
-            let next = scatter * axis.normalize();
-            if !(next.length() > 0.0) {
-                break;
-            }
-            axis = next;
-        }
-        let axis = axis.normalize();
-        let value = (scatter * axis).dot(axis).max(0.0);
-        scatter -= DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z) * value;
-        *extent = value.sqrt();
-    }
-    out
+    places.iter().for_each(|place| scatter += outer(*place - mean) * (1.0 / places.len() as f64));
+    eigen(scatter.to_cols_array_2d()).0.map(|square| square.max(0.0).sqrt())
 }
 
 #[cfg(test)]

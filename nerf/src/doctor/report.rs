@@ -1,133 +1,11 @@
 //! What an examination says: facts about a capture, and what is wrong with it.
 
-use crate::dataset::{Scope, Split};
+use super::kinds::{FindingKind, Severity, Text};
+use crate::dataset::{Scope, Split, View};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
-use std::fmt;
+use std::fmt::Display;
 use std::path::PathBuf;
-
-/// How much a finding matters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Severity {
-    /// Worth knowing; nothing needs to be done.
-    Note,
-    /// Views will probably be worse for it.
-    Warning,
-    /// Training will fail, or learn something else than the scene.
-    Error,
-}
-
-impl fmt::Display for Severity {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Severity::Note => "note",
-            Severity::Warning => "warning",
-            Severity::Error => "error",
-        })
-    }
-}
-
-macro_rules! kinds {
-    ($($(#[$doc:meta])* $kind:ident = $name:literal,)*) => {
-        /// What can be wrong with a capture. The names stay the same from version to version.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-        pub enum FindingKind {
-            $($(#[$doc])* #[serde(rename = $name)] $kind,)*
-        }
-
-        impl FindingKind {
-            /// All kinds.
-            pub const ALL: &[FindingKind] = &[$(FindingKind::$kind),*];
-
-            /// The name that is written to files and printed, such as `images-absent`.
-            pub fn name(self) -> &'static str {
-                match self {
-                    $(FindingKind::$kind => $name,)*
-                }
-            }
-        }
-    };
-}
-
-kinds! {
-    /// Images that the capture lists do not exist.
-    ImagesAbsent = "images-absent",
-    /// Images cannot be decoded.
-    ImagesUndecodable = "images-undecodable",
-    /// Images are of another shape than their camera.
-    ShapeMismatch = "shape-mismatch",
-    /// Photographs have several resolutions.
-    MixedResolutions = "mixed-resolutions",
-    /// A field of view is implausible.
-    FieldOfView = "field-of-view",
-    /// Horizontal and vertical focal length differ.
-    PixelAspect = "pixel-aspect",
-    /// The principal point is far from the middle of the image.
-    PrincipalPoint = "principal-point",
-    /// The lens folds the image back, or leaves part of it dark.
-    LensFolds = "lens-folds",
-    /// The lens bends light strongly.
-    StrongDistortion = "strong-distortion",
-    /// Cameras look away from each other.
-    LooksAway = "looks-away",
-    /// Camera axes are those of OpenCV and not of OpenGL.
-    OpenCvAxes = "opencv-axes",
-    /// Matrices lead from the world to the camera and not back.
-    WorldToCamera = "world-to-camera",
-    /// The world is seen in a mirror.
-    Mirrored = "mirrored",
-    /// Photographs agree with their cameras under no convention.
-    NoAgreement = "no-agreement",
-    /// Cameras and points, or cameras and the format's convention, have different scales.
-    Scale = "scale",
-    /// Coordinates are so large that digits are lost.
-    FarFromOrigin = "far-from-origin",
-    /// Photographs were taken with the camera turned about its optical axis.
-    Roll = "roll",
-    /// Different photographs have one pose.
-    DuplicatePoses = "duplicate-poses",
-    /// One image has several poses.
-    DuplicateImages = "duplicate-images",
-    /// Photographs are blurred.
-    Blurred = "blurred",
-    /// Photographs are brighter or darker than those beside them.
-    ExposureJump = "exposure-jump",
-    /// Photographs have other colours than those beside them.
-    WhiteBalanceJump = "white-balance-jump",
-    /// A camera is far from all others.
-    FarCamera = "far-camera",
-    /// No camera looks from a wide range of directions.
-    CoverageGap = "coverage-gap",
-    /// There are few photographs.
-    FewPhotographs = "few-photographs",
-    /// Photographs show nothing of the scene's box.
-    MissesBox = "misses-box",
-    /// Cameras stand in the box of a scene that ends there.
-    CameraInBox = "camera-in-box",
-    /// A photograph that is tested on is trained on too.
-    Leak = "leak",
-    /// Masks hide whole photographs.
-    MaskHidesAll = "mask-hides-all",
-    /// Masks hide nothing.
-    MaskHidesNothing = "mask-hides-nothing",
-    /// Photographs have an alpha channel that is opaque throughout.
-    OpaqueAlpha = "opaque-alpha",
-    /// Single photographs disagree with their cameras.
-    WrongPose = "wrong-pose",
-    /// There is nothing to measure a model by.
-    NothingHeldOut = "nothing-held-out",
-    /// All cameras stand in one place.
-    OnePlace = "one-place",
-    /// All cameras stand on a line.
-    OnALine = "on-a-line",
-}
-
-impl fmt::Display for FindingKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(self.name())
-    }
-}
 
 /// One thing that is wrong, or worth knowing.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -250,46 +128,42 @@ impl Report {
 pub(super) struct Findings(pub Vec<Finding>);
 
 impl Findings {
-    /// Adds a finding.
-    pub fn add(
-        &mut self,
-        kind: FindingKind,
-        severity: Severity,
-        what: impl ToString,
-        advice: &str,
-        views: Vec<String>,
-    ) {
-        let (what, advice) = (what.to_string(), advice.to_owned());
-        self.0.push(Finding { kind, severity, what, advice, views });
+    /// Adds a finding; `parts` take the places of `{}` in the message of its kind.
+    pub fn add(&mut self, kind: FindingKind, parts: &[&dyn Display]) -> &mut Finding {
+        let Text { severity, what: template, advice, .. } = kind.text();
+        debug_assert_eq!(template.matches("{}").count(), parts.len(), "{template}");
+        let mut pieces = template.split("{}");
+        let mut what = pieces.next().unwrap_or_default().to_owned();
+        pieces.zip(parts).for_each(|(piece, part)| what += &format!("{part}{piece}"));
+        let number = self.0.len();
+        self.0.push(Finding { kind, severity, what, advice: advice.to_owned(), views: vec![] });
+        &mut self.0[number]
     }
 
-    /// Adds a finding about some photographs, if there are some: `what` is told how many.
-    pub fn about(
+    /// Adds a finding about some photographs, if there are some: how many is the first part of the message.
+    pub fn about<'a>(
         &mut self,
         kind: FindingKind,
-        severity: Severity,
-        views: Vec<String>,
-        what: impl Fn(&str) -> String,
-        advice: &str,
-    ) {
-        if !views.is_empty() {
-            self.add(kind, severity, what(&counted(views.len())), advice, views);
+        views: impl IntoIterator<Item = &'a View>,
+        parts: &[&dyn Display],
+    ) -> Option<&mut Finding> {
+        let names: Vec<String> = views.into_iter().map(|view| view.name.clone()).collect();
+        let count = counted(names.len());
+        if names.is_empty() {
+            return None;
         }
+        let finding = self.add(kind, &[&[&count as &dyn Display], parts].concat());
+        finding.views = names;
+        Some(finding)
     }
 
     /// Adds a finding about photographs that are like another one each, if there are some: the first pair is named.
-    pub fn alike(
-        &mut self,
-        kind: FindingKind,
-        severity: Severity,
-        pairs: Vec<[String; 2]>,
-        what: impl Fn(&str) -> String,
-        advice: &str,
-    ) {
-        let Some([first, other]) = pairs.first() else { return };
-        let named = format!(": `{first}` and `{other}`{}", if pairs.len() > 1 { ", and others" } else { "" });
-        let views = pairs.iter().map(|[name, _]| name.clone()).collect();
-        self.about(kind, severity, views, |count| what(count) + &named, advice);
+    pub fn alike(&mut self, kind: FindingKind, pairs: &[[&View; 2]]) {
+        if let Some(finding) = self.about(kind, pairs.iter().map(|[view, _]| *view), &[]) {
+            let [first, other] = pairs[0];
+            let others = if pairs.len() > 1 { ", and others" } else { "" };
+            finding.what += &format!(": `{}` and `{}`{others}", first.name, other.name);
+        }
     }
 
     /// All of them, the gravest first, those of one severity in the order of their kinds.
@@ -300,6 +174,6 @@ impl Findings {
 }
 
 /// `1 photograph` or `3 photographs`.
-pub(super) fn counted(count: usize) -> String {
+fn counted(count: usize) -> String {
     if count == 1 { "1 photograph".to_owned() } else { format!("{count} photographs") }
 }

@@ -1,8 +1,9 @@
 //! What can be said of each camera alone: its field of view, its principal point, its lens.
 
-use super::report::{FindingKind, Findings, Severity};
+use super::kinds::FindingKind as Kind;
+use super::report::Findings;
 use crate::camera::{Camera, Lens};
-use crate::dataset::{Capture, View};
+use crate::dataset::Capture;
 
 /// Fields of view that lenses have, in degrees, and those of lenses that show half of the world and more.
 const VIEWS: [f64; 2] = [10.0, 150.0];
@@ -18,68 +19,25 @@ const STEPS: usize = 32;
 
 /// Adds what is wrong with single cameras.
 pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
-    use FindingKind as Kind;
-    use Severity::{Note, Warning};
-    let sized = || capture.views.iter().filter(|view| view.camera.width > 0 && view.camera.height > 0);
-    let named = |wrong: &dyn Fn(&Camera) -> bool| -> Vec<String> {
-        sized().filter(|view| wrong(&view.camera)).map(name).collect()
+    let mut about = |kind: Kind, wrong: &dyn Fn(&Camera) -> bool| {
+        let sized = capture.views.iter().filter(|view| view.camera.width > 0 && view.camera.height > 0);
+        findings.about(kind, sized.filter(|view| wrong(&view.camera)), &[]);
     };
-    let implausible = |camera: &Camera| {
+    about(Kind::FieldOfView, &|camera| {
         let most = if matches!(camera.lens, Lens::Fisheye { .. } | Lens::Fov { .. }) { WIDE } else { VIEWS[1] };
         camera.lens != Lens::Equirectangular
             && [0, 1].into_iter().any(|axis| !(VIEWS[0]..=most).contains(&field_of_view(camera, axis)))
-    };
-    findings.about(
-        Kind::FieldOfView,
-        Warning,
-        named(&implausible),
-        |count| format!("the field of view of {count} is below 10 or above 150 degrees"),
-        "Check the unit of the focal length (pixels, for the size of the images that the file names; not millimetres) and of \
-         `camera_angle_x` (radians).",
-    );
-    let stretched = |camera: &Camera| {
+    });
+    about(Kind::PixelAspect, &|camera| {
         let [x, y] = camera.focal;
         camera.lens != Lens::Equirectangular && !((x / y - 1.0).abs() <= ASPECT)
-    };
-    findings.about(
-        Kind::PixelAspect,
-        Warning,
-        named(&stretched),
-        |count| format!("the horizontal focal length of {count} is more than 5 % off the vertical one"),
-        "Cameras have square pixels: if the images were stretched, say so in both focal lengths; otherwise use one for both.",
-    );
-    let off_centre = |camera: &Camera| {
+    });
+    about(Kind::PrincipalPoint, &|camera| {
         let sides = [camera.width as f64, camera.height as f64];
         (0..2).any(|axis| !((camera.centre[axis] / sides[axis] - 0.5).abs() <= OFF_CENTRE))
-    };
-    findings.about(
-        Kind::PrincipalPoint,
-        Warning,
-        named(&off_centre),
-        |count| format!("the principal point of {count} is more than a tenth of the image from its middle"),
-        "If the images are smaller than those that the cameras were measured with, scale `cx` and `cy` with them; if they were \
-         cropped, this may be right.",
-    );
-    findings.about(
-        Kind::LensFolds,
-        Warning,
-        named(&|camera| !reaches(camera)),
-        |count| format!("the lens of {count} puts nothing in a part of the image, or folds it back on itself"),
-        "The coefficients were found from points nearer to the middle, and do not hold at the border: find them anew with \
-         fewer of them (k1 alone), or crop or undistort the images. Pixels that no light reaches are left out.",
-    );
-    findings.about(
-        Kind::StrongDistortion,
-        Note,
-        named(&|camera| reaches(camera) && bends(camera) > BENDS),
-        |count| format!("the lens of {count} bends light by more than 5 degrees at the border"),
-        "Nothing needs to be done if the coefficients are right. Straight lines that are curved in rendered views say that they \
-         are not.",
-    );
-}
-
-fn name(view: &View) -> String {
-    view.name.clone()
+    });
+    about(Kind::LensFolds, &|camera| !reaches(camera));
+    about(Kind::StrongDistortion, &|camera| reaches(camera) && bends(camera) > BENDS);
 }
 
 /// The horizontal (`axis` 0) or vertical field of view in degrees, distortion aside.

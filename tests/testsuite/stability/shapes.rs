@@ -4,7 +4,7 @@
 use ndarray::{ArrayD, Axis, IxDyn, Slice, concatenate, stack};
 use proptest::prelude::*;
 use raygrad::nerf::volume::{Accumulate, OpticalDepth, Weights};
-use raygrad::nerf::{Contraction, PositionalEncoding, SphericalHarmonics, rotation_exp, rotation_log};
+use raygrad::nerf::{Contraction, PositionalEncoding, SphericalHarmonics, rotation_exp};
 use raygrad::{Activation, Axes, Conv2dConfig, Indices, Pool2dConfig, Segments, Tape, Tensor, Var};
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -99,10 +99,9 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
         69 => tape.apply(PositionalEncoding { levels: j, input: k % 2 == 0 }, &[a]),
         70 => tape.apply(SphericalHarmonics::new(i), &[a]),
         71 => rotation_exp(a),
-        72 => rotation_log(a),
         73 => tape.apply(OpticalDepth::new(Tensor::ones(&[i + j])), &[&a.square()]),
         78 => tape.apply(Weights::new(segments()), &[&a.square()]),
-        79 => tape.apply(Accumulate(segments()), &[&a.square(), b]),
+        72 => tape.apply(Accumulate(segments()), &[&a.square(), b]),
         74 => tape.constant(Tensor::scalar(a.searchsorted(b, false).as_slice().len() as f64)),
         75 => tape.constant(Tensor::scalar(a.argmax(axis).as_slice().len() as f64)),
         76 => Var::meshgrid(&[a, b]).pop()?,
@@ -111,7 +110,7 @@ fn apply<'t>(op: usize, a: &V<'t>, b: &V<'t>, c: &V<'t>, [i, j, k]: [usize; 3]) 
     })
 }
 
-const OPERATIONS: usize = 80;
+const OPERATIONS: usize = 79;
 
 trait Einsum {
     fn einsum_with(&self, other: &Self, which: usize) -> Self;
@@ -126,9 +125,8 @@ impl Einsum for V<'_> {
 
 /// What is not the tape's to refuse: inputs that constructors and plain tensors check. Any other panic is an accident: an
 /// index out of bounds, an overflow, an `unwrap`.
-const MESSAGES: [&str; 7] = [
+const MESSAGES: [&str; 6] = [
     "one_hot: index",
-    "rotation matrices are",
     "rotation vectors of three elements",
     "searchsorted in a scalar",
     "searchsorted of shapes",

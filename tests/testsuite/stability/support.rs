@@ -75,6 +75,12 @@ pub fn within(what: &str, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: {got:e} for {expected:e}, tolerance {tolerance:e}");
 }
 
+/// How far a matrix, row by row, is from a rotation: the Frobenius norm of `R'R - 1`.
+pub fn skewness(rotation: &[f64]) -> f64 {
+    let gram = |i: usize, j: usize| (0..3).map(|k| rotation[3 * k + i] * rotation[3 * k + j]).sum::<f64>();
+    (0..9).map(|k| (gram(k / 3, k % 3) - f64::from(u8::from(k % 4 == 0))).powi(2)).sum::<f64>().sqrt()
+}
+
 /// Neither infinite nor NaN.
 #[track_caller]
 pub fn finite<T: Scalar>(what: &str, x: &Tensor<T>) {

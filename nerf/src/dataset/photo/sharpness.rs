@@ -6,30 +6,34 @@ impl Photo {
     /// The variance of the Laplacian of its brightness (Pech-Pacheco et al. 2000): more is sharper, among photographs of one
     /// thing and one size. 0 if a side is shorter than 3 pixels.
     pub fn sharpness(&self) -> f64 {
-        let Photo { width, height, .. } = *self;
-        if width < 3 || height < 3 {
-            return 0.0;
-        }
-        let line = |y: usize| -> Vec<f32> {
-            let luma = |[r, g, b, _]: [f32; 4]| 0.299 * r + 0.587 * g + 0.114 * b;
-            (0..width).map(|x| luma(self.pixel(x, y))).collect()
-        };
-        let mut lines = [line(0), line(1), line(2)];
-        let (mut sum, mut squares) = (0.0, 0.0);
-        for y in 1..height - 1 {
-            let [above, this, below] = &lines;
-            for x in 1..width - 1 {
-                let value = f64::from(this[x - 1] + this[x + 1] + above[x] + below[x] - 4.0 * this[x]);
-                (sum, squares) = (sum + value, squares + value * value);
-            }
-            if y + 2 < height {
-                lines.rotate_left(1);
-                lines[2] = line(y + 2);
-            }
-        }
-        let count = ((width - 2) * (height - 2)) as f64;
-        squares / count - (sum / count).powi(2)
+        let luma = |[r, g, b, _]: [f32; 4]| 0.299 * r + 0.587 * g + 0.114 * b;
+        let line = |y: usize| (0..self.width).map(|x| luma(self.pixel(x, y))).collect();
+        laplacian_variance([self.width, self.height], line)
     }
+}
+
+/// The variance of the Laplacian of a grey image, which gives its lines by their number; 0 if a side is shorter than 3 pixels.
+pub(crate) fn laplacian_variance([width, height]: [usize; 2], line: impl Fn(usize) -> Vec<f32>) -> f64 {
+    if width < 3 || height < 3 {
+        return 0.0;
+    }
+    let mut lines = [line(0), line(1), line(2)];
+    let (mut sum, mut squares) = (0.0, 0.0);
+    for y in 1..height - 1 {
+        let [above, this, below] = &lines;
+        for x in 1..width - 1 {
+            let [left, right, above, below, middle] =
+                [this[x - 1], this[x + 1], above[x], below[x], this[x]].map(f64::from);
+            let value = left + right + above + below - 4.0 * middle;
+            (sum, squares) = (sum + value, squares + value * value);
+        }
+        if y + 2 < height {
+            lines.rotate_left(1);
+            lines[2] = line(y + 2);
+        }
+    }
+    let count = ((width - 2) * (height - 2)) as f64;
+    squares / count - (sum / count) * (sum / count)
 }
 
 #[cfg(test)]

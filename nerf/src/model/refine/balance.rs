@@ -107,7 +107,6 @@ fn inverse_transposed(lower: &Matrix) -> Matrix {
 mod tests {
     use super::*;
     use crate::camera::lens::Lens;
-    use glam::DAffine3;
     use raygrad_autograd::Real;
 
     const BOX: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
@@ -164,7 +163,7 @@ mod tests {
             numbers[k] = step;
             let [x, y, z, a, b, c] = numbers;
             // The camera turns by that: what it sees turns back. It moves: what it sees moves back.
-            let turn = DAffine3::from(crate::camera::pose::Pose::from_vector([x, y, z], [0.0; 3])).matrix3;
+            let turn = crate::camera::rotation_matrix(DVec3::new(x, y, z));
             let moved = (turn.transpose() * (t * direction - DVec3::new(a, b, c))).normalize();
             for i in 0..3 {
                 assert!(((moved[i] - direction[i]) / step - found[i][k]).abs() < 1e-5, "{i} {k}");

@@ -10,9 +10,8 @@ pub use settings::{RefineConfig, Refined};
 use crate::camera::bounds::clip_span;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::{Camera, Ray};
-use crate::camera::pose::Pose;
 use crate::camera::rays::Rays;
-use crate::camera::rotation_exp;
+use crate::camera::{rotation_exp, rotation_matrix};
 use crate::dataset::Placement;
 use crate::model::extent::Extent;
 use crate::volume::query::RayVars;
@@ -263,7 +262,7 @@ impl Refine {
         let row = &params.get(poses).as_slice()[POSE * number..POSE * (number + 1)];
         let [x, y, z, a, b, c] =
             self.balance[number].map(|numbers| numbers.iter().zip(row).map(|(a, b)| a * b.to_f64()).sum::<f64>());
-        let turn = DAffine3::from(Pose::from_vector([x, y, z], [0.0; 3])).matrix3;
+        let turn = rotation_matrix(DVec3::new(x, y, z));
         let grown = self.groups.get(number).map_or(1.0, |group| self.growth(params, Some(*group)));
         let pose = DAffine3 {
             matrix3: turn * camera.pose.matrix3,
