@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::dataset::image::Image;
 use crate::error::{Error, Result};
+use crate::range::by_name;
 
 /// The background in front of which images with transparency are trained and shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -43,11 +44,7 @@ impl Background {
 
 impl fmt::Display for Background {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Background::White => "white",
-            Background::Black => "black",
-            Background::Random => "random",
-        })
+        self.serialize(f)
     }
 }
 
@@ -55,12 +52,8 @@ impl FromStr for Background {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        match text {
-            "white" => Ok(Background::White),
-            "black" => Ok(Background::Black),
-            "random" => Ok(Background::Random),
-            _ => Err(Error::setting("background", format!("must be white, black or random, is `{text}`"))),
-        }
+        by_name(text)
+            .ok_or_else(|| Error::setting("background", format!("must be white, black or random, is `{text}`")))
     }
 }
 

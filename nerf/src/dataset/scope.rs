@@ -1,6 +1,7 @@
 //! How far scenes go.
 
 use crate::error::{Error, Result};
+use crate::range::by_name;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -26,11 +27,7 @@ impl Scope {
 
 impl fmt::Display for Scope {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Scope::Bounded => "bounded",
-            Scope::Unbounded => "unbounded",
-            Scope::Forward => "forward",
-        })
+        self.serialize(f)
     }
 }
 
@@ -38,11 +35,7 @@ impl FromStr for Scope {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        match text {
-            "bounded" => Ok(Scope::Bounded),
-            "unbounded" => Ok(Scope::Unbounded),
-            "forward" => Ok(Scope::Forward),
-            _ => Err(Error::setting("scope", format!("must be bounded, unbounded or forward, is `{text}`"))),
-        }
+        by_name(text)
+            .ok_or_else(|| Error::setting("scope", format!("must be bounded, unbounded or forward, is `{text}`")))
     }
 }

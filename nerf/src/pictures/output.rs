@@ -31,12 +31,17 @@ impl Image {
             other => panic!("a PNG has 1, 3 or 4 channels, not {other}"),
         };
         assert!(self.width > 0 && self.height > 0, "a {}x{} image has no pixels", self.width, self.height);
-        let bytes: Vec<u8> = self.data.iter().map(|&value| quantise(value)).collect();
         let mut png = Vec::new();
-        PngEncoder::new(&mut png)
-            .write_image(&bytes, self.width as u32, self.height as u32, colour)
-            .expect("the shape is checked above, and writing to memory does not fail");
+        self.encode(PngEncoder::new(&mut png), colour);
         png
+    }
+
+    #[track_caller]
+    fn encode(&self, encoder: impl ImageEncoder, colour: ExtendedColorType) {
+        let bytes: Vec<u8> = self.data.iter().map(|&value| quantise(value)).collect();
+        encoder
+            .write_image(&bytes, self.width as u32, self.height as u32, colour)
+            .expect("the shape is checked before, and writing to memory does not fail");
     }
 
     /// The image as a JPEG file in memory: grey or RGB by its channels, each value [quantised](quantise). `quality` is from 1 to
@@ -55,11 +60,8 @@ impl Image {
         let sides = 1..=usize::from(u16::MAX);
         let fits = sides.contains(&self.width) && sides.contains(&self.height);
         assert!(fits, "a {}x{} image is no JPEG", self.width, self.height);
-        let bytes: Vec<u8> = self.data.iter().map(|&value| quantise(value)).collect();
         let mut jpeg = Vec::new();
-        JpegEncoder::new_with_quality(&mut jpeg, quality)
-            .write_image(&bytes, self.width as u32, self.height as u32, colour)
-            .expect("the shape is checked above, and writing to memory does not fail");
+        self.encode(JpegEncoder::new_with_quality(&mut jpeg, quality), colour);
         jpeg
     }
 

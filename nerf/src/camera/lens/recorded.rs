@@ -51,33 +51,22 @@ pub(crate) fn entries() -> Vec<Entry> {
         let z = |i: usize| from + (to - from) * (0.5 + 0.5 * wave(i + 4));
         Tensor::from_fn(&[6, 3], |i| if i % 3 == 2 { z(i) } else { wave(i) + 0.03 })
     };
-    let tensor = |values: &[f64]| Tensor::from_vec(&[values.len()], values.to_vec());
-    let brown = [0.1, -0.2, 0.03, 0.2, -0.05, 0.01, 0.002, -0.003];
-    let fisheye = [0.05, -0.02, 0.003, 0.001, 0.002, -0.003, 0.004, -0.001];
-    const BROWN: Lens = Lens::Brown { k: [0.0; 6], p: [0.0; 2] };
-    const FISHEYE: Lens = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
-    const FOV: Lens = Lens::Fov { omega: 0.0 };
-    const ALL: Lens = Lens::Equirectangular;
-    const NONE: Lens = Lens::Pinhole;
+    let entry = |name, lens: Lens, depths: [f64; 2], coefficients: &[&[f64]]| {
+        let entry =
+            Entry::function(name, move |x| lens_places(&lens, &x[0], &x[1]), move |x| lens_places(&lens, &x[0], &x[1]));
+        coefficients.iter().fold(entry, |entry, coefficients| {
+            let coefficients = Tensor::from_vec(&[coefficients.len()], coefficients.to_vec());
+            entry.sample_of(vec![coefficients, directions(depths[0], depths[1])])
+        })
+    };
+    let (ahead, aside) = ([0.8, 1.5], [-0.1, 1.2]);
+    let brown = Lens::Brown { k: [0.1, -0.2, 0.03, 0.2, -0.05, 0.01], p: [0.002, -0.003] };
+    let fisheye = Lens::Fisheye { k: [0.05, -0.02, 0.003, 0.001], p: [0.002, -0.003], s: [0.004, -0.001] };
     vec![
-        Entry::function("lens_brown", |x| lens_places(&BROWN, &x[0], &x[1]), |x| lens_places(&BROWN, &x[0], &x[1]))
-            .sample_of(vec![tensor(&brown), directions(0.8, 1.5)]),
-        Entry::function(
-            "lens_fisheye",
-            |x| lens_places(&FISHEYE, &x[0], &x[1]),
-            |x| lens_places(&FISHEYE, &x[0], &x[1]),
-        )
-        .sample_of(vec![tensor(&fisheye), directions(-0.1, 1.2)]),
-        Entry::function("lens_fov", |x| lens_places(&FOV, &x[0], &x[1]), |x| lens_places(&FOV, &x[0], &x[1]))
-            .sample_of(vec![tensor(&[0.9]), directions(0.8, 1.5)])
-            .sample_of(vec![tensor(&[1e-3]), directions(0.8, 1.5)]),
-        Entry::function(
-            "lens_equirectangular",
-            |x| lens_places(&ALL, &x[0], &x[1]),
-            |x| lens_places(&ALL, &x[0], &x[1]),
-        )
-        .sample_of(vec![tensor(&[]), directions(-0.1, 1.2)]),
-        Entry::function("lens_pinhole", |x| lens_places(&NONE, &x[0], &x[1]), |x| lens_places(&NONE, &x[0], &x[1]))
-            .sample_of(vec![tensor(&[]), directions(0.8, 1.5)]),
+        entry("lens_brown", brown, ahead, &[&brown.coefficients()]),
+        entry("lens_fisheye", fisheye, aside, &[&fisheye.coefficients()]),
+        entry("lens_fov", Lens::Fov { omega: 0.9 }, ahead, &[&[0.9], &[1e-3]]),
+        entry("lens_equirectangular", Lens::Equirectangular, aside, &[&[]]),
+        entry("lens_pinhole", Lens::Pinhole, ahead, &[&[]]),
     ]
 }

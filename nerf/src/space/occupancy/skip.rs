@@ -1,8 +1,8 @@
 //! How much empty-looking space may be skipped.
 
-use crate::range::check_range;
+use crate::range::{by_name, check_range};
 use crate::{Error, Result};
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
@@ -53,7 +53,8 @@ impl Skip {
 
 /// What is left out, switch by switch: a [`Skip`] is a set of these, and a configuration may say each for itself. In a file
 /// it is such a name, or an object with these fields.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(from = "Stored")]
 pub struct Skipping {
     /// Whether training passes over cells in which the field holds little. What it has passed over is empty in views too:
     /// the field was never asked there.
@@ -87,30 +88,20 @@ impl From<Skip> for Skipping {
 
 /// What a file may say.
 #[derive(Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, deny_unknown_fields)]
 enum Stored {
     Named(Skip),
-    Each(Each),
+    Each { grid: bool, carving: u32, pruning: f64, termination: f64, colors: f64 },
 }
 
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Each {
-    grid: bool,
-    carving: u32,
-    pruning: f64,
-    termination: f64,
-    colors: f64,
-}
-
-impl<'de> Deserialize<'de> for Skipping {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
-        Ok(match Stored::deserialize(deserializer)? {
+impl From<Stored> for Skipping {
+    fn from(stored: Stored) -> Self {
+        match stored {
             Stored::Named(skip) => skip.into(),
-            Stored::Each(Each { grid, carving, pruning, termination, colors }) => {
+            Stored::Each { grid, carving, pruning, termination, colors } => {
                 Skipping { grid, carving, pruning, termination, colors }
             }
-        })
+        }
     }
 }
 
@@ -128,23 +119,15 @@ impl Skipping {
 
 impl fmt::Display for Skip {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Skip::Off => "off",
-            Skip::Lossless => "lossless",
-            Skip::Fast => "fast",
-        })
+        self.serialize(f)
     }
 }
 
 impl FromStr for Skip {
     type Err = Error;
+
     fn from_str(name: &str) -> Result<Self> {
-        match name {
-            "off" => Ok(Skip::Off),
-            "lossless" => Ok(Skip::Lossless),
-            "fast" => Ok(Skip::Fast),
-            _ => Err(Error::setting("skip", format!("there is no `{name}`; use off, lossless or fast"))),
-        }
+        by_name(name).ok_or_else(|| Error::setting("skip", format!("there is no `{name}`; use off, lossless or fast")))
     }
 }
 
