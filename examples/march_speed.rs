@@ -86,7 +86,7 @@ fn time(what: &str, grid: &OccupancyGrid, rays: &Rays<f32>, step: &Step, repeats
 fn main() -> Result<()> {
     let scene = Scene::bulldozer();
     let grid = surfaces(&scene)?;
-    println!("{:.1} % of cells are occupied, {:?}", 100.0 * grid.occupied_share(), grid.occupied_bounds());
+    println!("{:.1} % of cells are occupied", 100.0 * grid.occupied_share());
     let mut all: Vec<Ray> = Vec::new();
     for camera in test_cameras(10, 100) {
         all.extend((0..100 * 100).map(|i| camera.pixel_ray(i % 100, i / 100)));

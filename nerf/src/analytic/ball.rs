@@ -3,7 +3,6 @@
 use super::{Layer, Layers, Medium};
 use crate::camera::pinhole::Ray;
 use glam::DVec3;
-use std::f64::consts::PI;
 
 /// A ball of one density and one colour.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,14 +27,6 @@ impl Ball {
         let [from, to] = [nearest - half_chord, nearest + half_chord];
         let layer = Layer { from, to, sigma: self.sigma, color: [self.color, 0.0] };
         Layers::new(if half_chord > 0.0 { std::slice::from_ref(&layer) } else { &[] })
-    }
-
-    /// The integral of the opacity over the image plane of parallel rays:
-    /// `pi R^2 - pi (1 - e^(-2 sigma R) (1 + 2 sigma R)) / (2 sigma^2)`.
-    pub fn opacity_integral(&self) -> f64 {
-        let x = 2.0 * self.sigma * self.radius;
-        let missing = (1.0 - (-x).exp() * (1.0 + x)) / (2.0 * self.sigma.powi(2));
-        PI * (self.radius.powi(2) - missing)
     }
 }
 

@@ -1,7 +1,6 @@
-//! Sets of cells as words of bits: growing, coarsening, and the box around them.
+//! Sets of cells as words of bits: growing, coarsening and counting.
 
 use super::lattice::{CELLS, EDGE, Lattice, cell};
-use glam::DVec3;
 
 /// For each axis how far apart the bits of neighbouring cells are.
 const STRIDES: [usize; 3] = [1, EDGE, EDGE * EDGE];
@@ -65,21 +64,4 @@ pub(super) fn coarsen(words: &mut [u64], lattice: &Lattice) {
 pub(super) fn count(words: &[u64], lattice: &Lattice) -> usize {
     let used = words.iter().enumerate().filter(|(i, _)| lattice.is_used(*i));
     used.map(|(_, word)| word.count_ones() as usize).sum()
-}
-
-/// The box around the set cells in scene units; `None` if there are none.
-pub(super) fn bounds(words: &[u64], lattice: &Lattice) -> Option<[DVec3; 2]> {
-    let mut found: Option<[DVec3; 2]> = None;
-    for (i, &word) in words.iter().enumerate().filter(|(i, word)| **word != 0 && lattice.is_used(*i)) {
-        let [corner, size] = lattice.block(i);
-        let (mut low, mut high) = ([0.0; 3], [0.0; 3]);
-        for axis in 0..3 {
-            let layer = |k: usize| word & LOWER[axis] << (k * STRIDES[axis]) != 0;
-            low[axis] = (0..EDGE).find(|&k| layer(k)).unwrap_or(0) as f64;
-            high[axis] = (0..EDGE).rfind(|&k| layer(k)).map_or(EDGE, |k| k + 1) as f64;
-        }
-        let (low, high) = (corner + size * DVec3::from(low), corner + size * DVec3::from(high));
-        found = Some(found.map_or([low, high], |[l, h]| [l.min(low), h.max(high)]));
-    }
-    found
 }

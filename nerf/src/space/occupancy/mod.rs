@@ -245,11 +245,6 @@ impl OccupancyGrid {
         self.lattice.holding(place).is_some_and(|(word, bit)| self.words[word] >> bit & 1 == 1)
     }
 
-    /// The box around the occupied cells in scene units; `None` if there are none.
-    pub fn occupied_bounds(&self) -> Option<[DVec3; 2]> {
-        bits::bounds(&self.words, &self.lattice)
-    }
-
     /// The mean density of the cells that were looked at, in 1 / scene unit, that of each cell as many times over as it is
     /// larger than those of cascade 0; 0 if there are none. Carved cells do not count.
     pub fn mean_density(&self) -> f64 {

@@ -68,20 +68,12 @@ proptest! {
     }
 
     #[test]
-    fn bounds_and_share_as_by_cells(seed in 0..1000u64, share in 0.0..0.005f64) {
+    fn the_share_is_as_by_cells(seed in 0..1000u64, share in 0.0..0.005f64) {
         let mut grid = grid(16, 1);
         let words = random_words(&grid.lattice, share, seed);
         let cells = set(&words, &grid.lattice);
         grid.occupy(words, false);
         prop_assert_eq!(grid.occupied_share(), cells.len() as f64 / 4096.0);
-        let size = (BOX[1] - BOX[0]) / 16.0;
-        let corner = |cell: &[usize; 3]| BOX[0] + size * DVec3::from(cell.map(|x| x as f64));
-        let low = cells.iter().map(corner).reduce(DVec3::min);
-        let high = cells.iter().map(|cell| corner(cell) + size).reduce(DVec3::max);
-        prop_assert_eq!(grid.occupied_bounds().is_none(), cells.is_empty());
-        for ([found_low, found_high], (low, high)) in grid.occupied_bounds().into_iter().zip(low.zip(high)) {
-            prop_assert!(found_low.distance(low) < 1e-12 && found_high.distance(high) < 1e-12);
-        }
     }
 
     #[test]
@@ -166,12 +158,11 @@ fn cells_tile_the_boxes() {
 fn a_new_grid_is_occupied_and_so_is_what_was_never_looked_at() {
     let mut grid = grid(16, 2);
     assert_eq!(grid.occupied_share(), 1.0);
-    assert_eq!(grid.occupied_bounds(), Some(grid.outer_bounds()));
     grid.threshold(&Threshold { min_sigma: 0.1, or_mean: true, dilate: false });
     assert_eq!(grid.occupied_share(), 1.0);
     grid.update(&Update::ALL, 0, 0, &|_, out| out.fill(0.0));
     grid.threshold(&Threshold { min_sigma: 0.1, or_mean: false, dilate: true });
-    assert_eq!((grid.occupied_share(), grid.occupied_bounds()), (0.0, None));
+    assert_eq!(grid.occupied_share(), 0.0);
     grid.update(&Update::ALL, 0, 0, &|_, out| out.fill(f32::NAN));
     grid.threshold(&Threshold { min_sigma: 0.1, or_mean: false, dilate: false });
     assert_eq!(grid.occupied_share(), 1.0, "a field's NaN is not empty space");
