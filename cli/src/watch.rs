@@ -95,8 +95,7 @@ impl<'a> Watch<'a> {
             progress: Progress::new(),
             warned: HashSet::new(),
         };
-        let summed = watch.summarise(&stats, None);
-        watch.warn(summed);
+        watch.attempt(|watch| watch.summarise(&stats, None));
         if tensorboard || run.file("tensorboard").is_dir() {
             watch.begin_events(step);
         }
@@ -127,14 +126,11 @@ impl<'a> Watch<'a> {
 
     /// Begins an event file for the steps after this one.
     fn begin_events(&mut self, step: u64) {
-        let events = Events::create(&self.run.file("tensorboard"), step + 1);
-        self.events = match events {
-            Ok(events) => Some(events),
-            Err(error) => {
-                self.warn(Err(error));
-                None
-            }
-        };
+        self.events = None;
+        self.attempt(|watch| {
+            watch.events = Some(Events::create(&watch.run.file("tensorboard"), step + 1)?);
+            Ok(())
+        });
     }
 
     /// Called after each step; `stops` says that it is the last one, whatever the budget. What cannot be written is said, and
@@ -146,8 +142,7 @@ impl<'a> Watch<'a> {
         self.psnr = Some(psnr);
         self.account.step(&stats);
         if is_logged(stats.step) {
-            let logged = self.log(&stats);
-            self.warn(logged);
+            self.attempt(|watch| watch.log(&stats));
         }
         let (fraction, left) = remaining(self.budget, &stats);
         self.progress.set(fraction, || {
@@ -157,8 +152,7 @@ impl<'a> Watch<'a> {
         });
         if stats.train_seconds >= self.next_preview {
             self.next_preview = 2.0 * stats.train_seconds.max(self.next_preview);
-            let shown = self.preview(trainer);
-            self.warn(shown);
+            self.attempt(|watch| watch.preview(trainer));
         }
         // Views look at a finished model, and training goes on from one that is not; and not from one that may have diverged,
         // unless there is no later one to come.
@@ -166,8 +160,7 @@ impl<'a> Watch<'a> {
         let good = stats.stuck == 0 || (ends && !stats.ends_diverged());
         if (ends || stats.train_seconds >= self.next_save) && good {
             self.next_save = stats.train_seconds + self.interval;
-            let saved = self.save(trainer, !ends);
-            self.warn(saved);
+            self.attempt(|watch| watch.save(trainer, !ends));
         }
     }
 
@@ -211,9 +204,7 @@ impl<'a> Watch<'a> {
     pub fn give_up(&mut self, trainer: &mut Trainer) -> bool {
         let back = checkpoint::load(self.run, trainer).and_then(|()| self.keep()).and_then(|()| self.cut(trainer));
         trainer.model.finish();
-        let found = back.is_ok();
-        self.warn(back);
-        found
+        self.attempt(|_| back)
     }
 
     /// Forgets what was written of steps after the one that a trainer is at.
@@ -229,17 +220,15 @@ impl<'a> Watch<'a> {
         Ok(())
     }
 
-    /// Says what went wrong, if it was not said before. That the run is lost ends training, and is said then.
-    fn warn(&mut self, done: Result<()>) {
-        let Err(error) = done else { return };
-        if self.lost {
-            return;
-        }
+    /// Does what training goes on without: says what went wrong, if it was not said before, and gives whether nothing did. That the
+    /// run is lost ends training, and is said then.
+    fn attempt(&mut self, work: impl FnOnce(&mut Self) -> Result<()>) -> bool {
+        let Err(error) = work(self) else { return true };
         let words = format!("raygrad: warning: {error}; training goes on");
-        if !self.warned.contains(&words) {
+        if !self.lost && self.warned.insert(words.clone()) {
             self.progress.note(&words);
-            self.warned.insert(words);
         }
+        false
     }
 
     /// Called when training has ended; unless somebody waits for that, there is a last preview. The model is written if it is
@@ -254,8 +243,7 @@ impl<'a> Watch<'a> {
         }
         let stats = trainer.stats();
         if stats.step > self.logged {
-            let logged = self.log(&stats);
-            self.warn(logged);
+            self.attempt(|watch| watch.log(&stats));
         }
         let shown = if ended == Ended::Interrupted { Ok(()) } else { self.preview(trainer) };
         self.keep()?;
@@ -296,8 +284,7 @@ impl<'a> Watch<'a> {
 
     /// Tells TensorBoard something, if it is told anything; what it cannot be told is said, and no more.
     fn tell(&mut self, write: impl FnOnce(&mut Events) -> Result<()>) {
-        let told = self.events.as_mut().map_or(Ok(()), write);
-        self.warn(told);
+        self.attempt(|watch| watch.events.as_mut().map_or(Ok(()), write));
     }
 
     fn summarise(&self, stats: &StepStats, ended: Option<Ended>) -> Result<()> {
