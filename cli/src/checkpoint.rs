@@ -4,7 +4,6 @@
 
 use std::fs;
 use std::io::{ErrorKind, Read};
-use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Error, Result, Trainer, write_atomic};
@@ -22,11 +21,6 @@ const LONGEST: usize = 80;
 fn folder(run: &Run) -> PathBuf {
     run.file("checkpoints")
 }
-
-/// How many stay if nothing is said: if the last is damaged, there is the one before.
-pub const KEPT: usize = *MAY_STAY.start();
-/// How many may stay.
-pub const MAY_STAY: RangeInclusive<usize> = 2..=1 << 14;
 
 /// Writes where training is, and removes all others but the last, as many as the run keeps with this.
 pub fn save(run: &Run, trainer: &Trainer) -> Result<()> {

@@ -3,6 +3,7 @@
 
 use std::fs::DirEntry;
 use std::io::ErrorKind;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use raygrad::nerf::{Budget, Config, Error, Extent, Model, Result, write_atomic};
@@ -10,7 +11,6 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
-use super::checkpoint;
 use super::lock::{Lock, State};
 use super::output::{make_folder, parent, remove};
 use super::scene::Scene;
@@ -21,6 +21,9 @@ const DEFAULT: &str = "run";
 /// The file by which a program keeps others out of a run, and the one that names it ([`Lock`]).
 const LOCK: &str = "lock";
 const OWNER: &str = "lock.owner";
+
+/// How many checkpoints may stay; the least if nothing is said: if the last is damaged, there is the one before.
+pub const CHECKPOINTS: RangeInclusive<usize> = 2..=1 << 14;
 
 /// What training writes in a run's folder, and evaluations beside it (`eval-..`).
 const OWN: [&str; 9] = [
@@ -56,14 +59,15 @@ pub struct RunConfig {
     #[serde(default)]
     pub budget: Option<Budget>,
     /// How many checkpoints stay.
-    #[serde(default = "kept")]
+    #[serde(default = "usual_checkpoints")]
     pub keep_checkpoints: usize,
     /// The model and how it is trained.
     pub config: Config,
 }
 
-fn kept() -> usize {
-    checkpoint::KEPT
+/// How many checkpoints stay if nothing is said.
+pub fn usual_checkpoints() -> usize {
+    *CHECKPOINTS.start()
 }
 
 /// A run on disk.
@@ -218,8 +222,8 @@ impl RunConfig {
             return Err(Error::setting("extent.span", format!("{near} to {far} is no span")));
         }
         let kept = self.keep_checkpoints;
-        if !checkpoint::MAY_STAY.contains(&kept) {
-            let (fewest, most) = checkpoint::MAY_STAY.into_inner();
+        if !CHECKPOINTS.contains(&kept) {
+            let (fewest, most) = CHECKPOINTS.into_inner();
             return Err(Error::setting("keep_checkpoints", format!("must be from {fewest} to {most}, is {kept}")));
         }
         self.config.check()?;

@@ -22,7 +22,7 @@ use super::lock::Lock;
 use super::output::{complain, print};
 use super::preview::Preview;
 use super::progress::spoken;
-use super::run::{Run, RunConfig, choose_folder};
+use super::run::{CHECKPOINTS, Run, RunConfig, choose_folder, usual_checkpoints};
 use super::scene::{Opened, Scene};
 use super::summary::Ended;
 use super::view::{Listener, PlaceArgs, Window};
@@ -116,7 +116,7 @@ pub struct Args {
     #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
     checkpoint: Duration,
     /// How many checkpoints stay, which `raygrad view` goes through [default: 2, or as before for a run that goes on]
-    #[arg(long, value_name = "N", value_parser = parse::within(checkpoint::MAY_STAY))]
+    #[arg(long, value_name = "N", value_parser = parse::within(CHECKPOINTS))]
     keep_checkpoints: Option<usize>,
     /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
     #[arg(long)]
@@ -352,7 +352,7 @@ impl Args {
             viewpoint: Viewpoint::of(data),
             photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
             budget: Some(self.budget()),
-            keep_checkpoints: self.keep_checkpoints.unwrap_or(checkpoint::KEPT),
+            keep_checkpoints: self.keep_checkpoints.unwrap_or_else(usual_checkpoints),
             config: trainer.model.config.clone(),
         })
     }
