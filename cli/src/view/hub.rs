@@ -1,7 +1,6 @@
 //! Where what pages ask for meets what is painted: one thread paints, and each page has tasks of its own.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -44,8 +43,6 @@ struct Waiting {
     told: Option<String>,
     /// Which picture was sent and has not been seen.
     flying: Option<Flying>,
-    /// How many messages of bytes are in `others`.
-    files: usize,
     overrun: bool,
 }
 
@@ -82,7 +79,6 @@ impl Outbox {
         let mut waiting = self.lock();
         waiting.overrun |= waiting.others.len() >= WAITING;
         if !waiting.overrun {
-            waiting.files += usize::from(matches!(message, Outgoing::Bytes(_)));
             waiting.others.push_back(message);
         }
         drop(waiting);
@@ -103,7 +99,6 @@ impl Outbox {
     pub fn take(&self) -> Option<Outgoing> {
         let mut waiting = self.lock();
         if let Some(message) = waiting.others.pop_front() {
-            waiting.files -= usize::from(matches!(message, Outgoing::Bytes(_)));
             return Some(message);
         }
         if let Some(text) = waiting.told.take() {
@@ -126,7 +121,7 @@ impl Outbox {
 
     /// How many files wait to be sent.
     pub fn files(&self) -> usize {
-        self.lock().files
+        self.lock().others.iter().filter(|message| matches!(message, Outgoing::Bytes(_))).count()
     }
 
     fn tell_state(&self, text: &str) {
@@ -164,6 +159,13 @@ struct State {
     saves: VecDeque<Save>,
     /// Whether something was asked for since somebody last waited.
     news: bool,
+    /// Whether training is to wait, and whether it is to end.
+    paused: bool,
+    stops: bool,
+    /// The share of time that pictures get of training.
+    share: f64,
+    /// What a page is told of the scene when it comes.
+    about: String,
 }
 
 /// What pages and the painter share.
@@ -171,14 +173,6 @@ struct State {
 pub struct Hub {
     state: Mutex<State>,
     wake: Condvar,
-    /// How many pages there are.
-    connected: AtomicUsize,
-    paused: AtomicBool,
-    stops: AtomicBool,
-    /// The share of time that pictures get of training, as the bits of an f64.
-    share: AtomicU64,
-    /// What a page is told of the scene when it comes.
-    about: Mutex<String>,
 }
 
 impl Hub {
@@ -188,12 +182,12 @@ impl Hub {
 
     /// Says what pages are told of the scene when they come from now on.
     pub fn introduce(&self, about: String) {
-        *self.about.lock().unwrap_or_else(PoisonError::into_inner) = about;
+        self.lock().about = about;
     }
 
     /// What a page is told of the scene when it comes.
     pub fn about(&self) -> String {
-        self.about.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.lock().about.clone()
     }
 
     /// A page comes, if there are fewer than so many.
@@ -205,7 +199,6 @@ impl Hub {
         let (number, outbox) = (state.next, Arc::new(Outbox::default()));
         state.next += 1;
         state.clients.insert(number, Client { wish: None, outbox: outbox.clone() });
-        self.connected.store(state.clients.len(), Ordering::Release);
         Some((number, outbox))
     }
 
@@ -214,13 +207,12 @@ impl Hub {
         let mut state = self.lock();
         state.clients.remove(&client);
         state.saves.retain(|save| save.client != client);
-        self.connected.store(state.clients.len(), Ordering::Release);
         self.news(&mut state);
     }
 
     /// How many pages there are.
     pub fn connected(&self) -> usize {
-        self.connected.load(Ordering::Acquire)
+        self.lock().clients.len()
     }
 
     /// A page wants to see something else: what it wanted before is forgotten.
@@ -345,34 +337,36 @@ impl Hub {
 
     /// Whether training is to wait.
     pub fn paused(&self) -> bool {
-        self.paused.load(Ordering::Relaxed)
+        self.lock().paused
     }
 
     /// Lets training wait or go on.
     pub fn pause(&self, pause: bool) {
-        self.paused.store(pause, Ordering::Relaxed);
-        self.wake();
+        let mut state = self.lock();
+        state.paused = pause;
+        self.news(&mut state);
     }
 
     /// Whether training is to end.
     pub fn stops(&self) -> bool {
-        self.stops.load(Ordering::Relaxed)
+        self.lock().stops
     }
 
     /// Lets training end.
     pub fn stop(&self) {
-        self.stops.store(true, Ordering::Relaxed);
-        self.wake();
+        let mut state = self.lock();
+        state.stops = true;
+        self.news(&mut state);
     }
 
     /// The share of time that pictures get of training.
     pub fn share(&self) -> f64 {
-        f64::from_bits(self.share.load(Ordering::Relaxed))
+        self.lock().share
     }
 
     /// Sets it.
     pub fn set_share(&self, share: f64) {
-        self.share.store(share.to_bits(), Ordering::Relaxed);
+        self.lock().share = share;
     }
 }
 
