@@ -37,7 +37,7 @@ type Area<B> = DrawingArea<B, Shift>;
 type Drawn<B> = std::result::Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>>;
 
 /// Makes the letters of this program known to plotters, as `sans-serif`.
-pub fn register_letters() {
+fn register_letters() {
     REGISTERED.call_once(|| {
         // A font that is part of the program can be read, as every run shows.
         let _ = register_font("sans-serif", FontStyle::Normal, FONT);
@@ -53,14 +53,23 @@ pub fn save(figure: &Figure, folder: &Path) -> Result<String> {
     draw(figure, &SVGBackend::with_string(&mut svg, size).into_drawing_area())
         .map_err(|e| Error::file(&svg_path, e))?;
     write_atomic(&svg_path, svg.as_bytes())?;
-    let mut bytes = vec![0; 3 * size.0 as usize * size.1 as usize];
     let png_path = folder.join(format!("{}.png", figure.name));
-    draw(figure, &BitMapBackend::with_buffer(&mut bytes, size).into_drawing_area())
-        .map_err(|e| Error::file(&png_path, e))?;
-    let mut image = Image::new(size.0 as usize, size.1 as usize, 3);
-    image.data.iter_mut().zip(&bytes).for_each(|(value, &byte)| *value = f32::from(byte) / 255.0);
+    let image = bitmap(size, |area| draw(figure, area)).map_err(|e| Error::file(&png_path, e))?;
     image.save_png(&png_path)?;
     Ok(svg)
+}
+
+/// The image of that width and height that `draw` draws, RGB.
+pub fn bitmap<E>(
+    size: (u32, u32),
+    draw: impl FnOnce(&Area<BitMapBackend<'_>>) -> std::result::Result<(), E>,
+) -> std::result::Result<Image, E> {
+    register_letters();
+    let mut bytes = vec![0; 3 * size.0 as usize * size.1 as usize];
+    draw(&BitMapBackend::with_buffer(&mut bytes, size).into_drawing_area())?;
+    let mut image = Image::new(size.0 as usize, size.1 as usize, 3);
+    image.data.iter_mut().zip(&bytes).for_each(|(value, &byte)| *value = f32::from(byte) / 255.0);
+    Ok(image)
 }
 
 fn size(figure: &Figure) -> (u32, u32) {

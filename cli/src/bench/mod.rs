@@ -18,7 +18,7 @@ use serde_json::Value;
 
 use super::output::{make_folder, note, print};
 use super::overwrite::Job;
-pub use draw::register_letters;
+pub use draw::bitmap;
 use figure::Figure;
 use table::Table;
 

@@ -6,7 +6,7 @@ use plotters::prelude::*;
 use raygrad::nerf::Image;
 
 use super::stage::{Pyramid, Stage};
-use crate::bench::register_letters;
+use crate::bench::bitmap;
 
 /// Width and height of one of the two views, and the height of the line above them.
 const PANEL: i32 = 760;
@@ -24,13 +24,8 @@ type Drawn = Result<(), DrawingAreaErrorKind<<BitMapBackend<'static> as DrawingB
 
 /// The picture, or what went wrong.
 pub fn draw(stage: &Stage) -> Result<Image, String> {
-    register_letters();
     let size = (2 * PANEL as u32, (PANEL + HEAD) as u32);
-    let mut bytes = vec![0; 3 * size.0 as usize * size.1 as usize];
-    both(stage, &BitMapBackend::with_buffer(&mut bytes, size).into_drawing_area()).map_err(|e| e.to_string())?;
-    let mut image = Image::new(size.0 as usize, size.1 as usize, 3);
-    image.data.iter_mut().zip(&bytes).for_each(|(value, &byte)| *value = f32::from(byte) / 255.0);
-    Ok(image)
+    bitmap(size, |area| both(stage, area)).map_err(|e| e.to_string())
 }
 
 fn both(stage: &Stage, area: &Area<'_>) -> Drawn {
