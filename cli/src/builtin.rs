@@ -1,4 +1,4 @@
-//! The built-in scenes as captures, for other programs.
+//! Scenes as captures, the built-in ones too.
 
 use std::path::Path;
 
@@ -13,16 +13,16 @@ use super::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 /// Width in pixels at which nothing but the cameras is of interest.
 const SMALL: usize = 8;
 
-/// The cameras of a built-in scene whose pictures are `width` pixels wide, by default as wide as those that are trained on;
-/// with the pictures in `folder`, if one is given.
+/// What a folder's files say; or the cameras of a built-in scene whose pictures are `width` pixels wide, by default as wide as those
+/// that are trained on, with the pictures in `folder`, if one is given.
 ///
 /// # Errors
-/// If the scene is a folder, it has no pictures of that width, or they cannot be written.
+/// If the files cannot be read; if a built-in scene has no pictures of that width, or they cannot be written.
 pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Result<Capture> {
     let (usual, format): ([usize; 2], _) = match scene {
         Scene::Embedded => ([EMBEDDED_SIZE; 2], Format::Blender),
         Scene::Landscape => (LANDSCAPE_SIZE, Format::Transforms),
-        Scene::Folder(folder) => return Err(Error::file(folder, "is no scene that is built in")),
+        Scene::Folder(folder) => return Capture::read(folder),
     };
     let width = width.unwrap_or(usual[0]);
     let height = width * usual[1] / usual[0];
@@ -33,7 +33,7 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
         if *scene == Scene::Embedded { embedded(split, width) } else { landscape(split, width) }
     };
     let mut views = vec![];
-    let mut progress = Progress::new();
+    let progress = Progress::new();
     for (i, split) in Split::ALL.into_iter().enumerate() {
         if folder.is_some() {
             progress.set(i as f64 / Split::ALL.len() as f64, || format!("{split} pictures"));

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use raygrad::nerf::{Error, Result};
 use serde_json::Value;
 
-use super::output::{checksum, complain, print};
+use super::output::{checksum, complain, entries, print};
 use super::run::Run;
 
 /// Conditions under which figures are figures of the same thing.
@@ -91,16 +91,13 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// The files of results in a run's folder, by name.
 fn results(folder: &Path, only: Option<&str>) -> Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(folder).map_err(|e| Error::file(folder, format!("cannot be read: {e}")))?;
     let is_result = |path: &PathBuf| {
         let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
         path.extension().is_some_and(|e| e == "json")
             && (stem == "eval" || stem.starts_with("eval-"))
             && only.is_none_or(|only| stem == only)
     };
-    let mut found: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(is_result).collect();
-    found.sort();
-    Ok(found)
+    Ok(entries(folder)?.into_iter().filter(is_result).collect())
 }
 
 /// The fields of a result, those of the model with `model.` before them, and in place of the views how they are called.

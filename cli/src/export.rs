@@ -5,7 +5,6 @@ mod page;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use raygrad::nerf::dataset::formats::transforms;
 use raygrad::nerf::dataset::{Capture, Split};
@@ -13,14 +12,14 @@ use raygrad::nerf::geometry::files::Format;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
 use serde_json::json;
 
+use super::builtin;
+use super::interrupt::{self, Work};
 use super::output::{parent, print};
 use super::overwrite::Job;
 use super::photographs::{check_trained, present};
 use super::prepare::convert::{Target, convert, relative};
-use super::prepare::program::Stop;
 use super::run::{Run, check_output};
 use super::scene::Scene;
-use super::{builtin, interrupt};
 
 /// Write the cameras or the shape of a run for other programs, or the scene as a page
 ///
@@ -80,7 +79,7 @@ impl Kind {
 }
 
 /// Writes the cameras, or the shape.
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     let kind = if args.to.is_some() { Kind::Cameras } else { Kind::of(&args.out)? };
     let arguments = json!({ "run": run.identity(), "shape": args.shape });
@@ -93,31 +92,25 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         job.check(&args.out)?;
     }
     match kind {
-        Kind::Shape => return geometry::run(&run, args.scene.as_ref(), &args.shape, &args.out, &job),
-        Kind::Page => return page::run(&run, &args.out, &job),
+        Kind::Shape => return Ok(geometry::run(&run, args.scene.as_ref(), &args.shape, &args.out, &job)?),
+        Kind::Page => return Ok(page::run(&run, &args.out, &job)?),
         Kind::Cameras => {}
     }
     let model = run.model()?;
     let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
-    let mut capture = match run.scene(args.scene.as_ref())? {
-        Scene::Folder(folder) => Capture::read(folder)?,
-        scene => builtin::capture(scene, None, args.to.map(|_| pictures.path()))?,
-    };
+    let scene = run.scene(args.scene.as_ref())?;
+    let mut capture = builtin::capture(scene, None, args.to.map(|_| pictures.path()))?;
     let refined = refine(&mut capture, &model, &run)?;
     let cameras = capture.views.len();
     match args.to {
         None => write(capture, &args.out, &job)?,
         Some(target) => {
             interrupt::listen_to_remove();
-            match convert(capture, target, false, args.allow_outside, &args.out) {
-                Ok(()) => {}
-                Err(Stop::Interrupted) => return Ok(interrupt::EXIT_CODE.into()),
-                Err(Stop::Failed(error)) => return Err(error),
-            }
+            convert(capture, target, false, args.allow_outside, &args.out)?;
         }
     }
     print(&format!("exported {cameras} cameras, {refined} of them refined: {}\n", args.out.display()))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Puts the cameras of the photographs that the model was trained on where it has found them to be; says how many those are.

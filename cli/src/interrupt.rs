@@ -2,10 +2,30 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use raygrad::nerf::Error;
+
 use super::output::{complain, note};
 
 /// Exit code of a program that was interrupted: 128 + SIGINT, as a shell reports it.
 pub const EXIT_CODE: u8 = 130;
+
+/// Why work ended early.
+#[derive(Debug)]
+pub enum Stop {
+    /// There was a Ctrl-C.
+    Interrupted,
+    /// Something is wrong.
+    Failed(Error),
+}
+
+/// What comes of work that may be interrupted.
+pub type Work<T> = Result<T, Stop>;
+
+impl From<Error> for Stop {
+    fn from(error: Error) -> Self {
+        Stop::Failed(error)
+    }
+}
 
 static REQUESTED: AtomicBool = AtomicBool::new(false);
 

@@ -1,7 +1,6 @@
 //! The command line program: parses its arguments, runs the subcommand, and turns errors into one line and an exit code. Each
 //! subcommand has a file of its own.
 
-mod base64;
 mod bench;
 mod builtin;
 mod cameras;
@@ -42,6 +41,7 @@ use clap::{Parser, Subcommand};
 use raygrad::nerf::{Error, Result};
 use raygrad::tensor::simd;
 
+use interrupt::{Stop, Work};
 use output::{complain, print};
 
 /// How the program ends, for scripts.
@@ -82,40 +82,44 @@ enum Command {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    run(cli).unwrap_or_else(|error| {
-        complain(&error.to_string());
-        ExitCode::FAILURE
+    run(cli).unwrap_or_else(|stop| match stop {
+        Stop::Interrupted => interrupt::EXIT_CODE.into(),
+        Stop::Failed(error) => {
+            complain(&error.to_string());
+            ExitCode::FAILURE
+        }
     })
 }
 
-fn run(cli: Cli) -> Result<ExitCode> {
+fn run(cli: Cli) -> Work<ExitCode> {
     simd::check_environment().map_err(|what| Error::setting("environment", what))?;
     if let Some(threads) = cli.threads {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
         pool.map_err(|e| Error::setting("threads", e))?;
     }
     match cli.command {
-        None => first_run(),
+        None => return first_run(),
         Some(Command::Train(args)) => {
             let trained = train::run(&args)?;
             if !trained.diverged {
                 suggest(&trained.folder)?;
             }
-            Ok(trained.exit_code())
+            return Ok(trained.exit_code());
         }
-        Some(Command::Prepare(args)) => prepare::run(&args),
-        Some(Command::Export(args)) => export::run(&args),
-        Some(Command::Eval(args)) => eval::run(&args).map(|()| ExitCode::SUCCESS),
-        Some(Command::Compare(args)) => compare::run(&args).map(|()| ExitCode::SUCCESS),
-        Some(Command::Doctor(args)) => doctor::run(&args),
-        Some(Command::Bench(args)) => bench::run(&args).map(|()| ExitCode::SUCCESS),
-        Some(Command::Render(args)) => render::run(&args),
-        Some(Command::View(args)) => view::run(&args),
+        Some(Command::Prepare(args)) => prepare::run(&args)?,
+        Some(Command::Export(args)) => export::run(&args)?,
+        Some(Command::Eval(args)) => eval::run(&args)?,
+        Some(Command::Compare(args)) => compare::run(&args)?,
+        Some(Command::Doctor(args)) => return Ok(doctor::run(&args)?),
+        Some(Command::Bench(args)) => bench::run(&args)?,
+        Some(Command::Render(args)) => render::run(&args)?,
+        Some(Command::View(args)) => view::run(&args)?,
     }
+    Ok(ExitCode::SUCCESS)
 }
 
 /// What the bare program does: trains with all defaults and renders a picture.
-fn first_run() -> Result<ExitCode> {
+fn first_run() -> Work<ExitCode> {
     let trained = train::run(&train::Args::default())?;
     if !trained.interrupted && !trained.diverged {
         render::run(&render::Args::picture(&trained.folder))?;

@@ -62,6 +62,14 @@ pub fn checksum(path: &Path) -> Result<String> {
     Ok(format!("{:08x}", crc32fast::hash(&bytes)))
 }
 
+/// The paths of what is in a folder, by name.
+pub fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder).and_then(|all| all.map(|entry| Ok(entry?.path())).collect());
+    let mut paths: Vec<PathBuf> = entries.map_err(|e| Error::file(folder, format!("cannot be read: {e}")))?;
+    paths.sort();
+    Ok(paths)
+}
+
 /// Makes a folder and those above it, and sees that files can be made in it.
 pub fn make_folder(folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(|e| Error::file(folder, format!("cannot be created: {e}")))?;

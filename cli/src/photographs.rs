@@ -21,10 +21,7 @@ pub struct Photograph {
 /// # Errors
 /// If the capture cannot be read, or has none; or to train on others than the run was trained on.
 pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: Split) -> Result<Vec<Photograph>> {
-    let capture = match run.scene(scene)? {
-        Scene::Folder(folder) => Capture::read(folder)?,
-        scene => builtin::capture(scene, None, None)?,
-    };
+    let capture = builtin::capture(run.scene(scene)?, None, None)?;
     let views = present(&capture, split)?;
     if views.is_empty() {
         return Err(Error::file(&capture.file, format!("has no {split} photographs")));

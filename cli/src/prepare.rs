@@ -11,18 +11,17 @@ mod video;
 mod workplace;
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use clap::ValueEnum;
+use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Capture;
-use raygrad::nerf::{Error, Result};
 
+use super::interrupt::Work;
 use super::output::{complain, print};
 use super::parse;
 use super::scene::Scene;
 use super::{builtin, doctor, interrupt};
 use convert::Target;
-use program::{Stop, Work};
 use workplace::Workplace;
 
 /// Names of photographs that are said, before it is only said how many more there are.
@@ -81,36 +80,21 @@ impl Glass {
 }
 
 /// Makes the dataset.
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Work<()> {
     interrupt::listen_to_remove();
-    let done = match (args.to, args.undistort) {
-        (None, false) => prepare(args),
+    match (args.to, args.undistort) {
+        (None, false) => prepare(args)?,
         (to, undistort) => {
             let pictures = tempfile::tempdir().map_err(|error| Error::setting("out", error))?;
-            let capture = match Scene::from(args.input.clone().into_os_string()) {
-                Scene::Folder(folder) => Capture::read(folder)?,
-                scene => builtin::capture(&scene, args.size, Some(pictures.path()))?,
-            };
+            let scene = Scene::from(args.input.clone().into_os_string());
+            let capture = builtin::capture(&scene, args.size, Some(pictures.path()))?;
             let to = to.unwrap_or_else(|| Target::of(capture.format));
-            convert::convert(capture, to, undistort, args.allow_outside, &args.out)
+            convert::convert(capture, to, undistort, args.allow_outside, &args.out)?;
         }
-    };
-    finished(done, &args.out)
-}
-
-/// What is said at the end, and the exit code.
-pub fn finished(done: Work<()>, out: &Path) -> Result<ExitCode> {
-    match done {
-        Ok(()) => {
-            let out = out.display();
-            print(&format!(
-                "next     raygrad doctor {out}   to examine it\n         raygrad train {out}   to train on it\n"
-            ))?;
-            Ok(ExitCode::SUCCESS)
-        }
-        Err(Stop::Interrupted) => Ok(interrupt::EXIT_CODE.into()),
-        Err(Stop::Failed(error)) => Err(error),
     }
+    let out = args.out.display();
+    print(&format!("next     raygrad doctor {out}   to examine it\n         raygrad train {out}   to train on it\n"))?;
+    Ok(())
 }
 
 /// Of a video or photographs.

@@ -1,9 +1,13 @@
 //! How far along a long task is, on standard error: a bar on a terminal, a line now and then elsewhere.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use raygrad::tensor::parallel;
 
+use super::interrupt::{self, Stop, Work};
 use super::output;
 
 /// Parts of the bar.
@@ -11,10 +15,10 @@ const PARTS: u64 = 1000;
 /// Time between lines where there is no bar.
 const INTERVAL: Duration = Duration::from_secs(5);
 
-/// A progress display; dropping it clears the bar.
+/// A progress display, which threads may share; dropping it clears the bar.
 pub struct Progress {
     bar: ProgressBar,
-    last_line: Instant,
+    last_line: Mutex<Instant>,
 }
 
 impl Progress {
@@ -23,18 +27,42 @@ impl Progress {
         let bar = ProgressBar::with_draw_target(Some(PARTS), ProgressDrawTarget::stderr());
         let style = ProgressStyle::with_template("{wide_bar:.cyan/dim} {percent:>3} %  {msg}");
         bar.set_style(style.expect("the template is a constant of the right form"));
-        Progress { bar, last_line: Instant::now() }
+        Progress { bar, last_line: Mutex::new(Instant::now()) }
     }
 
     /// Shows that `fraction` of the task is done, and a few words.
-    pub fn set(&mut self, fraction: f64, words: impl FnOnce() -> String) {
+    pub fn set(&self, fraction: f64, words: impl FnOnce() -> String) {
+        let mut last_line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
         if !self.bar.is_hidden() {
             self.bar.set_position((fraction.min(1.0) * PARTS as f64) as u64);
             self.bar.set_message(words());
-        } else if self.last_line.elapsed() >= INTERVAL {
-            self.last_line = Instant::now();
+        } else if last_line.elapsed() >= INTERVAL {
+            *last_line = Instant::now();
             output::note(&format!("{:3.0} %  {}", 100.0 * fraction.min(1.0), words()));
         }
+    }
+
+    /// Shows `3 of 12` and the words.
+    pub fn count(&self, done: usize, total: usize, words: &str) {
+        self.set(done as f64 / total as f64, || format!("{done} of {total} {words}"));
+    }
+
+    /// Does `total` pieces of work in parallel, and shows how many are done, as [`count`](Self::count) does.
+    ///
+    /// # Errors
+    /// The first of the pieces' own errors, by their numbers, when all have ended; or [`Stop::Interrupted`] after a Ctrl-C, when no
+    /// piece is begun any more.
+    pub fn each<R: Send>(&self, total: usize, words: &str, work: impl Fn(usize) -> Work<R> + Sync) -> Work<Vec<R>> {
+        let done = AtomicUsize::new(0);
+        let results = parallel::collect(total, |i| {
+            if interrupt::requested() {
+                return Err(Stop::Interrupted);
+            }
+            let result = work(i)?;
+            self.count(done.fetch_add(1, Ordering::Relaxed) + 1, total, words);
+            Ok(result)
+        });
+        results.into_iter().collect()
     }
 
     /// Shows a line that stays.

@@ -8,21 +8,20 @@ mod path_file;
 pub mod shown;
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::Instant;
 
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Camera, Error, Result, write_atomic};
 use serde_json::{Value, json};
 
+use super::interrupt::{self, Stop, Work};
 use super::output::{check_writable, checksum, note, other_numbered, parent, print};
 use super::overwrite::{Job, png_with_text};
+use super::parse;
 use super::precision::{Precision, Renderer};
-use super::prepare::program::Stop;
 use super::progress::{Progress, spoken};
 use super::run::{Run, check_output};
 use super::scene::Scene;
-use super::{interrupt, parse};
 pub use film::frames_of;
 use film::{Film, Reel};
 use flight::{CameraPath, Flight, FlightArgs};
@@ -140,7 +139,7 @@ impl Args {
 }
 
 /// Renders and writes the files.
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Work<()> {
     let run = Run::open(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| run.file(args.flight.path.name()));
     let kind = args.kind(&out)?;
@@ -169,7 +168,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             job.check(&out)?;
             write_atomic(&out, &png_with_text(&picture, job.mark()))?;
             cameras.truncate(1);
-            return report(&cameras, &out);
+            return Ok(report(&cameras, &out)?);
         }
         Kind::Film(film) => {
             film.check(&out, fps, [cameras[0].width, cameras[0].height])?;
@@ -185,20 +184,19 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.ends_with_input {
         interrupt::listen_to_input();
     }
-    if !render(&shown, &cameras, &mut frames)? {
-        return stopped(&frames, cameras.len());
+    let done = render(&shown, &cameras, &mut frames).and_then(|()| {
+        let Kind::Film(film) = kind else { return Ok(()) };
+        let size = [cameras[0].width, cameras[0].height];
+        film.write(&Reel { folder: frames.folder(), count: cameras.len(), size, fps, job: &job }, &out)
+    });
+    if let Err(Stop::Interrupted) = done {
+        let (done, all, folder) = (frames.done(), cameras.len(), frames.folder().display());
+        print(&format!("stopped  after {done} of {all} frames, in {folder}: the same command goes on\n"))?;
     }
+    done?;
     match kind {
-        Kind::Film(film) => {
-            let size = [cameras[0].width, cameras[0].height];
-            let reel = Reel { folder: frames.folder(), count: cameras.len(), size, fps, job: &job };
-            match film.write(&reel, &out) {
-                Ok(()) => {}
-                Err(Stop::Interrupted) => return stopped(&frames, cameras.len()),
-                Err(Stop::Failed(error)) => return Err(error),
-            }
-            if args.keep_frames { frames.keep() } else { frames.remove() }
-        }
+        Kind::Film(_) if !args.keep_frames => frames.remove(),
+        Kind::Film(_) => frames.keep(),
         _ => {
             frames.keep();
             let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
@@ -208,7 +206,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             }
         }
     }
-    report(&cameras, &out)
+    Ok(report(&cameras, &out)?)
 }
 
 /// The ending of films where nobody says one: what plays everywhere, or else what needs no other program.
@@ -222,17 +220,17 @@ pub fn film_ending() -> &'static str {
 /// The usual step of depths in files.
 const MILLI: f64 = 1e-3;
 
-/// Renders the frames that are not there yet; says whether all are there now, or it was interrupted.
-fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Result<bool> {
+/// Renders the frames that are not there yet.
+fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Work<()> {
     let (start, first, all) = (Instant::now(), frames.done(), cameras.len());
     if first > 0 {
         note(&format!("{first} of {all} frames are there already: {}", frames.folder().display()));
     }
-    let mut progress = Progress::new();
+    let progress = Progress::new();
     let mut beyond = 0;
     for camera in &cameras[first..] {
         if interrupt::requested() {
-            return Ok(false);
+            return Err(Stop::Interrupted);
         }
         let frame = shown.frame(camera);
         frames.push(&frame.image.to_png(), &frame.layers)?;
@@ -253,7 +251,7 @@ fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Result<
              or --save depth-npy"
         ));
     }
-    Ok(true)
+    Ok(())
 }
 
 /// The seconds that are left if it took so many from the `first` frame to here.
@@ -261,18 +259,10 @@ fn time_left(seconds: f64, [first, done, all]: [usize; 3]) -> f64 {
     seconds * (all - done) as f64 / (done - first) as f64
 }
 
-/// Says how to go on.
-fn stopped(frames: &Frames, all: usize) -> Result<ExitCode> {
-    let folder = frames.folder().display();
-    print(&format!("stopped  after {} of {all} frames, in {folder}: the same command goes on\n", frames.done()))?;
-    Ok(interrupt::EXIT_CODE.into())
-}
-
-fn report(cameras: &[Camera], out: &Path) -> Result<ExitCode> {
+fn report(cameras: &[Camera], out: &Path) -> Result<()> {
     let [width, height] = [cameras[0].width, cameras[0].height];
     let frames = if cameras.len() == 1 { "frame" } else { "frames" };
-    print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))?;
-    Ok(ExitCode::SUCCESS)
+    print(&format!("rendered {} {frames} of {width}x{height}: {}\n", cameras.len(), out.display()))
 }
 
 /// All that decides what frames show, the checksums of model and configuration among it.

@@ -4,8 +4,6 @@ use std::ffi::OsString;
 use std::fmt;
 use std::path::PathBuf;
 
-use std::sync::{Mutex, PoisonError};
-
 use raygrad::nerf::dataset::{Capture, Dataset, Frame, Reading, Scope, Split, Survey, evenly_spaced};
 use raygrad::nerf::{Error, Extent, Result};
 use raygrad_scenes::{embedded, landscape, landscape_distances};
@@ -123,11 +121,8 @@ impl Opened {
                 Dataset { frames: evenly_spaced(data.frames, views), scope: self.asked.unwrap_or(data.scope), ..data }
             }
             Some((capture, survey)) => {
-                let progress = Mutex::new(Progress::new());
-                let show = |done: usize, total: usize| {
-                    let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-                    progress.set(done as f64 / total as f64, || format!("{done} of {total} {split} photographs read"));
-                };
+                let (progress, words) = (Progress::new(), format!("{split} photographs read"));
+                let show = |done: usize, total: usize| progress.count(done, total, &words);
                 capture.load(split, survey, &Reading { downscale, views, distances: self.depth, progress: &show })?
             }
         };

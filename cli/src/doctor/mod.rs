@@ -7,7 +7,6 @@ mod table;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::{Mutex, PoisonError};
 
 use raygrad::nerf::dataset::{Capture, Scope};
 use raygrad::nerf::doctor::{Finding, FindingKind, Options, Report, Severity, examine, examine_cameras};
@@ -56,11 +55,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     // A capture that has no size has none: the examination says why.
     let survey = capture.survey(args.scope).ok();
     make_folder(&args.out)?;
-    let progress = Mutex::new(Progress::new());
-    let show = |done: usize, total: usize| {
-        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.set(done as f64 / total as f64, || format!("{done} of {total} photographs looked at"));
-    };
+    let progress = Progress::new();
+    let show = |done: usize, total: usize| progress.count(done, total, "photographs looked at");
     let report = examine(&capture, survey.as_ref(), &Options { progress: &show, ..Options::default() });
     drop(progress);
     let stage = Stage::new(&capture, survey.as_ref(), &report);

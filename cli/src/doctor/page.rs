@@ -2,13 +2,13 @@
 
 use std::collections::HashMap;
 
+use base64::prelude::{BASE64_STANDARD, Engine};
 use raygrad::nerf::dataset::{Capture, Photo, View};
 use raygrad::nerf::doctor::{Finding, Report};
 use raygrad::nerf::{Error, Result};
 
 use super::stage::Stage;
 use super::table;
-use crate::base64::base64;
 use crate::html::{escaped, filled};
 
 /// The page, with places for what is particular.
@@ -64,7 +64,7 @@ fn thumbnail(view: &View) -> Option<String> {
     let photo = Photo::open(view.image.as_ref()?, None).ok()?;
     let share = (SIDE as f64 / photo.width.max(photo.height) as f64).min(1.0);
     let size = [photo.width, photo.height].map(|side| ((side as f64 * share).round() as usize).max(1));
-    Some(base64(&photo.resized(size).over([1.0; 3]).to_png()))
+    Some(BASE64_STANDARD.encode(photo.resized(size).over([1.0; 3]).to_png()))
 }
 
 fn capitalised(text: &str) -> String {

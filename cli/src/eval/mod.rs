@@ -294,7 +294,7 @@ impl Judge {
         let count = self.data.frames.len();
         let drawn = report::regular(count);
         let (mut scores, mut seconds, mut evaluations) = (Vec::with_capacity(count), 0.0, Evaluations::default());
-        let mut progress = Progress::new();
+        let progress = Progress::new();
         for i in 0..count {
             let start = Instant::now();
             let picture = self.render(i);

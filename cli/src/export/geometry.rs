@@ -2,7 +2,6 @@
 
 use std::f64::consts::FRAC_PI_2;
 use std::path::Path;
-use std::process::ExitCode;
 use std::time::Instant;
 
 use raygrad::nerf::dataset::{Split, evenly_spaced};
@@ -81,7 +80,7 @@ impl Options {
 }
 
 /// Makes the shape and writes it.
-pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job: &Job) -> Result<ExitCode> {
+pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job: &Job) -> Result<()> {
     check_writable(parent(out))?;
     let model = run.model()?;
     let cameras = cameras(run, &model, scene)?;
@@ -129,8 +128,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job:
     let bytes = files::write_with_comment(&shape.placed_back(&model.extent.placement), out, job.mark())?;
     let part = if model.config.unbounded { ", of the box where the cameras look" } else { "" };
     let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
-    print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))?;
-    Ok(ExitCode::SUCCESS)
+    print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
 }
 
 /// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around it.

@@ -3,8 +3,8 @@
 
 use std::any::Any;
 use std::path::Path;
-use std::process::ExitCode;
 
+use base64::prelude::{BASE64_STANDARD, Engine};
 use half::f16;
 use raygrad::nerf::encoding::hash_grid::HashGrid;
 use raygrad::nerf::field::{Instant, InstantConfig, log_density_shift};
@@ -13,7 +13,6 @@ use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Error, Model, Result, write_atomic};
 use serde_json::{Value, json};
 
-use crate::base64::base64;
 use crate::html::{escaped, filled};
 use crate::output::print;
 use crate::overwrite::Job;
@@ -30,14 +29,13 @@ const MOST_FEATURES: usize = 16;
 const MOST_WIDTH: usize = 256;
 
 /// Writes the page of a run.
-pub fn run(run: &Run, out: &Path, job: &Job) -> Result<ExitCode> {
+pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
     let model = run.model()?;
     let page = page(run, &model, job.mark()).map_err(|what| Error::file(out, what))?;
     job.check(out)?;
     write_atomic(out, page.as_bytes())?;
     let megabytes = page.len() as f64 / 1e6;
-    print(&format!("exported a page of {megabytes:.1} MB: {}\n", out.display()))?;
-    Ok(ExitCode::SUCCESS)
+    print(&format!("exported a page of {megabytes:.1} MB: {}\n", out.display()))
 }
 
 /// What a page can be made of, or why there is none.
@@ -94,9 +92,9 @@ fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String
         },
     });
     let files = json!({
-        "table": base64(&table(model)?),
-        "weights": base64(&weights(model, config)?),
-        "words": base64(&marching.view_grid().words().iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<u8>>()),
+        "table": BASE64_STANDARD.encode(table(model)?),
+        "weights": BASE64_STANDARD.encode(weights(model, config)?),
+        "words": BASE64_STANDARD.encode(marching.view_grid().words().iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<u8>>()),
     });
     let texts = [
         ("title", escaped(&run.name())),

@@ -2,22 +2,18 @@
 
 use std::collections::HashSet;
 use std::path::{Component, Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 
 use clap::ValueEnum;
 use raygrad::nerf::dataset::formats::colmap::Encoding;
 use raygrad::nerf::dataset::formats::{blender, colmap, llff, transforms};
 use raygrad::nerf::dataset::{Capture, Depths, Format, Photo, Split, View};
 use raygrad::nerf::{Camera, Error, Result};
-use raygrad::tensor::parallel;
 
 use super::bounds;
-use super::program::{Stop, Work};
 use super::root::Root;
 use super::undistort;
 use super::workplace::Workplace;
-use crate::interrupt;
+use crate::interrupt::Work;
 use crate::output::{complain, note, print};
 use crate::progress::Progress;
 
@@ -124,7 +120,7 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
     let written = Capture { folder: place.folder().into(), views, ..capture.clone() };
     // First, so that what the format cannot hold is said before anything is copied.
     target.write(&written, place.folder())?;
-    copy(&jobs)?;
+    Progress::new().each(jobs.len(), "images written", |i| Ok(jobs[i].run()?))?;
     place.finish()?;
     describe(&capture, &jobs, out)?;
     if guessed > 0 {
@@ -242,24 +238,6 @@ fn inner(path: &str) -> &str {
         Some((first, rest)) if first == "images" || first.starts_with("images_") => rest,
         _ => path,
     }
-}
-
-/// Copies all files or makes them anew, in parallel.
-fn copy(jobs: &[Job]) -> Work<()> {
-    let progress = Mutex::new(Progress::new());
-    let (done, total) = (AtomicUsize::new(0), jobs.len());
-    let copied = parallel::collect(total, |i| {
-        if interrupt::requested() {
-            return Err(Stop::Interrupted);
-        }
-        jobs[i].run()?;
-        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
-        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.set(done as f64 / total as f64, || format!("{done} of {total} images written"));
-        Ok(())
-    });
-    // All are waited for, and the first error is that of the first photograph.
-    copied.into_iter().collect()
 }
 
 impl Job {

@@ -1,17 +1,13 @@
 //! A folder of photographs, without cameras.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 
 use raygrad::nerf::dataset::copy_upright;
 use raygrad::nerf::{Error, Result};
-use raygrad::tensor::parallel;
 
-use super::program::{Stop, Work};
 use super::root::Root;
 use super::workplace::Workplace;
-use crate::interrupt;
+use crate::interrupt::Work;
 use crate::output::complain;
 use crate::progress::Progress;
 
@@ -29,20 +25,10 @@ pub fn copy(folder: &Path, outside: bool, place: &Workplace) -> Work<usize> {
         found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
     }
     let to = place.make("images")?;
-    let (done, total) = (AtomicUsize::new(0), found.len());
-    let progress = Mutex::new(Progress::new());
-    let copied = parallel::collect(total, |i| {
-        if interrupt::requested() {
-            return Err(Stop::Interrupted);
-        }
-        copy_upright(&found[i], to.join(found[i].file_name().unwrap_or_default()))?;
-        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
-        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.set(done as f64 / total as f64, || format!("{done} of {total} photographs copied"));
-        Ok(())
-    });
-    copied.into_iter().collect::<Work<()>>()?;
-    Ok(total)
+    Progress::new().each(found.len(), "photographs copied", |i| {
+        Ok(copy_upright(&found[i], to.join(found[i].file_name().unwrap_or_default()))?)
+    })?;
+    Ok(found.len())
 }
 
 /// The photographs, in no order in particular. Warns of those that cannot be read.

@@ -7,9 +7,10 @@ use raygrad::nerf::dataset::formats::colmap;
 use raygrad::nerf::dataset::{Capture, Photo};
 use raygrad::nerf::{Error, Result};
 
-use super::program::{COLMAP, Work, counted};
+use super::program::{COLMAP, counted};
 use super::workplace::Workplace;
-use crate::output::note;
+use crate::interrupt::Work;
+use crate::output::{entries, note};
 use crate::progress::Progress;
 
 /// Photographs up to which every pair is compared, also of a video: so a walk around something closes.
@@ -42,8 +43,7 @@ pub fn check() -> Work<()> {
 /// frames of a video, in order; `model` is COLMAP's name of a kind of camera.
 pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
     let images = place.folder().join("images");
-    let mut names = names(&images)?;
-    names.sort();
+    let names = names(&images)?;
     let work = place.make(FOLDER)?;
     let colmap = Colmap { database: work.join("database.db"), images };
 
@@ -80,9 +80,8 @@ fn lost(names: Vec<String>, capture: &Capture) -> Vec<String> {
 }
 
 fn names(folder: &Path) -> Result<Vec<String>> {
-    let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
-    let entries = std::fs::read_dir(folder).map_err(bad)?;
-    entries.map(|entry| Ok(entry.map_err(bad)?.file_name().to_string_lossy().into_owned())).collect()
+    let name = |path: PathBuf| Some(path.file_name()?.to_string_lossy().into_owned());
+    Ok(entries(folder)?.into_iter().filter_map(name).collect())
 }
 
 /// The folders of COLMAP's models, by number.
@@ -123,7 +122,7 @@ impl Colmap {
         if let Some(name) = gpu.iter().flatten().find(|name| help.contains(**name)) {
             command.arg(format!("--{name}")).arg("0");
         }
-        let mut progress = Progress::new();
+        let progress = Progress::new();
         COLMAP.run(&mut command, None, |line| {
             let Some(done) = counted(line) else { return };
             progress.set(done, || format!("{:.0} % of {words}", 100.0 * done));
@@ -144,7 +143,7 @@ impl Colmap {
         for (name, path) in paths {
             command.arg(name).arg(path);
         }
-        let mut progress = Progress::new();
+        let progress = Progress::new();
         COLMAP.run(&mut command, Some(NO_MODEL), |line| {
             let Some(count) = registered(line) else { return };
             most = most.max(count);

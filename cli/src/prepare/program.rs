@@ -8,31 +8,13 @@ use std::time::Duration;
 
 use raygrad::nerf::Error;
 
-use crate::interrupt;
+use crate::interrupt::{self, Stop, Work};
 use crate::output::note;
 
 /// Lines that are kept of what a program has said, and shown if it fails.
 const KEPT: usize = 12;
 /// How often it is looked whether there was a Ctrl-C.
 const INTERVAL: Duration = Duration::from_millis(100);
-
-/// Why the work ended before its end.
-#[derive(Debug)]
-pub enum Stop {
-    /// There was a Ctrl-C.
-    Interrupted,
-    /// Something is wrong.
-    Failed(Error),
-}
-
-/// What comes of work that may be interrupted.
-pub type Work<T> = Result<T, Stop>;
-
-impl From<Error> for Stop {
-    fn from(error: Error) -> Self {
-        Stop::Failed(error)
-    }
-}
 
 /// A program that is installed beside this one.
 #[derive(Debug, Clone, Copy)]

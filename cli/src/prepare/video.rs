@@ -1,16 +1,14 @@
 //! Sharp frames of a video.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 
+use raygrad::nerf::Error;
 use raygrad::nerf::dataset::Photo;
-use raygrad::nerf::{Error, Result};
-use raygrad::tensor::parallel;
 
-use super::program::{FFMPEG, Stop, Work};
+use super::program::FFMPEG;
 use super::workplace::Workplace;
-use crate::interrupt;
+use crate::interrupt::Work;
+use crate::output::entries;
 use crate::progress::Progress;
 
 /// Frames that are looked at for each that is kept.
@@ -37,7 +35,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     let rate = (CANDIDATES as f64 * count as f64 / about.seconds).min(about.rate);
     let wanted = (rate * about.seconds).max(1.0);
     let folder = place.make(FOLDER)?;
-    let mut progress = Progress::new();
+    let progress = Progress::new();
     let mut command = FFMPEG.command();
     command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1", "-i"]);
     command.arg(video).arg("-map").arg("0:v:0").arg("-vf").arg(format!("fps={rate:.6}"));
@@ -47,11 +45,11 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
         let Some(frame) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
         progress.set(frame / wanted, || format!("{frame} of about {wanted:.0} frames taken from the video"));
     })?;
-    let candidates = files(&folder)?;
+    let candidates = entries(&folder)?;
     if candidates.is_empty() {
         return Err(Error::file(video, "has no frames: ffmpeg has written none").into());
     }
-    let kept = keep_sharp(&candidates, count, &place.make("images")?, progress)?;
+    let kept = keep_sharp(&candidates, count, &place.make("images")?, &progress)?;
     place.remove(FOLDER);
     Ok(kept)
 }
@@ -73,32 +71,13 @@ impl Video {
     }
 }
 
-/// The files in a folder by name.
-fn files(folder: &Path) -> Result<Vec<PathBuf>> {
-    let bad = |e: std::io::Error| Error::file(folder, format!("cannot be read: {e}"));
-    let entries = std::fs::read_dir(folder).map_err(bad)?;
-    let mut files = entries.map(|entry| Ok(entry.map_err(bad)?.path())).collect::<Result<Vec<_>>>()?;
-    files.sort();
-    Ok(files)
-}
-
 /// Moves the sharpest of every few candidates to a folder, and says how many those are.
-fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: Progress) -> Work<usize> {
+fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: &Progress) -> Work<usize> {
     // A short video has fewer frames than are asked for: no more than those are thrown away.
     let group = ((candidates.len() as f64 / count as f64).round() as usize).clamp(1, CANDIDATES);
-    let (done, progress) = (AtomicUsize::new(0), Mutex::new(progress));
-    let sharpness = parallel::collect(candidates.len(), |i| {
-        if interrupt::requested() {
-            return Err(Stop::Interrupted);
-        }
-        let sharpness = if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() };
-        let done = done.fetch_add(1, Ordering::Relaxed) + 1;
-        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress
-            .set(done as f64 / candidates.len() as f64, || format!("{done} of {} frames looked at", candidates.len()));
-        Ok(sharpness)
-    });
-    let sharpness = sharpness.into_iter().collect::<Work<Vec<f64>>>()?;
+    let sharpness = progress.each(candidates.len(), "frames looked at", |i| {
+        Ok(if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() })
+    })?;
     let mut kept = 0;
     for (files, sharpness) in candidates.chunks(group).zip(sharpness.chunks(group)) {
         let best = sharpness.iter().zip(files).max_by(|a, b| a.0.total_cmp(b.0));

@@ -4,22 +4,26 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
+use clap::ValueEnum;
 use raygrad::nerf::{Error, Image, Result};
 
 use super::animation::Animation;
 use super::frames::DIGITS;
-use crate::interrupt;
+use crate::interrupt::{self, Stop, Work};
 use crate::output::{check_writable, note, numbered, parent};
 use crate::overwrite::Job;
 use crate::parse::LARGEST;
-use crate::prepare::program::{FFMPEG, Stop, Work};
+use crate::prepare::program::FFMPEG;
 use crate::progress::Progress;
 
 /// A GIF shows a frame for two hundredths of a second at least: players show shorter ones for longer.
 const FASTEST_GIF: f64 = 50.0;
 
+/// What is counted while a film is written.
+const IN_FILM: &str = "frames in the film";
+
 /// A file that holds a film.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Film {
     Gif,
     Apng,
@@ -44,13 +48,7 @@ pub struct Reel<'a> {
 impl Film {
     /// By the ending of a file's name.
     pub fn of(ending: &str) -> Option<Film> {
-        match ending {
-            "gif" => Some(Film::Gif),
-            "apng" => Some(Film::Apng),
-            "mp4" => Some(Film::Mp4),
-            "webm" => Some(Film::Webm),
-            _ => None,
-        }
+        Film::from_str(ending, true).ok()
     }
 
     /// Whether it can be written, before there are frames.
@@ -138,10 +136,10 @@ impl Film {
             _ => &["-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],
         });
         command.arg(file);
-        let mut progress = Progress::new();
+        let progress = Progress::new();
         FFMPEG.run(&mut command, None, |line| {
-            if let Some(done) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) {
-                progress.set(done / count as f64, || format!("{done} of {count} frames in the film"));
+            if let Some(done) = line.strip_prefix("frame=").and_then(|n| n.trim().parse().ok()) {
+                progress.count(done, count, IN_FILM);
             }
         })
     }
@@ -157,15 +155,13 @@ fn animate(
     let bad = |what: String| Error::file(out, format!("cannot be written: {what}"));
     let to = File::create(file).map_err(|e| bad(e.to_string()))?;
     let mut animation = begin(BufWriter::new(to)).map_err(bad)?;
-    let mut progress = Progress::new();
+    let progress = Progress::new();
     for frame in 0..reel.count {
         if interrupt::requested() {
             return Err(Stop::Interrupted);
         }
         animation.push(&Image::open(reel.folder.join(numbered(frame, DIGITS)))?).map_err(bad)?;
-        progress.set((frame + 1) as f64 / reel.count as f64, || {
-            format!("{} of {} frames in the film", frame + 1, reel.count)
-        });
+        progress.count(frame + 1, reel.count, IN_FILM);
     }
     Ok(animation.finish().map_err(bad)?)
 }

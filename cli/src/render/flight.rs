@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use raygrad::nerf::camera::{CameraPath as Spline, Key, Spiral};
-use raygrad::nerf::dataset::{Capture, Split, evenly_spaced};
+use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::glam::DAffine3;
 use raygrad::nerf::{Camera, Error, Extent, Model, Result};
 use raygrad_scenes::test_cameras;
@@ -11,10 +11,10 @@ use serde::{Serialize, Serializer};
 
 use super::path_file::{self, Motion};
 use crate::cameras::{Viewpoint, fitted};
-use crate::parse;
 use crate::photographs::{Photograph, photographs};
 use crate::run::Run;
 use crate::scene::Scene;
+use crate::{builtin, parse};
 
 /// Most frames of a film.
 const MOST_FRAMES: usize = 100_000;
@@ -152,7 +152,9 @@ impl FlightArgs {
             }
             CameraPath::File(file) => {
                 let path_file::Path { motion, size, fps } =
-                    path_file::read(file, self.path_transform.as_deref(), || applied(run.scene(scene)?))?;
+                    path_file::read(file, self.path_transform.as_deref(), || {
+                        Ok(builtin::capture(run.scene(scene)?, None, None)?.applied)
+                    })?;
                 let (usual, fps) = (size.unwrap_or(usual), self.fps.or(fps).unwrap_or(FPS));
                 let keys = match motion {
                     Motion::Frames(_) if self.frames.is_some() || self.seconds.is_some() => {
@@ -252,14 +254,6 @@ impl FlightArgs {
 fn llff_focus([near, far]: [f64; 2]) -> f64 {
     let [near, far] = [0.9 * near, 5.0 * far];
     (0.25 / near + 0.75 / far).recip()
-}
-
-/// From coordinates of before to those of the capture's file.
-fn applied(scene: &Scene) -> Result<DAffine3> {
-    match scene {
-        Scene::Folder(folder) => Ok(Capture::read(folder)?.applied),
-        Scene::Embedded | Scene::Landscape => Ok(DAffine3::IDENTITY),
-    }
 }
 
 /// The photographs of these numbers or names.

@@ -54,10 +54,7 @@ impl Album {
     /// If the capture cannot be read, or those to train on are others.
     pub fn open(run: &Run, scene: Option<&Scene>) -> Result<Self> {
         let scene = run.scene(scene)?.clone();
-        let capture = match &scene {
-            Scene::Folder(folder) => Capture::read(folder)?,
-            made => builtin::capture(made, None, None)?,
-        };
+        let capture = builtin::capture(&scene, None, None)?;
         let width = if scene == Scene::Landscape { LANDSCAPE_SIZE[0] } else { EMBEDDED_SIZE };
         let placement = run.config.extent.placement;
         let mut entries = vec![];

@@ -15,7 +15,6 @@ mod talk;
 mod window;
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -88,7 +87,7 @@ impl PlaceArgs {
 }
 
 /// Serves until it is ended.
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<()> {
     let run = Arc::new(Run::open(&args.run)?);
     let model = Arc::new(run.model()?);
     let (hub, album) = (Arc::new(Hub::default()), album(&run, args.scene.as_ref()));
