@@ -1,6 +1,6 @@
 //! `raygrad export`: the cameras of a run.
 
-use super::Place;
+use super::{CLASSIC, Place, SMALL};
 use raygrad::nerf::dataset::{Capture, Split};
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::{Camera, Config, Extent, Model};
@@ -22,8 +22,7 @@ fn cameras(folder: &Path) -> Vec<(String, Option<Split>, Camera)> {
 #[test]
 fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
     let place = Place::with_scene();
-    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
-    place.succeeds(&format!("train scene --steps 1 --out plain {small}"));
+    place.succeeds(&format!("train scene --steps 1 --out plain {SMALL}"));
     let said = place.succeeds("export plain cameras.json");
     assert_eq!(said, "exported 11 cameras, 0 of them refined: cameras.json\n");
     let given = cameras(&place.path("scene"));
@@ -34,7 +33,7 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
     }
 
     let learned = r#"--set poses={"constant":{"rate":0.001}}"#;
-    place.succeeds(&format!("train scene --steps 8 --out run --scope unbounded {small} {learned}"));
+    place.succeeds(&format!("train scene --steps 8 --out run --scope unbounded {SMALL} {learned}"));
     let said = place.succeeds("export run run/cameras.json");
     assert_eq!(said, "exported 11 cameras, 6 of them refined: run/cameras.json\n");
     let config = place.json("run/config.json");
@@ -66,7 +65,7 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
     }
     assert!(colmap.len() == 11 && place.path("colmap/images/train/r_0.png").exists());
     // Of a capture whose names are not the paths of its images, too.
-    place.succeeds(&format!("train colmap --steps 1 --out other {small}"));
+    place.succeeds(&format!("train colmap --steps 1 --out other {SMALL}"));
     place.succeeds("export other colmap/again.json");
     for frame in place.json("colmap/again.json")["frames"].as_array().unwrap() {
         let path = frame["file_path"].as_str().unwrap();
@@ -83,7 +82,7 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
 #[test]
 fn the_built_in_scene_has_cameras_too() {
     let place = Place::empty();
-    place.succeeds("train --preset small --steps 1 --downscale 10");
+    place.succeeds(&format!("train --steps 1 --downscale 10 {CLASSIC}"));
     assert!(place.succeeds("export run cameras.json").starts_with("exported 90 cameras, 0 of them refined"));
     let cameras = exported(&place, "cameras.json");
     let of = |split: Split| cameras.iter().filter(|(_, given, _)| *given == Some(split)).count();
@@ -105,8 +104,7 @@ fn vertices(place: &Place, file: &str) -> (Vec<DVec3>, String) {
 #[test]
 fn shapes_are_in_the_coordinates_of_the_capture() {
     let place = Place::with_scene();
-    let small = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
-    place.succeeds(&format!("train scene --steps 2 --out run --scope unbounded {small}"));
+    place.succeeds(&format!("train scene --steps 2 --out run --scope unbounded {SMALL}"));
     let extent: Extent = serde_json::from_value(place.json("run/config.json")["extent"].clone()).unwrap();
     assert!((extent.placement.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
     // A fog, still: at a low density its surface is the box.

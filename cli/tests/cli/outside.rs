@@ -1,7 +1,7 @@
 //! Captures whose files name places outside of them: these may be read, nothing is written there, and what is there is copied
 //! into a new dataset only where that is allowed.
 
-use super::Place;
+use super::{Place, SMALL};
 use raygrad::nerf::Image;
 use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::glam::{DMat3, DQuat, DVec3};
@@ -87,9 +87,6 @@ fn only_there(place: &Place, commands: &[&str]) {
     }
 }
 
-const SMALL: &str =
-    "train scene --steps 3 --out run --set field.grid.log2_table=10 --set sampler.occupancy.resolution=16";
-
 #[test]
 fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
     let (place, views) = place();
@@ -111,10 +108,10 @@ fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
             "prepare scene --to nerfstudio --undistort --out out --allow-outside",
             "prepare scene --to colmap --undistort --out out --allow-outside",
             "prepare scene --to llff --undistort --out out --allow-outside",
-            SMALL,
+            &format!("train scene --steps 3 --out run {SMALL}"),
             "eval run --split train",
             "eval run --split test",
-            "render run --out out",
+            "render run --frames 2 --out out",
             "export run out.json",
             "doctor scene --out out",
         ],
@@ -182,7 +179,7 @@ fn nothing_is_written_where_a_model_of_colmap_says_that_photographs_are() {
             "prepare scene --to colmap-text --out out --allow-outside",
             "prepare scene --to llff --undistort --out out --allow-outside",
             "prepare scene --to blender --undistort --out out --allow-outside",
-            SMALL,
+            &format!("train scene --steps 3 --out run {SMALL}"),
             "eval run --split train",
             "export run out.json",
             "export run --to nerfstudio out --allow-outside",
@@ -292,7 +289,7 @@ fn private_files_are_not_copied_into_a_dataset() {
     only_there_converted(&place, convert);
     // Training may read what it is told to.
     write("mask_path", &json!("../../elsewhere/mask.png"));
-    only_there(&place, &[SMALL]);
+    only_there(&place, &[&format!("train scene --steps 3 --out run {SMALL}")]);
     refused(&place, "export run --to nerfstudio out", &["lies outside of", "--allow-outside"]);
 }
 

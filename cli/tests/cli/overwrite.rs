@@ -1,10 +1,7 @@
 //! Files of users are not replaced, and every command works again on its own output.
 
-use super::Place;
+use super::{Place, SMALL};
 use raygrad::nerf::Image;
-use std::process::Stdio;
-
-const SMALL: &str = "--set field.grid.log2_table=8 --set sampler.occupancy.resolution=16 --set sampler.samples=512";
 
 /// With a run, and a photograph at the given places.
 fn place(photographs: &[&str]) -> Place {
@@ -156,8 +153,9 @@ fn endings_that_are_not_known_are_named() {
 }
 
 #[test]
-fn doctor_and_bench_replace_their_own_files_alone() {
-    let place = place(&["scene/cameras.png", "results/plot.png"]);
+fn doctor_replaces_its_own_files_alone() {
+    let place = Place::with_scene();
+    photograph().save_png(place.path("scene/cameras.png")).unwrap();
     let run = |arguments: &str| place.command(arguments).output().unwrap();
     // Warnings of a small capture are no errors of the command.
     for out in ["", "--out again"] {
@@ -169,26 +167,6 @@ fn doctor_and_bench_replace_their_own_files_alone() {
     refuses(&place, "doctor scene --out scene", "scene/cameras.png");
     assert!(!place.path("scene/doctor.html").exists());
     assert_eq!(run("doctor scene --out scene --overwrite").status.code(), Some(3));
-    let bench = "bench --suite quadrature --quick --out";
-    place.fails(&format!("{bench} results"), &["results: holds files that are not a benchmark's", "add --overwrite"]);
-    assert_eq!(std::fs::read_dir(place.path("results")).unwrap().count(), 1);
-    // One that is killed at its beginning is begun again; one that is there stays until the next has come to its end.
-    let page = || std::fs::read_to_string(place.path("measured/report.html")).unwrap_or_default();
-    let killed = || {
-        let mut child =
-            place.command(&format!("{bench} measured")).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        super::wait(&mut child, || !page().is_empty());
-        child.kill().unwrap();
-        child.wait().unwrap();
-    };
-    killed();
-    place.succeeds(&format!("{bench} measured"));
-    let whole = page();
-    assert!(whole.contains("<svg"));
-    killed();
-    assert!(page().contains("<svg"));
-    place.succeeds(&format!("{bench} results --overwrite"));
-    assert!(place.path("results/report.html").exists() && place.path("results/plot.png").exists());
 }
 
 #[test]

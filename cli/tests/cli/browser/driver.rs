@@ -4,9 +4,10 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
+use base64::prelude::{BASE64_STANDARD, Engine};
 use raygrad::nerf::Image;
 use serde_json::{Map, Value, json};
 use tungstenite::stream::MaybeTlsStream;
@@ -38,47 +39,42 @@ impl Kind {
     }
 }
 
-/// A browser with one page.
-pub struct Browser {
-    pub kind: Kind,
+/// Runs a program until this one has ended, or lets go of its input, and removes a folder then.
+const UNTIL_LET_GO: &str = r#"folder="$1"; shift; "$@" & exec >&- 2>&-; read -r _; kill -9 $!; wait; rm -rf "$folder""#;
+
+/// Programs of Firefox that no test uses: it takes seconds to start.
+static IDLE: Mutex<Vec<Program>> = Mutex::new(vec![]);
+
+/// A browser that was started.
+struct Program {
     child: Child,
     /// What Firefox needs for WebGL, if it is installed: a display.
     display: Option<Child>,
     socket: WebSocket<MaybeTlsStream<TcpStream>>,
-    /// Of DevTools the session, of BiDi the page.
-    page: String,
-    number: u64,
-    /// What scripts of the page complained of.
-    pub complaints: Vec<String>,
-    /// With its settings, and what it has kept.
-    profile: tempfile::TempDir,
+    /// The folder with its settings, and what it has kept.
+    profile: PathBuf,
 }
 
-impl Drop for Browser {
+impl Drop for Program {
     fn drop(&mut self) {
         for child in [Some(&mut self.child), self.display.as_mut()].into_iter().flatten() {
-            let _ = child.kill();
+            drop(child.stdin.take());
             let _ = child.wait();
         }
     }
 }
 
-impl Browser {
-    /// Those that are installed; says which is not.
-    pub fn all() -> impl Iterator<Item = Self> {
-        [Kind::Chromium, Kind::Firefox].into_iter().filter_map(Self::open)
-    }
-
+impl Program {
     /// Nothing, which it says, where there is none.
-    pub fn open(kind: Kind) -> Option<Self> {
+    fn start(kind: Kind) -> Option<Self> {
         let Some(name) = kind.installed() else {
             println!("skipped: {kind:?} is not installed");
             return None;
         };
-        let profile = tempfile::tempdir().unwrap();
-        let folder = profile.path().display();
-        let (mut command, mut display) = (Command::new(name), None);
-        command.arg("--remote-debugging-port=0").env("HOME", profile.path()).env("TMPDIR", profile.path());
+        let profile = tempfile::tempdir().unwrap().keep();
+        let folder = profile.display();
+        let (mut command, mut display) = (until_let_go(&profile, name), None);
+        command.arg("--remote-debugging-port=0").env("HOME", &profile).env("TMPDIR", &profile);
         match kind {
             Kind::Chromium => {
                 command.args(["--headless=new", "--no-sandbox", "--no-first-run"]);
@@ -92,8 +88,8 @@ impl Browser {
                      user_pref(\"browser.download.always_ask_before_handling_new_types\", false);\n\
                      user_pref(\"webgl.force-enabled\", true);\n"
                 );
-                std::fs::write(profile.path().join("user.js"), settings).unwrap();
-                command.args(["--no-remote", "--profile"]).arg(profile.path());
+                std::fs::write(profile.join("user.js"), settings).unwrap();
+                command.args(["--no-remote", "--profile"]).arg(&profile);
                 match screen() {
                     Some((child, number)) => {
                         command.env("DISPLAY", format!(":{number}"));
@@ -118,14 +114,55 @@ impl Browser {
         if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
             stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
         }
-        let mut browser =
-            Browser { kind, child, display, socket, page: String::new(), number: 0, complaints: vec![], profile };
-        browser.begin();
+        Some(Program { child, display, socket, profile })
+    }
+}
+
+/// A command that ends with this program, and whose folder goes then.
+fn until_let_go(folder: &Path, program: &str) -> Command {
+    let mut command = Command::new("sh");
+    command.args(["-c", UNTIL_LET_GO, "sh"]).arg(folder).arg(program).stdin(Stdio::piped());
+    command
+}
+
+/// A browser with one page.
+pub struct Browser {
+    pub kind: Kind,
+    /// Until this is dropped.
+    program: Option<Program>,
+    /// Of DevTools the session, of BiDi the page.
+    page: String,
+    number: u64,
+    /// What scripts of the page complained of.
+    pub complaints: Vec<String>,
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        if self.kind == Kind::Firefox && !std::thread::panicking() {
+            IDLE.lock().unwrap().extend(self.program.take());
+        }
+    }
+}
+
+impl Browser {
+    /// Those that are installed; says which is not.
+    pub fn all() -> impl Iterator<Item = Self> {
+        [Kind::Chromium, Kind::Firefox].into_iter().filter_map(Self::open)
+    }
+
+    /// Nothing, which it says, where there is none.
+    pub fn open(kind: Kind) -> Option<Self> {
+        let idle = if kind == Kind::Firefox { IDLE.lock().unwrap().pop() } else { None };
+        let is_new = idle.is_none();
+        let program = Some(idle.or_else(|| Program::start(kind))?);
+        let mut browser = Browser { kind, program, page: String::new(), number: 0, complaints: vec![] };
+        browser.begin(is_new);
         browser.window(WINDOW[0], WINDOW[1], FINE, false);
         Some(browser)
     }
 
-    fn begin(&mut self) {
+    fn begin(&mut self, is_new: bool) {
         let text = |value: &Value| value.as_str().unwrap().to_owned();
         match self.kind {
             Kind::Chromium => {
@@ -135,15 +172,25 @@ impl Browser {
                 for domain in ["Page", "Runtime", "Log"] {
                     self.call(&format!("{domain}.enable"), json!({}));
                 }
-                let kept = json!({ "behavior": "allow", "downloadPath": self.profile.path() });
+                let kept = json!({ "behavior": "allow", "downloadPath": self.program().profile });
                 self.call("Page.setDownloadBehavior", kept);
             }
             Kind::Firefox => {
-                self.call("session.new", json!({ "capabilities": {} }));
-                self.call("session.subscribe", json!({ "events": ["log.entryAdded"] }));
-                self.page = text(&self.call("browsingContext.getTree", json!({}))["contexts"][0]["context"]);
+                if is_new {
+                    self.call("session.new", json!({ "capabilities": {} }));
+                    self.call("session.subscribe", json!({ "events": ["log.entryAdded"] }));
+                }
+                let old = self.call("browsingContext.getTree", json!({}))["contexts"][0]["context"].clone();
+                self.page = text(&self.call("browsingContext.create", json!({ "type": "tab" }))["context"]);
+                self.call("browsingContext.close", json!({ "context": old }));
+                // Those of the page before.
+                self.complaints.clear();
             }
         }
+    }
+
+    fn program(&mut self) -> &mut Program {
+        self.program.as_mut().unwrap()
     }
 
     /// What the browser answers to a message of its protocol.
@@ -154,9 +201,9 @@ impl Browser {
         if self.kind == Kind::Chromium && !self.page.is_empty() {
             message["sessionId"] = json!(self.page);
         }
-        self.socket.send(Message::text(message.to_string())).unwrap();
+        self.program().socket.send(Message::text(message.to_string())).unwrap();
         loop {
-            let Message::Text(text) = self.socket.read().unwrap() else { continue };
+            let Message::Text(text) = self.program().socket.read().unwrap() else { continue };
             let answer: Value = serde_json::from_str(&text).unwrap();
             let told = &answer["params"];
             match answer["method"].as_str() {
@@ -384,7 +431,7 @@ impl Browser {
     /// Waits for a file that the page gives to keep.
     #[track_caller]
     pub fn kept(&mut self, name: &str) -> PathBuf {
-        let (start, path) = (Instant::now(), self.profile.path().join(name));
+        let (start, path) = (Instant::now(), self.program().profile.join(name));
         while std::fs::metadata(&path).map_or(true, |file| file.len() == 0) {
             assert!(start.elapsed() < Duration::from_secs(30), "{name} was not kept");
             std::thread::sleep(Duration::from_millis(20));
@@ -403,7 +450,8 @@ impl Browser {
         };
         std::fs::create_dir_all(&folder).unwrap();
         let name = format!("{name}-{:?}.png", self.kind).to_lowercase();
-        std::fs::write(Path::new(&folder).join(name), bytes(png["data"].as_str().unwrap())).unwrap();
+        std::fs::write(Path::new(&folder).join(name), BASE64_STANDARD.decode(png["data"].as_str().unwrap()).unwrap())
+            .unwrap();
     }
 
     /// What the page shows of the scene.
@@ -414,7 +462,8 @@ impl Browser {
     pub fn canvas(&mut self, id: &str, place: &Place) -> Image {
         let url = self.value(&format!("document.getElementById('{id}').toDataURL('image/png')"));
         let path = place.path("canvas.png");
-        std::fs::write(&path, bytes(url.as_str().unwrap().split_once(',').unwrap().1)).unwrap();
+        let bytes = BASE64_STANDARD.decode(url.as_str().unwrap().split_once(',').unwrap().1).unwrap();
+        std::fs::write(&path, bytes).unwrap();
         let image = png(&path);
         if image.channels == 4 { image.over([1.0; 3]) } else { image }
     }
@@ -422,7 +471,7 @@ impl Browser {
 
 /// A display that nobody sees, and its number.
 fn screen() -> Option<(Child, String)> {
-    let mut command = Command::new("Xvfb");
+    let mut command = until_let_go(Path::new(""), "Xvfb");
     command.args(["-displayfd", "1", "-nolisten", "tcp", "-screen", "0", "1280x1024x24"]);
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().ok()?;
     let mut number = String::new();
@@ -445,22 +494,4 @@ fn plain(told: &Value) -> Value {
         "number" if value == "-0" => json!(-0.0),
         _ => value.clone(),
     }
-}
-
-/// What base 64 says.
-fn bytes(text: &str) -> Vec<u8> {
-    let digit = |letter: u8| match letter {
-        b'A'..=b'Z' => letter - b'A',
-        b'a'..=b'z' => letter - b'a' + 26,
-        b'0'..=b'9' => letter - b'0' + 52,
-        b'+' => 62,
-        b'/' => 63,
-        _ => panic!("{letter} is no digit"),
-    };
-    let digits: Vec<u8> = text.bytes().filter(|letter| *letter != b'=').map(digit).collect();
-    let whole = |four: &[u8]| {
-        let bits = four.iter().enumerate().fold(0_u32, |bits, (i, digit)| bits | u32::from(*digit) << (18 - 6 * i));
-        bits.to_be_bytes()[1..four.len()].to_vec()
-    };
-    digits.chunks(4).flat_map(whole).collect()
 }
