@@ -65,7 +65,7 @@ impl Storage {
         out
     }
 
-    fn read<T: Scalar>(self, bytes: &[u8]) -> Vec<T> {
+    pub(crate) fn read<T: Scalar>(self, bytes: &[u8]) -> Vec<T> {
         let pairs = || bytes.as_chunks().0.iter();
         match self {
             Storage::Full => bytes.chunks_exact(size_of::<T>()).map(T::read_le).collect(),
@@ -102,39 +102,38 @@ pub enum ParamsError {
     },
 }
 
-/// A part of a file, which is written out only when its turn comes: so no second copy of all parameters is made.
-enum Part<'a, T: Scalar> {
+/// A part of a file, which is written out only when its turn comes: so no second copy of all numbers is made.
+pub(crate) enum Part<'a, T: Scalar> {
+    /// A tensor, as it is stored.
     Value(Storage, &'a Tensor<T>),
-    Bytes([usize; 1], &'a [u8]),
+    /// Numbers of another type as bytes, and how many they are.
+    Bytes(Dtype, [usize; 1], Cow<'a, [u8]>),
 }
 
 impl<T: Scalar> View for Part<'_, T> {
     fn dtype(&self) -> Dtype {
         match self {
             Part::Value(storage, _) => storage.dtype::<T>(),
-            Part::Bytes(..) => Dtype::U8,
+            Part::Bytes(dtype, ..) => *dtype,
         }
     }
 
     fn shape(&self) -> &[usize] {
         match self {
             Part::Value(_, value) => value.shape(),
-            Part::Bytes(len, _) => len,
+            Part::Bytes(_, len, _) => len,
         }
     }
 
     fn data(&self) -> Cow<'_, [u8]> {
         match self {
             Part::Value(storage, value) => storage.write(value.as_slice()).into(),
-            Part::Bytes(_, bytes) => Cow::Borrowed(bytes),
+            Part::Bytes(.., bytes) => Cow::Borrowed(bytes),
         }
     }
 
     fn data_len(&self) -> usize {
-        match self {
-            Part::Value(storage, value) => value.len() * storage.dtype::<T>().bitsize() / 8,
-            Part::Bytes(_, bytes) => bytes.len(),
-        }
+        self.shape().iter().product::<usize>() * self.dtype().bitsize() / 8
     }
 }
 
@@ -161,7 +160,7 @@ impl<T: Scalar> Params<T> {
             return Err(ParamsError::Name(name.to_owned()));
         }
         let values = self.iter().map(|(name, value)| (name, Part::Value(storage.that_fits(value.as_slice()), value)));
-        let blobs = blobs.iter().map(|(name, bytes)| (*name, Part::Bytes([bytes.len()], bytes)));
+        let blobs = blobs.iter().map(|(name, bytes)| (*name, Part::Bytes(Dtype::U8, [bytes.len()], bytes.into())));
         let unordered = metadata.clone().into_iter().collect();
         let mut bytes = safetensors::serialize(values.chain(blobs), Some(unordered))?;
         sort_metadata(&mut bytes, metadata)?;

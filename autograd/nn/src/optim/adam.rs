@@ -4,7 +4,6 @@ use super::limits::{flushed, limited, tiny, tiny_square};
 use super::memory::Memory;
 use super::rule::Rule;
 use super::settings::{check, check_rate, check_share, or_panic};
-use super::state::Reader;
 use super::{Optimizer, OptimizerState, SettingError, StateError, UpdateReport};
 use crate::Params;
 use raygrad_autograd::Gradient;
@@ -230,9 +229,8 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
     }
 
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
-        let mut reader = Reader::new(state);
-        let (steps, memory) = (reader.steps()?, self.memory.loaded(params, &mut reader)?);
-        reader.finish()?;
+        let mut state = state.clone();
+        let (steps, memory) = (state.take_steps()?, self.memory.loaded(params, state)?);
         (self.steps, self.memory) = (steps, memory);
         Ok(())
     }

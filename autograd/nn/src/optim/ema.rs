@@ -1,10 +1,9 @@
 //! Averages of parameters.
 
 use super::limits::flushed;
-use super::state::Reader;
 use super::{OptimizerState, StateError};
 use crate::Params;
-use raygrad_tensor::{Scalar, Tensor, simd};
+use raygrad_tensor::{Scalar, simd};
 
 /// The exponential moving average of parameters: `a = decay a + (1 - decay) x` after each step. It is often a better
 /// model than the parameters themselves, whose last steps are noise (Polyak and Juditsky 1992).
@@ -80,12 +79,12 @@ impl<T: Scalar> Ema<T> {
     /// # Errors
     /// If the state is that of other parameters; then nothing changes.
     pub fn load_state(&mut self, state: &OptimizerState<T>) -> Result<(), StateError> {
-        let mut reader = Reader::new(state);
-        let (steps, mut values) = (reader.steps()?, vec![]);
+        let mut state = state.clone();
+        let (steps, mut values) = (state.take_steps()?, vec![]);
         for (name, value) in self.average.iter() {
-            values.push(Tensor::from_vec(value.shape(), reader.expect(name, "average", value.shape())?.to_vec()));
+            values.push(state.take(name, "average", value.shape())?);
         }
-        reader.finish()?;
+        state.refuse_rest()?;
         self.steps = steps;
         self.average.replace(values);
         Ok(())
@@ -119,6 +118,7 @@ fn blend<T: Scalar>(a: &mut [T], x: &[T], share: T) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use raygrad_tensor::Tensor;
 
     fn store(values: &[f64]) -> Params<f64> {
         let mut params = Params::new();

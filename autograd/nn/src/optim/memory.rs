@@ -1,7 +1,6 @@
 //! What an optimiser remembers of parameters, and the steps that use it.
 
 use super::rule::{LINE, Rule, Shared, Table, move_all};
-use super::state::Reader;
 use super::{Move, OptimizerState, StateError, UpdateReport};
 use crate::Params;
 use raygrad_autograd::RowSums;
@@ -103,8 +102,8 @@ impl<T: Scalar> Memory<T> {
     /// The same with what a state has of the parameters of this store in place of what is remembered.
     ///
     /// # Errors
-    /// If an entry is missing, has another shape, or belongs to a lazy parameter that is not lazy, or the reverse.
-    pub fn loaded(&self, params: &Params<T>, state: &mut Reader<'_, T>) -> Result<Self, StateError> {
+    /// If an entry is missing, unknown or of another shape, or belongs to a lazy parameter that is not lazy, or the reverse.
+    pub fn loaded(&self, params: &Params<T>, mut state: OptimizerState<T>) -> Result<Self, StateError> {
         let mut slots = vec![];
         for ((name, value), id) in params.iter().zip(params.ids()) {
             let lazy = params.moves_rows(id);
@@ -115,7 +114,7 @@ impl<T: Scalar> Memory<T> {
                     false => "belongs to a lazy parameter, and this one is not",
                 };
                 state.refuse(name, steps_name(!lazy), &format!("{what}: call Params::set_lazy as before"))?;
-                state.counts(name, steps_name(lazy), rows)?.map(<[u64]>::to_vec)
+                state.take_counts(name, steps_name(lazy), rows)?
             } else {
                 self.kinds.iter().any(|kind| state.has(name, kind)).then(|| vec![0; rows])
             };
@@ -127,14 +126,15 @@ impl<T: Scalar> Memory<T> {
             slot.steps = steps.into_iter().map(|step| u32::try_from(step).unwrap_or(u32::MAX)).collect();
             let features = (value.len() / rows).max(1);
             for (k, kind) in self.kinds.iter().enumerate() {
-                let numbers = state.expect(name, kind, value.shape())?;
+                let numbers = state.take(name, kind, value.shape())?;
                 let rows = slot.numbers.as_mut_slice().chunks_exact_mut(self.kinds.len() * features);
-                for (row, numbers) in rows.zip(numbers.chunks_exact(features)) {
+                for (row, numbers) in rows.zip(numbers.as_slice().chunks_exact(features)) {
                     row[k * features..][..features].copy_from_slice(numbers);
                 }
             }
             slots.push(slot);
         }
+        state.refuse_rest()?;
         Ok(Memory { slots, ..Memory::new(self.kinds, self.counts_steps) })
     }
 }

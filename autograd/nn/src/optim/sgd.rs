@@ -4,7 +4,6 @@ use super::limits::{flushed, tiny};
 use super::memory::Memory;
 use super::rule::Rule;
 use super::settings::{check, check_rate, check_share, or_panic};
-use super::state::Reader;
 use super::{Optimizer, OptimizerState, SettingError, StateError, UpdateReport};
 use crate::Params;
 use raygrad_autograd::Gradient;
@@ -84,10 +83,7 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
     }
 
     fn load_state(&mut self, params: &Params<T>, state: &OptimizerState<T>) -> Result<(), StateError> {
-        let mut reader = Reader::new(state);
-        let memory = self.memory.loaded(params, &mut reader)?;
-        reader.finish()?;
-        self.memory = memory;
+        self.memory = self.memory.loaded(params, state.clone())?;
         Ok(())
     }
 }

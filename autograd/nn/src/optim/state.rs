@@ -1,13 +1,13 @@
 //! What an optimiser remembers, by the names of the parameters.
 
 #[cfg(feature = "files")]
-use crate::{Storage, files::bad_entry};
+use crate::{Storage, files::bad_entry, storage::Part};
 #[cfg(feature = "files")]
 use raygrad_tensor::checked_len;
 use raygrad_tensor::{Scalar, Tensor};
 #[cfg(feature = "files")]
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
-use std::collections::{BTreeMap, BTreeSet};
+use safetensors::tensor::{Dtype, SafeTensors};
+use std::collections::BTreeMap;
 
 /// What an optimiser remembers, so that a run can go on where it stopped, bit for bit.
 ///
@@ -73,6 +73,49 @@ impl<T: Scalar> OptimizerState<T> {
     pub(crate) fn put_counts(&mut self, name: &str, what: &str, counts: Vec<u64>) {
         self.counts.insert(key(name, what), counts);
     }
+
+    /// Whether there are such numbers of a parameter.
+    pub(crate) fn has(&self, name: &str, what: &str) -> bool {
+        self.tensors.contains_key(&key(name, what))
+    }
+
+    /// Takes numbers of a parameter out.
+    pub(crate) fn take(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<Tensor<T>, StateError> {
+        let key = key(name, what);
+        let Some(tensor) = self.tensors.remove(&key) else { return Err(StateError::entry(&key, "is missing")) };
+        if tensor.shape() != shape {
+            return Err(StateError::entry(&key, format!("has the shape {:?}, and not {shape:?}", tensor.shape())));
+        }
+        Ok(tensor)
+    }
+
+    /// Takes counts of a parameter out, if there are any.
+    pub(crate) fn take_counts(&mut self, name: &str, what: &str, len: usize) -> Result<Option<Vec<u64>>, StateError> {
+        let key = key(name, what);
+        match self.counts.remove(&key) {
+            Some(counts) if counts.len() != len => {
+                Err(StateError::entry(&key, format!("has {} counts, and not {len}", counts.len())))
+            }
+            counts => Ok(counts),
+        }
+    }
+
+    /// Takes the optimiser's own number of steps out.
+    pub(crate) fn take_steps(&mut self) -> Result<u64, StateError> {
+        self.take_counts("", "steps", 1)?.map(|steps| steps[0]).ok_or_else(|| StateError::entry("steps", "is missing"))
+    }
+
+    /// An error with these words if there are counts that a parameter cannot have.
+    pub(crate) fn refuse(&self, name: &str, what: &str, words: &str) -> Result<(), StateError> {
+        let key = key(name, what);
+        if self.counts.contains_key(&key) { Err(StateError::entry(&key, words)) } else { Ok(()) }
+    }
+
+    /// An error if anything has not been taken out.
+    pub(crate) fn refuse_rest(&self) -> Result<(), StateError> {
+        let what = "is unknown: the state belongs to another optimiser or other parameters";
+        self.tensors.keys().chain(self.counts.keys()).min().map_or(Ok(()), |name| Err(StateError::entry(name, what)))
+    }
 }
 
 #[cfg(feature = "files")]
@@ -85,21 +128,12 @@ impl<T: Scalar> OptimizerState<T> {
         if let Some(name) = bad_entry(self.tensors.keys().chain(self.counts.keys()).map(String::as_str)) {
             return Err(StateError::entry(name, "is there twice, or has a name of the format's own"));
         }
-        let mut parts = vec![];
-        for (name, value) in &self.tensors {
-            let mut bytes = Vec::with_capacity(size_of_val(value.as_slice()));
-            value.as_slice().iter().for_each(|x| x.write_le(&mut bytes));
-            parts.push((name, Storage::Full.dtype::<T>(), value.shape().to_vec(), bytes));
-        }
-        for (name, counts) in &self.counts {
-            let bytes = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
-            parts.push((name, Dtype::U64, vec![counts.len()], bytes));
-        }
-        let mut views = Vec::with_capacity(parts.len());
-        for (name, dtype, shape, bytes) in &parts {
-            views.push((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?));
-        }
-        Ok(safetensors::serialize(views, None)?)
+        let values = self.tensors.iter().map(|(name, value)| (name, Part::Value(Storage::Full, value)));
+        let counts = self.counts.iter().map(|(name, counts)| {
+            let bytes: Vec<u8> = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
+            (name, Part::Bytes(Dtype::U64, [counts.len()], bytes.into()))
+        });
+        Ok(safetensors::serialize(values.chain(counts), None)?)
     }
 
     /// The state that such a file holds.
@@ -115,8 +149,7 @@ impl<T: Scalar> OptimizerState<T> {
                 if checked_len(view.shape()).is_none() {
                     return Err(StateError::entry(&name, format!("has shape {:?}, which is too large", view.shape())));
                 }
-                let values = view.data().chunks_exact(size_of::<T>()).map(T::read_le).collect();
-                state.tensors.insert(name, Tensor::from_vec(view.shape(), values));
+                state.tensors.insert(name, Tensor::from_vec(view.shape(), Storage::Full.read(view.data())));
             } else if view.dtype() == Dtype::U64 {
                 let counts = view.data().as_chunks().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect();
                 state.counts.insert(name, counts);
@@ -125,61 +158,5 @@ impl<T: Scalar> OptimizerState<T> {
             }
         }
         Ok(state)
-    }
-}
-
-/// A state that is being read: what has not been asked for is left over.
-pub(crate) struct Reader<'a, T: Scalar> {
-    state: &'a OptimizerState<T>,
-    left: BTreeSet<&'a str>,
-}
-
-impl<'a, T: Scalar> Reader<'a, T> {
-    pub fn new(state: &'a OptimizerState<T>) -> Self {
-        Reader { state, left: state.tensors.keys().chain(state.counts.keys()).map(String::as_str).collect() }
-    }
-
-    /// Whether there are such numbers of a parameter.
-    pub fn has(&self, name: &str, what: &str) -> bool {
-        self.state.tensors.contains_key(&key(name, what))
-    }
-
-    /// The numbers of a parameter.
-    pub fn expect(&mut self, name: &str, what: &str, shape: &[usize]) -> Result<&'a [T], StateError> {
-        let key = key(name, what);
-        let Some(tensor) = self.state.tensors.get(&key) else { return Err(StateError::entry(&key, "is missing")) };
-        self.left.remove(key.as_str());
-        if tensor.shape() != shape {
-            return Err(StateError::entry(&key, format!("has the shape {:?}, and not {shape:?}", tensor.shape())));
-        }
-        Ok(tensor.as_slice())
-    }
-
-    /// Counts of a parameter, if there are any.
-    pub fn counts(&mut self, name: &str, what: &str, len: usize) -> Result<Option<&'a [u64]>, StateError> {
-        let key = key(name, what);
-        let Some(counts) = self.state.counts.get(&key) else { return Ok(None) };
-        self.left.remove(key.as_str());
-        if counts.len() != len {
-            return Err(StateError::entry(&key, format!("has {} counts, and not {len}", counts.len())));
-        }
-        Ok(Some(counts))
-    }
-
-    /// An error with these words if there are counts that a parameter cannot have.
-    pub fn refuse(&self, name: &str, what: &str, words: &str) -> Result<(), StateError> {
-        let key = key(name, what);
-        if self.state.counts.contains_key(&key) { Err(StateError::entry(&key, words)) } else { Ok(()) }
-    }
-
-    /// The optimiser's own number of steps.
-    pub fn steps(&mut self) -> Result<u64, StateError> {
-        self.counts("", "steps", 1)?.map(|steps| steps[0]).ok_or_else(|| StateError::entry("steps", "is missing"))
-    }
-
-    /// An error if anything has not been asked for.
-    pub fn finish(self) -> Result<(), StateError> {
-        let what = "is unknown: the state belongs to another optimiser or other parameters";
-        self.left.first().map_or(Ok(()), |name| Err(StateError::entry(name, what)))
     }
 }
