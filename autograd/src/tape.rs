@@ -299,43 +299,31 @@ impl<T: Scalar> Tape<T> {
     }
 
     /// [`try_apply`](Self::try_apply) for any operation, so that it is compiled once.
+    #[track_caller]
     fn apply_boxed<'t>(
         &'t self,
         op: Box<dyn Op<T>>,
         inputs: &[&Var<'t, T>],
         at: &'static Location<'static>,
     ) -> Result<Var<'t, T>, Error> {
-        let value = if op.is_kept() { self.run_kept(&*op, inputs, at)? } else { self.run(&*op, inputs, at)? };
+        let value = self.run(&*op, inputs, at)?;
         Ok(self.record(op, inputs, value, at))
     }
 
-    /// The output of an operation, without a record.
+    /// The output of an operation, without a record, from the memory of the tape if it is there.
+    #[track_caller]
     fn run(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Tensor<T>, Error> {
         let shape = self.check_shapes(op, inputs, at)?;
-        let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
-        let value = op.forward(&values, &self.pool);
+        let recalled = if op.is_kept() { self.recalled(op.name(), &shape) } else { None };
+        let value = recalled.unwrap_or_else(|| {
+            let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
+            op.forward(&values, &self.pool)
+        });
         assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
         self.check_output(op.name(), inputs, &value, at)?;
-        Ok(value)
-    }
-
-    /// As [`run`](Self::run), with the memory of the tape.
-    #[track_caller]
-    fn run_kept(
-        &self,
-        op: &dyn Op<T>,
-        inputs: &[&Var<'_, T>],
-        at: &'static Location<'static>,
-    ) -> Result<Tensor<T>, Error> {
-        let shape = self.check_shapes(op, inputs, at)?;
-        let value = match self.recalled(op.name(), &shape) {
-            Some(value) => {
-                self.check_output(op.name(), inputs, &value, at)?;
-                value
-            }
-            None => self.run(op, inputs, at)?,
-        };
-        self.keep(&value);
+        if op.is_kept() {
+            self.keep(&value);
+        }
         Ok(value)
     }
 

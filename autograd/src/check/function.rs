@@ -77,6 +77,11 @@ pub(crate) fn inner(a: &[Tensor<f64>], b: &[Tensor<f64>]) -> f64 {
     value_and_size(a, b)[0]
 }
 
+/// The Euclidean norm.
+pub(crate) fn norm(x: &Tensor<f64>) -> f64 {
+    inner(std::slice::from_ref(x), std::slice::from_ref(x)).sqrt()
+}
+
 /// `x + h d`.
 fn moved(x: &[Tensor<f64>], d: &[Tensor<f64>], h: f64) -> Vec<Tensor<f64>> {
     let pair =
@@ -99,7 +104,7 @@ fn directions(x: &[Tensor<f64>], which: usize, most: usize) -> Vec<(Vec<Tensor<f
     };
     let random = |k: usize| {
         let d = spread(x.shape(), &[-1.0..1.0], 13 * k + which + 5);
-        let size = (inner(std::slice::from_ref(&d), std::slice::from_ref(&d)) / d.len() as f64).sqrt();
+        let size = norm(&d) / (d.len() as f64).sqrt();
         (along(d), size)
     };
     if x.len() > most { (0..most).map(random).collect() } else { (0..x.len()).map(unit).collect() }
@@ -121,7 +126,7 @@ fn against_differences(
     // What rounding makes of a difference, as a scale: the tolerance times this is let pass.
     let rounding = ROUNDINGS * f64::EPSILON * f(x)[1] / (check.step * check.tolerance);
     for (which, grad) in grads.iter().enumerate() {
-        let norm = inner(std::slice::from_ref(grad), std::slice::from_ref(grad)).sqrt();
+        let norm = norm(grad);
         for (k, (d, size)) in directions(x, which, check.directions).iter().enumerate() {
             let difference = |h: f64| (f(&moved(x, d, h))[0] - f(&moved(x, d, -h))[0]) / (2.0 * h);
             let numeric = (4.0 * difference(0.5 * check.step) - difference(check.step)) / 3.0;
@@ -187,7 +192,7 @@ pub fn check_function(
     let recorded_values: Vec<_> = recorded.iter().map(|grad| grad.value().clone()).collect();
     for (i, (recorded, grad)) in recorded_values.iter().zip(&grads).enumerate() {
         let what = format!("the recorded gradient against the unrecorded one, input {i}");
-        let norm = inner(std::slice::from_ref(grad), std::slice::from_ref(grad)).sqrt();
+        let norm = norm(grad);
         for (&recorded, &grad) in recorded.as_slice().iter().zip(grad.as_slice()) {
             compare(&what, recorded, grad, norm.max(f64::MIN_POSITIVE), 1e-10)?;
         }

@@ -27,43 +27,16 @@ fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &P
         variance_rows(x.as_slice(), n, out.as_mut_slice());
     } else {
         // As `variance_rows`: measured from the rounded mean, less what its rounding adds.
-        let scale = T::from_f64(1.0 / count);
-        let mean_of = |x: &Tensor<T>| {
-            map(
-                [&sum_to(x, shape, pool)],
-                pool,
-                #[inline(always)]
-                |[sum]| sum * scale,
-            )
-        };
+        let mean_of = |x: &Tensor<T>| sum_to(x, shape, pool) * T::from_f64(1.0 / count);
         let deviation = map(
             [x, &mean_of(x)],
             pool,
             #[inline(always)]
             |[x, mean]| x - mean,
         );
-        let square = map(
-            [&deviation],
-            pool,
-            #[inline(always)]
-            |[x]| x * x,
-        );
-        out = map(
-            [&mean_of(&square), &mean_of(&deviation)],
-            pool,
-            #[inline(always)]
-            |[square, rest]| square - rest * rest,
-        );
+        out = mean_of(&deviation.square()) - mean_of(&deviation).square();
     }
-    if correction == 0.0 {
-        return out;
-    }
-    map(
-        [&out],
-        pool,
-        #[inline(always)]
-        |[y]| y * ratio,
-    )
+    if correction == 0.0 { out } else { out * ratio }
 }
 
 /// y = the variance over the axes along which `shape` has extent 1: the sum of squared deviations from the mean,
@@ -119,13 +92,7 @@ impl<T: Scalar> Op<T> for Deviation {
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
-        let y = variance(x[0], &self.0.shape, self.0.correction, pool);
-        map(
-            [&y],
-            pool,
-            #[inline(always)]
-            |[y]| y.sqrt(),
-        )
+        variance(x[0], &self.0.shape, self.0.correction, pool).sqrt()
     }
 
     fn reads(&self) -> Reads {
@@ -176,12 +143,7 @@ impl<T: Scalar> Op<T> for Norm {
         // Sums in this range have lost nothing to overflow or underflow.
         let (least, most) = (T::from_f64(1e-25), T::from_f64(1e37));
         if sums.as_slice().iter().all(|&sum| sum > least && sum < most) {
-            return map(
-                [&sums],
-                pool,
-                #[inline(always)]
-                |[sum]| sum.sqrt(),
-            );
+            return sums.sqrt();
         }
         // Else in units of the greatest element.
         let mut size = map(
@@ -211,12 +173,7 @@ impl<T: Scalar> Op<T> for Norm {
                 if size > T::ZERO && size.is_finite() { quotient } else { limit }
             },
         );
-        map(
-            [&squares(&unit), &size],
-            pool,
-            #[inline(always)]
-            |[sum, size]| size * sum.sqrt(),
-        )
+        size * squares(&unit).sqrt()
     }
 
     fn reads(&self) -> Reads {
