@@ -89,7 +89,7 @@ fn biases(AdamConfig { beta1, beta2, .. }: AdamConfig, step: u32) -> [f64; 2] {
 
 impl<T: Scalar> Group<T> {
     /// Where the corrections end even if they are not yet 1, which matters to a beta2 above 0.9998 only.
-    const LONGEST: u32 = 1 << 17;
+    const LONGEST: usize = 1 << 17;
 
     #[track_caller]
     fn new(config: AdamConfig, decay: f64) -> Self {
@@ -99,10 +99,8 @@ impl<T: Scalar> Group<T> {
 
     /// Fills the corrections, if they are not.
     fn correct_rows(&mut self) {
-        let mut step = 0;
-        while step < Self::LONGEST && self.corrections.last() != Some(&[T::ONE; 2]) {
-            step += 1;
-            let [first, second] = biases(self.config, step);
+        while self.corrections.len() < Self::LONGEST && self.corrections.last() != Some(&[T::ONE; 2]) {
+            let [first, second] = biases(self.config, self.corrections.len() as u32 + 1);
             self.corrections.push([second.sqrt() / first, second.sqrt()].map(T::from_f64));
         }
     }
@@ -393,6 +391,20 @@ mod tests {
         let way = |id| -params.get(id).item();
         assert!((way(a) - 5.0).abs() < 1e-6 && (way(b) - 1.0).abs() < 1e-6 && (way(c) - 1.0).abs() < 1e-6);
         assert_eq!(adam.steps(), 50);
+    }
+
+    #[test]
+    fn corrections_of_rows_end_where_they_are_one_or_long_enough() {
+        for (beta2, least, most) in [(0.0, 1, 200), (0.999, 10_000, 40_000), (0.99999, 1 << 17, 1 << 17)] {
+            let mut params = store(Tensor::<f32>::zeros(&[2, 1]));
+            params.set_lazy(|_| true, true);
+            let mut adam = Adam::new(AdamConfig { beta2, ..AdamConfig::default() });
+            for _ in 0..3 {
+                step(&mut adam, &mut params, Tensor::ones(&[2, 1]), 0.1);
+                let count = adam.groups[0].corrections.len();
+                assert!((least..=most).contains(&count), "{count} for a beta2 of {beta2}");
+            }
+        }
     }
 
     #[test]
