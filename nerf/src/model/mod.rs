@@ -150,7 +150,7 @@ impl<T: Scalar> Model<T> {
         self.other_cameras(std::slice::from_ref(camera)).remove(0)
     }
 
-    /// The same of many: how the photographs' cameras have moved as a whole is found out but once.
+    /// The same of many, which finds once how the images' cameras have moved as a whole.
     pub fn other_cameras(&self, cameras: &[Camera]) -> Vec<Camera> {
         self.refine.as_ref().map_or_else(|| cameras.to_vec(), |refine| refine.other_cameras(&self.params, cameras))
     }

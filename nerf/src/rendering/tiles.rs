@@ -1,4 +1,4 @@
-//! What all views do: ask a model along the rays of a camera's pixels, tile by tile on all cores.
+//! Tiles: a model is asked along the rays of a camera's pixels, tile by tile on all cores.
 
 use super::picture::Viewing;
 use super::pixel::Pixel;
@@ -14,8 +14,8 @@ use raygrad_tensor::parallel::{self, Scratch, locked};
 use std::sync::{Mutex, PoisonError};
 
 impl<T: Scalar> Model<T> {
-    /// Hands `see` the field with the look of the model, and where it is sampled along `rays` in views, at steps `finer`
-    /// times smaller than the configured ones.
+    /// Samples `rays` as views do, at steps `finer` times smaller than the configured ones, and hands the samples to `see`
+    /// with the field and the look of the model.
     pub(crate) fn along<R>(
         &self,
         rays: &Rays<T>,
@@ -61,8 +61,8 @@ impl<T: Scalar> Model<T> {
         seen.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What is seen along the rays of a camera's pixels, row by row, in tiles of `tile` rays; `keep` takes what a tile
-    /// shows to its part of `out`. Nothing if it was not to go on.
+    /// Renders a camera's pixels, row by row, in tiles of `tile`; `keep` takes the pixels of a tile to its part of `out`.
+    /// Nothing if it was not to go on.
     pub(crate) fn pixels<P: Send>(
         &self,
         camera: &Camera,

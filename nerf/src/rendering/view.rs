@@ -23,7 +23,7 @@ struct Seen {
 }
 
 impl Model<f32> {
-    /// What is seen along rays without a background; each pixel of `out` is still that of nothing.
+    /// Renders rays without a background to `out`, whose pixels are those of nothing before.
     pub(super) fn see(&self, rays: &Rays<f32>, limits: &Limits, pool: &Pool<f32>, out: &mut [Pixel]) -> Evaluations {
         self.along(rays, 1, pool, |query, sampled| {
             let rule = self.sampler.quadrature();

@@ -106,8 +106,7 @@ impl Trainer {
         Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
 
-    /// As [`with_extent`](Self::with_extent), with a clock of one's own: the time since some moment, which training time is
-    /// measured by.
+    /// As [`with_extent`](Self::with_extent), with a clock that measures training time: it gives the time since some moment.
     ///
     /// # Errors
     /// As [`new`](Self::new).

@@ -22,9 +22,12 @@ pub struct Lit<'t, T: Scalar> {
 const FIRST_ROUND: usize = 4;
 
 impl Quadrature {
-    /// What the intervals of `steps` show of a field by this rule, in two passes: an unrecorded one for the densities, and a
-    /// recorded one on the samples that more than `termination` of the light reaches, which takes what was dear to work out
-    /// from the first. Without a termination there is only the second, on all samples. What is left out changes a pixel by at most `termination` times the range of colours.
+    /// What the intervals of `steps` show of a field by this rule, in two passes.
+    ///
+    /// An unrecorded pass finds the visible samples, which more than `termination` of the light reaches; a recorded one works
+    /// on those, and takes the outputs of operations that [are kept](raygrad_autograd::Op::is_kept) from the first. Without a
+    /// termination there is only the second, on all samples. The rest changes a pixel by at most `termination` times the range
+    /// of colours.
     pub fn render<'t, T: Scalar>(self, query: &Query<'_, 't, T>, steps: &Samples<T>, termination: f64) -> Lit<'t, T> {
         let tape = query.tape();
         if let Quadrature::Adaptive { tolerance } = self {
@@ -35,7 +38,7 @@ impl Quadrature {
         if !(termination > 0.0) {
             return Lit { asked: nodes.len(), kept: nodes.len(), rendered: self.render_nodes(query, nodes) };
         }
-        // What is found out unrecorded needs no variables.
+        // The unrecorded pass needs no variables.
         let plain = &Query { rays: None, slopes: false, ..*query };
         let Visible { samples, memo, asked } = tape.no_grad(|| match self.has_intervals() {
             false => visible(plain, &nodes, termination),
@@ -57,10 +60,10 @@ impl Quadrature {
     }
 }
 
-/// The samples that light reaches.
+/// The visible samples.
 struct Visible<T: Scalar> {
     samples: Samples<T>,
-    /// What was dear to work out for them.
+    /// The outputs of kept operations for them.
     memo: Memo<T>,
     /// Density queries.
     asked: usize,
@@ -87,7 +90,7 @@ fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, terminatio
     Visible { samples: samples.select(&rows, tape.pool()), memo, asked: sizes.iter().sum() }
 }
 
-/// Rows of what was dear to work out for so many samples at a time; nothing if it has other rows than samples.
+/// Rows of the memos of so many samples each; an empty memo if an output has other rows than samples.
 fn gathered<T: Scalar>(memos: Vec<Memo<T>>, rows: &[[u32; 2]], sizes: &[usize], pool: &Pool<T>) -> Memo<T> {
     let fits = |(memo, size): (&Memo<T>, &usize)| memo.values().iter().all(|value| value.shape().first() == Some(size));
     match memos.iter().zip(sizes).all(fits) {

@@ -58,8 +58,8 @@ impl<'a, T: Scalar> FrontToBack<'a, T> {
         (ROUND / self.depths.len().max(1)).max(LEAST)
     }
 
-    /// At most `count` samples of each ray that still has light; `None` if no ray has any. Who takes them adds their
-    /// optical depth to `depths`.
+    /// At most `count` samples of each ray that still has light; `None` if no ray has any. The caller adds their optical
+    /// depth to `depths`.
     pub fn take(&mut self, count: usize, pool: &Pool<T>) -> Option<Stretch<T>> {
         let piece = |(ray, rows): (usize, Range<usize>)| {
             let start = rows.start + self.passed;
@@ -70,7 +70,7 @@ impl<'a, T: Scalar> FrontToBack<'a, T> {
         (!pieces.is_empty()).then(|| Stretch { samples: self.samples.pieces(&pieces, pool), pieces })
     }
 
-    /// As [`take`](Self::take), of samples whose density the field is asked for.
+    /// As [`take`](Self::take), with the density of the samples; their optical depth is added to `depths`.
     #[track_caller]
     pub fn round<'t>(&mut self, query: &Query<'_, 't, T>, count: usize) -> Option<Round<'t, T>> {
         let stretch = self.take(count, query.tape().pool())?;
