@@ -2,15 +2,15 @@
 
 use std::path::Path;
 
-use raygrad::nerf::dataset::{Capture, Dataset, Format, Frame, Split, View};
-use raygrad::nerf::{Error, Result};
-use raygrad_scenes::{embedded, landscape};
+use raygrad::nerf::dataset::{Capture, Dataset, Format, Frame, Photo, Split, View};
+use raygrad::nerf::{Camera, Error, Result};
+use raygrad_scenes::{embedded, embedded_cameras, landscape, walk_cameras};
 
 use super::output::make_folder;
 use super::progress::Progress;
 use super::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
 
-/// Width in pixels at which nothing but the cameras is of interest.
+/// Width in pixels of cameras without pictures, before they are made as wide as is asked for.
 const SMALL: usize = 8;
 
 /// What a folder's files say; or the cameras of a built-in scene whose pictures are `width` pixels wide, by default as wide as those
@@ -29,8 +29,14 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
     if height * usual[0] != width * usual[1] {
         return Err(Error::setting("size", format!("{width}: the landscape has four columns for each three rows")));
     }
-    let rendered = |split: Split, width: usize| -> Dataset {
-        if *scene == Scene::Embedded { embedded(split, width) } else { landscape(split, width) }
+    let is_embedded = *scene == Scene::Embedded;
+    let views_of = |split: Split| -> Vec<(Camera, Option<Photo>)> {
+        if folder.is_none() {
+            let cameras = if is_embedded { embedded_cameras(split, SMALL) } else { walk_cameras(split, SMALL) };
+            return cameras.into_iter().map(|camera| (camera, None)).collect();
+        }
+        let Dataset { frames, .. } = if is_embedded { embedded(split, width) } else { landscape(split, width) };
+        frames.into_iter().map(|Frame { camera, image, .. }| (camera, Some(image))).collect()
     };
     let mut views = vec![];
     let progress = Progress::new();
@@ -38,11 +44,10 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
         if folder.is_some() {
             progress.set(i as f64 / Split::ALL.len() as f64, || format!("{split} pictures"));
         }
-        let frames = rendered(split, if folder.is_some() { width } else { SMALL }).frames;
-        for (number, Frame { camera, image, .. }) in frames.into_iter().enumerate() {
+        for (number, (camera, image)) in views_of(split).into_iter().enumerate() {
             let name = format!("{split}/{number}");
             let path = folder.map(|folder| folder.join(format!("{name}.png")));
-            if let Some(path) = &path {
+            if let (Some(path), Some(image)) = (&path, image) {
                 path.parent().map_or(Ok(()), make_folder)?;
                 image.to_image().save_png(path)?;
             }

@@ -18,17 +18,21 @@ const FAR: f64 = 1e4;
 /// Ray-traced on the current rayon pool in about a second at 200 pixels.
 pub fn embedded(split: Split, size: usize) -> Dataset {
     let scene = Scene::bulldozer();
-    let cameras: Vec<Camera> = match split {
-        Split::Train => train_cameras(60, size),
-        Split::Val => val_cameras(10, size),
-        Split::Test => test_cameras(20, size),
-    };
     // Room around the model, as a real capture would have it.
     let [low, high] = scene.bounds();
     let bounds = [low - 0.02, high + 0.02];
     let reach = bounds[1].max(-bounds[0]).length();
-    let frames = frames(split, cameras, |camera| scene.render(camera, SAMPLES).color);
+    let frames = frames(split, embedded_cameras(split, size), |camera| scene.render(camera, SAMPLES).color);
     dataset(frames, bounds, [DISTANCE - reach, DISTANCE + reach], Scope::Bounded)
+}
+
+/// The cameras of [`embedded`] of a split, whose images are `size` pixels wide and high.
+pub fn embedded_cameras(split: Split, size: usize) -> Vec<Camera> {
+    match split {
+        Split::Train => train_cameras(60, size),
+        Split::Val => val_cameras(10, size),
+        Split::Test => test_cameras(20, size),
+    }
 }
 
 /// The views of the procedural bulldozer in a landscape that goes out to a thousand units and has a sky: 100 to train on,

@@ -46,7 +46,7 @@ mod window;
 use glam::DVec3;
 
 pub use bvh::Hit;
-pub use dataset::{embedded, landscape, landscape_ahead, landscape_distances};
+pub use dataset::{embedded, embedded_cameras, landscape, landscape_ahead, landscape_distances};
 pub use landscape::Landscape;
 pub use render::View;
 pub use views::{ANGLE_X, DISTANCE, test_cameras, train_cameras, val_cameras};
