@@ -69,11 +69,10 @@ pub fn caches() -> Vec<(String, u64)> {
     (0..8).filter_map(cache).collect()
 }
 
-#[cfg(test)]
+#[cfg(all(test, target_os = "linux"))]
 mod tests {
     use super::*;
 
-    #[cfg(target_os = "linux")]
     #[test]
     fn memory_is_counted_in_bytes() {
         let before = peak_memory().unwrap();

@@ -127,11 +127,10 @@ pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
     colormap::depth_map(&depth, 1.0, 2.0)
 }
 
-#[cfg(test)]
+#[cfg(all(test, unix))]
 mod tests {
     use super::*;
 
-    #[cfg(unix)]
     #[test]
     fn output_to_who_is_gone_is_no_error() {
         let error = |number: i32| std::io::Error::from_raw_os_error(number);

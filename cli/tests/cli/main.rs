@@ -134,6 +134,7 @@ impl Place {
     }
 
     /// Adds a dataset of an unbounded scene in `around`, in nerfstudio's format.
+    #[cfg(unix)]
     fn add_landscape(&self) {
         static LANDSCAPE: LazyLock<Kept> = LazyLock::new(|| {
             let place = Place::empty();
@@ -713,6 +714,7 @@ fn ctrl_c_saves_the_model() {
 }
 
 /// Waits until something holds, for as long as the program runs and at most a minute.
+#[cfg(unix)]
 fn wait(child: &mut Child, holds: impl Fn() -> bool) {
     let start = Instant::now();
     while !holds() {

@@ -485,6 +485,7 @@ fn an_interrupted_film_goes_on_where_it_was() {
 }
 
 /// The frames of an APNG file, in bytes.
+#[cfg(unix)]
 fn decoded(path: &Path) -> Vec<Vec<u8>> {
     let bytes = std::fs::read(path).unwrap();
     let mut reader = png::Decoder::new(std::io::Cursor::new(&bytes[..])).read_info().unwrap();
