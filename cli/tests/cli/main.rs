@@ -2,9 +2,8 @@
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::sync::LazyLock;
-use std::time::{Duration, Instant};
 
 use raygrad::nerf::Image;
 use raygrad::nerf::dataset::{Split, evenly_spaced};
@@ -715,7 +714,8 @@ fn ctrl_c_saves_the_model() {
 
 /// Waits until something holds, for as long as the program runs and at most a minute.
 #[cfg(unix)]
-fn wait(child: &mut Child, holds: impl Fn() -> bool) {
+fn wait(child: &mut std::process::Child, holds: impl Fn() -> bool) {
+    use std::time::{Duration, Instant};
     let start = Instant::now();
     while !holds() {
         let running = child.try_wait().unwrap().is_none() && start.elapsed() < Duration::from_secs(60);

@@ -7,7 +7,6 @@ use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::{Camera, Config, Extent, Image, Model};
 use raygrad_scenes::ANGLE_X;
 use serde_json::{Value, json};
-use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// The greatest difference between two images of one size, in steps of 8 bits.
@@ -486,7 +485,7 @@ fn an_interrupted_film_goes_on_where_it_was() {
 
 /// The frames of an APNG file, in bytes.
 #[cfg(unix)]
-fn decoded(path: &Path) -> Vec<Vec<u8>> {
+fn decoded(path: &std::path::Path) -> Vec<Vec<u8>> {
     let bytes = std::fs::read(path).unwrap();
     let mut reader = png::Decoder::new(std::io::Cursor::new(&bytes[..])).read_info().unwrap();
     let count = reader.info().animation_control().unwrap().num_frames;
