@@ -33,7 +33,6 @@ fn a_browser_shows_the_scene_and_moves_about_it() {
 fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     browser.visit(server);
     let size = browser.value("[picture.width, picture.height]");
-    // Windows of browsers have bars of different heights.
     let file = format!("first-{:?}.png", browser.kind);
     place.succeeds(&format!("render run --frames 1 --size {}x{} --out {file}", size[0], size[1]));
     let expected = png(&place.path(&file));
@@ -140,7 +139,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
 #[test]
 fn a_browser_keeps_pictures_and_paths_that_are_the_programs() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 60 --out run --scope unbounded {SMALL}"));
+    place.succeeds(&format!("train scene --steps 60 --out run --scope unbounded {SMALL} --set sampler.cone=0.1"));
     let server = serve(&place, "view run");
     Browser::all().for_each(|browser| keeps_pictures(browser, &place, &server));
 }
@@ -211,7 +210,7 @@ fn a_browser_reaches_everything_by_its_controls() {
     let mut transforms = place.json("around/transforms.json");
     transforms["ply_file_path"] = json!("points.ply");
     std::fs::write(place.path("around/transforms.json"), transforms.to_string()).unwrap();
-    place.succeeds(&format!("train around --steps 60 --out run {SMALL}"));
+    place.succeeds(&format!("train around --steps 60 --out run {SMALL} --set sampler.cone=0.1"));
     let server = serve(&place, "view run");
     Browser::all().for_each(|browser| reaches_everything(browser, &place, &server));
 }

@@ -180,9 +180,8 @@ impl Browser {
                     self.call("session.new", json!({ "capabilities": {} }));
                     self.call("session.subscribe", json!({ "events": ["log.entryAdded"] }));
                 }
-                let old = self.call("browsingContext.getTree", json!({}))["contexts"][0]["context"].clone();
-                self.page = text(&self.call("browsingContext.create", json!({ "type": "tab" }))["context"]);
-                self.call("browsingContext.close", json!({ "context": old }));
+                self.page = text(&self.call("browsingContext.getTree", json!({}))["contexts"][0]["context"]);
+                self.go("about:blank");
                 // Those of the page before.
                 self.complaints.clear();
             }
