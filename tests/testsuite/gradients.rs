@@ -32,8 +32,10 @@ fn operations_in(folder: &Path, names: &mut BTreeSet<String>) {
             continue;
         }
         let text = std::fs::read_to_string(&path).unwrap();
-        for start in ["fn name(&self) -> &'static str {", "const NAME: &'static str =", "Entry::function("] {
-            names.extend(text.split(start).skip(1).filter_map(|body| Some(body.split('"').nth(1)?.to_string())));
+        for start in ["fn name(&self) -> &'static str {", "const NAME: &'static str =", "Entry::function(", " entry(\""]
+        {
+            let name = if start.ends_with('"') { 0 } else { 1 };
+            names.extend(text.split(start).skip(1).filter_map(|body| Some(body.split('"').nth(name)?.to_string())));
         }
     }
 }
