@@ -7,7 +7,7 @@ use raygrad_tensor::{Indices, Scalar};
 
 impl<'t, T: Scalar> Var<'t, T> {
     /// The elements sorted along `axis`, and where each stood: `y = x.gather(axis, &index)`. Equal elements keep their
-    /// order, and NaN counts as larger than every number ([`Tensor::argsort`]). The gradient goes back through the
+    /// order, and NaN counts as larger than every number ([`Tensor::argsort`](crate::Tensor::argsort)). The gradient goes back through the
     /// permutation.
     ///
     /// ```
@@ -37,7 +37,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.value().argsort(axis, descending)
     }
 
-    /// Where `values` would be inserted in the sorted rows of this tensor ([`Tensor::searchsorted`]); nothing to
+    /// Where `values` would be inserted in the sorted rows of this tensor ([`Tensor::searchsorted`](crate::Tensor::searchsorted)); nothing to
     /// differentiate.
     ///
     /// # Panics
