@@ -70,7 +70,13 @@ impl<T: Scalar> Memory<T> {
             // One number of each element lies at the same place, lazy or not.
             slot.steps.resize(rows, 0);
         }
-        assert!(slot.steps.len() == rows, "`{name}` was {}lazy until now", if part.lazy { "not " } else { "" });
+        let counts = slot.steps.len();
+        assert!(
+            counts == rows || counts.min(rows) > 1,
+            "`{name}` was {}lazy until now",
+            if part.lazy { "not " } else { "" }
+        );
+        assert!(counts == rows, "`{name}` has {rows} rows, and had {counts} at its first step");
         let [moved, skipped] = match part.lazy {
             true => slot.move_rows(part, &self.pool, row),
             false => slot.move_whole(part, &self.pool, whole),
@@ -86,8 +92,11 @@ impl<T: Scalar> Memory<T> {
                 continue;
             }
             if self.counts_steps {
+                // Of one row nothing says whether it was lazy; of several, that they were counted does.
+                let rows = value.shape().first().copied().unwrap_or(1);
+                let lazy = if rows == 1 { params.moves_rows(id) } else { slot.steps.len() > 1 };
                 let steps = slot.steps.iter().map(|&step| step.into()).collect();
-                state.put_counts(name, steps_name(params.moves_rows(id)), steps);
+                state.put_counts(name, steps_name(lazy), steps);
             }
             let features = value.len() / slot.steps.len();
             for (k, kind) in self.kinds.iter().enumerate() {

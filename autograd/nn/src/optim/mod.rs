@@ -84,7 +84,7 @@ impl<'a, T: Scalar> Move<'a, T> {
 /// of their own ([`Params::set_rate`], [`Params::set_decay`]).
 ///
 /// All optimisers here leave an element alone, with what they remember of it, and count it if its gradient is infinite or
-/// NaN or its new value would be, whether its parameter is lazy or not; set what they remember to 0 once it is below 1e-30
+/// NaN or its new value would be, whether its parameter is lazy or not (a row or parameter counts the step all the same); set what they remember to 0 once it is below 1e-30
 /// (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any number of threads.
 ///
 /// [`Bound::backward`](crate::Bound::backward) gives the gradients and lets go of the parameters, which can then be

@@ -142,7 +142,7 @@ impl<T: Scalar> Table<'_, T> {
         grads: &[T],
         rule: &impl Fn(u32) -> R,
     ) -> [usize; 2] {
-        let features = if W < 8 { W } else { self.features };
+        let features = if self.features == W { W } else { self.features };
         let (mut visited, mut skipped) = (0, 0);
         for (place, (&row, grad)) in rows.iter().zip(grads.chunks_exact(features)).enumerate() {
             if let Some(&later) = rows.get(place + AHEAD) {

@@ -340,6 +340,18 @@ fn a_lazy_parameter_stays_so() {
     params.set_lazy(|_| true, false);
     let grads = gradients(&params, ids, 1, false);
     assert!(message(|| drop(adam.update(&mut params, &grads, 0.1))).contains("`table` was lazy until now"));
+    // What is remembered is saved as what it is, whatever the flag says now.
+    let state = adam.state(&params);
+    assert!(adam.clone().load_state(&params, &state).is_err());
+    params.set_lazy(|name| name == "table", true);
+    adam.load_state(&params, &state).unwrap();
+    let (mut params, mut adam) = (Params::<f32>::new(), Adam::new(AdamConfig::default()));
+    let x = params.add("x", Tensor::zeros(&[4, 2]));
+    params.set_lazy(|_| true, true);
+    adam.update(&mut params, &[Tensor::ones(&[4, 2]).into()], 0.1).check().unwrap();
+    *params.get_mut(x) = Tensor::zeros(&[2, 4]);
+    let grads = [Tensor::ones(&[2, 4]).into()];
+    assert!(message(|| drop(adam.update(&mut params, &grads, 0.1))).contains("`x` has 2 rows, and had 4"));
 }
 
 /// A gradient of four rows of one feature in two parts, which puts sums of its own in the place of those it is given.
