@@ -12,7 +12,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 const WORTHWHILE: usize = 1 << 20;
 
 /// Elements of a piece: what two or three arrays of f32 may have in a core's second cache.
-pub(crate) const PIECE: usize = 1 << 15;
+pub const PIECE: usize = 1 << 15;
 
 /// What an element costs that is read, computed with a few operations and written.
 pub(crate) const ELEMENT: usize = 8;

@@ -4,7 +4,7 @@
 use super::row_grad::{RowGrad, add_rows};
 use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, Tape, Var, Vjp};
-use raygrad_tensor::parallel::chunks;
+use raygrad_tensor::parallel::{PIECE, chunks};
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
@@ -80,8 +80,8 @@ impl Pick {
         }
     }
 
-    /// Whether the indices are those of a result of this shape, and below `extent`.
-    fn check(&self, picked: &[usize], extent: usize) -> Result<(), ShapeError> {
+    /// Whether the indices are those of a result of the shape `picked`, and below `extent`; `x` is what was given.
+    fn check(&self, x: &[usize], picked: &[usize], extent: usize) -> Result<(), ShapeError> {
         match &self.places {
             Places::Entries(index) => {
                 let one_each = picked[self.axis] == index.len();
@@ -89,7 +89,8 @@ impl Pick {
                 check_index(index, extent, self.axis)
             }
             Places::Elements(index) => {
-                ensure(picked == index.shape(), || format!("indices of shape {:?} for {picked:?}", index.shape()))?;
+                let same = picked == index.shape();
+                ensure(same, || format!("indices of shape {:?} for {x:?}, along axis {}", index.shape(), self.axis))?;
                 check_index(index.as_slice(), extent, self.axis)
             }
         }
@@ -111,6 +112,20 @@ fn each_element(index: &[u32], inner: usize, mut f: impl FnMut(usize, usize)) {
     }
 }
 
+/// [`chunks`] of `len` elements, the blocks: as many in one task as make it worth its while.
+fn in_blocks<T: Send, S: Send>(
+    out: &mut [T],
+    len: usize,
+    work: usize,
+    scratch: impl Fn() -> S + Sync,
+    f: &(dyn Fn(&mut S, usize, &mut [T]) + Sync),
+) {
+    let many = (PIECE / len.max(1)).max(1);
+    chunks(out, many * len, work, scratch, &|scratch: &mut S, i, out| {
+        out.chunks_mut(len).enumerate().for_each(|(k, out)| f(scratch, i * many + k, out));
+    });
+}
+
 impl<T: Scalar> Op<T> for Pick {
     fn name(&self) -> &'static str {
         self.method.names[0]
@@ -118,7 +133,7 @@ impl<T: Scalar> Op<T> for Pick {
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
         let picked = self.resized(x[0], self.count())?;
-        self.check(&picked, x[0][self.axis])?;
+        self.check(x[0], &picked, x[0][self.axis])?;
         Ok(picked)
     }
 
@@ -141,7 +156,7 @@ impl<T: Scalar> Op<T> for Pick {
             }
         };
         let work = out.len();
-        chunks(out.as_mut_slice(), to, work, || (), &block);
+        in_blocks(out.as_mut_slice(), to, work, || (), &block);
         out
     }
 
@@ -168,7 +183,7 @@ impl<T: Scalar> Op<T> for Put {
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
         let shape = self.pick.resized(x[0], self.extent)?;
-        self.pick.check(x[0], self.extent)?;
+        self.pick.check(x[0], x[0], self.extent)?;
         Ok(shape)
     }
 
@@ -181,21 +196,29 @@ impl<T: Scalar> Op<T> for Put {
             let x = &x[i * from..][..from];
             out.fill(T::ZERO);
             match &self.pick.places {
-                Places::Entries(index) => add_rows(out, x, index, inner, sums),
-                Places::Elements(index) => {
-                    let index = &index.as_slice()[i * from..][..from];
-                    if self.pick.method.few_meet {
-                        return each_element(index, inner, |i, j| out[j] += x[i]);
+                // One block, which may be a large table.
+                Places::Entries(index) if self.pick.axis == 0 => return add_rows(out, x, index, inner, sums),
+                Places::Elements(index) if self.pick.method.few_meet => {
+                    return each_element(&index.as_slice()[i * from..][..from], inner, |i, j| out[j] += x[i]);
+                }
+                _ => {}
+            }
+            sums.clear();
+            sums.resize(out.len(), 0.0);
+            match &self.pick.places {
+                Places::Entries(index) => {
+                    for (x, &at) in x.chunks_exact(inner).zip(index.iter()) {
+                        sums[at as usize * inner..].iter_mut().zip(x).for_each(|(sum, x)| *sum += x.to_f64());
                     }
-                    sums.clear();
-                    sums.resize(out.len(), 0.0);
-                    each_element(index, inner, |i, j| sums[j] += x[i].to_f64());
-                    out.iter_mut().zip(sums).for_each(|(out, sum)| *out = T::from_f64(*sum));
+                }
+                Places::Elements(index) => {
+                    each_element(&index.as_slice()[i * from..][..from], inner, |i, j| sums[j] += x[i].to_f64());
                 }
             }
+            out.iter_mut().zip(sums).for_each(|(out, sum)| *out = T::from_f64(*sum));
         };
         let work = 2 * x.len() + out.len();
-        chunks(out.as_mut_slice(), self.extent * inner, work, Vec::new, &block);
+        in_blocks(out.as_mut_slice(), self.extent * inner, work, Vec::new, &block);
         out
     }
 
@@ -348,9 +371,9 @@ mod tests {
             (put(rows(&[0]), 5), "1 indices for [2, 3] along axis 0"),
             (picked(Pick { axis: 2, ..rows(&[0]) }), "there is no axis 2"),
             (picked(elements(1, &[2, 1], &[0, 3])), "index 1 is 3, but axis 1 has 3 entries"),
-            (picked(elements(1, &[1, 2], &[0, 0])), "indices of shape [1, 2] for [2, 2]"),
-            (picked(elements(1, &[2], &[0, 0])), "indices of shape [2] for [2, 0]"),
-            (put(elements(0, &[1, 3], &[0, 0, 0]), 4), "indices of shape [1, 3] for [2, 3]"),
+            (picked(elements(1, &[1, 2], &[0, 0])), "indices of shape [1, 2] for [2, 3], along axis 1"),
+            (picked(elements(1, &[2], &[0, 0])), "indices of shape [2] for [2, 3], along axis 1"),
+            (put(elements(0, &[1, 3], &[0, 0, 0]), 4), "indices of shape [1, 3] for [2, 3], along axis 0"),
             (put(elements(0, &[2, 3], &[0, 0, 0, 1, 1, 4]), 4), "index 5 is 4, but axis 0 has 4 entries"),
             // A result that is larger than memory.
             (put(rows(&[0, 0]), 1 << 63), "too many elements"),
