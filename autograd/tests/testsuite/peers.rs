@@ -34,6 +34,7 @@ const WITHOUT: [(&str, &str); 4] = [
     ("matmul_both_transposed", "compared as matmul.tt"),
 ];
 
+/// Of the functions that the catalogue lists by name, those of two operands, as methods: the order of operands is the method's.
 fn elementwise() -> Vec<Case> {
     cases! {
         "affine": |x| x[0].affine(-2.5, 0.75);
@@ -51,6 +52,11 @@ fn elementwise() -> Vec<Case> {
         "powf.1.5": |x| x[0].powf(1.5);
         "powf.2.5": |x| x[0].powf(2.5);
         "powf.-0.5": |x| x[0].powf(-0.5);
+        "atan2": |x| x[0].atan2(&x[1]);
+        "pow": |x| x[0].pow(&x[1]);
+        "xlogy": |x| x[0].xlogy(&x[1]);
+        "maximum": |x| x[0].maximum(&x[1]);
+        "minimum": |x| x[0].minimum(&x[1]);
         "add": |x| &x[0] + &x[1];
         "add.broadcast": |x| &x[0] + &x[1];
         "sub": |x| &x[0] - &x[1];
