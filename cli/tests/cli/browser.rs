@@ -614,11 +614,12 @@ fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
         }
     }
     for (name, train) in [
-        ("object", "scene --steps 80"),
+        // Two march in even steps, as all scenes that end do.
+        ("object", "scene --steps 80 --set sampler.cone=0"),
         // Of so few rounds a ray that all browsers here go through them, and with levels that are not hashed.
         (
             "slight",
-            "scene --steps 100 --set field.grid.levels=4 --set field.grid.log2_table=13 --set field.density_width=16 --set field.color_width=16",
+            "scene --steps 100 --set field.grid.levels=4 --set field.grid.log2_table=13 --set field.density_width=16 --set field.color_width=16 --set sampler.cone=0",
         ),
         ("landscape", "around --steps 40 --set field.codes=2 --refine exposure"),
         ("ahead", "around --steps 40 --scope forward"),
