@@ -13,7 +13,7 @@ macro_rules! functions {
             $each $arguments
             unary exp "`e^x`.";
             unary expm1 "`e^x - 1`, accurate near 0.";
-            unary ln "The natural logarithm.";
+            unary ln "The natural logarithm: -inf at 0, NaN below.";
             unary ln1p "`ln(1 + x)`, accurate near 0.";
             unary sin "Sine of an angle in radians.";
             unary cos "Cosine of an angle in radians.";
@@ -21,10 +21,10 @@ macro_rules! functions {
             unary cos_pi "`cos(pi x)`, with `x` reduced exactly first.";
             unary tanh "Hyperbolic tangent.";
             unary sigmoid "`1 / (1 + e^-x)`.";
-            unary softplus "`ln(1 + e^x)`.";
-            unary sqrt "Square root.";
+            unary softplus "`ln(1 + e^x)`, without overflow.";
+            unary sqrt "Square root: NaN below 0.";
             unary exp2 "`2^x`.";
-            unary log2 "The logarithm to base 2.";
+            unary log2 "The logarithm to base 2: -inf at 0, NaN below.";
             unary erf "The error function.";
             unary tan "Tangent of an angle in radians.";
             unary asin "The angle in -pi/2..=pi/2 of this sine; NaN outside -1..=1.";
@@ -33,11 +33,11 @@ macro_rules! functions {
             unary sinh "Hyperbolic sine.";
             unary cosh "Hyperbolic cosine.";
             unary abs "The absolute value.";
-            unary sign "1 for positive numbers, -1 for negative ones; zeros and NaN stay what they are. Its derivative is 0.";
-            unary floor "The next whole number below. Its derivative is 0.";
-            unary ceil "The next whole number above. Its derivative is 0.";
-            unary round "The nearest whole number, the even one of two. Its derivative is 0.";
-            binary atan2 "The angle in -pi..=pi of the vector (`x`, `self`).";
+            unary sign "1 for positive numbers, -1 for negative ones; zeros and NaN stay what they are.";
+            unary floor "The next whole number below.";
+            unary ceil "The next whole number above.";
+            unary round "The nearest whole number, the even one of two.";
+            binary atan2 "The angle in -pi..=pi of the vector (`other`, `self`).";
             binary pow "`self` to a real power; NaN for a negative base and a fractional exponent.";
             binary maximum "The greater of two numbers; NaN if one of them is.";
             binary minimum "The smaller of two numbers; NaN if one of them is.";
@@ -63,7 +63,8 @@ macro_rules! declared {
 ///
 /// A formula that is generic over `Real` is read in several ways: numbers compile to one vectorised loop, dual numbers
 /// carry derivatives along, and what stands for a variable of a tape writes the formula down there (gradients of
-/// gradients). Formulas have no branches: they choose with [`if_positive`](Self::if_positive).
+/// gradients). Formulas have no branches: they choose with [`if_positive`](Self::if_positive). The derivative of
+/// steps (`sign`, `floor`, `ceil`, `round`) is 0.
 pub trait Real:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {

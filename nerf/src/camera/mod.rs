@@ -1,12 +1,12 @@
 //! Cameras, their lenses and poses, the paths that they fly along, and the rays through their pixels.
 
 pub(crate) mod angles;
+pub(crate) mod axes;
 pub(crate) mod bounds;
 pub(crate) mod lens;
 pub(crate) mod ndc;
 pub(crate) mod path;
 pub(crate) mod pinhole;
-pub(crate) mod pose;
 pub(crate) mod rays;
 pub(crate) mod rotation;
 pub(crate) mod spiral;

@@ -78,7 +78,8 @@ pub struct Samples<T: Scalar> {
     pub directions: Tensor<T>,
     /// Distances along the rays, `[samples]`, rising within a ray.
     pub t: Tensor<T>,
-    /// Length of the interval that each sample stands for, `[samples]`.
+    /// Length of the interval that each sample stands for, `[samples]`. Of the nodes of a rule with two nodes an interval, that of
+    /// the interval that begins at the node, or 0.
     pub delta: Tensor<T>,
     /// The rows of each ray.
     pub segments: Segments,

@@ -1,6 +1,6 @@
 //! Poses under several conventions, and what cameras look at under each.
 
-use crate::camera::pose::axes;
+use crate::camera::axes::axes;
 use crate::numbers::{eigen, mean, median, outer};
 use glam::{DAffine3, DMat3, DVec3};
 

@@ -50,13 +50,15 @@ impl Model<f32> {
         if places.is_empty() {
             return Err(Error::setting("points", "are none: no camera sees anything solid"));
         }
+        let seeing = views.iter().fold(Evaluations::default(), |sum, (_, seen)| sum + seen.evaluations);
+        drop(views);
         let sights = places.len();
         let positions = thinned(&places, count);
         progress(Stage::Coloring, 0.0);
         let probe = Probe::new(self);
         let (normals, colors) = probe.look(self.cells(), self.judged(self.cells()), &positions);
         let mesh = Mesh { positions, triangles: vec![] };
-        let evaluations = views.iter().fold(probe.evaluations(), |sum, (_, seen)| sum + seen.evaluations);
+        let evaluations = seeing + probe.evaluations();
         Ok(PointCloud { shape: Shape { mesh, normals, colors }, sights, evaluations })
     }
 }

@@ -80,7 +80,7 @@ fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>, out: &mut [Option
         }
         for (ray, out) in out.iter_mut().enumerate() {
             let [origin, direction] = [&rays.origins, &rays.directions].map(|x| DVec3::from(x[ray].map(f64::from)));
-            let half = halves[ray].filter(|_| !followed.has_light(followed.depths[ray]));
+            let half = halves[ray].filter(|_| followed.has_ended(followed.depths[ray]));
             *out = half.map(|[distance, sigma]| Sight { place: origin + distance * direction, distance, sigma });
         }
         asked

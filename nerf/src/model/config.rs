@@ -348,8 +348,9 @@ impl Config {
             }
         }
         let rule = self.sampler.get::<MarchingConfig>().map(|marching| marching.quadrature);
-        let one_node = matches!(rule, None | Some(Quadrature::Midpoint | Quadrature::Left));
-        if !one_node && self.terms.iter().any(|term| term.get::<DistortionConfig>().is_some()) {
+        if rule.is_some_and(Quadrature::has_intervals)
+            && self.terms.iter().any(|term| term.get::<DistortionConfig>().is_some())
+        {
             let what = "needs samples that stand for an interval each: use the quadrature midpoint or left";
             return Err(Error::setting("terms.distortion", what));
         }

@@ -44,7 +44,7 @@ fn in_rounds(query: &Query<'_, '_, f32>, samples: &Samples<f32>, limits: &Limits
         evaluations = evaluations + shade(query, &round, limits, &mut seen, out);
     }
     for ((out, seen), &depth) in out.iter_mut().zip(&seen).zip(&rays.depths) {
-        finish(out, seen, depth, !rays.has_light(depth));
+        finish(out, seen, depth, rays.has_ended(depth));
     }
     evaluations
 }
@@ -121,7 +121,7 @@ fn in_chunks(
     }
     for (out, &depth) in out.iter_mut().zip(&rays.depths) {
         let seen = Seen { weight: -(-depth).exp_m1() as f32, uncolored: 0.0 };
-        finish(out, &seen, depth, !rays.has_light(depth));
+        finish(out, &seen, depth, rays.has_ended(depth));
     }
     evaluations
 }

@@ -53,6 +53,11 @@ impl<'a, T: Scalar> FrontToBack<'a, T> {
         depth < self.opaque
     }
 
+    /// Whether no light is left behind this optical depth; false for NaN.
+    pub fn has_ended(&self, depth: f64) -> bool {
+        depth >= self.opaque
+    }
+
     /// How many samples each ray takes in a round of views.
     pub fn round_size(&self) -> usize {
         (ROUND / self.depths.len().max(1)).max(LEAST)

@@ -1,5 +1,5 @@
-//! Functions whose vector version is not worth its while, from the standard library's: right to an ULP or so on the usual
-//! platforms, but calls, which end vectorisation.
+//! Functions without a polynomial of their own: short formulas, which vectorise, and the standard library's, which are right to
+//! an ULP or so on the usual platforms. Of these `tan`, `asin`, `acos`, `atan`, `atan2` and `pow` are calls, which end vectorisation.
 
 macro_rules! from_std {
     ($t:ident: $($f:ident)*) => {
