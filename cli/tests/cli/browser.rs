@@ -673,6 +673,8 @@ fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
                 let asked = format!("render({pose}, data.view.fov, 40, 30).then((bytes) => Array.from(bytes))");
                 let image = image(&browser.value(&asked), [40, 30]);
                 let expected = png(&place.path(&format!("{name}-seen/000{frame}.png")));
+                let darkest = expected.data.iter().copied().fold(1.0, f32::min);
+                assert!(darkest < 0.8, "{name} shows something: {darkest}");
                 let alike = psnr(&image, &expected);
                 // A stand-in that ends loops early leaves something out, which is said.
                 let partial = browser.value("status.textContent.includes('leaves parts')") == true;
