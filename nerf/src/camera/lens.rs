@@ -130,7 +130,7 @@ impl Lens {
         }
     }
 
-    /// The names of the [`coefficients`](Self::coefficients), which OpenCV, COLMAP and nerfstudio share.
+    /// The names of the [`coefficients`](Self::coefficients), as COLMAP has them.
     pub fn coefficient_names(&self) -> &'static [&'static str] {
         match self {
             Lens::Pinhole | Lens::Equirectangular => &[],
