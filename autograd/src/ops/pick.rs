@@ -354,6 +354,22 @@ mod tests {
     use super::*;
 
     #[test]
+    fn more_blocks_than_one_task_takes_are_picked_and_put_back() {
+        let (rows, label) = (PIECE + 7, |row: usize| (row * 7 % 3) as u32);
+        let tape = Tape::<f64>::new();
+        let x = tape.leaf(Tensor::from_fn(&[rows, 3], |i| i as f64));
+        let y = x.gather(1, Indices::new(&[rows, 1], (0..rows).map(label).collect::<Vec<_>>()));
+        let grad = y.square().sum().grad(&[&x]).remove(0);
+        for row in 0..rows {
+            let picked = 3 * row + label(row) as usize;
+            assert_eq!(y.value()[[row, 0]], picked as f64);
+            for place in 3 * row..3 * row + 3 {
+                assert_eq!(grad.as_slice()[place], if place == picked { 2.0 * place as f64 } else { 0.0 });
+            }
+        }
+    }
+
+    #[test]
     fn indices_that_do_not_fit_are_shape_errors() {
         let tape = Tape::<f32>::new();
         let x = tape.constant(Tensor::zeros(&[2, 3]));
