@@ -32,11 +32,10 @@ fn a_browser_shows_the_scene_and_moves_about_it() {
 
 fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     browser.visit(server);
-    let size = browser.value("[picture.width, picture.height]");
-    let file = format!("first-{:?}.png", browser.kind);
-    place.succeeds(&format!("render run --frames 1 --size {}x{} --out {file}", size[0], size[1]));
-    let expected = png(&place.path(&file));
     let first = browser.picture(place);
+    let file = format!("first-{:?}.png", browser.kind);
+    place.succeeds(&format!("render run --frames 1 --size {}x{} --out {file}", first.width, first.height));
+    let expected = png(&place.path(&file));
     assert!(psnr(&first, &expected) > 40.0, "{}", psnr(&first, &expected));
     browser.shot("first");
     // Whatever moves the camera changes the picture, and R brings it back.

@@ -270,6 +270,8 @@ impl Browser {
     pub fn visit(&mut self, server: &Server) {
         self.go(&format!("http://{}/", server.address));
         self.rested();
+        // The stage may change its size once more while the page is laid out.
+        self.until("String(shown.size) === String(sizes())");
     }
 
     /// Whether it has WebGL 2, and says that it skips if not: Firefox without a display has none.
