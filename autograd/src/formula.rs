@@ -6,6 +6,7 @@ use crate::{Cases, Dual, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Real, Scalar, Shape, Tensor, broadcast_shape, lanes_fused, map_fused, sum_to};
 use smallvec::SmallVec;
 use std::array::from_fn;
+use std::slice;
 
 /// A function of `N` numbers, applied to each element of `N` tensors with NumPy's broadcasting.
 ///
@@ -231,6 +232,9 @@ fn gradients<'t, T: Scalar, const N: usize>(
     block: &raygrad_tensor::Block<'_, T>,
 ) -> [Option<Var<'t, T>>; N] {
     let g = cx.g().value();
+    if g.len() == 1 {
+        return of_numbers(cx, readings, wanted, reads, block);
+    }
     let mut grads = [const { None }; N];
     if wanted.contains(&true) {
         // What no wanted gradient reads costs a register, not a pass over memory: `g` stands in for it.
@@ -246,6 +250,29 @@ fn gradients<'t, T: Scalar, const N: usize>(
         let shape = cx.shape(i);
         i += 1;
         grad.map(|grad| cx.constant(if grad.shape() == shape { grad } else { sum_to(&grad, shape, cx.pool()) }))
+    })
+}
+
+/// [`gradients`] of single numbers, without tensors in between.
+fn of_numbers<'t, T: Scalar, const N: usize>(
+    cx: &Vjp<'t, '_, T>,
+    readings: &[Reading; N],
+    wanted: [bool; N],
+    reads: u32,
+    block: &raygrad_tensor::Block<'_, T>,
+) -> [Option<Var<'t, T>>; N] {
+    let g = cx.g().value().item();
+    let mut values = [g; N];
+    if wanted.contains(&true) {
+        let y = if reads & Reading::OUTPUT == 0 { g } else { cx.output().item() };
+        let x: [T; N] = from_fn(|i| if reads >> i & 1 == 0 { g } else { cx.input(i).item() });
+        let x: SmallVec<[&[T]; 6]> = [&g, &y].into_iter().chain(&x).map(slice::from_ref).collect();
+        block(&x, &mut values.each_mut().map(slice::from_mut));
+    }
+    from_fn(|i| {
+        let given = if wanted[i] { values[i] } else { g };
+        let is_given = wanted[i] || cx.needs(i) && readings[i].is_gradient;
+        is_given.then(|| cx.constant(Tensor::full(cx.shape(i), given)))
     })
 }
 
