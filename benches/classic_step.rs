@@ -28,9 +28,9 @@ fn main() -> raygrad::nerf::Result<()> {
     let batch = (rays(&trainer) - before) as usize / REPEATS;
     report("classic NeRF, training step", batch, seconds);
     let camera = data.frames[0].camera.resized(SIDE, SIDE);
-    trainer.model.view(&camera, [1.0; 3]);
+    trainer.model.render(&camera, [1.0; 3]);
     let seconds = median(|| {
-        trainer.model.view(&camera, [1.0; 3]);
+        trainer.model.render(&camera, [1.0; 3]);
     });
     report("classic NeRF, forward", SIDE * SIDE, seconds);
     Ok(())

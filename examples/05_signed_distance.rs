@@ -12,7 +12,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::Image;
 use raygrad::{
-    Activation, Adam, AdamConfig, Axes, Bound, Init, Linear, Optimizer, Params, Pass, Pool, Schedule, Sequential, Tape,
+    Activation, Adam, AdamConfig, Axes, Bound, Init, Linear, Mode, Optimizer, Params, Pool, Schedule, Sequential, Tape,
     Tensor, Var,
 };
 use std::f32::consts::TAU;
@@ -43,7 +43,7 @@ fn exact_distance(border: &[[f32; 2]], at: [f32; 2]) -> f32 {
 /// adds to them.
 fn distance<'t>(network: &Sequential<f32>, params: &Bound<'t, f32>, x: &Var<'t, f32>) -> Var<'t, f32> {
     let circle = (x.square().sum_over(Axes::from(1).keepdims()) + 1e-4).sqrt() - 0.6;
-    circle + network.forward(params, x, Pass::Evaluate)
+    circle + network.forward(params, x, Mode::Evaluate)
 }
 
 /// Distances, and the lengths of their gradients by position, which are on the graph too.

@@ -12,7 +12,7 @@
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::{
-    Activation, Adam, AdamConfig, Conv2d, Conv2dConfig, INFER, Init, Linear, Optimizer, Params, Pass, Pool2dConfig,
+    Activation, Adam, AdamConfig, Conv2d, Conv2dConfig, INFER, Init, Linear, Mode, Optimizer, Params, Pool2dConfig,
     Sequential, Tape, Tensor,
 };
 
@@ -81,7 +81,7 @@ fn strokes(channels: &[usize], params: &mut Params<f32>, rng: &mut StdRng) -> Se
 /// The share of pictures whose highest score is that of the right digit.
 fn accuracy(model: &Sequential<f32>, params: &Params<f32>, (x, labels): &(Tensor<f32>, Vec<u32>)) -> f64 {
     let tape = Tape::new();
-    let scores = model.forward(&params.bind_constant(&tape), &tape.constant(x.clone()), Pass::Evaluate);
+    let scores = model.forward(&params.bind_constant(&tape), &tape.constant(x.clone()), Mode::Evaluate);
     let best = scores.argmax(-1);
     let right = best.as_slice().iter().zip(labels).filter(|(best, label)| best == label).count();
     right as f64 / labels.len() as f64
@@ -97,7 +97,7 @@ fn train(name: &str, params: &mut Params<f32>, model: &Sequential<f32>) -> f64 {
         let (x, labels) = pictures(BATCH, &mut rng);
         let tape = Tape::new();
         let bound = params.bind(&tape);
-        let scores = model.forward(&bound, &tape.constant(x), Pass::Train(step));
+        let scores = model.forward(&bound, &tape.constant(x), Mode::Train(step));
         let loss = scores.cross_entropy_loss(&labels);
         if step % (STEPS / 4) == 0 {
             let right = 100.0 * accuracy(model, params, &test);

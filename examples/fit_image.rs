@@ -10,7 +10,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use raygrad::nerf::pictures::metrics;
+use raygrad::nerf::imaging::metrics;
 use raygrad::nerf::{Image, PositionalEncoding};
 use raygrad::{
     Activation, Adam, AdamConfig, Bound, Init, Linear, Mlp, Optimizer, Params, Schedule, Tape, Tensor, Tiles, Var,
@@ -72,7 +72,7 @@ fn fit(truth: &Image, levels: usize) -> Image {
             let value = f64::from(loss.item());
             (loss, value)
         });
-        adam.update(&mut params, &sums.grads, schedule.rate(step as f64 / STEPS as f64))
+        adam.update(&mut params, &sums.grads, schedule.lr(step as f64 / STEPS as f64))
             .check()
             .expect("finite gradients");
         tiles.take_back(sums.grads);

@@ -6,8 +6,8 @@
 //! ```
 
 use raygrad::nerf::Image;
-use raygrad::nerf::pictures::lpips::Lpips;
-use raygrad::nerf::pictures::metrics::{psnr, ssim};
+use raygrad::nerf::imaging::lpips::Lpips;
+use raygrad::nerf::imaging::metrics::{psnr, ssim};
 use std::error::Error;
 use std::time::Instant;
 

@@ -12,7 +12,7 @@ use rand::rngs::StdRng;
 use rand::{SeedableRng, seq::SliceRandom};
 use raygrad::nerf::Jitter;
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Step, Threshold, Update};
-use raygrad::nerf::{Ray, Rays, Result, clip_span};
+use raygrad::nerf::{Ray, Rays, Result, clip_near_far};
 use raygrad_scenes::{Scene, test_cameras, train_cameras};
 use std::time::Instant;
 
@@ -93,7 +93,7 @@ fn main() -> Result<()> {
     }
     let pack = |all: &[Ray]| {
         let mut rays = Rays::new();
-        all.iter().for_each(|ray| rays.push(ray, clip_span(ray, BOUNDS, [2.0, 6.0])));
+        all.iter().for_each(|ray| rays.push(ray, clip_near_far(ray, BOUNDS, [2.0, 6.0])));
         rays
     };
     let ordered = pack(&all);

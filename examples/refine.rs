@@ -15,10 +15,10 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::Schedule;
 use raygrad::nerf::camera::rotation_matrix;
-use raygrad::nerf::dataset::{Dataset, Placement, Split, evenly_spaced, load};
+use raygrad::nerf::dataset::{Dataset, SceneTransform, Split, evenly_spaced, load};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::model::Refined;
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::metrics::psnr;
+use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::{Background, Budget, Camera, Config, Model, Preset, Result, Trainer};
 use raygrad_scenes::embedded;
 use std::collections::HashMap;
@@ -54,7 +54,7 @@ fn disturbed(data: &Dataset, degrees: f64, share: f64, factor: f64) -> Dataset {
 
 /// How cameras as they were found are off the true ones.
 struct Found {
-    placement: Placement,
+    placement: SceneTransform,
     degrees: f64,
     share: f64,
     focal: f64,
@@ -63,7 +63,7 @@ struct Found {
 fn compare(found: &[Camera], right: &Dataset) -> Option<Found> {
     let places = |cameras: &[Camera]| -> Vec<DVec3> { cameras.iter().map(|camera| camera.pose.translation).collect() };
     let truth: Vec<Camera> = right.frames.iter().map(|frame| frame.camera.clone()).collect();
-    let placement = Placement::between(&places(&truth), &places(found))?;
+    let placement = SceneTransform::between(&places(&truth), &places(found))?;
     let (size, count) = ((right.bounds[1] - right.bounds[0]).max_element(), found.len() as f64);
     let (mut degrees, mut share, mut focal) = (0.0, 0.0, 0.0);
     for (found, right) in found.iter().zip(&truth) {
@@ -83,7 +83,7 @@ fn score(model: &Model<f32>, views: &Dataset, found: &Found) -> f64 {
         let factor = 1.0 + 0.01 * found.focal;
         let camera = found.placement.camera(&frame.camera);
         let camera = Camera { focal: camera.focal.map(|focal| factor * focal), ..camera };
-        psnr(&model.view(&camera, [1.0; 3]).color, &frame.image.over([1.0; 3]))
+        psnr(&model.render(&camera, [1.0; 3]).color, &frame.image.over([1.0; 3]))
     });
     each.sum::<f64>() / views.frames.len() as f64
 }
@@ -107,12 +107,12 @@ fn main() -> Result<()> {
         Some(steps) => Budget::Steps(steps),
         None => Budget::Time(Duration::from_secs_f64(number("seconds", 60.0))),
     };
-    let plain = Config::preset(Preset::Instant).for_budget(budget.samples(), right.footprints());
-    let mut plain = plain.with_scope(right.scope);
+    let plain = Config::preset(Preset::Instant).for_budget(budget.samples(), right.pixels_per_side());
+    let mut plain = plain.with_scene_type(right.scope);
     if !right.has_alpha() {
         plain.background = Background::White;
     }
-    let mut refined = plain.clone().with_refined(&[Refined::Poses, Refined::Focal]);
+    let mut refined = plain.clone().with_refined(&[RefinedParam::Poses, RefinedParam::Focal]);
     // To try others.
     let faster = |schedule: Option<Schedule>, name: &str| {
         let factor = number(name, 1.0);
@@ -124,8 +124,8 @@ fn main() -> Result<()> {
         }
     };
     refined.poses = faster(refined.poses, "poses");
-    refined.refine.focal = faster(refined.refine.focal, "focal_rate");
-    refined.refine.coarse = number("coarse", refined.refine.coarse);
+    refined.camera_optimizer.focal = faster(refined.camera_optimizer.focal, "focal_rate");
+    refined.camera_optimizer.coarse = number("coarse", refined.camera_optimizer.coarse);
     println!("{} photographs, {budget:?} each", right.frames.len());
     println!("cameras             turned (deg)  moved (% of scene)  focal length (%)  PSNR (dB)");
     let runs = [("right", &plain, &right), ("wrong", &plain, &wrong), ("wrong, corrected", &refined, &wrong)];

@@ -9,10 +9,10 @@
 
 use rand::Rng;
 use raygrad::nerf::dataset::Split;
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::{
-    Budget, Config, Density, Field, FieldConfig, Fields, Image, Kind, Model, Preset, Result, Seen, Site, Space,
-    SphericalHarmonics, Trainer, register,
+    Budget, BuildContext, ComponentConfig, Config, Density, Field, FieldConfig, Fields, Image, Model, Preset, Result,
+    Space, SphericalHarmonics, Trainer, ViewInputs, register,
 };
 use raygrad::{Activation, Bound, Init, Linear, ParamId, Params, Scalar, Schedule, Tensor, Var};
 use raygrad_scenes::embedded;
@@ -34,11 +34,11 @@ struct SirenConfig {
     frequency: f64,
 }
 
-impl Kind<Fields> for SirenConfig {
+impl ComponentConfig<Fields> for SirenConfig {
     const KIND: &'static str = "siren";
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
-        let Site { space, params, name, rng, .. } = site;
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
+        let BuildContext { space, params, name, rng, .. } = site;
         let mut layers = vec![Sine::new(params, &format!("{name}.0"), [3, self.width], self.frequency, true, rng)];
         for i in 1..self.depth {
             layers.push(Sine::new(params, &format!("{name}.{i}"), [self.width; 2], 1.0, false, rng));
@@ -106,7 +106,7 @@ impl<T: Scalar> Field<T> for Siren {
         Density { value: (raw * 10.0 - 1.0).softplus() * (1.0 / self.space.unit), log: false, features }
     }
 
-    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
         let hidden = self.hidden.forward(params, &Var::concat(&[features, &directions], 1));
         self.color.forward(params, &hidden).sigmoid()
@@ -140,10 +140,10 @@ fn main() -> Result<()> {
     let (file, model) = (folder.join("siren.safetensors"), &trainer.model);
     model.save(&file)?;
     let text = serde_json::to_string(&model.config).expect("a configuration is text");
-    let loaded = Model::load(&file, serde_json::from_str(&text).expect("that can be read"), model.extent)?;
+    let loaded = Model::load(&file, serde_json::from_str(&text).expect("that can be read"), model.scene_box)?;
     let frames: Vec<_> = test.frames.iter().step_by(test.frames.len().div_ceil(8)).collect();
-    let seen: Vec<_> = frames.iter().map(|frame| loaded.view(&frame.camera, [1.0; 3]).color).collect();
-    assert_eq!(seen[0], model.view(&frames[0].camera, [1.0; 3]).color, "what was loaded is what was saved");
+    let seen: Vec<_> = frames.iter().map(|frame| loaded.render(&frame.camera, [1.0; 3]).color).collect();
+    assert_eq!(seen[0], model.render(&frames[0].camera, [1.0; 3]).color, "what was loaded is what was saved");
     let truth: Vec<_> = frames.iter().map(|frame| frame.image.over([1.0; 3])).collect();
     let mean = seen.iter().zip(&truth).map(|(a, b)| psnr(a, b)).sum::<f64>() / seen.len() as f64;
     let bytes = std::fs::metadata(&file).map_or(0, |file| file.len());

@@ -9,10 +9,10 @@
 //! too, so its picture is that of `off`, which leaves those cells out and nothing else. `bare` asks the field in those
 //! cells as well, where no photograph ever judged it.
 
-use raygrad::nerf::dataset::{Capture, Reading, Split};
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::dataset::{Capture, LoadOptions, Split};
+use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::space::occupancy::{OccupancyGrid, Skip};
-use raygrad::nerf::{Camera, Config, Evaluations, Extent, Image, Model};
+use raygrad::nerf::{Camera, Config, Evaluations, Image, Model, SceneBox};
 use serde_json::Value;
 use std::error::Error;
 use std::path::Path;
@@ -27,11 +27,15 @@ fn main() -> Result<(), Box<dyn Error>> {
     let size: usize = arguments.next().map_or(Ok(800), |size| size.parse())?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
-    let extent: Extent = serde_json::from_value(about["extent"].clone())?;
+    let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
     let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
     let mut model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
     let capture = Capture::read(folder)?;
-    let views = capture.load(Split::Test, &capture.survey(None)?, &Reading { views: VIEWS, ..Reading::default() })?;
+    let views = capture.load(
+        Split::Test,
+        &capture.analyze_scene(None)?,
+        &LoadOptions { views: VIEWS, ..LoadOptions::default() },
+    )?;
     let cameras: Vec<Camera> = views.frames.iter().map(|frame| frame.camera.resized(size, size)).collect();
 
     model.set_skip(Skip::Off);
@@ -51,7 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         println!("{name:9} {density:8.1}{color:8.1}{fewer:21.1}{mean:10.1}{largest:15.1e}{seconds:9.2}");
     };
     row("off", &unskipped, counts, seconds);
-    for skip in [Skip::Lossless, Skip::Fast] {
+    for skip in [Skip::NearLossless, Skip::Fast] {
         model.set_skip(skip);
         let (images, counts, seconds) = render(&model, &cameras);
         row(&skip.to_string(), &images, counts, seconds);
@@ -68,7 +72,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 /// The views in white, how often the field was asked in all, and the mean time of a view.
 fn render(model: &Model<f32>, cameras: &[Camera]) -> (Vec<Image>, Evaluations, f64) {
     let start = Instant::now();
-    let pictures: Vec<_> = cameras.iter().map(|camera| model.view(camera, [1.0; 3])).collect();
+    let pictures: Vec<_> = cameras.iter().map(|camera| model.render(camera, [1.0; 3])).collect();
     let seconds = start.elapsed().as_secs_f64() / cameras.len() as f64;
     let counts = pictures.iter().fold(Evaluations::default(), |sum, picture| sum + picture.evaluations);
     (pictures.into_iter().map(|picture| picture.color).collect(), counts, seconds)

@@ -15,7 +15,7 @@ use raygrad::nerf::Jitter;
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::encoding::hash_grid::HashGrid;
 use raygrad::nerf::space::occupancy::Step;
-use raygrad::nerf::{Config, Extent, Instant, InstantConfig, Model, Query, Rays};
+use raygrad::nerf::{Config, Instant, InstantConfig, Model, Query, Rays, SceneBox};
 use raygrad::tensor::matmul::{Matrix, gemm};
 use raygrad::tensor::simd;
 use raygrad::{Adam, Optimizer, Params, Pool, Tape, Tensor};
@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
-    let extent: Extent = serde_json::from_value(about["extent"].clone())?;
+    let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
     let folder = about["scene"]["folder"].as_str().ok_or("the run's scene is not a folder")?;
     let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
     let data = load(folder, Split::Train, 1)?;
@@ -86,7 +86,7 @@ fn batch(model: &Model<f32>, data: &Dataset, count: usize) -> (Rays<f32>, Vec<f3
     for _ in 0..count {
         let frame = &data.frames[rng.random_range(0..data.frames.len())];
         let (x, y) = (rng.random_range(0..frame.image.width), rng.random_range(0..frame.image.height));
-        rays.push_pixel(&frame.camera, [x, y], model.extent.bounds, model.extent.span);
+        rays.push_pixel(&frame.camera, [x, y], model.scene_box.bounds, model.scene_box.near_far);
         target.extend_from_slice(&frame.image.pixel(x, y)[..3]);
     }
     (rays, target)
@@ -130,13 +130,13 @@ fn measure(model: &Model<f32>, data: &Dataset) -> Result<(), Box<dyn Error>> {
         let params = model.params.bind(&tape);
         let start = time::Instant::now();
         let query = Query::new(field, &params);
-        let lit = sampler.config.quadrature.render(&query, &samples, sampler.config.termination);
+        let lit = sampler.config.quadrature.render(&query, &samples, sampler.config.early_stop_eps);
         let loss = model.config.loss.sum(&lit.rendered.over(&white), &target);
         let middle = start.elapsed().as_secs_f64();
         let given = loss.backward(&params.vars());
         whole = whole.min(start.elapsed().as_secs_f64());
         forward = forward.min(middle);
-        (asked, kept) = (lit.asked, lit.kept);
+        (asked, kept) = (lit.density_queries, lit.visible);
         grad = given.into_iter().find(|grad| !grad.is_dense());
         drop((lit, loss, params));
         tape.clear();

@@ -12,8 +12,8 @@
 //! latter.
 
 use glam::DVec3;
-use raygrad::nerf::geometry::{Mesh, Shape, files};
-use raygrad::nerf::{Camera, Config, Extent, Model, write_atomic};
+use raygrad::nerf::geometry::{ColoredMesh, Mesh, files};
+use raygrad::nerf::{Camera, Config, Model, SceneBox, write_atomic};
 use raygrad_scenes::{Scene, train_cameras};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     std::fs::create_dir_all(out)?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(run.join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
-    let extent: Extent = serde_json::from_value(about["extent"].clone())?;
+    let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
     if about["scene"] == "embedded" {
         let above = train_cameras(CAMERAS, PIXELS);
         let mut all = above.clone();
@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 /// Where rays through pixels meet the scene.
-fn hits(cameras: &[Camera]) -> Shape {
+fn hits(cameras: &[Camera]) -> ColoredMesh {
     let scene = Scene::bulldozer();
     let of = |camera: &Camera| {
         let rays = (0..PIXELS * PIXELS).map(|pixel| camera.pixel_ray(pixel % PIXELS, pixel / PIXELS));
@@ -60,12 +60,12 @@ fn hits(cameras: &[Camera]) -> Shape {
     };
     let (positions, normals): (Vec<DVec3>, Vec<DVec3>) = cameras.par_iter().flat_map_iter(of).unzip();
     let colors = vec![[128; 3]; positions.len()];
-    Shape { mesh: Mesh { positions, triangles: vec![] }, normals, colors }
+    ColoredMesh { mesh: Mesh { positions, triangles: vec![] }, normals, colors }
 }
 
 /// Writes the densities at the nodes of a lattice over the box.
 fn density(model: &Model<f32>, cells: usize, out: &Path) -> Result<(), Box<dyn Error>> {
-    let [low, high] = model.extent.bounds;
+    let [low, high] = model.scene_box.bounds;
     let cell = (high - low).max_element() / cells as f64;
     let nodes = ((high - low) / cell).round().to_array().map(|cells| cells as usize + 1);
     let grid = model.marching().ok_or("the model has no occupancy grid")?.view_grid();

@@ -8,10 +8,10 @@
 //! Trains for 60 seconds on the embedded scene unless told otherwise, saves the model, loads it, and draws it.
 
 use raygrad::nerf::dataset::Split;
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::{
-    Budget, Config, Density, Field, FieldConfig, Fields, Image, Kind, Model, Preset, Result, Seen, Site, Space,
-    SphericalHarmonics, Trainer, register,
+    Budget, BuildContext, ComponentConfig, Config, Density, Field, FieldConfig, Fields, Image, Model, Preset, Result,
+    Space, SphericalHarmonics, Trainer, ViewInputs, register,
 };
 use raygrad::{Activation, Bound, Init, Linear, ParamId, Scalar, Schedule, Tensor, Var};
 use raygrad_scenes::embedded;
@@ -33,11 +33,11 @@ struct TensorFConfig {
     width: usize,
 }
 
-impl Kind<Fields> for TensorFConfig {
+impl ComponentConfig<Fields> for TensorFConfig {
     const KIND: &'static str = "tensorf";
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
-        let Site { space, params, name, rng, .. } = site;
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
+        let BuildContext { space, params, name, rng, .. } = site;
         let (n, [density, color], direction) = (self.resolution, self.components, SphericalHarmonics::new(3));
         let factors = |axis: usize| {
             let channels = density + color;
@@ -125,7 +125,7 @@ impl<T: Scalar> Field<T> for TensorF {
         Density { value: (raw - 1.0).softplus() * (10.0 / self.space.unit), log: false, features }
     }
 
-    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
         let basis = self.basis.forward(params, features);
         let hidden = self.hidden.forward(params, &Var::concat(&[&basis, &directions], 1));
@@ -160,10 +160,10 @@ fn main() -> Result<()> {
     let (file, model) = (folder.join("tensorf.safetensors"), &trainer.model);
     model.save(&file)?;
     let text = serde_json::to_string(&model.config).expect("a configuration is text");
-    let loaded = Model::load(&file, serde_json::from_str(&text).expect("that can be read"), model.extent)?;
+    let loaded = Model::load(&file, serde_json::from_str(&text).expect("that can be read"), model.scene_box)?;
     let frames: Vec<_> = test.frames.iter().step_by(test.frames.len().div_ceil(8)).collect();
-    let seen: Vec<_> = frames.iter().map(|frame| loaded.view(&frame.camera, [1.0; 3]).color).collect();
-    assert_eq!(seen[0], model.view(&frames[0].camera, [1.0; 3]).color, "what was loaded is what was saved");
+    let seen: Vec<_> = frames.iter().map(|frame| loaded.render(&frame.camera, [1.0; 3]).color).collect();
+    assert_eq!(seen[0], model.render(&frames[0].camera, [1.0; 3]).color, "what was loaded is what was saved");
     let truth: Vec<_> = frames.iter().map(|frame| frame.image.over([1.0; 3])).collect();
     let mean = seen.iter().zip(&truth).map(|(a, b)| psnr(a, b)).sum::<f64>() / seen.len() as f64;
     let bytes = std::fs::metadata(&file).map_or(0, |file| file.len());

@@ -9,8 +9,8 @@
 //! in its place reads a NeRF-synthetic scene at half its size.
 
 use raygrad::nerf::dataset::Split;
-use raygrad::nerf::pictures::colormap::{depth_map, error_map};
-use raygrad::nerf::pictures::metrics;
+use raygrad::nerf::imaging::colormap::{depth_map, error_map};
+use raygrad::nerf::imaging::metrics;
 use raygrad::nerf::{Budget, Config, Image, Preset, Result, Trainer};
 use raygrad_scenes::embedded;
 use std::ops::ControlFlow;
@@ -49,7 +49,7 @@ fn main() -> Result<()> {
     let mut sum = 0.0;
     let chosen: Vec<_> = test.frames.iter().step_by(5).collect();
     for (i, frame) in chosen.iter().enumerate() {
-        let (view, truth) = (trainer.model.view(&frame.camera, background), frame.image.over(background));
+        let (view, truth) = (trainer.model.render(&frame.camera, background), frame.image.over(background));
         let psnr = metrics::psnr(&view.color, &truth);
         println!("{}: {psnr:.2} dB", frame.name);
         sum += psnr;

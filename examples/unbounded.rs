@@ -10,9 +10,9 @@
 //! train` does. From a window, where all photographs look the same way, what they see can be the cube instead of all of space:
 //! normalised device coordinates (Mildenhall et al. 2020, appendix C), with the same steps. Of the views that it has not seen, near is what lies in the box.
 
-use raygrad::nerf::dataset::{Dataset, Scope, Split, evenly_spaced};
+use raygrad::nerf::dataset::{Dataset, SceneType, Split, evenly_spaced};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::pictures::metrics::psnr_from_mse;
+use raygrad::nerf::imaging::metrics::psnr_from_mse;
 use raygrad::nerf::sampling::proposal::{ProposalConfig, Spacing};
 use raygrad::nerf::{Background, Budget, Config, Model, Preset, Result, SamplerConfig, Trainer};
 use raygrad_scenes::{landscape, landscape_ahead, landscape_distances};
@@ -29,7 +29,7 @@ fn score(model: &Model<f32>, views: &Dataset) -> [f64; 4] {
     let [low, high] = views.bounds;
     for frame in &views.frames {
         let camera = &frame.camera;
-        let (seen, truth) = (model.view(camera, [1.0; 3]).color, frame.image.to_image());
+        let (seen, truth) = (model.render(camera, [1.0; 3]).color, frame.image.to_image());
         for (i, distance) in landscape_distances(camera).data.iter().enumerate() {
             let ray = camera.ray((i % truth.width) as f64 + 0.5, (i / truth.width) as f64 + 0.5);
             let place: DVec3 = ray.at(f64::from(*distance));
@@ -58,17 +58,17 @@ fn main() -> Result<()> {
     let usual = Config { background: Background::White, ..Config::preset(Preset::Instant) };
     println!("way           steps  near (dB)  far (dB)  sky (dB)  all (dB)  seconds a view");
     for (name, scope) in [
-        ("bounded", Scope::Bounded),
-        ("contraction", Scope::Unbounded),
-        ("cascades", Scope::Unbounded),
-        ("ndc", Scope::Forward),
+        ("bounded", SceneType::Bounded),
+        ("contraction", SceneType::Unbounded),
+        ("cascades", SceneType::Unbounded),
+        ("ndc", SceneType::ForwardFacing),
     ] {
-        let leave_out = scope == Scope::Forward && !window;
+        let leave_out = scope == SceneType::ForwardFacing && !window;
         if leave_out || argument("only").is_some_and(|only| only != name) {
             continue;
         }
         let data = Dataset { scope, ..train.clone() };
-        let mut config = usual.clone().for_budget(budget.samples(), data.footprints()).with_scope(scope);
+        let mut config = usual.clone().for_budget(budget.samples(), data.pixels_per_side()).with_scene_type(scope);
         if name == "contraction" {
             let proposal = ProposalConfig { spacing: Spacing::Disparity, ..ProposalConfig::default() };
             config.sampler = SamplerConfig::new(proposal);

@@ -14,7 +14,7 @@
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Camera, Classic, ClassicConfig, Field, Image, Ray, Result, Seen, Site, Space};
+use raygrad::nerf::{BuildContext, Camera, Classic, ClassicConfig, Field, Image, Ray, Result, Space, ViewInputs};
 use raygrad::{Adam, AdamConfig, Bound, Optimizer, Params, Schedule, Segments, Tape, Tensor, Var};
 use raygrad_scenes::{Scene, train_cameras};
 use std::path::PathBuf;
@@ -62,17 +62,17 @@ fn look<'t>(
     let directions = &rows(&|pair| if seen { -pair[1] } else { DVec3::NEG_Z });
     // A ray for each point, with the point as its only sample.
     let segments = &Segments::uniform(at.len(), 1);
-    field.color(params, &density.features, &Seen { directions, segments, frames: None })
+    field.color(params, &density.features, &ViewInputs { directions, segments, frames: None })
 }
 
 /// Teaches a field the colours of the surface.
 fn learn(scene: &Scene, sights: &[Sight], seen: bool) -> Result<(Classic, Params<f32>)> {
     let mut rng = StdRng::seed_from_u64(0);
     let mut params = Params::new();
-    let config = ClassicConfig { depth: 4, width: 96, skips: vec![], view_width: 64, ..ClassicConfig::paper() };
+    let config = ClassicConfig { depth: 4, width: 96, skip_layers: vec![], view_width: 64, ..ClassicConfig::paper() };
     let field = {
         let space = Space::within(scene.bounds());
-        Classic::new(&config, Site { space, frames: 0, params: &mut params, name: "field", rng: &mut rng })?
+        Classic::new(&config, BuildContext { space, frames: 0, params: &mut params, name: "field", rng: &mut rng })?
     };
     let mut adam = Adam::new(AdamConfig::default());
     let schedule = Schedule::Exponential { from: 3e-3, to: 1e-4, warmup: 0.02 };
@@ -85,7 +85,7 @@ fn learn(scene: &Scene, sights: &[Sight], seen: bool) -> Result<(Classic, Params
         let error = look(&field, &bound, &tape, &at, seen) - tape.constant(Tensor::from_vec(&[BATCH, 3], colors));
         let loss = error.square().mean();
         let grads = bound.backward(&loss);
-        adam.update(&mut params, &grads, schedule.rate(step as f64 / STEPS as f64)).check().expect("finite gradients");
+        adam.update(&mut params, &grads, schedule.lr(step as f64 / STEPS as f64)).check().expect("finite gradients");
         if step % (STEPS / 5) == 0 {
             let name = if seen { "with direction" } else { "without direction" };
             println!("{name}: step {step}, mean squared error {:.5}", loss.item());

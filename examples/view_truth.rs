@@ -10,7 +10,7 @@
 //! its normals: each for itself is far off, and the mean of a small patch is not.
 
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Config, Extent, Image, Model};
+use raygrad::nerf::{Config, Image, Model, SceneBox};
 use raygrad_scenes::{Scene, test_cameras};
 use serde_json::Value;
 use std::error::Error;
@@ -27,13 +27,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     let run = std::env::args().nth(1).ok_or("name a run on the built-in scene: view_truth RUN")?;
     let about: Value = serde_json::from_str(&std::fs::read_to_string(Path::new(&run).join("config.json"))?)?;
     let config: Config = serde_json::from_value(about["config"].clone())?;
-    let extent: Extent = serde_json::from_value(about["extent"].clone())?;
+    let extent: SceneBox = serde_json::from_value(about["scene_box"].clone())?;
     let model = Model::load(Path::new(&run).join("model.safetensors"), config, extent)?;
     let scene = Scene::bulldozer();
 
     let (mut depths, mut angles, mut patches) = (vec![], vec![], vec![]);
     for camera in test_cameras(VIEWS, SIZE) {
-        let (truth, seen, normals) = (scene.render(&camera, 1), model.view(&camera, [1.0; 3]), model.normals(&camera));
+        let (truth, seen, normals) =
+            (scene.render(&camera, 1), model.render(&camera, [1.0; 3]), model.normals(&camera));
         for (x, y) in (0..SIZE).flat_map(|y| (0..SIZE).map(move |x| (x, y))) {
             if truth.depth.pixel(x, y)[0] == 0.0 || seen.opacity.pixel(x, y)[0] < 0.5 {
                 continue;

@@ -42,7 +42,7 @@
 //! | `min(x)` | `[1, 1, 1, 1, 3]` | `1` | `[0.25, 0.25, 0.25, 0.25, 0]` | |
 //! | `max(x)` | `[1, NaN]` | `NaN` | `[0, 0]` | NaN wins; nothing equals it |
 //! | `gt(a, b)` | `1; NaN` | `0` | `0; 0` | comparisons are masks |
-//! | `equals(a, b)` | `NaN; NaN` | `0` | `0; 0` | |
+//! | `elementwise_eq(a, b)` | `NaN; NaN` | `0` | `0; 0` | |
 //! | `where(mask, a, b)` | `0; 1; 2` | `2` | `0; 0; 1` | the mask has no gradient |
 //! | `if_positive(x, a, b)` | `NaN; 1; 2` | `2` | `0; 0; 1` | |
 //!
@@ -137,8 +137,8 @@ mod tests {
             "max(x)" => a.max(),
             "min(x)" => a.min(),
             "gt(a, b)" => a.tape().constant(a.gt(b).cast()),
-            "equals(a, b)" => a.tape().constant(a.equals(b).cast()),
-            "where(mask, a, b)" => b.where_(&!a.equals(0.0), c),
+            "equals(a, b)" => a.tape().constant(a.elementwise_eq(b).cast()),
+            "where(mask, a, b)" => b.where_(&!a.elementwise_eq(0.0), c),
             "if_positive(x, a, b)" => a.if_positive(b, c),
             "sqrt(x)" => a.sqrt(),
             "rsqrt(x)" => a.rsqrt(),

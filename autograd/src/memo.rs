@@ -6,7 +6,7 @@ use crate::Tape;
 use crate::tape::with_cell;
 use raygrad_tensor::{Pool, Scalar, Tensor};
 
-/// The outputs of those operations of a pass that [are worth keeping](Op::is_kept), in the order in which they ran.
+/// The outputs of those operations of a pass that [are worth keeping](Op::is_cacheable), in the order in which they ran.
 #[derive(Debug, Clone)]
 pub struct Memo<T: Scalar> {
     values: Vec<Tensor<T>>,
@@ -46,9 +46,9 @@ impl<T: Scalar> Memo<T> {
 }
 
 impl<T: Scalar> Tape<T> {
-    /// Runs `f`, and gives beside its result the outputs of those of its operations that [are kept](Op::is_kept): for
-    /// [`recall`](Self::recall).
-    pub fn remember<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
+    /// Runs `f`, and gives beside its result the outputs of those of its operations that [are kept](Op::is_cacheable): for
+    /// [`reuse_outputs`](Self::reuse_outputs).
+    pub fn cache_outputs<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
         let (result, values) = with_cell(&self.remembered, Some(vec![]), f);
         let values = values.unwrap_or_default();
         // Who remembers around it remembers this too.
@@ -56,7 +56,7 @@ impl<T: Scalar> Tape<T> {
         (result, Memo { values })
     }
 
-    /// Runs `f`, in which the operations that [are kept](Op::is_kept) take their outputs from a memo of the same operations
+    /// Runs `f`, in which the operations that [are kept](Op::is_cacheable) take their outputs from a memo of the same operations
     /// on the same inputs, instead of working them out again; they are recorded as ever. So a pass that was not recorded
     /// can find out which rows matter, and a recorded one go on with what is known of those.
     ///
@@ -89,7 +89,7 @@ impl<T: Scalar> Tape<T> {
     /// If `f` runs fewer or other such operations than the memo holds outputs of, as far as shapes tell. (An empty memo
     /// stands for no pass at all: everything is worked out.)
     #[track_caller]
-    pub fn recall<R>(&self, memo: Memo<T>, f: impl FnOnce() -> R) -> R {
+    pub fn reuse_outputs<R>(&self, memo: Memo<T>, f: impl FnOnce() -> R) -> R {
         if memo.values.is_empty() {
             return f();
         }
@@ -143,7 +143,7 @@ mod tests {
         fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
             Grads::one(cx.g() * 2.0)
         }
-        fn is_kept(&self) -> bool {
+        fn is_cacheable(&self) -> bool {
             true
         }
     }
@@ -158,18 +158,18 @@ mod tests {
     fn what_is_remembered_is_not_worked_out_again_and_has_its_gradient() {
         let (tape, count) = (Tape::new(), Arc::default());
         let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]));
-        let (first, a) = tape.no_grad(|| tape.remember(|| run(&x.gather_rows([2, 0]), &count)));
-        let (_, b) = tape.no_grad(|| tape.remember(|| run(&x.gather_rows([1]), &count)));
+        let (first, a) = tape.no_grad(|| tape.cache_outputs(|| run(&x.gather_rows([2, 0]), &count)));
+        let (_, b) = tape.no_grad(|| tape.cache_outputs(|| run(&x.gather_rows([1]), &count)));
         assert!(a.values().len() == 2 && !first.is_on_graph() && count.load(Ordering::Relaxed) == 4);
         // Rows 0 and 1, which are the second of the first memo and the only one of the second.
         let memo = Memo::gather(&[a, b], &[[0, 1], [1, 0]], tape.pool());
-        let seen = tape.recall(memo, || run(&x.gather_rows([0, 1]), &count));
+        let seen = tape.reuse_outputs(memo, || run(&x.gather_rows([0, 1]), &count));
         assert_eq!((seen.value(), count.load(Ordering::Relaxed)), (&Tensor::from([[5.0, 9.0], [13.0, 17.0]]), 4));
         assert_eq!(seen.sum().grad(&[&x])[0], [[4.0, 4.0], [4.0, 4.0], [0.0, 0.0]]);
         // Afterwards everything is as it was.
         run(&x, &count);
         assert_eq!(count.load(Ordering::Relaxed), 6);
-        tape.recall(Memo::gather(&[], &[], tape.pool()), || run(&x, &count));
+        tape.reuse_outputs(Memo::gather(&[], &[], tape.pool()), || run(&x, &count));
         assert_eq!(count.load(Ordering::Relaxed), 8);
     }
 
@@ -178,9 +178,9 @@ mod tests {
         let (tape, count) = (Tape::new(), Arc::default());
         let (bad, good) = (tape.leaf(Tensor::from([1.0, f64::INFINITY])), tape.leaf(Tensor::from([1.0, 2.0])));
         let twice = |x: &Var<'_, f64>| x.tape().try_apply(Twice(Arc::clone(&count)), &[x]).map(|y| y.into_value());
-        let (_, memo) = tape.remember(|| twice(&bad).unwrap());
+        let (_, memo) = tape.cache_outputs(|| twice(&bad).unwrap());
         tape.check_finite(true);
-        assert!(twice(&good).is_ok() && tape.recall(memo, || twice(&good)).is_err());
+        assert!(twice(&good).is_ok() && tape.reuse_outputs(memo, || twice(&good)).is_err());
     }
 
     #[test]
@@ -188,7 +188,7 @@ mod tests {
     fn numbers_have_no_rows() {
         let tape = Tape::new();
         let x = tape.leaf(Tensor::scalar(1.0));
-        let (_, memo) = tape.remember(|| run(&x, &Arc::default()));
+        let (_, memo) = tape.cache_outputs(|| run(&x, &Arc::default()));
         Memo::gather(&[memo], &[[0, 0]], tape.pool());
     }
 
@@ -196,16 +196,17 @@ mod tests {
     fn passes_within_passes_remember_and_recall_their_own() {
         let (tape, count) = (Tape::new(), Arc::default());
         let x = tape.leaf(Tensor::from([1.0, 2.0]));
-        let ((_, inner), outer) = tape.remember(|| tape.remember(|| run(&x, &count)));
+        let ((_, inner), outer) = tape.cache_outputs(|| tape.cache_outputs(|| run(&x, &count)));
         assert_eq!((inner.values().len(), outer.values().len()), (2, 2));
-        let (seen, again) = tape.recall(outer, || tape.remember(|| run(&x, &count)));
+        let (seen, again) = tape.reuse_outputs(outer, || tape.cache_outputs(|| run(&x, &count)));
         assert_eq!(
             (seen.value(), again.values().len(), count.load(Ordering::Relaxed)),
             (&Tensor::from([5.0, 9.0]), 2, 2)
         );
         // A panic leaves nothing behind.
-        let caught = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| tape.remember(|| panic!("on purpose"))));
-        assert!(caught.is_err() && tape.remember(|| ()).1.values().is_empty());
+        let caught =
+            std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| tape.cache_outputs(|| panic!("on purpose"))));
+        assert!(caught.is_err() && tape.cache_outputs(|| ()).1.values().is_empty());
         run(&x, &count);
         assert_eq!(count.load(Ordering::Relaxed), 4);
     }
@@ -214,15 +215,15 @@ mod tests {
     #[should_panic(expected = "twice: a memo holds an output of another shape for it")]
     fn a_memo_of_something_else_is_refused() {
         let (tape, count) = (Tape::new(), Arc::default());
-        let (_, memo) = tape.remember(|| run(&tape.leaf(Tensor::zeros(&[3])), &count));
-        tape.recall(memo, || run(&tape.leaf(Tensor::zeros(&[2])), &count));
+        let (_, memo) = tape.cache_outputs(|| run(&tape.leaf(Tensor::zeros(&[3])), &count));
+        tape.reuse_outputs(memo, || run(&tape.leaf(Tensor::zeros(&[2])), &count));
     }
 
     #[test]
     #[should_panic(expected = "outputs of a memo that no operation asked for")]
     fn a_memo_of_more_than_is_asked_for_is_refused() {
         let tape = Tape::<f64>::new();
-        let (_, memo) = tape.remember(|| run(&tape.leaf(Tensor::zeros(&[3])), &Arc::default()));
-        tape.recall(memo, || ());
+        let (_, memo) = tape.cache_outputs(|| run(&tape.leaf(Tensor::zeros(&[3])), &Arc::default()));
+        tape.reuse_outputs(memo, || ());
     }
 }

@@ -76,10 +76,10 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
         Ok(self.vjp(cx))
     }
 
-    /// Whether [`Tape::remember`] keeps the output, for [`Tape::recall`] to take it from there: worth it for an operation
+    /// Whether [`Tape::cache_outputs`] keeps the output, for [`Tape::reuse_outputs`] to take it from there: worth it for an operation
     /// that costs far more than a copy of its output. Each row of the output along the first axis must follow from the
     /// same row of the first input and from inputs that no row is special in (parameters).
-    fn is_kept(&self) -> bool {
+    fn is_cacheable(&self) -> bool {
         false
     }
 

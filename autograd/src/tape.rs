@@ -314,14 +314,14 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     fn run(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Tensor<T>, Error> {
         let shape = self.check_shapes(op, inputs, at)?;
-        let recalled = if op.is_kept() { self.recalled(op.name(), &shape) } else { None };
+        let recalled = if op.is_cacheable() { self.recalled(op.name(), &shape) } else { None };
         let value = recalled.unwrap_or_else(|| {
             let values: SmallVec<[&Tensor<T>; 4]> = inputs.iter().map(|x| &x.value).collect();
             op.forward(&values, &self.pool)
         });
         assert_eq!(value.shape(), shape.as_slice(), "{}: `forward` and `shape` disagree", op.name());
         self.check_output(op.name(), inputs, &value, at)?;
-        if op.is_kept() {
+        if op.is_cacheable() {
             self.keep(&value);
         }
         Ok(value)

@@ -3,7 +3,7 @@
     raygrad train --steps 2500 --out RUN
     raygrad export RUN mesh.ply
     cargo run --release --example surface_truth -- RUN TRUTH 256
-    python surface.py TRUTH mesh.ply ... [--level X]        # X as raygrad has printed it: scikit-image's mesh at that level
+    python surface.py TRUTH mesh.ply ... [--iso-value X]        # X as raygrad has printed it: scikit-image's mesh at that level
     python surface.py --views mesh.ply PICTURE.png          # three sides of it, as they are
 
 TRUTH holds points of the true surface: seen.ply those that the photographs' directions show, all.ply those of all sides.
@@ -125,7 +125,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("truth", nargs="?", type=Path)
     parser.add_argument("files", nargs="*", type=Path)
-    parser.add_argument("--level", type=float)
+    parser.add_argument("--iso-value", type=float)
     parser.add_argument("--views", nargs=2)
     args = parser.parse_args()
     if args.views:

@@ -4,7 +4,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use glam::DVec3;
 use raygrad::nerf::dataset::Dataset;
-use raygrad::nerf::{Camera, Error, Extent, Result};
+use raygrad::nerf::{Camera, Error, Result, SceneBox};
 use serde::{Deserialize, Serialize};
 
 /// The average training camera: what is needed to fly around a scene without its photographs.
@@ -86,7 +86,7 @@ impl Viewpoint {
     /// `count` cameras on a circle around the centre of the box, all looking at it, with z upwards; where the photographs
     /// are from a part of the circle, they swing to and fro on that. Those of a panorama, which was taken from the centre, stand
     /// there and look around.
-    pub fn orbit(&self, extent: &Extent, count: usize) -> Vec<Camera> {
+    pub fn orbit(&self, extent: &SceneBox, count: usize) -> Vec<Camera> {
         let centre = 0.5 * (extent.bounds[0] + extent.bounds[1]);
         let camera = |i: usize| {
             let outwards = self.distance <= FROM_CENTRE * extent.space().side();
@@ -131,7 +131,7 @@ mod tests {
         let viewpoint =
             Viewpoint { width: 40, height: 30, angle_x: 1.0, distance: 0.0, elevation: 0.0, azimuth: 0.3, reach: 0.2 };
         viewpoint.check().unwrap();
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 4.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 4.0]);
         let cameras = viewpoint.orbit(&extent, 4);
         let looks: Vec<DVec3> = cameras.iter().map(|camera| camera.ray(20.0, 15.0).direction).collect();
         for (look, expected) in looks.iter().zip([DVec3::X, DVec3::Y, DVec3::NEG_X, DVec3::NEG_Y]) {
@@ -144,9 +144,9 @@ mod tests {
     use raygrad::nerf::dataset::Split;
     use raygrad_scenes::embedded;
 
-    fn viewpoint() -> (Viewpoint, Extent) {
+    fn viewpoint() -> (Viewpoint, SceneBox) {
         let data = embedded(Split::Test, 8);
-        (Viewpoint::of(&data), Extent::new(data.bounds, [data.near, data.far]))
+        (Viewpoint::of(&data), SceneBox::new(data.bounds, [data.near, data.far]))
     }
 
     #[test]

@@ -38,17 +38,19 @@ const MEASURED: [&str; 7] = [
 /// Longest result that is read, in bytes.
 const LONGEST: u64 = 1 << 28;
 
-/// Put results of `raygrad eval` side by side, with all in which they differ
+/// Compare the results of several runs
 ///
-/// One row for each result of each run. What all have in common stands below the table, and a warning if figures are not of the
-/// same thing: other photographs, sizes, backgrounds, cameras.
+/// Prints one row per result of `raygrad eval`, and below the table what all have in common. Warns where results
+/// are not comparable: other images, sizes, backgrounds or cameras.
+///
+/// Example: raygrad compare run run-2 --only eval-test-fast
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folders that `raygrad train` made
+    /// Run folders, made by `raygrad train`
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
-    /// Only results of this name, such as eval-test-fast [default: all]
-    #[arg(long, value_name = "NAME")]
+    /// Only this result, such as eval-test-fast
+    #[arg(long, help_heading = "Output", value_name = "NAME")]
     only: Option<String>,
 }
 

@@ -21,36 +21,48 @@ use super::prepare::convert::{Target, convert, relative};
 use super::run::{Run, check_output};
 use super::scene::Scene;
 
-/// Write the cameras or the shape of a run for other programs, or the scene as a page
+/// Export cameras, a mesh, points or a scene page
 ///
-/// All is in the coordinates of the photographs' own files. Where the run has learned poses, photographs that it was
-/// trained on have the refined ones, moved as a whole to where the given ones are; of others, held-out ones, only focal length
-/// and lens follow. A file that ends in .ply, .obj or .glb has the surface as a mesh, or with --points as points, with normals and
-/// colours; of a scene that goes on, what is within the box where the cameras look. One that ends in .html has the whole scene as
-/// a page that renders itself in any browser with WebGL 2, to be sent to others: it needs no server and no network. The same
-/// command replaces its own files, and no others unless --overwrite is given.
+/// Everything is in the coordinates of the capture. If the run refined poses, training images get the refined ones,
+/// aligned as a whole to the given ones; other images keep their poses and get the refined focal length and lens.
+///
+/// A mesh or point cloud has normals and colours. Of an unbounded scene it covers the scene box. A page (.html)
+/// renders the whole scene in any browser with WebGL 2, without a server or a network.
+///
+/// The same command replaces its own files, and no others unless --overwrite is given.
+///
+/// Example: raygrad export my-run mesh.ply --triangles 50000
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder that `raygrad train` made
+    /// Run folder, made by `raygrad train`
     run: PathBuf,
-    /// File for the cameras, such as cameras.json, in the form of transforms.json: its paths begin at the folder of the
-    /// photographs. Or one for the shape, such as mesh.ply, mesh.obj or mesh.glb. With --to, a folder for a whole dataset
+    /// .json (cameras), .ply, .obj, .glb, .html, or a folder
+    ///
+    /// FILE.json: cameras as in transforms.json; its paths start at the image folder. FILE.ply, .obj or .glb: a
+    /// mesh or points. FILE.html: the scene as one page. With --to: a folder for a whole dataset.
     #[arg(value_name = "OUT")]
     out: PathBuf,
-    /// Write a whole dataset in this format, photographs and all
-    #[arg(long, value_enum, value_name = "FORMAT")]
+    /// Write a dataset in this format
+    ///
+    /// nerfstudio: transforms.json, also of instant-ngp. colmap: sparse/0/*.bin. colmap-text: sparse/0/*.txt. llff:
+    /// poses_bounds.npy. blender: transforms_train.json, as in the NeRF-synthetic scenes.
+    #[arg(long, help_heading = "Output", hide_possible_values = true, value_enum, value_name = "FORMAT")]
     to: Option<Target>,
-    /// Folder of the photographs, if they are no longer where they were for training
-    #[arg(long)]
+    /// Image folder, if it moved after training
+    ///
+    /// Without it, raygrad reads the images from where they were during training.
+    #[arg(long, help_heading = "Scene")]
     scene: Option<Scene>,
-    /// Replace a file that another command wrote
-    #[arg(long, conflicts_with = "to")]
+    /// Replace files that another command wrote
+    #[arg(long, help_heading = "Output", conflicts_with = "to")]
     overwrite: bool,
-    /// Copy files from outside of the photographs' folder into a dataset too
-    #[arg(long, requires = "to")]
+    /// Also copy files from outside the capture
+    ///
+    /// By default a new dataset takes no file from outside the capture folder, not even through a link.
+    #[arg(long, help_heading = "Output", requires = "to")]
     allow_outside: bool,
     #[command(flatten)]
-    shape: geometry::Options,
+    shape: geometry::GeometryOptions,
 }
 
 /// What is written, by the ending of the file's name.
@@ -118,11 +130,11 @@ pub fn run(args: &Args) -> Work<()> {
 /// What cameras have done as a whole is undone, which no photograph shows: so those of other photographs, and points, stay
 /// where they belong.
 fn refine(capture: &mut Capture, model: &Model<f32>, run: &Run) -> Result<usize> {
-    let Some(refine) = &model.refine else { return Ok(0) };
-    let drift = refine.placement(&model.params).unwrap_or_default();
-    let placement = model.extent.placement;
+    let Some(refine) = &model.camera_optimizer else { return Ok(0) };
+    let drift = refine.transform(&model.params).unwrap_or_default();
+    let placement = model.scene_box.transform;
     let views = present(capture, Split::Train)?;
-    check_trained(run, capture, &views, model.extent.frames)?;
+    check_trained(run, capture, &views, model.scene_box.frames)?;
     let trained: HashMap<String, usize> =
         views.iter().enumerate().map(|(number, view)| (view.field.clone(), number)).collect();
     for view in &mut capture.views {

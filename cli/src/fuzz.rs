@@ -8,10 +8,10 @@ use super::parse;
 use super::run::{Run, RunConfig};
 use super::scene::Scene;
 use super::train::changed;
-use super::view::messages::{Ask, Eye, View};
+use super::view::messages::{ClientMessage, Eye, View};
 use proptest::prelude::*;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Config, Error, Extent, Preset};
+use raygrad::nerf::{Config, Error, Preset, SceneBox};
 use raygrad_test_support::{
     campaign::campaign,
     damage::clear,
@@ -28,7 +28,7 @@ pub fn run_config() -> RunConfig {
         raygrad: "0.1.0".into(),
         scene: Scene::Embedded,
         downscale: 1,
-        extent: Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]),
+        scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]),
         viewpoint: Viewpoint {
             width: 8,
             height: 6,
@@ -110,7 +110,7 @@ fn campaign_configurations_of_runs() {
         std::fs::write(&file, bytes).unwrap();
         let run = Run::open(folder.path())?;
         // The path of the camera, for whatever has passed the checks.
-        for camera in run.config.viewpoint.orbit(&run.config.extent, 3) {
+        for camera in run.config.viewpoint.orbit(&run.config.scene_box, 3) {
             assert!(camera.width > 0 && camera.width <= 1 << 16 && camera.focal[0] > 0.0, "{camera:?}");
         }
         Ok::<(), Error>(())
@@ -126,9 +126,9 @@ fn campaign_messages_of_pages() {
     let free = json!({ "ask": "view", "id": 7, "view": { "eye": { "free": { "pose": pose, "fov": 40.5 } },
         "size": [640, 480], "show": "normals", "background": [255, 0, 7], "crop": [[-1, -1, -1], [1, 1, 1]], "skip": "off", "checkpoint": 12 } });
     let kept = json!({ "ask": "save", "view": { "eye": { "photograph": 3 }, "size": [8, 8] } });
-    let film = json!({ "ask": "film", "path": { "render_width": 64, "render_height": 48, "seconds": 1.5, "fps": 25 }, "skip": "fast" });
+    let video = json!({ "ask": "video", "path": { "render_width": 64, "render_height": 48, "seconds": 1.5, "fps": 25 }, "skip": "fast" });
     let others = [
-        film,
+        video,
         json!({ "ask": "share", "share": 0.3 }),
         json!({ "ask": "stop" }),
         json!({ "ask": "pause", "pause": true }),
@@ -137,8 +137,8 @@ fn campaign_messages_of_pages() {
         [free, kept].iter().chain(&others).map(|message| message.to_string().into_bytes()).collect();
     let parse = |bytes: &[u8]| {
         // What is no text is closed before.
-        let ask = Ask::read(std::str::from_utf8(bytes).map_err(|e| e.to_string())?)?;
-        if let Ask::View { view, .. } | Ask::Save { view } = &ask {
+        let ask = ClientMessage::read(std::str::from_utf8(bytes).map_err(|e| e.to_string())?)?;
+        if let ClientMessage::View { view, .. } | ClientMessage::Save { view } = &ask {
             let [width, height] = view.size.map(|side| side as usize);
             assert!((1..=1 << 22).contains(&(width * height)), "{width} {height}");
             if let Eye::Free { pose, fov } = &view.eye {

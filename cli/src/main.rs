@@ -47,23 +47,25 @@ use output::{complain, print};
 /// How the program ends, for scripts.
 const EXIT_CODES: &str = "\
 Exit codes:
-  0    done
-  1    an error, or training that has diverged
-  2    a command line that cannot be understood
-  3    doctor has found something to be warned of
-  4    doctor has found an error in the capture
-  130  interrupted (Ctrl-C, SIGTERM, hang-up); what `train` has done is saved";
+  0    success
+  1    error, or training diverged
+  2    invalid command line
+  3    doctor found warnings
+  4    doctor found errors in the capture
+  130  interrupted (Ctrl-C, SIGTERM, hang-up); `train` saves its progress";
 
-/// Neural radiance fields on a CPU: photographs and camera poses in, new views out.
+/// Neural radiance fields on a CPU: images and camera poses in, new views out
 ///
-/// Without a command, trains on a scene that is built in, for a minute or two, and renders a picture.
+/// Without a command, raygrad trains on a built-in scene for about a minute and renders an image.
 #[derive(Parser)]
-#[command(name = "raygrad", version, after_help = EXIT_CODES)]
+#[command(name = "raygrad", version, after_help = EXIT_CODES, term_width = 80)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
-    /// Threads to work with [default: as many as there are processors]
-    #[arg(long, global = true, value_name = "N", value_parser = parse::count(1024))]
+    /// Number of CPU threads [default: all]
+    ///
+    /// Range: 1 to 1024.
+    #[arg(long, help_heading = "Advanced", global = true, value_name = "N", value_parser = parse::count(1024))]
     threads: Option<usize>,
 }
 
@@ -143,11 +145,62 @@ fn suggest(folder: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::Cli;
-    use clap::CommandFactory;
+    use clap::{Command, CommandFactory};
+    use std::path::Path;
+
+    /// The program and its commands, ready to print help.
+    fn commands() -> Vec<Command> {
+        let mut program = Cli::command();
+        program.build();
+        let commands = program.get_subcommands().filter(|command| command.get_name() != "help").cloned();
+        let commands: Vec<Command> = commands.collect();
+        std::iter::once(program).chain(commands).collect()
+    }
 
     #[test]
-    fn the_command_line_is_consistent() {
+    fn command_line_is_consistent() {
         Cli::command().debug_assert();
         let _ = super::train::Args::default();
+    }
+
+    #[test]
+    fn short_help_has_one_line_an_option() {
+        for mut command in commands() {
+            let help = command.render_help().to_string();
+            for line in help.lines() {
+                assert!(!line.starts_with(&" ".repeat(12)), "{}: wrapped: {line}", command.get_name());
+                assert!(line.chars().count() <= 80, "{}: {line}", command.get_name());
+                if let Some(option) = line.trim_start().strip_prefix('-') {
+                    assert!(option.contains("  "), "{}: no description beside {line}", command.get_name());
+                }
+            }
+            let options = command.get_arguments().filter(|option| !option.is_hide_set() && !option.is_positional());
+            let lines = help.lines().filter(|line| line.trim_start().starts_with('-')).count();
+            assert_eq!(lines, options.count(), "{help}");
+        }
+    }
+
+    /// `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad help` writes them anew.
+    #[test]
+    fn help_matches_its_snapshots() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/help");
+        for mut command in commands() {
+            let name = command.get_name().to_owned();
+            let text = format!("{}\n---\n\n{}", command.render_help(), command.render_long_help());
+            let text: String = text.lines().map(|line| format!("{}\n", line.trim_end())).collect();
+            assert!(text.lines().all(|line| line.chars().count() <= 80), "{name}: a line is longer than 80:\n{text}");
+            let file = folder.join(format!("{name}.txt"));
+            if std::env::var_os("UPDATE_SNAPSHOTS").is_some() {
+                std::fs::create_dir_all(&folder).unwrap();
+                std::fs::write(&file, &text).unwrap();
+            }
+            let expected = std::fs::read_to_string(&file).unwrap_or_default();
+            assert_eq!(
+                text,
+                expected,
+                "`raygrad {name} --help` has changed; UPDATE_SNAPSHOTS=1 writes {}",
+                file.display()
+            );
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! What training takes of memory, said before it is taken.
 
 use raygrad::nerf::dataset::{Dataset, Frame};
-use raygrad::nerf::{Load, Trainer};
+use raygrad::nerf::{BatchSize, Trainer};
 
 use super::machine;
 
@@ -19,10 +19,10 @@ const SAMPLE: f64 = 3300.0;
 pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     let model = &trainer.model;
     let cells = model.sampler.grid().map_or(0, |grid| grid.cells());
-    let samples = match model.sampler.load() {
-        Load::Samples(samples) => samples,
+    let samples = match model.sampler.batch_size() {
+        BatchSize::Samples(samples) => samples,
         // Tapes of a few rays.
-        Load::Rays { .. } => 0,
+        BatchSize::Rays { .. } => 0,
     };
     let photographs: f64 = data.frames.iter().map(bytes).sum();
     let parts = [(model.params.elements(), PARAMETER), (cells, CELL), (samples, SAMPLE)]

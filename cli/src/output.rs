@@ -3,8 +3,8 @@
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::pictures::colormap;
-use raygrad::nerf::{Error, Image, Picture, Result};
+use raygrad::nerf::imaging::colormap;
+use raygrad::nerf::{Error, Image, Render, Result};
 
 /// Writes to standard output. A reader that has gone away, as in `raygrad eval run | head -1`, is no error, and a terminal that
 /// was closed is none.
@@ -108,7 +108,7 @@ const DEEP: f64 = 100.0;
 
 /// The depth of a picture in false colour: yellow near, violet far, black where there is nothing to see. That of a scene which
 /// goes on and on by its logarithm, from twice the near distance to two hundred times it.
-pub fn depth_colors(picture: &Picture, [near, far]: [f64; 2]) -> Image {
+pub fn depth_colors(picture: &Render, [near, far]: [f64; 2]) -> Image {
     let mut depth = picture.depth.clone();
     for (depth, &opacity) in depth.data.iter_mut().zip(&picture.opacity.data) {
         if opacity < 0.5 {

@@ -36,7 +36,7 @@ pub fn duration(text: &str) -> Result<Duration, String> {
 /// Most pixels on a side of an image.
 pub const LARGEST: usize = 16384;
 
-/// Frames a second that files of films can say.
+/// Frames a second that files of videos can say.
 pub const FPS: RangeInclusive<f64> = 0.01..=240.0;
 
 /// Frames a second.

@@ -27,9 +27,9 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
         return Err(Error::file(&capture.file, format!("has no {split} photographs")));
     }
     if split == Split::Train {
-        check_trained(run, &capture, &views, model.extent.frames)?;
+        check_trained(run, &capture, &views, model.scene_box.frames)?;
     }
-    let placement = model.extent.placement;
+    let placement = model.scene_box.transform;
     let given: Vec<Camera> = views.iter().map(|view| placement.camera(&view.camera)).collect();
     let cameras = match split {
         Split::Train => given.iter().enumerate().map(|(i, given)| model.learned_camera(i, given)).collect(),

@@ -1,7 +1,7 @@
 //! Rendering in single precision, as fast as the model allows, or in double precision with nothing left out.
 
 use clap::ValueEnum;
-use raygrad::nerf::{Camera, Image, Model, Picture, Result};
+use raygrad::nerf::{Camera, Image, Model, Render, Result};
 use serde::Serialize;
 
 /// The arithmetic of a picture.
@@ -35,16 +35,16 @@ impl Renderer {
     /// Lets views look like the photograph of this number, or like none in particular.
     pub fn look_like(&mut self, number: Option<u32>) {
         match self {
-            Renderer::Single(model) => model.look = number,
-            Renderer::Double(model) => model.look = number,
+            Renderer::Single(model) => model.appearance_image = number,
+            Renderer::Double(model) => model.appearance_image = number,
         }
     }
 
     /// The view from a camera over a background.
-    pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
+    pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Render {
         match self {
-            Renderer::Single(model) => model.view(camera, background),
-            Renderer::Double(model) => model.dense_view(camera, background.map(f64::from), 1).picture(),
+            Renderer::Single(model) => model.render(camera, background),
+            Renderer::Double(model) => model.render_reference(camera, background.map(f64::from), 1).picture(),
         }
     }
 

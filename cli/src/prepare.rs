@@ -27,35 +27,52 @@ use workplace::Workplace;
 /// Names of photographs that are said, before it is only said how many more there are.
 const NAMED: usize = 8;
 
-/// Make a dataset of a video or of photographs, or write a dataset in another format
+/// Make a dataset from a video, images or a dataset
 ///
-/// Of a video the sharpest frames are taken, with ffmpeg; where photographs were taken from is found out with COLMAP. Both
-/// must be installed. A dataset that has cameras already is converted with --to, --undistort or both.
+/// ffmpeg extracts the frames of a video, and COLMAP finds the camera poses; both must be installed. --to and
+/// --undistort convert a dataset that already has poses.
+///
+/// Example: raygrad prepare walk.mp4 --out my-scene
 #[derive(clap::Args)]
 pub struct Args {
-    /// A video, a folder of photographs, a dataset, or a scene that is built in: embedded or landscape
+    /// A video, an image folder, a dataset or a built-in scene
+    ///
+    /// Built-in scenes: embedded and landscape.
     input: PathBuf,
-    /// Folder for the dataset, which must not exist yet or be empty
-    #[arg(long, value_name = "DIR")]
+    /// New or empty folder for the dataset
+    #[arg(long, help_heading = "Output", value_name = "DIR")]
     out: PathBuf,
-    /// Write a dataset that has cameras in this format
-    #[arg(long, value_enum, value_name = "FORMAT")]
+    /// Convert a dataset to this format
+    ///
+    /// nerfstudio: transforms.json, also of instant-ngp. colmap: sparse/0/*.bin. colmap-text: sparse/0/*.txt. llff:
+    /// poses_bounds.npy. blender: transforms_train.json, as in the NeRF-synthetic scenes.
+    #[arg(long, help_heading = "Output", hide_possible_values = true, value_enum, value_name = "FORMAT")]
     to: Option<Target>,
-    /// Make the images of a dataset those of a camera without a lens; they are cropped so that no pixel is empty
-    #[arg(long)]
+    /// Remove lens distortion from the images
+    ///
+    /// The images are cropped so that no pixel is empty.
+    #[arg(long, help_heading = "Output")]
     undistort: bool,
-    /// Frames to take from a video, about: of three times as many, the sharpest
-    #[arg(long, value_name = "N", default_value_t = 120, value_parser = parse::count(10_000),
+    /// Frames to take from a video
+    ///
+    /// raygrad extracts three times as many and keeps the sharpest.
+    #[arg(long, help_heading = "Scene", value_name = "N", default_value_t = 120, value_parser = parse::count(10_000),
           conflicts_with_all = ["to", "undistort"])]
     frames: usize,
-    /// The lens that the photographs were taken with
-    #[arg(long, value_enum, default_value_t, conflicts_with_all = ["to", "undistort"])]
+    /// perspective or fisheye
+    ///
+    /// perspective: straight lines stay nearly straight. fisheye: they bend, as with action cameras.
+    #[arg(long, help_heading = "Scene", hide_possible_values = true, value_enum, default_value_t, conflicts_with_all = ["to", "undistort"])]
     lens: Glass,
-    /// Copy files that lie outside of the folder, or that links in it lead to, into the dataset too
-    #[arg(long)]
+    /// Also copy files from outside the input
+    ///
+    /// By default a new dataset takes no file from outside the input folder, not even through a link.
+    #[arg(long, help_heading = "Output")]
     allow_outside: bool,
-    /// Width in pixels of the pictures of a built-in scene, embedded or landscape, which --to writes [default: 200 and 400]
-    #[arg(long, value_name = "PIXELS", value_parser = parse::count(8192), requires = "to")]
+    /// Image width of a built-in scene, in pixels
+    ///
+    /// The default is 200 for embedded and 400 for landscape.
+    #[arg(long, help_heading = "Scene", value_name = "PIXELS", value_parser = parse::count(8192), requires = "to")]
     size: Option<usize>,
 }
 
@@ -129,7 +146,7 @@ fn prepare(args: &Args) -> Work<()> {
     report(&found, count, &args.out)?;
     // The dataset is there whatever is found in it.
     let (scene, out) = (Scene::Folder(args.out.clone()), args.out.join("doctor"));
-    if let Err(error) = doctor::run(&doctor::Args { scene, scope: None, out, overwrite: false, json: false }) {
+    if let Err(error) = doctor::run(&doctor::Args { scene, scene_type: None, out, overwrite: false, json: false }) {
         complain(&format!("warning: {error}"));
     }
     Ok(())

@@ -1,7 +1,7 @@
 //! Pictures of one view while a model learns.
 
 use raygrad::nerf::dataset::{Dataset, Frame, Split};
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::{Camera, Image, Model};
 
 use super::output::complain;
@@ -63,7 +63,7 @@ impl Preview {
             Some(number) => model.learned_camera(number, &self.camera),
             None => model.other_camera(&self.camera),
         };
-        let color = model.view(&camera, self.background).color;
+        let color = model.render(&camera, self.background).color;
         (Image::hconcat(&[&color, &self.truth]), psnr(&color, &self.truth))
     }
 }

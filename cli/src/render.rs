@@ -1,11 +1,11 @@
 //! `raygrad render`: new views.
 
 mod animation;
-mod film;
-mod flight;
+mod camera_motion;
 mod frames;
 mod path_file;
 pub mod shown;
+mod video;
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -22,55 +22,83 @@ use super::precision::{Precision, Renderer};
 use super::progress::{Progress, spoken};
 use super::run::{Run, check_output};
 use super::scene::Scene;
-pub use film::frames_of;
-use film::{Film, Reel};
-use flight::{CameraPath, Flight, FlightArgs};
+use camera_motion::{CameraMotion, CameraPath, CameraPathArgs};
 use frames::{DIGITS, Frames};
 use shown::{Layer, Show, Shown};
+pub use video::frames_of;
+use video::{VideoFormat, VideoWriter};
 
-/// Render pictures or a film of a model
+/// Render images or a video
 ///
-/// The same command replaces its own images and videos, and no others unless --overwrite is given. Frames of a video are
-/// written to FILE.frames/ first: the same command resumes there after a Ctrl-C or a crash.
+/// The same command replaces its own images and videos, and no others unless --overwrite is given. A video's frames
+/// go to FILE.frames/ first. After a Ctrl-C or a crash the same command resumes there.
+///
+/// Example: raygrad render my-run --out orbit.mp4 --seconds 6 --size 800x800
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder that `raygrad train` made
+    /// Run folder, made by `raygrad train`
     run: PathBuf,
     #[command(flatten)]
-    flight: FlightArgs,
-    /// Folder for PNG frames, or a file: FILE.png for the first frame; FILE.gif, FILE.apng or (by ffmpeg) FILE.mp4 or
-    /// FILE.webm for a film [default: RUN/PATH]
-    #[arg(long, value_name = "DIR|FILE")]
+    flight: CameraPathArgs,
+    /// A folder, or .png, .gif, .apng, .mp4, .webm
+    ///
+    /// A folder takes one PNG per frame; FILE.png takes the first frame. MP4 and WebM need ffmpeg. [default:
+    /// RUN/PATH]
+    #[arg(long, help_heading = "Output", value_name = "OUT")]
     out: Option<PathBuf>,
-    /// What frames show
-    #[arg(long, value_enum, default_value_t)]
+    /// color, depth, normals or opacity
+    ///
+    /// color: as an image shows it. depth: false colour, yellow near, violet far, black empty. normals: red, green
+    /// and blue for x, y and z in the capture's axes, from -1 to 1. opacity: white where all light is blocked.
+    #[arg(long, help_heading = "Output", hide_possible_values = true, value_enum, default_value_t)]
     show: Show,
-    /// As --show depth
-    #[arg(long, hide = true, conflicts_with = "show")]
-    depth: bool,
-    /// What to save beside each frame in a folder of frames
-    #[arg(long, value_enum, value_name = "LAYERS", value_delimiter = ',')]
+    /// Extra layers: depth,normals,opacity,alpha
+    ///
+    /// Layers go to folders beside the frames. depth: depth along the optical axis, depth/NUMBER.png, 16 bits in
+    /// steps of --depth-unit, 0 where empty. depth-npy: the same in capture units, depth/NUMBER.npy, f32 [height,
+    /// width]. normals: 0.5 + 0.5 n in the capture's axes, black where empty. opacity: grey. alpha: RGBA without
+    /// the background, not premultiplied.
+    #[arg(
+        long,
+        help_heading = "Output",
+        hide_possible_values = true,
+        value_enum,
+        value_name = "LAYERS",
+        value_delimiter = ','
+    )]
     save: Vec<Layer>,
-    /// Length of a step of depths in 16 bits, in the capture's units: with metres, 0.001 is a millimetre [default: 0.001]
-    #[arg(long, value_name = "LENGTH", value_parser = parse::above_zero)]
+    /// One 16-bit depth step, in capture units
+    ///
+    /// If the capture is in metres, 0.001 is a millimetre. [default: 0.001]
+    #[arg(long, help_heading = "Output", value_name = "LENGTH", value_parser = parse::above_zero)]
     depth_unit: Option<f64>,
-    /// What lies behind the scene: white, black or R,G,B from 0 to 255 [default: as in training]
-    #[arg(long, value_name = "COLOR", value_parser = parse::color)]
+    /// Background: white, black or R,G,B
+    ///
+    /// R, G and B range from 0 to 255. By default the background is that of training.
+    #[arg(long, help_heading = "Output", value_name = "COLOR", value_parser = parse::color)]
     background: Option<[f32; 3]>,
-    /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
-    #[arg(long)]
+    /// Empty-space skipping: off, near-lossless, fast
+    ///
+    /// near-lossless changes a colour by at most 0.5 % of its range, fast by at most 5 %. By default rendering
+    /// skips as much as the run's config says.
+    #[arg(long, help_heading = "Advanced")]
     skip: Option<Skip>,
-    /// Arithmetic of the pictures
-    #[arg(long, value_enum, default_value_t)]
+    /// Arithmetic: f32 or f64
+    ///
+    /// f64 renders every sample in occupied cells in double precision and skips nothing else. It is slow, and a
+    /// reference for measurements.
+    #[arg(long, help_heading = "Advanced", hide_possible_values = true, value_enum, default_value_t)]
     precision: Precision,
-    /// Leave the frames of a film in FILE.frames/
-    #[arg(long)]
+    /// Keep a video's frames in FILE.frames/
+    #[arg(long, help_heading = "Output")]
     keep_frames: bool,
     /// Replace files that another command wrote
-    #[arg(long)]
+    #[arg(long, help_heading = "Output")]
     overwrite: bool,
-    /// Folder of the photographs, if they are no longer where they were for training
-    #[arg(long)]
+    /// Image folder, if it moved after training
+    ///
+    /// Without it, raygrad reads the images from where they were during training.
+    #[arg(long, help_heading = "Scene")]
     scene: Option<Scene>,
     /// Stop, as by a Ctrl-C, when standard input ends
     #[arg(long, hide = true)]
@@ -82,10 +110,9 @@ impl Args {
     pub fn picture(run: &Path) -> Self {
         Args {
             run: run.into(),
-            flight: FlightArgs::default(),
+            flight: CameraPathArgs::default(),
             out: Some(run.join("picture.png")),
             show: Show::Color,
-            depth: false,
             save: vec![],
             depth_unit: None,
             background: None,
@@ -108,12 +135,12 @@ impl Args {
         if !self.save.contains(&Layer::Depth) && self.depth_unit.is_some() {
             return meaningless("depth-unit", "without --save depth");
         }
-        let film = matches!(kind, Kind::Film(_));
-        if self.keep_frames && !film {
-            return meaningless("keep-frames", "without a film");
+        let video = matches!(kind, Kind::Video(_));
+        if self.keep_frames && !video {
+            return meaningless("keep-frames", "without a video");
         }
         let counts = self.flight.seconds.is_some() || matches!(self.flight.path, CameraPath::File(_));
-        if self.flight.fps.is_some() && !counts && !film {
+        if self.flight.fps.is_some() && !counts && !video {
             return meaningless("fps", "for pictures without --seconds");
         }
         Ok(kind)
@@ -121,8 +148,7 @@ impl Args {
 
     /// What decides what the output shows, but for the model.
     fn job(&self, run: &Run) -> Job {
-        let Args { flight, show, depth, save, depth_unit, background, skip, precision, .. } = self;
-        let show = if *depth { Show::Depth } else { *show };
+        let Args { flight, show, save, depth_unit, background, skip, precision, .. } = self;
         let arguments = json!({
             "run": run.identity(),
             "flight": flight,
@@ -148,16 +174,16 @@ pub fn run(args: &Args) -> Work<()> {
     if kind != Kind::Folder {
         job.check(&out)?;
     }
-    // Before it is read: should it be replaced meanwhile, frames of both are never taken for one film.
+    // Before it is read: should it be replaced meanwhile, frames of both are never taken for one video.
     let stored = [checksum(&run.model_file())?, checksum(&run.file("config.json"))?];
     let mut model = run.model()?;
     if let Some(skip) = args.skip {
         model.set_skip(skip);
     }
-    let Flight { mut cameras, fps } = args.flight.cameras(&run, &model, args.scene.as_ref())?;
-    let extent = model.extent;
+    let CameraMotion { mut cameras, fps } = args.flight.cameras(&run, &model, args.scene.as_ref())?;
+    let extent = model.scene_box;
     let background = args.background.unwrap_or(model.config.background.shown());
-    let show = if args.depth { Show::Depth } else { args.show };
+    let show = args.show;
     let depth_unit = args.depth_unit.unwrap_or(MILLI);
     let renderer = Renderer::new(model, args.precision)?;
     let shown = Shown { renderer: &renderer, extent, background, show, save: &args.save, depth_unit };
@@ -170,8 +196,8 @@ pub fn run(args: &Args) -> Work<()> {
             cameras.truncate(1);
             return Ok(report(&cameras, &out)?);
         }
-        Kind::Film(film) => {
-            film.check(&out, fps, [cameras[0].width, cameras[0].height])?;
+        Kind::Video(video) => {
+            video.check(&out, fps, [cameras[0].width, cameras[0].height])?;
             frames_of(&out)
         }
         Kind::Folder => out.clone(),
@@ -185,9 +211,9 @@ pub fn run(args: &Args) -> Work<()> {
         interrupt::listen_to_input();
     }
     let done = render(&shown, &cameras, &mut frames).and_then(|()| {
-        let Kind::Film(film) = kind else { return Ok(()) };
+        let Kind::Video(video) = kind else { return Ok(()) };
         let size = [cameras[0].width, cameras[0].height];
-        film.write(&Reel { folder: frames.folder(), count: cameras.len(), size, fps, job: &job }, &out)
+        video.write(&VideoWriter { folder: frames.folder(), count: cameras.len(), size, fps, job: &job }, &out)
     });
     if let Err(Stop::Interrupted) = done {
         let (done, all, folder) = (frames.done(), cameras.len(), frames.folder().display());
@@ -195,8 +221,8 @@ pub fn run(args: &Args) -> Work<()> {
     }
     done?;
     match kind {
-        Kind::Film(_) if !args.keep_frames => frames.remove(),
-        Kind::Film(_) => frames.keep(),
+        Kind::Video(_) if !args.keep_frames => frames.remove(),
+        Kind::Video(_) => frames.keep(),
         _ => {
             frames.keep();
             let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
@@ -209,9 +235,9 @@ pub fn run(args: &Args) -> Work<()> {
     Ok(report(&cameras, &out)?)
 }
 
-/// The ending of films where nobody says one: what plays everywhere, or else what needs no other program.
-pub fn film_ending() -> &'static str {
-    match Film::Mp4.check_encoder(Path::new("FILE.mp4")) {
+/// The ending of videos where nobody says one: what plays everywhere, or else what needs no other program.
+pub fn video_ending() -> &'static str {
+    match VideoFormat::Mp4.check_encoder(Path::new("FILE.mp4")) {
         Ok(()) => "mp4",
         Err(_) => "gif",
     }
@@ -290,7 +316,7 @@ enum Kind {
     /// A folder of PNG files.
     Folder,
     Png,
-    Film(Film),
+    Video(VideoFormat),
 }
 
 impl Kind {
@@ -301,12 +327,12 @@ impl Kind {
         }
         match out.extension().and_then(|ending| ending.to_str()).map(str::to_ascii_lowercase).as_deref() {
             Some("png") => Ok(Kind::Png),
-            Some(ending) => match Film::of(ending) {
-                Some(film) => Ok(Kind::Film(film)),
+            Some(ending) => match VideoFormat::of(ending) {
+                Some(video) => Ok(Kind::Video(video)),
                 None if out.is_dir() => Ok(Kind::Folder),
                 None => {
                     let known = "use .png, .gif, .apng, .mp4 or .webm, or end the name of a folder with `/`";
-                    Err(Error::file(out, format!("`.{ending}` is not the ending of a picture or a film: {known}")))
+                    Err(Error::file(out, format!("`.{ending}` is not the ending of a picture or a video: {known}")))
                 }
             },
             None => Ok(Kind::Folder),
@@ -330,7 +356,7 @@ mod tests {
         let of = |name: &str| Kind::of(&folder.path().join(name));
         for (name, kind) in [
             ("a.PNG", Kind::Png),
-            ("a.b.gif", Kind::Film(Film::Gif)),
+            ("a.b.gif", Kind::Video(VideoFormat::Gif)),
             ("orbit", Kind::Folder),
             ("orbit.2/", Kind::Folder),
             ("orbit.gif/", Kind::Folder),

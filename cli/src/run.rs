@@ -1,12 +1,12 @@
 //! A run's folder: `config.json`, `model.safetensors`, `metrics.jsonl`, `previews/`, `checkpoints/`, `summary.json`, `lock`, if it
-//! was asked for `tensorboard/`, and later results of `raygrad eval`, pictures, and the films of `raygrad view` in `films/`.
+//! was asked for `tensorboard/`, and later results of `raygrad eval`, pictures, and the videos of `raygrad view` in `videos/`.
 
 use std::fs::DirEntry;
 use std::io::ErrorKind;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
-use raygrad::nerf::{Budget, Config, Error, Extent, Model, Result, write_atomic};
+use raygrad::nerf::{Budget, Config, Error, Model, Result, SceneBox, write_atomic};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -49,7 +49,8 @@ pub struct RunConfig {
     /// The factor by which they were made smaller.
     pub downscale: usize,
     /// The region that the model covers.
-    pub extent: Extent,
+    #[serde(alias = "extent")]
+    pub scene_box: SceneBox,
     /// Where the photographs were taken from, on average.
     pub viewpoint: Viewpoint,
     /// Names of the photographs that it is trained on.
@@ -197,7 +198,7 @@ impl Run {
 
     /// The run's model as it was last saved.
     pub fn model(&self) -> Result<Model<f32>> {
-        Model::load(self.model_file(), self.config.config.clone(), self.config.extent)
+        Model::load(self.model_file(), self.config.config.clone(), self.config.scene_box)
     }
 }
 
@@ -217,9 +218,9 @@ impl RunConfig {
         if self.downscale == 0 {
             return Err(Error::setting("downscale", "must be 1 or more, is 0"));
         }
-        let [near, far] = self.extent.span;
+        let [near, far] = self.scene_box.near_far;
         if !(near >= 0.0 && near < far && far.is_finite()) {
-            return Err(Error::setting("extent.span", format!("{near} to {far} is no span")));
+            return Err(Error::setting("scene_box.near_far", format!("{near} to {far} is not a range of distances")));
         }
         let kept = self.keep_checkpoints;
         if !CHECKPOINTS.contains(&kept) {

@@ -4,8 +4,8 @@ use std::ffi::OsString;
 use std::fmt;
 use std::path::PathBuf;
 
-use raygrad::nerf::dataset::{Capture, Dataset, Frame, Reading, Scope, Split, Survey, evenly_spaced};
-use raygrad::nerf::{Error, Extent, Result};
+use raygrad::nerf::dataset::{Capture, Dataset, Frame, LoadOptions, SceneAnalysis, SceneType, Split, evenly_spaced};
+use raygrad::nerf::{Error, Result, SceneBox};
 use raygrad_scenes::{embedded, landscape, landscape_distances};
 use serde::{Deserialize, Serialize};
 
@@ -52,24 +52,24 @@ impl fmt::Display for Scene {
 
 impl Scene {
     /// What the scene's files say, and where it lies; `asked` overrules how far it goes.
-    pub fn open(&self, asked: Option<Scope>) -> Result<Opened> {
+    pub fn open(&self, asked: Option<SceneType>) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, asked)) };
         let capture = Capture::read(folder)?;
-        let survey = capture.survey(asked)?;
+        let survey = capture.analyze_scene(asked)?;
         Ok(Opened::new(self, Some((capture, survey)), asked))
     }
 
     /// The same, lying where a model has it, which may go on beyond its box.
-    pub fn open_for(&self, extent: &Extent, goes_on: bool) -> Result<Opened> {
+    pub fn open_for(&self, extent: &SceneBox, goes_on: bool) -> Result<Opened> {
         let Scene::Folder(folder) = self else { return Ok(Opened::new(self, None, None)) };
-        let Extent { placement, bounds, span: [near, far], ndc, .. } = *extent;
+        let SceneBox { transform: placement, bounds, near_far: [near, far], ndc, .. } = *extent;
         let scope = match (goes_on, ndc) {
-            (false, _) => Scope::Bounded,
-            (true, None) => Scope::Unbounded,
-            (true, Some(_)) => Scope::Forward,
+            (false, _) => SceneType::Bounded,
+            (true, None) => SceneType::Unbounded,
+            (true, Some(_)) => SceneType::ForwardFacing,
         };
         let reason = "as the model has it".to_owned();
-        let survey = Survey { placement, scope, bounds, near, far, ndc, reason };
+        let survey = SceneAnalysis { transform: placement, scene_type: scope, bounds, near, far, ndc, reason };
         Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
     }
 
@@ -88,13 +88,13 @@ pub struct Opened {
     pub depth: bool,
     scene: Scene,
     /// What a folder holds.
-    pub capture: Option<(Capture, Survey)>,
+    pub capture: Option<(Capture, SceneAnalysis)>,
     /// How far the scene is to go, if that was asked for.
-    asked: Option<Scope>,
+    asked: Option<SceneType>,
 }
 
 impl Opened {
-    fn new(scene: &Scene, capture: Option<(Capture, Survey)>, asked: Option<Scope>) -> Self {
+    fn new(scene: &Scene, capture: Option<(Capture, SceneAnalysis)>, asked: Option<SceneType>) -> Self {
         Opened { depth: false, scene: scene.clone(), capture, asked }
     }
 
@@ -123,7 +123,11 @@ impl Opened {
             Some((capture, survey)) => {
                 let (progress, words) = (Progress::new(), format!("{split} photographs read"));
                 let show = |done: usize, total: usize| progress.count(done, total, &words);
-                capture.load(split, survey, &Reading { downscale, views, distances: self.depth, progress: &show })?
+                capture.load(
+                    split,
+                    survey,
+                    &LoadOptions { downscale, views, distances: self.depth, progress: &show },
+                )?
             }
         };
         for name in &data.skipped {

@@ -75,24 +75,24 @@ struct Summary<'a> {
     psnr: Option<f64>,
     /// Samples placed on rays, evaluations of densities and of colours, and those of each that there would have been if
     /// nothing in the box were skipped.
-    marched: u64,
-    samples: u64,
-    shaded: u64,
+    placed_samples: u64,
+    density_queries: u64,
+    color_queries: u64,
     unskipped: u64,
     /// What was left out of these: 0 to 1, of the last.
     skipped_share: Option<Shares>,
     restarts: u32,
     /// Elements whose gradient was not finite.
-    skipped_gradients: u64,
+    non_finite_gradients: u64,
     threads: usize,
     processor: String,
 }
 
 #[derive(Debug, PartialEq, Serialize)]
 struct Shares {
-    marched: f64,
-    samples: f64,
-    shaded: f64,
+    placed_samples: f64,
+    density_queries: f64,
+    color_queries: f64,
 }
 
 /// Keeps account of a run while it is trained.
@@ -171,13 +171,13 @@ impl Account {
             averaged_steps: self.recent.len(),
             loss,
             psnr,
-            marched: stats.marched,
-            samples: stats.samples,
-            shaded: stats.shaded,
+            placed_samples: stats.placed_samples,
+            density_queries: stats.density_queries,
+            color_queries: stats.color_queries,
             unskipped: stats.unskipped,
             skipped_share: shares(stats),
             restarts: stats.restarts,
-            skipped_gradients: stats.skipped,
+            non_finite_gradients: stats.non_finite,
             threads: rayon::current_num_threads(),
             processor: machine::processor(),
         };
@@ -188,8 +188,12 @@ impl Account {
 /// How much of what there is to do was left out.
 fn shares(stats: &StepStats) -> Option<Shares> {
     let share = |count: u64| 1.0 - count as f64 / stats.unskipped as f64;
-    let StepStats { marched, samples, shaded, unskipped, .. } = *stats;
-    (unskipped > 0).then(|| Shares { marched: share(marched), samples: share(samples), shaded: share(shaded) })
+    let StepStats { placed_samples, density_queries, color_queries, unskipped, .. } = *stats;
+    (unskipped > 0).then(|| Shares {
+        placed_samples: share(placed_samples),
+        density_queries: share(density_queries),
+        color_queries: share(color_queries),
+    })
 }
 
 #[cfg(test)]
@@ -222,16 +226,26 @@ mod tests {
         (1..=150).for_each(|step| account.step(&at(step)));
         let preview = Previewed { name: "val/0".into(), held_out: true, step: 140, psnr: Some(20.5) };
         account.preview(preview.clone());
-        let counts =
-            StepStats { marched: 50, samples: 40, shaded: 10, unskipped: 200, skipped: 3, restarts: 2, ..at(150) };
+        let counts = StepStats {
+            placed_samples: 50,
+            density_queries: 40,
+            color_queries: 10,
+            unskipped: 200,
+            non_finite: 3,
+            restarts: 2,
+            ..at(150)
+        };
         let ended = write(&account, &counts, Some(Ended::Interrupted));
         assert_eq!(ended["ended"], "interrupted");
         assert_eq!((ended["loss"].as_f64(), ended["psnr"].as_f64()), (Some(100.5), Some(-201.0)));
         assert_eq!(ended["averaged_steps"], 100);
         assert_eq!(ended["budget"], json!({ "steps": 300 }));
         assert_eq!(ended["preview"], json!({ "name": "val/0", "held_out": true, "step": 140, "psnr": 20.5 }));
-        assert_eq!(ended["skipped_share"], json!({ "marched": 0.75, "samples": 0.8, "shaded": 0.95 }));
-        assert_eq!([&ended["skipped_gradients"], &ended["restarts"]], [&json!(3), &json!(2)]);
+        assert_eq!(
+            ended["skipped_share"],
+            json!({ "placed_samples": 0.75, "density_queries": 0.8, "color_queries": 0.95 })
+        );
+        assert_eq!([&ended["non_finite_gradients"], &ended["restarts"]], [&json!(3), &json!(2)]);
         // It diverges, and goes back to where there was no such preview.
         account.retreat();
         account.cut(139);

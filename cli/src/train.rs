@@ -8,13 +8,13 @@ use std::time::Duration;
 
 use clap::Parser;
 use raygrad::Schedule;
-use raygrad::nerf::dataset::{Dataset, Scope, Split};
+use raygrad::nerf::dataset::{Dataset, SceneType, Split};
 use raygrad::nerf::losses::DepthConfig;
-use raygrad::nerf::model::Refined;
+use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Background, Budget, Config, Error, Preset, Result, StepStats, TermConfig, Trainer};
+use raygrad::nerf::{Background, Budget, Config, Error, LossTermConfig, Preset, Result, StepStats, Trainer};
 use serde_json::Value;
 
 use super::cameras::Viewpoint;
@@ -25,7 +25,7 @@ use super::progress::spoken;
 use super::run::{CHECKPOINTS, Run, RunConfig, choose_folder, usual_checkpoints};
 use super::scene::{Opened, Scene};
 use super::summary::Ended;
-use super::view::{Listener, PlaceArgs, Window};
+use super::view::{Listener, PlaceArgs, TrainingViewer};
 use super::watch::Watch;
 use super::{checkpoint, doctor, interrupt, machine, memory, parse, watch};
 
@@ -42,98 +42,150 @@ const NEW: [&str; 15] = [
     "carve",
     "seed",
     "downscale",
-    "scope",
+    "scene_type",
     "background",
     "refine",
-    "depth",
+    "depth_loss",
     "near",
-    "term",
+    "loss",
     "out",
-    "no_encoding",
+    "no_positional_encoding",
     "set",
 ];
 
 /// Train a model on a scene
 ///
-/// Ctrl-C finishes the step, saves the model and exits with code 130; a second Ctrl-C exits at once. `--resume RUN` goes on.
+/// Ctrl-C finishes the current step, saves the model and exits with code 130. A second Ctrl-C exits at once.
+/// `raygrad train --resume RUN` resumes the run.
+///
+/// Example: raygrad train my-scene --downscale 4 --budget 10m --out my-run
 #[derive(Parser)]
 pub struct Args {
-    /// Folder of a capture (transforms.json, Blender, COLMAP or LLFF), or a scene that is built in: embedded or landscape
+    /// Capture folder, or a built-in scene
+    ///
+    /// Built-in scenes: embedded and landscape.
+    ///
+    /// raygrad reads transforms.json (nerfstudio, instant-ngp), transforms_train.json (Blender), sparse/0 (COLMAP)
+    /// and poses_bounds.npy (LLFF).
     #[arg(default_value = "embedded")]
     scene: Scene,
-    /// Kind of model: instant (a minute), voxel (no network), small (minutes) or classic (the paper's, hours)
-    #[arg(long, default_value_t)]
+    /// Kind of model
+    ///
+    /// instant: a hash grid, good within a minute. voxel: a dense grid without a network. small: a small MLP,
+    /// minutes. classic: the networks of the NeRF paper, hours.
+    #[arg(long, help_heading = "Model", default_value_t)]
     preset: Preset,
-    /// How much empty space to pass over: off, lossless or fast [default: fast for instant and voxel; small and classic
-    /// sample hierarchically instead]
-    #[arg(long)]
+    /// Empty-space skipping: off, near-lossless, fast
+    ///
+    /// near-lossless changes a rendered colour by at most 0.5 % of its range, fast by at most 5 %. The default is
+    /// fast for instant and voxel. small and classic sample hierarchically unless --skip is given.
+    #[arg(long, help_heading = "Model")]
     skip: Option<Skip>,
-    /// How many photographs must show a place to be empty, by being transparent there, for it to be left out from the start
-    /// (of fewer than 17, one of eight is enough); 0 trusts no mask [default: 3]
-    #[arg(long, value_name = "N")]
+    /// Images that must agree a cell is empty
+    ///
+    /// Visual hull carving: before training, cells become empty where at least N images are transparent. Of fewer
+    /// than 17 images, one in eight is enough. 0 trusts no mask. [default: 3]
+    #[arg(long, help_heading = "Scene", value_name = "N")]
     carve: Option<u32>,
-    /// Training time, such as 90s, 10m or 1.5h; schedules stretch to it, and the table of an instant model grows with it
-    /// [default: by preset]
-    #[arg(long, value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
+    /// Training time: 90s, 10m or 1.5h
+    ///
+    /// Schedules stretch to the budget, and the hash table of an instant model grows with it. The default depends
+    /// on the preset.
+    #[arg(long, help_heading = "Time", value_name = "TIME", value_parser = parse::duration, conflicts_with = "steps")]
     budget: Option<Duration>,
-    /// Number of training steps in place of a time: the same seed then gives the same model, bit by bit
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    /// Training steps, instead of a time
+    ///
+    /// The same seed and number of steps give the same model, bit for bit.
+    #[arg(long, help_heading = "Time", value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
-    /// Seed of everything random
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    /// Random seed
+    #[arg(long, help_heading = "Advanced", value_name = "N", default_value_t = 0)]
     seed: u64,
-    /// Train at 1/K of the images' size
-    #[arg(long, value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
+    /// Divide the image size by K
+    ///
+    /// A training pixel is the mean of the image pixels that it covers. Range: 1 to 16384.
+    #[arg(long, help_heading = "Scene", value_name = "K", default_value = "1", value_parser = parse::count(1 << 14))]
     downscale: usize,
-    /// How far the scene goes: bounded (an object before nothing), unbounded, or forward (unbounded, and all photographs look
-    /// the same way) [default: found out from the photographs]
-    #[arg(long)]
-    scope: Option<Scope>,
-    /// What lies behind images, opaque ones too if it is said: white, black or random [default: random for instant and voxel, else white]
-    #[arg(long)]
+    /// bounded, unbounded or forward-facing
+    ///
+    /// bounded: an object in front of an empty background. unbounded: the images show the surroundings.
+    /// forward-facing: unbounded, and all cameras look the same way. By default raygrad infers the type from images
+    /// and cameras, and prints it with the reason.
+    #[arg(long, help_heading = "Scene", value_name = "TYPE")]
+    scene_type: Option<SceneType>,
+    /// Background: white, black or random
+    ///
+    /// Lies behind transparent images, and behind opaque ones too if given. The default is random for instant and
+    /// voxel, and white for small and classic.
+    #[arg(long, help_heading = "Scene", value_name = "COLOR")]
     background: Option<Background>,
-    /// What is corrected while the scene is trained, of poses,focal,lens,exposure,vignetting: where cameras were, how long
-    /// their focal length is, how their lens bends light; how bright each photograph is and of what white balance, how dark
-    /// all are in their corners
-    #[arg(long, value_name = "PARTS", value_delimiter = ',')]
-    refine: Vec<Refined>,
-    /// Hold the scene to depths that were measured beside the photographs (depth_file_path in transforms.json), with that
-    /// weight in the loss: --depth, or --depth=0.2
-    #[arg(long, value_name = "WEIGHT", num_args = 0..=1, require_equals = true, default_missing_value = "0.1")]
-    depth: Option<f64>,
-    /// Distance from each camera before which nothing is looked for, in the capture's own units [default: found out]
-    #[arg(long, value_name = "LENGTH")]
+    /// Refine poses,focal,lens,exposure,vignetting
+    ///
+    /// Optimizes the listed parameters together with the scene: camera poses, focal lengths, lens coefficients,
+    /// per-image exposure and white balance, vignetting. Example: --refine poses,focal
+    #[arg(long, help_heading = "Model", value_name = "PARAMS", value_delimiter = ',')]
+    refine: Vec<RefinedParam>,
+    /// Fit measured depths
+    ///
+    /// Adds a loss on depths measured along with the images (`depth_file_path` in transforms.json). Without a
+    /// number its weight is 0.1. Example: --depth-loss=0.2
+    #[arg(long, help_heading = "Model", value_name = "WEIGHT", num_args = 0..=1, require_equals = true, default_missing_value = "0.1")]
+    depth_loss: Option<f64>,
+    /// Near plane, in capture units
+    ///
+    /// Training places no samples closer to a camera. By default raygrad derives the near plane from cameras and
+    /// points. Example: --near 0.2
+    #[arg(long, help_heading = "Scene", value_name = "LENGTH")]
     near: Option<f64>,
-    /// A term of the loss with its weight, such as entropy=1e-3 (rays meet something or nothing) or distortion=0.1 (what they meet is
-    /// in one place); 0 takes it away
-    #[arg(long, value_name = "NAME=WEIGHT", value_parser = parse::weight)]
-    term: Vec<(String, f64)>,
-    /// Go on with a run that was ended, from its last checkpoint: within the steps or the time that it was given, or those that
-    /// are said beside it (--steps, --budget), which count from its beginning
-    #[arg(long, value_name = "RUN", conflicts_with_all = NEW)]
+    /// Add a loss term, such as distortion=0.1
+    ///
+    /// Terms: distortion (a ray's light comes from one place), entropy (a ray is opaque or empty), orientation
+    /// (normals face the camera), depth, total_variation. A weight of 0 removes the term. Give the flag several
+    /// times for several terms.
+    #[arg(long, help_heading = "Model", value_name = "NAME=WEIGHT", value_parser = parse::weight)]
+    loss: Vec<(String, f64)>,
+    /// Resume a run from its last checkpoint
+    ///
+    /// The run continues to the steps or budget that it was given. --steps or --budget beside --resume set a new
+    /// total, counted from the start of the run.
+    #[arg(long, help_heading = "Time", value_name = "RUN", conflicts_with_all = NEW)]
     resume: Option<PathBuf>,
-    /// Training time between checkpoints, which --resume goes on from
-    #[arg(long, value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
-    checkpoint: Duration,
-    /// How many checkpoints stay, which `raygrad view` goes through [default: 2, or as before for a run that goes on]
-    #[arg(long, value_name = "N", value_parser = parse::within(CHECKPOINTS))]
+    /// Time between checkpoints
+    ///
+    /// Measured in training time. --resume continues from the last checkpoint.
+    #[arg(long, help_heading = "Time", value_name = "TIME", value_parser = parse::duration, default_value = "60s")]
+    checkpoint_every: Duration,
+    /// Checkpoints to keep
+    ///
+    /// At least 2: if the last one is damaged, the one before remains. `raygrad view` steps through the kept ones.
+    /// A resumed run keeps as many as before. Range: 2 to 16384. [default: 2]
+    #[arg(long, help_heading = "Time", value_name = "N", value_parser = parse::within(CHECKPOINTS))]
     keep_checkpoints: Option<usize>,
-    /// Write event files for TensorBoard too, into RUN/tensorboard; a run that has some goes on with them
-    #[arg(long)]
+    /// Also write TensorBoard event files
+    ///
+    /// They go to RUN/tensorboard. A resumed run with event files starts a new file.
+    #[arg(long, help_heading = "Output")]
     tensorboard: bool,
-    /// Serve a page to look at the scene while it is trained; see also `raygrad view`
-    #[arg(long)]
+    /// Serve the viewer while training
+    ///
+    /// `raygrad view RUN` shows a run that has ended.
+    #[arg(long, help_heading = "Viewer")]
     view: bool,
     #[command(flatten)]
     place: PlaceArgs,
-    /// New folder for the run [default: run, or the first free one of run-2, run-3 ...]
-    #[arg(long, value_name = "RUN")]
+    /// New run folder [default: run, run-2, ...]
+    #[arg(long, help_heading = "Output", value_name = "RUN")]
     out: Option<PathBuf>,
-    /// Leave positional encoding out, to see what it is for
-    #[arg(long)]
-    no_encoding: bool,
-    /// Change one number of the preset, such as sampler.samples=16384; config.json in a run's folder shows them all
-    #[arg(long, value_name = "NAME=VALUE", value_parser = parse::setting)]
+    /// Leave out positional encoding
+    ///
+    /// Shows what the encoding is for: fine detail is lost.
+    #[arg(long, help_heading = "Advanced")]
+    no_positional_encoding: bool,
+    /// Set a config key: sampler.samples=16384
+    ///
+    /// Keys are those of config.json in the run folder; values are JSON. Give the flag several times for several
+    /// keys.
+    #[arg(long, help_heading = "Advanced", value_name = "NAME=VALUE", value_parser = parse::setting)]
     set: Vec<(String, Value)>,
 }
 
@@ -181,8 +233,8 @@ pub fn run(args: &Args) -> Result<Trained> {
 /// Trains a new run.
 fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
     let folder = choose_folder(args.out.as_deref())?;
-    let mut scene = args.scene.open(args.scope)?;
-    scene.depth = args.depth.is_some() || args.term.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0);
+    let mut scene = args.scene.open(args.scene_type)?;
+    scene.depth = args.depth_loss.is_some() || args.loss.iter().any(|(kind, weight)| kind == "depth" && *weight > 0.0);
     warn_of_memory(&scene, args.downscale);
     let mut data = scene.load(Split::Train, args.downscale, usize::MAX)?;
     if let Some(near) = args.near {
@@ -204,16 +256,16 @@ fn begin(args: &Args, listener: Option<Listener>) -> Result<Trained> {
 /// Goes on with a run from its last checkpoint.
 fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trained> {
     let mut run = Run::open(folder)?;
-    let RunConfig { extent, downscale, config, .. } = run.config.clone();
+    let RunConfig { scene_box: extent, downscale, config, .. } = run.config.clone();
     let budget = match (args.given(), run.config.budget) {
         (Some(budget), _) | (None, Some(budget)) => budget,
         (None, None) => return Err(Error::setting("budget", "the run does not know its own: say --budget or --steps")),
     };
     let mut scene = run.scene(None)?.open_for(&extent, config.unbounded)?;
-    scene.depth = config.terms.iter().any(|term| term.kind() == "depth");
+    scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
     let data = scene.load(Split::Train, downscale, usize::MAX)?;
-    let [near, far] = extent.span;
-    let data = Dataset { bounds: extent.bounds, near, far, placement: extent.placement, ndc: extent.ndc, ..data };
+    let [near, far] = extent.near_far;
+    let data = Dataset { bounds: extent.bounds, near, far, placement: extent.transform, ndc: extent.ndc, ..data };
     let names = data.frames.iter().map(|frame| &frame.name);
     if !names.eq(&run.config.photographs) {
         let what = format!("the run was trained on other photographs than {} has now", run.config.scene);
@@ -245,8 +297,8 @@ fn train(
     preview: Preview,
     listener: Option<Listener>,
 ) -> Result<Trained> {
-    let mut window = listener.map(|listener| Window::open(listener, &run, &trainer)).transpose()?;
-    let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint, preview, args.tensorboard)?;
+    let mut window = listener.map(|listener| TrainingViewer::open(listener, &run, &trainer)).transpose()?;
+    let mut watch = Watch::new((&run, lock), &trainer, budget, args.checkpoint_every, preview, args.tensorboard)?;
     interrupt::listen();
     let (mut diverged, mut ended_by_page) = (None, false);
     for retreats in 0.. {
@@ -303,7 +355,7 @@ fn train(
 impl Args {
     fn config(&self, data: &Dataset) -> Result<Config> {
         let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        config = config.for_budget(self.budget().samples(), data.footprints());
+        config = config.for_budget(self.budget().samples(), data.pixels_per_side());
         if let Some(background) = self.background {
             config.background = background;
         }
@@ -314,11 +366,11 @@ impl Args {
         if let Some(skip) = self.skip {
             config = config.with_skip(skip);
         }
-        config = config.with_scope(data.scope);
+        config = config.with_scene_type(data.scope);
         if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
             let what = format!(
                 "{} samples evenly along rays, and those of a scene that goes on are thousands of units long: use another, add \
-                 `--skip fast`, or say `--scope bounded`",
+                 `--skip fast`, or say `--scene-type bounded`",
                 self.preset
             );
             return Err(Error::setting("preset", what));
@@ -331,14 +383,14 @@ impl Args {
             sampler.occupancy.skip.carving = carve;
         }
         config = config.with_refined(&self.refine);
-        if let Some(weight) = self.depth {
-            config.terms.push(TermConfig::new(DepthConfig { weight }));
+        if let Some(weight) = self.depth_loss {
+            config.loss_terms.push(LossTermConfig::new(DepthConfig { weight }));
         }
-        for (kind, weight) in &self.term {
+        for (kind, weight) in &self.loss {
             config = with_term(config, kind, *weight)?;
         }
-        if self.no_encoding {
-            config = config.without_encoding();
+        if self.no_positional_encoding {
+            config = config.without_positional_encoding();
         }
         self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))
     }
@@ -348,7 +400,7 @@ impl Args {
             raygrad: env!("CARGO_PKG_VERSION").to_owned(),
             scene: self.scene.absolute()?,
             downscale: self.downscale,
-            extent: trainer.model.extent,
+            scene_box: trainer.model.scene_box,
             viewpoint: Viewpoint::of(data),
             photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
             budget: Some(self.budget()),
@@ -410,12 +462,12 @@ fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
 
 /// The configuration with a term of the loss of that weight, and without it at 0.
 fn with_term(mut config: Config, kind: &str, weight: f64) -> Result<Config> {
-    config.terms.retain(|term| term.kind() != kind);
+    config.loss_terms.retain(|term| term.kind() != kind);
     if weight != 0.0 {
         let bad = |e| Error::setting("term", format!("cannot be {kind}={weight}: {e}"));
         // Which terms there are, a configuration knows when it is read.
         let mut all = serde_json::to_value(&config).map_err(bad)?;
-        if let Some(terms) = all.get_mut("terms").and_then(Value::as_array_mut) {
+        if let Some(terms) = all.get_mut("loss_terms").and_then(Value::as_array_mut) {
             terms.push(serde_json::json!({ "kind": kind, "weight": weight }));
         }
         config = serde_json::from_value(all).map_err(bad)?;
@@ -453,7 +505,7 @@ fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Res
             capture.format,
             capture.present().count(),
             capture.views.len(),
-            survey.scope,
+            survey.scene_type,
             survey.reason
         ))?;
     }

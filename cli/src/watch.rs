@@ -157,7 +157,7 @@ impl<'a> Watch<'a> {
         // Views look at a finished model, and training goes on from one that is not; and not from one that may have diverged,
         // unless there is no later one to come.
         let ends = stops || fraction >= 1.0;
-        let good = stats.stuck == 0 || (ends && !stats.ends_diverged());
+        let good = stats.non_finite_steps == 0 || (ends && !stats.ends_diverged());
         if (ends || stats.train_seconds >= self.next_save) && good {
             self.next_save = stats.train_seconds + self.interval;
             self.attempt(|watch| watch.save(trainer, !ends));
@@ -179,11 +179,11 @@ impl<'a> Watch<'a> {
     /// Takes a trainer that has diverged, for that `reason`, back to a checkpoint, from where it goes on with lower learning
     /// rates, and says so. If that cannot be, it says why and gives `false`.
     pub fn retreat(&mut self, trainer: &mut Trainer, reason: &str) -> bool {
-        let (end, pace) = (trainer.stats().step, trainer.pace());
+        let (end, pace) = (trainer.stats().step, trainer.lr_scale());
         // What was good when it was written may have been on its way out of all bounds: the second time it is the one before.
         let back = self.keep().and_then(|()| checkpoint::step_back(self.run, self.back)).and_then(|()| {
             checkpoint::load(self.run, trainer)?;
-            trainer.set_pace(SLOWER * pace);
+            trainer.set_lr_scale(SLOWER * pace);
             checkpoint::save(self.run, trainer)?;
             self.cut(trainer)
         });

@@ -67,7 +67,7 @@ fn measure(config: &HashGridConfig, name: &str, position: fn(usize, usize) -> f6
     let encode = each_tile(|t| {
         std::hint::black_box(encoding.forward(&[&tiles[t].0, &table], &pool));
     });
-    let constants = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
+    let constants = AdamConfig { beta2: 0.99, eps: 1e-15, ..AdamConfig::default() };
     let (mut scatter, mut adam, mut moved) = (0.0, 0.0, 0);
     for (l, level) in grid.levels().iter().enumerate() {
         let shape = [level.rows.len(), grid.features()];

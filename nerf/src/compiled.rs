@@ -5,7 +5,7 @@
 
 use crate::analytic::{Integral, integrate};
 use crate::volume::quadrature::Quadrature;
-use crate::{DenseView, Model, Result, analytic};
+use crate::{Model, ReferenceRender, Result, analytic};
 
 /// The entries in f64; those in f32 are used by training and views.
 #[allow(clippy::type_complexity)] // the types of the entries
@@ -13,8 +13,8 @@ use crate::{DenseView, Model, Result, analytic};
 #[inline(never)]
 pub fn in_double() -> (
     fn(&Model<f32>) -> Result<Model<f64>>,
-    fn(&Model<f64>, &crate::Camera, [f64; 3], usize) -> DenseView,
+    fn(&Model<f64>, &crate::Camera, [f64; 3], usize) -> ReferenceRender,
     fn(&analytic::AnalyticScene, Quadrature, usize) -> Integral,
 ) {
-    (Model::cast, Model::dense_view, integrate::<f64>)
+    (Model::cast, Model::render_reference, integrate::<f64>)
 }

@@ -1,7 +1,7 @@
 //! The scenes as datasets: what a capture's files would give.
 
 use glam::DVec3;
-use raygrad_nerf::dataset::{Dataset, Frame, Image, Placement, Scope, Split};
+use raygrad_nerf::dataset::{Dataset, Frame, Image, SceneTransform, SceneType, Split};
 use raygrad_nerf::{Camera, Ndc};
 
 use crate::{DISTANCE, Landscape, Scene, test_cameras, train_cameras, val_cameras, walk_cameras, window_cameras};
@@ -23,7 +23,7 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
     let bounds = [low - 0.02, high + 0.02];
     let reach = bounds[1].max(-bounds[0]).length();
     let frames = frames(split, embedded_cameras(split, size), |camera| scene.render(camera, SAMPLES).color);
-    dataset(frames, bounds, [DISTANCE - reach, DISTANCE + reach], Scope::Bounded)
+    dataset(frames, bounds, [DISTANCE - reach, DISTANCE + reach], SceneType::Bounded)
 }
 
 /// The cameras of [`embedded`] of a split, whose images are `size` pixels wide and high.
@@ -50,7 +50,7 @@ pub fn landscape(split: Split, width: usize) -> Dataset {
     let eyes = Split::ALL.into_iter().flat_map(|split| walk_cameras(split, 4)).map(|camera| camera.pose.translation);
     let bounds = eyes.fold(Landscape::new().bulldozer_bounds(), |[low, high], eye| [low.min(eye), high.max(eye)]);
     let frames = outdoors(split, width, walk_cameras);
-    dataset(frames, [bounds[0] - 0.02, bounds[1] + 0.02], [NEAR, FAR], Scope::Unbounded)
+    dataset(frames, [bounds[0] - 0.02, bounds[1] + 0.02], [NEAR, FAR], SceneType::Unbounded)
 }
 
 /// The same landscape as it is seen ahead from a window before the bulldozer: 30 views to train on, 3 to validate, 6 to test,
@@ -63,13 +63,13 @@ pub fn landscape_ahead(split: Split, width: usize) -> Dataset {
     let near = 0.5;
     let cameras: Vec<Camera> = Split::ALL.into_iter().flat_map(|split| window_cameras(split, 4)).collect();
     let frames = outdoors(split, width, window_cameras);
-    let data = dataset(frames, [DVec3::splat(-1.5), DVec3::splat(1.5)], [near, FAR], Scope::Forward);
+    let data = dataset(frames, [DVec3::splat(-1.5), DVec3::splat(1.5)], [near, FAR], SceneType::ForwardFacing);
     // They look ahead.
     Dataset { ndc: Ndc::around(&cameras, near).ok(), ..data }
 }
 
-fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope: Scope) -> Dataset {
-    Dataset { frames, bounds, near, far, scope, ndc: None, placement: Placement::default(), skipped: vec![] }
+fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope: SceneType) -> Dataset {
+    Dataset { frames, bounds, near, far, scope, ndc: None, placement: SceneTransform::default(), skipped: vec![] }
 }
 
 /// What cameras of a split see.
@@ -123,7 +123,7 @@ mod tests {
     #[test]
     fn nothing_is_near_the_window() {
         let data = landscape_ahead(Split::Test, 16);
-        assert_eq!((data.frames.len(), data.scope), (6, Scope::Forward));
+        assert_eq!((data.frames.len(), data.scope), (6, SceneType::ForwardFacing));
         for frame in &data.frames {
             let distances = landscape_distances(&frame.camera);
             assert!(distances.data.iter().all(|d| *d == 0.0 || f64::from(*d) > data.near));

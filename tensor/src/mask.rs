@@ -250,13 +250,13 @@ impl<T: Scalar> Tensor<T> {
 
     /// Where elements equal those of another tensor or a number; a NaN equals nothing.
     #[track_caller]
-    pub fn equals(&self, other: impl Into<Tensor<T>>) -> Mask {
+    pub fn elementwise_eq(&self, other: impl Into<Tensor<T>>) -> Mask {
         self.compare(&other.into(), |a, b| a == b)
     }
 
     /// Where elements are NaN.
     pub fn is_nan(&self) -> Mask {
-        !self.equals(self)
+        !self.elementwise_eq(self)
     }
 
     /// The elements where `mask` is true, and those of `other` elsewhere; all three broadcast together (`numpy.where`,
@@ -274,7 +274,7 @@ impl<T: Scalar> Tensor<T> {
     /// # Panics
     /// If the mask has another shape.
     #[track_caller]
-    pub fn masked(&self, mask: &Mask) -> Self {
+    pub fn masked_select(&self, mask: &Mask) -> Self {
         assert_eq!(self.shape(), mask.shape(), "a mask of another shape");
         let mut kept = Vec::with_capacity(mask.count());
         kept.extend(self.iter().zip(mask.as_slice()).filter(|(_, keep)| **keep).map(|(x, _)| x));
@@ -343,7 +343,7 @@ mod tests {
         is(x.le(&row), [true, true, false, false]);
         is(x.gt(&row), [false, false, true, false]);
         is(x.ge(2.0), [false, true, true, false]);
-        is(x.equals(x.t()), [true, false, false, false]);
+        is(x.elementwise_eq(x.t()), [true, false, false, false]);
         is(x.is_nan(), [false, false, false, true]);
         is(x.gt(1.5) & x.lt(2.5), [false, true, false, false]);
         is(&x.gt(2.5) | &x.lt(1.5), [true, false, true, false]);
@@ -355,7 +355,7 @@ mod tests {
         assert_eq!((x.gt(1.5).count(), x.gt(1.5).nonzero().as_slice()), (2, &[1, 2][..]));
         assert_eq!(x.gt(1.5).cast::<f32>(), Tensor::from([[0.0, 1.0], [1.0, 0.0]]));
         assert_eq!(row.where_(&x.is_nan(), &x), Tensor::from([[1.0, 2.0], [3.0, 2.0]]));
-        assert_eq!(x.t().masked(&x.t().gt(0.0)), Tensor::from([1.0, 3.0, 2.0]));
+        assert_eq!(x.t().masked_select(&x.t().gt(0.0)), Tensor::from([1.0, 3.0, 2.0]));
     }
 
     #[test]

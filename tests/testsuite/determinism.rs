@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 /// Small networks, with more tiles than there are slots that sum gradients, and a last tile that is not full.
 fn config(seed: u64) -> Config {
-    let field = ClassicConfig { depth: 2, width: 32, skips: vec![], view_width: 16, ..ClassicConfig::paper() };
+    let field = ClassicConfig { depth: 2, width: 32, skip_layers: vec![], view_width: 16, ..ClassicConfig::paper() };
     let sampler = HierarchicalConfig {
         proposal: field.clone(),
         coarse: 8,
@@ -59,7 +59,7 @@ fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: Option<usiz
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
         let done: Vec<StepStats> = (0..steps).map(|step| trainer.step(f64::from(step) / f64::from(steps))).collect();
         trainer.model.finish();
-        let view = trainer.model.view(&data.frames[0].camera, [1.0; 3]);
+        let view = trainer.model.render(&data.frames[0].camera, [1.0; 3]);
         Outcome {
             params: trainer.model.params.values().iter().flat_map(|x| bits(x.as_slice())).collect(),
             pixels: [view.color, view.depth, view.opacity].iter().flat_map(|image| bits(&image.data)).collect(),

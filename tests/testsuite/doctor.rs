@@ -1,8 +1,8 @@
 //! Faults that are planted in a good capture are found by name, and a good capture has none.
 
-use raygrad::nerf::dataset::{Capture, Format, Point, Scope, Split, Survey, View, evenly_spaced};
+use raygrad::nerf::dataset::{Capture, Format, Point, SceneAnalysis, SceneType, Split, View, evenly_spaced};
 use raygrad::nerf::doctor::{
-    Finding, FindingKind as Kind, Options, Report, Resolution, Severity, examine, examine_cameras,
+    DoctorOptions, Finding, FindingKind as Kind, Report, Resolution, Severity, examine, examine_cameras,
 };
 use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
 use raygrad::nerf::{Camera, Image, Lens};
@@ -30,7 +30,7 @@ static FILES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| PHOTOGRAPHS.iter().map(|
 struct Planted {
     folder: TempDir,
     capture: Capture,
-    scope: Option<Scope>,
+    scope: Option<SceneType>,
 }
 
 impl Planted {
@@ -69,8 +69,8 @@ impl Planted {
         self.capture.views[view].mask = Some(path);
     }
 
-    fn survey(&self) -> Option<Survey> {
-        self.capture.survey(self.scope).ok()
+    fn survey(&self) -> Option<SceneAnalysis> {
+        self.capture.analyze_scene(self.scope).ok()
     }
 
     fn cameras(&self) -> Report {
@@ -78,7 +78,7 @@ impl Planted {
     }
 
     fn report(&self) -> Report {
-        examine(&self.capture, self.survey().as_ref(), &Options::default())
+        examine(&self.capture, self.survey().as_ref(), &DoctorOptions::default())
     }
 }
 
@@ -101,7 +101,7 @@ fn a_good_capture_has_no_findings() {
     let report = Planted::new().report();
     assert!(report.findings.is_empty(), "{:#?}", report.findings);
     assert!(report.facts.agreement.unwrap() > 0.4, "{:?}", report.facts.agreement);
-    let parts: Vec<_> = report.facts.parts.iter().map(|part| (part.split, part.present, part.absent)).collect();
+    let parts: Vec<_> = report.facts.subsets.iter().map(|part| (part.split, part.present, part.absent)).collect();
     assert_eq!(parts, [(Split::Train, 40, 0), (Split::Test, 8, 0)]);
     assert_eq!(report.facts.resolutions, [Resolution { width: SIZE, height: SIZE, photographs: 48 }]);
     let again: Report = serde_json::from_str(&serde_json::to_string(&report).unwrap()).unwrap();
@@ -346,7 +346,7 @@ fn places_that_give_no_depth_or_leave_gaps() {
     found(&planted.cameras(), Kind::CoverageGap, Note, &[], &[Kind::FewPhotographs]);
 
     let mut planted = Planted::new();
-    planted.scope = Some(Scope::Bounded);
+    planted.scope = Some(SceneType::Bounded);
     planted.camera(7).pose.translation *= 0.2;
     planted.camera(8).pose.matrix3 *= DMat3::from_rotation_y(3.0);
     let report = planted.cameras();
@@ -365,7 +365,7 @@ fn few_photographs_or_none_held_out() {
     found(&planted.cameras(), Kind::FewPhotographs, Error, &[], &[]);
     planted.capture.views.clear();
     let report = planted.report();
-    assert!(report.facts.lie.is_none());
+    assert!(report.facts.layout.is_none());
     found(&report, Kind::FewPhotographs, Error, &[], &[]);
 }
 
@@ -436,7 +436,7 @@ fn a_good_capture_through_a_lens_half_masked_and_lying_on_its_side_has_none_eith
     let facts = report.facts;
     assert!(facts.agreement.unwrap() > 0.4, "{:?}", facts.agreement);
     assert_eq!(facts.resolutions.iter().map(|r| [r.width, r.height]).collect::<Vec<_>>(), [size]);
-    let lie = facts.lie.unwrap();
+    let lie = facts.layout.unwrap();
     assert!(lie.up.dot(turn.transform_vector3(DVec3::Z)) > 0.98, "{lie:?}");
     assert!(lie.middle.length() < 0.5 && lie.near < lie.far, "{lie:?}");
     assert_eq!((facts.lenses.len(), facts.points), (1, 0));

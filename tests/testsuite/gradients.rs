@@ -9,8 +9,8 @@ use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::volume::Weights;
 use raygrad::nerf::{
-    ClassicConfig, Config, Extent, FieldConfig, InstantConfig, Loss as LossKind, Model, PositionalEncoding, Preset,
-    Rays, SamplerConfig, Samples, VoxelConfig, catalogue, clip_span,
+    ClassicConfig, Config, FieldConfig, InstantConfig, Loss as LossKind, Model, PositionalEncoding, Preset, Rays,
+    SamplerConfig, Samples, SceneBox, VoxelConfig, catalogue, clip_near_far,
 };
 use raygrad::{Activation, Bound, Op, Real, Scalar, Segments, Tape, Tensor, Var};
 use raygrad_scenes::{Scene, train_cameras};
@@ -63,14 +63,14 @@ impl Loss<f32> {
         // A cube of +-1: positions then need no scaling, and both precisions encode the very same numbers. The highest
         // frequency would amplify the rounding of a scaled position 1600 times.
         let [low, high] = Scene::bulldozer().bounds().map(|corner| corner.signum());
-        let extent = Extent::new([low, high], [2.0, 6.0]);
+        let extent = SceneBox::new([low, high], [2.0, 6.0]);
         let mut rng = StdRng::seed_from_u64(seed);
         let mut batch = Rays::new();
         let cameras = train_cameras(5, 16);
         while batch.len() < rays {
             let camera = &cameras[batch.len() % cameras.len()];
             let ray = camera.pixel_ray(rng.random_range(4..12), rng.random_range(4..12));
-            batch.push(&ray, clip_span(&ray, extent.bounds, extent.span));
+            batch.push(&ray, clip_near_far(&ray, extent.bounds, extent.near_far));
         }
         let model = Model::new(config, extent, seed).unwrap();
         // So many binary digits that positions are the same in both precisions.
@@ -88,7 +88,7 @@ impl Loss<f32> {
 
     /// The same numbers in double precision.
     fn double(&self) -> Loss<f64> {
-        let mut model = Model::new(self.model.config.clone(), self.model.extent, 0).unwrap();
+        let mut model = Model::new(self.model.config.clone(), self.model.scene_box, 0).unwrap();
         model.params.assign(&self.model.params);
         let samples = self.samples.iter().map(Samples::cast).collect();
         Loss { model, samples, target: self.target.cast(), background: self.background.cast() }
@@ -122,7 +122,7 @@ fn tiny() -> Config {
     let field = ClassicConfig {
         depth: 3,
         width: 8,
-        skips: vec![2],
+        skip_layers: vec![2],
         view_width: 6,
         position_levels: 3,
         direction_levels: 2,

@@ -2,7 +2,7 @@
 
 use raygrad::nerf::dataset::{Dataset, Split, load};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
-use raygrad::nerf::pictures::metrics;
+use raygrad::nerf::imaging::metrics;
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
@@ -17,7 +17,7 @@ use std::sync::Arc;
 /// Networks that learn the rough shape of a scene in seconds.
 fn config() -> Config {
     let paper = ClassicConfig::paper();
-    let fine = ClassicConfig { depth: 3, width: 48, skips: vec![], view_width: 24, position_levels: 5, ..paper };
+    let fine = ClassicConfig { depth: 3, width: 48, skip_layers: vec![], view_width: 24, position_levels: 5, ..paper };
     let coarse = ClassicConfig { depth: 2, width: 24, position_levels: 4, ..fine.clone() };
     let sampler = HierarchicalConfig {
         proposal: coarse,
@@ -56,11 +56,11 @@ fn learn(config: Config, steps: u64, train: Dataset, test: &Dataset) -> [f64; 2]
     let white = [1.0; 3];
     let mut trainer = Trainer::new(config, Arc::new(train)).unwrap();
     trainer.run(Budget::Steps(steps), |_| ControlFlow::Continue(()));
-    assert_eq!(trainer.stats().skipped, 0, "no gradient was infinite or NaN");
+    assert_eq!(trainer.stats().non_finite, 0, "no gradient was infinite or NaN");
     let mut sums = [0.0; 2];
     for frame in &test.frames {
         let truth = frame.image.over(white);
-        let learnt = trainer.model.view(&frame.camera, white).color;
+        let learnt = trainer.model.render(&frame.camera, white).color;
         let blank = Image { data: vec![1.0; truth.data.len()], ..truth.clone() };
         sums[0] += metrics::psnr(&learnt, &truth);
         sums[1] += metrics::psnr(&blank, &truth);

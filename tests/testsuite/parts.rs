@@ -9,10 +9,11 @@ use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::sampling::proposal::ProposalConfig;
 use raygrad::nerf::space::occupancy::{OccupancyConfig, Skip, Skipping};
 use raygrad::nerf::volume::quadrature::Quadrature;
-use raygrad::nerf::volume::{Lit, RayVars};
+use raygrad::nerf::volume::{RayVars, VisibleSamples};
 use raygrad::nerf::{
-    Budget, Config, Density, Extent, Field, FieldConfig, Fields, InstantConfig, Jitter, Kind, Model, Preset, Query,
-    Ray, Rays, Result, SamplerConfig, Samples, Seen, Site, Space, TermConfig, Trainer, register,
+    Budget, BuildContext, ComponentConfig, Config, Density, Field, FieldConfig, Fields, InstantConfig, Jitter,
+    LossTermConfig, Model, Preset, Query, Ray, Rays, Result, SamplerConfig, Samples, SceneBox, Space, Trainer,
+    ViewInputs, register,
 };
 use raygrad::{Bound, Init, Linear, Schedule};
 use raygrad::{Scalar, Tape, Tensor, Var};
@@ -51,10 +52,10 @@ fn comes_back(model: &Model<f32>) -> Vec<f32> {
     let text = serde_json::to_string(&model.config).unwrap();
     let read: Config = serde_json::from_str(&text).unwrap();
     assert_eq!(read, model.config);
-    let extent: Extent = serde_json::from_str(&serde_json::to_string(&model.extent).unwrap()).unwrap();
+    let extent: SceneBox = serde_json::from_str(&serde_json::to_string(&model.scene_box).unwrap()).unwrap();
     let loaded = Model::load(&path, read, extent).unwrap();
     let camera = &DATA.frames[1].camera;
-    let [one, other] = [model, &loaded].map(|model| model.view(camera, [1.0; 3]).color.data);
+    let [one, other] = [model, &loaded].map(|model| model.render(camera, [1.0; 3]).color.data);
     assert_eq!(one, other);
     one
 }
@@ -74,26 +75,26 @@ fn proposals_are_trained_rendered_and_stored() {
         let id = before.find(name).unwrap();
         assert!(before.get(id) != trainer.model.params.get(id), "{name} has learned nothing");
     }
-    assert!(names.len() == 6 && trainer.stats().samples > trainer.stats().shaded);
+    assert!(names.len() == 6 && trainer.stats().density_queries > trainer.stats().color_queries);
     trainer.model.finish();
     // Proposals are where the field is: most of the last samples of a ray that meets something lie where weights are.
     let model = &trainer.model;
     let picture = comes_back(model);
     assert!(picture.iter().all(|x| x.is_finite()) && picture.iter().any(|&x| x < 0.5));
-    let double = model.cast::<f64>().unwrap().dense_view(&DATA.frames[1].camera, [1.0; 3], 1).picture();
+    let double = model.cast::<f64>().unwrap().render_reference(&DATA.frames[1].camera, [1.0; 3], 1).picture();
     let worst = double.color.data.iter().zip(&picture).map(|(a, b)| (a - b).abs());
     let worst = worst.fold(0.0, raygrad::Real::maximum);
     assert!(worst < 0.02, "what views leave out, and digits: {worst}");
     let tape = Tape::new();
     let params = model.params.bind_constant(&tape);
     let mut rays = Rays::new();
-    rays.push_pixel(&DATA.frames[1].camera, [10, 10], model.extent.bounds, model.extent.span);
+    rays.push_pixel(&DATA.frames[1].camera, [10, 10], model.scene_box.bounds, model.scene_box.near_far);
     let purpose = raygrad::nerf::Purpose::View { finer: 1 };
     let sampled = model.sampler.sample(&Query::new(&*model.field, &params), &rays, purpose, &mut Jitter::Middle);
     let [near, far] = rays.spans[0].map(f64::from);
-    let t = sampled.steps.t.as_slice();
+    let t = sampled.samples.t.as_slice();
     let spread = f64::from(t[t.len() - 2] - t[1]) / (far - near);
-    assert!(spread < 0.5 && sampled.levels.len() == 2, "of the span: {spread}");
+    assert!(spread < 0.5 && sampled.histograms.len() == 2, "of the span: {spread}");
 }
 
 #[test]
@@ -108,7 +109,7 @@ fn what_lies_beyond_the_box_is_trained_and_seen_if_the_scene_goes_on() {
     config.unbounded = true;
     config.sampler.get_mut::<MarchingConfig>().unwrap().cone = 1.0 / 256.0;
     let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
-    let [inner, outer] = [trainer.model.extent.bounds, trainer.model.reach()];
+    let [inner, outer] = [trainer.model.scene_box.bounds, trainer.model.reach()];
     assert!((outer[1].x - outer[0].x) > 1.9 * (inner[1].x - inner[0].x));
     let [first, last] = train(&mut trainer, 80);
     assert!(last < 0.5 * first, "{first} to {last}");
@@ -116,7 +117,7 @@ fn what_lies_beyond_the_box_is_trained_and_seen_if_the_scene_goes_on() {
     comes_back(&trainer.model);
     // Rays that miss the box meet something all the same.
     let camera = &DATA.frames[1].camera;
-    let seen = trainer.model.view(camera, [1.0; 3]).opacity;
+    let seen = trainer.model.render(camera, [1.0; 3]).opacity;
     let misses = |i: &usize| {
         let ray = camera.pixel_ray(i % camera.width, i / camera.width);
         raygrad::nerf::intersect_box(&ray, inner).is_none()
@@ -140,10 +141,10 @@ struct Bare {
 
 static ASKED: [AtomicUsize; 2] = [AtomicUsize::new(0), AtomicUsize::new(0)];
 
-impl Kind<Fields> for BareConfig {
+impl ComponentConfig<Fields> for BareConfig {
     const KIND: &'static str = "bare";
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
-        let Site { space, params, name, rng, .. } = site;
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
+        let BuildContext { space, params, name, rng, .. } = site;
         let mut layer = |part: &str, sizes| {
             let activation = raygrad::Activation::Identity;
             Linear::new(params, &format!("{name}.{part}"), sizes, activation, Init::Glorot, &mut *rng)
@@ -159,7 +160,7 @@ impl<T: Scalar> Field<T> for Bare {
         let value = features.slice_axis(1, ..1).reshape(&[positions.shape()[0]]) * 5.0;
         Density { value, log: true, features }
     }
-    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         ASKED[usize::from(seen.frames.is_some())].fetch_add(1, Relaxed);
         if let Some(frames) = seen.frames {
             assert!(frames.len() == seen.segments.len() && frames.iter().all(|&i| (i as usize) < DATA.frames.len()));
@@ -199,7 +200,7 @@ fn a_field_of_ones_own_is_built_trained_rendered_saved_and_loaded() {
 
 /// A model of the instant kind in double precision with something in it, and rays through it.
 fn busy() -> (Model<f64>, Rays<f64>) {
-    let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]);
+    let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]);
     let mut model = Model::<f64>::new(instant(), extent, 5).unwrap();
     let ids: Vec<_> = model.params.ids().collect();
     for id in ids {
@@ -225,10 +226,10 @@ fn two_passes_show_and_differentiate_what_one_does_with_every_rule() {
         let query = Query::new(&*model.field, &params);
         let steps = stratified(&rays, 24, &mut Jitter::Middle, tape.pool());
         let [one, two] = [0.0, 1e-300].map(|least| rule.render(&query, &steps, least));
-        assert_eq!(one.kept, two.kept, "{rule}: nothing is left out");
-        let color = |seen: &Lit<'_, f64>| seen.rendered.color.value().as_slice().to_vec();
+        assert_eq!(one.visible, two.visible, "{rule}: nothing is left out");
+        let color = |seen: &VisibleSamples<'_, f64>| seen.rendered.color.value().as_slice().to_vec();
         assert!(color(&one) == color(&two) && color(&one).iter().any(|&x| x > 0.1), "{rule}: {:?}", color(&one));
-        let grads = |seen: &Lit<'_, f64>| {
+        let grads = |seen: &VisibleSamples<'_, f64>| {
             let mixed = seen.rendered.color.square().sum() + seen.rendered.depth().sum() * 0.1;
             mixed.grad(&params.vars())
         };
@@ -240,7 +241,7 @@ fn two_passes_show_and_differentiate_what_one_does_with_every_rule() {
         }
         // And with a limit that leaves something out.
         let some = rule.render(&query, &steps, 0.8);
-        assert!(some.kept < one.kept, "{rule}");
+        assert!(some.visible < one.visible, "{rule}");
         for (a, b) in color(&one).into_iter().zip(color(&some)) {
             assert!((a - b).abs() <= 0.8, "{rule}: {a} {b}");
         }
@@ -317,7 +318,7 @@ fn densities_are_measured_in_the_unit_of_the_box() {
         let mut config = Config::preset(preset);
         config.field = if preset == Preset::Instant { instant().field } else { config.field };
         let bounds = [DVec3::splat(-size), DVec3::splat(size)];
-        let model = Model::<f64>::new(config, Extent::new(bounds, [1.0, 4.0]), 3).unwrap();
+        let model = Model::<f64>::new(config, SceneBox::new(bounds, [1.0, 4.0]), 3).unwrap();
         let tape = Tape::new();
         let params = model.params.bind_constant(&tape);
         let positions = tape.constant(Tensor::from([[0.1, -0.3, 0.7]]).map(|x: f64| x * size));
@@ -329,7 +330,7 @@ fn densities_are_measured_in_the_unit_of_the_box() {
     }
     // A file from before there was a choice means scene units.
     let old = r#"{"bounds": [[-150, -150, -150], [150, 150, 150]], "span": [2, 6]}"#;
-    assert_eq!(serde_json::from_str::<Extent>(old).unwrap().unit, 1.0);
+    assert_eq!(serde_json::from_str::<SceneBox>(old).unwrap().unit, 1.0);
 }
 
 #[test]
@@ -338,17 +339,18 @@ fn terms_of_a_file_take_part_in_training() {
     let mut value = serde_json::to_value(&bare).unwrap();
     value["terms"] = serde_json::json!([{"kind": "distortion", "weight": 0.5}, {"kind": "entropy", "weight": 0.25}]);
     let config: Config = serde_json::from_value(value).unwrap();
-    let expected = [TermConfig::new(DistortionConfig { weight: 0.5 }), TermConfig::new(EntropyConfig { weight: 0.25 })];
-    assert_eq!(config.terms, expected.clone());
+    let expected =
+        [LossTermConfig::new(DistortionConfig { weight: 0.5 }), LossTermConfig::new(EntropyConfig { weight: 0.25 })];
+    assert_eq!(config.loss_terms, expected.clone());
     let loss = |config: &Config| Trainer::new(config.clone(), DATA.clone()).unwrap().step(0.0);
     let (plain, more) = (loss(&bare), loss(&config));
-    let alone = expected.map(|term| loss(&Config { terms: vec![term], ..bare.clone() }).loss - plain.loss);
+    let alone = expected.map(|term| loss(&Config { loss_terms: vec![term], ..bare.clone() }).loss - plain.loss);
     assert!(alone.iter().all(|x| *x > 1e-4) && more.psnr == plain.psnr, "{alone:?}");
     assert!((more.loss - plain.loss - alone[0] - alone[1]).abs() < 1e-5, "each counts: {alone:?} {}", more.loss);
     let mut steep = bare;
-    steep.terms = vec![TermConfig::new(OrientationConfig { weight: 0.1 })];
+    steep.loss_terms = vec![LossTermConfig::new(OrientationConfig { weight: 0.1 })];
     assert!(loss(&steep).loss > plain.loss && steep.check().is_ok());
-    steep.terms = vec![TermConfig::new(OrientationConfig { weight: -0.1 })];
+    steep.loss_terms = vec![LossTermConfig::new(OrientationConfig { weight: -0.1 })];
     assert!(steep.check().unwrap_err().to_string().starts_with("`orientation.weight`"));
     let mut gauss = config;
     gauss.sampler.get_mut::<MarchingConfig>().unwrap().quadrature = Quadrature::Gauss2;
@@ -361,7 +363,7 @@ fn a_budget_of_time_is_measured_by_the_clock_that_is_given_and_not_while_others_
     let tick = clock.clone();
     // Every look at the clock takes a second.
     let now = move || Duration::from_secs(tick.fetch_add(1, Relaxed));
-    let extent = Extent::new(DATA.bounds, [DATA.near, DATA.far]);
+    let extent = SceneBox::new(DATA.bounds, [DATA.near, DATA.far]);
     let mut trainer = Trainer::with_clock(instant(), DATA.clone(), extent, now).unwrap();
     let mut seen = vec![];
     trainer.run(Budget::Time(Duration::from_secs(11)), |trainer| {
@@ -381,9 +383,9 @@ fn switches_are_five_and_those_of_the_first_edition_are_understood() {
     assert_eq!(carving(r#"{"skip": "fast", "silhouettes": true}"#), 1);
     assert_eq!(carving(r#"{"skip": "fast", "silhouettes": false}"#), 0);
     assert_eq!(carving(r#"{"skip": "off", "silhouettes": true}"#), 0);
-    let fast = Skipping { grid: true, carving: 3, pruning: 0.05, termination: 1e-3, colors: 2e-3 };
-    let lossless = Skipping { pruning: 0.005, termination: 1e-4, colors: 1e-4, ..fast };
-    assert_eq!([Skip::Fast, Skip::Lossless].map(Skipping::from), [fast, lossless]);
+    let fast = Skipping { grid: true, carving: 3, pruning: 0.05, early_stop_eps: 1e-3, colors: 2e-3 };
+    let lossless = Skipping { pruning: 0.005, early_stop_eps: 1e-4, colors: 1e-4, ..fast };
+    assert_eq!([Skip::Fast, Skip::NearLossless].map(Skipping::from), [fast, lossless]);
     // Views leave out what they are told to; what training left out they cannot put back.
     let mut trainer = Trainer::new(instant(), DATA.clone()).unwrap();
     train(&mut trainer, 60);
@@ -393,13 +395,13 @@ fn switches_are_five_and_those_of_the_first_edition_are_understood() {
         model.set_skip(skip);
         let marching = model.marching().unwrap();
         assert!(marching.config.occupancy.skip.grid && marching.config.occupancy.skip.carving == 3);
-        let seen = model.view(camera, [1.0; 3]).evaluations;
+        let seen = model.render(camera, [1.0; 3]).evaluations;
         [seen.density, seen.color]
     };
     let none = Skipping::from(Skip::Off);
     let [all, every] = count(none);
     assert_eq!(all, every, "every sample has a colour");
-    let [density, color] = count(Skipping { termination: 0.05, ..none });
+    let [density, color] = count(Skipping { early_stop_eps: 0.05, ..none });
     assert!(density < all && color == density, "rays end early: {density} of {all}");
     let [density, color] = count(Skipping { colors: 0.05, ..none });
     assert!(density == all && color < all, "some have no colour: {color} of {all}");

@@ -3,16 +3,16 @@
 
 use raygrad::Params;
 use raygrad::nerf::analytic::{AnalyticField, AnalyticScene, Layer, Layers, scenes};
-use raygrad::nerf::dataset::{Dataset, Frame, Placement, Scope, Split};
+use raygrad::nerf::dataset::{Dataset, Frame, SceneTransform, SceneType, Split};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::{DMat3, DVec3};
-use raygrad::nerf::pictures::metrics::{psnr, ssim};
+use raygrad::nerf::imaging::metrics::{psnr, ssim};
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{OccupancyConfig, Skip};
 use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{
-    Camera, Config, Extent, Image, InstantConfig, Jitter, Lens, Limits, Model, Preset, Purpose, Query, Rays,
-    SamplerConfig, Trainer,
+    Camera, Config, Image, InstantConfig, Jitter, Lens, Model, Preset, Purpose, Query, RayTolerance, Rays,
+    SamplerConfig, SceneBox, Trainer,
 };
 use raygrad::{Real, Tape};
 use raygrad_scenes::{DISTANCE, Landscape, Scene, View, walk_cameras};
@@ -134,9 +134,9 @@ fn normals_apart(model: &Model<f32>, camera: &Camera, truth: &Image) -> f64 {
     let query = Query { slopes: true, ..Query::new(&*model.field, &params) };
     let mut rays = Rays::new();
     for i in 0..camera.width * camera.height {
-        rays.push_pixel(camera, [i % camera.width, i / camera.width], model.reach(), model.extent.span);
+        rays.push_pixel(camera, [i % camera.width, i / camera.width], model.reach(), model.scene_box.near_far);
     }
-    let steps = model.sampler.sample(&query, &rays, Purpose::View { finer: 1 }, &mut Jitter::Middle).steps;
+    let steps = model.sampler.sample(&query, &rays, Purpose::View { finer: 1 }, &mut Jitter::Middle).samples;
     let seen = model.sampler.quadrature().render(&query, &steps, 0.0).rendered;
     let normals = seen.accumulate(&seen.normals());
     let vector = |n: &[f32]| DVec3::new(n[0].into(), n[1].into(), n[2].into());
@@ -170,9 +170,9 @@ fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
         bounds: [low - 0.02, high + 0.02],
         near: 2.0,
         far: 6.0,
-        scope: Scope::Bounded,
+        scope: SceneType::Bounded,
         ndc: None,
-        placement: Placement::default(),
+        placement: SceneTransform::default(),
         skipped: vec![],
     };
     let mut config = Config::preset(Preset::Instant);
@@ -190,7 +190,7 @@ fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
     for number in 0..2 {
         let camera = camera(number);
         let truth = scene.render(&camera, 9);
-        let seen = trainer.model.view(&camera, [1.0; 3]);
+        let seen = trainer.model.render(&camera, [1.0; 3]);
         let color = truth.color.over([1.0; 3]);
         let close = psnr(&seen.color, &color);
         let far = |depth: &Image| {
@@ -227,7 +227,7 @@ fn what_ends_early_is_as_far_away_as_what_does_not() {
     let pose = Camera::look_at(scene.ray.origin, scene.ray.at(1.0), DVec3::Y);
     let camera = Camera { width: 1, height: 1, focal: [1.0; 2], centre: [0.5; 2], lens: Lens::Pinhole, pose };
     let model = medium(&scene, Quadrature::Midpoint, Skip::Off);
-    let seen = model.view_within(&camera, [1.0; 3], &Limits { termination: 0.2, color_budget: 0.0 });
+    let seen = model.render_within(&camera, [1.0; 3], &RayTolerance { early_stop_eps: 0.2, color_budget: 0.0 });
     let [depth, opacity] = [seen.depth.data[0], seen.opacity.data[0]];
     assert!((depth - 3.005).abs() < 0.01 && opacity == 1.0, "{depth} {opacity}");
     assert!((seen.color.data[0] - 0.5).abs() < 1e-5, "{:?}", seen.color.data);
@@ -238,7 +238,7 @@ fn medium(scene: &AnalyticScene, rule: Quadrature, skip: Skip) -> Model<f32> {
     let occupancy = OccupancyConfig { resolution: 32, cascades: 1, skip: skip.into() };
     let marching = MarchingConfig { occupancy, quadrature: rule, view_step: 1.0 / 400.0, ..MarchingConfig::default() };
     let config = Config { sampler: SamplerConfig::new(marching), ..Config::preset(Preset::Instant) };
-    let mut model = Model::new(config, Extent::new(scene.bounds(), [0.0, scene.length]), 0).unwrap();
+    let mut model = Model::new(config, SceneBox::new(scene.bounds(), [0.0, scene.length]), 0).unwrap();
     let mut params = Params::new();
     model.field = Arc::new(AnalyticField::new(scene.medium.clone(), &mut params));
     model.params = params;
@@ -264,13 +264,13 @@ fn views_of_known_media_are_exact_by_every_rule_and_within_every_limit() {
         let exact = &scene.exact;
         let opacity = 1.0 - exact.transmittance;
         for (rule, error) in rules {
-            for skip in [Skip::Off, Skip::Lossless, Skip::Fast] {
+            for skip in [Skip::Off, Skip::NearLossless, Skip::Fast] {
                 let model = medium(&scene, rule, skip);
-                let limits = Limits::of(&skip.into());
-                let few = Limits { termination: 0.02, color_budget: 0.02 };
+                let limits = RayTolerance::of(&skip.into());
+                let few = RayTolerance { early_stop_eps: 0.02, color_budget: 0.02 };
                 for limits in [limits, few] {
-                    let seen = model.view_within(&camera, white, &limits);
-                    let bound = error + skip.error_bound() + f64::from(limits.termination + limits.color_budget);
+                    let seen = model.render_within(&camera, white, &limits);
+                    let bound = error + skip.error_bound() + f64::from(limits.early_stop_eps + limits.color_budget);
                     let what = format!("{} by {rule}, {skip:?}, {limits:?}", scene.name);
                     let color = f64::from(seen.color.pixel(3, 1)[0]);
                     assert!((color - exact.color).abs() <= bound, "{what}: {color} for {}", exact.color);
@@ -284,7 +284,7 @@ fn views_of_known_media_are_exact_by_every_rule_and_within_every_limit() {
                     assert!(asked.density > 0 && asked.color > 0 && asked.density >= asked.color, "{what}: {asked:?}");
                 }
                 if skip == Skip::Off {
-                    let dense = model.dense_view(&camera, [scene.background; 3], 1).pixels[5 + 3];
+                    let dense = model.render_reference(&camera, [scene.background; 3], 1).pixels[5 + 3];
                     assert!((dense.color[1] - exact.color).abs() <= error, "{} by {rule}: the reference", scene.name);
                 }
             }

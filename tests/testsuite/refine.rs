@@ -3,10 +3,10 @@
 use raygrad::Real;
 use raygrad::Schedule;
 use raygrad::nerf::camera::rotation_matrix;
-use raygrad::nerf::dataset::{Dataset, Placement, Split};
+use raygrad::nerf::dataset::{Dataset, SceneTransform, Split};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::model::Refined;
+use raygrad::nerf::model::RefinedParam;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::{Camera, Config, InstantConfig, Lens, Model, Preset, Trainer, fitted_cameras};
 use raygrad_scenes::Scene;
@@ -65,7 +65,7 @@ fn errors(model: &Model<f32>, right: &Dataset, wrong: &Dataset) -> [f64; 2] {
         wrong.frames.iter().enumerate().map(|(i, frame)| model.learned_camera(i, &frame.camera)).collect();
     let place = |cameras: &[Camera]| -> Vec<DVec3> { cameras.iter().map(|camera| camera.pose.translation).collect() };
     let right_cameras: Vec<Camera> = right.frames.iter().map(|frame| frame.camera.clone()).collect();
-    let placement = Placement::between(&place(&right_cameras), &place(&found)).unwrap();
+    let placement = SceneTransform::between(&place(&right_cameras), &place(&found)).unwrap();
     let size = (right.bounds[1] - right.bounds[0]).max_element();
     let each = found.iter().zip(&right_cameras).map(|(found, right)| {
         let right = placement.camera(right);
@@ -95,8 +95,8 @@ fn before_a_known_scene(config: Config, right: &Dataset, wrong: &Dataset) -> Tra
 fn poses_are_found_in_a_scene_that_is_known() {
     let right = photographs(24, 48, Lens::Pinhole);
     let wrong = disturbed(&right, 2.0, 0.02, 1.0);
-    let mut config = instant().with_refined(&[Refined::Poses]);
-    config.refine.coarse = 0.0;
+    let mut config = instant().with_refined(&[RefinedParam::Poses]);
+    config.camera_optimizer.coarse = 0.0;
     config.poses = Some(Schedule::Exponential { from: 5e-3, to: 2e-5, warmup: 0.0 });
     let mut trainer = before_a_known_scene(config, &right, &wrong);
     let before = errors(&trainer.model, &right, &wrong);
@@ -111,8 +111,8 @@ fn poses_are_found_in_a_scene_that_is_known() {
 fn a_focal_length_is_found_in_a_scene_that_is_known() {
     let right = photographs(24, 48, Lens::Pinhole);
     let wrong = disturbed(&right, 0.0, 0.0, 1.05);
-    let mut config = instant().with_refined(&[Refined::Focal]);
-    config.refine.focal = Some(Schedule::Exponential { from: 3e-3, to: 1e-4, warmup: 0.0 });
+    let mut config = instant().with_refined(&[RefinedParam::Focal]);
+    config.camera_optimizer.focal = Some(Schedule::Exponential { from: 3e-3, to: 1e-4, warmup: 0.0 });
     let mut trainer = before_a_known_scene(config, &right, &wrong);
     train(&mut trainer, 300);
     let camera = trainer.model.learned_camera(3, &wrong.frames[3].camera);
@@ -127,9 +127,9 @@ fn a_lens_is_found_with_the_focal_length() {
     let right = photographs(16, 48, glass);
     let mut wrong = disturbed(&right, 0.0, 0.0, 1.03);
     wrong.frames.iter_mut().for_each(|frame| frame.camera.lens = Lens::Pinhole);
-    let mut config = instant().with_refined(&[Refined::Focal, Refined::Lens]);
-    config.refine.focal = Some(Schedule::Exponential { from: 2e-3, to: 1e-4, warmup: 0.0 });
-    config.refine.lens = Some(Schedule::Exponential { from: 5e-3, to: 2e-4, warmup: 0.0 });
+    let mut config = instant().with_refined(&[RefinedParam::Focal, RefinedParam::Lens]);
+    config.camera_optimizer.focal = Some(Schedule::Exponential { from: 2e-3, to: 1e-4, warmup: 0.0 });
+    config.camera_optimizer.lens = Some(Schedule::Exponential { from: 5e-3, to: 2e-4, warmup: 0.0 });
     let mut trainer = before_a_known_scene(config, &right, &wrong);
     train(&mut trainer, 400);
     let (found, right) = (trainer.model.learned_camera(2, &wrong.frames[2].camera), &right.frames[2].camera);
@@ -153,13 +153,13 @@ fn a_lens_is_found_with_the_focal_length() {
 #[test]
 fn what_was_found_of_cameras_is_stored_with_the_model() {
     let data = photographs(6, 16, Lens::Pinhole);
-    let config = instant().with_refined(&[Refined::Poses, Refined::Focal, Refined::Lens]);
+    let config = instant().with_refined(&[RefinedParam::Poses, RefinedParam::Focal, RefinedParam::Lens]);
     let mut trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
     train(&mut trainer, 10);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.safetensors");
     trainer.model.save(&path).unwrap();
-    let read = Model::load(&path, config.clone(), trainer.model.extent).unwrap();
+    let read = Model::load(&path, config.clone(), trainer.model.scene_box).unwrap();
     let camera = &data.frames[4].camera;
     let [one, other] = [&trainer.model, &read].map(|model| model.learned_camera(4, camera));
     assert!(one == other && one != *camera && one.lens != camera.lens && one.focal != camera.focal);
@@ -171,14 +171,14 @@ fn what_was_found_of_cameras_is_stored_with_the_model() {
     let mut value = serde_json::to_value(instant()).unwrap();
     value.as_object_mut().unwrap().remove("refine").unwrap();
     assert_eq!(serde_json::from_value::<Config>(value).unwrap(), instant());
-    let error = Model::<f32>::new(config, trainer.model.extent, 0).err().unwrap().to_string();
+    let error = Model::<f32>::new(config, trainer.model.scene_box, 0).err().unwrap().to_string();
     assert!(error.starts_with("`refine.focal`"), "{error}");
 }
 
 #[test]
 fn detail_comes_in_from_coarse_to_fine() {
     let data = Arc::new(photographs(6, 16, Lens::Pinhole));
-    let config = instant().with_refined(&[Refined::Poses]);
+    let config = instant().with_refined(&[RefinedParam::Poses]);
     let mut trainer = Trainer::new(config, data).unwrap();
     let table = trainer.model.params.find("field.table").unwrap();
     let rows = |trainer: &Trainer| trainer.model.params.get(table).as_slice().to_vec();
@@ -192,7 +192,7 @@ fn detail_comes_in_from_coarse_to_fine() {
     let late = moved(&first, &rows(&trainer));
     assert!(early < 0.5 && late > 0.9, "{early} {late}");
     let mut model = trainer.model.clone();
-    let view = |model: &Model<f32>| model.view(&model.cameras()[0].clone(), [1.0; 3]).color;
+    let view = |model: &Model<f32>| model.render(&model.cameras()[0].clone(), [1.0; 3]).color;
     let whole = view(&model);
     model.set_detail(1.0);
     assert!(view(&model) == whole, "after that share of the run everything is there");
@@ -218,9 +218,9 @@ fn exposures_and_vignetting_are_found_in_a_scene_that_is_known() {
         }
         frame.image = image.into();
     }
-    let mut config = instant().with_refined(&[Refined::Exposure, Refined::Vignetting]);
+    let mut config = instant().with_refined(&[RefinedParam::Exposure, RefinedParam::Vignetting]);
     let rate = Some(Schedule::Exponential { from: 2e-2, to: 2e-4, warmup: 0.0 });
-    (config.tone.exposure, config.tone.vignetting) = (rate, rate);
+    (config.exposure_model.exposure, config.exposure_model.vignetting) = (rate, rate);
     let mut trainer = before_a_known_scene(config, &right, &seen);
     train(&mut trainer, 300);
     let model = &trainer.model;
@@ -243,8 +243,8 @@ fn exposures_and_vignetting_are_found_in_a_scene_that_is_known() {
     let mut model = model.clone();
     model.finish();
     let mut error = |look: Option<u32>, vignetted: bool, truth: &Dataset| {
-        (model.look, model.vignetted) = (look, vignetted);
-        let view = model.view(&right.frames[5].camera, [0.0; 3]).color;
+        (model.appearance_image, model.vignetted) = (look, vignetted);
+        let view = model.render(&right.frames[5].camera, [0.0; 3]).color;
         let truth = truth.frames[5].image.over([0.0; 3]);
         let [sum, all] =
             view.data.iter().zip(&truth.data).fold([0.0; 2], |[sum, all], (a, b)| [sum + (a - b).abs(), all + b]);
@@ -261,8 +261,8 @@ fn photographs_that_were_not_trained_on_are_found_where_they_belong_and_nothing_
     let right = photographs(30, 48, Lens::Pinhole);
     let (mut known, mut held_out) = (right.clone(), right);
     held_out.frames = known.frames.split_off(24);
-    let mut config = instant().with_refined(&[Refined::Exposure]);
-    config.field.get_mut::<InstantConfig>().unwrap().codes = 2;
+    let mut config = instant().with_refined(&[RefinedParam::Exposure]);
+    config.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 2;
     let mut trainer = Trainer::new(config, Arc::new(known)).unwrap();
     train(&mut trainer, 400);
     trainer.model.finish();

@@ -4,7 +4,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
-use raygrad::nerf::{ClassicConfig, Config, Extent, Field, FieldConfig, Model, Preset, SamplerConfig, Trainer};
+use raygrad::nerf::{ClassicConfig, Config, Field, FieldConfig, Model, Preset, SamplerConfig, SceneBox, Trainer};
 use raygrad::{Tape, Tensor};
 use raygrad_scenes::embedded;
 use std::sync::Arc;
@@ -31,7 +31,7 @@ fn data() -> Arc<Dataset> {
 /// The least share, over both fields, of random points in the box that have density.
 fn density_share(model: &Model<f32>) -> f64 {
     let mut rng = StdRng::seed_from_u64(1);
-    let [low, high] = model.extent.bounds.map(|corner| corner.to_array());
+    let [low, high] = model.scene_box.bounds.map(|corner| corner.to_array());
     let points = Tensor::from_fn(&[400, 3], |i| rng.random_range(low[i % 3] as f32..high[i % 3] as f32));
     let share = |field: &dyn Field<f32>| {
         let tape = Tape::new();
@@ -45,7 +45,7 @@ fn density_share(model: &Model<f32>) -> f64 {
 #[test]
 fn of_a_hundred_seeds_none_starts_dead() {
     let data = data();
-    let extent = Extent::new(data.bounds, [data.near, data.far]);
+    let extent = SceneBox::new(data.bounds, [data.near, data.far]);
     let (mut dead, mut passed_over) = (0, 0);
     for seed in 0..100 {
         let bare = density_share(&Model::new(narrow(seed), extent, seed).unwrap());

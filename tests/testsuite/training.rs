@@ -5,12 +5,12 @@ use raygrad::nerf::camera::rotation_matrix;
 use raygrad::nerf::dataset::{Dataset, Split};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::losses::{DepthConfig, Outputs, TotalVariationConfig};
+use raygrad::nerf::losses::{DepthConfig, LossInputs, TotalVariationConfig};
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::sampling::proposal::ProposalConfig;
 use raygrad::nerf::{
-    Config, Extent, FieldConfig, GroupConfig, Image, InstantConfig, Kind, Model, Preset, Result, SamplerConfig, Site,
-    Term, TermConfig, Terms, Trainer, VoxelConfig,
+    BuildContext, ComponentConfig, Config, FieldConfig, GroupConfig, Image, InstantConfig, LossTerm, LossTermConfig,
+    LossTerms, Model, Preset, Result, SamplerConfig, SceneBox, Trainer, VoxelConfig,
 };
 use raygrad::{Real, Scalar, Var};
 use raygrad_scenes::Scene;
@@ -48,18 +48,18 @@ fn train(trainer: &mut Trainer, steps: u32) -> f64 {
 fn a_run_goes_on_from_its_state_bit_for_bit() {
     let data = Arc::new(photographs(12, 20));
     let mut everything = instant();
-    everything.field.get_mut::<InstantConfig>().unwrap().codes = 3;
+    everything.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 3;
     everything.poses = Some(Schedule::Constant { rate: 1e-3 });
     let smooth = TotalVariationConfig { weight: 0.1, params: "field.density.0.weight".into(), cells: None, draws: 2 };
-    everything.terms = vec![TermConfig::new(smooth)];
+    everything.loss_terms = vec![LossTermConfig::new(smooth)];
     let proposal = ProposalConfig { samples: 8, batch: 128, tile: 32, anneal: 30, ..ProposalConfig::default() };
     let proposals = Config { sampler: SamplerConfig::new(proposal), ..instant() };
     for (i, config) in [everything, proposals].into_iter().enumerate() {
         let new = || Trainer::new(config.clone(), data.clone()).unwrap();
         let mut trainer = new();
         trainer.model.params.freeze(|name| name.starts_with("field.color.0"));
-        trainer.model.params.set_rate(|name| name.starts_with("field.color.1"), 0.5);
-        trainer.model.params.set_decay(|name| name.starts_with("field.color.1"), 0.25);
+        trainer.model.params.set_lr_scale(|name| name.starts_with("field.color.1"), 0.5);
+        trainer.model.params.set_weight_decay_scale(|name| name.starts_with("field.color.1"), 0.25);
         let go_on = |trainer: &mut Trainer, steps: std::ops::Range<u32>| -> Vec<u64> {
             steps.map(|i| trainer.step(f64::from(i) / 60.0).loss.to_bits()).collect()
         };
@@ -76,20 +76,24 @@ fn a_run_goes_on_from_its_state_bit_for_bit() {
         let grows = sampler.training_state() != sampler.state();
         assert_eq!(grows, sampler.grid().is_some(), "what a run needs beyond a model is the grid's densities");
         let (now, then) = (trainer.stats(), later.stats());
-        assert_eq!((now.step, now.rays, now.samples, now.moved), (then.step, then.rays, then.samples, then.moved));
+        assert_eq!(
+            (now.step, now.rays, now.density_queries, now.moved),
+            (then.step, then.rays, then.density_queries, then.moved)
+        );
         assert_eq!((now.train_seconds, now.loss), (then.train_seconds, then.loss));
         assert_eq!(trainer.state().unwrap(), later.state().unwrap(), "what is written down is all there is");
         let more = before..before + 40;
         assert_eq!(go_on(&mut trainer, more.clone()), go_on(&mut later, more), "configuration {i}");
-        assert_eq!(later.stats().rate, later.model.config.schedule.rate(f64::from(before + 39) / 60.0));
+        assert_eq!(later.stats().lr, later.model.config.schedule.lr(f64::from(before + 39) / 60.0));
         assert_eq!(trainer.model.params.values(), later.model.params.values());
         let find = |part: &str| later.model.params.find(&format!("field.color.{part}.weight")).unwrap();
         let color = find("1");
-        assert_eq!([later.model.params.rate(color), later.model.params.decay(color)], [0.5, 0.25]);
+        assert_eq!([later.model.params.lr_scale(color), later.model.params.weight_decay_scale(color)], [0.5, 0.25]);
         assert!(later.model.params.is_frozen(find("0")) && !later.model.params.is_frozen(color));
         trainer.model.finish();
         later.model.finish();
-        let [one, other] = [&trainer, &later].map(|trainer| trainer.model.view(&data.frames[0].camera, [1.0; 3]).color);
+        let [one, other] =
+            [&trainer, &later].map(|trainer| trainer.model.render(&data.frames[0].camera, [1.0; 3]).color);
         assert_eq!(one, other);
     }
 }
@@ -107,8 +111,12 @@ fn what_is_no_state_of_this_run_changes_nothing() {
     let mut other = instant();
     other.field.get_mut::<InstantConfig>().unwrap().color_width = 8;
     let mut grouped = instant();
-    grouped.groups =
-        vec![GroupConfig { params: "field.color".into(), adam: grouped.adam, schedule: grouped.schedule, decay: 0.0 }];
+    grouped.groups = vec![GroupConfig {
+        params: "field.color".into(),
+        adam: grouped.adam,
+        schedule: grouped.schedule,
+        weight_decay: 0.0,
+    }];
     let cases = [
         (b"no state".to_vec(), "safetensors"),
         (before[..before.len() - 9].to_vec(), "safetensors"),
@@ -142,7 +150,7 @@ fn codes_take_up_what_photographs_differ_in() {
     }
     let data = Arc::new(data);
     let mut with = instant();
-    with.field.get_mut::<InstantConfig>().unwrap().codes = 4;
+    with.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 4;
     let mut trainers = [instant(), with.clone()].map(|config| Trainer::new(config, data.clone()).unwrap());
     let [bare, coded] = trainers.each_mut().map(|trainer| train(trainer, 250));
     assert!(coded < 0.5 * bare, "{coded} with codes, {bare} without");
@@ -153,13 +161,13 @@ fn codes_take_up_what_photographs_differ_in() {
     // New views are as bright as the mean of both kinds.
     let camera = &data.frames[3].camera;
     let mean = |model: &Model<f32>| {
-        let seen = model.view(camera, [0.0; 3]);
+        let seen = model.render(camera, [0.0; 3]);
         f64::from(seen.color.data.iter().sum::<f32>()) / f64::from(seen.opacity.data.iter().sum::<f32>()) / 3.0
     };
     let with_code = |model: &Model<f32>, number: u32| {
         let mut own = model.clone();
-        own.look = Some(number);
-        let [view, dense] = [own.view(camera, [0.0; 3]), own.dense_view(camera, [0.0; 3], 1).picture()];
+        own.appearance_image = Some(number);
+        let [view, dense] = [own.render(camera, [0.0; 3]), own.render_reference(camera, [0.0; 3], 1).picture()];
         let apart = view.color.data.iter().zip(&dense.color.data).map(|(a, b)| (a - b).abs());
         assert!(apart.fold(0.0, Real::maximum) < 0.01, "views and references have the same look");
         mean(&own)
@@ -167,13 +175,13 @@ fn codes_take_up_what_photographs_differ_in() {
     let [dark, bright, usual] = [with_code(model, 2), with_code(model, 3), mean(model)];
     assert!(bright > 1.5 * dark && usual > 1.1 * dark && usual < bright / 1.1, "{dark} {usual} {bright}");
     // The number of photographs goes with the model.
-    let extent: Extent = serde_json::from_str(&serde_json::to_string(&model.extent).unwrap()).unwrap();
+    let extent: SceneBox = serde_json::from_str(&serde_json::to_string(&model.scene_box).unwrap()).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.safetensors");
     model.save(&path).unwrap();
     let read = Model::load(&path, with.clone(), extent).unwrap();
     assert_eq!(mean(&read), usual);
-    let error = Model::<f32>::new(with, Extent { frames: 0, ..extent }, 0).err().unwrap().to_string();
+    let error = Model::<f32>::new(with, SceneBox { frames: 0, ..extent }, 0).err().unwrap().to_string();
     assert!(error.starts_with("`codes`"), "{error}");
 }
 
@@ -223,7 +231,7 @@ fn poses_that_are_off_are_found_in_a_scene_that_is_known() {
     assert!(after[0] < 0.6 * before[0] && after[1] < 0.3 * before[1], "{before:?} {after:?}");
     // Nothing is carved away that photographs show to be empty from where they were not.
     assert_eq!(Trainer::new(known.model.config.clone(), Arc::new(wrong.clone())).unwrap().stats().occupied, 1.0);
-    let error = Model::<f32>::new(trainer.model.config.clone(), Extent { frames: 0, ..trainer.model.extent }, 0);
+    let error = Model::<f32>::new(trainer.model.config.clone(), SceneBox { frames: 0, ..trainer.model.scene_box }, 0);
     assert!(error.err().unwrap().to_string().starts_with("`poses`"));
     let mut bad = trainer.model.config.clone();
     bad.poses = Some(Schedule::Constant { rate: -1.0 });
@@ -270,7 +278,7 @@ fn distances_that_were_measured_show_where_surfaces_are() {
         let (mut error, mut count) = (0.0, 0);
         for frame in &test {
             let truth = scene.render(&frame.camera, 1).depth;
-            let found = trainer.model.view(&frame.camera, [1.0; 3]).depth;
+            let found = trainer.model.render(&frame.camera, [1.0; 3]).depth;
             for (&truth, &found) in truth.data.iter().zip(&found.data).filter(|(truth, _)| **truth > 0.0) {
                 error += f64::from(if found > 0.0 { (truth - found).abs() } else { 1.0 });
                 count += 1;
@@ -279,7 +287,7 @@ fn distances_that_were_measured_show_where_surfaces_are() {
         error / f64::from(count)
     };
     let bare = with(&instant(), &data);
-    let depth = Config { terms: vec![TermConfig::new(DepthConfig { weight: 1.0 })], ..instant() };
+    let depth = Config { loss_terms: vec![LossTermConfig::new(DepthConfig { weight: 1.0 })], ..instant() };
     let error = Trainer::new(depth.clone(), Arc::new(data.clone())).err().unwrap().to_string();
     assert!(error.starts_with("`terms`") && error.contains("Frame::distances"), "{error}");
     for frame in &mut data.frames {
@@ -314,15 +322,15 @@ struct SpyConfig {
 
 static SEEDS: Mutex<Vec<(usize, u64)>> = Mutex::new(vec![]);
 
-impl Kind<Terms> for SpyConfig {
+impl ComponentConfig<LossTerms> for SpyConfig {
     const KIND: &'static str = "spy";
-    fn build<T: Scalar>(&self, _: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+    fn build<T: Scalar>(&self, _: BuildContext<'_, T>) -> Result<Arc<dyn LossTerm<T>>> {
         Ok(Arc::new(self.clone()))
     }
 }
 
-impl<T: Scalar> Term<T> for SpyConfig {
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+impl<T: Scalar> LossTerm<T> for SpyConfig {
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         SEEDS.lock().unwrap().push((self.number, seen.seed));
         assert_eq!([seen.frames.len(), seen.pixels.len(), seen.distances.len()], [seen.rays.len(); 3]);
         seen.rendered.color.sum() * 0.0
@@ -331,8 +339,8 @@ impl<T: Scalar> Term<T> for SpyConfig {
 
 #[test]
 fn every_term_draws_anew_in_every_tile_of_every_step() {
-    let terms = [0, 1].map(|number| TermConfig::new(SpyConfig { number })).to_vec();
-    let mut trainer = Trainer::new(Config { terms, ..instant() }, Arc::new(photographs(6, 16))).unwrap();
+    let terms = [0, 1].map(|number| LossTermConfig::new(SpyConfig { number })).to_vec();
+    let mut trainer = Trainer::new(Config { loss_terms: terms, ..instant() }, Arc::new(photographs(6, 16))).unwrap();
     train(&mut trainer, 3);
     let seeds = SEEDS.lock().unwrap().clone();
     let different: HashSet<u64> = seeds.iter().map(|(_, seed)| *seed).collect();
@@ -348,18 +356,18 @@ fn a_table_that_is_to_be_smooth_becomes_smoother() {
     config.sampler = instant().sampler;
     let smooth = |weight| {
         let cells = Some(vec![17; 3]);
-        TermConfig::new(TotalVariationConfig { weight, params: "field.table".into(), cells, draws: 8 })
+        LossTermConfig::new(TotalVariationConfig { weight, params: "field.table".into(), cells, draws: 8 })
     };
     let variation = |config: &Config| {
         let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
         let loss = train(&mut trainer, 150);
-        assert!(loss.is_finite() && trainer.stats().skipped == 0);
+        assert!(loss.is_finite() && trainer.stats().non_finite == 0);
         let table = trainer.model.params.values()[0].as_slice().chunks_exact(4).collect::<Vec<_>>();
         let squares = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from((a - b) * (a - b))).sum::<f64>();
         (0..table.len() - 1).filter(|i| i % 17 != 16).map(|i| squares(table[i], table[i + 1])).sum::<f64>()
     };
     let bare = variation(&config);
-    config.terms = vec![smooth(0.01)];
+    config.loss_terms = vec![smooth(0.01)];
     let smoothed = variation(&config);
     println!("variation of the table: {bare} without the term, {smoothed} with it");
     assert!(smoothed < 0.5 * bare, "{smoothed} {bare}");
@@ -373,8 +381,8 @@ fn samples_near_a_camera_learn_less_where_that_is_asked_for() {
     // Its unit is 2, and the nearest samples are 2 away.
     data.bounds = [DVec3::splat(-3.0), DVec3::splat(3.0)];
     let data = Arc::new(data);
-    let moved = |near_gradients: f64| {
-        let config = Config { near_gradients, ..instant() };
+    let moved = |gradient_scaling_distance: f64| {
+        let config = Config { gradient_scaling_distance, ..instant() };
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
         let grid = trainer.model.params.find("field.table").unwrap();
         let before = trainer.model.params.get(grid).clone();
@@ -390,6 +398,6 @@ fn samples_near_a_camera_learn_less_where_that_is_asked_for() {
     assert_eq!(usual, none, "no sample is as near as that");
     assert_eq!(usual.0, all.0, "values stay");
     assert!(usual.2 > 0.0 && all.2.is_finite() && usual.2 != all.2, "{usual:?} {all:?}");
-    let bad = Config { near_gradients: -1.0, ..instant() };
-    assert!(bad.check().unwrap_err().to_string().starts_with("`near_gradients`"));
+    let bad = Config { gradient_scaling_distance: -1.0, ..instant() };
+    assert!(bad.check().unwrap_err().to_string().starts_with("`gradient_scaling_distance`"));
 }

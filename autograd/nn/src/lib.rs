@@ -18,10 +18,10 @@ mod tiles;
 
 #[cfg(feature = "files")]
 pub use files::write_atomic;
-pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Pass, Sequential};
+pub use layers::{Conv2d, Dropout, Embedding, Init, Layer, LayerNorm, Linear, Mlp, Mode, Sequential};
 #[cfg(feature = "files")]
 pub use npz::NpzError;
-pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, Move, NonFinite, Optimizer, OptimizerState, Schedule};
+pub use optim::{Adam, AdamConfig, AdamW, Clipped, Ema, NonFinite, Optimizer, OptimizerState, ParamUpdate, Schedule};
 pub use optim::{SettingError, Sgd, SgdConfig, StateError, UpdateReport, clip_norm, clip_value, global_norm};
 pub use params::{Bound, ParamId, ParamLayout, Params};
 #[cfg(feature = "files")]

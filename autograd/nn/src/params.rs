@@ -1,6 +1,6 @@
 //! Parameters: named tensors outside any tape, so that many tapes share one model.
 
-use crate::Move;
+use crate::ParamUpdate;
 use raygrad_autograd::{Gradient, Tape};
 use raygrad_tensor::{Scalar, Tensor};
 use std::collections::HashMap;
@@ -209,7 +209,7 @@ impl<T: Scalar> Params<T> {
     /// # Panics
     /// If the factor is negative, infinite or NaN.
     #[track_caller]
-    pub fn set_rate(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
+    pub fn set_lr_scale(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
         assert!(factor >= 0.0 && factor.is_finite(), "a learning rate times {factor}");
         self.set(which, |setting| setting.rate = factor)
     }
@@ -220,7 +220,7 @@ impl<T: Scalar> Params<T> {
     /// # Panics
     /// If the factor is negative, infinite or NaN.
     #[track_caller]
-    pub fn set_decay(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
+    pub fn set_weight_decay_scale(&mut self, which: impl Fn(&str) -> bool, factor: f64) -> usize {
         assert!(factor >= 0.0 && factor.is_finite(), "a weight decay times {factor}");
         self.set(which, |setting| setting.decay = factor)
     }
@@ -256,7 +256,7 @@ impl<T: Scalar> Params<T> {
     /// # Panics
     /// If the handle is that of another store.
     #[track_caller]
-    pub fn rate(&self, id: ParamId) -> f64 {
+    pub fn lr_scale(&self, id: ParamId) -> f64 {
         self.settings[self.names.place(id)].rate
     }
 
@@ -265,22 +265,22 @@ impl<T: Scalar> Params<T> {
     /// # Panics
     /// If the handle is that of another store.
     #[track_caller]
-    pub fn decay(&self, id: ParamId) -> f64 {
+    pub fn weight_decay_scale(&self, id: ParamId) -> f64 {
         self.settings[self.names.place(id)].decay
     }
 
-    /// What an optimiser is to do with these gradients: one [`Move`] for each parameter that is not frozen and whose
+    /// What an optimiser is to do with these gradients: one [`ParamUpdate`] for each parameter that is not frozen and whose
     /// gradient has a share. `rate` gives the learning rate of the parameter at a place of the store, before its factor.
     ///
     /// # Panics
     /// If there is not one gradient of the same shape for each parameter that is not frozen, or a rate is not within 0
     /// to 1e30.
     #[track_caller]
-    pub fn moves<'a>(
+    pub fn updates<'a>(
         &'a mut self,
         grads: &'a [Gradient<T>],
         rate: impl Fn(usize) -> f64,
-    ) -> impl Iterator<Item = Move<'a, T>> {
+    ) -> impl Iterator<Item = ParamUpdate<'a, T>> {
         let free = self.settings.iter().filter(|setting| !setting.frozen).count();
         assert_eq!(grads.len(), free, "one gradient for each parameter that is not frozen");
         // Before anything is moved.
@@ -294,7 +294,7 @@ impl<T: Scalar> Params<T> {
         let free = parts.filter(|(_, (_, setting))| !setting.frozen);
         let moves = free.zip(grads).map(move |((slot, ((name, value), setting)), grad)| {
             let lazy = setting.moves_rows(value);
-            Move { slot, name, value, grad, rate: rate(slot) * setting.rate, decay: setting.decay, lazy }
+            ParamUpdate { slot, name, value, grad, rate: rate(slot) * setting.rate, decay: setting.decay, lazy }
         });
         moves.filter(|part| !part.grad.is_zero())
     }

@@ -56,7 +56,7 @@ impl<T: Scalar> Op<T> for Extremum {
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> {
         let (x, y, g) = (cx.x(0), cx.y(), cx.g());
         if cx.recording() {
-            let equal = x.equals(&y);
+            let equal = x.elementwise_eq(&y);
             let share = g / cx.constant(equal.cast()).sum_to(y.shape());
             return Grads::one(share.where_(&equal, 0.0));
         }

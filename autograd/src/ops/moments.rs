@@ -107,7 +107,7 @@ impl<T: Scalar> Op<T> for Deviation {
 /// `g / y`, and 0 where `y` is 0.
 fn over_unless_zero<'t, T: Scalar>(g: &Var<'t, T>, y: &Var<'t, T>) -> Var<'t, T> {
     let (zero, one) = (y.constant(0.0), y.constant(1.0));
-    let is_zero = y.equals(0.0);
+    let is_zero = y.elementwise_eq(0.0);
     // Divided by 1 where it is not chosen, so that the next derivative is not NaN.
     zero.where_(&is_zero, &(g / one.where_(&is_zero, y)))
 }

@@ -79,7 +79,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// Where `self > other`; broadcasts. A NaN compares as in Rust: it equals nothing. There is nothing to differentiate:
-    /// the result is a [`Mask`], for [`where_`](Self::where_), [`masked`](Self::masked), and as numbers by [`Mask::cast`].
+    /// the result is a [`Mask`], for [`where_`](Self::where_), [`masked_select`](Self::masked_select), and as numbers by [`Mask::cast`].
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -127,8 +127,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the shapes do not broadcast.
     #[track_caller]
-    pub fn equals(&self, other: impl Operand<'t, T>) -> Mask {
-        self.compare("equals", other, |a, b| a.equals(b))
+    pub fn elementwise_eq(&self, other: impl Operand<'t, T>) -> Mask {
+        self.compare("equals", other, |a, b| a.elementwise_eq(b))
     }
 
     /// `self` where `mask` holds, else `other`: PyTorch's `where`, with the underscore because Rust keeps that word to
@@ -155,7 +155,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// # Panics
     /// If the mask has another shape.
     #[track_caller]
-    pub fn masked(&self, mask: &Mask) -> Self {
+    pub fn masked_select(&self, mask: &Mask) -> Self {
         let same = ensure(mask.shape() == self.shape(), || format!("the mask has the shape {:?}", mask.shape()));
         self.fits("masked", same);
         self.reshape(&[self.value().len()]).gather_rows(mask.nonzero())
@@ -180,7 +180,7 @@ mod tests {
         let tape = Tape::<f64>::new();
         let a = tape.leaf(Tensor::from([1.0, 2.0, f64::INFINITY, f64::NAN]));
         let b = Tensor::from([2.0, 2.0, f64::INFINITY, f64::NAN]);
-        let all = [a.gt(&b), a.ge(&b), a.lt(&b), a.le(&b), a.equals(&b)];
+        let all = [a.gt(&b), a.ge(&b), a.lt(&b), a.le(&b), a.elementwise_eq(&b)];
         let expected = [[0, 0, 0, 0], [0, 1, 1, 0], [1, 0, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0]];
         for (got, expected) in all.iter().zip(expected) {
             assert_eq!(got.as_slice(), expected.map(|x| x == 1));
@@ -192,10 +192,10 @@ mod tests {
     fn what_a_mask_picks_gets_the_gradient() {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from([[1.0, -2.0], [3.0, 4.0]]));
-        let y = x.square().masked(&x.gt(0.0));
+        let y = x.square().masked_select(&x.gt(0.0));
         assert_eq!(y.value(), &Tensor::from([1.0, 9.0, 16.0]));
         assert_eq!(y.sum().grad(&[&x])[0], Tensor::from([[2.0, 0.0], [6.0, 8.0]]));
-        assert!(tape.try_run(|| x.masked(&x.slice_axis(0, ..1).gt(0.0))).is_err());
+        assert!(tape.try_run(|| x.masked_select(&x.slice_axis(0, ..1).gt(0.0))).is_err());
     }
 
     #[test]

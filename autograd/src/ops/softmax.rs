@@ -126,7 +126,7 @@ impl<T: Scalar> Op<T> for LogSumExp {
         let mut column = Shape::from_slice(y.shape());
         column.push(1);
         // x - y would be NaN where both are -inf; there e^x is the 0 that is wanted.
-        let nothing = y.equals(f64::NEG_INFINITY);
+        let nothing = y.elementwise_eq(f64::NEG_INFINITY);
         let y = y.constant(0.0).where_(&nothing, &y).reshape(&column);
         Grads::one((x - y).exp() * cx.g().reshape(&column))
     }

@@ -60,7 +60,7 @@ fn what_does_not_fit_is_an_error_at_the_line_that_asked() {
     refused(&tape, || x.clamp(1.0, 0.0));
     refused(&tape, || x.gt(x.t()));
     refused(&tape, || x.where_(&Mask::new(&[2], [true, false]), 0.0));
-    refused(&tape, || x.masked(&Mask::new(&[2], [true, false])));
+    refused(&tape, || x.masked_select(&Mask::new(&[2], [true, false])));
     refused(&tape, || x.dot(&x));
     refused(&tape, || x.outer(&x));
     refused(&tape, || x.matmul(1.0));

@@ -73,12 +73,12 @@ fn elementwise() -> Vec<Case> {
         "compare.lt.broadcast": |x| number(&x[0], x[0].lt(&x[1]));
         "compare.le": |x| number(&x[0], x[0].le(&x[1]));
         "compare.le.broadcast": |x| number(&x[0], x[0].le(&x[1]));
-        "compare.eq": |x| number(&x[0], x[0].equals(&x[1]));
-        "compare.eq.broadcast": |x| number(&x[0], x[0].equals(&x[1]));
-        "compare.ne": |x| number(&x[0], !x[0].equals(&x[1]));
-        "compare.ne.broadcast": |x| number(&x[0], !x[0].equals(&x[1]));
-        "where": |x| x[1].where_(&!x[0].equals(0.0), &x[2]);
-        "where.scalar": |x| x[1].where_(&!x[0].equals(0.0), &x[2]);
+        "compare.eq": |x| number(&x[0], x[0].elementwise_eq(&x[1]));
+        "compare.eq.broadcast": |x| number(&x[0], x[0].elementwise_eq(&x[1]));
+        "compare.ne": |x| number(&x[0], !x[0].elementwise_eq(&x[1]));
+        "compare.ne.broadcast": |x| number(&x[0], !x[0].elementwise_eq(&x[1]));
+        "where": |x| x[1].where_(&!x[0].elementwise_eq(0.0), &x[2]);
+        "where.scalar": |x| x[1].where_(&!x[0].elementwise_eq(0.0), &x[2]);
         "if_positive": |x| x[0].if_positive(&x[1], &x[2]);
         "lerp": |x| x[0].lerp(&x[1], &x[2]);
         "lerp.broadcast": |x| x[0].lerp(&x[1], &x[2]);

@@ -22,29 +22,41 @@ pub use draw::bitmap;
 use figure::Figure;
 use table::Table;
 
-/// Measure run time against error: CSV tables, SVG and PNG plots, and one page with all of them
+/// Measure run time against error
 ///
-/// Counts of work stand beside every time. Times are medians of runs in turns with a baseline (A B B A), and a control
-/// says how much of a difference is chance.
+/// Writes CSV tables, SVG and PNG plots, and one page with all of them. Counts of work stand beside every time.
+/// Times are medians of runs interleaved with a baseline (A B B A); a control run shows the noise.
+///
+/// Example: raygrad bench --quick --suite render
 #[derive(clap::Args)]
 pub struct Args {
-    /// What to measure
-    #[arg(long, value_enum, default_value_t = Suite::All)]
+    /// quadrature, kernels, render, train or all
+    ///
+    /// quadrature: integration rules on scenes with exact solutions. kernels: elementary functions, matrix
+    /// products, the hash grid. render: renderer settings on one trained model. train: quality against training
+    /// time.
+    #[arg(long, help_heading = "Scene", hide_possible_values = true, value_enum, default_value_t = Suite::All)]
     suite: Suite,
-    /// Less of everything: two minutes on two cores
-    #[arg(long)]
+    /// A short form: two minutes on two cores
+    #[arg(long, help_heading = "Time")]
     quick: bool,
-    /// Folder for the results, which replace those of an earlier benchmark
-    #[arg(long, value_name = "DIR", default_value = "bench")]
+    /// Folder for the results
+    ///
+    /// They replace those of an earlier benchmark.
+    #[arg(long, help_heading = "Output", value_name = "DIR", default_value = "bench")]
     out: PathBuf,
-    /// Write to a folder that holds other files too, and replace those of the same names
-    #[arg(long)]
+    /// Write to a folder that holds other files
+    ///
+    /// Replaces files of the same names.
+    #[arg(long, help_heading = "Output")]
     overwrite: bool,
-    /// Also measure a training step of PyTorch and of JAX, if they are installed (in the repository only)
-    #[arg(long)]
+    /// Also time PyTorch and JAX, if installed
+    ///
+    /// Works in a checkout of the repository only.
+    #[arg(long, help_heading = "Advanced")]
     peers: bool,
-    /// A run to render, in place of the built-in scene trained briefly
-    #[arg(long, value_name = "RUN")]
+    /// Render this run, not the built-in scene
+    #[arg(long, help_heading = "Scene", value_name = "RUN")]
     run: Option<PathBuf>,
 }
 

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
-use raygrad::nerf::pictures::metrics::{mse, psnr, psnr_from_mse};
+use raygrad::nerf::imaging::metrics::{mse, psnr, psnr_from_mse};
 use raygrad::nerf::sampling::marching::Marching;
 use raygrad::nerf::volume::quadrature::Quadrature;
 use raygrad::nerf::{Config, Error, Evaluations, Image, Instant, Model, Preset, Result, Trainer, Voxel};
@@ -97,7 +97,7 @@ fn trained(scale: &Scale) -> Result<(Model<f32>, Dataset)> {
 
 fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
     let run = Run::open(folder)?;
-    let data = run.scene(None)?.open_for(&run.config.extent, run.config.config.unbounded)?.load(
+    let data = run.scene(None)?.open_for(&run.config.scene_box, run.config.config.unbounded)?.load(
         Split::Test,
         run.config.downscale,
         scale.views,
@@ -126,7 +126,7 @@ fn references(model: &Model<f32>, views: &Dataset) -> Result<Reference> {
         if let Some(sampler) = double.marching_mut() {
             sampler.config.quadrature = rule;
         }
-        views.frames.iter().map(|frame| double.dense_view(&frame.camera, WHITE, FINER).picture().color).collect()
+        views.frames.iter().map(|frame| double.render_reference(&frame.camera, WHITE, FINER).picture().color).collect()
     };
     let [images, others] = RULES.map(&mut by);
     let errors = images.iter().zip(&others).map(|(a, b)| mse(a, b));
@@ -313,7 +313,7 @@ fn findings(outcomes: &[Outcome], pixels: f64, apart: f64) -> Vec<String> {
             1e3 * outcome.timed.seconds
         )
     };
-    let wanted = [("skip", "off"), ("skip", "lossless"), ("skip", "fast"), ("instant-ngp", "its rules")];
+    let wanted = [("skip", "off"), ("skip", "near-lossless"), ("skip", "fast"), ("instant-ngp", "its rules")];
     let [rule, other] = RULES;
     let reference =
         format!("reference: {rule}, {apart:.1} dB from that by {other}, beyond which differences say nothing");
@@ -325,7 +325,7 @@ fn findings(outcomes: &[Outcome], pixels: f64, apart: f64) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use raygrad::nerf::Limits;
+    use raygrad::nerf::RayTolerance;
     use raygrad::nerf::space::occupancy::Skip;
 
     #[test]
@@ -374,16 +374,16 @@ mod tests {
             let setting = all.iter().find(|s| s.group == group && s.name == name).unwrap();
             measure(&model, setting, (&base, &baseline), &views, &reference, 1).unwrap()
         };
-        let [off, lossless, fast] = ["off", "lossless", "fast"].map(|name| find("skip", name));
+        let [off, lossless, fast] = ["off", "near-lossless", "fast"].map(|name| find("skip", name));
         assert!(work(&fast.evaluations) <= work(&lossless.evaluations));
         assert!(work(&lossless.evaluations) <= work(&off.evaluations));
         assert!(off.psnr >= lossless.psnr - 0.01 && lossless.psnr >= 40.0, "{} {}", off.psnr, lossless.psnr);
         // The bound is that of a fog at the threshold all along a ray, of ending early and of the colour budget.
         let bound = |skip: Skip| {
-            let limits = Limits::of(&skip.into());
-            skip.error_bound() + f64::from(limits.termination + limits.color_budget)
+            let limits = RayTolerance::of(&skip.into());
+            skip.error_bound() + f64::from(limits.early_stop_eps + limits.color_budget)
         };
-        assert!(lossless.largest <= off.largest + bound(Skip::Lossless), "{}", lossless.largest);
+        assert!(lossless.largest <= off.largest + bound(Skip::NearLossless), "{}", lossless.largest);
         assert!(fast.largest <= off.largest + bound(Skip::Fast), "{}", fast.largest);
         let double = find("precision", "f64");
         assert_eq!(double.evaluations.density, off.evaluations.density);

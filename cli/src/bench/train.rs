@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use raygrad::nerf::dataset::{Dataset, Split, evenly_spaced};
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::metrics::psnr;
 use raygrad::nerf::space::occupancy::Skip;
 use raygrad::nerf::{Budget, Config, Preset, Result, StepStats, Trainer};
 use raygrad_scenes::embedded;
@@ -115,19 +115,19 @@ fn courses(quick: bool) -> Vec<Course> {
 
 /// Density evaluations, and those of colours and gradients.
 fn evaluations(stats: &StepStats) -> f64 {
-    (stats.samples + stats.shaded) as f64
+    (stats.density_queries + stats.color_queries) as f64
 }
 
 /// The model after 1, 1.5, 2.25 ... seconds, and at the end.
 fn train(course: &Course, data: &Arc<Dataset>, test: &Dataset) -> Result<Vec<Point>> {
     let config = Config { seed: course.seed, ..Config::preset(course.preset) };
     let budget = Budget::Time(Duration::from_secs(course.seconds));
-    let config = config.for_budget(budget.samples(), data.footprints()).with_skip(course.skip);
+    let config = config.for_budget(budget.samples(), data.pixels_per_side()).with_skip(course.skip);
     let mut trainer = Trainer::new(config, data.clone())?;
     let measure = |trainer: &Trainer| {
         let background = trainer.model.config.background.shown();
         let one = |frame: &raygrad::nerf::dataset::Frame| {
-            let seen = trainer.model.view(&frame.camera, background).color;
+            let seen = trainer.model.render(&frame.camera, background).color;
             psnr(&seen, &frame.image.over(background))
         };
         let psnr = test.frames.iter().map(one).sum::<f64>() / test.frames.len() as f64;
@@ -164,7 +164,8 @@ fn table(courses: &[Course], curves: &[Vec<Point>]) -> Table {
     let mut table = Table::new("train", &columns);
     for (course, curve) in courses.iter().zip(curves) {
         for Point { stats, psnr } in curve {
-            let counts = [stats.step, stats.rays, stats.samples, stats.shaded, stats.unskipped, stats.moved];
+            let counts =
+                [stats.step, stats.rays, stats.density_queries, stats.color_queries, stats.unskipped, stats.moved];
             let names = [course.preset.to_string(), course.skip.to_string(), course.seed.to_string()];
             let row = names.into_iter().chain([digits(stats.train_seconds)]);
             table.push(row.chain(counts.map(|n| n.to_string())).chain([digits(*psnr)]).collect());
@@ -242,7 +243,7 @@ mod tests {
     #[test]
     fn courses_are_named_by_what_is_unusual_in_them() {
         let name = |preset, skip| Course { preset, skip, seed: 0, seconds: 1 }.name();
-        assert_eq!(name(Preset::Instant, Skip::Lossless), "instant");
+        assert_eq!(name(Preset::Instant, Skip::NearLossless), "instant");
         assert_eq!(name(Preset::Voxel, Skip::Off), "voxel, no skipping");
         assert_eq!(name(Preset::Small, Skip::Fast), "small, skipping");
         assert_eq!(name(Preset::Small, Skip::Off), "small");

@@ -8,8 +8,8 @@ mod table;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use raygrad::nerf::dataset::{Capture, Scope};
-use raygrad::nerf::doctor::{Finding, FindingKind, Options, Report, Severity, examine, examine_cameras};
+use raygrad::nerf::dataset::{Capture, SceneType};
+use raygrad::nerf::doctor::{DoctorOptions, Finding, FindingKind, Report, Severity, examine, examine_cameras};
 use raygrad::nerf::{Error, Result, write_atomic};
 
 use super::output::{complain, make_folder, print};
@@ -19,26 +19,32 @@ use super::scene::{Opened, Scene};
 use serde_json::Value;
 use stage::Stage;
 
-/// Examine a capture before training on it: what is wrong, and what to do
+/// Check a capture before training
 ///
-/// Prints facts and findings, and writes DIR/cameras.png and DIR/doctor.html, a page of its own with the same, the photographs in
-/// question and the cameras to turn around. Exit code: 0 nothing above a note, 3 warnings, 4 errors in the capture; 1 if it cannot be
-/// read at all.
+/// Prints facts and findings with advice, draws the cameras to DIR/cameras.png and writes one page,
+/// DIR/doctor.html. The exit code is 0 if there is nothing above a note, 3 for warnings, 4 for errors, and 1 if the
+/// capture cannot be read.
+///
+/// Example: raygrad doctor my-scene
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of photographs with poses, in any format that can be trained on
+    /// Capture folder, in any format that train reads
     pub scene: Scene,
-    /// How far the scene goes: bounded, unbounded or forward [default: found out from the photographs]
-    #[arg(long)]
-    pub scope: Option<Scope>,
-    /// Folder for the picture and the page, which replace those of an earlier examination
-    #[arg(long, value_name = "DIR", default_value = "doctor")]
+    /// bounded, unbounded or forward-facing
+    ///
+    /// By default raygrad infers the type from images and cameras.
+    #[arg(long, help_heading = "Scene", value_name = "TYPE")]
+    pub scene_type: Option<SceneType>,
+    /// Folder for cameras.png and doctor.html
+    ///
+    /// They replace those of an earlier check.
+    #[arg(long, help_heading = "Output", value_name = "DIR", default_value = "doctor")]
     pub out: PathBuf,
-    /// Replace files of the same names that another command wrote
-    #[arg(long)]
+    /// Replace files that another command wrote
+    #[arg(long, help_heading = "Output")]
     pub overwrite: bool,
-    /// Print facts and findings as JSON in place of a table
-    #[arg(long)]
+    /// Print the report as JSON
+    #[arg(long, help_heading = "Output")]
     pub json: bool,
 }
 
@@ -53,11 +59,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     files.iter().try_for_each(|file| job.check(file))?;
     let capture = Capture::read(folder)?;
     // A capture that has no size has none: the examination says why.
-    let survey = capture.survey(args.scope).ok();
+    let survey = capture.analyze_scene(args.scene_type).ok();
     make_folder(&args.out)?;
     let progress = Progress::new();
     let show = |done: usize, total: usize| progress.count(done, total, "photographs looked at");
-    let report = examine(&capture, survey.as_ref(), &Options { progress: &show, ..Options::default() });
+    let report = examine(&capture, survey.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
     drop(progress);
     let stage = Stage::new(&capture, survey.as_ref(), &report);
     let drawn = drawing::draw(&stage).map_err(|e| Error::file(&files[0], e))?;

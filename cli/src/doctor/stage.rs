@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 
 use glam::DVec3;
-use raygrad::nerf::dataset::{Capture, Placement, Scope, Split, Survey, evenly_spaced};
+use raygrad::nerf::dataset::{Capture, SceneAnalysis, SceneTransform, SceneType, Split, evenly_spaced};
 use raygrad::nerf::doctor::{Report, Severity};
 use serde::Serialize;
 
@@ -46,8 +46,8 @@ pub struct Stage {
 
 impl Stage {
     /// Of a capture; one that has no survey is drawn in its own coordinates.
-    pub fn new(capture: &Capture, survey: Option<&Survey>, report: &Report) -> Self {
-        let placement = survey.map_or_else(Placement::default, |survey| survey.placement);
+    pub fn new(capture: &Capture, survey: Option<&SceneAnalysis>, report: &Report) -> Self {
+        let placement = survey.map_or_else(SceneTransform::default, |survey| survey.transform);
         let flagged: HashSet<&String> = report
             .findings
             .iter()
@@ -90,7 +90,7 @@ impl Stage {
         let inside = capture.points.iter().map(|point| (placement.point(point.position), point.color));
         let inside = inside.filter(|(place, _)| (*place - centre).abs().max_element() < 1.5 * reach).collect();
         let (points, colors) = evenly_spaced(inside, POINTS).into_iter().unzip();
-        let bounded = survey.is_none_or(|survey| survey.scope == Scope::Bounded);
+        let bounded = survey.is_none_or(|survey| survey.scene_type == SceneType::Bounded);
         Stage { cameras, points, colors, bounds, bounded, centre, reach }
     }
 }

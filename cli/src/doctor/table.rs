@@ -1,6 +1,6 @@
 //! Facts and findings as lines of text.
 
-use raygrad::nerf::doctor::{Facts, Finding, Lie, Part, Range, Report, Resolution};
+use raygrad::nerf::doctor::{CaptureSubset, Facts, Finding, Range, Report, Resolution, SceneLayout};
 
 /// Names of photographs that are printed with a finding; the page has all of them.
 const NAMES: usize = 6;
@@ -10,7 +10,7 @@ const WIDTH: usize = 96;
 /// The facts, each with its name.
 pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     let mut rows = vec![("format", facts.format.clone())];
-    let parts = facts.parts.iter().map(|Part { split, present, absent }| match absent {
+    let parts = facts.subsets.iter().map(|CaptureSubset { split, present, absent }| match absent {
         0 => format!("{present} {split}"),
         _ => format!("{present} {split} ({absent} absent)"),
     });
@@ -29,7 +29,7 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     if facts.points > 0 {
         rows.push(("points", facts.points.to_string()));
     }
-    if let Some(Lie { scope, reason, near, far, bounds: [low, high], scale, up, middle }) = &facts.lie {
+    if let Some(SceneLayout { scope, reason, near, far, bounds: [low, high], scale, up, middle }) = &facts.layout {
         rows.push(("scope", format!("{scope}: {reason}")));
         rows.push(("rays", format!("from {near:.3} to {far:.3} scene units")));
         rows.push(("box", format!("{low:.2} to {high:.2} scene units")));

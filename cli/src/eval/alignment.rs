@@ -31,7 +31,7 @@ impl Alignment {
     /// # Errors
     /// If a photograph is said to be one of those that were trained on, whose names are `trained`, and is not.
     pub fn apply(model: &Model<f32>, trained: &[String], split: Split, data: &mut Dataset) -> Result<Self> {
-        let Some(refine) = &model.refine else { return Ok(Alignment::None) };
+        let Some(refine) = &model.camera_optimizer else { return Ok(Alignment::None) };
         if split == Split::Train {
             for frame in &mut data.frames {
                 let number = trained.iter().position(|name| *name == frame.name).ok_or_else(|| {
@@ -44,7 +44,7 @@ impl Alignment {
         }
         let given: Vec<_> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
         data.frames.iter_mut().zip(model.other_cameras(&given)).for_each(|(frame, camera)| frame.camera = camera);
-        Ok(match refine.placement(&model.params) {
+        Ok(match refine.transform(&model.params) {
             Some(_) => Alignment::Similarity,
             None if refine.has_poses() => Alignment::None,
             None => Alignment::Glass,
@@ -76,8 +76,9 @@ impl Appearance {
     }
 
     pub fn of(model: &Model<f32>, split: Split, fit_half: bool) -> Self {
-        let has_codes = model.config.field.get::<InstantConfig>().is_some_and(|field| field.codes > 0);
-        match (fit_half, has_codes || model.config.tone.exposure.is_some()) {
+        let has_codes =
+            model.config.field.get::<InstantConfig>().is_some_and(|field| field.appearance_embedding_dim > 0);
+        match (fit_half, has_codes || model.config.exposure_model.exposure.is_some()) {
             (true, _) => Appearance::Half,
             (_, false) => Appearance::None,
             (_, true) if split == Split::Train => Appearance::Own,

@@ -10,11 +10,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use raygrad::nerf::dataset::{Capture, Dataset, Frame, Split};
-use raygrad::nerf::pictures::colormap;
-use raygrad::nerf::pictures::lpips::{Backbone, Lpips};
-use raygrad::nerf::pictures::metrics::{SSIM_WINDOW, psnr, ssim};
+use raygrad::nerf::imaging::colormap;
+use raygrad::nerf::imaging::lpips::{Backbone, Lpips};
+use raygrad::nerf::imaging::metrics::{SSIM_WINDOW, psnr, ssim};
 use raygrad::nerf::space::occupancy::{Skip, Skipping};
-use raygrad::nerf::{Background, Error, Evaluations, Image, Picture, Result, fitted_cameras, write_atomic};
+use raygrad::nerf::{Background, Error, Evaluations, Image, Render, Result, fitted_cameras, write_atomic};
 
 use super::lock::{Lock, State};
 use super::machine::processor;
@@ -35,45 +35,62 @@ const UNFINISHED: &str = "unfinished";
 /// The file by which an evaluation keeps others from writing there.
 const LOCK: &str = "unfinished.lock";
 
-/// Compare a model with photographs: PSNR, SSIM and, with weights for it, LPIPS
+/// Measure PSNR, SSIM and LPIPS on held-out images
 ///
-/// Writes RUN/eval-SPLIT-SKIP.json with the figures and all that they depend on, and a page to look at, RUN/eval-SPLIT-SKIP/index.html,
-/// with up to 13 pictures, the worst views among them: photograph, render, error, depth. --views, --precision, --fit-poses and
-/// --fit-half stand in the name too, as in RUN/eval-val-off-10.json, so that none replaces another's result; that of another
-/// --scene does. `raygrad compare` puts the results of several runs side by side.
+/// Writes RUN/eval-SPLIT-SKIP.json with the figures and the conditions they depend on.
+/// RUN/eval-SPLIT-SKIP/index.html shows up to 13 views, the worst ones among them: image, render, error, depth.
+///
+/// --views, --precision, --fit-poses and --fit-half become part of the name, as in RUN/eval-val-off-10.json. A
+/// result with another --scene replaces the one of the same name.
+///
+/// Example: raygrad eval my-run --views 10
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder that `raygrad train` made
+    /// Run folder, made by `raygrad train`
     run: PathBuf,
-    /// Folder of the photographs, if they are no longer where they were for training
-    #[arg(long)]
+    /// Image folder, if it moved after training
+    ///
+    /// Without it, raygrad reads the images from where they were during training.
+    #[arg(long, help_heading = "Scene")]
     scene: Option<Scene>,
-    /// Photographs to compare with: train, val or test
-    #[arg(long, default_value = "test")]
+    /// Split: train, val or test
+    #[arg(long, help_heading = "Scene", default_value = "test")]
     split: Split,
-    /// Compare with this many evenly spaced photographs [default: all]
-    #[arg(long, value_name = "N", value_parser = parse::count(usize::MAX))]
+    /// Use N evenly spaced views [default: all]
+    #[arg(long, help_heading = "Scene", value_name = "N", value_parser = parse::count(usize::MAX))]
     views: Option<usize>,
-    /// How much that hardly shows to leave out: off, lossless or fast [default: as in training]
-    #[arg(long)]
+    /// Empty-space skipping: off, near-lossless, fast
+    ///
+    /// near-lossless changes a colour by at most about 0.5 % of its range, fast by at most 5 %. By default rendering
+    /// skips as much as the run's config says.
+    #[arg(long, help_heading = "Advanced")]
     skip: Option<Skip>,
-    /// Move each photograph's camera to where the model shows it best, and compare then: of a model whose own cameras were
-    /// corrected, others are where they were given, which may be as wrong
-    #[arg(long)]
+    /// Align each camera to the model first
+    ///
+    /// Moves each held-out camera to where the model matches its image best. Use it after --refine poses: held-out
+    /// cameras keep their given poses, which may be as wrong as the others were.
+    #[arg(long, help_heading = "Model")]
     fit_poses: bool,
-    /// Fit a gain for each colour channel to the left half of each photograph, and compare the right half: where photographs
-    /// differ in exposure, nobody can know that of one that was held out
-    #[arg(long)]
+    /// Fit exposure on one half, score the other
+    ///
+    /// Fits one gain per colour channel to the left half of each image and compares the right half. Use it where
+    /// images differ in exposure: that of a held-out image is unknown.
+    #[arg(long, help_heading = "Model")]
     fit_half: bool,
-    /// Measure LPIPS too, with the weights of AlexNet or VGG-16 in this file: benches/peers/lpips_weights.py makes it. Figures
-    /// of one network are no measure of those of the other
-    #[arg(long, value_name = "FILE.safetensors")]
+    /// Also measure LPIPS, with these weights
+    ///
+    /// A safetensors file with the weights of AlexNet or VGG-16, made by benches/peers/lpips_weights.py. Values of
+    /// the two networks are not comparable.
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     lpips: Option<PathBuf>,
-    /// Arithmetic of the pictures
-    #[arg(long, value_enum, default_value_t)]
+    /// Arithmetic: f32 or f64
+    ///
+    /// f64 renders every sample in occupied cells in double precision and skips nothing else. It is slow, and a
+    /// reference for measurements.
+    #[arg(long, help_heading = "Advanced", hide_possible_values = true, value_enum, default_value_t)]
     precision: Precision,
-    /// Print what the file holds in place of a table
-    #[arg(long)]
+    /// Print the result as JSON
+    #[arg(long, help_heading = "Output")]
     json: bool,
 }
 
@@ -97,7 +114,7 @@ fn level(skip: Skipping) -> String {
         let Skipping { grid, carving, .. } = skip;
         Skipping { grid, carving, ..(*level).into() } == skip
     };
-    [Skip::Off, Skip::Lossless, Skip::Fast].into_iter().find(is).map_or("own".to_owned(), |level| level.to_string())
+    [Skip::Off, Skip::NearLossless, Skip::Fast].into_iter().find(is).map_or("own".to_owned(), |level| level.to_string())
 }
 
 /// Who says which photographs are held out.
@@ -122,7 +139,7 @@ pub fn run(args: &Args) -> Result<()> {
         model.set_skip(skip);
     }
     let scene = run.scene(args.scene.as_ref())?;
-    let opened = scene.open_for(&run.config.extent, run.config.config.unbounded)?;
+    let opened = scene.open_for(&run.config.scene_box, run.config.config.unbounded)?;
     let mut data = opened.load(args.split, run.config.downscale, args.views.unwrap_or(usize::MAX))?;
     if args.split != Split::Train
         && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
@@ -161,7 +178,7 @@ pub fn run(args: &Args) -> Result<()> {
         number.filter(|_| appearance == Appearance::Own).map(|number| number as u32)
     };
     let looks = data.frames.iter().map(own).collect();
-    let (background, span) = (shown_background(model.config.background), model.extent.span);
+    let (background, span) = (shown_background(model.config.background), model.scene_box.near_far);
     let renderer = Renderer::new(model, args.precision)?;
     let mut judge = Judge { renderer, background: background.shown(), span, data, looks, appearance, lpips };
     let (per_view, seconds_per_view, evaluations) = judge.all(&unfinished)?;
@@ -324,13 +341,13 @@ impl Judge {
         Ok(())
     }
 
-    fn render(&mut self, i: usize) -> Picture {
+    fn render(&mut self, i: usize) -> Render {
         self.renderer.look_like(self.looks[i]);
         self.renderer.view(&self.data.frames[i].camera, self.background)
     }
 
     /// A view beside its photograph, as they are compared.
-    fn shown(&self, i: usize, mut picture: Picture) -> Result<Shown> {
+    fn shown(&self, i: usize, mut picture: Render) -> Result<Shown> {
         let frame = &self.data.frames[i];
         let truth = frame.image.over(self.background);
         let half = self.appearance.fitted_columns(truth.width);
@@ -355,7 +372,7 @@ impl Judge {
 
 /// A view and its photograph, of which the columns from `half` on are compared.
 struct Shown {
-    picture: Picture,
+    picture: Render,
     truth: Image,
     half: usize,
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt;
 
 use raygrad::nerf::dataset::{Split, evenly_spaced};
-use raygrad::nerf::pictures::lpips::Backbone;
+use raygrad::nerf::imaging::lpips::Backbone;
 use raygrad::nerf::space::occupancy::Skipping;
 use raygrad::nerf::{Background, Budget, Model, StepStats};
 use serde::{Serialize, Serializer};

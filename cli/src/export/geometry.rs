@@ -7,7 +7,7 @@ use std::time::Instant;
 use raygrad::nerf::dataset::{Split, evenly_spaced};
 use raygrad::nerf::geometry::files;
 use raygrad::nerf::geometry::{Stage, SurfaceConfig};
-use raygrad::nerf::{Camera, Error, Extent, Model, Result};
+use raygrad::nerf::{Camera, Error, Model, Result, SceneBox};
 use serde::Serialize;
 
 use crate::cameras::Viewpoint;
@@ -29,10 +29,12 @@ const MOST_POINTS: usize = 10_000_000;
 
 /// What is made of a model's shape.
 #[derive(clap::Args, Serialize)]
-pub struct Options {
-    /// Write a point cloud of at most N points in place of a mesh [default: 200000]
+pub struct GeometryOptions {
+    /// Write at most N points instead of a mesh
+    ///
+    /// Without a number, 200000 points.
     #[arg(
-        long,
+        long, help_heading = "Mesh",
         value_name = "N",
         num_args = 0..=1,
         require_equals = true,
@@ -40,37 +42,47 @@ pub struct Options {
         value_parser = parse::count(MOST_POINTS)
     )]
     points: Option<usize>,
-    /// Make the mesh's triangles fewer, down to N
-    #[arg(long, value_name = "N", conflicts_with = "points")]
+    /// Decimate the mesh to N triangles
+    #[arg(long, help_heading = "Mesh", value_name = "N", conflicts_with = "points")]
     triangles: Option<usize>,
-    /// Cells along the longest side of the box in which the surface is looked for [default: 2 for each of the occupancy grid]
-    #[arg(long, value_name = "N", conflicts_with = "points")]
+    /// Cells along the box's longest side
+    ///
+    /// The default is twice the resolution of the occupancy grid.
+    #[arg(long, help_heading = "Mesh", value_name = "N", conflicts_with = "points")]
     resolution: Option<usize>,
-    /// Density on the surface, in 1 / scene unit [default: that where views see it]
-    #[arg(long, value_name = "X", conflicts_with = "points")]
-    level: Option<f64>,
-    /// Leave out parts with less than this share, 0 to 1, of the largest one's area; 0 keeps all [default: 0.01]
-    #[arg(long, value_name = "SHARE", conflicts_with = "points")]
-    parts: Option<f64>,
-    /// Do not take what no view sees to be solid
-    #[arg(long, conflicts_with = "points")]
-    hollow: bool,
-    /// Let the surface end at the border of the box, where it is closed otherwise
-    #[arg(long, conflicts_with = "points")]
-    open: bool,
+    /// Density on the surface, per scene unit
+    ///
+    /// The default is the lower quartile of the densities at which rays have lost half of their light.
+    #[arg(long, help_heading = "Mesh", value_name = "X", conflicts_with = "points")]
+    iso_value: Option<f64>,
+    /// Drop components below this area share
+    ///
+    /// A share of the largest component's area, 0 to 1. 0 keeps all components. [default: 0.01]
+    #[arg(long, help_heading = "Mesh", value_name = "SHARE", conflicts_with = "points")]
+    min_component: Option<f64>,
+    /// Keep cavities that no view sees
+    ///
+    /// By default space that no view sees counts as solid.
+    #[arg(long, help_heading = "Mesh", conflicts_with = "points")]
+    no_fill_unseen: bool,
+    /// Leave the mesh open at the scene box
+    ///
+    /// By default the mesh is closed there.
+    #[arg(long, help_heading = "Mesh", conflicts_with = "points")]
+    open_boundary: bool,
 }
 
-impl Options {
+impl GeometryOptions {
     /// Whether nothing of this is asked for, which cameras have no use for.
     pub fn check_absent(&self) -> Result<()> {
         let given = [
             ("points", self.points.is_some()),
             ("triangles", self.triangles.is_some()),
             ("resolution", self.resolution.is_some()),
-            ("level", self.level.is_some()),
-            ("parts", self.parts.is_some()),
-            ("hollow", self.hollow),
-            ("open", self.open),
+            ("iso-value", self.iso_value.is_some()),
+            ("min-component", self.min_component.is_some()),
+            ("no-fill-unseen", self.no_fill_unseen),
+            ("open-boundary", self.open_boundary),
         ];
         match given.iter().find(|(_, given)| *given) {
             Some((name, _)) => Err(Error::setting(name, "is for shapes: name a file that ends in .ply, .obj or .glb")),
@@ -80,7 +92,7 @@ impl Options {
 }
 
 /// Makes the shape and writes it.
-pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job: &Job) -> Result<()> {
+pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Path, job: &Job) -> Result<()> {
     check_writable(parent(out))?;
     let model = run.model()?;
     let cameras = cameras(run, &model, scene)?;
@@ -90,21 +102,24 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job:
     let (shape, said) = match options.points {
         Some(count) => {
             let cloud = model.point_cloud(&cameras, count, &mut show)?;
-            let points = cloud.shape.mesh.positions.len();
-            (cloud.shape, format!("{points} points, of {} places that {} views see", cloud.sights, cameras.len()))
+            let points = cloud.colored_mesh.mesh.positions.len();
+            (
+                cloud.colored_mesh,
+                format!("{points} points, of {} places that {} views see", cloud.sights, cameras.len()),
+            )
         }
         None => {
             let default = SurfaceConfig::default();
             let config = SurfaceConfig {
                 resolution: options.resolution,
-                level: options.level,
-                parts: options.parts.unwrap_or(default.parts),
+                iso_value: options.iso_value,
+                min_component: options.min_component.unwrap_or(default.min_component),
                 triangles: options.triangles,
-                filled: !options.hollow,
-                closed: !options.open,
+                fill_unseen: !options.no_fill_unseen,
+                closed: !options.open_boundary,
             };
             let surface = model.surface(&cameras, &config, &mut show)?;
-            let mesh = &surface.shape.mesh;
+            let mesh = &surface.colored_mesh.mesh;
             if let Some(most) = options.triangles.filter(|most| mesh.triangles.len() > *most) {
                 let count = mesh.triangles.len();
                 note(&format!(
@@ -116,16 +131,16 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job:
                 mesh.positions.len(),
                 mesh.triangles.len(),
                 if mesh.is_closed() { "closed" } else { "not closed" },
-                surface.level,
+                surface.iso_value,
                 surface.resolution,
                 surface.dropped
             );
-            (surface.shape, said)
+            (surface.colored_mesh, said)
         }
     };
     drop(display);
     job.check(out)?;
-    let bytes = files::write_with_comment(&shape.placed_back(&model.extent.placement), out, job.mark())?;
+    let bytes = files::write_with_comment(&shape.placed_back(&model.scene_box.transform), out, job.mark())?;
     let part = if model.config.unbounded { ", of the box where the cameras look" } else { "" };
     let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
     print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
@@ -133,7 +148,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &Options, out: &Path, job:
 
 /// Cameras that look at the scene: those of its photographs, if they are still there or `scene` says where, and others around it.
 fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<Camera>> {
-    let around = rings(&run.config.viewpoint, &run.config.extent);
+    let around = rings(&run.config.viewpoint, &run.config.scene_box);
     let own = match photographs(run, model, scene, Split::Train) {
         Ok(own) => evenly_spaced(own, PHOTOGRAPHS),
         Err(error) if scene.is_some() => return Err(error),
@@ -146,7 +161,7 @@ fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<C
 }
 
 /// Cameras around the scene, at the mean height of its photographs, lower, and higher.
-fn rings(viewpoint: &Viewpoint, extent: &Extent) -> Vec<Camera> {
+fn rings(viewpoint: &Viewpoint, extent: &SceneBox) -> Vec<Camera> {
     let mean = viewpoint.elevation;
     let elevations = [0.1 * mean, 0.5 * mean, mean, 0.5 * (mean + FRAC_PI_2.copysign(mean))];
     let ring = |elevation| Viewpoint { elevation, ..*viewpoint }.orbit(extent, RING);
@@ -196,7 +211,7 @@ mod tests {
 
     #[test]
     fn no_camera_around_a_scene_is_there_twice() {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::new(1.0, 2.0, 1.0)], [0.5, 9.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 2.0, 1.0)], [0.5, 9.0]);
         let around = |elevation: f64, reach: f64| {
             let view = Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation, azimuth: 0.2, reach };
             rings(&view, &extent)

@@ -72,7 +72,7 @@ fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String
         "background": model.config.background.shown(),
         "gain": model.gain(),
         "reach": model.reach().map(|corner| corner.to_array().map(finite)),
-        "span": model.view_span().map(finite),
+        "span": model.view_near_far().map(finite),
         "space": space(model),
         "march": march(model, marching),
         "grid": {
@@ -88,7 +88,7 @@ fn page(run: &Run, model: &Model<f32>, mark: &str) -> std::result::Result<String
             "color": config.color_width,
             "depth": config.color_depth,
             "degree": config.direction_degree,
-            "shift": log_density_shift(model.extent.unit),
+            "shift": log_density_shift(model.scene_box.unit),
         },
     });
     let files = json!({
@@ -136,14 +136,14 @@ fn space(model: &Model<f32>) -> Value {
 
 fn march(model: &Model<f32>, marching: &Marching) -> Value {
     let (grid, step) = (marching.view_grid(), marching.view_spacing());
-    let limits = model.sampler.limits();
+    let limits = model.sampler.tolerance();
     json!({
         "bounds": grid.bounds().map(|corner| corner.to_array()),
         "resolution": grid.resolution(),
         "cascades": grid.cascades(),
         "step": step.length,
         "cone": step.cone,
-        "termination": limits.termination,
+        "termination": limits.early_stop_eps,
         "budget": limits.color_budget,
     })
 }
@@ -202,7 +202,7 @@ fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Ve
         }
         let (seen, coded) = values.split_at(inputs * outputs);
         let mut added = vec![0.0; outputs];
-        if config.codes > 0 {
+        if config.appearance_embedding_dim > 0 {
             let (codes, [count, width]) = parameter(model, "field.codes")?;
             for (number, row) in coded.chunks(outputs).enumerate() {
                 let mean = codes.chunks(width).map(|code| code[number]).sum::<f32>() / count as f32;
@@ -219,7 +219,7 @@ fn weights(model: &Model<f32>, config: &InstantConfig) -> std::result::Result<Ve
 mod tests {
     use raygrad::nerf::encoding::hash_grid::HashGridConfig;
     use raygrad::nerf::glam::{DMat3, DVec3};
-    use raygrad::nerf::{Config, Extent, FieldConfig, Ndc, Preset, SamplerConfig};
+    use raygrad::nerf::{Config, FieldConfig, Ndc, Preset, SamplerConfig, SceneBox};
 
     use super::*;
 
@@ -232,12 +232,13 @@ mod tests {
             color_width: 2,
             color_depth: 1,
             direction_degree: 1,
-            codes: 2,
+            appearance_embedding_dim: 2,
         }
     }
 
-    fn model(config: InstantConfig, change: impl FnOnce(&mut Config, &mut Extent)) -> Model<f32> {
-        let mut extent = Extent { frames: 2, ..Extent::new([DVec3::NEG_ONE, DVec3::new(1.0, 3.0, 1.0)], [0.5, 9.0]) };
+    fn model(config: InstantConfig, change: impl FnOnce(&mut Config, &mut SceneBox)) -> Model<f32> {
+        let mut extent =
+            SceneBox { frames: 2, ..SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 3.0, 1.0)], [0.5, 9.0]) };
         let mut config = Config { field: FieldConfig::new(config), ..Config::preset(Preset::Instant) };
         change(&mut config, &mut extent);
         if let Some(marching) = config.sampler.get_mut::<MarchingConfig>() {
@@ -247,7 +248,7 @@ mod tests {
         Model::new(config, extent, 0).unwrap()
     }
 
-    fn as_it_is(_: &mut Config, _: &mut Extent) {}
+    fn as_it_is(_: &mut Config, _: &mut SceneBox) {}
 
     fn give(model: &mut Model<f32>, name: &str, values: &[f32]) {
         let id = model.params.find(name).unwrap();
@@ -333,9 +334,9 @@ mod tests {
     fn what_a_page_marches_through_is_what_views_do() {
         let model = model(small(), as_it_is);
         let marching = model.marching().unwrap();
-        let (told, step, limits) = (march(&model, marching), marching.view_spacing(), model.sampler.limits());
+        let (told, step, limits) = (march(&model, marching), marching.view_spacing(), model.sampler.tolerance());
         assert_eq!(json!([told["step"], told["cone"]]), json!([step.length, step.cone]));
-        assert_eq!(json!([told["termination"], told["budget"]]), json!([limits.termination, limits.color_budget]));
+        assert_eq!(json!([told["termination"], told["budget"]]), json!([limits.early_stop_eps, limits.color_budget]));
         let grid = marching.view_grid();
         assert_eq!(json!([told["resolution"], told["cascades"]]), json!([grid.resolution(), grid.cascades()]));
         assert_eq!(told["bounds"], json!([[-1.0, -1.0, -1.0], [1.0, 3.0, 1.0]]));

@@ -17,8 +17,8 @@ pub fn of(capture: &Capture) -> Result<(Vec<[f64; 2]>, usize)> {
     if guessed == 0 {
         return Ok((found.into_iter().flatten().collect(), 0));
     }
-    let survey = capture.survey(None)?;
-    let placement = survey.placement;
+    let survey = capture.analyze_scene(None)?;
+    let placement = survey.transform;
     let reach = survey.bounds[0].distance(survey.bounds[1]) * 0.5 / placement.scale;
     let middle = placement.point_back(0.5 * (survey.bounds[0] + survey.bounds[1]));
     let near = survey.near / placement.scale;

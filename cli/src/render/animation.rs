@@ -24,7 +24,7 @@ pub enum Animation<W: Write> {
 }
 
 impl<W: Write> Animation<W> {
-    /// A GIF without frames, with a comment. A frame is shown for a whole number of hundredths of a second, and the film for as
+    /// A GIF without frames, with a comment. A frame is shown for a whole number of hundredths of a second, and the video for as
     /// long as it should.
     pub fn gif(to: W, [width, height]: [u16; 2], fps: f64, comment: &str) -> Result<Self, String> {
         let mut encoder = gif::Encoder::new(to, width, height, &[]).map_err(|e| e.to_string())?;

@@ -11,7 +11,7 @@
 
 use std::path::Path as File;
 
-use raygrad::nerf::camera::{CameraPath, Curve, Key};
+use raygrad::nerf::camera::{CameraPath, Curve, Keyframe};
 use raygrad::nerf::dataset::formats::rigid;
 use raygrad::nerf::glam::{DAffine3, DMat3, DQuat, DVec3};
 use raygrad::nerf::{Error, Result};
@@ -45,7 +45,7 @@ pub struct Path {
 #[derive(Debug)]
 pub enum Motion {
     /// Every frame is there.
-    Frames(Vec<Key>),
+    Frames(Vec<Keyframe>),
     /// Between key frames, for so long, if the file says.
     Keys { path: CameraPath, seconds: Option<f64> },
 }
@@ -94,7 +94,7 @@ struct Shot {
 /// One key frame.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Keyframe {
+struct NerfstudioKeyframe {
     matrix: [f64; 16],
     fov: f64,
     #[serde(rename = "aspect")]
@@ -248,17 +248,17 @@ fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Pa
                     "must be 0 where there is no `camera_path`: others are not understood",
                 ));
             }
-            let frames: Vec<Keyframe> = serde_json::from_value(frames)
+            let frames: Vec<NerfstudioKeyframe> = serde_json::from_value(frames)
                 .map_err(|e| bad("keyframes", &format!("is not of the right form: {e}")))?;
             count(file, "keyframes", frames.len())?;
             let each = frames.iter().enumerate();
             let keys =
                 each.map(|(i, frame)| key(format!("keyframes[{i}]"), &frame.matrix, frame.fov, frame.render_time));
-            let keys: Vec<Key> = keys.collect::<Result<_>>()?;
+            let keys: Vec<Keyframe> = keys.collect::<Result<_>>()?;
             let closed = path.is_cycle.unwrap_or(false) && keys.len() > 1;
             // A key frame says how long it takes to get to it, the first of a cycle at its end.
             let usual = path.default_transition_sec.unwrap_or(TRANSITION);
-            let seconds = |(i, frame): (usize, &Keyframe)| {
+            let seconds = |(i, frame): (usize, &NerfstudioKeyframe)| {
                 let own = frame.override_transition_sec.filter(|_| frame.override_transition_enabled.unwrap_or(false));
                 let seconds = own.unwrap_or(usual);
                 let what = || bad(&format!("keyframes[{i}].override_transition_sec"), "must be above 0");
@@ -302,7 +302,7 @@ fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
         let pose = DAffine3 { matrix3, translation: DVec3::from(frame.position) };
         key(file, &name, pose, frame.fov, to_capture)
     };
-    let keys = path.path.iter().enumerate().map(of).collect::<Result<Vec<Key>>>()?;
+    let keys = path.path.iter().enumerate().map(of).collect::<Result<Vec<Keyframe>>>()?;
     let closed = path.closed && keys.len() > 1;
     let legs = if closed { keys.len() } else { keys.len() - 1 };
     // A time is when the next key frame is reached. Times that do not rise count for nothing.
@@ -326,7 +326,7 @@ fn count(file: &File, field: &str, count: usize) -> Result<()> {
 }
 
 /// A pose and a vertical angle in degrees, in the capture's coordinates.
-fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3) -> Result<Key> {
+fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3) -> Result<Keyframe> {
     let bad = |what: String| Error::field(file, name, what);
     rigid::pose(&pose).map_err(|what| bad(format!("its pose {what}")))?;
     if !(SMALLEST_FOV..=180.0 - SMALLEST_FOV).contains(&fov) {
@@ -337,7 +337,7 @@ fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3)
         matrix3: *matrix3 * pose.matrix3 * matrix3.determinant().cbrt().recip(),
         translation: to_capture.transform_point3(pose.translation),
     };
-    Ok(Key { pose, angle_y: fov.to_radians() })
+    Ok(Keyframe { pose, angle_y: fov.to_radians() })
 }
 
 /// Sixteen numbers row by row.

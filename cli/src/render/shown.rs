@@ -1,9 +1,9 @@
 //! What is shown of a view, and what is saved beside it.
 
 use clap::ValueEnum;
-use raygrad::nerf::dataset::{Depths, Placement};
+use raygrad::nerf::dataset::{Depths, SceneTransform};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Camera, Extent, Image, Picture};
+use raygrad::nerf::{Camera, Image, Render, SceneBox};
 use serde::{Deserialize, Serialize};
 
 use crate::output::depth_colors;
@@ -60,7 +60,7 @@ const SOLID: f32 = 0.5;
 pub struct Shown<'a> {
     pub renderer: &'a Renderer,
     /// Where the scene lies in its capture.
-    pub extent: Extent,
+    pub extent: SceneBox,
     pub background: [f32; 3],
     pub show: Show,
     pub save: &'a [Layer],
@@ -98,7 +98,7 @@ impl Shown<'_> {
         };
         let layers = self.save.iter().map(|&layer| (layer, contents(layer))).collect();
         let image = match (self.show, normals) {
-            (Show::Depth, _) => depth_colors(&picture, self.extent.span),
+            (Show::Depth, _) => depth_colors(&picture, self.extent.near_far),
             (Show::Normals, Some(normals)) => over(&normals, &picture.opacity, self.background),
             (Show::Opacity, _) => picture.opacity,
             (Show::Color | Show::Normals, _) => picture.color,
@@ -107,16 +107,16 @@ impl Shown<'_> {
     }
 
     fn normals(&self, camera: &Camera) -> Image {
-        facing(self.renderer.normals(camera), &self.extent.placement)
+        facing(self.renderer.normals(camera), &self.extent.transform)
     }
 
-    fn depths(&self, picture: &Picture, camera: &Camera) -> Depths {
-        depths(picture, camera, &self.extent.placement)
+    fn depths(&self, picture: &Render, camera: &Camera) -> Depths {
+        depths(picture, camera, &self.extent.transform)
     }
 }
 
 /// Unit normals as colours, in the capture's axes.
-pub fn facing(mut normals: Image, placement: &Placement) -> Image {
+pub fn facing(mut normals: Image, placement: &SceneTransform) -> Image {
     let back = placement.rotation.transpose();
     for pixel in normals.data.chunks_exact_mut(3) {
         let normal = DVec3::new(pixel[0].into(), pixel[1].into(), pixel[2].into());
@@ -127,12 +127,12 @@ pub fn facing(mut normals: Image, placement: &Placement) -> Image {
 }
 
 /// Depths of what is solid, in units of the capture.
-fn depths(picture: &Picture, camera: &Camera, placement: &Placement) -> Depths {
+fn depths(picture: &Render, camera: &Camera, placement: &SceneTransform) -> Depths {
     Depths::new(&solid(&picture.depth, picture), camera, placement.scale.recip())
 }
 
 /// An image with nothing where nothing is solid.
-fn solid(image: &Image, picture: &Picture) -> Image {
+fn solid(image: &Image, picture: &Render) -> Image {
     let mut image = image.clone();
     for (pixel, opacity) in image.data.chunks_exact_mut(image.channels).zip(&picture.opacity.data) {
         if !(*opacity >= SOLID) {
@@ -165,10 +165,10 @@ mod tests {
     fn normals_and_depths_are_the_captures() {
         // What is x, y and z in the capture is y, z and x in the scene, and twice as long.
         let rotation = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
-        let placement = Placement { rotation, scale: 2.0, origin: DVec3::ONE };
+        let placement = SceneTransform { rotation, scale: 2.0, origin: DVec3::ONE };
         let colors = facing(image(3, &[0.0, 0.7, 0.0, 0.0, 0.0, -0.3, 0.0, 0.0, 0.0]), &placement);
         assert_eq!(colors.data, [1.0, 0.5, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5]);
-        let picture = Picture {
+        let picture = Render {
             color: image(3, &[0.0; 9]),
             depth: image(1, &[6.0, 6.0, 6.0]),
             opacity: image(1, &[0.49, 0.5, 1.0]),

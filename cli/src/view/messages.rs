@@ -13,7 +13,7 @@ use crate::render::shown::Show;
 pub const LARGEST: u32 = 4096;
 /// Most pixels of a picture.
 const MOST_PIXELS: u32 = 1 << 22;
-/// Most pixels of all pictures of a film, which are kept as files until it is made.
+/// Most pixels of all pictures of a video, which are kept as files until it is made.
 const MOST_OF_A_FILM: u64 = 1 << 34;
 /// Coordinates beyond this, in scene units, are of nothing that can be seen.
 const FARTHEST: f64 = 1e9;
@@ -21,7 +21,7 @@ const FARTHEST: f64 = 1e9;
 /// What a page says: text, one JSON object a message.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(tag = "ask", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Ask {
+pub enum ClientMessage {
     /// Pictures of this, until something else is asked for. `id` comes back with them.
     View { id: u32, view: View },
     /// Nothing is looked at for now.
@@ -38,30 +38,33 @@ pub enum Ask {
     Stop {},
     /// The share of time that training leaves to pictures, 0 to .9.
     Share { share: f64 },
-    /// A film.
-    Film(Film),
-    /// The film that is being made is not wanted.
-    EndFilm {},
+    /// A video.
+    Video(VideoRequest),
+    /// The video that is being made is not wanted.
+    EndVideo {},
 }
 
-impl Ask {
+impl ClientMessage {
     /// Reads a message.
-    pub fn read(text: &str) -> Result<Ask, String> {
-        let ask: Ask = serde_json::from_str(text).map_err(|e| e.to_string().replace(char::is_control, " "))?;
+    pub fn read(text: &str) -> Result<ClientMessage, String> {
+        let ask: ClientMessage =
+            serde_json::from_str(text).map_err(|e| e.to_string().replace(char::is_control, " "))?;
         match &ask {
-            Ask::View { view, .. } | Ask::Save { view } => view.check()?,
-            Ask::Film(film) => film.check()?,
-            Ask::Share { share } if !(0.0..=0.9).contains(share) => return Err("a share is from 0 to 0.9".to_owned()),
+            ClientMessage::View { view, .. } | ClientMessage::Save { view } => view.check()?,
+            ClientMessage::Video(video) => video.check()?,
+            ClientMessage::Share { share } if !(0.0..=0.9).contains(share) => {
+                return Err("a share is from 0 to 0.9".to_owned());
+            }
             _ => (),
         }
         Ok(ask)
     }
 }
 
-/// A film along a camera path, of the run's model as a whole.
+/// A video along a camera path, of the run's model as a whole.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Film {
+pub struct VideoRequest {
     /// As `raygrad render --path` reads it, which says what else is wrong with it.
     pub path: Value,
     #[serde(default)]
@@ -74,10 +77,10 @@ pub struct Film {
     pub skip: Option<Skip>,
 }
 
-impl Film {
+impl VideoRequest {
     fn check(&self) -> Result<(), String> {
         if self.pixels()? > MOST_PIXELS.into() {
-            return Err(format!("a film's pictures have {MOST_PIXELS} pixels at most"));
+            return Err(format!("a video's pictures have {MOST_PIXELS} pixels at most"));
         }
         self.frames().map(drop)
     }
@@ -88,7 +91,7 @@ impl Film {
         if pixels * frames > MOST_OF_A_FILM as f64 {
             let most = MOST_OF_A_FILM as f64 / pixels;
             return Err(format!(
-                "a film of this size has {most:.0} frames at most, not {frames:.0}: lower its seconds, `fps` or size"
+                "a video of this size has {most:.0} frames at most, not {frames:.0}: lower its seconds, `fps` or size"
             ));
         }
         Ok(())
@@ -106,7 +109,7 @@ impl Film {
     fn number(&self, name: &str, most: f64) -> Result<f64, String> {
         match self.path.get(name).map(Value::as_f64) {
             Some(Some(value)) if (0.0..=most).contains(&value) => Ok(value),
-            _ => Err(format!("a film's `{name}` is a number up to {most}")),
+            _ => Err(format!("a video's `{name}` is a number up to {most}")),
         }
     }
 }
@@ -257,14 +260,14 @@ pub struct AboutPhotograph {
 /// What a page is told: of these, text.
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "tell", rename_all = "kebab-case")]
-pub enum Tell {
+pub enum ServerMessage {
     About(Box<About>),
     /// How training goes.
     Training(Value),
     /// Where photographs were taken, as it is known by now.
     Taken(Taken),
-    /// How a film is getting on, and in which file.
-    Film {
+    /// How a video is getting on, and in which file.
+    Video {
         file: String,
         words: String,
         ended: bool,
@@ -314,7 +317,7 @@ impl File {
 }
 
 /// As text.
-pub fn text(tell: &Tell) -> String {
+pub fn text(tell: &ServerMessage) -> String {
     serde_json::to_string(tell).unwrap_or_default()
 }
 

@@ -1,24 +1,24 @@
 //! `raygrad view`: a window on the scene, in a browser.
 
-mod album;
-mod guard;
-mod hub;
+mod access;
+mod cache;
+mod connection;
 pub mod messages;
-mod painter;
-mod parts;
+mod model_cache;
+mod photo_cache;
+mod renderer;
+mod requests;
+mod row_tiles;
 mod served;
 mod server;
-mod shelf;
-mod store;
-mod studio;
-mod talk;
-mod window;
+mod training_viewer;
+mod video_jobs;
 
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use raygrad::nerf::dataset::Placement;
+use raygrad::nerf::dataset::SceneTransform;
 use raygrad::nerf::glam::{DAffine3, DMat3, DVec3};
 use raygrad::nerf::{Model, Result};
 
@@ -26,15 +26,15 @@ use super::checkpoint;
 use super::output::{complain, note, print};
 use super::run::Run;
 use super::scene::Scene;
-use album::Album;
-use hub::Hub;
-use messages::{About, FirstView, Taken, Tell, rows};
-use painter::Painter;
-use shelf::Shelf;
-use studio::Studio;
+use messages::{About, FirstView, ServerMessage, Taken, rows};
+use model_cache::ModelCache;
+use photo_cache::PhotoCache;
+use renderer::Renderer;
+use requests::Requests;
+use video_jobs::VideoJobs;
 
 pub use server::Listener;
-pub use window::Window;
+pub use training_viewer::TrainingViewer;
 
 /// What moves cameras in pages.
 pub const CAMERA: &str = include_str!("page/camera.js");
@@ -42,32 +42,38 @@ pub const CAMERA: &str = include_str!("page/camera.js");
 /// The address of this machine that others cannot reach.
 const HOST: &str = "127.0.0.1";
 
-/// Look at a run in a browser
+/// Open a run in the browser viewer
 ///
-/// The program itself serves the page, to this machine alone unless --host says otherwise. Ctrl-C ends it.
+/// raygrad serves the page itself, to this machine only unless --host says otherwise. Ctrl-C ends it.
+///
+/// Example: raygrad view my-run --open
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder that `raygrad train` made
+    /// Run folder, made by `raygrad train`
     run: PathBuf,
     #[command(flatten)]
     place: PlaceArgs,
-    /// Open the page in the browser
-    #[arg(long)]
+    /// Open the viewer in the browser
+    #[arg(long, help_heading = "Viewer")]
     open: bool,
-    /// Folder of the photographs, if they are no longer where they were for training
-    #[arg(long)]
+    /// Image folder, if it moved after training
+    ///
+    /// Without it, raygrad reads the images from where they were during training.
+    #[arg(long, help_heading = "Scene")]
     scene: Option<Scene>,
 }
 
 /// Where pages are served.
 #[derive(Debug, Clone, clap::Args)]
 pub struct PlaceArgs {
-    /// Address or name under which pages are served: 127.0.0.1 for whoever uses this machine; with another, others come too who
-    /// have the link with its token, unencrypted
-    #[arg(long, default_value = HOST)]
+    /// Address to serve on
+    ///
+    /// 127.0.0.1 serves this machine only. With any other address, everyone who has the link with its token can
+    /// connect. The connection is not encrypted.
+    #[arg(long, help_heading = "Viewer", default_value = HOST)]
     host: String,
-    /// Port on which pages are served [default: a free one]
-    #[arg(long, default_value_t = 0, hide_default_value = true)]
+    /// Port to serve on [default: a free one]
+    #[arg(long, help_heading = "Viewer", default_value_t = 0, hide_default_value = true)]
     port: u16,
 }
 
@@ -90,27 +96,27 @@ impl PlaceArgs {
 pub fn run(args: &Args) -> Result<()> {
     let run = Arc::new(Run::open(&args.run)?);
     let model = Arc::new(run.model()?);
-    let (hub, album) = (Arc::new(Hub::default()), album(&run, args.scene.as_ref()));
-    hub.introduce(about(&run, &model, album.as_deref(), Some(checkpoint::steps(&run)?)));
-    let studio = Arc::new(Studio::new(run.clone(), args.scene.clone(), hub.clone()));
+    let (requests, photos) = (Arc::new(Requests::default()), photos(&run, args.scene.as_ref()));
+    requests.introduce(about(&run, &model, photos.as_deref(), Some(checkpoint::steps(&run)?)));
+    let video_jobs = Arc::new(VideoJobs::new(run.clone(), args.scene.clone(), requests.clone()));
     let background = model.config.background.shown();
-    let link = server::serve(args.place.listen()?, hub.clone(), album.clone(), Some(studio), background)?;
+    let link = server::serve(args.place.listen()?, requests.clone(), photos.clone(), Some(video_jobs), background)?;
     print(&format!("view     {link}\n"))?;
     if args.open
         && let Err(error) = open::that_detached(&link)
     {
         complain(&format!("warning: no browser could be opened: {error}"));
     }
-    let mut painter = Painter::new(hub.clone(), album, Some(Shelf::new(run, model.clone())));
+    let mut renderer = Renderer::new(requests.clone(), photos, Some(ModelCache::new(run, model.clone())));
     loop {
-        painter.work_or_wait(&model, 0, Duration::from_secs(1));
+        renderer.work_or_wait(&model, 0, Duration::from_secs(1));
     }
 }
 
 /// The photographs of a run, which it can be looked at without.
-fn album(run: &Run, scene: Option<&Scene>) -> Option<Arc<Album>> {
-    match Album::open(run, scene) {
-        Ok(album) => Some(Arc::new(album)),
+fn photos(run: &Run, scene: Option<&Scene>) -> Option<Arc<PhotoCache>> {
+    match PhotoCache::open(run, scene) {
+        Ok(photos) => Some(Arc::new(photos)),
         Err(error) => {
             note(&format!("photographs are not shown: {error}"));
             None
@@ -120,7 +126,7 @@ fn album(run: &Run, scene: Option<&Scene>) -> Option<Arc<Album>> {
 
 /// Where a scene is looked at from first.
 pub fn first_view(run: &Run) -> FirstView {
-    let (view, extent) = (&run.config.viewpoint, &run.config.extent);
+    let (view, extent) = (&run.config.viewpoint, &run.config.scene_box);
     let camera = &view.orbit(extent, 1)[0];
     FirstView {
         pose: rows(&camera.pose),
@@ -131,38 +137,39 @@ pub fn first_view(run: &Run) -> FirstView {
 }
 
 /// What pages are told of a scene; `checkpoints` are those that can be looked at, if it is not being trained.
-fn about(run: &Run, model: &Model<f32>, album: Option<&Album>, checkpoints: Option<Vec<u64>>) -> String {
+fn about(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>, checkpoints: Option<Vec<u64>>) -> String {
     let view = &run.config.viewpoint;
     let about = About {
         title: run.name(),
         first: first_view(run),
         size: [view.width, view.height],
         background: model.config.background.shown(),
-        taken: taken(run, model, album),
-        points: album.map_or(vec![], |album| album.points(model)),
+        taken: taken(run, model, photos),
+        points: photos.map_or(vec![], |photos| photos.points(model)),
         training: checkpoints.is_none(),
         checkpoints: checkpoints.unwrap_or_default(),
     };
-    messages::text(&Tell::About(Box::new(about)))
+    messages::text(&ServerMessage::About(Box::new(about)))
 }
 
 /// Where photographs were taken.
-fn taken(run: &Run, model: &Model<f32>, album: Option<&Album>) -> Taken {
+fn taken(run: &Run, model: &Model<f32>, photos: Option<&PhotoCache>) -> Taken {
     // As cameras of files are taken to where the model has them: where they are given, and from there by what it has learned.
-    let learned = model.refine.as_ref().and_then(|refine| refine.placement(&model.params)).unwrap_or_default();
+    let learned =
+        model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default();
     Taken {
-        to_capture: rows(&to_capture(&run.config.extent.placement, &learned)),
-        photographs: album.map_or(vec![], |album| album.about(model)),
+        to_capture: rows(&to_capture(&run.config.scene_box.transform, &learned)),
+        photographs: photos.map_or(vec![], |photos| photos.about(model)),
     }
 }
 
 /// From the scene to a capture that was placed in it and has moved since as a whole.
-fn to_capture(placement: &Placement, learned: &Placement) -> DAffine3 {
+fn to_capture(placement: &SceneTransform, learned: &SceneTransform) -> DAffine3 {
     inverse(placement) * inverse(learned)
 }
 
 /// From the scene to what was placed in it.
-fn inverse(placement: &Placement) -> DAffine3 {
+fn inverse(placement: &SceneTransform) -> DAffine3 {
     let turn = placement.rotation.transpose() * DMat3::from_diagonal(DVec3::splat(placement.scale.recip()));
     DAffine3 { matrix3: turn, translation: placement.origin }
 }
@@ -174,9 +181,9 @@ mod tests {
     #[test]
     fn what_was_placed_and_has_moved_is_found_where_it_was() {
         let placement =
-            Placement { rotation: DMat3::from_rotation_z(0.7), scale: 2.5, origin: DVec3::new(1.0, -2.0, 0.5) };
+            SceneTransform { rotation: DMat3::from_rotation_z(0.7), scale: 2.5, origin: DVec3::new(1.0, -2.0, 0.5) };
         let learned =
-            Placement { rotation: DMat3::from_rotation_x(-0.3), scale: 0.8, origin: DVec3::new(0.1, 0.4, -0.2) };
+            SceneTransform { rotation: DMat3::from_rotation_x(-0.3), scale: 0.8, origin: DVec3::new(0.1, 0.4, -0.2) };
         let point = DVec3::new(3.0, 4.0, -5.0);
         let found = to_capture(&placement, &learned).transform_point3(learned.point(placement.point(point)));
         assert!(found.abs_diff_eq(point, 1e-12), "{found}");

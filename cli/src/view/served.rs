@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use tokio::sync::Semaphore;
 
-use super::album::Album;
-use super::hub::Hub;
-use super::studio::Studio;
+use super::photo_cache::PhotoCache;
+use super::requests::Requests;
+use super::video_jobs::VideoJobs;
 
 /// How much pages and connections may take, and how long they are waited for.
 #[derive(Debug, Clone, Copy)]
@@ -62,10 +62,10 @@ impl Limits {
 
 /// What all connections know.
 pub struct Served {
-    pub hub: Arc<Hub>,
-    pub album: Option<Arc<Album>>,
-    /// What makes films, if they can be made.
-    pub studio: Option<Arc<Studio>>,
+    pub requests: Arc<Requests>,
+    pub photos: Option<Arc<PhotoCache>>,
+    /// What makes videos, if they can be made.
+    pub video_jobs: Option<Arc<VideoJobs>>,
     /// What photographs that have transparency stand before.
     pub background: [f32; 3],
     /// The name of this machine that pages may use, beside its addresses.

@@ -19,14 +19,14 @@ use raygrad::nerf::{Error, Result};
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
-use super::album::Album;
-use super::guard::{Key, guard};
-use super::hub::Hub;
+use super::access::{AccessToken, check_access};
+use super::connection::Connection;
+use super::photo_cache::PhotoCache;
+use super::requests::Requests;
 use super::served::{Limits, Served};
-use super::studio::Studio;
-use super::talk::Page;
+use super::video_jobs::VideoJobs;
 
-pub use super::hub::{sorry, text};
+pub use super::requests::{sorry, text};
 
 /// Bytes of what is asked before it is answered.
 const HEAD: usize = 1 << 14;
@@ -65,26 +65,26 @@ impl Listener {
 /// If the system has no thread left.
 pub fn serve(
     listener: Listener,
-    hub: Arc<Hub>,
-    album: Option<Arc<Album>>,
-    studio: Option<Arc<Studio>>,
+    requests: Arc<Requests>,
+    photos: Option<Arc<PhotoCache>>,
+    video_jobs: Option<Arc<VideoJobs>>,
     background: [f32; 3],
 ) -> Result<String> {
-    serve_within(Limits::USUAL, listener, hub, album, studio, background)
+    serve_within(Limits::USUAL, listener, requests, photos, video_jobs, background)
 }
 
 fn serve_within(
     limits: Limits,
     Listener { listener, address, host }: Listener,
-    hub: Arc<Hub>,
-    album: Option<Arc<Album>>,
-    studio: Option<Arc<Studio>>,
+    requests: Arc<Requests>,
+    photos: Option<Arc<PhotoCache>>,
+    video_jobs: Option<Arc<VideoJobs>>,
     background: [f32; 3],
 ) -> Result<String> {
     let bad = |e: std::io::Error| Error::setting("host", format!("{address} cannot be served: {e}"));
     let token = (!address.ip().is_loopback()).then(|| format!("{:032x}", rand::random::<u128>()));
     let link = link(address, &host, outward(address.ip(), beyond(address.ip())), token.as_deref());
-    let served = Served { hub, album, studio, background, host, token, readers: Semaphore::new(2), limits };
+    let served = Served { requests, photos, video_jobs, background, host, token, readers: Semaphore::new(2), limits };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(bad)?;
     let run = move || {
         runtime.block_on(async move {
@@ -146,11 +146,11 @@ async fn accept(listener: tokio::net::TcpListener, router: Router, limits: Limit
 }
 
 fn router(served: Arc<Served>) -> Router {
-    let guarded = middleware::from_fn_with_state(served.clone(), guard);
+    let guarded = middleware::from_fn_with_state(served.clone(), check_access);
     Router::new().route("/messages", get(messages)).fallback(file).layer(guarded).with_state(served)
 }
 
-async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query: Query<Key>) -> Response {
+async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query: Query<AccessToken>) -> Response {
     let Some((path, kind, text)) = FILES.iter().find(|(path, _, _)| *path == uri.path()) else {
         return (StatusCode::NOT_FOUND, "There is no such page.\n").into_response();
     };
@@ -166,7 +166,7 @@ async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query
 
 async fn messages(
     State(served): State<Arc<Served>>,
-    query: Query<Key>,
+    query: Query<AccessToken>,
     headers: HeaderMap,
     upgrade: WebSocketUpgrade,
 ) -> Response {
@@ -176,7 +176,7 @@ async fn messages(
         return (StatusCode::FORBIDDEN, "Only the page may ask.\n").into_response();
     }
     let longest = served.limits.longest;
-    let Some(page) = Page::join(served) else {
+    let Some(page) = Connection::join(served) else {
         return (StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open.\n").into_response();
     };
     let upgrade = upgrade.max_message_size(longest).max_frame_size(longest);

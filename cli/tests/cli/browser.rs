@@ -9,7 +9,7 @@ use super::view::{Server, serve};
 use super::{CLASSIC, Place, SMALL, png};
 use driver::{Browser, Kind};
 use raygrad::nerf::Image;
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::metrics::psnr;
 use serde_json::{Value, json};
 
 #[path = "browser/driver.rs"]
@@ -138,7 +138,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
 #[test]
 fn a_browser_keeps_pictures_and_paths_that_are_the_programs() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 60 --out run --scope unbounded {SMALL} --set sampler.cone=0.1"));
+    place.succeeds(&format!("train scene --steps 60 --out run --scene-type unbounded {SMALL} --set sampler.cone=0.1"));
     let server = serve(&place, "view run");
     Browser::all().for_each(|browser| keeps_pictures(browser, &place, &server));
 }
@@ -148,7 +148,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     browser.key("p");
     let saved = png(&browser.kept("view.png"));
     assert!(psnr(&browser.picture(place), &saved) > 35.0);
-    // Key frames where the camera is at first, and elsewhere; the film begins with what is seen.
+    // Key frames where the camera is at first, and elsewhere; the video begins with what is seen.
     browser.key("k");
     browser.drag([60.0, -5.0], "left");
     browser.key("k");
@@ -157,24 +157,24 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
     let path = browser.kept("path.json");
     std::fs::copy(path, place.path("path.json")).unwrap();
     // As large as the window it would take long.
-    browser.value("freeSizes = () => [48, 12]; document.getElementById('seconds').value = 0.5; document.getElementById('film').click()");
+    browser.value("freeSizes = () => [48, 12]; document.getElementById('seconds').value = 0.5; document.getElementById('video').click()");
     browser.until(
-        "document.getElementById('film-progress').textContent.endsWith('mp4: done') \
-                   || document.getElementById('film-progress').textContent.endsWith('gif: done')",
+        "document.getElementById('video-progress').textContent.endsWith('mp4: done') \
+                   || document.getElementById('video-progress').textContent.endsWith('gif: done')",
     );
-    assert!(browser.value("document.getElementById('end-film').hidden") == true);
-    let film = if browser.kind == Kind::Chromium { 1 } else { 2 };
-    let [ours, its] = ["path.json", &format!("run/films/film-{film}.json")].map(|name| place.json(name));
+    assert!(browser.value("document.getElementById('end-video').hidden") == true);
+    let video = if browser.kind == Kind::Chromium { 1 } else { 2 };
+    let [ours, its] = ["path.json", &format!("run/videos/video-{video}.json")].map(|name| place.json(name));
     let fov = |path: &Value| path["keyframes"][1]["fov"].as_f64().unwrap();
     assert!((fov(&ours) - fov(&its)).abs() < 1e-5 && ours["is_cycle"] == its["is_cycle"]);
     let size = format!("{}x{}", saved.width, saved.height);
     let rendered =
-        place.command(&format!("render run --path path.json --frames 2 --size {size} --out film")).output().unwrap();
+        place.command(&format!("render run --path path.json --frames 2 --size {size} --out video")).output().unwrap();
     // It says itself where it lies.
     let said = String::from_utf8_lossy(&rendered.stderr);
     assert!(rendered.status.success() && !said.contains("is taken to be"), "{said}");
-    std::fs::rename(place.path("film"), place.path(&format!("film-{:?}", browser.kind))).unwrap();
-    let [from, to] = ["0000", "0001"].map(|name| png(&place.path(&format!("film-{:?}/{name}.png", browser.kind))));
+    std::fs::rename(place.path("video"), place.path(&format!("video-{:?}", browser.kind))).unwrap();
+    let [from, to] = ["0000", "0001"].map(|name| png(&place.path(&format!("video-{:?}/{name}.png", browser.kind))));
     assert!(psnr(&from, &saved) > 42.0, "{}", psnr(&from, &saved));
     browser.rested();
     let seen = browser.picture(place);
@@ -370,10 +370,10 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.value("document.querySelector('#keys li:nth-child(2) button:last-child').click()");
     assert_eq!(browser.value("[keys.length, document.querySelectorAll('#keys li').length].join()"), "2,2");
     assert_eq!(browser.value("keys[1].eye.map((x) => x.toFixed(6)).join()"), last);
-    // What films cannot show is said, and that a path has two ends.
+    // What videos cannot show is said, and that a path has two ends.
     browser.set("crop", true);
     browser.value("document.getElementById('box-x-0').value = 1e9");
-    browser.click("film");
+    browser.click("video");
     browser.until("!$('sorry').hidden && $('sorry').textContent.includes('without a box')");
     browser.set("crop", false);
     browser.value("document.querySelector('#keys li button:last-child').click()");
@@ -620,8 +620,8 @@ fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
             "slight",
             "scene --steps 100 --set field.grid.levels=4 --set field.grid.log2_table=13 --set field.density_width=16 --set field.color_width=16 --set sampler.cone=0",
         ),
-        ("landscape", "around --steps 40 --set field.codes=2 --refine exposure"),
-        ("ahead", "around --steps 40 --scope forward"),
+        ("landscape", "around --steps 40 --set field.appearance_embedding_dim=2 --refine exposure"),
+        ("ahead", "around --steps 40 --scene-type forward-facing"),
     ] {
         if name == "ahead" {
             std::fs::write(place.path("around/transforms.json"), transforms.to_string()).unwrap();

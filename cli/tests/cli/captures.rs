@@ -3,19 +3,19 @@
 use super::{Place, SIZE, SMALL, png};
 use raygrad::Real;
 use raygrad::nerf::dataset::{Dataset, Split, load};
-use raygrad::nerf::{Camera, Config, Extent, Image, Model};
+use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
 use serde_json::{Value, json};
 
 /// The model of a run.
 fn model(place: &Place, run: &str) -> Model<f32> {
     let config = place.json(&format!("{run}/config.json"));
-    let extent: Extent = serde_json::from_value(config["extent"].clone()).unwrap();
+    let extent: SceneBox = serde_json::from_value(config["scene_box"].clone()).unwrap();
     let settings: Config = serde_json::from_value(config["config"].clone()).unwrap();
     Model::load(place.path(&format!("{run}/model.safetensors")), settings, extent).unwrap()
 }
 
 fn terms(place: &Place, run: &str) -> Value {
-    place.json(&format!("{run}/config.json"))["config"]["terms"].clone()
+    place.json(&format!("{run}/config.json"))["config"]["loss_terms"].clone()
 }
 
 #[test]
@@ -36,9 +36,9 @@ fn depths_are_learned_from_where_that_is_asked_for() {
         serde_json::from_str::<Value>(text.lines().next().unwrap()).unwrap()["loss"].as_f64().unwrap()
     };
     // Without files of depths there is nothing to learn from.
-    place.fails(&format!("train captured --steps 1 --depth {SMALL}"), &["`terms`", "depth_file_path"]);
+    place.fails(&format!("train captured --steps 1 --depth-loss {SMALL}"), &["`terms`", "depth_file_path"]);
     std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
-    let [plain, usual, heavy] = [loss("", "plain"), loss("--depth", "usual"), loss("--depth=2", "heavy")];
+    let [plain, usual, heavy] = [loss("", "plain"), loss("--depth-loss", "usual"), loss("--depth-loss=2", "heavy")];
     assert_eq!(terms(&place, "usual"), json!([{ "kind": "depth", "weight": 0.1 }]));
     assert_eq!(terms(&place, "heavy"), json!([{ "kind": "depth", "weight": 2.0 }]));
     assert!(usual > plain, "{usual} {plain}");
@@ -54,36 +54,39 @@ fn depths_are_learned_from_where_that_is_asked_for() {
         assert!(output.status.success() && said.contains("files of depths are left behind: "), "{flags}: {said}");
     }
     // The landscape measures its own.
-    place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth --out far {SMALL}"));
+    place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth-loss --out far {SMALL}"));
     assert_eq!(terms(&place, "far")[1], json!({ "kind": "depth", "weight": 0.1 }));
-    place.fails(&format!("train embedded --downscale 20 --steps 1 --depth {SMALL}"), &["`terms`"]);
+    place.fails(&format!("train embedded --downscale 20 --steps 1 --depth-loss {SMALL}"), &["`terms`"]);
 }
 
 #[test]
 fn terms_and_the_nearest_distance_can_be_said() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 1 --out one {SMALL} --term entropy=0.001 --near 2.5"));
+    place.succeeds(&format!("train scene --steps 1 --out one {SMALL} --loss entropy=0.001 --near 2.5"));
     assert_eq!(terms(&place, "one"), json!([{ "kind": "entropy", "weight": 0.001 }]));
-    assert_eq!(place.json("one/config.json")["extent"]["span"], json!([2.5, 6.0]));
+    assert_eq!(place.json("one/config.json")["scene_box"]["near_far"], json!([2.5, 6.0]));
     // Those that a scope brings are replaced or taken away.
     for (flag, expected) in [
         ("distortion=0", json!([])),
         ("distortion=0.5", json!([{ "kind": "distortion", "weight": 0.5 }])),
         ("entropy=0", json!([{ "kind": "distortion", "weight": 0.1 }])),
     ] {
-        place.succeeds(&format!("train scene --scope unbounded --steps 1 --out {flag} {SMALL} --term {flag}"));
+        place.succeeds(&format!("train scene --scene-type unbounded --steps 1 --out {flag} {SMALL} --loss {flag}"));
         assert_eq!(terms(&place, flag), expected);
     }
     // In the units of the files: here a unit of theirs is not one of the scene.
-    place.succeeds(&format!("train scene --scope unbounded --steps 1 --out near --near 0.25 {SMALL}"));
+    place.succeeds(&format!("train scene --scene-type unbounded --steps 1 --out near --near 0.25 {SMALL}"));
     let config = place.json("near/config.json");
-    let scale = config["extent"]["placement"]["scale"].as_f64().unwrap();
-    assert!((config["extent"]["span"][0].as_f64().unwrap() - 0.25 * scale).abs() < 1e-12 && scale != 1.0, "{config}");
+    let scale = config["scene_box"]["transform"]["scale"].as_f64().unwrap();
+    assert!(
+        (config["scene_box"]["near_far"][0].as_f64().unwrap() - 0.25 * scale).abs() < 1e-12 && scale != 1.0,
+        "{config}"
+    );
     place.fails(&format!("train scene --steps 1 {SMALL} --near 6"), &["`near`", "less than 6"]);
     place.fails(&format!("train scene --steps 1 {SMALL} --near=-1"), &["`near`"]);
-    place.fails(&format!("train scene --steps 1 {SMALL} --term fog=1"), &["`term`", "fog=1", "entropy"]);
+    place.fails(&format!("train scene --steps 1 {SMALL} --loss fog=1"), &["`term`", "fog=1", "entropy"]);
     for bad in ["entropy", "entropy=x", "entropy=-1", "entropy=NaN"] {
-        let output = place.command(&format!("train scene --steps 1 --term {bad}")).output().unwrap();
+        let output = place.command(&format!("train scene --steps 1 --loss {bad}")).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{bad}: {output:?}");
     }
 }
@@ -105,17 +108,17 @@ fn apart(a: &Image, b: &Image) -> f32 {
 fn photographs_are_compared_from_where_the_model_has_their_cameras() {
     let place = Place::with_scene();
     // At a rate at which they go astray, so that it can be seen.
-    let fast = r#"--set poses={"constant":{"rate":0.1}} --set refine={"focal":{"constant":{"rate":0.02}}}"#;
+    let fast = r#"--set poses={"constant":{"rate":0.1}} --set camera_optimizer={"focal":{"constant":{"rate":0.02}}}"#;
     place.succeeds(&format!("train scene --steps 40 --out run {SMALL} {fast}"));
     let model = model(&place, "run");
-    let view = |camera: &Camera| model.view(camera, [1.0; 3]).color;
+    let view = |camera: &Camera| model.render(camera, [1.0; 3]).color;
     // An animation from photograph to photograph, too.
     place.succeeds("render run --path test --out way");
     let first = png(&place.path("way/0000.png"));
     let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
     assert!(apart(&first, &view(&model.other_camera(given))) < 0.01 && apart(&first, &view(given)) > 0.05);
     let trained = &load(place.path("scene"), Split::Train, 1).unwrap().frames[2].camera;
-    place.succeeds("render run --path spline --through 2 --frames 1 --out through");
+    place.succeeds("render run --path spline --keyframes 2 --frames 1 --out through");
     let through = png(&place.path("through/0000.png"));
     assert!(apart(&through, &view(&model.other_camera(trained))) > 0.02);
     // A path's cameras have square pixels, and the vertical angle of the photograph's.
@@ -145,9 +148,10 @@ fn photographs_are_compared_from_where_the_model_has_their_cameras() {
 fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 12 --out plain {SMALL}"));
-    let fast = r#"--set tone={"exposure":{"constant":{"rate":0.05}},"vignetting":{"constant":{"rate":0.05}}}"#;
+    let fast =
+        r#"--set exposure_model={"exposure":{"constant":{"rate":0.05}},"vignetting":{"constant":{"rate":0.05}}}"#;
     place.succeeds(&format!("train scene --steps 12 --out run {SMALL} {fast}"));
-    place.succeeds(&format!("train scene --steps 1 --out codes {SMALL} --set field.codes=2"));
+    place.succeeds(&format!("train scene --steps 1 --out codes {SMALL} --set field.appearance_embedding_dim=2"));
     for (run, expected) in [("plain", "none"), ("run", "mean of the training photographs")] {
         place.succeeds(&format!("eval {run}"));
         assert_eq!(place.json(&format!("{run}/eval-test-fast.json"))["appearance"], expected);
@@ -159,9 +163,9 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     let mut model = model(&place, "run");
     let camera = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
     let shown = rendered(&place, "run/eval-test-fast");
-    let bright = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    let bright = apart(&shown, &model.render(camera, [1.0; 3]).color);
     model.vignetted = true;
-    let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    let own = apart(&shown, &model.render(camera, [1.0; 3]).color);
     assert!(own < 0.01 && bright > 0.02, "{own} {bright}");
     // After a gain for the left half of the picture, the right half of it is compared.
     place.succeeds("eval plain --fit-half");
@@ -182,27 +186,29 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
     assert_eq!(place.json("run/eval-train-fast.json")["appearance"], "each photograph's own");
     let camera = &load(place.path("scene"), Split::Train, 1).unwrap().frames[0].camera;
     let shown = rendered(&place, "run/eval-train-fast");
-    let usual = apart(&shown, &model.view(camera, [1.0; 3]).color);
-    model.look = Some(0);
-    let own = apart(&shown, &model.view(camera, [1.0; 3]).color);
+    let usual = apart(&shown, &model.render(camera, [1.0; 3]).color);
+    model.appearance_image = Some(0);
+    let own = apart(&shown, &model.render(camera, [1.0; 3]).color);
     assert!(own < 0.01 && usual > 0.02, "{own} {usual}");
 }
 
 #[test]
 fn scenes_that_are_moved_to_where_models_want_them_are_seen_from_where_they_were_photographed() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --scope unbounded --steps 12 --out run {SMALL} --refine exposure,vignetting"));
+    place.succeeds(&format!(
+        "train scene --scene-type unbounded --steps 12 --out run {SMALL} --refine exposure,vignetting"
+    ));
     let config = place.json("run/config.json");
-    assert!(config["extent"]["placement"]["scale"].as_f64().unwrap() != 1.0);
-    let tone = &config["config"]["tone"];
+    assert!(config["scene_box"]["transform"]["scale"].as_f64().unwrap() != 1.0);
+    let tone = &config["config"]["exposure_model"];
     assert!(tone["exposure"].is_object() && tone["vignetting"].is_object(), "{tone}");
     let mut model = model(&place, "run");
     model.vignetted = true;
     place.succeeds("eval run");
     let given = &load(place.path("scene"), Split::Test, 1).unwrap().frames[0].camera;
-    let moved = model.extent.placement.camera(given);
+    let moved = model.scene_box.transform.camera(given);
     let [right, wrong] = [&moved, given]
-        .map(|camera| apart(&rendered(&place, "run/eval-test-fast"), &model.view(camera, [1.0; 3]).color));
+        .map(|camera| apart(&rendered(&place, "run/eval-test-fast"), &model.render(camera, [1.0; 3]).color));
     assert!(right < 0.005 && wrong > 0.012, "{right} {wrong}");
 }
 
@@ -211,7 +217,7 @@ fn a_model_is_as_fine_as_its_photographs() {
     let place = Place::with_scene();
     let small = SMALL.replace("--set field.grid.log2_table=10", "");
     place.succeeds(&format!("train scene --steps 1 --out run {small}"));
-    let footprints = load(place.path("scene"), Split::Train, 1).unwrap().footprints();
+    let footprints = load(place.path("scene"), Split::Train, 1).unwrap().pixels_per_side();
     let grid = place.json("run/config.json")["config"]["field"]["grid"].clone();
     assert_eq!((&grid["finest"], &grid["log2_table"]), (&json!((2.0 * footprints).ceil() as usize), &json!(17)));
 }
@@ -247,14 +253,14 @@ fn what_was_trained_on_is_no_test() {
     place.fails("eval run", &["holds out the test photograph `train/r_3`", "was trained on"]);
     place.fails("eval run --split val --scene absent", &["absent"]);
     // A path from photograph to photograph is by those that were trained on.
-    place.fails("render run --path spline --through 0", &["trained on 6", "say with --scene"]);
+    place.fails("render run --path spline --keyframes 0", &["trained on 6", "say with --scene"]);
     // A run of the first edition does not know the names of its photographs.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
     let mut config = place.json("run/config.json");
     config["photographs"] = json!([]);
     std::fs::write(place.path("run/config.json"), config.to_string()).unwrap();
-    place.succeeds("render run --path spline --through 0,3 --frames 2 --size 4x4");
+    place.succeeds("render run --path spline --keyframes 0,3 --frames 2 --size 4x4");
     // Nor has one that was not trained on a camera that was learned.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL} --refine poses"));
@@ -285,28 +291,32 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
         said.contains("forward: photographs are opaque, so they show what lies behind, and all look ahead"),
         "{said}"
     );
-    let ndc = model(&place, "ahead").extent.ndc.unwrap();
+    let ndc = model(&place, "ahead").scene_box.ndc.unwrap();
     // Up is up in the scene, and the picture is taken from behind the cameras. A nearer near plane is nearer in it.
-    let survey = raygrad::nerf::dataset::Capture::read(place.path("captured")).unwrap().survey(None).unwrap();
+    let survey = raygrad::nerf::dataset::Capture::read(place.path("captured")).unwrap().analyze_scene(None).unwrap();
     assert_eq!(survey.ndc, Some(ndc));
     assert!(ndc.axes.y_axis.z > 0.999 && ndc.eye.z.abs() < 1.0, "{ndc:?}");
     place.succeeds(&format!("train captured --near 0.01 --steps 1 --out close {SMALL}"));
-    let close = model(&place, "close").extent;
-    assert!(close.span[0] < survey.near && close.ndc == Some(ndc.with_near(survey.near, close.span[0])), "{close:?}");
+    let close = model(&place, "close").scene_box;
+    assert!(
+        close.near_far[0] < survey.near && close.ndc == Some(ndc.with_near(survey.near, close.near_far[0])),
+        "{close:?}"
+    );
     assert_eq!(place.json("ahead/config.json")["config"]["unbounded"], json!(true));
     place.succeeds("render ahead --frames 2");
     place.succeeds("eval ahead");
-    place.succeeds(&format!("train captured --scope unbounded --steps 1 --out around {SMALL}"));
+    place.succeeds(&format!("train captured --scene-type unbounded --steps 1 --out around {SMALL}"));
     // What is gone on with says how far it goes.
     for (run, scope) in [("ahead", "forward"), ("around", "unbounded")] {
         let said = place.succeeds(&format!("train --resume {run} --steps 2"));
         assert!(said.contains(&format!("{scope}: as the model has it")), "{said}");
     }
-    assert_eq!(model(&place, "around").extent.ndc, None);
+    assert_eq!(model(&place, "around").scene_box.ndc, None);
     place.fails(
-        &format!("train scene --scope forward --steps 1 {SMALL}"),
+        &format!("train scene --scene-type forward-facing --steps 1 {SMALL}"),
         &["`scope`", "turned from each other", "use unbounded"],
     );
-    place.fails(&format!("train embedded --downscale 20 --scope forward --steps 1 {SMALL}"), &["unbounded"]);
+    place
+        .fails(&format!("train embedded --downscale 20 --scene-type forward-facing --steps 1 {SMALL}"), &["unbounded"]);
     place.succeeds("eval ahead --fit-poses");
 }

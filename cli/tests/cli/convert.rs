@@ -128,7 +128,7 @@ fn lenses_and_poses_survive_every_format() {
     let splits = |capture: &Capture| by_name(capture).iter().map(|(_, view)| view.split).collect::<Vec<_>>();
     assert_eq!(splits(&original), splits(&back), "the same photographs are held out");
     // A dataset that is another's is trained on as it is.
-    place.succeeds(&format!("train back --scope bounded --steps 1 {CLASSIC}"));
+    place.succeeds(&format!("train back --scene-type bounded --steps 1 {CLASSIC}"));
 }
 
 #[test]
@@ -350,7 +350,7 @@ fn built_in_scenes_are_written_for_other_programs() {
         let (found, expected) = (view.camera_of_image().unwrap(), &data.frames[3].camera);
         let [a, b] = [&found, expected].map(|camera| camera.ray(5.5, 3.5));
         assert!(a.origin.distance(b.origin) < 1e-6 && a.direction.distance(b.direction) < 1e-7, "{found:?}");
-        place.succeeds(&format!("train {scene}-made --steps 1 --scope bounded --out run-{scene} {CLASSIC}"));
+        place.succeeds(&format!("train {scene}-made --steps 1 --scene-type bounded --out run-{scene} {CLASSIC}"));
     }
     place.fails("prepare embedded --out other", &["embedded", "--to"]);
     place.fails("prepare landscape --to colmap --size 15 --out other", &["`size`: 15"]);

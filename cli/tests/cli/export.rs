@@ -3,7 +3,7 @@
 use super::{CLASSIC, Place, SMALL};
 use raygrad::nerf::dataset::{Capture, Split};
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::{Camera, Config, Extent, Model};
+use raygrad::nerf::{Camera, Config, Model, SceneBox};
 use std::path::Path;
 
 /// The cameras in a file of this name, read as a dataset's in the folder `scene`.
@@ -33,21 +33,21 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
     }
 
     let learned = r#"--set poses={"constant":{"rate":0.001}}"#;
-    place.succeeds(&format!("train scene --steps 8 --out run --scope unbounded {SMALL} {learned}"));
+    place.succeeds(&format!("train scene --steps 8 --out run --scene-type unbounded {SMALL} {learned}"));
     let said = place.succeeds("export run run/cameras.json");
     assert_eq!(said, "exported 11 cameras, 6 of them refined: run/cameras.json\n");
     let config = place.json("run/config.json");
     let part = |name: &str| config[name].clone();
-    let extent: Extent = serde_json::from_value(part("extent")).unwrap();
+    let extent: SceneBox = serde_json::from_value(part("scene_box")).unwrap();
     let settings: Config = serde_json::from_value(part("config")).unwrap();
     let model = Model::<f32>::load(place.path("run/model.safetensors"), settings, extent).unwrap();
     let mut number = 0;
     for (before, after) in given.iter().zip(exported(&place, "run/cameras.json")) {
         if before.1 == Some(Split::Train) {
-            let learned = model.learned_camera(number, &extent.placement.camera(&before.2));
+            let learned = model.learned_camera(number, &extent.transform.camera(&before.2));
             number += 1;
-            let drift = model.refine.as_ref().unwrap().placement(&model.params).unwrap();
-            let back = extent.placement.camera_back(&drift.camera_back(&learned));
+            let drift = model.camera_optimizer.as_ref().unwrap().transform(&model.params).unwrap();
+            let back = extent.transform.camera_back(&drift.camera_back(&learned));
             assert!(close(&back, &after.2, 1e-12) && !close(&back, &before.2, 1e-5), "{}", before.0);
         }
         let trained = before.1 == Some(Split::Train);
@@ -104,11 +104,11 @@ fn vertices(place: &Place, file: &str) -> (Vec<DVec3>, String) {
 #[test]
 fn shapes_are_in_the_coordinates_of_the_capture() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 2 --out run --scope unbounded {SMALL}"));
-    let extent: Extent = serde_json::from_value(place.json("run/config.json")["extent"].clone()).unwrap();
-    assert!((extent.placement.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
+    place.succeeds(&format!("train scene --steps 2 --out run --scene-type unbounded {SMALL}"));
+    let extent: SceneBox = serde_json::from_value(place.json("run/config.json")["scene_box"].clone()).unwrap();
+    assert!((extent.transform.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
     // A fog, still: at a low density its surface is the box.
-    let said = place.succeeds("export run mesh.ply --level 1e-6 --resolution 20");
+    let said = place.succeeds("export run mesh.ply --iso-value 1e-6 --resolution 20");
     assert!(
         said.starts_with("exported ") && said.contains(", closed; density 0.0000 per scene unit, 20 cells"),
         "{said}"
@@ -119,31 +119,31 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
         let [low, high] = extent.bounds;
         let slack = DVec3::splat(slack);
         places.iter().all(|x| {
-            let x = extent.placement.point(*x);
+            let x = extent.transform.point(*x);
             x.cmpge(low - slack).all() && x.cmple(high + slack).all()
         })
     };
     let cell = extent.space().side() / 20.0;
     assert!(within(&mesh, cell) && !within(&mesh, -cell));
-    let open = place.succeeds("export run open.ply --level 1e-6 --resolution 20 --parts 0 --open");
+    let open = place.succeeds("export run open.ply --iso-value 1e-6 --resolution 20 --min-component 0 --open");
     assert!(open.contains("0 small parts left out") && !open.contains(", closed"), "{open}");
 
-    let few = place.succeeds("export run few.glb --level 1e-6 --resolution 20 --triangles 500");
+    let few = place.succeeds("export run few.glb --iso-value 1e-6 --resolution 20 --triangles 500");
     assert!(few.contains(" 500 triangles, closed"), "{few}");
     // Four are too few for a closed surface with holes or corners in it, which is said.
-    let output = place.command("export run few.ply --level 1e-6 --resolution 20 --triangles 4").output().unwrap();
+    let output = place.command("export run few.ply --iso-value 1e-6 --resolution 20 --triangles 4").output().unwrap();
     let [said, noted] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert_eq!(!said.contains(" 4 triangles"), noted.contains("triangles, more than 4:"), "{said} {noted}");
     assert_eq!(&place.bytes("few.glb")[..4], b"glTF");
-    place.succeeds("export run mesh.OBJ --level 1e-6 --resolution 20");
+    place.succeeds("export run mesh.OBJ --iso-value 1e-6 --resolution 20");
     assert!(place.bytes("mesh.OBJ").starts_with(b"# x y z red green blue"));
 
     let said = place.succeeds("export run points.ply --points=50");
     let (points, header) = vertices(&place, "points.ply");
     assert!(said.contains(&format!("exported {} points, of ", points.len())) && !header.contains("face"), "{said}");
     assert!((10..=50).contains(&points.len()) && within(&points, 1e-9));
-    place.fails("export run no.ply --level=-1", &["`level`: is -1"]);
-    place.fails("export run no.ply --level 1e30 --hollow", &["`level`: is 1", "use a smaller one"]);
+    place.fails("export run no.ply --iso-value=-1", &["`level`: is -1"]);
+    place.fails("export run no.ply --iso-value 1e30 --no-fill-unseen", &["`level`: is 1", "use a smaller one"]);
     place.fails("export run cameras.json --triangles 9", &["`triangles`: is for shapes"]);
     place.fails("export run cameras.json --points", &["`points`: is for shapes"]);
     // Those of six photographs, and four rings of twelve around the scene, which are left when it is gone.

@@ -75,7 +75,7 @@ fn has_names(calls: &[String]) -> bool {
 }
 
 fn begin() -> String {
-    format!("--threads 1 train scene --steps 12 --checkpoint 0.001s --out run {SMALL}")
+    format!("--threads 1 train scene --steps 12 --checkpoint-every 0.001s --out run {SMALL}")
 }
 
 /// Goes on with what a fault has left, with a new run if that was not even begun, and gives what it was.
@@ -84,7 +84,7 @@ fn go_on(place: &Place) -> &'static str {
         place.succeeds(&begin());
         return "nothing: trained anew";
     }
-    place.succeeds("--threads 1 train --resume run --checkpoint 0.001s");
+    place.succeeds("--threads 1 train --resume run --checkpoint-every 0.001s");
     "the run: went on"
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::{Place, SIZE, png};
 use raygrad::Tensor;
 use raygrad::nerf::Image;
-use raygrad::nerf::pictures::lpips::Lpips;
+use raygrad::nerf::imaging::lpips::Lpips;
 use raygrad::nn::{Params, Storage};
 use serde_json::{Value, json};
 

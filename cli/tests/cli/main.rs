@@ -400,7 +400,7 @@ fn pictures_and_animations() {
     let left =
         ["007.png", "0007.png", "7.png", "notes.txt"].map(|name| place.path(&format!("run/eval-test/{name}")).exists());
     assert_eq!(left, [false, true, true, true]);
-    place.succeeds("render run --size 20x10 --out wide.PNG --depth");
+    place.succeeds("render run --size 20x10 --out wide.PNG --show depth");
     place.succeeds("render run --size 20x10 --out single.png");
     place.succeeds("render run --size 20x10 --out double.png --precision f64");
     let [single, double] = ["single.png", "double.png"].map(|name| png(&place.path(name)));
@@ -428,8 +428,8 @@ fn pictures_and_animations() {
 #[test]
 fn the_embedded_scene_needs_no_files() {
     let place = Place::empty();
-    let printed =
-        place.succeeds(&format!("train --steps 1 --downscale 10 --no-encoding --background random {CLASSIC}"));
+    let printed = place
+        .succeeds(&format!("train --steps 1 --downscale 10 --no-positional-encoding --background random {CLASSIC}"));
     assert!(printed.contains("embedded: 60 views of 20x20") && printed.contains("raygrad eval run"), "{printed}");
     let config = place.json("run/config.json");
     assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
@@ -615,7 +615,7 @@ fn bad_places_to_write_are_named() {
 #[test]
 fn how_many_masks_must_agree_can_be_said() {
     let place = Place::with_scene();
-    for (flag, expected) in [("", 3), ("--carve 0", 0), ("--carve 5 --skip lossless", 5)] {
+    for (flag, expected) in [("", 3), ("--carve 0", 0), ("--carve 5 --skip near-lossless", 5)] {
         place.succeeds(&format!("train scene --steps 1 --out run-{expected} {SMALL} {flag}"));
         let config = place.json(&format!("run-{expected}/config.json"));
         assert_eq!(config["config"]["sampler"]["occupancy"]["skip"]["carving"], expected, "{config}");
@@ -626,10 +626,14 @@ fn how_many_masks_must_agree_can_be_said() {
 #[test]
 fn codes_and_poses_are_trained_and_read_back() {
     let place = Place::with_scene();
-    let learned = r#"--set field.codes=4 --set poses={"constant":{"rate":0.001}}"#;
+    let learned = r#"--set field.appearance_embedding_dim=4 --set poses={"constant":{"rate":0.001}}"#;
     place.succeeds(&format!("train scene --steps 2 --out run {SMALL} {learned}"));
     let config = place.json("run/config.json");
-    assert_eq!((&config["config"]["field"]["codes"], &config["extent"]["frames"]), (&4.into(), &6.into()), "{config}");
+    assert_eq!(
+        (&config["config"]["field"]["appearance_embedding_dim"], &config["scene_box"]["frames"]),
+        (&4.into(), &6.into()),
+        "{config}"
+    );
     assert!(place.succeeds("eval run --split test --json").contains("psnr"));
 }
 

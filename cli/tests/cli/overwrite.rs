@@ -6,7 +6,7 @@ use raygrad::nerf::Image;
 /// With a run, and a photograph at the given places.
 fn place(photographs: &[&str]) -> Place {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 2 --scope unbounded --out run {SMALL}"));
+    place.succeeds(&format!("train scene --steps 2 --scene-type unbounded --out run {SMALL}"));
     for name in photographs {
         std::fs::create_dir_all(place.path(name).parent().unwrap()).unwrap();
         photograph().save_png(place.path(name)).unwrap();
@@ -30,7 +30,7 @@ fn refuses(place: &Place, arguments: &str, file: &str) {
 
 #[test]
 fn outputs_of_others_are_refused_and_own_ones_replaced() {
-    let place = place(&["p/0001.png", "scene/depth/0000.png", "photo.png", "film.gif.frames/0000.png"]);
+    let place = place(&["p/0001.png", "scene/depth/0000.png", "photo.png", "video.gif.frames/0000.png"]);
     std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
     std::fs::write(place.path("walk.gif"), b"footage").unwrap();
     let transforms = "scene/transforms_train.json";
@@ -42,20 +42,20 @@ fn outputs_of_others_are_refused_and_own_ones_replaced() {
         (format!("render run {frames} --out photo.png"), "photo.png"),
         (format!("render run {frames} --out walk.gif"), "walk.gif"),
         (format!("render run {frames} --out walk.mp4"), "walk.mp4"),
-        (format!("render run {frames} --out film.gif"), "film.gif.frames/0000.png"),
+        (format!("render run {frames} --out video.gif"), "video.gif.frames/0000.png"),
     ] {
         refuses(&place, &arguments, file);
     }
     assert!(
         !place.path("p/0000.png").exists()
             && !place.path("scene/0000.png").exists()
-            && !place.path("film.gif").exists()
+            && !place.path("video.gif").exists()
     );
-    std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
+    std::fs::remove_dir_all(place.path("video.gif.frames")).unwrap();
     // Each works again on its own output, also when the model is another by then; and is refused as another job.
     let commands =
         |out: &str| [format!("render run {frames} --out {out}"), format!("render run {frames} --fov 30 --out {out}")];
-    let outputs = ["frames", "film.gif", "film.apng", "picture.png"];
+    let outputs = ["frames", "video.gif", "video.apng", "picture.png"];
     for out in outputs {
         let [command, other] = commands(out);
         place.succeeds(&command);
@@ -65,8 +65,8 @@ fn outputs_of_others_are_refused_and_own_ones_replaced() {
     place.succeeds(&format!("render run {frames} --save depth --out deep"));
     let exports = [
         "cameras.json",
-        "mesh.ply --level 1e-6 --resolution 9",
-        "mesh.obj --level 1e-6 --resolution 9",
+        "mesh.ply --iso-value 1e-6 --resolution 9",
+        "mesh.obj --iso-value 1e-6 --resolution 9",
         "points.glb --points=9",
         "scene.html",
     ];
@@ -84,12 +84,12 @@ fn outputs_of_others_are_refused_and_own_ones_replaced() {
     for export in exports {
         place.succeeds(&format!("export run {export}"));
     }
-    refuses(&place, "export run mesh.ply --level 1e-6 --resolution 10", "mesh.ply");
+    refuses(&place, "export run mesh.ply --iso-value 1e-6 --resolution 10", "mesh.ply");
     // Another run is another job, wherever it is called from.
     place.succeeds(&format!("train scene --steps 2 --out other {SMALL}"));
-    refuses(&place, &format!("render other {frames} --out film.gif"), "film.gif");
+    refuses(&place, &format!("render other {frames} --out video.gif"), "video.gif");
     refuses(&place, "export other cameras.json", "cameras.json");
-    place.succeeds(&format!("render ./other/../run/ {frames} --out film.gif"));
+    place.succeeds(&format!("render ./other/../run/ {frames} --out video.gif"));
     // What is given to be replaced is.
     place.succeeds(&format!("export run {transforms} --overwrite"));
     assert!(place.json(transforms)["frames"].is_array());
@@ -145,7 +145,7 @@ fn endings_that_are_not_known_are_named() {
     for out in ["walk.mkv", "photo.jpg", "orbit.2"] {
         place.fails(
             &format!("render run --out {out}"),
-            &["is not the ending of a picture or a film", ".png, .gif, .apng"],
+            &["is not the ending of a picture or a video", ".png, .gif, .apng"],
         );
     }
     place.succeeds("render run --frames 1 --out orbit.2/");
@@ -170,15 +170,15 @@ fn doctor_replaces_its_own_files_alone() {
 }
 
 #[test]
-fn films_of_ffmpeg_say_what_they_are_of() {
+fn videos_of_ffmpeg_say_what_they_are_of() {
     if !super::render::has_ffmpeg() {
         return;
     }
     let place = place(&[]);
-    for film in ["film.mp4", "film.webm"] {
-        let command = format!("render run --frames 3 --size 12x9 --out {film}");
+    for video in ["video.mp4", "video.webm"] {
+        let command = format!("render run --frames 3 --size 12x9 --out {video}");
         place.succeeds(&command);
         place.succeeds(&command);
-        refuses(&place, &format!("{command} --fov 30"), film);
+        refuses(&place, &format!("{command} --fov 30"), video);
     }
 }

@@ -8,7 +8,7 @@ use std::process::{Child, Output, Stdio};
 
 /// Begins a long training in `run`, with many checkpoints, and waits for some of them.
 fn begin(place: &Place, flags: &str) -> Child {
-    let arguments = format!("train scene --budget 1h --checkpoint 0.05s --out run {flags} {SMALL}");
+    let arguments = format!("train scene --budget 1h --checkpoint-every 0.05s --out run {flags} {SMALL}");
     let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     wait(&mut child, || {
         let found = std::fs::read_dir(place.path("run/checkpoints"));
@@ -60,7 +60,7 @@ fn contents(place: &Place, folder: &str) -> Vec<(std::path::PathBuf, Vec<u8>)> {
 #[test]
 fn a_training_whose_folder_is_replaced_stops() {
     let place = Place::with_scene();
-    let small = format!("train scene --steps 40 --checkpoint 0.02s {SMALL}");
+    let small = format!("train scene --steps 40 --checkpoint-every 0.02s {SMALL}");
     place.succeeds(&format!("{small} --out whole"));
     for moves in [false, true] {
         let first = begin(&place, "");
@@ -89,7 +89,7 @@ fn a_training_whose_folder_is_replaced_stops() {
 fn a_training_whose_run_is_taken_over_stops() {
     // As where a file system has no locks: another program has named itself.
     let place = Place::with_scene();
-    for flags in ["--steps 100000", "--checkpoint 1h"] {
+    for flags in ["--steps 100000", "--checkpoint-every 1h"] {
         let first = begin(&place, "");
         let before = stopped(&first, || {
             std::fs::write(place.path("run/lock.owner"), "1 0123456789abcdef\n").unwrap();

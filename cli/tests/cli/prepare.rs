@@ -165,7 +165,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
     assert!(place.path("made/sparse/0/cameras.txt").exists() && !place.path("made/sparse/1").exists());
     assert_eq!(std::fs::metadata(place.path("made")).unwrap().permissions().mode() & 0o700, 0o700);
     // It is a dataset, and no second one is written over it.
-    place.succeeds(&format!("train made --scope bounded --steps 1 {CLASSIC}"));
+    place.succeeds(&format!("train made --scene-type bounded --steps 1 {CLASSIC}"));
     complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: holds files already", "--out"]);
 }
 

@@ -50,7 +50,7 @@ fn event_files(place: &Place, run: &str) -> Vec<PathBuf> {
 #[test]
 fn tensorboard_reads_what_metrics_say_and_no_more_after_a_run_went_on() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 40 --checkpoint 0.001s --tensorboard --out run {SMALL}"));
+    place.succeeds(&format!("train scene --steps 40 --checkpoint-every 0.001s --tensorboard --out run {SMALL}"));
     assert_eq!(event_files(&place, "run").len(), 1);
     // As if it had been killed after step 39, and its later steps were other ones.
     std::fs::remove_file(place.path("run/checkpoints/00000040.checkpoint")).unwrap();
@@ -134,7 +134,7 @@ fn of_a_line_that_does_not_fit_nothing_stays() {
 #[test]
 fn a_summary_says_how_a_run_ended_and_what_it_took() {
     let place = Place::with_scene();
-    let train = format!("train scene --seed 7 --steps 30 --checkpoint 0.001s --threads 2 --out run {SMALL}");
+    let train = format!("train scene --seed 7 --steps 30 --checkpoint-every 0.001s --threads 2 --out run {SMALL}");
     place.succeeds(&train);
     let summary = place.json("run/summary.json");
     let last = metrics(&place, "run").pop().unwrap();
@@ -142,7 +142,7 @@ fn a_summary_says_how_a_run_ended_and_what_it_took() {
         assert_eq!(summary[name], expected);
     }
     assert_eq!([&summary["steps"], &summary["resumed"], &summary["threads"]], [&json!(30), &json!(0), &json!(2)]);
-    for name in ["rays", "marched", "samples", "shaded", "unskipped", "restarts"] {
+    for name in ["rays", "placed_samples", "density_queries", "color_queries", "unskipped", "restarts"] {
         assert_eq!(summary[name], last[name], "{name}");
     }
     assert_eq!(summary["averaged_steps"], 30);
@@ -165,7 +165,7 @@ fn a_summary_says_how_a_run_ended_and_what_it_took() {
     assert_eq!([&later["steps"], &later["resumed"], &later["ended"]], [&json!(50), &json!(1), &json!("done")]);
     assert!(number(&later, "wall_seconds") > wall && number(&later, "train_seconds") > time, "{later}");
     assert_eq!(later["averaged_steps"], 21, "of the steps of this part, and the one that it began at");
-    let mut child = place.command("train --resume run --budget 1h --checkpoint 0.001s");
+    let mut child = place.command("train --resume run --budget 1h --checkpoint-every 0.001s");
     let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let steps = || place.json("run/summary.json")["steps"].as_u64().unwrap();
     super::wait(&mut child, || steps() > 50);

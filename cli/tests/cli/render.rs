@@ -1,10 +1,10 @@
-//! Paths, films, and what is saved beside frames.
+//! Paths, videos, and what is saved beside frames.
 
 use super::SMALL;
 use super::{Place, SIZE, complained, png};
 use raygrad::nerf::dataset::{Capture, Depths, Split};
 use raygrad::nerf::glam::{DAffine3, DVec3};
-use raygrad::nerf::{Camera, Config, Extent, Image, Model};
+use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
 use raygrad_scenes::ANGLE_X;
 use serde_json::{Value, json};
 use std::process::{Command, Stdio};
@@ -26,13 +26,13 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
     assert!(apart(&test[0], &test[1]) > 3.0 && apart(&test[1], &test[2]) > 3.0);
     // A spline passes its photographs, by number and by name.
     for (out, through) in [("numbers", "2,0"), ("names", "test/r_2,test/r_0")] {
-        place.succeeds(&format!("render run --path spline --through {through} --split test --frames 3 --out {out}"));
+        place.succeeds(&format!("render run --path spline --keyframes {through} --split test --frames 3 --out {out}"));
         let spline = [0, 1, 2].map(|i| png(&place.path(&format!("{out}/000{i}.png"))));
         assert!(apart(&spline[0], &test[2]) <= 1.0 && apart(&spline[2], &test[0]) <= 1.0);
         assert!(apart(&spline[1], &test[0]) > 3.0 && apart(&spline[1], &test[2]) > 3.0);
     }
     // A closed one is on its way back where an open one has arrived.
-    place.succeeds("render run --path spline --through 2,0 --split test --closed --frames 4 --out closed");
+    place.succeeds("render run --path spline --keyframes 2,0 --split test --closed --frames 4 --out closed");
     assert!(apart(&png(&place.path("closed/0002.png")), &test[0]) <= 1.0);
     // The cameras of a file are in the capture's coordinates.
     let transforms = place.transforms(Split::Test);
@@ -67,7 +67,7 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
     {
         assert!(apart(&one(flags), &usual) > 3.0, "{flags}");
     }
-    assert_eq!(one("--show depth"), one("--depth"));
+    assert_eq!(one("--show depth"), one("--depth-loss"));
     // At twice the tangent of half of the angle, what was seen is in the middle, at half the size.
     let wide = one("--size 48x48 --fov 71.507778");
     let middle = |x: usize, y: usize| wide.pixel(12 + x, 12 + y).to_vec();
@@ -82,16 +82,16 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
 #[test]
 fn paths_lie_where_the_scene_does() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 30 --out run --scope unbounded {SMALL}"));
+    place.succeeds(&format!("train scene --steps 30 --out run --scene-type unbounded {SMALL}"));
     let config = place.json("run/config.json");
-    let extent: Extent = serde_json::from_value(config["extent"].clone()).unwrap();
-    assert!((extent.placement.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
+    let extent: SceneBox = serde_json::from_value(config["scene_box"].clone()).unwrap();
+    assert!((extent.transform.scale - 1.0).abs() > 0.01, "the test is of coordinates that differ");
     let settings: Config = serde_json::from_value(config["config"].clone()).unwrap();
     let model = Model::<f32>::load(place.path("run/model.safetensors"), settings, extent).unwrap();
     let capture = Capture::read(place.path("scene")).unwrap();
     let given = &capture.split(Split::Test).unwrap()[1].camera;
-    let expected = model.view(&extent.placement.camera(given), model.config.background.shown()).color;
-    assert!(apart(&model.view(given, [1.0; 3]).color, &expected) > 6.0, "where it is matters");
+    let expected = model.render(&extent.transform.camera(given), model.config.background.shown()).color;
+    assert!(apart(&model.render(given, [1.0; 3]).color, &expected) > 6.0, "where it is matters");
     place.succeeds("render run --path test --out test");
     assert!(apart(&png(&place.path("test/0001.png")), &expected) <= 1.0);
     let rows = place.transforms(Split::Test)["frames"][1]["transform_matrix"].as_array().unwrap().clone();
@@ -175,16 +175,16 @@ fn flags_that_do_not_fit_are_named() {
     for (flags, expected) in [
         ("--path test --radius 2", ["`radius`", "--path test"]),
         ("--path spline", ["`through`", "0,5,9"]),
-        ("--path spline --through 0,6", ["`through`: `6` is no train photograph", "0 to 5"]),
+        ("--path spline --keyframes 0,6", ["`through`: `6` is no train photograph", "0 to 5"]),
         ("--path absent.json", ["absent.json", "cannot be read"]),
         ("--save depth --out one.png", ["`save`", "name a folder"]),
         ("--save depth --out one.gif", ["`save`", "name a folder"]),
         ("--depth-unit 0.01", ["`depth-unit`", "--save depth"]),
-        ("--keep-frames", ["`keep-frames`", "without a film"]),
+        ("--keep-frames", ["`keep-frames`", "without a video"]),
         ("--fps 30", ["`fps`", "--seconds"]),
         ("--fps 60 --out fast.gif", ["`fps`", "50 frames a second"]),
-        ("--out absent/film.apng", ["absent", "cannot be written to"]),
-        ("--out film.MOV", ["film.MOV: `.mov` is not the ending of a picture or a film", "the name of a folder"]),
+        ("--out absent/video.apng", ["absent", "cannot be written to"]),
+        ("--out video.MOV", ["video.MOV: `.mov` is not the ending of a picture or a video", "the name of a folder"]),
     ] {
         place.fails(&format!("render run {flags}"), &expected);
     }
@@ -286,20 +286,20 @@ fn depths_are_along_the_axis() {
 }
 
 #[test]
-fn films_hold_the_frames_at_their_speed() {
+fn videos_hold_the_frames_at_their_speed() {
     let place = Place::with_run();
     place.succeeds("render run --frames 3 --size 21x13 --out frames");
     let frames = [0, 1, 2].map(|i| png(&place.path(&format!("frames/000{i}.png"))));
-    place.succeeds("render run --frames 3 --size 21x13 --fps 10 --out film.gif");
-    let gif = place.bytes("film.gif");
+    place.succeeds("render run --frames 3 --size 21x13 --fps 10 --out video.gif");
+    let gif = place.bytes("video.gif");
     let mut decoder = gif::Decoder::new(&gif[..]).unwrap();
     let mut delays = vec![];
     while let Some(frame) = decoder.read_next_frame().unwrap() {
         delays.push(frame.delay);
     }
     assert_eq!(delays, [10; 3]);
-    place.succeeds("render run --seconds 0.12 --size 21x13 --out film.apng");
-    let apng = place.bytes("film.apng");
+    place.succeeds("render run --seconds 0.12 --size 21x13 --out video.apng");
+    let apng = place.bytes("video.apng");
     let mut reader = png::Decoder::new(std::io::Cursor::new(&apng[..])).read_info().unwrap();
     let control = *reader.info().animation_control().unwrap();
     assert_eq!((control.num_frames, control.num_plays), (3, 0));
@@ -311,11 +311,11 @@ fn films_hold_the_frames_at_their_speed() {
         let expected: Vec<u8> = frame.data.iter().map(|x| (255.0 * x).round() as u8).collect();
         assert!(bytes == expected, "not a color is lost");
     }
-    // Frames are gone with the film, unless they are to stay.
-    assert!(!place.path("film.gif.frames").exists() && !place.path("film.apng.frames").exists());
-    place.succeeds("render run --frames 3 --size 21x13 --out film.gif --keep-frames --overwrite");
-    assert_eq!(png(&place.path("film.gif.frames/0002.png")), frames[2]);
-    assert!(!place.path("film.gif.frames/unfinished.json").exists());
+    // Frames are gone with the video, unless they are to stay.
+    assert!(!place.path("video.gif.frames").exists() && !place.path("video.apng.frames").exists());
+    place.succeeds("render run --frames 3 --size 21x13 --out video.gif --keep-frames --overwrite");
+    assert_eq!(png(&place.path("video.gif.frames/0002.png")), frames[2]);
+    assert!(!place.path("video.gif.frames/unfinished.json").exists());
 }
 
 /// Whether ffmpeg is there; says so if not.
@@ -328,32 +328,36 @@ pub fn has_ffmpeg() -> bool {
 }
 
 #[test]
-fn ffmpeg_writes_films_whose_colors_are_those_of_the_frames() {
+fn ffmpeg_writes_videos_whose_colors_are_those_of_the_frames() {
     if !has_ffmpeg() {
         return;
     }
     let place = Place::with_run();
     // A folder whose name looks like a number of frames.
     std::fs::create_dir(place.path("a%03d b")).unwrap();
-    for film in ["film.mp4", "film.webm"] {
-        let film = format!("a%03d b/{film}");
+    for video in ["video.mp4", "video.webm"] {
+        let video = format!("a%03d b/{video}");
         let mut command =
             place.command("render run --frames 5 --size 63x41 --fps 12.5 --background 200,30,60 --keep-frames --out");
-        let output = command.arg(&film).output().unwrap();
-        assert!(output.status.success(), "{film}: {output:?}");
+        let output = command.arg(&video).output().unwrap();
+        assert!(output.status.success(), "{video}: {output:?}");
         assert!(String::from_utf8_lossy(&output.stderr).contains("black is added, to 64x42"), "{output:?}");
-        let bytes = place.bytes(&film);
+        let bytes = place.bytes(&video);
         let is_webm = bytes.starts_with(&[0x1a, 0x45, 0xdf, 0xa3]);
-        assert!(if film.ends_with("webm") { is_webm } else { &bytes[4..8] == b"ftyp" }, "{film}: {:x?}", &bytes[..12]);
+        assert!(
+            if video.ends_with("webm") { is_webm } else { &bytes[4..8] == b"ftyp" },
+            "{video}: {:x?}",
+            &bytes[..12]
+        );
         let first = place.path("first.png");
         let taken = Command::new("ffmpeg")
             .args(["-y", "-loglevel", "error", "-i"])
-            .arg(place.path(&film))
+            .arg(place.path(&video))
             .args(["-vf", "select=eq(n\\,3),scale=in_color_matrix=auto:in_range=auto", "-frames:v", "1"])
             .arg(&first)
             .status();
         assert!(taken.unwrap().success());
-        let (seen, frame) = (png(&first), png(&place.path(&format!("{film}.frames/0003.png"))));
+        let (seen, frame) = (png(&first), png(&place.path(&format!("{video}.frames/0003.png"))));
         assert_eq!([seen.width, seen.height], [64, 42]);
         // Colors have half the resolution, brightness has all of it.
         let bright = |x: usize| seen.pixel(x, 5).iter().zip([0.2126, 0.7152, 0.0722]).map(|(x, w)| x * w).sum::<f32>();
@@ -361,21 +365,21 @@ fn ffmpeg_writes_films_whose_colors_are_those_of_the_frames() {
         // In a corner there is nothing but background, which no chroma of others comes into.
         let [corner, expected] = [seen.pixel(3, 3), frame.pixel(3, 3)];
         let worst = corner.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, raygrad::Real::maximum);
-        assert!(255.0 * worst <= 6.0, "{film}: {corner:?} {expected:?}");
-        let said = Command::new("ffmpeg").arg("-i").arg(place.path(&film)).output().unwrap().stderr;
+        assert!(255.0 * worst <= 6.0, "{video}: {corner:?} {expected:?}");
+        let said = Command::new("ffmpeg").arg("-i").arg(place.path(&video)).output().unwrap().stderr;
         let said = String::from_utf8_lossy(&said).into_owned();
         assert!(said.contains("12.50 fps") && said.contains("00:00:00.40") && said.contains("bt709"), "{said}");
     }
     let left = std::fs::read_dir(place.path("a%03d b")).unwrap().count();
-    assert_eq!(left, 4, "two films and their frames");
+    assert_eq!(left, 4, "two videos and their frames");
 }
 
 #[test]
 fn without_ffmpeg_it_is_said_what_to_do_before_anything_is_rendered() {
     let place = Place::with_run();
-    let output = place.command("render run --out film.mp4").env("PATH", place.path("")).output().unwrap();
-    complained("no ffmpeg", &output, &["film.mp4", "`ffmpeg`: is not on the PATH", "apt install ffmpeg", "FILE.gif"]);
-    assert!(!place.path("film.mp4.frames").exists());
+    let output = place.command("render run --out video.mp4").env("PATH", place.path("")).output().unwrap();
+    complained("no ffmpeg", &output, &["video.mp4", "`ffmpeg`: is not on the PATH", "apt install ffmpeg", "FILE.gif"]);
+    assert!(!place.path("video.mp4.frames").exists());
 }
 
 #[cfg(unix)]
@@ -387,13 +391,13 @@ fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_an
         let ffmpeg = place.path("ffmpeg");
         std::fs::write(&ffmpeg, format!("#!/bin/sh\n{script}\n")).unwrap();
         std::fs::set_permissions(&ffmpeg, std::fs::Permissions::from_mode(0o755)).unwrap();
-        let command = "render run --frames 1 --size 8x6 --out film.mp4";
+        let command = "render run --frames 1 --size 8x6 --out video.mp4";
         let path = format!("{}:/usr/bin:/bin", place.path("").display());
         place.command(command).env("PATH", path).output().unwrap()
     };
     let output = with("echo ' V..... libvpx-vp9  VP9'");
-    complained("no encoder", &output, &["film.mp4: needs an ffmpeg with libx264", "FILE.gif"]);
-    assert!(!place.path("film.mp4.frames").exists());
+    complained("no encoder", &output, &["video.mp4: needs an ffmpeg with libx264", "FILE.gif"]);
+    assert!(!place.path("video.mp4.frames").exists());
     // It fails after it has said what is wrong and reported its progress for long.
     let output = with(
         "case $* in *-encoders*) echo ' V..... libx264 H.264';; *) echo 'the disk is full' >&2; sleep 0.3
@@ -405,20 +409,20 @@ fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_an
 
 #[cfg(unix)]
 #[test]
-fn an_interrupted_film_goes_on_where_it_was() {
+fn an_interrupted_video_goes_on_where_it_was() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 3 {SMALL}"));
-    let arguments = "render run --frames 100 --size 24x20 --out film.apng";
-    let frame = |i: usize| place.path(&format!("film.apng.frames/{i:04}.png"));
+    let arguments = "render run --frames 100 --size 24x20 --out video.apng";
+    let frame = |i: usize| place.path(&format!("video.apng.frames/{i:04}.png"));
     let mut child = place.command(arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     super::wait(&mut child, || frame(2).exists());
     Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
     assert_eq!(output.status.code(), Some(130), "{said}");
-    assert!(said.contains("of 100 frames, in film.apng.frames: the same command goes on"), "{said}");
-    let done = place.json("film.apng.frames/unfinished.json")["done"].as_u64().unwrap() as usize;
-    assert!(done >= 3 && frame(done - 1).exists() && !frame(done).exists() && !place.path("film.apng").exists());
+    assert!(said.contains("of 100 frames, in video.apng.frames: the same command goes on"), "{said}");
+    let done = place.json("video.apng.frames/unfinished.json")["done"].as_u64().unwrap() as usize;
+    assert!(done >= 3 && frame(done - 1).exists() && !frame(done).exists() && !place.path("video.apng").exists());
     // Frames that are there are not rendered again: a mark on one stays.
     let mark = Image { width: 24, height: 20, channels: 3, data: vec![0.2; 3 * 24 * 20] };
     mark.save_png(frame(1)).unwrap();
@@ -426,30 +430,30 @@ fn an_interrupted_film_goes_on_where_it_was() {
     assert!(output.status.success(), "{output:?}");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains(&format!("{done} of 100 frames are there already")), "{said}");
-    let frames = decoded(&place.path("film.apng"));
-    assert!(frames.len() == 100 && frames[1].iter().all(|x| *x == 51) && !place.path("film.apng.frames").exists());
-    // Others than those that were there are as in a film that was not interrupted.
+    let frames = decoded(&place.path("video.apng"));
+    assert!(frames.len() == 100 && frames[1].iter().all(|x| *x == 51) && !place.path("video.apng.frames").exists());
+    // Others than those that were there are as in a video that was not interrupted.
     place.succeeds("render run --frames 100 --size 24x20 --out whole.apng");
     let whole = decoded(&place.path("whole.apng"));
     assert!((0..100).all(|i| (whole[i] == frames[i]) == (i != 1)));
     // What would show something else begins again, where it may.
-    place.succeeds("render run --frames 2 --size 12x10 --out film.gif --keep-frames");
-    let film = "render run --frames 4000 --size 24x20 --out film.gif";
-    place.fails(film, &["film.gif: exists, and was not written by this command"]);
-    std::fs::remove_file(place.path("film.gif")).unwrap();
-    place.fails(film, &["film.gif.frames"]);
-    std::fs::remove_dir_all(place.path("film.gif.frames")).unwrap();
+    place.succeeds("render run --frames 2 --size 12x10 --out video.gif --keep-frames");
+    let video = "render run --frames 4000 --size 24x20 --out video.gif";
+    place.fails(video, &["video.gif: exists, and was not written by this command"]);
+    std::fs::remove_file(place.path("video.gif")).unwrap();
+    place.fails(video, &["video.gif.frames"]);
+    std::fs::remove_dir_all(place.path("video.gif.frames")).unwrap();
     let kept = |done: usize| {
-        let mut record = place.json("film.gif.frames/unfinished.json");
+        let mut record = place.json("video.gif.frames/unfinished.json");
         record["done"] = json!(done);
-        std::fs::write(place.path("film.gif.frames/unfinished.json"), record.to_string()).unwrap();
+        std::fs::write(place.path("video.gif.frames/unfinished.json"), record.to_string()).unwrap();
     };
     let begun = |flags: &str| {
         // When it is there again, it is this call's.
-        let _ = std::fs::remove_file(place.path("film.gif.frames/0003.png"));
-        let mut child = place.command(&format!("{film} {flags}"));
+        let _ = std::fs::remove_file(place.path("video.gif.frames/0003.png"));
+        let mut child = place.command(&format!("{video} {flags}"));
         let mut child = child.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-        super::wait(&mut child, || place.path("film.gif.frames/0003.png").exists());
+        super::wait(&mut child, || place.path("video.gif.frames/0003.png").exists());
         Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
         String::from_utf8(child.wait_with_output().unwrap().stderr).unwrap()
     };
@@ -461,7 +465,7 @@ fn an_interrupted_film_goes_on_where_it_was() {
         // From the same frames each time.
         begun("--overwrite");
         kept(3);
-        place.fails(&format!("{film} {flags}"), &["film.gif.frames"]);
+        place.fails(&format!("{video} {flags}"), &["video.gif.frames"]);
         let said = begun(&format!("{flags} --overwrite"));
         assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");
     }

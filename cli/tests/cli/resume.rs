@@ -42,7 +42,7 @@ fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
     place.succeeds(&format!("train scene --steps {steps} --out whole {SMALL}"));
     let whole = start.elapsed();
     let (mut killed, mut at) = (0, vec![]);
-    let mut arguments = format!("train scene --steps {steps} --out run --checkpoint 0.02s {SMALL}");
+    let mut arguments = format!("train scene --steps {steps} --out run --checkpoint-every 0.02s {SMALL}");
     loop {
         let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         // Somewhere in the time that is left of it, by the golden ratio; at last it is let be.
@@ -59,7 +59,7 @@ fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
         child.wait().unwrap();
         killed += 1;
         if place.path("run/config.json").exists() {
-            arguments = "train --resume run --checkpoint 0.02s".to_owned();
+            arguments = "train --resume run --checkpoint-every 0.02s".to_owned();
             let found = if place.path("run/checkpoints").exists() { checkpoints(&place, "run") } else { vec![] };
             at.push(found.into_iter().rfind(|path| path.extension().is_some_and(|e| e == "checkpoint")));
         }
@@ -118,7 +118,7 @@ fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() 
 fn what_is_damaged_leaves_the_checkpoint_before_it() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 30 --out whole {SMALL}"));
-    place.succeeds(&format!("train scene --steps 30 --out run --checkpoint 0.001s {SMALL}"));
+    place.succeeds(&format!("train scene --steps 30 --out run --checkpoint-every 0.001s {SMALL}"));
     let last = checkpoints(&place, "run").pop().unwrap();
     let bytes = std::fs::read(&last).unwrap();
     std::fs::write(&last, &bytes[..bytes.len() - 1]).unwrap();
@@ -180,7 +180,7 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
 fn what_cannot_be_written_for_a_while_does_not_end_a_run() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 150 --out whole {SMALL}"));
-    let arguments = format!("train scene --steps 150 --out run --checkpoint 0.01s {SMALL}");
+    let arguments = format!("train scene --steps 150 --out run --checkpoint-every 0.01s {SMALL}");
     let lost_its_folder = || {
         let mut child = place.command(&arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let begun = || std::fs::metadata(place.path("run/metrics.jsonl")).is_ok_and(|file| file.len() > 0);
@@ -209,7 +209,7 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
     place.fails("train --resume run", &["run: is being trained by another raygrad"]);
     drop(lock);
     place.succeeds("train --resume run --steps 4");
-    assert_eq!(place.json("run/config.json")["extent"]["span"][0], 2.5);
+    assert_eq!(place.json("run/config.json")["scene_box"]["near_far"][0], 2.5);
     // A folder in which nothing was finished is as good as none.
     std::fs::create_dir(place.path("begun")).unwrap();
     std::fs::write(place.path("begun/.tmpx1"), b"{").unwrap();
@@ -298,13 +298,13 @@ fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
     for line in &metrics {
         let done = (line["step"].as_f64().unwrap() - 1.0) / 120.0;
         let rate = (done / warmup).min(1.0) * (from + (to - from) * done) * 0.25_f64.powi(retreats);
-        assert!((line["rate"].as_f64().unwrap() - rate).abs() <= 1e-9 * rate, "{line}: {rate}");
+        assert!((line["lr"].as_f64().unwrap() - rate).abs() <= 1e-9 * rate, "{line}: {rate}");
     }
     // Going on with it, the rate stays as low.
-    let rate = metrics.last().unwrap()["rate"].as_f64().unwrap();
+    let rate = metrics.last().unwrap()["lr"].as_f64().unwrap();
     place.succeeds("train --resume run --steps 121");
     let last = self::metrics(&place, "run").pop().unwrap();
-    assert!(last["step"] == 121 && (last["rate"].as_f64().unwrap() / rate - 1.0).abs() < 0.2, "{last} after {rate}");
+    assert!(last["step"] == 121 && (last["lr"].as_f64().unwrap() / rate - 1.0).abs() < 0.2, "{last} after {rate}");
 }
 
 #[test]
@@ -312,7 +312,7 @@ fn a_run_that_diverges_again_and_again_ends_with_the_reason_and_its_last_good_mo
     let place = Place::empty();
     // It learns, until its rate leaves all bounds.
     let schedule = r#"{"exponential":{"from":0.0001,"to":1e30,"warmup":0.0}}"#;
-    let rates = format!("--set schedule={schedule} --checkpoint 0.02s");
+    let rates = format!("--set schedule={schedule} --checkpoint-every 0.02s");
     let output =
         place.command(&format!("train --downscale 10 --steps 400 --out run {SMALL} {rates}")).output().unwrap();
     assert_eq!(output.status.code(), Some(1), "{output:?}");

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use super::resume::assert_same;
 use super::{Kept, Place, SIZE, SMALL, png};
 use raygrad::nerf::Image;
-use raygrad::nerf::pictures::colormap;
-use raygrad::nerf::pictures::metrics::psnr;
+use raygrad::nerf::imaging::colormap;
+use raygrad::nerf::imaging::metrics::psnr;
 use serde_json::{Value, json};
 use tungstenite::handshake::client::generate_key;
 use tungstenite::http::Request;
@@ -452,7 +452,7 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("no photograph 99"));
     // Before what evaluations have behind the scene; and those that are to test with are there once.
     place.succeeds("prepare scene --to nerfstudio --out captured");
-    place.succeeds(&format!("train captured --scope bounded --background black --steps 150 --out black {SMALL}"));
+    place.succeeds(&format!("train captured --scene-type bounded --background black --steps 150 --out black {SMALL}"));
     place.succeeds("eval black");
     let server = serve(&place, "view black");
     let (mut page, about) = Page::open(&server.address);
@@ -498,7 +498,7 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
 #[test]
 fn photographs_with_codes_of_their_own_have_no_figure() {
     let place = Place::with_scene();
-    place.succeeds(&format!("train scene --steps 60 --set field.codes=2 --out run {SMALL}"));
+    place.succeeds(&format!("train scene --steps 60 --set field.appearance_embedding_dim=2 --out run {SMALL}"));
     place.succeeds("eval run");
     let scores = place.json("run/eval-test-fast.json");
     let server = serve(&place, "view run");
@@ -669,7 +669,7 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
 fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
     let place = Place::with_scene();
     // Of even steps, short ones leave out what shows.
-    let train = format!("train scene --steps 150 --checkpoint 0.02s {SMALL} --set sampler.cone=0");
+    let train = format!("train scene --steps 150 --checkpoint-every 0.02s {SMALL} --set sampler.cone=0");
     place.succeeds(&format!("{train} --keep-checkpoints 500 --out run"));
     assert_eq!(place.command("train scene --keep-checkpoints 1").output().unwrap().status.code(), Some(2));
     let server = serve(&place, "view run");
@@ -714,7 +714,7 @@ fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
     for (id, step) in (4..).zip([steps[1], steps[2], steps[3], steps[4], steps[1]]) {
         assert_eq!(page.look(id, &with("checkpoint", json!(step))).pop().unwrap().0["step"], step);
     }
-    for (id, skip) in (10..).zip(["off", "lossless", "fast"]) {
+    for (id, skip) in (10..).zip(["off", "near-lossless", "fast"]) {
         for (id, show) in [(id, "color"), (id + 10, "normals")] {
             place.succeeds(&format!(
                 "render run --frames 1 --size 64x64 --skip {skip} --show {show} --out {skip}-{show}"
@@ -772,67 +772,67 @@ fn path(about: &Value, seconds: f64) -> Value {
 }
 
 #[test]
-fn films_are_made_one_at_a_time_beside_what_is_seen() {
+fn videos_are_made_one_at_a_time_beside_what_is_seen() {
     let place = trained();
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
     let ended = |page: &mut Page| loop {
-        let told = page.text("film");
+        let told = page.text("video");
         if told["ended"] == true {
             return told;
         }
     };
-    page.say(json!({ "ask": "film", "path": path(&about, 0.8), "show": "depth" }));
+    page.say(json!({ "ask": "video", "path": path(&about, 0.8), "show": "depth" }));
     let told = ended(&mut page);
     assert_eq!(told["words"], "done");
-    let film = told["file"].as_str().unwrap();
+    let video = told["file"].as_str().unwrap();
     assert!(
-        film.starts_with("run/films/film-1.") && std::fs::metadata(place.path(film)).unwrap().len() > 100,
-        "{film}"
+        video.starts_with("run/videos/video-1.") && std::fs::metadata(place.path(video)).unwrap().len() > 100,
+        "{video}"
     );
-    assert!(!place.path(&format!("{film}.frames")).exists());
+    assert!(!place.path(&format!("{video}.frames")).exists());
     // The same by hand is the same.
-    let ending = film.rsplit('.').next().unwrap();
-    place.succeeds(&format!("render run --path run/films/film-1.json --show depth --overwrite --out again.{ending}"));
-    let bytes = [film, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
+    let ending = video.rsplit('.').next().unwrap();
+    place.succeeds(&format!("render run --path run/videos/video-1.json --show depth --overwrite --out again.{ending}"));
+    let bytes = [video, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
     assert!(bytes[0] == bytes[1]);
     // One that takes long does not hold up pictures or let another begin, until it is ended.
-    page.say(json!({ "ask": "film", "path": path(&about, 600.0) }));
-    page.text("film");
-    page.say(json!({ "ask": "film", "path": path(&about, 1.0) }));
+    page.say(json!({ "ask": "video", "path": path(&about, 600.0) }));
+    page.text("video");
+    page.say(json!({ "ask": "video", "path": path(&about, 1.0) }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("one is being made"));
     page.look(1, &first(&about, [16, 16]));
-    page.say(json!({ "ask": "end-film" }));
+    page.say(json!({ "ask": "end-video" }));
     assert_eq!(ended(&mut page)["words"], "ended");
-    let films = || std::fs::read_dir(place.path("run/films")).unwrap().count();
-    assert_eq!(films(), 2, "nothing is left of it");
+    let videos = || std::fs::read_dir(place.path("run/videos")).unwrap().count();
+    assert_eq!(videos(), 2, "nothing is left of it");
     // As it is seen, with what is behind it and as much left out.
-    for (film, flags) in [
+    for (video, flags) in [
         (json!({ "path": path(&about, 0.4), "show": "normals", "skip": "off" }), "--show normals --skip off"),
         (json!({ "path": path(&about, 0.4), "show": "opacity" }), "--show opacity"),
         (json!({ "path": path(&about, 0.4), "background": [0, 128, 255] }), "--background 0,128,255"),
     ] {
-        let mut asked = film;
-        asked["ask"] = json!("film");
+        let mut asked = video;
+        asked["ask"] = json!("video");
         page.say(asked);
         let told = ended(&mut page);
         assert_eq!(told["words"], "done", "{told}");
-        let film = told["file"].as_str().unwrap().to_owned();
-        let path = film.replace(ending, "json");
+        let video = told["file"].as_str().unwrap().to_owned();
+        let path = video.replace(ending, "json");
         place.succeeds(&format!("render run --path {path} {flags} --overwrite --out again.{ending}"));
-        let bytes = [&*film, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
+        let bytes = [&*video, &format!("again.{ending}")].map(|name| std::fs::read(place.path(name)).unwrap());
         assert!(bytes[0] == bytes[1], "{flags}");
     }
     // What is no path is said by who reads it.
     let mut fisheye = path(&about, 1.0);
     fisheye["camera_type"] = json!("fisheye");
-    page.say(json!({ "ask": "film", "path": fisheye }));
+    page.say(json!({ "ask": "video", "path": fisheye }));
     let words = ended(&mut page)["words"].as_str().unwrap().to_owned();
-    assert!(words.contains("film-5.json") && words.contains("perspective"), "{words}");
-    // A program that ends ends the film with it.
-    page.say(json!({ "ask": "film", "path": path(&about, 600.0) }));
-    let film = page.text("film")["file"].as_str().unwrap().to_owned();
-    let frames = place.path(&format!("{film}.frames"));
+    assert!(words.contains("video-5.json") && words.contains("perspective"), "{words}");
+    // A program that ends ends the video with it.
+    page.say(json!({ "ask": "video", "path": path(&about, 600.0) }));
+    let video = page.text("video")["file"].as_str().unwrap().to_owned();
+    let frames = place.path(&format!("{video}.frames"));
     while std::fs::read_dir(&frames).map_or(0, |found| found.count()) < 4 {
         std::thread::sleep(Duration::from_millis(20));
     }
@@ -844,13 +844,13 @@ fn films_are_made_one_at_a_time_beside_what_is_seen() {
     assert_eq!(count(), then);
     let server = serve(&place, "view run");
     let (mut page, about) = Page::open(&server.address);
-    page.say(json!({ "ask": "end-film" }));
+    page.say(json!({ "ask": "end-video" }));
     page.look(2, &first(&about, [17, 16]));
     let server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out other {SMALL}"));
     let (mut page, about) = Page::open(&server.address);
-    page.say(json!({ "ask": "film", "path": path(&about, 1.0) }));
+    page.say(json!({ "ask": "video", "path": path(&about, 1.0) }));
     assert!(page.text("sorry")["what"].as_str().unwrap().contains("training has ended"));
-    assert!(!place.path("other/films").exists());
+    assert!(!place.path("other/videos").exists());
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! A medium as a field.
 
 use super::Medium;
-use crate::field::{Density, Field, Seen};
+use crate::field::{Density, Field, ViewInputs};
 use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params};
 use std::sync::Arc;
@@ -41,7 +41,7 @@ impl<T: Scalar> Field<T> for AnalyticField {
         Density { value, log: false, features: positions.clone() }
     }
 
-    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let colors = rows(features.value()).flat_map(|position| [T::from_f64(self.medium.color(position)); 3]);
         features.tape().constant(Tensor::from_vec(features.shape(), colors.collect()))
     }

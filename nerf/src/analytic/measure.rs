@@ -4,7 +4,7 @@ use super::{AnalyticField, AnalyticScene};
 use crate::camera::rays::Rays;
 use crate::camera::rays::stratified;
 use crate::random::Jitter;
-use crate::volume::lit::Lit;
+use crate::volume::early_termination::VisibleSamples;
 use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use raygrad_autograd::{Scalar, Tape, Var};
@@ -39,7 +39,7 @@ pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations
     let bound = params.bind(&tape);
     let query = Query::new(&field, &bound);
     let steps = stratified(&rays, rule.intervals(evaluations), &mut Jitter::Middle, tape.pool());
-    let Lit { rendered: seen, asked: evaluations, .. } = rule.render(&query, &steps, 0.0);
+    let VisibleSamples { rendered: seen, density_queries: evaluations, .. } = rule.render(&query, &steps, 0.0);
     let color = seen.color.slice_axis(1, 1..2).sum() + seen.transmittance().sum() * scene.background;
     let depth = seen.depth().sum();
     let gradient = |value: &Var<'_, T>| value.grad(&bound.vars())[0].as_slice().iter().map(|x| x.to_f64()).collect();

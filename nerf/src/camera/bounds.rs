@@ -27,7 +27,7 @@ pub fn intersect_box(ray: &Ray, [low, high]: [DVec3; 2]) -> Option<[f64; 2]> {
 }
 
 /// The part of `span` (near and far distance) of a ray that lies in the box; empty, at near, if it misses.
-pub fn clip_span(ray: &Ray, bounds: [DVec3; 2], [near, far]: [f64; 2]) -> [f64; 2] {
+pub fn clip_near_far(ray: &Ray, bounds: [DVec3; 2], [near, far]: [f64; 2]) -> [f64; 2] {
     match intersect_box(ray, bounds) {
         Some([enter, leave]) if enter.max(near) < leave.min(far) => [enter.max(near), leave.min(far)],
         _ => [near, near],
@@ -41,7 +41,7 @@ impl Camera {
         let place = |i: usize, count: usize, size: usize| (i as f64 + 0.5) / count as f64 * size as f64;
         (0..columns * rows).any(|i| {
             let ray = self.ray(place(i % columns, columns, self.width), place(i / columns, rows, self.height));
-            let [enter, leave] = clip_span(&ray, bounds, span);
+            let [enter, leave] = clip_near_far(&ray, bounds, span);
             enter < leave
         })
     }

@@ -11,10 +11,10 @@ pub(crate) mod rays;
 pub(crate) mod rotation;
 pub(crate) mod spiral;
 
-pub use bounds::{clip_span, intersect_box};
+pub use bounds::{clip_near_far, intersect_box};
 pub use lens::{Lens, recorded::lens_places};
 pub use ndc::Ndc;
-pub use path::{CameraPath, Curve, Key};
+pub use path::{CameraPath, Curve, Keyframe};
 pub use pinhole::{Camera, Ray};
 pub use rays::{Rays, Samples, stratified};
 pub use rotation::{rotation_exp, rotation_matrix};

@@ -41,7 +41,7 @@ impl Ndc {
     pub fn around<'a>(cameras: impl IntoIterator<Item = &'a Camera>, near: f64) -> Result<Self> {
         let cameras: Vec<&Camera> = cameras.into_iter().collect();
         let mean = |of: fn(&Camera) -> DVec3| mean(cameras.iter().map(|camera| of(camera)));
-        let bad = |what: &str| Err(Error::setting("scope", format!("forward: {what}; use unbounded")));
+        let bad = |what: &str| Err(Error::setting("scene-type", format!("forward-facing: {what}; use unbounded")));
         let back = mean(|camera| camera.pose.matrix3.z_axis).normalize();
         // Of a flight to and fro no side is up.
         let up = mean(|camera| camera.pose.matrix3.y_axis);

@@ -5,17 +5,17 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 
 /// Where a camera is on a path, and how much it sees.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Key {
+pub struct Keyframe {
     /// Camera-to-world, with the axes of a [`Camera`]: a rotation and a translation.
     pub pose: DAffine3,
     /// The vertical field of view in radians, between 0 and pi.
     pub angle_y: f64,
 }
 
-impl Key {
+impl Keyframe {
     /// That of a camera: its lens and its principal point are left behind.
     pub fn of(camera: &Camera) -> Self {
-        Key { pose: camera.pose, angle_y: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan() }
+        Keyframe { pose: camera.pose, angle_y: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan() }
     }
 
     /// A pinhole camera there, with square pixels and its principal point in the middle:
@@ -29,12 +29,12 @@ impl Key {
     /// The key that is `share` of the way to another, beyond it above 1 and before this one below 0: on a straight
     /// line, by a turn about one axis, the short way round (slerp, Shoemake 1985), and with the focal length changing
     /// by a constant factor.
-    pub fn mix(&self, other: &Key, share: f64) -> Key {
+    pub fn mix(&self, other: &Keyframe, share: f64) -> Keyframe {
         let (from, to) = (&self.pose, &other.pose);
         let turn = DQuat::from_scaled_axis(share * turn(from, to));
         let rotation = (DQuat::from_mat3(&from.matrix3) * turn).normalize();
-        let focal = |key: &Key| (0.5 * key.angle_y).tan().ln();
-        Key {
+        let focal = |key: &Keyframe| (0.5 * key.angle_y).tan().ln();
+        Keyframe {
             pose: DAffine3 {
                 matrix3: DMat3::from_quat(rotation),
                 translation: from.translation + share * (to.translation - from.translation),
@@ -54,7 +54,7 @@ fn turn(from: &DAffine3, to: &DAffine3) -> DVec3 {
 /// How a path goes by its keys.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Curve {
-    /// Through each: a Catmull-Rom spline by the pyramid of Barry and Goldman (1988) of [`Key::mix`], for rotations as
+    /// Through each: a Catmull-Rom spline by the pyramid of Barry and Goldman (1988) of [`Keyframe::mix`], for rotations as
     /// Schlag (1991) has it. Speeds of moving, of turning and of zooming are continuous. From key to key a camera
     /// should turn by less than a right angle. How far along it a camera is at a time is a monotone cubic function (Fritsch and
     /// Butland 1984), so that times, however uneven, move cameras to and fro nowhere. Nerfstudio's paths are such ones.
@@ -76,7 +76,7 @@ pub enum Curve {
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraPath {
-    keys: Vec<Key>,
+    keys: Vec<Keyframe>,
     /// When each key is reached, from 0 on; of a closed path, the first once more.
     times: Vec<f64>,
     /// The curve's parameter there.
@@ -98,7 +98,7 @@ impl CameraPath {
     ///
     /// # Panics
     /// If there is no key.
-    pub fn through(keys: Vec<Key>, closed: bool) -> Self {
+    pub fn through(keys: Vec<Keyframe>, closed: bool) -> Self {
         let legs = legs(&keys, closed);
         let pairs = legs.iter().map(|&[from, to]| (&keys[from].pose, &keys[to].pose));
         let lengths = |of: fn(&DAffine3, &DAffine3) -> f64| -> Vec<f64> {
@@ -118,7 +118,7 @@ impl CameraPath {
     ///
     /// # Panics
     /// If there is no key, or not as many times, or one that is not above 0 and finite.
-    pub fn timed(keys: Vec<Key>, times: Vec<f64>, closed: bool, curve: Curve) -> Self {
+    pub fn timed(keys: Vec<Keyframe>, times: Vec<f64>, closed: bool, curve: Curve) -> Self {
         assert!(!keys.is_empty(), "a path of no keys");
         assert_eq!(times.len(), legs(&keys, closed).len(), "a time for each leg");
         assert!(times.iter().all(|time| *time > 0.0 && time.is_finite()), "times above 0");
@@ -138,14 +138,14 @@ impl CameraPath {
     }
 
     /// Where a camera is that has come so far, 0 to 1: by time, and so about evenly.
-    pub fn at(&self, share: f64) -> Key {
+    pub fn at(&self, share: f64) -> Keyframe {
         if self.keys.len() == 1 {
             return self.keys[0];
         }
         let time = share.clamp(0.0, 1.0) * self.length();
         // The last key ends the last leg.
         let leg = self.times[1..self.times.len() - 1].partition_point(|reached| *reached <= time);
-        let window: [(f64, Key); 4] = std::array::from_fn(|i| self.key(leg as isize + i as isize - 1));
+        let window: [(f64, Keyframe); 4] = std::array::from_fn(|i| self.key(leg as isize + i as isize - 1));
         let share = (time - self.times[leg]) / self.leg(leg)[0];
         match self.curve {
             Curve::Through => through(window, self.knots[leg] + self.passed(leg, share)),
@@ -191,7 +191,7 @@ impl CameraPath {
 
     /// `count` keys along the path, evenly in time: from its beginning to its end or, of a closed one, up to where it
     /// begins again.
-    pub fn frames(&self, count: usize) -> Vec<Key> {
+    pub fn frames(&self, count: usize) -> Vec<Keyframe> {
         let steps = if self.closed { count } else { count.saturating_sub(1).max(1) };
         (0..count).map(|i| self.at(i as f64 / steps as f64)).collect()
     }
@@ -201,7 +201,7 @@ impl CameraPath {
     }
 
     /// A key and its parameter; there are some before the first and after the last.
-    fn key(&self, i: isize) -> (f64, Key) {
+    fn key(&self, i: isize) -> (f64, Keyframe) {
         let count = self.keys.len() as isize;
         if self.closed {
             let at = i.rem_euclid(count) as usize;
@@ -223,24 +223,24 @@ impl CameraPath {
 }
 
 /// The first and the last key of each leg.
-fn legs(keys: &[Key], closed: bool) -> Vec<[usize; 2]> {
+fn legs(keys: &[Keyframe], closed: bool) -> Vec<[usize; 2]> {
     let count = if closed && keys.len() > 1 { keys.len() } else { keys.len().saturating_sub(1) };
     (0..count).map(|i| [i, (i + 1) % keys.len()]).collect()
 }
 
 /// The pyramid: between neighbours, between those, and between these, each by the parameters that it stands for.
-fn through(keys: [(f64, Key); 4], place: f64) -> Key {
+fn through(keys: [(f64, Keyframe); 4], place: f64) -> Keyframe {
     let knots = keys.map(|(knot, _)| knot);
-    let mix = |from: &Key, to: &Key, [start, end]: [usize; 2]| {
+    let mix = |from: &Keyframe, to: &Keyframe, [start, end]: [usize; 2]| {
         from.mix(to, (place - knots[start]) / (knots[end] - knots[start]))
     };
-    let first: [Key; 3] = std::array::from_fn(|i| mix(&keys[i].1, &keys[i + 1].1, [i, i + 1]));
-    let second: [Key; 2] = std::array::from_fn(|i| mix(&first[i], &first[i + 1], [i, i + 2]));
+    let first: [Keyframe; 3] = std::array::from_fn(|i| mix(&keys[i].1, &keys[i + 1].1, [i, i + 1]));
+    let second: [Keyframe; 2] = std::array::from_fn(|i| mix(&first[i], &first[i + 1], [i, i + 2]));
     mix(&second[0], &second[1], [1, 2])
 }
 
 /// The weighted mean by the uniform cubic B-spline's weights.
-fn near(keys: [Key; 4], u: f64) -> Key {
+fn near(keys: [Keyframe; 4], u: f64) -> Keyframe {
     let v = 1.0 - u;
     let middle = |u: f64| (3.0 * u * u * u - 6.0 * u * u + 4.0) / 6.0;
     let weights = [v * v * v / 6.0, middle(u), middle(v), u * u * u / 6.0];
@@ -253,7 +253,7 @@ fn near(keys: [Key; 4], u: f64) -> Key {
         angle_y += weight * key.angle_y;
     }
     let matrix3 = DMat3::from_quat(rotation.normalize());
-    Key { pose: DAffine3 { matrix3, translation }, angle_y }
+    Keyframe { pose: DAffine3 { matrix3, translation }, angle_y }
 }
 
 #[cfg(test)]

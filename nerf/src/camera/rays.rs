@@ -1,6 +1,6 @@
 //! Rays and the samples along them, packed: the samples of all rays stand one after another.
 
-use super::bounds::clip_span;
+use super::bounds::clip_near_far;
 use super::pinhole::{Camera, Ray};
 use crate::random::Jitter;
 use glam::DVec3;
@@ -35,7 +35,7 @@ impl<T: Scalar> Rays<T> {
     /// that lies in the box `bounds` (lower and upper corner).
     pub fn push_pixel(&mut self, camera: &Camera, [column, row]: [usize; 2], bounds: [DVec3; 2], span: [f64; 2]) {
         let ray = camera.pixel_ray(column, row);
-        self.push(&ray, clip_span(&ray, bounds, span));
+        self.push(&ray, clip_near_far(&ray, bounds, span));
     }
 
     /// Number of rays.

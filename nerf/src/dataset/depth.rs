@@ -75,8 +75,8 @@ impl Depths {
         decoded(path.as_ref()).map(drop)
     }
 
-    /// Of distances along the rays of a camera's pixels, as a [`Picture`](crate::Picture) has them, each multiplied by
-    /// `scale`: 1 over the [scale of the placement](super::Placement::scale) gives them in units of the capture.
+    /// Of distances along the rays of a camera's pixels, as a [`Render`](crate::Render) has them, each multiplied by
+    /// `scale`: 1 over the [scale of the placement](super::SceneTransform::scale) gives them in units of the capture.
     ///
     /// # Panics
     /// If the image is not one channel of the camera's size.

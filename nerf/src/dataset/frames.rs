@@ -3,8 +3,8 @@
 use super::image::Image;
 use super::mask::Mask;
 use super::photo::Photo;
-use super::placement::Placement;
-use super::scope::Scope;
+use super::scene_transform::SceneTransform;
+use super::scene_type::SceneType;
 use crate::camera::Ndc;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -88,11 +88,11 @@ pub struct Dataset {
     /// Distance along a ray, in scene units, beyond which there is nothing.
     pub far: f64,
     /// How far the scene goes.
-    pub scope: Scope,
-    /// What all photographs of the capture show, those of other splits too, where they [look the same way](Scope::Forward).
+    pub scope: SceneType,
+    /// What all photographs of the capture show, those of other splits too, where they [look the same way](SceneType::ForwardFacing).
     pub ndc: Option<Ndc>,
     /// From the coordinates of the files to those of the scene, in which everything here is.
-    pub placement: Placement,
+    pub placement: SceneTransform,
     /// Names of photographs that the dataset lists but whose image files are absent. They were left out; a caller
     /// should say so.
     pub skipped: Vec<String>,
@@ -102,11 +102,11 @@ impl Dataset {
     /// How many pixels of the photographs lie side by side along the longest side of the scene's box where they show its middle:
     /// the median over photographs. One that was taken from within the box counts as if its camera stood at its side. Where
     /// all [look the same way](Self::ndc), those are counted that lie across the picture of all they see, at that depth.
-    pub fn footprints(&self) -> f64 {
+    pub fn pixels_per_side(&self) -> f64 {
         let [lower, upper] = self.bounds;
         let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
         let each = self.frames.iter().map(|Frame { camera, .. }| {
-            if let Some(ndc) = self.ndc.filter(|_| self.scope == Scope::Forward) {
+            if let Some(ndc) = self.ndc.filter(|_| self.scope == SceneType::ForwardFacing) {
                 return ndc.pixels(camera, middle);
             }
             let distance = camera.pose.translation.distance(middle).max(0.5 * side);
@@ -149,7 +149,7 @@ impl Dataset {
         if needed && !found {
             let what = "one needs photographs with depths that were measured, and there are none: `depth_file_path` of \
                         transforms.json names their files, and a program sets `Frame::distances`";
-            return Err(Error::setting("terms", what));
+            return Err(Error::setting("loss_terms", what));
         }
         Ok(())
     }
@@ -214,12 +214,16 @@ mod tests {
         for (frame, distance) in data.frames.iter_mut().zip([8.0, 5.0, 40.0]) {
             frame.camera = camera(distance);
         }
-        assert!((data.footprints() - 4.0 * 100.0 / 8.0).abs() < 1e-9, "{}", data.footprints());
+        assert!((data.pixels_per_side() - 4.0 * 100.0 / 8.0).abs() < 1e-9, "{}", data.pixels_per_side());
         // Inside, as from a side.
         data.frames.iter_mut().for_each(|frame| frame.camera = camera(0.5));
-        assert!((data.footprints() - 200.0).abs() < 1e-9, "{}", data.footprints());
+        assert!((data.pixels_per_side() - 200.0).abs() < 1e-9, "{}", data.pixels_per_side());
         data.frames.iter_mut().for_each(|frame| frame.camera.lens = Lens::Equirectangular);
-        assert!((data.footprints() - 2.0 * 75.0 / std::f64::consts::TAU).abs() < 1e-9, "{}", data.footprints());
+        assert!(
+            (data.pixels_per_side() - 2.0 * 75.0 / std::f64::consts::TAU).abs() < 1e-9,
+            "{}",
+            data.pixels_per_side()
+        );
     }
 
     #[test]

@@ -6,9 +6,9 @@ use super::formats;
 use super::frames::{Dataset, Frame, Split, evenly_spaced};
 use super::mask::Mask;
 use super::photo::Photo;
-use super::placement::Placement;
-use super::scope::Scope;
-use super::survey::Survey;
+use super::scene_analysis::SceneAnalysis;
+use super::scene_transform::SceneTransform;
+use super::scene_type::SceneType;
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
@@ -32,7 +32,7 @@ pub(super) const WHITE: f32 = 0.99;
 
 /// How photographs are read.
 #[derive(Clone, Copy)]
-pub struct Reading<'a> {
+pub struct LoadOptions<'a> {
     /// The number that their width and height are divided by, rounded: a pixel is the mean of what it covers.
     pub downscale: usize,
     /// How many of them are read at most, [evenly spaced](evenly_spaced).
@@ -44,13 +44,13 @@ pub struct Reading<'a> {
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
 }
 
-impl Default for Reading<'_> {
+impl Default for LoadOptions<'_> {
     fn default() -> Self {
-        Reading { downscale: 1, views: usize::MAX, distances: false, progress: &|_, _| {} }
+        LoadOptions { downscale: 1, views: usize::MAX, distances: false, progress: &|_, _| {} }
     }
 }
 
-impl Reading<'_> {
+impl LoadOptions<'_> {
     /// Whether the numbers are usable.
     pub(super) fn check(&self) -> Result<()> {
         for (name, value) in [("views", self.views), ("downscale", self.downscale)] {
@@ -142,8 +142,8 @@ impl Capture {
     /// How the scene lies in the capture; `asked` overrules how far it goes.
     ///
     /// # Errors
-    /// If an image that has an alpha channel cannot be read, or as [`Survey::new`].
-    pub fn survey(&self, asked: Option<Scope>) -> Result<Survey> {
+    /// If an image that has an alpha channel cannot be read, or as [`SceneAnalysis::new`].
+    pub fn analyze_scene(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
         let ([mut clear, mut white, mut alpha], total) = ([0; 3], looked_at.len());
         for view in looked_at {
@@ -169,7 +169,7 @@ impl Capture {
             _ if 2 * alpha > total && self.format == Format::Blender => Some("photographs have alpha"),
             _ => None,
         };
-        Survey::new(self, empty, asked)
+        SceneAnalysis::new(self, empty, asked)
     }
 
     /// Reads one photograph, in its own size, as its camera has taken it: without its mask, and whatever a survey says.
@@ -187,7 +187,7 @@ impl Capture {
     /// If the split has none whose image exists, an image cannot be decoded or is of another shape than its camera, or
     /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. A single absent image is
     /// no error: see [`Dataset::skipped`].
-    pub fn load(&self, split: Split, survey: &Survey, reading: &Reading<'_>) -> Result<Dataset> {
+    pub fn load(&self, split: Split, survey: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
         reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
             self.split(split)?.into_iter().partition(|view| view.image.is_some());
@@ -203,7 +203,7 @@ impl Capture {
         let plans = plans.into_iter().collect::<Result<Vec<_>>>()?;
         let (done, total, lit) = (AtomicUsize::new(0), plans.len(), Lit::default());
         let frames = parallel::collect(total, |i| {
-            let frame = plans[i].frame(&survey.placement, &lit, reading.distances);
+            let frame = plans[i].frame(&survey.transform, &lit, reading.distances);
             (reading.progress)(done.fetch_add(1, Ordering::Relaxed) + 1, total);
             self.named(plans[i].view, frame)
         });
@@ -213,8 +213,8 @@ impl Capture {
             near: survey.near,
             ndc: survey.ndc,
             far: survey.far,
-            scope: survey.scope,
-            placement: survey.placement,
+            scope: survey.scene_type,
+            placement: survey.transform,
             skipped: absent.into_iter().map(|view| view.name.clone()).collect(),
         })
     }
@@ -244,7 +244,7 @@ impl<'a> Plan<'a> {
         Ok(Plan { view, path, size, to })
     }
 
-    fn frame(&self, placement: &Placement, lit: &Lit, is_measured: bool) -> Result<Frame> {
+    fn frame(&self, placement: &SceneTransform, lit: &Lit, is_measured: bool) -> Result<Frame> {
         let Plan { view, path, size, to } = self;
         let photo = Photo::open(path, Some(*size))?;
         let image = if [photo.width, photo.height] == *to { photo } else { photo.resized(*to) };

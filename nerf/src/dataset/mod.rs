@@ -14,11 +14,11 @@ pub(crate) mod image;
 pub(crate) mod load;
 mod mask;
 pub(crate) mod photo;
-pub(crate) mod placement;
 #[cfg(test)]
 pub(crate) mod sample;
-pub(crate) mod scope;
-pub(crate) mod survey;
+pub(crate) mod scene_analysis;
+pub(crate) mod scene_transform;
+pub(crate) mod scene_type;
 mod undistort;
 
 pub use self::image::Image;
@@ -28,28 +28,28 @@ pub use capture::{Capture, Format, Point, View};
 pub use color_space::{SrgbDecode, SrgbEncode, srgb_decode, srgb_encode};
 pub use depth::Depths;
 pub use frames::{Dataset, Frame, Split, evenly_spaced};
-pub use load::Reading;
+pub use load::LoadOptions;
 pub use mask::Mask;
 pub use photo::Photo;
 pub use photo::save::copy_upright;
-pub use placement::Placement;
-pub use scope::Scope;
-pub use survey::Survey;
+pub use scene_analysis::SceneAnalysis;
+pub use scene_transform::SceneTransform;
+pub use scene_type::SceneType;
 
 use std::path::Path;
 
 use crate::error::Result;
 
 /// Reads one split of the dataset in `folder`, its images [averaged](Photo::resized) down by the factor `downscale` (1 keeps
-/// them): [`Capture::read`], [`Capture::survey`] and [`Capture::load`] in one.
+/// them): [`Capture::read`], [`Capture::analyze_scene`] and [`Capture::load`] in one.
 ///
 /// # Errors
 /// As these. Every error names the file and the field. A single absent image is no error: see [`Dataset::skipped`].
 pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<Dataset> {
-    let reading = Reading { downscale, ..Reading::default() };
+    let reading = LoadOptions { downscale, ..LoadOptions::default() };
     reading.check()?;
     let capture = Capture::read(folder)?;
-    capture.load(split, &capture.survey(None)?, &reading)
+    capture.load(split, &capture.analyze_scene(None)?, &reading)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Photographs for unit tests: a ball of two colours in the middle of the world.
 
-use super::{Dataset, Frame, Image, Placement, Scope, Split};
+use super::{Dataset, Frame, Image, SceneTransform, SceneType, Split};
 use crate::camera::{Camera, Ndc, Ray};
 use glam::DVec3;
 
@@ -30,9 +30,9 @@ pub(crate) fn ball(split: Split, size: usize) -> Dataset {
         bounds: [DVec3::splat(-1.3), DVec3::splat(1.3)],
         near: DISTANCE - 2.3,
         far: DISTANCE + 2.3,
-        scope: Scope::Bounded,
+        scope: SceneType::Bounded,
         ndc: None,
-        placement: Placement::default(),
+        placement: SceneTransform::default(),
         skipped: vec![],
     }
 }
@@ -48,7 +48,7 @@ pub(crate) fn ball_ahead(size: usize) -> Dataset {
     let (near, far) = (0.5, 1e4);
     let ndc = Ndc::around(&cameras, near).ok();
     let frames = frames(cameras.into_iter());
-    Dataset { frames, near, far, scope: Scope::Forward, ndc, ..ball(Split::Val, 1) }
+    Dataset { frames, near, far, scope: SceneType::ForwardFacing, ndc, ..ball(Split::Val, 1) }
 }
 
 /// What cameras see of it.

@@ -151,12 +151,12 @@ kinds! {
     ExposureJump = "exposure-jump", Warning,
         "the brightness of {} is far from that of those beside",
         "Photograph with a fixed exposure. With photographs as they are, codes for each photograph (`--set \
-         field.codes=8`) take up what differs.";
+         field.appearance_embedding_dim=8`) take up what differs.";
     /// Photographs have other colours than those beside them.
     WhiteBalanceJump = "white-balance-jump", Warning,
         "the balance of colours in {} is far from that of those beside",
         "Photograph with a fixed white balance. With photographs as they are, codes for each photograph (`--set \
-         field.codes=8`) take up what differs.";
+         field.appearance_embedding_dim=8`) take up what differs.";
     /// A camera is far from all others.
     FarCamera = "far-camera", Warning,
         "the camera of {} was far from all others",
@@ -177,7 +177,7 @@ kinds! {
     /// Cameras stand in the box of a scene that ends there.
     CameraInBox = "camera-in-box", Warning,
         "the camera of {} stands in the box that is to hold the scene",
-        "A scene that ends at its box is seen from outside. If it is a room, train with `--scope unbounded`.";
+        "A scene that ends at its box is seen from outside. If it is a room, train with `--scene-type unbounded`.";
     /// A photograph that is tested on is trained on too.
     Leak = "leak", Warning,
         "of those held out, {} can be found among those to train on, or taken from the same place",

@@ -5,7 +5,7 @@ use super::nearby::{Nearby, usual_gap};
 use super::poses::{Convention, Focus, extents};
 use super::report::{Finding, Findings};
 use crate::camera::Camera;
-use crate::dataset::{Capture, Format, Scope, Split, Survey, View, evenly_spaced};
+use crate::dataset::{Capture, Format, SceneAnalysis, SceneType, Split, View, evenly_spaced};
 use crate::numbers::{mean, median};
 use Severity::{Error, Warning};
 use glam::{DAffine3, DVec3};
@@ -24,7 +24,7 @@ const ROLL: f64 = 30.0;
 const GAP: f64 = 120.0;
 
 /// Adds what is wrong with the cameras that have photographs, as a whole.
-pub(super) fn examine(capture: &Capture, survey: Option<&Survey>, findings: &mut Findings) {
+pub(super) fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &mut Findings) {
     let views: Vec<&View> = capture.present().collect();
     few(capture, &views, findings);
     if views.len() < 2 {
@@ -56,7 +56,7 @@ pub(super) fn examine(capture: &Capture, survey: Option<&Survey>, findings: &mut
     far_cameras(&views, &places, size[0], findings);
     scale(capture, &places, size[0], findings);
     if let Some(survey) = survey {
-        let up = survey.placement.rotation.transpose() * DVec3::Z;
+        let up = survey.transform.rotation.transpose() * DVec3::Z;
         roll(&views, up, findings);
         if let Some(focus) = focus.filter(Focus::is_inward) {
             coverage(&places, focus, up, findings);
@@ -214,14 +214,14 @@ fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) 
     }
 }
 
-fn in_the_box(views: &[&View], survey: &Survey, findings: &mut Findings) {
+fn in_the_box(views: &[&View], survey: &SceneAnalysis, findings: &mut Findings) {
     /// Rays that are tried along each side of an image; the second where all of the first miss a box that may lie between.
     const RAYS: [usize; 2] = [12, 200];
-    if survey.scope != Scope::Bounded {
+    if survey.scene_type != SceneType::Bounded {
         return;
     }
     let [low, high] = survey.bounds;
-    let placed = |view: &View| survey.placement.camera(&view.camera);
+    let placed = |view: &View| survey.transform.camera(&view.camera);
     let inside = |view: &&&View| {
         let eye = placed(view).pose.translation;
         eye.cmpge(low).all() && eye.cmple(high).all()

@@ -16,9 +16,9 @@ mod report;
 mod single;
 
 pub use kinds::{FindingKind, Severity};
-pub use report::{Facts, Finding, Lie, Part, Range, Report, Resolution};
+pub use report::{CaptureSubset, Facts, Finding, Range, Report, Resolution, SceneLayout};
 
-use crate::dataset::{Capture, Split, Survey, View};
+use crate::dataset::{Capture, SceneAnalysis, Split, View};
 use crate::numbers::median;
 use glam::DVec3;
 use pixels::Seen;
@@ -26,29 +26,29 @@ use report::Findings;
 
 /// How a capture is examined.
 #[derive(Clone, Copy)]
-pub struct Options<'a> {
+pub struct DoctorOptions<'a> {
     /// How many photographs are compared with their neighbours at most, evenly spaced; all of them are looked at otherwise.
     pub compared: usize,
     /// Is told how many are read, of how many; from several threads.
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
 }
 
-impl Default for Options<'_> {
+impl Default for DoctorOptions<'_> {
     fn default() -> Self {
-        Options { compared: 120, progress: &|_, _| {} }
+        DoctorOptions { compared: 120, progress: &|_, _| {} }
     }
 }
 
 /// What can be said of a capture without reading its pixels: this takes no time to speak of. Without a survey, as
-/// [`Capture::survey`] fails for captures that have no size, nothing is said of up and of the scene's box.
-pub fn examine_cameras(capture: &Capture, survey: Option<&Survey>) -> Report {
+/// [`Capture::analyze_scene`] fails for captures that have no size, nothing is said of up and of the scene's box.
+pub fn examine_cameras(capture: &Capture, survey: Option<&SceneAnalysis>) -> Report {
     let mut findings = Findings::default();
     let facts = without_pixels(capture, survey, &mut findings);
     Report { facts, findings: findings.sorted() }
 }
 
 /// Everything that can be said of a capture: its photographs are read, in parallel.
-pub fn examine(capture: &Capture, survey: Option<&Survey>, options: &Options<'_>) -> Report {
+pub fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, options: &DoctorOptions<'_>) -> Report {
     let mut findings = Findings::default();
     let mut facts = without_pixels(capture, survey, &mut findings);
     let looks = look::look_at_all(capture, options.progress);
@@ -61,7 +61,7 @@ pub fn examine(capture: &Capture, survey: Option<&Survey>, options: &Options<'_>
     Report { facts, findings: findings.sorted() }
 }
 
-fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Findings) -> Facts {
+fn without_pixels(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &mut Findings) -> Facts {
     let absent: Vec<&View> = capture.views.iter().filter(|view| view.image.is_none()).collect();
     let all = absent.len() == capture.views.len();
     if let Some(finding) = findings.about(FindingKind::ImagesAbsent, absent, &[&capture.views.len()])
@@ -80,7 +80,7 @@ fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Fin
             let views = capture.views.iter().filter(|view| view.split == Some(split));
             views.filter(|view| view.image.is_some() == exists).count()
         };
-        Part { split, present: count(true), absent: count(false) }
+        CaptureSubset { split, present: count(true), absent: count(false) }
     });
     let sized = || capture.views.iter().map(|view| &view.camera).filter(|camera| camera.width > 0);
     let mut lenses: Vec<String> = capture.views.iter().map(|view| single::described(&view.camera.lens)).collect();
@@ -89,21 +89,21 @@ fn without_pixels(capture: &Capture, survey: Option<&Survey>, findings: &mut Fin
     Facts {
         folder: capture.folder.clone(),
         format: capture.format.to_string(),
-        parts: parts.filter(|part| part.present + part.absent > 0).collect(),
+        subsets: parts.filter(|part| part.present + part.absent > 0).collect(),
         resolutions,
         focal: range(sized().map(|camera| camera.focal[0]).collect()),
         field_of_view: range(sized().map(|camera| single::field_of_view(camera, 0)).collect()),
         lenses,
         points: capture.points.len(),
-        lie: survey.map(|survey| Lie {
-            scope: survey.scope,
+        layout: survey.map(|survey| SceneLayout {
+            scope: survey.scene_type,
             reason: survey.reason.clone(),
             near: survey.near,
             far: survey.far,
             bounds: survey.bounds,
-            scale: survey.placement.scale,
-            up: survey.placement.rotation.transpose() * DVec3::Z,
-            middle: survey.placement.origin,
+            scale: survey.transform.scale,
+            up: survey.transform.rotation.transpose() * DVec3::Z,
+            middle: survey.transform.origin,
         }),
         agreement: None,
     }

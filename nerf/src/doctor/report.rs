@@ -1,7 +1,7 @@
 //! What an examination says: facts about a capture, and what is wrong with it.
 
 use super::kinds::{FindingKind, Severity, Text};
-use crate::dataset::{Scope, Split, View};
+use crate::dataset::{SceneType, Split, View};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
@@ -46,7 +46,7 @@ pub struct Resolution {
 
 /// The photographs of a split.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Part {
+pub struct CaptureSubset {
     /// The split.
     pub split: Split,
     /// How many of its images exist.
@@ -57,9 +57,9 @@ pub struct Part {
 
 /// Where the scene was found to be. Lengths and places are in the scene's units, `up` and `middle` in the capture's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Lie {
+pub struct SceneLayout {
     /// How far it goes.
-    pub scope: Scope,
+    pub scope: SceneType,
     /// Why that is thought.
     pub reason: String,
     /// Distance along a ray before which there is nothing.
@@ -84,7 +84,7 @@ pub struct Facts {
     /// How it is written.
     pub format: String,
     /// The photographs of each split that has some.
-    pub parts: Vec<Part>,
+    pub subsets: Vec<CaptureSubset>,
     /// The sizes of the images, the most frequent first.
     pub resolutions: Vec<Resolution>,
     /// Horizontal focal length in pixels, if cameras have a size.
@@ -96,7 +96,7 @@ pub struct Facts {
     /// Number of points of the scene that the capture has.
     pub points: usize,
     /// Where the scene lies, if that can be found out.
-    pub lie: Option<Lie>,
+    pub layout: Option<SceneLayout>,
     /// How well photographs agree with their cameras, if that was looked at and they have enough to compare: 0 as by chance,
     /// 1 perfectly; 0.3 is usual in a good capture.
     pub agreement: Option<f64>,

@@ -109,7 +109,7 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
         Reads::ALL
     }
 
-    fn is_kept(&self) -> bool {
+    fn is_cacheable(&self) -> bool {
         true
     }
 

@@ -1,9 +1,9 @@
 //! The network of the NeRF paper.
 
-use super::{Density, DensityActivation, Field, Fields, Seen};
+use super::{Density, DensityActivation, Field, Fields, ViewInputs};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::encoding::detail_weights;
 use crate::encoding::sinusoids::PositionalEncoding;
-use crate::kind::{Kind, Site};
 use crate::range::{check_parameters, check_range};
 use crate::space::cube::Space;
 use crate::{Error, Result};
@@ -24,7 +24,8 @@ pub struct ClassicConfig {
     /// Their width.
     pub width: usize,
     /// The layers, counted from 0, that see the encoded position once more.
-    pub skips: Vec<usize>,
+    #[serde(alias = "skips")]
+    pub skip_layers: Vec<usize>,
     /// Width of the layer that sees the direction.
     pub view_width: usize,
     /// Frequencies of the encoding of positions; 0 gives the network the bare coordinates.
@@ -42,7 +43,7 @@ impl ClassicConfig {
         ClassicConfig {
             depth: 8,
             width: 256,
-            skips: vec![5],
+            skip_layers: vec![5],
             view_width: 128,
             position_levels: 10,
             direction_levels: 4,
@@ -51,7 +52,7 @@ impl ClassicConfig {
     }
 }
 
-impl Kind<Fields> for ClassicConfig {
+impl ComponentConfig<Fields> for ClassicConfig {
     const KIND: &'static str = "classic";
 
     fn check(&self) -> Result<()> {
@@ -63,15 +64,16 @@ impl Kind<Fields> for ClassicConfig {
         if self.position_levels > 24 || self.direction_levels > 24 {
             return Err(Error::setting("position_levels", "more than 24 frequencies are beyond the precision of f32"));
         }
-        match self.skips.iter().find(|&&skip| !(1..self.depth).contains(&skip)) {
-            Some(skip) => {
-                Err(Error::setting("skips", format!("layer {skip} of {} cannot take the input again", self.depth)))
-            }
+        match self.skip_layers.iter().find(|&&skip| !(1..self.depth).contains(&skip)) {
+            Some(skip) => Err(Error::setting(
+                "skip_layers",
+                format!("layer {skip} of {} cannot take the input again", self.depth),
+            )),
             None => Ok(()),
         }
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
         Ok(Arc::new(Classic::new(self, site)?))
     }
 }
@@ -96,13 +98,14 @@ impl Classic {
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new<T: Scalar>(config: &ClassicConfig, site: Site<'_, T>) -> Result<Self> {
-        let Site { space, params, name, rng, .. } = site;
+    pub fn new<T: Scalar>(config: &ClassicConfig, site: BuildContext<'_, T>) -> Result<Self> {
+        let BuildContext { space, params, name, rng, .. } = site;
         config.check()?;
         let ClassicConfig { width, view_width, .. } = *config;
         let positions = PositionalEncoding { levels: config.position_levels, input: true }.width(3);
         let directions = PositionalEncoding { levels: config.direction_levels, input: true }.width(3);
-        let trunk = Mlp::new(params, &format!("{name}.trunk"), [positions, width, config.depth], &config.skips, rng);
+        let trunk =
+            Mlp::new(params, &format!("{name}.trunk"), [positions, width, config.depth], &config.skip_layers, rng);
         let mut layer = |part: &str, sizes, activation, init| {
             Linear::new(params, &format!("{name}.{part}"), sizes, activation, init, &mut *rng)
         };
@@ -148,7 +151,7 @@ impl<T: Scalar> Field<T> for Classic {
         Density { value, log: false, features }
     }
 
-    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let feature = self.feature.forward(params, features);
         let directions = self.sinusoids(seen.directions, self.config.direction_levels).segment_expand(seen.segments);
         let hidden = self.view.forward(params, &Var::concat(&[&feature, &directions], 1));
@@ -171,11 +174,12 @@ mod tests {
 
     #[test]
     fn frequencies_come_in_from_low_to_high_and_each_of_all_three_coordinates() {
-        let config = ClassicConfig { depth: 1, width: 8, skips: vec![], view_width: 4, ..ClassicConfig::paper() };
+        let config = ClassicConfig { depth: 1, width: 8, skip_layers: vec![], view_width: 4, ..ClassicConfig::paper() };
         let config = ClassicConfig { position_levels: 6, ..config };
         let mut params = Params::<f64>::new();
         let (space, rng) = (Space::within([DVec3::NEG_ONE, DVec3::ONE]), &mut Pcg64Mcg::seed_from_u64(5));
-        let field = Classic::new(&config, Site { space, frames: 0, params: &mut params, name: "field", rng }).unwrap();
+        let field =
+            Classic::new(&config, BuildContext { space, frames: 0, params: &mut params, name: "field", rng }).unwrap();
         // How much each input of the first layer matters: the bare coordinates, then six numbers a frequency.
         let inputs = |detail: f64| {
             let tape = Tape::new();

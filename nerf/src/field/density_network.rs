@@ -2,8 +2,8 @@
 
 use super::{Density, Grid, log_density_shift};
 use crate::Result;
+use crate::component::BuildContext;
 use crate::encoding::hash_grid::HashGridConfig;
-use crate::kind::Site;
 use raygrad_autograd::{Activation, Scalar, Var};
 use raygrad_nn::{Bound, Init, Linear};
 
@@ -22,11 +22,16 @@ impl DensityNetwork {
     ///
     /// # Errors
     /// If the grid is out of range.
-    pub fn new<T: Scalar>(grid: &HashGridConfig, width: usize, features: usize, mut site: Site<'_, T>) -> Result<Self> {
+    pub fn new<T: Scalar>(
+        grid: &HashGridConfig,
+        width: usize,
+        features: usize,
+        mut site: BuildContext<'_, T>,
+    ) -> Result<Self> {
         let shift = log_density_shift(site.space.unit);
         let grid = Grid::new(grid, site.child(site.name))?;
         let sizes = [([grid.width(), width], Activation::Relu), ([width, features], Activation::Identity)];
-        let Site { params, name, rng, .. } = site;
+        let BuildContext { params, name, rng, .. } = site;
         let layers = [0, 1].map(|i| {
             let (sizes, activation) = sizes[i];
             Linear::without_bias(params, &format!("{name}.density.{i}"), sizes, activation, Init::He, &mut *rng)

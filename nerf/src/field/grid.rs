@@ -1,9 +1,9 @@
 //! A hash grid over a scene, with its table among the parameters.
 
 use crate::Result;
+use crate::component::BuildContext;
 use crate::encoding::detail_weights;
 use crate::encoding::hash_grid::{HashEncoding, HashGrid, HashGridConfig};
-use crate::kind::Site;
 use crate::space::cube::Space;
 use rand::RngExt;
 use raygrad_autograd::{Scalar, Tensor, Var};
@@ -29,7 +29,7 @@ impl Grid {
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new<T: Scalar>(config: &HashGridConfig, site: Site<'_, T>) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &HashGridConfig, site: BuildContext<'_, T>) -> Result<Self> {
         let grid = HashGrid::new(config)?;
         let name = format!("{}.table", site.name);
         let table = site.params.add(name.clone(), grid.init(site.rng.random()));

@@ -1,9 +1,9 @@
 //! A hash grid and two small networks.
 
-use super::{Density, DensityNetwork, Field, Fields, Grid, Seen};
+use super::{Density, DensityNetwork, Field, Fields, Grid, ViewInputs};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
-use crate::kind::{Kind, Site};
 use crate::range::check_range;
 use crate::{Error, Result};
 use raygrad_autograd::{Activation, Scalar, Tensor, Var};
@@ -31,10 +31,11 @@ pub struct InstantConfig {
     /// exposure or a passer-by make of it (Martin-Brualla et al. 2021, "NeRF in the Wild", section 4.1). New views have the
     /// mean of all codes.
     #[serde(default)]
-    pub codes: usize,
+    #[serde(alias = "codes")]
+    pub appearance_embedding_dim: usize,
 }
 
-impl Kind<Fields> for InstantConfig {
+impl ComponentConfig<Fields> for InstantConfig {
     const KIND: &'static str = "instant";
 
     fn check(&self) -> Result<()> {
@@ -43,10 +44,10 @@ impl Kind<Fields> for InstantConfig {
         check_range("color_width", self.color_width, 1, 1 << 12)?;
         check_range("color_depth", self.color_depth, 1, 64)?;
         check_range("direction_degree", self.direction_degree, 1, 4)?;
-        check_range("codes", self.codes, 0, 256)
+        check_range("appearance_embedding_dim", self.appearance_embedding_dim, 0, 256)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
         Ok(Arc::new(Instant::new(self, site)?))
     }
 }
@@ -68,11 +69,13 @@ impl Instant {
     ///
     /// # Errors
     /// If the configuration is out of range, or has codes and the number of photographs is not known.
-    pub fn new<T: Scalar>(config: &InstantConfig, mut site: Site<'_, T>) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &InstantConfig, mut site: BuildContext<'_, T>) -> Result<Self> {
         config.check()?;
-        let InstantConfig { density_width, features, color_width, color_depth, codes, .. } = *config;
+        let InstantConfig {
+            density_width, features, color_width, color_depth, appearance_embedding_dim: codes, ..
+        } = *config;
         let density = DensityNetwork::new(&config.grid, density_width, features, site.child(site.name))?;
-        let Site { frames, params, name, rng, .. } = site;
+        let BuildContext { frames, params, name, rng, .. } = site;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let mut color = Vec::with_capacity(color_depth + 1);
         for i in 0..=color_depth {
@@ -83,7 +86,10 @@ impl Instant {
             color.push(Linear::without_bias(params, &name, [inputs, outputs], activation, Init::He, &mut *rng));
         }
         if codes > 0 && frames == 0 {
-            return Err(Error::setting("codes", "are for photographs, and it is not known how many there are"));
+            return Err(Error::setting(
+                "appearance_embedding_dim",
+                "are for photographs, and it is not known how many there are",
+            ));
         }
         let codes = (codes > 0).then(|| {
             let name = format!("{name}.codes");
@@ -106,7 +112,7 @@ impl<T: Scalar> Field<T> for Instant {
         self.density.density(params, positions)
     }
 
-    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
         let mut hidden = match self.codes.map(|codes| &params[codes]) {
             None => Var::concat(&[features, &directions], 1),

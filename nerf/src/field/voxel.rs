@@ -1,11 +1,11 @@
 //! A grid of voxels and no network.
 
 use super::grid::Grid;
-use super::{Density, Field, Fields, Seen, log_density_shift};
+use super::{Density, Field, Fields, ViewInputs, log_density_shift};
 use crate::Result;
+use crate::component::{BuildContext, ComponentConfig};
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::encoding::spherical::SphericalHarmonics;
-use crate::kind::{Kind, Site};
 use crate::range::check_range;
 use raygrad_autograd::{Scalar, Var};
 use raygrad_nn::Bound;
@@ -25,7 +25,7 @@ pub struct VoxelConfig {
     pub direction_degree: usize,
 }
 
-impl Kind<Fields> for VoxelConfig {
+impl ComponentConfig<Fields> for VoxelConfig {
     const KIND: &'static str = "voxel";
 
     fn check(&self) -> Result<()> {
@@ -33,7 +33,7 @@ impl Kind<Fields> for VoxelConfig {
         check_range("direction_degree", self.direction_degree, 1, 3)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Field<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn Field<T>>> {
         Ok(Arc::new(Voxel::new(self, site)?))
     }
 }
@@ -61,7 +61,7 @@ impl Voxel {
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new<T: Scalar>(config: &VoxelConfig, site: Site<'_, T>) -> Result<Self> {
+    pub fn new<T: Scalar>(config: &VoxelConfig, site: BuildContext<'_, T>) -> Result<Self> {
         config.check()?;
         let direction = SphericalHarmonics::new(config.direction_degree);
         let grid = HashGridConfig {
@@ -88,7 +88,7 @@ impl<T: Scalar> Field<T> for Voxel {
         Density { value: raw * LOG_DENSITY_GAIN - self.shift, log: true, features }
     }
 
-    fn color<'t>(&self, _params: &Bound<'t, T>, features: &Var<'t, T>, seen: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, _params: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let (samples, width) = (features.shape()[0], self.direction.width());
         let directions = features.tape().apply(self.direction, &[seen.directions]).segment_expand(seen.segments);
         let coefficients = features.slice_axis(1, 1..1 + 3 * width).reshape(&[samples, 3, width]);

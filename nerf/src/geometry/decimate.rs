@@ -100,7 +100,7 @@ impl Mesh {
             left -= gone;
         }
         self.triangles.retain(|triangle| *triangle != GONE);
-        self.drop_unused();
+        self.drop_unreferenced_vertices();
     }
 }
 

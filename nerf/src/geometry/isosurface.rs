@@ -1,6 +1,6 @@
 //! The surface on which a function of positions has a value.
 
-use super::cases::cases;
+use super::marching_cubes_table::cases;
 use super::mesh::Mesh;
 use crate::space::occupancy::{DensityFn, POINTS};
 use crate::{Error, Result};
@@ -137,8 +137,9 @@ fn limited(
                 let place = |corner: usize| x + (corner & 1) + width * (y + (corner >> 1 & 1));
                 let bit = |corner: usize| usize::from(is_dense(between[corner >> 2].values[place(corner)])) << corner;
                 let dense: usize = (0..8).map(bit).sum();
-                let vertex =
-                    |edge: super::cases::Edge| between[edge.corner >> 2].vertices[edge.axis][place(edge.corner)];
+                let vertex = |edge: super::marching_cubes_table::Edge| {
+                    between[edge.corner >> 2].vertices[edge.axis][place(edge.corner)]
+                };
                 triangles.extend(cases[dense].iter().map(|edges| edges.map(vertex)));
             }
         }

@@ -61,7 +61,7 @@ impl Mesh {
 
     /// For each triangle the number of the part that it belongs to, and how many parts there are. Triangles of a part are
     /// joined by vertices; parts are numbered in the order of their first triangles.
-    pub fn parts(&self) -> (Vec<usize>, usize) {
+    pub fn components(&self) -> (Vec<usize>, usize) {
         let mut leader: Vec<u32> = (0..self.positions.len() as u32).collect();
         for &[a, b, c] in &self.triangles {
             for other in [b, c] {
@@ -80,20 +80,20 @@ impl Mesh {
 
     /// Leaves out parts whose area is less than this share, 0 to 1, of that of the largest, and says how many those were. 0
     /// leaves out none.
-    pub fn drop_parts(&mut self, share: f64) -> usize {
-        let (parts, count) = self.parts();
+    pub fn drop_small_components(&mut self, share: f64) -> usize {
+        let (parts, count) = self.components();
         let mut areas = vec![0.0; count];
         parts.iter().enumerate().for_each(|(i, &part)| areas[part] += area(self.corners(i)));
         let least = share * areas.iter().copied().fold(0.0, f64::max);
         let stays: Vec<bool> = areas.iter().map(|area| *area >= least).collect();
         let mut parts = parts.into_iter();
         self.triangles.retain(|_| parts.next().is_some_and(|part| stays[part]));
-        self.drop_unused();
+        self.drop_unreferenced_vertices();
         stays.iter().filter(|stays| !**stays).count()
     }
 
     /// Leaves out vertices that no triangle has; the others keep their order.
-    pub fn drop_unused(&mut self) {
+    pub fn drop_unreferenced_vertices(&mut self) {
         const UNUSED: u32 = u32::MAX;
         let mut number = vec![UNUSED; self.positions.len()];
         self.triangles.as_flattened().iter().for_each(|&vertex| number[vertex as usize] = 0);
@@ -200,17 +200,17 @@ pub(super) mod tests {
         let sizes = [1.0, 0.5, 3.0, 0.2];
         let all = sizes.iter().enumerate().map(|(i, &size)| tetrahedron(DVec3::splat(5.0 * i as f64), size));
         let all = all.reduce(|a, b| both(a, &b)).unwrap();
-        let (parts, count) = all.parts();
+        let (parts, count) = all.components();
         assert_eq!((&parts[..], count), (&[0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3][..], 4));
         // Areas are as squares of sizes: 1/9, 1/36, 1 and 1/225 of the largest.
         for (share, left) in [(0.0, 4), (0.004, 4), (0.01, 3), (0.05, 2), (0.2, 1), (1.0, 1)] {
             let mut mesh = all.clone();
-            assert_eq!(mesh.drop_parts(share), 4 - left, "{share}");
-            assert_eq!((mesh.positions.len(), mesh.triangles.len(), mesh.parts().1), (4 * left, 4 * left, left));
+            assert_eq!(mesh.drop_small_components(share), 4 - left, "{share}");
+            assert_eq!((mesh.positions.len(), mesh.triangles.len(), mesh.components().1), (4 * left, 4 * left, left));
             assert!(mesh.is_closed() && mesh.bounds().unwrap()[1].x > 12.0, "the largest stays");
         }
         let mut mesh = all;
-        mesh.drop_parts(0.05);
+        mesh.drop_small_components(0.05);
         let expected = both(tetrahedron(DVec3::ZERO, 1.0), &tetrahedron(DVec3::splat(10.0), 3.0));
         assert_eq!(mesh, expected, "the others as they were");
     }

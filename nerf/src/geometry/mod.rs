@@ -3,7 +3,7 @@
 //! A [`Mesh`] is made of any function of positions by [`isosurface`], and of a model by
 //! [`Model::surface`](crate::Model::surface), which chooses the level of density, looks only where pictures do, leaves out
 //! small parts and says how vertices look. [`Model::point_cloud`](crate::Model::point_cloud) gives what cameras see, point by
-//! point. Either is a [`Shape`], and [`files`] writes it.
+//! point. Either is a [`ColoredMesh`], and [`files`] writes it.
 //!
 //! ```
 //! use glam::DVec3;
@@ -22,20 +22,20 @@
 //! # Ok::<(), raygrad_nerf::Error>(())
 //! ```
 
-mod cases;
+mod colored_mesh;
 mod decimate;
 pub mod files;
-mod hidden;
 mod isosurface;
+mod marching_cubes_table;
 mod mesh;
 mod points;
 mod probe;
-mod shape;
 mod sight;
 mod surface;
+mod unseen;
 
+pub use colored_mesh::ColoredMesh;
 pub use isosurface::{Lattice, isosurface};
 pub use mesh::Mesh;
 pub use points::PointCloud;
-pub use shape::Shape;
 pub use surface::{Stage, Surface, SurfaceConfig};

@@ -1,8 +1,8 @@
 //! What cameras see of a model, as points.
 
+use super::colored_mesh::ColoredMesh;
 use super::mesh::{Mesh, bounds};
 use super::probe::Probe;
-use super::shape::Shape;
 use super::sight::views;
 use super::surface::Stage;
 use crate::camera::Camera;
@@ -21,7 +21,7 @@ const HALVINGS: usize = 14;
 #[derive(Debug, Clone)]
 pub struct PointCloud {
     /// The points, in scene units.
-    pub shape: Shape,
+    pub colored_mesh: ColoredMesh,
     /// How many places the points were chosen of.
     pub sights: usize,
     /// How often the model was asked.
@@ -46,7 +46,7 @@ impl Model<f32> {
         let scale = |camera: &Camera| (rays / (camera.width * camera.height) as f64).sqrt();
         let views = views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done));
         let seen = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten().map(|sight| sight.place));
-        let places: Vec<DVec3> = seen.filter(|place| self.extent.holds(*place)).collect();
+        let places: Vec<DVec3> = seen.filter(|place| self.scene_box.contains(*place)).collect();
         if places.is_empty() {
             return Err(Error::setting("points", "are none: no camera sees anything solid"));
         }
@@ -59,7 +59,7 @@ impl Model<f32> {
         let (normals, colors) = probe.look(self.cells(), self.judged(self.cells()), &positions);
         let mesh = Mesh { positions, triangles: vec![] };
         let evaluations = seeing + probe.evaluations();
-        Ok(PointCloud { shape: Shape { mesh, normals, colors }, sights, evaluations })
+        Ok(PointCloud { colored_mesh: ColoredMesh { mesh, normals, colors }, sights, evaluations })
     }
 }
 

@@ -1,10 +1,10 @@
 //! Asking a model at places, as its pictures show them.
 
-use super::hidden::Hidden;
+use super::unseen::Hidden;
 use crate::camera::pinhole::Ray;
 use crate::camera::rays::{Rays, Samples};
+use crate::imaging::quantise;
 use crate::model::{Model, densities};
-use crate::pictures::quantise;
 use crate::space::occupancy::{OccupancyGrid, POINTS};
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
@@ -49,7 +49,7 @@ impl<'a> Probe<'a> {
     ) -> f32 {
         let place = |row: usize| DVec3::from(points[row].map(f64::from));
         let is_occupied = |place: DVec3| grid.is_none_or(|grid| grid.is_occupied(place));
-        let is_shown = |row: &usize| self.model.extent.holds(place(*row)) && is_occupied(place(*row));
+        let is_shown = |row: &usize| self.model.scene_box.contains(place(*row)) && is_occupied(place(*row));
         let rows: Vec<usize> = (0..points.len()).filter(is_shown).collect();
         out.fill(0.0);
         let is_hidden = |row: usize| hidden.is_some_and(|hidden| hidden.holds(place(row)));
@@ -106,7 +106,7 @@ impl<'a> Probe<'a> {
         let count = rays.len();
         let (here, one) = (Tensor::zeros(&[count]), Tensor::ones(&[count]));
         let samples = Samples::new(&rays, Segments::uniform(count, 1), here, one, &self.pool);
-        let frames = self.model.look.map(|look| vec![look; count]);
+        let frames = self.model.appearance_image.map(|look| vec![look; count]);
         let query = Query { frames: frames.as_deref(), ..Query::new(&*self.model.field, &params) };
         let color = query.color(&query.density(&samples).features, &samples);
         let stored = |color: &[f32; 3]| std::array::from_fn(|k| quantise((f64::from(color[k]) * gains[k]) as f32));

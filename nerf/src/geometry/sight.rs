@@ -3,7 +3,7 @@
 use crate::camera::Camera;
 use crate::camera::rays::Rays;
 use crate::model::Model;
-use crate::rendering::picture::Viewing;
+use crate::rendering::picture::RenderOptions;
 use crate::volume::render::Evaluations;
 use crate::volume::rounds::{FrontToBack, Stretch};
 use glam::DVec3;
@@ -55,13 +55,13 @@ pub(super) fn views(
 fn sights(model: &Model<f32>, camera: &Camera) -> Seen {
     let mut sights = vec![None; camera.width * camera.height];
     let see = |pool: &Pool<f32>, _, rays: &Rays<f32>, out: &mut [Option<Sight>]| see(model, rays, pool, out);
-    let evaluations = model.tiles(camera, &Viewing::over([0.0; 3]), TILE, sights.chunks_mut(TILE), see);
+    let evaluations = model.tiles(camera, &RenderOptions::over([0.0; 3]), TILE, sights.chunks_mut(TILE), see);
     Seen { sights, evaluations: evaluations.expect("nobody stops it") }
 }
 
 fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>, out: &mut [Option<Sight>]) -> Evaluations {
     model.along(rays, 1, pool, |query, sampled| {
-        let (mut asked, mut followed) = (sampled.evaluations, FrontToBack::new(&sampled.steps, MOST_LEFT));
+        let (mut asked, mut followed) = (sampled.evaluations, FrontToBack::new(&sampled.samples, MOST_LEFT));
         // The distance at which the optical depth of each ray is ln 2, and the density there.
         let mut halves: Vec<Option<[f64; 2]>> = vec![None; rays.len()];
         while let Some(round) = followed.round(query, followed.round_size()) {

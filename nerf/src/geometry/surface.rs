@@ -1,10 +1,10 @@
 //! The surface that a model's pictures show.
 
-use super::hidden::Hidden;
+use super::colored_mesh::ColoredMesh;
 use super::isosurface::{Lattice, MOST_CELLS, isosurface};
 use super::probe::Probe;
-use super::shape::Shape;
 use super::sight::{Seen, views};
+use super::unseen::Hidden;
 use crate::camera::Camera;
 use crate::model::Model;
 use crate::range::check_range;
@@ -30,29 +30,36 @@ pub struct SurfaceConfig {
     /// grid, or of a grid of 128 cells.
     pub resolution: Option<usize>,
     /// The density on the surface, in 1 / scene unit, above 0; without it the one at which cameras see it.
-    pub level: Option<f64>,
+    pub iso_value: Option<f64>,
     /// Parts of less than this share of the largest one's area, 0 to 1, are left out.
-    pub parts: f64,
+    pub min_component: f64,
     /// How many triangles there may be, at least 4, if not as many as it takes.
     pub triangles: Option<usize>,
     /// Whether what no camera sees is taken to be dense, further than a cell of the occupancy grid behind what is seen: there the
     /// field was never judged, and holds sponges and voids. What pictures leave out stays empty.
-    pub filled: bool,
+    pub fill_unseen: bool,
     /// Whether the surface is closed where it meets the box. Otherwise it ends there.
     pub closed: bool,
 }
 
 impl Default for SurfaceConfig {
     fn default() -> Self {
-        SurfaceConfig { resolution: None, level: None, parts: 0.01, triangles: None, filled: true, closed: true }
+        SurfaceConfig {
+            resolution: None,
+            iso_value: None,
+            min_component: 0.01,
+            triangles: None,
+            fill_unseen: true,
+            closed: true,
+        }
     }
 }
 
 impl SurfaceConfig {
     fn check(&self) -> Result<()> {
-        check_range("parts", self.parts, 0.0, 1.0)?;
+        check_range("min_component", self.min_component, 0.0, 1.0)?;
         self.resolution.map_or(Ok(()), |cells| check_range("resolution", cells, 1, MOST_CELLS))?;
-        if let Some(level) = self.level.filter(|level| !(*level > 0.0 && level.is_finite())) {
+        if let Some(level) = self.iso_value.filter(|level| !(*level > 0.0 && level.is_finite())) {
             return Err(Error::setting("level", format!("is {level}; use a density above 0")));
         }
         self.triangles.map_or(Ok(()), |count| check_range("triangles", count, 4, u32::MAX as usize))
@@ -76,9 +83,9 @@ pub enum Stage {
 #[derive(Debug, Clone)]
 pub struct Surface {
     /// The surface, in scene units.
-    pub shape: Shape,
+    pub colored_mesh: ColoredMesh,
     /// The density on it, in 1 / scene unit.
-    pub level: f64,
+    pub iso_value: f64,
     /// Cells of the lattice along the longest side of the box.
     pub resolution: usize,
     /// How many small parts were left out.
@@ -91,7 +98,7 @@ impl Model<f32> {
     /// The surface within the model's box (of a scene that goes on, the part of it where the cameras look), with normals
     /// against the slope of the density (over an edge of the occupancy grid's cells, as finer slopes are noise) and the colours that are seen along these.
     ///
-    /// It is where the density has one [level](SurfaceConfig::level). If none is given, it is the lower quartile of the
+    /// It is where the density has one [level](SurfaceConfig::iso_value). If none is given, it is the lower quartile of the
     /// densities at the places where half of a ray's light is blocked, over rays of the `cameras` that end in something solid: so
     /// the surface lies where pictures show it, and has few holes. What pictures leave out, cells that are not occupied, counts as empty.
     ///
@@ -106,14 +113,14 @@ impl Model<f32> {
         progress: &mut dyn FnMut(Stage, f64),
     ) -> Result<Surface> {
         config.check()?;
-        let (probe, bounds) = (Probe::new(self), self.extent.bounds);
-        let views = if config.filled || config.level.is_none() {
+        let (probe, bounds) = (Probe::new(self), self.scene_box.bounds);
+        let views = if config.fill_unseen || config.iso_value.is_none() {
             let scale = |camera: &Camera| (PIXELS / camera.width.max(camera.height) as f64).min(1.0);
             views(self, cameras, scale, &mut |done| progress(Stage::Seeing, done))
         } else {
             vec![]
         };
-        let level = config.level.map_or_else(|| self.level(&views), Ok)?;
+        let level = config.iso_value.map_or_else(|| self.level(&views), Ok)?;
         let grid = match self.cells() {
             Some(grid) => Cow::Borrowed(grid),
             None => {
@@ -123,7 +130,7 @@ impl Model<f32> {
             }
         };
         let judged = self.judged(Some(&grid));
-        let hidden = config.filled.then(|| Hidden::new(&views, judged));
+        let hidden = config.fill_unseen.then(|| Hidden::new(&views, judged));
         let resolution = config.resolution.unwrap_or(FINER * grid.resolution());
         let lattice = Lattice::over(if config.closed { bounds } else { within(bounds) }, resolution, config.closed)?;
         // What is hidden is dense whatever the level.
@@ -140,14 +147,20 @@ impl Model<f32> {
                 format!("is {level}, and there is no such density: use a smaller one"),
             ));
         }
-        let dropped = mesh.drop_parts(config.parts);
+        let dropped = mesh.drop_small_components(config.min_component);
         if let Some(count) = config.triangles {
             mesh.decimate(count, &mut |done| progress(Stage::Simplifying, done));
         }
         progress(Stage::Coloring, 0.0);
         let (normals, colors) = probe.look(Some(&grid), judged, &mesh.positions);
         let evaluations = views.iter().fold(probe.evaluations(), |sum, (_, seen)| sum + seen.evaluations);
-        Ok(Surface { shape: Shape { mesh, normals, colors }, level, resolution, dropped, evaluations })
+        Ok(Surface {
+            colored_mesh: ColoredMesh { mesh, normals, colors },
+            iso_value: level,
+            resolution,
+            dropped,
+            evaluations,
+        })
     }
 
     /// The cells that views look at, if they leave out any.
@@ -158,7 +171,7 @@ impl Model<f32> {
     /// The length, in scene units, below which photographs hardly judged the field: an edge of a cell of the grid.
     pub(super) fn judged(&self, grid: Option<&OccupancyGrid>) -> f64 {
         let cells = grid.map_or_else(|| OccupancyConfig::default().resolution, OccupancyGrid::resolution);
-        self.extent.space().side() / cells as f64
+        self.scene_box.space().side() / cells as f64
     }
 
     /// The lower quartile of the density of the places within the box that cameras see. Where the density is less the surface has
@@ -166,7 +179,7 @@ impl Model<f32> {
     fn level(&self, views: &[(Camera, Seen)]) -> Result<f64> {
         let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
         let mut sigmas: Vec<f64> =
-            sights.filter(|sight| self.extent.holds(sight.place)).map(|sight| sight.sigma).collect();
+            sights.filter(|sight| self.scene_box.contains(sight.place)).map(|sight| sight.sigma).collect();
         let quarter = sigmas.len() / 4;
         if sigmas.is_empty() {
             return Err(Error::setting("level", "is not known: no camera sees anything solid. Give one"));

@@ -1,7 +1,7 @@
 //! What proposals are fitted by.
 
 use crate::camera::rays::Samples;
-use crate::sampling::Level;
+use crate::sampling::ProposalHistogram;
 use raygrad_autograd::{Scalar, Tensor, Var};
 
 /// The interlevel loss of a proposal, a sum over rays (Barron et al. 2022, equation 13): `max(0, w - bound)^2 / w` of the
@@ -11,7 +11,11 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 /// # Panics
 /// If there is not one weight for each sample, or the samples are of other rays.
 #[track_caller]
-pub fn interlevel<'t, T: Scalar>(level: &Level<'t, T>, samples: &Samples<T>, weights: &Tensor<T>) -> Var<'t, T> {
+pub fn interlevel<'t, T: Scalar>(
+    level: &ProposalHistogram<'t, T>,
+    samples: &Samples<T>,
+    weights: &Tensor<T>,
+) -> Var<'t, T> {
     assert_eq!(weights.shape(), [samples.len()], "one weight for each sample");
     assert_eq!(samples.segments.len(), level.segments.len(), "samples of the proposal's rays");
     let (t, delta) = (samples.t.as_slice(), samples.delta.as_slice());
@@ -60,7 +64,7 @@ mod tests {
         let tape = Tape::<f64>::new();
         let edges = vec![0.0, 1.0, 2.0, 4.0, 0.0, 0.5, 1.0, 4.0];
         let segments = Segments::uniform(2, 3);
-        let level = |weights: [f64; 6]| Level {
+        let level = |weights: [f64; 6]| ProposalHistogram {
             edges: edges.clone(),
             weights: tape.leaf(Tensor::from(weights)),
             segments: segments.clone(),
@@ -82,7 +86,7 @@ mod tests {
         let signs: Vec<bool> = slopes.as_slice().iter().map(|&x| x < -1e-9).collect();
         assert_eq!(signs, [true, true, false, false, true, false], "only what is too small grows: {slopes:?}");
         let report = check_function(&Check::default(), &[Tensor::from([0.125, 0.125, 0.5, 0.5, 0.25, 0.5])], |x| {
-            let level = Level { edges: edges.clone(), weights: x[0].clone(), segments: segments.clone() };
+            let level = ProposalHistogram { edges: edges.clone(), weights: x[0].clone(), segments: segments.clone() };
             interlevel(&level, &at, &weights)
         });
         assert!(report.unwrap().comparisons >= 6);

@@ -1,5 +1,5 @@
 //! What training minimises: the [photometric loss](Loss) of every picture of the rays, what fits the sampler's proposals
-//! ([`interlevel`]), and any number of further [terms](Term) of what is rendered.
+//! ([`interlevel`]), and any number of further [terms](LossTerm) of what is rendered.
 
 pub(crate) mod interlevel;
 pub(crate) mod photometric;
@@ -12,7 +12,7 @@ pub use terms::{DepthConfig, DistortionConfig, EntropyConfig, OrientationConfig}
 pub use variation::TotalVariationConfig;
 
 use crate::camera::rays::Rays;
-use crate::kind::{Family, Part};
+use crate::component::{AnyConfig, ComponentType};
 use crate::volume::render::Rendered;
 use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::Bound;
@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 /// What a term may use: what is rendered of some rays, and what photographs show along them.
 #[derive(Clone, Copy)]
-pub struct Outputs<'a, 't, T: Scalar> {
+pub struct LossInputs<'a, 't, T: Scalar> {
     /// The parameters.
     pub params: &'a Bound<'t, T>,
     /// The rays, as they were sampled.
@@ -35,7 +35,7 @@ pub struct Outputs<'a, 't, T: Scalar> {
     /// A random number, another one for each term, tile and step: what a term that draws begins from.
     pub seed: u64,
     /// How much of the run is done, 0 to 1.
-    pub fraction: f64,
+    pub train_frac: f64,
     /// What is seen of the field, with a name for everything.
     pub rendered: &'a Rendered<'t, T>,
     /// What the photographs show, `[rays, 3]`, over the background where they have alpha.
@@ -46,30 +46,30 @@ pub struct Outputs<'a, 't, T: Scalar> {
 
 /// A term of the loss beside that of the colours.
 ///
-/// A term of one's own implements this and, for its configuration, [`Kind<Terms>`](crate::Kind).
-pub trait Term<T: Scalar>: Any + Send + Sync {
+/// A term of one's own implements this and, for its configuration, [`ComponentConfig<LossTerms>`](crate::ComponentConfig).
+pub trait LossTerm<T: Scalar>: Any + Send + Sync {
     /// The term as a sum over rays, a scalar, times its weight. (The mean of it is minimised, beside that of the squared
     /// errors of three channels: so a weight of 1 stands for three squared errors.)
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T>;
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T>;
 
     /// Whether it reads [normals](Rendered::normals), for which positions have to be on the tape.
-    fn reads_normals(&self) -> bool {
+    fn needs_normals(&self) -> bool {
         false
     }
 
-    /// Whether it needs [distances](Outputs::distances) that were measured: an error where a dataset has none.
-    fn reads_distances(&self) -> bool {
+    /// Whether it needs [distances](LossInputs::distances) that were measured: an error where a dataset has none.
+    fn needs_distances(&self) -> bool {
         false
     }
 }
 
 /// The family of terms.
-pub struct Terms;
+pub struct LossTerms;
 
-impl Family for Terms {
+impl ComponentType for LossTerms {
     const WHAT: &'static str = "term";
-    type Built<T: Scalar> = Arc<dyn Term<T>>;
+    type Built<T: Scalar> = Arc<dyn LossTerm<T>>;
 }
 
 /// Which term, and its weight.
-pub type TermConfig = Part<Terms>;
+pub type LossTermConfig = AnyConfig<LossTerms>;

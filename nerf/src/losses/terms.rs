@@ -1,8 +1,8 @@
 //! Terms of the loss that are known to help.
 
-use super::{Outputs, Term, Terms};
+use super::{LossInputs, LossTerm, LossTerms};
 use crate::Result;
-use crate::kind::{Kind, Site};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::range::check_range;
 use crate::volume::distortion::Distortion;
 use raygrad_autograd::{Scalar, Tensor, Var};
@@ -54,12 +54,12 @@ pub struct DepthConfig {
 /// A configuration is its own term.
 macro_rules! terms {
     ($($kind:literal $config:ty),*) => {
-        $(impl Kind<Terms> for $config {
+        $(impl ComponentConfig<LossTerms> for $config {
             const KIND: &'static str = $kind;
             fn check(&self) -> Result<()> {
                 check_range(concat!($kind, ".weight"), self.weight, 0.0, 1e6)
             }
-            fn build<T: Scalar>(&self, _: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+            fn build<T: Scalar>(&self, _: BuildContext<'_, T>) -> Result<Arc<dyn LossTerm<T>>> {
                 Ok(Arc::new(*self))
             }
         })*
@@ -68,14 +68,14 @@ macro_rules! terms {
 
 terms!("entropy" EntropyConfig, "orientation" OrientationConfig);
 
-impl Kind<Terms> for DistortionConfig {
+impl ComponentConfig<LossTerms> for DistortionConfig {
     const KIND: &'static str = "distortion";
 
     fn check(&self) -> Result<()> {
         check_range("distortion.weight", self.weight, 0.0, 1e6)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn LossTerm<T>>> {
         let reach = site.space.unbounded.then_some(0.5 * site.space.side());
         Ok(Arc::new(Evenness { weight: self.weight, reach }))
     }
@@ -99,14 +99,14 @@ impl Evenness {
     }
 }
 
-impl Kind<Terms> for DepthConfig {
+impl ComponentConfig<LossTerms> for DepthConfig {
     const KIND: &'static str = "depth";
 
     fn check(&self) -> Result<()> {
         check_range("depth.weight", self.weight, 0.0, 1e6)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn LossTerm<T>>> {
         Ok(Arc::new(Depth { weight: self.weight, unit: site.space.unit }))
     }
 }
@@ -118,8 +118,8 @@ struct Depth {
     unit: f64,
 }
 
-impl<T: Scalar> Term<T> for Evenness {
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+impl<T: Scalar> LossTerm<T> for Evenness {
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         let samples = &seen.rendered.samples;
         let (mut middles, mut lengths) = (Vec::with_capacity(samples.len()), Vec::with_capacity(samples.len()));
         for (rows, span) in samples.segments.ranges().zip(&seen.rays.spans) {
@@ -139,8 +139,8 @@ impl<T: Scalar> Term<T> for Evenness {
     }
 }
 
-impl<T: Scalar> Term<T> for EntropyConfig {
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+impl<T: Scalar> LossTerm<T> for EntropyConfig {
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         // With x the optical depth, ln(1 - o) = -x: exact where the ray is opaque, and o keeps its digits where it is thin.
         let (opacity, x) = (seen.rendered.opacity(), &seen.rendered.optical_depth);
         let met = &opacity * opacity.maximum(1e-20).ln();
@@ -149,21 +149,21 @@ impl<T: Scalar> Term<T> for EntropyConfig {
     }
 }
 
-impl<T: Scalar> Term<T> for OrientationConfig {
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+impl<T: Scalar> LossTerm<T> for OrientationConfig {
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         let rendered = seen.rendered;
         let directions = rendered.directions.segment_expand(&rendered.samples.segments);
         let away = (rendered.normals() * directions).sum_over(1).relu().square();
         (away * &rendered.weights).sum() * self.weight
     }
 
-    fn reads_normals(&self) -> bool {
+    fn needs_normals(&self) -> bool {
         true
     }
 }
 
-impl<T: Scalar> Term<T> for Depth {
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+impl<T: Scalar> LossTerm<T> for Depth {
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         let samples = &seen.rendered.samples;
         let (mut errors, mut behind) = (Vec::with_capacity(samples.len()), Vec::with_capacity(seen.rays.len()));
         let measured = seen.distances.iter().map(|&distance| (distance > 0.0).then_some(f64::from(distance)));
@@ -183,7 +183,7 @@ impl<T: Scalar> Term<T> for Depth {
         (met + left.sum()) * self.weight
     }
 
-    fn reads_distances(&self) -> bool {
+    fn needs_distances(&self) -> bool {
         true
     }
 }
@@ -193,7 +193,7 @@ mod tests {
     use super::*;
     use crate::camera::pinhole::Ray;
     use crate::camera::rays::{Rays, stratified};
-    use crate::field::{Density, Field, Seen};
+    use crate::field::{Density, Field, ViewInputs};
     use crate::random::Jitter;
     use crate::space::cube::Space;
     use crate::volume::quadrature::Quadrature;
@@ -214,18 +214,18 @@ mod tests {
             let z = positions.slice_axis(1, 2..3).reshape(&[positions.shape()[0]]);
             Density { value: z * vars[1] + vars[0], log: true, features: positions.clone() }
         }
-        fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+        fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
             features.constant(0.5).broadcast_to(features.shape())
         }
     }
 
     /// A term's value for two rays along z, as a function of the two parameters.
-    fn value<'t>(term: &dyn Term<f64>, x: &[Var<'t, f64>]) -> Var<'t, f64> {
+    fn value<'t>(term: &dyn LossTerm<f64>, x: &[Var<'t, f64>]) -> Var<'t, f64> {
         value_at(term, x, 0.65)
     }
 
     /// The same, with this distance measured along the first ray, and none along the second.
-    fn value_at<'t>(term: &dyn Term<f64>, x: &[Var<'t, f64>], distance: f64) -> Var<'t, f64> {
+    fn value_at<'t>(term: &dyn LossTerm<f64>, x: &[Var<'t, f64>], distance: f64) -> Var<'t, f64> {
         let mut params = Params::<f64>::new();
         params.add("much", Tensor::scalar(0.0));
         params.add("steep", Tensor::scalar(0.0));
@@ -235,23 +235,34 @@ mod tests {
             rays.push(&Ray { origin: DVec3::new(shift, 0.0, -1.0), direction: DVec3::Z }, [0.5 + shift, 2.0]);
         }
         let samples = stratified(&rays, 5, &mut Jitter::Middle, &Pool::new());
-        let query = Query { slopes: term.reads_normals(), ..Query::new(&Slope, &bound) };
+        let query = Query { slopes: term.needs_normals(), ..Query::new(&Slope, &bound) };
         let rendered = &Quadrature::Midpoint.render_nodes(&query, samples);
         let nothing = &Tensor::zeros(&[2, 3]);
         let (params, rays, frames, pixels) = (&bound, &rays, &[0, 0][..], &[[0, 0]; 2][..]);
         let distances = &[distance as f32, 0.0][..];
         let (target, background, seed, fraction) = (nothing, nothing, 0, 0.5);
-        term.loss(&Outputs { params, rays, frames, pixels, distances, seed, fraction, rendered, target, background })
+        term.loss(&LossInputs {
+            params,
+            rays,
+            frames,
+            pixels,
+            distances,
+            seed,
+            train_frac: fraction,
+            rendered,
+            target,
+            background,
+        })
     }
 
-    fn at(term: &dyn Term<f64>, much: f64, steep: f64) -> f64 {
+    fn at(term: &dyn LossTerm<f64>, much: f64, steep: f64) -> f64 {
         let tape = Tape::new();
         value(term, &[much, steep].map(|x| tape.leaf(Tensor::scalar(x)))).item()
     }
 
     #[test]
     fn terms_say_what_they_should_and_have_the_gradients_that_differences_show() {
-        let terms: [&dyn Term<f64>; 4] = [
+        let terms: [&dyn LossTerm<f64>; 4] = [
             &Evenness { weight: 2.0, reach: None },
             &EntropyConfig { weight: 0.5 },
             &OrientationConfig { weight: 3.0 },
@@ -307,7 +318,7 @@ mod tests {
         for (unbounded, reach) in [(false, None), (true, Some(1.1))] {
             let (space, params) = (Space { unbounded, ..space }, &mut Params::<f64>::new());
             let rng = &mut Pcg64Mcg::seed_from_u64(0);
-            let built = config.build(Site { space, frames: 0, params, name: "terms", rng }).unwrap();
+            let built = config.build(BuildContext { space, frames: 0, params, name: "terms", rng }).unwrap();
             let by_hand = Evenness { weight: 2.0, reach };
             assert_eq!(at(&*built, 0.3, 0.4), at(&by_hand, 0.3, 0.4));
         }
@@ -326,7 +337,7 @@ mod tests {
             let value = positions.matmul(&fall).reshape(&[positions.shape()[0]]);
             Density { value, log: true, features: positions.clone() }
         }
-        fn color<'t>(&self, _: &Bound<'t, f64>, features: &Var<'t, f64>, _: &Seen<'_, 't, f64>) -> Var<'t, f64> {
+        fn color<'t>(&self, _: &Bound<'t, f64>, features: &Var<'t, f64>, _: &ViewInputs<'_, 't, f64>) -> Var<'t, f64> {
             features.constant(0.5).broadcast_to(features.shape())
         }
     }
@@ -342,14 +353,14 @@ mod tests {
         let rendered =
             &Quadrature::Midpoint.render_nodes(&Query { slopes: true, ..Query::new(&Tilted, &bound) }, samples);
         let nothing = &Tensor::zeros(&[1, 3]);
-        let seen = Outputs {
+        let seen = LossInputs {
             params: &bound,
             rays: &rays,
             frames: &[0],
             pixels: &[[0; 2]],
             distances: &[0.0],
             seed: 0,
-            fraction: 0.0,
+            train_frac: 0.0,
             rendered,
             target: nothing,
             background: nothing,
@@ -363,8 +374,8 @@ mod tests {
     /// The sum of opacities.
     struct Opacity;
 
-    impl<T: Scalar> Term<T> for Opacity {
-        fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+    impl<T: Scalar> LossTerm<T> for Opacity {
+        fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
             seen.rendered.opacity().sum()
         }
     }

@@ -1,7 +1,7 @@
 //! How much a table varies from cell to cell.
 
-use super::{Outputs, Term, Terms};
-use crate::kind::{Kind, Site};
+use super::{LossInputs, LossTerm, LossTerms};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::random::stream;
 use crate::range::check_range;
 use crate::{Error, Result};
@@ -41,7 +41,7 @@ fn draws() -> usize {
 /// Rows that a table may have beyond its cells, less than so many.
 const PADDING: usize = 64;
 
-impl Kind<Terms> for TotalVariationConfig {
+impl ComponentConfig<LossTerms> for TotalVariationConfig {
     const KIND: &'static str = "total_variation";
 
     fn check(&self) -> Result<()> {
@@ -49,7 +49,7 @@ impl Kind<Terms> for TotalVariationConfig {
         check_range("total_variation.weight", self.weight, 0.0, 1e6)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Arc<dyn Term<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Arc<dyn LossTerm<T>>> {
         let error = |what: String| Err(Error::setting("total_variation", what));
         let Some(id) = site.params.find(&self.params) else {
             let names: Vec<&str> = site.params.names().collect();
@@ -104,8 +104,8 @@ impl TotalVariation {
     }
 }
 
-impl<T: Scalar> Term<T> for TotalVariation {
-    fn loss<'t>(&self, seen: &Outputs<'_, 't, T>) -> Var<'t, T> {
+impl<T: Scalar> LossTerm<T> for TotalVariation {
+    fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T> {
         let pairs = self.pairs(self.draws * seen.rays.len(), seen.seed);
         let table = &seen.params[self.id];
         // A gradient of rows stays one where nothing lies in between.
@@ -136,13 +136,18 @@ mod tests {
         TotalVariationConfig { weight: 2.0, params: "field.table".into(), cells, draws: 1024 }
     }
 
-    fn build(config: &TotalVariationConfig, params: &mut Params<f64>) -> Result<Arc<dyn Term<f64>>> {
+    fn build(config: &TotalVariationConfig, params: &mut Params<f64>) -> Result<Arc<dyn LossTerm<f64>>> {
         let space = Space::within([DVec3::ZERO, DVec3::ONE]);
-        config.build(Site { space, frames: 0, params, name: "terms", rng: &mut Pcg64Mcg::seed_from_u64(0) })
+        config.build(BuildContext { space, frames: 0, params, name: "terms", rng: &mut Pcg64Mcg::seed_from_u64(0) })
     }
 
     /// The term for `count` rays that meet nothing.
-    fn value<'t>(term: &dyn Term<f64>, params: &raygrad_nn::Bound<'t, f64>, count: usize, seed: u64) -> Var<'t, f64> {
+    fn value<'t>(
+        term: &dyn LossTerm<f64>,
+        params: &raygrad_nn::Bound<'t, f64>,
+        count: usize,
+        seed: u64,
+    ) -> Var<'t, f64> {
         let mut rays = Rays::new();
         (0..count).for_each(|_| rays.push(&Ray { origin: DVec3::ZERO, direction: DVec3::Z }, [0.0, 1.0]));
         let medium = crate::analytic::scenes().remove(0).medium;
@@ -152,14 +157,14 @@ mod tests {
         let samples = stratified(&rays, 1, &mut Jitter::Middle, &Pool::new());
         let rendered = &Quadrature::Midpoint.render_nodes(&Query::new(&field, &bound), samples);
         let nothing = &Tensor::zeros(&[count, 3]);
-        term.loss(&Outputs {
+        term.loss(&LossInputs {
             params,
             rays: &rays,
             frames: &vec![0; count],
             pixels: &vec![[0; 2]; count],
             distances: &vec![0.0; count],
             seed,
-            fraction: 0.0,
+            train_frac: 0.0,
             rendered,
             target: nothing,
             background: nothing,
@@ -233,7 +238,7 @@ mod tests {
             line.add("field.table", Tensor::zeros(shape));
             assert!(build(&config(None), &mut line).is_err(), "{shape:?}");
         }
-        assert!(Kind::check(&TotalVariationConfig { draws: 0, ..config(None) }).is_err());
+        assert!(ComponentConfig::check(&TotalVariationConfig { draws: 0, ..config(None) }).is_err());
         let read: TotalVariationConfig = serde_json::from_str(r#"{"weight": 0.5, "params": "field.table"}"#).unwrap();
         assert_eq!((read.draws, read.cells), (1, None));
     }

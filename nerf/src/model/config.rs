@@ -1,13 +1,13 @@
 //! What to train and how: the presets and every number behind them.
 
-use crate::dataset::Scope;
+use crate::dataset::SceneType;
 use crate::dataset::background::Background;
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, DensityActivation, FieldConfig, InstantConfig, VoxelConfig};
 use crate::losses::photometric::Loss;
-use crate::losses::{DistortionConfig, TermConfig};
-use crate::model::refine::{FOCAL, LENS, POSES, RefineConfig, Refined};
-use crate::model::tone::{EXPOSURE, ToneConfig, VIGNETTING};
+use crate::losses::{DistortionConfig, LossTermConfig};
+use crate::model::camera_optimizer::{CameraOptimizerConfig, FOCAL, LENS, POSES, RefinedParam};
+use crate::model::exposure::{EXPOSURE, ExposureConfig, VIGNETTING};
 use crate::range::{check_range, check_schedule};
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
@@ -95,7 +95,8 @@ pub struct GroupConfig {
     pub schedule: Schedule,
     /// Decoupled weight decay, as of [`AdamW`](raygrad_nn::AdamW).
     #[serde(default)]
-    pub decay: f64,
+    #[serde(alias = "decay")]
+    pub weight_decay: f64,
 }
 
 /// A model and how it is trained. It is stored with the model, so that a run can be read back.
@@ -103,13 +104,13 @@ pub struct GroupConfig {
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// What is fitted.
-    #[serde(deserialize_with = "super::known::read")]
+    #[serde(deserialize_with = "super::registry::read")]
     pub field: FieldConfig,
     /// Where it is sampled.
-    #[serde(deserialize_with = "super::known::read")]
+    #[serde(deserialize_with = "super::registry::read")]
     pub sampler: SamplerConfig,
     /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), or what all
-    /// photographs show as [one picture](crate::Ndc) where the [extent](crate::Extent::ndc) says so, and rays are
+    /// photographs show as [one picture](crate::Ndc) where the [extent](crate::SceneBox::ndc) says so, and rays are
     /// sampled as far as the sampler goes: marching, up to the outermost of the
     /// [cascades](crate::space::occupancy::OccupancyConfig::cascades) of its grid; others, over the whole span.
     #[serde(default)]
@@ -118,8 +119,9 @@ pub struct Config {
     #[serde(default)]
     pub loss: Loss,
     /// What is minimised beside it.
-    #[serde(default, deserialize_with = "super::known::read")]
-    pub terms: Vec<TermConfig>,
+    #[serde(default, deserialize_with = "super::registry::read")]
+    #[serde(alias = "terms")]
+    pub loss_terms: Vec<LossTermConfig>,
     /// Learning rate over the run.
     pub schedule: Schedule,
     /// The optimiser's constants, for networks.
@@ -130,20 +132,23 @@ pub struct Config {
     #[serde(default)]
     pub groups: Vec<GroupConfig>,
     /// The learning rate over the run of the photographs' poses, if they are to be learned: see
-    /// [`Refine`](crate::model::Refine).
+    /// [`CameraOptimizer`](crate::model::CameraOptimizer).
     #[serde(default)]
     pub poses: Option<Schedule>,
     /// What else is learned of cameras, and how.
     #[serde(default)]
-    pub refine: RefineConfig,
+    #[serde(alias = "refine")]
+    pub camera_optimizer: CameraOptimizerConfig,
     /// What is learned of how photographs show colours.
     #[serde(default)]
-    pub tone: ToneConfig,
-    /// Samples nearer to their camera than this, in units of the [extent](crate::Extent::unit), learn less, by the square of
+    #[serde(alias = "tone")]
+    pub exposure_model: ExposureConfig,
+    /// Samples nearer to their camera than this, in units of the [extent](crate::SceneBox::unit), learn less, by the square of
     /// their distance: they lie closer than others in front of each camera, and what they learn shows in one photograph alone
     /// (Philip and Deschaintre 2023, "Floaters No More", equation 6). 0 for none.
     #[serde(default)]
-    pub near_gradients: f64,
+    #[serde(alias = "near_gradients")]
+    pub gradient_scaling_distance: f64,
     /// What photographs with alpha are composited over.
     pub background: Background,
     /// Seed of everything random.
@@ -157,23 +162,29 @@ impl Config {
     /// The numbers of a preset.
     pub fn preset(preset: Preset) -> Self {
         let paper = ClassicConfig::paper();
-        let small = ClassicConfig { depth: 4, width: 128, skips: vec![], view_width: 64, ..paper.clone() };
-        let proposal =
-            ClassicConfig { depth: 2, width: 64, skips: vec![], view_width: 32, position_levels: 6, ..paper.clone() };
+        let small = ClassicConfig { depth: 4, width: 128, skip_layers: vec![], view_width: 64, ..paper.clone() };
+        let proposal = ClassicConfig {
+            depth: 2,
+            width: 64,
+            skip_layers: vec![],
+            view_width: 32,
+            position_levels: 6,
+            ..paper.clone()
+        };
         let classic = Config {
             field: FieldConfig::new(paper.clone()),
             sampler: SamplerConfig::new(HierarchicalConfig::default()),
             unbounded: false,
             loss: Loss::Mse,
-            terms: vec![],
+            loss_terms: vec![],
             schedule: Schedule::Exponential { from: 5e-4, to: 5e-6, warmup: 0.0 },
             adam: AdamConfig::default(),
-            table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
+            table_adam: AdamConfig { beta1: 0.9, beta2: 0.99, eps: 1e-15 },
             groups: vec![],
             poses: None,
-            refine: RefineConfig::default(),
-            tone: ToneConfig::default(),
-            near_gradients: 0.0,
+            camera_optimizer: CameraOptimizerConfig::default(),
+            exposure_model: ExposureConfig::default(),
+            gradient_scaling_distance: 0.0,
             background: Background::White,
             seed: 0,
             storage: Storage::Full,
@@ -201,11 +212,11 @@ impl Config {
                     color_width: 64,
                     color_depth: 2,
                     direction_degree: 4,
-                    codes: 0,
+                    appearance_embedding_dim: 0,
                 }),
                 sampler: SamplerConfig::new(MarchingConfig::default()),
                 schedule: Schedule::Linear { from: 2e-2, to: 0.0, warmup: 0.005 },
-                adam: AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 },
+                adam: AdamConfig { beta1: 0.9, beta2: 0.99, eps: 1e-15 },
                 background: Background::Random,
                 ..classic
             },
@@ -220,7 +231,7 @@ impl Config {
     }
 
     /// The same for what it is trained with: a number of [samples](crate::Budget::samples), and photographs of so many
-    /// [pixels](crate::dataset::Dataset::footprints) along a side of the scene. The table of a hash grid is as large and as fine as
+    /// [pixels](crate::dataset::Dataset::pixels_per_side) along a side of the scene. The table of a hash grid is as large and as fine as
     /// pays, see [`HashGridConfig::cpu`]; beyond 200 million samples (100 seconds on two cores) the steps along a ray grow
     /// shorter as training goes on, down to a pixel's footprint, and beyond 600 million a training step has twice as many.
     pub fn for_budget(mut self, samples: f64, footprints: f64) -> Self {
@@ -241,8 +252,8 @@ impl Config {
     /// is seen, and a [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in
     /// docs/benchmarks.md, section Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
     /// nothing.
-    pub fn with_scope(mut self, scope: Scope) -> Self {
-        let before = std::mem::replace(&mut self.unbounded, scope.goes_on());
+    pub fn with_scene_type(mut self, scope: SceneType) -> Self {
+        let before = std::mem::replace(&mut self.unbounded, scope.is_unbounded());
         if before == self.unbounded {
             return self;
         }
@@ -264,10 +275,10 @@ impl Config {
         }
         let field = self.field.get_mut::<InstantConfig>();
         if self.unbounded {
-            self.terms.push(TermConfig::new(DistortionConfig { weight: DISTORTION }));
+            self.loss_terms.push(LossTermConfig::new(DistortionConfig { weight: DISTORTION }));
             field.into_iter().for_each(|field| field.grid.finest *= 2);
         } else {
-            self.terms.retain(|term| term.get::<DistortionConfig>().is_none());
+            self.loss_terms.retain(|term| term.get::<DistortionConfig>().is_none());
             field.into_iter().for_each(|field| field.grid.finest /= 2);
         }
         self
@@ -275,15 +286,17 @@ impl Config {
 
     /// The same with these parts of the cameras learned, at rates that were found with the embedded scene
     /// (`examples/refine.rs`); while poses are, detail comes in from coarse to fine.
-    pub fn with_refined(mut self, parts: &[Refined]) -> Self {
+    pub fn with_refined(mut self, parts: &[RefinedParam]) -> Self {
         let rate = |from: f64, to: f64| Some(Schedule::Exponential { from, to, warmup: CAMERA_WARMUP });
         for part in parts {
             match part {
-                Refined::Poses => (self.poses, self.refine.coarse) = (rate(POSE_RATE[0], POSE_RATE[1]), COARSE),
-                Refined::Focal => self.refine.focal = rate(FOCAL_RATE[0], FOCAL_RATE[1]),
-                Refined::Lens => self.refine.lens = rate(LENS_RATE[0], LENS_RATE[1]),
-                Refined::Exposure => self.tone.exposure = rate(TONE_RATE[0], TONE_RATE[1]),
-                Refined::Vignetting => self.tone.vignetting = rate(TONE_RATE[0], TONE_RATE[1]),
+                RefinedParam::Poses => {
+                    (self.poses, self.camera_optimizer.coarse) = (rate(POSE_RATE[0], POSE_RATE[1]), COARSE)
+                }
+                RefinedParam::Focal => self.camera_optimizer.focal = rate(FOCAL_RATE[0], FOCAL_RATE[1]),
+                RefinedParam::Lens => self.camera_optimizer.lens = rate(LENS_RATE[0], LENS_RATE[1]),
+                RefinedParam::Exposure => self.exposure_model.exposure = rate(TONE_RATE[0], TONE_RATE[1]),
+                RefinedParam::Vignetting => self.exposure_model.vignetting = rate(TONE_RATE[0], TONE_RATE[1]),
             }
         }
         self
@@ -293,10 +306,10 @@ impl Config {
     pub(crate) fn camera_rate(&self, name: &str) -> Option<Schedule> {
         match name {
             POSES => self.poses,
-            FOCAL => self.refine.focal,
-            LENS => self.refine.lens,
-            EXPOSURE => self.tone.exposure,
-            VIGNETTING => self.tone.vignetting,
+            FOCAL => self.camera_optimizer.focal,
+            LENS => self.camera_optimizer.lens,
+            EXPOSURE => self.exposure_model.exposure,
+            VIGNETTING => self.exposure_model.vignetting,
             _ => None,
         }
     }
@@ -329,14 +342,14 @@ impl Config {
         named("adam", self.adam.check())?;
         named("table_adam", self.table_adam.check())?;
         check_schedule(POSES, self.poses)?;
-        self.refine.check()?;
-        self.tone.check()?;
-        check_range("near_gradients", self.near_gradients, 0.0, 1e6)?;
+        self.camera_optimizer.check()?;
+        self.exposure_model.check()?;
+        check_range("gradient_scaling_distance", self.gradient_scaling_distance, 0.0, 1e6)?;
         for group in &self.groups {
             let part = format!("groups.{}", group.params);
             named(&part, group.schedule.check())?;
             named(&part, group.adam.check())?;
-            check_range("groups.decay", group.decay, 0.0, 1e30)?;
+            check_range("groups.decay", group.weight_decay, 0.0, 1e30)?;
         }
         if let Some(marching) = self.sampler.get::<MarchingConfig>() {
             let cascades = marching.occupancy.cascades;
@@ -349,12 +362,12 @@ impl Config {
         }
         let rule = self.sampler.get::<MarchingConfig>().map(|marching| marching.quadrature);
         if rule.is_some_and(Quadrature::has_intervals)
-            && self.terms.iter().any(|term| term.get::<DistortionConfig>().is_some())
+            && self.loss_terms.iter().any(|term| term.get::<DistortionConfig>().is_some())
         {
             let what = "needs samples that stand for an interval each: use the quadrature midpoint or left";
-            return Err(Error::setting("terms.distortion", what));
+            return Err(Error::setting("loss_terms.distortion", what));
         }
-        self.terms.iter().try_for_each(TermConfig::check)?;
+        self.loss_terms.iter().try_for_each(LossTermConfig::check)?;
         self.field.check()?;
         self.sampler.check()
     }
@@ -365,7 +378,7 @@ impl Config {
     }
 
     /// The same without positional encoding: classic networks see bare coordinates.
-    pub fn without_encoding(mut self) -> Self {
+    pub fn without_positional_encoding(mut self) -> Self {
         for field in self.classic_fields() {
             (field.position_levels, field.direction_levels) = (0, 0);
         }
@@ -390,11 +403,11 @@ mod tests {
         let refined = |part| Config::preset(Preset::Instant).with_refined(&[part]);
         let rate = |from, to| Some(Schedule::Exponential { from, to, warmup: 0.1 });
         let expected = [
-            (Refined::Poses, "poses", rate(3e-3, 3e-5)),
-            (Refined::Focal, "focal", rate(5e-3, 5e-5)),
-            (Refined::Lens, "lens", rate(1e-3, 1e-5)),
-            (Refined::Exposure, "exposure", rate(1e-2, 1e-4)),
-            (Refined::Vignetting, "vignetting", rate(1e-2, 1e-4)),
+            (RefinedParam::Poses, "poses", rate(3e-3, 3e-5)),
+            (RefinedParam::Focal, "focal", rate(5e-3, 5e-5)),
+            (RefinedParam::Lens, "lens", rate(1e-3, 1e-5)),
+            (RefinedParam::Exposure, "exposure", rate(1e-2, 1e-4)),
+            (RefinedParam::Vignetting, "vignetting", rate(1e-2, 1e-4)),
         ];
         for (part, name, rate) in expected {
             let config = refined(part);
@@ -403,20 +416,24 @@ mod tests {
                 assert_eq!(config.camera_rate(other), rate.filter(|_| other == name), "{part}: {other}");
             }
             assert_eq!(config.camera_rate("field.table"), None);
-            assert_eq!((part.to_string(), name.parse::<Refined>().unwrap()), (name.to_owned(), part));
+            assert_eq!((part.to_string(), name.parse::<RefinedParam>().unwrap()), (name.to_owned(), part));
             // Detail comes in slowly while poses are learned, and only then.
-            let coarse = if part == Refined::Poses { 0.4 } else { 0.0 };
-            assert_eq!(config.refine.coarse, coarse);
-            let details = [0.0, 0.1, 0.4, 1.0].map(|fraction| config.refine.detail(fraction));
+            let coarse = if part == RefinedParam::Poses { 0.4 } else { 0.0 };
+            assert_eq!(config.camera_optimizer.coarse, coarse);
+            let details = [0.0, 0.1, 0.4, 1.0].map(|fraction| config.camera_optimizer.detail(fraction));
             assert_eq!(details, if coarse > 0.0 { [0.0, 0.25, 1.0, 1.0] } else { [1.0; 4] });
         }
         assert!(
-            "tone".parse::<Refined>().unwrap_err().to_string().contains("poses, focal, lens, exposure or vignetting")
+            "tone"
+                .parse::<RefinedParam>()
+                .unwrap_err()
+                .to_string()
+                .contains("poses, focal, lens, exposure or vignetting")
         );
-        let mut wrong = refined(Refined::Vignetting);
-        wrong.tone.vignetting = Some(Schedule::Constant { rate: f64::NAN });
+        let mut wrong = refined(RefinedParam::Vignetting);
+        wrong.exposure_model.vignetting = Some(Schedule::Constant { rate: f64::NAN });
         assert!(wrong.check().unwrap_err().to_string().starts_with("`tone.vignetting.constant.rate`"));
-        wrong.tone = ToneConfig { exposure: wrong.tone.vignetting, vignetting: None };
+        wrong.exposure_model = ExposureConfig { exposure: wrong.exposure_model.vignetting, vignetting: None };
         assert!(wrong.check().unwrap_err().to_string().starts_with("`tone.exposure.constant.rate`"));
     }
 
@@ -441,7 +458,7 @@ mod tests {
     #[test]
     fn a_scope_changes_what_a_scene_asks_for_once() {
         let preset = Config::preset(Preset::Instant);
-        let unbounded = preset.clone().with_scope(Scope::Unbounded);
+        let unbounded = preset.clone().with_scene_type(SceneType::Unbounded);
         unbounded.check().unwrap();
         let [before, after] =
             [&preset, &unbounded].map(|config| config.sampler.get::<MarchingConfig>().unwrap().clone());
@@ -450,27 +467,27 @@ mod tests {
         let [coarse, fine] =
             [&preset, &unbounded].map(|config| config.field.get::<InstantConfig>().unwrap().grid.finest);
         assert_eq!(fine, 2 * coarse);
-        assert!(unbounded.unbounded && unbounded.terms.len() == 1);
-        assert_eq!(unbounded.clone().with_scope(Scope::Unbounded), unbounded);
-        assert_eq!(unbounded.with_scope(Scope::Bounded), preset);
-        assert_eq!(preset.clone().with_scope(Scope::Bounded), preset);
+        assert!(unbounded.unbounded && unbounded.loss_terms.len() == 1);
+        assert_eq!(unbounded.clone().with_scene_type(SceneType::Unbounded), unbounded);
+        assert_eq!(unbounded.with_scene_type(SceneType::Bounded), preset);
+        assert_eq!(preset.clone().with_scene_type(SceneType::Bounded), preset);
         for other in [Preset::Voxel, Preset::Small, Preset::Classic] {
-            Config::preset(other).with_scope(Scope::Unbounded).check().unwrap();
+            Config::preset(other).with_scene_type(SceneType::Unbounded).check().unwrap();
         }
         // As many rays as before, each with more samples.
         let skipped = Config::preset(Preset::Small).with_skip(Skip::Fast);
         let samples = |config: &Config| config.sampler.get::<MarchingConfig>().unwrap().samples;
-        let open = skipped.clone().with_scope(Scope::Unbounded);
+        let open = skipped.clone().with_scene_type(SceneType::Unbounded);
         open.check().unwrap();
         assert_eq!((samples(&skipped), samples(&open)), (16 * 256, 4 * 16 * 256));
-        assert_eq!(open.with_scope(Scope::Bounded), skipped);
+        assert_eq!(open.with_scene_type(SceneType::Bounded), skipped);
         // Proposals are spread in inverse distance.
         let proposal = Config { sampler: SamplerConfig::new(ProposalConfig::default()), ..preset.clone() };
         let spacing = |config: &Config| config.sampler.get::<ProposalConfig>().unwrap().spacing;
-        let open = proposal.clone().with_scope(Scope::Unbounded);
+        let open = proposal.clone().with_scene_type(SceneType::Unbounded);
         assert_eq!((spacing(&proposal), spacing(&open)), (Spacing::Linear, Spacing::Disparity));
-        assert_eq!(open.with_scope(Scope::Bounded), proposal);
-        let long = Config::preset(Preset::Instant).for_budget(1.2e9, 400.0).with_scope(Scope::Unbounded);
+        assert_eq!(open.with_scene_type(SceneType::Bounded), proposal);
+        let long = Config::preset(Preset::Instant).for_budget(1.2e9, 400.0).with_scene_type(SceneType::Unbounded);
         assert_eq!(long.sampler.get::<MarchingConfig>().unwrap().last_step, None);
     }
 }

@@ -1,25 +1,25 @@
 //! A model: a field, where it is sampled, and its parameters.
 
+mod camera_optimizer;
 pub(crate) mod config;
-mod extent;
-mod known;
-mod refine;
+mod exposure;
+mod registry;
+mod scene_box;
 mod store;
-mod tone;
 
+pub use camera_optimizer::{CameraOptimizer, CameraOptimizerConfig, RefinedParam};
+pub(crate) use camera_optimizer::{FOCAL, LENS, POSES};
 pub use config::{Config, GroupConfig, Preset};
-pub use extent::Extent;
-pub(crate) use refine::{FOCAL, LENS, POSES};
-pub use refine::{Refine, RefineConfig, Refined};
-pub(crate) use tone::{EXPOSURE, VIGNETTING};
-pub use tone::{Tone, ToneConfig};
+pub(crate) use exposure::{EXPOSURE, VIGNETTING};
+pub use exposure::{ExposureConfig, ExposureModel};
+pub use scene_box::SceneBox;
 
 use crate::Result;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::{Rays, Samples};
+use crate::component::BuildContext;
 use crate::field::Field;
-use crate::kind::Site;
-use crate::losses::{Term, TermConfig};
+use crate::losses::{LossTerm, LossTermConfig};
 use crate::random::Jitter;
 use crate::range::check_range;
 use crate::sampling::marching::Marching;
@@ -46,7 +46,7 @@ pub struct Model<T: Scalar> {
     /// How it was made.
     pub config: Config,
     /// What it covers.
-    pub extent: Extent,
+    pub scene_box: SceneBox,
     /// Its parameters.
     pub params: Params<T>,
     /// What is rendered.
@@ -54,21 +54,21 @@ pub struct Model<T: Scalar> {
     /// Where it is sampled.
     pub sampler: Box<dyn Sampler<T>>,
     /// What is minimised beside the loss of colours.
-    pub terms: Vec<Arc<dyn Term<T>>>,
+    pub terms: Vec<Arc<dyn LossTerm<T>>>,
     /// Corrections of the photographs' cameras, if some are learned.
-    pub refine: Option<Refine>,
+    pub camera_optimizer: Option<CameraOptimizer>,
     /// What photographs make of the scene's colours, if that is learned.
-    pub tone: Option<Tone>,
+    pub exposure: Option<ExposureModel>,
     /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
     /// look like none in particular. Of a photograph that there is not, views panic.
-    pub look: Option<u32>,
-    /// Whether views have the photographs' darker corners, if a [`Tone`] knows of them. They have not, at first.
+    pub appearance_image: Option<u32>,
+    /// Whether views have the photographs' darker corners, if a [`ExposureModel`] knows of them. They have not, at first.
     pub vignetted: bool,
     /// How much of their detail fields have: see [`set_detail`](Self::set_detail).
     detail: f64,
 }
 
-fn space(config: &Config, extent: &Extent) -> Space {
+fn space(config: &Config, extent: &SceneBox) -> Space {
     Space { unbounded: config.unbounded, ..extent.space() }
 }
 
@@ -77,37 +77,56 @@ impl<T: Scalar> Model<T> {
     ///
     /// # Errors
     /// If the configuration is out of range.
-    pub fn new(config: Config, extent: Extent, seed: u64) -> Result<Self> {
+    pub fn new(config: Config, extent: SceneBox, seed: u64) -> Result<Self> {
         Model::with_cameras(config, extent, &[], seed)
     }
 
     /// As [`new`](Self::new), of a model that knows the cameras that its photographs were taken by, in their order: what
-    /// one needs that learns [focal lengths or lenses](RefineConfig). One that learns nothing of them forgets them.
+    /// one needs that learns [focal lengths or lenses](CameraOptimizerConfig). One that learns nothing of them forgets them.
     ///
     /// # Errors
     /// If the configuration is out of range, or there is not one camera for each photograph.
     #[inline(never)]
-    pub fn with_cameras(config: Config, extent: Extent, cameras: &[Camera], seed: u64) -> Result<Self> {
+    pub fn with_cameras(config: Config, extent: SceneBox, cameras: &[Camera], seed: u64) -> Result<Self> {
         config.check()?;
         let space = space(&config, &extent);
         space.check()?;
         let (mut params, frames) = (Params::new(), extent.frames);
-        check_range("extent.frames", frames, 0, MOST_FRAMES)?;
+        check_range("scene_box.frames", frames, 0, MOST_FRAMES)?;
         let rng = &mut Pcg64Mcg::seed_from_u64(seed);
-        let sampler = config.sampler.build(Site { space, frames, params: &mut params, name: "sampler", rng })?;
-        let field = config.field.build(Site { space, frames, params: &mut params, name: "field", rng })?;
-        let term = |term: &TermConfig| term.build(Site { space, frames, params: &mut params, name: "terms", rng });
-        let terms = config.terms.iter().map(term).collect::<Result<_>>()?;
-        let refine =
-            Refine::new(config.poses.is_some(), &config.refine, (&extent, config.unbounded), cameras, &mut params)?;
-        let tone = Tone::new(&config.tone, frames, &mut params)?;
+        let sampler =
+            config.sampler.build(BuildContext { space, frames, params: &mut params, name: "sampler", rng })?;
+        let field = config.field.build(BuildContext { space, frames, params: &mut params, name: "field", rng })?;
+        let term =
+            |term: &LossTermConfig| term.build(BuildContext { space, frames, params: &mut params, name: "terms", rng });
+        let terms = config.loss_terms.iter().map(term).collect::<Result<_>>()?;
+        let refine = CameraOptimizer::new(
+            config.poses.is_some(),
+            &config.camera_optimizer,
+            (&extent, config.unbounded),
+            cameras,
+            &mut params,
+        )?;
+        let tone = ExposureModel::new(&config.exposure_model, frames, &mut params)?;
         let (look, vignetted, detail) = (None, false, 1.0);
-        Ok(Model { config, extent, params, field, sampler, terms, refine, tone, look, vignetted, detail })
+        Ok(Model {
+            config,
+            scene_box: extent,
+            params,
+            field,
+            sampler,
+            terms,
+            camera_optimizer: refine,
+            exposure: tone,
+            appearance_image: look,
+            vignetted,
+            detail,
+        })
     }
 
     /// The map from the scene to the unit cube that fields and sampler are given.
     pub fn space(&self) -> Space {
-        space(&self.config, &self.extent)
+        space(&self.config, &self.scene_box)
     }
 
     /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
@@ -116,14 +135,14 @@ impl<T: Scalar> Model<T> {
         match self.sampler.grid() {
             Some(grid) => grid.outer_bounds(),
             None if self.config.unbounded => [DVec3::NEG_INFINITY, DVec3::INFINITY],
-            None => self.extent.bounds,
+            None => self.scene_box.bounds,
         }
     }
 
     /// The nearest and the farthest distance from a camera at which views look, in scene units: in a scene that ends, at all of
     /// it from wherever one stands; in one that goes on, as in training, which has not judged what is nearer to cameras.
-    pub fn view_span(&self) -> [f64; 2] {
-        let [near, far] = self.extent.span;
+    pub fn view_near_far(&self) -> [f64; 2] {
+        let [near, far] = self.scene_box.near_far;
         match self.space() {
             Space { unbounded: true, .. } => [near, far],
             bounded => [near.min(NEAREST * bounded.side()), f64::INFINITY],
@@ -136,28 +155,32 @@ impl<T: Scalar> Model<T> {
     }
 
     /// The camera of the photograph of this number as the model has found it to be: as it was, unless something of it is
-    /// [learned](Refine).
+    /// [learned](CameraOptimizer).
     ///
     /// # Panics
     /// If there is no such photograph.
     pub fn learned_camera(&self, number: usize, camera: &Camera) -> Camera {
-        self.refine.as_ref().map_or_else(|| camera.clone(), |refine| refine.camera(&self.params, number, camera))
+        self.camera_optimizer
+            .as_ref()
+            .map_or_else(|| camera.clone(), |refine| refine.camera(&self.params, number, camera))
     }
 
     /// A camera that took none of the photographs and is given beside theirs, where the model would have it: see
-    /// [`Refine::other_cameras`].
+    /// [`CameraOptimizer::other_cameras`].
     pub fn other_camera(&self, camera: &Camera) -> Camera {
         self.other_cameras(std::slice::from_ref(camera)).remove(0)
     }
 
     /// The same of many, which finds once how the images' cameras have moved as a whole.
     pub fn other_cameras(&self, cameras: &[Camera]) -> Vec<Camera> {
-        self.refine.as_ref().map_or_else(|| cameras.to_vec(), |refine| refine.other_cameras(&self.params, cameras))
+        self.camera_optimizer
+            .as_ref()
+            .map_or_else(|| cameras.to_vec(), |refine| refine.other_cameras(&self.params, cameras))
     }
 
     /// The cameras that the model was given, if it learns something of them and was told.
     pub fn cameras(&self) -> &[Camera] {
-        self.refine.as_ref().map_or(&[], Refine::cameras)
+        self.camera_optimizer.as_ref().map_or(&[], CameraOptimizer::cameras)
     }
 
     /// The share of their detail that fields have, 0 to 1.
@@ -180,12 +203,12 @@ impl<T: Scalar> Model<T> {
     }
 
     /// What red, green and blue of views are multiplied by in a picture's middle, each above 0, and cut off at 1 after: 1, unless a
-    /// [`Tone`] knows how photographs differ. Then it is that of [`look`](Self::look), or of none in particular.
+    /// [`ExposureModel`] knows how photographs differ. Then it is that of [`appearance_image`](Self::appearance_image), or of none in particular.
     ///
     /// # Panics
-    /// If `look` is no photograph.
+    /// If `appearance_image` is no photograph.
     pub fn gain(&self) -> [f64; 3] {
-        self.tone.as_ref().map_or([1.0; 3], |tone| tone.gain(&self.params, self.look, false).at(0.0))
+        self.exposure.as_ref().map_or([1.0; 3], |tone| tone.gain(&self.params, self.appearance_image, false).at(0.0))
     }
 
     /// The sampler, to be changed, if it marches through an occupancy grid.
@@ -199,7 +222,7 @@ impl<T: Scalar> Model<T> {
         let tape = Tape::new();
         let params = self.params.bind_constant(&tape);
         let sampled = self.sampler.sample(&Query::new(&*self.field, &params), rays, Purpose::Training, jitter);
-        sampled.coarse.into_iter().map(|seen| seen.samples).chain([sampled.steps]).collect()
+        sampled.coarse.into_iter().map(|seen| seen.samples).chain([sampled.samples]).collect()
     }
 
     /// The photometric loss at given samples, a differentiable function of the parameters alone: the sum over fields, rays
@@ -232,9 +255,9 @@ impl<T: Scalar> Model<T> {
     /// If the configuration is out of range, which that of a model in use is not.
     #[inline(never)]
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
-        let mut model = Model::with_cameras(self.config.clone(), self.extent, self.cameras(), 0)?;
+        let mut model = Model::with_cameras(self.config.clone(), self.scene_box, self.cameras(), 0)?;
         model.params.assign(&self.params);
-        (model.look, model.vignetted) = (self.look, self.vignetted);
+        (model.appearance_image, model.vignetted) = (self.appearance_image, self.vignetted);
         model.set_detail(self.detail);
         let state = self.sampler.state().into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect();
         model.sampler.load_state(&state)?;

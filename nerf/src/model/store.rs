@@ -1,7 +1,7 @@
 //! Models on disk.
 
 use super::config::Config;
-use super::{Extent, Model};
+use super::{Model, SceneBox};
 use crate::camera::Camera;
 use crate::files::write_atomic;
 use crate::{Error, Result};
@@ -35,7 +35,7 @@ impl Model<f32> {
     ///
     /// # Errors
     /// If the file cannot be read, is of a later version, or belongs to a model of another configuration.
-    pub fn load(path: impl AsRef<Path>, config: Config, extent: Extent) -> Result<Self> {
+    pub fn load(path: impl AsRef<Path>, config: Config, extent: SceneBox) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
         check_version(&bytes).map_err(|error| Error::file(&path, error))?;
         // How many parameters there are depends on the cameras.
@@ -118,7 +118,7 @@ mod tests {
 
     #[test]
     fn files_of_later_versions_are_refused() {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let model = Model::new(voxel(1), extent, 3).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn a_voxel_model_comes_back_as_it_was() {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let mut model = Model::new(voxel(2), extent, 3).unwrap();
         // A ball in one corner, so that the occupancy grid has something to remember.
         let table = model.params.find("field.table").unwrap();
@@ -157,7 +157,7 @@ mod tests {
         assert!(new.view_grid().occupied_share() < 0.5, "what views look at is pruned");
         assert_eq!(new.grid.occupied_share(), 1.0, "what is stored is not");
         let camera = &cameras_around(4, 24)[1];
-        let [seen, again] = [&model, &read].map(|model| model.view(camera, [1.0; 3]));
+        let [seen, again] = [&model, &read].map(|model| model.render(camera, [1.0; 3]));
         assert!(seen.color.data == again.color.data && seen.opacity.data.iter().any(|&x| x > 0.5));
         let error = Model::load(&path, voxel(3), extent).err().unwrap().to_string();
         assert!(error.contains("field.table"), "{error}");
@@ -165,12 +165,12 @@ mod tests {
 
     #[test]
     fn a_run_that_was_ended_early_comes_back_with_the_detail_that_it_had() {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         let mut model = Model::new(Config::preset(Preset::Small), extent, 3).unwrap();
         let camera = &cameras_around(4, 12)[1];
-        let view = |model: &Model<f32>| model.view(camera, [1.0; 3]).color;
+        let view = |model: &Model<f32>| model.render(camera, [1.0; 3]).color;
         let whole = view(&model);
         // Of the coarse field, which says where the other one is sampled.
         let coarse = |model: &Model<f32>| {
@@ -208,7 +208,7 @@ mod tests {
 
     #[test]
     fn sixteen_bits_take_half_of_the_file() {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
         let sizes = [Storage::Full, Storage::F16, Storage::Bf16].map(|storage| {

@@ -1,17 +1,17 @@
 //! Views in which nothing is left out, in any precision: what others are measured against.
 
-use super::picture::{Picture, Viewing};
+use super::picture::{Render, RenderOptions};
 use super::pixel::Pixel;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::model::Model;
-use crate::volume::lit::Lit;
+use crate::volume::early_termination::VisibleSamples;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Pool, Scalar, Var};
 
 /// A view in double precision.
 #[derive(Debug, Clone)]
-pub struct DenseView {
+pub struct ReferenceRender {
     /// Pixels in a row.
     pub width: usize,
     /// Number of rows.
@@ -29,28 +29,29 @@ impl<T: Scalar> Model<T> {
     /// The view from `camera` with all arithmetic in `T`, every sample in its middle, at steps `finer` times smaller than
     /// the configured ones. Nothing is left out but the cells that the occupancy grid holds to be empty.
     ///
-    /// In f64 at several times the steps it is a reference for faster ways: `model.cast::<f64>()?.dense_view(..)`. A
+    /// In f64 at several times the steps it is a reference for faster ways: `model.cast::<f64>()?.render_reference(..)`. A
     /// sampler without steps has as many samples whatever `finer` is.
     ///
     /// # Panics
     /// If `finer` is 0.
     #[inline(never)]
-    pub fn dense_view(&self, camera: &Camera, background: [f64; 3], finer: usize) -> DenseView {
+    pub fn render_reference(&self, camera: &Camera, background: [f64; 3], finer: usize) -> ReferenceRender {
         assert!(finer > 0, "steps that are 0 times smaller");
         let see = |pool: &Pool<T>, rays: &Rays<T>, out: &mut [Pixel]| self.dense_rays(rays, finer, pool, out);
         let mut pixels = vec![Pixel::default(); camera.width * camera.height];
         let keep = |seen: &[Pixel], out: &mut [Pixel]| {
             out.iter_mut().zip(seen).for_each(|(out, pixel)| *out = pixel.over(background));
         };
-        let all = Viewing::over([0.0; 3]);
+        let all = RenderOptions::over([0.0; 3]);
         let evaluations = self.pixels(camera, &all, TILE, see, pixels.chunks_mut(TILE), keep);
         let evaluations = evaluations.expect("nobody stops it");
-        DenseView { width: camera.width, height: camera.height, pixels, evaluations }
+        ReferenceRender { width: camera.width, height: camera.height, pixels, evaluations }
     }
 
     fn dense_rays(&self, rays: &Rays<T>, finer: usize, pool: &Pool<T>, out: &mut [Pixel]) -> Evaluations {
         self.along(rays, finer, pool, |query, sampled| {
-            let Lit { rendered, asked, .. } = self.sampler.quadrature().render(query, &sampled.steps, 0.0);
+            let VisibleSamples { rendered, density_queries: asked, .. } =
+                self.sampler.quadrature().render(query, &sampled.samples, 0.0);
             let [color, depth, left] = [&rendered.color, &rendered.depth(), &rendered.transmittance()].map(numbers);
             for (i, out) in out.iter_mut().enumerate() {
                 *out = Pixel {
@@ -68,10 +69,10 @@ fn numbers<T: Scalar>(values: &Var<'_, T>) -> Vec<f64> {
     values.value().as_slice().iter().map(|x| x.to_f64()).collect()
 }
 
-impl DenseView {
+impl ReferenceRender {
     /// The view rounded to single precision.
-    pub fn picture(&self) -> Picture {
-        let mut picture = Picture::new([self.width, self.height]);
+    pub fn picture(&self) -> Render {
+        let mut picture = Render::new([self.width, self.height]);
         picture.parts(self.pixels.len().max(1)).for_each(|part| part.fill(self.pixels.iter().copied()));
         picture.evaluations = self.evaluations;
         picture
@@ -83,7 +84,7 @@ mod tests {
     use super::*;
     use crate::dataset::sample::cameras_around;
     use crate::field::{FieldConfig, VoxelConfig};
-    use crate::model::Extent;
+    use crate::model::SceneBox;
     use crate::model::config::{Config, Preset};
     use crate::space::occupancy::Skip;
     use glam::DVec3;
@@ -93,7 +94,7 @@ mod tests {
     fn ball() -> Model<f32> {
         let mut config = Config::preset(Preset::Voxel).with_skip(Skip::Off);
         config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 2 });
-        let mut model = Model::new(config, Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]), 3).unwrap();
+        let mut model = Model::new(config, SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]), 3).unwrap();
         let table = model.params.find("field.table").unwrap();
         let rows = model.params.get_mut(table).as_mut_slice().chunks_exact_mut(16).enumerate();
         rows.for_each(|(i, row)| row[0] = if i % 21 < 9 && i / 441 < 9 { 0.3 } else { -2.0 });
@@ -106,13 +107,14 @@ mod tests {
         let double = model.cast::<f64>().unwrap();
         let camera = &cameras_around(4, 20)[1];
         let [background, black] = [[0.2, 0.5, 1.0], [0.0; 3]];
-        let [exact, single] = [double.dense_view(camera, background, 1), model.dense_view(camera, background, 1)];
+        let [exact, single] =
+            [double.render_reference(camera, background, 1), model.render_reference(camera, background, 1)];
         assert_eq!(exact.evaluations, single.evaluations);
         let values = |pixel: &Pixel| {
             let [r, g, b] = pixel.color;
             [r, g, b, pixel.depth, pixel.transmittance]
         };
-        let worst = |one: &DenseView, which: std::ops::Range<usize>| {
+        let worst = |one: &ReferenceRender, which: std::ops::Range<usize>| {
             let pairs = exact.pixels.iter().map(values).zip(one.pixels.iter().map(values));
             let errors = pairs.flat_map(|(a, b)| which.clone().map(move |i| (a[i] - b[i]).abs()));
             errors.fold(0.0_f64, Real::maximum)
@@ -121,19 +123,20 @@ mod tests {
         let (colour, all) = (worst(&single, 0..3), worst(&single, 0..5));
         println!("f32 against f64 at the same samples: colours {colour:.1e}, with distances {all:.1e}");
         assert!(colour > 0.0 && colour <= 1e-6 && all <= 1e-5, "{colour:e}, {all:e}");
-        let view = model.view(camera, background.map(|x| x as f32));
+        let view = model.render(camera, background.map(|x| x as f32));
         let picture = exact.picture();
         let differences = view.color.data.iter().zip(&picture.color.data).map(|(a, b)| (a - b).abs());
         assert!(differences.fold(0.0, Real::maximum) <= 1e-5, "the view that leaves out nothing is the same");
-        let depths = |one: &Picture, other: &Picture| {
+        let depths = |one: &Render, other: &Render| {
             let pairs = one.depth.data.iter().zip(&other.depth.data).map(|(a, b)| (a - b).abs());
             pairs.fold(0.0, Real::maximum)
         };
         assert!(depths(&view, &picture) <= 1e-4 && picture.depth.data.iter().any(|&t| t > 3.0), "and so are distances");
         assert!(
-            picture.opacity.data.iter().any(|&x| x > 0.5) && exact.pixels != double.dense_view(camera, black, 1).pixels
+            picture.opacity.data.iter().any(|&x| x > 0.5)
+                && exact.pixels != double.render_reference(camera, black, 1).pixels
         );
-        let finer = double.dense_view(camera, background, 3);
+        let finer = double.render_reference(camera, background, 3);
         assert!((1e-9..0.2).contains(&worst(&finer, 0..5)), "{}", worst(&finer, 0..5));
         assert!(finer.evaluations.density > 2 * exact.evaluations.density);
     }
@@ -142,13 +145,13 @@ mod tests {
     fn every_quadrature_shows_the_same_scene() {
         let mut model = ball();
         let camera = &cameras_around(4, 20)[1];
-        let reference = model.cast::<f64>().unwrap().dense_view(camera, [1.0; 3], 4).picture();
+        let reference = model.cast::<f64>().unwrap().render_reference(camera, [1.0; 3], 4).picture();
         use crate::volume::quadrature::Quadrature::*;
         // The voxels' edges are steep at the scale of a step.
         for rule in [Left, Midpoint, PiecewiseLinear, Gauss2, Adaptive { tolerance: 1e-4 }] {
             let Some(sampler) = model.marching_mut() else { panic!() };
             sampler.config.quadrature = rule;
-            let seen = model.view(camera, [1.0; 3]);
+            let seen = model.render(camera, [1.0; 3]);
             let differences = seen.color.data.iter().zip(&reference.color.data).map(|(a, b)| (a - b).abs());
             let worst = differences.fold(0.0, Real::maximum);
             println!("{rule:16} {worst:.1e} {:?}", seen.evaluations);

@@ -7,6 +7,6 @@ pub(crate) mod pixel;
 mod tiles;
 mod view;
 
-pub use dense::DenseView;
-pub use picture::{Picture, Viewing};
+pub use dense::ReferenceRender;
+pub use picture::{Render, RenderOptions};
 pub use pixel::Pixel;

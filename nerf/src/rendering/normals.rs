@@ -4,7 +4,7 @@ use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::dataset::image::Image;
 use crate::model::Model;
-use crate::rendering::picture::Viewing;
+use crate::rendering::picture::RenderOptions;
 use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Pool, Scalar};
@@ -16,7 +16,7 @@ impl<T: Scalar> Model<T> {
     /// The normals that are seen from a camera, three channels: along each ray the sum of weights times `-grad sigma /
     /// |grad sigma|` (as Verbin et al. 2022, equation 3 and after), in the scene's axes. Each is as long as the pixel
     /// is opaque where all that is seen faces one way, and shorter elsewhere. Light that is left when a ray
-    /// [ends](crate::Limits) counts for nothing.
+    /// [ends](crate::RayTolerance) counts for nothing.
     ///
     /// It takes a gradient for each sample: about as long as a step of training on as many rays.
     ///
@@ -24,16 +24,16 @@ impl<T: Scalar> Model<T> {
     /// If the field's density does not depend on positions through operations of the tape.
     #[inline(never)]
     pub fn normals(&self, camera: &Camera) -> Image {
-        self.normals_while(camera, &Viewing::over([0.0; 3])).expect("nobody stops it")
+        self.normals_cancellable(camera, &RenderOptions::over([0.0; 3])).expect("nobody stops it")
     }
 
     /// As [`normals`](Self::normals), of what lies in a box, for as long as somebody wants it: nothing if it was not to
-    /// [go on](Viewing::goes_on).
+    /// [go on](RenderOptions::keep_going).
     ///
     /// # Panics
     /// As [`normals`](Self::normals).
     #[inline(never)]
-    pub fn normals_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Image> {
+    pub fn normals_cancellable(&self, camera: &Camera, viewing: &RenderOptions<'_>) -> Option<Image> {
         let mut image = Image::new(camera.width, camera.height, 3);
         let out = image.data.chunks_mut(3 * TILE);
         let see = |pool: &Pool<T>, _, rays: &Rays<T>, out: &mut [f32]| self.normals_along(rays, viewing, pool, out);
@@ -41,17 +41,24 @@ impl<T: Scalar> Model<T> {
         Some(image)
     }
 
-    fn normals_along(&self, rays: &Rays<T>, viewing: &Viewing<'_>, pool: &Pool<T>, out: &mut [f32]) -> Evaluations {
+    fn normals_along(
+        &self,
+        rays: &Rays<T>,
+        viewing: &RenderOptions<'_>,
+        pool: &Pool<T>,
+        out: &mut [f32],
+    ) -> Evaluations {
         self.along(rays, 1, pool, |query, sampled| {
-            if sampled.steps.is_empty() {
+            if sampled.samples.is_empty() {
                 return sampled.evaluations;
             }
-            let termination = viewing.limits.unwrap_or_else(|| self.sampler.limits()).termination.into();
+            let termination = viewing.tolerance.unwrap_or_else(|| self.sampler.tolerance()).early_stop_eps.into();
             let query = Query { slopes: true, ..*query };
-            let seen = self.sampler.quadrature().render(&query, &sampled.steps, termination);
-            let normals = seen.rendered.normals_seen();
+            let seen = self.sampler.quadrature().render(&query, &sampled.samples, termination);
+            let normals = seen.rendered.accumulated_normals();
             out.iter_mut().zip(normals.as_slice()).for_each(|(out, value)| *out = value.to_f64() as f32);
-            sampled.evaluations + Evaluations { density: seen.asked as u64, color: seen.kept as u64, unskipped: 0 }
+            sampled.evaluations
+                + Evaluations { density: seen.density_queries as u64, color: seen.visible as u64, unskipped: 0 }
         })
     }
 }
@@ -59,8 +66,8 @@ impl<T: Scalar> Model<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Density, Field, Seen};
-    use crate::model::Extent;
+    use crate::field::{Density, Field, ViewInputs};
+    use crate::model::SceneBox;
     use crate::model::config::{Config, Preset};
     use glam::DVec3;
     use raygrad_autograd::{Tensor, Var};
@@ -85,7 +92,7 @@ mod tests {
             Density { value, log: self.log, features: positions.clone() }
         }
 
-        fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+        fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
             features.sigmoid()
         }
     }
@@ -93,7 +100,7 @@ mod tests {
     fn model(log: bool) -> Model<f32> {
         let config = Config::preset(Preset::Small);
         let mut model =
-            Model::new(config, Extent::new([DVec3::splat(-1.5), DVec3::splat(1.5)], [2.0, 6.0]), 0).unwrap();
+            Model::new(config, SceneBox::new([DVec3::splat(-1.5), DVec3::splat(1.5)], [2.0, 6.0]), 0).unwrap();
         model.field = Arc::new(Ellipsoid { log });
         model
     }
@@ -106,7 +113,7 @@ mod tests {
         let local = |point: DVec3| (point - DVec3::from(CENTRE)) / DVec3::from(RADII);
         for log in [false, true] {
             let model = model(log);
-            let (normals, depth) = (model.normals(&camera), model.view(&camera, [1.0; 3]).depth);
+            let (normals, depth) = (model.normals(&camera), model.render(&camera, [1.0; 3]).depth);
             let (mut hits, mut misses) = (0, 0);
             for pixel in 0..21 * 13 {
                 let [x, y] = [pixel % 21, pixel / 21];

@@ -5,14 +5,14 @@ use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
 use crate::dataset::image::Image;
 use crate::model::Model;
-use crate::sampling::Limits;
+use crate::sampling::RayTolerance;
 use crate::volume::render::Evaluations;
 use glam::DVec3;
 use raygrad_autograd::Pool;
 
 /// What a model sees from a camera.
 #[derive(Debug, Clone)]
-pub struct Picture {
+pub struct Render {
     /// Colour over the background, RGB in 0..=1.
     pub color: Image,
     /// Expected distance along the ray, in scene units, of what is visible; 0 where nothing is.
@@ -26,11 +26,11 @@ pub struct Picture {
 /// Below this opacity a pixel has no depth.
 const VISIBLE: f64 = 1e-3;
 
-impl Picture {
+impl Render {
     /// A picture of nothing.
     pub(crate) fn new([width, height]: [usize; 2]) -> Self {
         let image = |channels| Image::new(width, height, channels);
-        Picture { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
+        Render { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
     }
 
     /// The colour without the background that the picture was rendered over: RGBA, with the opacity as alpha and
@@ -92,21 +92,21 @@ impl Part<'_> {
 
 /// How a view is rendered that is looked at while it changes.
 #[derive(Clone, Copy)]
-pub struct Viewing<'a> {
+pub struct RenderOptions<'a> {
     /// What lies behind the scene, RGB in 0..=1. Normals have nothing behind them.
     pub background: [f32; 3],
     /// What may be left out; without it what goes with the configuration.
-    pub limits: Option<Limits>,
+    pub tolerance: Option<RayTolerance>,
     /// The box, lower and upper corner in scene units, beyond which nothing is shown: infinite for all.
     pub crop: [DVec3; 2],
     /// Asked before each tile, on any thread: once it says `false`, no more is rendered.
-    pub goes_on: &'a (dyn Fn() -> bool + Sync),
+    pub keep_going: &'a (dyn Fn() -> bool + Sync),
 }
 
-impl Viewing<'_> {
+impl RenderOptions<'_> {
     /// All of a scene, to the end, over a background.
     pub fn over(background: [f32; 3]) -> Self {
-        Viewing { background, limits: None, crop: EVERYWHERE, goes_on: &|| true }
+        RenderOptions { background, tolerance: None, crop: EVERYWHERE, keep_going: &|| true }
     }
 }
 
@@ -116,17 +116,17 @@ const EVERYWHERE: [DVec3; 2] = [DVec3::NEG_INFINITY, DVec3::INFINITY];
 impl Model<f32> {
     /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
     /// time, on any number of threads.
-    pub fn view(&self, camera: &Camera, background: [f32; 3]) -> Picture {
-        self.whole_view(camera, &Viewing::over(background))
+    pub fn render(&self, camera: &Camera, background: [f32; 3]) -> Render {
+        self.whole_view(camera, &RenderOptions::over(background))
     }
 
-    /// As [`view`](Self::view), with these limits in place of those that go with the configuration.
-    pub fn view_within(&self, camera: &Camera, background: [f32; 3], limits: &Limits) -> Picture {
-        self.whole_view(camera, &Viewing { limits: Some(*limits), ..Viewing::over(background) })
+    /// As [`view`](Self::render), with these limits in place of those that go with the configuration.
+    pub fn render_within(&self, camera: &Camera, background: [f32; 3], limits: &RayTolerance) -> Render {
+        self.whole_view(camera, &RenderOptions { tolerance: Some(*limits), ..RenderOptions::over(background) })
     }
 
-    /// As [`view`](Self::view), of what lies in a box, for as long as somebody wants it: nothing if it was not to
-    /// [go on](Viewing::goes_on).
+    /// As [`view`](Self::render), of what lies in a box, for as long as somebody wants it: nothing if it was not to
+    /// [go on](RenderOptions::keep_going).
     ///
     /// ```
     /// use raygrad_nerf::glam::{DAffine3, DVec3};
@@ -140,10 +140,10 @@ impl Model<f32> {
     /// assert!(model.view_while(&camera, &Viewing { goes_on: &|| false, ..lower_half }).is_none());
     /// # Ok::<_, raygrad_nerf::Error>(())
     /// ```
-    pub fn view_while(&self, camera: &Camera, viewing: &Viewing<'_>) -> Option<Picture> {
-        let limits = viewing.limits.unwrap_or_else(|| self.sampler.limits());
+    pub fn render_cancellable(&self, camera: &Camera, viewing: &RenderOptions<'_>) -> Option<Render> {
+        let limits = viewing.tolerance.unwrap_or_else(|| self.sampler.tolerance());
         let see = |pool: &Pool<f32>, rays: &Rays<f32>, out: &mut [Pixel]| self.see(rays, &limits, pool, out);
-        let (mut picture, tile) = (Picture::new([camera.width, camera.height]), self.sampler.view_tile());
+        let (mut picture, tile) = (Render::new([camera.width, camera.height]), self.sampler.view_tile());
         let background = viewing.background.map(f64::from);
         let keep = |pixels: &[Pixel], out: Part<'_>| out.fill(pixels.iter().map(|pixel| pixel.over(background)));
         picture.evaluations = self.pixels(camera, viewing, tile, see, picture.parts(tile), keep)?;
@@ -151,19 +151,19 @@ impl Model<f32> {
     }
 
     /// A view that nobody stops.
-    fn whole_view(&self, camera: &Camera, viewing: &Viewing<'_>) -> Picture {
-        self.view_while(camera, viewing).expect("nobody stops it")
+    fn whole_view(&self, camera: &Camera, viewing: &RenderOptions<'_>) -> Render {
+        self.render_cancellable(camera, viewing).expect("nobody stops it")
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::Extent;
+    use crate::model::SceneBox;
     use crate::model::config::{Config, Preset};
 
     fn model() -> Model<f32> {
-        let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
         Model::new(Config::preset(Preset::Small), extent, 0).unwrap()
     }
 
@@ -174,10 +174,13 @@ mod tests {
     #[test]
     fn what_lies_outside_of_a_box_is_not_seen() {
         let (model, camera) = (model(), camera(17, 13));
-        let whole = model.view(&camera, [1.0; 3]);
+        let whole = model.render(&camera, [1.0; 3]);
         let within = |lower: [f64; 3], upper: [f64; 3]| {
-            let viewing = Viewing { crop: [lower.into(), upper.into()], ..Viewing::over([1.0; 3]) };
-            (model.view_while(&camera, &viewing).unwrap(), model.normals_while(&camera, &viewing).unwrap())
+            let viewing = RenderOptions { crop: [lower.into(), upper.into()], ..RenderOptions::over([1.0; 3]) };
+            (
+                model.render_cancellable(&camera, &viewing).unwrap(),
+                model.normals_cancellable(&camera, &viewing).unwrap(),
+            )
         };
         // A box that is larger than the scene changes nothing, one beside it shows nothing.
         let (all, normals) = within([-9.0, -1.0, f64::NEG_INFINITY], [1.0, 9.0, f64::INFINITY]);
@@ -202,11 +205,11 @@ mod tests {
     #[test]
     fn a_scene_that_ends_is_seen_from_nearer_and_from_farther_than_its_photographs() {
         let seen = |span: [f64; 2], unbounded: bool, distance: f64| {
-            let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], span);
+            let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], span);
             let model: Model<f32> =
                 Model::new(Config { unbounded, ..Config::preset(Preset::Small) }, extent, 0).unwrap();
             let eye = Camera::look_at(DVec3::new(0.0, 0.0, distance), DVec3::ZERO, DVec3::Y);
-            (model.view(&Camera::from_angle(3, 3, 0.1, eye), [1.0; 3]).opacity, model.view_span())
+            (model.render(&Camera::from_angle(3, 3, 0.1, eye), [1.0; 3]).opacity, model.view_near_far())
         };
         for distance in [0.5, 4.0, 30.0] {
             let (opacity, span) = seen([2.0, 6.0], false, distance);
@@ -222,7 +225,7 @@ mod tests {
     #[test]
     fn tiles_hold_every_pixel_once_and_in_order() {
         let (model, camera) = (model(), camera(17, 13));
-        let viewing = Viewing::over([1.0; 3]);
+        let viewing = RenderOptions::over([1.0; 3]);
         let mut tiles = vec![(0, Rays::new()); 221_usize.div_ceil(50)];
         let keep = |_: &Pool<f32>, first, rays: &Rays<f32>, tile: &mut _| {
             *tile = (first, rays.clone());
@@ -235,7 +238,7 @@ mod tests {
         );
         let mut all = Rays::<f32>::new();
         for pixel in 0..221 {
-            all.push_pixel(&camera, [pixel % 17, pixel / 17], model.reach(), model.view_span());
+            all.push_pixel(&camera, [pixel % 17, pixel / 17], model.reach(), model.view_near_far());
         }
         assert_eq!(tiles.iter().flat_map(|(_, rays)| rays.directions.clone()).collect::<Vec<_>>(), all.directions);
         assert_eq!(tiles.iter().flat_map(|(_, rays)| rays.spans.clone()).collect::<Vec<_>>(), all.spans);
@@ -247,12 +250,12 @@ mod tests {
         let (model, camera) = (model(), camera(64, 64));
         let asked = AtomicUsize::new(0);
         let goes_on = || asked.fetch_add(1, Ordering::Relaxed) < 3;
-        let viewing = Viewing { goes_on: &goes_on, ..Viewing::over([1.0; 3]) };
-        assert!(model.view_while(&camera, &viewing).is_none());
+        let viewing = RenderOptions { keep_going: &goes_on, ..RenderOptions::over([1.0; 3]) };
+        assert!(model.render_cancellable(&camera, &viewing).is_none());
         let tiles = (64 * 64_usize).div_ceil(model.sampler.view_tile());
         assert!((4..tiles).contains(&asked.load(Ordering::Relaxed)), "{asked:?} of {tiles}");
-        assert!(model.normals_while(&camera, &viewing).is_none());
-        let whole = model.view_while(&camera, &Viewing { goes_on: &|| true, ..viewing }).unwrap();
-        assert_eq!(whole.color, model.view(&camera, [1.0; 3]).color);
+        assert!(model.normals_cancellable(&camera, &viewing).is_none());
+        let whole = model.render_cancellable(&camera, &RenderOptions { keep_going: &|| true, ..viewing }).unwrap();
+        assert_eq!(whole.color, model.render(&camera, [1.0; 3]).color);
     }
 }

@@ -1,6 +1,6 @@
 //! Tiles: a model is asked along the rays of a camera's pixels, tile by tile on all cores.
 
-use super::picture::Viewing;
+use super::picture::RenderOptions;
 use super::pixel::Pixel;
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
@@ -25,7 +25,7 @@ impl<T: Scalar> Model<T> {
     ) -> R {
         let tape = Tape::with_pool(pool.clone());
         let params = self.params.bind_constant(&tape);
-        let frames = self.look.map(|look| vec![look; rays.len()]);
+        let frames = self.appearance_image.map(|look| vec![look; rays.len()]);
         let query = Query { frames: frames.as_deref(), ..Query::new(&*self.field, &params) };
         see(&query, self.sampler.sample(&query, rays, Purpose::View { finer }, &mut Jitter::Middle))
     }
@@ -35,19 +35,19 @@ impl<T: Scalar> Model<T> {
     pub(crate) fn tiles<P: Send>(
         &self,
         camera: &Camera,
-        viewing: &Viewing<'_>,
+        viewing: &RenderOptions<'_>,
         tile: usize,
         out: impl Iterator<Item = P>,
         see: impl Fn(&Pool<T>, usize, &Rays<T>, P) -> Evaluations + Sync,
     ) -> Option<Evaluations> {
         let ([lower, upper], [from, to]) = (self.reach(), viewing.crop);
         let (bounds, count) = ([lower.max(from), upper.min(to)], camera.width * camera.height);
-        let [near, far] = self.view_span();
+        let [near, far] = self.view_near_far();
         // Which corner is which is nothing to a ray.
         let span = [near, if bounds[0].cmplt(bounds[1]).all() { far } else { near }];
         let (pools, seen) = (Scratch::<Pool<T>>::default(), Mutex::new(Some(Evaluations::default())));
         parallel::each_of(out, |which, out| {
-            let goes_on = locked(&seen).is_some() && (viewing.goes_on)();
+            let goes_on = locked(&seen).is_some() && (viewing.keep_going)();
             let evaluations = goes_on.then(|| {
                 let mut rays = Rays::new();
                 for pixel in which * tile..count.min((which + 1) * tile) {
@@ -66,13 +66,13 @@ impl<T: Scalar> Model<T> {
     pub(crate) fn pixels<P: Send>(
         &self,
         camera: &Camera,
-        viewing: &Viewing<'_>,
+        viewing: &RenderOptions<'_>,
         tile: usize,
         see: impl Fn(&Pool<T>, &Rays<T>, &mut [Pixel]) -> Evaluations + Sync,
         out: impl Iterator<Item = P>,
         keep: impl Fn(&[Pixel], P) + Sync,
     ) -> Option<Evaluations> {
-        let gain = self.tone.as_ref().map(|tone| tone.gain(&self.params, self.look, self.vignetted));
+        let gain = self.exposure.as_ref().map(|tone| tone.gain(&self.params, self.appearance_image, self.vignetted));
         self.tiles(camera, viewing, tile, out, |pool, first, rays, out| {
             let mut pixels = vec![Pixel::default(); rays.len()];
             let evaluations = see(pool, rays, &mut pixels);

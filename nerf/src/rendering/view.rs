@@ -3,7 +3,7 @@
 use super::pixel::Pixel;
 use crate::camera::rays::{Rays, Samples};
 use crate::model::Model;
-use crate::sampling::Limits;
+use crate::sampling::RayTolerance;
 use crate::volume::quadrature::Quadrature;
 use crate::volume::query::Query;
 use crate::volume::render::{Evaluations, accumulate};
@@ -24,12 +24,18 @@ struct Seen {
 
 impl Model<f32> {
     /// Renders rays without a background to `out`, whose pixels are those of nothing before.
-    pub(super) fn see(&self, rays: &Rays<f32>, limits: &Limits, pool: &Pool<f32>, out: &mut [Pixel]) -> Evaluations {
+    pub(super) fn see(
+        &self,
+        rays: &Rays<f32>,
+        limits: &RayTolerance,
+        pool: &Pool<f32>,
+        out: &mut [Pixel],
+    ) -> Evaluations {
         self.along(rays, 1, pool, |query, sampled| {
             let rule = self.sampler.quadrature();
             let asked = match rule.has_intervals() {
-                false => in_rounds(query, &rule.nodes(&sampled.steps), limits, out),
-                true => in_chunks(query, rule, &sampled.steps, limits, out),
+                false => in_rounds(query, &rule.nodes(&sampled.samples), limits, out),
+                true => in_chunks(query, rule, &sampled.samples, limits, out),
             };
             asked + sampled.evaluations
         })
@@ -37,9 +43,14 @@ impl Model<f32> {
 }
 
 /// The view of samples that stand for an interval each.
-fn in_rounds(query: &Query<'_, '_, f32>, samples: &Samples<f32>, limits: &Limits, out: &mut [Pixel]) -> Evaluations {
+fn in_rounds(
+    query: &Query<'_, '_, f32>,
+    samples: &Samples<f32>,
+    limits: &RayTolerance,
+    out: &mut [Pixel],
+) -> Evaluations {
     let (mut seen, mut evaluations) = (vec![Seen::default(); out.len()], Evaluations::default());
-    let mut rays = FrontToBack::new(samples, limits.termination.into());
+    let mut rays = FrontToBack::new(samples, limits.early_stop_eps.into());
     while let Some(round) = rays.round(query, rays.round_size()) {
         evaluations = evaluations + shade(query, &round, limits, &mut seen, out);
     }
@@ -53,7 +64,7 @@ fn in_rounds(query: &Query<'_, '_, f32>, samples: &Samples<f32>, limits: &Limits
 fn shade(
     query: &Query<'_, '_, f32>,
     round: &Round<'_, f32>,
-    limits: &Limits,
+    limits: &RayTolerance,
     seen: &mut [Seen],
     out: &mut [Pixel],
 ) -> Evaluations {
@@ -100,15 +111,16 @@ fn in_chunks(
     query: &Query<'_, '_, f32>,
     rule: Quadrature,
     steps: &Samples<f32>,
-    limits: &Limits,
+    limits: &RayTolerance,
     out: &mut [Pixel],
 ) -> Evaluations {
     let mut evaluations = Evaluations::default();
-    let mut rays = FrontToBack::new(steps, limits.termination.into());
+    let mut rays = FrontToBack::new(steps, limits.early_stop_eps.into());
     while let Some(Stretch { samples, pieces }) = rays.take(CHUNK, query.tape().pool()) {
         let seen = rule.render(&of_rays(query, pieces.len()), &samples, 0.0);
-        evaluations.density += seen.asked as u64;
-        evaluations.color += if let Quadrature::Adaptive { .. } = rule { seen.asked } else { seen.kept } as u64;
+        evaluations.density += seen.density_queries as u64;
+        evaluations.color +=
+            if let Quadrature::Adaptive { .. } = rule { seen.density_queries } else { seen.visible } as u64;
         let (color, depth) = (seen.rendered.color.value().as_slice().chunks_exact(3), seen.rendered.depth());
         let values = color.zip(depth.value().as_slice()).zip(seen.rendered.optical_depth.value().as_slice());
         for ((ray, _), ((color, &depth), &x)) in pieces.into_iter().zip(values) {

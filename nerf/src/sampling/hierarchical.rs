@@ -1,11 +1,11 @@
 //! Hierarchical sampling: a coarse field finds where to look, and the field proper is sampled there.
 
-use super::steps::importance;
-use super::{Load, Purpose, Sampled, Sampler, Samplers};
+use super::steps::importance_sampling;
+use super::{BatchSize, Purpose, Sampled, Sampler, Samplers};
 use crate::Result;
 use crate::camera::rays::{Rays, stratified};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::field::{Classic, ClassicConfig, Field};
-use crate::kind::{Kind, Site};
 use crate::random::Jitter;
 use crate::range::check_range;
 use crate::volume::quadrature::Quadrature;
@@ -40,7 +40,7 @@ impl Default for HierarchicalConfig {
     }
 }
 
-impl Kind<Samplers> for HierarchicalConfig {
+impl ComponentConfig<Samplers> for HierarchicalConfig {
     const KIND: &'static str = "hierarchical";
 
     fn check(&self) -> Result<()> {
@@ -51,8 +51,8 @@ impl Kind<Samplers> for HierarchicalConfig {
         check_range("uniform_share", self.uniform_share, 0.0, 1.0)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
-        let proposal = Classic::new(&self.proposal, Site { name: "proposal", ..site })?;
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Box<dyn Sampler<T>>> {
+        let proposal = Classic::new(&self.proposal, BuildContext { name: "proposal", ..site })?;
         Ok(Box::new(Hierarchical { config: self.clone(), proposal }))
     }
 }
@@ -80,14 +80,14 @@ impl<T: Scalar> Sampler<T> for Hierarchical {
         let first = stratified(rays, coarse, jitter, pool);
         let seen = Quadrature::Midpoint.render_nodes(&query.of(&self.proposal), first);
         let weights = seen.weights.value().as_slice();
-        let steps = importance(rays, &seen.samples, weights, fine, uniform_share, jitter, pool);
+        let steps = importance_sampling(rays, &seen.samples, weights, fine, uniform_share, jitter, pool);
         let asked = weights.len() as u64;
         let evaluations = Evaluations { density: asked, color: asked, unskipped: asked + steps.len() as u64 };
-        Sampled { steps, coarse: vec![seen], levels: vec![], evaluations }
+        Sampled { samples: steps, coarse: vec![seen], histograms: vec![], evaluations }
     }
 
-    fn load(&self) -> Load {
-        Load::Rays { step: self.config.batch, tile: self.config.tile }
+    fn batch_size(&self) -> BatchSize {
+        BatchSize::Rays { step: self.config.batch, tile: self.config.tile }
     }
 
     fn boxed(&self) -> Box<dyn Sampler<T>> {

@@ -1,9 +1,9 @@
 //! Marching: even steps through the occupied cells of a grid.
 
-use super::{Limits, Load, Progress, Purpose, Sampled, Sampler, Samplers};
+use super::{BatchSize, Progress, Purpose, RayTolerance, Sampled, Sampler, Samplers};
 use crate::camera::rays::{Rays, Samples};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::dataset::Dataset;
-use crate::kind::{Kind, Site};
 use crate::random::Jitter;
 use crate::range::check_range;
 use crate::space::occupancy::{
@@ -40,7 +40,8 @@ pub struct MarchingConfig {
     pub samples: usize,
     /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
     /// much.
-    pub termination: f64,
+    #[serde(alias = "termination")]
+    pub early_stop_eps: f64,
     /// How the integral along a ray is approximated; a step is an interval.
     pub quadrature: Quadrature,
 }
@@ -56,13 +57,13 @@ impl Default for MarchingConfig {
             view_step: 1.0 / 600.0,
             cone: 0.0,
             samples: 24576,
-            termination: 1e-3,
+            early_stop_eps: 1e-3,
             quadrature: Quadrature::Midpoint,
         }
     }
 }
 
-impl Kind<Samplers> for MarchingConfig {
+impl ComponentConfig<Samplers> for MarchingConfig {
     const KIND: &'static str = "marching";
 
     fn check(&self) -> Result<()> {
@@ -73,10 +74,10 @@ impl Kind<Samplers> for MarchingConfig {
         check_range("cone", self.cone, 0.0, 1.0)?;
         check_range("samples", self.samples, 1, 1 << 24)?;
         self.quadrature.check()?;
-        check_range("termination", self.termination, 0.0, 1.0)
+        check_range("early_stop_eps", self.early_stop_eps, 0.0, 1.0)
     }
 
-    fn build<T: Scalar>(&self, site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
+    fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<Box<dyn Sampler<T>>> {
         let grid = OccupancyGrid::new(site.space.bounds, &self.occupancy)?;
         Ok(Box::new(Marching::new(self.clone(), grid)))
     }
@@ -178,8 +179,8 @@ impl<T: Scalar> Sampler<T> for Marching {
         Sampled { evaluations: Evaluations { unskipped, ..Evaluations::default() }, ..Sampled::new(steps) }
     }
 
-    fn load(&self) -> Load {
-        Load::Samples(self.config.samples)
+    fn batch_size(&self) -> BatchSize {
+        BatchSize::Samples(self.config.samples)
     }
 
     fn boxed(&self) -> Box<dyn Sampler<T>> {
@@ -190,12 +191,12 @@ impl<T: Scalar> Sampler<T> for Marching {
         self.config.quadrature
     }
 
-    fn termination(&self) -> f64 {
-        self.config.termination
+    fn early_stop_eps(&self) -> f64 {
+        self.config.early_stop_eps
     }
 
-    fn limits(&self) -> Limits {
-        Limits::of(&self.config.occupancy.skip)
+    fn tolerance(&self) -> RayTolerance {
+        RayTolerance::of(&self.config.occupancy.skip)
     }
 
     fn view_tile(&self) -> usize {
@@ -212,7 +213,7 @@ impl<T: Scalar> Sampler<T> for Marching {
 
     /// Looks at some cells and passes over those that hold little.
     fn update(&mut self, progress: &Progress, densities: &DensityFn<'_>) -> bool {
-        let Progress { step, fraction, seed } = *progress;
+        let Progress { step, train_frac: fraction, seed } = *progress;
         self.progress = fraction;
         if step % GRID_EVERY != 1 || step == 1 || !self.config.occupancy.skip.grid {
             return false;
@@ -263,10 +264,10 @@ impl<T: Scalar> Sampler<T> for Marching {
     }
 }
 
-impl Limits {
+impl RayTolerance {
     /// What these switches say of views.
     pub fn of(skip: &Skipping) -> Self {
-        Limits { termination: skip.termination as f32, color_budget: skip.colors as f32 }
+        RayTolerance { early_stop_eps: skip.early_stop_eps as f32, color_budget: skip.colors as f32 }
     }
 }
 
@@ -295,8 +296,8 @@ mod tests {
             let config = MarchingConfig { occupancy, cone, view_step: 1e-3, ..MarchingConfig::default() };
             let sampler = Marching::new(config, grid);
             let mut rays = Rays::new();
-            rays.push(&scene.ray, crate::camera::bounds::clip_span(&scene.ray, reach, [0.0, scene.length]));
-            let steps = sampler.sample(&query, &rays, Purpose::View { finer: 1 }, &mut Jitter::Middle).steps;
+            rays.push(&scene.ray, crate::camera::bounds::clip_near_far(&scene.ray, reach, [0.0, scene.length]));
+            let steps = sampler.sample(&query, &rays, Purpose::View { finer: 1 }, &mut Jitter::Middle).samples;
             let count = steps.len();
             let color = Quadrature::Midpoint.render_nodes(&query, steps).over(&Tensor::full(&[1, 3], 1.0));
             (color.value().as_slice()[1], count)
@@ -326,7 +327,7 @@ mod tests {
                 assert_eq!(seen.lock().unwrap().len(), 4096, "all in the warm-up");
                 seen.lock().unwrap().clear();
             }
-            sampler.update(&Progress { step, fraction: 0.0, seed: 1 }, &look);
+            sampler.update(&Progress { step, train_frac: 0.0, seed: 1 }, &look);
         }
         assert_eq!(seen.lock().unwrap().len(), 4096, "one in sixteen each time, and another one each time");
     }
@@ -366,6 +367,6 @@ mod tests {
             assert_eq!(view, 4.0 / 600.0);
         }
         let wrong = MarchingConfig { last_step: Some(0.0), ..MarchingConfig::default() };
-        assert!(Kind::check(&wrong).unwrap_err().to_string().starts_with("`last_step`"));
+        assert!(ComponentConfig::check(&wrong).unwrap_err().to_string().starts_with("`last_step`"));
     }
 }

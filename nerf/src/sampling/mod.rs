@@ -12,9 +12,9 @@ pub mod steps;
 
 use crate::Result;
 use crate::camera::rays::{Rays, Samples};
+use crate::component::{AnyConfig, ComponentType};
 use crate::dataset::Dataset;
 use crate::field::Field;
-use crate::kind::{Family, Part};
 use crate::random::Jitter;
 use crate::space::occupancy::{DensityFn, OccupancyGrid};
 use crate::volume::quadrature::Quadrature;
@@ -39,11 +39,11 @@ pub enum Purpose {
 /// Where the field is sampled, and what else was found out on the way.
 pub struct Sampled<'t, T: Scalar> {
     /// The steps: each sample is the middle of an interval, or stands for it.
-    pub steps: Samples<T>,
+    pub samples: Samples<T>,
     /// What fields of the sampler's own showed: pictures of the same rays, to be fitted as well.
     pub coarse: Vec<Rendered<'t, T>>,
     /// Histograms that density fields of the sampler's own proposed, to be pulled towards the weights of the field.
-    pub levels: Vec<Level<'t, T>>,
+    pub histograms: Vec<ProposalHistogram<'t, T>>,
     /// How often the sampler asked, and how many steps there would be if nothing in the box were skipped.
     pub evaluations: Evaluations,
 }
@@ -52,12 +52,12 @@ impl<'t, T: Scalar> Sampled<'t, T> {
     /// Steps that nobody was asked for.
     pub fn new(steps: Samples<T>) -> Self {
         let evaluations = Evaluations { unskipped: steps.len() as u64, ..Evaluations::default() };
-        Sampled { steps, coarse: vec![], levels: vec![], evaluations }
+        Sampled { samples: steps, coarse: vec![], histograms: vec![], evaluations }
     }
 }
 
 /// A histogram along rays that a density field proposed.
-pub struct Level<'t, T: Scalar> {
+pub struct ProposalHistogram<'t, T: Scalar> {
     /// The edges of the bins of all rays, in scene units, rising along each ray: one more than bins a ray.
     pub edges: Vec<f64>,
     /// The weight of each bin, `[rays * bins]`.
@@ -71,22 +71,22 @@ pub struct Level<'t, T: Scalar> {
 /// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling the
 /// rest.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Limits {
+pub struct RayTolerance {
     /// A ray ends where less light than this is left, 0 to 1.
-    pub termination: f32,
+    pub early_stop_eps: f32,
     /// Samples whose weights add up to at most this have no colour of their own, 0 to 1. Quadratures of two nodes an
     /// interval colour every sample.
     pub color_budget: f32,
 }
 
-impl Limits {
+impl RayTolerance {
     /// Nothing is left out.
-    pub const NONE: Limits = Limits { termination: 0.0, color_budget: 0.0 };
+    pub const NONE: RayTolerance = RayTolerance { early_stop_eps: 0.0, color_budget: 0.0 };
 }
 
 /// How much a training step works on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Load {
+pub enum BatchSize {
     /// So many rays, in tiles of so many.
     Rays {
         /// Rays of a step.
@@ -104,16 +104,16 @@ pub struct Progress {
     /// The number of the step that comes next, from 1.
     pub step: u64,
     /// How much of the run is done, 0 to 1.
-    pub fraction: f64,
+    pub train_frac: f64,
     /// The run's seed.
     pub seed: u64,
 }
 
-/// Chooses where rays are sampled. Only [`sample`](Self::sample), [`load`](Self::load) and [`boxed`](Self::boxed) are
+/// Chooses where rays are sampled. Only [`sample`](Self::sample), [`batch_size`](Self::batch_size) and [`boxed`](Self::boxed) are
 /// needed; the rest is for samplers that learn, leave out, or remember.
 ///
-/// A sampler of one's own implements this and, for its configuration, [`Kind<Samplers>`](crate::Kind); with
-/// [`register`](crate::kind::register) it is trained, rendered, saved and loaded like those of this crate.
+/// A sampler of one's own implements this and, for its configuration, [`ComponentConfig<Samplers>`](crate::ComponentConfig); with
+/// [`register`](crate::component::register) it is trained, rendered, saved and loaded like those of this crate.
 pub trait Sampler<T: Scalar>: Any + Send + Sync {
     /// Where the field of `query` is sampled along `rays`. No gradient flows through the choice of places.
     fn sample<'t>(
@@ -125,7 +125,7 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
     ) -> Sampled<'t, T>;
 
     /// How much a training step works on.
-    fn load(&self) -> Load;
+    fn batch_size(&self) -> BatchSize;
 
     /// A copy.
     fn boxed(&self) -> Box<dyn Sampler<T>>;
@@ -136,13 +136,13 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
     }
 
     /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as much.
-    fn termination(&self) -> f64 {
+    fn early_stop_eps(&self) -> f64 {
         0.0
     }
 
     /// What views leave out.
-    fn limits(&self) -> Limits {
-        Limits::NONE
+    fn tolerance(&self) -> RayTolerance {
+        RayTolerance::NONE
     }
 
     /// Rays of a view that are worked out together.
@@ -203,10 +203,10 @@ impl<T: Scalar> Clone for Box<dyn Sampler<T>> {
 /// The family of samplers.
 pub struct Samplers;
 
-impl Family for Samplers {
+impl ComponentType for Samplers {
     const WHAT: &'static str = "sampler";
     type Built<T: Scalar> = Box<dyn Sampler<T>>;
 }
 
 /// Which sampler, and its numbers.
-pub type SamplerConfig = Part<Samplers>;
+pub type SamplerConfig = AnyConfig<Samplers>;

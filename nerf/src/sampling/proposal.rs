@@ -1,11 +1,11 @@
 //! Proposal sampling: small density fields say where along a ray the field is worth asking.
 
 use super::steps::{even_edges, invert_cdf};
-use super::{Level, Limits, Load, Progress, Purpose, Sampled, Sampler, Samplers};
+use super::{BatchSize, Progress, ProposalHistogram, Purpose, RayTolerance, Sampled, Sampler, Samplers};
 use crate::camera::rays::{Rays, Samples};
+use crate::component::{BuildContext, ComponentConfig};
 use crate::encoding::hash_grid::HashGridConfig;
-use crate::field::{Density, DensityNetwork, Field, Seen};
-use crate::kind::{Kind, Site};
+use crate::field::{Density, DensityNetwork, Field, ViewInputs};
 use crate::random::Jitter;
 use crate::range::check_range;
 use crate::space::occupancy::DensityFn;
@@ -59,7 +59,8 @@ pub struct ProposalConfig {
     /// Rays in a tile: one tape, on one core.
     pub tile: usize,
     /// Samples with less light than this in front of them are dropped.
-    pub termination: f64,
+    #[serde(alias = "termination")]
+    pub early_stop_eps: f64,
 }
 
 impl Default for ProposalConfig {
@@ -78,12 +79,12 @@ impl Default for ProposalConfig {
             spacing: Spacing::Linear,
             batch: 2048,
             tile: 256,
-            termination: 1e-3,
+            early_stop_eps: 1e-3,
         }
     }
 }
 
-impl Kind<Samplers> for ProposalConfig {
+impl ComponentConfig<Samplers> for ProposalConfig {
     const KIND: &'static str = "proposal";
 
     fn check(&self) -> Result<()> {
@@ -97,11 +98,11 @@ impl Kind<Samplers> for ProposalConfig {
         check_range("samples", self.samples, 1, 1 << 12)?;
         check_range("batch", self.batch, 1, 1 << 20)?;
         check_range("tile", self.tile, 1, 1 << 16)?;
-        check_range("termination", self.termination, 0.0, 1.0)?;
+        check_range("early_stop_eps", self.early_stop_eps, 0.0, 1.0)?;
         check_range("uniform_share", self.uniform_share, 0.0, 1.0)
     }
 
-    fn build<T: Scalar>(&self, mut site: Site<'_, T>) -> Result<Box<dyn Sampler<T>>> {
+    fn build<T: Scalar>(&self, mut site: BuildContext<'_, T>) -> Result<Box<dyn Sampler<T>>> {
         let mut fields = vec![];
         for (i, level) in self.levels.iter().enumerate() {
             let name = format!("proposal.{i}");
@@ -121,7 +122,7 @@ impl<T: Scalar> Field<T> for Proposer {
     }
 
     /// A grey that nobody asks for.
-    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         features.tape().constant(Tensor::full(&[features.shape()[0], 3], T::from_f64(0.5)))
     }
 }
@@ -248,27 +249,35 @@ impl<T: Scalar> Sampler<T> for Proposal {
             let bins = [level.samples, next.map_or(self.config.samples, |next| next.samples)];
             shares = self.resampled(&shares, weights.value().as_slice(), bins, next.is_some(), jitter);
             asked += samples.len() as u64;
-            levels.push(Level { edges, weights, segments: samples.segments });
+            levels.push(ProposalHistogram { edges, weights, segments: samples.segments });
         }
         let steps = self.steps(rays, &shares, self.config.samples, query).0;
         let unskipped = asked + steps.len() as u64;
-        Sampled { steps, coarse: vec![], levels, evaluations: Evaluations { density: asked, color: 0, unskipped } }
+        Sampled {
+            samples: steps,
+            coarse: vec![],
+            histograms: levels,
+            evaluations: Evaluations { density: asked, color: 0, unskipped },
+        }
     }
 
-    fn load(&self) -> Load {
-        Load::Rays { step: self.config.batch, tile: self.config.tile }
+    fn batch_size(&self) -> BatchSize {
+        BatchSize::Rays { step: self.config.batch, tile: self.config.tile }
     }
 
     fn boxed(&self) -> Box<dyn Sampler<T>> {
         Box::new(self.clone())
     }
 
-    fn termination(&self) -> f64 {
-        self.config.termination
+    fn early_stop_eps(&self) -> f64 {
+        self.config.early_stop_eps
     }
 
-    fn limits(&self) -> Limits {
-        Limits { termination: self.config.termination as f32, color_budget: self.config.termination as f32 }
+    fn tolerance(&self) -> RayTolerance {
+        RayTolerance {
+            early_stop_eps: self.config.early_stop_eps as f32,
+            color_budget: self.config.early_stop_eps as f32,
+        }
     }
 
     fn view_tile(&self) -> usize {
@@ -325,7 +334,7 @@ mod tests {
         let config = ProposalConfig { anneal: 100, spacing: Spacing::Disparity, ..ProposalConfig::default() };
         let mut sampler: Box<Proposal> = Box::new(Proposal { config, fields: vec![], trust: 0.0 });
         let mut at = |step: u64| {
-            let progress = Progress { step, fraction: 0.0, seed: 0 };
+            let progress = Progress { step, train_frac: 0.0, seed: 0 };
             Sampler::<f64>::update(&mut *sampler, &progress, &|_, _| {});
             sampler.trust
         };

@@ -15,7 +15,7 @@ use raygrad_autograd::{Pool, Scalar, Segments};
 ///
 /// # Panics
 /// If there is not one weight for each sample.
-pub fn importance<T: Scalar>(
+pub fn importance_sampling<T: Scalar>(
     rays: &Rays<T>,
     coarse: &Samples<T>,
     weights: &[T],
@@ -204,7 +204,7 @@ mod tests {
             let mut rng = Pcg64Mcg::seed_from_u64(seed);
             let coarse = stratified(&rays, 6, &mut Jitter::Random(&mut rng), &Pool::new());
             let weights: Vec<f64> = (0..12).map(|i| if i % 5 == 0 { 1.0 } else { 0.0 }).collect();
-            let fine = importance(&rays, &coarse, &weights, 9, 0.01, &mut Jitter::Random(&mut rng), &Pool::new());
+            let fine = importance_sampling(&rays, &coarse, &weights, 9, 0.01, &mut Jitter::Random(&mut rng), &Pool::new());
             for (ray, rows) in fine.segments.ranges().enumerate() {
                 let t = &fine.t.as_slice()[rows.clone()];
                 prop_assert!(t.windows(2).all(|pair| pair[0] <= pair[1]));

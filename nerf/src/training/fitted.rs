@@ -3,7 +3,7 @@
 use super::trainer::Trainer;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
-use crate::model::{Config, Model, POSES, RefineConfig};
+use crate::model::{CameraOptimizerConfig, Config, Model, POSES};
 use crate::{Error, Result};
 use raygrad_autograd::Tensor;
 use raygrad_nn::Schedule;
@@ -24,15 +24,15 @@ const RATE: Schedule = Schedule::Exponential { from: 2e-3, to: 2e-5, warmup: 0.0
 pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Camera>> {
     let config = Config {
         poses: Some(RATE),
-        refine: RefineConfig::default(),
-        terms: vec![],
+        camera_optimizer: CameraOptimizerConfig::default(),
+        loss_terms: vec![],
         groups: vec![],
-        near_gradients: 0.0,
+        gradient_scaling_distance: 0.0,
         ..model.config.clone()
     };
     let photographs = Arc::new(photographs);
     // No time is measured.
-    let mut trainer = Trainer::with_clock(config, photographs.clone(), model.extent, || Duration::ZERO)?;
+    let mut trainer = Trainer::with_clock(config, photographs.clone(), model.scene_box, || Duration::ZERO)?;
     let params = &mut trainer.model.params;
     let ids: Vec<_> = params.ids().filter(|id| params.name(*id) != POSES).collect();
     for id in ids {

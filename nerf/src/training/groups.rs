@@ -26,7 +26,7 @@ impl Groups {
         let mut groups = Groups { adam: Adam::new(config.adam), schedules: vec![config.schedule] };
         for group in &config.groups {
             let fits = |name: &str| name.starts_with(&group.params);
-            if groups.add(params, fits, group.adam, group.decay, group.schedule) == 0 {
+            if groups.add(params, fits, group.adam, group.weight_decay, group.schedule) == 0 {
                 let names: Vec<&str> = params.names().collect();
                 let what =
                     format!("no parameter begins so that is in no group before it; there are {}", names.join(", "));
@@ -83,7 +83,7 @@ impl Groups {
         self.adam.load_state(params, &state).map_err(failed)
     }
 
-    /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them, at `pace` times
+    /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them, at `lr_scale` times
     /// the rates of their schedules.
     pub fn update(
         &mut self,
@@ -92,7 +92,7 @@ impl Groups {
         fraction: f64,
         pace: f64,
     ) -> UpdateReport {
-        self.adam.update_groups(params, grads, |group| pace * self.schedules[group].rate(fraction))
+        self.adam.update_groups(params, grads, |group| pace * self.schedules[group].lr(fraction))
     }
 }
 
@@ -114,7 +114,7 @@ mod tests {
             params: params.into(),
             adam: AdamConfig::default(),
             schedule: Schedule::Constant { rate },
-            decay,
+            weight_decay: decay,
         };
         config.groups = vec![group("pose", 0.001, 0.0), group("field.color", 0.2, 0.5)];
         let mut params = Params::new();

@@ -1,13 +1,13 @@
 //! What a tile of a training step does: from rays to a loss, as ordinary graph code.
 
 use crate::dataset::batch::Batch;
-use crate::losses::Outputs;
+use crate::losses::LossInputs;
 use crate::losses::interlevel::interlevel;
 use crate::losses::photometric::Loss;
 use crate::model::Model;
 use crate::random::{Jitter, mixed};
 use crate::sampling::{Purpose, Sampled};
-use crate::volume::lit::Lit;
+use crate::volume::early_termination::VisibleSamples;
 use crate::volume::query::Query;
 use crate::volume::render::{Evaluations, Rendered};
 use raygrad_autograd::{Scalar, Var};
@@ -51,18 +51,22 @@ pub(crate) fn rays_loss<'t>(
     jitter: &mut Jitter<'_>,
 ) -> (Var<'t, f32>, Work) {
     let (tape, sampler) = (params.tape(), &*model.sampler);
-    let slopes = model.terms.iter().any(|term| term.reads_normals());
+    let slopes = model.terms.iter().any(|term| term.needs_normals());
     let seen = (&batch.frames[..], &batch.pixels[..]);
-    let moved =
-        model.refine.as_ref().map(|refine| refine.rays(params, &batch.rays, seen, model.reach(), model.extent.span));
+    let moved = model
+        .camera_optimizer
+        .as_ref()
+        .map(|refine| refine.rays(params, &batch.rays, seen, model.reach(), model.scene_box.near_far));
     let (vars, rays) = moved.as_ref().map_or((None, &batch.rays), |(vars, rays)| (Some(vars), rays));
-    let near = model.config.near_gradients * model.extent.unit;
+    let near = model.config.gradient_scaling_distance * model.scene_box.unit;
     let query = Query { frames: Some(&batch.frames), rays: vars, slopes, near, ..Query::new(&*model.field, params) };
     let rows = |values: &[[f32; 3]]| tape.pool().copy_of(&[values.len(), 3], values.as_flattened());
     let (target, background) = (rows(&batch.target), rows(&batch.background));
-    let Sampled { steps, coarse, levels, evaluations } = sampler.sample(&query, rays, Purpose::Training, jitter);
-    let Lit { rendered, asked, kept } = sampler.quadrature().render(&query, &steps, sampler.termination());
-    let gains = model.tone.as_ref().map(|tone| tone.gains(params, batch));
+    let Sampled { samples: steps, coarse, histograms: levels, evaluations } =
+        sampler.sample(&query, rays, Purpose::Training, jitter);
+    let VisibleSamples { rendered, density_queries: asked, visible: kept } =
+        sampler.quadrature().render(&query, &steps, sampler.early_stop_eps());
+    let gains = model.exposure.as_ref().map(|tone| tone.gains(params, batch));
     // As the photograph has it: what lies behind it is not of the scene.
     let shown = |seen: &Rendered<'t, f32>| match &gains {
         Some(gains) => seen.over(&background) + &seen.color * (gains - 1.0),
@@ -81,8 +85,19 @@ pub(crate) fn rays_loss<'t>(
     let (frames, pixels, distances) = (&batch.frames[..], &batch.pixels[..], &batch.distances[..]);
     let (rendered, target, background) = (&rendered, &target, &background);
     let seed = if model.terms.is_empty() { 0 } else { jitter.seed() };
-    let seen = Outputs { params, rays, frames, pixels, distances, seed, fraction, rendered, target, background };
-    let terms = (0..).zip(&model.terms).map(|(i, term)| term.loss(&Outputs { seed: mixed(seed, [i, 0]), ..seen }));
+    let seen = LossInputs {
+        params,
+        rays,
+        frames,
+        pixels,
+        distances,
+        seed,
+        train_frac: fraction,
+        rendered,
+        target,
+        background,
+    };
+    let terms = (0..).zip(&model.terms).map(|(i, term)| term.loss(&LossInputs { seed: mixed(seed, [i, 0]), ..seen }));
     let loss = coarse.chain(levels).chain(terms).fold(fine, |sum, term| term + sum);
     let left: f64 = tape.no_grad(|| rendered.transmittance().value().as_slice().iter().map(|x| x.to_f64()).sum());
     let work = Work {

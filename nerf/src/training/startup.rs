@@ -4,7 +4,7 @@ use crate::Result;
 use crate::camera::Camera;
 use crate::field::Field;
 use crate::model::config::Config;
-use crate::model::{Extent, Model};
+use crate::model::{Model, SceneBox};
 use crate::random::stream;
 use rand::RngExt;
 use raygrad_autograd::{Gradient, Tape, Tensor};
@@ -24,7 +24,7 @@ const COLLAPSES: u32 = 3;
 /// were passed over.
 pub(crate) fn living_model(
     config: &Config,
-    extent: Extent,
+    extent: SceneBox,
     cameras: &[Camera],
     seed: u64,
 ) -> Result<(Model<f32>, u32)> {
@@ -43,7 +43,7 @@ pub(crate) fn living_model(
 /// gradient.
 fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     let mut rng = stream(0, [0, 0]);
-    let [low, high] = model.extent.bounds.map(|corner| corner.to_array());
+    let [low, high] = model.scene_box.bounds.map(|corner| corner.to_array());
     let at = |i: usize, u: f64| (low[i % 3] + u * (high[i % 3] - low[i % 3])) as f32;
     let points = Tensor::from_fn(&[PROBES, 3], |i| at(i, rng.random()));
     let tape = Tape::new();

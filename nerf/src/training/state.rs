@@ -3,8 +3,8 @@
 use super::groups::Groups;
 use super::stats::StepStats;
 use super::trainer::Trainer;
-use crate::model::Extent;
 use crate::model::Model;
+use crate::model::SceneBox;
 use crate::model::config::Config;
 use crate::{Error, Result};
 use raygrad_nn::Storage;
@@ -22,7 +22,7 @@ const TRAINER: &str = "trainer";
 #[derive(Serialize, Deserialize)]
 struct Counts {
     config: Config,
-    extent: Extent,
+    extent: SceneBox,
     stats: StepStats,
     elapsed: Duration,
     /// Rays of the next step.
@@ -77,12 +77,12 @@ impl Trainer {
             name: params.name(id).to_owned(),
             frozen: params.is_frozen(id),
             lazy: params.is_lazy(id),
-            rate: params.rate(id),
-            decay: params.decay(id),
+            rate: params.lr_scale(id),
+            decay: params.weight_decay_scale(id),
         };
         let counts = Counts {
             config: self.model.config.clone(),
-            extent: self.model.extent,
+            extent: self.model.scene_box,
             stats: self.done,
             elapsed: self.elapsed,
             batch: self.batch,
@@ -142,8 +142,8 @@ impl Trainer {
                 model.params.unfreeze(is_own)
             };
             model.params.set_lazy(is_own, *lazy);
-            model.params.set_rate(is_own, *rate);
-            model.params.set_decay(is_own, *decay);
+            model.params.set_lr_scale(is_own, *rate);
+            model.params.set_weight_decay_scale(is_own, *decay);
         }
         let missing = || failed("lacks what an optimiser remembers");
         let remembered: Vec<Vec<u8>> =
@@ -159,7 +159,7 @@ impl Trainer {
 
 impl Model<f32> {
     /// This model as it was when a trainer wrote a [state](Trainer::state), ready to be rendered, with this one's
-    /// [`look`](Self::look) and what this one's views leave out: which is found out anew, as when a model is loaded.
+    /// [`appearance_image`](Self::appearance_image) and what this one's views leave out: which is found out anew, as when a model is loaded.
     ///
     /// ```no_run
     /// use raygrad_nerf::dataset::{Split, load};
@@ -192,7 +192,7 @@ impl Model<f32> {
             return Err(failed("holds a model, and not a run that can go on"));
         };
         let counts: Counts = serde_json::from_slice(&counts).map_err(failed)?;
-        if counts.config != self.config || counts.extent != self.extent {
+        if counts.config != self.config || counts.extent != self.scene_box {
             return Err(failed("is that of another configuration, or of other photographs"));
         }
         if !(0.0..=1.0).contains(&counts.detail) {
@@ -224,7 +224,7 @@ mod tests {
     fn counts_come_back_before_the_first_step_too() {
         let mut trainer = trainer();
         (trainer.collapses, trainer.done.restarts, trainer.batch) = (2, 3, 512);
-        trainer.set_pace(0.125);
+        trainer.set_lr_scale(0.125);
         trainer.elapsed = Duration::from_nanos(1_234_567_891);
         let state = trainer.state().unwrap();
         let mut later = self::trainer();

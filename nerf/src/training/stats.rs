@@ -63,11 +63,14 @@ pub struct StepStats {
     /// Rays so far.
     pub rays: u64,
     /// Samples placed on rays so far: without a grid all, with one those in occupied cells.
-    pub marched: u64,
+    #[serde(alias = "marched")]
+    pub placed_samples: u64,
     /// Evaluations of a density so far.
-    pub samples: u64,
+    #[serde(alias = "samples")]
+    pub density_queries: u64,
     /// Evaluations of a colour, and of all gradients, so far.
-    pub shaded: u64,
+    #[serde(alias = "shaded")]
+    pub color_queries: u64,
     /// Evaluations of each that there would have been so far if nothing in the box were skipped.
     pub unskipped: u64,
     /// Elements of parameters that were moved so far; of tables only rows that a sample looked up are.
@@ -84,12 +87,15 @@ pub struct StepStats {
     /// Share of the occupancy grid that is occupied; 1 without a grid.
     pub occupied: f64,
     /// The learning rate.
-    pub rate: f64,
+    #[serde(alias = "rate")]
+    pub lr: f64,
     /// Elements whose gradient was not finite, so far; they were left alone.
-    pub skipped: u64,
+    #[serde(alias = "skipped")]
+    pub non_finite: u64,
     /// Steps in a row, up to this one, that moved nothing because no gradient was finite: the run has diverged if they
     /// go on.
-    pub stuck: u64,
+    #[serde(alias = "stuck")]
+    pub non_finite_steps: u64,
     /// How often the start-up detector began again with another seed.
     pub restarts: u32,
 }
@@ -103,13 +109,13 @@ impl StepStats {
     /// Whether the run has diverged: for 100 steps in a row no gradient was finite, so that nothing moves any more. Its
     /// model is of no use.
     pub fn has_diverged(&self) -> bool {
-        self.stuck >= STUCK
+        self.non_finite_steps >= STUCK
     }
 
     /// Whether a run that ends here ends in numbers that are not finite: it [has diverged](Self::has_diverged), or would
     /// have, since no gradient of its second half was finite.
     pub fn ends_diverged(&self) -> bool {
-        self.has_diverged() || (self.stuck > 0 && 2 * self.stuck >= self.step)
+        self.has_diverged() || (self.non_finite_steps > 0 && 2 * self.non_finite_steps >= self.step)
     }
 }
 
@@ -120,18 +126,18 @@ impl Default for StepStats {
             step: 0,
             train_seconds: 0.0,
             rays: 0,
-            marched: 0,
-            samples: 0,
-            shaded: 0,
+            placed_samples: 0,
+            density_queries: 0,
+            color_queries: 0,
             unskipped: 0,
             moved: 0,
             loss: f64::NAN,
             psnr: f64::NAN,
             opacity: f64::NAN,
             occupied: 1.0,
-            rate: 0.0,
-            skipped: 0,
-            stuck: 0,
+            lr: 0.0,
+            non_finite: 0,
+            non_finite_steps: 0,
             restarts: 0,
         }
     }
@@ -157,7 +163,7 @@ mod tests {
 
     #[test]
     fn a_short_run_of_bad_numbers_ends_badly() {
-        let at = |step, stuck| StepStats { step, stuck, ..StepStats::default() };
+        let at = |step, stuck| StepStats { step, non_finite_steps: stuck, ..StepStats::default() };
         assert!(!at(0, 0).ends_diverged() && !at(50, 20).ends_diverged() && !at(5000, 99).ends_diverged());
         assert!(at(50, 25).ends_diverged() && at(1, 1).ends_diverged() && at(5000, 100).ends_diverged());
     }

@@ -6,12 +6,12 @@ use super::startup;
 use super::stats::{Budget, StepStats};
 use crate::camera::Camera;
 use crate::dataset::batch::Batch;
-use crate::dataset::{Dataset, Scope};
+use crate::dataset::{Dataset, SceneType};
+use crate::imaging::metrics::psnr_from_mse;
 use crate::model::config::Config;
-use crate::model::{Extent, Model, densities};
-use crate::pictures::metrics::psnr_from_mse;
+use crate::model::{Model, SceneBox, densities};
 use crate::random::{Jitter, stream};
-use crate::sampling::{Load, Progress};
+use crate::sampling::{BatchSize, Progress};
 use crate::{Error, Result};
 use raygrad_autograd::{Error as GraphError, Pool, Tape, Var};
 use raygrad_nn::{Bound, SLOTS, Tiles};
@@ -81,18 +81,18 @@ impl Trainer {
     /// If the configuration is out of range or not for a scene that [goes so far](Dataset::scope), the dataset has no frame, or no
     /// ray of it [meets the scene's box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
-        if data.scope.goes_on() && !config.unbounded {
+        if data.scope.is_unbounded() && !config.unbounded {
             let what = "is false, and the photographs show what lies beyond the scene's box; use `Config::with_scope` with \
                         the scope of the dataset";
             return Err(Error::setting("unbounded", what));
         }
-        let ndc = data.ndc.filter(|_| data.scope == Scope::Forward);
-        if data.scope == Scope::Forward && ndc.is_none() {
+        let ndc = data.ndc.filter(|_| data.scope == SceneType::ForwardFacing);
+        if data.scope == SceneType::ForwardFacing && ndc.is_none() {
             let what =
                 "forward needs what all photographs show, `Dataset::ndc`, which `Ndc::around` finds; use unbounded";
-            return Err(Error::setting("scope", what));
+            return Err(Error::setting("scene-type", what));
         }
-        let extent = Extent { placement: data.placement, ndc, ..Extent::new(data.bounds, [data.near, data.far]) };
+        let extent = SceneBox { transform: data.placement, ndc, ..SceneBox::new(data.bounds, [data.near, data.far]) };
         Trainer::with_extent(config, data, extent)
     }
 
@@ -101,7 +101,7 @@ impl Trainer {
     ///
     /// # Errors
     /// As [`new`](Self::new).
-    pub fn with_extent(config: Config, data: Arc<Dataset>, extent: Extent) -> Result<Self> {
+    pub fn with_extent(config: Config, data: Arc<Dataset>, extent: SceneBox) -> Result<Self> {
         let start = Instant::now();
         Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
@@ -113,24 +113,24 @@ impl Trainer {
     pub fn with_clock(
         config: Config,
         data: Arc<Dataset>,
-        extent: Extent,
+        extent: SceneBox,
         clock: impl Fn() -> Duration + Send + Sync + 'static,
     ) -> Result<Self> {
         if data.frames.is_empty() {
             return Err(Error::setting("dataset", "has no frames to train on"));
         }
-        let extent = Extent { frames: data.frames.len(), ..extent };
+        let extent = SceneBox { frames: data.frames.len(), ..extent };
         let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
         let (model, restarts) = startup::living_model(&config, extent, &cameras, config.seed)?;
         data.check_reach(model.reach())?;
-        data.check_distances(model.terms.iter().any(|term| term.reads_distances()))?;
+        data.check_distances(model.terms.iter().any(|term| term.needs_distances()))?;
         let mut trainer = Trainer {
             groups: Groups::new(&model.config, &model.params)?,
             tiles: Tiles::new(),
             pool: Pool::new(),
-            batch: match model.sampler.load() {
-                Load::Rays { step, .. } => step,
-                Load::Samples(_) => RAYS[0],
+            batch: match model.sampler.batch_size() {
+                BatchSize::Rays { step, .. } => step,
+                BatchSize::Samples(_) => RAYS[0],
             },
             model,
             data,
@@ -148,7 +148,7 @@ impl Trainer {
     fn prepare(&mut self) {
         let start = (self.clock)();
         // Not from cameras that are to be corrected: what is carved away never comes back.
-        if self.model.refine.is_none() {
+        if self.model.camera_optimizer.is_none() {
             self.model.sampler.prepare(&self.data);
         }
         self.count_occupied();
@@ -194,11 +194,11 @@ impl Trainer {
     /// One training step; `fraction` says how much of the run is done, for the schedule.
     pub fn step(&mut self, fraction: f64) -> StepStats {
         let start = (self.clock)();
-        if self.model.config.refine.coarse > 0.0 {
-            self.model.set_detail(self.model.config.refine.detail(fraction));
+        if self.model.config.camera_optimizer.coarse > 0.0 {
+            self.model.set_detail(self.model.config.camera_optimizer.detail(fraction));
         }
         // Of a model that began again, from its own beginning.
-        self.update_sampler(&Progress { step: self.groups.steps() + 1, fraction, seed: self.seed() });
+        self.update_sampler(&Progress { step: self.groups.steps() + 1, train_frac: fraction, seed: self.seed() });
         let mut tiles = std::mem::take(&mut self.tiles);
         let draw = self.draw(fraction);
         let number = draw.number;
@@ -217,19 +217,23 @@ impl Trainer {
             step: number,
             train_seconds: self.elapsed.as_secs_f64(),
             rays: self.done.rays + self.batch as u64,
-            marched: self.done.marched + work.marched,
-            samples: self.done.samples + work.evaluations.density,
-            shaded: self.done.shaded + work.evaluations.color,
+            placed_samples: self.done.placed_samples + work.marched,
+            density_queries: self.done.density_queries + work.evaluations.density,
+            color_queries: self.done.color_queries + work.evaluations.color,
             unskipped: self.done.unskipped + work.evaluations.unskipped,
             moved: self.done.moved + report.moved as u64,
             loss: work.loss / values,
             psnr: psnr_from_mse(work.error / values),
             opacity: work.opacity / self.batch as f64,
             occupied: self.done.occupied,
-            rate: self.pace * self.model.config.schedule.rate(fraction),
-            skipped: self.done.skipped + report.skipped as u64,
+            lr: self.pace * self.model.config.schedule.lr(fraction),
+            non_finite: self.done.non_finite + report.skipped as u64,
             // A network may turn NaN into gradients of 0, with which parameters do move.
-            stuck: if report.is_stuck() || !work.loss.is_finite() { self.done.stuck + 1 } else { 0 },
+            non_finite_steps: if report.has_only_non_finite() || !work.loss.is_finite() {
+                self.done.non_finite_steps + 1
+            } else {
+                0
+            },
             restarts: self.done.restarts,
         };
         self.adapt_batch(&work);
@@ -247,24 +251,24 @@ impl Trainer {
     /// The rays of the next step.
     fn draw(&self, fraction: f64) -> Draw<'_> {
         let (number, total) = (self.done.step + 1, self.batch);
-        let tile = match self.model.sampler.load() {
-            Load::Rays { tile, .. } => tile,
+        let tile = match self.model.sampler.batch_size() {
+            BatchSize::Rays { tile, .. } => tile,
             // With more, smaller tiles, recording them would cost a two-core machine an eighth of its time.
-            Load::Samples(_) => total.div_ceil(SLOTS),
+            BatchSize::Samples(_) => total.div_ceil(SLOTS),
         };
         Draw { model: &self.model, data: &self.data, seed: self.seed(), number, fraction, total, tile }
     }
 
     /// What the learning rates of all schedules are multiplied by; 1 at first.
-    pub fn pace(&self) -> f64 {
+    pub fn lr_scale(&self) -> f64 {
         self.pace
     }
 
-    /// Multiplies the learning rates of all schedules by `pace`, from the next step on; part of the [state](Self::state).
+    /// Multiplies the learning rates of all schedules by `lr_scale`, from the next step on; part of the [state](Self::state).
     ///
     /// # Panics
     /// If it is negative or not finite.
-    pub fn set_pace(&mut self, pace: f64) {
+    pub fn set_lr_scale(&mut self, pace: f64) {
         assert!(pace >= 0.0 && pace.is_finite(), "rates times {pace}");
         self.pace = pace;
     }
@@ -292,7 +296,7 @@ impl Trainer {
 
     /// Chooses the number of rays so that the next step has as many samples as it should.
     fn adapt_batch(&mut self, work: &Work) {
-        if let Load::Samples(samples) = self.model.sampler.load() {
+        if let BatchSize::Samples(samples) = self.model.sampler.batch_size() {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
             let rays = samples as f64 / each;
             // Not at once: the number of samples a ray is noisy.
@@ -313,7 +317,7 @@ impl Trainer {
     fn restart(&mut self) {
         self.done.restarts += 1;
         self.collapses += 1;
-        let Model { config, extent, .. } = &self.model;
+        let Model { config, scene_box: extent, .. } = &self.model;
         if let Ok((mut model, _)) = startup::living_model(config, *extent, self.model.cameras(), self.seed()) {
             // What was loaded and frozen is not thrown away, and rates are not forgotten.
             model.params.inherit(&self.model.params);

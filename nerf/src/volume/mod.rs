@@ -25,7 +25,7 @@
 pub(crate) mod accumulate;
 pub(crate) mod depth;
 pub(crate) mod distortion;
-pub(crate) mod lit;
+pub(crate) mod early_termination;
 pub mod quadrature;
 pub(crate) mod query;
 pub(crate) mod render;
@@ -37,7 +37,7 @@ pub(crate) mod weights;
 pub use accumulate::Accumulate;
 pub use depth::OpticalDepth;
 pub use distortion::Distortion;
-pub use lit::Lit;
+pub use early_termination::VisibleSamples;
 pub use query::{Query, RayVars};
-pub use render::{Evaluations, Rendered, Weighted, accumulate, weights};
+pub use render::{Evaluations, RayWeights, Rendered, accumulate, weights};
 pub use weights::Weights;

@@ -1,7 +1,7 @@
 //! Asking a field at samples along rays.
 
 use crate::camera::rays::Samples;
-use crate::field::{Density, Field, Seen};
+use crate::field::{Density, Field, ViewInputs};
 use raygrad_autograd::{Scalar, Tape, Tensor, Var};
 use raygrad_nn::Bound;
 
@@ -28,7 +28,7 @@ pub struct Query<'a, 't, T: Scalar> {
     /// Whether positions are variables of the tape although rays are not: what normals need.
     pub slopes: bool,
     /// The distance within which samples learn less, by the square of theirs, in scene units; 0 for none. See
-    /// [`Config::near_gradients`](crate::Config::near_gradients).
+    /// [`Config::gradient_scaling_distance`](crate::Config::gradient_scaling_distance).
     pub near: f64,
 }
 
@@ -99,7 +99,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     #[track_caller]
     pub fn color(&self, features: &Var<'t, T>, samples: &Samples<T>) -> Var<'t, T> {
         let directions = &self.directions(samples);
-        let seen = Seen { directions, segments: &samples.segments, frames: self.frames };
+        let seen = ViewInputs { directions, segments: &samples.segments, frames: self.frames };
         let color = self.field.color(self.params, features, &seen);
         match self.less(samples) {
             Some(shares) => with_slopes(color, &shares.reshape(&[samples.len(), 1])),
@@ -134,7 +134,12 @@ mod tests {
             let value = params.vars()[0].broadcast_to(&[positions.shape()[0]]);
             Density { value, log: false, features: positions.clone() }
         }
-        fn color<'t>(&self, params: &Bound<'t, f64>, features: &Var<'t, f64>, _: &Seen<'_, 't, f64>) -> Var<'t, f64> {
+        fn color<'t>(
+            &self,
+            params: &Bound<'t, f64>,
+            features: &Var<'t, f64>,
+            _: &ViewInputs<'_, 't, f64>,
+        ) -> Var<'t, f64> {
             params.vars()[0].broadcast_to(&[features.shape()[0], 3])
         }
     }

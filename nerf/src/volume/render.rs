@@ -62,7 +62,7 @@ pub fn accumulate<'t, T: Scalar>(weights: &Var<'t, T>, values: &Var<'t, T>, segm
 }
 
 /// How samples are weighted.
-pub struct Weighted<'t, T: Scalar> {
+pub struct RayWeights<'t, T: Scalar> {
     /// The weight of each sample, `[samples]`.
     pub weights: Var<'t, T>,
     /// The optical depth of each ray, `[rays]`.
@@ -138,7 +138,7 @@ impl<'t, T: Scalar> Rendered<'t, T> {
     /// # Panics
     /// As [`normals`](Self::normals), or if the density does not depend on positions.
     #[track_caller]
-    pub fn normals_seen(&self) -> Tensor<T> {
+    pub fn accumulated_normals(&self) -> Tensor<T> {
         let slopes = self.density.value.sum().grad(&[&self.positions]).remove(0);
         let tape = self.weights.tape();
         tape.no_grad(|| self.accumulate(&downhill(&tape.constant(slopes))).into_value())

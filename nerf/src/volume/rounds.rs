@@ -41,7 +41,7 @@ pub(crate) struct Round<'t, T: Scalar> {
 }
 
 impl<'a, T: Scalar> FrontToBack<'a, T> {
-    /// Follows rays until no more than `termination` of their light is left.
+    /// Follows rays until no more than `early_stop_eps` of their light is left.
     pub fn new(samples: &'a Samples<T>, termination: f64) -> Self {
         // Without a termination rays end where f64 has no light left.
         let opaque = -termination.max(5e-324).ln();
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
     use crate::camera::pinhole::Ray;
     use crate::camera::rays::{Rays, stratified};
-    use crate::field::{Field, Seen};
+    use crate::field::{Field, ViewInputs};
     use crate::random::Jitter;
     use glam::DVec3;
     use raygrad_autograd::{Tape, Tensor};
@@ -112,7 +112,7 @@ mod tests {
             let value = Tensor::from_fn(&[x.len() / 3], |i| if x[3 * i] > 0.0 { 1.0 } else { 0.0 });
             Density { value: positions.tape().constant(value), log: false, features: positions.clone() }
         }
-        fn color<'t>(&self, _: &Bound<'t, f64>, features: &Var<'t, f64>, _: &Seen<'_, 't, f64>) -> Var<'t, f64> {
+        fn color<'t>(&self, _: &Bound<'t, f64>, features: &Var<'t, f64>, _: &ViewInputs<'_, 't, f64>) -> Var<'t, f64> {
             features.clone()
         }
     }

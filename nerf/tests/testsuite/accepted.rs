@@ -2,7 +2,7 @@
 
 use proptest::prelude::*;
 use raygrad_nerf::dataset::formats::{blender, colmap, llff, transforms};
-use raygrad_nerf::dataset::{Capture, Format, Image, Point, Reading, Split, Survey, View};
+use raygrad_nerf::dataset::{Capture, Format, Image, LoadOptions, Point, SceneAnalysis, Split, View};
 use raygrad_nerf::encoding::hash_grid::HashGridConfig;
 use raygrad_nerf::glam::DVec3;
 use raygrad_nerf::sampling::marching::MarchingConfig;
@@ -113,16 +113,16 @@ impl Outcome {
 }
 
 /// Where the cameras and points of a capture are, and where its scene lies.
-fn read(folder: &Path) -> Result<(Capture, Survey)> {
+fn read(folder: &Path) -> Result<(Capture, SceneAnalysis)> {
     let capture = Capture::read(folder)?;
-    let survey = capture.survey(None)?;
+    let survey = capture.analyze_scene(None)?;
     Ok((capture, survey))
 }
 
 /// Trains one step on what was read, and renders a view.
-fn used((capture, survey): &(Capture, Survey)) -> Result<Outcome> {
-    let data = capture.load(Split::Train, survey, &Reading::default())?;
-    let mut config = tiny().with_scope(data.scope);
+fn used((capture, survey): &(Capture, SceneAnalysis)) -> Result<Outcome> {
+    let data = capture.load(Split::Train, survey, &LoadOptions::default())?;
+    let mut config = tiny().with_scene_type(data.scope);
     let sampler = config.sampler.get_mut::<MarchingConfig>().unwrap();
     (sampler.samples, sampler.occupancy.resolution) = (256, 16);
     // Long steps: how many samples a ray has proves nothing here.
@@ -130,7 +130,7 @@ fn used((capture, survey): &(Capture, Survey)) -> Result<Outcome> {
     let camera = data.frames[0].camera.clone();
     let mut trainer = Trainer::new(config, Arc::new(data))?;
     let loss = trainer.step(0.0).loss;
-    Ok(Outcome { loss, view: trainer.model.view(&camera, [1.0; 3]).color, size: [camera.width, camera.height] })
+    Ok(Outcome { loss, view: trainer.model.render(&camera, [1.0; 3]).color, size: [camera.width, camera.height] })
 }
 
 /// Damage that leaves a file a file, as often as not: digits for digits, and other bytes.

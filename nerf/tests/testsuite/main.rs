@@ -2,4 +2,4 @@
 
 mod accepted;
 mod lenses;
-mod rooms;
+mod modules;

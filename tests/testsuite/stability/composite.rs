@@ -3,7 +3,7 @@
 use super::support::*;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::camera::stratified;
-use raygrad::nerf::sampling::steps::importance;
+use raygrad::nerf::sampling::steps::importance_sampling;
 use raygrad::nerf::volume::{OpticalDepth, Weights};
 use raygrad::{Op, Pool, Real, Scalar, Segments, Tape, Tensor, Var};
 
@@ -138,7 +138,7 @@ fn no_interval_is_longer_than_the_ray<T: Scalar>() {
     let pool = Pool::new();
     let coarse = stratified(&rays, 16, &mut Jitter::Middle, &pool);
     let weights = vec![T::ONE; 16];
-    let fine = importance(&rays, &coarse, &weights, 32, 0.01, &mut Jitter::Middle, &pool);
+    let fine = importance_sampling(&rays, &coarse, &weights, 32, 0.01, &mut Jitter::Middle, &pool);
     for samples in [coarse, fine] {
         let n = samples.len();
         within("intervals", numbers(&samples.delta).iter().sum(), 4.0, 1e-5);

@@ -2,13 +2,13 @@
 
 use proptest::prelude::*;
 use rawzip::{CompressionMethod, ZipArchiveWriter};
-use raygrad::nerf::dataset::{Capture, Photo, Reading, Split, load};
+use raygrad::nerf::dataset::{Capture, LoadOptions, Photo, Split, load};
 use raygrad::nerf::encoding::hash_grid::HashGridConfig;
 use raygrad::nerf::glam::DVec3;
-use raygrad::nerf::pictures::lpips::Lpips;
+use raygrad::nerf::imaging::lpips::Lpips;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{OccupancyConfig, OccupancyGrid, Skip};
-use raygrad::nerf::{Background, ClassicConfig, Config, Error, Extent, Image, InstantConfig, Model, Preset, Trainer};
+use raygrad::nerf::{Background, ClassicConfig, Config, Error, Image, InstantConfig, Model, Preset, SceneBox, Trainer};
 use raygrad::{OptimizerState, Params, Scalar, Storage, Tensor};
 use raygrad_scenes::embedded;
 use raygrad_test_support::campaign::campaign;
@@ -48,8 +48,8 @@ fn config() -> Config {
     config
 }
 
-fn extent() -> Extent {
-    Extent { unit: 1.0, ..Extent::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]) }
+fn extent() -> SceneBox {
+    SceneBox { unit: 1.0, ..SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]) }
 }
 
 fn params<T: Scalar>() -> Params<T> {
@@ -92,7 +92,7 @@ proptest! {
         let text = scene(folder.path());
         std::fs::write(folder.path().join("transforms_train.json"), damaged(&text, &text, &damage)).unwrap();
         let read = Capture::read(folder.path()).and_then(|capture| {
-            capture.load(Split::Train, &capture.survey(None)?, &Reading { downscale, views, ..Reading::default() })
+            capture.load(Split::Train, &capture.analyze_scene(None)?, &LoadOptions { downscale, views, ..LoadOptions::default() })
         });
         match read {
             Ok(data) => {
@@ -251,13 +251,13 @@ fn models_that_no_memory_holds_are_refused() {
 #[test]
 fn extents_are_checked() {
     for bad in [f64::NAN, f64::INFINITY, 2.0] {
-        let extent = Extent::new([DVec3::splat(bad), DVec3::ONE], [2.0, 6.0]);
+        let extent = SceneBox::new([DVec3::splat(bad), DVec3::ONE], [2.0, 6.0]);
         clear(Model::<f32>::new(config(), extent, 0).err().expect("an error"), "bounds");
     }
     let mut codes = config();
-    codes.field.get_mut::<InstantConfig>().unwrap().codes = 8;
+    codes.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 8;
     for frames in [(1 << 20) + 1, 1 << 61, usize::MAX] {
-        let error = Model::<f32>::new(codes.clone(), Extent { frames, ..extent() }, 0).err().expect("an error");
+        let error = Model::<f32>::new(codes.clone(), SceneBox { frames, ..extent() }, 0).err().expect("an error");
         clear(error, "extent.frames");
     }
 }
@@ -282,8 +282,8 @@ fn campaign_masks_and_depths() {
     let [mask, depth] = ["mask.png", "depth.png"].map(|name| folder.path().join(name));
     let load = || {
         let capture = said(Capture::read(folder.path()))?;
-        let reading = Reading { distances: true, ..Reading::default() };
-        let data = said(capture.load(Split::Train, &said(capture.survey(None))?, &reading))?;
+        let reading = LoadOptions { distances: true, ..LoadOptions::default() };
+        let data = said(capture.load(Split::Train, &said(capture.analyze_scene(None))?, &reading))?;
         let distances = data.frames.iter().filter_map(|frame| frame.distances.as_ref());
         assert!(distances.flat_map(|image| &image.data).all(|x| *x >= 0.0 && x.is_finite()));
         Ok(())

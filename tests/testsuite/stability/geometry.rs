@@ -2,7 +2,7 @@
 
 use super::support::*;
 use raygrad::nerf::glam::{DMat3, DVec3};
-use raygrad::nerf::{Lens, Ndc, Ray, Space, clip_span, contract, intersect_box};
+use raygrad::nerf::{Lens, Ndc, Ray, Space, clip_near_far, contract, intersect_box};
 use raygrad::{Scalar, Tape};
 
 const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
@@ -43,7 +43,7 @@ fn rays_along_the_axes_of_a_box<T: Scalar>() {
         let [a, b, c, d, e, f] = numbers;
         let ray = ray::<T>([a, b, c], [d, e, f]);
         assert_eq!(intersect_box(&ray, UNIT), None, "NaN at {k}");
-        assert_eq!(clip_span(&ray, UNIT, [2.0, 6.0]), [2.0, 2.0]);
+        assert_eq!(clip_near_far(&ray, UNIT, [2.0, 6.0]), [2.0, 2.0]);
     }
 }
 

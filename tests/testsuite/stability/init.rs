@@ -3,7 +3,7 @@
 use super::support::noise;
 use raygrad::nerf::InstantConfig;
 use raygrad::nerf::dataset::Split;
-use raygrad::nerf::{Config, Extent, Field, Model, Preset, Trainer};
+use raygrad::nerf::{Config, Field, Model, Preset, SceneBox, Trainer};
 use raygrad::{Tape, Tensor};
 use raygrad_scenes::embedded;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 fn alive_share(model: &Model<f32>) -> f64 {
     let points = 256;
     let mut random = noise(1);
-    let [low, high] = model.extent.bounds.map(|corner| corner.to_array());
+    let [low, high] = model.scene_box.bounds.map(|corner| corner.to_array());
     let points = Tensor::from_fn(&[points, 3], |i| (low[i % 3] + random() * (high[i % 3] - low[i % 3])) as f32);
     let share = |field: &dyn Field<f32>| {
         let tape = Tape::new();
@@ -32,7 +32,7 @@ fn alive_share(model: &Model<f32>) -> f64 {
 #[test]
 fn a_hundred_seeds_of_every_preset_are_alive() {
     let data = embedded(Split::Val, 8);
-    let extent = Extent::new(data.bounds, [data.near, data.far]);
+    let extent = SceneBox::new(data.bounds, [data.near, data.far]);
     for preset in [Preset::Small, Preset::Classic, Preset::Instant] {
         let mut least = 1.0_f64;
         // The paper's network is large: fewer of them take as long.

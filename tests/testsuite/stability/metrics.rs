@@ -2,7 +2,7 @@
 
 use super::support::*;
 use raygrad::nerf::Image;
-use raygrad::nerf::pictures::metrics::{mse, psnr, psnr_from_mse, ssim};
+use raygrad::nerf::imaging::metrics::{mse, psnr, psnr_from_mse, ssim};
 
 fn image(size: usize, mut f: impl FnMut(usize) -> f32) -> Image {
     Image { width: size, height: size, channels: 3, data: (0..3 * size * size).map(&mut f).collect() }

@@ -3,7 +3,7 @@
 use super::support::*;
 use raygrad::{Adam, AdamConfig, AdamW, Gradient, Optimizer, Params, Scalar, Sgd, SgdConfig, Tensor};
 
-const TABLE: AdamConfig = AdamConfig { beta1: 0.9, beta2: 0.99, epsilon: 1e-15 };
+const TABLE: AdamConfig = AdamConfig { beta1: 0.9, beta2: 0.99, eps: 1e-15 };
 
 /// The most that a step can be, in learning rates: by Cauchy and Schwarz, `m^2 <= v sum (1-b1)^2 b1^2k / ((1-b2) b2^k)`.
 ///
@@ -66,13 +66,14 @@ fn first_steps<T: Scalar>() {
         for (g, way) in gradients.iter().zip(&way) {
             // The textbook's first step is lr g / (|g| + epsilon).
             let g = round::<T>(*g);
-            let expected = if g == 0.0 { 0.0 } else { -0.5 * g / (g.abs() + config.epsilon) };
+            let expected = if g == 0.0 { 0.0 } else { -0.5 * g / (g.abs() + config.eps) };
             let tiny = if g.abs() < 1e-25 { 1e-9 } else { 0.0 };
             within(&format!("g {g:e}"), *way, expected, by_type::<T>(1e-6, 1e-12) * expected.abs() + tiny);
             assert!(way.abs() <= 0.5 * bound(&config) * (1.0 + 1e-6), "{g:e}: {way:e}");
         }
     }
-    let first = |epsilon: f64| ways::<T>(AdamConfig { epsilon, ..AdamConfig::default() }, &[vec![1e-10]], 1.0)[0][0];
+    let first =
+        |epsilon: f64| ways::<T>(AdamConfig { eps: epsilon, ..AdamConfig::default() }, &[vec![1e-10]], 1.0)[0][0];
     for epsilon in ["1e-8", "1e-15"] {
         let expected = constant(&format!("Adam's first step / lr for a gradient of 1e-10 and epsilon {epsilon}"));
         near::<T>(epsilon, -first(epsilon.parse().unwrap()), expected, by_type::<T>(2e-6, 1e-12));
@@ -83,7 +84,7 @@ fn first_steps<T: Scalar>() {
 fn no_step_is_longer_than_the_bound<T: Scalar>() {
     let sizes =
         [1e-38, 1e-30, 1e-20, 3e-16, 1e-15, 3e-15, 1e-14, 1e-12, 1e-8, 1e-4, 1.0, 1e8, 1e18, 1e19, 1e20, 1e30, 1e38];
-    for config in [AdamConfig::default(), TABLE, AdamConfig { epsilon: 1e-15, ..AdamConfig::default() }] {
+    for config in [AdamConfig::default(), TABLE, AdamConfig { eps: 1e-15, ..AdamConfig::default() }] {
         let bound = bound(&config) * (1.0 + 1e-5);
         let mut random = noise(17);
         let n = sizes.len();
@@ -95,7 +96,7 @@ fn no_step_is_longer_than_the_bound<T: Scalar>() {
         let gradients: Vec<_> = (0..300).map(pattern).collect();
         for (step, way) in ways::<T>(config, &gradients, 1.0).iter().enumerate() {
             for (way, size) in way.iter().zip(sizes) {
-                assert!(way.abs() <= bound, "step {step}, |g| {size:e}, epsilon {:e}: {way:e}", config.epsilon);
+                assert!(way.abs() <= bound, "step {step}, |g| {size:e}, epsilon {:e}: {way:e}", config.eps);
             }
         }
         // Sizes that follow each other.
@@ -111,7 +112,7 @@ fn growing_gradients_reach_the_bound<T: Scalar>() {
         let growth = config.beta2 / config.beta1;
         let warm = (0..4000).map(|_| vec![1e-10]);
         let gradients: Vec<_> = warm.chain((0..160).map(|k| vec![1e-10 * growth.powi(k)])).collect();
-        let config = AdamConfig { epsilon: 1e-20, ..config };
+        let config = AdamConfig { eps: 1e-20, ..config };
         let most = ways::<T>(config, &gradients, 1.0).iter().map(|way| way[0].abs()).fold(0.0, raygrad::Real::maximum);
         let customary = constant(&format!("bound of Adam's step / lr for the {name} betas"));
         let expected = constant(&format!("bound of Adam's step / lr for the {name} betas, by Cauchy and Schwarz"));
@@ -215,7 +216,7 @@ fn lazy_adam_with_pauses<T: Scalar>() {
                     (m, v) =
                         (config.beta1 * m + (1.0 - config.beta1) * g, config.beta2 * v + (1.0 - config.beta2) * g * g);
                     let (m, v) = (m / (1.0 - config.beta1.powi(t)), v / (1.0 - config.beta2.powi(t)));
-                    x -= 0.01 * m / (v.sqrt() + config.epsilon);
+                    x -= 0.01 * m / (v.sqrt() + config.eps);
                 }
                 assert_eq!(self::step(&mut adam, &mut table, grad, 0.01), 0);
                 within(

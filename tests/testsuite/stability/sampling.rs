@@ -3,7 +3,7 @@
 use super::support::*;
 use raygrad::nerf::Jitter;
 use raygrad::nerf::camera::stratified;
-use raygrad::nerf::sampling::steps::{even_edges, importance, invert_cdf};
+use raygrad::nerf::sampling::steps::{even_edges, importance_sampling, invert_cdf};
 use raygrad::{Pool, Scalar};
 
 fn inverted<T: Scalar>(weights: &[f64], share: f64, u: &[f64]) -> Vec<f64> {
@@ -63,7 +63,7 @@ fn ends_and_ties<T: Scalar>() {
     // A span of no length: every bin edge is the same.
     let rays = ray_along_z::<T>(0.0, [2.0, 2.0]);
     let coarse = stratified(&rays, 8, &mut Jitter::Middle, &Pool::new());
-    let fine = importance(&rays, &coarse, &[T::ONE; 8], 8, 0.01, &mut Jitter::Middle, &Pool::new());
+    let fine = importance_sampling(&rays, &coarse, &[T::ONE; 8], 8, 0.01, &mut Jitter::Middle, &Pool::new());
     assert!(numbers(&fine.t).iter().all(|&t| t == 2.0) && numbers(&fine.delta).iter().all(|&d| d == 0.0));
 }
 
@@ -94,7 +94,7 @@ fn a_ray_with_bad_weights_is_sampled_evenly<T: Scalar>() {
     let coarse = stratified(&rays, 4, &mut Jitter::Middle, &Pool::new());
     let mut weights = [T::ZERO; 8];
     (weights[1], weights[5]) = (T::from_f64(f64::NAN), T::ONE);
-    let fine = importance(&rays, &coarse, &weights, 4, 0.0, &mut Jitter::Middle, &Pool::new());
+    let fine = importance_sampling(&rays, &coarse, &weights, 4, 0.0, &mut Jitter::Middle, &Pool::new());
     let t = numbers(&fine.t);
     assert_eq!(t[..8], [2.5, 2.5, 3.5, 3.5, 4.5, 4.5, 5.5, 5.5]);
     assert!(t[8..].iter().filter(|t| (3.0..=4.0).contains(*t)).count() == 5, "{t:?}");

@@ -5,9 +5,9 @@ use raygrad::nerf::Jitter;
 use raygrad::nerf::glam::DVec3;
 use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::{MarchBuffer, OccupancyConfig, OccupancyGrid, Skip, Step, Threshold, Update};
-use raygrad::nerf::volume::Lit;
+use raygrad::nerf::volume::VisibleSamples;
 use raygrad::nerf::volume::quadrature::Quadrature;
-use raygrad::nerf::{Camera, Config, Density, Extent, Field, Model, Preset, Query, Samples, Seen, VoxelConfig};
+use raygrad::nerf::{Camera, Config, Density, Field, Model, Preset, Query, Samples, SceneBox, ViewInputs, VoxelConfig};
 use raygrad::{Bound, Params, Scalar, Segments, Tape, Tensor, Var};
 use std::sync::Arc;
 
@@ -22,7 +22,7 @@ impl<T: Scalar> Field<T> for Fog {
         let sigma = Tensor::full(&[positions.shape()[0]], T::from_f64(self.sigma));
         Density { value: positions.tape().constant(sigma), log: false, features: positions.clone() }
     }
-    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &Seen<'_, 't, T>) -> Var<'t, T> {
+    fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         let z = features.slice_axis(1, 2..3);
         let white = z.gt(if self.white_behind { 0.0 } else { -5.0 });
         z.tape().constant(white.cast()).broadcast_to(&[features.shape()[0], 3])
@@ -45,10 +45,14 @@ fn training_ends_rays_within_the_bound<T: Scalar>() {
             let fog = Fog { sigma: 1.0, white_behind };
             let query = Query::new(&fog, &params);
             let [all, some] = [0.0, eps].map(|least| Quadrature::Midpoint.render(&query, &samples, least));
-            assert_eq!(all.kept, n);
-            assert!(some.kept <= n && (eps == 0.0 || some.kept.abs_diff(steps) <= 1), "{eps}: {} kept", some.kept);
+            assert_eq!(all.visible, n);
+            assert!(
+                some.visible <= n && (eps == 0.0 || some.visible.abs_diff(steps) <= 1),
+                "{eps}: {} kept",
+                some.visible
+            );
             for background in [0.0, 1.0] {
-                let pixel = |seen: &Lit<'_, T>| {
+                let pixel = |seen: &VisibleSamples<'_, T>| {
                     let [color, left] =
                         [&seen.rendered.color, &seen.rendered.transmittance()].map(|x| numbers(x.value()));
                     color[0] + background * left[0]
@@ -75,7 +79,7 @@ fn fog_model(fog: Fog, skip: Skip) -> (Model<f32>, Camera) {
         sampler.occupancy.skip = skip.into();
         sampler.step = 1.0 / 128.0;
     }
-    let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
+    let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
     if let Some(voxel) = config.field.get_mut::<VoxelConfig>() {
         voxel.resolution = 4;
     }
@@ -89,14 +93,14 @@ fn fog_model(fog: Fog, skip: Skip) -> (Model<f32>, Camera) {
 #[test]
 fn rendering_ends_rays_within_the_bound() {
     // What each level may leave out: light that is left, and colours of small weights.
-    for (skip, bound) in [(Skip::Lossless, 1e-4 + 1e-4), (Skip::Fast, 1e-3 + 2e-3)] {
+    for (skip, bound) in [(Skip::NearLossless, 1e-4 + 1e-4), (Skip::Fast, 1e-3 + 2e-3)] {
         for sigma in [0.05, 1.0, 4.0, 6.9, 30.0, 1e3, 1e30] {
             for white_behind in [false, true] {
                 for background in [0.0, 1.0] {
                     let view = |skip| {
                         let (mut model, camera) = fog_model(Fog { sigma, white_behind }, skip);
                         model.finish();
-                        model.view(&camera, [background; 3])
+                        model.render(&camera, [background; 3])
                     };
                     let (whole, part) = (view(Skip::Off), view(skip));
                     for (a, b) in whole.color.data.iter().zip(&part.color.data) {
@@ -114,10 +118,10 @@ fn rendering_ends_rays_within_the_bound() {
 /// The light that would have gone on stays with what is in front: a white body over black is white, not 1 - 1e-3.
 #[test]
 fn a_ray_that_ends_early_has_the_whole_colour() {
-    for skip in [Skip::Lossless, Skip::Fast] {
+    for skip in [Skip::NearLossless, Skip::Fast] {
         let (mut model, camera) = fog_model(Fog { sigma: 10.0, white_behind: false }, skip);
         model.finish();
-        let view = model.view(&camera, [0.0; 3]);
+        let view = model.render(&camera, [0.0; 3]);
         let brightest = view.color.data.iter().fold(0.0_f32, |a, &b| a.max(b));
         within("brightest", brightest.into(), 1.0, 1e-6);
     }
@@ -128,7 +132,7 @@ fn a_ray_that_ends_early_has_the_whole_colour() {
 fn the_depth_of_nothing_is_zero() {
     for sigma in [0.0, 1e-30, 1e-6] {
         let (model, camera) = fog_model(Fog { sigma, white_behind: true }, Skip::Off);
-        let picture = model.view(&camera, [1.0; 3]);
+        let picture = model.render(&camera, [1.0; 3]);
         assert!(picture.depth.data.iter().all(|&d| d == 0.0), "density {sigma}");
         assert!(picture.color.data.iter().all(|c| (c - 1.0).abs() < 1e-5));
     }
@@ -148,7 +152,7 @@ fn a_fog_just_below_the_usual_threshold_stays() {
         grid.threshold(&Threshold { min_sigma: 0.01 / step as f32, or_mean: true, dilate: false });
         assert_eq!(grid.occupied_share(), 1.0, "in training, step {training_step}");
     }
-    for skip in [Skip::Lossless, Skip::Fast] {
+    for skip in [Skip::NearLossless, Skip::Fast] {
         grid.rebuild(skip.min_sigma(grid.longest_path()), false, &fog);
         assert_eq!(grid.occupied_share(), 1.0, "{skip}");
     }
@@ -163,7 +167,7 @@ fn a_fog_just_below_the_usual_threshold_stays() {
 /// Matrix: the most that may be skipped, along the longest ray, changes a colour by no more than the declared bound.
 #[test]
 fn the_worst_fog_costs_no_more_than_declared() {
-    for skip in [Skip::Lossless, Skip::Fast] {
+    for skip in [Skip::NearLossless, Skip::Fast] {
         let config = OccupancyConfig { resolution: 16, ..OccupancyConfig::default() };
         let mut grid = OccupancyGrid::new([DVec3::NEG_ONE, DVec3::ONE], &config).unwrap();
         let sigma = skip.min_sigma(grid.longest_path());

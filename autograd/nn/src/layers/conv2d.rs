@@ -1,6 +1,6 @@
 //! The convolutional layer.
 
-use super::{Init, Layer, Pass};
+use super::{Init, Layer, Mode};
 use crate::{Bound, ParamId, Params};
 use rand::Rng;
 use raygrad_autograd::{Activation, Conv2dConfig, Var};
@@ -83,7 +83,7 @@ impl Conv2d {
 
 impl<T: Scalar> Layer<T> for Conv2d {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }
@@ -147,7 +147,7 @@ mod tests {
             let tape = Tape::new();
             let bound = params.bind(&tape);
             let x = tape.constant(Tensor::from_fn(&[8, 1, 6, 6], image));
-            let y = model.forward(&bound, &x, Pass::Train(0));
+            let y = model.forward(&bound, &x, Mode::Train(0));
             let loss = (y - tape.constant(labels.clone())).square().mean();
             losses.push(loss.item());
             let grads = bound.backward(&loss);

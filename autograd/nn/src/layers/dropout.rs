@@ -1,6 +1,6 @@
 //! Dropout.
 
-use super::{Layer, Pass};
+use super::{Layer, Mode};
 use crate::Bound;
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -26,7 +26,7 @@ impl Dropout {
     }
 
     /// `x`, in training with each element either 0 or divided by `1 - rate`; which ones follows from the seed and the
-    /// place alone. Two layers of a model need passes of their own ([`Pass::part`]), which [`Sequential`](super::Sequential)
+    /// place alone. Two layers of a model need passes of their own ([`Mode::part`]), which [`Sequential`](super::Sequential)
     /// gives them.
     ///
     /// ```
@@ -41,9 +41,9 @@ impl Dropout {
     /// assert_eq!(dropout.forward(&x, Pass::Train(7)).value(), y.value());
     /// ```
     #[track_caller]
-    pub fn forward<'t, T: Scalar>(&self, x: &Var<'t, T>, pass: Pass) -> Var<'t, T> {
+    pub fn forward<'t, T: Scalar>(&self, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
         match pass {
-            Pass::Train(seed) if self.rate > 0.0 => x * x.tape().constant(self.mask(x, seed)),
+            Mode::Train(seed) if self.rate > 0.0 => x * x.tape().constant(self.mask(x, seed)),
             _ => x.clone(),
         }
     }
@@ -63,7 +63,7 @@ impl Dropout {
 
 impl<T: Scalar> Layer<T> for Dropout {
     #[track_caller]
-    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
         self.forward(x, pass)
     }
 }
@@ -79,22 +79,22 @@ mod tests {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::ones(&[100, 1000]));
         for rate in [0.0, 0.1, 0.5, 0.9] {
-            let y = Dropout::new(rate).forward(&x, Pass::Train(3));
+            let y = Dropout::new(rate).forward(&x, Mode::Train(3));
             let zeros = y.value().as_slice().iter().filter(|&&y| y == 0.0).count() as f64 / 1e5;
             assert!((zeros - rate).abs() < 5.0 * (rate * (1.0 - rate) / 1e5).sqrt() + 1e-12, "{rate}: {zeros}");
             assert!((y.mean().item() - 1.0).abs() < 0.05, "{rate}");
             // The gradient passes where the value does, and with its factor.
             assert_eq!(y.sum().grad(&[&x])[0], *y.value());
         }
-        let other = Dropout::new(0.5).forward(&x, Pass::Train(4));
-        assert_ne!(Dropout::new(0.5).forward(&x, Pass::Train(3)).value(), other.value());
+        let other = Dropout::new(0.5).forward(&x, Mode::Train(4));
+        assert_ne!(Dropout::new(0.5).forward(&x, Mode::Train(3)).value(), other.value());
     }
 
     #[test]
     fn derivatives_and_odd_shapes_are_right() {
         for shape in [&[][..], &[0, 3], &[4, 2]] {
             let x = Tensor::from_fn(shape, |i| 0.3 * i as f64 - 0.8);
-            check_function(&Check::default(), &[x], |x| Dropout::new(0.4).forward(&x[0], Pass::Train(1)).sin())
+            check_function(&Check::default(), &[x], |x| Dropout::new(0.4).forward(&x[0], Mode::Train(1)).sin())
                 .unwrap();
         }
     }

@@ -1,6 +1,6 @@
 //! Layer normalisation.
 
-use super::{Layer, Pass};
+use super::{Layer, Mode};
 use crate::{Bound, ParamId, Params};
 use raygrad_autograd::Var;
 use raygrad_tensor::{Scalar, Tensor};
@@ -53,7 +53,7 @@ impl LayerNorm {
 
 impl<T: Scalar> Layer<T> for LayerNorm {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

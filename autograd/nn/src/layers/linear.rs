@@ -1,6 +1,6 @@
 //! The dense layer.
 
-use super::{Init, Layer, Pass};
+use super::{Init, Layer, Mode};
 use crate::{Bound, ParamId, Params};
 use rand::Rng;
 use raygrad_autograd::{Activation, Var};
@@ -56,7 +56,7 @@ impl Linear {
 
 impl<T: Scalar> Layer<T> for Linear {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

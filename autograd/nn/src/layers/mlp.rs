@@ -1,6 +1,6 @@
 //! A stack of dense layers.
 
-use super::{Init, Layer, Linear, Pass};
+use super::{Init, Layer, Linear, Mode};
 use crate::{Bound, Params};
 use rand::Rng;
 use raygrad_autograd::{Activation, Var};
@@ -62,7 +62,7 @@ impl Mlp {
 
 impl<T: Scalar> Layer<T> for Mlp {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
         self.forward(params, x)
     }
 }

@@ -31,30 +31,30 @@ pub trait Layer<T: Scalar>: Send + Sync {
     /// # Panics
     /// If the shape of `x` does not fit.
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Pass) -> Var<'t, T>;
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T>;
 }
 
 /// Whether a layer runs to be used or to be trained. All that is random follows from it, so the same pass gives the
 /// same bits on any thread, and again in a [`checkpoint`](raygrad_autograd::Tape::checkpoint).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pass {
+pub enum Mode {
     /// To be used: nothing is random.
     Evaluate,
     /// To be trained, with this seed: another one for each step, and for each part of a step that has a tape of its own.
     Train(u64),
 }
 
-impl Pass {
+impl Mode {
     /// The pass of part number `which` of a model: with a seed of its own, so that two layers do not draw the same.
-    pub fn part(self, which: u64) -> Pass {
+    pub fn part(self, which: u64) -> Mode {
         match self {
-            Pass::Evaluate => Pass::Evaluate,
-            Pass::Train(seed) => {
+            Mode::Evaluate => Mode::Evaluate,
+            Mode::Train(seed) => {
                 // The finaliser of SplitMix64 (Steele, Lea and Flood 2014).
                 let mut state = seed.wrapping_add(which.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
                 state = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
                 state = (state ^ (state >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-                Pass::Train(state ^ (state >> 31))
+                Mode::Train(state ^ (state >> 31))
             }
         }
     }

@@ -1,6 +1,6 @@
 //! Layers one after another.
 
-use super::{Layer, Pass};
+use super::{Layer, Mode};
 use crate::Bound;
 use raygrad_autograd::Var;
 use raygrad_tensor::Scalar;
@@ -40,7 +40,7 @@ where
     F: for<'t> Fn(&Var<'t, T>) -> Var<'t, T> + Send + Sync,
 {
     #[track_caller]
-    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, _params: &Bound<'t, T>, x: &Var<'t, T>, _pass: Mode) -> Var<'t, T> {
         (self.0)(x)
     }
 }
@@ -77,7 +77,7 @@ impl<T: Scalar> Sequential<T> {
     /// # Panics
     /// If a shape does not fit.
     #[track_caller]
-    pub fn forward<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Pass) -> Var<'t, T> {
+    pub fn forward<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
         let mut h = x.clone();
         for (i, layer) in self.layers.iter().enumerate() {
             h = layer.apply(params, &h, pass.part(i as u64));
@@ -88,7 +88,7 @@ impl<T: Scalar> Sequential<T> {
 
 impl<T: Scalar> Layer<T> for Sequential<T> {
     #[track_caller]
-    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Pass) -> Var<'t, T> {
+    fn apply<'t>(&self, params: &Bound<'t, T>, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {
         self.forward(params, x, pass)
     }
 }
@@ -143,11 +143,11 @@ mod tests {
             h = (h.matmul(w) + b).relu();
         }
         let expected = (h.tanh() * 2.0).matmul(bound.vars()[4]) + bound.vars()[5];
-        let got = model.forward(&bound, &x, Pass::Evaluate);
+        let got = model.forward(&bound, &x, Mode::Evaluate);
         for (got, expected) in got.value().as_slice().iter().zip(expected.value().as_slice()) {
             assert!((got - expected).abs() < 1e-14);
         }
-        assert_eq!(Sequential::new().forward(&bound, &x, Pass::Evaluate).value(), x.value());
+        assert_eq!(Sequential::new().forward(&bound, &x, Mode::Evaluate).value(), x.value());
     }
 
     #[test]
@@ -162,14 +162,14 @@ mod tests {
             y.value().as_slice().iter().map(|&y| y != 0.0).collect::<Vec<_>>()
         };
         let count = |left: &[bool]| left.iter().filter(|&&left| left).count();
-        let first = left(&two, Pass::Train(1));
+        let first = left(&two, Mode::Train(1));
         assert!((900..1100).contains(&count(&first)), "{}", count(&first));
         // Nor do the inner layers of two parts.
         let nested = Sequential::new().then(two.clone()).then(two.clone());
-        let left_of_four = count(&left(&nested, Pass::Train(1)));
+        let left_of_four = count(&left(&nested, Mode::Train(1)));
         assert!((190..310).contains(&left_of_four), "{left_of_four}");
-        assert_eq!(first, left(&two.clone(), Pass::Train(1)));
-        assert_ne!(first, left(&two, Pass::Train(2)));
+        assert_eq!(first, left(&two.clone(), Mode::Train(1)));
+        assert_ne!(first, left(&two, Mode::Train(2)));
     }
 
     #[test]
@@ -185,8 +185,8 @@ mod tests {
             let (whole, layout) = (model.clone(), params.layout());
             let y = match checked {
                 true => tape
-                    .checkpoint(&inputs, move |x| whole.forward(&layout.bind(x[1..].to_vec()), &x[0], Pass::Train(9))),
-                false => model.forward(&bound, &x, Pass::Train(9)),
+                    .checkpoint(&inputs, move |x| whole.forward(&layout.bind(x[1..].to_vec()), &x[0], Mode::Train(9))),
+                false => model.forward(&bound, &x, Mode::Train(9)),
             };
             y.square().sum().grad(&inputs)
         };
@@ -200,7 +200,7 @@ mod tests {
         let mut inputs = vec![Tensor::from_fn(&[3, 2], |i| (i as f64 + 0.5).cos())];
         inputs.extend(params.values().iter().cloned());
         check_function(&Check::default(), &inputs, |x| {
-            model.forward(&params.layout().bind(x[1..].to_vec()), &x[0], Pass::Train(5)).square()
+            model.forward(&params.layout().bind(x[1..].to_vec()), &x[0], Mode::Train(5)).square()
         })
         .unwrap();
     }

@@ -49,13 +49,14 @@ pub struct AdamConfig {
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
     /// networks, 1e-15 hash tables. At least 1e-30.
-    pub epsilon: f64,
+    #[cfg_attr(feature = "files", serde(alias = "epsilon"))]
+    pub eps: f64,
 }
 
 impl Default for AdamConfig {
     /// 0.9, 0.999, 1e-8.
     fn default() -> Self {
-        AdamConfig { beta1: 0.9, beta2: 0.999, epsilon: 1e-8 }
+        AdamConfig { beta1: 0.9, beta2: 0.999, eps: 1e-8 }
     }
 }
 
@@ -67,7 +68,7 @@ impl AdamConfig {
     pub fn check(&self) -> Result<(), SettingError> {
         check_share("beta1", self.beta1)?;
         check_share("beta2", self.beta2)?;
-        check("epsilon", self.epsilon, (1e-30..=1e30).contains(&self.epsilon), "1e-30 to 1e30")
+        check("eps", self.eps, (1e-30..=1e30).contains(&self.eps), "1e-30 to 1e30")
     }
 }
 
@@ -107,7 +108,7 @@ impl<T: Scalar> Group<T> {
 
     /// A step at this learning rate of a parameter with this factor of the decay, without correction of the bias.
     fn update(&self, rate: f64, decay: f64) -> Update<T> {
-        let (AdamConfig { beta1, beta2, epsilon }, decay) = (self.config, self.decay * decay);
+        let (AdamConfig { beta1, beta2, eps: epsilon }, decay) = (self.config, self.decay * decay);
         Update {
             beta: [beta1, beta2].map(T::from_f64),
             rest: [1.0 - beta1, 1.0 - beta2].map(T::from_f64),
@@ -189,7 +190,7 @@ impl<T: Scalar> Adam<T> {
     ) -> UpdateReport {
         let mut report = UpdateReport::default();
         let group = |slot: usize| self.members.get(slot).copied().unwrap_or(0);
-        let moves = params.moves(grads, |slot| rate(group(slot)));
+        let moves = params.updates(grads, |slot| rate(group(slot)));
         self.steps = self.steps.saturating_add(1);
         for part in moves {
             let group = &mut self.groups[group(part.slot)];
@@ -202,7 +203,7 @@ impl<T: Scalar> Adam<T> {
                 let [first, second] = biases(*config, step);
                 let root = second.sqrt();
                 let rate = T::from_f64(rate * root / first);
-                Update { rate, epsilon: T::from_f64(config.epsilon * root), ..update }
+                Update { rate, epsilon: T::from_f64(config.eps * root), ..update }
             };
             let row = |step: u32| {
                 let [rate, epsilon] = corrections[(step as usize).min(corrections.len()) - 1];
@@ -237,7 +238,7 @@ impl<T: Scalar> Optimizer<T> for Adam<T> {
 impl AdamW {
     /// An optimiser that has seen nothing. `decay` is the part of a parameter that goes at each step at learning rate 1,
     /// customarily 0.01; parameters can have a factor of their own, such as 0 for biases
-    /// ([`Params::set_decay`](crate::Params::set_decay)).
+    /// ([`Params::set_weight_decay_scale`](crate::Params::set_weight_decay_scale)).
     ///
     /// # Panics
     /// If [`AdamConfig::check`] finds something, or the decay is not within 0 to 1e30.
@@ -294,7 +295,7 @@ mod tests {
 
     fn one_step(g: f64, epsilon: f64) -> f64 {
         let mut params = store(Tensor::scalar(0.0_f32));
-        let mut adam = Adam::new(AdamConfig { epsilon, ..AdamConfig::default() });
+        let mut adam = Adam::new(AdamConfig { eps: epsilon, ..AdamConfig::default() });
         step(&mut adam, &mut params, Tensor::scalar(g as f32), 1.0);
         f64::from(params.values()[0].item())
     }
@@ -316,7 +317,7 @@ mod tests {
         for (factor, decay) in [(1.0, 0.1), (0.0, 0.1), (3.0, 0.02)] {
             let (mut adam, mut params) = (AdamW::new(AdamConfig::default(), decay), store(Tensor::scalar(0.5)));
             let (mut plain, mut free) = (Adam::new(AdamConfig::default()), store(Tensor::scalar(0.5)));
-            params.set_decay(|_| true, factor);
+            params.set_weight_decay_scale(|_| true, factor);
             let (mut m, mut v, mut expected, mut undecayed) = (0.0, 0.0, 0.5, 0.5);
             for t in 1..=500 {
                 let (g, rate) = (gradient(t), 0.01 * (1.0 + (t as f64).cos().abs()));
@@ -338,10 +339,14 @@ mod tests {
     fn nan_is_skipped_and_counted_and_nothing_goes_denormal() {
         let mut adam = Adam::<f32>::new(AdamConfig::default());
         let mut params = store(Tensor::from_vec(&[4], vec![1.0, 2.0, 3.0, f32::MAX]));
-        params.set_rate(|_| true, 1e3);
+        params.set_lr_scale(|_| true, 1e3);
         let grad = Tensor::from_vec(&[4], vec![1.0, f32::NAN, f32::INFINITY, -1.0]);
         let report = adam.update(&mut params, &[grad.into()], 1e30);
-        assert_eq!((report.moved, report.skipped, report.is_stuck()), (1, 3, false), "the last step overflows");
+        assert_eq!(
+            (report.moved, report.skipped, report.has_only_non_finite()),
+            (1, 3, false),
+            "the last step overflows"
+        );
         assert_eq!(report.bad, [("x".to_owned(), 3)]);
         let message = report.check().unwrap_err().to_string();
         assert_eq!(message, "3 of 4 elements stay where they are, for their gradient is not finite: 3 of `x`");
@@ -352,8 +357,8 @@ mod tests {
         let state = adam.state(&params);
         assert!(state.tensors.values().flat_map(Tensor::as_slice).all(|x| *x == 0.0 || x.is_normal()), "{state:?}");
         assert!(params.values()[0].is_finite());
-        assert!(adam.update(&mut params, &[Tensor::full(&[4], f32::NAN).into()], 0.1).is_stuck());
-        assert!(!adam.update(&mut params, &[Tensor::zeros(&[4]).into()], 0.1).is_stuck());
+        assert!(adam.update(&mut params, &[Tensor::full(&[4], f32::NAN).into()], 0.1).has_only_non_finite());
+        assert!(!adam.update(&mut params, &[Tensor::zeros(&[4]).into()], 0.1).has_only_non_finite());
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What an optimiser remembers of parameters, and the steps that use it.
 
 use super::rule::{LINE, Rule, Shared, Table, move_all};
-use super::{Move, OptimizerState, StateError, UpdateReport};
+use super::{OptimizerState, ParamUpdate, StateError, UpdateReport};
 use crate::Params;
 use raygrad_autograd::RowSums;
 use raygrad_tensor::{Pool, Scalar, parallel, simd};
@@ -52,7 +52,7 @@ impl<T: Scalar> Memory<T> {
     #[track_caller]
     pub fn update<const M: usize, R: Rule<T, M>>(
         &mut self,
-        part: Move<'_, T>,
+        part: ParamUpdate<'_, T>,
         whole: impl FnOnce(u32) -> R,
         row: impl Fn(u32) -> R + Sync,
         report: &mut UpdateReport,
@@ -162,7 +162,7 @@ impl<T: Scalar> Slot<T> {
     #[track_caller]
     fn move_whole<const M: usize, R: Rule<T, M>>(
         &mut self,
-        part: Move<'_, T>,
+        part: ParamUpdate<'_, T>,
         pool: &Pool<T>,
         rule: impl FnOnce(u32) -> R,
     ) -> [usize; 2] {
@@ -185,7 +185,7 @@ impl<T: Scalar> Slot<T> {
     #[track_caller]
     fn move_rows<const M: usize, R: Rule<T, M>>(
         &mut self,
-        part: Move<'_, T>,
+        part: ParamUpdate<'_, T>,
         pool: &Pool<T>,
         rule: impl Fn(u32) -> R + Sync,
     ) -> [usize; 2] {

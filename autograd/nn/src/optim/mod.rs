@@ -28,7 +28,7 @@ use std::borrow::Cow;
 
 /// One parameter that an optimiser is to move.
 #[derive(Debug)]
-pub struct Move<'a, T: Scalar> {
+pub struct ParamUpdate<'a, T: Scalar> {
     /// Which parameter of its store it is.
     pub slot: usize,
     /// Its name.
@@ -45,7 +45,7 @@ pub struct Move<'a, T: Scalar> {
     pub lazy: bool,
 }
 
-impl<'a, T: Scalar> Move<'a, T> {
+impl<'a, T: Scalar> ParamUpdate<'a, T> {
     /// The gradient as one tensor, from `pool` if it is not one already.
     pub fn dense_grad(&self, pool: &Pool<T>) -> Cow<'a, Tensor<T>> {
         match self.grad.dense() {
@@ -81,7 +81,7 @@ impl<'a, T: Scalar> Move<'a, T> {
 /// Every optimiser takes every gradient ([`Gradient`]): dense ones, rows of a table, and both. What it does depends on
 /// the gradient's value alone, unless a parameter is lazy ([`Params::set_lazy`]). Frozen parameters rest, and so does one
 /// whose gradient has no share because nothing depends on it; others move with the learning rate and the weight decay
-/// of their own ([`Params::set_rate`], [`Params::set_decay`]).
+/// of their own ([`Params::set_lr_scale`], [`Params::set_weight_decay_scale`]).
 ///
 /// All optimisers here leave an element alone, with what they remember of it, and count it if its gradient is infinite or
 /// NaN or its new value would be, whether its parameter is lazy or not (a row or parameter counts the step all the same); set what they remember to 0 once it is below 1e-30
@@ -107,7 +107,7 @@ impl<'a, T: Scalar> Move<'a, T> {
 /// assert!((params.get(x).item() - 2.0).abs() < 1e-3);
 /// ```
 pub trait Optimizer<T: Scalar> {
-    /// Moves the parameters of a store at learning rate `rate`. An implementation goes through [`Params::moves`].
+    /// Moves the parameters of a store at learning rate `rate`. An implementation goes through [`Params::updates`].
     ///
     /// # Panics
     /// If there is not one gradient of the same shape for each parameter that is not frozen or the rate is not within 0 to

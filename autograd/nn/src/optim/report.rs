@@ -6,7 +6,7 @@ use std::fmt;
 ///
 /// An element whose gradient is infinite or NaN stays where it is. That saves a run from a single overflow, but a run
 /// that has diverged would stand still without a word: so the report asks to be looked at. [`check`](Self::check) ends a
-/// run at the first bad gradient; who wants to go on looks whether it [`is_stuck`](Self::is_stuck) for many steps.
+/// run at the first bad gradient; who wants to go on looks whether it [`has_only_non_finite`](Self::has_only_non_finite) for many steps.
 #[must_use = "elements whose gradient is infinite or NaN stay where they are: `check` says whether there are any"]
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct UpdateReport {
@@ -38,7 +38,7 @@ impl UpdateReport {
 
     /// Whether there were gradients and none of them was of any use. Once in a while that is an overflow; at every step
     /// the run has diverged.
-    pub fn is_stuck(&self) -> bool {
+    pub fn has_only_non_finite(&self) -> bool {
         self.moved == 0 && self.skipped > 0
     }
 }

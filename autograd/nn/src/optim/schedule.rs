@@ -69,7 +69,7 @@ impl Schedule {
 
     /// The learning rate when `fraction` (0 to 1) of the run is done. The warm-up multiplies the rate, so it does not
     /// delay what follows.
-    pub fn rate(&self, fraction: f64) -> f64 {
+    pub fn lr(&self, fraction: f64) -> f64 {
         let fraction = fraction.clamp(0.0, 1.0);
         let rise = |warmup: f64| if fraction < warmup { fraction / warmup } else { 1.0 };
         match *self {
@@ -120,7 +120,7 @@ impl Schedule {
     /// The learning rate of step number `step`, counted from 0, of `steps`: the fraction in the middle of the step, so
     /// that a warm-up does not begin with a step of rate 0.
     pub fn at_step(&self, step: u64, steps: u64) -> f64 {
-        self.rate((step as f64 + 0.5) / steps.max(1) as f64)
+        self.lr((step as f64 + 0.5) / steps.max(1) as f64)
     }
 }
 
@@ -131,7 +131,7 @@ mod tests {
     #[track_caller]
     fn assert_rates(schedule: Schedule, rates: &[(f64, f64)]) {
         for &(fraction, rate) in rates {
-            let got = schedule.rate(fraction);
+            let got = schedule.lr(fraction);
             assert!((got - rate).abs() < 1e-15, "{schedule:?} at {fraction}: {got} instead of {rate}");
         }
     }
@@ -145,9 +145,9 @@ mod tests {
     #[test]
     fn schedules_hit_their_ends() {
         let decay = Schedule::Exponential { from: 1e-2, to: 1e-4, warmup: 0.1 };
-        assert_eq!(decay.rate(0.0), 0.0);
-        assert!((decay.rate(0.5) - 1e-3).abs() < 1e-12);
-        assert!((decay.rate(1.0) - 1e-4).abs() < 1e-12 && decay.rate(2.0) == decay.rate(1.0));
+        assert_eq!(decay.lr(0.0), 0.0);
+        assert!((decay.lr(0.5) - 1e-3).abs() < 1e-12);
+        assert!((decay.lr(1.0) - 1e-4).abs() < 1e-12 && decay.lr(2.0) == decay.lr(1.0));
     }
 
     #[test]

@@ -61,7 +61,7 @@ impl<T: Scalar> Optimizer<T> for Sgd<T> {
     #[track_caller]
     fn update(&mut self, params: &mut Params<T>, grads: &[Gradient<T>], rate: f64) -> UpdateReport {
         let mut report = UpdateReport::default();
-        for part in params.moves(grads, |_| rate) {
+        for part in params.updates(grads, |_| rate) {
             let decay = self.config.decay * part.decay;
             let update = Update {
                 rate: T::from_f64(part.rate),

@@ -9,8 +9,8 @@ fn frozen_parameters_rest_and_others_have_their_own_rates() {
     for name in ["trunk.weight", "trunk.bias", "head.weight"] {
         params.add(name, Tensor::ones(&[2]));
     }
-    assert_eq!(params.set_rate(|name| name.starts_with("trunk."), 0.5), 2);
-    assert_eq!(params.set_decay(|name| name.ends_with("bias"), 0.0), 1);
+    assert_eq!(params.set_lr_scale(|name| name.starts_with("trunk."), 0.5), 2);
+    assert_eq!(params.set_weight_decay_scale(|name| name.ends_with("bias"), 0.0), 1);
     assert_eq!(params.freeze(|name| name == "head.weight"), 1);
     let head = params.find("head.weight").unwrap();
     assert!(params.is_frozen(head) && params.name(head) == "head.weight" && params.find("body").is_none());
@@ -29,7 +29,7 @@ fn frozen_parameters_rest_and_others_have_their_own_rates() {
     };
     // Half the rate; decay adds the parameter, 1, to the gradient, 1, but for the bias.
     assert_eq!(step(&mut params, &mut sgd), (4, vec![0.9, 0.95, 1.0]));
-    assert_eq!((params.rate(head), params.rate(params.find("trunk.bias").unwrap())), (1.0, 0.5));
+    assert_eq!((params.lr_scale(head), params.lr_scale(params.find("trunk.bias").unwrap())), (1.0, 0.5));
     // Settings survive a change of precision and a load.
     let mut copy = params.cast::<f32>().cast::<f64>();
     let bytes = params.to_safetensors(Storage::Full, &Default::default(), &[]).unwrap();

@@ -3,7 +3,7 @@
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use raygrad_autograd::{Activation, Gradient, Pool, Tape, Tensor, Var};
-use raygrad_nn::{Dropout, Init, Linear, Optimizer, Params, Pass, Sequential, Sgd, SgdConfig};
+use raygrad_nn::{Dropout, Init, Linear, Mode, Optimizer, Params, Sequential, Sgd, SgdConfig};
 use std::sync::{Arc, Barrier, Mutex};
 
 const THREADS: usize = 8;
@@ -48,7 +48,7 @@ fn round(
         inputs.extend(bound.vars());
         let (network, layout) = (model.clone(), params.layout());
         let y = tape.checkpoint(&inputs, move |x: &[Var<'_, f32>]| {
-            network.forward(&layout.bind(x[1..].to_vec()), &x[0], Pass::Train(seed))
+            network.forward(&layout.bind(x[1..].to_vec()), &x[0], Mode::Train(seed))
         });
         let y = y.map_grad(|g| g * (1.0 + 1e-3 * f64::from(inner_gradient(g.value().as_slice()[0]))));
         let loss = y.square().mean();

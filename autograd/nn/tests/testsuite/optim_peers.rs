@@ -72,7 +72,7 @@ fn sgd(momentum: f64, nesterov: bool, decay: f64) -> SgdConfig {
 }
 
 fn adam(beta1: f64, beta2: f64, epsilon: f64) -> AdamConfig {
-    AdamConfig { beta1, beta2, epsilon }
+    AdamConfig { beta1, beta2, eps: epsilon }
 }
 
 fn cases<T: Scalar>() -> Vec<(&'static str, Box<dyn Optimizer<T>>)> {
@@ -172,7 +172,7 @@ fn learning_rates() {
         ("warmup", Schedule::Linear { from, to: from, warmup: 0.4 }),
     ] {
         for (step, expected) in reference.get(&format!("schedule.{name}")).as_slice().iter().enumerate() {
-            let rate = schedule.rate(step as f64 / STEPS as f64);
+            let rate = schedule.lr(step as f64 / STEPS as f64);
             assert!((rate - expected).abs() <= 1e-15, "{name}, step {step}: {rate} instead of {expected}");
         }
     }

@@ -19,7 +19,7 @@ fn optimisers<T: Scalar>() -> [(&'static str, Make<T>); 6] {
         ("momentum", || Box::new(Sgd::new(SgdConfig { nesterov: false, ..NESTEROV }))),
         ("nesterov", || Box::new(Sgd::new(NESTEROV))),
         ("adam", || Box::new(Adam::new(AdamConfig::default()))),
-        ("table", || Box::new(Adam::new(AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() }))),
+        ("table", || Box::new(Adam::new(AdamConfig { beta2: 0.99, eps: 1e-15, ..AdamConfig::default() }))),
         ("adamw", || Box::new(AdamW::new(AdamConfig::default(), 0.1))),
     ]
 }
@@ -241,8 +241,8 @@ fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
 fn frozen_parameters_rest_and_others_have_their_own_rates() {
     for (name, make) in optimisers::<f64>() {
         let (mut params, ids) = model::<f64>(false);
-        params.set_rate(|name| name == "vector", 0.5);
-        params.set_decay(|_| true, 0.0);
+        params.set_lr_scale(|name| name == "vector", 0.5);
+        params.set_weight_decay_scale(|_| true, 0.0);
         let mut other = params.clone();
         other.freeze(|name| name == "table");
         let start = params.clone();
@@ -254,7 +254,7 @@ fn frozen_parameters_rest_and_others_have_their_own_rates() {
         // Half of the rate is half of the way, of the first step.
         let way = |params: &Params<f64>| params.get(ids[1]).as_slice()[0] - start.get(ids[1]).as_slice()[0];
         other.assign(&start);
-        other.set_rate(|_| true, 1.0);
+        other.set_lr_scale(|_| true, 1.0);
         train(&mut *make(), &mut other, ids, 0, true).unwrap();
         assert!((way(&params) / way(&other) - 0.5).abs() < 1e-12, "{name}");
     }
@@ -273,7 +273,7 @@ fn small_numbers_of_f64_are_kept() {
     assert_eq!(once(&mut Sgd::new(momentum), 0.0, 1e-40), -1e-40);
     assert_eq!(once(&mut Sgd::new(SgdConfig { decay: 0.5, ..SgdConfig::default() }), 1e-40, 0.0), 0.5e-40);
     assert_eq!(once(&mut AdamW::new(AdamConfig::default(), 0.5), 1e-40, 0.0), 0.5e-40);
-    let config = AdamConfig { epsilon: 1e-30, ..AdamConfig::default() };
+    let config = AdamConfig { eps: 1e-30, ..AdamConfig::default() };
     let expected = -1e-35 / (1e-35 + 1e-30);
     assert!((once(&mut Adam::new(config), 0.0, 1e-35) / expected - 1.0).abs() < 1e-12);
     let mut params = Params::new();
@@ -298,7 +298,7 @@ fn settings_out_of_their_range_are_refused_by_name() {
         (AdamConfig { beta1: 1.0, ..adam }, "`beta1` is 1.0; use at least 0 and less than 1"),
         (AdamConfig { beta2: 2.0, ..adam }, "`beta2` is 2.0;"),
         (AdamConfig { beta2: f64::NAN, ..adam }, "`beta2` is NaN;"),
-        (AdamConfig { epsilon: 0.0, ..adam }, "`epsilon` is 0.0; use 1e-30 to 1e30"),
+        (AdamConfig { eps: 0.0, ..adam }, "`epsilon` is 0.0; use 1e-30 to 1e30"),
     ] {
         for message in [
             message(|| drop(Adam::<f32>::new(config))),
@@ -329,7 +329,7 @@ fn settings_out_of_their_range_are_refused_by_name() {
     assert!(update(&grads[1..], 0.1).contains("one gradient for each parameter that is not frozen"));
     let swapped = [grads[1].clone(), grads[0].clone(), grads[2].clone()];
     assert!(update(&swapped, 0.1).contains("the gradient of `table` has its shape"));
-    assert!(message(|| assert_eq!(params.set_rate(|_| true, -1.0), 0)).contains("a learning rate times -1"));
+    assert!(message(|| assert_eq!(params.set_lr_scale(|_| true, -1.0), 0)).contains("a learning rate times -1"));
 }
 
 #[test]
@@ -657,7 +657,7 @@ fn what_a_store_or_an_optimiser_cannot_take_is_refused() {
     };
     panics(&|| store("x", &[2]).assign(&store("y", &[2])));
     panics(&|| store("x", &[2]).assign(&store("x", &[3])));
-    panics(&|| assert_eq!(store("x", &[2]).set_decay(|_| true, -1.0), 1));
+    panics(&|| assert_eq!(store("x", &[2]).set_weight_decay_scale(|_| true, -1.0), 1));
     panics(&|| drop(store("x", &[2]).layout().bind(Vec::<Var<'_, f32>>::new())));
     let grads = || [Gradient::from(Tensor::<f32>::zeros(&[1]))];
     panics(&|| assert_eq!(raygrad_nn::clip_value(&mut grads(), f64::NAN), 0));
@@ -692,11 +692,11 @@ fn a_dense_gradient_reaches_the_optimiser_without_a_copy() {
     let mut params = Params::<f32>::new();
     params.add("x", Tensor::from([1.0, 2.0]));
     let dense = [Gradient::from(Tensor::from([3.0, 4.0]))];
-    let part = params.moves(&dense, |_| 0.1).next().unwrap();
+    let part = params.updates(&dense, |_| 0.1).next().unwrap();
     assert!(matches!(part.dense_grad(&Pool::none()), std::borrow::Cow::Borrowed(_)));
     let mut rows = Gradient::zero(&[2]);
     rows.add_sparse(Arc::new(RowGrad::new(&[2], [1].into(), Tensor::from([5.0]))));
     let rows = [rows];
-    let part = params.moves(&rows, |_| 0.1).next().unwrap();
+    let part = params.updates(&rows, |_| 0.1).next().unwrap();
     assert_eq!(part.dense_grad(&Pool::none()).into_owned(), Tensor::from([0.0, 5.0]));
 }

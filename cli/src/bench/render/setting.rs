@@ -4,7 +4,7 @@ use raygrad::Storage;
 use raygrad::nerf::sampling::marching::Marching;
 use raygrad::nerf::space::occupancy::{Skip, Threshold, Update};
 use raygrad::nerf::volume::quadrature::Quadrature;
-use raygrad::nerf::{Camera, Evaluations, Image, Limits, Model, Result};
+use raygrad::nerf::{Camera, Evaluations, Image, Model, RayTolerance, Result};
 
 /// The background of all pictures.
 pub const WHITE: [f64; 3] = [1.0; 3];
@@ -32,7 +32,7 @@ pub struct Setting {
     /// Cells that are passed over.
     pub cells: Cells,
     /// What is left out along a ray.
-    pub limits: Limits,
+    pub limits: RayTolerance,
     /// The rule for the integral along a ray.
     pub rule: Quadrature,
     /// All arithmetic in f64, nothing but empty cells left out.
@@ -49,7 +49,7 @@ impl Setting {
             name: "fast".to_owned(),
             step,
             cells: Cells::Depth(Skip::Fast.max_depth()),
-            limits: Limits::of(&Skip::Fast.into()),
+            limits: RayTolerance::of(&Skip::Fast.into()),
             rule: Quadrature::Midpoint,
             double: false,
             storage: Storage::Full,
@@ -92,10 +92,10 @@ impl Setting {
     /// The view of such a [`model`](Self::model).
     pub fn render(&self, model: &Model<f32>, camera: &Camera) -> Result<(Image, Evaluations)> {
         if self.double {
-            let view = model.cast::<f64>()?.dense_view(camera, WHITE, 1);
+            let view = model.cast::<f64>()?.render_reference(camera, WHITE, 1);
             return Ok((view.picture().color, view.evaluations));
         }
-        let picture = model.view_within(camera, WHITE.map(|x| x as f32), &self.limits);
+        let picture = model.render_within(camera, WHITE.map(|x| x as f32), &self.limits);
         Ok((picture.color, picture.evaluations))
     }
 }
@@ -103,16 +103,16 @@ impl Setting {
 /// All settings; `step` is that of the model's views.
 pub fn settings(step: f64) -> Vec<Setting> {
     let base = Setting::base(step);
-    let exact = Limits { termination: 0.0, color_budget: 0.0 };
+    let exact = RayTolerance { early_stop_eps: 0.0, color_budget: 0.0 };
     let of = |group: &'static str, name: String, setting: Setting| Setting { group, name, ..setting };
     let mut out = vec![
         of("skip", "off".into(), Setting { cells: Cells::Trained, limits: exact, ..base.clone() }),
         of(
             "skip",
-            "lossless".into(),
+            "near-lossless".into(),
             Setting {
-                cells: Cells::Depth(Skip::Lossless.max_depth()),
-                limits: Limits::of(&Skip::Lossless.into()),
+                cells: Cells::Depth(Skip::NearLossless.max_depth()),
+                limits: RayTolerance::of(&Skip::NearLossless.into()),
                 ..base.clone()
             },
         ),
@@ -125,11 +125,11 @@ pub fn settings(step: f64) -> Vec<Setting> {
         out.push(of("threshold", format!("depth {depth}"), Setting { cells: Cells::Depth(depth), ..base.clone() }));
     }
     for termination in [0.0, 1e-4, 1e-2, 0.1] {
-        let limits = Limits { termination, ..base.limits };
+        let limits = RayTolerance { early_stop_eps: termination, ..base.limits };
         out.push(of("termination", format!("{termination}"), Setting { limits, ..base.clone() }));
     }
     for color_budget in [0.0, 1e-4, 2e-2, 0.1] {
-        let limits = Limits { color_budget, ..base.limits };
+        let limits = RayTolerance { color_budget, ..base.limits };
         out.push(of("colour budget", format!("{color_budget}"), Setting { limits, ..base.clone() }));
     }
     for rule in [Quadrature::Left, Quadrature::PiecewiseLinear, Quadrature::Gauss2] {
@@ -150,7 +150,7 @@ pub fn settings(step: f64) -> Vec<Setting> {
     let ngp = Setting {
         step: 3.0_f64.sqrt() / 1024.0,
         cells: Cells::OneSample(0.01),
-        limits: Limits { termination: 0.01, color_budget: 0.0 },
+        limits: RayTolerance { early_stop_eps: 0.01, color_budget: 0.0 },
         ..base
     };
     out.push(of("instant-ngp", "its rules".into(), ngp));

@@ -51,7 +51,7 @@ fn close(found: &DAffine3, expected: &[f64; 16]) {
     assert!(found.abs_diff_eq(expected, 1e-7), "{found} {expected}");
 }
 
-fn shots(path: Path) -> Vec<Key> {
+fn shots(path: Path) -> Vec<Keyframe> {
     let Motion::Frames(keys) = path.motion else { panic!("it lists every frame") };
     keys
 }

@@ -44,20 +44,23 @@ fn a_view_has_the_camera_that_is_asked_for() {
 
 #[test]
 fn what_is_asked_for_is_read() {
-    let read = |message: Value| Ask::read(&message.to_string()).unwrap();
-    assert_eq!(read(json!({ "ask": "seen", "id": 4_294_967_295_u32 })), Ask::Seen { id: u32::MAX });
-    assert_eq!(read(json!({ "ask": "photograph", "number": 3 })), Ask::Photograph { number: 3 });
-    assert_eq!(read(json!({ "ask": "end-film" })), Ask::EndFilm {});
-    assert_eq!(read(json!({ "ask": "share", "share": 0 })), Ask::Share { share: 0.0 });
-    assert_eq!(read(json!({ "ask": "share", "share": 0.9 })), Ask::Share { share: 0.9 });
+    let read = |message: Value| ClientMessage::read(&message.to_string()).unwrap();
+    assert_eq!(read(json!({ "ask": "seen", "id": 4_294_967_295_u32 })), ClientMessage::Seen { id: u32::MAX });
+    assert_eq!(read(json!({ "ask": "photograph", "number": 3 })), ClientMessage::Photograph { number: 3 });
+    assert_eq!(read(json!({ "ask": "end-video" })), ClientMessage::EndVideo {});
+    assert_eq!(read(json!({ "ask": "share", "share": 0 })), ClientMessage::Share { share: 0.0 });
+    assert_eq!(read(json!({ "ask": "share", "share": 0.9 })), ClientMessage::Share { share: 0.9 });
     let mut view = View { eye: Eye::Free { pose: POSE, fov: 170.0 }, ..sized(9, 7) };
-    assert_eq!(read(json!({ "ask": "save", "view": asked(&view) })), Ask::Save { view: view.clone() });
+    assert_eq!(read(json!({ "ask": "save", "view": asked(&view) })), ClientMessage::Save { view: view.clone() });
     // At the ends of what there is.
     view.eye = Eye::Free { pose: [[1.0, 0.0, 0.0, 1e9], [0.0, 1.0, 0.0, -1e9], [0.0, 0.0, 1.0, 0.0]], fov: 1.0 };
     (view.compared, view.crop) = (true, Some([[-1e9; 3], [1e9; 3]]));
-    assert_eq!(read(json!({ "ask": "view", "id": 1, "view": asked(&view) })), Ask::View { id: 1, view: view.clone() });
+    assert_eq!(
+        read(json!({ "ask": "view", "id": 1, "view": asked(&view) })),
+        ClientMessage::View { id: 1, view: view.clone() }
+    );
     (view.compared, view.show, view.crop) = (false, Show::Depth, None);
-    assert_eq!(read(json!({ "ask": "view", "id": 1, "view": asked(&view) })), Ask::View { id: 1, view });
+    assert_eq!(read(json!({ "ask": "view", "id": 1, "view": asked(&view) })), ClientMessage::View { id: 1, view });
 }
 
 #[test]
@@ -103,13 +106,13 @@ fn what_is_no_message_is_refused_with_the_reason() {
         (pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])), "a pose is"),
         (pose(json!([[1, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0]])), "a pose is"),
         (pose(json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]])), "invalid length"),
-        (json!({ "ask": "film", "path": { "keys": [] } }).to_string(), "`render_width`"),
+        (json!({ "ask": "video", "path": { "keys": [] } }).to_string(), "`render_width`"),
     ] {
-        let reason = Ask::read(&message).unwrap_err();
+        let reason = ClientMessage::read(&message).unwrap_err();
         assert!(reason.contains(expected) && !reason.is_empty(), "{message}: {reason}");
     }
     // It is said in one line.
-    let reason = Ask::read(r#"{ "ask": "one\nof\u0007two" }"#).unwrap_err();
+    let reason = ClientMessage::read(r#"{ "ask": "one\nof\u0007two" }"#).unwrap_err();
     assert!(reason.contains("one of two"), "{reason}");
 }
 
@@ -127,11 +130,11 @@ fn pictures_have_so_many_pixels_and_no_more() {
 }
 
 #[test]
-fn films_have_so_many_pixels_and_no_more() {
-    let film = |[width, height]: [u32; 2], seconds: f64, fps: f64| -> Result<Result<(), String>, String> {
+fn videos_have_so_many_pixels_and_no_more() {
+    let video = |[width, height]: [u32; 2], seconds: f64, fps: f64| -> Result<Result<(), String>, String> {
         let path = json!({ "render_width": width, "render_height": height, "seconds": seconds, "fps": fps });
-        match Ask::read(&json!({ "ask": "film", "path": path }).to_string())? {
-            Ask::Film(film) => Ok(film.fits()),
+        match ClientMessage::read(&json!({ "ask": "video", "path": path }).to_string())? {
+            ClientMessage::Video(video) => Ok(video.fits()),
             other => panic!("{other:?}"),
         }
     };
@@ -143,7 +146,7 @@ fn films_have_so_many_pixels_and_no_more() {
         ([1920, 1080], 270.0, 30.0),
         ([4096, 1024], 128.0, 32.0),
     ] {
-        assert_eq!(film(size, seconds, fps), Ok(Ok(())), "{size:?} {seconds} {fps}");
+        assert_eq!(video(size, seconds, fps), Ok(Ok(())), "{size:?} {seconds} {fps}");
     }
     for (size, seconds, fps, expected) in [
         ([4097, 1], 1.0, 1.0, "`render_width` is a number up to 4096"),
@@ -153,17 +156,17 @@ fn films_have_so_many_pixels_and_no_more() {
         ([40, 40], -0.5, 1.0, "`seconds`"),
         ([40, 40], 1.0, 61.0, "`fps` is a number up to 60"),
     ] {
-        let reason = film(size, seconds, fps).unwrap_err();
+        let reason = video(size, seconds, fps).unwrap_err();
         assert!(reason.contains(expected), "{reason}");
     }
     for (size, seconds, fps, expected) in [
         ([4096, 1024], 128.5, 32.0, "4096 frames at most, not 4112: lower its seconds, `fps` or size"),
         ([2048, 2048], 600.0, 60.0, "4096 frames at most, not 36000"),
     ] {
-        let reason = film(size, seconds, fps).unwrap().unwrap_err();
+        let reason = video(size, seconds, fps).unwrap().unwrap_err();
         assert!(reason.contains(expected), "{reason}");
     }
-    assert!(Ask::read(r#"{ "ask": "film", "path": { "render_width": "8" } }"#).is_err());
+    assert!(ClientMessage::read(r#"{ "ask": "video", "path": { "render_width": "8" } }"#).is_err());
 }
 
 #[test]
@@ -179,7 +182,7 @@ fn photographs_come_in_the_size_that_is_asked_for() {
 
 #[test]
 fn pages_are_told_in_json() {
-    let told = text(&Tell::Sorry { what: "it is lost".to_owned() });
+    let told = text(&ServerMessage::Sorry { what: "it is lost".to_owned() });
     assert_eq!(told, r#"{"tell":"sorry","what":"it is lost"}"#);
 }
 

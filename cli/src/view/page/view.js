@@ -41,7 +41,7 @@ function told(message) {
   if (message.tell === "about") meet(message);
   else if (message.tell === "training") follow(message);
   else if (message.tell === "taken") moved(message);
-  else if (message.tell === "film") filmed(message);
+  else if (message.tell === "video") videoed(message);
   else if (message.tell === "sorry") apologise(message.what);
 }
 
@@ -113,7 +113,7 @@ function meet(message) {
     $("background").value = "#" + about.background.map(hex).join("");
   }
   for (const option of $("skip").options) option.disabled = about.training && !["", "off"].includes(option.value);
-  $("film").disabled = about.training;
+  $("video").disabled = about.training;
   // Beyond the last checkpoint is what the run ended with.
   const count = about.checkpoints.length, known = about.checkpoints.indexOf(checkpoint);
   const chosen = first || known < 0 ? count : known;
@@ -698,22 +698,22 @@ function savePath() {
   if (path) keep(new Blob([JSON.stringify(path, null, 1)], { type: "application/json" }), "path.json");
 }
 
-function makeFilm() {
+function makeVideo() {
   const path = cameraPath();
   if (!path) return;
   const seen = wanted();
   if (seen.crop || seen.checkpoint !== undefined || seen.compared) {
-    return apologise("A film shows the whole scene, as the run ended: without a box, a checkpoint, or the error.");
+    return apologise("A video shows the whole scene, as the run ended: without a box, a checkpoint, or the error.");
   }
   const text = JSON.stringify(path, (name, value) => (typeof value === "number" ? Number(value.toPrecision(12)) : value));
   if (text.length > 15000) return apologise("So many key frames have no room here: save the path, and render it from there.");
-  say({ ask: "film", path: JSON.parse(text), show: seen.show, skip: seen.skip, background: seen.background });
+  say({ ask: "video", path: JSON.parse(text), show: seen.show, skip: seen.skip, background: seen.background });
 }
 
-function filmed({ file, words, ended }) {
-  $("film-progress").hidden = false;
-  $("film-progress").textContent = `${file}: ${words}`;
-  $("end-film").hidden = ended;
+function videoed({ file, words, ended }) {
+  $("video-progress").hidden = false;
+  $("video-progress").textContent = `${file}: ${words}`;
+  $("end-video").hidden = ended;
 }
 
 function keep(blob, name) {
@@ -782,8 +782,8 @@ $("load-path").addEventListener("change", () => {
   // The same one may be chosen again.
   $("load-path").value = "";
 });
-$("film").addEventListener("click", makeFilm);
-$("end-film").addEventListener("click", () => say({ ask: "end-film" }));
+$("video").addEventListener("click", makeVideo);
+$("end-video").addEventListener("click", () => say({ ask: "end-video" }));
 $("checkpoint").addEventListener("input", settled);
 // After a click the scene has the focus again; whoever moves by keys stays where they are.
 document.querySelector("aside").addEventListener("click", (event) => {

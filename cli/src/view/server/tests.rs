@@ -4,8 +4,8 @@ use std::time::Instant;
 
 use super::*;
 use crate::render::shown::Show;
-use crate::view::hub::{Outgoing, Shot};
 use crate::view::messages::{Eye, Made, View};
+use crate::view::requests::{Outgoing, RenderedFrame};
 use serde_json::{Value, json};
 use tungstenite::handshake::client::generate_key;
 use tungstenite::http::Request;
@@ -17,18 +17,18 @@ const LONG: Duration = Duration::from_secs(30);
 /// What a message has that no connection holds while nobody reads it.
 const HUGE: usize = 48 << 20;
 
-fn served_at(host: &str, limits: Limits) -> (String, Arc<Hub>) {
-    let hub = Arc::new(Hub::default());
-    hub.introduce(r#"{"tell":"about"}"#.to_owned());
+fn served_at(host: &str, limits: Limits) -> (String, Arc<Requests>) {
+    let requests = Arc::new(Requests::default());
+    requests.introduce(r#"{"tell":"about"}"#.to_owned());
     let listener = Listener::bind(host, 0).unwrap();
-    let link = serve_within(limits, listener, hub.clone(), None, None, [1.0; 3]).unwrap();
-    (link.strip_prefix("http://").unwrap().to_owned(), hub)
+    let link = serve_within(limits, listener, requests.clone(), None, None, [1.0; 3]).unwrap();
+    (link.strip_prefix("http://").unwrap().to_owned(), requests)
 }
 
 /// Serves to this machine; gives the address.
-fn served(limits: Limits) -> (String, Arc<Hub>) {
-    let (link, hub) = served_at("127.0.0.1", limits);
-    (link.strip_suffix('/').unwrap().to_owned(), hub)
+fn served(limits: Limits) -> (String, Arc<Requests>) {
+    let (link, requests) = served_at("127.0.0.1", limits);
+    (link.strip_suffix('/').unwrap().to_owned(), requests)
 }
 
 fn connect(address: &str) -> TcpStream {
@@ -146,7 +146,7 @@ type Result<T, E> = std::result::Result<T, E>;
 #[test]
 fn nobody_from_elsewhere_is_served_and_nothing_but_the_page() {
     let listener = Listener::bind("127.0.0.1", 0).unwrap();
-    let link = serve(listener, Arc::new(Hub::default()), None, None, [1.0; 3]).unwrap();
+    let link = serve(listener, Arc::new(Requests::default()), None, None, [1.0; 3]).unwrap();
     let address = link.strip_prefix("http://").unwrap().strip_suffix('/').unwrap().to_owned();
     let port = address.rsplit(':').next().unwrap();
     let taken = Listener::bind("127.0.0.1", port.parse().unwrap()).map(drop).unwrap_err().to_string();
@@ -210,7 +210,7 @@ fn nobody_from_elsewhere_is_served_and_nothing_but_the_page() {
 
 #[test]
 fn others_come_with_the_token_alone() {
-    let (link, hub) = served_at("0.0.0.0", Limits::USUAL);
+    let (link, requests) = served_at("0.0.0.0", Limits::USUAL);
     let (host, token) = link.split_once("/?token=").unwrap();
     assert!(token.len() == 32 && token.bytes().all(|byte| byte.is_ascii_hexdigit()), "{token}");
     let address = format!("127.0.0.1:{}", host.rsplit(':').next().unwrap());
@@ -230,7 +230,7 @@ fn others_come_with_the_token_alone() {
         ["403", "403", "403", "101"]
     );
     assert_eq!(upgraded(&address, &format!("/messages?token={token}"), None).1, "403");
-    becomes(|| hub.connected() == 0);
+    becomes(|| requests.connected() == 0);
     // By a name it is not served, as nobody has said which it has.
     let (status, _, body) = request(&address, &format!("GET /?token={token} HTTP/1.1\r\nHost: box.lan"));
     assert!(status == 421 && body.contains("--host NAME"), "{body}");
@@ -263,7 +263,7 @@ fn it_goes_out_by_an_address_of_its_own() {
 
 #[test]
 fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
-    let (address, hub) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
+    let (address, requests) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
     let mut good = Client::open(&address);
     // Reasons end with a letter, however long these are.
     let long = json!({ "ask": "\u{e4}".repeat(100) }).to_string();
@@ -281,41 +281,41 @@ fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
     // As many as may come at once, and one more.
     let mut page = Client::open(&address);
     for _ in 0..3 {
-        page.say(&json!({ "ask": "end-film" }));
+        page.say(&json!({ "ask": "end-video" }));
     }
     page.say(&json!({ "ask": "share", "share": 0.5 }));
     assert_eq!(page.closed().1, "too many messages");
-    assert_eq!(hub.share(), 0.0, "the last one is not seen to");
+    assert_eq!(requests.share(), 0.0, "the last one is not seen to");
     // The others are still served, and three are not too many.
-    becomes(|| hub.connected() == 1);
+    becomes(|| requests.connected() == 1);
     for share in [0.25, 0.5, 0.75] {
         good.say(&json!({ "ask": "share", "share": share }));
-        becomes(|| hub.share() == share);
+        becomes(|| requests.share() == share);
     }
     good.socket.close(None).unwrap();
     good.closed();
-    becomes(|| hub.connected() == 0);
+    becomes(|| requests.connected() == 0);
 }
 
 #[test]
 fn a_message_is_so_long_and_no_longer() {
-    let (address, hub) = served(Limits::USUAL);
+    let (address, requests) = served(Limits::USUAL);
     let message = json!({ "ask": "share", "share": 0.5 }).to_string();
     let mut page = Client::open(&address);
     page.socket.send(Message::text(format!("{}{message}", " ".repeat((1 << 14) - message.len())))).unwrap();
-    becomes(|| hub.share() == 0.5);
-    hub.set_share(0.0);
+    becomes(|| requests.share() == 0.5);
+    requests.set_share(0.0);
     page.socket.send(Message::text(format!("{}{message}", " ".repeat((1 << 14) + 1 - message.len())))).unwrap();
     page.closed();
-    becomes(|| hub.connected() == 0);
-    assert_eq!(hub.share(), 0.0);
+    becomes(|| requests.connected() == 0);
+    assert_eq!(requests.share(), 0.0);
 }
 
 #[test]
 fn so_many_pages_are_served_and_no_more_until_one_goes() {
     // Connections are for those that are no pages yet.
     let silence = Duration::from_millis(400);
-    let (address, hub) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
+    let (address, requests) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
     let start = Instant::now();
     let mut pages: Vec<_> = (0..3).map(|_| joined(&address)).collect();
     assert!(pages.iter().all(|(_, status)| status == "101"));
@@ -329,7 +329,7 @@ fn so_many_pages_are_served_and_no_more_until_one_goes() {
         is_in
     });
     // Those that say nothing at all, not even that they are there, are taken to be gone.
-    becomes(|| hub.connected() == 0);
+    becomes(|| requests.connected() == 0);
     assert!(start.elapsed() >= silence);
 }
 
@@ -337,11 +337,11 @@ fn so_many_pages_are_served_and_no_more_until_one_goes() {
 fn a_page_that_only_looks_on_is_asked_whether_it_is_there_and_stays() {
     let (idle, silence) = (Duration::from_millis(100), Duration::from_secs(2));
     let connected = Duration::from_millis(200);
-    let (address, hub) = served(Limits { idle, silence, connected, ..Limits::USUAL });
+    let (address, requests) = served(Limits { idle, silence, connected, ..Limits::USUAL });
     let start = Instant::now();
     let mut page = Client::open(&address);
     let mut pings = 0;
-    hub.tell_state("{}");
+    requests.tell_state("{}");
     while start.elapsed() < silence + silence / 2 {
         let message = page.read().unwrap();
         if message.is_ping() {
@@ -350,21 +350,21 @@ fn a_page_that_only_looks_on_is_asked_whether_it_is_there_and_stays() {
         } else {
             // It is told how it goes meanwhile.
             std::thread::sleep(Duration::from_millis(20));
-            hub.tell_state("{}");
+            requests.tell_state("{}");
         }
     }
     assert!(pings >= 3, "{pings}");
-    assert_eq!(hub.connected(), 1);
+    assert_eq!(requests.connected(), 1);
 }
 
 #[test]
 fn who_is_slow_is_not_gone_in_the_middle_of_a_message() {
     let silence = Duration::from_millis(200);
-    let (address, hub) = served(Limits { silence, ..Limits::USUAL });
-    hub.introduce("x".repeat(HUGE));
+    let (address, requests) = served(Limits { silence, ..Limits::USUAL });
+    requests.introduce("x".repeat(HUGE));
     let mut page = Client::connect(&address);
     std::thread::sleep(3 * silence);
-    assert_eq!(hub.connected(), 1);
+    assert_eq!(requests.connected(), 1);
     let message = page.read().unwrap();
     assert!(message.is_text() && message.len() == HUGE);
 }
@@ -372,23 +372,23 @@ fn who_is_slow_is_not_gone_in_the_middle_of_a_message() {
 #[test]
 fn a_message_that_is_not_taken_is_not_waited_for_for_ever() {
     let patience = Duration::from_millis(200);
-    let (address, hub) = served(Limits { patience, slowest: 1 << 40, ..Limits::USUAL });
+    let (address, requests) = served(Limits { patience, slowest: 1 << 40, ..Limits::USUAL });
     let page = Client::open(&address);
     let start = Instant::now();
-    hub.tell(&Outgoing::Bytes(vec![7; HUGE]));
-    becomes(|| hub.connected() == 0);
+    requests.tell(&Outgoing::Bytes(vec![7; HUGE]));
+    becomes(|| requests.connected() == 0);
     assert!(start.elapsed() >= patience);
     drop(page);
 }
 
 #[test]
 fn who_asks_for_too_much_is_told() {
-    let (address, hub) = served(Limits::USUAL);
+    let (address, requests) = served(Limits::USUAL);
     let mut page = Client::open(&address);
     // Nothing is sent before this has gone, however quick the other side is.
-    hub.tell(&Outgoing::Bytes(vec![7; HUGE]));
+    requests.tell(&Outgoing::Bytes(vec![7; HUGE]));
     for _ in 0..100 {
-        hub.tell(&text(&crate::view::messages::Tell::Sorry { what: String::new() }));
+        requests.tell(&text(&crate::view::messages::ServerMessage::Sorry { what: String::new() }));
     }
     assert_eq!(page.closed(), (1, "too much was asked for".to_owned()));
 }
@@ -409,14 +409,14 @@ fn view() -> View {
 #[test]
 fn a_page_that_takes_no_picture_is_dropped() {
     let patience = Duration::from_secs(1);
-    let (address, hub) = served(Limits { patience, ..Limits::USUAL });
+    let (address, requests) = served(Limits { patience, ..Limits::USUAL });
     let mut page = Client::open(&address);
     page.say(&json!({ "ask": "view", "id": 1, "view": { "eye": { "photograph": 0 }, "size": [8, 8] } }));
-    becomes(|| !hub.wishes().is_empty());
-    assert_eq!(hub.wishes()[0].view, view());
+    becomes(|| !requests.wishes().is_empty());
+    assert_eq!(requests.wishes()[0].view, view());
     let show = |halvings: u32| {
         let made = Made { halvings, milliseconds: 1.0, compared: None, step: 0 };
-        hub.show(&hub.wishes()[0], Shot { made, jpeg: vec![7; 9] });
+        requests.show(&requests.wishes()[0], RenderedFrame { made, jpeg: vec![7; 9] });
     };
     // One that takes them stays, for longer than it may take.
     let start = Instant::now();
@@ -426,7 +426,7 @@ fn a_page_that_takes_no_picture_is_dropped() {
         page.say(&json!({ "ask": "seen", "id": 1 }));
         std::thread::sleep(2 * patience / 5);
     }
-    assert!(start.elapsed() > patience && hub.connected() == 1);
+    assert!(start.elapsed() > patience && requests.connected() == 1);
     let start = Instant::now();
     show(1);
     show(0);

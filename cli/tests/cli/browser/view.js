@@ -44,7 +44,7 @@ is("keys", keys, []);
 const chosen = [...$("photograph").options].map((option) => [option.value, option.textContent, option.parentElement.label]);
 is("photographs", chosen, [["", "-", undefined], ["1", "b", "trained on"], ["2", "c", "trained on"], ["3", "d", "validation"], ["0", "a", "test"]]);
 is("background", $("background").value, "#ff8000");
-const offered = () => ["photographs", "training", "checkpoints"].map((id) => $(id).hidden).concat([...$("skip").options].map((o) => o.disabled), $("film").disabled,
+const offered = () => ["photographs", "training", "checkpoints"].map((id) => $(id).hidden).concat([...$("skip").options].map((o) => o.disabled), $("video").disabled,
   document.querySelector("input[value=error]").disabled, $("checkpoint").max, $("checkpoint").value);
 is("offered", offered(), [false, true, false, false, false, false, false, false, false, "2", "2"]);
 is("sliders of the box", [...$("box").querySelectorAll("input")].map((i) => [i.id, i.min, i.max, i.value, i.getAttribute("aria-label")]), [
@@ -372,8 +372,8 @@ $("stop").click();
 is("not stopped", called(), []);
 window.confirm = () => true;
 $("stop").click();
-$("end-film").click();
-is("stopped", called(), [{ ask: "stop" }, { ask: "end-film" }]);
+$("end-video").click();
+is("stopped", called(), [{ ask: "stop" }, { ask: "end-video" }]);
 
 // ---- how often it is asked for ------------------------------------------------------------------------------------------------
 ask = real.ask;
@@ -443,10 +443,10 @@ is("sorry", [text("sorry"), $("sorry").hidden, timers.map((t) => t.after), reque
 timers.pop().run();
 is("for a while", $("sorry").hidden, true);
 again = false;
-told({ tell: "film", file: "f.mp4", words: "3 of 9", ended: false });
-is("a film", [text("film-progress"), $("film-progress").hidden, $("end-film").hidden], ["f.mp4: 3 of 9", false, false]);
-told({ tell: "film", file: "f.mp4", words: "done", ended: true });
-is("its end", [text("film-progress"), $("end-film").hidden], ["f.mp4: done", true]);
+told({ tell: "video", file: "f.mp4", words: "3 of 9", ended: false });
+is("a video", [text("video-progress"), $("video-progress").hidden, $("end-video").hidden], ["f.mp4: 3 of 9", false, false]);
+told({ tell: "video", file: "f.mp4", words: "done", ended: true });
+is("its end", [text("video-progress"), $("end-video").hidden], ["f.mp4: done", true]);
 // Pictures: the newest stays, whichever was decoded first.
 const coming = [];
 fixed(window, "createImageBitmap", () => new Promise((done) => coming.push(done)));
@@ -577,11 +577,11 @@ const written = {
 is("a path", cameraPath(), written);
 called();
 free();
-set("skip", "lossless");
-makeFilm();
-is("a film is asked for", called(), [{ ask: "film", path: written, show: "color", skip: "lossless", background: undefined }]);
-const sorry = (change, back) => { change(); $("sorry").textContent = ""; makeFilm(); back(); return [text("sorry").slice(0, 20), called()]; };
-const whole = "A film shows the who";
+set("skip", "near-lossless");
+makeVideo();
+is("a video is asked for", called(), [{ ask: "video", path: written, show: "color", skip: "near-lossless", background: undefined }]);
+const sorry = (change, back) => { change(); $("sorry").textContent = ""; makeVideo(); back(); return [text("sorry").slice(0, 20), called()]; };
+const whole = "A video shows the who";
 is("with a box", sorry(() => set("crop", true), () => set("crop", false)), [whole, []]);
 is("of a checkpoint", sorry(() => set("checkpoint", 0), () => set("checkpoint", 2)), [whole, []]);
 is("of the error", sorry(() => { document.querySelector("input[value=error]").checked = true; }, () => { document.querySelector("input[value=color]").checked = true; }), [whole, []]);

@@ -2,8 +2,8 @@ use super::*;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 /// Keys without any symmetry.
-fn keys() -> Vec<Key> {
-    let key = |[x, y, z]: [f64; 3], axis: DVec3, angle: f64, angle_y: f64| Key {
+fn keys() -> Vec<Keyframe> {
+    let key = |[x, y, z]: [f64; 3], axis: DVec3, angle: f64, angle_y: f64| Keyframe {
         pose: DAffine3 { matrix3: DMat3::from_axis_angle(axis.normalize(), angle), translation: DVec3::new(x, y, z) },
         angle_y,
     };
@@ -17,7 +17,7 @@ fn keys() -> Vec<Key> {
 }
 
 /// How far apart two keys are, in all that they say.
-fn apart(a: &Key, b: &Key) -> f64 {
+fn apart(a: &Keyframe, b: &Keyframe) -> f64 {
     let rotation = (a.pose.matrix3 - b.pose.matrix3).to_cols_array().iter().map(|x| x * x).sum::<f64>().sqrt();
     rotation + a.pose.translation.distance(b.pose.translation) + (a.angle_y - b.angle_y).abs()
 }
@@ -62,7 +62,7 @@ fn a_path_passes_its_keys_with_continuous_speeds() {
 fn positions_are_those_of_hermites_form_with_centripetal_times() {
     // Without turns times are square roots of distances; 1, 4 and 9 apart in a line, and 4 aside.
     let places = [[0.0, 0.0], [1.0, 0.0], [5.0, 0.0], [5.0, 9.0]].map(|[x, y]| DVec3::new(x, y, 2.0));
-    let keys = places.map(|place| Key { pose: DAffine3::from_translation(place), angle_y: 1.0 });
+    let keys = places.map(|place| Keyframe { pose: DAffine3::from_translation(place), angle_y: 1.0 });
     let path = CameraPath::through(keys.to_vec(), false);
     let knots = [0.0, 1.0, 3.0, 6.0];
     for (share, knot) in path.shares().iter().zip(knots) {
@@ -92,7 +92,7 @@ fn a_constant_turn_stays_one_and_is_the_short_way() {
     let key = |i: usize| {
         let angle = i as f64 * TAU / 7.0;
         let eye = 3.0 * DVec3::new(angle.cos(), angle.sin(), 0.5);
-        Key { pose: Camera::look_at(eye, DVec3::new(0.0, 0.0, 1.5), DVec3::Z), angle_y: 0.8 }
+        Keyframe { pose: Camera::look_at(eye, DVec3::new(0.0, 0.0, 1.5), DVec3::Z), angle_y: 0.8 }
     };
     let path = CameraPath::through((0..7).map(key).collect(), true);
     let frames = path.frames(70);
@@ -111,19 +111,20 @@ fn a_constant_turn_stays_one_and_is_the_short_way() {
     }
     assert!(apart(&frames[10], &key(1)) < 1e-9 && apart(&frames[0], &key(0)) < 1e-9);
     // A turn of 350 degrees is one of 10 the other way.
-    let turned = |degrees: f64| Key { pose: DAffine3::from_rotation_y(degrees.to_radians()), angle_y: 0.8 };
+    let turned = |degrees: f64| Keyframe { pose: DAffine3::from_rotation_y(degrees.to_radians()), angle_y: 0.8 };
     let between = turned(5.0).mix(&turned(355.0), 0.25);
     assert!(apart(&between, &turned(2.5)) < 1e-12);
     // And one of 210 is one of 150, whatever the sign of the quaternion that a matrix gives.
     for axis in [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y, DVec3::NEG_Z] {
-        let about = |degrees: f64| Key { pose: DAffine3::from_axis_angle(axis, degrees.to_radians()), angle_y: 0.8 };
+        let about =
+            |degrees: f64| Keyframe { pose: DAffine3::from_axis_angle(axis, degrees.to_radians()), angle_y: 0.8 };
         assert!(apart(&about(0.0).mix(&about(210.0), 0.5), &about(-75.0)) < 1e-12, "{axis}");
     }
 }
 
 #[test]
 fn fields_of_view_are_mixed_by_their_focal_lengths() {
-    let key = |angle_y: f64| Key { pose: DAffine3::IDENTITY, angle_y };
+    let key = |angle_y: f64| Keyframe { pose: DAffine3::IDENTITY, angle_y };
     // Tangents 1 and 1/4: 1/2 is between them.
     let between = key(FRAC_PI_2).mix(&key(2.0 * 0.25_f64.atan()), 0.5);
     assert!((between.angle_y - 2.0 * 0.5_f64.atan()).abs() < 1e-12);
@@ -131,9 +132,9 @@ fn fields_of_view_are_mixed_by_their_focal_lengths() {
     let camera = key(PI / 3.0).camera([400, 300]);
     let focal = 150.0 * 3.0_f64.sqrt();
     assert!(camera.focal.iter().all(|f| (f - focal).abs() < 1e-9) && camera.centre == [200.0, 150.0]);
-    assert!((Key::of(&camera).angle_y - PI / 3.0).abs() < 1e-12);
+    assert!((Keyframe::of(&camera).angle_y - PI / 3.0).abs() < 1e-12);
     let stretched = Camera { focal: [100.0, 150.0], ..camera };
-    assert!((Key::of(&stretched).angle_y - FRAC_PI_2).abs() < 1e-12, "it is that of the vertical");
+    assert!((Keyframe::of(&stretched).angle_y - FRAC_PI_2).abs() < 1e-12, "it is that of the vertical");
 }
 
 #[test]
@@ -141,7 +142,7 @@ fn near_its_keys_a_path_is_a_cubic_b_spline() {
     let keys = keys();
     let path = CameraPath::timed(keys.clone(), vec![1.0, 2.0, 0.5, 1.5], false, Curve::Near);
     assert_eq!(path.shares(), [0.0, 0.2, 0.6, 0.7, 1.0]);
-    let mean = |weights: [f64; 5], of: fn(&Key) -> DVec3| -> DVec3 {
+    let mean = |weights: [f64; 5], of: fn(&Keyframe) -> DVec3| -> DVec3 {
         keys.iter().zip(weights).map(|(key, weight)| weight * of(key)).sum()
     };
     let sixths = |weights: [f64; 5]| weights.map(|weight| weight / 6.0);
@@ -161,7 +162,7 @@ fn near_its_keys_a_path_is_a_cubic_b_spline() {
         assert!(excess.to_cols_array().iter().all(|x| x.abs() < 1e-12));
     }
     // Of turns about one axis the mean of two that are alike is halfway, whatever the sign of a quaternion.
-    let turned = |degrees: f64| Key { pose: DAffine3::from_rotation_z(degrees.to_radians()), angle_y: 0.8 };
+    let turned = |degrees: f64| Keyframe { pose: DAffine3::from_rotation_z(degrees.to_radians()), angle_y: 0.8 };
     let around = CameraPath::timed([170.0, 170.0, 190.0, 190.0].map(turned).to_vec(), vec![1.0; 3], false, Curve::Near);
     assert!(apart(&around.at(0.5), &turned(180.0)) < 1e-12);
 }
@@ -200,8 +201,8 @@ fn legs_of_no_time_to_speak_of_are_passed() {
 #[test]
 fn times_move_cameras_along_a_curve_that_they_do_not_bend() {
     // Equal steps along x, of which a curve through them makes x its parameter.
-    let key = |x: f64| Key { pose: DAffine3::from_translation(DVec3::new(x, 1.0, 2.0)), angle_y: 0.8 };
-    let keys: Vec<Key> = (0..5).map(|i| key(f64::from(i))).collect();
+    let key = |x: f64| Keyframe { pose: DAffine3::from_translation(DVec3::new(x, 1.0, 2.0)), angle_y: 0.8 };
+    let keys: Vec<Keyframe> = (0..5).map(|i| key(f64::from(i))).collect();
     let along = |path: &CameraPath, time: f64, all: f64| path.at(time / all).pose.translation.x;
     // scipy.interpolate.PchipInterpolator([0, 1, 3, 3.5, 5], [0, 1, 2, 3, 4])
     let open = CameraPath::timed(keys.clone(), vec![1.0, 2.0, 0.5, 1.5], false, Curve::Through);

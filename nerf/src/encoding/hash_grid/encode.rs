@@ -167,7 +167,7 @@ impl<T: Scalar> Op<T> for HashEncoding {
         out
     }
 
-    fn is_kept(&self) -> bool {
+    fn is_cacheable(&self) -> bool {
         true
     }
 

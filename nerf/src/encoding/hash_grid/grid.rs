@@ -38,8 +38,8 @@ impl HashGridConfig {
     /// Rows of more features on fewer levels, so fewer places of memory to visit; and as many of both as pay for what it is
     /// trained with: more of them hold more detail, but take longer, the more so if they do not fit the caches.
     ///
-    /// `samples` are those of the whole [training](crate::Budget::samples), and `footprints` how many
-    /// [pixels of the photographs](crate::dataset::Dataset::footprints) lie along a side of the scene: no cell is smaller
+    /// `samples` are those of the whole [training](crate::Budget::samples), and `pixels_per_side` how many
+    /// [pixels of the photographs](crate::dataset::Dataset::pixels_per_side) lie along a side of the scene: no cell is smaller
     /// than half of one, as nothing would be seen of it.
     pub fn cpu(samples: f64, footprints: f64) -> Self {
         let (log2_table, finest) = match samples {

@@ -37,7 +37,7 @@ fn fewer_triangles_hold_the_same() {
         assert_eq!(reports.len() - 1, fine.triangles.len() / OFTEN, "{name}");
         assert!(fine.triangles.len() > 3000, "{name}");
         assert!((999..=1000).contains(&coarse.triangles.len()), "{name}: {}", coarse.triangles.len());
-        assert!(coarse.is_closed() && coarse.parts().1 == 1, "{name}");
+        assert!(coarse.is_closed() && coarse.components().1 == 1, "{name}");
         let euler = |mesh: &Mesh| mesh.positions.len() as i64 - mesh.triangles.len() as i64 / 2;
         assert_eq!(euler(&coarse), euler(&fine), "{name}");
         assert!((coarse.volume() / fine.volume() - 1.0).abs() < 0.01, "{name}: {} {}", coarse.volume(), fine.volume());
@@ -95,7 +95,7 @@ fn borders_stay_where_they_are() {
     let mut mesh = of(|x| 1.0 + 0.1 * (4.0 * x.x).sin() - x.z, false);
     let before = mesh.clone();
     mesh.decimate(400, &mut |_| ());
-    assert!(mesh.triangles.len() <= 400 && !mesh.is_closed() && mesh.parts().1 == 1);
+    assert!(mesh.triangles.len() <= 400 && !mesh.is_closed() && mesh.components().1 == 1);
     assert!((mesh.area() / before.area() - 1.0).abs() < 0.01, "{} {}", mesh.area(), before.area());
     let ([low, high], [old_low, old_high]) = (mesh.bounds().unwrap(), before.bounds().unwrap());
     assert!(low.abs_diff_eq(old_low, 0.01) && high.abs_diff_eq(old_high, 0.01), "{low} {high}");

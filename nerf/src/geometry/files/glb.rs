@@ -1,6 +1,6 @@
 //! Binary glTF: a JSON description and one buffer.
 
-use super::super::shape::Shape;
+use super::super::colored_mesh::ColoredMesh;
 use crate::dataset::SrgbDecode;
 use glam::DVec3;
 use raygrad_autograd::Formula;
@@ -18,8 +18,8 @@ const JSON: &[u8; 4] = b"JSON";
 const BIN: &[u8; 4] = b"BIN\0";
 
 /// The file, or what is wrong.
-pub(super) fn to_bytes(shape: &Shape, generator: &str) -> Result<Vec<u8>, String> {
-    let Shape { mesh, normals, colors } = shape;
+pub(super) fn to_bytes(shape: &ColoredMesh, generator: &str) -> Result<Vec<u8>, String> {
+    let ColoredMesh { mesh, normals, colors } = shape;
     let [low, high] = mesh.bounds().ok_or("would have no vertices, which glTF does not allow")?;
     let middle = 0.5 * (low + high);
     let near = |place: &DVec3| (*place - middle).as_vec3().to_array();

@@ -6,7 +6,7 @@ mod ply;
 #[cfg(test)]
 mod tests;
 
-use super::shape::Shape;
+use super::colored_mesh::ColoredMesh;
 use crate::files::write_atomic;
 use crate::{Error, Result};
 use std::path::Path;
@@ -44,7 +44,7 @@ impl Format {
 /// # Errors
 /// If the ending is none of [`Format`]'s, there is not a normal and a colour for each vertex, the shape is too large or the file
 /// cannot be written.
-pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
+pub fn write(shape: &ColoredMesh, path: impl AsRef<Path>) -> Result<u64> {
     write_with_comment(shape, path, "raygrad")
 }
 
@@ -53,7 +53,7 @@ pub fn write(shape: &Shape, path: impl AsRef<Path>) -> Result<u64> {
 ///
 /// # Errors
 /// As [`write()`].
-pub fn write_with_comment(shape: &Shape, path: impl AsRef<Path>, comment: &str) -> Result<u64> {
+pub fn write_with_comment(shape: &ColoredMesh, path: impl AsRef<Path>, comment: &str) -> Result<u64> {
     let comment = &comment.replace(char::is_control, " ");
     let path = path.as_ref();
     let [vertices, normals, colors] = [shape.mesh.positions.len(), shape.normals.len(), shape.colors.len()];

@@ -1,13 +1,13 @@
 //! OBJ files: text, vertices from 1.
 
-use super::super::shape::Shape;
+use super::super::colored_mesh::ColoredMesh;
 use std::fmt::Write;
 
 /// Digits of places, counted from the first of the largest.
 const DIGITS: i32 = 8;
 
-pub(super) fn to_text(shape: &Shape, comment: &str) -> String {
-    let Shape { mesh, normals, colors } = shape;
+pub(super) fn to_text(shape: &ColoredMesh, comment: &str) -> String {
+    let ColoredMesh { mesh, normals, colors } = shape;
     let largest = mesh.bounds().map_or(1.0, |[low, high]| (high - low).max_element());
     // One point has no extent.
     let largest = if largest > 0.0 { largest } else { 1.0 };

@@ -1,9 +1,9 @@
 //! PLY files, as the points of datasets are written: places are doubles.
 
-use super::super::shape::Shape;
+use super::super::colored_mesh::ColoredMesh;
 
-pub(super) fn to_bytes(shape: &Shape, comment: &str) -> Vec<u8> {
-    let Shape { mesh, normals, colors } = shape;
+pub(super) fn to_bytes(shape: &ColoredMesh, comment: &str) -> Vec<u8> {
+    let ColoredMesh { mesh, normals, colors } = shape;
     let mut header = format!("ply\nformat binary_little_endian 1.0\ncomment {comment}\n");
     header += &format!("element vertex {}\n", mesh.positions.len());
     for property in ["double x", "double y", "double z", "float nx", "float ny", "float nz"] {

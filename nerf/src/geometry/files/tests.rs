@@ -2,7 +2,7 @@
 
 use super::super::mesh::Mesh;
 use super::*;
-use crate::dataset::{Placement, SrgbDecode};
+use crate::dataset::{SceneTransform, SrgbDecode};
 use glam::{DMat3, DQuat, DVec3};
 use ply_rs_bw::parser::Parser;
 use ply_rs_bw::ply::{DefaultElement, Property};
@@ -10,23 +10,23 @@ use raygrad_autograd::Formula;
 use std::f64::consts::FRAC_PI_2;
 
 /// Four vertices and three triangles, far away from the origin, no two numbers alike.
-fn shape() -> Shape {
+fn shape() -> ColoredMesh {
     let at = DVec3::new(500_000.25, -37.5, 12.0);
     let positions = [[0.0, 0.125, 0.25], [1.5, 0.375, 0.5], [0.625, 2.0, 0.75], [0.875, 1.0, 3.25]];
     let positions = positions.map(|x| at + DVec3::from(x)).to_vec();
     let normals = [[0.6, 0.0, 0.8], [-0.28, 0.96, 0.0], [0.0, -0.6, 0.8], [0.36, 0.48, -0.8]].map(DVec3::from).to_vec();
     let colors = vec![[255, 128, 0], [1, 2, 3], [90, 200, 40], [10, 20, 250]];
-    Shape { mesh: Mesh { positions, triangles: vec![[0, 1, 2], [2, 1, 3], [3, 0, 2]] }, normals, colors }
+    ColoredMesh { mesh: Mesh { positions, triangles: vec![[0, 1, 2], [2, 1, 3], [3, 0, 2]] }, normals, colors }
 }
 
-fn points() -> Shape {
+fn points() -> ColoredMesh {
     let mut shape = shape();
     shape.mesh.triangles.clear();
     shape
 }
 
 /// The bytes of a file.
-fn written(shape: &Shape, name: &str) -> Vec<u8> {
+fn written(shape: &ColoredMesh, name: &str) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
     let count = write(shape, &path).unwrap();
@@ -77,7 +77,7 @@ fn ply_files_are_read_by_another_library() {
 #[test]
 fn obj_files_are_read_by_another_library() {
     // In f32 it would not have the digits of what is far away.
-    let near = |mut shape: Shape| {
+    let near = |mut shape: ColoredMesh| {
         shape.mesh.positions.iter_mut().for_each(|x| *x -= DVec3::new(500_000.0, 0.0, 0.0));
         shape
     };
@@ -162,14 +162,14 @@ fn glb_files_are_read_by_another_library() {
         }
         assert_eq!(bytes.len() % 4, 0);
     }
-    let nothing = write(&Shape::default(), std::env::temp_dir().join("nothing.glb")).unwrap_err().to_string();
+    let nothing = write(&ColoredMesh::default(), std::env::temp_dir().join("nothing.glb")).unwrap_err().to_string();
     assert!(nothing.contains("nothing.glb: would have no vertices"), "{nothing}");
 }
 
 #[test]
 fn shapes_go_back_to_the_coordinates_of_the_capture() {
     // A quarter turn about z: x of the capture is y of the scene; half a scene unit is a unit of the capture.
-    let placement = Placement {
+    let placement = SceneTransform {
         rotation: DMat3::from_quat(DQuat::from_rotation_z(FRAC_PI_2)),
         scale: 0.5,
         origin: DVec3::new(10.0, 20.0, 30.0),
@@ -220,10 +220,10 @@ fn other_endings_are_refused() {
 
 #[test]
 fn a_bare_mesh_is_written_white_and_half_a_shape_is_an_error() {
-    let bare = Shape::from(shape().mesh);
+    let bare = ColoredMesh::from(shape().mesh);
     assert!(bare.normals == bare.mesh.normals() && bare.colors == [[255; 3]; 4]);
     assert!(written(&bare, "a.ply").len() > 4 * 39);
-    for half in [Shape { normals: vec![], ..shape() }, Shape { colors: vec![[0; 3]; 3], ..shape() }] {
+    for half in [ColoredMesh { normals: vec![], ..shape() }, ColoredMesh { colors: vec![[0; 3]; 3], ..shape() }] {
         let error = write(&half, "never.ply").unwrap_err().to_string();
         assert!(error.contains("never.ply: would have") && error.contains("for 4 vertices"), "{error}");
     }

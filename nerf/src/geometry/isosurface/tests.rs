@@ -49,7 +49,7 @@ fn a_ball_off_the_middle_of_a_box_with_unequal_sides() {
         let off =
             mesh.positions.iter().map(|x| (x.distance(centre) - radius).abs()).fold(0.0, raygrad_tensor::Real::maximum);
         assert!(off < bound, "{name}: {off}");
-        assert!(mesh.is_closed() && euler(&mesh) == 2 && mesh.parts().1 == 1, "{name}");
+        assert!(mesh.is_closed() && euler(&mesh) == 2 && mesh.components().1 == 1, "{name}");
         // Triangles lie within the ball by about an eighth of a squared cell over the radius.
         let (volume, area) = (4.0 / 3.0 * PI * radius.powi(3), 4.0 * PI * radius.powi(2));
         assert!((0.985..1.002).contains(&(mesh.volume() / volume)), "{name}: {}", mesh.volume() / volume);
@@ -73,7 +73,7 @@ fn a_torus_has_a_hole() {
         2.0 - around
     };
     let mesh = within(BOX, 90, 1.8, true, torus);
-    assert!(mesh.is_closed() && mesh.parts().1 == 1);
+    assert!(mesh.is_closed() && mesh.components().1 == 1);
     assert_eq!(euler(&mesh), 0);
     let volume = 2.0 * PI * PI * 0.45 * 0.2_f64.powi(2);
     assert!((0.98..1.002).contains(&(mesh.volume() / volume)), "{}", mesh.volume() / volume);
@@ -96,7 +96,7 @@ fn what_crosses_the_border_of_the_box_is_closed_there_if_it_is_to_be() {
     assert!(low.abs_diff_eq(DVec3::new(-1.0, -1.0, 0.0), slack), "{low}");
     assert!(high.abs_diff_eq(DVec3::new(2.0, -0.4, 1.5), slack), "{high}");
     let open = within(BOX, 50, 1.0, false, slab);
-    assert!(!open.is_closed() && open.parts().1 == 2, "the two sides of the slab");
+    assert!(!open.is_closed() && open.components().1 == 2, "the two sides of the slab");
     assert!((open.area() - 2.0 * 3.0 * 1.5).abs() < 1e-3, "{}", open.area());
     let [low, high] = open.bounds().unwrap();
     assert!(low.abs_diff_eq(DVec3::new(-1.0, -1.0, 0.0), 1e-5) && high.abs_diff_eq(DVec3::new(2.0, -0.4, 1.5), 1e-5));

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::field::{self, Density, Field, FieldConfig, VoxelConfig};
-use crate::model::{Config, Extent, Preset};
+use crate::model::{Config, Preset, SceneBox};
 use crate::sampling::marching::MarchingConfig;
 use glam::DVec3;
 use raygrad_autograd::{Tensor, Var};
@@ -26,7 +26,7 @@ impl Field<f32> for Balls {
         Density { value: deepest.unwrap(), log: true, features: positions.clone() }
     }
 
-    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
+    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::ViewInputs<'_, 't, f32>) -> Var<'t, f32> {
         0.5 - seen.directions.segment_expand(seen.segments) * 0.5
     }
 }
@@ -45,7 +45,7 @@ fn model_in(bounds: [DVec3; 2], balls: &[(DVec3, f64)], preset: Preset) -> Model
         config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
         sampler.occupancy.resolution = 32;
     }
-    let mut model = Model::new(config, Extent::new(bounds, [0.5, 8.0]), 0).unwrap();
+    let mut model = Model::new(config, SceneBox::new(bounds, [0.5, 8.0]), 0).unwrap();
     model.field = Arc::new(Balls(balls.to_vec()));
     model.finish();
     model
@@ -70,8 +70,14 @@ fn surface(model: &Model<f32>, config: &SurfaceConfig) -> Surface {
 }
 
 /// Of the right number of cells for the balls here.
-const CONFIG: SurfaceConfig =
-    SurfaceConfig { resolution: Some(80), level: None, parts: 0.01, triangles: None, filled: false, closed: true };
+const CONFIG: SurfaceConfig = SurfaceConfig {
+    resolution: Some(80),
+    iso_value: None,
+    min_component: 0.01,
+    triangles: None,
+    fill_unseen: false,
+    closed: true,
+};
 
 #[test]
 fn the_surface_is_where_views_see_it() {
@@ -79,10 +85,10 @@ fn the_surface_is_where_views_see_it() {
     // A ray to the middle has lost half of its light where the density is 40 ln 2; one that comes in at an angle, before.
     let most = STEEPNESS * LN_2;
     // The share of rays that come in at more than an angle is its squared sine: at the lower quartile the cosine is a half.
-    assert!((0.4 * most..0.6 * most).contains(&found.level), "{} {most}", found.level);
-    let radius = RADIUS - found.level.ln() / STEEPNESS;
-    let Shape { mesh, normals, colors } = &found.shape;
-    assert!(mesh.is_closed() && mesh.parts().1 == 1 && found.dropped == 0 && found.resolution == 80);
+    assert!((0.4 * most..0.6 * most).contains(&found.iso_value), "{} {most}", found.iso_value);
+    let radius = RADIUS - found.iso_value.ln() / STEEPNESS;
+    let ColoredMesh { mesh, normals, colors } = &found.colored_mesh;
+    assert!(mesh.is_closed() && mesh.components().1 == 1 && found.dropped == 0 && found.resolution == 80);
     assert!((mesh.volume() / (4.0 / 3.0 * PI * radius.powi(3)) - 1.0).abs() < 0.01);
     assert_eq!([normals.len(), colors.len()], [mesh.positions.len(); 2]);
     for ((place, normal), color) in mesh.positions.iter().zip(normals).zip(colors) {
@@ -97,18 +103,18 @@ fn the_surface_is_where_views_see_it() {
 #[test]
 fn a_level_that_is_given_is_taken() {
     for level in [1.0, 500.0] {
-        let found = surface(&ball(), &SurfaceConfig { level: Some(level), ..CONFIG });
+        let found = surface(&ball(), &SurfaceConfig { iso_value: Some(level), ..CONFIG });
         let radius = RADIUS - level.ln() / STEEPNESS;
-        assert!(found.level == level && !found.shape.mesh.positions.is_empty());
+        assert!(found.iso_value == level && !found.colored_mesh.mesh.positions.is_empty());
         let off = |place: &DVec3| (place.distance(CENTRE) - radius).abs();
-        assert!(found.shape.mesh.positions.iter().all(|place| off(place) < 1e-4), "{level}");
+        assert!(found.colored_mesh.mesh.positions.iter().all(|place| off(place) < 1e-4), "{level}");
         // Nothing but what is near was asked, of 82 x 69 x 56 nodes; for each vertex five times for its place and six times for
         // its normal.
-        let (asked, vertices) = (found.evaluations, found.shape.mesh.positions.len() as u64);
+        let (asked, vertices) = (found.evaluations, found.colored_mesh.mesh.positions.len() as u64);
         assert!((11 * vertices + 5000..150_000).contains(&asked.density), "{asked:?} {vertices}");
         assert_eq!(asked.color, vertices);
     }
-    let default = surface(&ball(), &SurfaceConfig { resolution: None, level: Some(1.0), ..CONFIG });
+    let default = surface(&ball(), &SurfaceConfig { resolution: None, iso_value: Some(1.0), ..CONFIG });
     assert_eq!(default.resolution, 64, "two cells for each of the grid's 32");
 }
 
@@ -123,8 +129,8 @@ fn what_pictures_leave_out_is_empty() {
         marching.grid.rebuild(0.5, false, &left);
     }
     half.finish();
-    let found = surface(&half, &SurfaceConfig { level: Some(1.0), ..CONFIG });
-    let mesh = &found.shape.mesh;
+    let found = surface(&half, &SurfaceConfig { iso_value: Some(1.0), ..CONFIG });
+    let mesh = &found.colored_mesh.mesh;
     // A cap of height RADIUS - .05, as the cut is at .25.
     let height: f64 = RADIUS - 0.05;
     let cap = PI * height * height * (3.0 * RADIUS - height) / 3.0;
@@ -134,10 +140,10 @@ fn what_pictures_leave_out_is_empty() {
 
 #[test]
 fn a_model_without_a_grid_has_the_same_surface() {
-    let config = SurfaceConfig { level: Some(2.0), ..CONFIG };
+    let config = SurfaceConfig { iso_value: Some(2.0), ..CONFIG };
     let with = surface(&ball(), &config);
     let without = surface(&model(&[(CENTRE, RADIUS)], Preset::Small), &config);
-    assert_eq!(with.shape.mesh, without.shape.mesh);
+    assert_eq!(with.colored_mesh.mesh, without.colored_mesh.mesh);
     // It was looked for in a grid first, and is not asked for everywhere on the lattice.
     assert!(without.evaluations.density > 128 * 128 * 128 / 4 && with.evaluations.density < 200_000);
 }
@@ -145,14 +151,14 @@ fn a_model_without_a_grid_has_the_same_surface() {
 #[test]
 fn small_parts_and_triangles_too_many_are_left_out() {
     let balls = [(CENTRE, RADIUS), (DVec3::new(-0.7, 0.8, -0.4), 0.15)];
-    let config = SurfaceConfig { level: Some(1.0), ..CONFIG };
+    let config = SurfaceConfig { iso_value: Some(1.0), ..CONFIG };
     // Its area is .09 of the other's.
     for (parts, dropped) in [(0.0, 0), (0.05, 0), (0.15, 1)] {
-        let found = surface(&model(&balls, Preset::Voxel), &SurfaceConfig { parts, ..config });
-        assert_eq!((found.dropped, found.shape.mesh.parts().1), (dropped, 2 - dropped), "{parts}");
+        let found = surface(&model(&balls, Preset::Voxel), &SurfaceConfig { min_component: parts, ..config });
+        assert_eq!((found.dropped, found.colored_mesh.mesh.components().1), (dropped, 2 - dropped), "{parts}");
     }
     let few = surface(&ball(), &SurfaceConfig { triangles: Some(500), ..config });
-    let Shape { mesh, normals, .. } = &few.shape;
+    let ColoredMesh { mesh, normals, .. } = &few.colored_mesh;
     assert!(mesh.triangles.len() == 500 && mesh.is_closed() && normals.len() == mesh.positions.len());
     assert!((mesh.volume() / (4.0 / 3.0 * PI * RADIUS.powi(3)) - 1.0).abs() < 0.02);
 }
@@ -161,8 +167,9 @@ fn small_parts_and_triangles_too_many_are_left_out() {
 fn what_meets_the_box_is_closed_or_open() {
     // Its middle is on the border of the box.
     let model = model(&[(DVec3::new(1.5, 0.2, 0.0), RADIUS)], Preset::Voxel);
-    let config = SurfaceConfig { level: Some(1.0), ..CONFIG };
-    let [closed, open] = [true, false].map(|closed| surface(&model, &SurfaceConfig { closed, ..config }).shape.mesh);
+    let config = SurfaceConfig { iso_value: Some(1.0), ..CONFIG };
+    let [closed, open] =
+        [true, false].map(|closed| surface(&model, &SurfaceConfig { closed, ..config }).colored_mesh.mesh);
     let half = 2.0 / 3.0 * PI * RADIUS.powi(3);
     assert!(closed.is_closed() && (closed.volume() / half - 1.0).abs() < 0.015, "{} {half}", closed.volume());
     assert!(!open.is_closed() && (open.area() / (2.0 * PI * RADIUS.powi(2)) - 1.0).abs() < 0.015, "{}", open.area());
@@ -172,7 +179,7 @@ fn what_meets_the_box_is_closed_or_open() {
     {
         assert!([low.x, high.x].map(|x| f64::from(x as f32)).into_iter().any(|x| x > high.x || x < low.x));
         let model = model_in([low, high], &[(DVec3::new(centre, 0.2, 0.1), RADIUS)], Preset::Voxel);
-        let open = surface(&model, &SurfaceConfig { closed: false, ..config }).shape.mesh;
+        let open = surface(&model, &SurfaceConfig { closed: false, ..config }).colored_mesh.mesh;
         let area = 2.0 * PI * RADIUS.powi(2);
         assert!(!open.is_closed() && (open.area() / area - 1.0).abs() < 0.015, "{centre}: {} {area}", open.area());
     }
@@ -184,12 +191,15 @@ fn what_cannot_be_made_is_said() {
         ball().surface(cameras, &config, &mut |_, _| ()).err().unwrap().to_string()
     };
     let cases = [
-        (SurfaceConfig { level: Some(-1.0), ..CONFIG }, "`level`: is -1"),
-        (SurfaceConfig { level: Some(f64::NAN), ..CONFIG }, "`level`: is NaN"),
-        (SurfaceConfig { level: Some(1e30), ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
+        (SurfaceConfig { iso_value: Some(-1.0), ..CONFIG }, "`level`: is -1"),
+        (SurfaceConfig { iso_value: Some(f64::NAN), ..CONFIG }, "`level`: is NaN"),
+        (SurfaceConfig { iso_value: Some(1e30), ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
         // What is hidden is not dense enough for it.
-        (SurfaceConfig { level: Some(1e30), filled: true, ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
-        (SurfaceConfig { parts: 1.5, ..CONFIG }, "`parts`: is 1.5"),
+        (
+            SurfaceConfig { iso_value: Some(1e30), fill_unseen: true, ..CONFIG },
+            "`level`: is 1000000000000000000000000000000",
+        ),
+        (SurfaceConfig { min_component: 1.5, ..CONFIG }, "`parts`: is 1.5"),
         (SurfaceConfig { triangles: Some(3), ..CONFIG }, "`triangles`: is 3"),
         (SurfaceConfig { resolution: Some(0), ..CONFIG }, "`resolution`: is 0"),
     ];
@@ -210,7 +220,7 @@ fn what_cannot_be_made_is_said() {
 fn points_are_what_cameras_see() {
     let model = ball();
     let found = model.point_cloud(&cameras(), 2000, &mut |_, done| assert!((0.0..=1.0).contains(&done))).unwrap();
-    let Shape { mesh, normals, colors } = &found.shape;
+    let ColoredMesh { mesh, normals, colors } = &found.colored_mesh;
     let count = mesh.positions.len();
     assert!((1500..=2000).contains(&count) && mesh.triangles.is_empty(), "{count}");
     // Twelve rays for each point that is wanted, however many cameras there are.
@@ -237,17 +247,17 @@ fn what_no_camera_sees_is_solid_if_it_is_to_be() {
     // The cells of the void are occupied, as those of a sponge are.
     let mut hollow = ball();
     hollow.field = Arc::new(Hollow);
-    let config = SurfaceConfig { level: Some(2.0), parts: 0.0, ..CONFIG };
-    let open = surface(&hollow, &config).shape.mesh;
-    let full = surface(&hollow, &SurfaceConfig { filled: true, ..config }).shape.mesh;
-    assert_eq!((open.parts().1, full.parts().1), (2, 1));
+    let config = SurfaceConfig { iso_value: Some(2.0), min_component: 0.0, ..CONFIG };
+    let open = surface(&hollow, &config).colored_mesh.mesh;
+    let full = surface(&hollow, &SurfaceConfig { fill_unseen: true, ..config }).colored_mesh.mesh;
+    assert_eq!((open.components().1, full.components().1), (2, 1));
     // The outside is where it was.
-    let whole = surface(&ball(), &config).shape.mesh;
+    let whole = surface(&ball(), &config).colored_mesh.mesh;
     assert!((full.volume() / whole.volume() - 1.0).abs() < 1e-4, "{} {}", full.volume(), whole.volume());
     assert!(open.volume() < 0.95 * whole.volume() && full.is_closed());
     // Without cameras nothing is known to be hidden.
-    let blind = hollow.surface(&[], &SurfaceConfig { filled: true, ..config }, &mut |_, _| ()).unwrap();
-    assert_eq!(blind.shape.mesh, open);
+    let blind = hollow.surface(&[], &SurfaceConfig { fill_unseen: true, ..config }, &mut |_, _| ()).unwrap();
+    assert_eq!(blind.colored_mesh.mesh, open);
 }
 
 /// The ball with a void in its middle.
@@ -259,7 +269,7 @@ impl Field<f32> for Hollow {
         Density { value: outer.value.minimum(-inner.value), ..outer }
     }
 
-    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::Seen<'_, 't, f32>) -> Var<'t, f32> {
+    fn color<'t>(&self, _: &Bound<'t, f32>, _: &Var<'t, f32>, seen: &field::ViewInputs<'_, 't, f32>) -> Var<'t, f32> {
         seen.directions.segment_expand(seen.segments)
     }
 }
@@ -269,8 +279,8 @@ fn colors_have_the_tone_of_views() {
     let rate = Some(raygrad_nn::Schedule::Constant { rate: 0.1 });
     let mut config = Config::preset(Preset::Voxel);
     config.field = FieldConfig::new(VoxelConfig { resolution: 20, direction_degree: 1 });
-    config.tone = crate::model::ToneConfig { exposure: rate, vignetting: rate };
-    let mut model = Model::new(config, Extent { frames: 2, ..ball().extent }, 0).unwrap();
+    config.exposure_model = crate::model::ExposureConfig { exposure: rate, vignetting: rate };
+    let mut model = Model::new(config, SceneBox { frames: 2, ..ball().scene_box }, 0).unwrap();
     model.field = Arc::new(Balls(vec![(CENTRE, RADIUS)]));
     let [exposure, vignetting] = ["exposure", "vignetting"].map(|name| model.params.find(name).unwrap());
     let gains: [[f32; 3]; 2] = [[0.5, 1.0, 0.25], [1.0, 0.25, 1.0]];
@@ -280,7 +290,7 @@ fn colors_have_the_tone_of_views() {
     let places = [CENTRE + 0.4 * DVec3::new(0.6, 0.0, 0.8)];
     // Of no photograph in particular, the geometric mean; in the middle of the picture, without darker corners.
     for (look, gains) in [(Some(0), gains[0]), (Some(1), gains[1]), (None, [0.5_f32.sqrt(), 0.5, 0.5])] {
-        model.look = look;
+        model.appearance_image = look;
         let (_, colors) = Probe::new(&model).look(None, 0.02, &places);
         for (found, expected) in colors[0].iter().zip([0.8, 0.5, 0.9].into_iter().zip(gains)) {
             assert!((f32::from(*found) - 255.0 * expected.0 * expected.1).abs() < 1.5, "{look:?}: {colors:?}");

@@ -8,7 +8,7 @@
 //! A ray that skips samples with a total optical depth `tau` changes its colour by at most `(1 - e^-tau)` times the
 //! range of colours (background included). If every skipped cell really holds no more than [`Skip::min_sigma`] of the
 //! longest path through the grid, `tau` is at most [`Skip::max_depth`], whatever the step, and the error at most
-//! [`Skip::error_bound`]: .005 for [`Skip::Lossless`] and .049 for [`Skip::Fast`]. That is the worst case, a fog just
+//! [`Skip::error_bound`]: .005 for [`Skip::NearLossless`] and .049 for [`Skip::Fast`]. That is the worst case, a fog just
 //! below the threshold along the whole ray; on scenes of solids with faint fog the error is a tenth of it.
 //!
 //! What a grid knows of a cell comes from points in it. [`OccupancyGrid::update`] looks at one random point a cell and
@@ -48,8 +48,8 @@
 
 mod bits;
 mod carve;
+mod empty_cubes;
 mod lattice;
-mod leaps;
 mod march;
 mod skip;
 mod store;
@@ -58,9 +58,9 @@ mod tests;
 mod update;
 
 use crate::{Error, Result};
+use empty_cubes::Leaps;
 use glam::DVec3;
 use lattice::{CARVED, CELLS, Lattice};
-use leaps::Leaps;
 use raygrad_tensor::parallel;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -92,7 +92,7 @@ pub struct OccupancyConfig {
 
 impl Default for OccupancyConfig {
     fn default() -> Self {
-        OccupancyConfig { resolution: 128, cascades: 1, skip: Skip::Lossless.into() }
+        OccupancyConfig { resolution: 128, cascades: 1, skip: Skip::NearLossless.into() }
     }
 }
 

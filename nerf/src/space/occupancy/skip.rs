@@ -8,13 +8,14 @@ use std::str::FromStr;
 
 /// What a grid may skip when rendering, by what it may cost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 pub enum Skip {
     /// Nothing but what lies outside of the box.
     Off,
     /// At most an optical depth of 1/200 along a ray: beyond what 8 bits show, except in fog at the threshold.
     #[default]
-    Lossless,
+    #[serde(alias = "lossless")]
+    NearLossless,
     /// At most an optical depth of 1/20 along a ray.
     Fast,
 }
@@ -24,7 +25,7 @@ impl Skip {
     pub fn max_depth(self) -> f64 {
         match self {
             Skip::Off => 0.0,
-            Skip::Lossless => 0.005,
+            Skip::NearLossless => 0.005,
             Skip::Fast => 0.05,
         }
     }
@@ -37,7 +38,7 @@ impl Skip {
     /// The density (1 / scene unit) up to which cells may be skipped if a ray's path through all of them is no longer
     /// than `path` scene units: `max_depth / path`, and for [`Skip::Off`] minus infinity, which no density is below.
     ///
-    /// With 500 steps along the path, that is 1e-5 of optical depth a step for [`Skip::Lossless`] and 1e-4 for
+    /// With 500 steps along the path, that is 1e-5 of optical depth a step for [`Skip::NearLossless`] and 1e-4 for
     /// [`Skip::Fast`].
     ///
     /// # Panics
@@ -46,7 +47,7 @@ impl Skip {
         assert!(path > 0.0, "a path of length {path}");
         match self {
             Skip::Off => f32::NEG_INFINITY,
-            Skip::Lossless | Skip::Fast => (self.max_depth() / path) as f32,
+            Skip::NearLossless | Skip::Fast => (self.max_depth() / path) as f32,
         }
     }
 }
@@ -66,7 +67,7 @@ pub struct Skipping {
     /// much, times the range of colours. 0 is none.
     pub pruning: f64,
     /// In views a ray ends where less light than this is left: a pixel changes by at most as much.
-    pub termination: f64,
+    pub early_stop_eps: f64,
     /// In views samples whose weights add up to at most this have no colour of their own: a pixel changes by at most as
     /// much. Quadratures of two nodes an interval colour every sample.
     pub colors: f64,
@@ -79,9 +80,9 @@ impl From<Skip> for Skipping {
     fn from(skip: Skip) -> Self {
         let (grid, carving, pruning) = (true, VOTES, skip.max_depth());
         match skip {
-            Skip::Off => Skipping { grid: false, carving: 0, pruning, termination: 0.0, colors: 0.0 },
-            Skip::Lossless => Skipping { grid, carving, pruning, termination: 1e-4, colors: 1e-4 },
-            Skip::Fast => Skipping { grid, carving, pruning, termination: 1e-3, colors: 2e-3 },
+            Skip::Off => Skipping { grid: false, carving: 0, pruning, early_stop_eps: 0.0, colors: 0.0 },
+            Skip::NearLossless => Skipping { grid, carving, pruning, early_stop_eps: 1e-4, colors: 1e-4 },
+            Skip::Fast => Skipping { grid, carving, pruning, early_stop_eps: 1e-3, colors: 2e-3 },
         }
     }
 }
@@ -91,15 +92,22 @@ impl From<Skip> for Skipping {
 #[serde(untagged, deny_unknown_fields)]
 enum Stored {
     Named(Skip),
-    Each { grid: bool, carving: u32, pruning: f64, termination: f64, colors: f64 },
+    Each {
+        grid: bool,
+        carving: u32,
+        pruning: f64,
+        #[serde(alias = "termination")]
+        early_stop_eps: f64,
+        colors: f64,
+    },
 }
 
 impl From<Stored> for Skipping {
     fn from(stored: Stored) -> Self {
         match stored {
             Stored::Named(skip) => skip.into(),
-            Stored::Each { grid, carving, pruning, termination, colors } => {
-                Skipping { grid, carving, pruning, termination, colors }
+            Stored::Each { grid, carving, pruning, early_stop_eps, colors } => {
+                Skipping { grid, carving, pruning, early_stop_eps, colors }
             }
         }
     }
@@ -112,7 +120,7 @@ impl Skipping {
     /// If one is out of range.
     pub fn check(&self) -> Result<()> {
         check_range("occupancy.skip.pruning", self.pruning, 0.0, 1.0)?;
-        check_range("occupancy.skip.termination", self.termination, 0.0, 1.0)?;
+        check_range("occupancy.skip.early_stop_eps", self.early_stop_eps, 0.0, 1.0)?;
         check_range("occupancy.skip.colors", self.colors, 0.0, 1.0)
     }
 }
@@ -127,7 +135,8 @@ impl FromStr for Skip {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        by_name(name).ok_or_else(|| Error::setting("skip", format!("there is no `{name}`; use off, lossless or fast")))
+        by_name(name)
+            .ok_or_else(|| Error::setting("skip", format!("there is no `{name}`; use off, near-lossless or fast")))
     }
 }
 
@@ -138,14 +147,14 @@ mod tests {
     #[test]
     fn switches_are_a_name_or_each_for_itself() {
         let read = |text: &str| serde_json::from_str::<Skipping>(text);
-        for skip in [Skip::Off, Skip::Lossless, Skip::Fast] {
+        for skip in [Skip::Off, Skip::NearLossless, Skip::Fast] {
             let switches = Skipping::from(skip);
             assert_eq!(read(&format!("\"{skip}\"")).unwrap(), switches);
             assert_eq!(read(&serde_json::to_string(&switches).unwrap()).unwrap(), switches);
             assert!(switches.check().is_ok() && switches.pruning == skip.max_depth());
         }
         let none = Skipping::from(Skip::Off);
-        assert!(!none.grid && none.carving == 0 && none.pruning + none.termination + none.colors == 0.0);
+        assert!(!none.grid && none.carving == 0 && none.pruning + none.early_stop_eps + none.colors == 0.0);
         assert!(read(r#"{"grid": true, "carving": 1, "pruning": 0, "termination": 0}"#).is_err());
         let wrong = Skipping { colors: 1.5, ..none }.check().unwrap_err().to_string();
         assert!(wrong.starts_with("`occupancy.skip.colors`: is 1.5"), "{wrong}");

@@ -1,7 +1,7 @@
 //! Grids as bytes, to be stored beside a model.
 
+use super::empty_cubes::Leaps;
 use super::lattice::CELLS;
-use super::leaps::Leaps;
 use super::{OccupancyConfig, OccupancyGrid};
 use crate::{Error, Result};
 use glam::DVec3;

@@ -379,10 +379,10 @@ fn settings_out_of_range_are_refused() {
         assert!(check(resolution, cascades).is_err(), "{resolution}, {cascades}");
     }
     assert!(OccupancyGrid::new([DVec3::ONE, DVec3::ONE], &OccupancyConfig::default()).is_err());
-    for skip in [Skip::Off, Skip::Lossless, Skip::Fast] {
+    for skip in [Skip::Off, Skip::NearLossless, Skip::Fast] {
         assert_eq!(skip.to_string().parse::<Skip>().unwrap(), skip);
     }
-    assert!("slow".parse::<Skip>().unwrap_err().to_string().contains("off, lossless or fast"));
+    assert!("slow".parse::<Skip>().unwrap_err().to_string().contains("off, near-lossless or fast"));
 }
 
 /// Colours of rays from all sides: samples at all steps, and at those that the grid leaves.
@@ -414,7 +414,7 @@ fn render(grid: &OccupancyGrid, density: &DensityFn<'_>) -> (Vec<f32>, u64) {
 #[test]
 fn skipping_costs_no_more_than_its_bound() {
     let all = grid(32, 1);
-    for skip in [Skip::Lossless, Skip::Fast] {
+    for skip in [Skip::NearLossless, Skip::Fast] {
         let min_sigma = skip.min_sigma(all.longest_path());
         for (fog, is_skipped) in [(0.99, false), (1.01 * min_sigma, false), (0.99 * min_sigma, true)] {
             let density = |points: &[[f32; 3]], out: &mut [f32]| {

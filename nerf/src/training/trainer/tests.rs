@@ -7,7 +7,7 @@ use crate::dataset::{
 };
 use crate::encoding::hash_grid::HashGridConfig;
 use crate::field::{ClassicConfig, InstantConfig};
-use crate::model::Refined;
+use crate::model::RefinedParam;
 use crate::sampling::SamplerConfig;
 use crate::sampling::hierarchical::HierarchicalConfig;
 use crate::sampling::marching::MarchingConfig;
@@ -41,10 +41,10 @@ fn fields_live_in_the_picture_of_all_that_photographs_show() {
     let data = ball_ahead(8);
     let ndc = data.ndc.unwrap();
     assert!(data.frames.iter().all(|frame| ndc.pixels(&frame.camera, DVec3::ZERO) < 20.0));
-    assert!((data.footprints() - ndc.pixels(&data.frames[2].camera, DVec3::ZERO)).abs() < 2.0);
-    let config = tiny_table().with_scope(data.scope);
+    assert!((data.pixels_per_side() - ndc.pixels(&data.frames[2].camera, DVec3::ZERO)).abs() < 2.0);
+    let config = tiny_table().with_scene_type(data.scope);
     let trainer = Trainer::new(config.clone(), Arc::new(data.clone())).unwrap();
-    assert_eq!(trainer.model.extent.ndc, Some(ndc));
+    assert_eq!(trainer.model.scene_box.ndc, Some(ndc));
     // Before its near plane all places of a line from the eye are one, and beside it not.
     let places = [0.5, 0.9, 1.5].map(|depth| ndc.eye - depth * ndc.near * ndc.axes.z_axis);
     let places = places.map(|place| place.as_vec3().to_array());
@@ -55,10 +55,10 @@ fn fields_live_in_the_picture_of_all_that_photographs_show() {
     };
     let [a, b, c] = densities(&trainer);
     assert!((a - b).abs() < 1e-7 && (a - c).abs() > 1e-6, "{a} {b} {c}");
-    let unbounded = Dataset { scope: Scope::Unbounded, ..data.clone() };
-    assert!(unbounded.footprints() != data.footprints());
+    let unbounded = Dataset { scope: SceneType::Unbounded, ..data.clone() };
+    assert!(unbounded.pixels_per_side() != data.pixels_per_side());
     let other = Trainer::new(config.clone(), Arc::new(unbounded)).unwrap();
-    assert_eq!(other.model.extent.ndc, None);
+    assert_eq!(other.model.scene_box.ndc, None);
     let [a, b, _] = densities(&other);
     assert!((a - b).abs() > 1e-6, "{a} {b}");
     let refused = |config: &Config, data: &Dataset| {
@@ -73,7 +73,7 @@ fn fields_live_in_the_picture_of_all_that_photographs_show() {
     let mut later = Trainer::new(config, Arc::new(data)).unwrap();
     later.load_state(&state).unwrap();
     assert_eq!(later.step(0.5).loss, trainer.step(0.5).loss);
-    assert_eq!(trainer.model.cast::<f64>().unwrap().extent.ndc, Some(ndc));
+    assert_eq!(trainer.model.cast::<f64>().unwrap().scene_box.ndc, Some(ndc));
 }
 
 #[test]
@@ -84,7 +84,17 @@ fn what_steps_did_adds_up_and_an_error_is_of_one_of_them() {
     let mut trainer = Trainer::new(config, Arc::new(data)).unwrap();
     let counts = |trainer: &mut Trainer| {
         trainer.step(0.0);
-        let StepStats { rays, marched, samples, shaded, unskipped, moved, loss, psnr, .. } = trainer.stats();
+        let StepStats {
+            rays,
+            placed_samples: marched,
+            density_queries: samples,
+            color_queries: shaded,
+            unskipped,
+            moved,
+            loss,
+            psnr,
+            ..
+        } = trainer.stats();
         assert!((psnr - psnr_from_mse(loss)).abs() < 1e-9 && psnr > 1.0, "{psnr} {loss}");
         [rays, marched, samples, shaded, unskipped, moved]
     };
@@ -107,7 +117,7 @@ fn the_last_tile_of_a_step_has_the_rays_that_are_left() {
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
         let stats = trainer.step(0.0);
         assert_eq!(stats.rays, batch as u64);
-        stats.marched
+        stats.placed_samples
     };
     assert!(marched(8) > 0);
     // Every ray takes as many steps; tiles are of eight.
@@ -124,12 +134,12 @@ fn a_restart_keeps_what_was_said_of_parameters() {
     let frozen = params.name(ids[0]).to_owned();
     params.get_mut(ids[0]).as_mut_slice().fill(0.25);
     params.freeze(|name| name == frozen);
-    params.set_rate(|name| name != frozen, 0.5);
+    params.set_lr_scale(|name| name != frozen, 0.5);
     let before: Vec<_> = params.values().to_vec();
     trainer.restart();
     let params = &trainer.model.params;
     let ids: Vec<_> = params.ids().collect();
-    assert!(params.is_frozen(ids[0]) && params.rate(ids[1]) == 0.5 && !params.is_frozen(ids[1]));
+    assert!(params.is_frozen(ids[0]) && params.lr_scale(ids[1]) == 0.5 && !params.is_frozen(ids[1]));
     assert_eq!(params.values()[0], before[0]);
     assert!(params.values().iter().zip(&before).skip(1).any(|(new, old)| new != old), "other numbers");
 }
@@ -138,13 +148,13 @@ fn a_restart_keeps_what_was_said_of_parameters() {
 fn a_restart_knows_the_cameras_that_it_corrects() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(3);
-    let config = tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure]);
+    let config = tiny().with_refined(&[RefinedParam::Poses, RefinedParam::Focal, RefinedParam::Exposure]);
     let mut trainer = Trainer::new(config, Arc::new(data.clone())).unwrap();
     trainer.step(0.0);
     trainer.restart();
     let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
     assert_eq!(trainer.model.cameras(), cameras);
-    assert!(trainer.model.tone.is_some() && trainer.model.refine.is_some());
+    assert!(trainer.model.exposure.is_some() && trainer.model.camera_optimizer.is_some());
     // They are as they were given, and move on.
     let moved = |trainer: &Trainer| trainer.model.learned_camera(1, &cameras[1]) != cameras[1];
     assert!(!moved(&trainer));
@@ -158,7 +168,7 @@ fn a_restart_knows_the_cameras_that_it_corrects() {
 /// Two tiny networks, and few rays of few samples.
 fn tiny() -> Config {
     let paper = ClassicConfig::paper();
-    let field = ClassicConfig { depth: 2, width: 16, skips: vec![], view_width: 8, position_levels: 3, ..paper };
+    let field = ClassicConfig { depth: 2, width: 16, skip_layers: vec![], view_width: 8, position_levels: 3, ..paper };
     let sampler = HierarchicalConfig {
         proposal: field.clone(),
         coarse: 6,
@@ -193,7 +203,7 @@ fn frozen_parameters_rest_and_others_have_their_own_rates() {
             let names: Vec<String> = params.names().map(String::from).collect();
             let rests = |name: &str| names.iter().position(|other| other == name).is_some_and(|i| i % 3 == round);
             if round == 1 {
-                params.set_rate(rests, 0.0)
+                params.set_lr_scale(rests, 0.0)
             } else {
                 params.freeze(rests)
             };
@@ -201,7 +211,7 @@ fn frozen_parameters_rest_and_others_have_their_own_rates() {
             for _ in 0..2 {
                 trainer.step(0.1);
             }
-            assert!(trainer.stats().skipped == 0 && !trainer.stats().has_diverged());
+            assert!(trainer.stats().non_finite == 0 && !trainer.stats().has_diverged());
             for ((name, before), after) in before.iter().zip(trainer.model.params.values()) {
                 assert_eq!(before == after, rests(name), "{name}, round {round}");
             }
@@ -240,7 +250,7 @@ fn a_run_that_has_diverged_ends() {
         trainer.step(0.0);
         trainer.model.params.values_mut().iter_mut().for_each(|x| x.as_mut_slice().fill(f32::NAN));
         trainer.run(Budget::Steps(1000), |trainer| {
-            assert!(trainer.stats().stuck + 1 == trainer.stats().step && trainer.stats().skipped > 0);
+            assert!(trainer.stats().non_finite_steps + 1 == trainer.stats().step && trainer.stats().non_finite > 0);
             ControlFlow::Continue(())
         });
         assert!(trainer.stats().has_diverged() && trainer.stats().step == 1 + STUCK);
@@ -250,7 +260,9 @@ fn a_run_that_has_diverged_ends() {
 #[test]
 fn what_is_not_finite_first_is_named() {
     let data = Arc::new(ball(Split::Train, 12));
-    for config in [tiny(), tiny_table(), tiny().with_refined(&[Refined::Poses, Refined::Focal, Refined::Exposure])] {
+    for config in
+        [tiny(), tiny_table(), tiny().with_refined(&[RefinedParam::Poses, RefinedParam::Focal, RefinedParam::Exposure])]
+    {
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
         for _ in 0..3 {
             assert!(trainer.first_non_finite(0.5).is_none());
@@ -263,19 +275,19 @@ fn what_is_not_finite_first_is_named() {
         let error = trainer.first_non_finite(0.5).unwrap();
         let GraphError::NonFinite { value, at, .. } = &error else { panic!("{error}") };
         assert!(!value.is_finite() && at.file().ends_with(".rs") && at.line() > 0, "{error}");
-        assert!(trainer.step(0.5).stuck > 0 && trainer.first_non_finite(0.5).is_some());
+        assert!(trainer.step(0.5).non_finite_steps > 0 && trainer.first_non_finite(0.5).is_some());
     }
 }
 
 #[test]
 fn a_slower_run_moves_less() {
     let data = Arc::new(ball(Split::Train, 12));
-    let config = tiny_table().with_refined(&[Refined::Exposure]);
+    let config = tiny_table().with_refined(&[RefinedParam::Exposure]);
     let [whole, half, none] = [1.0, 0.5, 0.0].map(|factor| {
         let mut trainer = Trainer::new(config.clone(), data.clone()).unwrap();
-        trainer.set_pace(factor);
+        trainer.set_lr_scale(factor);
         let before = trainer.model.params.clone();
-        let rate = trainer.step(0.3).rate;
+        let rate = trainer.step(0.3).lr;
         let after = trainer.model.params.values().iter();
         let moved = |(a, b): (&Tensor<f32>, &Tensor<f32>)| {
             let moves = a.as_slice().iter().zip(b.as_slice()).map(|(a, b)| f64::from(a - b).abs());

@@ -5,7 +5,7 @@ use super::share::gauss_share;
 use crate::camera::rays::Samples;
 use crate::field::Density;
 use crate::volume::query::Query;
-use crate::volume::render::{Rendered, Weighted, accumulate, weights};
+use crate::volume::render::{RayWeights, Rendered, accumulate, weights};
 use crate::volume::weights::Weights;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};
 use std::sync::Arc;
@@ -115,11 +115,11 @@ impl Quadrature {
     /// The weights of the rule's [nodes](Self::nodes) of this density.
     #[track_caller]
     #[inline(never)]
-    pub fn weighted<'t, T: Scalar>(self, density: &Density<'t, T>, nodes: &Samples<T>) -> Weighted<'t, T> {
+    pub fn weighted<'t, T: Scalar>(self, density: &Density<'t, T>, nodes: &Samples<T>) -> RayWeights<'t, T> {
         if !self.has_intervals() {
             let depth = density.optical_depth(&nodes.delta);
             let weights = weights(&depth, &nodes.segments);
-            return Weighted { weights, optical_depth: depth.segment_sum(&nodes.segments) };
+            return RayWeights { weights, optical_depth: depth.segment_sum(&nodes.segments) };
         }
         let intervals = Intervals::between(nodes);
         let ([a, b], depth) = intervals.optical_depth(density);
@@ -131,7 +131,7 @@ impl Quadrature {
         let [first, second] = [weights - &second, second];
         let [a, b] = intervals.ends;
         let weights = first.scatter_rows(a, nodes.len()) + second.scatter_rows(b, nodes.len());
-        Weighted { weights, optical_depth: depth.segment_sum(&intervals.segments) }
+        RayWeights { weights, optical_depth: depth.segment_sum(&intervals.segments) }
     }
 
     /// What the rule's [nodes](Self::nodes) show of a field.
@@ -151,14 +151,14 @@ impl Quadrature {
         positions: Var<'t, T>,
         density: Density<'t, T>,
     ) -> Rendered<'t, T> {
-        let Weighted { weights, optical_depth } = self.weighted(&density, &samples);
+        let RayWeights { weights, optical_depth } = self.weighted(&density, &samples);
         let color = query.color(&density.features, &samples);
         let color = accumulate(&weights, &color, &samples.segments);
         let directions = query.directions(&samples);
         Rendered { samples, positions, directions, density, weights, optical_depth, color }
     }
 
-    /// The nodes of the intervals that more than `termination` of the light reaches, and which of all nodes they are.
+    /// The nodes of the intervals that more than `early_stop_eps` of the light reaches, and which of all nodes they are.
     pub(crate) fn visible_nodes<T: Scalar>(
         self,
         density: &Density<'_, T>,

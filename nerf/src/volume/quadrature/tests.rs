@@ -7,12 +7,12 @@ use crate::camera::rays::Rays;
 use crate::camera::rays::stratified;
 use crate::dataset::{Split, sample::ball};
 use crate::field::{FieldConfig, VoxelConfig};
+use crate::imaging::metrics::psnr;
 use crate::model::config::{Config, Preset};
-use crate::pictures::metrics::psnr;
 use crate::random::Jitter;
 use crate::sampling::marching::MarchingConfig;
 use crate::training::trainer::Trainer;
-use crate::volume::lit::Lit;
+use crate::volume::early_termination::VisibleSamples;
 use crate::volume::query::Query;
 use glam::DVec3;
 use raygrad_autograd::{Tape, Tensor};
@@ -184,10 +184,10 @@ fn every_rule_trains_and_is_part_of_the_configuration() {
         let mut trainer = Trainer::new(config, data.clone()).unwrap();
         let first = trainer.step(0.0);
         let last = (1..60).map(|step| trainer.step(f64::from(step) / 60.0).loss).last().unwrap();
-        println!("{rule:16} loss {:.4} to {last:.4}, {} samples", first.loss, trainer.stats().samples);
+        println!("{rule:16} loss {:.4} to {last:.4}, {} samples", first.loss, trainer.stats().density_queries);
         assert!(last < 0.6 * first.loss, "{rule}: {} to {last}", first.loss);
         let frame = &data.frames[0];
-        let seen = psnr(&trainer.model.view(&frame.camera, [1.0; 3]).color, &frame.image.over([1.0; 3]));
+        let seen = psnr(&trainer.model.render(&frame.camera, [1.0; 3]).color, &frame.image.over([1.0; 3]));
         assert!(seen > 14.0, "{rule}: {seen} dB");
     }
     let bad = small(Quadrature::Adaptive { tolerance: 0.0 }).check().unwrap_err().to_string();
@@ -220,8 +220,13 @@ fn what_no_light_reaches_is_left_out_within_the_bound() {
     for rule in RULES.into_iter().chain([Quadrature::Adaptive { tolerance: 1e-3 }]) {
         let [all, lit] = [0.0, 1e-4].map(|least| rule.render(&Query::new(&field, &bound), &steps, least));
         // The second ray, through nothing, keeps all of its samples.
-        assert!(4 * lit.kept < 3 * all.kept && lit.asked <= all.asked, "{rule}: {} of {}", lit.kept, all.kept);
-        let values = |seen: &Lit<'_, f64>| {
+        assert!(
+            4 * lit.visible < 3 * all.visible && lit.density_queries <= all.density_queries,
+            "{rule}: {} of {}",
+            lit.visible,
+            all.visible
+        );
+        let values = |seen: &VisibleSamples<'_, f64>| {
             let seen = &seen.rendered;
             [seen.color.clone(), seen.depth(), seen.transmittance()]
                 .map(|value| value.value().as_slice().to_vec())
@@ -230,7 +235,8 @@ fn what_no_light_reaches_is_left_out_within_the_bound() {
         for (a, b) in values(&all).into_iter().zip(values(&lit)) {
             assert!((a - b).abs() <= 4.0 * 1e-4, "{rule}: {a} {b}");
         }
-        let gradient = |seen: &Lit<'_, f64>| seen.rendered.color.slice_axis(1, ..1).sum().grad(&bound.vars()).remove(0);
+        let gradient =
+            |seen: &VisibleSamples<'_, f64>| seen.rendered.color.slice_axis(1, ..1).sum().grad(&bound.vars()).remove(0);
         for (a, b) in gradient(&all).as_slice().iter().zip(gradient(&lit).as_slice()) {
             assert!((a - b).abs() <= 1e-3, "{rule}: {a} {b}");
         }

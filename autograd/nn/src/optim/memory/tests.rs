@@ -54,7 +54,7 @@ fn shared<T: Scalar>(shape: &[usize], share: impl SparseGrad<T>) -> Gradient<T> 
 fn equals_dense_adam_where_every_row_has_a_gradient() {
     let shapes = [[21, 1], [8, 2], [13, 4], [30, 8], [5, 3], [1, 70], [3, 24]];
     for (shape, decay) in shapes.into_iter().flat_map(|shape| [(shape, 0.0), (shape, 0.5)]) {
-        let config = AdamConfig { beta2: 0.99, epsilon: 1e-15, ..AdamConfig::default() };
+        let config = AdamConfig { beta2: 0.99, eps: 1e-15, ..AdamConfig::default() };
         let [mut lazy, mut dense] =
             [true, false].map(|lazy| Alone::<f32>::new(AdamW::new(config, decay), shape, 0.5, lazy));
         let len = shape[0] * shape[1];
@@ -111,18 +111,18 @@ fn rows_without_gradient_rest_and_bad_elements_are_counted() {
         assert_eq!(report.check(), Ok(if lazy { 0 } else { 32 }));
         // A step that would overflow is not taken.
         let mut table = Alone::<f32>::new(Adam::new(AdamConfig::default()), [2, 1], f64::from(f32::MAX), lazy);
-        table.params.set_rate(|_| true, 1e30);
+        table.params.set_lr_scale(|_| true, 1e30);
         let report = table.against(&[-1.0, 1.0], 1e8);
         assert_eq!((report.moved, report.skipped), (1, 1));
         assert!(table.values()[0] == f32::MAX && table.values()[1].is_finite(), "{:?}", table.values());
-        table.params.set_rate(|_| true, f64::MAX);
+        table.params.set_lr_scale(|_| true, f64::MAX);
         assert_eq!(table.against(&[-1.0, 1.0], 1.0).skipped, 2);
     }
 }
 
 #[test]
 fn extreme_gradients_move_nothing_wildly_and_leave_no_denormals() {
-    let mut table = Alone::<f32>::lazy(AdamConfig { epsilon: 1e-15, ..AdamConfig::default() }, [8, 1], 0.0);
+    let mut table = Alone::<f32>::lazy(AdamConfig { eps: 1e-15, ..AdamConfig::default() }, [8, 1], 0.0);
     let gradients = [1e-30, 1e-10, 1e30, -1e30, 1.0, f32::MIN_POSITIVE, 1e-42, 0.0];
     for _ in 0..1000 {
         let before = table.values().to_vec();

@@ -97,7 +97,7 @@ fn brute(grid: &OccupancyGrid, rays: &Rays<f32>, step: &Step) -> Vec<f32> {
 
 /// All samples in the box, from formulas in f64.
 fn exact_places(grid: &OccupancyGrid, ray: &Ray, span: [f64; 2], length: f64) -> Vec<f64> {
-    let [near, far] = crate::clip_span(ray, grid.outer_bounds(), span);
+    let [near, far] = crate::clip_near_far(ray, grid.outer_bounds(), span);
     (0..).map(|i| near + (i as f64 + 0.5) * length).take_while(|t| *t < far).collect()
 }
 

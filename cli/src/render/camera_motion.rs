@@ -1,0 +1,354 @@
+//! Where the camera goes: by name or as a file says, and what flags make of it.
+
+use std::path::PathBuf;
+
+use raygrad::nerf::camera::{CameraPath as Spline, Keyframe, Spiral};
+use raygrad::nerf::dataset::{Split, evenly_spaced};
+use raygrad::nerf::glam::DAffine3;
+use raygrad::nerf::{Camera, Error, Model, Result, SceneBox};
+use raygrad_scenes::test_cameras;
+use serde::{Serialize, Serializer};
+
+use super::path_file::{self, Motion};
+use crate::cameras::{Viewpoint, fitted};
+use crate::photographs::{Photograph, photographs};
+use crate::run::Run;
+use crate::scene::Scene;
+use crate::{builtin, parse};
+
+/// Most frames of a video.
+const MOST_FRAMES: usize = 100_000;
+/// Frames of an orbit.
+const ORBIT_FRAMES: usize = 60;
+/// Frames of a longer path, as many as LLFF's spiral has.
+const FRAMES: usize = 120;
+/// Frames a second, where nothing says how many.
+const FPS: f64 = 25.0;
+/// Where cameras have no average, how far a spiral goes from the orbit's first, as a share of its distance from the middle.
+const SPIRAL_SHARE: f64 = 0.1;
+
+/// Flags about where the camera goes.
+#[derive(Debug, Clone, Default, clap::Args, Serialize)]
+pub struct CameraPathArgs {
+    /// orbit, spiral, spline, test or FILE.json
+    ///
+    /// orbit: around the scene, or back and forth where all images are from one side. spiral: LLFF's, about the
+    /// mean camera. spline: through the images of --keyframes. test: from test view to test view. FILE.json: a
+    /// camera path of nerfstudio or instant-ngp.
+    #[arg(long, help_heading = "Camera", default_value = "orbit", value_parser = CameraPath::parse)]
+    pub path: CameraPath,
+    /// Number of frames
+    ///
+    /// The default is 60 for an orbit, 120 for other paths, one per test view, or what FILE.json says.
+    #[arg(long, help_heading = "Camera", value_name = "N", value_parser = parse::count(MOST_FRAMES))]
+    frames: Option<usize>,
+    /// Video length, instead of --frames
+    #[arg(long, help_heading = "Camera", value_parser = parse::above_zero, conflicts_with = "frames")]
+    pub seconds: Option<f64>,
+    /// Frames per second
+    ///
+    /// The default is 25, or what FILE.json says.
+    #[arg(long, help_heading = "Camera", value_parser = parse::fps)]
+    pub fps: Option<f64>,
+    /// Image size, such as 400x300
+    ///
+    /// The default is the size of the training images, or what FILE.json says. Range: 1 to 16384 per side.
+    #[arg(long, help_heading = "Camera", value_name = "WxH", value_parser = parse::size)]
+    size: Option<[usize; 2]>,
+    /// Aspect ratio, such as 16:9
+    ///
+    /// The height stays as usual. Range: 1:20 to 20:1.
+    #[arg(long, help_heading = "Camera", value_name = "W:H", value_parser = parse::aspect, conflicts_with = "size")]
+    aspect: Option<f64>,
+    /// Vertical field of view, in degrees
+    ///
+    /// The default is that of the training images. Range: 0 to 180, exclusive.
+    #[arg(long, help_heading = "Camera", value_name = "DEGREES", value_parser = parse::between(0.0, 180.0))]
+    fov: Option<f64>,
+    /// Scale of an orbit's or a spiral's radius
+    ///
+    /// 1 is the usual radius.
+    #[arg(long, help_heading = "Camera", value_name = "FACTOR", value_parser = parse::above_zero)]
+    radius: Option<f64>,
+    /// Height of an orbit, in degrees
+    ///
+    /// Angle above the horizon, -85 to 85. The default is the mean of the training cameras.
+    #[arg(long, help_heading = "Camera", value_name = "DEGREES", value_parser = parse::between(-85.0, 85.0), allow_negative_numbers = true)]
+    elevation: Option<f64>,
+    /// Images on a spline's path, such as 0,5,9
+    ///
+    /// By number, counted from 0, or by name.
+    #[arg(long, help_heading = "Camera", value_name = "VIEWS", value_delimiter = ',')]
+    keyframes: Vec<String>,
+    /// Split of --keyframes [default: train]
+    ///
+    /// train, val or test.
+    #[arg(long, help_heading = "Camera")]
+    split: Option<Split>,
+    /// Close a spline to a loop
+    #[arg(long, help_heading = "Camera")]
+    closed: bool,
+    /// Where FILE.json's world lies in the capture
+    ///
+    /// For nerfstudio its dataparser_transforms.json; for instant-ngp the transforms.json with scale and offset.
+    #[arg(long, help_heading = "Camera", value_name = "FILE")]
+    #[serde(serialize_with = "lossy")]
+    path_transform: Option<PathBuf>,
+}
+
+/// A path that may not be Unicode.
+fn lossy<S: Serializer>(path: &Option<PathBuf>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    path.as_ref().map(|path| path.to_string_lossy()).serialize(serializer)
+}
+
+/// Where the camera goes.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub enum CameraPath {
+    #[default]
+    Orbit,
+    Spiral,
+    Spline,
+    Test,
+    File(PathBuf),
+}
+
+impl CameraPath {
+    fn parse(text: &str) -> std::result::Result<Self, String> {
+        match text {
+            "orbit" => Ok(CameraPath::Orbit),
+            "spiral" => Ok(CameraPath::Spiral),
+            "spline" => Ok(CameraPath::Spline),
+            "test" => Ok(CameraPath::Test),
+            file if file.to_ascii_lowercase().ends_with(".json") => Ok(CameraPath::File(file.into())),
+            _ => Err("use orbit, spiral, spline, test or a FILE.json".to_owned()),
+        }
+    }
+
+    /// What it is called, and the folder of its pictures.
+    pub fn name(&self) -> &'static str {
+        match self {
+            CameraPath::Orbit => "orbit",
+            CameraPath::Spiral => "spiral",
+            CameraPath::Spline => "spline",
+            CameraPath::Test => "test",
+            CameraPath::File(_) => "path",
+        }
+    }
+}
+
+/// Cameras, at least one, all of one size, and how fast they are shown.
+pub struct CameraMotion {
+    pub cameras: Vec<Camera>,
+    /// Frames a second.
+    pub fps: f64,
+}
+
+impl CameraPathArgs {
+    /// The cameras along the path, in the scene's coordinates.
+    pub fn cameras(&self, run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<CameraMotion> {
+        self.check()?;
+        let (view, extent) = (&run.config.viewpoint, &run.config.scene_box);
+        let (usual, given) = ([view.width, view.height], self.fps.unwrap_or(FPS));
+        let flight = |cameras: Vec<Camera>| Ok::<_, Error>((cameras, usual, given));
+        let (cameras, usual, fps) = match &self.path {
+            CameraPath::Orbit => flight(self.orbit(view, &run.config.scene, extent, self.count(ORBIT_FRAMES, given)?))?,
+            CameraPath::Spiral => {
+                let spiral = self.spiral(view, extent, &photographs(run, model, scene, Split::Train)?);
+                let camera = |pose: DAffine3| Camera::from_angle(view.width, view.height, view.angle_x, pose);
+                flight(spiral.poses(self.count(FRAMES, given)?).into_iter().map(camera).collect())?
+            }
+            CameraPath::Spline => {
+                let split = self.split.unwrap_or(Split::Train);
+                let keys = chosen(&photographs(run, model, scene, split)?, &self.keyframes, split)?;
+                let keys = Spline::through(keys, self.closed).frames(self.count(FRAMES, given)?);
+                flight(keys.iter().map(|key| key.camera(usual)).collect())?
+            }
+            CameraPath::Test => {
+                let all = photographs(run, model, scene, Split::Test)?;
+                let some = evenly_spaced(all, self.frames.unwrap_or(usize::MAX));
+                // Of the size that they were read in, to the pixel.
+                let small = |side: usize| ((side as f64 / run.config.downscale as f64).round() as usize).max(1);
+                let camera = |camera: Camera| camera.resized(small(camera.width), small(camera.height));
+                flight(some.into_iter().map(|photograph| camera(photograph.camera)).collect())?
+            }
+            CameraPath::File(file) => {
+                let path_file::Path { motion, size, fps } =
+                    path_file::read(file, self.path_transform.as_deref(), || {
+                        Ok(builtin::capture(run.scene(scene)?, None, None)?.applied)
+                    })?;
+                let (usual, fps) = (size.unwrap_or(usual), self.fps.or(fps).unwrap_or(FPS));
+                let keys = match motion {
+                    Motion::Frames(_) if self.frames.is_some() || self.seconds.is_some() => {
+                        let flag = if self.frames.is_some() { "frames" } else { "seconds" };
+                        return Err(Error::setting(flag, "has no meaning for a file that lists every frame"));
+                    }
+                    Motion::Frames(keys) => keys,
+                    Motion::Keys { path, seconds } => {
+                        let usual = seconds.map_or(FRAMES, |seconds| (seconds * fps).round().max(1.0) as usize);
+                        path.frames(self.count(usual, fps)?)
+                    }
+                };
+                let given: Vec<Camera> = keys.iter().map(|key| extent.transform.camera(&key.camera(usual))).collect();
+                // Where the model has found that to be, but with the lens that the file says.
+                let found = model.other_cameras(&given).into_iter().zip(given);
+                (found.map(|(found, camera)| Camera { pose: found.pose, ..camera }).collect(), usual, fps)
+            }
+        };
+        let size = match (self.size, self.aspect) {
+            (Some(size), _) => size,
+            (None, Some(aspect)) => [(usual[1] as f64 * aspect).round().max(1.0) as usize, usual[1]],
+            (None, None) => usual,
+        };
+        let focal = self.fov.map(|degrees| 0.5 * size[1] as f64 / (0.5 * degrees.to_radians()).tan());
+        let fit = |camera: &Camera| {
+            let camera = fitted(camera, size);
+            Camera { focal: focal.map_or(camera.focal, |focal| [focal; 2]), ..camera }
+        };
+        Ok(CameraMotion { cameras: cameras.iter().map(fit).collect(), fps })
+    }
+
+    /// Whether the flags have a meaning for the path.
+    fn check(&self) -> Result<()> {
+        use CameraPath::*;
+        let (round, way) = (matches!(self.path, Orbit | Spiral), self.path == Spline);
+        let file = matches!(self.path, File(_));
+        let flags = [
+            ("radius", self.radius.is_some(), round, "orbit and spiral"),
+            ("elevation", self.elevation.is_some(), self.path == Orbit, "orbit"),
+            ("fov", self.fov.is_some(), round || way, "orbit, spiral and spline"),
+            ("through", !self.keyframes.is_empty(), way, "spline"),
+            ("split", self.split.is_some(), way, "spline"),
+            ("closed", self.closed, way, "spline"),
+            ("seconds", self.seconds.is_some(), self.path != Test, "all other paths"),
+            ("path-transform", self.path_transform.is_some(), file, "a FILE.json"),
+        ];
+        if let Some((flag, _, _, paths)) = flags.into_iter().find(|(_, given, fits, _)| *given && !fits) {
+            let what = format!("has no meaning for --path {}: it is for {paths}", self.path.name());
+            return Err(Error::setting(flag, what));
+        }
+        if way && self.keyframes.is_empty() {
+            return Err(Error::setting("through", "is needed for --path spline: say which photographs, such as 0,5,9"));
+        }
+        Ok(())
+    }
+
+    /// How many frames there are.
+    fn count(&self, usual: usize, fps: f64) -> Result<usize> {
+        let timed = self.seconds.map(|seconds| (seconds * fps).round().max(1.0) as usize);
+        let count = self.frames.or(timed).unwrap_or(usual);
+        if count > MOST_FRAMES {
+            let field = if self.seconds.is_some() { "seconds" } else { "path" };
+            return Err(Error::setting(field, format!("{count} frames are more than {MOST_FRAMES}")));
+        }
+        Ok(count)
+    }
+
+    fn orbit(&self, view: &Viewpoint, scene: &Scene, extent: &SceneBox, count: usize) -> Vec<Camera> {
+        if *scene == Scene::Embedded && self.radius.is_none() && self.elevation.is_none() {
+            return test_cameras(count, view.width);
+        }
+        let distance = view.distance * self.radius.unwrap_or(1.0);
+        let elevation = self.elevation.map_or(view.elevation, f64::to_radians);
+        Viewpoint { distance, elevation, ..*view }.orbit(extent, count)
+    }
+
+    fn spiral(&self, view: &Viewpoint, extent: &SceneBox, photographs: &[Photograph]) -> Spiral {
+        let middle = 0.5 * (extent.bounds[0] + extent.bounds[1]);
+        let ahead = |pose: &DAffine3| (middle - pose.translation).dot(-pose.matrix3.z_axis);
+        let times = self.radius.unwrap_or(1.0);
+        let cameras: Vec<Camera> = photographs.iter().map(|photograph| photograph.camera.clone()).collect();
+        if let Some(spiral) = Spiral::around(&cameras) {
+            let known = photographs.iter().filter_map(|photograph| photograph.bounds);
+            let known = known.reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]);
+            let [near, _] = extent.near_far;
+            let focus = known.map_or_else(|| ahead(&spiral.pose).max(near), llff_focus);
+            return Spiral { focus, radii: spiral.radii.map(|radius| times * radius), ..spiral };
+        }
+        let pose = view.orbit(extent, 1)[0].pose;
+        let focus = ahead(&pose).max(SPIRAL_SHARE * extent.space().side());
+        Spiral { pose, focus, radii: [times * SPIRAL_SHARE * focus; 3] }
+    }
+}
+
+/// What LLFF's spiral looks at, for the nearest and the farthest depth that photographs show: a weighted mean of them
+/// in inverse depth.
+fn llff_focus([near, far]: [f64; 2]) -> f64 {
+    let [near, far] = [0.9 * near, 5.0 * far];
+    (0.25 / near + 0.75 / far).recip()
+}
+
+/// The photographs of these numbers or names.
+fn chosen(photographs: &[Photograph], words: &[String], split: Split) -> Result<Vec<Keyframe>> {
+    let number = |word: &String| {
+        let named = photographs.iter().position(|photograph| photograph.name == *word);
+        let numbered = || word.parse().ok().filter(|number| *number < photographs.len());
+        named.or_else(numbered).ok_or_else(|| {
+            let (last, first) = (photographs.len() - 1, &photographs[0].name);
+            let what =
+                format!("`{word}` is no {split} photograph: use numbers from 0 to {last}, or names such as {first}");
+            Error::setting("through", what)
+        })
+    };
+    words.iter().map(|word| Ok(Keyframe::of(&photographs[number(word)?].camera))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::nerf::glam::DVec3;
+
+    #[test]
+    fn the_focus_of_a_spiral_is_that_of_the_published_code() {
+        // close_depth, inf_depth = bds.min()*.9, bds.max()*5.; dt = .75; 1./(((1.-dt)/close_depth + dt/inf_depth))
+        assert!((llff_focus([2.0, 30.0]) - 6.949806949806949).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_spiral_winds_about_photographs_from_one_side_and_about_the_orbit_of_others() {
+        let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 1.0, 3.0)], [0.5, 9.0]);
+        let view =
+            Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation: 0.3, azimuth: 0.0, reach: 0.4 };
+        let photograph = |i: usize, side: f64, bounds| {
+            let eye = DVec3::new(side * 4.0, 0.1 * i as f64 - 0.5, 1.0);
+            let pose = Camera::look_at(eye, eye - side * DVec3::X, DVec3::Z);
+            Photograph { name: String::new(), camera: Camera::from_angle(40, 30, 0.8, pose), bounds }
+        };
+        let args = CameraPathArgs { radius: Some(3.0), ..CameraPathArgs::default() };
+        let spiral = |photographs: Vec<Photograph>| args.spiral(&view, &extent, &photographs);
+        // Its focus is as far as the middle of the box, or as LLFF has it.
+        let ahead = spiral((0..11).map(|i| photograph(i, 1.0, None)).collect());
+        assert!((ahead.focus - 4.0).abs() < 1e-12 && (ahead.radii[0] - 1.5).abs() < 1e-12, "{ahead:?}");
+        let known = spiral((0..11).map(|i| photograph(i, 1.0, Some([2.0 + i as f64, 20.0 + i as f64]))).collect());
+        assert!((known.focus - 6.949806949806949).abs() < 1e-12);
+        // From both sides: as the first camera of the orbit, a tenth of the way about it, here three.
+        let around = spiral((0..10).map(|i| photograph(i, if i % 2 == 0 { 1.0 } else { -1.0 }, None)).collect());
+        assert!(around.pose.abs_diff_eq(view.orbit(&extent, 1)[0].pose, 1e-12) && (around.focus - 4.0).abs() < 1e-12);
+        assert!(around.radii.iter().all(|radius| (radius - 1.2).abs() < 1e-12));
+    }
+
+    #[test]
+    fn flags_that_a_path_does_not_know_are_named() {
+        let of = |path: &str| CameraPathArgs { path: CameraPath::parse(path).unwrap(), ..CameraPathArgs::default() };
+        let fails = |args: CameraPathArgs, expected: &str| {
+            let message = args.check().unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        };
+        fails(
+            CameraPathArgs { radius: Some(2.0), ..of("test") },
+            "`radius`: has no meaning for --path test: it is for orbit and spiral",
+        );
+        fails(CameraPathArgs { elevation: Some(2.0), ..of("spiral") }, "`elevation`");
+        fails(CameraPathArgs { fov: Some(2.0), ..of("a.JSON") }, "`fov`");
+        fails(CameraPathArgs { keyframes: vec!["1".into()], ..of("orbit") }, "`through`");
+        fails(CameraPathArgs { split: Some(Split::Test), ..of("orbit") }, "`split`");
+        fails(CameraPathArgs { closed: true, ..of("test") }, "`closed`");
+        fails(CameraPathArgs { seconds: Some(1.0), ..of("test") }, "`seconds`");
+        fails(CameraPathArgs { path_transform: Some("x".into()), ..of("orbit") }, "`path-transform`");
+        fails(of("spline"), "`through`: is needed");
+        assert!(CameraPath::parse("path.txt").is_err() && of("orbit").check().is_ok());
+        assert_eq!(CameraPathArgs { seconds: Some(2.5), ..of("orbit") }.count(7, 30.0).unwrap(), 75);
+        assert_eq!(CameraPathArgs { seconds: Some(1e-3), ..of("orbit") }.count(7, 30.0).unwrap(), 1);
+        assert!(CameraPathArgs { seconds: Some(1e9), ..of("orbit") }.count(7, 30.0).is_err());
+        assert_eq!(of("orbit").count(7, 30.0).unwrap(), 7);
+    }
+}

@@ -1,0 +1,201 @@
+//! Videos from frames in a folder: GIF and APNG by ourselves, MP4 and WebM by ffmpeg.
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use clap::ValueEnum;
+use raygrad::nerf::{Error, Image, Result};
+
+use super::animation::Animation;
+use super::frames::DIGITS;
+use crate::interrupt::{self, Stop, Work};
+use crate::output::{check_writable, note, numbered, parent};
+use crate::overwrite::Job;
+use crate::parse::LARGEST;
+use crate::prepare::program::FFMPEG;
+use crate::progress::Progress;
+
+/// A GIF shows a frame for two hundredths of a second at least: players show shorter ones for longer.
+const FASTEST_GIF: f64 = 50.0;
+
+/// What is counted while a video is written.
+const IN_FILM: &str = "frames in the video";
+
+/// A file that holds a video.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum VideoFormat {
+    Gif,
+    Apng,
+    Mp4,
+    Webm,
+}
+
+/// A video that is to be written.
+pub struct VideoWriter<'a> {
+    /// Where its frames are.
+    pub folder: &'a Path,
+    /// How many there are.
+    pub count: usize,
+    /// Their width and height.
+    pub size: [usize; 2],
+    /// How many are shown in a second.
+    pub fps: f64,
+    /// What the video is of, which it says of itself.
+    pub job: &'a Job,
+}
+
+impl VideoFormat {
+    /// By the ending of a file's name.
+    pub fn of(ending: &str) -> Option<VideoFormat> {
+        VideoFormat::from_str(ending, true).ok()
+    }
+
+    /// Whether it can be written, before there are frames.
+    pub fn check(self, out: &Path, fps: f64, size: [usize; 2]) -> Result<()> {
+        check_writable(parent(out))?;
+        if self == VideoFormat::Gif && fps > FASTEST_GIF {
+            let what =
+                format!("a GIF shows {FASTEST_GIF} frames a second at most, not {fps}: name a FILE.apng or FILE.mp4");
+            return Err(Error::setting("fps", what));
+        }
+        if let Some(side) = size.into_iter().find(|side| *side > LARGEST) {
+            return Err(Error::setting(
+                "size",
+                format!("has a side of {side} pixels, and videos have {LARGEST} at most"),
+            ));
+        }
+        match self {
+            VideoFormat::Gif | VideoFormat::Apng => Ok(()),
+            VideoFormat::Mp4 | VideoFormat::Webm => self.check_encoder(out),
+        }
+    }
+
+    /// Whether ffmpeg is there and has what this needs.
+    pub fn check_encoder(self, out: &Path) -> Result<()> {
+        let or = "or name a FILE.gif or FILE.apng, which need no other program";
+        let encoders = FFMPEG.ask(&["-hide_banner", "-encoders"]).map_err(|stop| match stop {
+            Stop::Failed(error) => Error::file(out, format!("{error}; {or}")),
+            Stop::Interrupted => Error::file(out, "was interrupted"),
+        })?;
+        let encoder = self.encoder();
+        if encoders.split_whitespace().any(|word| word == encoder) {
+            return Ok(());
+        }
+        Err(Error::file(
+            out,
+            format!("needs an ffmpeg with {encoder}, which the one here lacks: install another, {or}"),
+        ))
+    }
+
+    /// What ffmpeg writes it with.
+    fn encoder(self) -> &'static str {
+        if self == VideoFormat::Webm { "libvpx-vp9" } else { "libx264" }
+    }
+
+    /// Writes it, replacing the file as a whole.
+    pub fn write(self, reel: &VideoWriter<'_>, out: &Path) -> Work<()> {
+        let bad = |e: std::io::Error| Error::file(out, format!("cannot be written: {e}"));
+        let place = tempfile::Builder::new().prefix(".tmp").tempdir_in(parent(out)).map_err(bad)?;
+        let file = std::path::absolute(place.path()).map_err(bad)?.join("video");
+        let size = reel.size.map(|side| side as u16);
+        match self {
+            VideoFormat::Gif => animate(reel, out, &file, |to| Animation::gif(to, size, reel.fps, reel.job.mark()))?,
+            VideoFormat::Apng => {
+                let count = reel.count as u32;
+                animate(reel, out, &file, |to| Animation::apng(to, size, reel.fps, count, reel.job.mark()))?;
+            }
+            VideoFormat::Mp4 | VideoFormat::Webm => self.encode(reel, out, &file)?,
+        }
+        reel.job.check(out)?;
+        Ok(std::fs::rename(&file, out).map_err(bad)?)
+    }
+
+    /// By ffmpeg.
+    fn encode(self, reel: &VideoWriter<'_>, out: &Path, file: &Path) -> Work<()> {
+        let &VideoWriter { folder, count, size, fps, job } = reel;
+        let even = size.map(|side| side.next_multiple_of(2));
+        if even != size {
+            let [width, height] = even;
+            note(&format!("{}: videos have even sides: black is added, to {width}x{height}", out.display()));
+        }
+        let mut command = FFMPEG.command();
+        // In the folder, whose name may hold what ffmpeg reads as a number.
+        command.current_dir(folder);
+        command.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-nostats", "-progress", "pipe:1", "-y"]);
+        command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i", &format!("%0{DIGITS}d.png")]);
+        command.args(["-frames:v", &count.to_string()]);
+        // Players take an unnamed matrix by the size; this is named.
+        let filter = "pad=ceil(iw/2)*2:ceil(ih/2)*2,\
+                      scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int";
+        command.args(["-vf", filter, "-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"]);
+        command.args(["-color_trc", "iec61966-2-1", "-color_range", "tv"]);
+        command.args(["-c:v", self.encoder(), "-metadata", &format!("comment={}", job.mark())]);
+        command.args(match self {
+            VideoFormat::Webm => &["-crf", "24", "-b:v", "0", "-f", "webm"][..],
+            _ => &["-crf", "18", "-preset", "slow", "-movflags", "+faststart", "-f", "mp4"],
+        });
+        command.arg(file);
+        let progress = Progress::new();
+        FFMPEG.run(&mut command, None, |line| {
+            if let Some(done) = line.strip_prefix("frame=").and_then(|n| n.trim().parse().ok()) {
+                progress.count(done, count, IN_FILM);
+            }
+        })
+    }
+}
+
+/// By one of our encoders.
+fn animate(
+    reel: &VideoWriter<'_>,
+    out: &Path,
+    file: &Path,
+    begin: impl FnOnce(BufWriter<File>) -> std::result::Result<Animation<BufWriter<File>>, String>,
+) -> Work<()> {
+    let bad = |what: String| Error::file(out, format!("cannot be written: {what}"));
+    let to = File::create(file).map_err(|e| bad(e.to_string()))?;
+    let mut animation = begin(BufWriter::new(to)).map_err(bad)?;
+    let progress = Progress::new();
+    for frame in 0..reel.count {
+        if interrupt::requested() {
+            return Err(Stop::Interrupted);
+        }
+        animation.push(&Image::open(reel.folder.join(numbered(frame, DIGITS)))?).map_err(bad)?;
+        progress.count(frame + 1, reel.count, IN_FILM);
+    }
+    Ok(animation.finish().map_err(bad)?)
+}
+
+/// The folder of a video's frames, beside it.
+pub fn frames_of(video: &Path) -> PathBuf {
+    let mut name = video.as_os_str().to_owned();
+    name.push(".frames");
+    name.into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::Value;
+
+    #[test]
+    fn a_file_that_came_meanwhile_stays() {
+        let place = tempfile::tempdir().unwrap();
+        let (folder, out) = (place.path(), place.path().join("walk.gif"));
+        Image::new(4, 3, 3).save_png(folder.join(numbered(0, DIGITS))).unwrap();
+        let write = |video: VideoFormat, overwrites: bool| {
+            let job = Job::new("render", &Value::Null, overwrites);
+            video.write(&VideoWriter { folder, count: 1, size: [4, 3], fps: 10.0, job: &job }, &out)
+        };
+        for video in [VideoFormat::Gif, VideoFormat::Apng] {
+            std::fs::write(&out, b"footage").unwrap();
+            let Err(Stop::Failed(error)) = write(video, false) else { panic!("{video:?} is written") };
+            assert!(error.to_string().contains("walk.gif: exists, and was not written by this command"), "{error}");
+            assert_eq!(std::fs::read(&out).unwrap(), b"footage");
+            write(video, true).unwrap();
+            // Its own is replaced.
+            write(video, false).unwrap();
+        }
+        assert_eq!(std::fs::read_dir(folder).unwrap().count(), 2, "nothing is left beside it");
+    }
+}

@@ -1,0 +1,393 @@
+//! A page, from when it comes to when it goes: what it says, and what it is sent.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use axum::extract::ws::{CloseFrame, Message, WebSocket};
+use futures_util::stream::{SplitSink, SplitStream};
+use futures_util::{SinkExt, StreamExt};
+use raygrad::nerf::{Error, Result};
+use tokio::sync::Semaphore;
+use tokio::time::{timeout, timeout_at};
+
+use super::messages::{ClientMessage, File};
+use super::requests::{Outbox, Outgoing, sorry};
+use super::served::{Limits, Served};
+
+/// Quality of photographs as JPEG files, 1 to 100.
+const QUALITY: u8 = 88;
+/// Bytes that a close frame has room for, and some to spare.
+const REASON: usize = 120;
+
+/// One page.
+pub struct Connection {
+    client: u64,
+    outbox: Arc<Outbox>,
+    served: Arc<Served>,
+    /// Whether a photograph is being read.
+    reader: Arc<Semaphore>,
+    /// Whether something is being sent.
+    sending: AtomicBool,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        self.served.requests.leave(self.client);
+    }
+}
+
+impl Connection {
+    /// One that comes, if there is room for it.
+    pub fn join(served: Arc<Served>) -> Option<Self> {
+        let (client, outbox) = served.requests.join(served.limits.pages)?;
+        Some(Connection {
+            client,
+            outbox,
+            served,
+            reader: Arc::new(Semaphore::new(1)),
+            sending: AtomicBool::new(false),
+        })
+    }
+
+    /// Talks with it until it goes, or is listened to no longer.
+    pub async fn talk(self, socket: WebSocket) {
+        self.outbox.post(Outgoing::Text(self.served.requests.about()));
+        let patience = self.served.limits.patience;
+        let (mut out, mut heard) = socket.split();
+        let reason = tokio::select! {
+            reason = self.write(&mut out) => reason.map(str::to_owned),
+            reason = self.read(&mut heard) => reason,
+        };
+        drop(self);
+        if let Some(reason) = reason {
+            let close = CloseFrame { code: 1008, reason: shortened(reason).into() };
+            let _ = timeout(patience, out.send(Message::Close(Some(close)))).await;
+        }
+    }
+
+    /// Sends what there is for the page; gives why it is no longer sent anything, if it is there.
+    async fn write(&self, out: &mut SplitSink<WebSocket, Message>) -> Option<&'static str> {
+        let (outbox, limits) = (&self.outbox, &self.served.limits);
+        let mut pinged = Instant::now();
+        loop {
+            while let Some(message) = outbox.take() {
+                let (bytes, message) = framed(message);
+                // Meanwhile it cannot say anything.
+                self.sending.store(true, Ordering::Relaxed);
+                let sent = timeout(limits.patience_for(bytes), out.send(message)).await;
+                self.sending.store(false, Ordering::Relaxed);
+                if !matches!(sent, Ok(Ok(()))) {
+                    return None;
+                }
+            }
+            if outbox.is_overrun() {
+                return Some("too much was asked for");
+            }
+            let seen = outbox.flying().map(|(since, bytes)| since + limits.patience_for(bytes));
+            if seen.is_some_and(|until| until <= Instant::now()) {
+                return Some("a picture was not taken");
+            }
+            // Whether it is still there: a browser answers by itself, also one that looks on and says nothing.
+            if pinged.elapsed() >= limits.idle {
+                pinged = Instant::now();
+                if !matches!(timeout(limits.patience, out.send(Message::Ping(Default::default()))).await, Ok(Ok(()))) {
+                    return None;
+                }
+            }
+            let _ = timeout_at(next(pinged, seen, limits).into(), outbox.changed.notified()).await;
+        }
+    }
+
+    /// Takes what the page says; gives why it is listened to no longer, if it is there.
+    async fn read(&self, heard: &mut SplitStream<WebSocket>) -> Option<String> {
+        let limits = &self.served.limits;
+        let (mut allowed, mut last) = (limits.burst, Instant::now());
+        loop {
+            let message = match timeout(limits.silence, heard.next()).await {
+                Ok(Some(Ok(message))) => message,
+                Err(_) if self.sending.load(Ordering::Relaxed) => continue,
+                _ => return None,
+            };
+            allowed = limits.allowed(allowed, last.elapsed().as_secs_f64());
+            last = Instant::now();
+            if allowed < 0.0 {
+                return Some("too many messages".to_owned());
+            }
+            match message {
+                Message::Text(text) => match ClientMessage::read(&text) {
+                    Ok(ask) => self.answer(ask),
+                    Err(what) => return Some(what),
+                },
+                Message::Binary(_) => return Some("messages are text".to_owned()),
+                Message::Close(_) => return None,
+                Message::Ping(_) | Message::Pong(_) => (),
+            }
+        }
+    }
+
+    fn answer(&self, ask: ClientMessage) {
+        let Connection { client, outbox, served, reader, .. } = self;
+        let (client, requests) = (*client, &served.requests);
+        match ask {
+            ClientMessage::View { id, view } => requests.wish(client, id, view),
+            ClientMessage::Seen { id } => outbox.seen(id),
+            ClientMessage::Save { view } => {
+                if !requests.save(client, view) {
+                    outbox.post(sorry("so many pictures are saved one after the other"));
+                }
+            }
+            ClientMessage::Photograph { .. } if outbox.files() > served.limits.files => {
+                outbox.post(sorry("so many files are not taken"));
+            }
+            ClientMessage::Photograph { number } => match reader.clone().try_acquire_owned() {
+                Ok(permit) => {
+                    let (outbox, served) = (outbox.clone(), served.clone());
+                    tokio::spawn(async move {
+                        let photograph = photograph(number, &served).await;
+                        drop(permit);
+                        outbox.post(photograph);
+                    });
+                }
+                Err(_) => outbox.post(sorry("one photograph is read after the other")),
+            },
+            ClientMessage::Pause { pause } => requests.pause(pause),
+            ClientMessage::Stop {} => requests.stop(),
+            ClientMessage::Share { share } => requests.set_share(share),
+            ClientMessage::Rest {} => requests.rest(client),
+            ClientMessage::Video(video) => match served.video_jobs.clone() {
+                // It looks for what is installed.
+                Some(video_jobs) => {
+                    let outbox = outbox.clone();
+                    tokio::task::spawn_blocking(move || {
+                        let begun = video.fits().and_then(|()| video_jobs.begin(&video).map_err(|e| e.to_string()));
+                        if let Err(what) = begun {
+                            outbox.post(sorry(&what));
+                        }
+                    });
+                }
+                None => outbox.post(sorry("videos are made when training has ended")),
+            },
+            ClientMessage::EndVideo {} => {
+                if let Some(video_jobs) = &served.video_jobs {
+                    video_jobs.end();
+                }
+            }
+        }
+    }
+}
+
+/// A message as it is sent, and how many bytes it has.
+fn framed(message: Outgoing) -> (usize, Message) {
+    match message {
+        Outgoing::Text(text) => (text.len(), Message::Text(text.into())),
+        Outgoing::Bytes(bytes) => (bytes.len(), Message::Binary(bytes.into())),
+    }
+}
+
+/// When there is something to see to, though nothing is to be sent: the page is asked whether it is there, or must have seen a
+/// picture.
+fn next(pinged: Instant, seen: Option<Instant>, limits: &Limits) -> Instant {
+    let ping = pinged + limits.idle;
+    seen.map_or(ping, |seen| seen.min(ping))
+}
+
+/// As much of a reason as a close frame has room for.
+fn shortened(mut reason: String) -> String {
+    let room = (0..=REASON).rev().find(|at| reason.is_char_boundary(*at)).unwrap_or(0);
+    reason.truncate(room);
+    reason
+}
+
+/// A photograph as the page wants it.
+async fn photograph(number: usize, served: &Arc<Served>) -> Outgoing {
+    let Ok(_permit) = served.readers.acquire().await else { return sorry("it cannot be read") };
+    let (photos, background) = (served.photos.clone(), served.background);
+    let read = move || -> Result<Vec<u8>> {
+        let photos = photos.ok_or_else(|| Error::setting("photograph", "the run's photographs are not known"))?;
+        Ok(File::Photograph { number }.message(&photos.photo(number)?.over(background).to_jpeg(QUALITY)))
+    };
+    match tokio::task::spawn_blocking(read).await {
+        Ok(Ok(bytes)) => Outgoing::Bytes(bytes),
+        Ok(Err(error)) => sorry(&error.to_string()),
+        Err(_) => sorry("it cannot be read"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fuzz::run_config;
+    use crate::run::Run;
+    use crate::view::messages::View;
+    use crate::view::requests::Requests;
+    use crate::view::video_jobs::VideoJobs;
+    use serde_json::{Value, json};
+    use std::time::Duration;
+
+    /// A page of a scene without photographs, as it is beside its connection.
+    fn page(video_jobs: impl FnOnce(&Arc<Requests>) -> Option<Arc<VideoJobs>>) -> Connection {
+        let requests = Arc::new(Requests::default());
+        let video_jobs = video_jobs(&requests);
+        let (readers, limits) = (Semaphore::new(1), Limits::USUAL);
+        let (background, host) = ([1.0; 3], String::new());
+        Connection::join(Arc::new(Served {
+            requests,
+            photos: None,
+            video_jobs,
+            background,
+            host,
+            token: None,
+            readers,
+            limits,
+        }))
+        .unwrap()
+    }
+
+    fn view() -> View {
+        serde_json::from_value(json!({ "eye": { "photograph": 0 }, "size": [8, 8] })).unwrap()
+    }
+
+    fn ask(page: &Connection, message: Value) {
+        page.answer(ClientMessage::read(&message.to_string()).unwrap());
+    }
+
+    /// Why the page does not get what it has asked for; nothing if it was not told.
+    fn apology(page: &Connection) -> Option<String> {
+        match page.outbox.take()? {
+            Outgoing::Text(text) => {
+                let told: Value = serde_json::from_str(&text).unwrap();
+                assert_eq!(told["tell"], "sorry");
+                Some(told["what"].as_str().unwrap().to_owned())
+            }
+            Outgoing::Bytes(bytes) => panic!("{bytes:?}"),
+        }
+    }
+
+    /// The same, of what is found out beside.
+    async fn later(page: &Connection) -> String {
+        for _ in 0..2000 {
+            if let Some(what) = apology(page) {
+                return what;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        panic!("nothing is said")
+    }
+
+    #[test]
+    fn what_is_asked_for_is_seen_to() {
+        let page = page(|_| None);
+        let requests = &page.served.requests;
+        page.answer(ClientMessage::View { id: 1, view: view() });
+        assert_eq!(requests.wishes().len(), 1);
+        page.answer(ClientMessage::Rest {});
+        assert!(requests.wishes().is_empty());
+        assert!(!requests.paused() && !requests.stops());
+        page.answer(ClientMessage::Pause { pause: true });
+        assert!(requests.paused() && !requests.stops());
+        page.answer(ClientMessage::Pause { pause: false });
+        page.answer(ClientMessage::Stop {});
+        page.answer(ClientMessage::Share { share: 0.25 });
+        assert!(!requests.paused() && requests.stops() && requests.share() == 0.25);
+        page.answer(ClientMessage::EndVideo {});
+        assert_eq!(apology(&page), None);
+        ask(
+            &page,
+            json!({ "ask": "video", "path": { "render_width": 8, "render_height": 8, "seconds": 1, "fps": 1 } }),
+        );
+        assert_eq!(apology(&page).unwrap(), "videos are made when training has ended");
+        // Four pictures to keep may wait.
+        let refused = (1..).find_map(|count| {
+            page.answer(ClientMessage::Save { view: view() });
+            apology(&page).map(|what| (count, what))
+        });
+        assert_eq!(refused, Some((5, "so many pictures are saved one after the other".to_owned())));
+        assert!(requests.next_save().is_some_and(|save| save.client == page.client));
+        let requests = requests.clone();
+        drop(page);
+        assert_eq!(requests.connected(), 0);
+    }
+
+    #[tokio::test]
+    async fn photographs_are_read_one_after_the_other() {
+        let page = page(|_| None);
+        // Others are being read for other pages.
+        let others = page.served.readers.acquire().await.unwrap();
+        ask(&page, json!({ "ask": "photograph", "number": 0 }));
+        tokio::task::yield_now().await;
+        assert_eq!(apology(&page), None);
+        ask(&page, json!({ "ask": "photograph", "number": 1 }));
+        assert_eq!(apology(&page).unwrap(), "one photograph is read after the other");
+        drop(others);
+        assert!(later(&page).await.contains("not known"));
+        ask(&page, json!({ "ask": "photograph", "number": 1 }));
+        assert!(later(&page).await.contains("not known"));
+    }
+
+    #[tokio::test]
+    async fn photographs_are_for_pages_that_take_them() {
+        let page = page(|_| None);
+        let limit = page.served.limits.files;
+        for _ in 0..limit {
+            page.outbox.post(Outgoing::Bytes(vec![]));
+        }
+        let asked = async |expected: &str| {
+            ask(&page, json!({ "ask": "photograph", "number": 0 }));
+            let files = page.outbox.files();
+            (0..files).for_each(|_| assert!(matches!(page.outbox.take(), Some(Outgoing::Bytes(_)))));
+            assert!(later(&page).await.contains(expected));
+            (0..files + 1).for_each(|_| page.outbox.post(Outgoing::Bytes(vec![])));
+        };
+        asked("not known").await;
+        // One more, and two.
+        asked("so many files are not taken").await;
+        asked("so many files are not taken").await;
+    }
+
+    #[tokio::test]
+    async fn why_no_video_is_made_is_said() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let run = Arc::new(Run { folder: file.path().to_owned(), config: run_config() });
+        let page = page(|requests| Some(Arc::new(VideoJobs::new(run, None, requests.clone()))));
+        let video =
+            json!({ "ask": "video", "path": { "render_width": 8, "render_height": 8, "seconds": 1, "fps": 1 } });
+        for _ in 0..2 {
+            ask(&page, video.clone());
+            assert!(later(&page).await.contains("videos"), "its folder is a file");
+        }
+        let path = json!({ "render_width": 2048, "render_height": 2048, "seconds": 600, "fps": 60 });
+        ask(&page, json!({ "ask": "video", "path": path }));
+        assert!(later(&page).await.contains("lower its seconds"));
+        // One of another page, which this one may end, too.
+        page.served.video_jobs.as_ref().unwrap().claim().unwrap();
+        ask(&page, video.clone());
+        assert!(later(&page).await.contains("one is being made: wait"));
+        page.answer(ClientMessage::EndVideo {});
+        ask(&page, video);
+        assert!(later(&page).await.contains("ends"));
+    }
+
+    #[test]
+    fn messages_have_as_many_bytes_as_they_are_said_to_have() {
+        assert_eq!(framed(Outgoing::Text("\u{e4}x".to_owned())), (3, Message::Text("\u{e4}x".into())));
+        assert_eq!(framed(Outgoing::Bytes(vec![7; 5])), (5, Message::Binary(vec![7; 5].into())));
+    }
+
+    #[test]
+    fn what_is_first_is_seen_to_first() {
+        let (limits, start) = (Limits::USUAL, Instant::now());
+        let after = |seconds: u64| start + Duration::from_secs(seconds);
+        let next = |seen: Option<u64>| next(start, seen.map(after), &limits);
+        assert_eq!([next(None), next(Some(1)), next(Some(60))], [after(5), after(1), after(5)]);
+    }
+
+    #[test]
+    fn reasons_are_as_long_as_there_is_room_and_end_with_a_letter() {
+        assert_eq!(shortened("not taken".to_owned()), "not taken");
+        assert_eq!(shortened("x".repeat(500)), "x".repeat(REASON));
+        assert_eq!(shortened("\u{e4}".repeat(100)), "\u{e4}".repeat(REASON / 2));
+        assert_eq!(shortened(format!("x{}", "\u{e4}".repeat(100))), format!("x{}", "\u{e4}".repeat(REASON / 2 - 1)));
+        assert_eq!(shortened(String::new()), "");
+    }
+}

@@ -1,0 +1,341 @@
+//! The photographs of a run, one at a time.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use raygrad::nerf::dataset::{Capture, Frame, Photo, Point, Split, View};
+use raygrad::nerf::glam::DVec3;
+use raygrad::nerf::{Camera, Error, Model, Result};
+use raygrad_scenes::{embedded, landscape};
+
+use super::cache::{Cache, Cached};
+use super::messages::{AboutPhotograph, rows};
+use super::requests::Requests;
+use crate::builtin;
+use crate::eval::alignment::Appearance;
+use crate::photographs::{check_trained, present};
+use crate::run::Run;
+use crate::scene::{EMBEDDED_SIZE, LANDSCAPE_SIZE, Scene};
+
+/// Photographs that are kept in memory.
+const KEPT: usize = 4;
+/// Longest side that they are kept at.
+const LONGEST: usize = 1600;
+/// Most points that a page is told of.
+const MOST_POINTS: usize = 4000;
+
+/// The photographs of all splits, by number.
+pub struct PhotoCache {
+    capture: Capture,
+    scene: Scene,
+    /// What the sides of photographs are divided by where they are trained on and evaluated.
+    downscale: usize,
+    entries: Vec<Entry>,
+    /// The best points of the capture, in the scene.
+    points: Vec<(DVec3, [u8; 3])>,
+    kept: Cache<usize, Photo>,
+    /// The photographs of a split of a scene that is built in, which are made together, and their width.
+    made: Mutex<Option<(Split, Vec<Frame>)>>,
+    width: usize,
+}
+
+struct Entry {
+    split: Split,
+    /// Which of its split it is.
+    number: usize,
+    view: View,
+    /// The camera as the files have it, in the scene.
+    given: Camera,
+}
+
+impl PhotoCache {
+    /// Those that a run was trained on and those that were held out. No image is read.
+    ///
+    /// # Errors
+    /// If the capture cannot be read, or those to train on are others.
+    pub fn open(run: &Run, scene: Option<&Scene>) -> Result<Self> {
+        let scene = run.scene(scene)?.clone();
+        let capture = builtin::capture(&scene, None, None)?;
+        let width = if scene == Scene::Landscape { LANDSCAPE_SIZE[0] } else { EMBEDDED_SIZE };
+        let placement = run.config.scene_box.transform;
+        let mut entries = vec![];
+        for split in Split::ALL {
+            // A capture need not have all of them.
+            let Ok(views) = present(&capture, split) else { continue };
+            // Where there are none to validate with, those are the test views.
+            let names = |views: &[&View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+            let are_tests = |tests: Vec<&View>| names(&tests) == names(&views);
+            if split == Split::Val && present(&capture, Split::Test).is_ok_and(are_tests) {
+                continue;
+            }
+            if split == Split::Train {
+                check_trained(run, &capture, &views, run.config.scene_box.frames)?;
+            }
+            entries.extend(views.into_iter().enumerate().map(|(number, view)| {
+                let given = placement.camera(&view.camera);
+                Entry { split, number, view: view.clone(), given }
+            }));
+        }
+        let points = best(&capture.points).map(|point| (placement.point(point.position), point.color)).collect();
+        let downscale = run.config.downscale;
+        let (kept, made) = (Cache::new(KEPT), Mutex::default());
+        Ok(PhotoCache { capture, scene, downscale, entries, points, kept, made, width })
+    }
+
+    /// Whether there is a photograph of this number.
+    pub fn has(&self, number: usize) -> bool {
+        number < self.entries.len()
+    }
+
+    /// The camera of a photograph, where a model has it.
+    pub fn camera(&self, number: usize, model: &Model<f32>) -> Option<Camera> {
+        let Entry { split, number, given, .. } = self.entries.get(number)?;
+        Some(match split {
+            Split::Train => model.learned_camera(*number, given),
+            _ => model.other_camera(given),
+        })
+    }
+
+    /// All of them.
+    fn cameras(&self, model: &Model<f32>) -> Vec<Camera> {
+        let given: Vec<Camera> = self.entries.iter().map(|entry| entry.given.clone()).collect();
+        let camera = |(entry, other): (&Entry, Camera)| match entry.split {
+            Split::Train => model.learned_camera(entry.number, &entry.given),
+            _ => other,
+        };
+        self.entries.iter().zip(model.other_cameras(&given)).map(camera).collect()
+    }
+
+    /// Whether evaluations compare a photograph at this size: as it is trained on, from the files themselves.
+    pub fn is_evaluated_at(&self, number: usize, size: [usize; 2]) -> bool {
+        let is_averaged = self.downscale == 1 || matches!(self.scene, Scene::Folder(_));
+        self.entries.get(number).is_some_and(|Entry { given, .. }| {
+            let sides = [given.width, given.height];
+            let own = sides.map(|side| ((side as f64 / self.downscale as f64).round() as usize).max(1));
+            is_averaged && size == own && sides.iter().all(|side| *side <= LONGEST)
+        })
+    }
+
+    /// Whether evaluations see a photograph otherwise than a page: without what its mask covers, or with what was learned of it alone.
+    pub fn is_special(&self, number: usize, model: &Model<f32>) -> bool {
+        let own = |entry: &Entry| Appearance::of(model, entry.split, false) == Appearance::Own;
+        self.entries.get(number).is_some_and(|entry| entry.view.mask.is_some() || own(entry))
+    }
+
+    /// The photograph that was taken nearest to where a camera is, looking the way it looks.
+    pub fn nearest(&self, camera: &Camera, model: &Model<f32>) -> Option<usize> {
+        let middle = 0.5 * (model.scene_box.bounds[0] + model.scene_box.bounds[1]);
+        let reach = camera.pose.translation.distance(middle).max(1e-6);
+        let apart = |own: &Camera| {
+            let away = own.pose.translation.distance(camera.pose.translation) / reach;
+            away + own.pose.matrix3.z_axis.distance(camera.pose.matrix3.z_axis)
+        };
+        let apart = self.cameras(model).iter().map(apart).enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+        apart.map(|(number, _)| number)
+    }
+
+    /// A photograph, no larger than a page shows it.
+    ///
+    /// # Errors
+    /// If there is none of this number, or it cannot be read.
+    pub fn photo(&self, number: usize) -> Result<Arc<Photo>> {
+        self.kept.get_now(number, || self.read(number))
+    }
+
+    /// The same, read beside all else; wakes who waits at the requests when it has come.
+    pub fn fetch(self: &Arc<Self>, number: usize, requests: &Arc<Requests>) -> Cached<Photo> {
+        let (photos, requests) = (self.clone(), requests.clone());
+        self.kept.get(number, move || photos.read(number), move || requests.wake())
+    }
+
+    fn read(&self, number: usize) -> Result<Photo> {
+        let entry = self.entries.get(number);
+        let entry = entry.ok_or_else(|| Error::setting("photograph", format!("there is no photograph {number}")))?;
+        let photo = match &self.scene {
+            Scene::Folder(_) => self.capture.photo(&entry.view)?,
+            made => self.made(made, entry)?,
+        };
+        Ok(if photo.width.max(photo.height) > LONGEST { shrunk(&photo) } else { photo })
+    }
+
+    /// A photograph of a scene that is built in.
+    fn made(&self, scene: &Scene, entry: &Entry) -> Result<Photo> {
+        let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        let frames = match made.take_if(|(split, _)| *split == entry.split) {
+            Some((_, frames)) => frames,
+            None => match scene {
+                Scene::Landscape => landscape(entry.split, self.width).frames,
+                _ => embedded(entry.split, self.width).frames,
+            },
+        };
+        let photo = frames.get(entry.number).map(|frame| frame.image.clone());
+        *made = Some((entry.split, frames));
+        photo.ok_or_else(|| Error::setting("photograph", format!("there is no photograph {}", entry.number)))
+    }
+
+    /// What a page is told of them.
+    pub fn about(&self, model: &Model<f32>) -> Vec<AboutPhotograph> {
+        let about = |(entry, camera): (&Entry, Camera)| AboutPhotograph {
+            name: entry.view.name.clone(),
+            split: entry.split,
+            pose: rows(&camera.pose),
+            fov: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan().to_degrees(),
+            centre: [camera.centre[0] / camera.width as f64, camera.centre[1] / camera.height as f64],
+            size: [camera.width, camera.height],
+        };
+        self.entries.iter().zip(self.cameras(model)).map(about).collect()
+    }
+
+    /// Places of the scene and their colours: the best of them, if there are many.
+    pub fn points(&self, model: &Model<f32>) -> Vec<([f32; 3], [u8; 3])> {
+        // With the cameras, if these are found to have been elsewhere.
+        let learned =
+            model.camera_optimizer.as_ref().and_then(|refine| refine.transform(&model.params)).unwrap_or_default();
+        let place = |(point, color): &(DVec3, [u8; 3])| (learned.point(*point).as_vec3().to_array(), *color);
+        self.points.iter().map(place).collect()
+    }
+}
+
+/// The points that most photographs show, and of those that as many show the ones that are known best; so many that a page has
+/// room for them.
+fn best(points: &[Point]) -> impl Iterator<Item = &Point> {
+    let mut points: Vec<&Point> = points.iter().collect();
+    points.sort_by(|a, b| b.views.cmp(&a.views).then(a.error.total_cmp(&b.error)));
+    points.into_iter().take(MOST_POINTS)
+}
+
+/// A photograph whose longest side is as long as is kept.
+fn shrunk(photo: &Photo) -> Photo {
+    let share = LONGEST as f64 / photo.width.max(photo.height) as f64;
+    let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
+    photo.resized([side(photo.width), side(photo.height)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad::Schedule;
+    use raygrad::nerf::dataset::SceneTransform;
+    use raygrad::nerf::glam::DAffine3;
+    use raygrad::nerf::{Config, Image, Preset, SceneBox};
+    use std::path::PathBuf;
+
+    /// Photographs from these places, looking down, of these splits.
+    fn photos(scene: Scene, places: &[(Split, DVec3)]) -> PhotoCache {
+        let capture = builtin::capture(&Scene::Landscape, None, None).unwrap();
+        let mut numbers = [0; 3];
+        let entry = |(split, place): &(Split, DVec3)| {
+            let which = Split::ALL.iter().position(|own| own == split).unwrap();
+            let given = Camera::from_angle(40, 30, 0.8, DAffine3::from_translation(*place));
+            numbers[which] += 1;
+            Entry { split: *split, number: numbers[which] - 1, view: capture.views[0].clone(), given }
+        };
+        let entries = places.iter().map(entry).collect();
+        let (kept, made) = (Cache::new(KEPT), Mutex::default());
+        PhotoCache { capture, scene, downscale: 1, entries, points: vec![], kept, made, width: 16 }
+    }
+
+    fn model(bounds: [DVec3; 2], cameras: &[Camera], learns: bool) -> Model<f32> {
+        let poses = learns.then_some(Schedule::Constant { rate: 1e-3 });
+        let extent = SceneBox { frames: cameras.len(), ..SceneBox::new(bounds, [0.1, 9.0]) };
+        Model::with_cameras(Config { poses, ..Config::preset(Preset::Voxel) }, extent, cameras, 0).unwrap()
+    }
+
+    const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
+
+    #[test]
+    fn photographs_that_were_trained_on_are_where_they_were_found_and_others_beside_them() {
+        let at = |x: f64, y: f64| DVec3::new(x, y, 3.0);
+        let places = [
+            (Split::Train, at(0.0, 1.0)),
+            (Split::Train, at(1.0, 0.0)),
+            (Split::Train, at(-1.0, 0.5)),
+            (Split::Test, at(0.5, 0.0)),
+        ];
+        let photos = photos(Scene::Embedded, &places);
+        let given: Vec<Camera> = photos.entries.iter().map(|entry| entry.given.clone()).collect();
+        let mut model = model(UNIT, &given[..3], true);
+        assert_eq!((0..4).map(|i| photos.camera(i, &model).unwrap()).collect::<Vec<_>>(), given);
+        let poses = model.params.find("poses").unwrap();
+        let moved: Vec<f32> = (0..18).map(|i| 0.05 + 0.02 * (i * i % 7) as f32).collect();
+        model.params.get_mut(poses).as_mut_slice().copy_from_slice(&moved);
+        let expected: Vec<Camera> =
+            (0..3).map(|i| model.learned_camera(i, &given[i])).chain([model.other_camera(&given[3])]).collect();
+        assert!(expected.iter().zip(&given).all(|(a, b)| a != b));
+        assert_eq!((0..4).map(|i| photos.camera(i, &model).unwrap()).collect::<Vec<_>>(), expected);
+        assert_eq!(photos.cameras(&model), expected);
+        assert!(photos.camera(4, &model).is_none() && photos.has(3) && !photos.has(4));
+    }
+
+    #[test]
+    fn the_nearest_photograph_stands_near_and_looks_the_same_way() {
+        let mut photos = photos(Scene::Embedded, &[(Split::Train, DVec3::new(0.0, 0.0, 5.0)); 3]);
+        let model = model([DVec3::ZERO, DVec3::splat(2.0)], &[], false);
+        // Two away and turned by a right angle; six away, held alike; the same place, turned round.
+        photos.entries[0].given.pose = DAffine3::from_rotation_x(1.5) * DAffine3::from_translation(DVec3::ZERO);
+        photos.entries[0].given.pose.translation = DVec3::new(2.0, 0.0, 7.0);
+        photos.entries[1].given.pose.translation = DVec3::new(6.0, 0.0, 7.0);
+        photos.entries[2].given.pose = DAffine3::from_rotation_x(3.1);
+        photos.entries[2].given.pose.translation = DVec3::new(0.0, 0.0, 7.0);
+        let camera = Camera::from_angle(4, 3, 0.8, DAffine3::from_translation(DVec3::new(0.0, 0.0, 7.0)));
+        // By the way from the middle, (1, 1, 1), of 6.16: .32 + 1.36, .97 + 0, 0 + 2.
+        assert_eq!(photos.nearest(&camera, &model), Some(1));
+        photos.entries[1].given.pose.translation.x = 11.0;
+        assert_eq!(photos.nearest(&camera, &model), Some(0), "1.78");
+        photos.entries.clear();
+        assert_eq!(photos.nearest(&camera, &model), None);
+    }
+
+    #[test]
+    fn figures_are_those_of_evaluations_where_these_see_the_same() {
+        let mut photos =
+            photos(Scene::Folder(PathBuf::new()), &[(Split::Train, DVec3::ZERO), (Split::Test, DVec3::ONE)]);
+        let model = model(UNIT, &[], false);
+        assert!(!photos.is_special(0, &model) && !photos.is_special(7, &model));
+        photos.entries[0].view.mask = Some(PathBuf::from("mask.png"));
+        assert!(photos.is_special(0, &model) && !photos.is_special(1, &model));
+        // Of the size that is trained on.
+        let at = |photos: &PhotoCache, size: [usize; 2]| photos.is_evaluated_at(1, size);
+        assert_eq!([[40, 30], [20, 15], [39, 30], [40, 29]].map(|size| at(&photos, size)), [true, false, false, false]);
+        photos.downscale = 4;
+        assert_eq!([[40, 30], [10, 8], [10, 7]].map(|size| at(&photos, size)), [false, true, false]);
+        // Those that are built in are not made smaller, but made so.
+        photos.scene = Scene::Landscape;
+        assert!(!at(&photos, [10, 8]) && !photos.is_evaluated_at(2, [40, 30]));
+        (photos.downscale, photos.entries[1].given.width) = (1, LONGEST + 1);
+        assert!(!at(&photos, [LONGEST + 1, 30]), "it is shown smaller");
+    }
+
+    #[test]
+    fn photographs_that_are_built_in_are_made_by_their_split_and_number() {
+        let places = [(Split::Train, DVec3::ZERO), (Split::Test, DVec3::ZERO), (Split::Test, DVec3::ZERO)];
+        let photos = photos(Scene::Landscape, &places);
+        let tests = landscape(Split::Test, 16).frames;
+        assert_eq!(photos.read(2).unwrap().to_image(), tests[1].image.to_image());
+        assert_eq!(photos.read(1).unwrap().to_image(), tests[0].image.to_image());
+        assert_ne!(photos.read(0).unwrap().to_image(), tests[0].image.to_image());
+        assert!(photos.read(3).is_err_and(|error| error.to_string().contains("no photograph 3")));
+    }
+
+    #[test]
+    fn the_points_that_are_known_best_come_first() {
+        let of = |views: u32, error: f64| Point { position: DVec3::ZERO, color: [0; 3], error, views };
+        let mut points = vec![of(2, 0.1), of(5, 0.9), of(5, 0.2), of(3, 0.0)];
+        let order = best(&points).map(|point| (point.views, point.error)).collect::<Vec<_>>();
+        assert_eq!(order, [(5, 0.2), (5, 0.9), (3, 0.0), (2, 0.1)]);
+        points.resize(MOST_POINTS + 1, of(1, 0.0));
+        assert_eq!(best(&points).count(), MOST_POINTS);
+        // In the scene, and with the cameras.
+        let mut photos = photos(Scene::Embedded, &[(Split::Train, DVec3::ZERO)]);
+        photos.points = vec![(DVec3::new(1.0, 2.0, 3.0), [4, 5, 6])];
+        assert_eq!(photos.points(&model(UNIT, &[], false)), [([1.0, 2.0, 3.0], [4, 5, 6])]);
+        assert_eq!(SceneTransform::default().point(DVec3::X), DVec3::X);
+    }
+
+    #[test]
+    fn large_photographs_keep_their_proportions() {
+        for (size, expected) in [([3200, 100], [1600, 50]), ([20, 1700], [19, 1600]), ([1601, 1], [1600, 1])] {
+            let small = shrunk(&Photo::from(Image::new(size[0], size[1], 3)));
+            assert_eq!([small.width, small.height], expected);
+        }
+    }
+}

@@ -1,0 +1,305 @@
+//! How a scene lies in its capture, found out from its cameras: up, middle, scale, and how far it goes.
+
+use super::capture::{Capture, Format, Point, View};
+use super::frames::evenly_spaced;
+use super::scene_transform::SceneTransform;
+use super::scene_type::SceneType;
+use crate::camera::Ndc;
+use crate::camera::axes::{across, axes};
+use crate::camera::pinhole::Camera;
+use crate::error::{Error, Result};
+use crate::numbers::{mean, median, outer};
+use glam::{DAffine3, DMat3, DVec3};
+use raygrad_tensor::parallel;
+
+/// Where a scene is and how far it goes, in scene units, and why that is thought.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneAnalysis {
+    /// From the capture's coordinates to those of the scene.
+    pub transform: SceneTransform,
+    /// How far it goes.
+    pub scene_type: SceneType,
+    /// Lower and upper corner of its box.
+    pub bounds: [DVec3; 2],
+    /// Distance along a ray before which there is nothing.
+    pub near: f64,
+    /// Distance along a ray beyond which there is nothing.
+    pub far: f64,
+    /// What all cameras see, if they [look the same way](SceneType::ForwardFacing), in scene units.
+    pub ndc: Option<Ndc>,
+    /// How the scope was found, in a few words.
+    pub reason: String,
+}
+
+/// Half of a box's side in scene units, as in the NeRF-synthetic scenes.
+const HALF_BOX: f64 = 1.5;
+/// Near and far of the NeRF-synthetic scenes: their files do not say where the scene lies, and all work on them uses these.
+const CONVENTION: [f64; 2] = [2.0, 6.0];
+/// Where nothing else is known, a ray of an unbounded scene begins at this share of the cameras' distance from its middle.
+const NEAR_SHARE: f64 = 0.05;
+/// An unbounded scene's end, in sides of its box.
+const FAR_SIDES: f64 = 1000.0;
+/// Half of the box of an unbounded scene, as a share of the cameras' distance from its middle.
+const INNER_SHARE: f64 = 0.5;
+/// Where cameras look about nothing in common and nothing says how far they see: how much farther than they stand apart.
+const AHEAD: f64 = 5.0;
+/// The same where they look all around.
+const AROUND: f64 = 3.0;
+/// Times that the middle is found, the last ones without what is far off.
+const ROUNDS: usize = 8;
+
+impl SceneAnalysis {
+    /// Of a capture, from all photographs that exist. `empty` says in a few words why it is thought, if it is, that there is
+    /// nothing behind an object, which only their pixels tell; `asked` overrules what is found.
+    ///
+    /// # Errors
+    /// If there is no photograph, or all cameras stand in one place, so that nothing has a size; if they do not look the same
+    /// way, and [are to](SceneType::ForwardFacing).
+    pub fn new(capture: &Capture, empty: Option<&str>, asked: Option<SceneType>) -> Result<SceneAnalysis> {
+        let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
+        if cameras.is_empty() {
+            let Some(first) = capture.views.first() else {
+                return Err(Error::file(&capture.file, "lists no photographs"));
+            };
+            let what = format!(
+                "none of the {} images exists, not even that of the first, `{}`, in or below {}",
+                capture.views.len(),
+                first.name,
+                capture.folder.display()
+            );
+            return Err(Error::field(&capture.file, &first.field, what));
+        }
+        // Opaque photographs show what lies behind, wherever their cameras stand.
+        let bounded = asked.map_or(empty.is_some(), |scope| scope == SceneType::Bounded);
+        if capture.format == Format::Blender && bounded && conventional(&cameras) {
+            return Ok(SceneAnalysis {
+                transform: SceneTransform::default(),
+                scene_type: SceneType::Bounded,
+                bounds: [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)],
+                near: CONVENTION[0],
+                far: CONVENTION[1],
+                ndc: None,
+                reason: "the NeRF-synthetic convention: all within 1.5 units of the origin".to_owned(),
+            });
+        }
+        let (scope, reason) = match (asked, empty) {
+            (Some(scope), _) => (scope, "as asked"),
+            (None, Some(why)) => (SceneType::Bounded, why),
+            (None, None) => {
+                if Ndc::around(cameras.iter().copied(), 1.0).is_ok() {
+                    (
+                        SceneType::ForwardFacing,
+                        "photographs are opaque, so they show what lies behind, and all look ahead",
+                    )
+                } else {
+                    (SceneType::Unbounded, "photographs are opaque, so they show what lies behind")
+                }
+            }
+        };
+        let depths: Vec<[f64; 2]> = capture.present().filter_map(|view| view.bounds).collect();
+        let points = trusted(&capture.points);
+        let Layout { middle, inner, looks } = Layout::new(&cameras, &depths, &points);
+        let reason = format!("{reason}; {looks}");
+        let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
+        if !(distance > 1e-9 * (1.0 + middle.length())) {
+            let what = "all cameras stand in one place: nothing in the scene has a size";
+            return Err(Error::file(&capture.file, what));
+        }
+        let half = match scope {
+            SceneType::Bounded => half_width(&cameras, middle),
+            SceneType::Unbounded | SceneType::ForwardFacing => inner,
+        };
+        let placement = SceneTransform { rotation: upright(&cameras), scale: HALF_BOX / half, origin: middle };
+        let bounds = [DVec3::splat(-HALF_BOX), DVec3::splat(HALF_BOX)];
+        let [near, far] = match scope {
+            SceneType::Bounded => {
+                let distances = || cameras.iter().map(|camera| camera.pose.translation.distance(middle));
+                let reach = 3.0_f64.sqrt() * half;
+                let nearest = distances().fold(f64::INFINITY, f64::min);
+                [(nearest - reach).max(NEAR_SHARE * distance), distances().fold(0.0, f64::max) + reach]
+            }
+            SceneType::Unbounded | SceneType::ForwardFacing => {
+                let given = depths.iter().map(|[near, _]| *near).reduce(f64::min);
+                let near = given.or_else(|| nearest_point(&cameras, &points));
+                let near = near.map_or(NEAR_SHARE * distance, |near| 0.5 * near);
+                [near.min(0.5 * distance), FAR_SIDES * 2.0 * half]
+            }
+        };
+        let [near, far] = [near, far].map(|length| length * placement.scale);
+        let ndc = match scope {
+            SceneType::ForwardFacing => {
+                let placed: Vec<Camera> = cameras.iter().map(|camera| placement.camera(camera)).collect();
+                Some(Ndc::around(&placed, near)?)
+            }
+            SceneType::Bounded | SceneType::Unbounded => None,
+        };
+        Ok(SceneAnalysis { transform: placement, scene_type: scope, bounds, near, far, ndc, reason })
+    }
+}
+
+impl Capture {
+    /// The photographs whose images exist.
+    pub fn present(&self) -> impl Iterator<Item = &View> {
+        self.views.iter().filter(|view| view.image.is_some())
+    }
+}
+
+/// Whether cameras stand around the origin as those of the NeRF-synthetic scenes, and look at it.
+fn conventional(cameras: &[&Camera]) -> bool {
+    let [near, far] = CONVENTION;
+    cameras.iter().all(|camera| {
+        let eye = camera.pose.translation;
+        let looks = -camera.pose.matrix3.z_axis;
+        (near + 0.5..far - 0.5).contains(&eye.length()) && looks.dot(-eye.normalize()) > 0.7
+    })
+}
+
+/// Where a scene lies for cameras that look at it, ahead or around.
+struct Layout {
+    middle: DVec3,
+    /// Half of the box of an unbounded scene.
+    inner: f64,
+    /// How cameras look, in a few words.
+    looks: &'static str,
+}
+
+impl Layout {
+    /// `depths` are the nearest and farthest that each camera sees, if all are known, and `points` some of what they see.
+    fn new(cameras: &[&Camera], depths: &[[f64; 2]], points: &[DVec3]) -> Self {
+        let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
+        if depths.len() == cameras.len() {
+            let middle = ahead(cameras, depths);
+            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "depths say where it lies" };
+        }
+        if let Some(middle) = middle(cameras) {
+            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look at one place" };
+        }
+        let mean = average(cameras, |pose| pose.translation);
+        let forward = average(cameras, |pose| -pose.matrix3.z_axis);
+        let spread = distances(mean);
+        let known = points.len() >= FEWEST;
+        if forward.length() > 0.8 {
+            let forward = forward.normalize();
+            let depth = known.then(|| median(points.iter().map(|point| (*point - mean).dot(forward))));
+            let middle = mean + depth.filter(|depth| *depth > 0.0).unwrap_or(AHEAD * spread) * forward;
+            let inner = (INNER_SHARE * distances(middle)).max(spread);
+            return Layout { middle, inner, looks: "cameras look the same way" };
+        }
+        let seen = known.then(|| median(points.iter().map(|point| point.distance(mean))));
+        Layout { middle: mean, inner: seen.unwrap_or(AROUND * spread).max(spread), looks: "cameras look around" }
+    }
+}
+
+/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. `None` where
+/// they do not look at one place, as in a room or along a wall.
+fn middle(cameras: &[&Camera]) -> Option<DVec3> {
+    let mean = average(cameras, |pose| pose.translation);
+    let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
+    let mut weights = vec![1.0; cameras.len()];
+    let mut found = mean;
+    // A camera that is lost is not to move it: the farther an axis passes, the less it counts.
+    for _ in 0..ROUNDS {
+        let (matrix, sum) = axes(cameras.iter().map(|camera| &camera.pose).zip(weights.iter().copied()), mean);
+        // Axes that are nearly parallel meet nowhere in particular.
+        let damping = DMat3::from_diagonal(DVec3::splat(1e-3 * weights.iter().sum::<f64>()));
+        found = mean + (matrix + damping).inverse() * sum;
+        let passes = passes_at(found);
+        let usual = median(cameras.iter().map(&passes)).max(1e-2 * spread);
+        weights = cameras.iter().map(|camera| 1.0 / (1.0 + (passes(camera) / (3.0 * usual)).powi(2))).collect();
+    }
+    let passes = passes_at(found);
+    let ahead = |camera: &&&Camera| (found - camera.pose.translation).dot(-camera.pose.matrix3.z_axis) > 0.0;
+    let most = 4 * cameras.iter().filter(ahead).count() > 3 * cameras.len();
+    // Axes come together there, and do not meet by chance, as nearly parallel ones do.
+    let together =
+        2.0 * median(cameras.iter().map(&passes)) < median(cameras.iter().map(|c| c.pose.translation.distance(mean)));
+    (most && together && found.is_finite() && found.distance(mean) < 100.0 * spread).then_some(found)
+}
+
+/// How far from a place the optical axis of a camera passes.
+fn passes_at(place: DVec3) -> impl Fn(&&Camera) -> f64 {
+    move |camera| (across(&camera.pose) * (place - camera.pose.translation)).length()
+}
+
+/// The mean of what poses of cameras have.
+fn average(cameras: &[&Camera], of: fn(&DAffine3) -> DVec3) -> DVec3 {
+    mean(cameras.iter().map(|camera| of(&camera.pose)))
+}
+
+/// The middle of what lies ahead of cameras whose files say how near and far it is: halfway in inverse distance.
+fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
+    mean(cameras.iter().zip(depths).map(|(camera, [near, far])| {
+        camera.pose.translation - camera.pose.matrix3.z_axis * (2.0 / (1.0 / near + 1.0 / far))
+    }))
+}
+
+/// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal axes
+/// (the least principal axis of these), on the side of their own up.
+fn upright(cameras: &[&Camera]) -> DMat3 {
+    let mean = average(cameras, |pose| pose.matrix3.y_axis);
+    let mut spread = DMat3::from_diagonal(DVec3::splat(1e-4));
+    for camera in cameras {
+        spread += outer(camera.pose.matrix3.x_axis) * (1.0 / cameras.len() as f64);
+    }
+    let inverse = spread.inverse();
+    let mut up = if mean.length() > 1e-3 { mean.normalize() } else { DVec3::Z };
+    for _ in 0..64 {
+        up = (inverse * up).normalize();
+    }
+    if !up.is_finite() {
+        return DMat3::IDENTITY;
+    }
+    // Of cameras that look straight down no side is up in their pictures: what they look away from is.
+    let back = average(cameras, |pose| pose.matrix3.z_axis);
+    let side = if up.dot(mean).abs() > 0.1 { up.dot(mean) } else { up.dot(back) };
+    let up = if side < 0.0 { -up } else { up };
+    // The shortest way, so that a capture that is upright already is not turned.
+    DMat3::from_quat(glam::DQuat::from_rotation_arc(up, DVec3::Z))
+}
+
+/// Half of the width of what cameras see at the middle of the scene.
+fn half_width(cameras: &[&Camera], middle: DVec3) -> f64 {
+    median(cameras.iter().map(|camera| {
+        let [x, y] = [0, 1].map(|axis| {
+            let size = [camera.width, camera.height][axis] as f64;
+            0.5 * size / camera.focal[axis]
+        });
+        camera.pose.translation.distance(middle) * x.max(y).min(1.0)
+    }))
+}
+
+/// Cameras and points that are asked: more would say the same.
+const ASKED: [usize; 2] = [64, 20_000];
+/// Points that say something together.
+const FEWEST: usize = 100;
+
+/// Some of the points that can be trusted.
+fn trusted(points: &[Point]) -> Vec<DVec3> {
+    /// Photographs that a point must be seen in, and pixels that it may be off.
+    const TRUSTED: (u32, f64) = (3, 2.0);
+    // Some files do not say in how many photographs a point is seen.
+    let trusted = |p: &&Point| (p.views == 0 || p.views >= TRUSTED.0) && !(p.error > TRUSTED.1);
+    evenly_spaced(points.iter().filter(trusted).map(|p| p.position).collect(), ASKED[1])
+}
+
+/// The distance of the nearest points from the cameras that see them; `None` if there are too few to trust.
+fn nearest_point(cameras: &[&Camera], trusted: &[DVec3]) -> Option<f64> {
+    if trusted.len() < FEWEST {
+        return None;
+    }
+    let nearest = |camera: &Camera| {
+        let seen = trusted.iter().filter(|point| camera.shows(**point));
+        let mut depths: Vec<f64> = seen.map(|point| point.distance(camera.pose.translation)).collect();
+        depths.sort_by(f64::total_cmp);
+        // The nearest of two hundred: a few are always wrong.
+        depths.get(depths.len() / 200).copied()
+    };
+    let asked = evenly_spaced(cameras.to_vec(), ASKED[0]);
+    let nearest = parallel::collect(asked.len(), |i| nearest(asked[i]));
+    let mut nearest: Vec<f64> = nearest.into_iter().flatten().collect();
+    nearest.sort_by(f64::total_cmp);
+    nearest.get(nearest.len() / 20).copied()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,250 @@
+use super::*;
+use std::path::{Path, PathBuf};
+
+fn camera(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
+    Camera { focal: [500.0, 250.0], ..Camera::from_angle(400, 300, 0.8, Camera::look_at(eye, target, up)) }
+}
+
+fn capture(format: Format, cameras: Vec<Camera>) -> Capture {
+    let view = |(i, camera): (usize, Camera)| View {
+        image: Some(PathBuf::from(format!("{i}.png"))),
+        ..View::new(format!("{i}.png"), format!("frames[{i}]"), camera)
+    };
+    Capture::new(
+        Path::new("scene"),
+        "scene/transforms.json".into(),
+        format,
+        cameras.into_iter().enumerate().map(view).collect(),
+    )
+}
+
+const CENTRE: DVec3 = DVec3::new(10.0, 20.0, 5.0);
+
+/// Eyes on a quarter of a circle of that radius around the centre, pitched down, with y downwards as COLMAP has it.
+fn quarter(radius: f64) -> Vec<Camera> {
+    let eye = |i: usize| {
+        let angle = i as f64 * 0.3;
+        CENTRE + radius * DVec3::new(0.8 * angle.cos(), -0.6, 0.8 * angle.sin())
+    };
+    (0..6).map(|i| camera(eye(i), CENTRE, DVec3::NEG_Y)).collect()
+}
+
+#[test]
+fn the_middle_is_what_cameras_look_at_and_up_is_theirs() {
+    let survey = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, None).unwrap();
+    assert_eq!(survey.scene_type, SceneType::Unbounded);
+    // Axes are held back a little towards the cameras.
+    assert!(survey.transform.origin.distance(CENTRE) < 0.05, "{}", survey.transform.origin);
+    let up = survey.transform.rotation * DVec3::NEG_Y;
+    assert!(up.distance(DVec3::Z) < 1e-3, "{up}");
+    survey.transform.check().unwrap();
+    // Half of the box is half of the cameras' distance, and 1.5 units.
+    assert!((survey.transform.scale - 1.5 / 2.0).abs() < 0.005, "{}", survey.transform.scale);
+    assert_eq!(survey.bounds, [DVec3::splat(-1.5), DVec3::splat(1.5)]);
+    assert!((survey.near - 0.05 * 3.0).abs() < 1e-3 && (survey.far - 3000.0).abs() < 1e-9, "{survey:?}");
+    // A camera that is lost, far away and looking elsewhere, moves it little.
+    let mut cameras = quarter(4.0);
+    cameras.push(camera(CENTRE + DVec3::new(300.0, 50.0, 0.0), CENTRE + DVec3::new(300.0, 90.0, 20.0), DVec3::NEG_Y));
+    let lost = SceneAnalysis::new(&capture(Format::Colmap, cameras), None, None).unwrap();
+    assert!(lost.transform.origin.distance(CENTRE) < 0.5, "{}", lost.transform.origin);
+}
+
+#[test]
+fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
+    let outwards = [[1.0, 0.0], [0.0, 1.0], [0.3, -1.0], [2.0, 0.5]].map(|[x, y]| {
+        let eye = DVec3::new(x, y, 0.0);
+        camera(eye, 3.0 * eye, DVec3::Z)
+    });
+    let mean = outwards.iter().map(|camera| camera.pose.translation).sum::<DVec3>() / 4.0;
+    let survey = SceneAnalysis::new(&capture(Format::Transforms, outwards.to_vec()), None, None).unwrap();
+    assert!(survey.transform.origin.distance(mean) < 1e-9, "{}", survey.transform.origin);
+    assert!(survey.transform.rotation.abs_diff_eq(DMat3::IDENTITY, 1e-9), "upright already");
+    assert!(survey.reason.ends_with("; cameras look around"), "{}", survey.reason);
+    // What they see is thought to be three times as far as they stand apart, unless points say where.
+    let spread = median(outwards.iter().map(|camera| camera.pose.translation.distance(mean)));
+    let half = |survey: &SceneAnalysis| 1.5 / survey.transform.scale;
+    assert!((half(&survey) - 3.0 * spread).abs() < 1e-9, "{}", half(&survey));
+    let mut room = capture(Format::Colmap, outwards.to_vec());
+    let wall = |i: usize| mean + 7.0 * DVec3::new((i as f64).cos(), (i as f64).sin(), 0.0);
+    room.points = (0..150).map(|i| Point { position: wall(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    assert!((half(&SceneAnalysis::new(&room, None, None).unwrap()) - 7.0).abs() < 1e-9);
+    // Points in between the cameras do not make the box smaller than their own.
+    room.points.iter_mut().for_each(|point| point.position = mean + 1e-3 * point.position);
+    assert!((half(&SceneAnalysis::new(&room, None, None).unwrap()) - spread).abs() < 1e-9);
+}
+
+#[test]
+fn what_cameras_that_look_the_same_way_show_lies_ahead() {
+    let wall = (0..5).map(|i| {
+        let eye = DVec3::new(0.1 * f64::from(i), 0.05 * f64::from(i % 2), 0.0);
+        camera(eye, eye + DVec3::Y, DVec3::Z)
+    });
+    let mut wall = capture(Format::Colmap, wall.collect());
+    let mean = wall.views.iter().map(|view| view.camera.pose.translation).sum::<DVec3>() / 5.0;
+    let spread = median(wall.views.iter().map(|view| view.camera.pose.translation.distance(mean)));
+    let survey = SceneAnalysis::new(&wall, None, None).unwrap();
+    assert!(survey.transform.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", survey.transform.origin);
+    assert_eq!(
+        survey.reason,
+        "photographs are opaque, so they show what lies behind, and all look ahead; cameras look the same way"
+    );
+    assert_eq!(survey.scene_type, SceneType::ForwardFacing);
+    let placed: Vec<Camera> = wall.views.iter().map(|view| survey.transform.camera(&view.camera)).collect();
+    assert_eq!(survey.ndc, Some(Ndc::around(&placed, survey.near).unwrap()));
+    let asked = SceneAnalysis::new(&wall, None, Some(SceneType::Unbounded)).unwrap();
+    assert_eq!(
+        asked,
+        SceneAnalysis {
+            scene_type: SceneType::Unbounded,
+            ndc: None,
+            reason: "as asked; cameras look the same way".into(),
+            ..survey
+        }
+    );
+    assert_eq!(SceneAnalysis::new(&wall, Some("it is"), None).unwrap().scene_type, SceneType::Bounded);
+    let place = |i: usize| DVec3::new(0.2 + 0.1 * (i as f64).sin(), 4.0, 0.0);
+    wall.points = (0..150).map(|i| Point { position: place(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    let survey = SceneAnalysis::new(&wall, None, None).unwrap();
+    assert!(survey.transform.origin.distance(mean + 3.98 * DVec3::Y) < 0.01, "{}", survey.transform.origin);
+    assert!((1.5 / survey.transform.scale - 1.99).abs() < 0.03, "half of the distance");
+    // Depth counts, and not how far to a side: a flight at a height of 50 over a wide field.
+    let flight = (0..25).map(|i| {
+        let eye = DVec3::new(100.0 * f64::from(i % 5), 100.0 * f64::from(i / 5), 50.0);
+        // Held a little askew, as by the wind: axes meet nowhere in particular.
+        let askew = 3.0 * DVec3::new((7.0 * f64::from(i)).sin(), (3.0 * f64::from(i)).cos(), 0.0);
+        camera(eye, eye + askew - 50.0 * DVec3::Z, DVec3::Y)
+    });
+    let mut flight = capture(Format::Colmap, flight.collect());
+    let field = |i: usize| DVec3::new(400.0 * (i as f64).sin().powi(2), 400.0 * (1.3 * i as f64).cos().powi(2), 0.0);
+    flight.points = (0..500).map(|i| Point { position: field(i), color: [0; 3], error: 1.0, views: 3 }).collect();
+    // A hundred that are not to be trusted.
+    let bad = Point { position: DVec3::new(0.0, 0.0, -900.0), color: [0; 3], error: 9.0, views: 1 };
+    flight.points.extend(std::iter::repeat_n(bad, 600));
+    let survey = SceneAnalysis::new(&flight, None, None).unwrap();
+    assert!(survey.reason.ends_with("; cameras look the same way"), "{}", survey.reason);
+    assert!(survey.transform.origin.distance(DVec3::new(200.0, 200.0, 0.0)) < 8.0, "{}", survey.transform.origin);
+    assert!(1.5 / survey.transform.scale > 100.0, "all of the flight is in the box");
+    // Ninety-nine points are too few.
+    wall.points.truncate(99);
+    let few = SceneAnalysis::new(&wall, None, None).unwrap();
+    assert!(few.transform.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9);
+}
+
+#[test]
+fn a_walk_ahead_is_no_view_from_a_window() {
+    let walk = (0..5).map(|i| {
+        let eye = DVec3::new(0.1 * f64::from(i % 2), 0.3 * f64::from(i), 0.0);
+        camera(eye, eye + DVec3::Y, DVec3::Z)
+    });
+    let survey = SceneAnalysis::new(&capture(Format::Colmap, walk.collect()), None, None).unwrap();
+    assert_eq!((survey.scene_type, survey.ndc), (SceneType::Unbounded, None));
+    let asked = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, Some(SceneType::ForwardFacing))
+        .unwrap_err()
+        .to_string();
+    assert!(asked.contains("`scope`") && asked.contains("forward"), "{asked}");
+    assert!(survey.reason.starts_with("photographs are opaque, so they show what lies behind; "), "{}", survey.reason);
+}
+
+#[test]
+fn cameras_that_look_down_have_the_sky_behind_them() {
+    // Two strips of a flight, the second flown back: no side of the pictures is up.
+    let flight = (0..8).map(|i| {
+        let north = if i % 2 == 0 { DVec3::Y } else { DVec3::NEG_Y };
+        let eye = DVec3::new(f64::from(i), f64::from(i % 3), 50.0);
+        camera(eye, eye - DVec3::Z * 50.0, north)
+    });
+    let survey = SceneAnalysis::new(&capture(Format::Colmap, flight.collect()), None, None).unwrap();
+    assert!((survey.transform.rotation * DVec3::Z).z > 0.9, "{:?}", survey.transform.rotation);
+}
+
+#[test]
+fn a_bounded_scene_is_as_wide_as_what_cameras_see_of_it() {
+    let eyes = [DVec3::new(3.0, 0.0, 0.0), DVec3::new(0.0, 4.0, 0.0), DVec3::new(-8.0, 0.0, 0.0)];
+    let cameras = eyes.map(|eye| camera(eye, DVec3::ZERO, DVec3::Z));
+    let survey =
+        SceneAnalysis::new(&capture(Format::Transforms, cameras.to_vec()), Some("it is transparent"), None).unwrap();
+    assert_eq!(survey.scene_type, SceneType::Bounded);
+    // Half of 300 rows over a focal length of 250 is more than half of 400 columns over 500: .6 of the distance 4.
+    let half = 1.5 / survey.transform.scale;
+    assert!((half - 2.4).abs() < 0.02, "{half}");
+    let (near, far) = (survey.near / survey.transform.scale, survey.far / survey.transform.scale);
+    assert!((near - 0.2).abs() < 0.02 && (far - (8.0 + 3.0_f64.sqrt() * 2.4)).abs() < 0.1, "{near} {far}");
+}
+
+#[test]
+fn points_and_depths_say_where_a_scene_begins() {
+    let mut capture = capture(Format::Colmap, quarter(4.0));
+    let eye = capture.views[0].camera.pose.translation;
+    let towards = (CENTRE - eye).normalize();
+    let point = |distance: f64| Point { position: eye + distance * towards, color: [0; 3], error: 1.0, views: 3 };
+    // Of four hundred the two nearest are not believed.
+    capture.points =
+        (0..400).map(|i| point([0.1, 0.2, 1.0].get(i).copied().unwrap_or(1.0 + 0.01 * i as f64))).collect();
+    let near = |capture: &Capture| {
+        let survey = SceneAnalysis::new(capture, None, None).unwrap();
+        survey.near / survey.transform.scale
+    };
+    assert!((near(&capture) - 0.5).abs() < 0.2, "{}", near(&capture));
+    let usual = 0.05 * 4.0;
+    for spoil in [|p: &mut Point| p.views = 2, |p: &mut Point| p.error = 2.01] {
+        let mut spoilt = capture.clone();
+        spoilt.points.iter_mut().for_each(spoil);
+        assert!((near(&spoilt) - usual).abs() < 0.01, "{}", near(&spoilt));
+    }
+    // Files of nerfstudio do not count photographs.
+    capture.points.iter_mut().for_each(|p| (p.views, p.error) = (0, f64::NAN));
+    assert!((near(&capture) - 0.5).abs() < 0.2);
+    // A capture that looks forward: the middle is ahead, halfway in inverse distance.
+    let forward = (0..5).map(|i| {
+        let eye = DVec3::new(0.1 * f64::from(i), 0.0, 0.0);
+        camera(eye, eye + DVec3::Y, DVec3::Z)
+    });
+    let mut forward = self::capture(Format::Llff, forward.collect());
+    forward.views.iter_mut().for_each(|view| view.bounds = Some([2.0, 6.0]));
+    let survey = SceneAnalysis::new(&forward, None, None).unwrap();
+    assert!(survey.transform.origin.distance(DVec3::new(0.2, 3.0, 0.0)) < 1e-9, "{}", survey.transform.origin);
+    assert!((survey.near / survey.transform.scale - 1.0).abs() < 1e-9);
+}
+
+#[test]
+fn what_is_asked_for_counts_then_the_convention_then_transparency() {
+    let around = |radius: f64| {
+        let mut capture = capture(Format::Blender, quarter(radius));
+        capture.views.iter_mut().for_each(|view| view.camera.pose.translation -= CENTRE);
+        capture
+    };
+    // Opaque photographs show what lies behind, wherever their cameras stand.
+    assert_eq!(SceneAnalysis::new(&around(4.0), None, None).unwrap().scene_type, SceneType::Unbounded);
+    let asked = SceneAnalysis::new(&around(4.0), None, Some(SceneType::Bounded)).unwrap();
+    let conventional = SceneAnalysis::new(&around(4.0), Some("it is transparent"), None).unwrap();
+    assert_eq!(asked, conventional);
+    assert_eq!((conventional.near, conventional.far, conventional.transform), (2.0, 6.0, SceneTransform::default()));
+    assert_eq!(conventional.scene_type, SceneType::Bounded);
+    assert_eq!(
+        SceneAnalysis::new(&around(4.0), Some("it is transparent"), Some(SceneType::Unbounded)).unwrap().scene_type,
+        SceneType::Unbounded
+    );
+    for radius in [2.4, 5.6] {
+        let other = SceneAnalysis::new(&around(radius), Some("it is transparent"), None).unwrap();
+        assert!(other.transform != SceneTransform::default() && other.scene_type == SceneType::Bounded, "{radius}");
+        assert_eq!(SceneAnalysis::new(&around(radius), None, None).unwrap().scene_type, SceneType::Unbounded);
+    }
+    assert_eq!("unbounded".parse::<SceneType>().unwrap().to_string(), "unbounded");
+    let message = "endless".parse::<SceneType>().unwrap_err().to_string();
+    assert!(message.starts_with("`scope`"), "{message}");
+}
+
+#[test]
+fn captures_without_size_or_images_are_errors() {
+    let mut one = capture(Format::Colmap, vec![quarter(4.0)[0].clone(); 5]);
+    let message = SceneAnalysis::new(&one, None, None).unwrap_err().to_string();
+    assert!(message.contains("one place"), "{message}");
+    one.views.iter_mut().for_each(|view| view.image = None);
+    let message = SceneAnalysis::new(&one, None, None).unwrap_err().to_string();
+    assert!(
+        message.contains("frames[0]") && message.contains("none of the 5 images") && message.contains("0.png"),
+        "{message}"
+    );
+    one.views.clear();
+    assert!(SceneAnalysis::new(&one, None, None).is_err());
+}

@@ -1,0 +1,206 @@
+//! How photographs differ from the scene that they show: exposure, white balance, and corners that are darker.
+
+use crate::dataset::batch::Batch;
+use crate::range::check_schedule;
+use crate::{Error, Result};
+use raygrad_autograd::{Scalar, Tensor, Var};
+use raygrad_nn::{Bound, ParamId, Params, Schedule};
+use serde::{Deserialize, Serialize};
+
+/// The name of the parameter of exposures.
+pub(crate) const EXPOSURE: &str = "exposure";
+/// That of darker corners.
+pub(crate) const VIGNETTING: &str = "vignetting";
+/// Numbers that say how corners darken.
+const POWERS: usize = 3;
+
+/// What is learned of how photographs show the scene's colours.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ExposureConfig {
+    /// The learning rate over the run of exposures, if they are learned: see [`ExposureModel`].
+    pub exposure: Option<Schedule>,
+    /// The learning rate over the run of vignetting, if it is learned.
+    pub vignetting: Option<Schedule>,
+}
+
+impl ExposureConfig {
+    /// Whether the numbers make sense.
+    ///
+    /// # Errors
+    /// If one is out of range.
+    pub fn check(&self) -> Result<()> {
+        check_schedule("exposure_model.exposure", self.exposure)?;
+        check_schedule("exposure_model.vignetting", self.vignetting)
+    }
+}
+
+/// What photographs make of the scene's colours, as parameters; 0 everywhere leaves colours as they are.
+///
+/// The colour that arrives from the scene is multiplied by a gain `exp(e + v1 s + v2 s^2 + v3 s^3)`, in the values that
+/// photographs store:
+/// - `exposure` `[photographs, 3]`: e for red, green and blue, so that white balance is part of it (the images' exposures of
+///   Mueller et al. 2022, instant-ngp). Between .2 and 1 of a full value, a gain of light is nearly one of stored values.
+/// - `vignetting` `[3]`: v1, v2 and v3 for all photographs, with the square s of a pixel's
+///   [distance from the optical axis](crate::camera::Camera::off_axis) in halves of the diagonal (Goldman and Chen 2005,
+///   "Vignette and exposure calibration and compensation", equation 2, of a logarithm, so that no gain is negative).
+///
+/// What lies behind the scene, the background, is not multiplied. Views have the geometric mean of all exposures, or that
+/// of the photograph that they [look like](crate::Model::appearance_image), and no vignetting but
+/// [where it is wanted](crate::Model::vignetted). What photographs have cut off at white is not found again.
+#[derive(Debug, Clone)]
+pub struct ExposureModel {
+    exposure: Option<ParamId>,
+    vignetting: Option<ParamId>,
+}
+
+/// What a view's colours are multiplied by.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Gain {
+    exposure: [f64; 3],
+    vignetting: [f64; POWERS],
+}
+
+impl ExposureModel {
+    /// Of this many photographs, so far without a difference. `None` if nothing is to be learned.
+    ///
+    /// # Errors
+    /// If exposures are to be learned, and it is not known of how many photographs.
+    pub(crate) fn new<T: Scalar>(
+        config: &ExposureConfig,
+        frames: usize,
+        params: &mut Params<T>,
+    ) -> Result<Option<Self>> {
+        if config.exposure.is_some() && frames == 0 {
+            let what = "are those of photographs, and it is not known how many there are";
+            return Err(Error::setting("exposure_model.exposure", what));
+        }
+        let exposure = config.exposure.map(|_| params.add(EXPOSURE, Tensor::zeros(&[frames, 3])));
+        let vignetting = config.vignetting.map(|_| params.add(VIGNETTING, Tensor::zeros(&[POWERS])));
+        // A step sees few photographs of many.
+        params.set_lazy(|name| name == EXPOSURE, exposure.is_some());
+        Ok((exposure.is_some() || vignetting.is_some()).then_some(ExposureModel { exposure, vignetting }))
+    }
+
+    /// What the colours of a batch's rays are multiplied by, `[rays, 3]`.
+    ///
+    /// # Panics
+    /// If there is no photograph of a ray's number.
+    #[track_caller]
+    pub(crate) fn gains<'t, T: Scalar>(&self, params: &Bound<'t, T>, batch: &Batch) -> Var<'t, T> {
+        let exposure = self.exposure.map(|id| params[id].gather_rows(&batch.frames));
+        let vignetting = self.vignetting.map(|id| {
+            let powers = batch.off_axis.iter().flat_map(|&s| [s, s * s, s * s * s]);
+            let powers = powers.map(|power| T::from_f64(power.into())).collect();
+            let powers = params.tape().constant(Tensor::from_vec(&[batch.off_axis.len(), POWERS], powers));
+            powers.matmul(params[id].reshape(&[POWERS, 1])).broadcast_to(&[batch.off_axis.len(), 3])
+        });
+        let sum = [exposure, vignetting].into_iter().flatten().reduce(|a, b| a + b);
+        sum.map_or_else(|| params.tape().constant(Tensor::ones(&[batch.rays.len(), 3])), |sum| sum.exp())
+    }
+
+    /// What views' colours are multiplied by: as of the photograph `appearance_image`, or of none in particular.
+    ///
+    /// # Panics
+    /// If there is no such photograph.
+    pub(crate) fn gain<T: Scalar>(&self, params: &Params<T>, look: Option<u32>, vignetted: bool) -> Gain {
+        let exposure = self.exposure.map_or([0.0; 3], |id| {
+            let all = params.get(id).as_slice().as_chunks::<3>().0;
+            let own = look.map_or(all, |look| &all[look as usize..=look as usize]);
+            std::array::from_fn(|k| own.iter().map(|row| row[k].to_f64()).sum::<f64>() / own.len() as f64)
+        });
+        let vignetting = self.vignetting.filter(|_| vignetted).map_or([0.0; POWERS], |id| {
+            let numbers = params.get(id).as_slice();
+            std::array::from_fn(|k| numbers[k].to_f64())
+        });
+        Gain { exposure, vignetting }
+    }
+}
+
+impl Gain {
+    /// At a pixel that lies [so far](crate::camera::Camera::off_axis) off the axis.
+    pub fn at(&self, off_axis: f64) -> [f64; 3] {
+        let falloff = self.vignetting.iter().rev().fold(0.0, |sum, v| off_axis * (v + sum));
+        self.exposure.map(|e| (e + falloff).exp())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_autograd::Tape;
+    use raygrad_autograd::check::{Check, check_function};
+
+    const RATE: Option<Schedule> = Some(Schedule::Constant { rate: 0.1 });
+
+    /// A tone of two photographs that has learned something.
+    fn learned() -> (ExposureModel, Params<f64>) {
+        let mut params = Params::new();
+        let config = ExposureConfig { exposure: RATE, vignetting: RATE };
+        let tone = ExposureModel::new(&config, 2, &mut params).unwrap().unwrap();
+        let [exposure, vignetting] = [EXPOSURE, VIGNETTING].map(|name| params.find(name).unwrap());
+        params.get_mut(exposure).as_mut_slice().copy_from_slice(&[0.1, 0.2, 0.3, -0.5, 0.0, 0.1]);
+        params.get_mut(vignetting).as_mut_slice().copy_from_slice(&[-0.4, 0.2, -0.1]);
+        (tone, params)
+    }
+
+    fn batch() -> Batch {
+        Batch { frames: vec![1, 0, 1], off_axis: vec![0.5, 1.0, 0.0], ..Batch::default() }
+    }
+
+    #[test]
+    fn training_and_views_multiply_by_the_same() {
+        let (tone, params) = learned();
+        let tape = Tape::new();
+        let gains = tone.gains(&params.bind(&tape), &batch());
+        // -.4 / 2 + .2 / 4 - .1 / 8, and -.4 + .2 - .1.
+        let falloffs = [-0.1625_f64, -0.3, 0.0];
+        let exposures = [[-0.5, 0.0, 0.1], [0.1, 0.2, 0.3], [-0.5, 0.0, 0.1]];
+        for (ray, (falloff, exposure)) in falloffs.into_iter().zip(exposures).enumerate() {
+            let view = tone.gain(&params, Some(batch().frames[ray]), true).at(batch().off_axis[ray].into());
+            for k in 0..3 {
+                let expected = (exposure[k] + falloff).exp();
+                assert!((gains.value().as_slice()[3 * ray + k] - expected).abs() < 1e-12, "{ray} {k}");
+                assert!((view[k] - expected).abs() < 1e-12, "{ray} {k}: {view:?}");
+            }
+        }
+        // Of no photograph in particular, as bright as all on average, and with bright corners.
+        let usual = tone.gain(&params, None, false).at(1.0);
+        for (gain, expected) in usual.into_iter().zip([-0.2_f64, 0.1, 0.2]) {
+            assert!((gain - expected.exp()).abs() < 1e-12, "{usual:?}");
+        }
+    }
+
+    #[test]
+    fn gains_have_the_gradients_that_differences_show() {
+        let (tone, params) = learned();
+        let values: Vec<Tensor<f64>> = params.values().to_vec();
+        let report = check_function(&Check::default(), &values, |x| {
+            tone.gains(&params.layout().bind(x.to_vec()), &batch()).square().sum()
+        });
+        assert!(report.is_ok(), "{report:?}");
+    }
+
+    #[test]
+    fn one_may_be_learned_without_the_other() {
+        for (config, names) in [
+            (ExposureConfig::default(), &[][..]),
+            (ExposureConfig { exposure: RATE, ..ExposureConfig::default() }, &[EXPOSURE]),
+            (ExposureConfig { vignetting: RATE, ..ExposureConfig::default() }, &[VIGNETTING]),
+        ] {
+            let mut params = Params::<f32>::new();
+            let tone = ExposureModel::new(&config, 2, &mut params).unwrap();
+            assert_eq!((params.names().collect::<Vec<_>>(), tone.is_none()), (names.to_vec(), names.is_empty()));
+            let Some(tone) = tone else { continue };
+            let tape = Tape::new();
+            let gains = tone.gains(&params.bind(&tape), &batch());
+            assert!(gains.shape() == [3, 3] && gains.value().as_slice().iter().all(|gain| *gain == 1.0), "{names:?}");
+        }
+        let nobody = ExposureModel::new(
+            &ExposureConfig { exposure: RATE, ..ExposureConfig::default() },
+            0,
+            &mut Params::<f32>::new(),
+        );
+        assert!(nobody.err().unwrap().to_string().contains("exposure_model.exposure"));
+    }
+}

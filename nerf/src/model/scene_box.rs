@@ -1,0 +1,60 @@
+//! Where a scene is.
+
+use crate::camera::Ndc;
+use crate::dataset::SceneTransform;
+use crate::space::cube::Space;
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+/// The scene's extent and what it was photographed with, stored with the model.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneBox {
+    /// Lower and upper corner of the box that holds the scene.
+    pub bounds: [DVec3; 2],
+    /// Distances along a ray between which it is sampled.
+    #[serde(alias = "span")]
+    pub near_far: [f64; 2],
+    /// The length that the field measures its densities by, in scene units: see [`Space::unit`].
+    #[serde(default = "one")]
+    pub unit: f64,
+    /// How many photographs the model is fitted to; 0 if that is not known.
+    #[serde(default)]
+    pub frames: usize,
+    /// From the coordinates of the photographs' files to those of the scene.
+    #[serde(default)]
+    #[serde(alias = "placement")]
+    pub transform: SceneTransform,
+    /// What the photographs show, where they all look the same way: see [`Space::ndc`].
+    #[serde(default)]
+    pub ndc: Option<Ndc>,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+impl SceneBox {
+    /// Of a new model.
+    pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
+        SceneBox {
+            bounds,
+            near_far: span,
+            unit: Space::within(bounds).unit,
+            frames: 0,
+            transform: SceneTransform::default(),
+            ndc: None,
+        }
+    }
+
+    /// Whether a place (scene units) is in the box that holds the scene, its faces included.
+    pub fn contains(&self, place: DVec3) -> bool {
+        let [low, high] = self.bounds;
+        place.cmpge(low).all() && place.cmple(high).all()
+    }
+
+    /// The map to the unit cube, for a scene within its box: one that goes on is `unbounded` too.
+    pub fn space(&self) -> Space {
+        Space { unit: self.unit, ndc: self.ndc, ..Space::within(self.bounds) }
+    }
+}

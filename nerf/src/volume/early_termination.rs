@@ -1,0 +1,117 @@
+//! Rendering only those samples that light reaches.
+
+use super::quadrature::{Quadrature, refine};
+use super::query::{Query, RayVars};
+use super::render::Rendered;
+use super::rounds::FrontToBack;
+use crate::camera::rays::Samples;
+use raygrad_autograd::{Memo, Pool, Scalar};
+
+/// What is seen, and what it took.
+pub struct VisibleSamples<'t, T: Scalar> {
+    /// What is seen.
+    pub rendered: Rendered<'t, T>,
+    /// Density queries.
+    pub density_queries: usize,
+    /// Visible samples, which were evaluated with colour and for gradients.
+    pub visible: usize,
+}
+
+/// Samples that each ray takes in the first round. Each further round takes twice as many: few rounds, and at most about
+/// as many samples in vain as there were needed.
+const FIRST_ROUND: usize = 4;
+
+impl Quadrature {
+    /// What the intervals of `steps` show of a field by this rule, in two passes.
+    ///
+    /// An unrecorded pass finds the visible samples, which more than `early_stop_eps` of the light reaches; a recorded one works
+    /// on those, and takes the outputs of operations that [are kept](raygrad_autograd::Op::is_cacheable) from the first. Without a
+    /// termination there is only the second, on all samples. The rest changes a pixel by at most `early_stop_eps` times the range
+    /// of colours.
+    pub fn render<'t, T: Scalar>(
+        self,
+        query: &Query<'_, 't, T>,
+        steps: &Samples<T>,
+        termination: f64,
+    ) -> VisibleSamples<'t, T> {
+        let tape = query.tape();
+        if let Quadrature::Adaptive { tolerance } = self {
+            let (nodes, asked) = refine(query, steps, tolerance, termination);
+            return VisibleSamples {
+                density_queries: asked,
+                visible: nodes.len(),
+                rendered: self.render_nodes(query, nodes),
+            };
+        }
+        let nodes = self.nodes(steps);
+        if !(termination > 0.0) {
+            return VisibleSamples {
+                density_queries: nodes.len(),
+                visible: nodes.len(),
+                rendered: self.render_nodes(query, nodes),
+            };
+        }
+        // The unrecorded pass needs no variables.
+        let plain = &Query { rays: None, slopes: false, ..*query };
+        let Visible { samples, memo, asked } = tape.no_grad(|| match self.has_intervals() {
+            false => visible(plain, &nodes, termination),
+            true => {
+                let (density, memo) = tape.cache_outputs(|| plain.density(&nodes));
+                let (samples, rows) = self.visible_nodes(&density, &nodes, termination);
+                let rows: Vec<[u32; 2]> = rows.into_iter().map(|row| [0, row]).collect();
+                Visible { samples, memo: gathered(vec![memo], &rows, &[nodes.len()], tape.pool()), asked: nodes.len() }
+            }
+        });
+        let positions = query.positions(&samples);
+        // Rays that are variables may be other rays than those that were marched.
+        let same = |rays: &RayVars<'t, T>| {
+            rays.origins.value() == &samples.origins && rays.directions.value() == &samples.directions
+        };
+        let memo = if query.rays.is_none_or(same) { memo } else { Memo::gather(&[], &[], tape.pool()) };
+        let density = tape.reuse_outputs(memo, || query.density_at(&samples, &positions));
+        VisibleSamples {
+            visible: samples.len(),
+            rendered: self.render_density(query, samples, positions, density),
+            density_queries: asked,
+        }
+    }
+}
+
+/// The visible samples.
+struct Visible<T: Scalar> {
+    samples: Samples<T>,
+    /// The outputs of kept operations for them.
+    memo: Memo<T>,
+    /// Density queries.
+    asked: usize,
+}
+
+/// The samples in front of which more than `early_stop_eps` of the light is left, found in rounds.
+fn visible<T: Scalar>(query: &Query<'_, '_, T>, samples: &Samples<T>, termination: f64) -> Visible<T> {
+    let (tape, mut rays) = (query.tape(), FrontToBack::new(samples, termination));
+    // Of what is found: the number of the sample, and its place among what was asked.
+    let (mut found, mut memos, mut sizes) = (Vec::<(u32, [u32; 2])>::new(), vec![], vec![]);
+    while let (Some(round), memo) = tape.cache_outputs(|| rays.round(query, FIRST_ROUND << memos.len())) {
+        let numbers = round.stretch.pieces.into_iter().flat_map(|(_, rows)| rows);
+        for ((row, sample), depth) in (0..).zip(numbers).zip(&round.in_front) {
+            if rays.has_light(*depth) {
+                found.push((sample as u32, [memos.len() as u32, row]));
+            }
+        }
+        sizes.push(round.in_front.len());
+        memos.push(memo);
+    }
+    found.sort_unstable_by_key(|(sample, _)| *sample);
+    let (rows, places): (Vec<u32>, Vec<[u32; 2]>) = found.into_iter().unzip();
+    let memo = gathered(memos, &places, &sizes, tape.pool());
+    Visible { samples: samples.select(&rows, tape.pool()), memo, asked: sizes.iter().sum() }
+}
+
+/// Rows of the memos of so many samples each; an empty memo if an output has other rows than samples.
+fn gathered<T: Scalar>(memos: Vec<Memo<T>>, rows: &[[u32; 2]], sizes: &[usize], pool: &Pool<T>) -> Memo<T> {
+    let fits = |(memo, size): (&Memo<T>, &usize)| memo.values().iter().all(|value| value.shape().first() == Some(size));
+    match memos.iter().zip(sizes).all(fits) {
+        true => Memo::gather(&memos, rows, pool),
+        false => Memo::gather(&[], &[], pool),
+    }
+}
