@@ -1,4 +1,4 @@
-//! The worst error of every operation of the catalogue, by check, as the table of `docs/operations.md`, which this writes.
+//! Writes `docs/library/operations.md`: the worst error of every operation of the catalogue, by check.
 //!
 //! ```text
 //! cargo run --release -p raygrad-autograd --example check_table
@@ -11,22 +11,45 @@ use std::path::Path;
 
 const HEAD: &str = "# Operations and their errors
 
-Written by `cargo run --release -p raygrad-autograd --example check_table`. Every operation of the catalogue
-(`autograd/src/check/catalogue.rs`) is examined on several inputs: scalars, no elements, broadcast shapes, rows short and long.
+The table gives the worst error that the operation check measured for each operation of `raygrad-autograd`.
+This page is generated; do not edit it by hand:
 
-- **entries**: how often the operation is in the catalogue, with different settings; **checks**: comparisons made.
-- **first**, **second**: derivatives against central differences in f64, with a step scaled to the input and Richardson's
-  extrapolation; relative to the norm of the gradient of the input that moves, and to what the rounding of the function's
-  values makes of a difference. The second derivatives are those of the gradient by all inputs and by the output's
-  gradient. Limit: 1e-7.
-- **f32**: value and gradient in f32 against f64 from the same rounded inputs, as a distance relative to the norm (limit
-  2e-6), and the worst element in units in the last place (limit 32); an element smaller than the root mean square of its
-  tensor counts as that large.
+```sh
+cargo run --release -p raygrad-autograd --example check_table
+```
 
-Not in the table, because they pass or fail: the same bits when run again and on buffers with old values; the same
-results (1e-14) from transposed and reversed views; one variable as two inputs; fused operations against their references (1e-12); formulas
-against dual numbers (1e-12); linear operations against their adjoints (1e-14); exact values and gradients at extremes.
-`autograd/tests/testsuite/peers.rs` compares value, gradient and second gradient of each operation with PyTorch in f64, within 2e-14.
+The source is `autograd/examples/check_table.rs`. The operations and their inputs come from the catalogue,
+`autograd/src/check/catalogue.rs`. The inputs include scalars, empty tensors, broadcast shapes, and short and long rows.
+
+| column | meaning | limit |
+|---|---|---|
+| entries | catalogue entries of the operation, one per setting | |
+| checks | comparisons made | |
+| first | first derivatives against central differences in f64 | 1e-7 |
+| second | second derivatives against central differences of first derivatives in f64 | 1e-7 |
+| f32, norm | value and gradients in f32 against f64, as a distance relative to the norm | 2e-6 |
+| f32, ULP | the worst element of the same, in units in the last place of f32 | 32 |
+
+- Errors of derivatives are relative to the norm of the gradient by the input that moves. A term is added for the
+  rounding of the function's values.
+- Differences use Richardson extrapolation with a step scaled to the input.
+- Second derivatives differentiate the gradient by all inputs and by the output's gradient.
+- Both precisions start from the same inputs, rounded to f32.
+- In the ULP column, an element below its tensor's root mean square counts as that large.
+
+Checks that only pass or fail are not in the table:
+
+| check | limit |
+|---|---|
+| a second run, and a run on buffers with old values, give the same bits | exact |
+| inputs from transposed or reversed arrays give the same results | 1e-14 |
+| one variable as two inputs gives the sum of both gradients | 1e-12 |
+| a constant input does not change the other gradients | 1e-12 |
+| a fused operation agrees with its reference | 1e-12 |
+| a formula agrees with dual numbers | 1e-13 (value), 1e-12 (gradient) |
+| the gradient of a linear operation is its adjoint | 1e-14 |
+| values and gradients at extremes agree with the exact ones | 1e-9 (f64), 5e-7 (f32) |
+| value, gradient and second gradient agree with PyTorch in f64 (`autograd/tests/testsuite/peers.rs`) | 2e-14 |
 
 ";
 
@@ -59,7 +82,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let entries = rows.iter().map(|(_, entries, _)| entries).sum();
     line(&format!("all {}", rows.len()), entries, &all)?;
     print!("{table}");
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/operations.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/library/operations.md");
     write_atomic(&path, table.as_bytes())?;
     Ok(())
 }

@@ -69,7 +69,7 @@ def main():
                     row[2].append(nanoseconds(f, x, torch.empty_like(x)))
 
     print(f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, {args.elements} elements")
-    print("| type | function | ns | std ns | torch ns | times std | times torch |")
+    print("| type | function | ns an element | std, ns | PyTorch, ns | times std | times PyTorch |")
     print("|---|---|--:|--:|--:|--:|--:|")
     for (kind, name), row in figures.items():
         ours, std, peer = (statistics.median(column) if column else None for column in row)
