@@ -2,8 +2,8 @@
 //!
 //! Each module holds the rows of the stress matrix and of the failure catalogue that belong together, in f32 and f64
 //! (`single::` and `double::`), through the public interface. Expected values that are not plain come from
-//! `reference/constants.json`, which `reference/constants.py` computes with 50 digits. docs/stability.md says which test
-//! stands for which row, and what the suite has found.
+//! `reference/constants.json`, which `reference/constants.py` computes with 50 digits. docs/library/numerics.md lists
+//! the rows of each module, and the failures that each guard prevents.
 
 #[macro_use]
 mod support;

@@ -410,7 +410,7 @@ fn render(grid: &OccupancyGrid, density: &DensityFn<'_>) -> (Vec<f32>, u64) {
     (pairs.map(|(color, left)| color + left).collect(), samples.len() as u64)
 }
 
-/// numerics.md, section 5, "occupancy": fog everywhere, above and just below what may be skipped, with balls in it.
+/// docs/library/numerics.md, "Skipping": fog everywhere, above and just below what may be skipped, with balls in it.
 #[test]
 fn skipping_costs_no_more_than_its_bound() {
     let all = grid(32, 1);

@@ -217,7 +217,7 @@ fn rays_that_are_not_finite_have_no_samples() {
     assert!(march(&grid, &one(DVec3::ZERO, DVec3::ZERO, [0.0, f64::INFINITY]), &step).t.len() <= 100);
 }
 
-/// numerics.md, section 5, "march": the entry at 0, 2, 1e3, 32768 and 1e6, and steps below an ULP.
+/// docs/library/numerics.md, "Sampling", march: the entry at 0, 2, 1e3, 32768 and 1e6, and steps below an ULP.
 #[test]
 fn far_from_the_origin_samples_do_not_drift_and_the_march_ends() {
     let length = 3.0_f32.sqrt() / 1024.0;
@@ -245,7 +245,7 @@ fn far_from_the_origin_samples_do_not_drift_and_the_march_ends() {
     assert!(found.steps <= MAX_STEPS as u64 && found.t.is_empty());
 }
 
-/// numerics.md, section 5, "cone stepping".
+/// docs/library/numerics.md, "Sampling", cone stepping.
 #[test]
 fn cones_follow_their_recurrence_and_tend_to_uniform_steps() {
     let config = OccupancyConfig { resolution: 16, cascades: 6, ..OccupancyConfig::default() };
