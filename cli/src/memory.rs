@@ -15,7 +15,7 @@ const CELL: f64 = 12.0;
 /// Bytes for each sample of a step, on the tape and in gradients that are not yet added up.
 const SAMPLE: f64 = 3300.0;
 
-/// About how many bytes training takes, photographs and all; `docs/benchmarks.md` has what it came to.
+/// About how many bytes training takes, photographs and all; `docs/benchmarks/results.md` has what it came to.
 pub fn need(trainer: &Trainer, data: &Dataset) -> f64 {
     let model = &trainer.model;
     let cells = model.sampler.grid().map_or(0, |grid| grid.cells());

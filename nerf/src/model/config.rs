@@ -250,7 +250,7 @@ impl Config {
     /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
     /// boxes at steps that grow, proposals are spread in inverse distance, a hash grid is twice as fine, as it holds all that
     /// is seen, and a [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in
-    /// docs/benchmarks.md, section Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
+    /// docs/benchmarks/results.md, section Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
     /// nothing.
     pub fn with_scene_type(mut self, scope: SceneType) -> Self {
         let before = std::mem::replace(&mut self.unbounded, scope.is_unbounded());

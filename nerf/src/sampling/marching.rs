@@ -53,7 +53,7 @@ impl Default for MarchingConfig {
             occupancy,
             step: 1.0 / 200.0,
             last_step: None,
-            // Figures are in docs/benchmarks.md, section Rendering.
+            // Figures are in docs/benchmarks/results.md, section Rendering.
             view_step: 1.0 / 600.0,
             cone: 0.0,
             samples: 24576,
