@@ -64,7 +64,7 @@ pub struct ProposalConfig {
 }
 
 impl Default for ProposalConfig {
-    /// Two proposals of 48 and 24 samples, and 16 of the field: figures are in docs/benchmarks/results.md, section Samplers.
+    /// Two proposals of 48 and 24 samples, and 16 of the field: see docs/benchmarks/results.md, section Samplers.
     fn default() -> Self {
         let level = |finest, samples| ProposalLevel {
             grid: HashGridConfig { levels: 4, features: 2, log2_table: 14, coarsest: 16, finest },
