@@ -137,7 +137,7 @@ mod tests {
             "max(x)" => a.max(),
             "min(x)" => a.min(),
             "gt(a, b)" => a.tape().constant(a.gt(b).cast()),
-            "equals(a, b)" => a.tape().constant(a.elementwise_eq(b).cast()),
+            "elementwise_eq(a, b)" => a.tape().constant(a.elementwise_eq(b).cast()),
             "where(mask, a, b)" => b.where_(&!a.elementwise_eq(0.0), c),
             "if_positive(x, a, b)" => a.if_positive(b, c),
             "sqrt(x)" => a.sqrt(),

@@ -330,6 +330,10 @@ fn contents(folder: &Path) -> Result<Contents> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use raygrad::nerf::glam::DVec3;
+    use raygrad::nerf::losses::DistortionConfig;
+    use raygrad::nerf::space::occupancy::Skip;
+    use raygrad::nerf::{GroupConfig, LossTermConfig, Preset};
 
     #[test]
     fn runs_of_later_versions_are_told_apart() {
@@ -340,5 +344,74 @@ mod tests {
             assert_eq!(later(text), None, "{text}");
         }
         assert_eq!(later(&format!(r#"{{"raygrad":"{}"}}"#, env!("CARGO_PKG_VERSION"))), None);
+    }
+    /// Keys of `config.json` before they were renamed.
+    const OLD_KEYS: [(&str, &str); 12] = [
+        ("scene_box", "extent"),
+        ("near_far", "span"),
+        ("transform", "placement"),
+        ("loss_terms", "terms"),
+        ("camera_optimizer", "refine"),
+        ("exposure_model", "tone"),
+        ("gradient_scaling_distance", "near_gradients"),
+        ("appearance_embedding_dim", "codes"),
+        ("skip_layers", "skips"),
+        ("early_stop_eps", "termination"),
+        ("weight_decay", "decay"),
+        ("eps", "epsilon"),
+    ];
+
+    /// The JSON value with keys and words as earlier versions wrote them; `found` counts each.
+    fn aged(value: Value, found: &mut [usize]) -> Value {
+        let mut old = |text: &str| match OLD_KEYS.iter().position(|(new, _)| *new == text) {
+            Some(i) => {
+                found[i] += 1;
+                OLD_KEYS[i].1.to_owned()
+            }
+            None => text.to_owned(),
+        };
+        match value {
+            Value::String(text) => Value::String(old(&text)),
+            Value::Array(values) => values.into_iter().map(|value| aged(value, found)).collect(),
+            Value::Object(fields) => {
+                let names: Vec<String> = fields.keys().map(|name| old(name)).collect();
+                let values: Vec<Value> = fields.into_iter().map(|(_, value)| aged(value, found)).collect();
+                Value::Object(names.into_iter().zip(values).collect())
+            }
+            other => other,
+        }
+    }
+
+    #[test]
+    fn config_with_earlier_keys_is_read() {
+        let viewpoint =
+            Viewpoint { width: 8, height: 6, angle_x: 0.7, distance: 4.0, elevation: 0.5, azimuth: 0.0, reach: 1.0 };
+        let mut found = [0; OLD_KEYS.len()];
+        for preset in [Preset::Classic, Preset::Small, Preset::Instant, Preset::Voxel] {
+            let mut config = Config::preset(preset).with_skip(Skip::NearLossless);
+            config.gradient_scaling_distance = 0.25;
+            config.loss_terms = vec![LossTermConfig::new(DistortionConfig { weight: 0.5 })];
+            config.exposure_model.vignetting = config.poses;
+            let group =
+                GroupConfig { params: "field".into(), adam: config.adam, schedule: config.schedule, weight_decay: 0.5 };
+            config.groups.push(group);
+            let config = RunConfig {
+                raygrad: "0.1.0".into(),
+                scene: Scene::Embedded,
+                downscale: 2,
+                scene_box: SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.5, 4.0]),
+                viewpoint,
+                photographs: vec![],
+                budget: Some(Budget::Steps(7)),
+                keep_checkpoints: 3,
+                config,
+            };
+            let text = serde_json::to_string(&config).unwrap();
+            let value: Value = serde_json::from_str(&text).unwrap();
+            let old = aged(value, &mut found);
+            assert_eq!(serde_json::from_value::<RunConfig>(old).unwrap(), config, "{preset}");
+        }
+        assert!(found.iter().all(|count| *count > 0), "{found:?}");
+        assert_eq!(serde_json::from_str::<Skip>(r#""lossless""#).unwrap(), Skip::NearLossless);
     }
 }

@@ -115,8 +115,8 @@ pub struct Args {
     scene_type: Option<SceneType>,
     /// Background: white, black or random
     ///
-    /// Lies behind transparent images, and behind opaque ones too if given. The default is random for instant and
-    /// voxel, and white for small and classic.
+    /// Lies behind transparent images, and behind opaque ones too if given. The default for transparent images is
+    /// random with instant and voxel, and white with small and classic.
     #[arg(long, help_heading = "Scene", value_name = "COLOR")]
     background: Option<Background>,
     /// Refine poses,focal,lens,exposure,vignetting
@@ -140,8 +140,8 @@ pub struct Args {
     /// Add a loss term, such as distortion=0.1
     ///
     /// Terms: distortion (a ray's light comes from one place), entropy (a ray is opaque or empty), orientation
-    /// (normals face the camera), depth, total_variation. A weight of 0 removes the term. Give the flag several
-    /// times for several terms.
+    /// (normals face the camera), depth. A weight of 0 removes the term. Give the flag several times for several terms.
+    /// total_variation needs more than a weight: --set 'loss_terms=[{"kind": "total_variation", ...}]'.
     #[arg(long, help_heading = "Model", value_name = "NAME=WEIGHT", value_parser = parse::weight)]
     loss: Vec<(String, f64)>,
     /// Resume a run from its last checkpoint

@@ -337,7 +337,8 @@ fn densities_are_measured_in_the_unit_of_the_box() {
 fn terms_of_a_file_take_part_in_training() {
     let bare = instant();
     let mut value = serde_json::to_value(&bare).unwrap();
-    value["terms"] = serde_json::json!([{"kind": "distortion", "weight": 0.5}, {"kind": "entropy", "weight": 0.25}]);
+    value["loss_terms"] =
+        serde_json::json!([{"kind": "distortion", "weight": 0.5}, {"kind": "entropy", "weight": 0.25}]);
     let config: Config = serde_json::from_value(value).unwrap();
     let expected =
         [LossTermConfig::new(DistortionConfig { weight: 0.5 }), LossTermConfig::new(EntropyConfig { weight: 0.25 })];
@@ -354,7 +355,7 @@ fn terms_of_a_file_take_part_in_training() {
     assert!(steep.check().unwrap_err().to_string().starts_with("`orientation.weight`"));
     let mut gauss = config;
     gauss.sampler.get_mut::<MarchingConfig>().unwrap().quadrature = Quadrature::Gauss2;
-    assert!(gauss.check().unwrap_err().to_string().starts_with("`terms.distortion`"));
+    assert!(gauss.check().unwrap_err().to_string().starts_with("`loss_terms.distortion`"));
 }
 
 #[test]

@@ -169,10 +169,10 @@ fn what_was_found_of_cameras_is_stored_with_the_model() {
     assert_eq!(again, one);
     // A configuration from before cameras could be corrected still loads.
     let mut value = serde_json::to_value(instant()).unwrap();
-    value.as_object_mut().unwrap().remove("refine").unwrap();
+    value.as_object_mut().unwrap().remove("camera_optimizer").unwrap();
     assert_eq!(serde_json::from_value::<Config>(value).unwrap(), instant());
     let error = Model::<f32>::new(config, trainer.model.scene_box, 0).err().unwrap().to_string();
-    assert!(error.starts_with("`refine.focal`"), "{error}");
+    assert!(error.starts_with("`camera_optimizer.focal`"), "{error}");
 }
 
 #[test]

@@ -182,7 +182,7 @@ fn codes_take_up_what_photographs_differ_in() {
     let read = Model::load(&path, with.clone(), extent).unwrap();
     assert_eq!(mean(&read), usual);
     let error = Model::<f32>::new(with, SceneBox { frames: 0, ..extent }, 0).err().unwrap().to_string();
-    assert!(error.starts_with("`codes`"), "{error}");
+    assert!(error.starts_with("`appearance_embedding_dim`"), "{error}");
 }
 
 #[test]
@@ -289,7 +289,7 @@ fn distances_that_were_measured_show_where_surfaces_are() {
     let bare = with(&instant(), &data);
     let depth = Config { loss_terms: vec![LossTermConfig::new(DepthConfig { weight: 1.0 })], ..instant() };
     let error = Trainer::new(depth.clone(), Arc::new(data.clone())).err().unwrap().to_string();
-    assert!(error.starts_with("`terms`") && error.contains("Frame::distances"), "{error}");
+    assert!(error.starts_with("`loss_terms`") && error.contains("Frame::distances"), "{error}");
     for frame in &mut data.frames {
         frame.distances = Some(scene.render(&frame.camera, 1).depth);
     }

@@ -128,7 +128,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes do not broadcast.
     #[track_caller]
     pub fn elementwise_eq(&self, other: impl Operand<'t, T>) -> Mask {
-        self.compare("equals", other, |a, b| a.elementwise_eq(b))
+        self.compare("elementwise_eq", other, |a, b| a.elementwise_eq(b))
     }
 
     /// `self` where `mask` holds, else `other`: PyTorch's `where`, with the underscore because Rust keeps that word to

@@ -20,7 +20,7 @@ const FARTHEST: f64 = 1e9;
 
 /// What a page says: text, one JSON object a message.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(tag = "ask", rename_all = "kebab-case", deny_unknown_fields)]
+#[serde(tag = "ask", rename_all = "kebab-case", deny_unknown_fields, expecting = "a message")]
 pub enum ClientMessage {
     /// Pictures of this, until something else is asked for. `id` comes back with them.
     View { id: u32, view: View },

@@ -36,7 +36,7 @@ fn depths_are_learned_from_where_that_is_asked_for() {
         serde_json::from_str::<Value>(text.lines().next().unwrap()).unwrap()["loss"].as_f64().unwrap()
     };
     // Without files of depths there is nothing to learn from.
-    place.fails(&format!("train captured --steps 1 --depth-loss {SMALL}"), &["`terms`", "depth_file_path"]);
+    place.fails(&format!("train captured --steps 1 --depth-loss {SMALL}"), &["`loss_terms`", "depth_file_path"]);
     std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
     let [plain, usual, heavy] = [loss("", "plain"), loss("--depth-loss", "usual"), loss("--depth-loss=2", "heavy")];
     assert_eq!(terms(&place, "usual"), json!([{ "kind": "depth", "weight": 0.1 }]));
@@ -56,7 +56,7 @@ fn depths_are_learned_from_where_that_is_asked_for() {
     // The landscape measures its own.
     place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth-loss --out far {SMALL}"));
     assert_eq!(terms(&place, "far")[1], json!({ "kind": "depth", "weight": 0.1 }));
-    place.fails(&format!("train embedded --downscale 20 --steps 1 --depth-loss {SMALL}"), &["`terms`"]);
+    place.fails(&format!("train embedded --downscale 20 --steps 1 --depth-loss {SMALL}"), &["`loss_terms`"]);
 }
 
 #[test]
@@ -288,7 +288,7 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
     std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
     let said = place.succeeds(&format!("train captured --steps 1 --out ahead {SMALL} --set sampler.step=0.1"));
     assert!(
-        said.contains("forward: photographs are opaque, so they show what lies behind, and all look ahead"),
+        said.contains("forward-facing: photographs are opaque, so they show what lies behind, and all look ahead"),
         "{said}"
     );
     let ndc = model(&place, "ahead").scene_box.ndc.unwrap();

@@ -205,7 +205,8 @@ fn exit_codes_are_as_the_help_says() {
     let found = [code("--version"), code("eval nowhere"), code("eval --nonsense"), interrupted];
     assert_eq!(found, [Some(0), Some(1), Some(2), Some(130)]);
     let help = place.succeeds("--help");
-    for line in ["0    done", "1    an error", "2    a command line", "3    doctor", "4    doctor", "130  interrupted"]
+    for line in
+        ["0    success", "1    error", "2    invalid command line", "3    doctor", "4    doctor", "130  interrupted"]
     {
         assert!(help.contains(&format!("\n  {line}")), "{line}: {help}");
     }

@@ -67,7 +67,6 @@ fn paths_go_where_photographs_were_taken_and_where_files_say() {
     {
         assert!(apart(&one(flags), &usual) > 3.0, "{flags}");
     }
-    assert_eq!(one("--show depth"), one("--depth-loss"));
     // At twice the tangent of half of the angle, what was seen is in the middle, at half the size.
     let wide = one("--size 48x48 --fov 71.507778");
     let middle = |x: usize, y: usize| wide.pixel(12 + x, 12 + y).to_vec();

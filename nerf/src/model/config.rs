@@ -432,9 +432,9 @@ mod tests {
         );
         let mut wrong = refined(RefinedParam::Vignetting);
         wrong.exposure_model.vignetting = Some(Schedule::Constant { rate: f64::NAN });
-        assert!(wrong.check().unwrap_err().to_string().starts_with("`tone.vignetting.constant.rate`"));
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.vignetting.constant.rate`"));
         wrong.exposure_model = ExposureConfig { exposure: wrong.exposure_model.vignetting, vignetting: None };
-        assert!(wrong.check().unwrap_err().to_string().starts_with("`tone.exposure.constant.rate`"));
+        assert!(wrong.check().unwrap_err().to_string().starts_with("`exposure_model.exposure.constant.rate`"));
     }
 
     #[test]

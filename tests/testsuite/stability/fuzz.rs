@@ -258,7 +258,7 @@ fn extents_are_checked() {
     codes.field.get_mut::<InstantConfig>().unwrap().appearance_embedding_dim = 8;
     for frames in [(1 << 20) + 1, 1 << 61, usize::MAX] {
         let error = Model::<f32>::new(codes.clone(), SceneBox { frames, ..extent() }, 0).err().expect("an error");
-        clear(error, "extent.frames");
+        clear(error, "scene_box.frames");
     }
 }
 

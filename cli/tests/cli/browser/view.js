@@ -581,7 +581,7 @@ set("skip", "near-lossless");
 makeVideo();
 is("a video is asked for", called(), [{ ask: "video", path: written, show: "color", skip: "near-lossless", background: undefined }]);
 const sorry = (change, back) => { change(); $("sorry").textContent = ""; makeVideo(); back(); return [text("sorry").slice(0, 20), called()]; };
-const whole = "A video shows the who";
+const whole = "A video shows the wh";
 is("with a box", sorry(() => set("crop", true), () => set("crop", false)), [whole, []]);
 is("of a checkpoint", sorry(() => set("checkpoint", 0), () => set("checkpoint", 2)), [whole, []]);
 is("of the error", sorry(() => { document.querySelector("input[value=error]").checked = true; }, () => { document.querySelector("input[value=color]").checked = true; }), [whole, []]);

@@ -118,7 +118,7 @@ impl CameraOptimizer {
         params: &mut Params<T>,
     ) -> Result<Option<Self>> {
         let [focal, lens] = [config.focal.is_some(), config.lens.is_some()];
-        let wanted = [(poses, POSES), (focal, "refine.focal"), (lens, "refine.lens")];
+        let wanted = [(poses, POSES), (focal, "camera_optimizer.focal"), (lens, "camera_optimizer.lens")];
         let Some((_, name)) = wanted.into_iter().find(|(wanted, _)| *wanted) else { return Ok(None) };
         let frames = extent.frames;
         if frames == 0 {

@@ -210,14 +210,17 @@ fn cameras_have_to_be_known_where_they_are_corrected() {
     };
     assert!(message(true, &none, 0, &[]).starts_with("`poses`"));
     assert!(message(true, &none, 7, &cameras).starts_with("`poses`"));
-    assert!(message(false, &all(), 6, &[]).starts_with("`refine.focal`"));
+    assert!(message(false, &all(), 6, &[]).starts_with("`camera_optimizer.focal`"));
     let panoramas = vec![cameras[5].clone(); 2];
     assert!(
         message(true, &CameraOptimizerConfig { focal: None, ..all() }, 2, &panoramas)
-            .starts_with("`refine.lens`: equirect")
+            .starts_with("`camera_optimizer.lens`: equirect")
     );
     assert!(new(true, &none, 2, &panoramas).unwrap().is_some());
-    assert!(message(true, &CameraOptimizerConfig { focal: None, ..all() }, 5, &cameras).starts_with("`refine.lens`"));
+    assert!(
+        message(true, &CameraOptimizerConfig { focal: None, ..all() }, 5, &cameras)
+            .starts_with("`camera_optimizer.lens`")
+    );
 }
 
 #[test]
