@@ -210,5 +210,5 @@ fn exit_codes_are_as_the_help_says() {
     {
         assert!(help.contains(&format!("\n  {line}")), "{line}: {help}");
     }
-    assert!(include_str!("../../../README.md").contains("**Exit codes.**"));
+    assert!(include_str!("../../../docs/reference/exit-codes.md").contains("\n| 130 | interrupted"));
 }
