@@ -49,7 +49,7 @@ pub struct AdamConfig {
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
     /// networks, 1e-15 hash tables. At least 1e-30.
-    #[cfg_attr(feature = "files", serde(alias = "epsilon"))]
+    #[serde(alias = "epsilon")]
     pub eps: f64,
 }
 

@@ -298,7 +298,7 @@ fn settings_out_of_their_range_are_refused_by_name() {
         (AdamConfig { beta1: 1.0, ..adam }, "`beta1` is 1.0; use at least 0 and less than 1"),
         (AdamConfig { beta2: 2.0, ..adam }, "`beta2` is 2.0;"),
         (AdamConfig { beta2: f64::NAN, ..adam }, "`beta2` is NaN;"),
-        (AdamConfig { eps: 0.0, ..adam }, "`epsilon` is 0.0; use 1e-30 to 1e30"),
+        (AdamConfig { eps: 0.0, ..adam }, "`eps` is 0.0; use 1e-30 to 1e30"),
     ] {
         for message in [
             message(|| drop(Adam::<f32>::new(config))),
