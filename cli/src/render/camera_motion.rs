@@ -30,7 +30,7 @@ const SPIRAL_SHARE: f64 = 0.1;
 /// Flags about where the camera goes.
 #[derive(Debug, Clone, Default, clap::Args, Serialize)]
 pub struct CameraPathArgs {
-    /// orbit, spiral, spline, test or a .json
+    /// Kind of path, or FILE.json
     ///
     /// orbit: around the scene, or back and forth where all images are from one side. spiral: LLFF's, about the
     /// mean camera. spline: through the images of --keyframes. test: from test view to test view. FILE.json: a
