@@ -307,7 +307,7 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
     place.succeeds("eval ahead");
     place.succeeds(&format!("train captured --scene-type unbounded --steps 1 --out around {SMALL}"));
     // What is gone on with says how far it goes.
-    for (run, scope) in [("ahead", "forward"), ("around", "unbounded")] {
+    for (run, scope) in [("ahead", "forward-facing"), ("around", "unbounded")] {
         let said = place.succeeds(&format!("train --resume {run} --steps 2"));
         assert!(said.contains(&format!("{scope}: as the model has it")), "{said}");
     }

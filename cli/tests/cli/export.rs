@@ -153,7 +153,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     let moved = place.succeeds("export run some.ply --points=20 --scene moved");
     assert!(moved.contains("that 54 views see"), "{moved}");
     place.fails("export run no.ply --scene scene", &["scene: there is no such folder"]);
-    place.fails("export run no.ply --to colmap --open-boundary", &["`open`: is for shapes"]);
+    place.fails("export run no.ply --to colmap --open-boundary", &["`open-boundary`: is for shapes"]);
     place.fails("export run absent/no.ply", &["absent"]);
     std::fs::create_dir(place.path("folder.glb")).unwrap();
     place.fails("export run folder.glb", &["folder.glb: is a folder"]);
