@@ -11,20 +11,22 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Viewpoint {
-    /// Width of the training images in pixels.
+    /// Width of the training images. Unit: pixels. Range: 1 to 65536.
     pub width: usize,
-    /// Their height.
+    /// Height of the training images. Unit: pixels. Range: 1 to 65536.
     pub height: usize,
-    /// Horizontal field of view in radians.
+    /// Horizontal field of view. Unit: radians. Range: more than 0 and less than pi.
     pub angle_x: f64,
-    /// Mean distance of the cameras from the centre of the scene's box, in scene units.
+    /// Mean distance of the cameras from the centre of the scene box. Unit: scene units. Range: 0 or more.
     pub distance: f64,
-    /// Their mean angle above the horizon as seen from there, in radians.
+    /// Mean angle of the cameras above the horizon, seen from that centre. Unit: radians. Range: between -pi/2 and
+    /// pi/2.
     pub elevation: f64,
-    /// The direction, in radians about the vertical, that cameras stand in on average, if they stand in a part of the circle.
+    /// Mean direction of the cameras about the vertical, where they stand in a part of the circle. Unit: radians.
     #[serde(default)]
     pub azimuth: f64,
-    /// How far on either side of it they stand, in radians; half a turn where they stand all around.
+    /// Angle that the cameras cover on either side of `azimuth`; pi where they stand all around. Unit: radians.
+    /// Range: 0 to pi.
     #[serde(default = "all_around")]
     pub reach: f64,
 }

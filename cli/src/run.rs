@@ -42,27 +42,27 @@ const OWN: [&str; 9] = [
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// The version of raygrad that made it.
+    /// Version of raygrad that made the run.
     pub raygrad: String,
-    /// Its photographs.
+    /// Source of the images.
     pub scene: Scene,
-    /// The factor by which they were made smaller.
+    /// Factor by which the image size was divided. Range: 1 or more.
     pub downscale: usize,
-    /// The region that the model covers.
+    /// Scene box, and the scene transform that placed the capture in it.
     #[serde(alias = "extent")]
     pub scene_box: SceneBox,
-    /// Where the photographs were taken from, on average.
+    /// Average training camera. Orbits start from it.
     pub viewpoint: Viewpoint,
-    /// Names of the photographs that it is trained on.
+    /// Names of the training images.
     #[serde(default)]
     pub photographs: Vec<String>,
-    /// How long it was to be trained; the first edition did not say.
+    /// Training budget. Runs of the first version have none.
     #[serde(default)]
     pub budget: Option<Budget>,
-    /// How many checkpoints stay.
+    /// Number of checkpoints to keep. Range: 2 to 16384.
     #[serde(default = "usual_checkpoints")]
     pub keep_checkpoints: usize,
-    /// The model and how it is trained.
+    /// Model and training settings. `--set` takes its keys.
     pub config: Config,
 }
 

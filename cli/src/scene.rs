@@ -21,11 +21,11 @@ pub const LANDSCAPE_SIZE: [usize; 2] = [400, 300];
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Scene {
-    /// The bulldozer that is built in.
+    /// The built-in bulldozer.
     Embedded,
-    /// The bulldozer in a landscape without bounds, built in too.
+    /// The built-in bulldozer in an unbounded landscape.
     Landscape,
-    /// A dataset in this folder.
+    /// Path of a capture folder.
     Folder(PathBuf),
 }
 

@@ -14,12 +14,12 @@ use std::collections::{BTreeMap, HashMap};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Storage {
-    /// That of the parameters: they come back bit for bit.
+    /// That of the model: parameters come back bit for bit.
     #[default]
     Full,
-    /// IEEE 754 binary16: 11 bits of precision (a relative error of 4.9e-4) from 6.1e-5 to 65504, steps of 6e-8 below.
+    /// IEEE 754 binary16: a relative error of at most 4.9e-4 from 6.1e-5 to 65504, and steps of 6e-8 below.
     F16,
-    /// The upper half of an f32: 8 bits of precision (a relative error of 3.9e-3), the range of f32.
+    /// The upper half of an f32: a relative error of at most 3.9e-3, and the range of f32.
     Bf16,
 }
 

@@ -14,13 +14,14 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ndc {
-    /// Where the picture is taken from, in scene units.
+    /// Centre of projection, behind the cameras. Unit: scene units.
     pub eye: DVec3,
-    /// Its right, up and back, of length 1.
+    /// Right, up and back axis of the projection, each of length 1.
     pub axes: DMat3,
-    /// Half of its width and height at depth 1: tangents of half of its angles.
+    /// Half of the width and height of the projection at depth 1: the tangents of half its angles of view. Range:
+    /// more than 0.
     pub slopes: [f64; 2],
-    /// Depth of the near plane, more than 0: what is nearer is seen at it.
+    /// Depth of the near plane. Nearer points are moved onto it. Unit: scene units. Range: more than 0.
     pub near: f64,
 }
 

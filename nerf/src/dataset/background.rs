@@ -14,13 +14,13 @@ use crate::range::by_name;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
-    /// White: the convention under which results on the synthetic scenes are published.
+    /// White, as in published results on the synthetic scenes.
     #[default]
     White,
     /// Black.
     Black,
-    /// While training, a colour drawn anew for each ray, so that no density can pose as background: with images that
-    /// have alpha, or that are opaque throughout. White when images are shown or measured.
+    /// A random colour for each training ray, so that no density can imitate the background. Rendered and evaluated
+    /// images get white.
     Random,
 }
 

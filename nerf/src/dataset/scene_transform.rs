@@ -11,11 +11,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneTransform {
-    /// What the axes of the capture become.
+    /// Rotation from the axes of the capture to those of the scene, column by column.
     pub rotation: DMat3,
-    /// The length of a unit of the capture in scene units, above 0.
+    /// Length of a capture unit. Unit: scene units. Range: more than 0.
     pub scale: f64,
-    /// The place in the capture that becomes the scene's origin.
+    /// The point of the capture that becomes the origin of the scene. Unit: capture units.
     pub origin: DVec3,
 }
 

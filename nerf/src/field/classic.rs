@@ -19,20 +19,21 @@ const FIRST_LEVELS: usize = 2;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ClassicConfig {
-    /// Number of layers that see the position.
+    /// Number of layers that see the position. Range: 1 to 16384.
     pub depth: usize,
-    /// Their width.
+    /// Width of these layers. Range: 1 to 16384.
     pub width: usize,
-    /// The layers, counted from 0, that see the encoded position once more.
+    /// Layers, counted from 0, that see the encoded position once more (skip connections). Range: 1 to `depth` - 1
+    /// each.
     #[serde(alias = "skips")]
     pub skip_layers: Vec<usize>,
-    /// Width of the layer that sees the direction.
+    /// Width of the layer that sees the viewing direction. Range: 1 to 16384.
     pub view_width: usize,
-    /// Frequencies of the encoding of positions; 0 gives the network the bare coordinates.
+    /// Frequencies of the positional encoding of positions. 0 passes bare coordinates. Range: 0 to 24.
     pub position_levels: usize,
-    /// Frequencies of the encoding of directions.
+    /// Frequencies of the positional encoding of directions. 0 passes bare directions. Range: 0 to 24.
     pub direction_levels: usize,
-    /// How the raw density becomes a density.
+    /// Activation that turns the raw output into a density.
     pub density: DensityActivation,
 }
 

@@ -15,21 +15,22 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InstantConfig {
-    /// The grid that positions are looked up in.
+    /// Hash grid that encodes positions.
     pub grid: HashGridConfig,
-    /// Width of the one hidden layer between the grid and the density.
+    /// Width of the one hidden layer between the grid and the density. Range: 1 to 4096.
     pub density_width: usize,
-    /// Outputs of the density network: the first is the logarithm of the density, all are seen by the colour network.
+    /// Outputs of the density network. The first is the logarithm of the density; the colour network sees all.
+    /// Range: 1 to 4096.
     pub features: usize,
-    /// Width of the colour network's hidden layers.
+    /// Width of the hidden layers of the colour network. Range: 1 to 4096.
     pub color_width: usize,
-    /// Number of its hidden layers.
+    /// Number of hidden layers of the colour network. Range: 1 to 64.
     pub color_depth: usize,
-    /// Degree of the spherical harmonics that encode directions, 1 to 4.
+    /// Degree of the spherical harmonics that encode directions. Range: 1 to 4.
     pub direction_degree: usize,
-    /// Numbers of a code of its own that the colour network sees of each photograph, 0 (no codes) to 256: what light,
-    /// exposure or a passer-by make of it (Martin-Brualla et al. 2021, "NeRF in the Wild", section 4.1). New views have the
-    /// mean of all codes.
+    /// Dimensions of the appearance embedding, a learned vector per image that the colour network sees. It absorbs
+    /// changes of light and exposure (Martin-Brualla et al. 2021, "NeRF in the Wild", section 4.1). New views use
+    /// the mean of all embeddings. 0 learns none. Range: 0 to 256.
     #[serde(default)]
     #[serde(alias = "codes")]
     pub appearance_embedding_dim: usize,

@@ -95,9 +95,10 @@ pub type FieldConfig = AnyConfig<Fields>;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DensityActivation {
-    /// `softplus(x - 1)`: smooth, and never without a gradient.
+    /// `softplus(x - 1)`: smooth, with a gradient everywhere.
     Softplus,
-    /// `max(x, 0)`, as in the paper: empty space is exactly empty, but a network may start with no density anywhere.
+    /// `max(x, 0)`, as in the NeRF paper. Empty space is exactly empty, but a network may start without any
+    /// density.
     Relu,
 }
 

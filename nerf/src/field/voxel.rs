@@ -19,9 +19,9 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VoxelConfig {
-    /// Cells along the longest side of the box, 1 to 512.
+    /// Cells along the longest side of the scene box. Range: 1 to 512.
     pub resolution: usize,
-    /// Degree of the spherical harmonics that a colour is made of, 1 to 3.
+    /// Degree of the spherical harmonics that represent a colour. Range: 1 to 3.
     pub direction_degree: usize,
 }
 

@@ -9,13 +9,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Loss {
-    /// `e^2`.
+    /// Squared error, `e^2`.
     #[default]
     Mse,
-    /// Huber's loss (Huber 1964, equation 2.3), doubled so that it is `e^2` up to `|e| = delta`; beyond, it is the straight
-    /// line `2 delta |e| - delta^2`, so that a few pixels that cannot be explained pull less.
+    /// Huber loss (Huber 1964, equation 2.3), doubled: `e^2` up to `|e| = delta`, and `2 delta |e| - delta^2`
+    /// beyond. Outliers count less.
     Huber {
-        /// Errors up to this are squared, 1e-4 to 1. Colours lie in 0..=1: 0.1 is usual.
+        /// Largest error that is squared. Colours lie in 0 to 1; 0.1 is usual. Range: 0.0001 to 1.
         delta: f64,
     },
 }

@@ -15,7 +15,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DistortionConfig {
-    /// Its weight, 0 to 1e6: 0.001 to 0.01 is usual, and 0.1 in an unbounded scene.
+    /// Weight of the term. Usual are 0.001 to 0.01, and 0.1 in an unbounded scene. Range: 0 to 1000000.
     pub weight: f64,
 }
 
@@ -24,7 +24,7 @@ pub struct DistortionConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EntropyConfig {
-    /// Its weight, 0 to 1e6: 0.0001 to 0.01 is usual.
+    /// Weight of the term. Usual are 0.0001 to 0.01. Range: 0 to 1000000.
     pub weight: f64,
 }
 
@@ -34,7 +34,7 @@ pub struct EntropyConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OrientationConfig {
-    /// Its weight, 0 to 1e6: 0.1 is usual.
+    /// Weight of the term. Usual is 0.1. Range: 0 to 1000000.
     pub weight: f64,
 }
 
@@ -47,7 +47,7 @@ pub struct OrientationConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {
-    /// Its weight, 0 to 1e6; the tests have 1.
+    /// Weight of the term. `--depth-loss` uses 0.1. Range: 0 to 1000000.
     pub weight: f64,
 }
 

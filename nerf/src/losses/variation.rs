@@ -20,16 +20,17 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TotalVariationConfig {
-    /// Its weight, 0 to 1e6. The mean over rays is minimised: a weight of 1 stands for three squared errors of colours.
+    /// Weight of the term. It multiplies the mean over rays: a weight of 1 counts as much as three squared errors
+    /// of colours. Range: 0 to 1000000.
     pub weight: f64,
-    /// The parameter's name: `field.table`.
+    /// Name of the table to smooth, such as `field.table`.
     pub params: String,
-    /// Cells along each of its axes, the slowest first, where its rows are numbered through, as those of a [voxel
-    /// field](crate::VoxelConfig) are (`resolution + 1`, three times; rows beyond them, less than 64, are
-    /// padding). Without them the parameter's own axes; the last one is that of the channels.
+    /// Cells along each axis of the table, slowest axis first; null takes the axes of the parameter except the
+    /// last, its channels. A [voxel field](crate::VoxelConfig) needs `resolution + 1` three times. Up to 63 rows
+    /// beyond the cells are padding.
     #[serde(default)]
     pub cells: Option<Vec<usize>>,
-    /// Cells that are looked at for each ray, 1 to 1024.
+    /// Random cells per ray that a training step compares with their neighbours. Range: 1 to 1024.
     #[serde(default = "draws")]
     pub draws: usize,
 }

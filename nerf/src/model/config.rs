@@ -51,14 +51,14 @@ const COARSE: f64 = 0.4;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// The paper's networks and numbers: 64 + 128 samples, two networks of 8 layers of 256.
+    /// The networks and numbers of the NeRF paper: 64 + 128 samples a ray, two networks of 8 layers of 256.
     Classic,
-    /// The same idea with half of the depth and of the width: a recognisable scene in minutes.
+    /// Networks of half the depth and width: a recognisable scene in minutes.
     Small,
-    /// A hash grid marched through an occupancy grid: a good scene in a minute.
+    /// A hash grid, marched through an occupancy grid: a good scene in a minute.
     #[default]
     Instant,
-    /// A grid of voxels, marched in the same way: no network, and five times the parameters.
+    /// A dense voxel grid without a network, marched in the same way. It has five times the parameters.
     Voxel,
 }
 
@@ -87,13 +87,14 @@ impl fmt::Display for Preset {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GroupConfig {
-    /// What their names begin with: `field.color`. A parameter belongs to the first group that it fits.
+    /// Prefix of the names of the parameters in this group, such as `field.color`. A parameter belongs to the first
+    /// group whose prefix fits.
     pub params: String,
-    /// The optimiser's constants.
+    /// Adam constants of the group.
     pub adam: AdamConfig,
-    /// Learning rate over the run.
+    /// Learning rate of the group over the run.
     pub schedule: Schedule,
-    /// Decoupled weight decay, as of [`AdamW`](raygrad_nn::AdamW).
+    /// Decoupled weight decay of the group, as in [`AdamW`](raygrad_nn::AdamW). Range: 0 to 1e30.
     #[serde(default)]
     #[serde(alias = "decay")]
     pub weight_decay: f64,
@@ -103,57 +104,59 @@ pub struct GroupConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// What is fitted.
+    /// The field: density and colour at each point of the scene.
     #[serde(deserialize_with = "super::registry::read")]
     pub field: FieldConfig,
-    /// Where it is sampled.
+    /// The sampler, which places the samples along each ray.
     #[serde(deserialize_with = "super::registry::read")]
     pub sampler: SamplerConfig,
-    /// Whether the scene goes on beyond its box: fields then see all of space [contracted](crate::contract), or what all
-    /// photographs show as [one picture](crate::Ndc) where the [extent](crate::SceneBox::ndc) says so, and rays are
-    /// sampled as far as the sampler goes: marching, up to the outermost of the
-    /// [cascades](crate::space::occupancy::OccupancyConfig::cascades) of its grid; others, over the whole span.
+    /// Whether the scene extends beyond its scene box. Fields then see all of space [contracted](crate::contract)
+    /// into a cube, or, in a forward-facing scene, [normalised device coordinates](crate::Ndc). A marching sampler
+    /// reaches the outermost box of its [cascades](crate::space::occupancy::OccupancyConfig::cascades). The other
+    /// samplers cover the whole range from near to far.
     #[serde(default)]
     pub unbounded: bool,
-    /// What is minimised.
+    /// Loss between rendered and true colours.
     #[serde(default)]
     pub loss: Loss,
-    /// What is minimised beside it.
+    /// Loss terms that are added to the colour loss. `--loss NAME=WEIGHT` sets one.
     #[serde(default, deserialize_with = "super::registry::read")]
     #[serde(alias = "terms")]
     pub loss_terms: Vec<LossTermConfig>,
     /// Learning rate over the run.
     pub schedule: Schedule,
-    /// The optimiser's constants, for networks.
+    /// Adam constants of the networks.
     pub adam: AdamConfig,
-    /// The optimiser's constants for the rows of a table.
+    /// Adam constants of tables, such as that of a hash grid. Rows without a gradient keep their moments.
     pub table_adam: AdamConfig,
-    /// Parameters that are moved in a way of their own; all others as the fields above say.
+    /// Parameter groups with Adam constants and learning rates of their own. All other parameters use the keys
+    /// above.
     #[serde(default)]
     pub groups: Vec<GroupConfig>,
-    /// The learning rate over the run of the photographs' poses, if they are to be learned: see
+    /// Learning rate of the camera poses over the run; null keeps the poses fixed. `--refine poses` sets it. See
     /// [`CameraOptimizer`](crate::model::CameraOptimizer).
     #[serde(default)]
     pub poses: Option<Schedule>,
-    /// What else is learned of cameras, and how.
+    /// Optimization of focal lengths and lenses.
     #[serde(default)]
     #[serde(alias = "refine")]
     pub camera_optimizer: CameraOptimizerConfig,
-    /// What is learned of how photographs show colours.
+    /// Exposure, white balance and vignetting of the images.
     #[serde(default)]
     #[serde(alias = "tone")]
     pub exposure_model: ExposureConfig,
-    /// Samples nearer to their camera than this, in units of the [extent](crate::SceneBox::unit), learn less, by the square of
-    /// their distance: they lie closer than others in front of each camera, and what they learn shows in one photograph alone
-    /// (Philip and Deschaintre 2023, "Floaters No More", equation 6). 0 for none.
+    /// Gradients of samples nearer to their camera than this are scaled by the square of distance over this
+    /// distance. It prevents floaters in front of cameras (Philip and Deschaintre 2023, "Floaters No More",
+    /// equation 6). 0 turns it off. Unit: the `unit` of the [scene box](crate::SceneBox::unit). Range: 0 to
+    /// 1000000.
     #[serde(default)]
     #[serde(alias = "near_gradients")]
     pub gradient_scaling_distance: f64,
-    /// What photographs with alpha are composited over.
+    /// Background behind transparent pixels.
     pub background: Background,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// The number type of parameters in the file that a model is saved to.
+    /// Number type of the parameters in `model.safetensors`.
     #[serde(default)]
     pub storage: Storage,
 }

@@ -18,9 +18,11 @@ const POWERS: usize = 3;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExposureConfig {
-    /// The learning rate over the run of exposures, if they are learned: see [`ExposureModel`].
+    /// Learning rate of the exposures over the run; null learns none. `--refine exposure` sets it. Each image has a
+    /// gain for red, green and blue, so white balance is included. See [`ExposureModel`].
     pub exposure: Option<Schedule>,
-    /// The learning rate over the run of vignetting, if it is learned.
+    /// Learning rate of the vignetting over the run; null learns none. `--refine vignetting` sets it. All images
+    /// share three coefficients.
     pub vignetting: Option<Schedule>,
 }
 

@@ -10,22 +10,23 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneBox {
-    /// Lower and upper corner of the box that holds the scene.
+    /// Lower and upper corner of the scene box. Unit: scene units.
     pub bounds: [DVec3; 2],
-    /// Distances along a ray between which it is sampled.
+    /// Distances from the camera between which rays are sampled. Unit: scene units. Range: 0 <= near < far.
     #[serde(alias = "span")]
     pub near_far: [f64; 2],
-    /// The length that the field measures its densities by, in scene units: see [`Space::unit`].
+    /// Length by which the field measures densities: a density of 1 means 1 / `unit`. See [`Space::unit`]. Unit:
+    /// scene units. Range: more than 0.
     #[serde(default = "one")]
     pub unit: f64,
-    /// How many photographs the model is fitted to; 0 if that is not known.
+    /// Number of training images; 0 if unknown.
     #[serde(default)]
     pub frames: usize,
-    /// From the coordinates of the photographs' files to those of the scene.
+    /// Scene transform, from the coordinates of the capture to those of the scene.
     #[serde(default)]
     #[serde(alias = "placement")]
     pub transform: SceneTransform,
-    /// What the photographs show, where they all look the same way: see [`Space::ndc`].
+    /// Normalised device coordinates of a forward-facing scene; null for other scenes. See [`Space::ndc`].
     #[serde(default)]
     pub ndc: Option<Ndc>,
 }

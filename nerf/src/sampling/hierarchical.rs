@@ -20,15 +20,16 @@ use serde::{Deserialize, Serialize};
 pub struct HierarchicalConfig {
     /// The coarse network.
     pub proposal: ClassicConfig,
-    /// Stratified samples a ray, through the coarse network.
+    /// Stratified samples a ray for the coarse network. Range: 1 to 4096.
     pub coarse: usize,
-    /// Further samples a ray where the coarse network found something.
+    /// Further samples a ray, placed by importance sampling from the weights of the coarse network. Range: 0 to
+    /// 4096.
     pub fine: usize,
-    /// Share of the further samples that is spread evenly, in 0..=1.
+    /// Share of the further samples that is spread evenly. Range: 0 to 1.
     pub uniform_share: f64,
-    /// Rays in a training step.
+    /// Rays in a training step. Range: 1 to 1048576.
     pub batch: usize,
-    /// Rays in a tile: one tape, on one core.
+    /// Rays in a tile, which one core computes on one tape. Range: 1 to 65536.
     pub tile: usize,
 }
 

@@ -24,25 +24,27 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MarchingConfig {
-    /// The occupancy grid, and what may be skipped with it.
+    /// Occupancy grid, and what rendering may skip with it.
     pub occupancy: OccupancyConfig,
-    /// Length of a training step along a ray, as a share of the longest side of the box.
+    /// Distance between samples along a ray in training. Unit: longest side of the scene box. Range: 0.00001 to 1.
     pub step: f64,
-    /// The same at the end of training, if it changes: evenly on a logarithmic scale. Long steps leave samples for more
-    /// rays, short ones show fine detail as it is.
+    /// The same at the end of training, approached evenly on a logarithmic scale; null keeps it constant. Long
+    /// intervals leave samples for more rays, short ones resolve fine detail. Unit: longest side of the scene box.
+    /// Range: 0.00001 to 1.
     pub last_step: Option<f64>,
-    /// The same in rendering. Training starts each ray at random, so it fits what finer steps show.
+    /// The same in rendering. Training starts each ray at a random offset, so finer intervals fit. Unit: longest
+    /// side of the scene box. Range: 0.00001 to 1.
     pub view_step: f64,
-    /// How much longer a step is for each scene unit of distance, 0 to 1: see [`Step::cone`]. 0 is even steps; 1/256 is
-    /// customary where a scene goes on beyond its box.
+    /// Growth of the interval with distance from the camera: see [`Step::cone`]. 0 keeps intervals even; 1/256 is
+    /// usual for unbounded scenes. Unit: 1 / scene unit. Range: 0 to 1.
     pub cone: f64,
-    /// Samples that a training step places on its rays; the number of rays follows.
+    /// Samples in a training step. The number of rays follows from it. Range: 1 to 16777216.
     pub samples: usize,
-    /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as
-    /// much.
+    /// Early termination in training: samples are dropped where the transmittance is below this. A colour changes
+    /// by at most as much. Range: 0 to 1.
     #[serde(alias = "termination")]
     pub early_stop_eps: f64,
-    /// How the integral along a ray is approximated; a step is an interval.
+    /// Quadrature rule for the integral along a ray.
     pub quadrature: Quadrature,
 }
 

@@ -23,8 +23,8 @@ pub enum Spacing {
     /// Evenly in distance.
     #[default]
     Linear,
-    /// Evenly in inverse distance, as suits scenes without bounds (Barron et al. 2022, section 4). Rays then begin at a
-    /// thousandth of their far end, if not later.
+    /// Evenly in inverse distance, for unbounded scenes (Barron et al. 2022, section 4). Rays then begin no nearer
+    /// than a thousandth of their far end.
     Disparity,
 }
 
@@ -32,11 +32,11 @@ pub enum Spacing {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProposalLevel {
-    /// The grid that positions are looked up in.
+    /// Hash grid of the proposal network.
     pub grid: HashGridConfig,
-    /// Width of the one hidden layer between the grid and the density.
+    /// Width of the one hidden layer between the grid and the density. Range: 1 to 4096.
     pub width: usize,
-    /// Samples a ray.
+    /// Samples a ray for this proposal network. Range: 1 to 4096.
     pub samples: usize,
 }
 
@@ -44,21 +44,23 @@ pub struct ProposalLevel {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProposalConfig {
-    /// The proposals, each sampled where the one before it found something; at least one.
+    /// Proposal networks, at least one. Each is sampled where the one before it found density.
     pub levels: Vec<ProposalLevel>,
-    /// Samples a ray of the field itself.
+    /// Samples a ray for the field itself. Range: 1 to 4096.
     pub samples: usize,
-    /// Share of all samples that is spread evenly, in 0..=1.
+    /// Share of all samples that is spread evenly. Range: 0 to 1.
     pub uniform_share: f64,
-    /// Steps over which proposals gain their full say (Barron et al. 2022, section 4, "annealing").
+    /// Training steps over which the proposal weights reach their full effect (Barron et al. 2022, section 4,
+    /// "annealing"). Unit: steps.
     pub anneal: u64,
-    /// How the first samples are spread.
+    /// Spacing of the first samples of a ray.
     pub spacing: Spacing,
-    /// Rays in a training step.
+    /// Rays in a training step. Range: 1 to 1048576.
     pub batch: usize,
-    /// Rays in a tile: one tape, on one core.
+    /// Rays in a tile, which one core computes on one tape. Range: 1 to 65536.
     pub tile: usize,
-    /// Samples with less light than this in front of them are dropped.
+    /// Early termination: samples are dropped where the transmittance is below this. A colour changes by at most as
+    /// much. Range: 0 to 1.
     #[serde(alias = "termination")]
     pub early_stop_eps: f64,
 }

@@ -12,10 +12,10 @@ pub(crate) const STUCK: u64 = 100;
 /// In a file it is `{"steps": 5000}` or `{"seconds": 60}`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Budget {
-    /// A number of steps.
+    /// Number of training steps.
     #[serde(rename = "steps")]
     Steps(u64),
-    /// Training time; what happens between steps does not count. The schedule stretches to it.
+    /// Training time. Work between steps, such as saving, does not count. Schedules stretch to it. Unit: seconds.
     #[serde(rename = "seconds", with = "seconds")]
     Time(Duration),
 }

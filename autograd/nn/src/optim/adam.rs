@@ -43,12 +43,12 @@ pub struct AdamW;
 /// Constants of [`Adam`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct AdamConfig {
-    /// Decay of the first moment, at least 0 and less than 1.
+    /// Decay of the first moment. Range: at least 0 and less than 1.
     pub beta1: f64,
-    /// Decay of the second moment, at least 0 and less than 1.
+    /// Decay of the second moment. Range: at least 0 and less than 1.
     pub beta2: f64,
     /// Added to the root of the second moment. It bounds the step of elements with tiny gradients: 1e-8 suits dense
-    /// networks, 1e-15 hash tables. At least 1e-30.
+    /// networks, 1e-15 hash tables. Range: 1e-30 to 1e30.
     #[serde(alias = "epsilon")]
     pub eps: f64,
 }

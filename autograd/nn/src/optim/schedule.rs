@@ -9,48 +9,49 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
-    /// The same throughout.
+    /// The same rate throughout.
     Constant {
-        /// The rate.
+        /// Learning rate. Range: 0 to 1e30.
         rate: f64,
     },
-    /// `from + (to - from) fraction`, after a linear rise from 0. With `to` equal to `from`: constant after a warm-up.
+    /// `from + (to - from) fraction`, after a linear rise from 0. With `to` equal to `from`, constant after a
+    /// warm-up.
     Linear {
-        /// The rate at the start.
+        /// Learning rate at the start. Range: 0 to 1e30.
         from: f64,
-        /// The rate at the end.
+        /// Learning rate at the end. Range: 0 to 1e30.
         to: f64,
-        /// The fraction of the run over which the rate rises.
+        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
-    /// `from * factor^k` after `k` times `every` of the run: a staircase.
+    /// `from * factor^k` after `k` times `every` of the run: a staircase, after a linear rise from 0.
     Step {
-        /// The rate at the start.
+        /// Learning rate at the start. Range: 0 to 1e30.
         from: f64,
-        /// What each stair multiplies it by.
+        /// Factor of each stair. Range: 0 to 1.
         factor: f64,
-        /// The fraction of the run that a stair takes.
+        /// Fraction of the run that a stair takes. Range: more than 0, to 1.
         every: f64,
-        /// The fraction of the run over which the rate rises.
+        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
-    /// `from * (to / from)^fraction`, after a linear rise from 0 over the first `warmup` of the run.
+    /// `from * (to / from)^fraction`, after a linear rise from 0.
     Exponential {
-        /// The rate at the start.
+        /// Learning rate at the start. Range: more than 0, to 1e30.
         from: f64,
-        /// The rate at the end.
+        /// Learning rate at the end. Range: more than 0, to 1e30.
         to: f64,
-        /// The fraction of the run over which the rate rises.
+        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
-    /// Half a cosine wave from `from` to `to` (Loshchilov and Hutter 2017, equation 5, one period), after a linear rise
-    /// from 0.
+    /// Half a cosine wave from `from` to `to`, after a linear rise from 0 (Loshchilov and Hutter 2017, equation 5,
+    /// one period).
     Cosine {
-        /// The rate at the start.
+        /// Learning rate at the start. Range: 0 to 1e30.
         from: f64,
-        /// The rate at the end.
+        /// Learning rate at the end. Range: 0 to 1e30.
         to: f64,
-        /// The fraction of the run over which the rate rises.
+        /// Fraction of the run over which the rate rises from 0. Range: 0 to 1.
         warmup: f64,
     },
 }

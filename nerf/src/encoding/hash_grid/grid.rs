@@ -13,16 +13,16 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HashGridConfig {
-    /// Number of resolutions, 1 to 32.
+    /// Number of levels, each of another resolution. Range: 1 to 32.
     pub levels: usize,
-    /// Features in a row of the table: 1, 2, 4, 8, 16 or 32.
+    /// Features in a row of the table. Range: 1, 2, 4, 8, 16 or 32.
     pub features: usize,
-    /// Binary logarithm of the most rows that a level may have, 4 to 28.
+    /// Binary logarithm of the largest number of rows of a level. Range: 4 to 28.
     pub log2_table: u32,
-    /// Cells along an axis of the coarsest level, at least 1.
+    /// Cells along an axis of the coarsest level. Range: 1 to `finest`.
     pub coarsest: usize,
-    /// Cells along an axis of the finest level, at most 65536: finer cells would leave f32 too few digits for the place
-    /// within a cell.
+    /// Cells along an axis of the finest level. Finer cells would leave f32 too few digits for the place within a
+    /// cell. Range: `coarsest` to 65536.
     pub finest: usize,
 }
 

@@ -19,13 +19,14 @@ pub(crate) const LENS: &str = "lens";
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraOptimizerConfig {
-    /// The learning rate over the run of focal lengths, if they are learned: see [`CameraOptimizer`](crate::model::CameraOptimizer).
+    /// Learning rate of the focal lengths over the run; null keeps them fixed. `--refine focal` sets it. See
+    /// [`CameraOptimizer`](crate::model::CameraOptimizer).
     pub focal: Option<Schedule>,
-    /// The learning rate over the run of the lenses' coefficients, if they are learned.
+    /// Learning rate of the lens coefficients over the run; null keeps them fixed. `--refine lens` sets it.
     pub lens: Option<Schedule>,
-    /// The share of the run over which detail comes in, from coarse to fine (Lin et al. 2021, "BARF", equation 14); 0 has
-    /// all of it from the start. Cameras follow the slopes of what they see, and those of fine detail point to the nearest
-    /// repetition of a pattern and not to where it belongs.
+    /// Share of the run over which detail fades in, from coarse to fine (Lin et al. 2021, "BARF", equation 14).
+    /// Fine detail too early pulls a pose to the nearest repetition of a pattern. 0 shows all detail from the
+    /// start. Range: 0 to 1.
     pub coarse: f64,
 }
 

@@ -81,12 +81,14 @@ const TASK: usize = 256;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(from = "Stored")]
 pub struct OccupancyConfig {
-    /// Cells along each axis: a multiple of 4, of 16 if there are several cascades; at most 1024, and with all cascades at
-    /// most 2^30 cells (4.4 GB).
+    /// Cells along each axis, at most 2^30 (4.4 GB) with all cascades. Several cascades need a multiple of 16.
+    /// Range: a multiple of 4 up to 1024.
     pub resolution: usize,
-    /// Number of nested boxes, 1 to 8: the scene's own, and each further one twice as large around the same centre.
+    /// Number of nested boxes: the scene box, then boxes that are each twice as large around the same centre. A
+    /// bounded scene has 1, an unbounded one 2 to 8. Range: 1 to 8.
     pub cascades: usize,
-    /// What may be left out.
+    /// Empty-space skipping: `"off"`, `"near-lossless"`, `"fast"`, or an object with all keys below. `--skip` sets
+    /// it.
     pub skip: Skipping,
 }
 
@@ -103,7 +105,7 @@ struct Stored {
     resolution: usize,
     cascades: usize,
     skip: Skipping,
-    /// The first edition's switch for carving, for which one photograph was enough.
+    /// Switch for visual hull carving. true becomes a `carving` of 1, false one of 0.
     silhouettes: Option<bool>,
 }
 

@@ -10,13 +10,13 @@ use std::str::FromStr;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Skip {
-    /// Nothing but what lies outside of the box.
+    /// Skips nothing within the scene box.
     Off,
-    /// At most an optical depth of 1/200 along a ray: beyond what 8 bits show, except in fog at the threshold.
+    /// Skips an optical depth of at most 1/200 along a ray. 8 bits do not show it, except in fog at the threshold.
     #[default]
     #[serde(alias = "lossless")]
     NearLossless,
-    /// At most an optical depth of 1/20 along a ray.
+    /// Skips an optical depth of at most 1/20 along a ray.
     Fast,
 }
 
@@ -57,19 +57,20 @@ impl Skip {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(from = "Stored")]
 pub struct Skipping {
-    /// Whether training passes over cells in which the field holds little. What it has passed over is empty in views too:
-    /// the field was never asked there.
+    /// Whether training skips cells with little density. Views skip these cells too.
     pub grid: bool,
-    /// Before training, cells go that so many photographs show to be empty, by being fully transparent there; 0 carves
-    /// nothing. One wrong mask empties nothing if two have to agree. Of few photographs fewer are asked for: one of eight.
+    /// Visual hull carving: number of images that must show a cell as transparent before it becomes empty. Two or
+    /// more protect against one wrong mask. Of fewer than 17 images, one in eight is enough. 0 carves nothing.
+    /// `--carve` sets it. Unit: images.
     pub carving: u32,
-    /// Views pass over cells that together add no more than this optical depth to any ray: a pixel changes by at most as
-    /// much, times the range of colours. 0 is none.
+    /// Optical depth that views may skip along a ray, in cells of low density. A pixel changes by at most as much,
+    /// times the range of colours. Range: 0 to 1.
     pub pruning: f64,
-    /// In views a ray ends where less light than this is left: a pixel changes by at most as much.
+    /// Early termination in views: a ray ends where the transmittance is below this. A pixel changes by at most as
+    /// much. Range: 0 to 1.
     pub early_stop_eps: f64,
-    /// In views samples whose weights add up to at most this have no colour of their own: a pixel changes by at most as
-    /// much. Quadratures of two nodes an interval colour every sample.
+    /// Total weight of the samples of a ray whose colours views may leave out. A pixel changes by at most as much.
+    /// Quadratures with two nodes an interval evaluate every colour. Range: 0 to 1.
     pub colors: f64,
 }
 

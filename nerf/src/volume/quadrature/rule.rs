@@ -11,23 +11,22 @@ use std::fmt;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Quadrature {
-    /// One evaluation at the near end of each interval, as in Mildenhall et al. 2020, equation 3, but for the last
-    /// interval, which ends where the ray does.
+    /// One evaluation at the near end of each interval (Mildenhall et al. 2020, equation 3). The last interval ends
+    /// where the ray does.
     Left,
     /// One evaluation in the middle of each interval, or at a random place in training.
     #[default]
     Midpoint,
-    /// One evaluation at each end of an interval, shared with the next; density linear in between, and the mean colour
-    /// (Uy et al. 2023, "NeRF Revisited: Fixing Quadrature Instability in Volume Rendering", with the mean in place of
-    /// the near colour).
+    /// One evaluation at each end of an interval, shared with the next. Density is linear in between, with the mean
+    /// colour (Uy et al. 2023, "NeRF Revisited", with the mean in place of the near colour).
     PiecewiseLinear,
-    /// Two evaluations in each interval, at the nodes of Gauss's rule; colour linear in optical depth
+    /// Two evaluations in each interval, at the nodes of Gauss's rule. Colour is linear in optical depth
     /// ([`gauss_share`](super::gauss_share)).
     Gauss2,
-    /// As [`PiecewiseLinear`](Self::PiecewiseLinear), with intervals halved until halving changes the pixel by less than
-    /// `tolerance` each. Colours are evaluated in every round.
+    /// As [`PiecewiseLinear`](Self::PiecewiseLinear), but halves intervals until halving changes a pixel by less
+    /// than `tolerance`. Each round evaluates colours.
     Adaptive {
-        /// The change of a pixel that is not followed up, 1e-9 to 1.
+        /// Change of a pixel below which an interval is not halved further. Range: 0.000000001 to 1.
         tolerance: f64,
     },
 }
