@@ -6,6 +6,7 @@ mod builtin;
 mod cameras;
 mod checkpoint;
 mod compare;
+mod completions;
 mod doctor;
 mod eval;
 mod events;
@@ -17,6 +18,7 @@ mod interrupt;
 mod journal;
 mod lock;
 mod machine;
+mod man;
 mod memory;
 mod output;
 mod overwrite;
@@ -80,6 +82,8 @@ enum Command {
     Doctor(doctor::Args),
     Export(export::Args),
     Bench(bench::Args),
+    Completions(completions::Args),
+    Man(man::Args),
 }
 
 fn main() -> ExitCode {
@@ -114,6 +118,8 @@ fn run(cli: Cli) -> Work<ExitCode> {
         Some(Command::Compare(args)) => compare::run(&args)?,
         Some(Command::Doctor(args)) => return Ok(doctor::run(&args)?),
         Some(Command::Bench(args)) => bench::run(&args)?,
+        Some(Command::Completions(args)) => completions::run(&args)?,
+        Some(Command::Man(args)) => man::run(&args)?,
         Some(Command::Render(args)) => render::run(&args)?,
         Some(Command::View(args)) => view::run(&args)?,
     }
@@ -149,7 +155,7 @@ mod tests {
     use std::path::Path;
 
     /// The program and its commands, ready to print help.
-    fn commands() -> Vec<Command> {
+    pub fn commands() -> Vec<Command> {
         let mut program = Cli::command();
         program.build();
         let commands = program.get_subcommands().filter(|command| command.get_name() != "help").cloned();
