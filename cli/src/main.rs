@@ -28,6 +28,8 @@ mod precision;
 mod prepare;
 mod preview;
 mod progress;
+#[cfg(test)]
+mod reference;
 mod render;
 mod run;
 mod scene;

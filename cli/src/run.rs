@@ -214,7 +214,7 @@ fn later_version(config: &str) -> Option<String> {
 
 impl RunConfig {
     /// Whether the numbers are usable. The model checks its own.
-    fn check(&self) -> Result<()> {
+    pub fn check(&self) -> Result<()> {
         if self.downscale == 0 {
             return Err(Error::setting("downscale", "must be 1 or more, is 0"));
         }

@@ -1,0 +1,650 @@
+//! `docs/reference/config.md`: every key of `config.json`. Types and descriptions come from the sources, defaults from the presets,
+//! ranges from what [`Config::check`] says about absurd values.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+
+use glam::{DMat3, DVec2, DVec3};
+use raygrad::nerf::{Config, Error, Model, Ndc, Preset};
+use serde_json::{Value, json};
+
+use super::source::{Field, Sources};
+use super::{compare, markdown, wrap};
+use crate::run::RunConfig;
+
+/// Titles and introductions of the page's sections, by the name of the struct or enum.
+const TITLES: [(&str, &str, &str); 29] = [
+    ("RunConfig", "Run", "The keys at the top of `config.json`."),
+    ("Scene", "Scene", "A word, or an object with a folder."),
+    ("SceneBox", "Scene box", "The region that the model covers."),
+    ("SceneTransform", "Scene transform", "scene = `scale * rotation * (capture - origin)`."),
+    ("Ndc", "Normalised device coordinates", "The projection of a forward-facing scene."),
+    ("Viewpoint", "Viewpoint", "The average training camera."),
+    ("Budget", "Budget", "An object with one of these keys."),
+    (
+        "Config",
+        "Model and training",
+        "The keys below `config`. Below, and for `--set`, they are written without `config.`",
+    ),
+    ("ClassicConfig", "Classic field", "The networks of the NeRF paper."),
+    ("InstantConfig", "Instant field", "A hash grid, a density network and a colour network."),
+    ("VoxelConfig", "Voxel field", "A dense voxel grid without a network."),
+    ("HashGridConfig", "Hash grid", "A multiresolution hash grid (Müller et al. 2022)."),
+    ("HierarchicalConfig", "Hierarchical sampler", "A coarse network shows where the field is sampled."),
+    ("MarchingConfig", "Marching sampler", "Even intervals through the occupied cells of a grid."),
+    ("ProposalConfig", "Proposal sampler", "Small density networks show where the field is sampled."),
+    ("ProposalLevel", "Proposal network", "One proposal network."),
+    ("OccupancyConfig", "Occupancy grid", "The cells that may hold something."),
+    ("Skipping", "Empty-space skipping", "What training and views skip. A word sets all keys at once."),
+    ("Quadrature", "Quadrature", "A word, or an object for the adaptive rule."),
+    ("Loss", "Loss", "The loss of the error `e` of one colour channel. A word, or an object."),
+    ("DistortionConfig", "Distortion loss", "Pulls the weights along a ray together, against floaters and fog."),
+    ("EntropyConfig", "Entropy loss", "Makes each ray opaque or empty."),
+    ("OrientationConfig", "Orientation loss", "Turns normals towards the camera. It makes steps several times slower."),
+    ("DepthConfig", "Depth loss", "Fits measured depths."),
+    ("TotalVariationConfig", "Total variation loss", "Smooths a table where no image shows it."),
+    (
+        "Schedule",
+        "Schedule",
+        "A learning rate over the run, whose `fraction` rises from 0 to 1. An object with one of these keys.",
+    ),
+    ("AdamConfig", "Adam", "Constants of the Adam optimizer."),
+    ("GroupConfig", "Parameter group", "Parameters with Adam constants and a learning rate of their own."),
+    ("CameraOptimizerConfig", "Camera optimizer", "What is learned of the cameras beside their poses."),
+];
+/// The last of them.
+const EXPOSURE: (&str, &str, &str) =
+    ("ExposureConfig", "Exposure model", "What is learned of how images show the scene's colours.");
+
+fn title(name: &str) -> (&'static str, &'static str) {
+    let all = TITLES.iter().chain([&EXPOSURE]);
+    let found = all.into_iter().find(|(own, ..)| *own == name);
+    found.map(|(_, title, text)| (*title, *text)).unwrap_or_else(|| panic!("`{name}` needs a title in TITLES"))
+}
+
+/// Where a sample of a configuration comes from.
+#[derive(Clone, Copy, PartialEq)]
+enum Origin {
+    Preset(&'static str),
+    /// A file that says as little as it may.
+    Minimal,
+    /// A file that says all that can be said.
+    Full,
+    /// The keys that a minimal file lacks.
+    Absent,
+}
+
+/// Configurations of runs as files may have them, which together have every key.
+fn samples() -> Vec<(Origin, Value)> {
+    let preset = |preset: Preset| serde_json::to_value(Config::preset(preset)).unwrap();
+    let run = |config: Value| {
+        json!({
+            "raygrad": env!("CARGO_PKG_VERSION"),
+            "scene": "embedded",
+            "downscale": 1,
+            "scene_box": {"bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], "near_far": [0.5, 6.0]},
+            "viewpoint": {"width": 24, "height": 24, "angle_x": 0.7, "distance": 4.0, "elevation": 0.5},
+            "config": config,
+        })
+    };
+    let instant = preset(Preset::Instant);
+    let with = |key: &str, value: Value| {
+        let mut config = instant.clone();
+        config[key] = value;
+        run(config)
+    };
+    let mut samples = vec![];
+    for (name, each) in
+        [("classic", Preset::Classic), ("small", Preset::Small), ("instant", Preset::Instant), ("voxel", Preset::Voxel)]
+    {
+        samples.push((Origin::Preset(name), run(preset(each))));
+    }
+    let constant = json!({"constant": {"rate": 0.1}});
+    for (key, value) in [
+        ("sampler", json!({"kind": "proposal"})),
+        ("sampler", json!({"kind": "marching"})),
+        ("groups", json!([{"params": "field.", "adam": instant["adam"], "schedule": constant}])),
+        ("loss_terms", json!([{"kind": "total_variation", "weight": 0.1, "params": "field.table"}])),
+    ] {
+        samples.push((Origin::Minimal, with(key, value)));
+    }
+    let ramp = json!({"from": 0.1, "to": 0.01, "warmup": 0.1});
+    let step = json!({"step": {"from": 0.1, "factor": 0.5, "every": 0.1, "warmup": 0.1}});
+    for schedule in [constant, step, json!({"linear": ramp}), json!({"exponential": ramp}), json!({"cosine": ramp})] {
+        let group = json!([{"params": "field.", "adam": instant["adam"], "schedule": schedule}]);
+        let [optics, colors] = [["focal", "lens"], ["exposure", "vignetting"]];
+        let both = |[a, b]: [&str; 2]| json!({a: schedule, b: schedule});
+        for (key, value) in [
+            ("schedule", schedule.clone()),
+            ("poses", schedule.clone()),
+            ("groups", group),
+            ("camera_optimizer", both(optics)),
+            ("exposure_model", both(colors)),
+        ] {
+            samples.push((Origin::Full, with(key, value)));
+        }
+    }
+    for kind in ["distortion", "entropy", "orientation", "depth"] {
+        samples.push((Origin::Full, with("loss_terms", json!([{"kind": kind, "weight": 0.1}]))));
+    }
+    samples.push((Origin::Full, with("loss", json!({"huber": {"delta": 0.1}}))));
+    let adaptive = json!({"kind": "marching", "quadrature": {"adaptive": {"tolerance": 1e-3}}, "last_step": 0.002});
+    samples.push((Origin::Full, with("sampler", adaptive)));
+    let slopes = DVec2::ONE.to_array();
+    let ndc = Ndc { eye: DVec3::ZERO, axes: DMat3::IDENTITY, slopes, near: 1.0 };
+    for (key, value) in [
+        ("scene", json!({"folder": "my-scene"})),
+        ("budget", json!({"steps": 5000})),
+        ("budget", json!({"seconds": 60.0})),
+        ("scene_box", json!({"bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], "near_far": [0.5, 6.0], "ndc": ndc})),
+    ] {
+        let mut sample = run(instant.clone());
+        sample[key] = value;
+        samples.push((Origin::Full, sample));
+    }
+    samples
+}
+
+/// The values of a sample's keys by path: `config.sampler{marching}.step`, `config.groups[].params`.
+type Keys = BTreeMap<String, Vec<Value>>;
+
+/// Collects the keys of a value with their values.
+fn walk(value: &Value, path: &str, keys: &mut Keys) {
+    match value {
+        Value::Object(fields) => {
+            let kind = fields.get("kind").and_then(Value::as_str).map(|kind| format!("{{{kind}}}")).unwrap_or_default();
+            for (name, value) in fields.iter().filter(|(name, _)| *name != "kind") {
+                let path = format!("{path}{kind}.{name}");
+                walk(value, &path, keys);
+                keys.entry(path).or_default().push(value.clone());
+            }
+        }
+        Value::Array(all) => all.iter().for_each(|value| walk(value, &format!("{path}[]"), keys)),
+        _ => {}
+    }
+}
+
+/// The value at a path; of lists the first.
+fn at<'a>(value: &'a mut Value, path: &str) -> Option<&'a mut Value> {
+    path.split('.').skip(1).try_fold(value, |value, part| {
+        let name = part.split(['[', '{']).next()?;
+        let mut value = value.get_mut(name)?;
+        if part.contains("[]") {
+            value = value.get_mut(0)?;
+        }
+        match part.split_once('{') {
+            Some((_, kind)) if value["kind"] != kind.trim_end_matches('}') => None,
+            _ => Some(value),
+        }
+    })
+}
+
+/// A struct or an enum, and the paths at which it stands.
+struct Section {
+    name: String,
+    kind: Option<String>,
+    paths: Vec<String>,
+}
+
+/// All sections in the order of the page, and the paths of all keys.
+struct Schema<'a> {
+    sources: &'a Sources,
+    sections: Vec<Section>,
+    keys: BTreeSet<String>,
+}
+
+/// The type within `Option` and `Vec`, and what a path to it ends with.
+fn inner(ty: &str) -> (&str, &'static str) {
+    let ty = ty.strip_prefix("Option<").and_then(|ty| ty.strip_suffix('>')).unwrap_or(ty);
+    match ty.strip_prefix("Vec<").and_then(|ty| ty.strip_suffix('>')) {
+        Some(ty) => (ty, "[]"),
+        None => (ty, ""),
+    }
+}
+
+/// The components that a type stands for.
+fn family(ty: &str) -> Option<&'static str> {
+    [("FieldConfig", "Fields"), ("SamplerConfig", "Samplers"), ("LossTermConfig", "LossTerms")]
+        .into_iter()
+        .find_map(|(own, family)| (own == ty).then_some(family))
+}
+
+impl Schema<'_> {
+    fn visit(&mut self, name: &str, kind: Option<&str>, path: &str) {
+        match self.sections.iter_mut().find(|section| section.name == name) {
+            Some(section) => section.paths.push(path.into()),
+            None => {
+                self.sections.push(Section { name: name.into(), kind: kind.map(Into::into), paths: vec![path.into()] });
+            }
+        }
+        let item = self.sources.get(name).unwrap_or_else(|| panic!("no struct `{name}` in the sources"));
+        for field in &item.fields {
+            self.field(field, path);
+        }
+        for variant in item.variants.iter().filter(|variant| item.fields.is_empty() && !is_word(variant)) {
+            self.field(variant, path);
+            let path = format!("{path}.{}", variant.name);
+            variant.fields.iter().for_each(|field| self.field(field, &path));
+        }
+    }
+
+    fn field(&mut self, field: &Field, path: &str) {
+        let path = format!("{path}.{}", field.name);
+        let (ty, list) = inner(&field.ty);
+        let below = format!("{path}{list}");
+        self.keys.insert(path);
+        if let Some(family) = family(ty) {
+            let kinds = self.sources.kinds.iter().filter(|(_, own, _)| own == family);
+            for (kind, _, name) in kinds {
+                self.visit(name, Some(kind), &format!("{below}{{{kind}}}"));
+            }
+        } else if self.sources.get(ty).is_some_and(|item| !item.fields.is_empty() || !item.variants.iter().all(is_word))
+        {
+            self.visit(ty, None, &below);
+        }
+    }
+}
+
+/// Whether a variant is a word in a file.
+fn is_word(variant: &Field) -> bool {
+    variant.ty.is_empty() && variant.fields.is_empty()
+}
+
+fn schema(sources: &Sources) -> Schema<'_> {
+    let mut schema = Schema { sources, sections: vec![], keys: BTreeSet::new() };
+    schema.visit("RunConfig", None, "");
+    schema
+}
+
+/// A description, its unit and its range.
+fn described(doc: &str) -> (String, Option<String>, Option<String>) {
+    // Links between items are for rustdoc.
+    let mut text = String::new();
+    let mut rest = doc;
+    while let Some((before, after)) = rest.split_once('[') {
+        text += before;
+        match after.split_once(']') {
+            Some((label, after)) if label.starts_with('`') || after.starts_with('(') => {
+                text += label;
+                rest = after.strip_prefix('(').and_then(|a| a.split_once(')')).map_or(after, |(_, after)| after);
+            }
+            _ => {
+                text.push('[');
+                rest = after;
+            }
+        }
+    }
+    text += rest;
+    let take = |text: &mut String, word: &str| {
+        let (before, fact) = text.split_once(word)?;
+        let (before, fact) = (before.trim().to_owned(), fact.trim().trim_end_matches('.').to_owned());
+        *text = before;
+        Some(fact)
+    };
+    let range = take(&mut text, "Range: ");
+    let unit = take(&mut text, "Unit: ");
+    // Names in Rust are for rustdoc, too.
+    while let Some((before, after)) = text.split_once(" See `") {
+        let rest = after.split_once("`.").map_or("", |(_, rest)| rest).to_owned();
+        text = format!("{before}{rest}");
+    }
+    (text, unit, range)
+}
+
+/// The range of a number: what [`Config::check`] asks for in place of absurd values.
+fn range(path: &str, ty: &str, samples: &[(Origin, Value)]) -> Option<String> {
+    let key = path.rsplit('.').next()?;
+    let sample = samples.iter().find_map(|(_, sample)| {
+        let mut sample = sample.clone();
+        at(&mut sample, path).is_some().then_some(sample)
+    })?;
+    let probes = match ty {
+        "usize" | "u32" | "u64" => vec![json!(0), json!(4_000_000_000_u32), json!(1_u64 << 60)],
+        "f64" => vec![json!(-1e300), json!(1e300), json!(0.0)],
+        _ => return None,
+    };
+    let mut ranges: Vec<String> = vec![];
+    for probe in probes {
+        let mut sample = sample.clone();
+        *at(&mut sample, path)? = probe;
+        let Ok(run) = serde_json::from_value::<RunConfig>(sample) else { continue };
+        let refused = match run.check() {
+            Ok(()) if path.contains(".grid.") => Model::<f32>::new(run.config, run.scene_box, 0).err(),
+            checked => checked.err(),
+        };
+        let Some(Error::Setting { name, what }) = refused else { continue };
+        let found = what.split_once("; use ").map(|(_, range)| range).or_else(|| {
+            let must = what.strip_prefix("must be ")?.split_once(", is ")?.0;
+            Some(must.strip_prefix("from ").unwrap_or(must))
+        });
+        if let Some(found) =
+            found.filter(|found| name.rsplit('.').next() == Some(key) && !ranges.iter().any(|r| r == found))
+        {
+            ranges.push(found.to_owned());
+        }
+    }
+    let first = ranges.first()?.clone();
+    match first.strip_prefix("0 to ") {
+        Some(most) if ranges.iter().any(|range| range == "more than 0") => Some(format!("more than 0, to {most}")),
+        _ => Some(first),
+    }
+}
+
+/// A type in words.
+fn type_words(sources: &Sources, ty: &str) -> String {
+    if let Some(ty) = ty.strip_prefix("Option<").and_then(|ty| ty.strip_suffix('>')) {
+        return format!("{} or null", type_words(sources, ty));
+    }
+    if let Some(ty) = ty.strip_prefix("Vec<").and_then(|ty| ty.strip_suffix('>')) {
+        let words = type_words(sources, ty);
+        return match words.as_str() {
+            "integer" | "text" => format!("list of {words}s"),
+            _ => format!("list of {}", words.replacen("object ", "objects ", 1)),
+        };
+    }
+    if let Some(family) = family(ty) {
+        let kinds = sources.kinds.iter().filter(|(_, own, _)| own == family);
+        let links: Vec<String> =
+            kinds.map(|(kind, _, name)| format!("[`{kind}`](#{})", anchor(title(name).0))).collect();
+        return format!("object whose `kind` is {}", links.join(", "));
+    }
+    match ty {
+        "usize" | "u32" | "u64" => "integer".into(),
+        "f64" | "f32" | "Duration" => "number".into(),
+        "bool" => "true or false".into(),
+        "String" => "text".into(),
+        "PathBuf" => "path".into(),
+        "DVec3" => "3 numbers".into(),
+        "DMat3" => "9 numbers".into(),
+        "[f64; 2]" => "2 numbers".into(),
+        "[DVec3; 2]" => "2 points of 3 numbers".into(),
+        _ => {
+            let item = sources.get(ty).unwrap_or_else(|| panic!("a type `{ty}` without words"));
+            if item.fields.is_empty() && item.variants.iter().all(is_word) {
+                return "word".into();
+            }
+            let title = title(ty).0;
+            format!("[{title}](#{})", anchor(title))
+        }
+    }
+}
+
+fn anchor(title: &str) -> String {
+    title.to_lowercase().replace(' ', "-")
+}
+
+/// A path as `--set` takes it.
+fn shown(path: &str) -> String {
+    let mut text = String::new();
+    let mut is_kind = false;
+    for c in path.trim_start_matches(".config").trim_start_matches('.').chars() {
+        is_kind = (is_kind || c == '{') && c != '}';
+        if !is_kind && c != '}' {
+            text.push(c);
+        }
+    }
+    text
+}
+
+fn value_words(value: &Value) -> Option<String> {
+    match value {
+        Value::Object(fields) if fields.contains_key("kind") => Some(format!("`{}`", fields["kind"].as_str()?)),
+        // Of an enum's variant that has fields.
+        Value::Object(fields) if fields.len() == 1 && fields.values().all(Value::is_object) => {
+            Some(format!("`{value}`"))
+        }
+        Value::Object(_) => None,
+        Value::Array(all) if all.iter().any(Value::is_object) => None,
+        Value::String(word) => Some(format!("`{word}`")),
+        _ => Some(format!("`{value}`")),
+    }
+}
+
+/// The defaults of a key of a section, as a sentence.
+fn defaults(section: &Section, field: &Field, keys: &[(Origin, Keys)]) -> Option<String> {
+    let mut parts = vec![];
+    for path in &section.paths {
+        let full = format!("{path}.{}", field.name);
+        let of = |value: &[Value]| value.iter().map(value_words).collect::<Option<Vec<_>>>().map(|all| all.join(", "));
+        // Each value with the presets that have it.
+        let mut values: Vec<(String, Vec<&str>)> = vec![];
+        for (origin, keys) in keys {
+            if let (Origin::Preset(name), Some(value)) = (origin, keys.get(&full))
+                && full.starts_with(".config")
+            {
+                let value = of(value)?;
+                match values.iter_mut().find(|(other, _)| *other == value) {
+                    Some((_, names)) => names.push(name),
+                    None => values.push((value, vec![name])),
+                }
+            }
+        }
+        let text = match &values[..] {
+            [] => {
+                let absent = keys.iter().find(|(origin, keys)| *origin == Origin::Absent && keys.contains_key(&full));
+                let Some((_, keys)) = absent else { continue };
+                of(&keys[&full])?
+            }
+            [(value, names)] if names.len() == 4 => value.clone(),
+            values => {
+                let words = values.iter().map(|(value, names)| format!("{value} ({})", names.join(", ")));
+                words.collect::<Vec<_>>().join(", ")
+            }
+        };
+        parts.push((shown(path), text));
+    }
+    let is_file = !section.paths[0].starts_with(".config");
+    match &parts[..] {
+        [] => None,
+        [(_, text)] if is_file => Some(format!("If absent: {text}")),
+        [(_, text)] => Some(format!("Default: {text}")),
+        parts => {
+            let parts: Vec<String> = parts.iter().map(|(path, text)| format!("{text} in `{path}`")).collect();
+            Some(format!("Default: {}", parts.join("; ")))
+        }
+    }
+}
+
+/// A key: its description, and below it what is known of it.
+fn entry(schema: &Schema<'_>, section: &Section, field: &Field, below: &str, samples: &Samples) -> String {
+    let sources = schema.sources;
+    let (text, unit, said) = described(&field.doc);
+    assert!(!text.is_empty(), "`{}.{}` has no description", section.name, field.name);
+    let mut facts = vec![];
+    if !field.ty.is_empty() {
+        facts.push(format!("Type: {}", type_words(sources, &field.ty)));
+    }
+    let (ty, _) = inner(&field.ty);
+    if let Some(item) = sources.get(ty)
+        && item.fields.is_empty()
+        && item.variants.iter().all(is_word)
+    {
+        let words: Vec<String> = item.variants.iter().map(|word| format!("`{}`", word.name)).collect();
+        facts.push(format!("Values: {}", words.join(", ")));
+    }
+    facts.extend(unit.map(|unit| format!("Unit: {unit}")));
+    let path = format!("{}{below}.{}", section.paths[0], field.name);
+    let ty = field.ty.trim_start_matches("Option<").trim_end_matches('>');
+    let found = range(&path, ty, &samples.values);
+    if let (Some(found), Some(said)) = (&found, &said) {
+        // A range that depends on another key names it.
+        assert!(
+            found == said || said.contains('`'),
+            "{path}: the code asks for `{found}`, the doc comment says `{said}`"
+        );
+    }
+    let any = matches!(ty, "usize" | "u32" | "u64").then(|| "0 or more".to_owned());
+    facts.extend(said.or(found).or(any).map(|range| format!("Range: {range}")));
+    if below.is_empty() {
+        facts.extend(defaults(section, field, &samples.keys));
+    }
+    if path.starts_with(".config") && !field.ty.is_empty() && !samples.has_default(&path) {
+        facts.push("Required".into());
+    }
+    if !field.aliases.is_empty() {
+        let names: Vec<String> = field.aliases.iter().map(|name| format!("`{name}`")).collect();
+        facts.push(format!("Earlier name: {}", names.join(", ")));
+    }
+    let (indent, bullet) = if below.is_empty() { ("  ", "- ") } else { ("    ", "  - ") };
+    let mut page = wrap(bullet, indent, &format!("**`{}`**: {}", field.name, markdown(&text)));
+    if !facts.is_empty() {
+        // A line break.
+        page.insert(page.len() - 1, '\\');
+        page += &wrap(indent, indent, &facts.iter().map(|fact| format!("{fact}.")).collect::<Vec<_>>().join(" "));
+    }
+    if let Some(item) = sources.get(inner(&field.ty).0)
+        && item.fields.is_empty()
+        && item.variants.iter().all(is_word)
+    {
+        for word in &item.variants {
+            page += &word_entry(word, &format!("{indent}- "));
+        }
+    }
+    page
+}
+
+fn word_entry(word: &Field, bullet: &str) -> String {
+    let text = described(&word.doc).0;
+    assert!(!text.is_empty(), "`{}` has no description", word.name);
+    let indent = " ".repeat(bullet.len());
+    let earlier: String = word.aliases.iter().map(|name| format!(" Earlier name: `{name}`.")).collect();
+    wrap(bullet, &indent, &format!("`{}`: {}{earlier}", word.name, markdown(&text)))
+}
+
+/// The samples and their keys.
+struct Samples {
+    values: Vec<(Origin, Value)>,
+    keys: Vec<(Origin, Keys)>,
+}
+
+impl Samples {
+    fn new() -> Self {
+        let (mut values, mut keys) = (vec![], vec![]);
+        for (origin, written) in samples() {
+            let read: RunConfig = serde_json::from_value(written.clone()).unwrap();
+            let value = serde_json::to_value(read).unwrap();
+            let (mut before, mut after) = (Keys::new(), Keys::new());
+            walk(&written, "", &mut before);
+            walk(&value, "", &mut after);
+            if origin == Origin::Minimal {
+                keys.push((
+                    Origin::Absent,
+                    after.clone().into_iter().filter(|(path, _)| !before.contains_key(path)).collect(),
+                ));
+            }
+            keys.push((origin, after));
+            values.push((origin, value));
+        }
+        Samples { values, keys }
+    }
+
+    /// Whether presets have a key, or a file may lack it.
+    fn has_default(&self, path: &str) -> bool {
+        let is_said = |origin: &Origin| matches!(origin, Origin::Preset(_) | Origin::Absent);
+        self.keys.iter().any(|(origin, keys)| is_said(origin) && keys.contains_key(path))
+    }
+}
+
+fn page() -> String {
+    let sources = Sources::read();
+    let (schema, samples) = (schema(&sources), Samples::new());
+    let mut page = "# config.json\n\n".to_owned();
+    for text in [
+        "Each run folder holds a `config.json`: the scene, the cameras and every setting of model and training. \
+         `raygrad train --set NAME=VALUE` sets a key below `config`, such as `--set sampler.samples=16384`. Values are JSON. \
+         Parts of a path are separated by points; `[]` stands for the elements of a list.",
+        "Defaults are those of the presets; one value means that all presets have it. `raygrad train` changes some for the \
+         budget and the scene type: the size of the hash grid, `step`, `last_step`, `samples` and, for unbounded scenes, \
+         `cascades`, `resolution`, `cone`, `view_step` and a distortion loss.",
+        "This page is generated from the program. `UPDATE_SNAPSHOTS=1 cargo test -p raygrad-cli --bin raygrad reference` \
+         writes it.",
+    ] {
+        page += &wrap("", "", text);
+        page.push('\n');
+    }
+    let mut earlier: BTreeSet<(String, String)> = BTreeSet::new();
+    for section in &schema.sections {
+        let (title, intro) = title(&section.name);
+        write!(page, "## {title}\n\n").unwrap();
+        let mut intro = intro.to_owned();
+        let mut places: Vec<String> = section.paths.iter().map(|path| format!("`{}`", shown(path))).collect();
+        places.sort();
+        places.dedup();
+        if let Some(kind) = &section.kind {
+            write!(intro, " Its `kind` is `{kind}`.").unwrap();
+        }
+        if !matches!(section.name.as_str(), "RunConfig" | "Config") {
+            write!(intro, " Used in {}.", places.join(", ")).unwrap();
+        }
+        page += &wrap("", "", &intro);
+        page.push('\n');
+        let item = sources.get(&section.name).unwrap();
+        let mut remember = |name: &str, fields: &[Field]| {
+            for field in fields {
+                earlier.extend(field.aliases.iter().map(|old| (old.clone(), format!("{name}{}", field.name))));
+            }
+        };
+        for field in &item.fields {
+            page += &entry(&schema, section, field, "", &samples);
+        }
+        remember("", &item.fields);
+        for variant in &item.variants {
+            if variant.ty == "earlier" {
+                page += &word_entry(
+                    &Field { doc: format!("{} Files of earlier versions have it.", variant.doc), ..variant.clone() },
+                    "- ",
+                );
+            } else if let Some(words) = sources.get(&variant.ty).filter(|_| !item.fields.is_empty()) {
+                page += "- A word in place of the object:\n";
+                words.variants.iter().for_each(|word| page += &word_entry(word, "  - "));
+            } else if is_word(variant) {
+                page += &word_entry(variant, "- ");
+            } else {
+                page += &entry(&schema, section, variant, "", &samples);
+                for field in &variant.fields {
+                    page += &entry(&schema, section, field, &format!(".{}", variant.name), &samples);
+                }
+            }
+        }
+        page.push('\n');
+    }
+    page += "## Keys of earlier versions\n\n";
+    page += &wrap("", "", "raygrad reads these keys of files of earlier versions, and writes the new ones.");
+    page += "\n| earlier key | key |\n|---|---|\n";
+    for (old, new) in earlier {
+        writeln!(page, "| `{old}` | `{new}` |").unwrap();
+    }
+    page
+}
+
+#[test]
+fn config_page_matches_the_program() {
+    compare("config.md", &page());
+}
+
+#[test]
+fn config_page_has_every_key() {
+    let sources = Sources::read();
+    let schema = schema(&sources);
+    let keys: BTreeSet<String> = Samples::new().keys.into_iter().flat_map(|(_, keys)| keys.into_keys()).collect();
+    let new: Vec<&String> = keys.difference(&schema.keys).collect();
+    assert!(new.is_empty(), "keys that the sources do not have: {new:?}");
+    let unseen: Vec<&String> = schema.keys.difference(&keys).collect();
+    assert!(unseen.is_empty(), "keys that no sample has, so that their ranges are not looked for: {unseen:?}");
+    assert!(keys.len() > 150, "{} keys", keys.len());
+    let page = page();
+    for key in &schema.keys {
+        let name = key.rsplit('.').next().unwrap();
+        assert!(page.contains(&format!("**`{name}`**")), "{key}");
+    }
+}
+
+#[test]
+fn config_ranges_come_from_the_checks() {
+    let samples = Samples::new().values;
+    let range = |path: &str, ty: &str| range(path, ty, &samples);
+    assert_eq!(range(".config.field{instant}.grid.levels", "usize").as_deref(), Some("1 to 32"));
+    assert_eq!(range(".config.schedule.exponential.to", "f64").as_deref(), Some("more than 0, to 1e30"));
+    assert_eq!(range(".keep_checkpoints", "usize").as_deref(), Some("2 to 16384"));
+    assert_eq!(range(".config.seed", "u64"), None);
+}
