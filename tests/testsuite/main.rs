@@ -2,6 +2,7 @@
 
 mod determinism;
 mod doctor;
+mod documents;
 mod gradients;
 mod learning;
 mod parts;

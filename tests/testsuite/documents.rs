@@ -1,0 +1,459 @@
+//! Rules for the Markdown files of the repository: line widths, sentence lengths, phrases, links and the summary of the book.
+//!
+//! `cargo test --test testsuite documents -- --nocapture` prints the figures, for comments of the sources too.
+
+use std::collections::HashMap;
+use std::fmt;
+use std::path::{Component, Path, PathBuf};
+
+/// Longest line in characters, in tables too.
+const WIDTH: usize = 120;
+/// Most words of a sentence.
+const LONGEST: usize = 30;
+/// Phrases that say less than plain ones.
+const BANNED: [&str; 8] =
+    ["it is said", "is found out", "whoever", "is dear", "one's own", "as it lies", "goes on", "is asked for"];
+/// Their full stop ends no sentence.
+const ABBREVIATIONS: [&str; 7] = ["al.", "e.g.", "i.e.", "vs.", "cf.", "Fig.", "No."];
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The files of the repository whose names end like this, by path from its root.
+fn files(extension: &str) -> Vec<PathBuf> {
+    fn visit(folder: &Path, extension: &str, files: &mut Vec<PathBuf>) {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let entry = entry.unwrap();
+            let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
+            if entry.file_type().unwrap().is_dir() {
+                // Built files, folders of tools, and runs.
+                let is_skipped =
+                    name.starts_with('.') || name.starts_with("target") || path.join("config.json").exists();
+                if !is_skipped && name != "node_modules" {
+                    visit(&path, extension, files);
+                }
+            } else if path.extension().is_some_and(|own| own == extension) {
+                files.push(path.strip_prefix(root()).unwrap().to_path_buf());
+            }
+        }
+    }
+    let mut found = vec![];
+    visit(root(), extension, &mut found);
+    found.sort();
+    found
+}
+
+fn read(file: &Path) -> String {
+    std::fs::read_to_string(root().join(file)).unwrap_or_else(|error| panic!("{}: {error}", file.display()))
+}
+
+/// Something that departs from a rule.
+struct Finding {
+    file: PathBuf,
+    line: usize,
+    what: String,
+}
+
+impl fmt::Display for Finding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}:{}: {}", self.file.display(), self.line, self.what)
+    }
+}
+
+#[track_caller]
+fn assert_none(rule: &str, findings: &[Finding]) {
+    let lines: Vec<String> = findings.iter().map(|finding| format!("\n  {finding}")).collect();
+    assert!(findings.is_empty(), "{rule}: {} findings{}", findings.len(), lines.concat());
+}
+
+/// What a line of Markdown is.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Kind {
+    Code,
+    Table,
+    Heading,
+    Blank,
+    /// The first line of an item of a list.
+    Item,
+    Text,
+}
+
+/// The lines of a Markdown text with their kinds.
+fn lines(text: &str) -> Vec<(Kind, &str)> {
+    let mut fence: Option<&str> = None;
+    let mut is_comment = false;
+    let kind = |line| {
+        let bare: &str = str::trim_start(line);
+        let bare = bare.trim_start_matches("> ");
+        if let Some(open) = fence {
+            if bare.starts_with(open) {
+                fence = None;
+            }
+            return Kind::Code;
+        }
+        if let Some(open) = ["```", "~~~"].into_iter().find(|open| bare.starts_with(open)) {
+            fence = Some(open);
+            return Kind::Code;
+        }
+        if is_comment || bare.starts_with("<!--") {
+            is_comment = !bare.contains("-->");
+            return Kind::Code;
+        }
+        let digits = bare.trim_start_matches(|c: char| c.is_ascii_digit());
+        match () {
+            () if bare.is_empty() => Kind::Blank,
+            () if bare.starts_with('|') => Kind::Table,
+            () if bare.starts_with('#') && bare.trim_start_matches('#').starts_with(' ') => Kind::Heading,
+            // An instruction to mdBook, or a tag of HTML.
+            () if bare.starts_with("{{") || bare.starts_with('<') && bare.ends_with('>') => Kind::Blank,
+            () if ["- ", "* ", "+ "].iter().any(|mark| bare.starts_with(mark)) => Kind::Item,
+            () if digits.len() < bare.len() && digits.starts_with(". ") => Kind::Item,
+            () => Kind::Text,
+        }
+    };
+    let mut kind = kind;
+    text.lines().map(|line| (kind(line), line)).collect()
+}
+
+/// Paragraphs and items of lists, as one line each without what surrounds them, with the number of their first line.
+fn paragraphs(text: &str) -> Vec<(usize, String)> {
+    let mut all: Vec<(usize, String)> = vec![];
+    let mut is_open = false;
+    for (i, (kind, line)) in lines(text).into_iter().enumerate() {
+        let bare = line.trim().trim_start_matches("> ").trim_end_matches('\\');
+        match kind {
+            Kind::Item => {
+                let bare = bare.trim_start_matches(|c: char| c.is_ascii_digit());
+                all.push((i + 1, bare[1..].trim_start().to_owned()));
+                is_open = true;
+            }
+            Kind::Text if is_open => {
+                let (_, paragraph) = all.last_mut().unwrap();
+                *paragraph += " ";
+                *paragraph += bare;
+            }
+            Kind::Text => {
+                all.push((i + 1, bare.to_owned()));
+                is_open = true;
+            }
+            _ => is_open = false,
+        }
+    }
+    all
+}
+
+/// A paragraph's words as they are read: code is one word, of a link the text counts.
+fn plain(paragraph: &str) -> String {
+    let mut text = String::new();
+    for (part, is_code) in paragraph.split('`').zip([false, true].into_iter().cycle()) {
+        text += if is_code { "code" } else { part };
+    }
+    while let Some((start, after)) = text.split_once("](") {
+        let rest = after.split_once(')').map_or("", |(_, rest)| rest);
+        text = format!("{}{rest}", start.replace(['[', '!'], ""));
+    }
+    text.replace("**", "")
+}
+
+/// The sentences of a paragraph.
+fn sentences(paragraph: &str) -> Vec<String> {
+    let (mut all, mut sentence) = (vec![], vec![]);
+    let text = plain(paragraph);
+    for word in text.split_whitespace() {
+        if word.chars().any(char::is_alphanumeric) {
+            sentence.push(word);
+        }
+        let bare = word.trim_end_matches(['"', ')', '*', '_', '\'', '”', ']']);
+        let bare = bare.trim_start_matches('(');
+        if bare.ends_with(['.', '!', '?']) && !bare.ends_with("..") && !ABBREVIATIONS.contains(&bare) {
+            all.push(std::mem::take(&mut sentence).join(" "));
+        }
+    }
+    all.push(sentence.join(" "));
+    all.retain(|sentence| !sentence.is_empty());
+    all
+}
+
+fn words(sentence: &str) -> usize {
+    sentence.split(' ').count()
+}
+
+/// Lengths of sentences, as figures.
+#[derive(Default)]
+struct Lengths {
+    sentences: usize,
+    words: usize,
+    longest: (usize, String),
+    long: usize,
+}
+
+impl Lengths {
+    fn add(&mut self, sentence: &str, file: &Path, line: usize) {
+        let words = words(sentence);
+        self.sentences += 1;
+        self.words += words;
+        self.long += usize::from(words > LONGEST);
+        if words > self.longest.0 {
+            self.longest = (words, format!("{}:{line}", file.display()));
+        }
+    }
+}
+
+impl fmt::Display for Lengths {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (mean, (longest, place)) = (self.words as f64 / self.sentences.max(1) as f64, &self.longest);
+        let (count, long) = (self.sentences, self.long);
+        write!(f, "{count} sentences, mean {mean:.1} words, longest {longest} ({place}), {long} over {LONGEST} words")
+    }
+}
+
+/// The banned phrases in a text.
+fn banned(text: &str) -> impl Iterator<Item = &'static str> {
+    let text = format!(" {} ", text.to_lowercase().replace('’', "'"));
+    BANNED.into_iter().filter(move |phrase| {
+        text.match_indices(phrase).any(|(at, _)| {
+            let [before, after] = [text[..at].chars().next_back(), text[at + phrase.len()..].chars().next()];
+            [before, after].iter().all(|c| !c.is_some_and(char::is_alphanumeric))
+        })
+    })
+}
+
+/// The anchors of a page, as GitHub makes them.
+fn anchors(file: &Path, text: &str) -> Vec<String> {
+    let mut all: Vec<String> = vec![];
+    let mut seen: HashMap<String, usize> = HashMap::new();
+    for (kind, line) in lines(text) {
+        if kind == Kind::Heading {
+            let title = heading(line.trim_start_matches(['#', ' ', '>']));
+            let count = seen.entry(title.clone()).or_default();
+            all.push(if *count == 0 { title.clone() } else { format!("{title}-{count}") });
+            *count += 1;
+        }
+        // An include of mdBook.
+        if let Some(other) = line.trim().strip_prefix("{{#include ").and_then(|rest| rest.strip_suffix("}}")) {
+            let other = normal(&file.with_file_name(other));
+            all.extend(anchors(&other, &read(&other)));
+        }
+        for tag in ["id=\"", "name=\""] {
+            all.extend(line.split(tag).skip(1).filter_map(|rest| Some(rest.split_once('"')?.0.to_owned())));
+        }
+    }
+    all
+}
+
+/// A heading's anchor: in lower case, without punctuation, with hyphens for blanks.
+fn heading(title: &str) -> String {
+    let mut text = title.trim().to_owned();
+    while let Some((start, after)) = text.split_once("](") {
+        let rest = after.split_once(')').map_or("", |(_, rest)| rest);
+        text = format!("{}{rest}", start.replace(['[', '!'], ""));
+    }
+    let kept = text.chars().filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
+    kept.flat_map(char::to_lowercase).map(|c| if c == ' ' { '-' } else { c }).collect()
+}
+
+/// A path without `..`.
+fn normal(path: &Path) -> PathBuf {
+    let mut out = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::ParentDir if out.pop() => {}
+            Component::CurDir => {}
+            part => out.push(part),
+        }
+    }
+    out
+}
+
+/// The targets of a page's links and images, with their lines.
+fn links(text: &str) -> Vec<(usize, String)> {
+    let mut all = vec![];
+    for (i, (kind, line)) in lines(text).into_iter().enumerate().filter(|(_, (kind, _))| *kind != Kind::Code) {
+        // Without inline code.
+        let bare: String = line.split('`').step_by(2).collect::<Vec<_>>().join("code");
+        let target = |rest: &str| rest.split([')', ' ']).next().unwrap_or_default().to_owned();
+        all.extend(bare.split("](").skip(1).map(|rest| (i + 1, target(rest))));
+        for tag in ["src=\"", "href=\""] {
+            let targets = line.split(tag).skip(1).filter_map(|rest| Some(rest.split_once('"')?.0.to_owned()));
+            all.extend(targets.map(|target| (i + 1, target)));
+        }
+        if kind == Kind::Text
+            && bare.starts_with('[')
+            && let Some((_, rest)) = bare.split_once("]: ")
+        {
+            all.push((i + 1, target(rest)));
+        }
+    }
+    let is_local = |target: &str| !target.contains("://") && !target.starts_with("mailto:") && !target.is_empty();
+    all.retain(|(_, target)| is_local(target));
+    all
+}
+
+/// What is wrong with a link, if anything.
+fn check_link(file: &Path, target: &str) -> Option<String> {
+    let (path, anchor) = target.split_once('#').map_or((target, None), |(path, anchor)| (path, Some(anchor)));
+    let other = if path.is_empty() { file.to_path_buf() } else { normal(&file.with_file_name(path)) };
+    if !root().join(&other).exists() {
+        return Some(format!("`{target}`: there is no {}", other.display()));
+    }
+    let anchor = anchor?;
+    if other.extension().is_none_or(|extension| extension != "md") {
+        return None;
+    }
+    let known = anchors(&other, &read(&other)).iter().any(|own| own == anchor);
+    (!known).then(|| format!("`{target}`: {} has no heading of this anchor", other.display()))
+}
+
+#[test]
+fn documents_lines_fit_120_characters() {
+    let mut findings = vec![];
+    for file in files("md") {
+        for (i, (kind, line)) in lines(&read(&file)).into_iter().enumerate() {
+            let width = line.chars().count();
+            if kind != Kind::Code && width > WIDTH {
+                findings.push(Finding { file: file.clone(), line: i + 1, what: format!("{width} characters") });
+            }
+        }
+    }
+    assert_none("Markdown lines have at most 120 characters", &findings);
+}
+
+#[test]
+fn documents_sentences_fit_30_words() {
+    let (mut findings, mut each) = (vec![], vec![]);
+    let (mut all, mut written, mut manual) = <(Lengths, Lengths, Lengths)>::default();
+    for file in files("md") {
+        let mut own = Lengths::default();
+        let is_manual = file == Path::new("README.md") || file.starts_with("docs");
+        for (line, paragraph) in paragraphs(&read(&file)) {
+            for sentence in sentences(&paragraph) {
+                let counts = [(&mut own, true), (&mut all, true), (&mut manual, is_manual)];
+                counts.into_iter().filter(|(_, counts)| *counts).for_each(|(own, _)| own.add(&sentence, &file, line));
+                if !file.starts_with("docs/reference") && is_manual {
+                    written.add(&sentence, &file, line);
+                }
+                let count = words(&sentence);
+                if count > LONGEST {
+                    let start: String = sentence.chars().take(60).collect();
+                    findings.push(Finding { file: file.clone(), line, what: format!("{count} words: {start} ...") });
+                }
+            }
+        }
+        each.push(format!("  {}: {own}", file.display()));
+    }
+    println!("README.md and docs: {manual}\nthe same without docs/reference: {written}\nall Markdown: {all}");
+    println!("{}", each.join("\n"));
+    assert_none("sentences have at most 30 words", &findings);
+}
+
+#[test]
+fn documents_have_no_banned_phrase() {
+    let mut findings = vec![];
+    for file in files("md") {
+        let text = read(&file);
+        let others =
+            lines(&text).into_iter().enumerate().filter(|(_, (k, _))| matches!(k, Kind::Table | Kind::Heading));
+        let others = others.map(|(i, (_, line))| (i + 1, line.to_owned()));
+        for (line, text) in paragraphs(&text).into_iter().chain(others) {
+            findings.extend(banned(&text).map(|phrase| Finding {
+                file: file.clone(),
+                line,
+                what: format!("`{phrase}`"),
+            }));
+        }
+    }
+    assert_none("phrases to put plainly", &findings);
+}
+
+#[test]
+fn documents_links_lead_somewhere() {
+    let (mut findings, mut count) = (vec![], 0);
+    for file in files("md") {
+        for (line, target) in links(&read(&file)) {
+            count += 1;
+            findings.extend(check_link(&file, &target).map(|what| Finding { file: file.clone(), line, what }));
+        }
+    }
+    println!("{count} relative links");
+    assert_none("relative links and anchors exist", &findings);
+    assert!(count > 0);
+}
+
+#[test]
+fn documents_are_all_in_the_summary() {
+    let summary = Path::new("docs/SUMMARY.md");
+    if !root().join(summary).exists() {
+        eprintln!("skipped: there is no docs/SUMMARY.md yet");
+        return;
+    }
+    let text = read(summary);
+    let entries: Vec<(usize, PathBuf)> =
+        links(&text).into_iter().map(|(line, target)| (line, normal(&summary.with_file_name(target)))).collect();
+    let mut findings = vec![];
+    let mut add = |line: usize, what: String| findings.push(Finding { file: summary.into(), line, what });
+    for (i, (line, entry)) in entries.iter().enumerate() {
+        if !root().join(entry).exists() {
+            add(*line, format!("there is no {}", entry.display()));
+        }
+        if entries[..i].iter().any(|(_, other)| other == entry) {
+            add(*line, format!("{} is in it twice", entry.display()));
+        }
+    }
+    for page in files("md").into_iter().filter(|file| file.starts_with("docs") && file != summary) {
+        if !entries.iter().any(|(_, entry)| *entry == page) {
+            add(1, format!("{} is not in it", page.display()));
+        }
+    }
+    assert_none("the summary has each page of docs once", &findings);
+}
+
+/// Figures of the sources' documentation comments; no rule for them.
+#[test]
+fn documents_in_rustdoc_are_counted() {
+    let mut crates: Vec<(String, Lengths)> = vec![];
+    let (mut all, mut phrases) = (Lengths::default(), 0);
+    for file in files("rs").iter().filter(|file| file.components().any(|part| part.as_os_str() == "src")) {
+        let mut block = String::new();
+        let text = read(file);
+        for line in text.lines() {
+            let line = line.trim_start();
+            let comment = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"));
+            // What lies between two comments ends a paragraph, and every line has its number.
+            block += comment.unwrap_or_default();
+            block.push('\n');
+        }
+        let first = file.components().take_while(|part| part.as_os_str() != "src").collect::<PathBuf>();
+        let name = if first.as_os_str().is_empty() { "raygrad".to_owned() } else { first.display().to_string() };
+        if crates.last().is_none_or(|(last, _)| *last != name) {
+            crates.push((name, Lengths::default()));
+        }
+        for (line, paragraph) in paragraphs(&block) {
+            phrases += banned(&paragraph).count();
+            for sentence in sentences(&paragraph) {
+                all.add(&sentence, file, line);
+                crates.last_mut().unwrap().1.add(&sentence, file, line);
+            }
+        }
+    }
+    println!("rustdoc: {all}; {phrases} banned phrases");
+    crates.iter().for_each(|(name, lengths)| println!("  {name}: {lengths}"));
+    assert!(all.sentences > 1000);
+}
+
+#[test]
+fn documents_parser_finds_sentences_and_anchors() {
+    let text = "# A `b` [c](d.md), e_f!\n\nOne two\nthree. Four (et al. 2020) `five six. x`. [Six](x.md) seven\n\n- item one\n  \
+                more.\n- item\n\n```\ncode here. And here.\n```\n\n| a table. |\n\n## A\n## A\n1. first\n> quoted\n";
+    let found: Vec<String> = paragraphs(text).iter().flat_map(|(_, paragraph)| sentences(paragraph)).collect();
+    let expected =
+        ["One two three.", "Four (et al. 2020) code.", "Six seven", "item one more.", "item", "first quoted"];
+    assert_eq!(found, expected);
+    assert_eq!(anchors(Path::new("x.md"), text), ["a-b-c-e_f", "a", "a-1"]);
+    assert_eq!(links(text), [(1, "d.md".to_owned()), (4, "x.md".to_owned())]);
+    assert_eq!(lines(text).iter().filter(|(kind, _)| *kind == Kind::Code).count(), 3);
+    assert_eq!(normal(Path::new("docs/a/../../README.md")), Path::new("README.md"));
+    assert_eq!(banned("The scene Goes on; it goes once.").collect::<Vec<_>>(), ["goes on"]);
+    assert!(check_link(Path::new("README.md"), "no/such.md").is_some());
+    assert_eq!(check_link(Path::new("docs/x.md"), "../Cargo.toml"), None);
+}
