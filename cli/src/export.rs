@@ -24,7 +24,7 @@ use super::scene::Scene;
 /// Export cameras, a mesh, points or a scene page
 ///
 /// Everything is in the coordinates of the capture. If the run refined poses, training images get the refined ones,
-/// aligned as a whole to the given ones; other images keep their poses and get the refined focal length and lens.
+/// aligned as a whole to the given ones. Other images keep their poses and get the refined focal length and lens.
 ///
 /// A mesh or point cloud has normals and colours. Of an unbounded scene it covers the scene box. A page (.html)
 /// renders the whole scene in any browser with WebGL 2, without a server or a network.
