@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_of_gradients_are_those_of_the_plain_computation() {
+    fn checkpoint_second_order_equals_plain() {
         let run = |checked: bool| {
             let tape = Tape::<f64>::new();
             let x = tape.leaf(Tensor::from_vec(&[3], vec![0.3, -0.8, 1.4]));
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_wanted_constant_or_not_recorded_costs_nothing() {
+    fn checkpoint_unneeded_work_costs_nothing() {
         let tape = Tape::<f64>::new();
         let (x, c) = (tape.leaf(Tensor::ones(&[2])), tape.constant(Tensor::ones(&[2])));
         assert!(!tape.checkpoint(&[&c], |x| x[0].exp()).is_on_graph());

@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn products_with_the_jacobian_agree_with_it_from_both_sides() {
+    fn jvp_and_vjp_agree_with_jacobian() {
         let (v, u) = ([0.3, -2.0], [1.0, -0.5, 4.0]);
         let j = slopes();
         let (y, slope) = jvp(curve, &[vector(&AT)], &[vector(&v)]);
@@ -345,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn the_hessian_is_symmetric_and_the_derivative_of_the_gradient() {
+    fn hessian_is_symmetric_gradient_derivative() {
         let x = network_inputs();
         let whole = hessian(network, &x);
         let v: Vec<_> = x.iter().map(|x| Tensor::from_fn(x.shape(), |i| (i as f64 * 1.3 + 0.2).cos())).collect();

@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_remembered_is_not_worked_out_again_and_has_its_gradient() {
+    fn cached_outputs_are_reused_with_gradient() {
         let (tape, count) = (Tape::new(), Arc::default());
         let x = tape.leaf(Tensor::from([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]));
         let (first, a) = tape.no_grad(|| tape.cache_outputs(|| run(&x.gather_rows([2, 0]), &count)));

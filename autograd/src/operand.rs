@@ -172,7 +172,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_pair_of_forms_gives_the_same_and_only_variables_get_gradients() {
+    fn operand_forms_agree_only_vars_get_gradients() {
         let tape = Tape::<f32>::new();
         let (a, b) = (Tensor::from([3.0, -1.5]), Tensor::from([0.5, 4.0]));
         let (x, y) = (tape.leaf(a.clone()), tape.leaf(b.clone()));

@@ -157,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sums_are_those_of_a_dense_gradient_and_rows_come_once() {
+    fn row_sums_equal_dense_gradient() {
         let mut sums = RowSums::<f64>::new(5, 2);
         for round in 0..3 {
             let mut dense = [0.0; 10];

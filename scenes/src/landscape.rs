@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_views_of_half_the_size_have_the_same_mean() {
+    fn landscape_half_size_views_have_same_mean() {
         let landscape = Landscape::new();
         for camera in walk_cameras(Split::Val, 128) {
             let mean = |camera: &Camera| {

@@ -122,7 +122,7 @@ mod tests {
 
     /// The mean of what a pixel of some size shows differs little from what a single ray of that footprint computes.
     #[test]
-    fn landscape_noise_of_a_footprint_is_about_the_mean_over_it() {
+    fn noise_of_footprint_is_its_mean() {
         for footprint in [0.1, 0.5, 2.0, 8.0] {
             let (mut squares, mut rough) = (0.0, 0.0);
             for i in 0..200 {
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_edges_and_stripes_are_means_over_the_footprint() {
+    fn edges_and_stripes_are_footprint_means() {
         for width in [0.01, 0.3, 1.7, 5.0] {
             for at in [-3.2, -0.4, 0.0, 0.1, 0.45, 2.3] {
                 let n = 20_000;

@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cameras_stand_on_the_upper_hemisphere_and_look_at_the_origin() {
+    fn cameras_on_hemisphere_look_at_origin() {
         for camera in [train_cameras(60, 20), val_cameras(10, 20), test_cameras(20, 20)].concat() {
             let eye = camera.pose.translation;
             assert!((eye.length() - DISTANCE).abs() < 1e-12 && eye.z > 0.0);

@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_cameras_see_the_whole_bulldozer_and_nothing_stands_before_it() {
+    fn landscape_cameras_see_whole_bulldozer() {
         let landscape = Landscape::new();
         let [min, max] = landscape.bulldozer_bounds();
         for camera in all(400) {
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn landscape_views_differ_and_those_to_test_lie_between_those_to_train() {
+    fn landscape_test_views_lie_between_train_views() {
         let cameras = all(8);
         for (i, a) in cameras.iter().enumerate() {
             assert!(cameras[..i].iter().all(|b| a.pose.translation.distance(b.pose.translation) > 0.01), "view {i}");

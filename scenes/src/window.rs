@@ -47,7 +47,7 @@ mod tests {
     use raygrad_nerf::Ndc;
 
     #[test]
-    fn window_cameras_look_ahead_over_the_bulldozer_and_those_to_test_stand_between_those_to_train() {
+    fn window_test_cameras_stand_between_train_cameras() {
         assert_eq!(Split::ALL.map(|split| window_cameras(split, 8).len()), [30, 3, 6]);
         let [low, high] = Landscape::new().bulldozer_bounds();
         let train = window_cameras(Split::Train, 400);

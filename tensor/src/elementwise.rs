@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn one_large_angle_in_a_block_is_reduced_as_it_must_be() {
+    fn sine_one_large_angle_in_block_is_reduced() {
         fn check<T: Scalar>(large: f64) {
             let mut x = vec![T::from_f64(0.7); 3 * BLOCK];
             for i in [5, BLOCK, 3 * BLOCK - 1] {

@@ -327,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn too_large_an_angle_is_reported_for_quick_numbers_only() {
+    fn quick_lane_reports_too_large_angles() {
         fn sine<const QUICK: bool>(x: f64) -> (bool, f64) {
             let mut y = [0.0];
             let outside = lanes_fused::<f64, QUICK, 0, 1, 1>(&[&[x]], &mut [&mut y], |[], [x]| {

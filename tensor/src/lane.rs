@@ -133,7 +133,7 @@ mod tests {
     use super::has_angle;
 
     #[test]
-    fn formulas_with_a_sine_or_a_cosine_are_known_by_their_words() {
+    fn has_angle_finds_sine_and_cosine() {
         for formula in ["x.sin()", "Real::cos(x)", "a * (x + b).sin() - 1.0", "cos", "sinh(x) + sin(x)"] {
             assert!(has_angle(formula), "{formula}");
         }

@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn large_choices_among_views_are_those_of_their_elements() {
+    fn select_large_views_equals_elements() {
         let shape = [501, 403];
         let at = |i: usize| [i / 403, i % 403];
         let x = Tensor::<f64>::from_fn(&[403, 501], |i| i as f64);

@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn large_products_of_views_and_of_batches_are_those_of_copies() {
+    fn matmul_large_views_equal_copies() {
         let pool = Pool::new();
         let value = |i: usize| ((i * 7919) % 1009) as f64 / 500.0 - 1.0;
         // Cut by rows, by columns, by depth, and not at all; one large product of a batch, many small ones.

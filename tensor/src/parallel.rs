@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pool_of_the_callers_own_helps_unless_the_caller_is_one_of_many() {
+    fn own_pool_helps_unless_caller_is_one_of_many() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
         let inside =
             pool.install(|| [is_worthwhile(1 << 30), serial(|| is_worthwhile(1 << 30)), is_worthwhile(1 << 30)]);

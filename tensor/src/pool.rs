@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn classes_waste_at_most_a_quarter_and_hold_their_size() {
+    fn size_class_wastes_at_most_a_quarter() {
         for len in (65..5000).chain([1 << 20, (1 << 20) + 1]) {
             let class_ = class(len);
             assert!(class_ >= len && class_ * 4 <= len * 5 + 4, "{len} -> {class_}");

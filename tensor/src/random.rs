@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_have_their_distributions_and_neighbours_are_independent() {
+    fn random_numbers_match_their_distribution() {
         let mut rng = StdRng::seed_from_u64(7);
         let cases = [
             (Tensor::rand(&[100, 200], &mut rng), 0.5, 1.0 / 12.0),
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_uniform_number_is_below_one_in_single_precision() {
+    fn uniform_f32_largest_is_below_one() {
         /// Gives nothing but ones.
         struct Ones;
         impl rand::TryRng for Ones {

@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hyperbolic_functions_keep_their_digits_at_both_ends() {
+    fn hyperbolics_at_both_ends_keep_digits() {
         for i in 0..4000 {
             for x in [1e-9 * 1.01_f64.powi(i), -1e-6 * 1.01_f64.powi(i)] {
                 let single = x as f32;

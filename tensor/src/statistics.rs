@@ -206,7 +206,7 @@ mod tests {
     use ndarray::Axis;
 
     #[test]
-    fn reductions_are_those_of_ndarray_on_any_axes_and_views() {
+    fn reduction_any_axes_and_views_equals_ndarray() {
         let x = Tensor::<f64>::from_fn(&[3, 4, 5], |i| ((i * 37) % 23) as f64 - 9.5);
         for x in [x.clone(), x.permute(&[2, 0, 1]), x.flip(1).t()] {
             let array = x.view();

@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shape_beyond_all_memory_is_an_error_and_takes_none() {
+    fn npz_shape_beyond_memory_is_an_error() {
         let whole = format!("{}", u64::MAX);
         for shape in [
             "(0, 9223372036854775808)",

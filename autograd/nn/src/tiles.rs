@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gradient_is_that_of_the_sum_of_all_tiles_in_every_step() {
+    fn tiled_gradient_equals_sum_of_tiles() {
         let (params, ids) = store();
         let mut tiles = Tiles::<f32>::new();
         for count in [1, 3, 8, 19, 2, 0] {
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_change_no_bit_and_frozen_parameters_have_no_gradient() {
+    fn tiles_any_threads_give_same_bits() {
         let (mut params, ids) = store();
         params.freeze(|name| name == "b");
         let run = |threads: usize| {

@@ -354,7 +354,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn more_blocks_than_one_task_takes_are_picked_and_put_back() {
+    fn pick_many_blocks_are_put_back() {
         let (rows, label) = (PIECE + 7, |row: usize| (row * 7 % 3) as u32);
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from_fn(&[rows, 3], |i| i as f64));
@@ -439,7 +439,7 @@ mod tests {
 
     /// An axis with entries before and behind it, and fewer or more indices than entries.
     #[test]
-    fn gathering_along_an_axis_in_the_middle_is_what_its_definition_says() {
+    fn gather_middle_axis_matches_definition() {
         let tape = Tape::<f64>::new();
         let x = tape.constant(Tensor::from_fn(&[3, 4, 2], |i| i as f64));
         for count in [1, 2, 4, 7] {

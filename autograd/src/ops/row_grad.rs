@@ -106,7 +106,7 @@ mod tests {
     use crate::Tape;
 
     #[test]
-    fn the_sparse_gradient_is_the_dense_one_up_to_rounding() {
+    fn sparse_gradient_equals_dense_up_to_rounding() {
         let index: Arc<[u32]> = [3, 0, 3, 3, 1].into();
         let run = |sparse: bool| {
             let tape = Tape::<f32>::new();

@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn an_infinite_gradient_on_one_side_of_a_choice_leaves_the_other_alone() {
+    fn select_infinite_gradient_stays_on_its_side() {
         let tape = Tape::<f64>::new();
         let x = tape.leaf(Tensor::from_vec(&[2], vec![0.0, 4.0]));
         let y = x.sqrt().where_(&x.gt(1.0), &x).sum();

@@ -5,7 +5,7 @@ use raygrad_autograd::check::*;
 use raygrad_autograd::*;
 
 #[test]
-fn importing_everything_leaves_the_methods_of_variables_alone() {
+fn glob_import_keeps_var_methods() {
     let tape = Tape::<f64>::new();
     let x = tape.leaf(Tensor::scalar(0.5));
     let y = x.sin() + x.cos() * x.exp() + x.maximum(&x) + x.powi(3);
@@ -121,7 +121,7 @@ fn the_functions_of_a_formula_are_the_operations<T: Scalar>() {
 }
 
 #[test]
-fn the_functions_of_a_formula_are_the_operations_at_every_kind_of_point() {
+fn formula_functions_equal_operations() {
     the_functions_of_a_formula_are_the_operations::<f32>();
     the_functions_of_a_formula_are_the_operations::<f64>();
 }

@@ -206,7 +206,7 @@ impl Formula<1> for Thrice {
 }
 
 #[test]
-fn faults_too_small_for_differences_are_caught_by_the_exact_checks() {
+fn exact_checks_catch_tiny_faults() {
     assert_caught(&Entry::examined(Thrice), "the gradient against dual numbers");
     let by = "the output along a gradient against the input along its adjoint";
     assert_caught(&Entry::new(Elementwise(Thrice)).linear().sample(&[&[2, 3]]), by);

@@ -15,7 +15,7 @@ fn refused<T: Scalar, R>(tape: &Tape<T>, f: impl FnOnce() -> R) -> Error {
 }
 
 #[test]
-fn what_does_not_fit_is_an_error_at_the_line_that_asked() {
+fn misfit_is_an_error_at_the_callers_line() {
     let tape = Tape::<f64>::new();
     let x = tape.leaf(Tensor::from_fn(&[2, 3], |i| i as f64));
     let wide = tape.leaf(Tensor::zeros(&[1 << 40, 1]));
@@ -109,7 +109,7 @@ fn clamp_limits_out_of_order_are_refused() {
 }
 
 #[test]
-fn nodes_of_composed_methods_have_the_line_of_their_caller() {
+fn composed_method_nodes_have_callers_line() {
     let tape = Tape::<f32>::new();
     tape.check_finite(true);
     let x = tape.leaf(Tensor::full(&[2, 2], f32::MAX));
@@ -160,7 +160,7 @@ fn axes_count_from_either_end_as_those_of_tensors_do() {
 }
 
 #[test]
-fn numbers_and_tensors_are_constants_with_the_right_gradients() {
+fn numbers_and_tensors_are_constants() {
     let tape = Tape::<f64>::new();
     let a = Tensor::from([2.0, -4.0]);
     let x = tape.leaf(a.clone());
@@ -202,7 +202,7 @@ fn classes_come_in_a_list_or_in_the_shape_of_the_rows() {
 }
 
 #[test]
-fn unrecorded_gradients_of_angles_of_any_size_are_right() {
+fn angle_gradients_any_size_are_right() {
     // The quick reduction does not reach them.
     for angle in [1e9_f64, 1e30, -3e22] {
         let tape = Tape::<f64>::new();

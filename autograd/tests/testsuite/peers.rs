@@ -355,7 +355,7 @@ fn every_case_agrees_with_the_reference() {
 }
 
 #[test]
-fn every_operation_of_the_catalogue_has_a_reference_or_a_reason() {
+fn every_operation_has_a_peer_or_a_reason() {
     let reference = reference();
     let cases = cases(&reference);
     let mut covered: BTreeSet<_> = cases.iter().map(|case| operation(&case.name)).collect();

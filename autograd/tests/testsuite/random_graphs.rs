@@ -79,7 +79,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_program_has_the_derivatives_that_differences_say(
+    fn random_graph_derivatives_match_differences(
         program in prop::collection::vec(any::<Step>(), 1..14),
         values in prop::collection::vec(-1.0..1.0_f64, 6 + 3 + 1 + 4),
     ) {

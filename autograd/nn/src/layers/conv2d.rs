@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn is_the_operation_with_its_parameters_and_has_its_derivatives() {
+    fn conv2d_layer_equals_operation() {
         let config = Conv2dConfig { stride: [2, 1], padding: [1, 0], ..Conv2dConfig::default() };
         for bias in [false, true] {
             let mut params = Params::<f64>::new();

@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn values_have_the_variance_and_the_bounds_that_their_formula_says() {
+    fn init_matches_variance_and_bounds() {
         let n = 200.0 * 300.0;
         let cases = [
             (Init::Glorot, 2.0 / 500.0, 1.8),
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn an_orthogonal_matrix_is_orthogonal_along_its_shorter_side() {
+    fn init_orthogonal_along_shorter_side() {
         for shape in [&[7, 7][..], &[40, 9], &[9, 40], &[6, 3, 5], &[1, 4], &[4], &[0, 3], &[3, 0]] {
             let gain = 2.5_f64.sqrt();
             let x = Init::Orthogonal(gain).tensor::<f64>(shape, [1, 1], &mut rng());

@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn a_checkpointed_network_with_dropout_gives_the_same_bits() {
+    fn checkpointed_dropout_network_gives_same_bits() {
         let mut params = Params::new();
         let model = model(&mut params);
         let run = |checked: bool| {

@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn follows_the_algorithm_in_f64_with_and_without_decay() {
+    fn adam_f64_follows_the_algorithm() {
         let gradient = |t: usize| (t as f64 * 0.7).sin();
         for (factor, decay) in [(1.0, 0.1), (0.0, 0.1), (3.0, 0.02)] {
             let (mut adam, mut params) = (AdamW::new(AdamConfig::default(), decay), store(Tensor::scalar(0.5)));
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_is_skipped_and_counted_and_nothing_goes_denormal() {
+    fn adam_nan_is_skipped_and_counted() {
         let mut adam = Adam::<f32>::new(AdamConfig::default());
         let mut params = store(Tensor::from_vec(&[4], vec![1.0, 2.0, 3.0, f32::MAX]));
         params.set_lr_scale(|_| true, 1e3);
@@ -362,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn a_decaying_parameter_ends_at_zero_and_a_bad_gradient_stops_it() {
+    fn decayed_parameter_ends_at_zero() {
         let mut adam = AdamW::new::<f32>(AdamConfig::default(), 1.0);
         let mut params = store(Tensor::from_vec(&[2], vec![1e-25_f32, 1e-25]));
         let mut skipped = 0;
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn corrections_of_rows_end_where_they_are_one_or_long_enough() {
+    fn row_bias_correction_ends_at_one() {
         for (beta2, least, most) in [(0.0, 1, 200), (0.999, 10_000, 40_000), (0.99999, 1 << 17, 1 << 17)] {
             let mut params = store(Tensor::<f32>::zeros(&[2, 1]));
             params.set_lazy(|_| true, true);

@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn neither_overflow_nor_bad_elements_nor_zeros_spoil_the_norm() {
+    fn global_norm_survives_overflow_nan_and_zeros() {
         let mut grads = [Tensor::from_vec(&[4], vec![f64::MAX, -f64::MAX, f64::MAX, f64::INFINITY])];
         let clipped = limit_norm(&mut grads, 3.0_f64.sqrt());
         assert_eq!((clipped.norm, clipped.bad), (f64::INFINITY, 1));

@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_parameters_do_not_enter_and_nothing_goes_denormal() {
+    fn ema_skips_non_finite_parameters() {
         let mut ema = Ema::new(&store(&[1.0, 1.0]).cast::<f32>(), 0.5);
         assert_eq!(ema.update(&store(&[f64::NAN, 0.0]).cast()), 1);
         assert_eq!(ema.params().values()[0].as_slice(), [1.0, 0.5]);

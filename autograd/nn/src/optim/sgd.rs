@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_gradients_are_skipped_and_counted_and_nothing_goes_denormal() {
+    fn sgd_non_finite_gradients_are_skipped_and_counted() {
         for momentum in [0.0, 0.9] {
             let mut sgd = Sgd::<f32>::new(SgdConfig { momentum, decay: 0.5, ..SgdConfig::default() });
             let start = [1.0, 2.0, 3.0, -3e38, 1e-25];

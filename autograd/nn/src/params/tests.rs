@@ -4,7 +4,7 @@ use super::*;
 use crate::{Optimizer, Sgd, SgdConfig, Storage};
 
 #[test]
-fn frozen_parameters_rest_and_others_have_their_own_rates() {
+fn frozen_parameters_rest_others_have_own_lr() {
     let mut params = Params::<f64>::new();
     for name in ["trunk.weight", "trunk.bias", "head.weight"] {
         params.add(name, Tensor::ones(&[2]));

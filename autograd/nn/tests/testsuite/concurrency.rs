@@ -73,7 +73,7 @@ fn rounds(which: usize, pool: Pool<f32>, start: &Params<f32>, model: &Sequential
 }
 
 #[test]
-fn eight_threads_give_the_bits_of_one_in_a_thousand_rounds() {
+fn eight_threads_give_the_bits_of_one() {
     let mut params = Params::new();
     let model = model(&mut params);
     let alone: Vec<_> = (0..THREADS).map(|which| rounds(which, Pool::new(), &params, &model, ROUNDS)).collect();
@@ -101,7 +101,7 @@ fn eight_threads_give_the_bits_of_one_in_a_thousand_rounds() {
 }
 
 #[test]
-fn a_tape_moves_between_threads_and_its_values_are_shared() {
+fn tape_moves_between_threads() {
     // A tensor recorded on one thread is read on others while that thread differentiates.
     let params = {
         let mut params = Params::<f32>::new();

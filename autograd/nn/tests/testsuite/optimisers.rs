@@ -91,7 +91,7 @@ fn a_sparse_gradient_gives_exactly_the_dense_result() {
 }
 
 #[test]
-fn a_lazy_table_moves_the_rows_with_a_gradient_in_whatever_form_it_comes() {
+fn lazy_table_moves_rows_of_any_gradient_form() {
     for (name, make) in optimisers::<f64>() {
         let (mut rows, ids) = model::<f64>(true);
         let (mut whole, mut eager) = (rows.clone(), rows.clone());
@@ -131,7 +131,7 @@ fn a_penalty_on_a_lazy_table_visits_every_row() {
 }
 
 #[test]
-fn a_lazy_table_moves_as_an_eager_one_where_every_row_has_a_gradient() {
+fn lazy_table_with_full_gradient_equals_eager() {
     for (name, make) in optimisers::<f64>() {
         let (mut lazy, ids) = model::<f64>(true);
         let mut eager = lazy.clone();
@@ -209,7 +209,7 @@ fn averages_go_on_bit_for_bit() {
 }
 
 #[test]
-fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
+fn optimizer_state_of_other_shape_is_refused() {
     let (mut params, ids) = model::<f32>(true);
     let mut adam = Adam::new(AdamConfig::default());
     for step in 0..3 {
@@ -238,7 +238,7 @@ fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
 }
 
 #[test]
-fn frozen_parameters_rest_and_others_have_their_own_rates() {
+fn frozen_parameters_rest_others_have_own_lr() {
     for (name, make) in optimisers::<f64>() {
         let (mut params, ids) = model::<f64>(false);
         params.set_lr_scale(|name| name == "vector", 0.5);
@@ -449,7 +449,7 @@ fn a_panic_leaves_nothing_for_the_next_step() {
 }
 
 #[test]
-fn update_with_a_gradient_of_another_shape_moves_nothing() {
+fn update_gradient_of_other_shape_moves_nothing() {
     for (name, make) in optimisers::<f32>() {
         let mut params = Params::<f32>::new();
         params.add("a", Tensor::scalar(1.0));
@@ -648,7 +648,7 @@ fn a_step_copies_no_parameter() {
 }
 
 #[test]
-fn what_a_store_or_an_optimiser_cannot_take_is_refused() {
+fn optimizer_invalid_input_is_refused() {
     let panics = |f: &dyn Fn()| assert!(catch_unwind(AssertUnwindSafe(f)).is_err());
     let store = |name: &str, shape: &[usize]| {
         let mut params = Params::<f32>::new();
@@ -688,7 +688,7 @@ fn averages_that_cannot_go_on_stay_as_they_are() {
 }
 
 #[test]
-fn a_dense_gradient_reaches_the_optimiser_without_a_copy() {
+fn dense_gradient_reaches_optimizer_uncopied() {
     let mut params = Params::<f32>::new();
     params.add("x", Tensor::from([1.0, 2.0]));
     let dense = [Gradient::from(Tensor::from([3.0, 4.0]))];

@@ -194,7 +194,7 @@ fn tiny_table() -> Config {
 }
 
 #[test]
-fn frozen_parameters_rest_and_others_have_their_own_rates() {
+fn frozen_parameters_rest_others_have_own_lr() {
     let data = Arc::new(ball(Split::Train, 12));
     for config in [tiny(), tiny_table()] {
         for round in 0..3 {

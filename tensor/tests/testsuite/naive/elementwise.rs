@@ -83,7 +83,7 @@ fn sines<T: Scalar>() {
 }
 
 #[test]
-fn sines_of_angles_that_are_large_at_the_ends_of_blocks() {
+fn sine_large_angles_at_block_ends() {
     in_both!(sines);
 }
 

@@ -21,7 +21,7 @@ use std::process::Command;
 /// the plain fallback, with AVX2 and with AVX-512 (as far as the machine has them), on one, three and eight threads, and
 /// from within a pool of three threads.
 #[test]
-fn at_every_instruction_set_and_on_any_number_of_threads() {
+fn naive_agrees_on_all_simd_levels_and_threads() {
     let runs = [("scalar", "1", ""), ("v3", "3", ""), ("v4", "8", ""), ("v3", "2", "3")];
     let children = runs.map(|(level, threads, installed)| {
         let mut command = Command::new(std::env::current_exe().unwrap());
