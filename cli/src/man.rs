@@ -55,10 +55,12 @@ fn pages() -> Result<Vec<(String, String)>> {
     let commands: Vec<_> = std::iter::once(program.clone()).chain(program.get_subcommands().cloned()).collect();
     let page = |command: clap::Command| {
         let name = command.get_display_name().unwrap_or("raygrad").to_owned();
-        let (man, mut text) = (Man::new(command), vec![]);
+        let man = Man::new(command).source(format!("raygrad {}", env!("CARGO_PKG_VERSION")));
+        let mut text = vec![];
         man.render(&mut text).map_err(|e| Error::setting("man", e))?;
         let text = String::from_utf8(text).map_err(|e| Error::setting("man", e))?;
-        Ok((format!("{name}.1"), text))
+        // The heading of what stands after the help of the program.
+        Ok((format!("{name}.1"), text.replace(".SH EXTRA\nExit codes:\n", ".SH \"EXIT CODES\"\n")))
     };
     commands.into_iter().map(page).collect()
 }
@@ -72,6 +74,7 @@ mod tests {
     fn man_has_a_page_for_each_command_with_each_flag() {
         let pages = pages().unwrap();
         let names: Vec<&str> = pages.iter().map(|(name, _)| name.as_str()).collect();
+        assert!(pages[0].1.contains(".SH \"EXIT CODES\""), "{}", pages[0].1);
         for command in commands() {
             let name = command.get_name();
             let file = if name == "raygrad" { "raygrad.1".to_owned() } else { format!("raygrad-{name}.1") };
