@@ -13,6 +13,8 @@ const LONGEST: usize = 30;
 /// Phrases that say less than plain ones.
 const BANNED: [&str; 8] =
     ["it is said", "is found out", "whoever", "is dear", "one's own", "as it lies", "goes on", "is asked for"];
+/// Pages of short facts that the program's tests write.
+const GENERATED: [&str; 2] = ["docs/reference/commands.md", "docs/reference/config.md"];
 /// Their full stop ends no sentence.
 const ABBREVIATIONS: [&str; 7] = ["al.", "e.g.", "i.e.", "vs.", "cf.", "Fig.", "No."];
 
@@ -330,7 +332,7 @@ fn documents_sentences_fit_30_words() {
             for sentence in sentences(&paragraph) {
                 let counts = [(&mut own, true), (&mut all, true), (&mut manual, is_manual)];
                 counts.into_iter().filter(|(_, counts)| *counts).for_each(|(own, _)| own.add(&sentence, &file, line));
-                if !file.starts_with("docs/reference") && is_manual {
+                if is_manual && !GENERATED.iter().any(|page| file == Path::new(page)) {
                     written.add(&sentence, &file, line);
                 }
                 let count = words(&sentence);
@@ -342,7 +344,7 @@ fn documents_sentences_fit_30_words() {
         }
         each.push(format!("  {}: {own}", file.display()));
     }
-    println!("README.md and docs: {manual}\nthe same without docs/reference: {written}\nall Markdown: {all}");
+    println!("README.md and docs: {manual}\nthe same without generated pages: {written}\nall Markdown: {all}");
     println!("{}", each.join("\n"));
     assert_none("sentences have at most 30 words", &findings);
 }
