@@ -141,7 +141,7 @@ pub struct Args {
     ///
     /// Terms: distortion (a ray's light comes from one place), entropy (a ray is opaque or empty), orientation
     /// (normals face the camera), depth. A weight of 0 removes the term. Give the flag several times for several terms.
-    /// total_variation needs more than a weight: --set 'loss_terms=[{"kind": "total_variation", ...}]'.
+    /// total_variation needs more than a weight: `--set 'loss_terms=[{"kind": "total_variation", ...}]'`.
     #[arg(long, help_heading = "Model", value_name = "NAME=WEIGHT", value_parser = parse::weight)]
     loss: Vec<(String, f64)>,
     /// Resume a run from its last checkpoint

@@ -352,7 +352,7 @@ impl Config {
             let part = format!("groups.{}", group.params);
             named(&part, group.schedule.check())?;
             named(&part, group.adam.check())?;
-            check_range("groups.decay", group.weight_decay, 0.0, 1e30)?;
+            check_range("groups.weight_decay", group.weight_decay, 0.0, 1e30)?;
         }
         if let Some(marching) = self.sampler.get::<MarchingConfig>() {
             let cascades = marching.occupancy.cascades;

@@ -33,7 +33,7 @@
 //!         *out = if DVec3::from(point.map(f64::from)).length() < 0.5 { 10.0 } else { 0.0 };
 //!     }
 //! };
-//! grid.rebuild(Skip::Lossless.min_sigma(grid.longest_path()), true, &ball);
+//! grid.rebuild(Skip::NearLossless.min_sigma(grid.longest_path()), true, &ball);
 //! assert!(grid.occupied_share() < 0.15);
 //!
 //! let mut rays = Rays::new();
