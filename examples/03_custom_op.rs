@@ -1,4 +1,4 @@
-//! An operation of one's own, and the examination that finds out what is wrong with it.
+//! A custom operation, and the check that finds errors in it.
 //!
 //! ```text
 //! cargo run --release --example 03_custom_op

@@ -1,5 +1,5 @@
-//! A field of one's own: a network of sines, without any encoding (Sitzmann et al. 2020, "Implicit Neural Representations
-//! with Periodic Activation Functions"), in one file that nothing in raygrad knows of.
+//! A custom field in one file: a network of sines without an encoding (Sitzmann et al. 2020, "Implicit Neural
+//! Representations with Periodic Activation Functions").
 //!
 //! ```text
 //! cargo run --release --example siren [seconds] [folder for the picture and the model]

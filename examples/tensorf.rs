@@ -1,5 +1,5 @@
-//! A field of one's own: planes and vectors in place of a hash grid (Chen et al. 2022, "TensoRF: Tensorial Radiance
-//! Fields", section 4.2, the vector-matrix factorisation), in one file that nothing in raygrad knows of.
+//! A custom field in one file: planes and vectors in place of a hash grid (Chen et al. 2022, "TensoRF: Tensorial
+//! Radiance Fields", section 4.2, the vector-matrix factorisation).
 //!
 //! ```text
 //! cargo run --release --example tensorf [seconds] [folder for the picture and the model]

@@ -1,4 +1,4 @@
-//! Ways to hold a scene that goes on to the horizon, by what they make of near, far and sky.
+//! Compares ways to represent an unbounded scene, by their errors near, far and in the sky.
 //!
 //! ```text
 //! cargo run --release --example unbounded [seconds=60] [pixels=200] [from=walk|window] [only=bounded|contraction|cascades|ndc]

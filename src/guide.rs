@@ -1,4 +1,4 @@
-//! A guide: from a first gradient to an operation of one's own and a trained model.
+//! A guide: from a first gradient to a custom operation and a trained model.
 //!
 //! # A gradient
 //!
@@ -74,7 +74,7 @@
 //! assert!(error.to_string().starts_with("sqrt: the gradient of input 0 is inf at index [1]"));
 //! ```
 //!
-//! # An operation of one's own
+//! # A custom operation
 //!
 //! A chain of elementwise operations passes over memory once for each of them, and once more for each gradient. Written
 //! as a [`formula!`](crate::formula), it is one pass forward, without arrays in between, and one backward for the
@@ -128,10 +128,10 @@
 //! assert!(report.first_order < 1e-9 && report.second_order < 1e-9);
 //! ```
 //!
-//! With the feature `check`, [`check_op`](crate::autograd::check::check_op) is the examination that every operation of this crate has to pass: finite differences of
-//! first and second order, dual numbers, f32 against f64, extremes, inputs of any origin, the same bits twice. A wrong
-//! sign, a forgotten factor or a missing sum does not get through. What is not elementwise is an [`Op`](crate::Op), whose
-//! derivative is written with variables. An operation may be *fused*: then it carries a `reference` made of plain
+//! With the feature `check`, [`check_op`](crate::autograd::check::check_op) runs the checks that every operation of this
+//! crate passes: finite differences of first and second order, dual numbers, f32 against f64, extremes, inputs of any
+//! origin, the same bits twice. They find a wrong sign, a forgotten factor or a missing sum. An operation that is not
+//! elementwise is an [`Op`](crate::Op), whose derivative is written with variables. An operation may be *fused*: then it carries a `reference` made of plain
 //! operations, which is its oracle and its second derivative. A function that is made of operations needs no derivative
 //! at all, and [`check_function`](crate::autograd::check::check_function) checks what it uses.
 //!

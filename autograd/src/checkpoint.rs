@@ -1,4 +1,4 @@
-//! Rematerialisation: a part of a computation keeps its inputs only, and runs again when its gradient is asked for.
+//! Checkpointing (rematerialisation): a part of a computation keeps only its inputs, and runs again in the backward pass.
 
 use crate::op::Given;
 use crate::sweep::parts;

@@ -201,7 +201,7 @@ impl<T: Scalar, F: Formula<N>, const N: usize> Op<T> for Elementwise<F, N> {
     }
 }
 
-/// Gradient, operands and result of a pass that is recorded; of what is not read, numbers without a value.
+/// Gradient, operands and result of a recorded pass. Those that the derivative does not read have no value.
 #[allow(clippy::type_complexity)] // three numbers and their places
 fn given<'s, 't, T: Scalar, const N: usize>(
     cx: &Vjp<'t, '_, T>,

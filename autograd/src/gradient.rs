@@ -9,8 +9,8 @@ use std::sync::Arc;
 /// A share of a gradient that has a form of its own: of a table of which few rows were used (an embedding, a hash grid),
 /// it is much smaller than the table.
 ///
-/// An operation gives one with [`Grads::with_sparse`](crate::Grads::with_sparse). It reaches an optimiser as it is, in a
-/// [`Gradient`]; whoever wants a dense gradient adds it up.
+/// An operation gives one with [`Grads::with_sparse`](crate::Grads::with_sparse). It reaches an optimizer unchanged, in
+/// a [`Gradient`]; [`Gradient::into_dense`] adds it up.
 pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
     /// The shape of the tensor whose gradient it is.
     fn shape(&self) -> &[usize];

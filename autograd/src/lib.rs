@@ -12,7 +12,7 @@
 //! * [`Tape`], [`Var`]: what is recorded; every operation is a method of [`Var`].
 //! * [`derivatives`]: of functions: Jacobian, Hessian, and products with them.
 //! * [`conventions`]: values and gradients at ties, kinks and the edges of domains.
-//! * [`Formula`], [`formula!`]: elementwise operations of one's own, in one pass forward and one backward.
+//! * [`Formula`], [`formula!`]: custom elementwise operations, in one pass forward and one backward.
 //! * [`Op`]: any other operation.
 //! * [`Gradient`], [`SparseGrad`]: what an optimiser gets: a dense sum, and shares of a few rows beside it.
 //! * `check` (with the feature of this name): the examination that every operation here has to pass.

@@ -85,7 +85,7 @@ impl<N> Nodes<N> {
         number
     }
 
-    /// Frees what a node holds; its number and its edges stay. Whoever is reading it frees it afterwards.
+    /// Frees the contents of a node; its number and its edges stay. A reader of the node frees it afterwards.
     pub fn free(&self, node: u32) {
         if let Ok(mut place) = self.place(node).try_borrow_mut() {
             *place = None;

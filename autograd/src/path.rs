@@ -78,7 +78,7 @@ impl Path {
         self.marks[place].wanted
     }
 
-    /// Whether the sweep goes on from the node at this place.
+    /// Whether the sweep continues from the node at this place.
     pub fn leads(&self, place: usize) -> bool {
         self.marks[place].leads
     }

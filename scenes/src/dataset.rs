@@ -39,7 +39,7 @@ pub fn embedded_cameras(split: Split, size: usize) -> Vec<Camera> {
 /// 10 to validate, 20 to test, each `width` pixels wide, three quarters of that high, and opaque.
 ///
 /// [`landscape_distances`] tells what in them is near, far and sky. The bounds are those of the bulldozer and the
-/// cameras: most of what is seen lies beyond them.
+/// cameras: most visible surfaces lie beyond them.
 ///
 /// Ray-traced on the current rayon pool in about ten seconds at 400 pixels on two cores.
 ///

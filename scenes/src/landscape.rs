@@ -66,7 +66,7 @@ impl Landscape {
     /// Height of the ground in scene units: the plane `z = GROUND`.
     pub const GROUND: f64 = GROUND;
 
-    /// Where a ray first meets a surface, or `None` if it goes on into the sky.
+    /// Where a ray first meets a surface, or `None` if it leaves into the sky.
     ///
     /// The solids are numbered: those of the bulldozer as in [its own scene](Scene), then all others, and the ground last.
     pub fn trace(&self, ray: &Ray) -> Option<Hit> {

@@ -18,8 +18,8 @@ pub(crate) const BLOCK: usize = 4096;
 /// `M` results of one pass over tensors that broadcast together, each of the common shape. Results that are not `wanted`
 /// are computed too, since one loop computes all, but take no memory.
 ///
-/// Views are read as they lie. What all operands repeat is worked out once, and the results repeat it; where nobody shows all
-/// elements in row-major order, the results have the order of an operand.
+/// Views are read without a copy. Axes that all operands broadcast are computed once, and the results broadcast them. If no
+/// operand is in row-major order, the results have the order of an operand.
 ///
 /// `block` is usually [`lanes_fused`], which is all of this that is compiled for each formula.
 ///

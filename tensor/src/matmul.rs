@@ -155,7 +155,7 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
 }
 
 /// The product of the matrices in the last two axes of `a` `[.., m, k]` and `b` `[.., k, n]`; the axes before count matrices,
-/// and broadcast. Views, transposes above all, are read as they lie. All threads work on one large product, or on many
+/// and broadcast. Views, above all transposes, are read without a copy. All threads work on one large product, or on many
 /// small ones.
 ///
 /// ```

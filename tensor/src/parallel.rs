@@ -1,8 +1,8 @@
 //! Large loops on all of rayon's threads, with the same bits at any number of them.
 //!
 //! An operation on a large tensor is cut into pieces, in a way that leaves what is added to what to the sizes alone. The
-//! threads of the caller's rayon pool work on the pieces. Who has cut the work already, further outside, says so with
-//! [`serial`]: an operation that waited for others there would only delay it.
+//! threads of the caller's rayon pool work on the pieces. A caller that already runs in parallel wraps its operations in
+//! [`serial`]: waiting for other threads there would only delay it.
 
 use rayon::prelude::*;
 use std::cell::Cell;

@@ -211,8 +211,8 @@ pub fn sum_axes<T: Scalar>(x: &Tensor<T>, axes: &[usize], pool: &Pool<T>) -> Ten
 }
 
 /// The sum over the axes along which `shape` would have to be stretched to become `x.shape()`: the adjoint of
-/// [`Tensor::broadcast_to`]. A view is summed as it lies: along axes that repeat elements that is a product, and axes in
-/// another order are no obstacle.
+/// [`Tensor::broadcast_to`]. A view is summed without a copy: along broadcast axes the sum is a product, and permuted
+/// axes cost nothing extra.
 ///
 /// # Panics
 /// If `shape` does not broadcast to the shape of `x`.

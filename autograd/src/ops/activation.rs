@@ -107,7 +107,7 @@ impl Formula<1> for Elu {
     const NAME: &'static str = "elu";
     #[inline(always)]
     fn f<E: Real>(&self, [x]: [E; 1]) -> E {
-        // Of min(x, 0): what is not chosen must not overflow either, or it would be NaN in the second derivative.
+        // Of min(x, 0): the branch not taken must not overflow either, or the second derivative would be NaN.
         let below = x.like(self.alpha) * x.if_positive(x.like(0.0), x).expm1();
         x.if_positive(x, below)
     }

@@ -50,7 +50,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The matrix product, with NumPy's conventions:
     /// - two matrices, `[m, k]` times `[k, n]`;
     /// - more axes count matrices, and broadcast: `[b, 1, m, k]` times `[c, k, n]` gives `[b, c, m, n]`;
-    /// - a transpose ([`t`](Self::t)) and any other view is read as it lies;
+    /// - a transpose ([`t`](Self::t)) and any other view is read without a copy;
     /// - a vector `[k]` on the left is a row, on the right a column, and that axis is missing from the result, which is
     ///   a scalar for two vectors.
     ///

@@ -76,7 +76,7 @@ fn orthogonal<T: Scalar>(gain: f64, shape: &[usize], rng: &mut (impl Rng + ?Size
             }
         }
         let norm = v.iter().map(|v| v * v).sum::<f64>().sqrt();
-        // What is left of a vector that the others span is noise: draw another.
+        // The remainder of a vector in the span of the others is noise: draw another.
         if norm > 1e-8 {
             v.iter_mut().for_each(|v| *v /= norm);
             basis.push(v);

@@ -74,7 +74,7 @@ impl<T: Scalar> Ema<T> {
         state
     }
 
-    /// Goes on from what [`state`](Self::state) gave.
+    /// Resumes from a [`state`](Self::state).
     ///
     /// # Errors
     /// If the state is that of other parameters; then nothing changes.

@@ -83,9 +83,11 @@ impl<'a, T: Scalar> ParamUpdate<'a, T> {
 /// whose gradient has no share because nothing depends on it; others move with the learning rate and the weight decay
 /// of their own ([`Params::set_lr_scale`], [`Params::set_weight_decay_scale`]).
 ///
-/// All optimisers here leave an element alone, with what they remember of it, and count it if its gradient is infinite or
-/// NaN or its new value would be, whether its parameter is lazy or not (a row or parameter counts the step all the same); set what they remember to 0 once it is below 1e-30
-/// (1e-300 in f64), so that no denormal numbers slow them down; and give the same bits at any number of threads.
+/// All optimizers here share three rules.
+/// - An element whose gradient or new value is infinite or NaN keeps its value and its state, and is counted. Its row or
+///   parameter counts the step all the same. This holds for lazy and other parameters.
+/// - State below 1e-30 (1e-300 in f64) becomes 0, so that no denormal numbers slow the update down.
+/// - The bits are the same at any number of threads.
 ///
 /// [`Bound::backward`](crate::Bound::backward) gives the gradients and lets go of the parameters, which can then be
 /// moved in place. While a tape or a variable still holds one, an update copies it first.

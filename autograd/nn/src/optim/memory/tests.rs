@@ -234,7 +234,7 @@ fn sums_of_another_size_are_refused() {
 
 #[test]
 fn tasks_share_a_table() {
-    // More rows than one task takes, backwards: each is moved once, whoever does it.
+    // More rows than one task takes, backwards: each is moved once, by any task.
     let count = 3 * ROWS + 5;
     let values: Vec<_> = (0..count as u32).rev().map(|row| (row, if row % 2 == 0 { 1.0 } else { -1.0 })).collect();
     let mut table = Alone::<f32>::lazy(AdamConfig::default(), [count, 1], 0.0);
