@@ -35,22 +35,22 @@ pub fn save(path: &Path, sections: &[Section], quick: bool, mark: &str) -> Resul
     if quick {
         page += "<p>A quick run: fewer and smaller measurements.</p>\n";
     }
-    let rows: Vec<Vec<String>> = machine::describe().into_iter().map(Vec::from).collect();
-    page += &table_html(&["machine", ""], &rows);
     for section in sections {
         page += &format!("<h2>{}</h2>\n<p><code>{}</code></p>\n", escaped(&section.title), escaped(&section.command));
+        for (svg, caption) in &section.figures {
+            page += &format!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption));
+        }
         if !section.findings.is_empty() {
             let items: String = section.findings.iter().map(|text| format!("<li>{}</li>", escaped(text))).collect();
             page += &format!("<ul>{items}</ul>\n");
-        }
-        for (svg, caption) in &section.figures {
-            page += &format!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption));
         }
         for table in &section.tables {
             let summary = format!("<details><summary>{}.csv</summary>", escaped(&table.name));
             page += &format!("{summary}{}</details>\n", table_html(&table.columns, &table.rows));
         }
     }
+    let rows: Vec<Vec<String>> = machine::describe().into_iter().map(Vec::from).collect();
+    page += &format!("<details><summary>Machine</summary>{}</details>\n", table_html(&["machine", ""], &rows));
     page += "</body></html>\n";
     write_atomic(path, page.as_bytes())
 }

@@ -9,7 +9,7 @@ use crate::html::{escaped, filled};
 /// The page, with places for what is particular.
 const PAGE: &str = include_str!("page.html");
 
-/// The text of the page: what the figures depend on, the views that are drawn, the worst first, and all views.
+/// The text of the page: the drawn views, the worst first; a table of all views; the settings, folded.
 pub fn page(report: &Report) -> String {
     let order = report.by_psnr();
     let drawn = report.drawn();
