@@ -44,11 +44,11 @@ fn refusal(headers: &HeaderMap, own: &str) -> Option<(StatusCode, &'static str)>
     let text = |name| headers.get(name).map(|value: &HeaderValue| value.to_str().unwrap_or_default());
     let host = text(header::HOST).unwrap_or_default();
     if !is_own(host, own) {
-        let what = "This is not served under that name: use the address, or start with --host NAME.\n";
+        let what = "Unknown host name. Open the printed address, or restart with --host NAME.\n";
         return Some((StatusCode::MISDIRECTED_REQUEST, what));
     }
     let foreign = text(header::ORIGIN).is_some_and(|origin| !is_same(origin, host));
-    foreign.then_some((StatusCode::FORBIDDEN, "Pages of elsewhere may not ask.\n"))
+    foreign.then_some((StatusCode::FORBIDDEN, "Requests from other sites are not allowed.\n"))
 }
 
 /// Whether a `Host` is an address, which no name can be turned to, or one of this machine's names.

@@ -57,7 +57,7 @@ impl<K: Copy + PartialEq + Send + 'static, V: Send + Sync + 'static> Cache<K, V>
                 // Of a panic it is not waited for either.
                 let made = std::panic::catch_unwind(std::panic::AssertUnwindSafe(make));
                 let made =
-                    made.map_err(|_| "it cannot be had".to_owned()).and_then(|made| made.map_err(|e| e.to_string()));
+                    made.map_err(|_| "loading failed".to_owned()).and_then(|made| made.map_err(|e| e.to_string()));
                 let mut state = store.lock();
                 state.coming = None;
                 match made {

@@ -82,11 +82,11 @@ impl Connection {
                 }
             }
             if outbox.is_overrun() {
-                return Some("too much was asked for");
+                return Some("too many unsent replies");
             }
             let seen = outbox.flying().map(|(since, bytes)| since + limits.patience_for(bytes));
             if seen.is_some_and(|until| until <= Instant::now()) {
-                return Some("a picture was not taken");
+                return Some("an image was not acknowledged");
             }
             // Whether it is still there: a browser answers by itself, also one that looks on and says nothing.
             if pinged.elapsed() >= limits.idle {
@@ -119,7 +119,7 @@ impl Connection {
                     Ok(ask) => self.answer(ask),
                     Err(what) => return Some(what),
                 },
-                Message::Binary(_) => return Some("messages are text".to_owned()),
+                Message::Binary(_) => return Some("messages must be text".to_owned()),
                 Message::Close(_) => return None,
                 Message::Ping(_) | Message::Pong(_) => (),
             }
@@ -134,11 +134,11 @@ impl Connection {
             ClientMessage::Seen { id } => outbox.seen(id),
             ClientMessage::Save { view } => {
                 if !requests.save(client, view) {
-                    outbox.post(sorry("so many pictures are saved one after the other"));
+                    outbox.post(sorry("too many saves are waiting: try again when one is done"));
                 }
             }
             ClientMessage::Photograph { .. } if outbox.files() > served.limits.files => {
-                outbox.post(sorry("so many files are not taken"));
+                outbox.post(sorry("too many images are waiting: try again when one has arrived"));
             }
             ClientMessage::Photograph { number } => match reader.clone().try_acquire_owned() {
                 Ok(permit) => {
@@ -149,7 +149,7 @@ impl Connection {
                         outbox.post(photograph);
                     });
                 }
-                Err(_) => outbox.post(sorry("one photograph is read after the other")),
+                Err(_) => outbox.post(sorry("another image is still loading: try again")),
             },
             ClientMessage::Pause { pause } => requests.pause(pause),
             ClientMessage::Stop {} => requests.stop(),
@@ -166,7 +166,7 @@ impl Connection {
                         }
                     });
                 }
-                None => outbox.post(sorry("videos are made when training has ended")),
+                None => outbox.post(sorry("videos can be rendered only after training")),
             },
             ClientMessage::EndVideo {} => {
                 if let Some(video_jobs) = &served.video_jobs {
@@ -201,16 +201,17 @@ fn shortened(mut reason: String) -> String {
 
 /// A photograph as the page wants it.
 async fn photograph(number: usize, served: &Arc<Served>) -> Outgoing {
-    let Ok(_permit) = served.readers.acquire().await else { return sorry("it cannot be read") };
+    let Ok(_permit) = served.readers.acquire().await else { return sorry("the image cannot be read") };
     let (photos, background) = (served.photos.clone(), served.background);
     let read = move || -> Result<Vec<u8>> {
-        let photos = photos.ok_or_else(|| Error::setting("photograph", "the run's photographs are not known"))?;
+        let photos = photos
+            .ok_or_else(|| Error::setting("image", "the run's images are not available; the terminal shows why"))?;
         Ok(File::Photograph { number }.message(&photos.photo(number)?.over(background).to_jpeg(QUALITY)))
     };
     match tokio::task::spawn_blocking(read).await {
         Ok(Ok(bytes)) => Outgoing::Bytes(bytes),
         Ok(Err(error)) => sorry(&error.to_string()),
-        Err(_) => sorry("it cannot be read"),
+        Err(_) => sorry("the image cannot be read"),
     }
 }
 
@@ -296,13 +297,13 @@ mod tests {
             &page,
             json!({ "ask": "video", "path": { "render_width": 8, "render_height": 8, "seconds": 1, "fps": 1 } }),
         );
-        assert_eq!(apology(&page).unwrap(), "videos are made when training has ended");
+        assert_eq!(apology(&page).unwrap(), "videos can be rendered only after training");
         // Four pictures to keep may wait.
         let refused = (1..).find_map(|count| {
             page.answer(ClientMessage::Save { view: view() });
             apology(&page).map(|what| (count, what))
         });
-        assert_eq!(refused, Some((5, "so many pictures are saved one after the other".to_owned())));
+        assert_eq!(refused, Some((5, "too many saves are waiting: try again when one is done".to_owned())));
         assert!(requests.next_save().is_some_and(|save| save.client == page.client));
         let requests = requests.clone();
         drop(page);
@@ -318,11 +319,11 @@ mod tests {
         tokio::task::yield_now().await;
         assert_eq!(apology(&page), None);
         ask(&page, json!({ "ask": "photograph", "number": 1 }));
-        assert_eq!(apology(&page).unwrap(), "one photograph is read after the other");
+        assert_eq!(apology(&page).unwrap(), "another image is still loading: try again");
         drop(others);
-        assert!(later(&page).await.contains("not known"));
+        assert_eq!(later(&page).await, "`image`: the run's images are not available; the terminal shows why");
         ask(&page, json!({ "ask": "photograph", "number": 1 }));
-        assert!(later(&page).await.contains("not known"));
+        assert_eq!(later(&page).await, "`image`: the run's images are not available; the terminal shows why");
     }
 
     #[tokio::test]
@@ -339,10 +340,10 @@ mod tests {
             assert!(later(&page).await.contains(expected));
             (0..files + 1).for_each(|_| page.outbox.post(Outgoing::Bytes(vec![])));
         };
-        asked("not known").await;
+        asked("not available").await;
         // One more, and two.
-        asked("so many files are not taken").await;
-        asked("so many files are not taken").await;
+        asked("too many images are waiting: try again when one has arrived").await;
+        asked("too many images are waiting: try again when one has arrived").await;
     }
 
     #[tokio::test]
@@ -358,14 +359,15 @@ mod tests {
         }
         let path = json!({ "render_width": 2048, "render_height": 2048, "seconds": 600, "fps": 60 });
         ask(&page, json!({ "ask": "video", "path": path }));
-        assert!(later(&page).await.contains("lower its seconds"));
+        let expected = "36000 frames of this size are too many (at most 4096): lower the seconds, `fps` or size";
+        assert_eq!(later(&page).await, expected);
         // One of another page, which this one may end, too.
         page.served.video_jobs.as_ref().unwrap().claim().unwrap();
         ask(&page, video.clone());
-        assert!(later(&page).await.contains("one is being made: wait"));
+        assert_eq!(later(&page).await, "`video`: another video is rendering: wait for it or cancel it");
         page.answer(ClientMessage::EndVideo {});
         ask(&page, video);
-        assert!(later(&page).await.contains("ends"));
+        assert_eq!(later(&page).await, "`video`: the last video stops after its frame: try again then");
     }
 
     #[test]

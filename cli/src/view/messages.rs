@@ -53,7 +53,7 @@ impl ClientMessage {
             ClientMessage::View { view, .. } | ClientMessage::Save { view } => view.check()?,
             ClientMessage::Video(video) => video.check()?,
             ClientMessage::Share { share } if !(0.0..=0.9).contains(share) => {
-                return Err("a share is from 0 to 0.9".to_owned());
+                return Err("`share` must be from 0 to 0.9".to_owned());
             }
             _ => (),
         }
@@ -80,7 +80,7 @@ pub struct VideoRequest {
 impl VideoRequest {
     fn check(&self) -> Result<(), String> {
         if self.pixels()? > MOST_PIXELS.into() {
-            return Err(format!("a video's pictures have {MOST_PIXELS} pixels at most"));
+            return Err(format!("a video's frames may have at most {MOST_PIXELS} pixels"));
         }
         self.frames().map(drop)
     }
@@ -91,7 +91,7 @@ impl VideoRequest {
         if pixels * frames > MOST_OF_A_FILM as f64 {
             let most = MOST_OF_A_FILM as f64 / pixels;
             return Err(format!(
-                "a video of this size has {most:.0} frames at most, not {frames:.0}: lower its seconds, `fps` or size"
+                "{frames:.0} frames of this size are too many (at most {most:.0}): lower the seconds, `fps` or size"
             ));
         }
         Ok(())
@@ -109,7 +109,7 @@ impl VideoRequest {
     fn number(&self, name: &str, most: f64) -> Result<f64, String> {
         match self.path.get(name).map(Value::as_f64) {
             Some(Some(value)) if (0.0..=most).contains(&value) => Ok(value),
-            _ => Err(format!("a video's `{name}` is a number up to {most}")),
+            _ => Err(format!("a video's `{name}` must be a number from 0 to {most}")),
         }
     }
 }
@@ -160,25 +160,25 @@ impl View {
         let [width, height] = self.size;
         let sides = 1..=LARGEST;
         if !sides.contains(&width) || !sides.contains(&height) || width * height > MOST_PIXELS {
-            return Err(format!("{width}x{height} is no size from 1x1 to {MOST_PIXELS} pixels"));
+            return Err(format!("{width}x{height} is not a size of 1 to {MOST_PIXELS} pixels"));
         }
         if self.compared && self.show != Show::Color {
-            return Err("colours are compared, and nothing else".to_owned());
+            return Err("only colours can be compared".to_owned());
         }
         if let Eye::Free { pose, fov } = &self.eye {
             let rotation = rotation(pose);
             let excess = rotation.transpose() * rotation - DMat3::IDENTITY;
             let turns = excess.to_cols_array().iter().all(|x| x.abs() < 1e-3) && rotation.determinant() > 0.0;
             if !turns || !pose.iter().all(|row| row[3].abs() <= FARTHEST) {
-                return Err("a pose is a rotation and a place".to_owned());
+                return Err("`pose` must be a rotation and a position".to_owned());
             }
             if !(1.0..=170.0).contains(fov) {
-                return Err("a field of view is from 1 to 170 degrees".to_owned());
+                return Err("`fov` must be from 1 to 170 degrees".to_owned());
             }
         }
         let numbers = self.crop.iter().flatten().flatten();
         if !numbers.into_iter().all(|x| x.abs() <= FARTHEST) {
-            return Err("a box has two corners".to_owned());
+            return Err("`crop` must be two finite corners".to_owned());
         }
         Ok(())
     }

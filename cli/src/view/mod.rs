@@ -105,7 +105,7 @@ pub fn run(args: &Args) -> Result<()> {
     if args.open
         && let Err(error) = open::that_detached(&link)
     {
-        complain(&format!("warning: no browser could be opened: {error}"));
+        complain(&format!("warning: cannot open a browser: {error}"));
     }
     let mut renderer = Renderer::new(requests.clone(), photos, Some(ModelCache::new(run, model.clone())));
     loop {
@@ -118,7 +118,7 @@ fn photos(run: &Run, scene: Option<&Scene>) -> Option<Arc<PhotoCache>> {
     match PhotoCache::open(run, scene) {
         Ok(photos) => Some(Arc::new(photos)),
         Err(error) => {
-            note(&format!("photographs are not shown: {error}"));
+            note(&format!("the viewer shows no images: {error}"));
             None
         }
     }

@@ -149,7 +149,7 @@ impl PhotoCache {
 
     fn read(&self, number: usize) -> Result<Photo> {
         let entry = self.entries.get(number);
-        let entry = entry.ok_or_else(|| Error::setting("photograph", format!("there is no photograph {number}")))?;
+        let entry = entry.ok_or_else(|| Error::setting("image", format!("there is no image {number}")))?;
         let photo = match &self.scene {
             Scene::Folder(_) => self.capture.photo(&entry.view)?,
             made => self.made(made, entry)?,
@@ -169,7 +169,7 @@ impl PhotoCache {
         };
         let photo = frames.get(entry.number).map(|frame| frame.image.clone());
         *made = Some((entry.split, frames));
-        photo.ok_or_else(|| Error::setting("photograph", format!("there is no photograph {}", entry.number)))
+        photo.ok_or_else(|| Error::setting("image", format!("there is no image {}", entry.number)))
     }
 
     /// What a page is told of them.
@@ -313,7 +313,7 @@ mod tests {
         assert_eq!(photos.read(2).unwrap().to_image(), tests[1].image.to_image());
         assert_eq!(photos.read(1).unwrap().to_image(), tests[0].image.to_image());
         assert_ne!(photos.read(0).unwrap().to_image(), tests[0].image.to_image());
-        assert!(photos.read(3).is_err_and(|error| error.to_string().contains("no photograph 3")));
+        assert!(photos.read(3).is_err_and(|error| error.to_string().contains("no image 3")));
     }
 
     #[test]

@@ -143,16 +143,13 @@ impl Renderer {
             (Eye::Free { .. }, photos) => view.compared && photos.is_none(),
         };
         if unknown {
-            return self.refuse(i, "there is no such photograph, or the run's photographs are not known");
+            return self.refuse(i, "there is no such image, or the run's images are not available");
         }
         if self.models.is_none() && view.checkpoint.is_some() {
-            return self.refuse(i, "checkpoints are looked at when training has ended");
+            return self.refuse(i, "checkpoints can be shown only after training");
         }
         if self.models.is_none() && !matches!(view.skip, None | Some(Skip::Off)) {
-            return self.refuse(
-                i,
-                "what hardly shows is left out when training has ended; until then, all is shown, or what training has",
-            );
+            return self.refuse(i, "during training, choose skipping `as in training` or `off`");
         }
         let (own, step) = match (&self.models, ModelKey::of(view)) {
             (Some(models), which) => match models.get(which, &self.requests) {

@@ -152,14 +152,15 @@ fn router(served: Arc<Served>) -> Router {
 
 async fn file(method: Method, uri: Uri, State(served): State<Arc<Served>>, query: Query<AccessToken>) -> Response {
     let Some((path, kind, text)) = FILES.iter().find(|(path, _, _)| *path == uri.path()) else {
-        return (StatusCode::NOT_FOUND, "There is no such page.\n").into_response();
+        return (StatusCode::NOT_FOUND, "No such page.\n").into_response();
     };
     if method != Method::GET && method != Method::HEAD {
         return (StatusCode::METHOD_NOT_ALLOWED, [(header::ALLOW, "GET, HEAD")]).into_response();
     }
     // Style and script are no secret.
     if *path == "/" && !query.opens(served.token.as_deref()) {
-        return (StatusCode::FORBIDDEN, "The link has a token at its end, which this one has not.\n").into_response();
+        return (StatusCode::FORBIDDEN, "The token is missing or wrong. Open the link that raygrad printed.\n")
+            .into_response();
     }
     ([(header::CONTENT_TYPE, *kind)], Body::from(*text)).into_response()
 }
@@ -173,11 +174,11 @@ async fn messages(
     // Browsers always say where a page is from that asks for this.
     let origin = headers.get(header::ORIGIN).is_some();
     if !query.opens(served.token.as_deref()) || !origin {
-        return (StatusCode::FORBIDDEN, "Only the page may ask.\n").into_response();
+        return (StatusCode::FORBIDDEN, "Only the viewer page may connect.\n").into_response();
     }
     let longest = served.limits.longest;
     let Some(page) = Connection::join(served) else {
-        return (StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open.\n").into_response();
+        return (StatusCode::SERVICE_UNAVAILABLE, "Too many viewer pages are open. Close one.\n").into_response();
     };
     let upgrade = upgrade.max_message_size(longest).max_frame_size(longest);
     upgrade.on_upgrade(move |socket| page.talk(socket))

@@ -125,7 +125,7 @@ impl TrainingViewer {
         while self.requests.paused() && !self.is_over() {
             if !waits {
                 self.tell(trainer, psnr, left, None, true);
-                note("training waits: a page has paused it");
+                note("training paused by the viewer");
                 waits = true;
             }
             if alone.is_longer(self.requests.connected(), ALONE) {
@@ -135,7 +135,7 @@ impl TrainingViewer {
             self.tell(trainer, psnr, left, None, false);
         }
         if waits && !self.is_over() {
-            note("training goes on");
+            note("training resumed");
             self.tell(trainer, psnr, left, None, true);
         }
         self.requests.stops()
@@ -150,7 +150,7 @@ impl TrainingViewer {
     pub fn end(&mut self, trainer: &Trainer, ended: Ended) {
         let how = match ended {
             Ended::Done => "done",
-            Ended::Interrupted => "stopped, and saved",
+            Ended::Interrupted => "stopped and saved",
             Ended::Diverged => "diverged",
         };
         let stats = trainer.stats();
@@ -162,7 +162,7 @@ impl TrainingViewer {
             // For it to arrive before the program ends.
             std::thread::sleep(Duration::from_millis(100));
         } else {
-            note("the page shows the scene until it is closed; Ctrl-C ends it now");
+            note("the viewer stays open until its page closes; Ctrl-C ends it now");
         }
         let mut alone = Alone::default();
         while !interrupt::requested() && !alone.is_longer(self.requests.connected(), GONE) {

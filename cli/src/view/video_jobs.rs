@@ -85,8 +85,8 @@ impl VideoJobs {
                 *work = Work::Begun;
                 return Ok(());
             }
-            Work::Begun | Work::Video { .. } => "one is being made: wait for it, or end it",
-            Work::Ending => "one is being made, and ends after its frame: ask again then",
+            Work::Begun | Work::Video { .. } => "another video is rendering: wait for it or cancel it",
+            Work::Ending => "the last video stops after its frame: try again then",
         };
         Err(Error::setting("video", busy))
     }
@@ -97,7 +97,7 @@ impl VideoJobs {
         let begun = self.spawn(program, video, &path, &out);
         begun.map_err(|e| {
             remove(std::slice::from_ref(&path));
-            Error::file(&path, format!("no video can be made of it: {e}"))
+            Error::file(&path, format!("cannot start the video: {e}"))
         })
     }
 
@@ -119,7 +119,7 @@ impl VideoJobs {
 
     /// Tells of a video until it has ended; of one that nobody wants any more nothing is left.
     fn follow(&self, mut child: Child, path: &Path, out: &Path) {
-        self.tell(out, "begun", false);
+        self.tell(out, "started", false);
         let (words, mut last) = (child.stderr.take(), String::new());
         for line in words.into_iter().flat_map(|words| BufReader::new(words).lines().map_while(|line| line.ok())) {
             self.tell(out, line.trim(), false);
@@ -132,7 +132,7 @@ impl VideoJobs {
             _ => {
                 let _ = fs::remove_dir_all(frames_of(out));
                 remove(&[path.to_owned()]);
-                "ended"
+                "cancelled"
             }
         };
         // Who is told may ask for the next.
@@ -179,7 +179,7 @@ fn new_file(folder: &Path, path: &Value) -> Result<PathBuf> {
     let names: Vec<String> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
     let is_free = |name: &String| !names.iter().any(|taken| taken.starts_with(name));
     let Some(name) = (1..=MOST).map(|number| format!("video-{number}.")).find(is_free) else {
-        return Err(Error::file(folder, format!("holds {MOST} videos: remove some")));
+        return Err(Error::file(folder, format!("holds {MOST} videos, the most allowed: remove some")));
     };
     let file = folder.join(name + "json");
     // Another program's, that has come between, stays.
@@ -215,7 +215,7 @@ mod tests {
         }
         assert!(made(5).ends_with("video-999.json"));
         let full = new_file(&videos, &Value::Null).unwrap_err().to_string();
-        assert!(full.contains("holds 999 videos"), "{full}");
+        assert!(full.contains("holds 999 videos, the most allowed: remove some"), "{full}");
     }
 
     fn video() -> VideoRequest {
@@ -330,24 +330,25 @@ mod tests {
             let second = place.script("second", "cat > /dev/null\nexit 130");
             place.video_jobs.end();
             place.make(&first).unwrap();
-            place.tells("begun", false);
-            assert!(place.make(&second).unwrap_err().contains("one is being made: wait"));
+            place.tells("started", false);
+            let refused = place.make(&second).unwrap_err();
+            assert_eq!(refused, "`video`: another video is rendering: wait for it or cancel it");
             assert!(place.video_jobs.begin(&video()).is_err());
             for _ in 0..2 {
                 place.video_jobs.end();
                 let refused = place.make(&second).unwrap_err();
-                assert!(refused.contains("one is being made") && refused.contains("ends"), "{refused}");
+                assert_eq!(refused, "`video`: the last video stops after its frame: try again then");
             }
             fs::write(go, "").unwrap();
-            place.tells("ended", true);
+            place.tells("cancelled", true);
             assert_eq!(place.videos(), [""; 0], "nothing is left of it");
             // The next is another's, and goes on.
             place.make(&second).unwrap();
-            place.tells("begun", false);
+            place.tells("started", false);
             assert!(matches!(*place.video_jobs.lock(), Work::Video { .. }));
             assert_eq!(place.videos(), ["video-1.json"]);
             place.video_jobs.end();
-            place.tells("ended", true);
+            place.tells("cancelled", true);
             assert_eq!(place.videos(), [""; 0]);
         }
 
@@ -372,12 +373,12 @@ mod tests {
                 done.send(()).unwrap();
             });
             ended.recv_timeout(LONG / 2).expect("it waits");
-            assert!(place.make("other".as_ref()).unwrap_err().contains("ends"));
+            assert!(place.make("other".as_ref()).unwrap_err().contains("the last video stops after its frame"));
             answers.send("gif").unwrap();
             making.join().unwrap();
             // It was ended before it began.
-            place.tells("begun", false);
-            place.tells("ended", true);
+            place.tells("started", false);
+            place.tells("cancelled", true);
             assert_eq!(place.videos(), [""; 0]);
         }
 
@@ -386,11 +387,11 @@ mod tests {
             let place = Place::new();
             for _ in 0..2 {
                 let refused = place.make(&place.folder.path().join("absent")).unwrap_err();
-                assert!(refused.contains("video-1.json: no video can be made of it"), "{refused}");
+                assert!(refused.contains("video-1.json: cannot start the video"), "{refused}");
                 assert_eq!(place.videos(), [""; 0]);
             }
             place.make(&place.script("script", "echo video > \"$8\"")).unwrap();
-            place.tells("begun", false);
+            place.tells("started", false);
             place.tells("done", true);
             assert_eq!(place.videos(), ["video-1.gif", "video-1.json"]);
         }
@@ -399,16 +400,16 @@ mod tests {
         fn what_the_program_says_is_told() {
             let place = Place::new();
             place.make(&place.script("fails", "echo ' one' >&2\necho two >&2\nexit 1")).unwrap();
-            for words in ["begun", "one", "two"] {
+            for words in ["started", "one", "two"] {
                 place.tells(words, false);
             }
             place.tells("two", true);
             assert_eq!(place.videos(), ["video-1.json"], "what it complains of");
             place.make(&place.script("killed", "echo one >&2\nkill -9 $$")).unwrap();
-            for words in ["begun", "one"] {
+            for words in ["started", "one"] {
                 place.tells(words, false);
             }
-            place.tells("ended", true);
+            place.tells("cancelled", true);
             assert_eq!(place.videos(), ["video-1.json"]);
         }
     }

@@ -57,7 +57,7 @@ function programOf(fragment) {
   });
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
-    throw new Error(`The graphics card does not understand the scene: ${shaders.map((s) => gl.getShaderInfoLog(s)).join(" ")} ${gl.getProgramInfoLog(program)}`);
+    throw new Error(`The graphics card cannot compile the scene: ${shaders.map((s) => gl.getShaderInfoLog(s)).join(" ")} ${gl.getProgramInfoLog(program)}`);
   }
   gl.useProgram(program);
   return program;
@@ -89,8 +89,8 @@ void main() {
 
 function begin() {
   gl = picture.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
-  if (!gl) throw new Error("This browser has no WebGL 2, which renders the scene.");
-  if (endsLoopsEarly()) warning = " · this browser's driver leaves parts of the scene out; another browser may show all";
+  if (!gl) throw new Error("This browser has no WebGL 2, which the scene needs.");
+  if (endsLoopsEarly()) warning = " · this browser's driver leaves parts of the scene out; try another browser";
   const { grid, network, space, march } = data;
   const each = grid.features, texels = Math.ceil(each / 4);
   const defines = {
@@ -171,7 +171,7 @@ async function rowsOf({ pose, fov }, width, height, from, count) {
   for (;;) {
     const state = gl.clientWaitSync(fence, 0, 0);
     if (state === gl.ALREADY_SIGNALED || state === gl.CONDITION_SATISFIED) break;
-    if (state === gl.WAIT_FAILED) throw new Error("The graphics card has given up.");
+    if (state === gl.WAIT_FAILED) throw new Error("The graphics card failed to render.");
     await new Promise((done) => setTimeout(done, 1));
   }
   gl.deleteSync(fence);
@@ -275,7 +275,7 @@ try {
     else if (!steer(event)) return;
     event.preventDefault();
   });
-  picture.addEventListener("webglcontextlost", () => tell("The graphics card was taken away: load the page again.", true));
+  picture.addEventListener("webglcontextlost", () => tell("The browser lost the graphics card: reload the page.", true));
   document.getElementById("reset").addEventListener("click", reset);
   reset();
   new ResizeObserver(ask).observe(stage);

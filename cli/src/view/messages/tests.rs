@@ -87,24 +87,24 @@ fn what_is_no_message_is_refused_with_the_reason() {
         (json!({ "ask": "everything" }).to_string(), "unknown variant"),
         (json!({ "ask": "view", "id": -1, "view": view }).to_string(), "invalid value"),
         (more.to_string(), "unknown field"),
-        (json!({ "ask": "share", "share": 0.95 }).to_string(), "a share is"),
-        (json!({ "ask": "share", "share": -0.05 }).to_string(), "a share is"),
+        (json!({ "ask": "share", "share": 0.95 }).to_string(), "`share` must be"),
+        (json!({ "ask": "share", "share": -0.05 }).to_string(), "`share` must be"),
         (json!({ "ask": "share", "share": null }).to_string(), "invalid type"),
         (json!({ "ask": "photograph", "number": -3 }).to_string(), "invalid value"),
-        (changed("size", json!([4_294_967_295_u32, 4_294_967_295_u32])), "is no size"),
+        (changed("size", json!([4_294_967_295_u32, 4_294_967_295_u32])), "is not a size"),
         (changed("show", json!("secrets")), "unknown variant"),
-        (json!({ "ask": "save", "view": compared }).to_string(), "colours are compared"),
-        (ask(&compared).to_string(), "colours are compared"),
+        (json!({ "ask": "save", "view": compared }).to_string(), "only colours can be compared"),
+        (ask(&compared).to_string(), "only colours can be compared"),
         (changed("background", json!([0, 0, 256])), "invalid value"),
-        (changed("crop", json!([[0, 0, 0], [1, 1, 1e10]])), "a box has"),
+        (changed("crop", json!([[0, 0, 0], [1, 1, 1e10]])), "`crop` must be"),
         (changed("crop", json!([[0, 0, 0]])), "invalid length"),
-        (field_of_view(170.1), "a field of view is"),
-        (field_of_view(0.9), "a field of view is"),
+        (field_of_view(170.1), "`fov` must be"),
+        (field_of_view(0.9), "`fov` must be"),
         (changed("eye", json!({ "photograph": -1 })), "invalid value"),
         (changed("eye", json!({})), "expected"),
-        (pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0]])), "a pose is"),
-        (pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])), "a pose is"),
-        (pose(json!([[1, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0]])), "a pose is"),
+        (pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0]])), "`pose` must be"),
+        (pose(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])), "`pose` must be"),
+        (pose(json!([[1, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0]])), "`pose` must be"),
         (pose(json!([[1, 0, 0], [0, 1, 0], [0, 0, 1]])), "invalid length"),
         (json!({ "ask": "video", "path": { "keys": [] } }).to_string(), "`render_width`"),
     ] {
@@ -125,7 +125,7 @@ fn pictures_have_so_many_pixels_and_no_more() {
         [[0, 16], [16, 0], [0, 0], [4097, 1], [1, 4097], [4096, 1025], [1025, 4096], [2048, 2049], [4096, 4096]]
     {
         let reason = sized(width, height).check().unwrap_err();
-        assert!(reason.contains(&format!("{width}x{height} is no size")), "{reason}");
+        assert!(reason.contains(&format!("{width}x{height} is not a size")), "{reason}");
     }
 }
 
@@ -149,19 +149,24 @@ fn videos_have_so_many_pixels_and_no_more() {
         assert_eq!(video(size, seconds, fps), Ok(Ok(())), "{size:?} {seconds} {fps}");
     }
     for (size, seconds, fps, expected) in [
-        ([4097, 1], 1.0, 1.0, "`render_width` is a number up to 4096"),
+        ([4097, 1], 1.0, 1.0, "`render_width` must be a number from 0 to 4096"),
         ([1, 4097], 1.0, 1.0, "`render_height`"),
-        ([4096, 1025], 1.0, 1.0, "4194304 pixels at most"),
-        ([40, 40], 600.5, 1.0, "`seconds` is a number up to 600"),
+        ([4096, 1025], 1.0, 1.0, "at most 4194304 pixels"),
+        ([40, 40], 600.5, 1.0, "`seconds` must be a number from 0 to 600"),
         ([40, 40], -0.5, 1.0, "`seconds`"),
-        ([40, 40], 1.0, 61.0, "`fps` is a number up to 60"),
+        ([40, 40], 1.0, 61.0, "`fps` must be a number from 0 to 60"),
     ] {
         let reason = video(size, seconds, fps).unwrap_err();
         assert!(reason.contains(expected), "{reason}");
     }
     for (size, seconds, fps, expected) in [
-        ([4096, 1024], 128.5, 32.0, "4096 frames at most, not 4112: lower its seconds, `fps` or size"),
-        ([2048, 2048], 600.0, 60.0, "4096 frames at most, not 36000"),
+        (
+            [4096, 1024],
+            128.5,
+            32.0,
+            "4112 frames of this size are too many (at most 4096): lower the seconds, `fps` or size",
+        ),
+        ([2048, 2048], 600.0, 60.0, "36000 frames of this size are too many (at most 4096)"),
     ] {
         let reason = video(size, seconds, fps).unwrap().unwrap_err();
         assert!(reason.contains(expected), "{reason}");

@@ -23,10 +23,10 @@ function connect() {
   socket.onopen = () => { attempts = 0; $("lost").hidden = true; unseen = null; };
   socket.onmessage = (event) => (typeof event.data === "string" ? told(JSON.parse(event.data)) : brought(event.data));
   socket.onclose = (event) => {
-    $("lost").textContent = training && training.ended ? "Training has ended, and the program with it: raygrad view shows the run." : event.reason ? `The program has closed the connection: ${event.reason}. Trying again…`
-      : attempts < 3 ? "The program does not answer. Trying again…"
+    $("lost").textContent = training && training.ended ? "Training has ended and raygrad has exited. Open the run with raygrad view." : event.reason ? `raygrad closed the connection: ${event.reason}. Reconnecting…`
+      : attempts < 3 ? "raygrad does not respond. Reconnecting…"
       // Whether it refuses a link's token is not told.
-      : "The program does not answer. If it has been started again, this link may be an old one: the program prints the new one. Trying again…";
+      : "raygrad does not respond. If it was restarted, open the new link that it printed. Reconnecting…";
     $("lost").hidden = false;
     attempts += 1;
     setTimeout(connect, Math.min(5000, 250 * 2 ** attempts));
@@ -102,7 +102,7 @@ function meet(message) {
   select.replaceChildren(new Option("-", ""));
   for (const split of ["train", "val", "test"]) {
     const group = document.createElement("optgroup");
-    group.label = { train: "trained on", val: "validation", test: "test" }[split];
+    group.label = { train: "training", val: "validation", test: "test" }[split];
     about.photographs.forEach((photograph, i) => {
       if (photograph.split === split) group.append(new Option(photograph.name, String(i)));
     });
@@ -272,7 +272,7 @@ function settled() {
   $("fov-out").textContent = `${view.fov.toFixed(0)}°`;
   $("blend-out").textContent = `${$("blend").value} %`;
   const checkpoint = about.checkpoints[Number($("checkpoint").value)];
-  $("checkpoint-out").textContent = checkpoint === undefined ? "the end" : `step ${checkpoint}`;
+  $("checkpoint-out").textContent = checkpoint === undefined ? "final model" : `step ${checkpoint}`;
   ask();
 }
 
@@ -349,7 +349,7 @@ function blend() {
 async function overlay(number, blob) {
   const bitmap = await createImageBitmap(blob).catch(() => null);
   requested = null;
-  if (!bitmap) return apologise("The photograph cannot be shown.");
+  if (!bitmap) return apologise("The browser cannot decode the image.");
   photo.width = bitmap.width;
   photo.height = bitmap.height;
   photo.getContext("2d").drawImage(bitmap, 0, 0);
@@ -549,10 +549,10 @@ function listKeys() {
     const item = document.createElement("li");
     const go = document.createElement("button"), drop = document.createElement("button");
     go.textContent = "go to";
-    go.setAttribute("aria-label", `Go to key frame ${i + 1}`);
+    go.setAttribute("aria-label", `Go to keyframe ${i + 1}`);
     go.addEventListener("click", () => { free(); Object.assign(view, structuredClone(key)); settled(); });
     drop.textContent = "remove";
-    drop.setAttribute("aria-label", `Remove key frame ${i + 1}`);
+    drop.setAttribute("aria-label", `Remove keyframe ${i + 1}`);
     drop.addEventListener("click", () => { keys.splice(i, 1); listKeys(); ask(); });
     item.append(go, drop);
     list.append(item);
@@ -589,7 +589,7 @@ function flight(count) {
 const duration = () => clamp(Number($("seconds").value) || 4, 0.5, 600);
 
 function play() {
-  if (keys.length < 2) return apologise("A path needs two key frames.");
+  if (keys.length < 2) return apologise("A path needs two keyframes.");
   free();
   const seconds = duration(), start = performance.now(), turn = playing;
   const frames = flight(Math.ceil(60 * seconds));
@@ -655,7 +655,7 @@ function take(path) {
 
 async function loadPath(file) {
   const path = file.size > LARGEST ? null : await file.text().then(JSON.parse).catch(() => null);
-  if (!take(path)) return apologise(`${file.name} is no path that was saved here: of up to ${MOST_KEYS} key frames, and 1 MB.`);
+  if (!take(path)) return apologise(`${file.name} is not a path saved by this viewer (limits: ${MOST_KEYS} keyframes, 1 MB).`);
   listKeys();
   marksOf();
 }
@@ -679,7 +679,7 @@ function recall() {
 
 /** The path in the form that `render` reads, if it is one. */
 function cameraPath() {
-  if (keys.length < 2) return apologise("A path needs two key frames.");
+  if (keys.length < 2) return apologise("A path needs two keyframes.");
   // The picture's own proportions, in sides that encoders take.
   const [width, height] = evenly(freeSizes());
   return {
@@ -703,10 +703,10 @@ function makeVideo() {
   if (!path) return;
   const seen = wanted();
   if (seen.crop || seen.checkpoint !== undefined || seen.compared) {
-    return apologise("A video shows the whole scene, as the run ended: without a box, a checkpoint, or the error.");
+    return apologise("A video shows the final model: turn off the crop box, the checkpoint and the error.");
   }
   const text = JSON.stringify(path, (name, value) => (typeof value === "number" ? Number(value.toPrecision(12)) : value));
-  if (text.length > 15000) return apologise("So many key frames have no room here: save the path, and render it from there.");
+  if (text.length > 15000) return apologise("Too many keyframes for the viewer: save the path and use raygrad render.");
   say({ ask: "video", path: JSON.parse(text), show: seen.show, skip: seen.skip, background: seen.background });
 }
 
@@ -728,9 +728,9 @@ function keep(blob, name) {
 function follow(message) {
   training = message;
   const { step, loss, psnr, left, paused, share, ended } = message;
-  $("progress").textContent = ended ? `ended after ${step} steps: ${ended}`
+  $("progress").textContent = ended ? `${ended} after ${step} steps`
     : `step ${step} · loss ${typeof loss === "number" ? loss.toPrecision(3) : "-"} · PSNR ${digits(psnr, 2)} dB · ${paused ? "paused" : `${left} of training left`}`;
-  $("pause").textContent = paused ? "Go on" : "Pause";
+  $("pause").textContent = paused ? "Resume" : "Pause";
   for (const id of ["pause", "stop", "share"]) $(id).disabled = Boolean(ended);
   if (document.activeElement !== $("share")) $("share").value = String(100 * share);
   $("share-out").textContent = `${Math.round(100 * share)} %`;
@@ -790,7 +790,7 @@ document.querySelector("aside").addEventListener("click", (event) => {
   if (event.detail && event.target.closest("button")) stage.focus({ preventScroll: true });
 });
 $("pause").addEventListener("click", () => say({ ask: "pause", pause: !(training && training.paused) }));
-$("stop").addEventListener("click", () => { if (confirm("End training here and save what it has found?")) say({ ask: "stop" }); });
+$("stop").addEventListener("click", () => { if (confirm("Stop training and save the model?")) say({ ask: "stop" }); });
 $("share").addEventListener("input", () => say({ ask: "share", share: Number($("share").value) / 100 }));
 // Some browsers keep what was chosen before the page was loaded again.
 for (const input of document.querySelectorAll("input")) [input.checked, input.value] = [input.defaultChecked, input.defaultValue];

@@ -88,11 +88,11 @@ fn large_pictures_are_painted_a_few_at_a_time() {
 fn what_cannot_be_seen_is_said_and_the_rest_is_seen() {
     let model = fog();
     for (change, expected) in [
-        (json!({ "compared": true }), "no such photograph"),
-        (json!({ "eye": { "photograph": 0 } }), "no such photograph"),
-        (json!({ "checkpoint": 3 }), "training has ended"),
-        (json!({ "skip": "fast" }), "training has ended"),
-        (json!({ "skip": "near-lossless" }), "training has ended"),
+        (json!({ "compared": true }), "there is no such image, or the run's images are not available"),
+        (json!({ "eye": { "photograph": 0 } }), "there is no such image, or the run's images are not available"),
+        (json!({ "checkpoint": 3 }), "checkpoints can be shown only after training"),
+        (json!({ "skip": "fast" }), "during training, choose skipping `as in training` or `off`"),
+        (json!({ "skip": "near-lossless" }), "during training, choose skipping `as in training` or `off`"),
     ] {
         let mut view = json!({ "eye": { "free": { "pose": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]], "fov": 50 } }, "size": [8, 8] });
         view.as_object_mut().unwrap().extend(change.as_object().unwrap().clone());

@@ -182,17 +182,21 @@ fn nobody_from_elsewhere_is_served_and_nothing_but_the_page() {
         assert!(head.contains(&format!("content-type: text/{kind}")), "{file}: {head}");
     }
     for (head, expected, what) in [
-        (format!("GET / HTTP/1.1\r\nHost: evil.example:{port}"), 421, "use the address, or start with --host NAME"),
-        ("GET / HTTP/1.1\r\nHost: ".to_owned(), 421, "not served under that name"),
-        (format!("GET /view.js HTTP/1.1\r\nHost: 127.0.0.1.evil.example:{port}"), 421, "not served"),
-        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example"), 403, "of elsewhere"),
-        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: null"), 403, "of elsewhere"),
+        (
+            format!("GET / HTTP/1.1\r\nHost: evil.example:{port}"),
+            421,
+            "Open the printed address, or restart with --host NAME",
+        ),
+        ("GET / HTTP/1.1\r\nHost: ".to_owned(), 421, "Unknown host name"),
+        (format!("GET /view.js HTTP/1.1\r\nHost: 127.0.0.1.evil.example:{port}"), 421, "Unknown host name"),
+        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example"), 403, "Requests from other sites"),
+        (format!("GET / HTTP/1.1\r\nHost: {address}\r\nOrigin: null"), 403, "Requests from other sites"),
         (format!("POST / HTTP/1.1\r\nHost: {address}\r\nContent-Length: 0"), 405, ""),
-        (format!("POST /nothing HTTP/1.1\r\nHost: {address}\r\nContent-Length: 0"), 404, "no such page"),
-        (format!("GET /../Cargo.toml HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
-        (format!("GET /..%2f..%2fetc/passwd HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
-        (format!("GET //etc/passwd HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
-        (format!("GET /config.json HTTP/1.1\r\nHost: {address}"), 404, "no such page"),
+        (format!("POST /nothing HTTP/1.1\r\nHost: {address}\r\nContent-Length: 0"), 404, "No such page"),
+        (format!("GET /../Cargo.toml HTTP/1.1\r\nHost: {address}"), 404, "No such page"),
+        (format!("GET /..%2f..%2fetc/passwd HTTP/1.1\r\nHost: {address}"), 404, "No such page"),
+        (format!("GET //etc/passwd HTTP/1.1\r\nHost: {address}"), 404, "No such page"),
+        (format!("GET /config.json HTTP/1.1\r\nHost: {address}"), 404, "No such page"),
         (format!("GET /messages HTTP/1.1\r\nHost: {address}"), 400, ""),
     ] {
         let (status, answered, body) = request(&address, &head);
@@ -270,8 +274,8 @@ fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
     for (message, expected) in [
         (Message::text("{"), "EOF"),
         (Message::text(long), "unknown variant"),
-        (Message::text(json!({ "ask": "share", "share": 0.95 }).to_string()), "a share is from 0 to 0.9"),
-        (Message::binary(vec![1, 2, 3]), "messages are text"),
+        (Message::text(json!({ "ask": "share", "share": 0.95 }).to_string()), "`share` must be from 0 to 0.9"),
+        (Message::binary(vec![1, 2, 3]), "messages must be text"),
     ] {
         let mut page = Client::open(&address);
         page.socket.send(message.clone()).unwrap();
@@ -390,7 +394,7 @@ fn who_asks_for_too_much_is_told() {
     for _ in 0..100 {
         requests.tell(&text(&crate::view::messages::ServerMessage::Sorry { what: String::new() }));
     }
-    assert_eq!(page.closed(), (1, "too much was asked for".to_owned()));
+    assert_eq!(page.closed(), (1, "too many unsent replies".to_owned()));
 }
 
 fn view() -> View {
@@ -431,7 +435,7 @@ fn a_page_that_takes_no_picture_is_dropped() {
     show(1);
     show(0);
     let (pictures, reason) = page.closed();
-    assert_eq!((pictures, &*reason), (1, "a picture was not taken"));
+    assert_eq!((pictures, &*reason), (1, "an image was not acknowledged"));
     assert!(start.elapsed() >= patience && start.elapsed() < LONG / 2);
 }
 

@@ -99,7 +99,7 @@ const sides = [Math.ceil((data.grid.rows * Math.ceil(data.grid.features / 4)) / 
 const large = "The scene is too large for this graphics card.";
 is("room", [limits(sides[0] - 1, sides[1]), limits(sides[0], sides[1] - 1), limits(...sides)], [large, large, ""]);
 ({ rowsOf, paint, show } = real);
-const gone = "The graphics card was taken away: load the page again.";
+const gone = "The browser lost the graphics card: reload the page.";
 gl.getExtension("WEBGL_lose_context").loseContext();
 for (let i = 0; i < 400 && sorry.textContent !== gone; i++) await rest(5);
 await turnTo();

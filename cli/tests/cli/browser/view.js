@@ -42,7 +42,7 @@ is("reset", [rows(view), view.fov, view.pivot, view.photograph], [along([0, -9, 
 is("names", [document.title, text("title")], ["fake - raygrad", "fake"]);
 is("keys", keys, []);
 const chosen = [...$("photograph").options].map((option) => [option.value, option.textContent, option.parentElement.label]);
-is("photographs", chosen, [["", "-", undefined], ["1", "b", "trained on"], ["2", "c", "trained on"], ["3", "d", "validation"], ["0", "a", "test"]]);
+is("photographs", chosen, [["", "-", undefined], ["1", "b", "training"], ["2", "c", "training"], ["3", "d", "validation"], ["0", "a", "test"]]);
 is("background", $("background").value, "#ff8000");
 const offered = () => ["photographs", "training", "checkpoints"].map((id) => $(id).hidden).concat([...$("skip").options].map((o) => o.disabled), $("video").disabled,
   document.querySelector("input[value=error]").disabled, $("checkpoint").max, $("checkpoint").value);
@@ -271,7 +271,7 @@ is("another", [photo.hidden, called()], [true, [{ ask: "photograph", number: 2 }
 await overlay(1, blob);
 is("one that is not wanted any more", [photo.hidden, called()], [true, [{ ask: "photograph", number: 2 }]]);
 await overlay(2, new Blob(["none"]));
-is("none", [requested, text("sorry"), $("sorry").hidden], [null, "The photograph cannot be shown.", false]);
+is("none", [requested, text("sorry"), $("sorry").hidden], [null, "The browser cannot decode the image.", false]);
 free();
 is("free", [view.photograph, $("photograph").value, $("blend").value, text("blend-out")], [null, "", "0", "0 %"]);
 set("blend", 40);
@@ -293,7 +293,7 @@ settled();
 is("a checkpoint", text("checkpoint-out"), "step 200");
 set("checkpoint", 2);
 settled();
-is("the end", text("checkpoint-out"), "the end");
+is("the end", text("checkpoint-out"), "final model");
 room = { x: 0, y: 0, width: 400, height: 200 };
 
 // ---- sizes ------------------------------------------------------------------------------------------------------------------
@@ -580,21 +580,21 @@ free();
 set("skip", "near-lossless");
 makeVideo();
 is("a video is asked for", called(), [{ ask: "video", path: written, show: "color", skip: "near-lossless", background: undefined }]);
-const sorry = (change, back) => { change(); $("sorry").textContent = ""; makeVideo(); back(); return [text("sorry").slice(0, 20), called()]; };
-const whole = "A video shows the wh";
+const sorry = (change, back) => { change(); $("sorry").textContent = ""; makeVideo(); back(); return [text("sorry"), called()]; };
+const whole = "A video shows the final model: turn off the crop box, the checkpoint and the error.";
 is("with a box", sorry(() => set("crop", true), () => set("crop", false)), [whole, []]);
 is("of a checkpoint", sorry(() => set("checkpoint", 0), () => set("checkpoint", 2)), [whole, []]);
 is("of the error", sorry(() => { document.querySelector("input[value=error]").checked = true; }, () => { document.querySelector("input[value=color]").checked = true; }), [whole, []]);
 const three = keys;
-is("of many", sorry(() => { keys = Array.from({ length: 400 }, () => key([0.1, 1 / 3, 0])); }, () => { keys = three; }), ["So many key frames h", []]);
-is("of one", sorry(() => { keys = three.slice(0, 1); }, () => { keys = three; }), ["A path needs two key", []]);
+is("of many", sorry(() => { keys = Array.from({ length: 400 }, () => key([0.1, 1 / 3, 0])); }, () => { keys = three; }), ["Too many keyframes for the viewer: save the path and use raygrad render.", []]);
+is("of one", sorry(() => { keys = three.slice(0, 1); }, () => { keys = three; }), ["A path needs two keyframes.", []]);
 // A path that was saved comes back, with what each key frame looks at straight ahead; what is none leaves all as it is.
 const given = [key([0, -4, 0]), key([3, -5, 1], { right: [S, S, 0], back: [S, -S, 0], fov: 33 }), key([1, 1, 0.1], { right: [0.6, 0, 0.8], up: [-0.8, 0, 0.6] })];
 const back = [[0, 0, 0], [-1, -1, 1], [1, 1.3, 0.1]].map((pivot, i) => ({ ...given[i], pivot }));
 keys = given;
 set("closed", true), set("seconds", "7.5");
 const kept = JSON.stringify(cameraPath());
-const load = async (words) => { $("sorry").textContent = ""; await loadPath(new File([words], "f.json")); return [keys, $("closed").checked, $("seconds").value, text("sorry").slice(0, 17)]; };
+const load = async (words) => { $("sorry").textContent = ""; await loadPath(new File([words], "f.json")); return [keys, $("closed").checked, $("seconds").value, text("sorry")]; };
 keys = [], set("closed", false), set("seconds", "2");
 is("loaded", [await load(kept), $("keys").children.length], [[back, true, "7.5", ""], 3]);
 const spoilt = (change) => { const path = JSON.parse(kept); change(path); return JSON.stringify(path); };
@@ -605,7 +605,7 @@ const bad = {
   stretched: spoilt((p) => { p.keyframes[0].matrix = p.keyframes[0].matrix.map((x) => 1.1 * x); }), mirrored: spoilt((p) => { for (const i of [0, 4, 8]) p.keyframes[0].matrix[i] *= -1; }),
   many: spoilt((p) => { p.keyframes = Array.from({ length: 1001 }, () => ({ fov: 50, matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1] })); }), long: kept + " ".repeat(1e6),
 };
-for (const [name, words] of Object.entries(bad)) is(`not loaded, ${name}`, await load(words), [back, true, "7.5", "f.json is no path"]);
+for (const [name, words] of Object.entries(bad)) is(`not loaded, ${name}`, await load(words), [back, true, "7.5", "f.json is not a path saved by this viewer (limits: 1000 keyframes, 1 MB)."]);
 is("as many as may be", (await load(spoilt((p) => { p.keyframes = Array.from({ length: 1000 }, () => p.keyframes[0]); })))[0].length, 1000);
 is("half of it is left out", (await load(spoilt((p) => { delete p.seconds; delete p.is_cycle; }))).slice(1), [false, "7.5", ""]);
 const loader = loadPath;
@@ -647,7 +647,7 @@ set("closed", true), set("seconds", "7");
 keys = three;
 called();
 listKeys();
-is("buttons", [...$("keys").querySelectorAll("button")].map((b) => [b.textContent, b.getAttribute("aria-label")]).slice(2, 4), [["go to", "Go to key frame 2"], ["remove", "Remove key frame 2"]]);
+is("buttons", [...$("keys").querySelectorAll("button")].map((b) => [b.textContent, b.getAttribute("aria-label")]).slice(2, 4), [["go to", "Go to keyframe 2"], ["remove", "Remove keyframe 2"]]);
 $("keys").querySelectorAll("button")[2].click();
 is("gone to", view.eye, [1, 1, 0]);
 view.eye[0] = 5;
@@ -689,10 +689,10 @@ is("curves", curves(), [["M2.0 50.0L52.0 34.0L102.0 18.0", "loss 100.0"], ["M2.0
 $("training").hidden = false;
 $("share").focus();
 follow({ ...going, loss: null, psnr: null, paused: true, share: 0.5, curves: { loss: [2, 2], psnr: [], speed: [1, 999.96] } });
-is("paused", [text("progress"), text("pause"), $("share").value, text("share-out")], ["step 12 · loss - · PSNR - dB · paused", "Go on", "35", "50 %"]);
+is("paused", [text("progress"), text("pause"), $("share").value, text("share-out")], ["step 12 · loss - · PSNR - dB · paused", "Resume", "35", "50 %"]);
 is("few points", curves(), [["M2.0 50.0L102.0 50.0", "loss 2.000"], [], ["M2.0 50.0L102.0 18.0", "rays/s 1000"]]);
 told({ tell: "training", ...going, ended: "stopped" });
-is("ended", [text("progress"), ["pause", "stop", "share"].map((id) => $(id).disabled)], ["ended after 12 steps: stopped", [true, true, true]]);
+is("ended", [text("progress"), ["pause", "stop", "share"].map((id) => $(id).disabled)], ["stopped after 12 steps", [true, true, true]]);
 
 // ---- the connection -----------------------------------------------------------------------------------------------------------------
 const made = [];
@@ -711,16 +711,16 @@ say({ ask: "rest" });
 is("said", called(), ['{"ask":"rest"}']);
 const lost = (reason) => { socket.onclose({ reason }); return [text("lost"), $("lost").hidden, timers.pop()]; };
 const [words, covers, timer] = lost("");
-is("lost", [words, covers, timer.after], ["The program does not answer. Trying again…", false, 500]);
-is("why", lost("stalled")[0], "The program has closed the connection: stalled. Trying again…");
-const seldom = [lost(""), lost(""), lost(""), lost("")].map(([words, , timer]) => [words === "The program does not answer. Trying again…", words.includes("may be an old one: the program prints the new one"), timer.after]);
+is("lost", [words, covers, timer.after], ["raygrad does not respond. Reconnecting…", false, 500]);
+is("why", lost("stalled")[0], "raygrad closed the connection: stalled. Reconnecting…");
+const seldom = [lost(""), lost(""), lost(""), lost("")].map(([words, , timer]) => [words === "raygrad does not respond. Reconnecting…", words === "raygrad does not respond. If it was restarted, open the new link that it printed. Reconnecting…", timer.after]);
 is("more and more seldom", seldom, [[true, false, 2000], [false, true, 4000], [false, true, 5000], [false, true, 5000]]);
 timer.run();
 unseen = 4;
 socket.onopen();
 is("found again", [made.length, $("lost").hidden, unseen, lost("")[2].after], [2, true, null, 500]);
 training = { ended: "done" };
-is("after training", lost("")[0].slice(0, 19), "Training has ended,");
+is("after training", lost("")[0], "Training has ended and raygrad has exited. Open the run with raygrad view.");
 const heard = [];
 told = (message) => heard.push(message);
 brought = (data) => heard.push(data.byteLength);
