@@ -27,7 +27,7 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
     let width = width.unwrap_or(usual[0]);
     let height = width * usual[1] / usual[0];
     if height * usual[0] != width * usual[1] {
-        return Err(Error::setting("size", format!("{width}: the landscape has four columns for each three rows")));
+        return Err(Error::setting("size", format!("is {width}; the landscape is 4:3, so use a multiple of 4")));
     }
     let is_embedded = *scene == Scene::Embedded;
     let views_of = |split: Split| -> Vec<(Camera, Option<Photo>)> {
@@ -42,7 +42,7 @@ pub fn capture(scene: &Scene, width: Option<usize>, folder: Option<&Path>) -> Re
     let progress = Progress::new();
     for (i, split) in Split::ALL.into_iter().enumerate() {
         if folder.is_some() {
-            progress.set(i as f64 / Split::ALL.len() as f64, || format!("{split} pictures"));
+            progress.set(i as f64 / Split::ALL.len() as f64, || format!("rendering {split} images"));
         }
         for (number, (camera, image)) in views_of(split).into_iter().enumerate() {
             let name = format!("{split}/{number}");

@@ -71,16 +71,26 @@ impl Viewpoint {
     pub fn check(&self) -> Result<()> {
         let positive = |x: f64| x > 0.0 && x.is_finite();
         let checks = [
-            ("viewpoint.width", (1..=LARGEST).contains(&self.width)),
-            ("viewpoint.height", (1..=LARGEST).contains(&self.height)),
-            ("viewpoint.angle_x", positive(self.angle_x) && self.angle_x < PI),
-            ("viewpoint.distance", self.distance >= 0.0 && self.distance.is_finite()),
-            ("viewpoint.elevation", self.elevation.abs() < FRAC_PI_2),
-            ("viewpoint.azimuth", self.azimuth.is_finite()),
-            ("viewpoint.reach", (0.0..=PI).contains(&self.reach)),
+            ("viewpoint.width", self.width as f64, (1..=LARGEST).contains(&self.width), "1 to 65536 pixels"),
+            ("viewpoint.height", self.height as f64, (1..=LARGEST).contains(&self.height), "1 to 65536 pixels"),
+            (
+                "viewpoint.angle_x",
+                self.angle_x,
+                positive(self.angle_x) && self.angle_x < PI,
+                "an angle between 0 and pi",
+            ),
+            ("viewpoint.distance", self.distance, self.distance >= 0.0 && self.distance.is_finite(), "0 or more"),
+            (
+                "viewpoint.elevation",
+                self.elevation,
+                self.elevation.abs() < FRAC_PI_2,
+                "an angle between -pi/2 and pi/2",
+            ),
+            ("viewpoint.azimuth", self.azimuth, self.azimuth.is_finite(), "a finite angle"),
+            ("viewpoint.reach", self.reach, (0.0..=PI).contains(&self.reach), "an angle from 0 to pi"),
         ];
-        match checks.iter().find(|(_, good)| !good) {
-            Some((name, _)) => Err(Error::setting(name, "is out of range")),
+        match checks.iter().find(|(_, _, good, _)| !good) {
+            Some((name, value, _, range)) => Err(Error::setting(name, format!("is {value}; use {range}"))),
             None => Ok(()),
         }
     }
@@ -225,6 +235,6 @@ mod tests {
     fn nonsense_is_named() {
         let (view, _) = viewpoint();
         let message = Viewpoint { distance: -1.0, ..view }.check().unwrap_err().to_string();
-        assert_eq!(message, "`viewpoint.distance`: is out of range");
+        assert_eq!(message, "`viewpoint.distance`: is -1; use 0 or more");
     }
 }

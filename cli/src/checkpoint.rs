@@ -58,7 +58,7 @@ pub fn steps(run: &Run) -> Result<Vec<u64>> {
 /// If there is no checkpoint of this step, or it is damaged.
 pub fn read(run: &Run, step: u64) -> Result<Vec<u8>> {
     let found = all(&folder(run))?.into_iter().find(|(own, _)| *own == step);
-    let (_, path) = found.ok_or_else(|| Error::file(folder(run), format!("there is no checkpoint of step {step}")))?;
+    let (_, path) = found.ok_or_else(|| Error::file(folder(run), format!("no checkpoint of step {step}")))?;
     let bytes = fs::read(&path).map_err(|e| Error::file(&path, format!("cannot be read: {e}")))?;
     parse(&path, bytes)
 }
@@ -110,7 +110,7 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
     for (_, path) in checkpoints {
         // One that is there and cannot be read just now is not passed over either.
         let unread =
-            |e| Error::file(&path, format!("cannot be read: {e}; remove it to go on from the checkpoint before it"));
+            |e| Error::file(&path, format!("cannot be read: {e}; delete it to resume from the checkpoint before it"));
         let bytes = fs::read(&path).map_err(unread)?;
         let loaded =
             parse(&path, bytes).and_then(|state| trainer.load_state(&state).map_err(|e| Error::file(&path, e)));
@@ -118,11 +118,13 @@ pub fn load(run: &Run, trainer: &mut Trainer) -> Result<()> {
         complain(&format!("warning: {error}"));
     }
     match none {
-        false => Err(Error::file(folder(run), "no checkpoint can be used: the run cannot go on, train anew")),
+        false => {
+            Err(Error::file(folder(run), "every checkpoint is damaged, so the run cannot resume: train a new run"))
+        }
         // The first one is there before the metrics are.
         true if run.file("metrics.jsonl").exists() => Err(Error::file(
             &run.folder,
-            "has no checkpoints, as runs of earlier versions: it cannot go on, train anew",
+            "has no checkpoints, like runs of earlier versions, and cannot resume: train a new run",
         )),
         true => Ok(()),
     }
@@ -139,7 +141,10 @@ fn check_version(path: &Path, beginning: &[u8]) -> Result<()> {
         None => Ok(()),
         Some(version) => Err(Error::file(
             path,
-            format!("has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer"),
+            format!(
+                "has format version {version}, and this raygrad reads up to {VERSION}: use the raygrad that wrote \
+                 it, or a newer one"
+            ),
         )),
     }
 }
@@ -151,21 +156,21 @@ pub(super) fn parse(path: &Path, mut bytes: Vec<u8>) -> Result<Vec<u8>> {
     let end = bytes.iter().take(LONGEST).position(|byte| *byte == b'\n');
     let line = end.and_then(|end| std::str::from_utf8(&bytes[..end]).ok()?.strip_prefix(MAGIC));
     let (Some(end), Some(line)) = (end, line) else {
-        return Err(bad("is no checkpoint, or its beginning is damaged".into()));
+        return Err(bad("not a checkpoint, or its header is damaged".into()));
     };
     let mut words = line.split_whitespace();
     let version: Option<u32> = words.next().and_then(|word| word.parse().ok());
     let sum = words.next().and_then(|word| u32::from_str_radix(word, 16).ok());
     let length: Option<usize> = words.next().and_then(|word| word.parse().ok());
     let (Some(_), Some(sum), Some(length)) = (version, sum, length) else {
-        return Err(bad("is no checkpoint, or its beginning is damaged".into()));
+        return Err(bad("not a checkpoint, or its header is damaged".into()));
     };
     let state = bytes.split_off(end + 1);
     if state.len() != length {
-        return Err(bad(format!("is damaged: it has {} bytes of {length}", state.len())));
+        return Err(bad(format!("damaged: it has {} of {length} bytes", state.len())));
     }
     if crc32fast::hash(&state) != sum {
-        return Err(bad("is damaged: its checksum is another".into()));
+        return Err(bad("damaged: its checksum does not match".into()));
     }
     Ok(state)
 }

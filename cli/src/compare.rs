@@ -23,7 +23,7 @@ const SAME: [&str; 13] = [
     "appearance",
     "pixel_offset",
     "quantisation",
-    "photographs",
+    "images",
 ];
 /// What is measured; all else in a result is a condition.
 const MEASURED: [&str; 7] = [
@@ -72,8 +72,8 @@ pub fn run(args: &Args) -> Result<()> {
         let model = checksum(&opened.model_file()).ok();
         if found.is_empty() {
             let what = match &args.only {
-                Some(name) => format!("has no result {name}.json; `raygrad eval` makes them"),
-                None => "has no results; `raygrad eval` makes them".to_owned(),
+                Some(name) => format!("has no result `{name}.json`: run `raygrad eval` first"),
+                None => "has no eval results: run `raygrad eval` first".to_owned(),
             };
             return Err(Error::file(run, what));
         }
@@ -82,7 +82,10 @@ pub fn run(args: &Args) -> Result<()> {
             if let (Some(now), Some(then)) = (&model, fields.get("model.crc32"))
                 && now != then
             {
-                complain(&format!("warning: {}: is of a model that has been trained on since", path.display()));
+                complain(&format!(
+                    "warning: {}: the model was trained further after this result: run `raygrad eval` again",
+                    path.display()
+                ));
             }
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             rows.push(Row { run: run.display().to_string(), name, fields });
@@ -107,13 +110,14 @@ fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     let bad = |what: String| Error::file(path, what);
     let length = std::fs::metadata(path).map_err(|e| bad(format!("cannot be read: {e}")))?.len();
     if length > LONGEST {
-        return Err(bad(format!("is no result: it has {length} bytes")));
+        let [own, most] = [length, LONGEST].map(|bytes| bytes >> 20);
+        return Err(bad(format!("not an eval result ({own} MiB; the limit is {most} MiB)")));
     }
     let text = std::fs::read_to_string(path).map_err(|e| bad(format!("cannot be read: {e}")))?;
-    let value: Value = serde_json::from_str(&text).map_err(|e| bad(format!("is no result: {e}")))?;
-    let Value::Object(all) = value else { return Err(bad("is no result: it holds no fields".into())) };
+    let value: Value = serde_json::from_str(&text).map_err(|e| bad(format!("not an eval result: {e}")))?;
+    let Value::Object(all) = value else { return Err(bad("not an eval result: it is not a JSON object".into())) };
     if !all.contains_key("psnr_mean") {
-        return Err(bad("is no result: it has no `psnr_mean`".into()));
+        return Err(bad("not an eval result: it has no `psnr_mean`".into()));
     }
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let mut fields = BTreeMap::new();
@@ -121,7 +125,7 @@ fn read(path: &Path) -> Result<BTreeMap<String, String>> {
         match (name.as_str(), value) {
             ("per_view", Value::Array(views)) => {
                 let names: Vec<String> = views.iter().map(|view| text(&view["name"])).collect();
-                fields.insert("photographs".to_owned(), names.join(", "));
+                fields.insert("images".to_owned(), names.join(", "));
             }
             ("model", Value::Object(model)) => {
                 fields.extend(model.iter().map(|(name, value)| (format!("model.{name}"), text(value))));
@@ -168,16 +172,16 @@ fn table(rows: &[Row]) -> String {
         text.push('\n');
     }
     for name in other {
-        text += &format!("not the same {name}, so that these figures cannot be compared:\n");
+        text += &format!("different {name}, so these results are not comparable:\n");
         for row in rows {
             text += &format!("  {} {}: {}\n", row.run, row.name, value(row, name));
         }
     }
     if weights.iter().any(|crc32| *crc32 != weights[0]) {
-        text += "not the same weights of LPIPS (lpips_crc32), so that these figures of it cannot be compared\n";
+        text += "different LPIPS weights (lpips_crc32), so the LPIPS values are not comparable\n";
     }
     let common: Vec<String> = common.iter().map(|name| format!("{name} {}", value(&rows[0], name))).collect();
-    text + &format!("all: {}\n", common.join("; "))
+    text + &format!("same for all: {}\n", common.join("; "))
 }
 
 #[cfg(test)]
@@ -198,8 +202,8 @@ mod tests {
         assert_eq!(lines[0], "run    result     PSNR   SSIM  s/view  model.seed  threads");
         assert_eq!(lines[1], "first  eval-test  31.13  -     -       0           -");
         assert_eq!(lines[2], "b      eval-test  NaN    -     -       7           2");
-        assert_eq!(lines[3], "not the same views, so that these figures cannot be compared:");
-        assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "all: split test"]);
+        assert_eq!(lines[3], "different views, so these results are not comparable:");
+        assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "same for all: split test"]);
     }
 
     #[test]
@@ -213,18 +217,22 @@ mod tests {
         assert_eq!(lines[0], "run  result     PSNR   SSIM    LPIPS   s/view  lpips_backbone  lpips_crc32");
         assert_eq!(lines[1], "a    eval-test  31.13  0.9000  -       -       -               -");
         assert_eq!(lines[2], "b    eval-test  31.13  0.9000  0.0568  -       vgg             0a");
-        assert_eq!(lines[3..], ["all: "]);
+        assert_eq!(lines[3..], ["same for all: "]);
         let text = table(&[row("a", &with("0b", "vgg")), row("b", &plain), row("c", &with("0a", "vgg"))]);
-        assert!(text.contains("\nnot the same weights of LPIPS"), "{text}");
+        assert!(text.contains("\ndifferent LPIPS weights (lpips_crc32)"), "{text}");
         let text = table(&[row("a", &with("0a", "vgg")), row("b", &with("0a", "vgg"))]);
-        assert!(!text.contains("not the same") && text.contains("lpips_backbone vgg; lpips_crc32 0a"), "{text}");
+        assert!(!text.contains("different") && text.contains("lpips_backbone vgg; lpips_crc32 0a"), "{text}");
     }
 
     #[test]
     fn what_is_no_result_is_an_error_that_names_it() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("eval-test.json");
-        for (text, expected) in [("[1]", "no fields"), ("{}", "`psnr_mean`"), ("{\"psnr", "is no result")] {
+        for (text, expected) in [
+            ("[1]", "not an eval result: it is not a JSON object"),
+            ("{}", "`psnr_mean`"),
+            ("{\"psnr", "not an eval result"),
+        ] {
             std::fs::write(&path, text).unwrap();
             let error = read(&path).unwrap_err().to_string();
             assert!(error.contains("eval-test.json") && error.contains(expected), "{error}");
@@ -232,7 +240,7 @@ mod tests {
         let text =
             r#"{"psnr_mean":3.5,"model":{"seed":4},"per_view":[{"name":"b","psnr":1},{"name":"a"}],"scene":"x"}"#;
         std::fs::write(&path, text).unwrap();
-        let expected = [("model.seed", "4"), ("photographs", "b, a"), ("psnr_mean", "3.5"), ("scene", "x")];
+        let expected = [("model.seed", "4"), ("images", "b, a"), ("psnr_mean", "3.5"), ("scene", "x")];
         let expected: BTreeMap<_, _> = expected.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
         assert_eq!(read(&path).unwrap(), expected);
         for name in ["eval.json", "evaluation.json", "eval-val.json.tmp", "eval-val.json"] {

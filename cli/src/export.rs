@@ -82,9 +82,9 @@ impl Kind {
             Some("json") => Ok(Kind::Cameras),
             Some("html") => Ok(Kind::Page),
             _ => {
-                let known = "end the name in .json for cameras, .ply, .obj or .glb for the shape, .html for a page, or name a \
+                let known = "use .json for cameras, .ply, .obj or .glb for a mesh, .html for a scene page, or name a \
                              format with --to";
-                Err(Error::file(out, format!("has no ending that says what to export: {known}")))
+                Err(Error::file(out, format!("has no known file extension: {known}")))
             }
         }
     }

@@ -36,12 +36,12 @@ pub fn listen() {
 
 /// As [`listen`], for frames that the same command goes on with.
 pub fn listen_to_go_on() {
-    set("stopping after this frame; Ctrl-C again stops at once", "let this frame be finished");
+    set("stopping after this frame; Ctrl-C again stops at once", "finish this frame");
 }
 
 /// As [`listen`], for work whose unfinished result is removed.
 pub fn listen_to_remove() {
-    set("stopping, and removing what is unfinished; Ctrl-C again stops at once", "remove what is unfinished");
+    set("stopping and removing unfinished files; Ctrl-C again stops at once", "remove unfinished files");
 }
 
 /// From now on the end of standard input counts as a Ctrl-C: of the program at its other end, whatever ends that.

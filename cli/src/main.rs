@@ -144,9 +144,8 @@ fn first_run() -> Work<ExitCode> {
 fn suggest(folder: &Path) -> Result<()> {
     let folder = folder.display();
     print(&format!(
-        "next     raygrad render {folder} --out {folder}/orbit.gif   to fly around the scene\n         \
-         raygrad view {folder} --open   to look around in a browser\n         \
-         raygrad eval {folder}   to measure it on views it has not seen\n"
+        "next     raygrad render {folder} --out {folder}/orbit.gif   to render an orbit video\n         raygrad view \
+         {folder} --open   to open the viewer\n         raygrad eval {folder}   to measure it on held-out images\n"
     ))
 }
 

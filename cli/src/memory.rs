@@ -51,8 +51,8 @@ pub fn shortage(need: f64, free: f64) -> Option<String> {
     let [needed, left] = [need, free].map(|bytes| bytes / 1e9);
     (need > free).then(|| {
         format!(
-            "warning: training takes about {needed:.1} GB of memory, of {left:.1} GB that are free: the system may end it; say \
-             --downscale, or a smaller table or batch with --set (field.grid.log2_table, sampler.samples)"
+            "warning: training needs about {needed:.1} GB of memory, but {left:.1} GB are free: use --downscale, or \
+             lower field.grid.log2_table or sampler.samples with --set"
         )
     })
 }
@@ -70,7 +70,7 @@ mod tests {
     fn a_warning_says_what_is_missing() {
         assert_eq!(shortage(1e9, 1e9), None);
         let said = shortage(3.26e9, 2.5e9).unwrap();
-        assert!(said.contains("about 3.3 GB of memory, of 2.5 GB that are free"), "{said}");
+        assert!(said.contains("about 3.3 GB of memory, but 2.5 GB are free"), "{said}");
     }
 
     #[test]

@@ -24,7 +24,7 @@ pub fn photographs(run: &Run, model: &Model<f32>, scene: Option<&Scene>, split: 
     let capture = builtin::capture(run.scene(scene)?, None, None)?;
     let views = present(&capture, split)?;
     if views.is_empty() {
-        return Err(Error::file(&capture.file, format!("has no {split} photographs")));
+        return Err(Error::file(&capture.file, format!("has no {split} images")));
     }
     if split == Split::Train {
         check_trained(run, &capture, &views, model.scene_box.frames)?;
@@ -57,14 +57,14 @@ pub fn present(capture: &Capture, split: Split) -> Result<Vec<&View>> {
 
 /// Whether these views to train on are the `count` photographs that a run was trained on; of 0, that is not known.
 pub fn check_trained(run: &Run, capture: &Capture, views: &[&View], count: usize) -> Result<()> {
-    let bad = |what: String| Err(Error::file(&capture.file, format!("{what}: say with --scene where those are")));
+    let bad = |what: String| Err(Error::file(&capture.file, format!("{what}: name their folder with --scene")));
     if count > 0 && views.len() != count {
-        return bad(format!("has {} photographs to train on, and the run was trained on {count}", views.len()));
+        return bad(format!("has {} training images, and the run was trained on {count}", views.len()));
     }
     let (names, is_made) = (&run.config.photographs, capture.present().next().is_none());
     // Runs of the first edition have no names, and those of built-in scenes have others.
     if !is_made && !names.is_empty() && !views.iter().map(|view| &view.name).eq(names) {
-        return bad("has other photographs to train on than those that the run was trained on".to_owned());
+        return bad("has other training images than the run was trained on".to_owned());
     }
     Ok(())
 }

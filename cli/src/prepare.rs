@@ -110,7 +110,7 @@ pub fn run(args: &Args) -> Work<()> {
         }
     }
     let out = args.out.display();
-    print(&format!("next     raygrad doctor {out}   to examine it\n         raygrad train {out}   to train on it\n"))?;
+    print(&format!("next     raygrad doctor {out}   to check it\n         raygrad train {out}   to train on it\n"))?;
     Ok(())
 }
 
@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> Work<()> {
 fn prepare(args: &Args) -> Work<()> {
     let input = &args.input;
     if !matches!(Scene::from(input.clone().into_os_string()), Scene::Folder(_)) {
-        let what = "is a scene that is built in: say with --to in which format to write it";
+        let what = "is a built-in scene: choose the format to write with --to";
         return Err(Error::file(input, what).into());
     }
     if !input.exists() {
@@ -126,7 +126,7 @@ fn prepare(args: &Args) -> Work<()> {
     }
     let is_video = input.is_file();
     if !is_video && Capture::read(input).is_ok() {
-        let what = "is a dataset that has cameras already: say with --to in which format to write it";
+        let what = "already has camera poses: choose the format to convert it to with --to";
         return Err(Error::file(input, what).into());
     }
     // Before work that may take long.
@@ -139,7 +139,7 @@ fn prepare(args: &Args) -> Work<()> {
         true => video::frames(input, args.frames, &place)?,
         false => photographs::copy(input, args.allow_outside, &place)?,
     };
-    let what = if is_video { "sharp frames of" } else { "photographs of" };
+    let what = if is_video { "sharp frames from" } else { "images from" };
     print(&format!("images   {count} {what} {}\n", input.display()))?;
     let found = poses::find(&place, is_video, args.lens.model())?;
     place.finish()?;
@@ -155,14 +155,14 @@ fn prepare(args: &Args) -> Work<()> {
 fn report(found: &poses::Found, count: usize, out: &Path) -> Work<()> {
     let poses::Found { registered, lost, models } = found;
     let models = if *models > 1 { format!(", in the largest of {models} models") } else { String::new() };
-    print(&format!("cameras  {registered} of {count} photographs registered{models}\n"))?;
+    print(&format!("cameras  {registered} of {count} images registered{models}\n"))?;
     if !lost.is_empty() {
         let more = lost.len().saturating_sub(NAMED);
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-        print(&format!("lost     {}{more}\n", lost[..lost.len().min(NAMED)].join(", ")))?;
+        print(&format!("no pose  {}{more}\n", lost[..lost.len().min(NAMED)].join(", ")))?;
     }
     if 2 * registered < count {
-        complain("warning: most photographs have no camera: they may overlap too little, or be blurred");
+        complain("warning: most images have no camera pose: take more images that overlap and are sharp");
     }
     print(&format!("scene    {}\n", out.display()))?;
     Ok(())

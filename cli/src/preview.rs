@@ -30,7 +30,7 @@ impl Preview {
         match held_out {
             Ok(data) => Self::new(&data.frames[0], None, background),
             Err(error) => {
-                complain(&format!("warning: previews show a training view, as there is no other: {error}"));
+                complain(&format!("warning: previews show a training image, because no image is held out: {error}"));
                 Self::new(&train.frames[0], Some(0), background)
             }
         }

@@ -128,20 +128,20 @@ impl Args {
     /// What the output is, if the flags fit it.
     fn kind(&self, out: &Path) -> Result<Kind> {
         let kind = Kind::of(out)?;
-        let meaningless = |flag: &str, what: &str| Err(Error::setting(flag, format!("has no meaning {what}")));
+        let unfit = |flag: &str, what: &str| Err(Error::setting(flag, what));
         if kind != Kind::Folder && !self.save.is_empty() {
-            return meaningless("save", "for a single file: name a folder with --out");
+            return unfit("save", "needs a folder: name one with --out");
         }
         if !self.save.contains(&Layer::Depth) && self.depth_unit.is_some() {
-            return meaningless("depth-unit", "without --save depth");
+            return unfit("depth-unit", "needs --save depth");
         }
         let video = matches!(kind, Kind::Video(_));
         if self.keep_frames && !video {
-            return meaningless("keep-frames", "without a video");
+            return unfit("keep-frames", "needs a video: name a .mp4, .webm, .gif or .apng file with --out");
         }
         let counts = self.flight.seconds.is_some() || matches!(self.flight.path, CameraPath::File(_));
         if self.flight.fps.is_some() && !counts && !video {
-            return meaningless("fps", "for pictures without --seconds");
+            return unfit("fps", "needs a video or --seconds");
         }
         Ok(kind)
     }
@@ -217,7 +217,7 @@ pub fn run(args: &Args) -> Work<()> {
     });
     if let Err(Stop::Interrupted) = done {
         let (done, all, folder) = (frames.done(), cameras.len(), frames.folder().display());
-        print(&format!("stopped  after {done} of {all} frames, in {folder}: the same command goes on\n"))?;
+        print(&format!("stopped  after {done} of {all} frames, in {folder}: run the same command to resume\n"))?;
     }
     done?;
     match kind {
@@ -228,7 +228,7 @@ pub fn run(args: &Args) -> Work<()> {
             let older = other_numbered(&out, DIGITS, &(0..cameras.len()).collect::<Vec<_>>());
             if !older.is_empty() {
                 // They may be what somebody wants to keep.
-                note(&format!("{} holds {} more numbered pictures, from a longer path", out.display(), older.len()));
+                note(&format!("{} also holds {} numbered images of a longer path", out.display(), older.len()));
             }
         }
     }
@@ -250,7 +250,7 @@ const MILLI: f64 = 1e-3;
 fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Work<()> {
     let (start, first, all) = (Instant::now(), frames.done(), cameras.len());
     if first > 0 {
-        note(&format!("{first} of {all} frames are there already: {}", frames.folder().display()));
+        note(&format!("resuming after {first} of {all} frames: {}", frames.folder().display()));
     }
     let progress = Progress::new();
     let mut beyond = 0;
@@ -273,8 +273,8 @@ fn render(shown: &Shown<'_>, cameras: &[Camera], frames: &mut Frames) -> Work<()
     if beyond > 0 {
         let most = f64::from(u16::MAX) * shown.depth_unit;
         note(&format!(
-            "depths beyond {most} in {beyond} frames have no room in 16 bits and are 0: say a longer --depth-unit, \
-             or --save depth-npy"
+            "{beyond} frames have depths above {most}, the 16-bit limit, saved as 0: use a larger --depth-unit or \
+             --save depth-npy"
         ));
     }
     Ok(())
@@ -331,8 +331,8 @@ impl Kind {
                 Some(video) => Ok(Kind::Video(video)),
                 None if out.is_dir() => Ok(Kind::Folder),
                 None => {
-                    let known = "use .png, .gif, .apng, .mp4 or .webm, or end the name of a folder with `/`";
-                    Err(Error::file(out, format!("`.{ending}` is not the ending of a picture or a video: {known}")))
+                    let known = "use .png, .gif, .apng, .mp4 or .webm, or end a folder's name with `/`";
+                    Err(Error::file(out, format!("`.{ending}` is not an image or video extension: {known}")))
                 }
             },
             None => Ok(Kind::Folder),
@@ -366,8 +366,8 @@ mod tests {
         }
         for name in ["walk.mkv", "walk.mov", "picture.jpg", "a.json", "orbit.2"] {
             let message = of(name).unwrap_err().to_string();
-            let known = "use .png, .gif, .apng, .mp4 or .webm, or end the name of a folder with `/`";
-            assert!(message.contains("is not the ending") && message.ends_with(known), "{message}");
+            let known = "use .png, .gif, .apng, .mp4 or .webm, or end a folder's name with `/`";
+            assert!(message.contains("is not an image or video extension: ") && message.ends_with(known), "{message}");
         }
         std::fs::create_dir(&dotted).unwrap();
         assert_eq!(of("orbit.2").unwrap(), Kind::Folder);

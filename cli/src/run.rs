@@ -110,7 +110,7 @@ impl Run {
         let file = folder.join("config.json");
         let text = std::fs::read_to_string(&file).map_err(|e| match e.kind() {
             ErrorKind::NotFound => {
-                Error::file(folder, "is not a run: it has no config.json; `raygrad train` makes runs")
+                Error::file(folder, "is not a run: it has no config.json; `raygrad train` creates runs")
             }
             _ => Error::file(&file, format!("cannot be read: {e}")),
         })?;
@@ -119,10 +119,10 @@ impl Run {
                 let own = env!("CARGO_PKG_VERSION");
                 Error::file(
                     &file,
-                    format!("was made by raygrad {version}, and this is {own}: use that one, or a newer ({e})"),
+                    format!("raygrad {version} wrote it, and this is raygrad {own}: use {version} or newer ({e})"),
                 )
             }
-            None => Error::file(&file, format!("is not a run's: {e}")),
+            None => Error::file(&file, format!("not a run's configuration: {e}")),
         })?;
         config.check().map_err(|e| Error::file(&file, e))?;
         Ok(Run { folder: folder.into(), config })
@@ -130,7 +130,7 @@ impl Run {
 
     /// Keeps other programs from training this run.
     pub fn lock(&self) -> Result<Lock> {
-        Lock::take(&self.file(LOCK), || Error::file(&self.folder, "is being trained by another raygrad"))
+        Lock::take(&self.file(LOCK), || Error::file(&self.folder, "another raygrad is training it: wait until it ends"))
     }
 
     /// Asked before each write: whether the folder is still the one that was locked. One that was removed or moved is made again,
@@ -140,8 +140,8 @@ impl Run {
     /// If another program has the folder now, or one at its path, or it cannot be made again.
     pub fn keep(&self, lock: &mut Lock) -> Result<bool> {
         let lost = || {
-            let what = "training stopped: another raygrad has this folder now, or one that took its place. Nothing more was \
-                        written to it. If the run was moved, resume it there with `raygrad train --resume`";
+            let what = "training stopped: another raygrad now uses this folder. This one wrote nothing more to it. \
+                        If the run was moved, resume it there with `raygrad train --resume`";
             Error::file(&self.folder, what)
         };
         match lock.state() {
@@ -190,7 +190,7 @@ impl Run {
     pub fn scene<'a>(&'a self, given: Option<&'a Scene>) -> Result<&'a Scene> {
         match (given, &self.config.scene) {
             (None, Scene::Folder(folder)) if !folder.exists() => {
-                Err(Error::file(folder, "the run's photographs are no longer here: say with --scene where they are"))
+                Err(Error::file(folder, "the run's images are no longer here: name their folder with --scene"))
             }
             (given, trained) => Ok(given.unwrap_or(trained)),
         }
@@ -216,16 +216,19 @@ impl RunConfig {
     /// Whether the numbers are usable. The model checks its own.
     pub fn check(&self) -> Result<()> {
         if self.downscale == 0 {
-            return Err(Error::setting("downscale", "must be 1 or more, is 0"));
+            return Err(Error::setting("downscale", "is 0; use 1 or more"));
         }
         let [near, far] = self.scene_box.near_far;
         if !(near >= 0.0 && near < far && far.is_finite()) {
-            return Err(Error::setting("scene_box.near_far", format!("{near} to {far} is not a range of distances")));
+            return Err(Error::setting(
+                "scene_box.near_far",
+                format!("is {near} to {far}; near must be at least 0 and less than far"),
+            ));
         }
         let kept = self.keep_checkpoints;
         if !CHECKPOINTS.contains(&kept) {
             let (fewest, most) = CHECKPOINTS.into_inner();
-            return Err(Error::setting("keep_checkpoints", format!("must be from {fewest} to {most}, is {kept}")));
+            return Err(Error::setting("keep_checkpoints", format!("is {kept}; use {fewest} to {most}")));
         }
         self.config.check()?;
         self.viewpoint.check()
@@ -245,7 +248,7 @@ pub fn check_output(out: &Path) -> Result<()> {
         let first = name.to_string_lossy().to_ascii_lowercase();
         let is_own = OWN.contains(&first.as_str()) || first.starts_with("eval-");
         if is_own && ["config.json", "model.safetensors"].iter().all(|file| folder.join(file).is_file()) {
-            return Err(Error::file(out, format!("`{first}` is a part of a run: choose another name")));
+            return Err(Error::file(out, format!("`{first}` belongs to a run: choose another name")));
         }
         let Some((parent, last)) = folder.parent().zip(folder.file_name()) else { return Ok(()) };
         (name, folder) = (last.into(), parent);
@@ -283,15 +286,13 @@ pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
 /// The error for a folder that holds a run: one that is being trained would come back when it is removed.
 fn holds_a_run(folder: &Path) -> Error {
     match Lock::is_taken(&folder.join(LOCK)) {
-        true => {
-            Error::file(folder, "is being trained by another raygrad: stop that one first, or choose another --out")
-        }
-        false => Error::file(folder, "already holds a run: choose another --out, or remove that folder"),
+        true => Error::file(folder, "another raygrad is training it: stop that one or choose another --out"),
+        false => Error::file(folder, "already holds a run: choose another --out or remove that folder"),
     }
 }
 
 fn holds_other_files(folder: &Path) -> Error {
-    Error::file(folder, "holds files that are not a run's: choose another folder with --out")
+    Error::file(folder, "holds files that do not belong to a run: choose another folder with --out")
 }
 
 /// Whether a file is all that a program has left that was ended before its run began.

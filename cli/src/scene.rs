@@ -68,7 +68,7 @@ impl Scene {
             (true, None) => SceneType::Unbounded,
             (true, Some(_)) => SceneType::ForwardFacing,
         };
-        let reason = "as the model has it".to_owned();
+        let reason = "as in training".to_owned();
         let survey = SceneAnalysis { transform: placement, scene_type: scope, bounds, near, far, ndc, reason };
         Ok(Opened::new(self, Some((Capture::read(folder)?, survey)), None))
     }
@@ -121,7 +121,7 @@ impl Opened {
                 Dataset { frames: evenly_spaced(data.frames, views), scope: self.asked.unwrap_or(data.scope), ..data }
             }
             Some((capture, survey)) => {
-                let (progress, words) = (Progress::new(), format!("{split} photographs read"));
+                let (progress, words) = (Progress::new(), format!("{split} images read"));
                 let show = |done: usize, total: usize| progress.count(done, total, &words);
                 capture.load(
                     split,
@@ -131,7 +131,7 @@ impl Opened {
             }
         };
         for name in &data.skipped {
-            complain(&format!("warning: {}: the {split} image `{name}` is absent and was skipped", self.scene));
+            complain(&format!("warning: {}: the {split} image `{name}` is missing and was skipped", self.scene));
         }
         Ok(data)
     }

@@ -220,7 +220,7 @@ impl Trained {
 /// Trains and leaves the model in a new folder, or goes on with a run.
 pub fn run(args: &Args) -> Result<Trained> {
     if !args.view && args.place.are_given() {
-        return Err(Error::setting("view", "is what --host and --port are for: say it too"));
+        return Err(Error::setting("view", "is missing: --host and --port need --view"));
     }
     // Before anything is made that would have to go again.
     let listener = args.view.then(|| args.place.listen()).transpose()?;
@@ -259,7 +259,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     let RunConfig { scene_box: extent, downscale, config, .. } = run.config.clone();
     let budget = match (args.given(), run.config.budget) {
         (Some(budget), _) | (None, Some(budget)) => budget,
-        (None, None) => return Err(Error::setting("budget", "the run does not know its own: say --budget or --steps")),
+        (None, None) => return Err(Error::setting("budget", "the run has none: add --budget or --steps")),
     };
     let mut scene = run.scene(None)?.open_for(&extent, config.unbounded)?;
     scene.depth = config.loss_terms.iter().any(|term| term.kind() == "depth");
@@ -268,7 +268,10 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
     let data = Dataset { bounds: extent.bounds, near, far, placement: extent.transform, ndc: extent.ndc, ..data };
     let names = data.frames.iter().map(|frame| &frame.name);
     if !names.eq(&run.config.photographs) {
-        let what = format!("the run was trained on other photographs than {} has now", run.config.scene);
+        let what = format!(
+            "the run was trained on other images than {} has now: restore those, or train a new run",
+            run.config.scene
+        );
         return Err(Error::file(folder, what));
     }
     let (data, background) = (Arc::new(data), config.background.shown());
@@ -283,7 +286,7 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         run.write()?;
     }
     describe(&run, &trainer, &data, &scene)?;
-    print(&format!("from     step {}\n", trainer.stats().step))?;
+    print(&format!("resumed  at step {}\n", trainer.stats().step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
     train((run, lock), trainer, budget, args, preview, listener)
 }
@@ -340,8 +343,8 @@ fn train(
         let schedule = trainer.model.config.schedule;
         let rate = if let Schedule::Constant { .. } = schedule { "rate" } else { "from" };
         complain(&format!(
-            "training has diverged: its numbers are no longer finite{reason}; the model is that of step {}; try a lower rate \
-             with --set schedule.{}.{rate}=..",
+            "training diverged: its values are not finite{reason}; the saved model is from step {}; lower the \
+             learning rate with --set schedule.{}.{rate}=VALUE",
             trainer.stats().step,
             schedule.name()
         ));
@@ -369,15 +372,15 @@ impl Args {
         config = config.with_scene_type(data.scope);
         if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
             let what = format!(
-                "{} samples evenly along rays, and those of a scene that goes on are thousands of units long: use another, add \
-                 `--skip fast`, or say `--scene-type bounded`",
+                "{} spaces samples evenly, too few for the long rays of an unbounded scene: use instant or voxel, or \
+                 add --skip fast or --scene-type bounded",
                 self.preset
             );
             return Err(Error::setting("preset", what));
         }
         if let Some(carve) = self.carve {
             let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
-                let what = format!("the preset {} has no grid to carve; choose `--skip fast` beside it", self.preset);
+                let what = format!("the preset {} has no occupancy grid to carve: add --skip fast", self.preset);
                 return Err(Error::setting("carve", what));
             };
             sampler.occupancy.skip.carving = carve;
@@ -428,8 +431,8 @@ fn warn_of_memory(scene: &Opened, downscale: usize) {
     if bytes(downscale) > free {
         let enough = (downscale..1 << 14).find(|k| bytes(*k) <= 0.5 * free).unwrap_or(downscale);
         complain(&format!(
-            "warning: {} photographs take about {:.1} GB of memory at this size, of {:.1} GB that are free; with --downscale \
-             {enough} {:.1} GB",
+            "warning: {} images need about {:.1} GB of memory, but {:.1} GB are free: --downscale {enough} needs \
+             {:.1} GB",
             capture.present().count(),
             bytes(downscale) / 1e9,
             free / 1e9,
@@ -452,7 +455,7 @@ fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
 fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
     let far = data.far / data.placement.scale;
     if !(0.0..far).contains(&near) {
-        return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, where the scene ends")));
+        return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, the far plane")));
     }
     let near = near * data.placement.scale;
     data.ndc = data.ndc.map(|ndc| ndc.with_near(data.near, near));
@@ -464,7 +467,7 @@ fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
 fn with_term(mut config: Config, kind: &str, weight: f64) -> Result<Config> {
     config.loss_terms.retain(|term| term.kind() != kind);
     if weight != 0.0 {
-        let bad = |e| Error::setting("term", format!("cannot be {kind}={weight}: {e}"));
+        let bad = |e| Error::setting("loss", format!("cannot be {kind}={weight}: {e}"));
         // Which terms there are, a configuration knows when it is read.
         let mut all = serde_json::to_value(&config).map_err(bad)?;
         if let Some(terms) = all.get_mut("loss_terms").and_then(Value::as_array_mut) {
@@ -480,9 +483,9 @@ pub fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
     let unknown = |_| Error::setting(name, "cannot be changed");
     let mut all = serde_json::to_value(config).map_err(unknown)?;
     let pointer = format!("/{}", name.replace('.', "/"));
-    let place = all.pointer_mut(&pointer).ok_or_else(|| {
-        Error::setting(name, "there is no such number; config.json in a run's folder shows the names")
-    })?;
+    let place = all
+        .pointer_mut(&pointer)
+        .ok_or_else(|| Error::setting(name, "is not a config key; config.json in a run folder lists them"))?;
     *place = value.clone();
     serde_json::from_value(all).map_err(|e| Error::setting(name, format!("cannot be {value}: {e}")))
 }
@@ -501,7 +504,7 @@ fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Res
     if let Some((capture, survey)) = &scene.capture {
         let held_out = capture.present().count() - views;
         print(&format!(
-            "capture  {}, {} of {} images exist, {held_out} held out; {}: {}\n",
+            "capture  {}, {} of {} images found, {held_out} held out; {}: {}\n",
             capture.format,
             capture.present().count(),
             capture.views.len(),
@@ -510,7 +513,7 @@ fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Res
         ))?;
     }
     print(&format!(
-        "scene    {}: {views} views of {}x{}\nmodel    {} parameters, {} threads\nrun      {}\n",
+        "scene    {}: {views} images of {}x{}\nmodel    {} parameters, {} threads\nrun      {}\n",
         run.config.scene,
         image.width,
         image.height,
@@ -524,11 +527,11 @@ fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Res
 fn summarise(run: &Run, stats: &StepStats, interrupted: bool) -> Result<()> {
     let what = if interrupted { "stopped " } else { "trained " };
     print(&format!(
-        "{what} {} steps in {}, {:.0} rays/s; the model is {}\n",
+        "{what} {} steps in {}, {:.0} rays/s; model saved to {}\n",
         stats.step,
         spoken(stats.train_seconds),
         stats.rays as f64 / stats.train_seconds.max(1e-9),
         run.model_file().display()
     ))?;
-    if interrupted { print(&format!("to go on raygrad train --resume {}\n", run.folder.display())) } else { Ok(()) }
+    if interrupted { print(&format!("resume   raygrad train --resume {}\n", run.folder.display())) } else { Ok(()) }
 }

@@ -188,14 +188,14 @@ impl<'a> Watch<'a> {
             self.cut(trainer)
         });
         let step = trainer.stats().step;
-        let what = format!("raygrad: warning: for many steps up to {end} nothing was finite{reason}");
+        let what = format!("raygrad: warning: training diverged before step {end}: its values are not finite{reason}");
         match &back {
             Ok(()) => {
                 self.back = Some(step);
                 self.account.retreat();
-                self.progress.note(&format!("{what}; going on from step {step} at {SLOWER} times the rate"));
+                self.progress.note(&format!("{what}; resuming from step {step} with {SLOWER} times the learning rate"));
             }
-            Err(error) => self.progress.note(&format!("{what}, and the run cannot go back: {error}")),
+            Err(error) => self.progress.note(&format!("{what}; it cannot return to a checkpoint: {error}")),
         }
         back.is_ok()
     }
@@ -224,7 +224,7 @@ impl<'a> Watch<'a> {
     /// run is lost ends training, and is said then.
     fn attempt(&mut self, work: impl FnOnce(&mut Self) -> Result<()>) -> bool {
         let Err(error) = work(self) else { return true };
-        let words = format!("raygrad: warning: {error}; training goes on");
+        let words = format!("raygrad: warning: {error}; training continues");
         if !self.lost && self.warned.insert(words.clone()) {
             self.progress.note(&words);
         }

@@ -104,10 +104,10 @@ fn functions(rounds: usize, quick: bool, results: &mut Results) {
     let columns = [
         "type",
         "function",
-        "ns an element",
+        "ns per element",
         "ratio to exp",
         "control",
-        "spread of the control",
+        "control spread",
         "largest error, ULP",
         "mean error, ULP",
         "stated bound, ULP",
@@ -119,7 +119,7 @@ fn functions(rounds: usize, quick: bool, results: &mut Results) {
     let double_errors: Vec<Option<Accuracy>> = match double_accuracies(&double, Path::new(DOUBLE_REFERENCE)) {
         Some(errors) => errors.into_iter().map(Some).collect(),
         None => {
-            let what = format!("errors in f64 are left out: they need {DOUBLE_REFERENCE}; run in the repository");
+            let what = format!("no errors in f64, which need {DOUBLE_REFERENCE}: run in a checkout of the repository");
             results.findings.push(what);
             vec![None; double.len()]
         }
@@ -139,7 +139,7 @@ fn functions(rounds: usize, quick: bool, results: &mut Results) {
         let points = labels.iter().map(|label| label.0).collect();
         panels.push(Panel {
             title: kind.to_owned(),
-            x: Axis::log("ns an element"),
+            x: Axis::log("ns per element"),
             y: Axis::linear("largest error, ULP"),
             series: vec![Series::marks("", usize::from(kind == "f64"), points)],
             labels,
@@ -154,8 +154,8 @@ fn functions(rounds: usize, quick: bool, results: &mut Results) {
         name: "functions".to_owned(),
         title: format!("Elementary functions, one thread, {}", simd::name()),
         caption: format!(
-            "Slices of {ELEMENTS} elements, in cache. Errors in f32 are over every {step}th number, in f64 over samples \
-             and hard cases."
+            "Slices of {ELEMENTS} elements, in cache. Errors in f32 cover every {step}th number; errors in f64 cover \
+             samples and hard cases."
         ),
         columns: 2,
         panel: [600, 420],
@@ -222,12 +222,12 @@ fn products(rounds: usize, results: &mut Results) {
     let columns = [
         "rows x inner x columns",
         "FLOP",
-        "bytes of the operands",
+        "operand bytes",
         "microseconds",
         "GFLOP/s",
-        "share of the FMA peak",
+        "fraction of FMA peak",
         "control",
-        "spread of the control",
+        "control spread",
     ];
     let mut table = Table::new("gemm", &columns);
     let operands = |[m, k, n]: [usize; 3]| {
@@ -260,12 +260,12 @@ fn products(rounds: usize, results: &mut Results) {
     results.figures.push(Figure {
         name: "gemm".to_owned(),
         title: "Matrix products in f32, one thread".to_owned(),
-        caption: "The line is what nothing but fused multiply-adds in registers reach.".to_owned(),
+        caption: "The line is the peak of fused multiply-adds in registers.".to_owned(),
         columns: 1,
         panel: [760, 360],
         panels: vec![Panel {
             title: "by shape: rows x inner x columns".to_owned(),
-            x: Axis::linear("number of the shape"),
+            x: Axis::linear("shape number"),
             y: Axis::linear("GFLOP/s"),
             series: vec![Series::marks("gemm", 0, points), Series::line("FMA peak", 1, line)],
             labels: names,
@@ -279,14 +279,14 @@ const SAMPLES: usize = 4096;
 
 fn hash_grids(rounds: usize, quick: bool, results: &mut Results) -> Result<()> {
     let columns = [
-        "log2 of the table",
-        "bytes of the tables",
-        "look-ups a sample",
-        "bytes looked up a sample",
-        "ns a sample, along rays",
-        "ns a sample, random",
+        "log2 table size",
+        "table bytes",
+        "look-ups per sample",
+        "bytes looked up per sample",
+        "ns per sample, along rays",
+        "ns per sample, random",
         "control",
-        "spread of the control",
+        "control spread",
     ];
     let mut table = Table::new("hash-grid", &columns);
     let sizes: &[u32] = if quick { &[12, 15, 18] } else { &[10, 12, 13, 14, 15, 16, 17, 18, 19, 20] };
@@ -320,14 +320,14 @@ fn hash_grids(rounds: usize, quick: bool, results: &mut Results) -> Result<()> {
     let caches = machine::caches().into_iter().map(|(name, bytes)| ([bytes as f64 / 1024.0, lowest], name));
     results.figures.push(Figure {
         name: "hash-grid".to_owned(),
-        title: "Hash grid of 8 levels of 4 features: encoding a sample, one thread".to_owned(),
-        caption: "Diamonds mark the sizes of the caches.".to_owned(),
+        title: "Hash grid, 8 levels of 4 features: encoding one sample, one thread".to_owned(),
+        caption: "Diamonds mark the cache sizes.".to_owned(),
         columns: 1,
         panel: [760, 360],
         panels: vec![Panel {
-            title: "time against the size of the tables".to_owned(),
-            x: Axis::log("KiB of tables"),
-            y: Axis::linear("ns a sample"),
+            title: "time against table size".to_owned(),
+            x: Axis::log("table size, KiB"),
+            y: Axis::linear("ns per sample"),
             series: vec![
                 Series::line("along rays", 0, along),
                 Series::line("random", 1, random),

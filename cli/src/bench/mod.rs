@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> Result<()> {
     let wanted = |suite| args.suite == suite || args.suite == Suite::All;
     let mut sections = vec![];
     if wanted(Suite::Quadrature) {
-        note("quadrature: rules on scenes that are known exactly");
+        note("quadrature: integration rules on scenes with exact solutions");
         sections.push(save(
             "Quadrature",
             "--suite quadrature",
@@ -111,24 +111,24 @@ pub fn run(args: &Args) -> Result<()> {
         sections.push(save("Kernels", "--suite kernels", on_one_thread(|| kernels::run(args.quick))??, &args.out)?);
     }
     if wanted(Suite::Render) {
-        note("render: settings of the renderer on one model");
+        note("render: renderer settings on one model");
         sections.push(save("Rendering", "--suite render", render::run(args.quick, args.run.as_deref())?, &args.out)?);
     }
     if wanted(Suite::Train) {
-        note("train: quality against time");
+        note("train: quality against training time");
         sections.push(save("Training", "--suite train", train::run(args.quick, args.peers)?, &args.out)?);
     }
     report::save(&page, &sections, args.quick, job.mark())?;
     let findings = sections.iter().flat_map(|section| &section.findings);
     let findings: String = findings.map(|finding| format!("{finding}\n")).collect();
-    print(&format!("{findings}written: {}, and tables and plots beside it\n", page.display()))
+    print(&format!("{findings}written: {}; tables and plots are in the same folder\n", page.display()))
 }
 
 /// Whether results may be written to a folder: it is new or empty, or its page is that of an earlier benchmark.
 fn check_folder(folder: &Path, page: &Path, job: &Job) -> Result<()> {
     let is_taken = std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some());
     if is_taken && !job.overwrites() && !job.wrote(page) {
-        let what = "holds files that are not a benchmark's: choose another --out, or add --overwrite";
+        let what = "holds files of something else: choose another --out or add --overwrite";
         return Err(Error::file(folder, what));
     }
     Ok(())

@@ -44,7 +44,7 @@ pub fn run(quick: bool) -> Results {
     let times = times(sizes, quick);
     let mut errors = Table::new(
         "quadrature",
-        &["scene", "rule", "evaluations", "error of colour", "error of depth", "error of gradient", "ns a ray"],
+        &["scene", "rule", "evaluations", "colour error", "depth error", "gradient error", "ns per ray"],
     );
     let time_of = |point: &Point| {
         let same = times.iter().find(|time| time.rule == point.rule && time.size == point.size);
@@ -168,11 +168,11 @@ fn time_table(times: &[Cost]) -> Table {
         &[
             "rule",
             "evaluations",
-            "forward, ns a ray",
-            "forward and backward, ns a ray",
+            "forward, ns per ray",
+            "forward and backward, ns per ray",
             "ratio to midpoint",
             "control",
-            "spread of the control",
+            "control spread",
         ],
     );
     for Cost { rule, size, forward, both } in times {
@@ -228,15 +228,15 @@ fn error_figure(scenes: &[AnalyticScene], points: &[Point], which: usize) -> Fig
     let what = QUANTITIES[which];
     Figure {
         name: format!("quadrature-{what}"),
-        title: format!("Error of the {what} against evaluations a ray"),
+        title: format!("Error of the {what} against evaluations per ray"),
         caption: format!(
-            "Absolute error of the {what} in f64 on scenes of which it is known exactly. On smooth scenes the slope is \
-             the order of the rule; at a jump of the density all rules of fixed steps have slope 1, and only bisection \
-             finds it. With constant colour every rule is exact."
+            "Absolute error of the {what} in f64, on scenes with exact solutions. On smooth scenes the slope is the \
+             order of the rule. At a jump in density all fixed-step rules have slope 1; only bisection finds the \
+             jump. With constant colour every rule is exact."
         ),
         columns: 3,
         panel: [400, 290],
-        panels: panels(scenes, "evaluations a ray", "absolute error", |scene| series(scene, points, at)),
+        panels: panels(scenes, "evaluations per ray", "absolute error", |scene| series(scene, points, at)),
     }
 }
 
@@ -248,14 +248,14 @@ fn time_figure(scenes: &[AnalyticScene], points: &[Point], time_of: &dyn Fn(&Poi
     };
     Figure {
         name: "quadrature-time".to_owned(),
-        title: "Error of the colour against the time of compositing a ray".to_owned(),
+        title: "Colour error against the time to composite a ray".to_owned(),
         caption:
-            "The time is that of compositing and of its gradient, f32, one thread, with densities and colours given; \
-                  what a field costs comes on top for each evaluation."
+            "Time to composite a ray and its gradient from given densities and colours, in f32 on one thread. Field \
+             evaluations cost extra."
                 .to_owned(),
         columns: 3,
         panel: [400, 290],
-        panels: panels(scenes, "ns a ray, forward and backward", "absolute error", fixed),
+        panels: panels(scenes, "ns per ray, forward and backward", "absolute error", fixed),
     }
 }
 
@@ -266,7 +266,7 @@ fn findings(points: &[Point]) -> Vec<String> {
     for first in at.iter().filter(|point| point.style == 0) {
         let own = at.iter().filter(|point| point.scene == first.scene);
         if let Some(best) = own.min_by(|a, b| a.errors[0].total_cmp(&b.errors[0])) {
-            out.push(format!("{}: in 128 evaluations {} is best, error {:.1e}", best.scene, best.rule, best.errors[0]));
+            out.push(format!("{}: {} is best at 128 evaluations, error {:.1e}", best.scene, best.rule, best.errors[0]));
         }
     }
     out

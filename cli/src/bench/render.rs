@@ -60,10 +60,13 @@ pub fn run(quick: bool, folder: Option<&Path>) -> Result<Results> {
         None => trained(&scale)?,
     };
     let Some(sampler) = model.marching() else {
-        return Err(Error::setting("run", "samples hierarchically; choose one that marches, such as preset instant"));
+        return Err(Error::setting(
+            "run",
+            "samples hierarchically: choose a run with the sampler `marching`, such as preset instant",
+        ));
     };
     let step = sampler.config.view_step;
-    note("render: the reference in f64");
+    note("render: reference in f64");
     let Reference { images: reference, apart } = references(&model, &views)?;
     let mut outcomes = vec![];
     let base = Setting::base(step);
@@ -103,7 +106,7 @@ fn stored(folder: &Path, scale: &Scale) -> Result<(Model<f32>, Dataset)> {
         scale.views,
     )?;
     if data.frames.is_empty() {
-        return Err(Error::file(folder, "its scene has no test views to compare with"));
+        return Err(Error::file(folder, "its scene has no test images to compare with"));
     }
     let mut model = run.model()?;
     // What its views leave out of their own accord is for the settings to say.
@@ -202,18 +205,18 @@ fn table(outcomes: &[Outcome], model: &Model<f32>, pixels: f64) -> Table {
     let columns = [
         "group",
         "setting",
-        "densities a ray",
-        "colours a ray",
-        "look-ups a ray",
-        "table bytes a ray",
-        "FLOP a ray",
+        "density queries per ray",
+        "colour queries per ray",
+        "look-ups per ray",
+        "table bytes per ray",
+        "FLOP per ray",
         "ms",
         "ratio to default",
         "control",
-        "spread of the control",
+        "control spread",
         "PSNR against the reference, dB",
         "largest error",
-        "PSNR against the photographs, dB",
+        "PSNR against the images, dB",
         "dominated",
     ];
     let mut table = Table::new("render", &columns);
@@ -251,14 +254,14 @@ fn figure(outcomes: &[Outcome], pixels: f64, by_time: bool) -> Figure {
         if by_time { 1e3 * outcome.timed.seconds } else { work(&outcome.evaluations) as f64 / pixels }
     };
     let (name, label, title) = if by_time {
-        ("render-time", "milliseconds for a view", "Error against time")
+        ("render-time", "milliseconds per image", "Error against time")
     } else {
-        ("render-evaluations", "densities and colours a ray", "Error against evaluations")
+        ("render-evaluations", "density and colour queries per ray", "Error against evaluations")
     };
     let kinds: [Quantity; 3] = [
         ("against the f64 reference", "PSNR, dB", |o| o.psnr),
         ("largest error against the reference", "largest error of a channel", |o| o.largest),
-        ("against the photographs", "PSNR, dB", |o| o.truth),
+        ("against the images", "PSNR, dB", |o| o.truth),
     ];
     let panel = |(title, y_label, value): Quantity| {
         let at = |outcome: &Outcome| [x(outcome), value(outcome)];
@@ -289,10 +292,11 @@ fn figure(outcomes: &[Outcome], pixels: f64, by_time: bool) -> Figure {
         name: name.to_owned(),
         title: format!("Rendering: {}", title.to_lowercase()),
         caption: format!(
-            "One model, many ways to render it; each group changes one thing of the default (`fast`). The reference is in \
-             f64, by Gauss's rule at steps {FINER} times smaller, with nothing left out but the cells that training passed over. Hollow: \
-             another setting is better in evaluations and PSNR against the reference, or equal in one and better in the \
-             other. `ngp` follows the rules of instant-ngp: one random sample a cell, threshold .01, rays stop at .01."
+            "One model, rendered with many settings. Each group changes one setting of the default (`fast`). The \
+             reference is in f64, with Gauss's rule and steps {FINER} times smaller; it skips only the cells that \
+             training skipped. Hollow points are dominated: another setting has no more evaluations and no lower \
+             PSNR against the reference, and beats it in one of them. `ngp` follows instant-ngp: one random sample \
+             per cell, threshold .01, rays stop at a transmittance of .01."
         ),
         columns: 3,
         panel: [430, 360],
@@ -304,8 +308,8 @@ fn findings(outcomes: &[Outcome], pixels: f64, apart: f64) -> Vec<String> {
     let named = |group: &str, name: &str| outcomes.iter().find(|o| o.setting.group == group && o.setting.name == name);
     let line = |what: &str, outcome: &Outcome| {
         format!(
-            "{what}: {:.1} evaluations a ray, {:.1} dB against the reference, largest error {:.1e}, {:.2} dB against the \
-             photographs, {:.1} ms",
+            "{what}: {:.1} evaluations per ray, {:.1} dB against the reference, largest error {:.1e}, {:.2} dB \
+             against the images, {:.1} ms",
             work(&outcome.evaluations) as f64 / pixels,
             outcome.psnr,
             outcome.largest,
@@ -316,7 +320,7 @@ fn findings(outcomes: &[Outcome], pixels: f64, apart: f64) -> Vec<String> {
     let wanted = [("skip", "off"), ("skip", "near-lossless"), ("skip", "fast"), ("instant-ngp", "its rules")];
     let [rule, other] = RULES;
     let reference =
-        format!("reference: {rule}, {apart:.1} dB from that by {other}, beyond which differences say nothing");
+        format!("reference: {rule}; it agrees with {other} to {apart:.1} dB, so larger PSNRs are not meaningful");
     let lines =
         wanted.into_iter().filter_map(|(group, name)| Some(line(&format!("{group} {name}"), named(group, name)?)));
     [reference].into_iter().chain(lines).collect()

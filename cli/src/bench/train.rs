@@ -64,7 +64,7 @@ pub fn run(quick: bool, peers: bool) -> Result<Results> {
     let panel = |title: &str, x: &str, series| Panel {
         title: title.to_owned(),
         x: Axis::log(x),
-        y: Axis::linear("PSNR on test views, dB"),
+        y: Axis::linear("PSNR on test images, dB"),
         series,
         labels: vec![],
     };
@@ -72,8 +72,8 @@ pub fn run(quick: bool, peers: bool) -> Result<Results> {
         name: "train".to_owned(),
         title: "Training on the built-in scene".to_owned(),
         caption:
-            "One line for each seed. The time is that of training alone. Evaluations are those of densities and of \
-                  colours with gradients. The schedule of each course stretches to its whole time."
+            "One line per seed. Time is training time alone. Evaluations are density queries and colour queries with \
+             gradients. Each schedule stretches to the whole time."
                 .to_owned(),
         columns: 2,
         panel: [600, 420],
@@ -155,10 +155,10 @@ fn table(courses: &[Course], curves: &[Vec<Point>]) -> Table {
         "training seconds",
         "steps",
         "rays",
-        "densities",
-        "colours and gradients",
-        "if nothing were skipped",
-        "parameters moved",
+        "density queries",
+        "colour queries",
+        "queries without skipping",
+        "parameters updated",
         "PSNR, dB",
     ];
     let mut table = Table::new("train", &columns);
@@ -200,16 +200,16 @@ fn add_peers(
         let seconds = match seconds_a_step(framework, quick) {
             Ok(seconds) => seconds,
             Err(what) => {
-                findings.push(format!("{framework} is left out: {what}"));
+                findings.push(format!("{framework} was not measured: {what}"));
                 continue;
             }
         };
-        findings.push(format!("{framework}: {seconds:.3} s for a step of the classic model"));
+        findings.push(format!("{framework}: {seconds:.3} s per step of the classic model"));
         if let Some((_, curve)) = classic {
             let points = curve.iter().map(|point| [point.stats.step as f64 * seconds, point.psnr]).collect();
             series.push(Series {
                 hollow: true,
-                ..Series::line(&format!("classic at the pace of {framework}"), 5 + style, points)
+                ..Series::line(&format!("classic at the speed of {framework}"), 5 + style, points)
             });
         }
     }
@@ -219,7 +219,7 @@ fn add_peers(
 fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, String> {
     let script = "benches/peers/classic_nerf.py";
     if !std::path::Path::new(script).is_file() {
-        return Err(format!("there is no {script} here; run in the repository"));
+        return Err(format!("{script} is not here: run in a checkout of the repository"));
     }
     let steps = if quick { "1" } else { "5" };
     let threads = rayon::current_num_threads().to_string();
@@ -228,7 +228,7 @@ fn seconds_a_step(framework: &str, quick: bool) -> std::result::Result<f64, Stri
     if !output.status.success() {
         let message = String::from_utf8_lossy(&output.stderr);
         let last = message.lines().last().unwrap_or("no message");
-        return Err(format!("{last} (benches/peers/README.md says how to install it)"));
+        return Err(format!("{last} (benches/peers/README.md explains how to install it)"));
     }
     let text = String::from_utf8_lossy(&output.stdout);
     let line: Option<Value> = text.lines().last().and_then(|line| serde_json::from_str(line).ok());

@@ -104,11 +104,11 @@ fn legend(stage: &Stage, area: &Area<'_>) -> Drawn {
     let count = |kind: &str| stage.cameras.iter().filter(|camera| camera.kind == kind).count();
     let flagged = stage.cameras.iter().filter(|camera| camera.flagged).count();
     let entries = [
-        (TRAIN, format!("{} to train on", count("train")), count("train")),
+        (TRAIN, format!("{} training", count("train")), count("train")),
         (TEST, format!("{} held out", count("test")), count("test")),
         (FLAGGED, format!("{flagged} with a finding"), flagged),
         (ABSENT, format!("{} without an image", count("absent")), count("absent")),
-        (BOX, if stage.bounded { "box" } else { "box; the scene goes on beyond it" }.to_owned(), 1),
+        (BOX, if stage.bounded { "scene box" } else { "scene box (unbounded scene)" }.to_owned(), 1),
     ];
     let mut x = 16;
     for (color, words, _) in entries.iter().filter(|entry| entry.2 > 0) {

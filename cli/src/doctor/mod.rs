@@ -51,7 +51,7 @@ pub struct Args {
 /// Examines, writes the files and prints the result.
 pub fn run(args: &Args) -> Result<ExitCode> {
     let Scene::Folder(folder) = &args.scene else {
-        return Err(Error::setting("scene", "the scene that is built in has no files to examine; name a folder"));
+        return Err(Error::setting("scene", "built-in scenes have no files to check: name a folder"));
     };
     // Its folder has one name for all captures: each examination replaces the last.
     let job = Job::new("doctor", &Value::Null, args.overwrite);
@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let survey = capture.analyze_scene(args.scene_type).ok();
     make_folder(&args.out)?;
     let progress = Progress::new();
-    let show = |done: usize, total: usize| progress.count(done, total, "photographs looked at");
+    let show = |done: usize, total: usize| progress.count(done, total, "images checked");
     let report = examine(&capture, survey.as_ref(), &DoctorOptions { progress: &show, ..DoctorOptions::default() });
     drop(progress);
     let stage = Stage::new(&capture, survey.as_ref(), &report);
@@ -95,7 +95,7 @@ pub fn warn(scene: &Opened) {
     for Finding { kind, severity, what, .. } in findings.iter().filter(|finding| !said(finding)) {
         if *severity > Severity::Note {
             let folder = capture.folder.display();
-            complain(&format!("{severity}: {kind}: {what}; `raygrad doctor {folder}` says more"));
+            complain(&format!("{severity}: {kind}: {what}; `raygrad doctor {folder}` shows details"));
         }
     }
 }

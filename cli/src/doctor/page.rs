@@ -27,7 +27,7 @@ pub fn page(capture: &Capture, report: &Report, stage: &Stage, mark: &str) -> Re
     let views: HashMap<&str, &View> = capture.views.iter().rev().map(|view| (view.name.as_str(), view)).collect();
     let mut findings: String = report.findings.iter().map(|finding| section(&views, finding)).collect();
     if findings.is_empty() {
-        findings = "<p class=\"good\">Nothing is wrong with it.</p>".to_owned();
+        findings = "<p class=\"good\">No problems found.</p>".to_owned();
     }
     let data = serde_json::to_string(stage).map_err(|e| Error::setting("page", e))?;
     // Within a script nothing may look like its end.

@@ -24,18 +24,18 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
     });
     rows.push(("resolution", joined(sizes)));
     rows.extend(facts.focal.map(|focal| ("focal length", format!("{} pixels", range(focal)))));
-    rows.extend(facts.field_of_view.map(|view| ("field of view", format!("{} degrees across", range(view)))));
+    rows.extend(facts.field_of_view.map(|view| ("field of view", format!("{} degrees horizontal", range(view)))));
     rows.push(("lens", joined(facts.lenses.iter().take(4).cloned())));
     if facts.points > 0 {
         rows.push(("points", facts.points.to_string()));
     }
     if let Some(SceneLayout { scope, reason, near, far, bounds: [low, high], scale, up, middle }) = &facts.layout {
-        rows.push(("scope", format!("{scope}: {reason}")));
-        rows.push(("rays", format!("from {near:.3} to {far:.3} scene units")));
-        rows.push(("box", format!("{low:.2} to {high:.2} scene units")));
-        rows.push(("scale", format!("{scale:.4} scene units to a unit of the files")));
-        rows.push(("up", format!("{up:.3} in the files")));
-        rows.push(("middle", format!("{middle:.3} in the files")));
+        rows.push(("scene type", format!("{scope}: {reason}")));
+        rows.push(("near to far", format!("{near:.3} to {far:.3} scene units")));
+        rows.push(("scene box", format!("{low:.2} to {high:.2} scene units")));
+        rows.push(("scale", format!("{scale:.4} scene units per capture unit")));
+        rows.push(("up axis", format!("{up:.3} in capture coordinates")));
+        rows.push(("centre", format!("{middle:.3} in capture coordinates")));
     }
     if let Some(agreement) = facts.agreement {
         let word = if agreement < 0.1 {
@@ -45,10 +45,7 @@ pub fn facts(facts: &Facts) -> Vec<(&'static str, String)> {
         } else {
             "good"
         };
-        rows.push((
-            "agreement",
-            format!("{agreement:.2} of photographs with each other, which is {word} (0 is chance, 1 most)"),
-        ));
+        rows.push(("agreement", format!("{agreement:.2} between images, {word} (0 is chance, 1 is perfect)")));
     }
     rows
 }
@@ -69,7 +66,7 @@ pub fn text(report: &Report) -> String {
     let mut text = format!("{}\n", report.facts.folder.display());
     rows.iter().for_each(|(name, value)| text += &format!("  {name:width$}  {value}\n"));
     if report.findings.is_empty() {
-        text += "\nnothing is wrong with it\n";
+        text += "\nno problems found\n";
     }
     for finding in &report.findings {
         let Finding { kind, severity, what, advice, .. } = finding;

@@ -35,7 +35,11 @@ impl Alignment {
         if split == Split::Train {
             for frame in &mut data.frames {
                 let number = trained.iter().position(|name| *name == frame.name).ok_or_else(|| {
-                    let what = format!("the run was not trained on `{}`, and has not found its camera", frame.name);
+                    let what = format!(
+                        "`{}` is not a training image of the run, which has no camera for it: name the unchanged \
+                         capture with --scene",
+                        frame.name
+                    );
                     Error::setting("scene", what)
                 })?;
                 frame.camera = model.learned_camera(number, &frame.camera);

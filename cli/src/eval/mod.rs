@@ -145,7 +145,7 @@ pub fn run(args: &Args) -> Result<()> {
         && let Some(frame) = data.frames.iter().find(|frame| run.config.photographs.contains(&frame.name))
     {
         let what = format!(
-            "holds out the {} photograph `{}`, which the run was trained on: the files have changed since",
+            "the {} image `{}` was a training image of the run: name the unchanged capture with --scene",
             args.split, frame.name
         );
         return Err(Error::setting("scene", what));
@@ -158,7 +158,7 @@ pub fn run(args: &Args) -> Result<()> {
     model.vignetted = true;
     let mut cameras = Alignment::apply(&model, &run.config.photographs, args.split, &mut data)?;
     if args.fit_poses {
-        note("fitting poses to photographs");
+        note("aligning cameras to the images");
         let found = fitted_cameras(&model, data.clone())?;
         data.frames.iter_mut().zip(found).for_each(|(frame, camera)| frame.camera = camera);
         cameras = Alignment::Fitted;
@@ -167,7 +167,7 @@ pub fn run(args: &Args) -> Result<()> {
     let name = args.name(skip, lpips.as_ref().map(Lpips::backbone));
     let pictures = run.file(&name);
     make_folder(&pictures)?;
-    let busy = || Error::file(&pictures, "is being written by another raygrad");
+    let busy = || Error::file(&pictures, "another raygrad is writing it: wait until it ends");
     let lock = Lock::take(&pictures.join(LOCK), busy)?;
     // What an evaluation that was ended before has left there is begun again.
     let unfinished = pictures.join(UNFINISHED);
@@ -221,7 +221,7 @@ pub fn run(args: &Args) -> Result<()> {
     let drawn = report.drawn();
     judge.draw_others(&drawn, &unfinished)?;
     if lock.state() != State::Kept {
-        let what = "was removed, or another raygrad evaluates there now: nothing was written";
+        let what = "was removed, or another raygrad evaluates there now: nothing was written; run the command again";
         return Err(Error::file(&pictures, what));
     }
     // An evaluation that is ended before leaves the last one's result as it was.
@@ -253,24 +253,22 @@ fn check_seen(backbone: Backbone, data: &Dataset, appearance: Appearance) -> Res
         masked += usize::from(mask.is_some());
         if mask.is_none() && (width < side || height < side) {
             return bad(format!(
-                "of `{name}` {width}x{height} pixels are compared, and {backbone} needs {side}x{side}"
+                "`{name}` has {width}x{height} pixels to compare; {backbone} needs at least {side}x{side}"
             ));
         }
         largest = largest.max(if mask.is_some() { 0 } else { width * height });
     }
     if masked == data.frames.len() {
-        return bad(
-            "is of whole images, and all of these have masks, drawn or of corners that a lens leaves dark".into()
-        );
+        return bad("needs an image without a mask: all of these have one, drawn or from dark lens corners".into());
     }
     if masked > 0 {
-        note(&format!("LPIPS is of whole images: {masked} of {} have masks, and none", data.frames.len()));
+        note(&format!("LPIPS leaves out {masked} of {} images, because they have masks", data.frames.len()));
     }
     let need = largest as f64 * backbone.bytes();
     if let Some(free) = memory::available().filter(|free| need > *free) {
         let [need, free] = [need, free].map(|bytes| bytes / 1e9);
         complain(&format!(
-            "warning: LPIPS of these images takes about {need:.1} GB of memory, of {free:.1} GB that are free"
+            "warning: LPIPS needs about {need:.1} GB of memory for these images, but {free:.1} GB are free"
         ));
     }
     Ok(())
@@ -325,7 +323,7 @@ impl Judge {
             }
             let done = i + 1;
             progress.set(done as f64 / count as f64, || {
-                format!("view {done} of {count}  {}  PSNR {:.2}", score.name, score.psnr)
+                format!("image {done} of {count}  {}  PSNR {:.2}", score.name, score.psnr)
             });
             scores.push(score);
         }
@@ -353,7 +351,8 @@ impl Judge {
         let half = self.appearance.fitted_columns(truth.width);
         if half > 0 {
             if frame.mask.is_some() && used(frame, &truth, half..truth.width).data.is_empty() {
-                let what = format!("the mask of `{}` leaves nothing of its right half to compare", frame.name);
+                let what =
+                    format!("the mask of `{}` covers its whole right half: evaluate without --fit-half", frame.name);
                 return Err(Error::setting("fit-half", what));
             }
             let gains = gains(frame, &picture.color, &truth, half);
@@ -460,7 +459,11 @@ mod tests {
         let check =
             |data: &Dataset, appearance| check_seen(Backbone::Vgg, data, appearance).map_err(|error| error.to_string());
         assert!(check(&data, Appearance::None).is_ok());
-        assert!(check(&data, Appearance::Half).unwrap_err().contains("13x26 pixels are compared, and vgg needs 16x16"));
+        assert!(
+            check(&data, Appearance::Half)
+                .unwrap_err()
+                .contains("has 13x26 pixels to compare; vgg needs at least 16x16")
+        );
         // Too low, in a photograph that counts.
         let low = data.frames[0].image.clone();
         data.frames[1].image = Image::new(40, 15, 3).into();
@@ -468,6 +471,6 @@ mod tests {
         data.frames[1].mask = Some(Arc::new(Mask::new(40, 15, |_, _| true)));
         assert!(check(&data, Appearance::None).is_ok());
         data.frames[0].mask = Some(Arc::new(Mask::new(low.width, low.height, |x, _| x > 3)));
-        assert!(check(&data, Appearance::None).unwrap_err().contains("all of these have masks"));
+        assert!(check(&data, Appearance::None).unwrap_err().contains("needs an image without a mask"));
     }
 }

@@ -196,7 +196,7 @@ pub fn table(report: &Report) -> String {
     let figures = |name: &str, psnr: f64, ssim: Option<f64>, lpips: Option<f64>| {
         row([name, &format!("{psnr:.2}"), &four_digits(ssim), &four_digits(lpips)])
     };
-    let mut text = row(["view", "PSNR", "SSIM", "LPIPS"]);
+    let mut text = row(["image", "PSNR", "SSIM", "LPIPS"]);
     for Score { name, psnr, ssim, lpips } in &report.per_view {
         text += &figures(name, *psnr, *ssim, *lpips);
     }
@@ -204,25 +204,26 @@ pub fn table(report: &Report) -> String {
     text += &figures(&mean_of, report.psnr_mean, report.ssim_mean, lpips_mean);
     let Report { split, hold_out, background, seconds_per_view, .. } = report;
     let size = format!("{}x{}", report.width, report.height);
-    text +=
-        &format!("{split} views ({hold_out}) of {size} over {background}, {seconds_per_view:.2} s to render each\n");
+    text += &format!(
+        "{split} images ({hold_out}), {size}, {background} background, {seconds_per_view:.2} s to render each\n"
+    );
     let worst: Vec<String> = report.worst().iter().map(|&i| report.per_view[i].to_string()).collect();
     text += &format!("worst: {}\n", worst.join(", "));
     if let Some(Perceived { lpips_backbone, lpips_crc32, .. }) = &report.lpips {
-        text += &format!("LPIPS: {lpips_backbone}, weights with the CRC-32 {lpips_crc32}\n");
+        text += &format!("LPIPS: {lpips_backbone}, weights CRC-32 {lpips_crc32}\n");
     }
     text += match report.appearance {
         Appearance::None => "",
-        Appearance::Own => "exposures and codes: each photograph's own\n",
-        Appearance::Mean => "exposures and codes: the mean of the training photographs'\n",
-        Appearance::Half => "compared: right halves, after gains that were fitted to left halves\n",
+        Appearance::Own => "exposure and appearance embeddings: each image's own\n",
+        Appearance::Mean => "exposure and appearance embeddings: mean of the training images\n",
+        Appearance::Half => "compared: right halves, with exposure fitted to the left halves\n",
     };
     text + match report.cameras {
         Alignment::None => "",
         Alignment::Learned => "cameras: as learned\n",
-        Alignment::Fitted => "cameras: each fitted to its own photograph\n",
+        Alignment::Fitted => "cameras: each aligned to its own image\n",
         Alignment::Glass => "cameras: focal length and lens as learned\n",
-        Alignment::Similarity => "cameras: moved as those of the training photographs have as a whole\n",
+        Alignment::Similarity => "cameras: moved by the similarity transform of the training cameras\n",
     }
 }
 

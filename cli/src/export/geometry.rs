@@ -85,7 +85,9 @@ impl GeometryOptions {
             ("open-boundary", self.open_boundary),
         ];
         match given.iter().find(|(_, given)| *given) {
-            Some((name, _)) => Err(Error::setting(name, "is for shapes: name a file that ends in .ply, .obj or .glb")),
+            Some((name, _)) => {
+                Err(Error::setting(name, "applies to meshes and point clouds: name a .ply, .obj or .glb file"))
+            }
             None => Ok(()),
         }
     }
@@ -105,7 +107,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
             let points = cloud.colored_mesh.mesh.positions.len();
             (
                 cloud.colored_mesh,
-                format!("{points} points, of {} places that {} views see", cloud.sights, cameras.len()),
+                format!("{points} points, from {} surface samples in {} views", cloud.sights, cameras.len()),
             )
         }
         None => {
@@ -123,14 +125,15 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
             if let Some(most) = options.triangles.filter(|most| mesh.triangles.len() > *most) {
                 let count = mesh.triangles.len();
                 note(&format!(
-                    "the mesh keeps {count} triangles, more than {most}: with fewer it would fold or lose a part"
+                    "the mesh keeps {count} triangles, more than {most}: fewer would fold it or lose a component"
                 ));
             }
             let said = format!(
-                "{} vertices, {} triangles, {}; density {:.4} per scene unit, {} cells along the box, {} small parts left out",
+                "{} vertices, {} triangles, {}; iso-value {:.4} per scene unit, {} cells along the box, {} small \
+                 components removed",
                 mesh.positions.len(),
                 mesh.triangles.len(),
-                if mesh.is_closed() { "closed" } else { "not closed" },
+                if mesh.is_closed() { "closed" } else { "open" },
                 surface.iso_value,
                 surface.resolution,
                 surface.dropped
@@ -141,7 +144,7 @@ pub fn run(run: &Run, scene: Option<&Scene>, options: &GeometryOptions, out: &Pa
     drop(display);
     job.check(out)?;
     let bytes = files::write_with_comment(&shape.placed_back(&model.scene_box.transform), out, job.mark())?;
-    let part = if model.config.unbounded { ", of the box where the cameras look" } else { "" };
+    let part = if model.config.unbounded { ", cropped to the scene box" } else { "" };
     let (size, seconds) = (bytes as f64 / 1e6, start.elapsed().as_secs_f64());
     print(&format!("exported {said}{part}: {} ({size:.1} MB, {seconds:.1} s)\n", out.display()))
 }
@@ -153,7 +156,7 @@ fn cameras(run: &Run, model: &Model<f32>, scene: Option<&Scene>) -> Result<Vec<C
         Ok(own) => evenly_spaced(own, PHOTOGRAPHS),
         Err(error) if scene.is_some() => return Err(error),
         Err(error) => {
-            note(&format!("looking from around the scene alone, as its photographs' cameras are not known: {error}"));
+            note(&format!("using only cameras around the scene, because those of the images are unknown: {error}"));
             vec![]
         }
     };
@@ -193,10 +196,10 @@ impl Display {
         };
         let left = since.elapsed().as_secs_f64() * (1.0 - done) / done.max(f64::MIN_POSITIVE);
         let doing = match stage {
-            Stage::Seeing => "looking at the scene",
-            Stage::Meshing => "finding the surface",
-            Stage::Simplifying => "making triangles fewer",
-            Stage::Coloring => "finding colours",
+            Stage::Seeing => "finding visible space",
+            Stage::Meshing => "extracting the surface",
+            Stage::Simplifying => "simplifying the mesh",
+            Stage::Coloring => "colouring the mesh",
         };
         self.progress
             .set(done, || if done > 0.0 { format!("{doing}, {} left", spoken(left)) } else { doing.to_owned() });

@@ -35,29 +35,31 @@ pub fn run(run: &Run, out: &Path, job: &Job) -> Result<()> {
     job.check(out)?;
     write_atomic(out, page.as_bytes())?;
     let megabytes = page.len() as f64 / 1e6;
-    print(&format!("exported a page of {megabytes:.1} MB: {}\n", out.display()))
+    print(&format!("exported a scene page of {megabytes:.1} MB: {}\n", out.display()))
 }
 
 /// What a page can be made of, or why there is none.
 fn check(model: &Model<f32>) -> std::result::Result<(&InstantConfig, &Marching), String> {
     let (Some(config), Some(marching)) = (model.config.field.get::<InstantConfig>(), model.marching()) else {
         return Err(format!(
-            "can be made of a field of the kind `instant` that is marched through, and this is `{}` with `{}`",
+            "a scene page needs the field `instant` and the sampler `marching`; the run has `{}` and `{}`",
             model.config.field.kind(),
             model.config.sampler.kind()
         ));
     };
     if model.config.sampler.get::<MarchingConfig>().is_some_and(|c| c.quadrature != Quadrature::Midpoint) {
-        return Err("can be made of a run with the quadrature `midpoint`".to_owned());
+        return Err(
+            "a scene page needs the quadrature `midpoint`: train with --set sampler.quadrature=midpoint".to_owned()
+        );
     }
     for (most, what, own) in [
-        (MOST_FEATURES, "`table`", config.grid.features),
+        (MOST_FEATURES, "`grid.features`", config.grid.features),
         (MOST_WIDTH, "`density_width`", config.density_width),
         (MOST_WIDTH, "`features`", config.features),
         (MOST_WIDTH, "`color_width`", config.color_width),
     ] {
         if own > most {
-            return Err(format!("can be made of a {what} of up to {most} numbers a row, and this has {own}"));
+            return Err(format!("a scene page needs {what} of at most {most}; the run has {own}"));
         }
     }
     Ok((config, marching))
@@ -149,7 +151,10 @@ fn march(model: &Model<f32>, marching: &Marching) -> Value {
 }
 
 fn parameter<'a>(model: &'a Model<f32>, name: &str) -> std::result::Result<(&'a [f32], [usize; 2]), String> {
-    let id = model.params.find(name).ok_or_else(|| format!("needs the parameter `{name}`"))?;
+    let id = model
+        .params
+        .find(name)
+        .ok_or_else(|| format!("a scene page needs the parameter `{name}`, which the model lacks"))?;
     let tensor = model.params.get(id);
     let shape = tensor.shape();
     Ok((tensor.as_slice(), [shape[0], shape[1]]))
@@ -161,7 +166,7 @@ fn table(model: &Model<f32>) -> std::result::Result<Vec<u8>, String> {
     let halves: Vec<f16> = table.iter().map(|x| f16::from_f32(*x)).collect();
     match halves.iter().all(|x| x.is_finite()) {
         true => Ok(halves.iter().flat_map(|x| x.to_le_bytes()).collect()),
-        false => Err("can be made of a table of numbers that 16 bits hold, and this has larger ones".to_owned()),
+        false => Err("a scene page stores the hash table in 16 bits, and this one has larger values".to_owned()),
     }
 }
 
@@ -307,7 +312,7 @@ mod tests {
         assert_eq!((bytes.len(), &bytes[..5]), (2 * values.len(), &[0x00, 0x3c, 0x00, 0xc1, 0x00][..]));
         values[3] = 1e6;
         give(&mut model, "field.table", &values);
-        assert!(table(&model).is_err_and(|what| what.contains("larger ones")));
+        assert!(table(&model).is_err_and(|what| what.contains("larger values")));
     }
 
     #[test]
@@ -350,15 +355,15 @@ mod tests {
             change(&mut config);
             refused(&model(config, as_it_is))
         };
-        assert!(with(&|config| config.grid.features = 32).contains("`table`"));
-        assert!(with(&|config| config.density_width = 257).contains("`density_width` of up to 256"));
+        assert!(with(&|config| config.grid.features = 32).contains("`grid.features`"));
+        assert!(with(&|config| config.density_width = 257).contains("`density_width` of at most 256"));
         assert!(with(&|config| config.features = 257).contains("`features`"));
         assert!(with(&|config| config.color_width = 257).contains("`color_width`"));
         let mut most = InstantConfig { density_width: 256, features: 256, color_width: 256, ..small() };
         most.grid.features = 16;
         assert!(check(&model(most, as_it_is)).is_ok());
         let classic = model(small(), |config, _| config.sampler = Config::preset(Preset::Classic).sampler);
-        assert!(refused(&classic).contains("`instant` with `hierarchical`"));
+        assert!(refused(&classic).contains("`instant` and `hierarchical`"));
         let gauss = model(small(), |config, _| {
             config.sampler =
                 SamplerConfig::new(MarchingConfig { quadrature: Quadrature::Gauss2, ..MarchingConfig::default() });

@@ -94,7 +94,7 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
         capture.views.retain(|view| view.image.is_some());
     }
     if capture.present().next().is_none() && undistorted {
-        return Err(Error::file(&capture.file, "has no photograph whose image exists").into());
+        return Err(Error::file(&capture.file, "none of its images exists: check their paths").into());
     }
     for view in &mut capture.views {
         // Images may be smaller than the file of the cameras says; other programs want to be told.
@@ -124,9 +124,7 @@ pub fn convert(mut capture: Capture, target: Target, undistorted: bool, outside:
     place.finish()?;
     describe(&capture, &jobs, out)?;
     if guessed > 0 {
-        note(&format!(
-            "{guessed} photographs show too few points to tell their depths: those of the scene's box were written"
-        ));
+        note(&format!("{guessed} images see too few points for a depth range: raygrad wrote that of the scene box"));
     }
     Ok(())
 }
@@ -173,12 +171,12 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         }
     };
     if !has_masks {
-        warn(capture.views.iter().filter(|view| view.mask.is_some()).count(), "masks are left behind: LLFF has none");
+        warn(capture.views.iter().filter(|view| view.mask.is_some()).count(), "masks are not converted: LLFF has none");
     }
     if !has_depths {
-        let why = if undistorted { "they are not undistorted" } else { "the format has none" };
+        let why = if undistorted { "--undistort does not change them" } else { "the format has none" };
         let count = capture.views.iter().filter(|view| view.depth.is_some()).count();
-        warn(count, &format!("files of depths are left behind: {why}"));
+        warn(count, &format!("depth files are not converted: {why}"));
     }
     let mut taken = HashSet::new();
     let mut jobs = vec![];
@@ -187,7 +185,7 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
         let inner = inner(&rest);
         let (image, name) = target.place(inner, &rest, view.split);
         if !taken.insert(image.clone()) {
-            let what = format!("`{}` would be the file {image}, as another would: rename it", view.name);
+            let what = format!("`{}` and another image would both become {image}: rename one", view.name);
             return Err(Error::field(&capture.file, &view.field, what));
         }
         let mut to = view.clone();
@@ -204,7 +202,8 @@ fn jobs(capture: &Capture, target: Target, undistorted: bool, folder: &Path) -> 
     if matches!(target, Target::Colmap | Target::Llff) {
         let held_out =
             capture.views.iter().filter(|view| view.split.is_some_and(|split| split != Split::Train)).count();
-        let why = "photographs are held out, which the format cannot say: whoever reads it holds out others, such as every eighth";
+        let why = "held-out images lose their split, which the format cannot store: readers hold out others, such as \
+                   every eighth";
         warn(held_out, why);
     }
     Ok(jobs)

@@ -25,7 +25,7 @@ pub fn copy(folder: &Path, outside: bool, place: &Workplace) -> Work<usize> {
         found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
     }
     let to = place.make("images")?;
-    Progress::new().each(found.len(), "photographs copied", |i| {
+    Progress::new().each(found.len(), "images copied", |i| {
         Ok(copy_upright(&found[i], to.join(found[i].file_name().unwrap_or_default()))?)
     })?;
     Ok(found.len())
@@ -44,7 +44,7 @@ fn find(folder: &Path) -> Result<Vec<PathBuf>> {
         let others = files.iter().filter(|path| ends(path, &NOT_READ)).count();
         let found: Vec<PathBuf> = files.into_iter().filter(|path| ends(path, &READ)).collect();
         if others > 0 {
-            let what = "images are HEIC, TIFF or raw, which are not read: convert them to JPEG or PNG";
+            let what = "images are HEIC, TIFF or raw, which raygrad cannot read: convert them to JPEG or PNG";
             if found.is_empty() {
                 return Err(Error::file(folder, format!("{others} {what}")));
             }
@@ -54,5 +54,5 @@ fn find(folder: &Path) -> Result<Vec<PathBuf>> {
             return Ok(found);
         }
     }
-    Err(Error::file(folder, "holds no photographs: expected .jpg, .png or .webp files in it or in its folder `images`"))
+    Err(Error::file(folder, "holds no images: put .jpg, .png or .webp files in it or in its folder `images`"))
 }

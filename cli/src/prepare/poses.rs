@@ -52,19 +52,19 @@ pub fn find(place: &Workplace, sequence: bool, model: &str) -> Work<Found> {
         // One lens is known better from all photographs than each from one.
         arguments.extend(["--ImageReader.single_camera", "1"]);
     }
-    colmap.step("feature_extractor", Some(EXTRACTION), "features found in photographs", &arguments)?;
+    colmap.step("feature_extractor", Some(EXTRACTION), "extracting features", &arguments)?;
     let matcher = if names.len() > EXHAUSTIVE { "sequential_matcher" } else { "exhaustive_matcher" };
     if names.len() > EXHAUSTIVE && !sequence {
-        note(&format!("more than {EXHAUSTIVE} photographs: each is compared with those that follow by name alone"));
+        note(&format!("more than {EXHAUSTIVE} images: COLMAP matches each only with those that follow by name"));
     }
-    colmap.step(matcher, Some(MATCHING), "photographs compared", &[])?;
+    colmap.step(matcher, Some(MATCHING), "matching images", &[])?;
     let found = colmap.map(&place.make(&format!("{FOLDER}/models"))?, names.len())?;
     let count = found.len();
     // Of equals, the one that was found first.
     let largest = found.into_iter().rev().max_by_key(|(_, capture)| capture.views.len());
     let Some((folder, capture)) = largest else {
-        let what = "has found no cameras: the photographs overlap too little, or are blurred, or show too little that can \
-                    be told apart";
+        let what = "found no camera poses: the images overlap too little, are blurred or lack texture; take more \
+                    that overlap and are sharp";
         return Err(Error::setting("colmap mapper", what).into());
     };
     let to = place.make("sparse")?.join("0");
@@ -125,7 +125,7 @@ impl Colmap {
         let progress = Progress::new();
         COLMAP.run(&mut command, None, |line| {
             let Some(done) = counted(line) else { return };
-            progress.set(done, || format!("{:.0} % of {words}", 100.0 * done));
+            progress.set(done, || format!("{words}: {:.0} %", 100.0 * done));
         })
     }
 
@@ -148,8 +148,8 @@ impl Colmap {
             let Some(count) = registered(line) else { return };
             most = most.max(count);
             progress.set(most as f64 / total as f64, || match count {
-                count if count < most => format!("{most} of {total} photographs registered; {count} in another model"),
-                _ => format!("{most} of {total} photographs registered"),
+                count if count < most => format!("{most} of {total} images registered; {count} in another model"),
+                _ => format!("{most} of {total} images registered"),
             });
         })?;
         let folders = folders(models)?.into_iter();

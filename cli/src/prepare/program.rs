@@ -95,8 +95,8 @@ impl Program {
         }
         let step = command.get_args().next().and_then(|step| step.to_str()).filter(|step| !step.starts_with('-'));
         let name = step.map_or(self.name.to_owned(), |step| format!("{} {step}", self.name));
-        let above = if kept.is_empty() { "and said nothing" } else { "and its last words are above" };
-        Err(Error::setting(name, format!("has failed ({}), {above}", ending(status))).into())
+        let above = if kept.is_empty() { "and printed nothing" } else { "and its last output is above" };
+        Err(Error::setting(name, format!("failed ({}), {above}", ending(status))).into())
     }
 
     /// A command that runs it.
@@ -111,7 +111,7 @@ impl Program {
 
     fn unusable(&self, error: &std::io::Error) -> Stop {
         let what = match error.kind() {
-            ErrorKind::NotFound => format!("is not on the PATH; install it: {}", self.install),
+            ErrorKind::NotFound => format!("is not on the PATH: install it with {}", self.install),
             _ => format!("cannot be run: {error}"),
         };
         Error::setting(self.name, what).into()

@@ -30,7 +30,7 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     let said = FFMPEG.ask(&["-hide_banner".as_ref(), "-nostdin".as_ref(), "-i".as_ref(), video.as_os_str()])?;
     let Some(about) = Video::parse(&said) else {
         let last = said.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("nothing").trim();
-        return Err(Error::file(video, format!("is no video that ffmpeg can read; it says: {last}")).into());
+        return Err(Error::file(video, format!("ffmpeg cannot read it as a video: {last}")).into());
     };
     let rate = (CANDIDATES as f64 * count as f64 / about.seconds).min(about.rate);
     let wanted = (rate * about.seconds).max(1.0);
@@ -43,11 +43,11 @@ pub fn frames(video: &Path, count: usize, place: &Workplace) -> Work<usize> {
     command.args(["-qmin", "1", "-q:v", "1"]).arg(folder.join("%06d.jpg"));
     FFMPEG.run(&mut command, None, |line| {
         let Some(frame) = line.strip_prefix("frame=").and_then(|n| n.trim().parse::<f64>().ok()) else { return };
-        progress.set(frame / wanted, || format!("{frame} of about {wanted:.0} frames taken from the video"));
+        progress.set(frame / wanted, || format!("{frame} of about {wanted:.0} frames extracted"));
     })?;
     let candidates = entries(&folder)?;
     if candidates.is_empty() {
-        return Err(Error::file(video, "has no frames: ffmpeg has written none").into());
+        return Err(Error::file(video, "ffmpeg extracted no frames: check that the video plays").into());
     }
     let kept = keep_sharp(&candidates, count, &place.make("images")?, &progress)?;
     place.remove(FOLDER);
@@ -75,7 +75,7 @@ impl Video {
 fn keep_sharp(candidates: &[PathBuf], count: usize, to: &Path, progress: &Progress) -> Work<usize> {
     // A short video has fewer frames than are asked for: no more than those are thrown away.
     let group = ((candidates.len() as f64 / count as f64).round() as usize).clamp(1, CANDIDATES);
-    let sharpness = progress.each(candidates.len(), "frames looked at", |i| {
+    let sharpness = progress.each(candidates.len(), "frames rated for sharpness", |i| {
         Ok(if group == 1 { 0.0 } else { Photo::open(&candidates[i], None)?.sharpness() })
     })?;
     let mut kept = 0;

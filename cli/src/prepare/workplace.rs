@@ -24,20 +24,20 @@ impl Workplace {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be created: {e}"));
         let is_inside = match others(out) {
             Ok(others) if !others.is_empty() => {
-                return Err(Error::file(out, "holds files already: choose another --out, or remove that folder"));
+                return Err(Error::file(out, "is not empty: choose another --out or remove that folder"));
             }
             Ok(_) => true,
             Err(e) if out.is_dir() => return Err(Error::file(out, format!("cannot be read: {e}"))),
             Err(_) if out.exists() => return Err(Error::file(out, "is not a folder")),
             Err(_) if out.is_symlink() => {
                 let what =
-                    "is a symbolic link to a folder that does not exist: make that folder, or choose another --out";
+                    "is a symbolic link to a folder that does not exist: create that folder or choose another --out";
                 return Err(Error::file(out, what));
             }
             Err(_) => false,
         };
         let absolute = std::path::absolute(out).map_err(bad)?;
-        let name = absolute.file_name().ok_or_else(|| Error::file(out, "has no name that a folder can have"))?;
+        let name = absolute.file_name().ok_or_else(|| Error::file(out, "is not a valid folder name"))?;
         let folder = if is_inside { &absolute } else { absolute.parent().unwrap_or(&absolute) };
         std::fs::create_dir_all(folder).map_err(bad)?;
         let mut builder = tempfile::Builder::new();
@@ -80,7 +80,7 @@ impl Workplace {
         let moved = if is_inside { move_up(&done, &out) } else { std::fs::rename(&done, &out) };
         moved.map_err(|e| {
             let done = done.display();
-            Error::file(&out, format!("cannot be written: {e}; the work is finished and kept: move it from {done}"))
+            Error::file(&out, format!("cannot be written: {e}; the result is complete: move it from {done}"))
         })
     }
 }
@@ -103,7 +103,7 @@ fn others(folder: &Path) -> std::io::Result<Vec<OsString>> {
 /// Moves all that is in a folder to the one that holds it and nothing else.
 fn move_up(from: &Path, to: &Path) -> std::io::Result<()> {
     if !others(to)?.is_empty() {
-        return Err(std::io::Error::other("it holds files by now"));
+        return Err(std::io::Error::other("it is no longer empty"));
     }
     for entry in std::fs::read_dir(from)? {
         let name = entry?.file_name();
@@ -134,7 +134,7 @@ mod tests {
     /// The folder that an error says the work is kept in.
     fn kept(error: &Error) -> PathBuf {
         let message = error.to_string();
-        let (_, kept) = message.split_once("the work is finished and kept: move it from ").unwrap();
+        let (_, kept) = message.split_once("the result is complete: move it from ").unwrap();
         kept.into()
     }
 
@@ -169,7 +169,7 @@ mod tests {
         fs::create_dir(&gone).unwrap();
         drop(filled(&gone));
         assert!(names(&gone).is_empty());
-        assert!(Workplace::new(&new).err().unwrap().to_string().contains("holds files already"));
+        assert!(Workplace::new(&new).err().unwrap().to_string().contains("is not empty"));
         assert!(Workplace::new(&new.join("images/0.png")).err().unwrap().to_string().contains("is not a folder"));
         assert_eq!(names(folder.path()), ["a", "empty", "gone"]);
     }

@@ -180,7 +180,7 @@ impl CameraPathArgs {
                 let keys = match motion {
                     Motion::Frames(_) if self.frames.is_some() || self.seconds.is_some() => {
                         let flag = if self.frames.is_some() { "frames" } else { "seconds" };
-                        return Err(Error::setting(flag, "has no meaning for a file that lists every frame"));
+                        return Err(Error::setting(flag, "does not apply to a file that lists every frame"));
                     }
                     Motion::Frames(keys) => keys,
                     Motion::Keys { path, seconds } => {
@@ -216,18 +216,21 @@ impl CameraPathArgs {
             ("radius", self.radius.is_some(), round, "orbit and spiral"),
             ("elevation", self.elevation.is_some(), self.path == Orbit, "orbit"),
             ("fov", self.fov.is_some(), round || way, "orbit, spiral and spline"),
-            ("through", !self.keyframes.is_empty(), way, "spline"),
+            ("keyframes", !self.keyframes.is_empty(), way, "spline"),
             ("split", self.split.is_some(), way, "spline"),
             ("closed", self.closed, way, "spline"),
             ("seconds", self.seconds.is_some(), self.path != Test, "all other paths"),
             ("path-transform", self.path_transform.is_some(), file, "a FILE.json"),
         ];
         if let Some((flag, _, _, paths)) = flags.into_iter().find(|(_, given, fits, _)| *given && !fits) {
-            let what = format!("has no meaning for --path {}: it is for {paths}", self.path.name());
+            let what = format!("does not apply to --path {}: it is for {paths}", self.path.name());
             return Err(Error::setting(flag, what));
         }
         if way && self.keyframes.is_empty() {
-            return Err(Error::setting("through", "is needed for --path spline: say which photographs, such as 0,5,9"));
+            return Err(Error::setting(
+                "keyframes",
+                "is missing: --path spline needs images, such as --keyframes 0,5,9",
+            ));
         }
         Ok(())
     }
@@ -238,7 +241,7 @@ impl CameraPathArgs {
         let count = self.frames.or(timed).unwrap_or(usual);
         if count > MOST_FRAMES {
             let field = if self.seconds.is_some() { "seconds" } else { "path" };
-            return Err(Error::setting(field, format!("{count} frames are more than {MOST_FRAMES}")));
+            return Err(Error::setting(field, format!("{count} frames are more than the limit of {MOST_FRAMES}")));
         }
         Ok(count)
     }
@@ -285,8 +288,8 @@ fn chosen(photographs: &[Photograph], words: &[String], split: Split) -> Result<
         named.or_else(numbered).ok_or_else(|| {
             let (last, first) = (photographs.len() - 1, &photographs[0].name);
             let what =
-                format!("`{word}` is no {split} photograph: use numbers from 0 to {last}, or names such as {first}");
-            Error::setting("through", what)
+                format!("`{word}` is not a {split} image: use numbers from 0 to {last}, or names such as {first}");
+            Error::setting("keyframes", what)
         })
     };
     words.iter().map(|word| Ok(Keyframe::of(&photographs[number(word)?].camera))).collect()
@@ -335,16 +338,16 @@ mod tests {
         };
         fails(
             CameraPathArgs { radius: Some(2.0), ..of("test") },
-            "`radius`: has no meaning for --path test: it is for orbit and spiral",
+            "`radius`: does not apply to --path test: it is for orbit and spiral",
         );
         fails(CameraPathArgs { elevation: Some(2.0), ..of("spiral") }, "`elevation`");
         fails(CameraPathArgs { fov: Some(2.0), ..of("a.JSON") }, "`fov`");
-        fails(CameraPathArgs { keyframes: vec!["1".into()], ..of("orbit") }, "`through`");
+        fails(CameraPathArgs { keyframes: vec!["1".into()], ..of("orbit") }, "`keyframes`");
         fails(CameraPathArgs { split: Some(Split::Test), ..of("orbit") }, "`split`");
         fails(CameraPathArgs { closed: true, ..of("test") }, "`closed`");
         fails(CameraPathArgs { seconds: Some(1.0), ..of("test") }, "`seconds`");
         fails(CameraPathArgs { path_transform: Some("x".into()), ..of("orbit") }, "`path-transform`");
-        fails(of("spline"), "`through`: is needed");
+        fails(of("spline"), "`keyframes`: is missing");
         assert!(CameraPath::parse("path.txt").is_err() && of("orbit").check().is_ok());
         assert_eq!(CameraPathArgs { seconds: Some(2.5), ..of("orbit") }.count(7, 30.0).unwrap(), 75);
         assert_eq!(CameraPathArgs { seconds: Some(1e-3), ..of("orbit") }.count(7, 30.0).unwrap(), 1);

@@ -51,7 +51,9 @@ impl Frames {
     pub fn new(folder: PathBuf, of: Value, job: &Job, count: usize, save: &[Layer]) -> Result<Self> {
         check(&folder, record(&folder).as_ref(), &of, job, count, save)?;
         make_folder(&folder)?;
-        let lock = Lock::take(&folder.join(LOCK), || Error::file(&folder, "is being rendered to by another raygrad"))?;
+        let lock = Lock::take(&folder.join(LOCK), || {
+            Error::file(&folder, "another raygrad is rendering to it: wait until it ends")
+        })?;
         let left = record(&folder);
         let strange = match &left {
             Some(left) => left.strange,
@@ -60,7 +62,7 @@ impl Frames {
         let others = left.as_ref().filter(|left| left.of != of && left.done > 0);
         if let Some(Record { of: before, done, .. }) = others {
             let others = differing(before, &of).join(", ");
-            note(&format!("{}: {done} frames are replaced, which were of another {others}", folder.display()));
+            note(&format!("{}: replacing {done} frames that were rendered with another {others}", folder.display()));
         }
         let done = left.filter(|left| left.of == of).map_or(0, |left| left.done);
         let record = Record { of, job: job.mark().to_owned(), done: 0, strange };
@@ -102,8 +104,8 @@ impl Frames {
     fn check_lock(&self) -> Result<()> {
         let what = match self.lock.state() {
             State::Kept => return Ok(()),
-            State::Gone => "was removed or moved while frames were written to it: the same command begins again",
-            State::Lost => "another raygrad writes frames here now: this one has stopped",
+            State::Gone => "was removed or moved during rendering: run the same command to start again",
+            State::Lost => "another raygrad now renders to it, so this one stopped",
         };
         Err(Error::file(&self.folder, what))
     }
@@ -124,7 +126,7 @@ impl Frames {
             return;
         }
         if self.record.strange {
-            note(&format!("{}: held pictures before, and is not removed", self.folder.display()));
+            note(&format!("{}: kept, because it held other images before", self.folder.display()));
             return self.keep();
         }
         remove(&other_numbered(&self.folder, DIGITS, &[]));
@@ -170,7 +172,7 @@ fn check(folder: &Path, left: Option<&Record>, of: &Value, job: &Job, count: usi
         return Err(match left {
             Some(_) => Error::file(
                 folder,
-                "holds unfinished frames of another command: repeat that one to finish them, or add --overwrite",
+                "holds unfinished frames of another command: repeat that command or add --overwrite",
             ),
             None => taken(file),
         });
@@ -249,7 +251,7 @@ mod tests {
         let again = || Frames::new(place.path().into(), json!({}), &job(0, false), 3, &[]);
         let frames = again().unwrap();
         let error = again().err().unwrap().to_string();
-        assert!(error.contains("by another raygrad"), "{error}");
+        assert!(error.contains("another raygrad is rendering to it"), "{error}");
         drop(frames);
         again().unwrap();
         let [a, b] = [json!({"size": [1, 2], "model": 3, "only": 0}), json!({"size": [1, 2], "model": 4, "b": null})];
@@ -294,9 +296,7 @@ mod tests {
         std::fs::write(folder.join("0001.png"), b"cut off").unwrap();
         new(&job(0, false), &[Layer::Depth]).unwrap();
         let error = new(&job(1, false), &[]).unwrap_err().to_string();
-        assert!(error.ends_with(
-            "holds unfinished frames of another command: repeat that one to finish them, or add --overwrite"
-        ));
+        assert!(error.ends_with("holds unfinished frames of another command: repeat that command or add --overwrite"));
         new(&job(1, true), &[]).unwrap();
         // What shows the same is its own, as where a run was moved; a picture that came meanwhile stays.
         let mut frames = Frames::new(folder.into(), of(&job(1, true)), &job(2, false), 3, &[]).unwrap();
@@ -312,10 +312,10 @@ mod tests {
         let folder = place.path().join("frames");
         let mut first = frames(&folder, 1);
         std::fs::rename(&folder, place.path().join("moved")).unwrap();
-        assert!(first.push(&[0], &[]).unwrap_err().to_string().contains("was removed or moved while frames"));
+        assert!(first.push(&[0], &[]).unwrap_err().to_string().contains("was removed or moved during rendering"));
         let mut second = frames(&folder, 2);
         for layers in [vec![], vec![(Layer::Depth, vec![1])]] {
-            assert!(first.push(&[1], &layers).unwrap_err().to_string().contains("another raygrad writes frames here"));
+            assert!(first.push(&[1], &layers).unwrap_err().to_string().contains("another raygrad now renders to it"));
         }
         second.push(&[2], &[]).unwrap();
         // Nor is anything of the other one removed.

@@ -169,23 +169,18 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
         return ngp(file, whole(file, document)?, &to_capture);
     }
     if !has("camera_path") && !has("keyframes") {
-        let what =
-            "is no camera path: it has neither nerfstudio's `camera_path` or `keyframes` nor instant-ngp's `path`";
+        let what = "not a camera path: it has no `camera_path`, `keyframes` (nerfstudio) or `path` (instant-ngp)";
         return Err(Error::file(file, what));
     }
     let path: Nerfstudio = whole(file, document)?;
     let to_capture = match (transform, path.coordinates) {
         (None, Some(Coordinates::Capture)) => DAffine3::IDENTITY,
         (Some(_), Some(Coordinates::Capture)) => {
-            return Err(Error::field(
-                file,
-                "coordinates",
-                "says that it is in the capture's: leave --path-transform out",
-            ));
+            return Err(Error::field(file, "coordinates", "is already `capture`: remove --path-transform"));
         }
         (None, None) => {
             note(&format!(
-                "{}: is taken to be in the capture's coordinates; nerfstudio writes its own: say --path-transform with its \
+                "{}: assuming capture coordinates; for a path from nerfstudio, add --path-transform \
                  dataparser_transforms.json",
                 file.display()
             ));
@@ -198,27 +193,30 @@ pub fn read(file: &File, transform: Option<&File>, applied: impl FnOnce() -> Res
 
 fn parse<T: DeserializeOwned>(file: &File) -> Result<T> {
     let text = std::fs::read_to_string(file).map_err(|e| Error::file(file, format!("cannot be read: {e}")))?;
-    serde_json::from_str(&text).map_err(|e| Error::file(file, format!("is not of the right form: {e}")))
+    serde_json::from_str(&text).map_err(|e| Error::file(file, format!("is malformed: {e}")))
 }
 
 fn whole<T: DeserializeOwned>(file: &File, document: Value) -> Result<T> {
-    serde_json::from_value(document).map_err(|e| Error::file(file, format!("is not of the right form: {e}")))
+    serde_json::from_value(document).map_err(|e| Error::file(file, format!("is malformed: {e}")))
 }
 
 fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Path> {
     let bad = |field: &str, what: &str| Error::field(file, field, what);
     let size = [path.render_width, path.render_height];
     if !size.iter().all(|side| (1..=LARGEST).contains(side)) {
-        return Err(bad("render_width", &format!("with `render_height` must be from 1 to {LARGEST}, is {size:?}")));
+        return Err(bad(
+            "render_width",
+            &format!("the image size is {}x{}; use 1 to {LARGEST} pixels a side", size[0], size[1]),
+        ));
     }
     if path.camera_type.as_deref().is_some_and(|kind| kind != "perspective") {
-        return Err(bad("camera_type", "must be `perspective`: other lenses are not understood"));
+        return Err(bad("camera_type", "must be `perspective`, the only supported camera type"));
     }
     if path.crop.is_some() {
-        return Err(bad("crop", "is not understood: scenes are shown as a whole"));
+        return Err(bad("crop", "is not supported: remove it"));
     }
-    if path.fps.is_some_and(|fps| !FPS.contains(&fps)) {
-        return Err(bad("fps", &format!("must be from {} to {}", FPS.start(), FPS.end())));
+    if let Some(fps) = path.fps.filter(|fps| !FPS.contains(fps)) {
+        return Err(bad("fps", &format!("is {fps}; use {} to {}", FPS.start(), FPS.end())));
     }
     for (name, value) in [("seconds", path.seconds), ("default_transition_sec", path.default_transition_sec)] {
         if value.is_some_and(|value| !(value > 0.0 && value <= 1e6)) {
@@ -227,7 +225,7 @@ fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Pa
     }
     let key = |name: String, matrix: &[f64; 16], fov: f64, time: Option<f64>| {
         if time.is_some() {
-            return Err(bad(&format!("{name}.render_time"), "is not understood: scenes stand still"));
+            return Err(bad(&format!("{name}.render_time"), "is not supported, because scenes are static: remove it"));
         }
         key(file, &name, from_rows(matrix).map_err(|what| bad(&name, &what))?, fov, to_capture)
     };
@@ -243,13 +241,10 @@ fn nerfstudio(file: &File, path: Nerfstudio, to_capture: &DAffine3) -> Result<Pa
         (true, None) => return Err(bad("camera_path", "is empty")),
         (true, Some(frames)) => {
             if path.smoothness_value.is_some_and(|value| value != 0.0) {
-                return Err(bad(
-                    "smoothness_value",
-                    "must be 0 where there is no `camera_path`: others are not understood",
-                ));
+                return Err(bad("smoothness_value", "must be 0 without a `camera_path`: smoothing is not supported"));
             }
-            let frames: Vec<NerfstudioKeyframe> = serde_json::from_value(frames)
-                .map_err(|e| bad("keyframes", &format!("is not of the right form: {e}")))?;
+            let frames: Vec<NerfstudioKeyframe> =
+                serde_json::from_value(frames).map_err(|e| bad("keyframes", &format!("is malformed: {e}")))?;
             count(file, "keyframes", frames.len())?;
             let each = frames.iter().enumerate();
             let keys =
@@ -278,7 +273,7 @@ fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
     let bad = |field: &str, what: &str| Error::field(file, field, what);
     count(file, "path", path.path.len())?;
     if path.spline_order.is_some_and(|order| order != 3) {
-        return Err(bad("spline_order", "must be 3: splines of another order are not understood"));
+        return Err(bad("spline_order", "must be 3, the only supported order"));
     }
     let of = |(i, frame): (usize, &NgpKey)| {
         let name = format!("path[{i}]");
@@ -288,13 +283,10 @@ fn ngp(file: &File, path: Ngp, to_capture: &DAffine3) -> Result<Path> {
             return Err(bad(&format!("{name}.R"), "must be a quaternion x, y, z, w"));
         }
         if frame.aperture_size != 0.0 {
-            return Err(bad(
-                &format!("{name}.aperture_size"),
-                "must be 0: a lens that is out of focus is not understood",
-            ));
+            return Err(bad(&format!("{name}.aperture_size"), "must be 0: depth of field is not supported"));
         }
         if frame.glow_mode != 0 {
-            return Err(bad(&format!("{name}.glow_mode"), "must be 0: it is not understood"));
+            return Err(bad(&format!("{name}.glow_mode"), "must be 0: glow is not supported"));
         }
         // Its cameras have y down and look along z.
         let turned = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
@@ -321,7 +313,7 @@ fn count(file: &File, field: &str, count: usize) -> Result<()> {
     match count {
         0 => Err(Error::field(file, field, "is empty")),
         1..=MOST => Ok(()),
-        _ => Err(Error::field(file, field, format!("has {count} frames, more than {MOST}"))),
+        _ => Err(Error::field(file, field, format!("has {count} frames; the limit is {MOST}"))),
     }
 }
 
@@ -330,7 +322,7 @@ fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3)
     let bad = |what: String| Error::field(file, name, what);
     rigid::pose(&pose).map_err(|what| bad(format!("its pose {what}")))?;
     if !(SMALLEST_FOV..=180.0 - SMALLEST_FOV).contains(&fov) {
-        return Err(bad(format!("`fov` must be from {SMALLEST_FOV} to {} degrees, is {fov}", 180.0 - SMALLEST_FOV)));
+        return Err(bad(format!("`fov` is {fov}; use {SMALLEST_FOV} to {} degrees", 180.0 - SMALLEST_FOV)));
     }
     let DAffine3 { matrix3, .. } = to_capture;
     let pose = DAffine3 {
@@ -344,7 +336,7 @@ fn key(file: &File, name: &str, pose: DAffine3, fov: f64, to_capture: &DAffine3)
 fn from_rows(m: &[f64; 16]) -> std::result::Result<DAffine3, String> {
     let last = &m[12..];
     if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(value, expected)| !((value - expected).abs() < 1e-3)) {
-        return Err(format!("its matrix must be written row by row, the last one 0 0 0 1, which is {last:?}"));
+        return Err(format!("the last row of its matrix is {last:?}; write the matrix row by row, ending in 0 0 0 1"));
     }
     let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
     Ok(DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) })

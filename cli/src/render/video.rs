@@ -20,7 +20,7 @@ use crate::progress::Progress;
 const FASTEST_GIF: f64 = 50.0;
 
 /// What is counted while a video is written.
-const IN_FILM: &str = "frames in the video";
+const IN_FILM: &str = "frames encoded";
 
 /// A file that holds a video.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -55,14 +55,13 @@ impl VideoFormat {
     pub fn check(self, out: &Path, fps: f64, size: [usize; 2]) -> Result<()> {
         check_writable(parent(out))?;
         if self == VideoFormat::Gif && fps > FASTEST_GIF {
-            let what =
-                format!("a GIF shows {FASTEST_GIF} frames a second at most, not {fps}: name a FILE.apng or FILE.mp4");
+            let what = format!("is {fps}; a GIF shows at most {FASTEST_GIF} frames a second: use .apng or .mp4");
             return Err(Error::setting("fps", what));
         }
         if let Some(side) = size.into_iter().find(|side| *side > LARGEST) {
             return Err(Error::setting(
                 "size",
-                format!("has a side of {side} pixels, and videos have {LARGEST} at most"),
+                format!("has a side of {side} pixels; use at most {LARGEST} for a video"),
             ));
         }
         match self {
@@ -73,7 +72,7 @@ impl VideoFormat {
 
     /// Whether ffmpeg is there and has what this needs.
     pub fn check_encoder(self, out: &Path) -> Result<()> {
-        let or = "or name a FILE.gif or FILE.apng, which need no other program";
+        let or = "or use .gif or .apng, which need no ffmpeg";
         let encoders = FFMPEG.ask(&["-hide_banner", "-encoders"]).map_err(|stop| match stop {
             Stop::Failed(error) => Error::file(out, format!("{error}; {or}")),
             Stop::Interrupted => Error::file(out, "was interrupted"),
@@ -82,10 +81,7 @@ impl VideoFormat {
         if encoders.split_whitespace().any(|word| word == encoder) {
             return Ok(());
         }
-        Err(Error::file(
-            out,
-            format!("needs an ffmpeg with {encoder}, which the one here lacks: install another, {or}"),
-        ))
+        Err(Error::file(out, format!("needs {encoder}, which this ffmpeg lacks: install an ffmpeg that has it, {or}")))
     }
 
     /// What ffmpeg writes it with.
@@ -117,7 +113,7 @@ impl VideoFormat {
         let even = size.map(|side| side.next_multiple_of(2));
         if even != size {
             let [width, height] = even;
-            note(&format!("{}: videos have even sides: black is added, to {width}x{height}", out.display()));
+            note(&format!("{}: padded with black to {width}x{height}, because videos need even sides", out.display()));
         }
         let mut command = FFMPEG.command();
         // In the folder, whose name may hold what ffmpeg reads as a number.
@@ -190,7 +186,7 @@ mod tests {
         for video in [VideoFormat::Gif, VideoFormat::Apng] {
             std::fs::write(&out, b"footage").unwrap();
             let Err(Stop::Failed(error)) = write(video, false) else { panic!("{video:?} is written") };
-            assert!(error.to_string().contains("walk.gif: exists, and was not written by this command"), "{error}");
+            assert!(error.to_string().contains("walk.gif: exists, and this command did not write it"), "{error}");
             assert_eq!(std::fs::read(&out).unwrap(), b"footage");
             write(video, true).unwrap();
             // Its own is replaced.

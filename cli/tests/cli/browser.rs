@@ -125,7 +125,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
     assert_eq!(browser.value("mode()"), "color");
     browser.shot("checkpoint");
     slide(&mut browser, 2);
-    assert_eq!(browser.value("document.getElementById('checkpoint-out').textContent"), "the end");
+    assert_eq!(browser.value("document.getElementById('checkpoint-out').textContent"), "final model");
     browser.value("document.getElementById('skip').value = 'off'; document.getElementById('skip').dispatchEvent(new Event('change'))");
     browser.rested();
     browser.value("stage.focus()");
@@ -172,7 +172,7 @@ fn keeps_pictures(mut browser: Browser, place: &Place, server: &Server) {
         place.command(&format!("render run --path path.json --frames 2 --size {size} --out video")).output().unwrap();
     // It says itself where it lies.
     let said = String::from_utf8_lossy(&rendered.stderr);
-    assert!(rendered.status.success() && !said.contains("is taken to be"), "{said}");
+    assert!(rendered.status.success() && !said.contains("assuming capture coordinates"), "{said}");
     std::fs::rename(place.path("video"), place.path(&format!("video-{:?}", browser.kind))).unwrap();
     let [from, to] = ["0000", "0001"].map(|name| png(&place.path(&format!("video-{:?}/{name}.png", browser.kind))));
     assert!(psnr(&from, &saved) > 42.0, "{}", psnr(&from, &saved));
@@ -374,13 +374,13 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
     browser.set("crop", true);
     browser.value("document.getElementById('box-x-0').value = 1e9");
     browser.click("video");
-    browser.until("!$('sorry').hidden && $('sorry').textContent.includes('without a box')");
+    browser.until("!$('sorry').hidden && $('sorry').textContent.includes('turn off the crop box')");
     browser.set("crop", false);
     browser.value("document.querySelector('#keys li button:last-child').click()");
     // It is seen from the bottom of the controls too.
     browser.value("document.querySelector('aside').scrollTo(0, 1e6)");
     browser.click("play");
-    browser.until("$('sorry').textContent.includes('two key frames')");
+    browser.until("$('sorry').textContent.includes('two keyframes')");
     assert!(browser.sees("sorry"));
     // Nothing is painted for a page that nobody sees, and it goes on when it is seen.
     browser.click("reset");
@@ -469,7 +469,7 @@ fn a_browser_shows_training_and_controls_it() {
     browser.until("typeof training !== 'undefined' && training !== null && training.step > 20 && shown !== null");
     browser.until("shown.step > 10");
     browser.value("document.getElementById('pause').click()");
-    browser.until("training.paused === true && document.getElementById('pause').textContent === 'Go on'");
+    browser.until("training.paused === true && document.getElementById('pause').textContent === 'Resume'");
     let step = browser.value("training.step");
     browser.value("new Promise((done) => setTimeout(done, 900))");
     assert_eq!(browser.value("training.step"), step);
@@ -482,7 +482,7 @@ fn a_browser_shows_training_and_controls_it() {
     browser.value("document.getElementById('pause').click()");
     browser.until(&format!("training.step > {step}"));
     browser.value("window.confirm = () => true; document.getElementById('stop').click()");
-    browser.until("training.ended === 'stopped, and saved'");
+    browser.until("training.ended === 'stopped and saved'");
     browser.shot("ended");
     browser.go("about:blank");
     assert_eq!(server.child.wait().unwrap().code(), Some(0));

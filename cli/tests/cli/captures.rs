@@ -51,7 +51,7 @@ fn depths_are_learned_from_where_that_is_asked_for() {
     for flags in ["--to colmap --out left", "--undistort --out straight"] {
         let output = place.command(&format!("prepare captured {flags}")).output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
-        assert!(output.status.success() && said.contains("files of depths are left behind: "), "{flags}: {said}");
+        assert!(output.status.success() && said.contains("depth files are not converted: "), "{flags}: {said}");
     }
     // The landscape measures its own.
     place.succeeds(&format!("train landscape --downscale 20 --steps 1 --depth-loss --out far {SMALL}"));
@@ -82,9 +82,15 @@ fn terms_and_the_nearest_distance_can_be_said() {
         (config["scene_box"]["near_far"][0].as_f64().unwrap() - 0.25 * scale).abs() < 1e-12 && scale != 1.0,
         "{config}"
     );
-    place.fails(&format!("train scene --steps 1 {SMALL} --near 6"), &["`near`", "less than 6"]);
-    place.fails(&format!("train scene --steps 1 {SMALL} --near=-1"), &["`near`"]);
-    place.fails(&format!("train scene --steps 1 {SMALL} --loss fog=1"), &["`term`", "fog=1", "entropy"]);
+    place.fails_with(
+        &format!("train scene --steps 1 {SMALL} --near 6"),
+        "`near`: is 6; use 0 to less than 6.0000, the far plane",
+    );
+    place.fails_with(
+        &format!("train scene --steps 1 {SMALL} --near=-1"),
+        "`near`: is -1; use 0 to less than 6.0000, the far plane",
+    );
+    place.fails(&format!("train scene --steps 1 {SMALL} --loss fog=1"), &["`loss`: cannot be fog=1: ", "entropy"]);
     for bad in ["entropy", "entropy=x", "entropy=-1", "entropy=NaN"] {
         let output = place.command(&format!("train scene --steps 1 --loss {bad}")).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{bad}: {output:?}");
@@ -157,7 +163,9 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
         assert_eq!(place.json(&format!("{run}/eval-test-fast.json"))["appearance"], expected);
     }
     assert!(
-        place.succeeds("eval codes --views 1").contains("exposures and codes: the mean of the training photographs'")
+        place
+            .succeeds("eval codes --views 1")
+            .contains("exposure and appearance embeddings: mean of the training images")
     );
     // The mean exposure, and corners that are as dark as in all photographs.
     let mut model = model(&place, "run");
@@ -233,7 +241,11 @@ fn opaque_photographs_have_a_plain_background_unless_another_is_asked_for() {
     assert_eq!(background("--background random", "random"), "random");
     assert_eq!(background("--background black", "black"), "black");
     // What samples evenly would see nothing of a scene that goes on.
-    place.fails("train landscape --downscale 20 --steps 1 --preset small", &["`preset`", "small", "--skip fast"]);
+    place.fails_with(
+        "train landscape --downscale 20 --steps 1 --preset small",
+        "`preset`: small spaces samples evenly, too few for the long rays of an unbounded scene: use instant or \
+         voxel, or add --skip fast or --scene-type bounded",
+    );
     let marched = "--preset small --skip fast --set sampler.samples=512 --set sampler.occupancy.resolution=16";
     place.succeeds(&format!("train landscape --downscale 20 --steps 1 --out skipped {marched}"));
 }
@@ -250,10 +262,13 @@ fn what_was_trained_on_is_no_test() {
     test["frames"][1] = moved;
     place.write_transforms(Split::Test, &test);
     place.write_transforms(Split::Train, &rest);
-    place.fails("eval run", &["holds out the test photograph `train/r_3`", "was trained on"]);
+    place.fails_with(
+        "eval run",
+        "`scene`: the test image `train/r_3` was a training image of the run: name the unchanged capture with --scene",
+    );
     place.fails("eval run --split val --scene absent", &["absent"]);
     // A path from photograph to photograph is by those that were trained on.
-    place.fails("render run --path spline --keyframes 0", &["trained on 6", "say with --scene"]);
+    place.fails("render run --path spline --keyframes 0", &["trained on 6", "name their folder with --scene"]);
     // A run of the first edition does not know the names of its photographs.
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out run {SMALL}"));
@@ -268,8 +283,12 @@ fn what_was_trained_on_is_no_test() {
     std::fs::rename(place.path("scene/train/r_3.png"), place.path("scene/train/r_9.png")).unwrap();
     train["frames"][3]["file_path"] = json!("./train/r_9");
     place.write_transforms(Split::Train, &train);
-    place.fails("eval run --split train", &["was not trained on `train/r_9`"]);
-    place.fails("export run other.json", &["has other photographs to train on than those"]);
+    place.fails_with(
+        "eval run --split train",
+        "`scene`: `train/r_9` is not a training image of the run, which has no camera for it: name the unchanged \
+         capture with --scene",
+    );
+    place.fails("export run other.json", &["has other training images than the run"]);
 }
 
 #[test]
@@ -309,12 +328,12 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
     // What is gone on with says how far it goes.
     for (run, scope) in [("ahead", "forward-facing"), ("around", "unbounded")] {
         let said = place.succeeds(&format!("train --resume {run} --steps 2"));
-        assert!(said.contains(&format!("{scope}: as the model has it")), "{said}");
+        assert!(said.contains(&format!("{scope}: as in training")), "{said}");
     }
     assert_eq!(model(&place, "around").scene_box.ndc, None);
     place.fails(
         &format!("train scene --scene-type forward-facing --steps 1 {SMALL}"),
-        &["`scope`", "turned from each other", "use unbounded"],
+        &["`scene-type`", "turned from each other", "use unbounded"],
     );
     place
         .fails(&format!("train embedded --downscale 20 --scene-type forward-facing --steps 1 {SMALL}"), &["unbounded"]);

@@ -139,7 +139,9 @@ fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
     let output = place.command("prepare scene --to llff --out made").output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(
-        output.status.code() == Some(1) && said.contains("has a lens") && said.contains("1 masks are left"),
+        output.status.code() == Some(1)
+            && said.contains("has a lens")
+            && said.contains("1 masks are not converted: LLFF has none"),
         "{said}"
     );
     // Two images that would have one name, as folders go.
@@ -148,8 +150,11 @@ fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
     transforms["frames"][0]["file_path"] = "images/more_9.png".into();
     transforms["frames"][1].as_object_mut().unwrap().remove("mask_path");
     std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
-    place.fails("prepare scene --to llff --undistort --out made", &["more_9.png", "as another would"]);
-    place.fails("prepare scene --to colmap --out scene", &["scene: holds files already"]);
+    place.fails("prepare scene --to llff --undistort --out made", &["more_9.png", "would both become"]);
+    place.fails_with(
+        "prepare scene --to colmap --out scene",
+        "scene: is not empty: choose another --out or remove that folder",
+    );
     std::fs::write(place.path("scene/images/5.png"), "no picture").unwrap();
     place.fails("prepare scene --to colmap --out made", &["`frames[5]`", "5.png: cannot be decoded"]);
     assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 1, "nothing is left");
@@ -352,8 +357,14 @@ fn built_in_scenes_are_written_for_other_programs() {
         assert!(a.origin.distance(b.origin) < 1e-6 && a.direction.distance(b.direction) < 1e-7, "{found:?}");
         place.succeeds(&format!("train {scene}-made --steps 1 --scene-type bounded --out run-{scene} {CLASSIC}"));
     }
-    place.fails("prepare embedded --out other", &["embedded", "--to"]);
-    place.fails("prepare landscape --to colmap --size 15 --out other", &["`size`: 15"]);
-    place.fails("prepare absent --to colmap --size 16 --out other", &["absent: there is no such folder"]);
+    place.fails_with(
+        "prepare embedded --out other",
+        "embedded: is a built-in scene: choose the format to write with --to",
+    );
+    place.fails_with(
+        "prepare landscape --to colmap --size 15 --out other",
+        "`size`: is 15; the landscape is 4:3, so use a multiple of 4",
+    );
+    place.fails_with("prepare absent --to colmap --size 16 --out other", "absent: there is no such folder");
     assert!(!place.path("other").exists());
 }

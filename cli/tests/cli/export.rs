@@ -71,11 +71,15 @@ fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
         let path = frame["file_path"].as_str().unwrap();
         assert!(place.path(&format!("colmap/{path}")).is_file(), "{path}");
     }
-    place.fails("export run scene", &["scene: has no ending that says what to export", "--to"]);
-    place.fails("export run colmap --to llff", &["colmap: holds files already"]);
+    place.fails_with(
+        "export run scene",
+        "scene: has no known file extension: use .json for cameras, .ply, .obj or .glb for a mesh, .html for a scene \
+         page, or name a format with --to",
+    );
+    place.fails_with("export run colmap --to llff", "colmap: is not empty: choose another --out or remove that folder");
     // Other photographs than those that it was trained on have no refined cameras.
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
-    place.fails("export run other.json", &["has 5 photographs to train on", "trained on 6"]);
+    place.fails("export run other.json", &["has 5 training images", "trained on 6"]);
     assert!(!place.path("other.json").exists());
 }
 
@@ -110,7 +114,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     // A fog, still: at a low density its surface is the box.
     let said = place.succeeds("export run mesh.ply --iso-value 1e-6 --resolution 20");
     assert!(
-        said.starts_with("exported ") && said.contains(", closed; density 0.0000 per scene unit, 20 cells"),
+        said.starts_with("exported ") && said.contains(", closed; iso-value 0.0000 per scene unit, 20 cells"),
         "{said}"
     );
     let (mesh, header) = vertices(&place, "mesh.ply");
@@ -126,7 +130,7 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     let cell = extent.space().side() / 20.0;
     assert!(within(&mesh, cell) && !within(&mesh, -cell));
     let open = place.succeeds("export run open.ply --iso-value 1e-6 --resolution 20 --min-component 0 --open-boundary");
-    assert!(open.contains("0 small parts left out") && !open.contains(", closed"), "{open}");
+    assert!(open.contains("0 small components removed") && !open.contains(", closed"), "{open}");
 
     let few = place.succeeds("export run few.glb --iso-value 1e-6 --resolution 20 --triangles 500");
     assert!(few.contains(" 500 triangles, closed"), "{few}");
@@ -140,22 +144,31 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
 
     let said = place.succeeds("export run points.ply --points=50");
     let (points, header) = vertices(&place, "points.ply");
-    assert!(said.contains(&format!("exported {} points, of ", points.len())) && !header.contains("face"), "{said}");
+    assert!(said.contains(&format!("exported {} points, from ", points.len())) && !header.contains("face"), "{said}");
     assert!((10..=50).contains(&points.len()) && within(&points, 1e-9));
     place.fails("export run no.ply --iso-value=-1", &["`level`: is -1"]);
     place.fails("export run no.ply --iso-value 1e30 --no-fill-unseen", &["`level`: is 1", "use a smaller one"]);
-    place.fails("export run cameras.json --triangles 9", &["`triangles`: is for shapes"]);
-    place.fails("export run cameras.json --points", &["`points`: is for shapes"]);
+    place.fails_with(
+        "export run cameras.json --triangles 9",
+        "`triangles`: applies to meshes and point clouds: name a .ply, .obj or .glb file",
+    );
+    place.fails_with(
+        "export run cameras.json --points",
+        "`points`: applies to meshes and point clouds: name a .ply, .obj or .glb file",
+    );
     // Those of six photographs, and four rings of twelve around the scene, which are left when it is gone.
-    assert!(said.contains("that 54 views see"), "{said}");
+    assert!(said.contains("in 54 views"), "{said}");
     std::fs::rename(place.path("scene"), place.path("moved")).unwrap();
-    assert!(place.succeeds("export run some.ply --points=20").contains("that 48 views see"));
+    assert!(place.succeeds("export run some.ply --points=20").contains("in 48 views"));
     let moved = place.succeeds("export run some.ply --points=20 --scene moved");
-    assert!(moved.contains("that 54 views see"), "{moved}");
+    assert!(moved.contains("in 54 views"), "{moved}");
     place.fails("export run no.ply --scene scene", &["scene: there is no such folder"]);
-    place.fails("export run no.ply --to colmap --open-boundary", &["`open-boundary`: is for shapes"]);
+    place.fails_with(
+        "export run no.ply --to colmap --open-boundary",
+        "`open-boundary`: applies to meshes and point clouds: name a .ply, .obj or .glb file",
+    );
     place.fails("export run absent/no.ply", &["absent"]);
     std::fs::create_dir(place.path("folder.glb")).unwrap();
-    place.fails("export run folder.glb", &["folder.glb: is a folder"]);
+    place.fails_with("export run folder.glb", "folder.glb: is a folder, not a file");
     assert!(!place.path("no.ply").exists());
 }

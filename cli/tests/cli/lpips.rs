@@ -88,10 +88,10 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     assert!(figures.len() == 3 && (mean - figures.iter().sum::<f64>() / 3.0).abs() < 1e-12);
     // In the table and on the page.
     let lines: Vec<Vec<&str>> = table.lines().map(|line| line.split_whitespace().collect()).collect();
-    assert_eq!(lines[0], ["view", "PSNR", "SSIM", "LPIPS"]);
+    assert_eq!(lines[0], ["image", "PSNR", "SSIM", "LPIPS"]);
     assert_eq!(lines[2].last().unwrap(), &format!("{:.4}", figures[1]), "{table}");
     assert_eq!(lines[4].last().unwrap(), &format!("{mean:.4}"), "{table}");
-    assert!(table.contains(&format!("\nLPIPS: vgg, weights with the CRC-32 {crc}\n")), "{table}");
+    assert!(table.contains(&format!("\nLPIPS: vgg, weights CRC-32 {crc}\n")), "{table}");
     let page = page("eval-test-lpips-vgg");
     assert!(
         page.contains("<th>LPIPS</th></tr>") && page.contains(&format!("<td>{:.4}</td></tr>", figures[2])),
@@ -104,7 +104,10 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     assert!(compared.contains(&format!("lpips_backbone vgg; lpips_crc32 {crc}")), "{compared}");
 
     // Of the right halves only, which are too small; of what is masked there is none.
-    place.fails("eval run --lpips vgg.safetensors --fit-half", &["`lpips`", "12x24", "vgg needs 16x16"]);
+    place.fails_with(
+        "eval run --lpips vgg.safetensors --fit-half",
+        "`lpips`: `test/r_0` has 12x24 pixels to compare; vgg needs at least 16x16",
+    );
     let mut transforms: Value = place.json("scene/transforms_test.json");
     let mut mask = Image { width: SIZE, height: SIZE, channels: 1, data: vec![1.0; SIZE * SIZE] };
     mask.data[SIZE + 3] = 0.0;
@@ -112,7 +115,10 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
     transforms["frames"][1]["mask_path"] = json!("mask.png");
     std::fs::write(place.path("scene/transforms_test.json"), transforms.to_string()).unwrap();
     let output = place.command("eval run --lpips vgg.safetensors").output().unwrap();
-    assert!(String::from_utf8_lossy(&output.stderr).contains("1 of 3 have masks"), "{output:?}");
+    assert!(
+        String::from_utf8_lossy(&output.stderr).contains("LPIPS leaves out 1 of 3 images, because they have masks"),
+        "{output:?}"
+    );
     let table = String::from_utf8(output.stdout).unwrap();
     let masked = place.json("run/eval-test-lpips-vgg.json");
     let views = masked["per_view"].as_array().unwrap();
@@ -125,7 +131,10 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
 fn weights_that_do_not_serve_are_refused_before_anything_is_rendered() {
     let place = Place::with_run();
     weights(&place, "alex.safetensors", ALEX);
-    place.fails("eval run --lpips alex.safetensors", &["`lpips`", "`test/r_0`", "24x24", "alex needs 31x31"]);
+    place.fails_with(
+        "eval run --lpips alex.safetensors",
+        "`lpips`: `test/r_0` has 24x24 pixels to compare; alex needs at least 31x31",
+    );
     place.fails("eval run --lpips absent", &["absent: cannot be read"]);
     let bytes = place.bytes("alex.safetensors");
     std::fs::write(place.path("part.safetensors"), &bytes[..bytes.len() / 2]).unwrap();

@@ -199,6 +199,19 @@ impl Place {
     fn fails(&self, arguments: &str, expected: &[&str]) {
         complained(arguments, &self.command(arguments).output().unwrap(), expected);
     }
+
+    /// Fails with this message, after the program's name, and nothing else on standard error.
+    #[track_caller]
+    fn fails_with(&self, arguments: &str, message: &str) {
+        complained_of(arguments, &self.command(arguments).output().unwrap(), message);
+    }
+}
+
+/// Ended with this message and nothing else on standard error.
+#[track_caller]
+fn complained_of(what: &str, output: &Output, message: &str) {
+    let said = (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned());
+    assert_eq!(said, (Some(1), format!("raygrad: {message}\n")), "{what}");
 }
 
 #[track_caller]
@@ -263,7 +276,7 @@ fn a_run_is_complete_and_can_be_evaluated() {
     assert!(page.contains("<tr><th>model seed</th><td>0</td></tr>"), "{page}");
 
     let table = place.succeeds("eval run --split val --views 1");
-    assert!(table.contains("worst: val/r_0 (") && table.contains("val views (as the capture's files say)"), "{table}");
+    assert!(table.contains("worst: val/r_0 (") && table.contains("val images (as the capture's files say)"), "{table}");
     assert!(table.contains("mean of 1") && table.contains("val/r_0") && !table.contains("val/r_1"), "{table}");
     // Beside the other result, and not in its place.
     assert_eq!(place.json("run/eval-val-1.json")["split"], "val");
@@ -271,16 +284,16 @@ fn a_run_is_complete_and_can_be_evaluated() {
     assert!(place.path("run/eval-val-1/000.png").exists() && printed["skip"].is_null());
     // Side by side with another's.
     place.succeeds(&format!("train scene --steps 2 --seed 9 --out other {CLASSIC}"));
-    place.fails("compare run other", &["other: has no results"]);
+    place.fails_with("compare run other", "other: has no eval results: run `raygrad eval` first");
     place.succeeds("eval other");
     let table = place.succeeds("compare run other --only eval-test");
     let psnr =
         |run: &str| format!("{:.2}", place.json(&format!("{run}/eval-test.json"))["psnr_mean"].as_f64().unwrap());
     let rows: Vec<Vec<&str>> = table.lines().take(3).map(|line| line.split_whitespace().collect()).collect();
     assert!(rows[0].contains(&"model.seed") && rows[1][..3] == ["run", "eval-test", &psnr("run")], "{table}");
-    assert!(rows[2][..3] == ["other", "eval-test", &psnr("other")] && !table.contains("not the same"), "{table}");
+    assert!(rows[2][..3] == ["other", "eval-test", &psnr("other")] && !table.contains("different"), "{table}");
     let output = place.command("compare run").output().unwrap();
-    assert!(String::from_utf8_lossy(&output.stdout).contains("not the same photographs"));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("different images"));
     assert!(output.stderr.is_empty(), "{output:?}");
     // Its figures are no longer those of its model.
     place.succeeds("train --resume run --steps 4");
@@ -288,12 +301,12 @@ fn a_run_is_complete_and_can_be_evaluated() {
     let said = String::from_utf8_lossy(&output.stderr);
     std::fs::create_dir_all(place.path("run/eval-test/unfinished")).unwrap();
     std::fs::write(place.path("run/eval-test/unfinished/999.png"), b"half").unwrap();
-    let stale = "is of a model that has been trained on since";
+    let stale = "the model was trained further after this result";
     assert!(output.status.success() && said.matches(stale).count() == 2 && !said.contains("other/"), "{said}");
     // One at a time.
     let lock = std::fs::File::create(place.path("run/eval-test/unfinished.lock")).unwrap();
     lock.lock().unwrap();
-    place.fails("eval run", &["run/eval-test: is being written by another raygrad"]);
+    place.fails_with("eval run", "run/eval-test: another raygrad is writing it: wait until it ends");
     drop(lock);
     // What an evaluation that was killed has left is begun again; what is evaluated anew is not stale.
     place.succeeds("eval run");
@@ -349,7 +362,7 @@ fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
     std::fs::write(place.path("capture/transforms.json"), transforms.to_string()).unwrap();
 
     let table = place.succeeds("doctor capture");
-    assert!(table.contains("nothing is wrong") && table.contains("bounded: photographs are transparent"), "{table}");
+    assert!(table.contains("no problems found") && table.contains("bounded: photographs are transparent"), "{table}");
     assert!(
         table.contains("  resolution     64x64\n") && table.contains("  images         35 train, 5 test\n"),
         "{table}"
@@ -374,7 +387,7 @@ fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
     std::fs::write(place.path("capture/images/09.png"), b"no image").unwrap();
     assert_eq!(report(4)["findings"][0]["kind"], "images-undecodable");
     assert!(String::from_utf8(place.bytes("other/doctor.html")).unwrap().contains("images-undecodable"));
-    place.fails("doctor embedded", &["`scene`", "name a folder"]);
+    place.fails_with("doctor embedded", "`scene`: built-in scenes have no files to check: name a folder");
     place.fails("doctor absent", &["absent: there is no such folder"]);
 }
 
@@ -390,7 +403,7 @@ fn pictures_and_animations() {
     let output = place.command("render run --frames 1").output().unwrap();
     assert!(output.status.success() && place.path("run/orbit/0001.png").exists());
     let said = String::from_utf8(output.stderr).unwrap();
-    assert!(said.contains("orbit holds 1 more numbered pictures, from a longer path"), "{said}");
+    assert!(said.contains("orbit also holds 1 numbered images of a longer path"), "{said}");
     // Pictures of an evaluation that is replaced go; nothing else does.
     std::fs::create_dir(place.path("run/eval-test")).unwrap();
     for name in ["007.png", "0007.png", "7.png", "notes.txt"] {
@@ -430,15 +443,15 @@ fn the_embedded_scene_needs_no_files() {
     let place = Place::empty();
     let printed = place
         .succeeds(&format!("train --steps 1 --downscale 10 --no-positional-encoding --background random {CLASSIC}"));
-    assert!(printed.contains("embedded: 60 views of 20x20") && printed.contains("raygrad eval run"), "{printed}");
+    assert!(printed.contains("embedded: 60 images of 20x20") && printed.contains("raygrad eval run"), "{printed}");
     let config = place.json("run/config.json");
     assert_eq!([&config["scene"], &config["config"]["background"]], ["embedded", "random"]);
     assert_eq!(config["config"]["field"]["position_levels"], 0);
     place.succeeds("eval run --views 1");
     assert_eq!(place.json("run/eval-test-1.json")["background"], "white");
     place.succeeds("render run --out one.png");
-    place.fails("train --downscale 3", &["`downscale`", "200x200"]);
-    place.fails("train landscape --downscale 16", &["`downscale`", "400x300"]);
+    place.fails_with("train --downscale 3", "`downscale`: 3 does not divide the image size 200x200");
+    place.fails_with("train landscape --downscale 16", "`downscale`: 16 does not divide the image size 400x300");
 }
 
 #[test]
@@ -458,15 +471,24 @@ fn nothing_is_overwritten() {
     for name in ["run-2", "run-3"] {
         assert!(place.succeeds(&format!("train scene --steps 1 {CLASSIC}")).contains(name));
     }
-    place.fails("train scene --preset small --steps 1 --out run", &["run: already holds a run", "--out"]);
-    place.fails("train scene --preset small --steps 1 --out scene", &["scene: holds files that are not a run's"]);
+    place.fails_with(
+        "train scene --preset small --steps 1 --out run",
+        "run: already holds a run: choose another --out or remove that folder",
+    );
+    place.fails_with(
+        "train scene --preset small --steps 1 --out scene",
+        "scene: holds files that do not belong to a run: choose another folder with --out",
+    );
     assert_eq!(place.bytes("run/model.safetensors"), before);
     assert!(!place.path("scene/config.json").exists());
     // An empty folder is as good as none.
     std::fs::create_dir(place.path("empty")).unwrap();
     place.succeeds(&format!("train scene --steps 1 --out empty {CLASSIC}"));
     std::fs::remove_file(place.path("run/config.json")).unwrap();
-    place.fails("train scene --preset small --steps 1", &["run: holds files that are not a run's"]);
+    place.fails_with(
+        "train scene --preset small --steps 1",
+        "run: holds files that do not belong to a run: choose another folder with --out",
+    );
     assert_eq!(place.bytes("run/model.safetensors"), before);
 }
 
@@ -510,8 +532,8 @@ fn absent_images_are_skipped_with_a_warning() {
     std::fs::remove_file(place.path("scene/train/r_3.png")).unwrap();
     let output = place.command(&format!("train scene --steps 1 {CLASSIC}")).output().unwrap();
     let (printed, warned) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success() && printed.contains("5 views of 24x24"), "{printed}{warned}");
-    assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is absent"), "{warned}");
+    assert!(output.status.success() && printed.contains("5 images of 24x24"), "{printed}{warned}");
+    assert!(warned.contains("raygrad: warning: scene: the train image `train/r_3` is missing"), "{warned}");
 }
 
 /// The folder of a run that was trained before files held less than the whole grid: such files load for ever.
@@ -554,8 +576,11 @@ fn bad_runs_are_named() {
     let place = Place::with_run();
     std::fs::create_dir(place.path("empty")).unwrap();
     for command in ["eval", "render"] {
-        place.fails(&format!("{command} absent"), &["absent: there is no such folder"]);
-        place.fails(&format!("{command} empty"), &["empty: is not a run", "config.json"]);
+        place.fails_with(&format!("{command} absent"), "absent: there is no such folder");
+        place.fails_with(
+            &format!("{command} empty"),
+            "empty: is not a run: it has no config.json; `raygrad train` creates runs",
+        );
     }
     let config = place.json("run/config.json");
     let write = |config: &str| std::fs::write(place.path("run/config.json"), config).unwrap();
@@ -567,10 +592,13 @@ fn bad_runs_are_named() {
     let bad = [
         ("{ \"raygrad\": ".to_owned(), ["run/config.json", "line 1"]),
         ("{}".to_owned(), ["run/config.json", "missing field"]),
-        (edited("/downscale", json!(0)), ["run/config.json", "`downscale`"]),
-        (edited("/scene_box/near_far", json!([6.0, 2.0])), ["run/config.json", "`scene_box.near_far`"]),
+        (edited("/downscale", json!(0)), ["run/config.json", "`downscale`: is 0; use 1 or more"]),
+        (
+            edited("/scene_box/near_far", json!([6.0, 2.0])),
+            ["run/config.json", "`scene_box.near_far`: is 6 to 2; near must"],
+        ),
         (edited("/scene_box/bounds/0/0", json!(9.0)), ["`bounds`", "is no box"]),
-        (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`"]),
+        (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`: is 0; use 1 to 65536 pixels"]),
         (edited("/config/sampler/batch", json!(0)), ["run/config.json", "`batch`"]),
         (edited("/config/field/width", json!(64)), ["run/model.safetensors", "in the file"]),
         (edited("/config/field/depth", json!(3)), ["run/model.safetensors", "another configuration"]),
@@ -599,13 +627,13 @@ fn bad_places_to_write_are_named() {
         "train scene --preset small --steps 1 --out scene/transforms_test.json",
         &["transforms_test.json: cannot be used"],
     );
-    place.fails(
+    place.fails_with(
         "render run --out run/config.json/frames",
-        &["run/config.json/frames: `config.json` is a part of a run"],
+        "run/config.json/frames: `config.json` belongs to a run: choose another name",
     );
     place.fails("render run --out absent/picture.png", &["absent: cannot be written to"]);
     std::fs::create_dir(place.path("folder.gif")).unwrap();
-    place.fails("render run --out folder.gif", &["folder.gif: is a folder"]);
+    place.fails_with("render run --out folder.gif", "folder.gif: is a folder, not a file");
     // Where pictures should go there is a file.
     std::fs::write(place.path("run/eval-test"), b"").unwrap();
     place.fails("eval run", &["run/eval-test: cannot be created"]);
@@ -620,7 +648,10 @@ fn how_many_masks_must_agree_can_be_said() {
         let config = place.json(&format!("run-{expected}/config.json"));
         assert_eq!(config["config"]["sampler"]["occupancy"]["skip"]["carving"], expected, "{config}");
     }
-    place.fails("train scene --preset small --steps 1 --carve 2", &["`carve`", "the preset small", "--skip fast"]);
+    place.fails_with(
+        "train scene --preset small --steps 1 --carve 2",
+        "`carve`: the preset small has no occupancy grid to carve: add --skip fast",
+    );
 }
 
 #[test]
@@ -683,7 +714,10 @@ fn bad_arguments_are_usage_errors() {
     complained("RAYGRAD_SIMD", &output, &["RAYGRAD_SIMD is \"avx\"", "scalar, v3 or v4"]);
     // Nobody who asks for a page trains without one.
     for place_of_page in ["--host ::1", "--port 7000"] {
-        place.fails(&format!("train --steps 1 {place_of_page}"), &["`view`", "--host and --port"]);
+        place.fails_with(
+            &format!("train --steps 1 {place_of_page}"),
+            "`view`: is missing: --host and --port need --view",
+        );
     }
     assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 0);
 }
@@ -766,7 +800,7 @@ fn the_quadrature_benchmark_leaves_tables_plots_and_a_page() {
     };
     killed("results", "");
     let printed = place.succeeds(&format!("{bench} results"));
-    assert!(printed.contains("in 128 evaluations") && printed.contains("report.html"), "{printed}");
+    assert!(printed.contains("at 128 evaluations") && printed.contains("report.html"), "{printed}");
     let text = |name: &str| String::from_utf8(place.bytes(&format!("results/{name}"))).unwrap();
     let table = text("quadrature.csv");
     assert!(table.starts_with("scene,rule,evaluations,") && table.lines().count() > 150, "{table}");
@@ -784,7 +818,10 @@ fn the_quadrature_benchmark_leaves_tables_plots_and_a_page() {
     // Files of others are replaced where that is asked for.
     std::fs::create_dir(place.path("others")).unwrap();
     std::fs::write(place.path("others/plot.png"), "").unwrap();
-    place.fails(&format!("{bench} others"), &["others: holds files that are not a benchmark's", "add --overwrite"]);
+    place.fails_with(
+        &format!("{bench} others"),
+        "others: holds files of something else: choose another --out or add --overwrite",
+    );
     assert_eq!(std::fs::read_dir(place.path("others")).unwrap().count(), 1);
     killed("others", "--overwrite");
     assert!(place.path("others/report.html").exists() && place.path("others/plot.png").exists());

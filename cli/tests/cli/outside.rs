@@ -141,7 +141,7 @@ fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
     config["photographs"][0] = json!("../../../x");
     std::fs::write(place.path("work/run/config.json"), config.to_string()).unwrap();
     let output = place.command("train --resume run --steps 4").current_dir(place.path("work")).output().unwrap();
-    super::complained("resume", &output, &["other photographs"]);
+    super::complained("resume", &output, &["other images"]);
 }
 
 #[test]

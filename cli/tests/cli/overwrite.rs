@@ -23,7 +23,7 @@ fn photograph() -> Image {
 fn refuses(place: &Place, arguments: &str, file: &str) {
     let before = place.bytes(file);
     let expected =
-        format!("{file}: exists, and was not written by this command: choose another output, or add --overwrite");
+        format!("{file}: exists, and this command did not write it: choose another output or add --overwrite");
     place.fails(arguments, &[&expected]);
     assert!(place.bytes(file) == before, "{arguments} has changed {file}");
 }
@@ -121,7 +121,7 @@ fn files_of_a_run_are_never_an_output() {
         ("render run --frames 1 --out other/tensorboard/0 --overwrite", "tensorboard"),
     ] {
         std::fs::create_dir_all(place.path("run/eval-test")).unwrap();
-        place.fails(arguments, &[&format!("`{name}` is a part of a run: choose another name")]);
+        place.fails(arguments, &[&format!("`{name}` belongs to a run: choose another name")]);
     }
     place.succeeds("train --resume run --steps 3");
     // What lies beside them is.
@@ -134,18 +134,16 @@ fn endings_that_are_not_known_are_named() {
     let place = place(&[]);
     std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
     for out in ["walk.mp4", "cameras", "cameras.txt", "mesh.stl"] {
-        let expected = "end the name in .json for cameras, .ply, .obj or .glb for the shape, .html for a page";
-        place.fails(
-            &format!("export run {out}"),
-            &[&format!("{out}: has no ending that says what to export: "), expected],
-        );
+        let expected = "use .json for cameras, .ply, .obj or .glb for a mesh, .html for a scene page";
+        place.fails(&format!("export run {out}"), &[&format!("{out}: has no known file extension: "), expected]);
         place.fails(&format!("export run {out} --overwrite"), &[expected]);
     }
     assert_eq!(place.bytes("walk.mp4"), b"footage");
     for out in ["walk.mkv", "photo.jpg", "orbit.2"] {
         place.fails(
             &format!("render run --out {out}"),
-            &["is not the ending of a picture or a video", ".png, .gif, .apng"],
+            &["is not an image or video extension: use .png, .gif, .apng, .mp4 or .webm, or end a folder's name with \
+               `/`"],
         );
     }
     place.succeeds("render run --frames 1 --out orbit.2/");

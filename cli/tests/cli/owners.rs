@@ -35,7 +35,7 @@ fn lost(what: &str, mut output: Output) {
     let said = String::from_utf8(output.stderr).unwrap();
     let last = said.lines().rfind(|line| line.starts_with("raygrad: ")).unwrap_or_default().to_owned();
     output.stderr = (last + "\n").into_bytes();
-    let expected = "run: training stopped: another raygrad has this folder now, or one that took its place";
+    let expected = "run: training stopped: another raygrad now uses this folder";
     complained(what, &output, &[expected, "raygrad train --resume"]);
 }
 
@@ -112,9 +112,9 @@ fn a_folder_that_is_removed_is_made_again() {
     let is_there = |name: &str| place.path(&format!("run/{name}")).exists();
     wait(&mut first, || ["checkpoints", "metrics.jsonl", "tensorboard", "model.safetensors"].into_iter().all(is_there));
     // It would come back however often one removes it.
-    place.fails(
+    place.fails_with(
         &format!("train scene --steps 3 --out run {SMALL}"),
-        &["run: is being trained by another raygrad: stop"],
+        "run: another raygrad is training it: stop that one or choose another --out",
     );
     // Without its lock the run is still there, and is kept.
     let metrics = || String::from_utf8(place.bytes("run/metrics.jsonl")).unwrap();

@@ -1,6 +1,6 @@
 //! `raygrad prepare` of videos and photographs, with scripts in place of ffmpeg and colmap.
 
-use super::{CLASSIC, Place, complained, wait};
+use super::{CLASSIC, Place, complained, complained_of, wait};
 use raygrad::nerf::Image;
 use raygrad::nerf::dataset::Photo;
 use std::os::unix::fs::PermissionsExt;
@@ -139,9 +139,9 @@ fn made(place: &Place) -> Vec<String> {
 fn a_video_becomes_a_dataset_of_its_sharp_frames() {
     let place = place();
     let said = succeeds(&place, "prepare walk.mp4 --out made --frames 10");
-    assert!(said.contains("images   10 sharp frames of walk.mp4\n"), "{said}");
-    assert!(said.contains("cameras  8 of 10 photographs registered, in the largest of 2 models\n"), "{said}");
-    assert!(said.contains("lost     frame_00009.jpg, frame_00010.jpg\n"), "{said}");
+    assert!(said.contains("images   10 sharp frames from walk.mp4\n"), "{said}");
+    assert!(said.contains("cameras  8 of 10 images registered, in the largest of 2 models\n"), "{said}");
+    assert!(said.contains("no pose  frame_00009.jpg, frame_00010.jpg\n"), "{said}");
     // The doctor has looked at it: of cameras in a row that look the same way there is something to say.
     assert!(said.contains("written: made/doctor/cameras.png, made/doctor/doctor.html\n"), "{said}");
     assert!(said.contains("\nnext     raygrad doctor made ") && said.contains("raygrad train made "), "{said}");
@@ -166,7 +166,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
     assert_eq!(std::fs::metadata(place.path("made")).unwrap().permissions().mode() & 0o700, 0o700);
     // It is a dataset, and no second one is written over it.
     place.succeeds(&format!("train made --scene-type bounded --steps 1 {CLASSIC}"));
-    complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: holds files already", "--out"]);
+    complained("again", &run(&place, "prepare walk.mp4 --out made"), &["made: is not empty", "--out"]);
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn photographs_become_a_dataset_turned_as_they_were_held() {
     // Stored across, shown upright: another size than the rest, so that each has its own camera.
     std::fs::write(place.path("photos/turned.jpg"), jpeg(4, 6)).unwrap();
     let said = succeeds(&place, "prepare photos --out made --lens fisheye");
-    assert!(said.contains("images   6 photographs of photos\ncameras  4 of 6 photographs"), "{said}");
+    assert!(said.contains("images   6 images from photos\ncameras  4 of 6 images"), "{said}");
     assert!(
         ran(&place, &["feature_extractor", "camera_model OPENCV_FISHEYE"]) && !log(&place).contains("single_camera")
     );
@@ -219,18 +219,17 @@ fn programs_that_fail_show_their_last_words_and_nothing_is_left() {
         let output = command(&place, "prepare photos --out made").env("FAILS", step).output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(1), "{said}");
-        for expected in
-            ["  elapsed\n", "  out of luck\n", &format!("raygrad: `colmap {step}`: has failed (exit code 3), ")]
+        for expected in ["  elapsed\n", "  out of luck\n", &format!("raygrad: `colmap {step}`: failed (exit code 3), ")]
         {
             assert!(said.contains(expected), "{said}");
         }
         assert_eq!(made(&place), [""; 0]);
     }
     let output = command(&place, "prepare photos --out made").env("MODELS", "none").output().unwrap();
-    complained("no model", &output, &["`colmap mapper`: has found no cameras", "overlap too little"]);
+    complained("no model", &output, &["`colmap mapper`: found no camera poses", "overlap too little"]);
     std::fs::write(place.path("bin/ffmpeg"), "#!/bin/sh\necho walk.mp4: Invalid data found >&2\nexit 1\n").unwrap();
     let output = run(&place, "prepare walk.mp4 --out made");
-    complained("no video", &output, &["walk.mp4: is no video", "it says: walk.mp4: Invalid data found"]);
+    complained("no video", &output, &["walk.mp4: ffmpeg cannot read it as a video", "walk.mp4: Invalid data found"]);
     assert_eq!(made(&place), [""; 0]);
 }
 
@@ -258,14 +257,26 @@ fn ctrl_c_ends_the_program_and_leaves_nothing() {
 fn bad_inputs_are_named() {
     let place = place();
     std::fs::create_dir(place.path("empty")).unwrap();
-    complained("absent", &run(&place, "prepare absent --out made"), &["absent: there is no such file or folder"]);
-    complained("empty", &run(&place, "prepare empty --out made"), &["empty: holds no photographs"]);
+    complained_of("absent", &run(&place, "prepare absent --out made"), "absent: there is no such file or folder");
+    complained_of(
+        "empty",
+        &run(&place, "prepare empty --out made"),
+        "empty: holds no images: put .jpg, .png or .webp files in it or in its folder `images`",
+    );
     std::fs::write(place.path("empty/0.HEIC"), "").unwrap();
-    complained("heic", &run(&place, "prepare empty --out made"), &["1 images are HEIC", "convert them"]);
+    complained_of(
+        "heic",
+        &run(&place, "prepare empty --out made"),
+        "empty: 1 images are HEIC, TIFF or raw, which raygrad cannot read: convert them to JPEG or PNG",
+    );
     complained("no cameras", &run(&place, "prepare photos --out made --to colmap"), &["photos: is not a dataset"]);
-    complained("a file", &run(&place, "prepare photos --out walk.mp4"), &["walk.mp4: is not a folder"]);
+    complained_of("a file", &run(&place, "prepare photos --out walk.mp4"), "walk.mp4: is not a folder");
     succeeds(&place, "prepare photos --out made");
-    complained("a dataset", &run(&place, "prepare made --out other"), &["made: is a dataset", "--to"]);
+    complained_of(
+        "a dataset",
+        &run(&place, "prepare made --out other"),
+        "made: already has camera poses: choose the format to convert it to with --to",
+    );
     std::fs::write(place.path("photos/4.JPG"), "no picture").unwrap();
     complained("a damaged one", &run(&place, "prepare photos --out other"), &["4.JPG: cannot be decoded"]);
     assert!(!made(&place).iter().any(|name| name.contains("other")));
@@ -292,7 +303,7 @@ fn of_many_photographs_each_is_compared_with_those_that_follow() {
         let output = run(&place, &format!("prepare many-{count} --out made-{count}"));
         assert!(output.status.success(), "{output:?}");
         assert!(ran(&place, &[matcher, "--database_path", &format!("made-{count}")]), "{}", log(&place));
-        let noted = String::from_utf8_lossy(&output.stderr).contains("with those that follow by name alone");
+        let noted = String::from_utf8_lossy(&output.stderr).contains("only with those that follow by name");
         assert_eq!(noted, said);
     }
 }

@@ -1,7 +1,7 @@
 //! Paths, videos, and what is saved beside frames.
 
 use super::SMALL;
-use super::{Place, SIZE, complained, png};
+use super::{Place, SIZE, complained, complained_of, png};
 use raygrad::nerf::dataset::{Capture, Depths, Split};
 use raygrad::nerf::glam::{DAffine3, DVec3};
 use raygrad::nerf::{Camera, Config, Image, Model, SceneBox};
@@ -112,12 +112,14 @@ fn paths_lie_where_the_scene_does() {
     own["coordinates"] = json!("capture");
     for (path, is_told) in [(&path, true), (&own, false)] {
         let (code, said) = said(path, "");
-        assert!(code == Some(0) && said.contains("is taken to be in the capture's coordinates") == is_told, "{said}");
+        assert!(code == Some(0) && said.contains("assuming capture coordinates") == is_told, "{said}");
         assert!(apart(&png(&place.path("said/0000.png")), &expected) <= 1.0);
     }
     let (code, words) = said(&own, "--path-transform path.json");
     assert!(
-        code == Some(1) && words.contains("`coordinates`") && words.contains("leave --path-transform out"),
+        code == Some(1)
+            && words.contains("`coordinates`")
+            && words.contains("is already `capture`: remove --path-transform"),
         "{words}"
     );
     own["coordinates"] = json!("scene");
@@ -172,21 +174,28 @@ fn test_views_are_seen_as_they_are_compared() {
 fn flags_that_do_not_fit_are_named() {
     let place = Place::with_run();
     for (flags, expected) in [
-        ("--path test --radius 2", ["`radius`", "--path test"]),
-        ("--path spline", ["`through`", "0,5,9"]),
-        ("--path spline --keyframes 0,6", ["`through`: `6` is no train photograph", "0 to 5"]),
-        ("--path absent.json", ["absent.json", "cannot be read"]),
-        ("--save depth --out one.png", ["`save`", "name a folder"]),
-        ("--save depth --out one.gif", ["`save`", "name a folder"]),
-        ("--depth-unit 0.01", ["`depth-unit`", "--save depth"]),
-        ("--keep-frames", ["`keep-frames`", "without a video"]),
-        ("--fps 30", ["`fps`", "--seconds"]),
-        ("--fps 60 --out fast.gif", ["`fps`", "50 frames a second"]),
-        ("--out absent/video.apng", ["absent", "cannot be written to"]),
-        ("--out video.MOV", ["video.MOV: `.mov` is not the ending of a picture or a video", "the name of a folder"]),
+        ("--path test --radius 2", "`radius`: does not apply to --path test: it is for orbit and spiral"),
+        ("--path spline", "`keyframes`: is missing: --path spline needs images, such as --keyframes 0,5,9"),
+        (
+            "--path spline --keyframes 0,6",
+            "`keyframes`: `6` is not a train image: use numbers from 0 to 5, or names such as train/r_0",
+        ),
+        ("--save depth --out one.png", "`save`: needs a folder: name one with --out"),
+        ("--save depth --out one.gif", "`save`: needs a folder: name one with --out"),
+        ("--depth-unit 0.01", "`depth-unit`: needs --save depth"),
+        ("--keep-frames", "`keep-frames`: needs a video: name a .mp4, .webm, .gif or .apng file with --out"),
+        ("--fps 30", "`fps`: needs a video or --seconds"),
+        ("--fps 60 --out fast.gif", "`fps`: is 60; a GIF shows at most 50 frames a second: use .apng or .mp4"),
+        (
+            "--out video.MOV",
+            "video.MOV: `.mov` is not an image or video extension: use .png, .gif, .apng, .mp4 or .webm, or end a \
+             folder's name with `/`",
+        ),
     ] {
-        place.fails(&format!("render run {flags}"), &expected);
+        place.fails_with(&format!("render run {flags}"), expected);
     }
+    place.fails("render run --path absent.json", &["absent.json: cannot be read: "]);
+    place.fails("render run --out absent/video.apng", &["absent: cannot be written to: "]);
     let listed = json!({
         "render_width": 4, "render_height": 4,
         "camera_path": [{ "camera_to_world": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1], "fov": 50 }],
@@ -194,8 +203,8 @@ fn flags_that_do_not_fit_are_named() {
     std::fs::write(place.path("path.json"), listed.to_string()).unwrap();
     let output = place.command("render run --path path.json --frames 3").output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("`frames`: has no meaning for a file that lists every frame"), "{said}");
-    assert!(output.status.code() == Some(1) && said.contains("say --path-transform"), "{said}");
+    assert!(said.contains("`frames`: does not apply to a file that lists every frame"), "{said}");
+    assert!(output.status.code() == Some(1) && said.contains("add --path-transform"), "{said}");
     for flags in [
         "--seconds 0",
         "--seconds 2 --fps 0.009",
@@ -219,7 +228,9 @@ fn flags_that_do_not_fit_are_named() {
     std::fs::write(place.path("keys.json"), keys.to_string()).unwrap();
     assert!(place.succeeds("render run --path keys.json --fps 10 --out keys").contains("rendered 5 frames of 4x4"));
     let output = place.command("render run --path keys.json --fps 240 --seconds 500 --out keys").output().unwrap();
-    assert!(String::from_utf8_lossy(&output.stderr).contains("`seconds`: 120000 frames are more than 100000"));
+    assert!(
+        String::from_utf8_lossy(&output.stderr).contains("`seconds`: 120000 frames are more than the limit of 100000")
+    );
 }
 
 #[test]
@@ -340,7 +351,7 @@ fn ffmpeg_writes_videos_whose_colors_are_those_of_the_frames() {
             place.command("render run --frames 5 --size 63x41 --fps 12.5 --background 200,30,60 --keep-frames --out");
         let output = command.arg(&video).output().unwrap();
         assert!(output.status.success(), "{video}: {output:?}");
-        assert!(String::from_utf8_lossy(&output.stderr).contains("black is added, to 64x42"), "{output:?}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains("padded with black to 64x42"), "{output:?}");
         let bytes = place.bytes(&video);
         let is_webm = bytes.starts_with(&[0x1a, 0x45, 0xdf, 0xa3]);
         assert!(
@@ -377,7 +388,11 @@ fn ffmpeg_writes_videos_whose_colors_are_those_of_the_frames() {
 fn without_ffmpeg_it_is_said_what_to_do_before_anything_is_rendered() {
     let place = Place::with_run();
     let output = place.command("render run --out video.mp4").env("PATH", place.path("")).output().unwrap();
-    complained("no ffmpeg", &output, &["video.mp4", "`ffmpeg`: is not on the PATH", "apt install ffmpeg", "FILE.gif"]);
+    complained(
+        "no ffmpeg",
+        &output,
+        &["video.mp4", "`ffmpeg`: is not on the PATH", "apt install ffmpeg", "or use .gif or .apng"],
+    );
     assert!(!place.path("video.mp4.frames").exists());
 }
 
@@ -395,7 +410,9 @@ fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_an
         place.command(command).env("PATH", path).output().unwrap()
     };
     let output = with("echo ' V..... libvpx-vp9  VP9'");
-    complained("no encoder", &output, &["video.mp4: needs an ffmpeg with libx264", "FILE.gif"]);
+    let expected = "video.mp4: needs libx264, which this ffmpeg lacks: install an ffmpeg that has it, or use .gif or \
+                    .apng, which need no ffmpeg";
+    complained_of("no encoder", &output, expected);
     assert!(!place.path("video.mp4.frames").exists());
     // It fails after it has said what is wrong and reported its progress for long.
     let output = with(
@@ -403,7 +420,7 @@ fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_an
          i=0; while [ $i -lt 20 ]; do echo frame=$i; i=$((i+1)); done; exit 3;; esac",
     );
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(said.contains("  the disk is full") && said.contains("`ffmpeg`: has failed (exit code 3)"), "{said}");
+    assert!(said.contains("  the disk is full") && said.contains("`ffmpeg`: failed (exit code 3)"), "{said}");
 }
 
 #[cfg(unix)]
@@ -419,7 +436,7 @@ fn an_interrupted_video_goes_on_where_it_was() {
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
     assert_eq!(output.status.code(), Some(130), "{said}");
-    assert!(said.contains("of 100 frames, in video.apng.frames: the same command goes on"), "{said}");
+    assert!(said.contains("of 100 frames, in video.apng.frames: run the same command to resume"), "{said}");
     let done = place.json("video.apng.frames/unfinished.json")["done"].as_u64().unwrap() as usize;
     assert!(done >= 3 && frame(done - 1).exists() && !frame(done).exists() && !place.path("video.apng").exists());
     // Frames that are there are not rendered again: a mark on one stays.
@@ -428,7 +445,7 @@ fn an_interrupted_video_goes_on_where_it_was() {
     let output = place.command(arguments).output().unwrap();
     assert!(output.status.success(), "{output:?}");
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains(&format!("{done} of 100 frames are there already")), "{said}");
+    assert!(said.contains(&format!("resuming after {done} of 100 frames")), "{said}");
     let frames = decoded(&place.path("video.apng"));
     assert!(frames.len() == 100 && frames[1].iter().all(|x| *x == 51) && !place.path("video.apng.frames").exists());
     // Others than those that were there are as in a video that was not interrupted.
@@ -438,7 +455,7 @@ fn an_interrupted_video_goes_on_where_it_was() {
     // What would show something else begins again, where it may.
     place.succeeds("render run --frames 2 --size 12x10 --out video.gif --keep-frames");
     let video = "render run --frames 4000 --size 24x20 --out video.gif";
-    place.fails(video, &["video.gif: exists, and was not written by this command"]);
+    place.fails(video, &["video.gif: exists, and this command did not write it"]);
     std::fs::remove_file(place.path("video.gif")).unwrap();
     place.fails(video, &["video.gif.frames"]);
     std::fs::remove_dir_all(place.path("video.gif.frames")).unwrap();
@@ -459,28 +476,31 @@ fn an_interrupted_video_goes_on_where_it_was() {
     begun("");
     kept(3);
     let said = begun("--fps 5 --overwrite");
-    assert!(said.contains("3 of 4000 frames are there already"), "the speed is not in the frames: {said}");
+    assert!(said.contains("resuming after 3 of 4000 frames"), "the speed is not in the frames: {said}");
     for flags in ["--show depth", "--background black", "--fov 30", "--skip off"] {
         // From the same frames each time.
         begun("--overwrite");
         kept(3);
         place.fails(&format!("{video} {flags}"), &["video.gif.frames"]);
         let said = begun(&format!("{flags} --overwrite"));
-        assert!(!said.contains("already") && said.contains("3 frames are replaced, which were of another"), "{said}");
+        assert!(
+            !said.contains("already") && said.contains("replacing 3 frames that were rendered with another"),
+            "{said}"
+        );
     }
     // Another model, of which the same is asked.
     begun("--overwrite");
     kept(3);
     place.succeeds("train --resume run --steps 4");
     let said = begun("");
-    assert!(said.contains("which were of another config, model"), "{said}");
+    assert!(said.contains("that were rendered with another config, model"), "{said}");
     // One at a time.
     let mut child = place.command("render run --frames 400 --size 36x30 --out slow.gif").stdout(Stdio::null()).spawn();
     let child = child.as_mut().unwrap();
     super::wait(child, || place.path("slow.gif.frames/0000.png").exists());
     place.fails(
         "render run --frames 400 --size 36x30 --out slow.gif",
-        &["slow.gif.frames: is being rendered to by another raygrad"],
+        &["slow.gif.frames: another raygrad is rendering to it"],
     );
     child.kill().unwrap();
     child.wait().unwrap();

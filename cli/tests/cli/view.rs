@@ -323,7 +323,7 @@ fn a_picture_is_painted_once_and_none_for_who_looks_away() {
     let mut view = first(&about, [8, 8]);
     view["checkpoint"] = json!(0);
     page.say(json!({ "ask": "view", "id": 2, "view": view }));
-    assert!(page.text("sorry")["what"].as_str().unwrap().contains("training has ended"));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("only after training"));
     // Held, it is painted as fine as it goes, once.
     page.say(json!({ "ask": "view", "id": 6, "view": first(&about, [300, 300]) }));
     page.hear(Duration::from_millis(500));
@@ -449,7 +449,7 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     let photograph = png(&place.path("scene/train/r_3.png")).over([1.0; 3]);
     assert!(head["number"] == 3 && psnr(&decoded(&bytes), &photograph) > 30.0);
     page.say(json!({ "ask": "photograph", "number": 99 }));
-    assert!(page.text("sorry")["what"].as_str().unwrap().contains("no photograph 99"));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("no image 99"));
     // Before what evaluations have behind the scene; and those that are to test with are there once.
     place.succeeds("prepare scene --to nerfstudio --out captured");
     place.succeeds(&format!("train captured --scene-type bounded --background black --steps 150 --out black {SMALL}"));
@@ -488,10 +488,10 @@ fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
     assert_eq!(about["photographs"], json!([]));
     for (id, view) in [(1, &view), (2, &json!({ "eye": { "photograph": 0 }, "size": [8, 8] }))] {
         page.say(json!({ "ask": "view", "id": id, "view": view }));
-        assert!(page.text("sorry")["what"].as_str().unwrap().contains("not known"));
+        assert!(page.text("sorry")["what"].as_str().unwrap().contains("not available"));
     }
     page.say(json!({ "ask": "photograph", "number": 0 }));
-    assert!(page.text("sorry")["what"].as_str().unwrap().contains("not known"));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("not available"));
 }
 
 /// Each has its own in evaluations, and pages have the mean of all.
@@ -549,10 +549,10 @@ fn nobody_from_elsewhere_is_served_and_others_come_with_the_token_alone() {
     // A port that is taken is named.
     place.fails(&format!("view run --port {port}"), &["`host`", port, "cannot be used"]);
     place.fails("view run --host nowhere.invalid", &["`host`", "nowhere.invalid"]);
-    place.fails("train scene --steps 1 --out other --port 1", &["`view`", "--port"]);
+    place.fails_with("train scene --steps 1 --out other --port 1", "`view`: is missing: --host and --port need --view");
     place.fails(&format!("train scene --steps 1 --view --port {port} --out other"), &["`host`", port]);
     assert!(!place.path("other").exists(), "nothing is begun");
-    place.fails("view absent", &["absent", "no such folder"]);
+    place.fails_with("view absent", "absent: there is no such folder");
     let server = serve(&place, "view run --host 0.0.0.0");
     let (host, token) = server.address.split_once("/?token=").unwrap();
     let address = format!("127.0.0.1:{}", host.rsplit(':').next().unwrap());
@@ -567,10 +567,10 @@ fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
     let (mut good, about) = Page::open(&server.address);
     let (mut page, _) = Page::open(&server.address);
     page.say(json!({ "ask": "view", "id": 1, "view": first(&about, [4096, 4096]) }));
-    assert!(page.closed().contains("4096x4096 is no size"));
+    assert!(page.closed().contains("4096x4096 is not a size"));
     // A photograph of no such number is said not to be there, and the other page is still served.
     good.say(json!({ "ask": "view", "id": 5, "view": { "eye": { "photograph": 4000 }, "size": [16, 16] } }));
-    assert!(good.text("sorry")["what"].as_str().unwrap().contains("no such photograph"));
+    assert!(good.text("sorry")["what"].as_str().unwrap().contains("no such image"));
     assert_eq!(good.look(6, &first(&about, [16, 16])).pop().unwrap().0["id"], 6);
 }
 
@@ -645,9 +645,7 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert_same(&place, "whole", "run");
     let said = String::from_utf8_lossy(&place.bytes("said")).into_owned();
-    for words in
-        ["training waits: a page has paused it", "training goes on", "the page shows the scene until it is closed"]
-    {
+    for words in ["training paused by the viewer", "training resumed", "the viewer stays open until its page closes"] {
         assert_eq!(said.matches(words).count(), 1, "{words}: {said}");
     }
 
@@ -658,7 +656,7 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
     while page.text("training")["paused"] != true {}
     page.say(json!({ "ask": "stop" }));
     let ended = page.ended();
-    assert!(ended["step"].as_u64().unwrap() < 300 && ended["ended"] == "stopped, and saved", "{ended}");
+    assert!(ended["step"].as_u64().unwrap() < 300 && ended["ended"] == "stopped and saved", "{ended}");
     drop(page);
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     place.succeeds("train --resume other");
@@ -800,10 +798,10 @@ fn videos_are_made_one_at_a_time_beside_what_is_seen() {
     page.say(json!({ "ask": "video", "path": path(&about, 600.0) }));
     page.text("video");
     page.say(json!({ "ask": "video", "path": path(&about, 1.0) }));
-    assert!(page.text("sorry")["what"].as_str().unwrap().contains("one is being made"));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("another video is rendering"));
     page.look(1, &first(&about, [16, 16]));
     page.say(json!({ "ask": "end-video" }));
-    assert_eq!(ended(&mut page)["words"], "ended");
+    assert_eq!(ended(&mut page)["words"], "cancelled");
     let videos = || std::fs::read_dir(place.path("run/videos")).unwrap().count();
     assert_eq!(videos(), 2, "nothing is left of it");
     // As it is seen, with what is behind it and as much left out.
@@ -849,7 +847,7 @@ fn videos_are_made_one_at_a_time_beside_what_is_seen() {
     let server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out other {SMALL}"));
     let (mut page, about) = Page::open(&server.address);
     page.say(json!({ "ask": "video", "path": path(&about, 1.0) }));
-    assert!(page.text("sorry")["what"].as_str().unwrap().contains("training has ended"));
+    assert!(page.text("sorry")["what"].as_str().unwrap().contains("only after training"));
     assert!(!place.path("other/videos").exists());
 }
 
