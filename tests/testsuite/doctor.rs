@@ -463,9 +463,7 @@ fn each_of_very_many_equal_poses_is_named_once() {
         // All held-out ones have the pose of a training one, but for the one elsewhere; all but the first of each that of another.
         assert_eq!(views(Kind::Leak).len(), held_out - usize::from(is_held_out(5)));
         assert_eq!(views(Kind::DuplicatePoses).len(), count - 3);
-        assert!(
-            report.finds(Kind::DuplicatePoses).unwrap().what.starts_with("the pose of 1197 photographs is exactly")
-        );
+        assert!(report.finds(Kind::DuplicatePoses).unwrap().what.starts_with("the pose of 1197 images is exactly"));
         assert_eq!(*views(Kind::FarCamera), ["5.png"]);
     }
 }
@@ -480,7 +478,7 @@ fn each_of_several_equal_poses_is_named_once() {
     let report = planted.cameras();
     let finding = report.finds(Kind::DuplicatePoses).unwrap();
     assert_eq!(finding.views, ["11.png", "12.png", "13.png"]);
-    let expected = "the pose of 3 photographs is exactly that of another: `11.png` and `10.png`, and others";
+    let expected = "the pose of 3 images is exactly that of another image: `11.png` and `10.png`, and others";
     assert_eq!(finding.what, expected);
 }
 

@@ -1,9 +1,8 @@
-//! Whether photographs agree with their cameras: what one shows at a place, another must show on a certain line.
+//! Agreement of images with their cameras along epipolar lines.
 //!
-//! Patches of one photograph are looked for in another, along the line on which the cameras say that they lie (the epipolar
-//! line), and along lines beside it, where they should not be found. How often the first has the best match says how well
-//! cameras and photographs fit: as often as any other line if they do not, nearly always if they do. No threshold on the
-//! likeness of patches decides, and what is wrong about it, such as reflections, is wrong for all lines alike.
+//! Patches of one image are searched in another: along the epipolar line, and along parallel lines beside it. The share of
+//! patches whose best match is on the epipolar line measures agreement: a fifth by chance, nearly all for right cameras.
+//! Errors such as reflections affect all lines alike.
 
 use super::nearby::usual_gap;
 use super::picture::{Patch, Picture};
@@ -11,9 +10,9 @@ use super::poses::Focus;
 use glam::{DAffine3, DMat3, DVec3};
 use raygrad_tensor::parallel;
 
-/// Photographs that each one is compared with.
+/// Images that each one is compared with.
 const NEIGHBOURS: usize = 5;
-/// The angle between optical axes, in radians, beyond which photographs are hardly alike.
+/// The angle between optical axes, in radians, beyond which images hardly match.
 const ANGLE: f64 = 0.8;
 /// How far beside the line of a patch the others lie, in pixels.
 const BESIDE: [f64; 5] = [0.0, -16.0, -8.0, 8.0, 16.0];
@@ -23,30 +22,30 @@ const ALIKE: f32 = 0.8;
 const STEP: f64 = 1.3;
 const MOST_STEPS: f64 = 160.0;
 
-/// A photograph with the pose that it is said to have.
+/// An image with its pose.
 #[derive(Clone, Copy)]
 pub(super) struct Placed<'a> {
     pub picture: &'a Picture,
     pub pose: DAffine3,
 }
 
-/// How often the line on which the cameras put a patch has its best match.
+/// Counts of patches whose best match is on the epipolar line.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Tally {
-    /// How often it has.
+    /// Patches with the best match there.
     pub wins: usize,
-    /// Of how many patches that have a match on some line.
+    /// Patches that have a match on some line.
     pub trials: usize,
 }
 
 impl Tally {
-    /// 1 if it always has, 0 if as often as by chance.
+    /// 1 if all match on the epipolar line, 0 at chance.
     pub fn skill(self) -> f64 {
         let chance = 1.0 / BESIDE.len() as f64;
         (self.wins as f64 / self.trials.max(1) as f64 - chance) / (1.0 - chance)
     }
 
-    /// How often a line wins at this skill.
+    /// The win rate at this skill.
     pub fn rate(skill: f64) -> f64 {
         let chance = 1.0 / BESIDE.len() as f64;
         chance + (1.0 - chance) * skill
@@ -59,13 +58,13 @@ impl std::ops::AddAssign for Tally {
     }
 }
 
-/// Two photographs that were compared, by their numbers.
+/// Two compared images, by index.
 pub(super) struct Pair {
     pub views: [usize; 2],
     pub tally: Tally,
 }
 
-/// Compares those of the photographs whose numbers are in `of` with their neighbours, in parallel.
+/// Compares the images with indices `of` with their neighbours, in parallel.
 pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
     let poses: Vec<DAffine3> = all.iter().map(|placed| placed.pose).collect();
     let focus = Focus::of(&poses).filter(|focus| focus.ahead > 0.75);
@@ -81,7 +80,7 @@ pub(super) fn compare(all: &[Placed<'_>], of: &[usize]) -> Vec<Pair> {
     parallel::collect(pairs.len(), |i| one(&pairs[i]))
 }
 
-/// The numbers of the photographs that are most like one: near, and looking the same way, but not from the same place.
+/// The indices of the nearest images that look the same way, but not from the same place.
 fn neighbours(poses: &[DAffine3], i: usize, usual: f64) -> Vec<usize> {
     let a = poses[i];
     let mut costs: Vec<(f64, usize)> = poses
@@ -126,7 +125,7 @@ impl Transfer<'_> {
     }
 }
 
-/// Looks for the patches of one photograph in another.
+/// Searches the patches of one image in another.
 fn matched(a: Placed<'_>, b: Placed<'_>, nearest: f64) -> Tally {
     // From the axes of OpenGL to those of images.
     let axes = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));

@@ -1,5 +1,4 @@
-//! What the agreement of photographs with each other says: under which convention cameras are written, and which of them are
-//! wrong.
+//! Findings from how well images match their neighbours: the convention of the poses, and single wrong poses.
 
 use super::agreement::{Pair, Placed, Tally, compare};
 use super::kinds::FindingKind as Kind;
@@ -10,22 +9,21 @@ use crate::dataset::{View, evenly_spaced};
 use crate::numbers::median;
 use std::collections::BTreeMap;
 
-/// Photographs that are compared with their neighbours under each convention.
+/// Images that are compared with their neighbours under each convention.
 const TRIED: usize = 12;
-/// Patches that must have a match before agreement says anything of the capture.
+/// Patches that must have a match before agreement counts.
 const ENOUGH: usize = 100;
-/// The same of a single photograph, and how many standard deviations it must be from what is usual.
+/// The same for a single image, and the standard deviations it must be from the others.
 const FEWEST: usize = 8;
 const DEVIATIONS: f64 = 4.0;
 /// The agreement of good cameras.
 const GOOD: f64 = 0.2;
-/// Below it photographs and cameras have nothing to do with each other.
+/// Below it, images and cameras do not match at all.
 const NONE: f64 = 0.06;
 /// A camera is wrong whose agreement is a smaller share of that of the others.
 const WRONG: f64 = 0.35;
 
-/// Adds what is wrong about how photographs, each with its picture, agree with each other; returns how well they do, if there
-/// is enough to compare.
+/// Adds findings about agreement between images; returns the agreement, if enough patches match.
 pub(super) fn examine(all: &[(&View, &Picture)], most: usize, findings: &mut Findings) -> Option<f64> {
     let under = |convention: Convention| -> Vec<Placed<'_>> {
         all.iter().map(|(view, picture)| Placed { picture, pose: convention.apply(view.camera.pose) }).collect()
@@ -62,7 +60,7 @@ fn total(pairs: &[Pair]) -> Tally {
     total
 }
 
-/// The finding that photographs agree under another convention than the one that is read.
+/// Adds the finding that images match under another convention than the one that is read.
 fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findings) {
     // What poses alone made one think is settled.
     findings.0.retain(|finding| {
@@ -76,13 +74,13 @@ fn another(convention: Convention, [own, other]: [f64; 2], findings: &mut Findin
             findings.add(Kind::Mirrored, &[])
         }
     };
-    finding.what += &format!(" (photographs agree to {other:.2} so, and to {own:.2} as it is read)");
+    finding.what += &format!(" (agreement {other:.2} if changed, {own:.2} as read)");
     if convention == Convention::WorldToOpenCv {
-        finding.advice += " Then change the signs of the second and third column: their camera axes are OpenCV's.";
+        finding.advice += " Then negate the second and third columns: the camera axes are OpenCV's.";
     }
 }
 
-/// The numbers of the photographs that do not agree with their neighbours, though these agree with each other.
+/// The indices of images that do not match their neighbours, although these match each other.
 fn wrong_poses(pairs: &[Pair]) -> Vec<usize> {
     let mut wrong: Vec<usize> = vec![];
     // The worst first, and then without it: one wrong camera does not make those beside it wrong.
@@ -103,7 +101,7 @@ fn wrong_poses(pairs: &[Pair]) -> Vec<usize> {
     wrong
 }
 
-/// Whether a photograph agrees far less than is usual, and that is no chance.
+/// Whether an image matches significantly less than the others.
 fn is_wrong(tally: Tally, usual: f64) -> bool {
     let (count, rate) = (tally.trials as f64, Tally::rate(usual));
     let deviation = (count * rate * (1.0 - rate)).sqrt();

@@ -1,4 +1,4 @@
-//! What can be said of all cameras together, from their poses alone.
+//! Findings from all poses together.
 
 use super::kinds::{FindingKind as Kind, Severity};
 use super::nearby::{Nearby, usual_gap};
@@ -10,7 +10,7 @@ use crate::numbers::{mean, median};
 use Severity::{Error, Warning};
 use glam::{DAffine3, DVec3};
 
-/// Fewer photographs than these are too few, and hardly enough.
+/// Fewer images than the first are an error, fewer than the second a warning.
 const FEW: [usize; 2] = [5, 20];
 /// Cameras that are not farther apart than this share of their distance from the origin stand in one place.
 const ONE_PLACE: f64 = 1e-9;
@@ -23,7 +23,7 @@ const ROLL: f64 = 30.0;
 /// The angle in degrees, as seen from the middle, that may be without a camera.
 const GAP: f64 = 120.0;
 
-/// Adds what is wrong with the cameras that have photographs, as a whole.
+/// Adds findings about the cameras that have images, as a whole.
 pub(super) fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, findings: &mut Findings) {
     let views: Vec<&View> = capture.present().collect();
     few(capture, &views, findings);
@@ -67,9 +67,9 @@ pub(super) fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, finding
 
 fn few(capture: &Capture, views: &[&View], findings: &mut Findings) {
     let what = match views.len() {
-        0 => "is no photograph",
-        1 => "is only 1 photograph",
-        count => &format!("are only {count} photographs"),
+        0 => "no images",
+        1 => "only 1 image",
+        count => &format!("only {count} images"),
     };
     if views.len() < FEW[1] {
         let finding = findings.add(Kind::FewPhotographs, &[&what]);
@@ -107,7 +107,7 @@ fn by_points(capture: &Capture, views: &[&View]) -> Option<(Convention, Severity
     (best > 0.2).then_some((convention, Error))
 }
 
-/// The same, from what cameras look at: as those that look around in a room look away from each other too, that is no proof.
+/// The convention that camera axes suggest. It is no proof: cameras inside a room look away from each other too.
 fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Convention, Severity)> {
     if focus.is_some_and(|focus| focus.is_inward() && size > 1e-3 * focus.distance) {
         return None;
@@ -127,7 +127,7 @@ fn by_axes(poses: &[DAffine3], focus: Option<Focus>, size: f64) -> Option<(Conve
     focus.is_some_and(away).then_some((Convention::OpenCv, Warning))
 }
 
-/// Photographs with the pose of another one; each is named once, whatever the number of others.
+/// Images with the pose of another; each is named once, whatever the number of others.
 fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: &mut Findings) {
     /// How near poses are that are the same: as a share of a length, and in radians.
     const SAME: [f64; 2] = [1e-6, 1e-5];
@@ -137,7 +137,7 @@ fn pairs(views: &[&View], places: &[DVec3], distance: f64, size: f64, findings: 
         let [a, b] = [i, j].map(|i| views[i].camera.pose.matrix3);
         (0..3).map(|axis| a.col(axis).distance_squared(b.col(axis))).sum::<f64>()
     };
-    // Of each photograph that is trained on, or held out, one that is trained on, or held out, and has its pose.
+    // For each image of one set (trained on or held out), an image of another set with the same pose.
     let alike = |of: bool, among: bool, length: f64, [share, angle]: [f64; 2]| -> Vec<[usize; 2]> {
         let nearby = Nearby::new(places, |i| is_trained(i) == among, share * length);
         let is_other = |i: usize, j: usize| of != among || j < i;
@@ -177,11 +177,11 @@ fn scale(capture: &Capture, places: &[DVec3], size: f64, findings: &mut Findings
             kind: Kind::Scale,
             severity: Warning,
             what: format!(
-                "cameras are {from_origin:.3} units from the origin, and about 4 in other scenes of this format"
+                "the cameras are {from_origin:.3} units from the origin; Blender captures usually use about 4"
             ),
             advice:
-                "The scene's size is found out from its cameras, and not taken from the convention; scale positions if \
-                     other programs are to read the files."
+                "raygrad finds the scene's size from the cameras, so training is fine. For other programs, scale the \
+                positions."
                     .to_owned(),
             views: vec![],
         });

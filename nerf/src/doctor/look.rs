@@ -1,4 +1,4 @@
-//! What the pixels of one photograph say, read once and at a small size.
+//! Measurements of the pixels of one image, from a single read at a small size.
 
 use super::picture::{Picture, grey};
 use crate::dataset::load::same_shape;
@@ -16,11 +16,11 @@ const SMALL: usize = 200;
 /// Brightness below which a pixel counts as this.
 const DARK: f64 = 0.01;
 
-/// What the pixels of a photograph say.
+/// Measurements of an image.
 pub(super) struct Look {
     /// Whether some pixel is transparent; `None` without an alpha channel.
     pub transparent: Option<bool>,
-    /// Equal for equal photographs.
+    /// Equal for equal images.
     pub hash: u64,
     /// The logarithm of the variance of the Laplacian over the variance of the brightness; `None` of a flat image.
     pub sharpness: Option<f64>,
@@ -30,11 +30,11 @@ pub(super) struct Look {
     pub balance: [f64; 2],
     /// The share of the pixels that the mask uses, if there is one.
     pub used: Option<f64>,
-    /// The photograph as a small grey pinhole image, if its camera fits.
+    /// The image in grey as a small pinhole camera sees it, if its camera fits.
     pub picture: Option<Picture>,
 }
 
-/// Looks at the photographs, in parallel; the result has the order of the views, of which each has an image.
+/// Measures all images, in parallel, in the order of the views that have one.
 pub(super) fn look_at_all<'a>(
     capture: &'a Capture,
     progress: &(dyn Fn(usize, usize) + Sync),

@@ -1,7 +1,7 @@
-//! Whether a capture is good, and if not, what is wrong with it and what to do.
+//! Checks a capture for problems and gives advice, before time is spent on training.
 //!
-//! [`examine_cameras`] looks at poses, lenses and the headers of images; [`examine`] at pixels too: how sharp and how bright
-//! photographs are, and whether they agree with each other where the cameras say that they show the same.
+//! Start with [`examine`], which reads all images: sharpness, exposure, and agreement with neighbours along epipolar lines.
+//! [`examine_cameras`] checks only poses, lenses and image headers, in milliseconds.
 
 mod agreement;
 mod consistency;
@@ -24,12 +24,12 @@ use glam::DVec3;
 use pixels::Seen;
 use report::Findings;
 
-/// How a capture is examined.
+/// Options of [`examine`].
 #[derive(Clone, Copy)]
 pub struct DoctorOptions<'a> {
-    /// How many photographs are compared with their neighbours at most, evenly spaced; all of them are looked at otherwise.
+    /// Maximum number of images, evenly spaced, that are compared with their neighbours. All images are read regardless.
     pub compared: usize,
-    /// Is told how many are read, of how many; from several threads.
+    /// Progress callback `(read, total)`, in images; called from several threads.
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
 }
 
@@ -39,15 +39,17 @@ impl Default for DoctorOptions<'_> {
     }
 }
 
-/// What can be said of a capture without reading its pixels: this takes no time to speak of. Without a survey, as
-/// [`Capture::analyze_scene`] fails for captures that have no size, nothing is said of up and of the scene's box.
+/// Examines poses, lenses and image headers, without reading pixels.
+///
+/// `survey` comes from [`Capture::analyze_scene`], which fails for captures without a size. Without it, checks of the up
+/// direction and the scene box are left out.
 pub fn examine_cameras(capture: &Capture, survey: Option<&SceneAnalysis>) -> Report {
     let mut findings = Findings::default();
     let facts = without_pixels(capture, survey, &mut findings);
     Report { facts, findings: findings.sorted() }
 }
 
-/// Everything that can be said of a capture: its photographs are read, in parallel.
+/// Examines everything that [`examine_cameras`] does and reads all images, in parallel.
 pub fn examine(capture: &Capture, survey: Option<&SceneAnalysis>, options: &DoctorOptions<'_>) -> Report {
     let mut findings = Findings::default();
     let mut facts = without_pixels(capture, survey, &mut findings);

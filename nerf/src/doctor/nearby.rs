@@ -1,4 +1,4 @@
-//! Which of many places are near a place, without comparing all of them with each other.
+//! A spatial index: finds places near a place in linear time.
 
 use crate::dataset::evenly_spaced;
 use crate::numbers::median;
@@ -26,8 +26,8 @@ impl<'a> Nearby<'a> {
         Nearby { places, radius, cells }
     }
 
-    /// The numbers of the wanted places that are at most `radius` from place `i`, itself among them, in no order in particular;
-    /// where very many lie around it, the first of them.
+    /// The indices of the wanted places at most `radius` from place `i`, including itself, in no particular order. Where very
+    /// many lie around it, the first of them.
     pub fn of(&self, i: usize) -> impl Iterator<Item = usize> {
         let (place, [x, y, z]) = (self.places[i], cell(self.places[i], self.radius));
         let steps = |at: i64| [at, at.saturating_sub(1), at.saturating_add(1)];
@@ -38,8 +38,7 @@ impl<'a> Nearby<'a> {
     }
 }
 
-/// The median distance of a place from that which is so many places away, in the order of their distances; of some places if
-/// there are many.
+/// The median distance of a place from its `away`-th nearest neighbour, over at most `ASKED` places.
 pub(super) fn usual_gap(places: &[DVec3], away: usize) -> f64 {
     /// The most places that are asked.
     const ASKED: usize = 500;

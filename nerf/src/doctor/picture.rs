@@ -1,4 +1,4 @@
-//! A small grey image with the camera of a pinhole, whatever lens took the photograph.
+//! A small grey pinhole image, undistorted from any lens.
 
 use crate::camera::{Camera, Lens};
 use crate::dataset::{Image, Photo};

@@ -1,4 +1,4 @@
-//! What photographs say of their own quality, and of each other's.
+//! Findings from pixels: blur, exposure, colour balance, masks, alpha and duplicates.
 
 use super::kinds::{FindingKind as Kind, Severity};
 use super::look::Look;
@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::numbers::{median, spread};
 use std::collections::{HashMap, HashSet};
 
-/// A photograph with what its pixels say.
+/// An image and the measurements of its pixels.
 pub(super) struct Seen<'a> {
     pub view: &'a View,
     pub look: &'a Look,
@@ -17,15 +17,15 @@ pub(super) struct Seen<'a> {
 
 /// How many usual deviations an outlier is from the others.
 const FAR: f64 = 5.0;
-/// The least ratios that are worth a word: of the contrast of edges, of brightness, and of colours.
+/// The smallest ratios that are reported: of edge contrast, of brightness, and of colour balance.
 const BLUR: f64 = 4.0;
 const BRIGHTNESS: f64 = 1.5;
 const COLOUR: f64 = 1.2;
-/// Neighbours that a photograph is compared with, and how far before it and behind it in the file they are looked for.
+/// Neighbours that an image is compared with, and how far before and after it in the file they may be.
 const NEIGHBOURS: usize = 6;
 const AROUND: usize = 1000;
 
-/// The sizes of the photographs, from the headers of their files, the most frequent first.
+/// The sizes of the images, from the headers of their files, the most frequent first.
 pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 2], usize)> {
     let mut counts: HashMap<[usize; 2], usize> = HashMap::new();
     let (mut shapes, mut first) = (vec![], String::new());
@@ -35,7 +35,7 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
         if view.camera.width > 0 && !same_shape(stored, &view.camera) && !same_shape(shown, &view.camera) {
             if shapes.is_empty() {
                 let [w, h] = shown;
-                first = format!("{w}x{h} pixels for {}x{}", view.camera.width, view.camera.height);
+                first = format!("{w}x{h} pixels, the camera has {}x{}", view.camera.width, view.camera.height);
             }
             shapes.push(view);
         }
@@ -50,7 +50,7 @@ pub(super) fn sizes(capture: &Capture, findings: &mut Findings) -> Vec<([usize; 
     counts
 }
 
-/// Adds what photographs that cannot be read say.
+/// Adds a finding about images that cannot be decoded.
 pub(super) fn unreadable(looks: &[(&View, Result<Look>)], findings: &mut Findings) {
     let errors: Vec<_> = looks.iter().filter_map(|(view, look)| Some((*view, look.as_ref().err()?))).collect();
     if let Some((_, first)) = errors.first() {
@@ -58,7 +58,7 @@ pub(super) fn unreadable(looks: &[(&View, Result<Look>)], findings: &mut Finding
     }
 }
 
-/// Adds what is wrong with photographs that can be read.
+/// Adds findings about images that can be decoded.
 pub(super) fn examine(seen: &[Seen<'_>], findings: &mut Findings) {
     duplicates(seen, findings);
     blurred(seen, findings);
@@ -88,7 +88,7 @@ fn duplicates(seen: &[Seen<'_>], findings: &mut Findings) {
     }
 }
 
-/// Of each value how far it is from the median of the neighbours' that have one: what all around share is no fault.
+/// The difference of each value from the median of its neighbours: a value that all neighbours share is no fault.
 fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Option<f64>> {
     let values: Vec<Option<f64>> = seen.iter().map(|one| value(one.look)).collect();
     let pose = |i: usize| seen[i].view.camera.pose;
@@ -113,7 +113,7 @@ fn residuals(seen: &[Seen<'_>], value: impl Fn(&Look) -> Option<f64>) -> Vec<Opt
     (0..seen.len()).map(residual).collect()
 }
 
-/// The photographs whose value is this far from their neighbours', and from what is usual.
+/// The images whose residual exceeds `least` and `FAR` deviations.
 fn outliers<'a>(seen: &[Seen<'a>], residuals: &[Option<f64>], least: f64, wrong: impl Fn(f64) -> f64) -> Vec<&'a View> {
     let known: Vec<f64> = residuals.iter().flatten().copied().collect();
     let limit = (FAR * spread(&known)).max(least);
@@ -153,8 +153,8 @@ fn alpha(seen: &[Seen<'_>], findings: &mut Findings) {
     {
         finding.severity = Severity::Warning;
         finding.advice =
-            "Others are transparent where there is nothing: these were saved without, and their background is \
-                          learned as part of the scene."
+            "Save these with a transparent background as the others are, or training learns their background as \
+            part of the scene."
                 .to_owned();
     }
 }

@@ -1,10 +1,10 @@
-//! Poses under several conventions, and what cameras look at under each.
+//! Pose conventions, and the point that cameras look at under each.
 
 use crate::camera::axes::axes;
 use crate::numbers::{eigen, mean, median, outer};
 use glam::{DAffine3, DMat3, DVec3};
 
-/// A way in which the matrices of a capture may be meant.
+/// A convention that the matrices of a capture may follow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Convention {
     /// As they are read: from the camera to the world, and the camera looks along its -z with y up (OpenGL).
@@ -35,7 +35,7 @@ impl Convention {
         Convention::MirroredBackwards,
     ];
 
-    /// The pose that a pose would be if it were meant in this way.
+    /// Reinterprets a pose under this convention.
     pub fn apply(self, pose: DAffine3) -> DAffine3 {
         let turned = |pose: DAffine3, axes: DVec3| DAffine3 {
             matrix3: pose.matrix3 * DMat3::from_diagonal(axes),
@@ -59,7 +59,7 @@ impl Convention {
     }
 }
 
-/// What cameras look at.
+/// The point that cameras look at.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Focus {
     /// The place nearest to all optical axes, in the sense of least squares.

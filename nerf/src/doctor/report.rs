@@ -1,4 +1,4 @@
-//! What an examination says: facts about a capture, and what is wrong with it.
+//! The report of an examination: facts about a capture, and findings.
 
 use super::kinds::{FindingKind, Severity, Text};
 use crate::dataset::{SceneType, Split, View};
@@ -7,117 +7,118 @@ use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::path::PathBuf;
 
-/// One thing that is wrong, or worth knowing.
+/// A problem of a capture, or a note about it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Finding {
-    /// What it is.
+    /// The kind.
     pub kind: FindingKind,
-    /// How much it matters.
+    /// The severity.
     pub severity: Severity,
-    /// What was found, in a sentence.
+    /// The finding in one sentence.
     pub what: String,
-    /// What to do about it.
+    /// How to fix it.
     pub advice: String,
-    /// The names of the photographs that it is about; none where it is about all of them.
+    /// The names of the affected images; empty if it concerns the whole capture.
     pub views: Vec<String>,
 }
 
-/// A number over all cameras.
+/// The range of a number over all cameras.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Range {
-    /// The least.
+    /// The minimum.
     pub least: f64,
-    /// That in the middle.
+    /// The median.
     pub median: f64,
-    /// The greatest.
+    /// The maximum.
     pub most: f64,
 }
 
-/// An image size, and how many photographs have it.
+/// An image size with the number of images that have it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Resolution {
-    /// Pixels in a row.
+    /// Width in pixels.
     pub width: usize,
-    /// Number of rows.
+    /// Height in pixels.
     pub height: usize,
-    /// Number of photographs.
+    /// Number of images.
     pub photographs: usize,
 }
 
-/// The photographs of a split.
+/// The images of one split.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CaptureSubset {
     /// The split.
     pub split: Split,
-    /// How many of its images exist.
+    /// Number of images that exist.
     pub present: usize,
-    /// How many do not.
+    /// Number of listed images that do not exist.
     pub absent: usize,
 }
 
-/// Where the scene was found to be. Lengths and places are in the scene's units, `up` and `middle` in the capture's.
+/// The scene as [`SceneAnalysis`](crate::dataset::SceneAnalysis) found it. Lengths are in scene units; `up` and `middle` are
+/// in the capture's coordinates.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneLayout {
-    /// How far it goes.
+    /// Bounded, unbounded or forward-facing.
     pub scope: SceneType,
-    /// Why that is thought.
+    /// The reason for this type.
     pub reason: String,
-    /// Distance along a ray before which there is nothing.
+    /// Near plane, in scene units.
     pub near: f64,
-    /// Distance along a ray beyond which there is nothing.
+    /// Far plane, in scene units.
     pub far: f64,
-    /// Lower and upper corner of its box.
+    /// Lower and upper corner of the scene box.
     pub bounds: [DVec3; 2],
-    /// The length of a unit of the capture in scene units.
+    /// Scene units per unit of the capture.
     pub scale: f64,
-    /// The direction in the capture that is up.
+    /// The up direction, a unit vector in the capture's coordinates.
     pub up: DVec3,
-    /// The place in the capture that is the middle of the scene.
+    /// The centre of the scene, in the capture's coordinates.
     pub middle: DVec3,
 }
 
-/// What a capture is.
+/// Facts about a capture.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Facts {
-    /// The folder.
+    /// The capture's folder.
     pub folder: PathBuf,
-    /// How it is written.
+    /// The file format, such as `COLMAP`.
     pub format: String,
-    /// The photographs of each split that has some.
+    /// The splits that have images.
     pub subsets: Vec<CaptureSubset>,
-    /// The sizes of the images, the most frequent first.
+    /// The image sizes, the most frequent first.
     pub resolutions: Vec<Resolution>,
     /// Horizontal focal length in pixels, if cameras have a size.
     pub focal: Option<Range>,
     /// Horizontal field of view in degrees, if cameras have a size.
     pub field_of_view: Option<Range>,
-    /// The lenses, with their coefficients.
+    /// The distinct lenses, with their coefficients.
     pub lenses: Vec<String>,
-    /// Number of points of the scene that the capture has.
+    /// Number of the capture's sparse points.
     pub points: usize,
-    /// Where the scene lies, if that can be found out.
+    /// The scene layout, if it can be found.
     pub layout: Option<SceneLayout>,
-    /// How well photographs agree with their cameras, if that was looked at and they have enough to compare: 0 as by chance,
-    /// 1 perfectly; 0.3 is usual in a good capture.
+    /// Agreement of images with their cameras along epipolar lines: 0 is chance, 1 is perfect, 0.3 is usual in a good capture.
+    /// `None` if it was not measured or too few patches match.
     pub agreement: Option<f64>,
 }
 
 /// The result of an examination.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Report {
-    /// What the capture is.
+    /// Facts about the capture.
     pub facts: Facts,
-    /// What is wrong with it, the gravest first.
+    /// The findings, the most severe first.
     pub findings: Vec<Finding>,
 }
 
 impl Report {
-    /// How much the gravest finding matters; `None` if there is none.
+    /// Returns the highest severity, or `None` without findings.
     pub fn severity(&self) -> Option<Severity> {
         self.findings.iter().map(|finding| finding.severity).max()
     }
 
-    /// Whether something of a kind was found.
+    /// Returns the first finding of a kind, if there is one.
     pub fn finds(&self, kind: FindingKind) -> Option<&Finding> {
         self.findings.iter().find(|finding| finding.kind == kind)
     }
@@ -140,7 +141,7 @@ impl Findings {
         &mut self.0[number]
     }
 
-    /// Adds a finding about some photographs, if there are some: how many is the first part of the message.
+    /// Adds a finding about images, if there are any; their count is the first part of the message.
     pub fn about<'a>(
         &mut self,
         kind: FindingKind,
@@ -157,7 +158,7 @@ impl Findings {
         Some(finding)
     }
 
-    /// Adds a finding about photographs that are like another one each, if there are some: the first pair is named.
+    /// Adds a finding about images that equal another, if there are any; names the first pair.
     pub fn alike(&mut self, kind: FindingKind, pairs: &[[&View; 2]]) {
         if let Some(finding) = self.about(kind, pairs.iter().map(|[view, _]| *view), &[]) {
             let [first, other] = pairs[0];
@@ -166,14 +167,14 @@ impl Findings {
         }
     }
 
-    /// All of them, the gravest first, those of one severity in the order of their kinds.
+    /// Sorts them: the most severe first, then in the order of their kinds.
     pub fn sorted(mut self) -> Vec<Finding> {
         self.0.sort_by_key(|finding| (std::cmp::Reverse(finding.severity), finding.kind));
         self.0
     }
 }
 
-/// `1 photograph` or `3 photographs`.
+/// `1 image` or `3 images`.
 fn counted(count: usize) -> String {
-    if count == 1 { "1 photograph".to_owned() } else { format!("{count} photographs") }
+    if count == 1 { "1 image".to_owned() } else { format!("{count} images") }
 }

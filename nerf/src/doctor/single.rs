@@ -1,4 +1,4 @@
-//! What can be said of each camera alone: its field of view, its principal point, its lens.
+//! Findings from single cameras: field of view, principal point and lens.
 
 use super::kinds::FindingKind as Kind;
 use super::report::Findings;
@@ -17,7 +17,7 @@ const BENDS: f64 = 5.0;
 /// Places along a line from the principal point to the border at which a lens is asked.
 const STEPS: usize = 32;
 
-/// Adds what is wrong with single cameras.
+/// Adds findings about single cameras.
 pub(super) fn examine(capture: &Capture, findings: &mut Findings) {
     let mut about = |kind: Kind, wrong: &dyn Fn(&Camera) -> bool| {
         let sized = capture.views.iter().filter(|view| view.camera.width > 0 && view.camera.height > 0);
