@@ -1,9 +1,9 @@
-//! This crate's operations, for the checks.
+//! This crate's differentiable operations, for automatic checks.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 
-/// Every operation of this crate, with the inputs it is checked on.
+/// Returns every operation of this crate with the inputs that it is checked on.
 pub fn catalogue() -> Vec<Entry> {
     let mut entries = crate::encoding::sinusoids::entries();
     entries.extend(crate::volume::depth::entries());

@@ -1,4 +1,4 @@
-//! What is compiled here, for f64 as for f32, so that no crate that calls it compiles it again.
+//! Instantiations for f32 and f64 that are compiled in this crate, so that no caller compiles them again.
 //!
 //! A generic function is compiled in every crate that uses it, unless it is marked `#[inline(never)]` and a crate below has
 //! used it for the same types. So marked are the entries that stand for much code (of this crate and of those below).

@@ -1,4 +1,6 @@
-//! Parts of a model that are chosen by name, here or in any crate: a configuration that knows what it builds.
+//! Custom fields, samplers and loss terms: implement [`ComponentConfig`] for a configuration, then [`register`] its name.
+//!
+//! A [`Config`](crate::Config) holds each as an [`AnyConfig`], which reads and writes `{"kind": "<KIND>", ..}`.
 
 use crate::space::cube::Space;
 use crate::{Error, Result};
@@ -13,85 +15,87 @@ use std::any::Any;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// What can be chosen: fields, samplers, or terms of the loss.
+/// A type of component that a configuration chooses by name: [`Fields`](crate::Fields), [`Samplers`](crate::Samplers) or
+/// [`LossTerms`](crate::LossTerms).
 pub trait ComponentType: Sized + 'static {
-    /// What one of them is called in messages.
+    /// The word for such a component in messages, such as `field`.
     const WHAT: &'static str;
-    /// What is built.
+    /// The type that a configuration builds.
     type Built<T: Scalar>: 'static;
 }
 
-/// Where something is built, and with what.
+/// The arguments of [`ComponentConfig::build`].
 pub struct BuildContext<'a, T: Scalar> {
-    /// The scene's region.
+    /// The map from the scene to the unit cube.
     pub space: Space,
-    /// How many photographs the model is fitted to, for what has numbers of its own for each: 0 if that is not known.
+    /// Number of training images, for components with parameters per image; 0 if it is not known.
     pub frames: usize,
-    /// Where parameters go.
+    /// The parameters, to which the component adds its own.
     pub params: &'a mut Params<T>,
-    /// What their names begin with: `<name>.table`.
+    /// The prefix of the parameters' names: `<name>.table`.
     pub name: &'a str,
-    /// Where their first values come from.
+    /// The source of initial values.
     pub rng: &'a mut dyn Rng,
 }
 
 impl<T: Scalar> BuildContext<'_, T> {
-    /// The same place for a part with another name.
+    /// Returns a context for a part of this component, with the prefix `name`.
     pub fn child<'b>(&'b mut self, name: &'b str) -> BuildContext<'b, T> {
         BuildContext { space: self.space, frames: self.frames, params: &mut *self.params, name, rng: &mut *self.rng }
     }
 }
 
-/// A configuration that can be chosen by its name: of a field (`ComponentConfig<Fields>`) or of a sampler (`ComponentConfig<Samplers>`).
+/// A named configuration of a field (`ComponentConfig<Fields>`), a sampler (`ComponentConfig<Samplers>`) or a loss term
+/// (`ComponentConfig<LossTerms>`).
 ///
-/// In a file it is `{"kind": "<KIND>", ..}` with the configuration's own fields. [`register`] makes the name known to
-/// whatever reads such files.
+/// In a file it is `{"kind": "<KIND>", ..}` with the configuration's own fields. [`register`] the name before reading such
+/// a file.
 pub trait ComponentConfig<F: ComponentType>:
     Serialize + DeserializeOwned + Clone + fmt::Debug + Send + Sync + 'static
 {
-    /// The name.
+    /// The name in files.
     const KIND: &'static str;
 
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     fn check(&self) -> Result<()> {
         Ok(())
     }
 
-    /// Builds what is configured, with new parameters.
+    /// Builds the component and adds its parameters to `site.params`.
     ///
     /// # Errors
-    /// If it cannot be built of these numbers.
+    /// If these values cannot be built.
     fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<F::Built<T>>;
 }
 
-/// A [`ComponentConfig`] whose type is known only while the program runs: what a [`Config`](crate::Config) holds.
+/// A type-erased [`ComponentConfig`], as a [`Config`](crate::Config) holds it.
 pub struct AnyConfig<F: ComponentType>(Box<dyn AnyKind<F>>);
 
 impl<F: ComponentType> AnyConfig<F> {
-    /// This configuration.
+    /// Erases the type of `config`.
     pub fn new(config: impl ComponentConfig<F>) -> Self {
         AnyConfig(Box::new(config))
     }
 
-    /// Its name.
+    /// Returns its [`ComponentConfig::KIND`].
     pub fn kind(&self) -> &'static str {
         self.0.kind()
     }
 
-    /// The configuration, if it is a `K`.
+    /// Returns the configuration if it is a `K`.
     pub fn get<K: ComponentConfig<F>>(&self) -> Option<&K> {
         (&*self.0 as &dyn Any).downcast_ref()
     }
 
-    /// The configuration, to be changed, if it is a `K`.
+    /// Returns the configuration mutably if it is a `K`.
     pub fn get_mut<K: ComponentConfig<F>>(&mut self) -> Option<&mut K> {
         (&mut *self.0 as &mut dyn Any).downcast_mut()
     }
 
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
     /// As [`ComponentConfig::check`].
@@ -99,10 +103,10 @@ impl<F: ComponentType> AnyConfig<F> {
         self.0.check()
     }
 
-    /// Builds what is configured, with new parameters.
+    /// Checks the configuration, builds the component and adds its parameters to `site.params`.
     ///
     /// # Errors
-    /// As [`ComponentConfig::check`] and [`ComponentConfig::build`].
+    /// As [`ComponentConfig::check`] and [`ComponentConfig::build`]; also if `T` is neither f32 nor f64.
     pub fn build<T: Scalar>(&self, site: BuildContext<'_, T>) -> Result<F::Built<T>> {
         self.check()?;
         let BuildContext { space, frames, params, name, rng } = site;
@@ -112,16 +116,16 @@ impl<F: ComponentType> AnyConfig<F> {
         } else if let Some(params) = params.downcast_mut() {
             Box::new(self.0.double(BuildContext { space, frames, params, name, rng })?)
         } else {
-            return Err(Error::setting(F::WHAT, "can be built in f32 and f64"));
+            return Err(Error::setting(F::WHAT, "has parameters of another type; use f32 or f64"));
         };
         match built.downcast() {
             Ok(built) => Ok(*built),
-            Err(_) => unreachable!("what is built is of the type of its parameters"),
+            Err(_) => unreachable!("a component has the scalar type of its parameters"),
         }
     }
 }
 
-/// What a [`ComponentConfig`] does, without its type.
+/// [`ComponentConfig`] as an object-safe trait.
 trait AnyKind<F: ComponentType>: Any + fmt::Debug + Send + Sync {
     fn kind(&self) -> &'static str;
     fn check(&self) -> Result<()>;
@@ -170,20 +174,23 @@ impl<F: ComponentType> fmt::Debug for AnyConfig<F> {
 }
 
 impl<F: ComponentType> PartialEq for AnyConfig<F> {
-    /// Whether both would be written alike.
+    /// Compares names and serialised values.
     fn eq(&self, other: &Self) -> bool {
         self.kind() == other.kind() && matches!((self.0.value(), other.0.value()), (Ok(a), Ok(b)) if a == b)
     }
 }
 
-/// The name of the name.
+/// The key of the name in files.
 const KIND: &str = "kind";
 
 impl<F: ComponentType> Serialize for AnyConfig<F> {
     fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
         use serde::ser::Error;
         let Value::Object(fields) = self.0.value().map_err(S::Error::custom)? else {
-            return Err(S::Error::custom(format!("the configuration `{}` is not made of fields", self.kind())));
+            return Err(S::Error::custom(format!(
+                "the configuration `{}` must be a struct with named fields",
+                self.kind()
+            )));
         };
         let mut map = serializer.serialize_map(Some(1 + fields.len()))?;
         map.serialize_entry(KIND, self.kind())?;
@@ -197,7 +204,7 @@ impl<'de, F: ComponentType> Deserialize<'de> for AnyConfig<F> {
         let mut fields = serde_json::Map::deserialize(deserializer)?;
         let named = fields.remove(KIND);
         let Some(kind) = named.as_ref().and_then(Value::as_str) else {
-            return Err(D::Error::custom(format!("a {} has a field `{KIND}`: its name", F::WHAT)));
+            return Err(D::Error::custom(format!("a {} needs the field `{KIND}` with its name", F::WHAT)));
         };
         // A copy: what is read may hold parts of its own.
         let all: Vec<Registered<F>> = {
@@ -206,24 +213,26 @@ impl<'de, F: ComponentType> Deserialize<'de> for AnyConfig<F> {
         };
         let Some((_, read)) = all.iter().find(|(known, _)| *known == kind) else {
             let known: Vec<_> = all.iter().map(|(known, _)| *known).collect();
-            let what = format!("there is no {} `{kind}`; known are {}", F::WHAT, known.join(", "));
-            let what =
-                if known.is_empty() { "nothing is registered but as part of a whole configuration" } else { &what };
-            return Err(D::Error::custom(format!("{what}; a program registers what is its own")));
+            let remedy = match known.join(", ") {
+                names if names.is_empty() => "read it as part of a whole `Config`, or call `register` first".to_owned(),
+                names => format!("use {names}, or call `register` first"),
+            };
+            return Err(D::Error::custom(format!("unknown {} `{kind}`; {remedy}", F::WHAT)));
         };
         read(Value::Object(fields)).map_err(|error| D::Error::custom(format!("{} `{kind}`: {error}", F::WHAT)))
     }
 }
 
-/// A name of a family, and how to read what it stands for.
+/// A component's name with the function that reads its configuration.
 type Registered<F> = (&'static str, fn(Value) -> serde_json::Result<AnyConfig<F>>);
 
-/// What was [registered](register): a [`Registered`] each, of all families.
+/// All [registered](register) components: a [`Registered`] each, of all types.
 static REGISTERED: RwLock<Vec<Box<dyn Any + Send + Sync>>> = RwLock::new(vec![]);
 
-/// Makes the name of a [`ComponentConfig`] known to whatever reads configurations in this program, beside those of this crate, which
-/// [`Config`](crate::Config) knows, and whose names stay theirs: `register::<Fields, MyFieldConfig>()`, once, before the
-/// first is read. Who only makes configurations needs it not.
+/// Registers the name of a [`ComponentConfig`], so that this program can read it from files.
+///
+/// Call `register::<Fields, MyFieldConfig>()` once, before the first such file is read. The names of this crate's own
+/// components are known already and keep their meaning. Configurations made in code need no registration.
 pub fn register<F: ComponentType, K: ComponentConfig<F>>() {
     let one: Registered<F> = (K::KIND, |fields| Ok(AnyConfig::new(serde_json::from_value::<K>(fields)?)));
     REGISTERED.write().unwrap_or_else(PoisonError::into_inner).push(Box::new(one));

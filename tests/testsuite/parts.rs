@@ -177,14 +177,14 @@ fn a_field_of_ones_own_is_built_trained_rendered_saved_and_loaded() {
     let written = serde_json::to_value(&config).unwrap();
     assert_eq!(written["field"], serde_json::from_str::<serde_json::Value>(text).unwrap());
     let error = serde_json::from_value::<Config>(written).unwrap_err().to_string();
-    assert!(error.contains("no field `bare`; known are classic, instant, voxel"), "{error}");
+    assert!(error.contains("unknown field `bare`; use classic, instant, voxel, or call `register` first"), "{error}");
     register::<Fields, BareConfig>();
     assert_eq!(read().unwrap(), config.field);
     assert!(read().unwrap() != FieldConfig::new(BareConfig { width: 9 }), "numbers count");
     assert!(config.field != instant().field && read().unwrap().get::<InstantConfig>().is_none());
     for (wrong, what) in [
         (r#"{"kind": "bare", "width": 8, "depth": 2}"#, "field `bare`: unknown field `depth`"),
-        (r#"{"width": 8}"#, "a field has a field `kind`"),
+        (r#"{"width": 8}"#, "a field needs the field `kind` with its name"),
     ] {
         let error = serde_json::from_str::<FieldConfig>(wrong).unwrap_err().to_string();
         assert!(error.contains(what), "{error}");

@@ -126,7 +126,7 @@ fn what_is_no_state_of_this_run_changes_nothing() {
         (new(Config { seed: 1, ..instant() }).state().unwrap(), "another configuration"),
         (
             Trainer::new(instant(), Arc::new(photographs(7, 16))).unwrap().state().unwrap(),
-            "another configuration, or of other photographs",
+            "another configuration or to other images",
         ),
     ];
     for (bytes, expected) in cases {

@@ -1,4 +1,4 @@
-//! What to train and how: the presets and every number behind them.
+//! Training configurations and presets.
 
 use crate::dataset::SceneType;
 use crate::dataset::background::Background;
@@ -21,11 +21,11 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Nested boxes of an unbounded scene, each twice as large as the one before.
+/// Cascades of an unbounded scene, each twice as large as the one before.
 const CASCADES: usize = 6;
 /// Cells along each axis of each of them.
 const RESOLUTION: usize = 32;
-/// Steps through an unbounded scene, in training and in views, as shares of the box's side.
+/// Steps through an unbounded scene, in training and in renders, as shares of the box's side.
 const STEP: f64 = 1.0 / 100.0;
 const VIEW_STEP: f64 = 1.0 / 150.0;
 /// Samples of a training step, for each of one within a box: most of them lie behind what is opaque, and cost little.
@@ -47,7 +47,7 @@ const CAMERA_WARMUP: f64 = 0.1;
 /// The share of a run in which poses are learned over which detail comes in.
 const COARSE: f64 = 0.4;
 
-/// A named configuration.
+/// A named configuration, for [`Config::preset`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
@@ -66,9 +66,9 @@ impl FromStr for Preset {
     type Err = Error;
     fn from_str(name: &str) -> Result<Self> {
         let all = [Preset::Classic, Preset::Small, Preset::Instant, Preset::Voxel];
-        all.into_iter().find(|preset| preset.to_string() == name).ok_or_else(|| {
-            Error::setting("preset", format!("there is no `{name}`; use classic, small, instant or voxel"))
-        })
+        all.into_iter()
+            .find(|preset| preset.to_string() == name)
+            .ok_or_else(|| Error::setting("preset", format!("is `{name}`; use classic, small, instant or voxel")))
     }
 }
 
@@ -83,7 +83,7 @@ impl fmt::Display for Preset {
     }
 }
 
-/// Parameters that are moved in a way of their own.
+/// A group of parameters with its own optimizer settings and schedule.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GroupConfig {
@@ -100,7 +100,15 @@ pub struct GroupConfig {
     pub weight_decay: f64,
 }
 
-/// A model and how it is trained. It is stored with the model, so that a run can be read back.
+/// The configuration of a model and its training; stored with the model.
+///
+/// ```
+/// use raygrad_nerf::dataset::SceneType;
+/// use raygrad_nerf::{Config, Preset};
+/// let config = Config::preset(Preset::Instant).with_scene_type(SceneType::Unbounded);
+/// config.check()?;
+/// # Ok::<_, raygrad_nerf::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -123,7 +131,7 @@ pub struct Config {
     #[serde(default, deserialize_with = "super::registry::read")]
     #[serde(alias = "terms")]
     pub loss_terms: Vec<LossTermConfig>,
-    /// Learning rate over the run.
+    /// Learning-rate schedule over the run.
     pub schedule: Schedule,
     /// Adam constants of the networks.
     pub adam: AdamConfig,
@@ -162,7 +170,7 @@ pub struct Config {
 }
 
 impl Config {
-    /// The numbers of a preset.
+    /// Returns the configuration of a preset, for a bounded scene.
     pub fn preset(preset: Preset) -> Self {
         let paper = ClassicConfig::paper();
         let small = ClassicConfig { depth: 4, width: 128, skip_layers: vec![], view_width: 64, ..paper.clone() };
@@ -233,10 +241,12 @@ impl Config {
         }
     }
 
-    /// The same for what it is trained with: a number of [samples](crate::Budget::samples), and photographs of so many
-    /// [pixels](crate::dataset::Dataset::pixels_per_side) along a side of the scene. The table of a hash grid is as large and as fine as
-    /// pays, see [`HashGridConfig::cpu`]; beyond 200 million samples (100 seconds on two cores) the steps along a ray grow
-    /// shorter as training goes on, down to a pixel's footprint, and beyond 600 million a training step has twice as many.
+    /// Adapts the hash grid and the sampling to a training budget.
+    ///
+    /// `samples` is [`Budget::samples`](crate::Budget::samples), `footprints` is
+    /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side). [`HashGridConfig::cpu`] chooses the table's size
+    /// and resolution. Beyond 200 million samples (100 seconds on two cores) steps along a ray shrink during training, down to
+    /// a pixel's footprint. Beyond 600 million a training step has twice as many samples.
     pub fn for_budget(mut self, samples: f64, footprints: f64) -> Self {
         if let Some(field) = self.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig::cpu(samples, footprints);
@@ -250,11 +260,11 @@ impl Config {
         self
     }
 
-    /// The same for a scene that goes as far: see [`unbounded`](Self::unbounded). An unbounded scene is marched through nested
-    /// boxes at steps that grow, proposals are spread in inverse distance, a hash grid is twice as fine, as it holds all that
-    /// is seen, and a [distortion](DistortionConfig) clears the fog that would do for surfaces. Figures are in
-    /// docs/benchmarks/results.md, section Captures. What a [budget](Self::for_budget) says of steps is left behind. A second call with the same scope changes
-    /// nothing.
+    /// Adapts the configuration to the type of scene; a second call with the same type changes nothing.
+    ///
+    /// For an unbounded scene it marches through cascades with growing steps, spreads proposals in inverse distance, doubles the
+    /// resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. It overrides the steps that
+    /// [`for_budget`](Self::for_budget) chose. Figures are in docs/benchmarks/results.md, section Captures.
     pub fn with_scene_type(mut self, scope: SceneType) -> Self {
         let before = std::mem::replace(&mut self.unbounded, scope.is_unbounded());
         if before == self.unbounded {
@@ -287,8 +297,8 @@ impl Config {
         self
     }
 
-    /// The same with these parts of the cameras learned, at rates that were found with the embedded scene
-    /// (`examples/refine.rs`); while poses are, detail comes in from coarse to fine.
+    /// Enables refinement of these camera parameters, at learning rates found with `examples/refine.rs`. With
+    /// [`RefinedParam::Poses`], detail is enabled from coarse to fine.
     pub fn with_refined(mut self, parts: &[RefinedParam]) -> Self {
         let rate = |from: f64, to: f64| Some(Schedule::Exponential { from, to, warmup: CAMERA_WARMUP });
         for part in parts {
@@ -305,7 +315,7 @@ impl Config {
         self
     }
 
-    /// The learning rate of the parameter of this name, if it is one of cameras or of what they make of colours.
+    /// The schedule of the parameter of this name, if it is one of the camera optimizer or the exposure model.
     pub(crate) fn camera_rate(&self, name: &str) -> Option<Schedule> {
         match name {
             POSES => self.poses,
@@ -317,7 +327,7 @@ impl Config {
         }
     }
 
-    /// The same, sampled by marching through an occupancy grid that skips that much (`off` leaves another sampler alone).
+    /// Sets the skipping of empty space, by marching through an occupancy grid; [`Skip::Off`] keeps another sampler.
     pub fn with_skip(mut self, skip: Skip) -> Self {
         if let Some(marching) = self.sampler.get_mut::<MarchingConfig>() {
             marching.occupancy.skip = skip.into();
@@ -332,10 +342,10 @@ impl Config {
         self
     }
 
-    /// Whether the numbers make sense together.
+    /// Checks that all values are in range and fit each other.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range or contradicts another; the error names it.
     pub fn check(&self) -> Result<()> {
         self.loss.check()?;
         let named = |part: &str, checked: std::result::Result<(), SettingError>| {
@@ -357,9 +367,7 @@ impl Config {
         if let Some(marching) = self.sampler.get::<MarchingConfig>() {
             let cascades = marching.occupancy.cascades;
             if self.unbounded != (cascades > 1) {
-                let what = format!(
-                    "is {cascades}; use 1 for a scene within its box, and 2 to 8 with `unbounded` for one that goes on"
-                );
+                let what = format!("is {cascades}; use 1 for a bounded scene, and 2 to 8 for an unbounded one");
                 return Err(Error::setting("occupancy.cascades", what));
             }
         }
@@ -367,7 +375,7 @@ impl Config {
         if rule.is_some_and(Quadrature::has_intervals)
             && self.loss_terms.iter().any(|term| term.get::<DistortionConfig>().is_some())
         {
-            let what = "needs samples that stand for an interval each: use the quadrature midpoint or left";
+            let what = "needs one sample per interval: use the quadrature midpoint or left";
             return Err(Error::setting("loss_terms.distortion", what));
         }
         self.loss_terms.iter().try_for_each(LossTermConfig::check)?;
@@ -380,7 +388,7 @@ impl Config {
         self.field.get_mut::<ClassicConfig>().into_iter().chain(proposal)
     }
 
-    /// The same without positional encoding: classic networks see bare coordinates.
+    /// Removes the positional encoding from classic networks.
     pub fn without_positional_encoding(mut self) -> Self {
         for field in self.classic_fields() {
             (field.position_levels, field.direction_levels) = (0, 0);
@@ -388,7 +396,7 @@ impl Config {
         self
     }
 
-    /// The same with the paper's ReLU density in classic networks.
+    /// Uses the paper's ReLU density in classic networks.
     pub fn with_relu_density(mut self) -> Self {
         for field in self.classic_fields() {
             field.density = DensityActivation::Relu;

@@ -1,4 +1,4 @@
-//! How photographs differ from the scene that they show: exposure, white balance, and corners that are darker.
+//! The exposure model: exposure and white balance per image, and vignetting.
 
 use crate::dataset::batch::Batch;
 use crate::range::check_schedule;
@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 
 /// The name of the parameter of exposures.
 pub(crate) const EXPOSURE: &str = "exposure";
-/// That of darker corners.
+/// The name of the parameter of vignetting.
 pub(crate) const VIGNETTING: &str = "vignetting";
-/// Numbers that say how corners darken.
+/// Coefficients of the vignetting polynomial.
 const POWERS: usize = 3;
 
-/// What is learned of how photographs show the scene's colours.
+/// Configuration of the [`ExposureModel`].
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExposureConfig {
@@ -27,36 +27,35 @@ pub struct ExposureConfig {
 }
 
 impl ExposureConfig {
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     pub fn check(&self) -> Result<()> {
         check_schedule("exposure_model.exposure", self.exposure)?;
         check_schedule("exposure_model.vignetting", self.vignetting)
     }
 }
 
-/// What photographs make of the scene's colours, as parameters; 0 everywhere leaves colours as they are.
+/// Learned gains from the scene's colours to those of each image; parameters of 0 leave colours unchanged.
 ///
-/// The colour that arrives from the scene is multiplied by a gain `exp(e + v1 s + v2 s^2 + v3 s^3)`, in the values that
-/// photographs store:
-/// - `exposure` `[photographs, 3]`: e for red, green and blue, so that white balance is part of it (the images' exposures of
-///   Mueller et al. 2022, instant-ngp). Between .2 and 1 of a full value, a gain of light is nearly one of stored values.
-/// - `vignetting` `[3]`: v1, v2 and v3 for all photographs, with the square s of a pixel's
-///   [distance from the optical axis](crate::camera::Camera::off_axis) in halves of the diagonal (Goldman and Chen 2005,
-///   "Vignette and exposure calibration and compensation", equation 2, of a logarithm, so that no gain is negative).
+/// The gain is `exp(e + v1 s + v2 s^2 + v3 s^3)`, applied to stored (sRGB) values:
+/// - `exposure` `[images, 3]`: e for red, green and blue, which includes white balance (per-image exposure of Mueller et al.
+///   2022, instant-ngp). Between 0.2 and 1, a gain of light is nearly a gain of stored values.
+/// - `vignetting` `[3]`: v1, v2 and v3, shared by all images. s is the square of a pixel's
+///   [distance from the optical axis](crate::camera::Camera::off_axis) in units of half the diagonal (Goldman and Chen 2005,
+///   "Vignette and exposure calibration and compensation", equation 2, as a logarithm, so that no gain is negative).
 ///
-/// What lies behind the scene, the background, is not multiplied. Views have the geometric mean of all exposures, or that
-/// of the photograph that they [look like](crate::Model::appearance_image), and no vignetting but
-/// [where it is wanted](crate::Model::vignetted). What photographs have cut off at white is not found again.
+/// The background is not multiplied. Renders use the geometric mean of all exposures, or the exposure of
+/// [`appearance_image`](crate::Model::appearance_image), and no vignetting unless
+/// [`vignetted`](crate::Model::vignetted) is set. Values clipped at white are not recovered.
 #[derive(Debug, Clone)]
 pub struct ExposureModel {
     exposure: Option<ParamId>,
     vignetting: Option<ParamId>,
 }
 
-/// What a view's colours are multiplied by.
+/// The gain of a render.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Gain {
     exposure: [f64; 3],
@@ -64,30 +63,30 @@ pub(crate) struct Gain {
 }
 
 impl ExposureModel {
-    /// Of this many photographs, so far without a difference. `None` if nothing is to be learned.
+    /// A model of gains 1 for this many images; `None` if nothing is learned.
     ///
     /// # Errors
-    /// If exposures are to be learned, and it is not known of how many photographs.
+    /// If exposures are learned and `frames` is 0.
     pub(crate) fn new<T: Scalar>(
         config: &ExposureConfig,
         frames: usize,
         params: &mut Params<T>,
     ) -> Result<Option<Self>> {
         if config.exposure.is_some() && frames == 0 {
-            let what = "are those of photographs, and it is not known how many there are";
+            let what = "needs the number of images; set `SceneBox::frames`";
             return Err(Error::setting("exposure_model.exposure", what));
         }
         let exposure = config.exposure.map(|_| params.add(EXPOSURE, Tensor::zeros(&[frames, 3])));
         let vignetting = config.vignetting.map(|_| params.add(VIGNETTING, Tensor::zeros(&[POWERS])));
-        // A step sees few photographs of many.
+        // A step sees few of the images.
         params.set_lazy(|name| name == EXPOSURE, exposure.is_some());
         Ok((exposure.is_some() || vignetting.is_some()).then_some(ExposureModel { exposure, vignetting }))
     }
 
-    /// What the colours of a batch's rays are multiplied by, `[rays, 3]`.
+    /// The gains of a batch's rays, `[rays, 3]`.
     ///
     /// # Panics
-    /// If there is no photograph of a ray's number.
+    /// If a ray's frame index is out of range.
     #[track_caller]
     pub(crate) fn gains<'t, T: Scalar>(&self, params: &Bound<'t, T>, batch: &Batch) -> Var<'t, T> {
         let exposure = self.exposure.map(|id| params[id].gather_rows(&batch.frames));
@@ -101,10 +100,10 @@ impl ExposureModel {
         sum.map_or_else(|| params.tape().constant(Tensor::ones(&[batch.rays.len(), 3])), |sum| sum.exp())
     }
 
-    /// What views' colours are multiplied by: as of the photograph `appearance_image`, or of none in particular.
+    /// The gain of renders: of the image `look`, or the mean of all.
     ///
     /// # Panics
-    /// If there is no such photograph.
+    /// If `look` is out of range.
     pub(crate) fn gain<T: Scalar>(&self, params: &Params<T>, look: Option<u32>, vignetted: bool) -> Gain {
         let exposure = self.exposure.map_or([0.0; 3], |id| {
             let all = params.get(id).as_slice().as_chunks::<3>().0;
@@ -120,7 +119,7 @@ impl ExposureModel {
 }
 
 impl Gain {
-    /// At a pixel that lies [so far](crate::camera::Camera::off_axis) off the axis.
+    /// The gain at a pixel with this [distance from the axis](crate::camera::Camera::off_axis).
     pub fn at(&self, off_axis: f64) -> [f64; 3] {
         let falloff = self.vignetting.iter().rev().fold(0.0, |sum, v| off_axis * (v + sum));
         self.exposure.map(|e| (e + falloff).exp())

@@ -1,4 +1,7 @@
-//! A model: a field, where it is sampled, and its parameters.
+//! Models: a field with its sampler, loss terms and parameters.
+//!
+//! Start with [`Config::preset`] and [`Model`]; a [`Trainer`](crate::Trainer) makes the model for a dataset.
+//! [`CameraOptimizer`] refines poses and [`ExposureModel`] fits exposure per image.
 
 mod camera_optimizer;
 pub(crate) mod config;
@@ -35,36 +38,36 @@ use raygrad_nn::{Bound, Params};
 use std::any::Any;
 use std::sync::Arc;
 
-/// Photographs that a model is fitted to, at most: it may have numbers of its own for each.
+/// The most training images: a model may have parameters per image.
 const MOST_FRAMES: usize = 1 << 20;
-/// What is nearer to a camera than this share of the scene's side is not looked at.
+/// The near plane of renders, as a share of the scene box's side.
 const NEAREST: f64 = 1e-2;
 
-/// A field with its sampler and parameters.
+/// A field with its sampler, loss terms and parameters.
 #[derive(Clone)]
 pub struct Model<T: Scalar> {
-    /// How it was made.
+    /// The configuration that it was built from.
     pub config: Config,
-    /// What it covers.
+    /// The scene box.
     pub scene_box: SceneBox,
-    /// Its parameters.
+    /// All parameters, by name.
     pub params: Params<T>,
-    /// What is rendered.
+    /// The field that is rendered.
     pub field: Arc<dyn Field<T>>,
-    /// Where it is sampled.
+    /// The sampler, which places samples along rays.
     pub sampler: Box<dyn Sampler<T>>,
-    /// What is minimised beside the loss of colours.
+    /// Loss terms that are added to the photometric loss.
     pub terms: Vec<Arc<dyn LossTerm<T>>>,
-    /// Corrections of the photographs' cameras, if some are learned.
+    /// Corrections of the training cameras, if any are learned.
     pub camera_optimizer: Option<CameraOptimizer>,
-    /// What photographs make of the scene's colours, if that is learned.
+    /// The exposure model, if it is learned.
     pub exposure: Option<ExposureModel>,
-    /// The number of the photograph that views look like, where a field knows how photographs differ; without one they
-    /// look like none in particular. Of a photograph that there is not, views panic.
+    /// The index of the training image whose appearance embedding and exposure renders use; `None` uses the mean of all.
+    /// Rendering panics if it is out of range.
     pub appearance_image: Option<u32>,
-    /// Whether views have the photographs' darker corners, if a [`ExposureModel`] knows of them. They have not, at first.
+    /// Whether renders have the [`ExposureModel`]'s vignetting; initially `false`.
     pub vignetted: bool,
-    /// How much of their detail fields have: see [`set_detail`](Self::set_detail).
+    /// The share of detail of the fields: see [`set_detail`](Self::set_detail).
     detail: f64,
 }
 
@@ -73,7 +76,7 @@ fn space(config: &Config, extent: &SceneBox) -> Space {
 }
 
 impl<T: Scalar> Model<T> {
-    /// A model with random parameters; the same seed gives the same parameters.
+    /// Creates a model with random parameters, determined by `seed`.
     ///
     /// # Errors
     /// If the configuration is out of range.
@@ -81,11 +84,12 @@ impl<T: Scalar> Model<T> {
         Model::with_cameras(config, extent, &[], seed)
     }
 
-    /// As [`new`](Self::new), of a model that knows the cameras that its photographs were taken by, in their order: what
-    /// one needs that learns [focal lengths or lenses](CameraOptimizerConfig). One that learns nothing of them forgets them.
+    /// Creates a model as [`new`](Self::new) with the cameras of its training images, in their order.
+    ///
+    /// Refining [focal lengths or lenses](CameraOptimizerConfig) needs them. Without refinement they are not kept.
     ///
     /// # Errors
-    /// If the configuration is out of range, or there is not one camera for each photograph.
+    /// If the configuration is out of range, or there is not one camera per image.
     #[inline(never)]
     pub fn with_cameras(config: Config, extent: SceneBox, cameras: &[Camera], seed: u64) -> Result<Self> {
         config.check()?;
@@ -124,13 +128,13 @@ impl<T: Scalar> Model<T> {
         })
     }
 
-    /// The map from the scene to the unit cube that fields and sampler are given.
+    /// Returns the map from the scene to the unit cube that the fields and the sampler use.
     pub fn space(&self) -> Space {
         space(&self.config, &self.scene_box)
     }
 
-    /// The box within which rays are sampled, lower and upper corner in scene units: infinite where neither the scene nor a
-    /// grid ends.
+    /// Returns the box within which rays are sampled, lower and upper corner in scene units. It is infinite for an unbounded
+    /// scene without an occupancy grid.
     pub fn reach(&self) -> [DVec3; 2] {
         match self.sampler.grid() {
             Some(grid) => grid.outer_bounds(),
@@ -139,8 +143,10 @@ impl<T: Scalar> Model<T> {
         }
     }
 
-    /// The nearest and the farthest distance from a camera at which views look, in scene units: in a scene that ends, at all of
-    /// it from wherever one stands; in one that goes on, as in training, which has not judged what is nearer to cameras.
+    /// Returns the near and far plane of renders, in scene units.
+    ///
+    /// For a bounded scene they enclose the whole box from any camera. For an unbounded scene they are those of training, which
+    /// has not learned what is nearer to cameras.
     pub fn view_near_far(&self) -> [f64; 2] {
         let [near, far] = self.scene_box.near_far;
         match self.space() {
@@ -149,46 +155,45 @@ impl<T: Scalar> Model<T> {
         }
     }
 
-    /// All fields: those of the sampler, if it has any, and the one that is rendered.
+    /// Returns all fields: the sampler's own, such as proposals, then the one that is rendered.
     pub fn fields(&self) -> Vec<&dyn Field<T>> {
         self.sampler.fields().into_iter().chain([&*self.field]).collect()
     }
 
-    /// The camera of the photograph of this number as the model has found it to be: as it was, unless something of it is
-    /// [learned](CameraOptimizer).
+    /// Returns the camera of the training image `number`, corrected by the [`CameraOptimizer`] if there is one.
     ///
     /// # Panics
-    /// If there is no such photograph.
+    /// If `number` is out of range.
     pub fn learned_camera(&self, number: usize, camera: &Camera) -> Camera {
         self.camera_optimizer
             .as_ref()
             .map_or_else(|| camera.clone(), |refine| refine.camera(&self.params, number, camera))
     }
 
-    /// A camera that took none of the photographs and is given beside theirs, where the model would have it: see
+    /// Returns a camera of the capture that took no training image, such as a held-out one, in the refined coordinates: see
     /// [`CameraOptimizer::other_cameras`].
     pub fn other_camera(&self, camera: &Camera) -> Camera {
         self.other_cameras(std::slice::from_ref(camera)).remove(0)
     }
 
-    /// The same of many, which finds once how the images' cameras have moved as a whole.
+    /// Returns [`other_camera`](Self::other_camera) of many, and finds the common similarity once.
     pub fn other_cameras(&self, cameras: &[Camera]) -> Vec<Camera> {
         self.camera_optimizer
             .as_ref()
             .map_or_else(|| cameras.to_vec(), |refine| refine.other_cameras(&self.params, cameras))
     }
 
-    /// The cameras that the model was given, if it learns something of them and was told.
+    /// Returns the given training cameras, if the model refines cameras and knows them; otherwise an empty slice.
     pub fn cameras(&self) -> &[Camera] {
         self.camera_optimizer.as_ref().map_or(&[], CameraOptimizer::cameras)
     }
 
-    /// The share of their detail that fields have, 0 to 1.
+    /// The share of detail of the fields, 0 to 1.
     pub(crate) fn detail(&self) -> f64 {
         self.detail
     }
 
-    /// Gives all fields that share of their detail, 0 to 1: see [`Field::with_detail`]. All parameters stay.
+    /// Sets the share of detail of all fields, 0 to 1: see [`Field::with_detail`]. Parameters do not change.
     pub fn set_detail(&mut self, detail: f64) {
         self.detail = detail;
         if let Some(field) = self.field.with_detail(detail) {
@@ -197,27 +202,29 @@ impl<T: Scalar> Model<T> {
         self.sampler.set_detail(detail);
     }
 
-    /// The sampler, if it marches through an occupancy grid.
+    /// Returns the sampler if it marches through an occupancy grid.
     pub fn marching(&self) -> Option<&Marching> {
         (&*self.sampler as &dyn Any).downcast_ref()
     }
 
-    /// What red, green and blue of views are multiplied by in a picture's middle, each above 0, and cut off at 1 after: 1, unless a
-    /// [`ExposureModel`] knows how photographs differ. Then it is that of [`appearance_image`](Self::appearance_image), or of none in particular.
+    /// Returns the [`ExposureModel`]'s gain of red, green and blue at the image centre, each above 0; 1 without such a model.
+    ///
+    /// It is that of [`appearance_image`](Self::appearance_image), or the mean of all. Renders clip colours at 1 after it.
     ///
     /// # Panics
-    /// If `appearance_image` is no photograph.
+    /// If `appearance_image` is out of range.
     pub fn gain(&self) -> [f64; 3] {
         self.exposure.as_ref().map_or([1.0; 3], |tone| tone.gain(&self.params, self.appearance_image, false).at(0.0))
     }
 
-    /// The sampler, to be changed, if it marches through an occupancy grid.
+    /// Returns the sampler mutably if it marches through an occupancy grid.
     pub fn marching_mut(&mut self) -> Option<&mut Marching> {
         (&mut *self.sampler as &mut dyn Any).downcast_mut()
     }
 
-    /// Where fields are sampled along `rays` by the sampler as it is in training, with the parameters as they are now:
-    /// first what each [coarse](crate::sampling::Sampled::coarse) picture is made of, and last the steps of the field.
+    /// Places samples along `rays` as in training, with the current parameters.
+    ///
+    /// Returns one set for each [coarse](crate::sampling::Sampled::coarse) render, and last the samples of the field.
     pub fn samples(&self, rays: &Rays<T>, jitter: &mut Jitter<'_>) -> Vec<Samples<T>> {
         let tape = Tape::new();
         let params = self.params.bind_constant(&tape);
@@ -225,9 +232,10 @@ impl<T: Scalar> Model<T> {
         sampled.coarse.into_iter().map(|seen| seen.samples).chain([sampled.samples]).collect()
     }
 
-    /// The photometric loss at given samples, a differentiable function of the parameters alone: the sum over fields, rays
-    /// and channels of the configured loss against `target` `[rays, 3]` over `background` `[rays, 3]`. Rays are those of no
-    /// photograph in particular, and stay where they are.
+    /// Returns the photometric loss at fixed samples, differentiable with respect to the parameters.
+    ///
+    /// It is the sum over fields, rays and channels of the configured loss against `target` `[rays, 3]`, over `background`
+    /// `[rays, 3]`. Rays use the mean appearance, and cameras are not refined.
     ///
     /// # Panics
     /// If there are more sets of samples than [`fields`](Self::fields).
@@ -239,7 +247,7 @@ impl<T: Scalar> Model<T> {
         background: &Tensor<T>,
     ) -> Var<'t, T> {
         let fields = self.fields();
-        assert!(samples.len() <= fields.len(), "one set of samples for each field");
+        assert!(samples.len() <= fields.len(), "more sets of samples than fields");
         let error = |(field, samples): (&dyn Field<T>, &Samples<T>)| {
             let seen = self.sampler.quadrature().render(&Query::new(field, params), samples, 0.0);
             self.config.loss.sum(&seen.rendered.over(background), target)
@@ -248,11 +256,10 @@ impl<T: Scalar> Model<T> {
         errors.reduce(|sum, error| sum + error).unwrap_or_else(|| params.tape().constant(Tensor::scalar(T::ZERO)))
     }
 
-    /// The same model in another precision: the same samples, occupied cells and parameters, the latter rounded if need
-    /// be.
+    /// Converts the model to another precision, with the same samples, occupied cells and (rounded) parameters.
     ///
     /// # Errors
-    /// If the configuration is out of range, which that of a model in use is not.
+    /// If the configuration is out of range, which cannot happen for a model in use.
     #[inline(never)]
     pub fn cast<U: Scalar>(&self) -> Result<Model<U>> {
         let mut model = Model::with_cameras(self.config.clone(), self.scene_box, self.cameras(), 0)?;
@@ -269,17 +276,18 @@ impl<T: Scalar> Model<T> {
 }
 
 impl Model<f32> {
-    /// The field's density at each of these positions (scene units), in 1 / scene unit, into the slot of the same number:
-    /// what an [`OccupancyGrid`](crate::space::occupancy::OccupancyGrid) asks for.
+    /// Evaluates the field's density at each of `points` (scene units) into `out`, in 1 / scene unit.
+    ///
+    /// An [`OccupancyGrid`](crate::space::occupancy::OccupancyGrid) takes such a function.
     ///
     /// # Panics
-    /// If there are not as many slots as positions.
+    /// If `out` has another length than `points`.
     pub fn densities(&self, points: &[[f32; 3]], out: &mut [f32]) {
         densities(&*self.field, &self.params, &Pool::new(), points, out);
     }
 
-    /// Chooses what views leave out from now on; what training has left out stays so. A model without an occupancy grid
-    /// leaves out what it has to.
+    /// Sets how renders skip empty space and weak samples. It does not undo skipping in training, and has no effect without an
+    /// occupancy grid.
     pub fn set_skip(&mut self, skip: impl Into<Skipping>) {
         if let Some(marching) = self.marching_mut() {
             // What training left out cannot be put back.
@@ -289,8 +297,9 @@ impl Model<f32> {
         }
     }
 
-    /// Looks closely at everything that the sampler may look at: for rendering within the error bound of the
-    /// configuration. [`Trainer::run`](crate::Trainer::run) and [`load`](Self::load) end with it.
+    /// Updates the whole occupancy grid at full sampling, so that renders keep the configured error bound.
+    ///
+    /// [`Trainer::run`](crate::Trainer::run) and [`load`](Self::load) end with it.
     pub fn finish(&mut self) {
         let Model { sampler, field, params, .. } = self;
         let pool = Pool::new();

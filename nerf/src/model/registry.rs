@@ -1,4 +1,4 @@
-//! The fields, samplers and terms of this crate, by name: one line for each.
+//! Registers this crate's fields, samplers and loss terms by name, one line each.
 
 use crate::component::register;
 use crate::field::{ClassicConfig, Fields, InstantConfig, VoxelConfig};
@@ -28,7 +28,7 @@ fn register_all() {
     });
 }
 
-/// Reads what holds parts of a configuration, which may be of this crate.
+/// Deserialises a value that may hold this crate's components.
 pub(super) fn read<'de, V: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<V, D::Error> {
     register_all();
     V::deserialize(deserializer)

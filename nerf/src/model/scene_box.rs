@@ -1,4 +1,4 @@
-//! Where a scene is.
+//! The scene's box, near and far plane, and transform.
 
 use crate::camera::Ndc;
 use crate::dataset::SceneTransform;
@@ -6,7 +6,7 @@ use crate::space::cube::Space;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-/// The scene's extent and what it was photographed with, stored with the model.
+/// The scene box with near and far plane, number of images and scene transform; stored with the model.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneBox {
@@ -36,7 +36,7 @@ fn one() -> f64 {
 }
 
 impl SceneBox {
-    /// Of a new model.
+    /// Creates a scene box with unit 1, without images, transform or NDC.
     pub fn new(bounds: [DVec3; 2], span: [f64; 2]) -> Self {
         SceneBox {
             bounds,
@@ -48,13 +48,13 @@ impl SceneBox {
         }
     }
 
-    /// Whether a place (scene units) is in the box that holds the scene, its faces included.
+    /// Returns whether a point (scene units) is inside the box, faces included.
     pub fn contains(&self, place: DVec3) -> bool {
         let [low, high] = self.bounds;
         place.cmpge(low).all() && place.cmple(high).all()
     }
 
-    /// The map to the unit cube, for a scene within its box: one that goes on is `unbounded` too.
+    /// Returns the map to the unit cube of a bounded scene; [`Model::space`](crate::Model::space) contracts unbounded ones.
     pub fn space(&self) -> Space {
         Space { unit: self.unit, ndc: self.ndc, ..Space::within(self.bounds) }
     }

@@ -1,4 +1,4 @@
-//! Models on disk.
+//! Saving and loading models.
 
 use super::config::Config;
 use super::{Model, SceneBox};
@@ -10,8 +10,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 impl Model<f32> {
-    /// Writes the parameters in the number type of the configuration and what the sampler knows (such as which cells of an
-    /// occupancy grid are occupied) as safetensors: beside the file first and then over it.
+    /// Writes parameters and sampler state (such as occupied cells) to a safetensors file, atomically.
+    ///
+    /// [`Config::storage`] is the number type of the parameters in the file.
     ///
     /// # Errors
     /// If the file cannot be written.
@@ -31,10 +32,10 @@ impl Model<f32> {
         write_atomic(path, &bytes)
     }
 
-    /// A model of this configuration with the parameters of a file.
+    /// Reads a model that [`save`](Self::save) wrote, with the same configuration and scene box.
     ///
     /// # Errors
-    /// If the file cannot be read, is of a later version, or belongs to a model of another configuration.
+    /// If the file cannot be read, has a later format version, or belongs to another configuration.
     pub fn load(path: impl AsRef<Path>, config: Config, extent: SceneBox) -> Result<Self> {
         let bytes = std::fs::read(&path).map_err(|error| Error::file(&path, error))?;
         check_version(&bytes).map_err(|error| Error::file(&path, error))?;
@@ -57,30 +58,30 @@ impl Model<f32> {
     }
 }
 
-/// What a file says of how it is laid out: `raygrad`, and the version. The first edition did not say which.
+/// The metadata key of the format: `raygrad` and its version. The first edition did not write it.
 const FORMAT: &str = "format";
 /// The version that is written.
 const VERSION: u64 = 1;
 
-/// Whether a file is of a version that is known.
+/// An error unless this version can be read.
 fn check_version(bytes: &[u8]) -> std::result::Result<(), String> {
     let stored = stored_words(bytes, FORMAT).map_err(|error| error.to_string())?;
     let Some(words) = stored.as_deref().and_then(|words| words.strip_prefix("raygrad ")) else { return Ok(()) };
     match words.parse::<u64>() {
         Ok(version) if version <= VERSION => Ok(()),
-        Ok(version) => Err(format!(
-            "has version {version}, and this raygrad knows {VERSION}: use the one that wrote it, or a newer"
-        )),
-        Err(_) => Err(format!("has a version that is no number: {words:?}")),
+        Ok(version) => {
+            Err(format!("has format version {version}, this raygrad reads up to {VERSION}: use a newer raygrad"))
+        }
+        Err(_) => Err(format!("has format version {words:?}, not a number: copy the file again")),
     }
 }
 
-/// The name of the cameras that the photographs were taken by, in files of models that learn something of them.
+/// The name of the training cameras, in files of models that refine cameras.
 const CAMERAS: &str = "cameras";
-/// That of how much of its detail the field has.
+/// The name of the share of detail.
 const DETAIL: &str = "detail";
 
-/// The cameras in the file of a model, as they are stored, if they are.
+/// The cameras in a model file, if it has any.
 fn cameras(stored: Option<&[u8]>) -> Result<Vec<Camera>> {
     let wrong = |what: String| Error::setting(CAMERAS, what);
     let Some(stored) = stored else { return Ok(vec![]) };
@@ -88,7 +89,7 @@ fn cameras(stored: Option<&[u8]>) -> Result<Vec<Camera>> {
     for camera in &cameras {
         camera.lens.check()?;
         if !(camera.focal.iter().all(|focal| *focal > 0.0) && camera.width > 0 && camera.height > 0) {
-            return Err(wrong(format!("{camera:?} is none")));
+            return Err(wrong(format!("a camera needs focal lengths and a size above 0, is {camera:?}")));
         }
     }
     Ok(cameras)
@@ -133,7 +134,10 @@ mod tests {
         };
         assert!([None, Some("raygrad"), Some("raygrad 1"), Some("pt")].into_iter().all(|words| load(words).is_ok()));
         let newer = load(Some("raygrad 2")).unwrap_err();
-        assert!(newer.contains("model.safetensors: has version 2, and this raygrad knows 1"), "{newer}");
+        assert!(
+            newer.contains("model.safetensors: has format version 2, this raygrad reads up to 1: use a newer raygrad"),
+            "{newer}"
+        );
         assert!(load(Some("raygrad one")).unwrap_err().contains("no number"));
     }
 

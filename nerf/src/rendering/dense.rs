@@ -1,4 +1,4 @@
-//! Views in which nothing is left out, in any precision: what others are measured against.
+//! Reference renders: every sample, in any precision.
 
 use super::picture::{Render, RenderOptions};
 use super::pixel::Pixel;
@@ -9,34 +9,33 @@ use crate::volume::early_termination::VisibleSamples;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Pool, Scalar, Var};
 
-/// A view in double precision.
+/// A reference render, with pixels in double precision.
 #[derive(Debug, Clone)]
 pub struct ReferenceRender {
-    /// Pixels in a row.
+    /// Width in pixels.
     pub width: usize,
-    /// Number of rows.
+    /// Height in pixels.
     pub height: usize,
-    /// What is seen over the background, row by row.
+    /// Pixels over the background, row by row.
     pub pixels: Vec<Pixel>,
-    /// How often fields were asked.
+    /// Number of field evaluations.
     pub evaluations: Evaluations,
 }
 
-/// Rays that are evaluated together.
+/// Rays per tile.
 const TILE: usize = 64;
 
 impl<T: Scalar> Model<T> {
-    /// The view from `camera` with all arithmetic in `T`, every sample in its middle, at steps `finer` times smaller than
-    /// the configured ones. Nothing is left out but the cells that the occupancy grid holds to be empty.
+    /// Renders every sample with arithmetic in `T`, at steps `finer` times smaller than configured.
     ///
-    /// In f64 at several times the steps it is a reference for faster ways: `model.cast::<f64>()?.render_reference(..)`. A
-    /// sampler without steps has as many samples whatever `finer` is.
+    /// It skips only the cells that the occupancy grid marks empty. In f64 with several times the steps it is a reference for
+    /// faster renders: `model.cast::<f64>()?.render_reference(..)`. Samplers without steps ignore `finer`.
     ///
     /// # Panics
     /// If `finer` is 0.
     #[inline(never)]
     pub fn render_reference(&self, camera: &Camera, background: [f64; 3], finer: usize) -> ReferenceRender {
-        assert!(finer > 0, "steps that are 0 times smaller");
+        assert!(finer > 0, "`finer` must be at least 1, is 0");
         let see = |pool: &Pool<T>, rays: &Rays<T>, out: &mut [Pixel]| self.dense_rays(rays, finer, pool, out);
         let mut pixels = vec![Pixel::default(); camera.width * camera.height];
         let keep = |seen: &[Pixel], out: &mut [Pixel]| {
@@ -44,7 +43,7 @@ impl<T: Scalar> Model<T> {
         };
         let all = RenderOptions::over([0.0; 3]);
         let evaluations = self.pixels(camera, &all, TILE, see, pixels.chunks_mut(TILE), keep);
-        let evaluations = evaluations.expect("nobody stops it");
+        let evaluations = evaluations.expect("never cancelled");
         ReferenceRender { width: camera.width, height: camera.height, pixels, evaluations }
     }
 
@@ -70,7 +69,7 @@ fn numbers<T: Scalar>(values: &Var<'_, T>) -> Vec<f64> {
 }
 
 impl ReferenceRender {
-    /// The view rounded to single precision.
+    /// Returns the render rounded to single precision.
     pub fn picture(&self) -> Render {
         let mut picture = Render::new([self.width, self.height]);
         picture.parts(self.pixels.len().max(1)).for_each(|part| part.fill(self.pixels.iter().copied()));

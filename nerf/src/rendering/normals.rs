@@ -1,4 +1,4 @@
-//! Views of normals.
+//! Rendering of normals.
 
 use crate::camera::pinhole::Camera;
 use crate::camera::rays::Rays;
@@ -9,26 +9,26 @@ use crate::volume::query::Query;
 use crate::volume::render::Evaluations;
 use raygrad_autograd::{Pool, Scalar};
 
-/// Rays that are evaluated together: the densities of all their samples are on one tape.
+/// Rays per tile: the densities of all their samples are on one tape.
 const TILE: usize = 64;
 
 impl<T: Scalar> Model<T> {
-    /// The normals that are seen from a camera, three channels: along each ray the sum of weights times `-grad sigma /
-    /// |grad sigma|` (as Verbin et al. 2022, equation 3 and after), in the scene's axes. Each is as long as the pixel
-    /// is opaque where all that is seen faces one way, and shorter elsewhere. Light that is left when a ray
-    /// [ends](crate::RayTolerance) counts for nothing.
+    /// Renders normals, three channels in the scene's axes: along each ray the sum of `-w grad sigma / |grad sigma|` (Verbin et
+    /// al. 2022, equation 3 and after).
     ///
-    /// It takes a gradient for each sample: about as long as a step of training on as many rays.
+    /// A normal's length is the pixel's opacity where all visible surfaces face one way, and less elsewhere. Light beyond
+    /// [early termination](crate::RayTolerance) does not count. The gradient of each sample takes about as long as a training
+    /// step on as many rays.
     ///
     /// # Panics
     /// If the field's density does not depend on positions through operations of the tape.
     #[inline(never)]
     pub fn normals(&self, camera: &Camera) -> Image {
-        self.normals_cancellable(camera, &RenderOptions::over([0.0; 3])).expect("nobody stops it")
+        self.normals_cancellable(camera, &RenderOptions::over([0.0; 3])).expect("never cancelled")
     }
 
-    /// As [`normals`](Self::normals), of what lies in a box, for as long as somebody wants it: nothing if it was not to
-    /// [go on](RenderOptions::keep_going).
+    /// Renders as [`normals`](Self::normals), with a crop box and cancellation; returns `None` if
+    /// [`keep_going`](RenderOptions::keep_going) returned `false`.
     ///
     /// # Panics
     /// As [`normals`](Self::normals).

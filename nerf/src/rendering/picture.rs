@@ -1,4 +1,4 @@
-//! Rendering whole images.
+//! Rendering of whole images.
 
 use super::pixel::Pixel;
 use crate::camera::pinhole::Camera;
@@ -10,16 +10,16 @@ use crate::volume::render::Evaluations;
 use glam::DVec3;
 use raygrad_autograd::Pool;
 
-/// What a model sees from a camera.
+/// A rendered image with depth and opacity.
 #[derive(Debug, Clone)]
 pub struct Render {
-    /// Colour over the background, RGB in 0..=1.
+    /// Colour over the background: RGB, 0 to 1.
     pub color: Image,
-    /// Expected distance along the ray, in scene units, of what is visible; 0 where nothing is.
+    /// Expected distance along the ray, one channel in scene units; 0 where opacity is below 1e-3.
     pub depth: Image,
-    /// Share of the ray's light that is blocked, 0..=1.
+    /// Opacity: the share of the ray's light that is blocked, one channel, 0 to 1.
     pub opacity: Image,
-    /// How often fields were asked.
+    /// Number of field evaluations.
     pub evaluations: Evaluations,
 }
 
@@ -27,26 +27,25 @@ pub struct Render {
 const VISIBLE: f64 = 1e-3;
 
 impl Render {
-    /// A picture of nothing.
+    /// An empty render.
     pub(crate) fn new([width, height]: [usize; 2]) -> Self {
         let image = |channels| Image::new(width, height, channels);
         Render { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
     }
 
-    /// The colour without the background that the picture was rendered over: RGBA, with the opacity as alpha and
-    /// colours that are not multiplied by it; where nothing is visible all 0.
+    /// Removes the background that was rendered over: returns RGBA with the opacity as straight alpha; 0 where nothing is visible.
     ///
     /// ```
-    /// use raygrad_nerf::{Evaluations, Image, Picture};
+    /// use raygrad_nerf::{Evaluations, Image, Render};
     /// let image = |channels, values: &[f32]| Image { width: 1, height: 1, channels, data: values.to_vec() };
     /// // A quarter of orange before blue.
-    /// let picture = Picture {
+    /// let render = Render {
     ///     color: image(3, &[0.25, 0.125, 0.75]),
     ///     depth: image(1, &[3.0]),
     ///     opacity: image(1, &[0.25]),
     ///     evaluations: Evaluations::default(),
     /// };
-    /// assert_eq!(picture.rgba([0.0, 0.0, 1.0]).data, [1.0, 0.5, 0.0, 0.25]);
+    /// assert_eq!(render.rgba([0.0, 0.0, 1.0]).data, [1.0, 0.5, 0.0, 0.25]);
     /// ```
     pub fn rgba(&self, background: [f32; 3]) -> Image {
         let mut out = Image::new(self.color.width, self.color.height, 4);
@@ -61,7 +60,7 @@ impl Render {
         out
     }
 
-    /// Its parts of `tile` pixels each, row by row.
+    /// Parts of `tile` pixels, row by row.
     pub(crate) fn parts(&mut self, tile: usize) -> impl Iterator<Item = Part<'_>> {
         let [color, depth, opacity] = [&mut self.color, &mut self.depth, &mut self.opacity];
         let rest = depth.data.chunks_mut(tile).zip(opacity.data.chunks_mut(tile));
@@ -70,7 +69,7 @@ impl Render {
     }
 }
 
-/// A part of a picture.
+/// A part of a render.
 pub(crate) struct Part<'a> {
     color: &'a mut [f32],
     depth: &'a mut [f32],
@@ -78,7 +77,7 @@ pub(crate) struct Part<'a> {
 }
 
 impl Part<'_> {
-    /// Takes these pixels, in single precision.
+    /// Stores these pixels in single precision.
     pub fn fill(self, pixels: impl Iterator<Item = Pixel>) {
         let rest = self.depth.iter_mut().zip(self.opacity);
         for (pixel, (color, (depth, opacity))) in pixels.zip(self.color.chunks_exact_mut(3).zip(rest)) {
@@ -90,54 +89,57 @@ impl Part<'_> {
     }
 }
 
-/// How a view is rendered that is looked at while it changes.
+/// Options of [`Model::render_cancellable`](crate::Model::render_cancellable).
 #[derive(Clone, Copy)]
 pub struct RenderOptions<'a> {
-    /// What lies behind the scene, RGB in 0..=1. Normals have nothing behind them.
+    /// Background colour, RGB, 0 to 1; normals have no background.
     pub background: [f32; 3],
-    /// What may be left out; without it what goes with the configuration.
+    /// Tolerances of early termination and skipped colours; `None` uses the configured ones.
     pub tolerance: Option<RayTolerance>,
-    /// The box, lower and upper corner in scene units, beyond which nothing is shown: infinite for all.
+    /// Crop box, lower and upper corner in scene units; infinite shows everything.
     pub crop: [DVec3; 2],
-    /// Asked before each tile, on any thread: once it says `false`, no more is rendered.
+    /// Called before each tile, on any thread; rendering stops once it returns `false`.
     pub keep_going: &'a (dyn Fn() -> bool + Sync),
 }
 
 impl RenderOptions<'_> {
-    /// All of a scene, to the end, over a background.
+    /// Renders the whole scene over a background, without cancellation.
     pub fn over(background: [f32; 3]) -> Self {
         RenderOptions { background, tolerance: None, crop: EVERYWHERE, keep_going: &|| true }
     }
 }
 
-/// The box that holds everything.
+/// The infinite box.
 const EVERYWHERE: [DVec3; 2] = [DVec3::NEG_INFINITY, DVec3::INFINITY];
 
 impl Model<f32> {
-    /// The view from `camera` over a background colour, samples in the middle of their bins or steps: the same bits each
-    /// time, on any number of threads.
+    /// Renders the image of `camera` over a background colour (RGB, 0 to 1).
+    ///
+    /// Samples lie at the centres of their bins, so the result has the same bits each time and on any number of threads.
     pub fn render(&self, camera: &Camera, background: [f32; 3]) -> Render {
         self.whole_view(camera, &RenderOptions::over(background))
     }
 
-    /// As [`view`](Self::render), with these limits in place of those that go with the configuration.
+    /// Renders as [`render`](Self::render), with `limits` instead of the configured tolerances.
     pub fn render_within(&self, camera: &Camera, background: [f32; 3], limits: &RayTolerance) -> Render {
         self.whole_view(camera, &RenderOptions { tolerance: Some(*limits), ..RenderOptions::over(background) })
     }
 
-    /// As [`view`](Self::render), of what lies in a box, for as long as somebody wants it: nothing if it was not to
-    /// [go on](RenderOptions::keep_going).
+    /// Renders as [`render`](Self::render), with a crop box and cancellation; returns `None` if
+    /// [`keep_going`](RenderOptions::keep_going) returned `false`.
     ///
     /// ```
     /// use raygrad_nerf::glam::{DAffine3, DVec3};
-    /// use raygrad_nerf::{Camera, Config, Extent, Model, Preset, Viewing};
-    /// let extent = Extent::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
-    /// let model = Model::new(Config::preset(Preset::Voxel), extent, 0)?;
+    /// use raygrad_nerf::{Camera, Config, Model, Preset, RenderOptions, SceneBox};
+    /// let scene_box = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [0.0, 10.0]);
+    /// let model = Model::new(Config::preset(Preset::Voxel), scene_box, 0)?;
     /// let camera = Camera::from_angle(8, 6, 0.7, DAffine3::from_translation(3.0 * DVec3::Z));
-    /// let lower_half = Viewing { crop: [DVec3::NEG_ONE, DVec3::new(1.0, 0.0, 1.0)], ..Viewing::over([1.0; 3]) };
-    /// let picture = model.view_while(&camera, &lower_half).expect("it was not stopped");
-    /// assert_eq!(picture.color.pixel(4, 0), [1.0; 3]);
-    /// assert!(model.view_while(&camera, &Viewing { goes_on: &|| false, ..lower_half }).is_none());
+    /// let crop = [DVec3::NEG_ONE, DVec3::new(1.0, 0.0, 1.0)];
+    /// let lower_half = RenderOptions { crop, ..RenderOptions::over([1.0; 3]) };
+    /// let render = model.render_cancellable(&camera, &lower_half).expect("not cancelled");
+    /// assert_eq!(render.color.pixel(4, 0), [1.0; 3]);
+    /// let cancelled = RenderOptions { keep_going: &|| false, ..lower_half };
+    /// assert!(model.render_cancellable(&camera, &cancelled).is_none());
     /// # Ok::<_, raygrad_nerf::Error>(())
     /// ```
     pub fn render_cancellable(&self, camera: &Camera, viewing: &RenderOptions<'_>) -> Option<Render> {
@@ -150,9 +152,9 @@ impl Model<f32> {
         Some(picture)
     }
 
-    /// A view that nobody stops.
+    /// A render that is never cancelled.
     fn whole_view(&self, camera: &Camera, viewing: &RenderOptions<'_>) -> Render {
-        self.render_cancellable(camera, viewing).expect("nobody stops it")
+        self.render_cancellable(camera, viewing).expect("never cancelled")
     }
 }
 

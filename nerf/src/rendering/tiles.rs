@@ -1,4 +1,4 @@
-//! Tiles: a model is asked along the rays of a camera's pixels, tile by tile on all cores.
+//! Evaluation of a model along the rays of a camera, tile by tile on all cores.
 
 use super::picture::RenderOptions;
 use super::pixel::Pixel;
@@ -14,8 +14,8 @@ use raygrad_tensor::parallel::{self, Scratch, locked};
 use std::sync::{Mutex, PoisonError};
 
 impl<T: Scalar> Model<T> {
-    /// Samples `rays` as views do, at steps `finer` times smaller than the configured ones, and hands the samples to `see`
-    /// with the field and the look of the model.
+    /// Samples `rays` as renders do, at steps `finer` times smaller than configured, and passes the samples to `see` with the
+    /// field and the model's appearance.
     pub(crate) fn along<R>(
         &self,
         rays: &Rays<T>,
@@ -30,8 +30,8 @@ impl<T: Scalar> Model<T> {
         see(&query, self.sampler.sample(&query, rays, Purpose::View { finer }, &mut Jitter::Middle))
     }
 
-    /// The rays of a camera's pixels, row by row, in tiles of `tile`, on all cores: `see` is told the number of a
-    /// tile's first pixel, its rays and its part of `out`. Nothing if it was not to go on.
+    /// Calls `see` for tiles of `tile` pixels, row by row, on all cores: with the index of the tile's first pixel, its rays and
+    /// its part of `out`. `None` if it was cancelled.
     pub(crate) fn tiles<P: Send>(
         &self,
         camera: &Camera,
@@ -61,8 +61,8 @@ impl<T: Scalar> Model<T> {
         seen.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Renders a camera's pixels, row by row, in tiles of `tile`; `keep` takes the pixels of a tile to its part of `out`.
-    /// Nothing if it was not to go on.
+    /// Renders a camera's pixels, row by row, in tiles of `tile`; `keep` stores a tile's pixels in its part of `out`. `None` if it
+    /// was cancelled.
     pub(crate) fn pixels<P: Send>(
         &self,
         camera: &Camera,

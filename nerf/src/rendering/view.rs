@@ -1,4 +1,4 @@
-//! Views: densities front to back in rounds until the light is used up, colours where they matter.
+//! Fast rendering: densities front to back in rounds until a ray terminates, colours only where they matter.
 
 use super::pixel::Pixel;
 use crate::camera::rays::{Rays, Samples};
@@ -11,7 +11,7 @@ use crate::volume::rounds::{FrontToBack, Round, Stretch};
 use crate::volume::weights::Weights;
 use raygrad_autograd::Pool;
 
-/// Steps that a ray takes at a time where rules weight intervals themselves: the nodes at their ends are asked twice.
+/// Samples per chunk of a ray for rules that weight intervals themselves: nodes at chunk ends are evaluated twice.
 const CHUNK: usize = 16;
 
 /// Weights of the samples of a ray so far.
@@ -23,7 +23,7 @@ struct Seen {
 }
 
 impl Model<f32> {
-    /// Renders rays without a background to `out`, whose pixels are those of nothing before.
+    /// Renders rays without a background to `out`, whose pixels must be the default.
     pub(super) fn see(
         &self,
         rays: &Rays<f32>,
@@ -42,7 +42,7 @@ impl Model<f32> {
     }
 }
 
-/// The view of samples that stand for an interval each.
+/// Renders samples that stand for one interval each.
 fn in_rounds(
     query: &Query<'_, '_, f32>,
     samples: &Samples<f32>,
@@ -60,7 +60,7 @@ fn in_rounds(
     evaluations
 }
 
-/// Adds what a round shows to its rays.
+/// Adds the colours of a round to its rays.
 fn shade(
     query: &Query<'_, '_, f32>,
     round: &Round<'_, f32>,
@@ -101,12 +101,12 @@ fn shade(
     count
 }
 
-/// The query along some of its rays: each has the look of the same photograph.
+/// The query for some of its rays, all with the same appearance.
 fn of_rays<'a, 't>(query: &Query<'a, 't, f32>, rays: usize) -> Query<'a, 't, f32> {
     Query { frames: query.frames.map(|frames| &frames[..rays]), ..*query }
 }
 
-/// The view by a rule that weights intervals itself, front to back in chunks of steps.
+/// Renders with a rule that weights intervals itself, front to back in chunks of samples.
 fn in_chunks(
     query: &Query<'_, '_, f32>,
     rule: Quadrature,
@@ -138,12 +138,12 @@ fn in_chunks(
     evaluations
 }
 
-/// Makes up for what was left out along a ray of this optical depth, and behind it, if the ray has `ended`.
+/// Compensates for samples without colour and, if the ray has `ended` early, for the rest of its light.
 fn finish(out: &mut Pixel, seen: &Seen, depth: f64, ended: bool) {
     let colored = f64::from(seen.weight - seen.uncolored);
     out.transmittance = (-depth).exp();
     if colored > 0.0 {
-        // The light that would have gone on stays with what is in front.
+        // The remaining light is attributed to what is in front.
         let total = if ended { 1.0 } else { f64::from(seen.weight) };
         out.color.iter_mut().for_each(|value| *value *= total / colored);
         if ended {

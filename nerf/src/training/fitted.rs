@@ -1,4 +1,4 @@
-//! Where photographs were taken from that a model was not trained on.
+//! Alignment of held-out cameras to a trained model.
 
 use super::trainer::Trainer;
 use crate::camera::Camera;
@@ -10,17 +10,18 @@ use raygrad_nn::Schedule;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Steps that are taken with all photographs together.
+/// Optimization steps, over all images together.
 const STEPS: u64 = 400;
-/// The learning rate of poses: of the radians by which what a photograph shows moves.
+/// The learning-rate schedule of poses, in radians by which an image moves.
 const RATE: Schedule = Schedule::Exponential { from: 2e-3, to: 2e-5, warmup: 0.0 };
 
-/// The cameras of these photographs, each moved to where the model shows what its photograph does, as nearly as can be found
-/// from where they are given: the test-time optimisation of poses of Lin et al. 2021, "BARF", section 4.2. Nothing of the model
-/// changes. Of a photograph that is compared with the model afterwards, this takes six numbers.
+/// Refines the poses of images against a fixed model and returns their cameras.
+///
+/// This is the test-time pose optimization of Lin et al. 2021, "BARF", section 4.2. It starts at the given poses. An
+/// evaluation after it uses images to which six numbers each were fitted.
 ///
 /// # Errors
-/// If there is no photograph, or none of them shows the scene.
+/// If there is no image, or no image shows the scene.
 pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Camera>> {
     let config = Config {
         poses: Some(RATE),
@@ -38,17 +39,17 @@ pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Ca
     for id in ids {
         let name = params.name(id).to_owned();
         let Some(known) = model.params.find(&name).map(|id| model.params.get(id)) else {
-            return Err(Error::setting(name, "is no parameter of the model"));
+            return Err(Error::setting(name, "is missing in the model; use one that was built from its configuration"));
         };
         let shape = params.get(id).shape().to_vec();
-        // What is known of each of its own photographs is the mean for others.
+        // Parameters per training image become their mean for other images.
         let value = if known.shape() == shape { known.clone() } else { mean_rows(known, &shape) };
         *params.get_mut(id) = value;
     }
     params.freeze(|name| name != POSES);
     trainer.model.sampler = model.sampler.boxed();
     if let Some(marching) = trainer.model.marching_mut() {
-        // What is empty stays so.
+        // Empty cells stay empty.
         marching.config.occupancy.skip.grid = false;
     }
     for step in 0..STEPS {
@@ -58,7 +59,7 @@ pub fn fitted_cameras(model: &Model<f32>, photographs: Dataset) -> Result<Vec<Ca
     Ok(frames.map(|(i, frame)| trainer.model.learned_camera(i, &frame.camera)).collect())
 }
 
-/// The mean of the rows, as often as that shape has rows.
+/// The mean of the rows, repeated for each row of `shape`.
 fn mean_rows(rows: &Tensor<f32>, shape: &[usize]) -> Tensor<f32> {
     let width = shape[1..].iter().product::<usize>();
     let count = rows.as_slice().len() / width;

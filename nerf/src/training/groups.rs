@@ -1,4 +1,4 @@
-//! Groups of parameters, each with constants of the optimiser, a schedule and a decay of its own.
+//! Parameter groups, each with its own optimizer settings, schedule and weight decay.
 
 use crate::model::config::Config;
 use crate::model::{EXPOSURE, FOCAL, LENS, POSES, VIGNETTING};
@@ -6,11 +6,11 @@ use crate::{Error, Result};
 use raygrad_autograd::Gradient;
 use raygrad_nn::{Adam, AdamConfig, Optimizer, OptimizerState, Params, Schedule, StateError, UpdateReport};
 
-/// Parameters of cameras, each of which has a learning rate of its own.
+/// Parameters of cameras, each with its own schedule.
 const CAMERAS: [&str; 5] = [POSES, FOCAL, LENS, EXPOSURE, VIGNETTING];
 
-/// The optimiser of all parameters, which belong to groups: the first of the configuration that a name fits, and else one
-/// for each parameter of cameras, one for the tables, of which only rows are moved, and the rest.
+/// The optimizer of all parameters. A parameter belongs to the first configured group that matches its name; otherwise to
+/// that of its camera parameter, of the tables (updated by rows), or of the rest.
 pub(crate) struct Groups {
     adam: Adam<f32>,
     /// Of each group, as the optimiser numbers them.
@@ -18,18 +18,18 @@ pub(crate) struct Groups {
 }
 
 impl Groups {
-    /// Groups of these parameters that have seen nothing.
+    /// Creates the groups of these parameters, at step 0.
     ///
     /// # Errors
-    /// If a group of the configuration has no parameter.
+    /// If a configured group has no parameter.
     pub fn new(config: &Config, params: &Params<f32>) -> Result<Self> {
         let mut groups = Groups { adam: Adam::new(config.adam), schedules: vec![config.schedule] };
         for group in &config.groups {
             let fits = |name: &str| name.starts_with(&group.params);
             if groups.add(params, fits, group.adam, group.weight_decay, group.schedule) == 0 {
                 let names: Vec<&str> = params.names().collect();
-                let what =
-                    format!("no parameter begins so that is in no group before it; there are {}", names.join(", "));
+                let names = names.join(", ");
+                let what = format!("matches no parameter outside of earlier groups; use a prefix of one of {names}");
                 return Err(Error::setting(format!("groups.{}", group.params), what));
             }
         }
@@ -43,7 +43,7 @@ impl Groups {
         Ok(groups)
     }
 
-    /// A further group of those parameters that `which` chooses and that are in none yet; returns how many these are.
+    /// Adds a group of the parameters that `which` chooses and no group has; returns their number.
     fn add(
         &mut self,
         params: &Params<f32>,
@@ -61,7 +61,7 @@ impl Groups {
         self.adam.steps()
     }
 
-    /// What the optimiser remembers of these parameters, as bytes.
+    /// The optimizer's state as bytes.
     ///
     /// # Errors
     /// If the format cannot hold it.
@@ -69,10 +69,10 @@ impl Groups {
         self.adam.state(params).to_safetensors().map_err(failed)
     }
 
-    /// Takes back what [`state`](Self::state) gave, as it is or in parts: earlier versions had one for each group.
+    /// Restores a [`state`](Self::state), whole or in parts: earlier versions had one per group.
     ///
     /// # Errors
-    /// If it is that of other parameters.
+    /// If it belongs to other parameters.
     pub fn load_state(&mut self, params: &Params<f32>, parts: &[Vec<u8>]) -> Result<()> {
         let mut state = OptimizerState::default();
         for part in parts {
@@ -83,8 +83,8 @@ impl Groups {
         self.adam.load_state(params, &state).map_err(failed)
     }
 
-    /// Moves the parameters at `fraction` of the run against gradients as [`Optimizer::update`] takes them, at `lr_scale` times
-    /// the rates of their schedules.
+    /// Updates the parameters at `fraction` of the run, with `pace` times the learning rates of their schedules; see
+    /// [`Optimizer::update`].
     pub fn update(
         &mut self,
         params: &mut Params<f32>,

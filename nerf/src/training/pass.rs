@@ -1,4 +1,4 @@
-//! What a tile of a training step does: from rays to a loss, as ordinary graph code.
+//! The forward pass of a tile of a training step: from rays to a loss.
 
 use crate::dataset::batch::Batch;
 use crate::losses::LossInputs;
@@ -14,14 +14,14 @@ use raygrad_autograd::{Scalar, Var};
 use raygrad_nn::Bound;
 use std::ops::Add;
 
-/// What was done and what came out, summed over rays.
+/// Counts and results, summed over rays.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Work {
     /// Samples placed on rays.
     pub marched: u64,
-    /// How often fields were asked.
+    /// Field evaluations.
     pub evaluations: Evaluations,
-    /// What is minimised, before the mean over rays and channels.
+    /// The loss, before the mean over rays and channels.
     pub loss: f64,
     /// Squared error of the field.
     pub error: f64,
@@ -42,7 +42,7 @@ impl Add for Work {
     }
 }
 
-/// The loss of some rays, a sum over rays and channels, and what it took.
+/// The loss of a batch, a sum over rays and channels, and its counts.
 pub(crate) fn rays_loss<'t>(
     model: &Model<f32>,
     params: &Bound<'t, f32>,
@@ -67,7 +67,7 @@ pub(crate) fn rays_loss<'t>(
     let VisibleSamples { rendered, density_queries: asked, visible: kept } =
         sampler.quadrature().render(&query, &steps, sampler.early_stop_eps());
     let gains = model.exposure.as_ref().map(|tone| tone.gains(params, batch));
-    // As the photograph has it: what lies behind it is not of the scene.
+    // As the image has it: the background is not part of the scene.
     let shown = |seen: &Rendered<'t, f32>| match &gains {
         Some(gains) => seen.over(&background) + &seen.color * (gains - 1.0),
         None => seen.over(&background),

@@ -1,4 +1,4 @@
-//! The start-up detector: a network can begin, or soon end, without density anywhere, and then never learns.
+//! The start-up detector: restarts networks that have no density anywhere at the start, and so would never learn.
 
 use crate::Result;
 use crate::camera::Camera;

@@ -1,4 +1,4 @@
-//! A run as one thing that can be written down, and gone on with.
+//! Training state: saving and resuming a run.
 
 use super::groups::Groups;
 use super::stats::StepStats;
@@ -17,8 +17,8 @@ const MOST_RAYS: usize = 1 << 20;
 /// The name of the trainer's own numbers in the bytes.
 const TRAINER: &str = "trainer";
 
-/// What a trainer knows beside the model and the optimiser. There is no random state: every random number is a function of
-/// the seed, the number of the step and that of the tile.
+/// A trainer's state beside model and optimizer. There is no random state: every random number is a function of the seed, the
+/// step and the tile.
 #[derive(Serialize, Deserialize)]
 struct Counts {
     config: Config,
@@ -28,15 +28,15 @@ struct Counts {
     /// Rays of the next step.
     batch: usize,
     collapses: u32,
-    /// What learning rates are multiplied by.
+    /// The lr scale.
     #[serde(default = "one")]
     pace: f64,
-    /// How much of its detail the field has.
+    /// The share of detail of the fields.
     #[serde(default = "one")]
     detail: f64,
-    /// How many parts the optimiser's state has: one. Earlier versions had one for each group of parameters.
+    /// Number of parts of the optimizer's state: one. Earlier versions had one per group of parameters.
     groups: usize,
-    /// What was said of the parameters, in their order.
+    /// Settings of the parameters, in their order.
     settings: Vec<Setting>,
 }
 
@@ -44,7 +44,7 @@ fn one() -> f64 {
     1.0
 }
 
-/// What was said of a parameter.
+/// Settings of a parameter.
 #[derive(Serialize, Deserialize)]
 struct Setting {
     name: String,
@@ -54,7 +54,7 @@ struct Setting {
     decay: f64,
 }
 
-/// The name of a part of the optimiser's state.
+/// The name of a part of the optimizer's state.
 fn part(number: usize) -> String {
     format!("optimizer.{number}")
 }
@@ -64,9 +64,10 @@ fn failed(what: impl ToString) -> Error {
 }
 
 impl Trainer {
-    /// All that the next steps depend on, beside the configuration and the photographs, as a safetensors file: parameters in
-    /// full and what was said of them, what the optimiser and the sampler remember, the step, the training time and the
-    /// number of rays. [`load_state`](Self::load_state) goes on from it.
+    /// Returns the training state as a safetensors file, to [resume](Self::load_state) from.
+    ///
+    /// It holds parameters in full precision with their settings, the states of optimizer and sampler, the step, the training
+    /// time and the number of rays. Configuration and images are not part of it.
     ///
     /// # Errors
     /// If the format cannot hold it.
@@ -101,8 +102,9 @@ impl Trainer {
         bytes.map_err(failed)
     }
 
-    /// Goes on from a [state](Self::state) of a trainer of the same configuration and photographs: the next steps are what
-    /// they would have been there, bit for bit. If it fails, nothing has changed.
+    /// Resumes from a [state](Self::state) of a trainer with the same configuration and images.
+    ///
+    /// The next steps equal those of the original trainer, bit for bit. After an error, nothing has changed.
     ///
     /// ```no_run
     /// use raygrad_nerf::dataset::{Split, load};
@@ -122,19 +124,21 @@ impl Trainer {
     /// ```
     ///
     /// # Errors
-    /// If the bytes are no such state, or one of another configuration.
+    /// If the bytes are not a training state, or belong to another configuration.
     pub fn load_state(&mut self, state: &[u8]) -> Result<()> {
         let (mut model, counts, mut blobs) = self.model.restored(state)?;
         if !(1..=MOST_RAYS).contains(&counts.batch) {
-            return Err(failed(format!("has steps of {} rays; use 1 to {MOST_RAYS}", counts.batch)));
+            return Err(failed(format!("has {} rays per step; use 1 to {MOST_RAYS}", counts.batch)));
         }
         if !(counts.pace >= 0.0 && counts.pace.is_finite()) {
-            return Err(failed(format!("has learning rates times {}", counts.pace)));
+            return Err(failed(format!("has an lr scale of {}; use a finite number of at least 0", counts.pace)));
         }
         for Setting { name, frozen, lazy, rate, decay } in &counts.settings {
             let is_own = |other: &str| other == name;
             if !(*rate >= 0.0 && rate.is_finite() && *decay >= 0.0 && decay.is_finite()) {
-                return Err(failed(format!("gives `{name}` a learning rate times {rate} and a decay times {decay}")));
+                return Err(failed(format!(
+                    "has an lr scale of {rate} and a weight decay scale of {decay} for `{name}`; use finite numbers of at least 0"
+                )));
             }
             if *frozen {
                 model.params.freeze(is_own)
@@ -145,7 +149,7 @@ impl Trainer {
             model.params.set_lr_scale(is_own, *rate);
             model.params.set_weight_decay_scale(is_own, *decay);
         }
-        let missing = || failed("lacks what an optimiser remembers");
+        let missing = || failed("lacks a part of the optimizer's state; use one that `Trainer::state` wrote");
         let remembered: Vec<Vec<u8>> =
             (0..counts.groups).map(|i| blobs.remove(&part(i)).ok_or_else(missing)).collect::<Result<_>>()?;
         let mut groups = Groups::new(&model.config, &model.params)?;
@@ -158,8 +162,10 @@ impl Trainer {
 }
 
 impl Model<f32> {
-    /// This model as it was when a trainer wrote a [state](Trainer::state), ready to be rendered, with this one's
-    /// [`appearance_image`](Self::appearance_image) and what this one's views leave out: which is found out anew, as when a model is loaded.
+    /// Returns the model of a training [state](Trainer::state), ready to render.
+    ///
+    /// It keeps this model's [`appearance_image`](Self::appearance_image) and skipping, and updates the occupancy grid as
+    /// [`load`](Self::load) does.
     ///
     /// ```no_run
     /// use raygrad_nerf::dataset::{Split, load};
@@ -177,26 +183,28 @@ impl Model<f32> {
     /// ```
     ///
     /// # Errors
-    /// If the bytes are no such state, or one of another configuration.
+    /// If the bytes are not a training state, or belong to another configuration.
     pub fn at_state(&self, state: &[u8]) -> Result<Self> {
         let (mut model, ..) = self.restored(state)?;
         model.finish();
         Ok(model)
     }
 
-    /// The model of a state, what is said of the run beside it, and what was not used yet.
+    /// The model of a state, the counts beside it, and the parts that were not used yet.
     fn restored(&self, state: &[u8]) -> Result<(Self, Counts, HashMap<String, Vec<u8>>)> {
         let mut model = self.clone();
         let mut blobs = model.params.load_safetensors(state).map_err(failed)?;
         let Some(counts) = blobs.remove(TRAINER) else {
-            return Err(failed("holds a model, and not a run that can go on"));
+            return Err(failed("holds a model, not a training state; resume from a checkpoint"));
         };
         let counts: Counts = serde_json::from_slice(&counts).map_err(failed)?;
         if counts.config != self.config || counts.extent != self.scene_box {
-            return Err(failed("is that of another configuration, or of other photographs"));
+            return Err(failed(
+                "belongs to another configuration or to other images; use those that it was written with",
+            ));
         }
         if !(0.0..=1.0).contains(&counts.detail) {
-            return Err(failed(format!("has a share of {} of its detail", counts.detail)));
+            return Err(failed(format!("has a detail of {}; use 0 to 1", counts.detail)));
         }
         model.set_detail(counts.detail);
         model.sampler.load_state(&blobs)?;
@@ -269,7 +277,7 @@ mod tests {
             (written(&|counts| counts.settings[0].rate = -1.0), "a learning rate times -1"),
             (written(&|counts| counts.settings[1].decay = -2.0), "a decay times -2"),
             (written(&|counts| counts.pace = -1.0), "learning rates times -1"),
-            (written(&|counts| counts.groups = 9), "lacks what an optimiser remembers"),
+            (written(&|counts| counts.groups = 9), "lacks a part of the optimizer's state"),
             (written(&|counts| counts.groups = 0), "groups"),
             (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),
             (written(&|counts| counts.detail = 1.5), "a share of 1.5"),

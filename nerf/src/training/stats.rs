@@ -1,13 +1,13 @@
-//! How long to train, and what was done.
+//! The training budget, and statistics of a step.
 
 use raygrad_nn::SLOTS;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::time::Duration;
 
-/// Steps in a row without a finite gradient after which a run has diverged: an overflow of one batch passes.
+/// Consecutive steps without a finite gradient after which a run has diverged: a single overflow passes.
 pub(crate) const STUCK: u64 = 100;
 
-/// How long to train.
+/// The length of a run, in steps or time.
 ///
 /// In a file it is `{"steps": 5000}` or `{"seconds": 60}`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -26,8 +26,9 @@ const SAMPLES_PER_STEP: f64 = 24576.0;
 const SAMPLES_PER_SECOND: f64 = 1e6;
 
 impl Budget {
-    /// How many samples along rays training has time for, about: what [`Config::for_budget`](crate::Config::for_budget) takes. A
-    /// number of steps gives the same on any machine; a time more of them where there are more threads.
+    /// Estimates the samples along rays that fit in the budget, for [`Config::for_budget`](crate::Config::for_budget).
+    ///
+    /// For steps it is the same on any machine; for a time it grows with the number of threads.
     pub fn samples(self) -> f64 {
         match self {
             Budget::Steps(steps) => steps as f64 * SAMPLES_PER_STEP,
@@ -53,29 +54,29 @@ mod seconds {
     }
 }
 
-/// What one step did, and the run so far.
+/// Statistics of a training step and of the run so far.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct StepStats {
-    /// Number of the step, from 1.
+    /// Number of the step, counted from 1.
     pub step: u64,
-    /// Training time so far.
+    /// Training time so far, in seconds.
     pub train_seconds: f64,
-    /// Rays so far.
+    /// Rays traced so far.
     pub rays: u64,
-    /// Samples placed on rays so far: without a grid all, with one those in occupied cells.
+    /// Samples placed on rays so far; with an occupancy grid only those in occupied cells.
     #[serde(alias = "marched")]
     pub placed_samples: u64,
-    /// Evaluations of a density so far.
+    /// Density evaluations so far.
     #[serde(alias = "samples")]
     pub density_queries: u64,
-    /// Evaluations of a colour, and of all gradients, so far.
+    /// Colour evaluations, and evaluations of all gradients, so far.
     #[serde(alias = "shaded")]
     pub color_queries: u64,
-    /// Evaluations of each that there would have been so far if nothing in the box were skipped.
+    /// Evaluations so far if no space in the box were skipped.
     pub unskipped: u64,
-    /// Elements of parameters that were moved so far; of tables only rows that a sample looked up are.
+    /// Parameter elements updated so far; of tables only the rows that a sample reads.
     pub moved: u64,
-    /// The mean loss, of a hierarchical model that of the coarse field plus that of the fine one.
+    /// Mean loss over rays and channels; for a hierarchical model, coarse plus fine.
     #[serde(deserialize_with = "number_or_nan")]
     pub loss: f64,
     /// PSNR on this step's rays, in dB.
@@ -86,41 +87,39 @@ pub struct StepStats {
     pub opacity: f64,
     /// Share of the occupancy grid that is occupied; 1 without a grid.
     pub occupied: f64,
-    /// The learning rate.
+    /// The learning rate of the default group.
     #[serde(alias = "rate")]
     pub lr: f64,
-    /// Elements whose gradient was not finite, so far; they were left alone.
+    /// Elements with a non-finite gradient so far; they were not updated.
     #[serde(alias = "skipped")]
     pub non_finite: u64,
-    /// Steps in a row, up to this one, that moved nothing because no gradient was finite: the run has diverged if they
-    /// go on.
+    /// Consecutive steps, up to this one, without any finite gradient; see [`has_diverged`](Self::has_diverged).
     #[serde(alias = "stuck")]
     pub non_finite_steps: u64,
-    /// How often the start-up detector began again with another seed.
+    /// Restarts with another seed by the start-up detector.
     pub restarts: u32,
 }
 
-/// A number that files write as nothing if it is not finite.
+/// A number that files write as null if it is not finite.
 fn number_or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
 
 impl StepStats {
-    /// Whether the run has diverged: for 100 steps in a row no gradient was finite, so that nothing moves any more. Its
-    /// model is of no use.
+    /// Returns whether the run has diverged: no gradient was finite for 100 consecutive steps. Its model is useless.
     pub fn has_diverged(&self) -> bool {
         self.non_finite_steps >= STUCK
     }
 
-    /// Whether a run that ends here ends in numbers that are not finite: it [has diverged](Self::has_diverged), or would
-    /// have, since no gradient of its second half was finite.
+    /// Returns whether a run that ends at this step has diverged: as [`has_diverged`](Self::has_diverged), or without a finite
+    /// gradient in its second half.
     pub fn ends_diverged(&self) -> bool {
         self.has_diverged() || (self.non_finite_steps > 0 && 2 * self.non_finite_steps >= self.step)
     }
 }
 
 impl Default for StepStats {
-    /// Nothing done.
+    /// Statistics before the first step.
     fn default() -> Self {
         StepStats {
             step: 0,

@@ -1,4 +1,4 @@
-//! Training: tiles of rays on as many cores as there are, and the same bits on any number of them.
+//! The trainer: tiles of rays on all cores, with the same bits on any number of threads.
 
 use super::groups::Groups;
 use super::pass::{Work, rays_loss};
@@ -21,26 +21,26 @@ use std::time::{Duration, Instant};
 
 /// Rays of a step that is to have a number of samples: the least, and the most.
 const RAYS: [usize; 2] = [256, 1 << 16];
-/// Steps between the times when memory that they did not need is freed: the number of samples changes as training goes on.
+/// Steps between two trims of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
 
 /// A model in training.
 pub struct Trainer {
-    /// The model as it is now.
+    /// The current model.
     pub model: Model<f32>,
     data: Arc<Dataset>,
     pub(super) groups: Groups,
     tiles: Tiles<f32>,
-    /// For what happens outside of the tiles.
+    /// Memory for work outside of tiles.
     pool: Pool<f32>,
     /// Rays of the next step.
     pub(super) batch: usize,
-    /// What time it is.
+    /// The clock.
     clock: Box<dyn Fn() -> Duration + Send + Sync>,
     pub(super) elapsed: Duration,
-    /// How many models of this run have collapsed.
+    /// Collapsed models of this run.
     pub(super) collapses: u32,
-    /// What all learning rates are multiplied by.
+    /// The lr scale.
     pub(super) pace: f64,
     pub(super) done: StepStats,
 }
@@ -50,7 +50,7 @@ struct Draw<'a> {
     model: &'a Model<f32>,
     data: &'a Dataset,
     seed: u64,
-    /// The number of the step.
+    /// The step's number.
     number: u64,
     fraction: f64,
     /// Rays of the step, and of a tile.
@@ -63,7 +63,7 @@ impl Draw<'_> {
         self.total.div_ceil(self.tile)
     }
 
-    /// The share of a tile in the mean loss of the step, and what it took.
+    /// A tile's part of the step's mean loss, and its counts.
     fn loss<'t>(&self, which: usize, params: &Bound<'t, f32>) -> (Var<'t, f32>, Work) {
         let Draw { model, data, seed, number, fraction, total, tile } = *self;
         let rng = &mut stream(seed, [number, which as u64]);
@@ -75,29 +75,27 @@ impl Draw<'_> {
 }
 
 impl Trainer {
-    /// A new model for a dataset.
+    /// Creates a model and its trainer for a dataset.
     ///
     /// # Errors
-    /// If the configuration is out of range or not for a scene that [goes so far](Dataset::scope), the dataset has no frame, or no
-    /// ray of it [meets the scene's box](Dataset::check_reach).
+    /// If the configuration is out of range or does not fit the [type of scene](Dataset::scope), if the dataset has no frame, or
+    /// if none of its rays [meets the scene box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
         if data.scope.is_unbounded() && !config.unbounded {
-            let what = "is false, and the photographs show what lies beyond the scene's box; use `Config::with_scope` with \
-                        the scope of the dataset";
+            let what = "is false, but the dataset is unbounded; use `Config::with_scene_type` with the dataset's type";
             return Err(Error::setting("unbounded", what));
         }
         let ndc = data.ndc.filter(|_| data.scope == SceneType::ForwardFacing);
         if data.scope == SceneType::ForwardFacing && ndc.is_none() {
-            let what =
-                "forward needs what all photographs show, `Dataset::ndc`, which `Ndc::around` finds; use unbounded";
+            let what = "forward-facing needs `Dataset::ndc`, which `Ndc::around` finds; otherwise use unbounded";
             return Err(Error::setting("scene-type", what));
         }
         let extent = SceneBox { transform: data.placement, ndc, ..SceneBox::new(data.bounds, [data.near, data.far]) };
         Trainer::with_extent(config, data, extent)
     }
 
-    /// As [`new`](Self::new), for a scene that lies as `extent` says, whatever the dataset says: to
-    /// [go on](Self::load_state) with a run of which no more is known than its model.
+    /// Creates a trainer as [`new`](Self::new), with this scene box instead of the dataset's: for instance to
+    /// [resume](Self::load_state) a run with that of its model.
     ///
     /// # Errors
     /// As [`new`](Self::new).
@@ -106,7 +104,8 @@ impl Trainer {
         Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
 
-    /// As [`with_extent`](Self::with_extent), with a clock that measures training time: it gives the time since some moment.
+    /// Creates a trainer as [`with_extent`](Self::with_extent), with a clock for training time: it returns the time since a fixed
+    /// moment.
     ///
     /// # Errors
     /// As [`new`](Self::new).
@@ -117,7 +116,7 @@ impl Trainer {
         clock: impl Fn() -> Duration + Send + Sync + 'static,
     ) -> Result<Self> {
         if data.frames.is_empty() {
-            return Err(Error::setting("dataset", "has no frames to train on"));
+            return Err(Error::setting("dataset", "has no frames; load a split that has images"));
         }
         let extent = SceneBox { frames: data.frames.len(), ..extent };
         let cameras: Vec<Camera> = data.frames.iter().map(|frame| frame.camera.clone()).collect();
@@ -144,10 +143,10 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// Lets the sampler learn from the photographs. That is training too.
+    /// Lets the sampler learn from the images, within the training time.
     fn prepare(&mut self) {
         let start = (self.clock)();
-        // Not from cameras that are to be corrected: what is carved away never comes back.
+        // Not with cameras that are refined: carved space never comes back.
         if self.model.camera_optimizer.is_none() {
             self.model.sampler.prepare(&self.data);
         }
@@ -159,13 +158,14 @@ impl Trainer {
         self.done.occupied = self.model.sampler.grid().map_or(1.0, |grid| grid.occupied_share());
     }
 
-    /// What the last step did.
+    /// Returns the statistics of the last step.
     pub fn stats(&self) -> StepStats {
         self.done
     }
 
-    /// Trains until the budget is used up or `observe`, which is called after every step, breaks, or until the run has
-    /// [diverged](StepStats::has_diverged). The time that `observe` takes does not count.
+    /// Trains until the budget is used up, `observe` breaks, or the run has [diverged](StepStats::has_diverged).
+    ///
+    /// `observe` is called after every step; its time does not count.
     pub fn run(&mut self, budget: Budget, mut observe: impl FnMut(&Trainer) -> ControlFlow<()>) {
         loop {
             let fraction = match budget {
@@ -181,9 +181,9 @@ impl Trainer {
             }
         }
         let start = (self.clock)();
-        // What the last look at the field takes is not to stand beside what steps took.
+        // Frees the memory of the steps before the last update of the grid.
         (self.tiles, self.pool) = (Tiles::new(), Pool::new());
-        // A model of numbers that are none has nothing to look at.
+        // A model of non-finite parameters has nothing to look at.
         if !self.done.has_diverged() {
             self.model.finish();
         }
@@ -191,7 +191,7 @@ impl Trainer {
         self.elapsed += (self.clock)().saturating_sub(start);
     }
 
-    /// One training step; `fraction` says how much of the run is done, for the schedule.
+    /// Performs one training step; `fraction` of the run (0 to 1) sets the schedules.
     pub fn step(&mut self, fraction: f64) -> StepStats {
         let start = (self.clock)();
         if self.model.config.camera_optimizer.coarse > 0.0 {
@@ -259,23 +259,25 @@ impl Trainer {
         Draw { model: &self.model, data: &self.data, seed: self.seed(), number, fraction, total, tile }
     }
 
-    /// What the learning rates of all schedules are multiplied by; 1 at first.
+    /// Returns the lr scale, initially 1.
     pub fn lr_scale(&self) -> f64 {
         self.pace
     }
 
-    /// Multiplies the learning rates of all schedules by `lr_scale`, from the next step on; part of the [state](Self::state).
+    /// Sets the lr scale, which multiplies all learning rates from the next step on. It is part of the [state](Self::state).
     ///
     /// # Panics
     /// If it is negative or not finite.
     pub fn set_lr_scale(&mut self, pace: f64) {
-        assert!(pace >= 0.0 && pace.is_finite(), "rates times {pace}");
+        assert!(pace >= 0.0 && pace.is_finite(), "the lr scale must be finite and at least 0, is {pace}");
         self.pace = pace;
     }
 
-    /// What would be infinite or NaN first if the next step were taken, `fraction` as in [`step`](Self::step): the operation
-    /// or the gradient, the line that recorded it and the element, as the [NaN finder](Tape::check_finite) names them.
-    /// Nothing if nothing would. Of a run that [has diverged](StepStats::has_diverged) it is the reason.
+    /// Finds the first infinite or NaN value that the next step would compute, with `fraction` as in [`step`](Self::step).
+    ///
+    /// The error names the operation or gradient, the source line that recorded it and the element; see
+    /// [`Tape::check_finite`]. Returns `None` if all values are finite. It explains why a run [has
+    /// diverged](StepStats::has_diverged).
     pub fn first_non_finite(&self, fraction: f64) -> Option<GraphError> {
         let draw = self.draw(fraction);
         let find = |which| {
@@ -294,7 +296,7 @@ impl Trainer {
         (0..draw.tiles()).find_map(find)
     }
 
-    /// Chooses the number of rays so that the next step has as many samples as it should.
+    /// Chooses the number of rays for the configured number of samples per step.
     fn adapt_batch(&mut self, work: &Work) {
         if let BatchSize::Samples(samples) = self.model.sampler.batch_size() {
             let each = (work.marched as f64 / self.batch as f64).max(0.5);
@@ -313,7 +315,7 @@ impl Trainer {
         }
     }
 
-    /// Begins again with other random parameters.
+    /// Restarts with other random parameters.
     fn restart(&mut self) {
         self.done.restarts += 1;
         self.collapses += 1;

@@ -1,9 +1,9 @@
-//! Corrections of a pose that show alike in its photograph, and each on its own.
+//! Preconditioning of pose corrections.
 //!
-//! A camera that turns to the left and one that moves there show nearly the same; an optimiser that takes numbers one by
-//! one walks along such a valley in very small steps. Numbers that are told apart by what they move make it round (Park et
-//! al. 2023, "CamP: Camera Preconditioning for Neural Radiance Fields", section 4; here with the factor of Cholesky in place
-//! of the square root, and the angles of directions in place of pixels, so that it serves every lens).
+//! A camera that turns left and one that moves left show nearly the same, so an optimizer makes slow progress along that
+//! valley. Decorrelated parameters avoid it (Park et al. 2023, "CamP: Camera Preconditioning for Neural Radiance Fields",
+//! section 4). Here the Cholesky factor replaces the matrix square root, and angles of directions replace pixels, which
+//! serves every lens.
 
 use crate::camera::bounds::clip_near_far;
 use crate::camera::pinhole::Camera;

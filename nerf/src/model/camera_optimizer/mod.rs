@@ -1,4 +1,4 @@
-//! Cameras that are learned with the scene.
+//! Pose refinement: cameras optimised together with the scene.
 
 mod balance;
 mod newton;
@@ -23,42 +23,41 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params};
 use std::sync::Arc;
 
-/// By how much, as a part, focal lengths and principal points may differ that are the same.
+/// Relative tolerance within which focal lengths and principal points count as equal.
 const SAME: f64 = 1e-9;
 
-/// Corrections of the cameras of photographs, as parameters; 0 everywhere leaves them as they were given.
+/// Learned corrections of the training cameras; parameters of 0 leave them unchanged.
 ///
-/// - `poses` `[photographs, 6]`: for each six numbers from which follow, by a matrix of its own, a rotation vector (radians,
-///   in the axes of the scene) that it is turned by about its own centre, and a translation. 1 of any of them moves what the
-///   photograph shows of the scene's box by about a radian, and no two of them alike (Park et al. 2023, "CamP"), but
-///   where the cameras as they were given are not known: there they are the rotation vector, and the translation in units of
-///   the [extent](crate::SceneBox::unit). The gradient comes through the [rays](RayVars) of the samples (Lin et al. 2021,
-///   "BARF", equation 5), as far as these move to other lines.
-/// - `focal` `[cameras, 2]`: the logarithm of a factor of the focal length, along columns and along rows. Photographs of
-///   equal focal length, principal point and lens (at the same size) share a camera. If poses are learned too, it steps
-///   back from the scene's middle by the same factor: the scene stays as large as it was, and only the perspective changes.
-/// - `lens` `[cameras, 4]`: what is added to the lens's coefficients `k1, k2, p1, p2` (of a fisheye `k1, k2`; of a field of
-///   view that alone); a pinhole becomes a [`Lens::Brown`].
+/// - `poses` `[images, 6]`: preconditioned pose corrections (Park et al. 2023, "CamP"). A constant matrix per image maps them
+///   to a rotation vector (radians, scene axes) about the camera's centre and a translation. A unit of each moves the image of
+///   the scene box by about a radian, independently of the others. Without known cameras, they are the rotation vector and the
+///   translation in units of [`SceneBox::unit`](crate::SceneBox::unit). The gradient comes through the [rays](RayVars) of the
+///   samples (Lin et al. 2021, "BARF", equation 5); the part along a ray is dropped.
+/// - `focal` `[cameras, 2]`: the logarithm of a factor of the focal length, along columns and rows. Images of equal focal
+///   length, principal point and lens (at one size) share a camera. If poses are learned too, the camera moves away from
+///   the scene's centre by the same factor: the scene keeps its size, and only the perspective changes.
+/// - `lens` `[cameras, 4]`: added to the distortion coefficients `k1, k2, p1, p2` (fisheye: `k1, k2`; FOV model: omega). A
+///   pinhole becomes a [`Lens::Brown`].
 ///
-/// What photographs show to be empty is not carved away while their cameras are not known.
+/// Visual hull carving is off while cameras are refined.
 ///
-/// A scene and its cameras can turn, move and grow together without any photograph changing: only what cameras are to one
-/// another is found. [`placement`](Self::transform) says how they have moved as a whole.
+/// Images fix only the cameras relative to each other: scene and cameras can turn, move and grow together.
+/// [`transform`](Self::transform) returns that common similarity.
 #[derive(Debug, Clone)]
 pub struct CameraOptimizer {
     poses: Option<ParamId>,
     focal: Option<ParamId>,
     lens: Option<ParamId>,
     extent: SceneBox,
-    /// For each photograph what its six numbers mean.
+    /// The preconditioning matrix of each image.
     balance: Arc<[Matrix]>,
-    /// The photographs' cameras as they were given; none, if only poses are learned and nobody said.
+    /// The given cameras; empty if only poses are learned and cameras are unknown.
     cameras: Arc<[Camera]>,
-    /// For each photograph which camera of those that differ took it.
+    /// The index of the shared camera of each image.
     groups: Arc<[u32]>,
 }
 
-/// Whether two cameras differ at most in their poses and in the size of their pictures.
+/// Whether two cameras differ at most in their poses and image sizes.
 fn is_same(a: &Camera, b: &Camera) -> bool {
     let shape = |camera: &Camera| {
         let [width, height] = [camera.width as f64, camera.height as f64];
@@ -69,7 +68,7 @@ fn is_same(a: &Camera, b: &Camera) -> bool {
     a.lens == b.lens && shape(a).into_iter().zip(shape(b)).all(near)
 }
 
-/// The number of its camera for each photograph, and how many there are.
+/// The index of the shared camera of each image, and the number of cameras.
 fn grouped(cameras: &[Camera]) -> (Vec<u32>, usize) {
     let mut kinds: Vec<&Camera> = vec![];
     let number = |camera| {
@@ -84,9 +83,8 @@ fn grouped(cameras: &[Camera]) -> (Vec<u32>, usize) {
 
 /// The same origins, with the gradient of what moves them across their rays alone.
 ///
-/// A ray that begins further back is the same line, and shows the same; but samples stay at their distances, and slide along
-/// it. What that does to their densities is the quadrature's error, which the next step's samples do not have. It says that
-/// cameras should come nearer wherever the scene is too thin, and they would.
+/// A ray that begins further back is the same line and shows the same. Its samples keep their distances, so they slide along
+/// it, which changes the quadrature's error. That gradient would pull cameras towards thin parts of the scene.
 fn across<'t, T: Scalar>(origins: &Var<'t, T>, directions: &Var<'t, T>) -> Var<'t, T> {
     let (start, along) = (origins.detach(), directions.detach());
     let moved = origins - &start;
@@ -104,12 +102,13 @@ fn with_glass(camera: &Camera) -> Camera {
 }
 
 impl CameraOptimizer {
-    /// Corrections of the photographs of a scene that correct nothing so far; `cameras` are theirs, or none, and with the
-    /// scene's extent stands whether it goes on beyond its box. `None` if nothing is to be learned.
+    /// Creates corrections of 0; returns `None` if nothing is learned.
+    ///
+    /// `cameras` are those of the images, or empty if only poses are learned; the `bool` says whether the scene is unbounded.
     ///
     /// # Errors
-    /// If there is no photograph, there is not one camera for each, or focal lengths or lenses are to be learned and there
-    /// are no cameras, or none that has any.
+    /// If `extent.frames` is 0, if there is not one camera per image, or if focal lengths or lenses are learned and all cameras
+    /// are equirectangular or missing.
     pub fn new<T: Scalar>(
         poses: bool,
         config: &CameraOptimizerConfig,
@@ -122,15 +121,15 @@ impl CameraOptimizer {
         let Some((_, name)) = wanted.into_iter().find(|(wanted, _)| *wanted) else { return Ok(None) };
         let frames = extent.frames;
         if frames == 0 {
-            return Err(Error::setting(name, "are those of photographs, and it is not known how many there are"));
+            return Err(Error::setting(name, "needs the number of images; set `SceneBox::frames`"));
         }
         if cameras.len() != frames && (focal || lens || !cameras.is_empty()) {
-            let what = format!("corrects the cameras of {frames} photographs, and {} are known", cameras.len());
+            let what = format!("needs {frames} cameras, one per image, not {}", cameras.len());
             return Err(Error::setting(if focal || lens { wanted[usize::from(!focal) + 1].1 } else { name }, what));
         }
         let panoramas = cameras.iter().all(|camera| camera.lens == Lens::Equirectangular);
         if panoramas && (focal || lens) {
-            let what = "equirectangular images have no focal length and no lens that could be wrong";
+            let what = "cannot be refined: equirectangular images have no focal length and no distortion";
             return Err(Error::setting(wanted[usize::from(!focal) + 1].1, what));
         }
         let cameras: Arc<[Camera]> =
@@ -139,7 +138,7 @@ impl CameraOptimizer {
         let poses = poses.then(|| params.add(POSES, Tensor::zeros(&[frames, 6])));
         let focal = focal.then(|| params.add(FOCAL, Tensor::zeros(&[count, 2])));
         let lens = lens.then(|| params.add(LENS, Tensor::zeros(&[count, CORRECTIONS])));
-        // A step sees few photographs of many.
+        // A step sees few of the images.
         params.set_lazy(|name| name == POSES, true);
         let SceneBox { bounds, near_far: span, unit, .. } = *extent;
         let balance = match cameras.is_empty() {
@@ -149,22 +148,22 @@ impl CameraOptimizer {
         Ok(Some(CameraOptimizer { poses, focal, lens, extent: *extent, balance, cameras, groups: groups.into() }))
     }
 
-    /// The photographs' cameras as they were given; none, if they are not known.
+    /// Returns the given cameras of the images; empty if they are not known.
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
     }
 
-    /// Whether poses are learned.
+    /// Returns whether poses are learned.
     pub fn has_poses(&self) -> bool {
         self.poses.is_some()
     }
 
-    /// The rays through the centres of `pixels` (column, row) of photographs `frames`, each of `[rays]`, as variables,
-    /// corrected, and the same rays as numbers with the part of `span` that lies in the box `bounds`. `rays` are those of
-    /// the cameras as they were given.
+    /// Corrects rays through pixel centres: returns them as variables, and as numbers clipped to `span` and `bounds`.
+    ///
+    /// `rays` are those of the given cameras; `frames` (image indices) and `pixels` (column, row) have one entry per ray.
     ///
     /// # Panics
-    /// If there is not one number and one pixel for each ray, or no photograph of a number.
+    /// If `frames` or `pixels` has another length than `rays`, or an index is out of range.
     #[track_caller]
     pub fn rays<'t, T: Scalar>(
         &self,
@@ -174,7 +173,7 @@ impl CameraOptimizer {
         bounds: [DVec3; 2],
         span: [f64; 2],
     ) -> (RayVars<'t, T>, Rays<T>) {
-        assert_eq!([frames.len(), pixels.len()], [rays.len(); 2], "one photograph and one pixel for each ray");
+        assert_eq!([frames.len(), pixels.len()], [rays.len(); 2], "`frames` and `pixels` must have one entry per ray");
         let (tape, count) = (params.tape(), rays.len());
         let rows = |values: &[[T; 3]]| tape.constant(Tensor::from_vec(&[count, 3], values.as_flattened().to_vec()));
         let groups = || frames.iter().map(|&frame| self.groups[frame as usize]).collect::<Vec<u32>>();
@@ -184,7 +183,7 @@ impl CameraOptimizer {
                 let [focal, lens] = [focal, lens].map(|id| id.map(|id| &params[id]));
                 let value = |var: Option<&Var<'t, T>>| var.map(|var| var.value().clone());
                 let (grown, added) = (value(focal), value(lens));
-                // As many cameras as photographs, however many rays.
+                // As many cameras as images, however many rays.
                 let now: Vec<Camera> = (0..self.cameras.len())
                     .map(|i| self.glass(grown.as_ref(), added.as_ref(), Some(self.groups[i]), &self.cameras[i]))
                     .collect();
@@ -226,7 +225,7 @@ impl CameraOptimizer {
         (RayVars { origins, directions }, moved)
     }
 
-    /// The middle of the scene.
+    /// The centre of the scene box.
     fn middle(&self) -> DVec3 {
         0.5 * (self.extent.bounds[0] + self.extent.bounds[1])
     }
@@ -251,10 +250,10 @@ impl CameraOptimizer {
         found
     }
 
-    /// The camera of a photograph, corrected; that of its picture at another size, too.
+    /// Returns the corrected camera of the image with index `number`; `camera` may have another size.
     ///
     /// # Panics
-    /// If there is no photograph of this number.
+    /// If `number` is out of range.
     pub fn camera<T: Scalar>(&self, params: &Params<T>, number: usize, camera: &Camera) -> Camera {
         let [focal, lens] = [self.focal, self.lens].map(|id| id.map(|id| params.get(id)));
         let camera = self.glass(focal, lens, self.groups.get(number).copied(), camera);
@@ -271,8 +270,8 @@ impl CameraOptimizer {
         Camera { pose, ..camera }
     }
 
-    /// By how much a camera steps back from the scene's middle, with the focal length of its group, or, if that is not
-    /// known, with all on average; 1 if poses or focal lengths are not learned.
+    /// The factor of a camera's distance from the scene's centre, from the focal length of its group or the mean of all; 1 unless
+    /// poses and focal lengths are learned.
     fn growth<T: Scalar>(&self, params: &Params<T>, group: Option<u32>) -> f64 {
         let (Some(focal), Some(_)) = (self.focal, self.poses) else { return 1.0 };
         let all = params.get(focal).as_slice();
@@ -280,16 +279,15 @@ impl CameraOptimizer {
         (own.iter().map(|x| x.to_f64()).sum::<f64>() / own.len() as f64).exp()
     }
 
-    /// The camera, that many times as far from the scene's middle.
+    /// The camera at `growth` times its distance from the scene's centre.
     fn stepped(&self, camera: &Camera, growth: f64) -> Camera {
         let mut stepped = camera.clone();
         stepped.pose.translation = self.middle() + growth * (camera.pose.translation - self.middle());
         stepped
     }
 
-    /// The similarity that takes the cameras, each stepped back by its growth, nearest to where they were found; how they
-    /// are held counts as much as where they stand, so that it is known of many in a line, too. `None` if poses are not
-    /// learned, or cameras are not known.
+    /// The similarity from the given cameras, each moved by its growth, to the refined ones, by least squares. Orientations count
+    /// as much as positions, so that cameras on a line suffice. `None` if poses are not learned or cameras are not known.
     fn similarity<T: Scalar>(&self, params: &Params<T>, growths: &[f64]) -> Option<SceneTransform> {
         self.poses?;
         let count = self.cameras.len() as f64;
@@ -306,8 +304,8 @@ impl CameraOptimizer {
         SceneTransform::between(&given.collect::<Vec<_>>(), &found.collect::<Vec<_>>())
     }
 
-    /// How the cameras have moved as a whole: the similarity that takes them as they were given nearest to how they were
-    /// found. `None` if poses are not learned, or cameras are not known.
+    /// Returns the similarity that maps the given cameras closest to the refined ones, by least squares. `None` if poses are not
+    /// learned or cameras are not known.
     pub fn transform<T: Scalar>(&self, params: &Params<T>) -> Option<SceneTransform> {
         let growth = self.growth(params, None);
         let rest = self.similarity(params, &vec![growth; self.cameras.len()])?;
@@ -316,8 +314,8 @@ impl CameraOptimizer {
         Some(SceneTransform { scale: rest.scale * growth, origin, ..rest })
     }
 
-    /// Cameras that took none of the photographs, given beside theirs: moved as they have as a whole and, if one of them is
-    /// the same but for its pose, with what was found of its focal length and lens.
+    /// Maps other cameras of the capture, such as held-out ones, by [`transform`](Self::transform). A camera with the intrinsics
+    /// of a training camera also gets its refined focal length and lens.
     pub fn other_cameras<T: Scalar>(&self, params: &Params<T>, cameras: &[Camera]) -> Vec<Camera> {
         let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
         let similarity = self.similarity(params, &growths);

@@ -1,8 +1,8 @@
-//! The directions of pixels, differentiable by focal length and lens.
+//! Ray directions of pixels, differentiable with respect to focal length and lens.
 //!
-//! The direction that belongs to a pixel is a root and no formula: the lens must put it at the pixel. It is found in
-//! numbers; then one step of Newton's method from it, recorded on the tape with the Jacobian as a constant, leaves it where
-//! it is and has its exact gradient, by the implicit function theorem.
+//! The direction of a pixel is the root of an equation: the lens must project it to the pixel. A solver finds it in plain
+//! numbers. One step of Newton's method from there, recorded on the tape with a constant Jacobian, does not move it and has
+//! its exact gradient, by the implicit function theorem.
 
 use crate::camera::lens::Lens;
 use crate::camera::lens_places;

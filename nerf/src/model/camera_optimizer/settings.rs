@@ -1,4 +1,4 @@
-//! What of the cameras is learned, and how fast.
+//! Configuration of the camera optimizer.
 
 use crate::model::exposure::{EXPOSURE, VIGNETTING};
 use crate::range::{check_range, check_schedule};
@@ -10,12 +10,12 @@ use std::str::FromStr;
 
 /// The name of the parameter of poses.
 pub(crate) const POSES: &str = "poses";
-/// That of focal lengths.
+/// The name of the parameter of focal lengths.
 pub(crate) const FOCAL: &str = "focal";
-/// That of lenses.
+/// The name of the parameter of lenses.
 pub(crate) const LENS: &str = "lens";
 
-/// What is learned of cameras beside their poses, and how the scene is held back meanwhile.
+/// Configuration of the [`CameraOptimizer`](crate::model::CameraOptimizer), beside [`Config::poses`](crate::Config::poses).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraOptimizerConfig {
@@ -31,15 +31,15 @@ pub struct CameraOptimizerConfig {
 }
 
 impl CameraOptimizerConfig {
-    /// How much of the detail there is at this fraction of the run, 0 to 1.
+    /// Returns the share of detail at this fraction of the run, 0 to 1.
     pub fn detail(&self, fraction: f64) -> f64 {
         if self.coarse > 0.0 { (fraction / self.coarse).clamp(0.0, 1.0) } else { 1.0 }
     }
 
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     pub fn check(&self) -> Result<()> {
         check_range("camera_optimizer.coarse", self.coarse, 0.0, 1.0)?;
         check_schedule("camera_optimizer.focal", self.focal)?;
@@ -47,18 +47,18 @@ impl CameraOptimizerConfig {
     }
 }
 
-/// A part of what cameras did that can be learned.
+/// A camera parameter that can be refined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RefinedParam {
-    /// Where it was and how it was held, for each photograph.
+    /// Position and orientation, per image.
     Poses,
-    /// Its focal length.
+    /// Focal length, per camera.
     Focal,
-    /// The coefficients of its lens.
+    /// Distortion coefficients, per camera.
     Lens,
-    /// How bright it made what it saw, and of what white balance, for each photograph.
+    /// Exposure and white balance, per image.
     Exposure,
-    /// How dark it made the corners of its photographs.
+    /// Vignetting, shared by all images.
     Vignetting,
 }
 
@@ -73,7 +73,7 @@ impl FromStr for RefinedParam {
             RefinedParam::Vignetting,
         ];
         all.into_iter().find(|part| part.to_string() == name).ok_or_else(|| {
-            let what = format!("there is no `{name}`; use poses, focal, lens, exposure or vignetting");
+            let what = format!("is `{name}`; use poses, focal, lens, exposure or vignetting");
             Error::setting("camera_optimizer", what)
         })
     }
