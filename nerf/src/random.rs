@@ -1,9 +1,9 @@
-//! Random numbers: a stream for each purpose, and places in bins.
+//! Random streams, and jitter of samples.
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// A generator for one purpose: mixes the parts so that neighbouring numbers give unrelated streams.
+/// A generator for one purpose: mixes the parts so that neighbouring seeds give unrelated streams.
 pub(crate) fn stream(seed: u64, parts: [u64; 2]) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(mixed(seed, parts))
 }
@@ -21,11 +21,11 @@ pub(crate) fn mixed(seed: u64, parts: [u64; 2]) -> u64 {
     state
 }
 
-/// Uniform random numbers in `[0, 1)`, or the middle of every bin when rendering.
+/// The position of samples within their bins: at the centre for renders, random in training.
 pub enum Jitter<'a> {
-    /// Every sample in the middle of its bin: the same image each time.
+    /// Every sample at the centre of its bin: the same image each time.
     Middle,
-    /// Every sample at a random place in its bin.
+    /// Every sample at a uniformly random place in its bin.
     Random(&'a mut dyn Rng),
 }
 
@@ -37,7 +37,7 @@ impl Jitter<'_> {
         }
     }
 
-    /// What other random numbers begin from.
+    /// A seed for other random numbers.
     pub(crate) fn seed(&mut self) -> u64 {
         match self {
             Jitter::Middle => 0,

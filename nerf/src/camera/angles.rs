@@ -1,4 +1,4 @@
-//! Functions of angles that are smooth through 0, for any kind of number.
+//! Functions of angles that are smooth through 0, generic over the number type.
 
 use raygrad_autograd::Real;
 

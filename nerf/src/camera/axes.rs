@@ -1,4 +1,4 @@
-//! Where poses look: the place that their optical axes come nearest to.
+//! The point closest to the optical axes of poses.
 
 use crate::numbers::outer;
 use glam::{DAffine3, DMat3, DVec3};

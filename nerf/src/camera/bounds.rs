@@ -1,12 +1,12 @@
-//! The box that holds a scene, and the part of a ray inside it.
+//! Intersection of rays with boxes.
 
 use crate::camera::pinhole::{Camera, Ray};
 use glam::DVec3;
 
-/// The distances at which a ray enters and leaves the box with these lower and upper corners; `None` if it misses.
+/// Returns the distances at which a ray enters and leaves a box (lower and upper corner), or `None` if it misses.
 ///
-/// A ray that starts inside enters at 0. A direction component of 0 (of either sign) asks only whether the origin lies
-/// between the faces, faces included. NaN misses.
+/// A ray that starts inside enters at 0. For a direction component of 0 the origin must lie between the faces, faces included.
+/// NaN misses.
 pub fn intersect_box(ray: &Ray, [low, high]: [DVec3; 2]) -> Option<[f64; 2]> {
     let (mut enter, mut leave) = (0.0, f64::INFINITY);
     for axis in 0..3 {
@@ -26,7 +26,7 @@ pub fn intersect_box(ray: &Ray, [low, high]: [DVec3; 2]) -> Option<[f64; 2]> {
     (enter <= leave).then_some([enter, leave])
 }
 
-/// The part of `span` (near and far distance) of a ray that lies in the box; empty, at near, if it misses.
+/// Returns the part of `[near, far]` of a ray that lies in the box; empty, at near, if it misses.
 pub fn clip_near_far(ray: &Ray, bounds: [DVec3; 2], [near, far]: [f64; 2]) -> [f64; 2] {
     match intersect_box(ray, bounds) {
         Some([enter, leave]) if enter.max(near) < leave.min(far) => [enter.max(near), leave.min(far)],
@@ -35,8 +35,7 @@ pub fn clip_near_far(ray: &Ray, bounds: [DVec3; 2], [near, far]: [f64; 2]) -> [f
 }
 
 impl Camera {
-    /// Whether one of so many columns and rows of rays, evenly spaced over the image, meets a box, lower and upper corner,
-    /// between the distances `span`.
+    /// Whether one of `columns` x `rows` rays, evenly spaced over the image, meets a box between the distances `span`.
     pub(crate) fn meets(&self, bounds: [DVec3; 2], span: [f64; 2], [columns, rows]: [usize; 2]) -> bool {
         let place = |i: usize, count: usize, size: usize| (i as f64 + 0.5) / count as f64 * size as f64;
         (0..columns * rows).any(|i| {

@@ -1,4 +1,4 @@
-//! Lenses: between directions and places in the image plane, both ways.
+//! Lens models: projection of directions to the image plane and back.
 
 pub(crate) mod fold;
 pub(crate) mod inverse;
@@ -14,14 +14,14 @@ use raygrad_autograd::Real;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// How a camera's glass bends light: the map between directions and places in the image plane.
+/// A lens model: the map between directions and places in the image plane.
 ///
-/// Directions and places have the axes of images here: `x` right, `y` down, `z` into the scene. A place is in units of the
-/// focal length from the principal point, `[(column - cx) / fx, (row - cy) / fy]`.
+/// Directions and places use image axes: `x` right, `y` down, `z` into the scene. A place is relative to the principal point in
+/// units of the focal length: `[(column - cx) / fx, (row - cy) / fy]`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Lens {
-    /// None: straight lines stay straight.
+    /// No distortion.
     #[default]
     Pinhole,
     /// OpenCV's rational model with radial coefficients `k1 .. k6` (the last three in the denominator) and tangential
@@ -32,7 +32,7 @@ pub enum Lens {
         /// Tangential coefficients `p1, p2`.
         p: [f64; 2],
     },
-    /// The equidistant fisheye (Kannala and Brandt 2006): an angle `a` to the axis is put at
+    /// The equidistant fisheye (Kannala and Brandt 2006): an angle `a` to the axis maps to the radius
     /// `a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8)`; then tangential and thin-prism terms. OpenCV's `fisheye`; COLMAP's
     /// SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE and THIN_PRISM_FISHEYE.
     Fisheye {
@@ -43,41 +43,43 @@ pub enum Lens {
         /// Thin-prism coefficients `sx1, sy1`.
         s: [f64; 2],
     },
-    /// One parameter, the field of view `omega` in radians (Devernay and Faugeras 2001): COLMAP's FOV.
+    /// The FOV model with one parameter, `omega` in radians (Devernay and Faugeras 2001): COLMAP's FOV.
     Fov {
-        /// The field of view in radians.
+        /// The field of view in radians, below pi.
         omega: f64,
     },
-    /// All directions: columns are longitudes, rows latitudes. A focal length is in pixels for each radian.
+    /// All directions: columns are longitudes, rows latitudes. Focal lengths are in pixels per radian.
     Equirectangular,
 }
 
 impl Lens {
-    /// The direction, of length 1, of the light that reaches this place; `None` where the lens puts nothing.
+    /// Returns the unit direction that projects to `place`, or `None` if there is none.
     ///
-    /// A distortion is undone up to where it first folds the image back, on the way from the axis, and nowhere else.
+    /// The inverse covers the image up to the first fold, seen from the axis.
     ///
     /// ```
     /// use raygrad_nerf::Lens;
     /// let barrel = Lens::Brown { k: [-0.5, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
     /// let direction = barrel.direction([0.54, 0.0]).unwrap();
     /// assert!((direction.x / direction.z - 0.7562852).abs() < 1e-7);
-    /// assert!(barrel.direction([0.6, 0.0]).is_none(), "this lens puts nothing there");
+    /// assert!(barrel.direction([0.6, 0.0]).is_none(), "beyond the fold");
     /// ```
     pub fn direction(&self, place: [f64; 2]) -> Option<DVec3> {
         self.solve(place).ok().filter(|direction| direction.is_finite())
     }
 
-    /// As [`direction`](Self::direction); where the lens puts nothing, the outermost direction towards there. Finite for
-    /// every finite place.
+    /// Returns [`direction`](Self::direction) or, if there is none, the outermost direction towards `place`. It is finite for every
+    /// finite place.
     pub fn nearest(&self, place: [f64; 2]) -> DVec3 {
         let (Ok(direction) | Err(direction)) = self.solve(place);
         // Only coefficients and places beyond all measure have no answer in numbers.
         if direction.is_finite() { direction } else { DVec3::Z }
     }
 
-    /// Where light from this direction, of any length but 0, reaches the image plane; `None` if it does not: from behind
-    /// the image plane, except by a fisheye or an equirectangular image, and from beyond the first fold of the image.
+    /// Projects a direction, of any length but 0, to the image plane.
+    ///
+    /// Returns `None` for directions beyond the first fold of the image, and for those behind the image plane unless the lens is a
+    /// fisheye or equirectangular.
     pub fn place(&self, direction: DVec3) -> Option<[f64; 2]> {
         // Squares of what is left neither overflow nor vanish.
         let [x, y, z] = (direction / direction.abs().max_element()).to_array();
@@ -99,12 +101,13 @@ impl Lens {
         place.iter().all(|x| x.is_finite()).then_some(place)
     }
 
-    /// The formula of [`place`](Self::place), for a lens of this kind with these [`coefficients`](Self::coefficients), and
-    /// for any kind of number: with variables it has derivatives by all of them. It knows nothing of folds, and of
-    /// directions from behind a lens that sees none it makes what the formula gives.
+    /// Evaluates the formula of [`place`](Self::place) for any number type, with these [`coefficients`](Self::coefficients).
+    ///
+    /// With variables it is differentiable with respect to all arguments. It does not check for folds or for directions behind the
+    /// lens.
     ///
     /// # Panics
-    /// If the coefficients are not as many as the lens has.
+    /// If there is another number of coefficients than the lens has.
     pub fn project<E: Real>(&self, coefficients: &[E], direction: [E; 3]) -> [E; 2] {
         match (self, coefficients) {
             (Lens::Pinhole, []) => maps::perspective(direction),
@@ -116,11 +119,11 @@ impl Lens {
             }
             (Lens::Fov { .. }, &[omega]) => maps::field_of_view(omega, direction),
             (Lens::Equirectangular, []) => maps::longitude_and_latitude(direction),
-            _ => panic!("{} coefficients for {self:?}", coefficients.len()),
+            _ => panic!("{self:?} has {} coefficients, not {}", self.coefficients().len(), coefficients.len()),
         }
     }
 
-    /// What describes the lens, in order: `k1 .. k6, p1, p2`; `k1 .. k4, p1, p2, sx1, sy1`; `omega`; or nothing.
+    /// Returns the coefficients, in order: `k1 .. k6, p1, p2`; `k1 .. k4, p1, p2, sx1, sy1`; `omega`; or none.
     pub fn coefficients(&self) -> Vec<f64> {
         match self {
             Lens::Pinhole | Lens::Equirectangular => vec![],
@@ -130,7 +133,7 @@ impl Lens {
         }
     }
 
-    /// The names of the [`coefficients`](Self::coefficients), as COLMAP has them.
+    /// Returns the names of the [`coefficients`](Self::coefficients), as in COLMAP.
     pub fn coefficient_names(&self) -> &'static [&'static str] {
         match self {
             Lens::Pinhole | Lens::Equirectangular => &[],
@@ -140,10 +143,10 @@ impl Lens {
         }
     }
 
-    /// A lens of this kind with other [`coefficients`](Self::coefficients).
+    /// Returns a lens of the same model with other [`coefficients`](Self::coefficients).
     ///
     /// # Panics
-    /// If they are not as many.
+    /// If there is another number of coefficients than the lens has.
     #[must_use]
     pub fn with_coefficients(&self, coefficients: &[f64]) -> Lens {
         match (self, coefficients) {
@@ -155,21 +158,21 @@ impl Lens {
                 Lens::Fisheye { k: [k1, k2, k3, k4], p: [p1, p2], s: [sx1, sy1] }
             }
             (Lens::Fov { .. }, &[omega]) => Lens::Fov { omega },
-            _ => panic!("{} coefficients for {self:?}", coefficients.len()),
+            _ => panic!("{self:?} has {} coefficients, not {}", self.coefficients().len(), coefficients.len()),
         }
     }
 
-    /// Whether this is a lens.
+    /// Checks that all coefficients are in range.
     ///
     /// # Errors
-    /// If a coefficient is not finite, or a field of view is not below half a turn.
+    /// If a coefficient is not finite, or a field of view is not below pi.
     pub fn check(&self) -> Result<()> {
         if let Some(bad) = self.coefficients().iter().find(|x| !x.is_finite()) {
-            return Err(Error::setting("lens", format!("a coefficient is {bad}: {self:?}")));
+            return Err(Error::setting("lens", format!("has the coefficient {bad}; use finite numbers, is {self:?}")));
         }
         match self {
             Lens::Fov { omega } if !(omega.abs() < PI) => {
-                Err(Error::setting("lens", format!("a field of view of {omega}; it is in radians, below pi")))
+                Err(Error::setting("lens", format!("has a field of view of {omega}; use radians, below pi")))
             }
             _ => Ok(()),
         }

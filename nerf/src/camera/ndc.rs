@@ -1,4 +1,4 @@
-//! Normalised device coordinates: what cameras see that all look the same way, as a cube.
+//! Normalised device coordinates (NDC) for forward-facing scenes.
 
 use super::pinhole::Camera;
 use crate::numbers::{mean, median};
@@ -6,11 +6,11 @@ use crate::{Error, Result};
 use glam::{DMat3, DVec2, DVec3, Vec3Swizzles};
 use serde::{Deserialize, Serialize};
 
-/// What cameras see that all look the same way, as the unit cube: across it lies as in a picture, and along it evenly in inverse
-/// depth, from the near plane to infinity (Mildenhall et al. 2020, appendix C). Straight lines stay straight.
+/// The NDC frustum of a forward-facing scene (Mildenhall et al. 2020, appendix C).
 ///
-/// The paper's picture is that of one of the cameras, which leaves out what others see beside it. This one is taken from as far
-/// behind them as it takes to have all that they see in it. [`Space::cube`](crate::Space::cube) is the map.
+/// [`Space::cube`](crate::Space::cube) maps it to the unit cube: x and y are image coordinates, z is even in inverse depth, from
+/// the near plane to infinity. Straight lines stay straight. The paper uses the frustum of one camera, which crops what other
+/// cameras see. This frustum starts far enough behind the cameras to hold all of theirs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ndc {
@@ -25,7 +25,7 @@ pub struct Ndc {
     pub near: f64,
 }
 
-/// How much wider it is than what cameras see: views are taken beside them, and refined cameras move.
+/// The factor by which it is wider than the cameras' views: renders are taken beside them, and refined cameras move.
 const MARGIN: f64 = 1.1;
 /// The picture is at most so much wider than that of the usual camera: 15 degrees to either side of what is 60 degrees wide.
 const TURNED: f64 = 1.75;
@@ -33,16 +33,16 @@ const TURNED: f64 = 1.75;
 const LOST: f64 = 5.0;
 
 impl Ndc {
-    /// All that cameras see beyond the distance `near` from each.
+    /// Finds the frustum of everything that cameras see beyond the distance `near` from each.
     ///
     /// # Errors
-    /// If there is no camera; if some are turned from others by more than a part of what they see, or look about an object on an
-    /// arc; if they move more along where they look than across it, or one stands far from all others: then there is no picture
-    /// in which all that matters is as large as in theirs.
+    /// If there is no camera or the scene is not forward-facing: cameras are rotated against each other, surround an object, move
+    /// more along their axes than across them, or one stands far from all others.
     pub fn around<'a>(cameras: impl IntoIterator<Item = &'a Camera>, near: f64) -> Result<Self> {
         let cameras: Vec<&Camera> = cameras.into_iter().collect();
         let mean = |of: fn(&Camera) -> DVec3| mean(cameras.iter().map(|camera| of(camera)));
-        let bad = |what: &str| Err(Error::setting("scene-type", format!("forward-facing: {what}; use unbounded")));
+        let bad =
+            |what: &str| Err(Error::setting("scene-type", format!("cannot be forward-facing: {what}; use unbounded")));
         let back = mean(|camera| camera.pose.matrix3.z_axis).normalize();
         // Of a flight to and fro no side is up.
         let up = mean(|camera| camera.pose.matrix3.y_axis);
@@ -50,7 +50,7 @@ impl Ndc {
         let right = up.cross(back).normalize();
         let (axes, middle) = (DMat3::from_cols(right, back.cross(right), back), mean(|camera| camera.pose.translation));
         if !(axes.is_finite() && middle.is_finite()) {
-            return bad("cameras look no way in common");
+            return bad("cameras have no common viewing direction");
         }
         let slopes = |camera: &Camera, axes: DMat3| {
             camera.border().fold(DVec2::ZERO, |most, direction| {
@@ -62,18 +62,18 @@ impl Ndc {
         let steepest = cameras.iter().fold(DVec2::ZERO, |most, camera| most.max(slopes(camera, axes)));
         let usual = median(cameras.iter().map(|camera| slopes(camera, camera.pose.matrix3).max_element()));
         if !(steepest.max_element() <= TURNED * usual && usual.is_finite()) {
-            return bad("cameras are turned from each other");
+            return bad("cameras look in different directions");
         }
         let offsets: Vec<DVec3> = cameras.iter().map(|c| axes.transpose() * (c.pose.translation - middle)).collect();
         let low = offsets.iter().fold(DVec3::INFINITY, |low, offset| low.min(*offset));
         let high = offsets.iter().fold(DVec3::NEG_INFINITY, |high, offset| high.max(*offset));
         let moved = high - low;
         if moved.z > moved.xy().length() {
-            return bad("cameras move more along where they look than across it");
+            return bad("cameras move more along their viewing direction than across it");
         }
         let farthest = offsets.iter().fold(0.0, |most: f64, offset| most.max(offset.length()));
         if farthest > LOST * median(offsets.iter().map(|offset| offset.length())) {
-            return bad("a camera stands far from all others");
+            return bad("a camera is far from all others");
         }
         let slopes = MARGIN * steepest;
         let behind = offsets.iter().map(|offset| (offset.xy().abs() / slopes).max_element() + offset.z);
@@ -84,7 +84,7 @@ impl Ndc {
         Ok(ndc)
     }
 
-    /// The same where nothing is nearer than `to` to a camera, and was thought to be no nearer than `from`.
+    /// Returns the frustum for a near plane of `to`, where that of [`around`](Self::around) was `from`.
     #[must_use]
     pub fn with_near(self, from: f64, to: f64) -> Self {
         // In the corners of a picture, distances are longer than depths.
@@ -92,20 +92,20 @@ impl Ndc {
         Ndc { near: self.near + depth * (to - from), ..self }
     }
 
-    /// Whether the numbers are usable.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is not finite, a length is not above 0, or axes are no rotation.
+    /// If a number is not finite, a length is not above 0, or the axes are not a rotation.
     pub fn check(&self) -> Result<()> {
         let lengths = [self.slopes[0], self.slopes[1], self.near];
         let turns = (self.axes.transpose() * self.axes).abs_diff_eq(DMat3::IDENTITY, 1e-6);
         if self.eye.is_finite() && turns && lengths.iter().all(|x| *x > 0.0 && x.is_finite()) {
             return Ok(());
         }
-        Err(Error::setting("ndc", "needs a near plane and slopes above 0, a finite eye and axes that are a rotation"))
+        Err(Error::setting("ndc", "needs a near plane and slopes above 0, a finite eye, and axes that are a rotation"))
     }
 
-    /// How many pixels of a camera lie side by side across the picture at the depth of a place.
+    /// Returns the number of a camera's pixels across the frustum at the depth of `place`.
     pub fn pixels(&self, camera: &Camera, place: DVec3) -> f64 {
         let depth = self.axes.z_axis.dot(self.eye - place).max(self.near);
         let ahead = self.axes.z_axis.dot(self.eye - camera.pose.translation);

@@ -1,24 +1,25 @@
-//! Paths that cameras fly along, between key frames.
+//! Camera paths between keyframes.
 
 use super::pinhole::Camera;
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 
-/// Where a camera is on a path, and how much it sees.
+/// A pose and a field of view on a camera path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Keyframe {
-    /// Camera-to-world, with the axes of a [`Camera`]: a rotation and a translation.
+    /// Camera-to-world transform with the axes of a [`Camera`]: a rotation and a translation.
     pub pose: DAffine3,
     /// The vertical field of view in radians, between 0 and pi.
     pub angle_y: f64,
 }
 
 impl Keyframe {
-    /// That of a camera: its lens and its principal point are left behind.
+    /// Takes the pose and field of view of a camera; lens and principal point are dropped.
     pub fn of(camera: &Camera) -> Self {
         Keyframe { pose: camera.pose, angle_y: 2.0 * (0.5 * camera.height as f64 / camera.focal[1]).atan() }
     }
 
-    /// A pinhole camera there, with square pixels and its principal point in the middle:
+    /// Returns a pinhole camera with square pixels and its principal point at the image centre.
+    ///
     /// `focal = height / (2 tan(angle_y / 2))`.
     pub fn camera(&self, [width, height]: [usize; 2]) -> Camera {
         let tangent = (0.5 * self.angle_y).tan();
@@ -26,9 +27,10 @@ impl Keyframe {
         Camera::from_angle(width, height, angle_x, self.pose)
     }
 
-    /// The key that is `share` of the way to another, beyond it above 1 and before this one below 0: on a straight
-    /// line, by a turn about one axis, the short way round (slerp, Shoemake 1985), and with the focal length changing
-    /// by a constant factor.
+    /// Interpolates to another keyframe; a `share` below 0 or above 1 extrapolates.
+    ///
+    /// Positions lie on a straight line, rotations turn about one axis the short way round (slerp, Shoemake 1985), and the focal
+    /// length changes geometrically.
     pub fn mix(&self, other: &Keyframe, share: f64) -> Keyframe {
         let (from, to) = (&self.pose, &other.pose);
         let turn = DQuat::from_scaled_axis(share * turn(from, to));
@@ -51,25 +53,25 @@ fn turn(from: &DAffine3, to: &DAffine3) -> DVec3 {
     (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis()
 }
 
-/// How a path goes by its keys.
+/// The type of curve between keyframes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Curve {
-    /// Through each: a Catmull-Rom spline by the pyramid of Barry and Goldman (1988) of [`Keyframe::mix`], for rotations as
-    /// Schlag (1991) has it. Speeds of moving, of turning and of zooming are continuous. From key to key a camera
-    /// should turn by less than a right angle. How far along it a camera is at a time is a monotone cubic function (Fritsch and
-    /// Butland 1984), so that times, however uneven, move cameras to and fro nowhere. Nerfstudio's paths are such ones.
+    /// An interpolating Catmull-Rom spline, as in nerfstudio: the pyramid of Barry and Goldman (1988) of [`Keyframe::mix`], for
+    /// rotations after Schlag (1991). Velocities are continuous. Between keyframes a camera should turn by less than a right
+    /// angle. The position over time is a monotone cubic function (Fritsch and Butland 1984), so uneven times never reverse the
+    /// camera.
     Through,
-    /// Near each, as smooth as a uniform cubic B-spline: in the middle of a leg's end, a key counts four sixths and its
-    /// neighbours one. Rotations are weighted means of quaternions. These are the paths of instant-ngp.
+    /// An approximating uniform cubic B-spline, as in instant-ngp: at a keyframe's time it has the weight 4/6 and its neighbours
+    /// 1/6 each. Rotations are weighted means of quaternions.
     Near,
 }
 
-/// A path by key frames.
+/// A camera path through keyframes.
 ///
 /// ```
-/// use raygrad_nerf::camera::{CameraPath, Key};
+/// use raygrad_nerf::camera::{CameraPath, Keyframe};
 /// use raygrad_nerf::glam::{DAffine3, DVec3};
-/// let key = |x: f64, angle_y: f64| Key { pose: DAffine3::from_translation(DVec3::new(x, 0.0, 1.0)), angle_y };
+/// let key = |x: f64, angle_y: f64| Keyframe { pose: DAffine3::from_translation(DVec3::new(x, 0.0, 1.0)), angle_y };
 /// let path = CameraPath::through(vec![key(0.0, 0.8), key(1.0, 0.8), key(2.0, 0.8)], false);
 /// assert!((path.at(0.25).pose.translation.x - 0.5).abs() < 1e-12);
 /// assert_eq!(path.shares(), [0.0, 0.5, 1.0]);
@@ -77,7 +79,7 @@ pub enum Curve {
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraPath {
     keys: Vec<Keyframe>,
-    /// When each key is reached, from 0 on; of a closed path, the first once more.
+    /// The time of each keyframe, from 0; of a closed path, the first once more.
     times: Vec<f64>,
     /// The curve's parameter there.
     knots: Vec<f64>,
@@ -92,12 +94,13 @@ const LEAST_LEG: f64 = 1e-3;
 const LEAST_TIME: f64 = 1e-6;
 
 impl CameraPath {
-    /// Through keys, at least one, and back to the first if it is `closed`. A leg takes time as the square root of its
-    /// length, in which turning counts as much as moving does in all: the centripetal parameter, with which curves have
-    /// neither loops nor cusps between their keys (Yuksel, Schaefer and Keyser 2011).
+    /// Creates a path of [`Curve::Through`], which returns to the first keyframe if `closed`.
+    ///
+    /// The time between keyframes is the square root of their distance, in which turning and moving count equally over the path.
+    /// With this centripetal parameter, curves have neither loops nor cusps (Yuksel, Schaefer and Keyser 2011).
     ///
     /// # Panics
-    /// If there is no key.
+    /// If there is no keyframe.
     pub fn through(keys: Vec<Keyframe>, closed: bool) -> Self {
         let legs = legs(&keys, closed);
         let pairs = legs.iter().map(|&[from, to]| (&keys[from].pose, &keys[to].pose));
@@ -113,15 +116,21 @@ impl CameraPath {
         CameraPath { knots: path.times.clone(), ..path }
     }
 
-    /// By keys, with the time that each leg takes, in any unit: one less than keys or, if the path is `closed`, as many. One that
-    /// is less than a millionth of the longest counts as that. Times do not bend the curve: its parameter rises by one in each leg.
+    /// Creates a path with given times between keyframes, in any unit.
+    ///
+    /// There is one time fewer than keyframes or, if the path is `closed`, as many. A time below a millionth of the longest counts
+    /// as that. Times do not bend the curve: its parameter rises by one between keyframes.
     ///
     /// # Panics
-    /// If there is no key, or not as many times, or one that is not above 0 and finite.
+    /// If there is no keyframe, another number of times, or a time that is not above 0 and finite.
     pub fn timed(keys: Vec<Keyframe>, times: Vec<f64>, closed: bool, curve: Curve) -> Self {
-        assert!(!keys.is_empty(), "a path of no keys");
-        assert_eq!(times.len(), legs(&keys, closed).len(), "a time for each leg");
-        assert!(times.iter().all(|time| *time > 0.0 && time.is_finite()), "times above 0");
+        assert!(!keys.is_empty(), "a path needs at least one keyframe");
+        assert_eq!(
+            times.len(),
+            legs(&keys, closed).len(),
+            "a path needs one time for each pair of neighbouring keyframes"
+        );
+        assert!(times.iter().all(|time| *time > 0.0 && time.is_finite()), "times must be finite and above 0");
         let least = LEAST_TIME * times.iter().copied().fold(0.0, f64::max);
         let mut reached = vec![0.0];
         for time in times {
@@ -131,13 +140,13 @@ impl CameraPath {
         CameraPath { keys, times: reached, knots, closed, curve }
     }
 
-    /// Where along the path its keys are, 0 to 1.
+    /// Returns the position of each keyframe along the path, 0 to 1.
     pub fn shares(&self) -> Vec<f64> {
         let length = self.length();
         self.times[..self.keys.len()].iter().map(|time| if length > 0.0 { time / length } else { 0.0 }).collect()
     }
 
-    /// Where a camera is that has come so far, 0 to 1: by time, and so about evenly.
+    /// Returns the keyframe at a share of the path's time, 0 to 1.
     pub fn at(&self, share: f64) -> Keyframe {
         if self.keys.len() == 1 {
             return self.keys[0];
@@ -189,8 +198,7 @@ impl CameraPath {
         }
     }
 
-    /// `count` keys along the path, evenly in time: from its beginning to its end or, of a closed one, up to where it
-    /// begins again.
+    /// Returns `count` keyframes evenly in time, from start to end. On a closed path the last one leads back to the first.
     pub fn frames(&self, count: usize) -> Vec<Keyframe> {
         let steps = if self.closed { count } else { count.saturating_sub(1).max(1) };
         (0..count).map(|i| self.at(i as f64 / steps as f64)).collect()

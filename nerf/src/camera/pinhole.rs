@@ -1,30 +1,30 @@
-//! Pinhole cameras and the rays through their pixels.
+//! Cameras and the rays through their pixels.
 
 use crate::camera::lens::Lens;
 use glam::{DAffine3, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A straight line `origin + t * direction`, `t >= 0`.
+/// A ray: the points `origin + t * direction` with `t >= 0`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ray {
-    /// Where the ray starts, in scene units.
+    /// The origin, in scene units.
     pub origin: DVec3,
-    /// Its direction, of length 1: `t` is a distance in scene units.
+    /// The direction, of length 1, so that `t` is a distance in scene units.
     pub direction: DVec3,
 }
 
 impl Ray {
-    /// The point at distance `t`.
+    /// Returns the point at distance `t`.
     pub fn at(&self, t: f64) -> DVec3 {
         self.origin + t * self.direction
     }
 }
 
-/// A camera.
+/// A camera: image size, intrinsics, lens and pose.
 ///
-/// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates
-/// are continuous, with `(0, 0)` at the upper left corner of the image, so the centre of the pixel in column `i` and
-/// row `j` is `(i + 0.5, j + 0.5)`.
+/// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates are
+/// continuous, with `(0, 0)` at the upper left corner of the image. So the centre of the pixel in column `i` and row `j` is
+/// `(i + 0.5, j + 0.5)`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Camera {
@@ -36,14 +36,14 @@ pub struct Camera {
     pub focal: [f64; 2],
     /// The principal point in pixels.
     pub centre: [f64; 2],
-    /// How light is bent on its way to the image.
+    /// The lens model with its distortion coefficients.
     pub lens: Lens,
     /// Camera-to-world transform: a rotation and a translation.
     pub pose: DAffine3,
 }
 
 impl Camera {
-    /// A camera with square pixels and its principal point in the middle of the image.
+    /// Creates a pinhole camera with square pixels and its principal point at the image centre.
     ///
     /// `angle_x` is the horizontal field of view in radians: `focal = width / (2 tan(angle_x / 2))`.
     pub fn from_angle(width: usize, height: usize, angle_x: f64, pose: DAffine3) -> Self {
@@ -52,7 +52,7 @@ impl Camera {
         Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }
     }
 
-    /// A pose at `eye` that looks at `target`, with `up` upwards in the image.
+    /// Returns the pose at `eye` that looks at `target`, with `up` upwards in the image.
     ///
     /// `up` must not be parallel to the viewing direction.
     pub fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
@@ -61,8 +61,10 @@ impl Camera {
         DAffine3 { matrix3: glam::DMat3::from_cols(right, back.cross(right), back), translation: eye }
     }
 
-    /// The ray through the continuous pixel position `(x, y)`. Where the [lens](Lens) puts nothing, that of the outermost
-    /// direction towards there: see [`sees`](Self::sees).
+    /// Returns the ray through the continuous pixel position `(x, y)`.
+    ///
+    /// Where the [lens](Lens) maps no direction to it, the ray has the outermost direction towards there: see
+    /// [`sees`](Self::sees).
     pub fn ray(&self, x: f64, y: f64) -> Ray {
         let [x, y] = self.plane(x, y);
         let local = match self.lens {
@@ -72,26 +74,27 @@ impl Camera {
         Ray { origin: self.pose.translation, direction: (self.pose.matrix3 * local).normalize() }
     }
 
-    /// Whether some light reaches the continuous pixel position `(x, y)` through the [lens](Lens).
+    /// Returns whether the [lens](Lens) maps a direction to the continuous pixel position `(x, y)`.
     pub fn sees(&self, x: f64, y: f64) -> bool {
         self.lens.direction(self.plane(x, y)).is_some()
     }
 
-    /// The continuous pixel position at which a point in world coordinates is seen, which may lie outside of the image;
-    /// `None` for points that no light comes from, such as those behind a pinhole.
+    /// Projects a point in world coordinates to a continuous pixel position, which may lie outside of the image.
+    ///
+    /// Returns `None` for points that the lens does not see, such as those behind a pinhole.
     pub fn pixel_of(&self, point: DVec3) -> Option<[f64; 2]> {
         let local = self.pose.matrix3.transpose() * (point - self.pose.translation);
         let [x, y] = self.lens.place(local * DVec3::new(1.0, -1.0, -1.0))?;
         Some([x * self.focal[0] + self.centre[0], y * self.focal[1] + self.centre[1]])
     }
 
-    /// Whether a point in world coordinates is seen within the image.
+    /// Whether a point in world coordinates projects into the image.
     pub(crate) fn shows(&self, point: DVec3) -> bool {
         let [width, height] = [self.width as f64, self.height as f64];
         self.pixel_of(point).is_some_and(|[x, y]| (0.0..width).contains(&x) && (0.0..height).contains(&y))
     }
 
-    /// Directions of rays along the border of the image, of those that light reaches; of all if it reaches none.
+    /// Directions of rays along the border of the image, where the lens sees any; otherwise all.
     pub(crate) fn border(&self) -> impl Iterator<Item = DVec3> {
         /// Places along each side.
         const PLACES: usize = 16;
@@ -107,25 +110,26 @@ impl Camera {
         [(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1]]
     }
 
-    /// Column and row of the pixel of this number, row by row.
+    /// Column and row of the pixel with this index, row by row.
     pub(crate) fn place_of(&self, pixel: usize) -> [usize; 2] {
         [pixel % self.width, pixel / self.width]
     }
 
-    /// The ray through the centre of the pixel in column `column` and row `row`.
+    /// Returns the ray through the centre of the pixel in column `column` and row `row`.
     pub fn pixel_ray(&self, column: usize, row: usize) -> Ray {
         self.ray(column as f64 + 0.5, row as f64 + 0.5)
     }
 
-    /// How far the centre of the pixel `[column, row]` lies from the principal point: the square of the distance, in halves of
-    /// the picture's diagonal, so that corners of a centred picture have 1.
+    /// Returns the squared distance of the centre of pixel `[column, row]` from the principal point.
+    ///
+    /// The unit is half the image's diagonal, so that corners of a centred image have 1.
     pub fn off_axis(&self, [column, row]: [usize; 2]) -> f64 {
         let [x, y] = [column as f64 + 0.5 - self.centre[0], row as f64 + 0.5 - self.centre[1]];
         let [width, height] = [self.width, self.height].map(|side| 0.5 * side as f64);
         (x * x + y * y) / (width * width + height * height)
     }
 
-    /// The same view at another image size.
+    /// Returns the same view at another image size.
     pub fn resized(&self, width: usize, height: usize) -> Self {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);
         Camera {

@@ -1,4 +1,4 @@
-//! Rays and the samples along them, packed: the samples of all rays stand one after another.
+//! Batches of rays, and packed samples: the samples of all rays stand one after another.
 
 use super::bounds::clip_near_far;
 use super::pinhole::{Camera, Ray};
@@ -14,41 +14,42 @@ pub struct Rays<T> {
     pub origins: Vec<[T; 3]>,
     /// Unit directions.
     pub directions: Vec<[T; 3]>,
-    /// For each ray the distances `[near, far]` between which it is sampled; equal where there is nothing to sample.
+    /// The near and far distance of each ray, in scene units; equal if nothing is to be sampled.
     pub spans: Vec<[T; 2]>,
 }
 
 impl<T: Scalar> Rays<T> {
-    /// No rays.
+    /// Creates an empty batch.
     pub fn new() -> Self {
         Rays { origins: vec![], directions: vec![], spans: vec![] }
     }
 
-    /// Adds a ray that is sampled over `[near, far]`.
+    /// Adds a ray with its `[near, far]` distances.
     pub fn push(&mut self, ray: &Ray, span: [f64; 2]) {
         self.origins.push(ray.origin.to_array().map(T::from_f64));
         self.directions.push(ray.direction.to_array().map(T::from_f64));
         self.spans.push(span.map(T::from_f64));
     }
 
-    /// Adds the ray through the centre of a camera's pixel, column and row, with the part of `span` (near and far distance)
-    /// that lies in the box `bounds` (lower and upper corner).
+    /// Adds the ray through the centre of a camera's pixel.
+    ///
+    /// Its span is the part of `span` (near and far distance) within the box `bounds` (lower and upper corner).
     pub fn push_pixel(&mut self, camera: &Camera, [column, row]: [usize; 2], bounds: [DVec3; 2], span: [f64; 2]) {
         let ray = camera.pixel_ray(column, row);
         self.push(&ray, clip_near_far(&ray, bounds, span));
     }
 
-    /// Number of rays.
+    /// Returns the number of rays.
     pub fn len(&self) -> usize {
         self.origins.len()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no rays.
     pub fn is_empty(&self) -> bool {
         self.origins.is_empty()
     }
 
-    /// The same rays in another precision.
+    /// Converts the rays to another precision.
     pub fn cast<U: Scalar>(&self) -> Rays<U> {
         fn all<const N: usize, T: Scalar, U: Scalar>(x: &[[T; N]]) -> Vec<[U; N]> {
             x.iter().map(|x| x.map(|x| U::from_f64(x.to_f64()))).collect()
@@ -56,7 +57,7 @@ impl<T: Scalar> Rays<T> {
         Rays { origins: all(&self.origins), directions: all(&self.directions), spans: all(&self.spans) }
     }
 
-    /// The rays with these numbers.
+    /// Returns the rays with indices in `range`.
     ///
     /// # Panics
     /// If the range leaves the batch.
@@ -69,49 +70,49 @@ impl<T: Scalar> Rays<T> {
     }
 }
 
-/// Where rays are sampled: `segments` says which rows belong to which ray.
+/// Samples along rays, packed: `segments` assigns rows to rays.
 #[derive(Debug, Clone)]
 pub struct Samples<T: Scalar> {
-    /// Where the rays start, `[rays, 3]`, in scene units.
+    /// Origins of the rays, `[rays, 3]`, in scene units.
     pub origins: Tensor<T>,
     /// Unit viewing directions, `[rays, 3]`.
     pub directions: Tensor<T>,
-    /// Distances along the rays, `[samples]`, rising within a ray.
+    /// Distances `t` along the rays, `[samples]`, in scene units, rising within a ray.
     pub t: Tensor<T>,
-    /// Length of the interval that each sample stands for, `[samples]`. Of the nodes of a rule with two nodes an interval, that of
-    /// the interval that begins at the node, or 0.
+    /// Length of each sample's interval, `[samples]`, in scene units. With two nodes per interval it is the length of the interval
+    /// that begins at the node, or 0.
     pub delta: Tensor<T>,
-    /// The rows of each ray.
+    /// The rows of each ray's samples.
     pub segments: Segments,
 }
 
 impl<T: Scalar> Samples<T> {
-    /// Samples at distances `t`, each standing for an interval of length `delta`.
+    /// Creates samples at distances `t` with intervals of length `delta`, both `[samples]`.
     ///
     /// # Panics
-    /// If there are not as many distances and intervals as rows, or not as many segments as rays.
+    /// If `t` or `delta` does not have one entry per row, or `segments` not one segment per ray.
     pub fn new(rays: &Rays<T>, segments: Segments, t: Tensor<T>, delta: Tensor<T>, pool: &Pool<T>) -> Self {
-        assert_eq!(segments.len(), rays.len(), "one segment for each ray");
+        assert_eq!(segments.len(), rays.len(), "segments must have one entry per ray");
         let rows = |values: &[[T; 3]]| pool.copy_of(&[rays.len(), 3], values.as_flattened());
         let rays = [rows(&rays.origins), rows(&rays.directions)];
         Samples::along(rays, segments, t, delta)
     }
 
-    /// Other samples of the same rays.
+    /// Creates other samples of the same rays.
     ///
     /// # Panics
-    /// If there are not as many distances and intervals as rows, or not as many segments as rays.
+    /// If `t` or `delta` does not have one entry per row, or `segments` not one segment per ray.
     pub fn at(&self, segments: Segments, t: Tensor<T>, delta: Tensor<T>) -> Self {
-        assert_eq!(segments.len(), self.segments.len(), "one segment for each ray");
+        assert_eq!(segments.len(), self.segments.len(), "segments must have one entry per ray");
         Samples::along([self.origins.clone(), self.directions.clone()], segments, t, delta)
     }
 
     fn along([origins, directions]: [Tensor<T>; 2], segments: Segments, t: Tensor<T>, delta: Tensor<T>) -> Self {
-        assert_eq!([t.len(), delta.len()], [segments.rows(); 2], "one distance and one interval for each sample");
+        assert_eq!([t.len(), delta.len()], [segments.rows(); 2], "t and delta must have one entry per sample");
         Samples { origins, directions, t, delta, segments }
     }
 
-    /// Positions `origin + t direction`, `[samples, 3]`, in scene units.
+    /// Returns the positions `origin + t direction`, `[samples, 3]`, in scene units.
     pub fn positions(&self, pool: &Pool<T>) -> Tensor<T> {
         let mut positions = pool.tensor(&[self.len(), 3]);
         let out = positions.as_mut_slice();
@@ -128,10 +129,10 @@ impl<T: Scalar> Samples<T> {
         positions
     }
 
-    /// The samples with these rising numbers; rays keep their number, some without samples.
+    /// Returns the samples with these rising indices; all rays remain, some without samples.
     ///
     /// # Panics
-    /// If a number is out of range.
+    /// If an index is out of range.
     pub fn select(&self, rows: &[u32], pool: &Pool<T>) -> Self {
         let mut offsets = Vec::with_capacity(self.segments.len() + 1);
         offsets.push(0);
@@ -149,10 +150,10 @@ impl<T: Scalar> Samples<T> {
         self.at(Segments::new(offsets), t, delta)
     }
 
-    /// Pieces of some rays, each with the number of its ray and of its samples: a ray for each piece.
+    /// Returns a ray for each of `pieces`: the index of a ray and a range of its rows.
     ///
     /// # Panics
-    /// If a number is out of range.
+    /// If an index is out of range.
     pub fn pieces(&self, pieces: &[(usize, Range<usize>)], pool: &Pool<T>) -> Self {
         let ends = pieces.iter().scan(0, |end, (_, rows)| {
             *end += rows.len() as u32;
@@ -173,7 +174,7 @@ impl<T: Scalar> Samples<T> {
         Samples::along(rays, segments, t, delta)
     }
 
-    /// The same samples in another precision.
+    /// Converts the samples to another precision.
     pub fn cast<U: Scalar>(&self) -> Samples<U> {
         Samples {
             origins: self.origins.cast(),
@@ -184,7 +185,7 @@ impl<T: Scalar> Samples<T> {
         }
     }
 
-    /// Number of samples.
+    /// Returns the number of samples.
     pub fn len(&self) -> usize {
         self.segments.rows()
     }
@@ -195,8 +196,9 @@ impl<T: Scalar> Samples<T> {
     }
 }
 
-/// One sample in each of `count` equal bins between a ray's near and far distance (Mildenhall et al. 2020, equation 2).
-/// Each stands for its bin: with random places that converges faster than the distance to the next sample.
+/// Places one sample in each of `count` equal bins between near and far (Mildenhall et al. 2020, equation 2).
+///
+/// `delta` is the width of the bin. With random places this converges faster than the distance to the next sample.
 pub fn stratified<T: Scalar>(rays: &Rays<T>, count: usize, jitter: &mut Jitter<'_>, pool: &Pool<T>) -> Samples<T> {
     let segments = Segments::uniform(rays.len(), count);
     let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));

@@ -1,4 +1,4 @@
-//! Rotations for poses that are optimised: from rotation vectors, with gradients at every angle.
+//! Rotations from rotation vectors, with gradients at every angle.
 
 use crate::camera::angles::sinc_and_cos_of_root;
 use glam::{DMat3, DVec3};
@@ -35,13 +35,14 @@ pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
     ]
 }
 
-/// The matrix of the rotation by the length of `vector`, in radians, about its direction: that of [`rotation_exp`] bit for bit.
+/// Returns the rotation matrix of a rotation vector, whose length is the angle in radians; equals [`rotation_exp`] bit for bit.
 pub fn rotation_matrix(vector: DVec3) -> DMat3 {
     DMat3::from_cols_array(&exp(vector.to_array())).transpose()
 }
 
-/// Rotation matrices `[.., 3, 3]` for rotation vectors `[.., 3]`: axes whose lengths are angles in radians. The gradient
-/// is finite at every angle, 0 and pi included.
+/// Computes rotation matrices `[.., 3, 3]` from rotation vectors `[.., 3]`, whose lengths are angles in radians.
+///
+/// It is Rodrigues' formula. The gradient is finite at every angle, 0 and pi included.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -54,10 +55,10 @@ pub fn rotation_matrix(vector: DVec3) -> DMat3 {
 /// ```
 ///
 /// # Panics
-/// If the last extent is not 3.
+/// If the last axis is not 3.
 #[track_caller]
 pub fn rotation_exp<'t, T: Scalar>(vectors: &Var<'t, T>) -> Var<'t, T> {
-    assert_eq!(vectors.shape().last(), Some(&3), "rotation vectors of three elements");
+    assert_eq!(vectors.shape().last(), Some(&3), "the last axis of rotation vectors must be 3");
     let [x, y, z] = [0, 1, 2].map(|i| vectors.slice_axis(-1, i..i + 1));
     let parts = record([&x, &y, &z], |vector| exp(vector));
     let shape: Shape = vectors.shape().iter().copied().chain([3]).collect();

@@ -1,4 +1,4 @@
-//! The spiral on which local light field fusion shows captures from one side (Mildenhall et al. 2019).
+//! The spiral camera path of LLFF (Mildenhall et al. 2019).
 
 use super::pinhole::Camera;
 use crate::numbers::mean;
@@ -14,20 +14,21 @@ const LEAST_MEAN: f64 = 0.7;
 /// Cameras of which no more than this share stand farther from the average one, along an axis, than the spiral goes.
 const WITHIN: f64 = 0.9;
 
-/// A camera that winds around a pose and looks at one place.
+/// A spiral path around a pose that looks at one point (LLFF, Mildenhall et al. 2019).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Spiral {
-    /// The pose in its middle.
+    /// The pose at its centre.
     pub pose: DAffine3,
-    /// How far it goes along the axes of that: to the right, up, and to and fro, in scene units.
+    /// Amplitudes along the pose's axes (right, up, back), in scene units.
     pub radii: [f64; 3],
-    /// How far ahead of the middle the place is that cameras look at, in scene units.
+    /// Distance from the centre pose to the point that cameras look at, in scene units.
     pub focus: f64,
 }
 
 impl Spiral {
-    /// Around the average of cameras, as far as nine in ten of them go, with a focus of 1; `None` if there are none, or
-    /// they do not look the same way, so that they have no average.
+    /// Finds a spiral around the average of cameras, with amplitudes that hold nine in ten of them and a focus of 1.
+    ///
+    /// Returns `None` if there are no cameras, or they have no common viewing direction.
     pub fn around(cameras: &[Camera]) -> Option<Self> {
         let mean = |of: fn(&Camera) -> DVec3| mean(cameras.iter().map(of));
         let (back, up) = (mean(|camera| camera.pose.matrix3.z_axis), mean(|camera| camera.pose.matrix3.y_axis));
@@ -42,8 +43,9 @@ impl Spiral {
         Some(Spiral { pose, radii, focus: 1.0 })
     }
 
-    /// `count` poses, all looking at the focus; the last leads to the first. With the radii `r` and an angle `a` they
-    /// are at `(r0 cos a, -r1 sin a, -r2 sin(a / 2))` along the axes of the middle.
+    /// Returns `count` poses that look at the focus; the last leads back to the first.
+    ///
+    /// At the angle `a` the position is `(r0 cos a, -r1 sin a, -r2 sin(a / 2))` along the axes of the centre pose.
     pub fn poses(&self, count: usize) -> Vec<DAffine3> {
         let Spiral { pose, radii: [right, up, back], focus } = *self;
         let target = pose.transform_point3(DVec3::new(0.0, 0.0, -focus));

@@ -1,4 +1,4 @@
-//! What lies behind a scene, and compositing over it.
+//! Backgrounds, and compositing over them.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,7 +10,7 @@ use crate::dataset::image::Image;
 use crate::error::{Error, Result};
 use crate::range::by_name;
 
-/// The background in front of which images with transparency are trained and shown.
+/// The background behind images with alpha, in training and output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
@@ -25,7 +25,7 @@ pub enum Background {
 }
 
 impl Background {
-    /// The colour behind a training ray. Only [`Random`](Self::Random) draws from `rng`: three uniform values in 0..1.
+    /// Returns the colour behind a training ray. Only [`Random`](Self::Random) draws from `rng`: three uniform values, 0 to 1.
     pub fn draw(self, rng: &mut (impl Rng + ?Sized)) -> [f32; 3] {
         match self {
             Background::Random => rng.random(),
@@ -33,7 +33,7 @@ impl Background {
         }
     }
 
-    /// The colour behind images that are shown or measured.
+    /// Returns the colour behind images in output and evaluation.
     pub fn shown(self) -> [f32; 3] {
         match self {
             Background::White | Background::Random => [1.0; 3],
@@ -52,13 +52,12 @@ impl FromStr for Background {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        by_name(text)
-            .ok_or_else(|| Error::setting("background", format!("must be white, black or random, is `{text}`")))
+        by_name(text).ok_or_else(|| Error::setting("background", format!("is `{text}`; use white, black or random")))
     }
 }
 
-/// One pixel over a background colour: `alpha c + (1 - alpha) background` for RGBA, where alpha is not premultiplied;
-/// RGB passes through.
+/// Composites one pixel over a background colour: `alpha c + (1 - alpha) background` for RGBA with straight alpha. RGB passes
+/// through.
 ///
 /// # Panics
 /// If the pixel has neither 3 nor 4 channels.
@@ -70,12 +69,12 @@ pub fn over(pixel: &[f32], background: [f32; 3]) -> [f32; 3] {
             let [below_r, below_g, below_b] = background.map(|value| (1.0 - alpha) * value);
             [alpha * r + below_r, alpha * g + below_g, alpha * b + below_b]
         }
-        _ => panic!("a pixel over a background has 3 or 4 channels, not {}", pixel.len()),
+        _ => panic!("a pixel needs 3 or 4 channels, not {}", pixel.len()),
     }
 }
 
 impl Image {
-    /// The image [over](over()) a background colour: RGB, of the same size.
+    /// Composites the image [over](over()) a background colour: returns RGB of the same size.
     ///
     /// # Panics
     /// If the image has neither 3 nor 4 channels.

@@ -1,4 +1,4 @@
-//! Training rays and what they should show.
+//! Batches of training rays with target colours.
 
 use super::Dataset;
 use super::background::{Background, over};
@@ -6,27 +6,27 @@ use crate::camera::rays::Rays;
 use glam::DVec3;
 use rand::{Rng, RngExt};
 
-/// Rays with what photographs show along them.
+/// A batch of training rays with target colours.
 #[derive(Debug, Clone, Default)]
 pub struct Batch {
     /// The rays.
     pub rays: Rays<f32>,
-    /// For each ray the number of its photograph in the dataset.
+    /// Image index of each ray, `[rays]`.
     pub frames: Vec<u32>,
-    /// For each ray the column and the row of its pixel.
+    /// Pixel (column, row) of each ray, `[rays]`.
     pub pixels: Vec<[u32; 2]>,
-    /// For each ray how far its pixel lies [off the axis](crate::camera::Camera::off_axis).
+    /// [Distance from the optical axis](crate::camera::Camera::off_axis) of each pixel, `[rays]`.
     pub off_axis: Vec<f32>,
-    /// For each ray the [distance](super::Frame::distances) that was measured along it; 0 where none was.
+    /// Measured [distance](super::Frame::distances) along each ray, `[rays]`; 0 where there is none.
     pub distances: Vec<f32>,
-    /// The photographs' colours, over the background where they have alpha.
+    /// Colours of the images, `[rays, 3]`, over the background where they have alpha.
     pub target: Vec<[f32; 3]>,
-    /// The background that each ray is composited over.
+    /// Background of each ray, `[rays, 3]`.
     pub background: Vec<[f32; 3]>,
 }
 
 impl Batch {
-    /// Random pixels of random photographs, with rays that are sampled within the box `bounds`.
+    /// Draws `count` random pixels of random images, with rays clipped to the box `bounds`.
     ///
     /// # Panics
     /// If the dataset has no frames.

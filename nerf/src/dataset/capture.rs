@@ -1,4 +1,4 @@
-//! A capture as its files describe it: cameras and where their images are, before any pixel is read.
+//! Captures: cameras and image paths, before any pixel is read.
 
 use super::Split;
 use crate::camera::pinhole::Camera;
@@ -6,16 +6,16 @@ use glam::{DAffine3, DVec3};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// A way to write cameras and images to a folder.
+/// The file format of a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// NeRF-synthetic: `transforms_train.json` and its like, written by Blender (Mildenhall et al. 2020).
+    /// NeRF-synthetic: `transforms_train.json`, `.._val.json`, `.._test.json`, written by Blender (Mildenhall et al. 2020).
     Blender,
     /// `transforms.json` of instant-ngp and nerfstudio.
     Transforms,
     /// COLMAP's `sparse/0`, binary or text.
     Colmap,
-    /// `poses_bounds.npy` of local light field fusion (Mildenhall et al. 2019).
+    /// `poses_bounds.npy` of LLFF (Mildenhall et al. 2019).
     Llff,
 }
 
@@ -30,77 +30,76 @@ impl fmt::Display for Format {
     }
 }
 
-/// What the files of a capture say. Cameras and points are in the capture's own coordinates.
+/// A capture as its files describe it. Cameras and points are in the capture's own coordinates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Capture {
     /// The folder.
     pub folder: PathBuf,
-    /// The file that holds the cameras: errors name it.
+    /// The file with the cameras, which errors name.
     pub file: PathBuf,
-    /// How it is written.
+    /// The file format.
     pub format: Format,
-    /// Photographs, in the order of the file; those whose image is absent too.
+    /// The images in the order of the file, including those whose file does not exist.
     pub views: Vec<View>,
-    /// Points of the scene that were found when its cameras were, if there are any.
+    /// Sparse points of the scene; may be empty.
     pub points: Vec<Point>,
-    /// The file that they were read from, if there is one.
+    /// The file of the points, if there is one.
     pub points_file: Option<PathBuf>,
-    /// Half the side of the box that holds the scene, in units of instant-ngp's unit cube, if the file says so
-    /// (`aabb_scale`).
+    /// instant-ngp's `aabb_scale`: half the side of the scene box in units of its unit cube, if given.
     pub aabb_scale: Option<f64>,
-    /// From coordinates of before (COLMAP's) to those of this file (nerfstudio's `applied_transform` and `applied_scale`);
-    /// the identity where nothing is said.
+    /// The transform that was applied to the original (COLMAP) coordinates: nerfstudio's `applied_transform` and `applied_scale`.
+    /// The identity if not given.
     pub applied: DAffine3,
 }
 
 impl Capture {
-    /// These photographs, and nothing else.
+    /// Creates a capture of these images, without points.
     pub fn new(folder: &Path, file: PathBuf, format: Format, views: Vec<View>) -> Self {
         let (points, points_file, aabb_scale, applied) = (vec![], None, None, DAffine3::IDENTITY);
         Capture { folder: folder.to_owned(), file, format, views, points, points_file, aabb_scale, applied }
     }
 }
 
-/// One photograph, not yet read.
+/// An image of a capture, not yet read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
-    /// Its name: the path of its image as the file has it, without a leading `./`.
+    /// The name: the image path as in the file, without a leading `./`.
     pub name: String,
-    /// Where the file speaks of it, for errors: `frames[3]`, or `image 17` where there are no names.
+    /// The entry in the file, for errors: `frames[3]` or `image 17`.
     pub field: String,
-    /// Its image, if that exists.
+    /// The image file, if it exists.
     pub image: Option<PathBuf>,
-    /// The camera, for an image of the size that the file speaks of; width and height are 0 where it speaks of none.
+    /// The camera, for the image size in the file; width and height are 0 if it gives none.
     pub camera: Camera,
-    /// The split that the file puts it in, if it says.
+    /// The split, if the file gives it.
     pub split: Option<Split>,
-    /// An image that is black where the photograph is not to be used.
+    /// The mask file, if there is one: black where pixels are not used.
     pub mask: Option<PathBuf>,
-    /// A file of depths along the optical axis, and the length of one of its units in those of the capture.
+    /// A depth file (along the optical axis), and the length of its unit in units of the capture.
     pub depth: Option<(PathBuf, f64)>,
-    /// How sharp the photograph is, in a unit of the program that wrote the file; more is sharper.
+    /// The sharpness in the file, in the writing program's unit; more is sharper.
     pub sharpness: Option<f64>,
-    /// The nearest and farthest depth of points that it shows, if the file says.
+    /// The nearest and farthest depth of visible points, if the file gives them, in units of the capture.
     pub bounds: Option<[f64; 2]>,
 }
 
 impl View {
-    /// A photograph of which nothing is known but its name, where the file speaks of it, and its camera.
+    /// Creates a view with a name, an entry for errors and a camera, and nothing else.
     pub fn new(name: impl Into<String>, field: impl Into<String>, camera: Camera) -> Self {
         let (image, split, mask, depth, sharpness, bounds) = (None, None, None, None, None, None);
         View { name: name.into(), field: field.into(), image, camera, split, mask, depth, sharpness, bounds }
     }
 }
 
-/// A point of the scene.
+/// A sparse point of the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
-    /// Where it is.
+    /// The position, in the capture's coordinates.
     pub position: DVec3,
-    /// Its colour.
+    /// The colour, RGB.
     pub color: [u8; 3],
-    /// How far, in pixels on average, it is from where the photographs show it.
+    /// The mean reprojection error in pixels.
     pub error: f64,
-    /// How many photographs show it.
+    /// Number of images that show it.
     pub views: u32,
 }

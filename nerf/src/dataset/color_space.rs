@@ -1,7 +1,7 @@
-//! The sRGB transfer curve: between linear light, in which light adds up, and code values, in which pictures are stored.
+//! The sRGB transfer curve between linear light and stored values.
 //!
-//! NeRF is trained, and its images are blended, in code values as they stand in files: half of white over black is .5
-//! there, where half of the light would be .735. Use these operations for a model whose colours are light.
+//! NeRF is trained and blended in stored values: half of white over black is 0.5, while half of the light would be 0.735. Use these
+//! operations for a model with linear colours.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
@@ -13,14 +13,14 @@ const SLOPE: f64 = 12.92;
 const OFFSET: f64 = 0.055;
 const EXPONENT: f64 = 2.4;
 
-/// y = 12.92 x up to x = 0.0031308, else 1.055 x^(1/2.4) - 0.055: code values for linear light.
+/// The operation y = 12.92 x up to x = 0.0031308, else 1.055 x^(1/2.4) - 0.055: linear light to sRGB values.
 ///
-/// The line goes on below 0, and the curve beyond 1, so that the gradient is finite everywhere: at most 12.92. (The
-/// standard's rounded constants leave a step of 2.9e-8 at the knee.) NaN stays NaN.
+/// The line extends below 0 and the curve beyond 1, so the gradient is finite everywhere, at most 12.92. The standard's rounded
+/// constants leave a step of 2.9e-8 at the knee. NaN stays NaN.
 #[derive(Debug, Clone, Copy)]
 pub struct SrgbEncode;
 
-/// y = x / 12.92 up to x = 0.04045, else ((x + 0.055) / 1.055)^2.4: linear light for code values, the inverse of
+/// The operation y = x / 12.92 up to x = 0.04045, else ((x + 0.055) / 1.055)^2.4: sRGB values to linear light, the inverse of
 /// [`SrgbEncode`] up to the standard's rounding.
 #[derive(Debug, Clone, Copy)]
 pub struct SrgbDecode;
@@ -68,7 +68,7 @@ impl Formula<1> for SrgbDecode {
     }
 }
 
-/// sRGB code values for linear light, of any shape; see [`SrgbEncode`].
+/// Encodes linear light, of any shape, as sRGB values; see [`SrgbEncode`].
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -84,7 +84,7 @@ pub fn srgb_encode<'t, T: Scalar>(light: &Var<'t, T>) -> Var<'t, T> {
     SrgbEncode.on([light])
 }
 
-/// Linear light for sRGB code values, of any shape; see [`SrgbDecode`].
+/// Decodes sRGB values, of any shape, to linear light; see [`SrgbDecode`].
 #[track_caller]
 pub fn srgb_decode<'t, T: Scalar>(codes: &Var<'t, T>) -> Var<'t, T> {
     SrgbDecode.on([codes])

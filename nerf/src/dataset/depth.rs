@@ -1,4 +1,4 @@
-//! Depths along the optical axis, as files of depths have them: what was measured beside photographs, and what is rendered.
+//! Depth images: reading measured depths, and writing rendered ones.
 
 use super::formats::npy;
 use super::image::Image;
@@ -21,7 +21,7 @@ pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image
     let apart = 2 * (width * rows).abs_diff(height * columns);
     if width == 0 || height == 0 || apart > (width + height).max(rows + columns) {
         return Err(wrong(format!(
-            "has {width}x{height} depths, and its photograph {columns}x{rows} pixels: they must have one shape"
+            "has {width}x{height} depths but the image {columns}x{rows} pixels; use one aspect ratio"
         )));
     }
     let axis = -camera.pose.matrix3.z_axis;
@@ -52,13 +52,12 @@ fn decoded(path: &Path) -> Result<([usize; 2], Vec<f64>)> {
     let values = match decoded {
         DynamicImage::ImageLuma8(image) => image.into_raw().into_iter().map(f64::from).collect(),
         DynamicImage::ImageLuma16(image) => image.into_raw().into_iter().map(f64::from).collect(),
-        _ => return Err(wrong("has colours: depths are one channel of 8 or 16 bits, or a .npy array".into())),
+        _ => return Err(wrong("has colour channels; use one channel of 8 or 16 bits, or a .npy array".into())),
     };
     Ok((size, values))
 }
 
-/// Depths along the optical axis, as sets of photographs with depths have them: what
-/// [`View::depth`](super::View::depth) is read from, 0 where there is nothing.
+/// A depth image along the optical axis, as [`View::depth`](super::View::depth) reads it; 0 where there is no depth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Depths {
     size: [usize; 2],
@@ -67,7 +66,7 @@ pub struct Depths {
 }
 
 impl Depths {
-    /// Whether a file holds depths, as training reads them.
+    /// Checks that training can read a depth file.
     ///
     /// # Errors
     /// If it cannot be read or decoded.
@@ -75,8 +74,9 @@ impl Depths {
         decoded(path.as_ref()).map(drop)
     }
 
-    /// Of distances along the rays of a camera's pixels, as a [`Render`](crate::Render) has them, each multiplied by
-    /// `scale`: 1 over the [scale of the placement](super::SceneTransform::scale) gives them in units of the capture.
+    /// Converts distances along rays, as a [`Render`](crate::Render) has them, to depths, and multiplies them by `scale`.
+    ///
+    /// A `scale` of 1 over [`SceneTransform::scale`](super::SceneTransform::scale) gives units of the capture.
     ///
     /// # Panics
     /// If the image is not one channel of the camera's size.
@@ -94,8 +94,8 @@ impl Depths {
         Depths { size: [camera.width, camera.height], values }
     }
 
-    /// A PNG of one channel of 16 bits, in units of length `unit`, rounded; and how many depths are too great for it,
-    /// of which it has 0.
+    /// Encodes a 16-bit PNG of one channel, in multiples of `unit`, rounded. Also returns the number of depths that do not fit and
+    /// are written as 0.
     ///
     /// # Panics
     /// If it has no pixels.
@@ -120,7 +120,7 @@ impl Depths {
         (bytes.into_inner(), beyond)
     }
 
-    /// A `.npy` file of an array `[height, width]` of f32.
+    /// Encodes a `.npy` file of an f32 array `[height, width]`.
     pub fn to_npy(&self) -> Vec<u8> {
         let [width, height] = self.size;
         npy::write_single([height, width], &self.values)

@@ -1,4 +1,4 @@
-//! Photographs with their cameras, and the region that they show.
+//! Images with cameras, and the region of the scene that they show.
 
 use super::image::Image;
 use super::mask::Mask;
@@ -19,13 +19,13 @@ use std::str::FromStr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// What the images of a part of a dataset are for.
+/// The split of a dataset: training, validation or test.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// Images to fit.
+    /// Images to train on.
     Train,
-    /// Images to watch progress and choose settings by.
+    /// Images to validate progress and choose settings.
     Val,
     /// Images to report results on.
     Test,
@@ -35,7 +35,7 @@ impl Split {
     /// All splits.
     pub const ALL: [Split; 3] = [Split::Train, Split::Val, Split::Test];
 
-    /// The name that files and the command line use: `train`, `val` or `test`.
+    /// Returns the name in files and on the command line: `train`, `val` or `test`.
     pub fn name(self) -> &'static str {
         match self {
             Split::Train => "train",
@@ -55,53 +55,53 @@ impl FromStr for Split {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        let wrong = || Error::setting("split", format!("must be train, val or test, is `{text}`"));
+        let wrong = || Error::setting("split", format!("is `{text}`; use train, val or test"));
         by_name(text).ok_or_else(wrong)
     }
 }
 
-/// One photograph.
+/// An image with its camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
-    /// Its name in the dataset, such as `train/r_0`.
+    /// The name in the dataset, such as `train/r_0`.
     pub name: String,
-    /// The camera that took it, for the size that the image has here.
+    /// The camera, for the size of `image`.
     pub camera: Camera,
-    /// The picture: RGB or RGBA as in the file.
+    /// The pixels: RGB or RGBA as in the file.
     pub image: Photo,
-    /// Which of its pixels are used; all, where there is none.
+    /// The mask of used pixels; `None` uses all.
     pub mask: Option<Arc<Mask>>,
-    /// What was measured beside it, if anything, for the term [`depth`](crate::losses::DepthConfig) of the loss: one channel
-    /// of the same size, the distance along the ray through each pixel's centre in scene units, and 0 where it is not known.
+    /// Measured distances for the [depth loss](crate::losses::DepthConfig): one channel of the same size, along the ray through each
+    /// pixel's centre, in scene units; 0 where unknown.
     pub distances: Option<Image>,
 }
 
-/// The photographs of one split, and the region of space that they show.
+/// The images of one split, with the scene box, near and far plane.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
-    /// At least one photograph, in the order of the file.
+    /// The images, at least one, in the order of the file.
     pub frames: Vec<Frame>,
-    /// Least and greatest corner of an axis-aligned box that holds the scene, in scene units.
+    /// Lower and upper corner of the scene box, in scene units.
     pub bounds: [DVec3; 2],
-    /// Distance along a ray, in scene units, before which there is nothing.
+    /// Near plane: distance along a ray, in scene units.
     pub near: f64,
-    /// Distance along a ray, in scene units, beyond which there is nothing.
+    /// Far plane: distance along a ray, in scene units.
     pub far: f64,
-    /// How far the scene goes.
+    /// Bounded, unbounded or forward-facing.
     pub scope: SceneType,
-    /// What all photographs of the capture show, those of other splits too, where they [look the same way](SceneType::ForwardFacing).
+    /// The NDC frustum of all images of the capture, other splits included, if it is [forward-facing](SceneType::ForwardFacing).
     pub ndc: Option<Ndc>,
-    /// From the coordinates of the files to those of the scene, in which everything here is.
+    /// The transform from the files' coordinates to those of the scene, which all fields use.
     pub placement: SceneTransform,
-    /// Names of photographs that the dataset lists but whose image files are absent. They were left out; a caller
-    /// should say so.
+    /// Names of listed images whose files do not exist. They were left out; callers should report them.
     pub skipped: Vec<String>,
 }
 
 impl Dataset {
-    /// How many pixels of the photographs lie side by side along the longest side of the scene's box where they show its middle:
-    /// the median over photographs. One that was taken from within the box counts as if its camera stood at its side. Where
-    /// all [look the same way](Self::ndc), those are counted that lie across the picture of all they see, at that depth.
+    /// Returns the number of pixels along the longest side of the scene box, seen at its centre: the median over images.
+    ///
+    /// A camera inside the box counts as if it stood at its side. For a forward-facing scene it counts the pixels across the
+    /// [NDC frustum](Self::ndc) at that depth.
     pub fn pixels_per_side(&self) -> f64 {
         let [lower, upper] = self.bounds;
         let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
@@ -120,16 +120,16 @@ impl Dataset {
         median(each)
     }
 
-    /// Whether some image has transparency and so needs a [background](crate::dataset::background).
+    /// Returns whether an image has an alpha channel and so needs a [background](crate::dataset::background).
     pub fn has_alpha(&self) -> bool {
         self.frames.iter().any(|frame| frame.image.has_alpha())
     }
 
-    /// Whether [distances](Frame::distances), where there are some, fit their photographs, and there are some if they are
-    /// `needed`.
+    /// Checks the [distances](Frame::distances) of all images; with `needed`, at least one image must have some.
     ///
     /// # Errors
-    /// If they are of another size, have several channels, or are no lengths; or are needed and there are none.
+    /// If distances have another size than their image or several channels, if one is negative or not finite, or if they are needed
+    /// and missing.
     pub fn check_distances(&self, needed: bool) -> Result<()> {
         let mut found = false;
         for Frame { name, image, distances, .. } in &self.frames {
@@ -138,26 +138,26 @@ impl Dataset {
             let [own, other] =
                 [[image.width, image.height, 1], [distances.width, distances.height, distances.channels]];
             if own != other {
-                let what = format!("has distances of {other:?} columns, rows and channels, and not {own:?}");
+                let what = format!("has distances of shape {other:?} (columns, rows, channels); use {own:?}");
                 return Err(Error::setting(name.clone(), what));
             }
             if let Some(bad) = distances.data.iter().find(|x| !(x.is_finite() && **x >= 0.0)) {
-                let what = format!("has the distance {bad}; use lengths in scene units, and 0 where nothing is known");
+                let what = format!("has the distance {bad}; use lengths in scene units, and 0 where unknown");
                 return Err(Error::setting(name.clone(), what));
             }
         }
         if needed && !found {
-            let what = "one needs photographs with depths that were measured, and there are none: `depth_file_path` of \
-                        transforms.json names their files, and a program sets `Frame::distances`";
+            let what = "a term needs measured depths, but no image has any; name the files in `depth_file_path` of \
+            transforms.json, or set `Frame::distances`";
             return Err(Error::setting("loss_terms", what));
         }
         Ok(())
     }
 
-    /// Whether the photographs show anything of the box `bounds` at all, within which rays are sampled.
+    /// Checks that the images show a part of the box `bounds`, within which rays are sampled.
     ///
     /// # Errors
-    /// If no ray of any photograph meets the box between `near` and `far`: nothing could ever be learned.
+    /// If no ray of any image meets the box between `near` and `far`, so that nothing could be learned.
     pub fn check_reach(&self, bounds: [DVec3; 2]) -> Result<()> {
         /// Rays that are tried along each side of an image, before all.
         const RAYS: usize = 32;
@@ -177,9 +177,9 @@ impl Dataset {
         let distances = self.frames.iter().map(|frame| frame.camera.pose.translation.distance(0.5 * (low + high)));
         let mean = distances.sum::<f64>() / self.frames.len().max(1) as f64;
         let what = format!(
-            "no ray of the {} photographs meets the box from {low} to {high} between the distances {} and {} from its \
-             camera; the cameras are {mean:.3} from its middle on average: scale and move their positions to where the \
-             scene lies in the box",
+            "no ray of the {} images meets the box from {low} to {high} between the near plane {} and the far plane {}; \
+            the cameras are {mean:.3} from its centre on average: scale and move their positions so that the box \
+            holds the scene",
             self.frames.len(),
             self.near,
             self.far
@@ -188,8 +188,7 @@ impl Dataset {
     }
 }
 
-/// At most `count` of the items, in order and evenly spaced from the first: of `n` items those numbered `i n / count`,
-/// rounded down.
+/// Returns at most `count` of the items, in order and evenly spaced: of `n` items those with index `i n / count`, rounded down.
 pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
     let (n, count) = (items.len(), count.min(items.len()));
     let mut wanted = (0..count).map(|i| i * n / count).peekable();

@@ -1,61 +1,69 @@
-//! Images in memory: rows of f32 channels.
+//! Float images in memory.
 
 use super::average::average;
 
-/// An image of `channels` values a pixel, row by row from the top.
+/// An image of f32 values, row by row from the top, `[height, width, channels]`.
 ///
-/// Colours keep the transfer curve of the file they came from (sRGB for PNG and JPEG) and lie in 0..=1: that is the
-/// space in which NeRF is trained and measured. Alpha, where there is a fourth channel, is not premultiplied.
+/// Colours keep the transfer curve of their file (sRGB for PNG and JPEG) and lie in 0 to 1; NeRF is trained and evaluated in that
+/// space. Alpha, the fourth channel, is straight (not premultiplied).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Image {
-    /// Pixels in a row.
+    /// Width in pixels.
     pub width: usize,
-    /// Number of rows.
+    /// Height in pixels.
     pub height: usize,
-    /// Values in a pixel: 1 grey, 3 RGB, 4 RGBA.
+    /// Values per pixel: 1 grey, 3 RGB, 4 RGBA.
     pub channels: usize,
     /// `height * width * channels` values.
     pub data: Vec<f32>,
 }
 
 impl Image {
-    /// An image of zeros.
+    /// Creates an image of zeros.
     pub fn new(width: usize, height: usize, channels: usize) -> Self {
         Image { width, height, channels, data: vec![0.0; width * height * channels] }
     }
 
-    /// The channels of the pixel in column `x` and row `y`.
+    /// Returns the channels of the pixel in column `x` and row `y`.
     ///
     /// # Panics
     /// If the pixel lies outside the image.
     pub fn pixel(&self, x: usize, y: usize) -> &[f32] {
-        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} image", self.width, self.height);
+        assert!(
+            x < self.width && y < self.height,
+            "pixel ({x}, {y}) is outside of the {}x{} image",
+            self.width,
+            self.height
+        );
         let start = (y * self.width + x) * self.channels;
         &self.data[start..start + self.channels]
     }
 
-    /// As [`pixel`](Self::pixel), for writing.
+    /// Returns the channels of the pixel in column `x` and row `y`, mutably.
     ///
     /// # Panics
     /// If the pixel lies outside the image.
     pub fn pixel_mut(&mut self, x: usize, y: usize) -> &mut [f32] {
-        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} image", self.width, self.height);
+        assert!(
+            x < self.width && y < self.height,
+            "pixel ({x}, {y}) is outside of the {}x{} image",
+            self.width,
+            self.height
+        );
         let start = (y * self.width + x) * self.channels;
         &mut self.data[start..start + self.channels]
     }
 
-    /// The image at `1 / factor` of its size: each pixel is the average of a box of `factor x factor` pixels.
+    /// Downscales by an integer factor: each pixel is the average of `factor x factor` pixels.
     ///
-    /// In an RGBA image colours are weighted by their alpha, so what hides in transparent pixels does not bleed into
-    /// their neighbours; a box that is wholly transparent becomes zero.
+    /// RGBA colours are weighted by alpha, so colours of transparent pixels do not bleed. A fully transparent box becomes zero.
     ///
     /// # Panics
-    /// If `factor` is 0 or does not divide both the width and the height. (Cropping instead would change what the
-    /// camera of the image sees.)
+    /// If `factor` is 0 or does not divide both the width and the height. (Cropping would change the camera's field of view.)
     #[track_caller]
     pub fn downscaled(&self, factor: usize) -> Image {
         let divides = factor > 0 && self.width.is_multiple_of(factor) && self.height.is_multiple_of(factor);
-        assert!(divides, "a factor of {factor} does not divide a {}x{} image", self.width, self.height);
+        assert!(divides, "the factor {factor} must divide both sides of a {}x{} image", self.width, self.height);
         if factor == 1 {
             return self.clone();
         }
@@ -65,18 +73,18 @@ impl Image {
         Image { width: small[0], height: small[1], channels, data }
     }
 
-    /// Images side by side, from left to right.
+    /// Concatenates images side by side, from left to right.
     ///
     /// # Panics
     /// If there are none, or if their heights or channels differ.
     #[track_caller]
     pub fn hconcat(images: &[&Image]) -> Image {
-        assert!(!images.is_empty(), "no images to put side by side");
+        assert!(!images.is_empty(), "there must be at least one image");
         let (height, channels) = (images[0].height, images[0].channels);
         for other in images {
             assert!(
                 other.height == height && other.channels == channels,
-                "images side by side need one height and one number of channels"
+                "images side by side must have one height and one number of channels"
             );
         }
         let width = images.iter().map(|i| i.width).sum();
@@ -90,11 +98,11 @@ impl Image {
         Image { width, height, channels, data }
     }
 
-    /// Stops at the caller's line unless both images have one shape.
+    /// Panics at the caller's line unless both images have one shape.
     #[track_caller]
     pub(crate) fn assert_same_shape(&self, other: &Image) {
         let shape = |i: &Image| [i.height, i.width, i.channels];
-        assert_eq!(shape(self), shape(other), "the images differ in height, width or channels");
+        assert_eq!(shape(self), shape(other), "images must have the same height, width and channels");
     }
 }
 

@@ -1,4 +1,4 @@
-//! From a capture to photographs in memory.
+//! Loading of a capture's images.
 
 use super::capture::{Capture, Format, View};
 use super::depth::distances;
@@ -30,17 +30,16 @@ const WHITE_BORDER: f64 = 0.98;
 /// How much of a pixel of a mask must be white for it to be used.
 pub(super) const WHITE: f32 = 0.99;
 
-/// How photographs are read.
+/// Options of [`Capture::load`].
 #[derive(Clone, Copy)]
 pub struct LoadOptions<'a> {
-    /// The number that their width and height are divided by, rounded: a pixel is the mean of what it covers.
+    /// Divisor of width and height, at least 1; pixels are area averages.
     pub downscale: usize,
-    /// How many of them are read at most, [evenly spaced](evenly_spaced).
+    /// Maximum number of images, [evenly spaced](evenly_spaced), at least 1.
     pub views: usize,
-    /// Whether [distances](Frame::distances) are read too, of the photographs that have a [file of depths](View::depth):
-    /// four bytes a pixel.
+    /// Whether to read [distances](Frame::distances) from [depth files](View::depth), which take four bytes per pixel.
     pub distances: bool,
-    /// Is told how many are read, of how many; from several threads.
+    /// Progress callback `(read, total)`, in images; called from several threads.
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
 }
 
@@ -51,11 +50,11 @@ impl Default for LoadOptions<'_> {
 }
 
 impl LoadOptions<'_> {
-    /// Whether the numbers are usable.
+    /// Checks that all values are in range.
     pub(super) fn check(&self) -> Result<()> {
         for (name, value) in [("views", self.views), ("downscale", self.downscale)] {
             if value == 0 {
-                return Err(Error::setting(name, "must be 1 or more, is 0"));
+                return Err(Error::setting(name, "is 0; use 1 or more"));
             }
         }
         Ok(())
@@ -63,13 +62,13 @@ impl LoadOptions<'_> {
 }
 
 impl Capture {
-    /// What the files of a folder say: its format is found out, and where they put no photograph in a split, this does: sorted
-    /// by name, every eighth of them is held out to [test](Split::Test) on, from the first, whether its image exists or not;
-    /// all others are to train on. If they say only what to train on, the others are to test on.
+    /// Reads the cameras of a folder in any [format](super::formats), without decoding images.
+    ///
+    /// Without splits in the files, every eighth image by name, from the first, is held out as [test](Split::Test) image, whether its
+    /// file exists or not; the others are training images. If the files list only training images, the others are test images.
     ///
     /// # Errors
-    /// If the folder is absent or of no known format, or a file has a bad field; if a photograph is to be trained and tested
-    /// on.
+    /// If the folder is absent or has no known format, a file has a bad field, or an image is in both the training and the test split.
     pub fn read(folder: impl AsRef<Path>) -> Result<Capture> {
         let folder = folder.as_ref();
         if !folder.is_dir() {
@@ -95,8 +94,7 @@ impl Capture {
         }
     }
 
-    /// Whether the photographs that are held out are those that [`read`](Self::read) holds out where files say nothing:
-    /// every eighth by name, from the first.
+    /// Returns whether the held-out images are every eighth by name, as [`read`](Self::read) chooses without splits in the files.
     pub fn holds_out_every_eighth(&self) -> bool {
         let mut views: Vec<&View> = self.views.iter().collect();
         views.sort_by(|a, b| a.name.cmp(&b.name));
@@ -110,15 +108,17 @@ impl Capture {
         let trained: HashMap<&PathBuf, &View> = train.filter_map(|view| Some((view.image.as_ref()?, view))).collect();
         for view in self.present().filter(|view| view.split != Some(Split::Train)) {
             if let Some(other) = view.image.as_ref().and_then(|image| trained.get(image)) {
-                let what = format!("the image `{}` is to be tested on and is trained on as {}", view.name, other.field);
+                let what = format!(
+                    "`{}` is held out, but its image is trained on as {}: remove one of them",
+                    view.name, other.field
+                );
                 return Err(Error::field(&self.file, &view.field, what));
             }
         }
         Ok(())
     }
 
-    /// The photographs of a split. A capture that holds out one set alone has it for [`Split::Val`] and for
-    /// [`Split::Test`].
+    /// Returns the images of a split. A capture with a single held-out set returns it for [`Split::Val`] and [`Split::Test`].
     ///
     /// # Errors
     /// If there is none.
@@ -134,15 +134,15 @@ impl Capture {
             found = of(other);
         }
         if found.is_empty() {
-            return Err(Error::file(&self.file, format!("has no {split} photographs")));
+            return Err(Error::file(&self.file, format!("has no {split} images")));
         }
         Ok(found)
     }
 
-    /// How the scene lies in the capture; `asked` overrules how far it goes.
+    /// Finds the scene transform, type, box, near and far plane from cameras and a few images; `asked` overrides the type.
     ///
     /// # Errors
-    /// If an image that has an alpha channel cannot be read, or as [`SceneAnalysis::new`].
+    /// If an image with an alpha channel cannot be read, or as [`SceneAnalysis::new`].
     pub fn analyze_scene(&self, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let looked_at = evenly_spaced(self.present().collect(), LOOKED_AT);
         let ([mut clear, mut white, mut alpha], total) = ([0; 3], looked_at.len());
@@ -163,37 +163,40 @@ impl Capture {
             }
         }
         let empty = match (2 * clear > total, white == total) {
-            (true, _) => Some("photographs are transparent where there is nothing"),
-            (_, true) => Some("photographs show an object before white"),
+            (true, _) => Some("images have a transparent background"),
+            (_, true) => Some("images show an object before white"),
             // That is how the format has objects.
-            _ if 2 * alpha > total && self.format == Format::Blender => Some("photographs have alpha"),
+            _ if 2 * alpha > total && self.format == Format::Blender => Some("images have alpha"),
             _ => None,
         };
         SceneAnalysis::new(self, empty, asked)
     }
 
-    /// Reads one photograph, in its own size, as its camera has taken it: without its mask, and whatever a survey says.
+    /// Reads one image at full size, in the orientation of its camera, without its mask.
     ///
     /// # Errors
-    /// If its image does not exist, cannot be decoded or is of another shape than its camera.
+    /// If the image does not exist, cannot be decoded or has another aspect ratio than its camera.
     pub fn photo(&self, view: &View) -> Result<Photo> {
         let Some(path) = &view.image else { return Err(Error::file(&view.name, "does not exist")) };
         self.named(view, open(path, &view.camera))
     }
 
-    /// Reads the photographs of a split, in parallel, and puts their cameras where the survey says.
+    /// Reads the images of a split, in parallel, and maps their cameras to the scene by `survey`.
     ///
     /// # Errors
-    /// If the split has none whose image exists, an image cannot be decoded or is of another shape than its camera, or
-    /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. A single absent image is
-    /// no error: see [`Dataset::skipped`].
+    /// If none of the split's images exists, an image cannot be decoded or has another aspect ratio than its camera, or `downscale` or
+    /// `views` is 0. Which of several errors is reported does not depend on timing. Single absent images are not an
+    /// error: see [`Dataset::skipped`].
     pub fn load(&self, split: Split, survey: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
         reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
             self.split(split)?.into_iter().partition(|view| view.image.is_some());
         if present.is_empty() {
             let first = &absent[0];
-            let what = format!("none of the {split} images exists, not even that of the first, `{}`", first.name);
+            let what = format!(
+                "none of the {split} images exists (the first is `{}`); correct the paths or copy the images there",
+                first.name
+            );
             return Err(Error::field(&self.file, &first.field, what));
         }
         let present = evenly_spaced(present, reading.views);
@@ -257,7 +260,10 @@ impl<'a> Plan<'a> {
             (given, lit) => given.map(Arc::new).or(lit),
         };
         if mask.as_ref().is_some_and(|mask| mask.used() == 0) {
-            return Err(Error::file(path, "shows nothing: all of its pixels are masked, or not reached by light"));
+            return Err(Error::file(
+                path,
+                "has no usable pixel: all are masked or outside of the lens; correct its mask or remove it",
+            ));
         }
         let camera = placement.camera(&camera);
         let measured = view.depth.as_ref().filter(|_| is_measured);
@@ -271,7 +277,7 @@ pub(super) fn size_for(path: &Path, camera: &Camera) -> Result<[usize; 2]> {
     let [stored, shown] = Photo::size_of_file(path)?;
     [stored, shown].into_iter().find(|size| same_shape(*size, camera)).ok_or_else(|| {
         let (Camera { width, height, .. }, [w, h]) = (camera, stored);
-        let what = format!("has {w}x{h} pixels, and its camera is for {width}x{height}: they must have one shape");
+        let what = format!("has {w}x{h} pixels but its camera {width}x{height}; use one aspect ratio");
         Error::file(path, what)
     })
 }
@@ -318,7 +324,7 @@ fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
     let shape = (mask.width * of[1]).abs_diff(mask.height * of[0]) <= of[0].max(of[1]);
     if !shape || mask.width < width || mask.height < height {
         let what = format!(
-            "has {}x{} pixels, and its photograph {}x{}: it must be as large, or the same at another scale",
+            "has {}x{} pixels but its image {}x{}; use one aspect ratio",
             mask.width, mask.height, of[0], of[1]
         );
         return Err(Error::file(path, what));

@@ -1,8 +1,8 @@
-//! Which pixels of a photograph are used.
+//! Masks of used pixels.
 
 use rand::{Rng, RngExt};
 
-/// Which pixels of a photograph are used: the others are neither trained on nor compared with.
+/// A mask of the pixels of an image that training and evaluation use.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Mask {
     width: usize,
@@ -15,7 +15,7 @@ pub struct Mask {
 }
 
 impl Mask {
-    /// The pixels, column and row, for which `used` is true.
+    /// Creates a mask of the pixels (column, row) for which `used` is true.
     pub fn new(width: usize, height: usize, used: impl Fn(usize, usize) -> bool) -> Self {
         let mut words = vec![0_u64; (width * height).div_ceil(64)];
         for pixel in (0..width * height).filter(|pixel| used(pixel % width, pixel / width)) {
@@ -29,32 +29,37 @@ impl Mask {
         Mask { width, height, words, before, used: count as usize }
     }
 
-    /// Width and height.
+    /// Returns width and height.
     pub fn size(&self) -> [usize; 2] {
         [self.width, self.height]
     }
 
-    /// How many pixels are used.
+    /// Returns the number of used pixels.
     pub fn used(&self) -> usize {
         self.used
     }
 
-    /// Whether a pixel is used.
+    /// Returns whether a pixel is used.
     ///
     /// # Panics
-    /// If it lies outside of the photograph.
+    /// If it lies outside of the image.
     pub fn uses(&self, x: usize, y: usize) -> bool {
-        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} mask", self.width, self.height);
+        assert!(
+            x < self.width && y < self.height,
+            "pixel ({x}, {y}) is outside of the {}x{} mask",
+            self.width,
+            self.height
+        );
         let pixel = y * self.width + x;
         self.words[pixel / 64] >> (pixel % 64) & 1 == 1
     }
 
-    /// A random one of the pixels that are used, column and row, each as likely as the others.
+    /// Draws a uniformly random used pixel (column, row).
     ///
     /// # Panics
     /// If none is used.
     pub fn draw(&self, rng: &mut (impl Rng + ?Sized)) -> [usize; 2] {
-        assert!(self.used > 0, "no pixel of this photograph is used");
+        assert!(self.used > 0, "the mask has no used pixel");
         let number = rng.random_range(0..self.used) as u32;
         let word = self.before.partition_point(|before| *before <= number) - 1;
         let mut left = self.words[word];

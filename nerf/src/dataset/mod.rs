@@ -1,6 +1,7 @@
-//! Photographs with camera poses, read from a folder.
+//! Datasets: images with cameras, read from a folder.
 //!
-//! Each format has a file of its own here, and [`load`] recognises which one a folder holds.
+//! Start with [`load`], which recognises the [format](formats). [`Capture::read`] reads only cameras, to be analysed
+//! ([`Capture::analyze_scene`]) and loaded ([`Capture::load`]) step by step.
 
 mod average;
 pub mod background;
@@ -40,11 +41,13 @@ use std::path::Path;
 
 use crate::error::Result;
 
-/// Reads one split of the dataset in `folder`, its images [averaged](Photo::resized) down by the factor `downscale` (1 keeps
-/// them): [`Capture::read`], [`Capture::analyze_scene`] and [`Capture::load`] in one.
+/// Reads one split of the dataset in `folder`, with images [averaged](Photo::resized) down by the factor `downscale` (1 keeps
+/// them).
+///
+/// It combines [`Capture::read`], [`Capture::analyze_scene`] and [`Capture::load`].
 ///
 /// # Errors
-/// As these. Every error names the file and the field. A single absent image is no error: see [`Dataset::skipped`].
+/// As these; every error names the file and the field. Single absent images are not an error: see [`Dataset::skipped`].
 pub fn load(folder: impl AsRef<Path>, split: Split, downscale: usize) -> Result<Dataset> {
     let reading = LoadOptions { downscale, ..LoadOptions::default() };
     reading.check()?;

@@ -1,4 +1,4 @@
-//! Photographs in memory, in the integers that their files hold.
+//! Images in memory with the integers of their files.
 
 use super::average::{Stored, average};
 use super::background::over;
@@ -14,22 +14,21 @@ mod resample;
 pub(crate) mod save;
 pub(crate) mod sharpness;
 
-/// A photograph of RGB or RGBA values. A pixel takes three or four bytes, or twice as many where the file has 16 bits.
+/// An RGB or RGBA image with the integers of its file: three or four bytes per pixel, twice that for 16 bits.
 ///
-/// Colours keep the transfer curve of the file that they came from (sRGB for PNG, JPEG and WebP). Alpha, where there is
-/// some, is not premultiplied.
+/// Colours keep the transfer curve of their file (sRGB for PNG, JPEG and WebP). Alpha is straight (not premultiplied).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Photo {
-    /// Pixels in a row.
+    /// Width in pixels.
     pub width: usize,
-    /// Number of rows.
+    /// Height in pixels.
     pub height: usize,
-    /// Values in a pixel: 3 for RGB, 4 for RGBA.
+    /// Values per pixel: 3 for RGB, 4 for RGBA.
     pub channels: usize,
     values: Values,
 }
 
-/// What a photograph holds, row by row from the top.
+/// The values, row by row from the top.
 #[derive(Debug, Clone, PartialEq)]
 enum Values {
     Bytes(Vec<u8>),
@@ -38,7 +37,7 @@ enum Values {
 }
 
 impl From<Image> for Photo {
-    /// Grey becomes three equal channels. The values stay floats, of 12 or 16 bytes a pixel.
+    /// Converts an image, keeping floats (12 or 16 bytes per pixel). Grey becomes three equal channels.
     ///
     /// # Panics
     /// If the image has not 1, 3 or 4 channels.
@@ -47,20 +46,21 @@ impl From<Image> for Photo {
         let (channels, data) = match channels {
             1 => (3, data.into_iter().flat_map(|x| [x; 3]).collect()),
             3 | 4 => (channels, data),
-            _ => panic!("a photograph has 1, 3 or 4 channels, not {channels}"),
+            _ => panic!("an image needs 1, 3 or 4 channels, not {channels}"),
         };
         Photo { width, height, channels, values: Values::Floats(data) }
     }
 }
 
 impl Photo {
-    /// Reads a PNG, JPEG or WebP file, whichever its contents say it is: RGBA if it has transparency, otherwise RGB; turned
-    /// as its EXIF orientation says. But where `size`, the width and height that a camera was measured for, is that of the
-    /// file's pixels as they are stored, so are the pixels: programs that find cameras look at these.
+    /// Reads a PNG, JPEG or WebP file, by its contents: RGBA if it has transparency, otherwise RGB.
+    ///
+    /// It applies the EXIF orientation, unless `size`, the width and height of the camera, is that of the stored pixels: programs that
+    /// calibrate cameras use these.
     ///
     /// # Errors
-    /// If the file cannot be read or decoded, or says that it has more than 2^28 pixels, or than 64 MiB and 16 KiB for each of its bytes;
-    /// the error names it.
+    /// If the file cannot be read or decoded, or claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte of the file. The
+    /// error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder(path)?;
@@ -86,25 +86,25 @@ impl Photo {
         Photo { width, height, channels, values }
     }
 
-    /// Width and height of an image file, as it is stored and as it is shown, read from its header alone.
+    /// Reads `[width, height]` of an image file from its header: as stored, and after the EXIF orientation.
     ///
     /// # Errors
-    /// If the file cannot be read, is no image or has more than 2^28 pixels.
+    /// If the file cannot be read, is not an image or has more than 2^28 pixels.
     pub fn size_of_file(path: impl AsRef<Path>) -> Result<[[usize; 2]; 2]> {
         let (mut decoder, stored) = decoder(path.as_ref())?;
         let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
         Ok([stored, turned_size(stored, turn)])
     }
 
-    /// Whether an image file has an alpha channel, from its header alone.
+    /// Reads from its header whether an image file has an alpha channel.
     ///
     /// # Errors
-    /// If the file cannot be read or is no image.
+    /// If the file cannot be read or is not an image.
     pub fn file_has_alpha(path: impl AsRef<Path>) -> Result<bool> {
         Ok(decoder(path.as_ref())?.0.color_type().has_alpha())
     }
 
-    /// The share of pixels that are wholly transparent.
+    /// Returns the share of fully transparent pixels, 0 to 1.
     pub fn transparent_share(&self) -> f64 {
         let clear = self.pixels().filter(|pixel| pixel[3] == 0.0);
         if self.has_alpha() { clear.count() as f64 / (self.width * self.height).max(1) as f64 } else { 0.0 }
@@ -123,12 +123,17 @@ impl Photo {
         white as f64 / f64::from(count.max(1))
     }
 
-    /// A pixel as red, green, blue and alpha in 0..=1; alpha is 1 where there is none.
+    /// Returns a pixel as RGBA, 0 to 1; alpha is 1 without an alpha channel.
     ///
     /// # Panics
-    /// If the pixel lies outside the photograph.
+    /// If the pixel lies outside of the image.
     pub fn pixel(&self, x: usize, y: usize) -> [f32; 4] {
-        assert!(x < self.width && y < self.height, "pixel ({x}, {y}) of a {}x{} photograph", self.width, self.height);
+        assert!(
+            x < self.width && y < self.height,
+            "pixel ({x}, {y}) is outside of the {}x{} image",
+            self.width,
+            self.height
+        );
         let start = (y * self.width + x) * self.channels;
         match &self.values {
             Values::Bytes(values) => rgba(&values[start..start + self.channels]),
@@ -137,17 +142,17 @@ impl Photo {
         }
     }
 
-    /// All [pixels](Self::pixel), row by row.
+    /// Returns all [pixels](Self::pixel), row by row.
     pub fn pixels(&self) -> impl Iterator<Item = [f32; 4]> {
         (0..self.height).flat_map(move |y| (0..self.width).map(move |x| self.pixel(x, y)))
     }
 
-    /// Whether there is an alpha channel.
+    /// Returns whether there is an alpha channel.
     pub fn has_alpha(&self) -> bool {
         self.channels == 4
     }
 
-    /// Bytes that the pixels take.
+    /// Returns the size of the pixels in bytes.
     pub fn bytes(&self) -> usize {
         match &self.values {
             Values::Bytes(values) => values.len(),
@@ -156,7 +161,7 @@ impl Photo {
         }
     }
 
-    /// The same as an image of floats.
+    /// Converts to floats, 0 to 1.
     pub fn to_image(&self) -> Image {
         let data = match &self.values {
             Values::Bytes(values) => values.iter().map(|x| x.unit()).collect(),
@@ -166,24 +171,22 @@ impl Photo {
         Image { width: self.width, height: self.height, channels: self.channels, data }
     }
 
-    /// The photograph over a background colour: RGB, of the same size.
+    /// Composites over a background colour: returns RGB of the same size.
     pub fn over(&self, background: [f32; 3]) -> Image {
         let data = self.pixels().flat_map(|pixel| over(&pixel, background)).collect();
         Image { width: self.width, height: self.height, channels: 3, data }
     }
 
-    /// The photograph at another, smaller size: each pixel is the mean over the part of the photograph that it covers, whole
-    /// pixels or parts of them, rounded to the integers of the file.
+    /// Downsizes by area averaging, rounded to the integers of the file.
     ///
-    /// In an RGBA photograph colours are weighted by their alpha, so what hides in transparent pixels does not bleed into
-    /// their neighbours; what is wholly transparent becomes zero.
+    /// RGBA colours are weighted by alpha, so colours of transparent pixels do not bleed. Fully transparent areas become zero.
     ///
     /// # Panics
-    /// If a side is 0 or longer than it was.
+    /// If a side is 0 or longer than before.
     #[track_caller]
     pub fn resized(&self, [width, height]: [usize; 2]) -> Photo {
         let fits = (1..=self.width).contains(&width) && (1..=self.height).contains(&height);
-        assert!(fits, "a {}x{} photograph cannot be averaged to {width}x{height}", self.width, self.height);
+        assert!(fits, "a {}x{} image cannot be downsized to {width}x{height}", self.width, self.height);
         if [width, height] == [self.width, self.height] {
             return self.clone();
         }
@@ -248,7 +251,7 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     if reader.format() == Some(ImageFormat::WebP) {
         let mut inner = reader.into_inner();
         if !chunks_fit(&mut inner, length).map_err(unread)? {
-            return Err(bad("it ends before its last part does: was it copied completely?".into()));
+            return Err(bad("it ends within its last chunk: copy it again".into()));
         }
         reader = ImageReader::with_format(inner, ImageFormat::WebP);
     }
@@ -256,10 +259,10 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     let (width, height) = decoder.dimensions();
     let size = [width as usize, height as usize];
     if size[0].saturating_mul(size[1]) > MOST_PIXELS {
-        return Err(bad(format!("{width}x{height} pixels are more than 2^28")));
+        return Err(bad(format!("{width}x{height} pixels are more than the limit of 2^28")));
     }
     if decoder.total_bytes() > MOST_BYTES[0].saturating_mul(length).saturating_add(MOST_BYTES[1]) {
-        return Err(bad(format!("{width}x{height} pixels are more than {length} bytes can hold")));
+        return Err(bad(format!("{width}x{height} pixels cannot come from {length} bytes: copy it again")));
     }
     Ok((decoder, size))
 }

@@ -1,4 +1,4 @@
-//! How a scene lies in its capture, found out from its cameras: up, middle, scale, and how far it goes.
+//! Analysis of a capture's cameras: scene transform (up, centre, scale), type of scene, scene box, near and far plane.
 
 use super::capture::{Capture, Format, Point, View};
 use super::frames::evenly_spaced;
@@ -12,22 +12,22 @@ use crate::numbers::{mean, median, outer};
 use glam::{DAffine3, DMat3, DVec3};
 use raygrad_tensor::parallel;
 
-/// Where a scene is and how far it goes, in scene units, and why that is thought.
+/// The scene transform, type, box, near and far plane that a capture's cameras suggest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SceneAnalysis {
     /// From the capture's coordinates to those of the scene.
     pub transform: SceneTransform,
-    /// How far it goes.
+    /// Bounded, unbounded or forward-facing.
     pub scene_type: SceneType,
-    /// Lower and upper corner of its box.
+    /// Lower and upper corner of the scene box, in scene units.
     pub bounds: [DVec3; 2],
-    /// Distance along a ray before which there is nothing.
+    /// Near plane: distance along a ray, in scene units.
     pub near: f64,
-    /// Distance along a ray beyond which there is nothing.
+    /// Far plane: distance along a ray, in scene units.
     pub far: f64,
-    /// What all cameras see, if they [look the same way](SceneType::ForwardFacing), in scene units.
+    /// The NDC frustum of a [forward-facing](SceneType::ForwardFacing) scene.
     pub ndc: Option<Ndc>,
-    /// How the scope was found, in a few words.
+    /// The reason for `scene_type`, in a few words.
     pub reason: String,
 }
 
@@ -49,20 +49,21 @@ const AROUND: f64 = 3.0;
 const ROUNDS: usize = 8;
 
 impl SceneAnalysis {
-    /// Of a capture, from all photographs that exist. `empty` says in a few words why it is thought, if it is, that there is
-    /// nothing behind an object, which only their pixels tell; `asked` overrules what is found.
+    /// Analyses the cameras of all images that exist.
+    ///
+    /// `empty` is the reason why the background seems empty, which only pixels show; [`Capture::analyze_scene`] finds it. `asked`
+    /// overrides the type of scene.
     ///
     /// # Errors
-    /// If there is no photograph, or all cameras stand in one place, so that nothing has a size; if they do not look the same
-    /// way, and [are to](SceneType::ForwardFacing).
+    /// If there is no image, if all cameras stand in one place, or if `asked` is forward-facing and the cameras are not.
     pub fn new(capture: &Capture, empty: Option<&str>, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
         if cameras.is_empty() {
             let Some(first) = capture.views.first() else {
-                return Err(Error::file(&capture.file, "lists no photographs"));
+                return Err(Error::file(&capture.file, "lists no images; add frames to it"));
             };
             let what = format!(
-                "none of the {} images exists, not even that of the first, `{}`, in or below {}",
+                "none of the {} images exists (the first is `{}`) in or below {}; correct the paths or copy the images there",
                 capture.views.len(),
                 first.name,
                 capture.folder.display()
@@ -83,16 +84,16 @@ impl SceneAnalysis {
             });
         }
         let (scope, reason) = match (asked, empty) {
-            (Some(scope), _) => (scope, "as asked"),
+            (Some(scope), _) => (scope, "as requested"),
             (None, Some(why)) => (SceneType::Bounded, why),
             (None, None) => {
                 if Ndc::around(cameras.iter().copied(), 1.0).is_ok() {
                     (
                         SceneType::ForwardFacing,
-                        "photographs are opaque, so they show what lies behind, and all look ahead",
+                        "images are opaque, so they show a background, and all cameras look ahead",
                     )
                 } else {
-                    (SceneType::Unbounded, "photographs are opaque, so they show what lies behind")
+                    (SceneType::Unbounded, "images are opaque, so they show a background")
                 }
             }
         };
@@ -102,7 +103,7 @@ impl SceneAnalysis {
         let reason = format!("{reason}; {looks}");
         let distance = median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if !(distance > 1e-9 * (1.0 + middle.length())) {
-            let what = "all cameras stand in one place: nothing in the scene has a size";
+            let what = "has all cameras in one place, so the scene has no scale; check the positions of the poses";
             return Err(Error::file(&capture.file, what));
         }
         let half = match scope {
@@ -138,7 +139,7 @@ impl SceneAnalysis {
 }
 
 impl Capture {
-    /// The photographs whose images exist.
+    /// Returns the images that exist.
     pub fn present(&self) -> impl Iterator<Item = &View> {
         self.views.iter().filter(|view| view.image.is_some())
     }
@@ -169,7 +170,7 @@ impl Layout {
         let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if depths.len() == cameras.len() {
             let middle = ahead(cameras, depths);
-            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "depths say where it lies" };
+            return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "depths give its position" };
         }
         if let Some(middle) = middle(cameras) {
             return Layout { middle, inner: INNER_SHARE * distances(middle), looks: "cameras look at one place" };

@@ -1,4 +1,4 @@
-//! Where a capture lies in its scene.
+//! The scene transform.
 
 use crate::camera::pinhole::Camera;
 use crate::error::{Error, Result};
@@ -6,8 +6,9 @@ use crate::numbers::{eigen, mean};
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// The map from a capture's own coordinates, which its files have, to those of the scene, which models are trained in:
-/// `scale * rotation * (x - origin)`. It has an inverse, so that whatever was found can be said in the capture's coordinates.
+/// The scene transform `scale * rotation * (x - origin)`, from a capture's coordinates to those of the scene.
+///
+/// Models are trained in scene coordinates. nerfstudio calls it the dataparser transform.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneTransform {
@@ -20,16 +21,17 @@ pub struct SceneTransform {
 }
 
 impl Default for SceneTransform {
-    /// The capture's coordinates are those of the scene.
+    /// The identity.
     fn default() -> Self {
         SceneTransform { rotation: DMat3::IDENTITY, scale: 1.0, origin: DVec3::ZERO }
     }
 }
 
 impl SceneTransform {
-    /// The similarity that takes `from` nearest to `to`, point by point: with the least sum of squared distances (Umeyama
-    /// 1991; the rotation as a quaternion, Horn 1987). `None` if there are fewer than three points, not as many of each, or
-    /// they are all in a line, about which anything can turn.
+    /// Finds the similarity from `from` to `to` with the least sum of squared distances (Umeyama 1991; the rotation as a quaternion,
+    /// Horn 1987).
+    ///
+    /// Returns `None` if there are fewer than three points, their numbers differ, or all lie on a line.
     pub fn between(from: &[DVec3], to: &[DVec3]) -> Option<Self> {
         if from.len() < 3 || from.len() != to.len() {
             return None;
@@ -53,37 +55,37 @@ impl SceneTransform {
         (most - second > 1e-6 * most && found.check().is_ok()).then_some(found)
     }
 
-    /// Whether the numbers are usable.
+    /// Checks that it is a similarity.
     ///
     /// # Errors
-    /// If the rotation is none to 1e-6, the scale not above 0 or a number not finite.
+    /// If `rotation` is not a rotation to 1e-6, the scale is not above 0, or a number is not finite.
     pub fn check(&self) -> Result<()> {
         let excess = self.rotation.transpose() * self.rotation - DMat3::IDENTITY;
         let rotates = excess.to_cols_array().iter().all(|x| x.abs() < 1e-6) && self.rotation.determinant() > 0.0;
         if rotates && self.scale > 0.0 && self.scale.is_finite() && self.origin.is_finite() {
             return Ok(());
         }
-        Err(Error::setting("transform", "must be a rotation, a scale above 0 and an origin"))
+        Err(Error::setting("transform", "needs a rotation matrix, a scale above 0 and a finite origin"))
     }
 
-    /// A place of the capture, in the scene.
+    /// Maps a point from the capture to the scene.
     pub fn point(&self, point: DVec3) -> DVec3 {
         self.scale * (self.rotation * (point - self.origin))
     }
 
-    /// A place of the scene, in the capture: the inverse of [`point`](Self::point).
+    /// Maps a point from the scene to the capture: the inverse of [`point`](Self::point).
     pub fn point_back(&self, point: DVec3) -> DVec3 {
         self.rotation.transpose() * point / self.scale + self.origin
     }
 
-    /// A camera of the capture, in the scene: the same pixels see the same things.
+    /// Maps a camera from the capture to the scene; its pixels show the same points.
     pub fn camera(&self, camera: &Camera) -> Camera {
         let DAffine3 { matrix3, translation } = camera.pose;
         let pose = DAffine3 { matrix3: self.rotation * matrix3, translation: self.point(translation) };
         Camera { pose, ..camera.clone() }
     }
 
-    /// A camera of the scene, in the capture: the inverse of [`camera`](Self::camera).
+    /// Maps a camera from the scene to the capture: the inverse of [`camera`](Self::camera).
     pub fn camera_back(&self, camera: &Camera) -> Camera {
         let DAffine3 { matrix3, translation } = camera.pose;
         let pose = DAffine3 { matrix3: self.rotation.transpose() * matrix3, translation: self.point_back(translation) };

@@ -1,4 +1,4 @@
-//! How far scenes go.
+//! The type of scene.
 
 use crate::error::{Error, Result};
 use crate::range::by_name;
@@ -6,21 +6,21 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// How far a scene goes.
+/// The type of scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SceneType {
-    /// It ends at its box: an object before a background that is transparent or of one colour.
+    /// Bounded by its box: an object before a transparent or plain background.
     Bounded,
-    /// It goes on beyond its box, and photographs show what is there.
+    /// Unbounded: the images show a background beyond the scene box.
     Unbounded,
-    /// So does this one, and all photographs look the same way: see [`Ndc`](crate::Ndc).
+    /// Forward-facing: unbounded, and all cameras look the same way; see [`Ndc`](crate::Ndc).
     #[serde(alias = "forward")]
     ForwardFacing,
 }
 
 impl SceneType {
-    /// Whether it goes on beyond its box.
+    /// Returns whether the scene extends beyond its box (unbounded or forward-facing).
     pub fn is_unbounded(self) -> bool {
         self != SceneType::Bounded
     }
@@ -37,7 +37,7 @@ impl FromStr for SceneType {
 
     fn from_str(text: &str) -> Result<Self> {
         by_name(text).ok_or_else(|| {
-            Error::setting("scene-type", format!("`{text}` is not bounded, unbounded or forward-facing"))
+            Error::setting("scene-type", format!("is `{text}`; use bounded, unbounded or forward-facing"))
         })
     }
 }

@@ -1,4 +1,4 @@
-//! Photographs as a camera without a lens would have taken them.
+//! Undistortion: images as a pinhole camera takes them.
 
 use super::capture::View;
 use super::image::Image;
@@ -24,18 +24,18 @@ const HALVINGS: usize = 32;
 const ROUNDING: f64 = 1e-4;
 
 impl Camera {
-    /// The pinhole camera that keeps most of what these have taken, from where the first stood: with square pixels, its
-    /// principal point in the middle and their focal length (their median, where they differ). All that it sees, each of
-    /// them sees, so that photographs of it have no empty pixel. It is at most 100 degrees wide and high where a lens is a
-    /// fisheye.
+    /// Finds the largest pinhole camera that all of `cameras` cover, so that its images have no empty pixel.
+    ///
+    /// It has the pose of the first camera, square pixels, a centred principal point, and their (median) focal length. Its field
+    /// of view is at most 100 degrees if a lens is a fisheye.
     ///
     /// # Errors
-    /// If there is no camera, or no such picture: one shows all directions, or does not see its own optical axis.
+    /// If there is no camera, one is equirectangular, or one does not see its own optical axis.
     pub fn undistorted(cameras: &[&Camera]) -> Result<Camera> {
         let bad = |what: &str| Error::setting("undistort", what);
-        let first = cameras.first().ok_or_else(|| bad("there is no camera"))?;
+        let first = cameras.first().ok_or_else(|| bad("needs at least one camera"))?;
         if cameras.iter().any(|camera| camera.lens == Lens::Equirectangular) {
-            return Err(bad("a panorama shows all directions, and no pinhole camera does"));
+            return Err(bad("cannot turn equirectangular images into one pinhole image; cut them into views first"));
         }
         let mut focals: Vec<f64> = cameras.iter().map(|camera| (camera.focal[0] * camera.focal[1]).sqrt()).collect();
         focals.sort_by(f64::total_cmp);
@@ -54,7 +54,7 @@ impl Camera {
         let best = [x, last(best[1], |y| around([x, y]))];
         let [width, height] = best.map(|half| (2.0 * half * focal + ROUNDING) as usize);
         if width == 0 || height == 0 {
-            return Err(bad("a camera does not see its own optical axis: there is no picture around it"));
+            return Err(bad("needs cameras that see their optical axis; check the principal points and lenses"));
         }
         let centre = [0.5 * width as f64, 0.5 * height as f64];
         Ok(Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose: first.pose })
@@ -95,21 +95,20 @@ fn sees_all(camera: &Camera, [x, y]: [f64; 2]) -> bool {
 }
 
 impl View {
-    /// The camera for the size that the image has, which may be another than what the file of the cameras says.
+    /// Returns the camera scaled to the size of the image file, which may differ from the size in the capture.
     ///
     /// # Errors
-    /// If there is no image, or its header cannot be read, or it is of another shape than the camera.
+    /// If there is no image, its header cannot be read, or it has another aspect ratio than the camera.
     pub fn camera_of_image(&self) -> Result<Camera> {
         let Some(image) = &self.image else { return Err(Error::file(&self.name, "does not exist")) };
         let [width, height] = size_for(image, &self.camera)?;
         Ok(self.camera.resized(width, height))
     }
 
-    /// The photograph as the camera `to` would have taken it, which stands where this one does, and its mask: 1 where the
-    /// photograph is used.
+    /// Resamples the image as the camera `to` sees it from the same pose, with its mask (1 where pixels are used).
     ///
     /// # Errors
-    /// If an image cannot be read or decoded, or is of another shape than the camera.
+    /// If an image cannot be read or decoded, or has another aspect ratio than the camera.
     pub fn seen_by(&self, to: &Camera) -> Result<(Photo, Option<Image>)> {
         let Some(image) = &self.image else { return Err(Error::file(&self.name, "does not exist")) };
         let size = [to.width, to.height];

@@ -1,4 +1,4 @@
-//! The network of the NeRF paper.
+//! The network of the NeRF paper (Mildenhall et al. 2020).
 
 use super::{Density, DensityActivation, Field, Fields, ViewInputs};
 use crate::component::{BuildContext, ComponentConfig};
@@ -12,10 +12,10 @@ use raygrad_nn::{Bound, Init, Linear, Mlp};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Frequencies that are there from the start where detail comes in: they tell halves of the box apart.
+/// Frequencies that are enabled from the start of coarse-to-fine training: they tell halves of the box apart.
 const FIRST_LEVELS: usize = 2;
 
-/// Size and shape of a [`Classic`] field.
+/// Configuration of a [`Classic`] field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ClassicConfig {
@@ -38,8 +38,8 @@ pub struct ClassicConfig {
 }
 
 impl ClassicConfig {
-    /// The paper's network: 8 layers of 256, the position again at the sixth, 128 for the direction, 10 and 4
-    /// frequencies. Density is softplus instead of the paper's ReLU.
+    /// Returns the paper's network: 8 layers of 256 with a skip connection at the sixth, 128 for the direction, 10 and 4
+    /// frequencies. The density is softplus instead of the paper's ReLU.
     pub fn paper() -> Self {
         ClassicConfig {
             depth: 8,
@@ -63,12 +63,12 @@ impl ComponentConfig<Fields> for ClassicConfig {
         }
         check_parameters(self.depth * self.width * (self.width + 200))?;
         if self.position_levels > 24 || self.direction_levels > 24 {
-            return Err(Error::setting("position_levels", "more than 24 frequencies are beyond the precision of f32"));
+            return Err(Error::setting("position_levels", "has more frequencies than f32 can resolve; use at most 24"));
         }
         match self.skip_layers.iter().find(|&&skip| !(1..self.depth).contains(&skip)) {
             Some(skip) => Err(Error::setting(
                 "skip_layers",
-                format!("layer {skip} of {} cannot take the input again", self.depth),
+                format!("has layer {skip}; use layers from 1 to below `depth` ({})", self.depth),
             )),
             None => Ok(()),
         }
@@ -79,8 +79,10 @@ impl ComponentConfig<Fields> for ClassicConfig {
     }
 }
 
-/// The NeRF paper's field (Mildenhall et al. 2020, figure 7): positions through a deep stack to density and a feature
-/// vector, which together with the direction gives colour. Positions are scaled so that the scene's box becomes -1..1.
+/// The field of the NeRF paper (Mildenhall et al. 2020, figure 7).
+///
+/// A deep network maps the encoded position to a density and a feature vector; with the direction, that gives the colour.
+/// Positions are scaled so that the scene box becomes -1 to 1.
 #[derive(Debug, Clone)]
 pub struct Classic {
     config: ClassicConfig,
@@ -90,12 +92,12 @@ pub struct Classic {
     feature: Linear,
     view: Linear,
     color: Linear,
-    /// The weight of each frequency of positions, if they are not all 1.
+    /// The weight of each frequency of positions; `None` if all are 1.
     weights: Option<Arc<[f64]>>,
 }
 
 impl Classic {
-    /// A field with new parameters `<name>...`.
+    /// Creates a field with parameters `<name>...`.
     ///
     /// # Errors
     /// If the configuration is out of range.
@@ -122,7 +124,8 @@ impl Classic {
         })
     }
 
-    /// The same field with that share of the frequencies of positions, 0 to 1, the lowest first: see [`detail_weights`].
+    /// Returns the field with a share of the frequencies of positions enabled, 0 to 1, the lowest first: see
+    /// [`detail_weights`].
     #[must_use]
     pub fn coarsened(&self, detail: f64) -> Self {
         let weights = detail_weights(detail, self.config.position_levels, FIRST_LEVELS).map(Into::into);

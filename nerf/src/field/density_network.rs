@@ -1,4 +1,4 @@
-//! A hash grid and a small network that give a density.
+//! A hash grid with a small density network.
 
 use super::{Density, Grid, log_density_shift};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! A hash grid over a scene, with its table among the parameters.
+//! A hash grid over a scene, with its table as a parameter.
 
 use crate::Result;
 use crate::component::BuildContext;
@@ -10,10 +10,10 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId};
 use std::sync::Arc;
 
-/// Levels that are there from the start where [detail](Grid::with_detail) comes in.
+/// Levels that are enabled from the start of coarse-to-fine training, see [`Grid::with_detail`].
 const FIRST_LEVELS: usize = 3;
 
-/// What fields that look positions up in a table have in common.
+/// A hash grid over the scene with its table parameter, shared by fields that look up positions.
 #[derive(Debug, Clone)]
 pub struct Grid {
     grid: HashGrid,
@@ -24,8 +24,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// A grid over the scene with a new parameter `<name>.table`. Its gradient is sparse, and only rows that got one are
-    /// moved.
+    /// Creates a grid over the scene with the parameter `<name>.table`, which sparse (lazy) Adam updates by rows.
     ///
     /// # Errors
     /// If the configuration is out of range.
@@ -37,34 +36,34 @@ impl Grid {
         Ok(Grid { grid, table, space: site.space, weights: None })
     }
 
-    /// The same grid with that share of its levels, 0 to 1, the coarsest first: see [`detail_weights`].
+    /// Returns the grid with a share of its levels enabled, 0 to 1, the coarsest first: see [`detail_weights`].
     #[must_use]
     pub fn with_detail(&self, detail: f64) -> Self {
         let weights = detail_weights(detail, self.grid.levels().len(), FIRST_LEVELS).map(Into::into);
         Grid { weights, ..self.clone() }
     }
 
-    /// Channels of an encoding.
+    /// Returns the number of channels of an encoding.
     pub fn width(&self) -> usize {
         self.grid.width()
     }
 
-    /// What the features of each level are multiplied by, if not all of them count in full.
+    /// Returns the weight of each level's features, or `None` if all are 1.
     pub fn weights(&self) -> Option<&[f64]> {
         self.weights.as_deref()
     }
 
-    /// The parameter.
+    /// Returns the table parameter.
     pub fn table(&self) -> ParamId {
         self.table
     }
 
-    /// The grid.
+    /// Returns the hash grid.
     pub fn grid(&self) -> &HashGrid {
         &self.grid
     }
 
-    /// The features at positions in scene units, `[samples, 3]` to `[samples, width]`.
+    /// Encodes positions `[samples, 3]` (scene units) to features `[samples, width]`.
     #[track_caller]
     pub fn encode<'t, T: Scalar>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Var<'t, T> {
         let tape = positions.tape();

@@ -1,4 +1,4 @@
-//! A hash grid and two small networks.
+//! A hash grid with two small networks (instant-ngp).
 
 use super::{Density, DensityNetwork, Field, Fields, Grid, ViewInputs};
 use crate::component::{BuildContext, ComponentConfig};
@@ -11,7 +11,7 @@ use raygrad_nn::{Bound, Init, Linear, ParamId};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Size of an [`Instant`] field.
+/// Configuration of an [`Instant`] field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InstantConfig {
@@ -53,23 +53,24 @@ impl ComponentConfig<Fields> for InstantConfig {
     }
 }
 
-/// A field as in Mueller et al. 2022, section 5.4: a multiresolution hash grid, a density network of one hidden layer,
-/// and a colour network that sees its outputs and the direction. No layer has a bias. The density is the exponential of
-/// the first output.
+/// The field of instant-ngp (Mueller et al. 2022, section 5.4).
+///
+/// A multiresolution hash grid feeds a density network of one hidden layer. Its outputs and the direction feed a colour network.
+/// No layer has a bias. The density is the exponential of the first output.
 #[derive(Debug, Clone)]
 pub struct Instant {
     density: DensityNetwork,
     direction: SphericalHarmonics,
     color: Vec<Linear>,
-    /// A code for each photograph, if there are codes.
+    /// The appearance embeddings, if there are any.
     codes: Option<ParamId>,
 }
 
 impl Instant {
-    /// A field with new parameters `<name>...`; codes are 0, so that all photographs are alike at first.
+    /// Creates a field with parameters `<name>...`; appearance embeddings start at 0.
     ///
     /// # Errors
-    /// If the configuration is out of range, or has codes and the number of photographs is not known.
+    /// If the configuration is out of range, or has appearance embeddings and `site.frames` is 0.
     pub fn new<T: Scalar>(config: &InstantConfig, mut site: BuildContext<'_, T>) -> Result<Self> {
         config.check()?;
         let InstantConfig {
@@ -89,20 +90,20 @@ impl Instant {
         if codes > 0 && frames == 0 {
             return Err(Error::setting(
                 "appearance_embedding_dim",
-                "are for photographs, and it is not known how many there are",
+                "needs the number of images; set `SceneBox::frames`",
             ));
         }
         let codes = (codes > 0).then(|| {
             let name = format!("{name}.codes");
             let id = params.add(&name, Tensor::zeros(&[frames, codes]));
-            // A step sees few photographs of many.
+            // A step sees few of the images.
             params.set_lazy(|other| other == name, true);
             id
         });
         Ok(Instant { density, direction, color, codes })
     }
 
-    /// The grid that positions are looked up in.
+    /// Returns the grid.
     pub fn grid(&self) -> &Grid {
         &self.density.grid
     }

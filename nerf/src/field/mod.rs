@@ -1,4 +1,7 @@
-//! Fields: functions of position and direction that give density and colour.
+//! Radiance fields: density and colour as functions of position and direction.
+//!
+//! [`Instant`] is a hash grid, [`Classic`] the NeRF paper's network, [`Voxel`] a voxel grid. Implement [`Field`] for a custom
+//! one; see docs/library/custom-field.md.
 
 mod classic;
 mod density_network;
@@ -22,65 +25,68 @@ use std::sync::Arc;
 /// Logarithms of densities are cut here: `e^80 delta` is opaque for any interval above 1e-32, and finite.
 pub(crate) const MOST_LOG_DENSITY: f64 = 80.0;
 
-/// What fields whose density is an exponential subtract from its logarithm, in a space of this unit, in scene units: a new one is a
-/// thin fog, of density about 0.4 in the space's unit.
+/// Returns the shift that fields with an exponential density subtract from its logarithm; `unit` is
+/// [`Space::unit`](crate::Space::unit), in scene units.
+///
+/// With it a new field is a thin fog, of density about 0.4 per unit.
 pub fn log_density_shift(unit: f64) -> f64 {
     1.0 + unit.ln()
 }
 
-/// What a field says of positions alone.
+/// The density of samples, with the features that their colour is computed from.
 pub struct Density<'t, T: Scalar> {
-    /// Density per scene unit, at least 0, or its natural logarithm, `[samples]`.
+    /// Density sigma per scene unit, at least 0, or its natural logarithm, `[samples]`.
     pub value: Var<'t, T>,
     /// Whether `value` is the logarithm.
     pub log: bool,
-    /// What the colour is computed from, `[samples, features]`.
+    /// Input of [`Field::color`], `[samples, features]`.
     pub features: Var<'t, T>,
 }
 
 impl<'t, T: Scalar> Density<'t, T> {
-    /// Density per scene unit, `[samples]`; a logarithm counts as at most 80.
+    /// Returns the density sigma per scene unit, `[samples]`; a logarithm is clamped at 80.
     #[track_caller]
     pub fn sigma(&self) -> Var<'t, T> {
         if self.log { self.value.minimum(MOST_LOG_DENSITY).exp() } else { self.value.clone() }
     }
 }
 
-/// From where samples are seen.
+/// The viewing rays of samples, as input of [`Field::color`].
 #[derive(Clone, Copy)]
 pub struct ViewInputs<'a, 't, T: Scalar> {
     /// Unit directions of the rays, `[rays, 3]`.
     pub directions: &'a Var<'t, T>,
-    /// Which samples belong to which ray.
+    /// The rows of each ray's samples.
     pub segments: &'a Segments,
-    /// The number of the photograph that each ray belongs to, `[rays]`: for a field with a code for each photograph. There
-    /// is none in views, unless they are to have the [look](crate::Model::appearance_image) of one.
+    /// The image index of each ray, `[rays]`, for fields with appearance embeddings. `None` in renders without an
+    /// [`appearance_image`](crate::Model::appearance_image).
     pub frames: Option<&'a [u32]>,
 }
 
-/// A radiance field. Density depends on position alone, so that surfaces stay where they are from every side; colour
-/// depends on the viewing direction too.
+/// A radiance field: density from position, colour from position and viewing direction.
 ///
-/// A field of one's own implements this and, for its configuration, [`ComponentConfig<Fields>`](crate::ComponentConfig); with
-/// [`register`](crate::component::register) it is trained, rendered, saved and loaded like those of this crate.
+/// A custom field implements this trait and, for its configuration, [`ComponentConfig<Fields>`](crate::ComponentConfig). After
+/// [`register`](crate::component::register) it trains, renders, saves and loads like the built-in fields.
 pub trait Field<T: Scalar>: Any + Send + Sync {
-    /// The density at `positions` `[samples, 3]`, in scene units. What it says of one position must not depend on the
-    /// others: training asks of many and goes on with some, and takes the outputs of operations that
-    /// [are kept](raygrad_autograd::Op::is_cacheable), row by row, from the first time (if they have a row for each position).
+    /// Computes the density at `positions` `[samples, 3]`, in scene units.
+    ///
+    /// Each row must depend on its own position only. Training evaluates many positions, keeps some, and reuses the rows of
+    /// [cacheable](raygrad_autograd::Op::is_cacheable) operations from the first pass.
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T>;
 
-    /// Colour `[samples, 3]` in 0..=1, for the features that [`density`](Self::density) gave, some rows of them or all.
+    /// Computes colours `[samples, 3]`, 0 to 1, from rows of the features that [`density`](Self::density) returned.
     fn color<'t>(&self, params: &Bound<'t, T>, features: &Var<'t, T>, seen: &ViewInputs<'_, 't, T>) -> Var<'t, T>;
 
-    /// The same field, with the same parameters, as it is with that share of its detail, 0 to 1: while cameras are learned,
-    /// detail comes in [from coarse to fine](crate::model::CameraOptimizerConfig::coarse). `None` for a field that has all of it at
-    /// once.
+    /// Returns the field with a share of its detail, 0 to 1, and the same parameters.
+    ///
+    /// Pose refinement enables detail [from coarse to fine](crate::model::CameraOptimizerConfig::coarse). `None`, the default, is
+    /// for fields without levels of detail.
     fn with_detail(&self, _detail: f64) -> Option<Arc<dyn Field<T>>> {
         None
     }
 }
 
-/// The family of fields.
+/// The [`ComponentType`] of fields.
 pub struct Fields;
 
 impl ComponentType for Fields {
@@ -88,10 +94,10 @@ impl ComponentType for Fields {
     type Built<T: Scalar> = Arc<dyn Field<T>>;
 }
 
-/// Which field, and its size.
+/// The configuration of any field.
 pub type FieldConfig = AnyConfig<Fields>;
 
-/// How a network's raw output becomes a density.
+/// The activation from a network's raw output to a density.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DensityActivation {
@@ -103,7 +109,7 @@ pub enum DensityActivation {
 }
 
 impl DensityActivation {
-    /// The density for the raw output `x`.
+    /// Applies the activation to the raw output `x`, of any shape.
     #[track_caller]
     pub fn apply<'t, T: Scalar>(self, x: &Var<'t, T>) -> Var<'t, T> {
         match self {

@@ -1,4 +1,4 @@
-//! A grid of voxels and no network.
+//! A voxel grid without a network.
 
 use super::grid::Grid;
 use super::{Density, Field, Fields, ViewInputs, log_density_shift};
@@ -12,7 +12,7 @@ use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Size of a [`Voxel`] field.
+/// Configuration of a [`Voxel`] field.
 ///
 /// The table has `(resolution + 1)^3` rows of `1 + 3 direction_degree^2` numbers, rounded up to a power of two: 137 MB at
 /// 128 and degree 2. Training takes four times as much, for the gradient and two moments.
@@ -38,16 +38,16 @@ impl ComponentConfig<Fields> for VoxelConfig {
     }
 }
 
-/// What the logarithm of the density is multiplied by: without a network before it, it moves by little more than the
-/// learning rate in a step, and has further to go than a colour.
+/// Factor of the log density: without a network it changes by little more than the learning rate per step, and has further to
+/// go than a colour.
 const LOG_DENSITY_GAIN: f64 = 10.0;
 
-/// A field as in Fridovich-Keil et al. 2022, "Plenoxels: Radiance Fields without Neural Networks", section 3.2: each
-/// corner of a dense grid has a density and, for each colour, coefficients of spherical harmonics; what lies between the
-/// corners is interpolated trilinearly. The colour is the sigmoid of the harmonics' sum. Unlike the paper's, the density
-/// is the exponential of what is interpolated, and the grid keeps its resolution and every voxel.
+/// A voxel grid of densities and spherical harmonics (Fridovich-Keil et al. 2022, "Plenoxels: Radiance Fields without Neural
+/// Networks", section 3.2).
 ///
-/// A row of the table is the logarithm of the density, then the coefficients of red, green and blue, then padding.
+/// Each corner of a dense grid has a log density and spherical harmonics per colour channel, interpolated trilinearly. The
+/// colour is the sigmoid of the harmonics' sum. Unlike the paper, the density is an exponential, and the grid is neither
+/// refined nor pruned. A row of the table is the log density, then the coefficients of red, green and blue, then padding.
 #[derive(Debug, Clone)]
 pub struct Voxel {
     grid: Grid,
@@ -57,7 +57,7 @@ pub struct Voxel {
 }
 
 impl Voxel {
-    /// A field with one new parameter, `<name>.table`.
+    /// Creates a field with one parameter, `<name>.table`.
     ///
     /// # Errors
     /// If the configuration is out of range.
@@ -75,7 +75,7 @@ impl Voxel {
         Ok(Voxel { grid: Grid::new(&grid, site)?, direction, shift })
     }
 
-    /// The grid that positions are looked up in.
+    /// Returns the grid.
     pub fn grid(&self) -> &Grid {
         &self.grid
     }

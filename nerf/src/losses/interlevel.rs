@@ -1,29 +1,30 @@
-//! What proposals are fitted by.
+//! The interlevel loss.
 
 use crate::camera::rays::Samples;
 use crate::sampling::ProposalHistogram;
 use raygrad_autograd::{Scalar, Tensor, Var};
 
-/// The interlevel loss of a proposal, a sum over rays (Barron et al. 2022, equation 13): `max(0, w - bound)^2 / w` of the
-/// weights `w` `[samples]` of samples in the middles of intervals, where the bound is the sum of the proposal's bins that
-/// the interval touches. The weights count as constants: the proposal follows the field and not the other way.
+/// Computes the interlevel loss of a proposal, a sum over rays (Barron et al. 2022, equation 13).
+///
+/// Each sample adds `max(0, w - bound)^2 / w` for its weight `w` `[samples]`. The bound is the sum of the proposal's bins that the
+/// sample's interval touches. The weights are constants: the proposal follows the field, not the reverse.
 ///
 /// # Panics
-/// If there is not one weight for each sample, or the samples are of other rays.
+/// If there is not one weight per sample, or the samples belong to other rays.
 #[track_caller]
 pub fn interlevel<'t, T: Scalar>(
     level: &ProposalHistogram<'t, T>,
     samples: &Samples<T>,
     weights: &Tensor<T>,
 ) -> Var<'t, T> {
-    assert_eq!(weights.shape(), [samples.len()], "one weight for each sample");
-    assert_eq!(samples.segments.len(), level.segments.len(), "samples of the proposal's rays");
+    assert_eq!(weights.shape(), [samples.len()], "weights must have one entry per sample");
+    assert_eq!(samples.segments.len(), level.segments.len(), "samples and proposal must have the same rays");
     let (t, delta) = (samples.t.as_slice(), samples.delta.as_slice());
     let [mut first, mut last] = [vec![], vec![]];
     for (ray, rows) in samples.segments.ranges().enumerate() {
         let bins = level.segments.range(ray);
         if bins.is_empty() {
-            assert!(rows.is_empty(), "a proposal without bins for ray {ray}");
+            assert!(rows.is_empty(), "the proposal has no bins for ray {ray}, which has samples");
             continue;
         }
         let edges = &level.edges[bins.start + ray..=bins.end + ray];

@@ -1,5 +1,7 @@
-//! What training minimises: the [photometric loss](Loss) of every picture of the rays, what fits the sampler's proposals
-//! ([`interlevel`]), and any number of further [terms](LossTerm) of what is rendered.
+//! Losses: the photometric [`Loss`], the [`interlevel`] loss of proposals, and further [loss terms](LossTerm).
+//!
+//! A configuration lists terms such as [`DistortionConfig`] and [`DepthConfig`] in
+//! [`Config::loss_terms`](crate::Config::loss_terms). Implement [`LossTerm`] for a custom one.
 
 pub(crate) mod interlevel;
 pub(crate) mod photometric;
@@ -19,57 +21,59 @@ use raygrad_nn::Bound;
 use std::any::Any;
 use std::sync::Arc;
 
-/// What a term may use: what is rendered of some rays, and what photographs show along them.
+/// The inputs of a loss term: rendered rays and their targets.
 #[derive(Clone, Copy)]
 pub struct LossInputs<'a, 't, T: Scalar> {
     /// The parameters.
     pub params: &'a Bound<'t, T>,
-    /// The rays, as they were sampled.
+    /// The sampled rays.
     pub rays: &'a Rays<T>,
-    /// The number of the photograph of each ray.
+    /// The image index of each ray, `[rays]`.
     pub frames: &'a [u32],
-    /// Column and row of its pixel.
+    /// The pixel (column, row) of each ray, `[rays]`.
     pub pixels: &'a [[u32; 2]],
-    /// The distance along each ray, in scene units, at which what it meets was measured to be; 0 where it was not.
+    /// The measured distance along each ray, `[rays]`, in scene units; 0 where there is none.
     pub distances: &'a [f32],
-    /// A random number, another one for each term, tile and step: what a term that draws begins from.
+    /// A random seed that differs for each term, tile and step.
     pub seed: u64,
-    /// How much of the run is done, 0 to 1.
+    /// Fraction of the run that is done, 0 to 1.
     pub train_frac: f64,
-    /// What is seen of the field, with a name for everything.
+    /// The rendered rays of the field.
     pub rendered: &'a Rendered<'t, T>,
-    /// What the photographs show, `[rays, 3]`, over the background where they have alpha.
+    /// The images' colours, `[rays, 3]`, over the background where they have alpha.
     pub target: &'a Tensor<T>,
     /// The background of each ray, `[rays, 3]`.
     pub background: &'a Tensor<T>,
 }
 
-/// A term of the loss beside that of the colours.
+/// A loss term that is added to the photometric loss.
 ///
-/// A term of one's own implements this and, for its configuration, [`ComponentConfig<LossTerms>`](crate::ComponentConfig).
+/// A custom term implements this trait and, for its configuration, [`ComponentConfig<LossTerms>`](crate::ComponentConfig).
 pub trait LossTerm<T: Scalar>: Any + Send + Sync {
-    /// The term as a sum over rays, a scalar, times its weight. (The mean of it is minimised, beside that of the squared
-    /// errors of three channels: so a weight of 1 stands for three squared errors.)
+    /// Computes the term as a sum over rays, a scalar, times its weight.
+    ///
+    /// Training minimises its mean over rays and three channels, as for the squared errors: a weight of 1 counts as three squared
+    /// errors.
     fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T>;
 
-    /// Whether it reads [normals](Rendered::normals), for which positions have to be on the tape.
+    /// Returns whether it reads [normals](Rendered::normals), for which positions must be on the tape.
     fn needs_normals(&self) -> bool {
         false
     }
 
-    /// Whether it needs [distances](LossInputs::distances) that were measured: an error where a dataset has none.
+    /// Returns whether it needs measured [distances](LossInputs::distances); training a dataset without them is then an error.
     fn needs_distances(&self) -> bool {
         false
     }
 }
 
-/// The family of terms.
+/// The [`ComponentType`] of loss terms.
 pub struct LossTerms;
 
 impl ComponentType for LossTerms {
-    const WHAT: &'static str = "term";
+    const WHAT: &'static str = "loss term";
     type Built<T: Scalar> = Arc<dyn LossTerm<T>>;
 }
 
-/// Which term, and its weight.
+/// The configuration of any loss term.
 pub type LossTermConfig = AnyConfig<LossTerms>;

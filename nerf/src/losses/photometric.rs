@@ -1,11 +1,11 @@
-//! How far colours are from those of photographs.
+//! The photometric loss.
 
 use crate::Result;
 use crate::range::check_range;
 use raygrad_autograd::{Scalar, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
-/// The loss of one channel of a pixel, as a function of its error `e`. Training minimises its mean.
+/// The photometric loss, as a function of the error `e` of one colour channel. Training minimises its mean.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Loss {
@@ -28,10 +28,9 @@ impl Loss {
         }
     }
 
-    /// The sum of the losses of `color` `[rays, 3]` against `target` `[rays, 3]`.
+    /// Returns the summed loss of `color` `[rays, 3]` against `target` `[rays, 3]`.
     ///
-    /// Huber's loss is smooth but for the jumps of its second derivative at `|e| = delta`, where that of the inner part
-    /// counts.
+    /// The second derivative of Huber's loss jumps at `|e| = delta`, where that of the inner part counts.
     #[track_caller]
     pub fn sum<'t, T: Scalar>(self, color: &Var<'t, T>, target: &Tensor<T>) -> Var<'t, T> {
         let error = color - color.tape().constant(target.clone());

@@ -1,4 +1,4 @@
-//! Terms of the loss that are known to help.
+//! Loss terms from the literature.
 
 use super::{LossInputs, LossTerm, LossTerms};
 use crate::Result;
@@ -9,9 +9,11 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// The [distortion](Distortion) of the weights along each ray, over its span: pulls them together, against floaters and fog
-/// (Barron et al. 2022, equation 15). In an unbounded scene distances beyond half of the side of its box count by their
-/// inverses, as [space](crate::Contraction) does.
+/// The [distortion](Distortion) loss (kind `distortion`): it concentrates weights along each ray, against floaters and fog
+/// (Barron et al. 2022, equation 15).
+///
+/// Distances are shares of the ray's span. In an unbounded scene, distances beyond half the box's side count by their inverses, as
+/// in the [contraction](crate::Contraction).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DistortionConfig {
@@ -19,8 +21,8 @@ pub struct DistortionConfig {
     pub weight: f64,
 }
 
-/// The entropy of each ray's opacity `o`, `-o ln o - (1 - o) ln(1 - o)`: a ray is to meet something or nothing (Kim et al.
-/// 2022, "InfoNeRF", of a whole ray).
+/// The entropy loss (kind `entropy`): `-o ln o - (1 - o) ln(1 - o)` of each ray's opacity `o`, which drives it to 0 or 1 (Kim et
+/// al. 2022, "InfoNeRF", for whole rays).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EntropyConfig {
@@ -28,9 +30,11 @@ pub struct EntropyConfig {
     pub weight: f64,
 }
 
-/// `w max(0, n . d)^2` of the weights w and [normals](crate::Rendered::normals) n of samples that are seen along d:
-/// surfaces are to face the viewer (Verbin et al. 2022, "Ref-NeRF", equation 11). It differentiates the density twice, which
-/// takes several times as long as a step without it.
+/// The orientation loss (kind `orientation`): `sum w max(0, n . d)^2` penalises surfaces that face away from the camera (Verbin
+/// et al. 2022, "Ref-NeRF", equation 11).
+///
+/// w are weights, n [normals](crate::Rendered::normals) and d ray directions. It differentiates the density twice, which takes
+/// several times as long as a step without it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OrientationConfig {
@@ -38,12 +42,13 @@ pub struct OrientationConfig {
     pub weight: f64,
 }
 
-/// How far from what was measured the light of a ray comes from: `sum of w e(t) + T e(far)` for the weights w of samples at
-/// t and the light T that is left at the far end of the span, with `e(t) = min(1, ((t - d) / u)^2)` for the
-/// [distance](crate::dataset::Frame::distances) d and the [unit](crate::Space::unit) u of the scene. It is least where all
-/// light comes from d, and where d lies beyond the span, where all is left. Rays of which nothing was measured, or something
-/// before the span begins, count nothing. (Of the kind of Deng et al. 2022, "Depth-supervised NeRF", section 4; the square up
-/// to 1 stands in place of their likelihood, so that it is finite everywhere.)
+/// The depth loss (kind `depth`): `sum w e(t) + T e(far)` with `e(t) = min(1, ((t - d) / u)^2)`.
+///
+/// w are the weights of samples at t, T is the transmittance at the far end of the span, d the measured
+/// [distance](crate::dataset::Frame::distances) and u the scene's [unit](crate::Space::unit). It is minimal if all weight lies at
+/// d, or, if d lies beyond the span, if no light is blocked. Rays without a measurement, or with one before the span, add
+/// nothing. It is related to Deng et al. 2022, "Depth-supervised NeRF", section 4; the clamped square replaces their likelihood, so
+/// that it is finite everywhere.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {
@@ -51,7 +56,7 @@ pub struct DepthConfig {
     pub weight: f64,
 }
 
-/// A configuration is its own term.
+/// Terms whose configuration is the term itself.
 macro_rules! terms {
     ($($kind:literal $config:ty),*) => {
         $(impl ComponentConfig<LossTerms> for $config {
@@ -81,15 +86,15 @@ impl ComponentConfig<LossTerms> for DistortionConfig {
     }
 }
 
-/// The distortion, with what distances are measured by.
+/// The distortion loss with its scale of distances.
 struct Evenness {
     weight: f64,
-    /// Half of the side of an unbounded scene's box: farther away, distances count by their inverses.
+    /// Half the side of an unbounded scene's box: beyond it, distances count by their inverses.
     reach: Option<f64>,
 }
 
 impl Evenness {
-    /// A distance as it counts along a ray of this span, rising.
+    /// A distance as a rising share of the span.
     fn place(&self, distance: f64, [near, far]: [f64; 2]) -> f64 {
         match self.reach {
             None => (distance - near) / (far - near).max(1e-12),
@@ -111,7 +116,7 @@ impl ComponentConfig<LossTerms> for DepthConfig {
     }
 }
 
-/// The numbers.
+/// The depth loss.
 struct Depth {
     weight: f64,
     /// The length that errors are measured by, in scene units.

@@ -1,4 +1,4 @@
-//! How much a table varies from cell to cell.
+//! Total variation of tables.
 
 use super::{LossInputs, LossTerm, LossTerms};
 use crate::component::{BuildContext, ComponentConfig};
@@ -11,12 +11,12 @@ use raygrad_nn::ParamId;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// The squared differences of a table's neighbouring cells, summed over axes and channels, the mean over cells (Chen et al.
-/// 2022, "TensoRF", section 4.3, and Fridovich-Keil et al. 2022, "Plenoxels", equation 3, without its root): a table that is
-/// smooth where photographs say nothing.
+/// The total variation loss of a table (kind `total_variation`): it smooths cells that images do not determine.
 ///
-/// Each step looks at some cells for each ray, at random: the expectation is that of all, and of a lazy table only their rows
-/// are moved. (What no ray touches is moved by Adam by about the learning rate, whatever the weight.)
+/// It is the mean over cells of the squared differences of neighbours, summed over axes and channels (Chen et al. 2022,
+/// "TensoRF", section 4.3; Fridovich-Keil et al. 2022, "Plenoxels", equation 3, without its root). Each step draws random cells
+/// per ray, with the same expectation; only their rows of a lazy table are updated. Adam moves cells that no ray touches by about
+/// the learning rate, whatever the weight.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TotalVariationConfig {
@@ -54,28 +54,31 @@ impl ComponentConfig<LossTerms> for TotalVariationConfig {
         let error = |what: String| Err(Error::setting("total_variation", what));
         let Some(id) = site.params.find(&self.params) else {
             let names: Vec<&str> = site.params.names().collect();
-            return error(format!("there is no parameter `{}`; there are {}", self.params, names.join(", ")));
+            return error(format!("has no parameter `{}`; use one of {}", self.params, names.join(", ")));
         };
         let shape = site.params.get(id).shape();
         let Some((&channels, own)) = shape.split_last() else {
-            return error(format!("the parameter `{}` is a number", self.params));
+            return error(format!("needs a table, but the parameter `{}` is a single number", self.params));
         };
         if own.is_empty() || self.cells.is_none() && site.params.is_lazy(id) {
-            return error(format!("the parameter `{}` is {shape:?}: say its `cells` along each axis", self.params));
+            return error(format!(
+                "needs `cells` along each axis: the parameter `{}` has the shape {shape:?}",
+                self.params
+            ));
         }
         let cells = self.cells.clone().unwrap_or_else(|| own.to_vec());
         let all: usize = own.iter().product();
         let rows = cells.iter().try_fold(1, |rows: usize, &along| rows.checked_mul(along)).unwrap_or(usize::MAX);
         if cells.is_empty() || rows == 0 || rows > all || all - rows >= PADDING || u32::try_from(rows).is_err() {
             let what =
-                format!("the cells {cells:?} are not those of the parameter `{}`, which is {shape:?}", self.params);
+                format!("has cells {cells:?} that do not fit the parameter `{}` of shape {shape:?}", self.params);
             return error(what);
         }
         Ok(Arc::new(TotalVariation { id, cells, channels, draws: self.draws, weight: self.weight }))
     }
 }
 
-/// The table and the numbers.
+/// The term of one table.
 struct TotalVariation {
     id: ParamId,
     /// Along each axis, the slowest first.

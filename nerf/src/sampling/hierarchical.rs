@@ -1,4 +1,4 @@
-//! Hierarchical sampling: a coarse field finds where to look, and the field proper is sampled there.
+//! Hierarchical sampling with a coarse and a fine field (NeRF).
 
 use super::steps::importance_sampling;
 use super::{BatchSize, Purpose, Sampled, Sampler, Samplers};
@@ -14,11 +14,11 @@ use crate::volume::render::Evaluations;
 use raygrad_autograd::Scalar;
 use serde::{Deserialize, Serialize};
 
-/// Numbers of a [`Hierarchical`] sampler.
+/// Configuration of a [`Hierarchical`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HierarchicalConfig {
-    /// The coarse network.
+    /// The coarse field.
     pub proposal: ClassicConfig,
     /// Stratified samples a ray for the coarse network. Range: 1 to 4096.
     pub coarse: usize,
@@ -34,7 +34,7 @@ pub struct HierarchicalConfig {
 }
 
 impl Default for HierarchicalConfig {
-    /// The paper's: a coarse network as large as the fine one, 64 + 128 samples.
+    /// The paper's values: a coarse network as large as the fine one, 64 + 128 samples.
     fn default() -> Self {
         let proposal = ClassicConfig::paper();
         HierarchicalConfig { proposal, coarse: 64, fine: 128, uniform_share: 0.01, batch: 1024, tile: 8 }
@@ -58,11 +58,10 @@ impl ComponentConfig<Samplers> for HierarchicalConfig {
     }
 }
 
-/// The coarse field and the numbers (Mildenhall et al. 2020, section 5.2). The coarse field is fitted to the photographs as
-/// well.
+/// Hierarchical sampling (Mildenhall et al. 2020, section 5.2). The coarse field is trained on the images too.
 #[derive(Debug, Clone)]
 pub struct Hierarchical {
-    /// The numbers.
+    /// The configuration.
     pub config: HierarchicalConfig,
     /// The coarse field.
     pub proposal: Classic,

@@ -1,4 +1,4 @@
-//! Marching: even steps through the occupied cells of a grid.
+//! Ray marching through the occupied cells of a grid (instant-ngp).
 
 use super::{BatchSize, Progress, Purpose, RayTolerance, Sampled, Sampler, Samplers};
 use crate::camera::rays::{Rays, Samples};
@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-/// Numbers of a [`Marching`] sampler.
+/// Configuration of a [`Marching`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MarchingConfig {
@@ -85,49 +85,49 @@ impl ComponentConfig<Samplers> for MarchingConfig {
     }
 }
 
-/// In training, cells whose optical depth a step is below this (or below the mean) are passed over.
+/// Training skips cells whose optical depth per step is below this (or below the mean).
 const TRAINING_DEPTH: f32 = 0.01;
-/// Training steps in which all cells are looked at.
+/// Training steps in which all cells are updated.
 const WARM_UP: u64 = 256;
 /// Steps between updates of the occupancy grid.
 const GRID_EVERY: u64 = 16;
 /// The name of the occupancy grid in a file.
 const GRID: &str = "occupancy";
 
-/// The occupancy grid and the numbers.
+/// Ray marching with an occupancy grid (Mueller et al. 2022, instant-ngp).
 #[derive(Debug, Clone)]
 pub struct Marching {
-    /// The numbers.
+    /// The configuration.
     pub config: MarchingConfig,
-    /// Which cells hold something that training works on: a part of the model.
+    /// The occupancy grid of training, saved with the model.
     pub grid: OccupancyGrid,
-    /// Which of these views look at, if fewer: see [`Sampler::finish`].
+    /// The occupancy grid of renders, if it has fewer cells: see [`Sampler::finish`].
     pruned: Option<OccupancyGrid>,
-    /// How much of training is done, 0 to 1.
+    /// Fraction of training that is done, 0 to 1.
     pub progress: f64,
-    /// What nobody marches with at the moment.
+    /// Unused buffers.
     buffers: Arc<Scratch<MarchBuffer>>,
 }
 
 impl Marching {
-    /// Marching through a grid, before training.
+    /// Creates a sampler at the start of training.
     pub fn new(config: MarchingConfig, grid: OccupancyGrid) -> Self {
         Marching { config, grid, pruned: None, progress: 0.0, buffers: Arc::default() }
     }
 
-    /// The length of a training step in scene units, now.
+    /// Returns the current step length of training, in scene units.
     pub fn step(&self) -> f32 {
         let first = self.config.step;
         let last = self.config.last_step.unwrap_or(first);
         self.length(first * (last / first).powf(self.progress))
     }
 
-    /// The length of a step in scene units when rendering.
+    /// Returns the step length of renders, in scene units.
     pub fn view_step(&self) -> f32 {
         self.length(self.config.view_step)
     }
 
-    /// How far apart the samples of views are.
+    /// Returns the spacing of samples in renders.
     pub fn view_spacing(&self) -> Step {
         self.spacing(self.view_step())
     }
@@ -143,13 +143,13 @@ impl Marching {
         (share * (high - low).max_element()) as f32
     }
 
-    /// The cells that views look at.
+    /// Returns the occupancy grid of renders.
     pub fn view_grid(&self) -> &OccupancyGrid {
         self.pruned.as_ref().unwrap_or(&self.grid)
     }
 
-    /// Samples in occupied cells of a grid at even steps of this length from each ray's near end, and how many there would be if all
-    /// cells were occupied. Where they lie is worked out in f32, so they are the same in every precision.
+    /// Places samples in the occupied cells of a grid, at even steps from each ray's near end; also returns their number if all
+    /// cells were occupied. Positions are computed in f32, so they are the same in every precision.
     pub fn march<T: Scalar>(
         &self,
         grid: &OccupancyGrid,
@@ -205,7 +205,7 @@ impl<T: Scalar> Sampler<T> for Marching {
         512
     }
 
-    /// Leaves out what no photograph shows, and what their silhouettes show to be empty.
+    /// Marks cells empty that no image shows, and carves the visual hull.
     fn prepare(&mut self, data: &Dataset) {
         if self.config.occupancy.skip.grid {
             visibility::carve_unseen(&mut self.grid, data);
@@ -213,7 +213,7 @@ impl<T: Scalar> Sampler<T> for Marching {
         silhouette::carve(&mut self.grid, data, self.config.occupancy.skip.carving);
     }
 
-    /// Looks at some cells and passes over those that hold little.
+    /// Updates some cells from the field's densities.
     fn update(&mut self, progress: &Progress, densities: &DensityFn<'_>) -> bool {
         let Progress { step, train_frac: fraction, seed } = *progress;
         self.progress = fraction;
@@ -228,11 +228,10 @@ impl<T: Scalar> Sampler<T> for Marching {
         true
     }
 
-    /// Looks closely at what is occupied, and finds out what views may leave out by the configuration's error bound. The
-    /// grid of training, which is stored with the model, stays as it is.
+    /// Samples the occupied cells densely and finds those that renders may skip within the configured error bound. The saved grid
+    /// of training does not change.
     ///
-    /// What training passed over stays empty: the field was never asked there, and what it would say is not part of the
-    /// scene that was fitted.
+    /// Cells that training skipped stay empty: the field was never trained there.
     fn finish(&mut self, densities: &DensityFn<'_>) {
         let pruning = self.config.occupancy.skip.pruning;
         self.pruned = (pruning > 0.0).then(|| {
@@ -250,16 +249,18 @@ impl<T: Scalar> Sampler<T> for Marching {
         vec![(GRID, self.grid.occupied_to_bytes())]
     }
 
-    /// With the densities of the cells, which go on to be averaged.
+    /// Includes the moving averages of the cells' densities.
     fn training_state(&self) -> Vec<(&'static str, Vec<u8>)> {
         vec![(GRID, self.grid.to_bytes())]
     }
 
     fn load_state(&mut self, state: &HashMap<String, Vec<u8>>) -> Result<()> {
-        let Some(bytes) = state.get(GRID) else { return Err(Error::setting(GRID, "holds no occupancy grid")) };
+        let Some(bytes) = state.get(GRID) else {
+            return Err(Error::setting(GRID, "is missing in the file; save the model again"));
+        };
         let grid = OccupancyGrid::from_bytes(bytes)?;
         if grid.bounds() != self.grid.bounds() || grid.cells() != self.grid.cells() {
-            return Err(Error::setting(GRID, "belongs to a model of another configuration"));
+            return Err(Error::setting(GRID, "belongs to another configuration; use the one that it was saved with"));
         }
         (self.grid, self.pruned) = (grid, None);
         Ok(())
@@ -267,7 +268,7 @@ impl<T: Scalar> Sampler<T> for Marching {
 }
 
 impl RayTolerance {
-    /// What these switches say of views.
+    /// Returns the tolerances that a skipping configuration sets for renders.
     pub fn of(skip: &Skipping) -> Self {
         RayTolerance { early_stop_eps: skip.early_stop_eps as f32, color_budget: skip.colors as f32 }
     }

@@ -1,9 +1,10 @@
-//! Where rays are sampled.
+//! Samplers, which place samples along rays. Implement [`Sampler`] for a custom one.
 //!
-//! A [`Sampler`] gives steps along rays, and may ask the field, or fields of its own, where to look:
-//! [`Marching`](marching::Marching) takes even steps through the occupied cells of a grid,
-//! [`Hierarchical`](hierarchical::Hierarchical) more samples where a coarse field of its own found something, and
-//! [`Proposal`](proposal::Proposal) resamples what small density fields of its own propose.
+//! | sampler | samples |
+//! |---|---|
+//! | [`Marching`](marching::Marching) | even steps through the occupied cells of a grid (instant-ngp) |
+//! | [`Hierarchical`](hierarchical::Hierarchical) | coarse, then fine by importance sampling (NeRF) |
+//! | [`Proposal`](proposal::Proposal) | resampled from small density fields (mip-NeRF 360) |
 
 pub mod hierarchical;
 pub mod marching;
@@ -24,98 +25,98 @@ use raygrad_autograd::{Scalar, Segments, Var};
 use std::any::Any;
 use std::collections::HashMap;
 
-/// What samples are for.
+/// The purpose of samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// A training step.
     Training,
-    /// A view, with steps so many times smaller than the configured ones, at least 1: where a sampler has steps.
+    /// A render, with steps `finer` times smaller than configured; samplers without steps ignore it.
     View {
-        /// How many times.
+        /// The divisor of the step length, at least 1.
         finer: usize,
     },
 }
 
-/// Where the field is sampled, and what else was found out on the way.
+/// The result of [`Sampler::sample`].
 pub struct Sampled<'t, T: Scalar> {
-    /// The steps: each sample is the middle of an interval, or stands for it.
+    /// The samples of the field, each with an interval.
     pub samples: Samples<T>,
-    /// What fields of the sampler's own showed: pictures of the same rays, to be fitted as well.
+    /// Renders of the sampler's coarse fields along the same rays, which are trained on the images too.
     pub coarse: Vec<Rendered<'t, T>>,
-    /// Histograms that density fields of the sampler's own proposed, to be pulled towards the weights of the field.
+    /// Histograms of proposal fields, which the [interlevel loss](crate::losses::interlevel) fits to the field's weights.
     pub histograms: Vec<ProposalHistogram<'t, T>>,
-    /// How often the sampler asked, and how many steps there would be if nothing in the box were skipped.
+    /// The sampler's own evaluations, and the number of samples without skipping.
     pub evaluations: Evaluations,
 }
 
 impl<'t, T: Scalar> Sampled<'t, T> {
-    /// Steps that nobody was asked for.
+    /// Wraps samples that took no evaluations.
     pub fn new(steps: Samples<T>) -> Self {
         let evaluations = Evaluations { unskipped: steps.len() as u64, ..Evaluations::default() };
         Sampled { samples: steps, coarse: vec![], histograms: vec![], evaluations }
     }
 }
 
-/// A histogram along rays that a density field proposed.
+/// The histogram of a proposal field along rays.
 pub struct ProposalHistogram<'t, T: Scalar> {
-    /// The edges of the bins of all rays, in scene units, rising along each ray: one more than bins a ray.
+    /// Bin edges of all rays, in scene units, rising along each ray: `bins + 1` per ray.
     pub edges: Vec<f64>,
     /// The weight of each bin, `[rays * bins]`.
     pub weights: Var<'t, T>,
-    /// The bins of each ray.
+    /// The rows of each ray's bins.
     pub segments: Segments,
 }
 
-/// What may be left out along one ray of a view.
+/// The tolerances of a render, per ray.
 ///
-/// Each changes a pixel by at most its value times the range of colours; what is left out is made up for by scaling the
-/// rest.
+/// Each changes a pixel by at most its value times the range of colours. The remaining samples are scaled to compensate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RayTolerance {
-    /// A ray ends where less light than this is left, 0 to 1.
+    /// Early termination: a ray ends where its transmittance falls below this, 0 to 1.
     pub early_stop_eps: f32,
-    /// Samples whose weights add up to at most this have no colour of their own, 0 to 1. Quadratures of two nodes an
-    /// interval colour every sample.
+    /// Samples whose weights sum to at most this take no colour evaluation, 0 to 1. Quadratures with two nodes per interval ignore
+    /// it.
     pub color_budget: f32,
 }
 
 impl RayTolerance {
-    /// Nothing is left out.
+    /// No tolerance: every sample is evaluated.
     pub const NONE: RayTolerance = RayTolerance { early_stop_eps: 0.0, color_budget: 0.0 };
 }
 
-/// How much a training step works on.
+/// The size of a training step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BatchSize {
-    /// So many rays, in tiles of so many.
+    /// A fixed number of rays.
     Rays {
-        /// Rays of a step.
+        /// Rays per step.
         step: usize,
-        /// Rays of a tile: one tape, on one core.
+        /// Rays per tile: one tape, on one core.
         tile: usize,
     },
-    /// So many rays that about so many samples lie on them.
+    /// The number of rays that holds about this many samples.
     Samples(usize),
 }
 
-/// How far training is.
+/// The progress of training.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Progress {
-    /// The number of the step that comes next, from 1.
+    /// Number of the next step, from 1.
     pub step: u64,
-    /// How much of the run is done, 0 to 1.
+    /// Fraction of the run that is done, 0 to 1.
     pub train_frac: f64,
     /// The run's seed.
     pub seed: u64,
 }
 
-/// Chooses where rays are sampled. Only [`sample`](Self::sample), [`batch_size`](Self::batch_size) and [`boxed`](Self::boxed) are
-/// needed; the rest is for samplers that learn, leave out, or remember.
+/// Places samples along rays.
 ///
-/// A sampler of one's own implements this and, for its configuration, [`ComponentConfig<Samplers>`](crate::ComponentConfig); with
-/// [`register`](crate::component::register) it is trained, rendered, saved and loaded like those of this crate.
+/// Only [`sample`](Self::sample), [`batch_size`](Self::batch_size) and [`boxed`](Self::boxed) are required; the rest is for
+/// samplers that learn, skip samples or have state. A custom sampler implements this trait and, for its configuration,
+/// [`ComponentConfig<Samplers>`](crate::ComponentConfig). After [`register`](crate::component::register) it trains, renders,
+/// saves and loads like the built-in samplers.
 pub trait Sampler<T: Scalar>: Any + Send + Sync {
-    /// Where the field of `query` is sampled along `rays`. No gradient flows through the choice of places.
+    /// Places samples of the field of `query` along `rays`. No gradient flows through their positions.
     fn sample<'t>(
         &self,
         query: &Query<'_, 't, T>,
@@ -124,71 +125,71 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
         jitter: &mut Jitter<'_>,
     ) -> Sampled<'t, T>;
 
-    /// How much a training step works on.
+    /// Returns the size of a training step.
     fn batch_size(&self) -> BatchSize;
 
-    /// A copy.
+    /// Returns a boxed copy.
     fn boxed(&self) -> Box<dyn Sampler<T>>;
 
-    /// How the integral over the steps is approximated.
+    /// Returns the quadrature of the volume rendering integral.
     fn quadrature(&self) -> Quadrature {
         Quadrature::Midpoint
     }
 
-    /// Samples with less light than this in front of them are dropped in training: the colour changes by at most as much.
+    /// Returns the transmittance below which training drops samples; it bounds the change of colours. 0 keeps all.
     fn early_stop_eps(&self) -> f64 {
         0.0
     }
 
-    /// What views leave out.
+    /// Returns the tolerances of renders.
     fn tolerance(&self) -> RayTolerance {
         RayTolerance::NONE
     }
 
-    /// Rays of a view that are worked out together.
+    /// Returns the number of rays per tile of a render.
     fn view_tile(&self) -> usize {
         32
     }
 
-    /// Fields of the sampler's own.
+    /// Returns the sampler's own fields.
     fn fields(&self) -> Vec<&dyn Field<T>> {
         vec![]
     }
 
-    /// Gives fields of the sampler's own that share of their detail: see [`Field::with_detail`].
+    /// Sets the share of detail of the sampler's own fields: see [`Field::with_detail`].
     fn set_detail(&mut self, _detail: f64) {}
 
-    /// Learns from the photographs what can be known before the first step.
+    /// Prepares from the images before the first step, for instance by visual hull carving.
     fn prepare(&mut self, _data: &Dataset) {}
 
-    /// Learns from the field's densities, before a training step; says whether the [grid](Self::grid) has changed.
+    /// Updates from the field's densities before a training step; returns whether the [grid](Self::grid) changed.
     fn update(&mut self, _progress: &Progress, _densities: &DensityFn<'_>) -> bool {
         false
     }
 
-    /// Looks closely at a field that is finished, before it is rendered.
+    /// Updates from a trained field before it is rendered.
     fn finish(&mut self, _densities: &DensityFn<'_>) {}
 
-    /// The occupancy grid, if there is one.
+    /// Returns the occupancy grid, if there is one.
     fn grid(&self) -> Option<&OccupancyGrid> {
         None
     }
 
-    /// What is stored with a model, beside the parameters, under names.
+    /// Returns named state that is saved with a model, beside the parameters.
     fn state(&self) -> Vec<(&'static str, Vec<u8>)> {
         vec![]
     }
 
-    /// What is written down of a run that is to go on: all that the next steps depend on and that
-    /// [`update`](Self::update) is not told.
+    /// Returns named state that is saved to resume training: everything that the next steps depend on, beyond the arguments of
+    /// [`update`](Self::update).
     fn training_state(&self) -> Vec<(&'static str, Vec<u8>)> {
         self.state()
     }
 
-    /// Takes back what [`state`](Self::state) or [`training_state`](Self::training_state) gave.
+    /// Restores [`state`](Self::state) or [`training_state`](Self::training_state).
     ///
     /// # Errors
-    /// If something is absent, or of a sampler of another configuration.
+    /// If a part is absent, or belongs to another configuration.
     fn load_state(&mut self, _state: &HashMap<String, Vec<u8>>) -> Result<()> {
         Ok(())
     }
@@ -200,7 +201,7 @@ impl<T: Scalar> Clone for Box<dyn Sampler<T>> {
     }
 }
 
-/// The family of samplers.
+/// The [`ComponentType`] of samplers.
 pub struct Samplers;
 
 impl ComponentType for Samplers {
@@ -208,5 +209,5 @@ impl ComponentType for Samplers {
     type Built<T: Scalar> = Box<dyn Sampler<T>>;
 }
 
-/// Which sampler, and its numbers.
+/// The configuration of any sampler.
 pub type SamplerConfig = AnyConfig<Samplers>;

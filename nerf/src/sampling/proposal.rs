@@ -1,4 +1,4 @@
-//! Proposal sampling: small density fields say where along a ray the field is worth asking.
+//! Proposal sampling: small density fields guide the samples of the field (mip-NeRF 360).
 
 use super::steps::{even_edges, invert_cdf};
 use super::{BatchSize, Progress, ProposalHistogram, Purpose, RayTolerance, Sampled, Sampler, Samplers};
@@ -16,7 +16,7 @@ use raygrad_autograd::{Scalar, Segments, Tensor, Var};
 use raygrad_nn::Bound;
 use serde::{Deserialize, Serialize};
 
-/// How places are spread along a ray before anything is known of it.
+/// The spacing of the first samples along a ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Spacing {
@@ -28,7 +28,7 @@ pub enum Spacing {
     Disparity,
 }
 
-/// One proposal: a density field of its own, and how many samples it is asked for.
+/// Configuration of one proposal field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProposalLevel {
@@ -40,7 +40,7 @@ pub struct ProposalLevel {
     pub samples: usize,
 }
 
-/// Numbers of a [`Proposal`] sampler.
+/// Configuration of a [`Proposal`] sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProposalConfig {
@@ -91,7 +91,7 @@ impl ComponentConfig<Samplers> for ProposalConfig {
 
     fn check(&self) -> Result<()> {
         if self.levels.is_empty() {
-            return Err(Error::setting("levels", "is empty; use one proposal or more"));
+            return Err(Error::setting("levels", "is empty; use at least one proposal"));
         }
         for level in &self.levels {
             check_range("levels.samples", level.samples, 1, 1 << 12)?;
@@ -114,7 +114,7 @@ impl ComponentConfig<Samplers> for ProposalConfig {
     }
 }
 
-/// A density of which only the place matters.
+/// A field of which only the density is used.
 #[derive(Debug, Clone)]
 struct Proposer(DensityNetwork);
 
@@ -123,28 +123,30 @@ impl<T: Scalar> Field<T> for Proposer {
         self.0.density(params, positions)
     }
 
-    /// A grey that nobody asks for.
+    /// A placeholder, never used.
     fn color<'t>(&self, _: &Bound<'t, T>, features: &Var<'t, T>, _: &ViewInputs<'_, 't, T>) -> Var<'t, T> {
         features.tape().constant(Tensor::full(&[features.shape()[0], 3], T::from_f64(0.5)))
     }
 }
 
-/// Proposals, and the numbers (Barron et al. 2022, mip-NeRF 360, section 3): each proposal is a density field that is
-/// asked at few places; where its weights lie the next one is asked, and at last the field itself. Proposals are not
-/// fitted to photographs but to the weights of the field, with [`interlevel`](crate::losses::interlevel).
+/// Proposal sampling (Barron et al. 2022, mip-NeRF 360, section 3).
+///
+/// Each proposal is a small density field. Its weights along a ray are the histogram from which the next proposal's samples are
+/// drawn, and finally those of the field. Proposals are not trained on images but on the field's weights, with
+/// [`interlevel`](crate::losses::interlevel).
 #[derive(Debug, Clone)]
 pub struct Proposal {
-    /// The numbers.
+    /// The configuration.
     pub config: ProposalConfig,
     fields: Vec<Proposer>,
-    /// The exponent of the proposals' weights: 0 is no say at all.
+    /// The annealing exponent of the proposals' weights: 0 ignores them.
     trust: f64,
 }
 
 /// In disparity a ray begins at this share of its far end, if not later: at 0 disparity has no end.
 const NEAREST: f64 = 1e-3;
 
-/// How far a place is along a ray of this span, as a share that is even in the spacing.
+/// The map between distances along a ray and shares that are even in the spacing.
 struct Scale {
     ends: [f64; 2],
     disparity: bool,
@@ -166,8 +168,7 @@ impl Scale {
 }
 
 impl Proposal {
-    /// The bins between edges, given as shares of each ray's span, as samples in their middles, and their edges as
-    /// distances.
+    /// The samples at the centres of bins, with bin edges as distances; `shares` are the edges as shares of each ray's span.
     fn steps<T: Scalar>(
         &self,
         rays: &Rays<T>,
@@ -192,8 +193,8 @@ impl Proposal {
         (Samples::new(rays, segments, t, delta, pool), edges)
     }
 
-    /// Edges of `bins` bins a ray, as shares of its span, around places that a histogram over `shares` says are worth it.
-    /// With `whole` the outermost bins go to the ends of the span.
+    /// Edges of `bins` bins per ray, as shares of its span, around samples drawn from a histogram over `shares`. With `whole` the
+    /// outermost bins extend to the ends of the span.
     fn resampled<T: Scalar>(
         &self,
         shares: &[f64],

@@ -1,20 +1,21 @@
-//! Where to sample a ray: stratified bins, and more samples where a first pass found something.
+//! Importance sampling along rays, and the inverse cumulative distribution function (CDF) behind it.
+//!
+//! Start with [`importance_sampling`]; [`invert_cdf`] is the step for one ray.
 
 use crate::camera::rays::{Rays, Samples};
 use crate::random::Jitter;
 use crate::{Error, Result};
 use raygrad_autograd::{Pool, Scalar, Segments};
 
-/// `count` further samples a ray, drawn from the density that `weights` (one for each of the stratified samples
-/// `coarse`) describes over the bins, merged with the coarse ones in order (Mildenhall et al. 2020, section 5.2).
+/// Adds `count` samples per ray, drawn from the histogram of `weights`, merged with the `coarse` samples in order (Mildenhall
+/// et al. 2020, section 5.2).
 ///
-/// The density is an explicit mixture, `1 - uniform_share` of it from the weights: a ray whose weights are all zero is
-/// sampled evenly, and no region is starved. So is a ray with a weight that is negative, infinite or NaN: what made it
-/// shows in the colours. Each sample stands for the interval up to half way to its neighbours, the
-/// outermost up to near and far.
+/// `weights` `[coarse samples]` has one entry per stratified sample. The density is a mixture: `1 - uniform_share` from the
+/// weights, the rest uniform. A ray whose weights are all zero is sampled evenly; so is a ray with a weight that is negative,
+/// infinite or NaN. `delta` of a sample reaches half way to its neighbours, of the outermost ones to near and far.
 ///
 /// # Panics
-/// If there is not one weight for each sample.
+/// If there is not one weight per sample.
 pub fn importance_sampling<T: Scalar>(
     rays: &Rays<T>,
     coarse: &Samples<T>,
@@ -24,7 +25,7 @@ pub fn importance_sampling<T: Scalar>(
     jitter: &mut Jitter<'_>,
     pool: &Pool<T>,
 ) -> Samples<T> {
-    assert_eq!(weights.len(), coarse.len(), "one weight for each coarse sample");
+    assert_eq!(weights.len(), coarse.len(), "weights must have one entry per coarse sample");
     let bins = if rays.is_empty() { 0 } else { coarse.len() / rays.len() };
     let segments = Segments::uniform(rays.len(), bins + count);
     let (mut t, mut delta) = (pool.tensor(&[segments.rows()]), pool.tensor(&[segments.rows()]));
@@ -50,7 +51,7 @@ pub fn importance_sampling<T: Scalar>(
     Samples::new(rays, segments, t, delta, pool)
 }
 
-/// The length of the part of `[near, far]` that is nearest to each of the rising distances `t`.
+/// The length of the part of `[near, far]` that is closest to each of the rising distances `t`.
 fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
     let half = T::from_f64(0.5);
     let mut edge = near;
@@ -65,18 +66,25 @@ fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
     }
 }
 
-/// Inverts the cumulative distribution of a histogram between rising `edges` (one more than weights; two may be equal) at
-/// the rising numbers `u` in `[0, 1)`: `out[i]` rises with `u[i]` and lies between the first and the last edge.
+/// Inverts the CDF of a histogram at the rising numbers `u` in `[0, 1)`, into `out`.
 ///
-/// The density is `1 - uniform_share` times that of the weights, which are spread evenly within their bins, and
-/// `uniform_share` times an even one; it is even where the sum of the weights is 0. Only the proportions of the weights
-/// matter, whatever their size.
+/// `edges` are `bins + 1` rising numbers, of which neighbours may be equal. The density is `1 - uniform_share` times that of the
+/// weights, constant within a bin, plus `uniform_share` times a uniform one. It is uniform if the weights sum to 0. Weights need
+/// no normalisation. `out[i]` rises with `u[i]` and lies between the first and the last edge.
+///
+/// ```
+/// use raygrad_nerf::sampling::steps::invert_cdf;
+/// let mut out = [0.0; 3];
+/// invert_cdf(&[0.0, 1.0, 2.0], &[1.0, 3.0], 0.0, &[0.125, 0.25, 0.625], &mut out)?;
+/// assert_eq!(out, [0.5, 1.0, 1.5]);
+/// # Ok::<_, raygrad_nerf::Error>(())
+/// ```
 ///
 /// # Errors
-/// If a weight is negative, infinite or NaN; `out` is then as it was.
+/// If a weight is negative, infinite or NaN; `out` is then unchanged.
 ///
 /// # Panics
-/// If there is no bin, or not one more edge than weights.
+/// If there is no bin, or `edges` has not one entry more than `weights`.
 pub fn invert_cdf<T: Scalar>(
     edges: &[f64],
     weights: &[T],
@@ -85,12 +93,15 @@ pub fn invert_cdf<T: Scalar>(
     out: &mut [f64],
 ) -> Result<()> {
     let bins = weights.len();
-    assert!(bins > 0, "a distribution over no bins");
-    assert_eq!(edges.len(), bins + 1, "one more edge than weights");
+    assert!(bins > 0, "a histogram needs at least one bin");
+    assert_eq!(edges.len(), bins + 1, "edges must have one entry more than weights");
     let mut largest = 0.0_f64;
     for (bin, weight) in weights.iter().enumerate() {
         if !(weight.is_finite() && *weight >= T::ZERO) {
-            return Err(Error::setting(format!("weights[{bin}]"), format!("is {weight}; use 0 or more")));
+            return Err(Error::setting(
+                format!("weights[{bin}]"),
+                format!("is {weight}; use finite numbers of at least 0"),
+            ));
         }
         largest = largest.max(weight.to_f64());
     }
@@ -114,7 +125,7 @@ pub fn invert_cdf<T: Scalar>(
     Ok(())
 }
 
-/// `bins + 1` edges of equal bins over `[0, 1]`.
+/// Returns the `bins + 1` edges of equal bins over `[0, 1]`.
 pub fn even_edges(bins: usize) -> Vec<f64> {
     (0..=bins).map(|i| i as f64 / bins.max(1) as f64).collect()
 }

@@ -4,11 +4,13 @@
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 
-/// The sum of `w_i v_i` over the samples of each ray: weights `[samples]` and values `[samples, channels]`, whatever they
-/// are (colours, distances, normals), to `[rays, channels]`. Sums are carried in f64.
+/// The operation `sum_i w_i v_i` over the samples of each ray: weights `[samples]` and values `[samples, channels]` to
+/// `[rays, channels]`.
+///
+/// Values may be colours, distances or normals. Sums are carried in f64.
 #[derive(Debug, Clone)]
 pub struct Accumulate(
-    /// The samples of each ray.
+    /// The rows of each ray's samples.
     pub Segments,
 );
 

@@ -1,4 +1,4 @@
-//! Optical depths: how much each interval of a ray dims the light.
+//! Optical depths of intervals.
 
 use crate::field::MOST_LOG_DENSITY;
 use crate::{Error, Result};
@@ -7,11 +7,10 @@ use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 use raygrad_tensor::map;
 
-/// The optical depth `x_i = sigma_i delta_i` of intervals of length `delta`: `[samples]` to `[samples]`, of densities of at
-/// least 0, or of their logarithms (see [`of_log_density`](Self::of_log_density)).
+/// The operation `x_i = sigma_i delta_i`: densities `[samples]` to optical depths `[samples]`.
 ///
-/// A density of 0 has no optical depth even if `delta` is infinite; where `delta` is infinite the gradient of the density
-/// is defined as 0.
+/// Densities are at least 0, or given as logarithms (see [`of_log_density`](Self::of_log_density)). A density of 0 has the
+/// optical depth 0 even if `delta` is infinite; where `delta` is infinite the gradient is defined as 0.
 #[derive(Debug, Clone)]
 pub struct OpticalDepth<T: Scalar> {
     delta: Tensor<T>,
@@ -19,45 +18,52 @@ pub struct OpticalDepth<T: Scalar> {
 }
 
 impl<T: Scalar> OpticalDepth<T> {
-    /// For densities of samples that stand for intervals of length `delta` `[samples]`. The operation panics where a
-    /// density is negative; ask [`check`](Self::check) first if one may be.
+    /// Creates the operation for intervals of length `delta` `[samples]`, in scene units.
+    ///
+    /// Applying it panics if a density is negative; call [`check`](Self::check) first if one may be.
     ///
     /// # Panics
-    /// As [`try_new`](Self::try_new).
+    /// If an interval is negative or NaN.
     #[track_caller]
     pub fn new(delta: Tensor<T>) -> Self {
         OpticalDepth::try_new(delta).unwrap_or_else(|error| panic!("{error}"))
     }
 
-    /// As [`new`](Self::new).
+    /// Creates the operation as [`new`](Self::new), with an error instead of a panic.
     ///
     /// # Errors
     /// If an interval is negative or NaN.
     pub fn try_new(delta: Tensor<T>) -> Result<Self> {
         match delta.as_slice().iter().position(|&delta| !(delta >= T::ZERO)) {
-            Some(i) => Err(Error::setting(format!("delta[{i}]"), format!("is {}; use 0 or more", delta.as_slice()[i]))),
+            Some(i) => Err(Error::setting(
+                format!("delta[{i}]"),
+                format!("is {}; use lengths of at least 0", delta.as_slice()[i]),
+            )),
             None => Ok(OpticalDepth { delta, log_density: false }),
         }
     }
 
-    /// The same for logarithms z of densities, `sigma = e^z`. The exponential is part of the operation: its gradient `x`
-    /// stays finite, and so does `x e^-x`, what [weights](super::Weights) make of it, where that of a separate exponential
-    /// is infinity times 0.
+    /// Creates the operation for log densities z, `sigma = e^z`.
+    ///
+    /// The fused exponential keeps gradients finite: its gradient is `x`, and [weights](super::Weights) multiply it by `e^-x`. A
+    /// separate exponential would give infinity times 0.
+    ///
+    /// # Panics
+    /// If an interval is negative or NaN.
     #[track_caller]
     pub fn of_log_density(delta: Tensor<T>) -> Self {
         OpticalDepth { log_density: true, ..OpticalDepth::new(delta) }
     }
 
-    /// Whether every density is one: at least 0, or NaN, which is somebody else's fault and passes through. Any number is
-    /// the logarithm of one.
+    /// Checks that no density is negative. NaN passes, and so does any log density.
     ///
     /// # Errors
-    /// If a density is negative; the error says which.
+    /// If a density is negative; the error names its index.
     pub fn check(&self, density: &Tensor<T>) -> Result<()> {
         let density = density.as_slice();
         match density.iter().position(|&sigma| !self.log_density && sigma < T::ZERO) {
             Some(i) => {
-                let what = format!("is {}; a density is at least 0: end the network with a softplus", density[i]);
+                let what = format!("is {}; use densities of at least 0, for instance by a softplus", density[i]);
                 Err(Error::setting(format!("density[{i}]"), what))
             }
             None => Ok(()),
@@ -77,7 +83,7 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
     fn shape(&self, x: &[&[usize]]) -> std::result::Result<Shape, ShapeError> {
         match x[0] == self.delta.shape() {
             true => Ok(x[0].into()),
-            false => Err(format!("densities must be {:?}, one for each interval", self.delta.shape())),
+            false => Err(format!("densities must be {:?}, one per interval", self.delta.shape())),
         }
     }
 

@@ -1,11 +1,11 @@
-//! The distortion loss: pulls the weights along a ray together.
+//! The distortion loss, which concentrates the weights along a ray.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 
-/// For each ray, `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` of the weights `w` of samples with midpoints `m` and
-/// intervals of length `d` (Barron et al. 2022, mip-NeRF 360, equation 15): `[samples]` to `[rays]`.
+/// The operation `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` for each ray: weights `w` `[samples]` to `[rays]`, with
+/// midpoints `m` and interval lengths `d` (Barron et al. 2022, mip-NeRF 360, equation 15).
 ///
 /// The double sum is `w . D w` with `(D w)_i = sum_j w_j |m_i - m_j|`, of which two passes give the part from the left,
 /// `L_(i+1) = L_i + W_i (m_(i+1) - m_i)` with W the sum of the weights so far, and the part from the right. Nothing is
@@ -20,22 +20,22 @@ pub struct Distortion<T: Scalar> {
 }
 
 impl<T: Scalar> Distortion<T> {
-    /// For samples with these midpoints `[samples]`, rising within each ray, and interval lengths `[samples]`.
+    /// Creates the operation for midpoints `[samples]`, rising within each ray, and interval lengths `[samples]`.
     ///
     /// # Panics
-    /// If there is not one midpoint and one length for each row of the segments, midpoints fall within a ray, or a length
-    /// is negative or NaN.
+    /// If there is not one midpoint and one length per row of the segments, midpoints fall within a ray, or a length is negative or
+    /// NaN.
     #[track_caller]
     pub fn new(midpoints: Tensor<T>, lengths: Tensor<T>, segments: Segments) -> Self {
         for (what, values) in [("midpoint", &midpoints), ("length", &lengths)] {
-            assert_eq!(values.shape(), [segments.rows()], "one {what} for each sample");
+            assert_eq!(values.shape(), [segments.rows()], "there must be one {what} per sample");
         }
         let m = midpoints.as_slice();
         for (ray, mut rows) in segments.ranges().enumerate() {
             let rises = rows.clone().skip(1).all(|i| m[i] >= m[i - 1]) && rows.all(|i| m[i].is_finite());
-            assert!(rises, "the midpoints of ray {ray} do not rise");
+            assert!(rises, "the midpoints of ray {ray} must rise");
         }
-        assert!(lengths.as_slice().iter().all(|&d| d >= T::ZERO), "lengths are at least 0");
+        assert!(lengths.as_slice().iter().all(|&d| d >= T::ZERO), "lengths must be at least 0");
         Distortion { midpoints, lengths, segments }
     }
 

@@ -1,4 +1,4 @@
-//! Rendering only those samples that light reaches.
+//! Early ray termination: rendering only the visible samples.
 
 use super::quadrature::{Quadrature, refine};
 use super::query::{Query, RayVars};
@@ -7,13 +7,13 @@ use super::rounds::FrontToBack;
 use crate::camera::rays::Samples;
 use raygrad_autograd::{Memo, Pool, Scalar};
 
-/// What is seen, and what it took.
+/// The result of rendering the visible samples only.
 pub struct VisibleSamples<'t, T: Scalar> {
-    /// What is seen.
+    /// The rendered rays.
     pub rendered: Rendered<'t, T>,
-    /// Density queries.
+    /// Number of density evaluations.
     pub density_queries: usize,
-    /// Visible samples, which were evaluated with colour and for gradients.
+    /// Number of visible samples, which were evaluated for colour and gradients.
     pub visible: usize,
 }
 
@@ -22,12 +22,11 @@ pub struct VisibleSamples<'t, T: Scalar> {
 const FIRST_ROUND: usize = 4;
 
 impl Quadrature {
-    /// What the intervals of `steps` show of a field by this rule, in two passes.
+    /// Renders `steps` by this rule, with early ray termination in two passes.
     ///
-    /// An unrecorded pass finds the visible samples, which more than `early_stop_eps` of the light reaches; a recorded one works
-    /// on those, and takes the outputs of operations that [are kept](raygrad_autograd::Op::is_cacheable) from the first. Without a
-    /// termination there is only the second, on all samples. The rest changes a pixel by at most `early_stop_eps` times the range
-    /// of colours.
+    /// An unrecorded pass finds the visible samples, where the transmittance exceeds `termination`. A recorded pass evaluates those
+    /// and reuses the outputs of [cacheable](raygrad_autograd::Op::is_cacheable) operations. With a `termination` of 0 there is only
+    /// the second pass, on all samples. Dropped samples change a pixel by at most `termination` times the range of colours.
     pub fn render<'t, T: Scalar>(
         self,
         query: &Query<'_, 't, T>,

@@ -1,16 +1,32 @@
-//! Volume rendering: what arrives at the eye from samples along rays.
+//! Volume rendering: from densities and colours of samples to the colours of rays.
 //!
-//! There is one way from a density to a picture, for training, views and references alike:
-//! [density](crate::Density) → [`OpticalDepth`] of each interval → [`Weights`], front to back → [`Accumulate`] of colours,
-//! distances or whatever else. Each arrow is an operation of its own (functions of the same name in small letters apply
-//! them), and [`Rendered`] has everything together under its name. A [`quadrature::Quadrature`] says where along a ray the
-//! field is asked and how its answers are weighted.
+//! Training, renders and references share the operations
+//! [density](crate::Density) → [`OpticalDepth`] → [`Weights`] → [`Accumulate`] (of colours, distances or normals).
+//! [`Rendered`] holds all results of a batch of rays. A [`quadrature::Quadrature`] chooses the samples and their weights.
+//!
+//! # Notation
+//!
+//! | letter | meaning | shape | unit |
+//! |---|---|---|---|
+//! | `t` | distance of a sample along its ray | `[samples]` | scene unit |
+//! | `delta` | length of a sample's interval | `[samples]` | scene unit |
+//! | `sigma` | density | `[samples]` | 1 / scene unit |
+//! | `x = sigma delta` | optical depth of an interval | `[samples]` | |
+//! | `alpha = 1 - exp(-x)` | opacity of an interval | `[samples]` | 0 to 1 |
+//! | `T_i = exp(-sum of x_j for j < i)` | transmittance in front of a sample | `[samples]` | 0 to 1 |
+//! | `w = T alpha` | weight of a sample | `[samples]` | 0 to 1 |
+//! | `c` | colour of a sample | `[samples, 3]` | 0 to 1 |
+//!
+//! The colour of a ray is `sum w c`, its opacity `sum w`, its depth sum `sum w t` (Mildenhall et al. 2020, equation 3; Max
+//! 1995). Samples are packed: those of all rays stand one after another, and `Segments` holds the rows of each ray.
+//!
+//! # Example
 //!
 //! ```
 //! use raygrad_autograd::{Segments, Tape, Tensor};
 //! use raygrad_nerf::volume::{OpticalDepth, accumulate, weights};
 //! let tape = Tape::<f64>::new();
-//! // Two rays: of three samples and of one.
+//! // Two rays, of three samples and of one.
 //! let segments = Segments::new([0, 3, 4]);
 //! let sigma = tape.leaf(Tensor::from([0.0, 0.5, 2.0, 1e9]));
 //! let x = tape.apply(OpticalDepth::new(Tensor::full(&[4], 0.1)), &[&sigma]);
@@ -18,8 +34,8 @@
 //! let color = tape.constant(Tensor::from([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.5]]));
 //! let seen = accumulate(&w, &color, &segments);
 //! assert_eq!(seen.shape(), [2, 3]);
-//! assert_eq!(seen.slice_axis(0, 1..).value(), [[0.5, 0.5, 0.5]]); // a wall
-//! assert_eq!(seen.sum().grad(&[&sigma])[0].as_slice()[3], 0.0); // it cannot become more opaque
+//! assert_eq!(seen.slice_axis(0, 1..).value(), [[0.5, 0.5, 0.5]]); // an opaque wall
+//! assert_eq!(seen.sum().grad(&[&sigma])[0].as_slice()[3], 0.0); // its opacity is saturated
 //! ```
 
 pub(crate) mod accumulate;

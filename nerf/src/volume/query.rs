@@ -1,54 +1,54 @@
-//! Asking a field at samples along rays.
+//! Evaluation of a field at samples along rays.
 
 use crate::camera::rays::Samples;
 use crate::field::{Density, Field, ViewInputs};
 use raygrad_autograd::{Scalar, Tape, Tensor, Var};
 use raygrad_nn::Bound;
 
-/// Rays that are variables: what learns poses.
+/// Rays as variables of the tape, for pose refinement.
 #[derive(Clone)]
 pub struct RayVars<'t, T: Scalar> {
-    /// Where they start, `[rays, 3]`.
+    /// Origins, `[rays, 3]`, in scene units.
     pub origins: Var<'t, T>,
     /// Unit directions, `[rays, 3]`.
     pub directions: Var<'t, T>,
 }
 
-/// A field with its parameters, and what is known of the rays along which it is asked.
+/// A field with its parameters and the context of the rays along which it is evaluated.
 #[derive(Clone, Copy)]
 pub struct Query<'a, 't, T: Scalar> {
-    /// What is asked.
+    /// The field.
     pub field: &'a dyn Field<T>,
     /// The parameters.
     pub params: &'a Bound<'t, T>,
-    /// The number of the photograph that each ray belongs to.
+    /// The image index of each ray, `[rays]`; `None` uses the mean appearance.
     pub frames: Option<&'a [u32]>,
-    /// The rays as variables; without them rays are constants.
+    /// The rays as variables; `None` makes them constants.
     pub rays: Option<&'a RayVars<'t, T>>,
-    /// Whether positions are variables of the tape although rays are not: what normals need.
+    /// Whether positions are variables even if rays are constants, as normals need.
     pub slopes: bool,
-    /// The distance within which samples learn less, by the square of theirs, in scene units; 0 for none. See
+    /// The gradient scaling distance, in scene units; 0 turns it off. See
     /// [`Config::gradient_scaling_distance`](crate::Config::gradient_scaling_distance).
     pub near: f64,
 }
 
 impl<'a, 't, T: Scalar> Query<'a, 't, T> {
-    /// Of a field, along rays of which nothing is known.
+    /// Creates a query with constant rays and the mean appearance.
     pub fn new(field: &'a dyn Field<T>, params: &'a Bound<'t, T>) -> Self {
         Query { field, params, frames: None, rays: None, slopes: false, near: 0.0 }
     }
 
-    /// The same of another field.
+    /// Returns the query for another field.
     pub fn of(self, field: &'a dyn Field<T>) -> Self {
         Query { field, ..self }
     }
 
-    /// The tape that the parameters are on.
+    /// Returns the tape of the parameters.
     pub fn tape(&self) -> &'t Tape<T> {
         self.params.tape()
     }
 
-    /// Positions of samples, `[samples, 3]`, in scene units.
+    /// Returns the positions of samples, `[samples, 3]`, in scene units.
     #[track_caller]
     pub fn positions(&self, samples: &Samples<T>) -> Var<'t, T> {
         let tape = self.tape();
@@ -62,7 +62,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
         }
     }
 
-    /// Unit directions of the rays of samples, `[rays, 3]`.
+    /// Returns the unit directions of the samples' rays, `[rays, 3]`.
     pub fn directions(&self, samples: &Samples<T>) -> Var<'t, T> {
         match self.rays {
             Some(rays) => rays.directions.clone(),
@@ -70,13 +70,13 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
         }
     }
 
-    /// The density at samples.
+    /// Computes the density at samples.
     #[track_caller]
     pub fn density(&self, samples: &Samples<T>) -> Density<'t, T> {
         self.density_at(samples, &self.positions(samples))
     }
 
-    /// As [`density`](Self::density), of samples whose [positions](Self::positions) are known.
+    /// Computes the density as [`density`](Self::density), with known [positions](Self::positions).
     #[track_caller]
     pub fn density_at(&self, samples: &Samples<T>, positions: &Var<'t, T>) -> Density<'t, T> {
         let density = self.field.density(self.params, positions);
@@ -86,7 +86,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
         }
     }
 
-    /// What part of its gradient each sample learns from, `[samples]`, if any learns less.
+    /// The gradient scale of each sample, `[samples]`, if any is below 1.
     fn less(&self, samples: &Samples<T>) -> Option<Tensor<T>> {
         let near = self.near;
         if near == 0.0 || !self.tape().is_recording() || !samples.t.as_slice().iter().any(|t| t.to_f64() < near) {
@@ -95,7 +95,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
         Some(samples.t.map(|t| T::from_f64((t.to_f64() / near).powi(2).min(1.0))))
     }
 
-    /// The colour of samples with these features, `[samples, 3]`.
+    /// Computes the colour of samples with these features, `[samples, 3]`.
     #[track_caller]
     pub fn color(&self, features: &Var<'t, T>, samples: &Samples<T>) -> Var<'t, T> {
         let directions = &self.directions(samples);
@@ -108,7 +108,7 @@ impl<'a, 't, T: Scalar> Query<'a, 't, T> {
     }
 }
 
-/// The same values with that part of their gradients.
+/// The same values with scaled gradients.
 fn with_slopes<'t, T: Scalar>(x: Var<'t, T>, shares: &Tensor<T>) -> Var<'t, T> {
     // What is added is 0.
     let moved = (&x - x.detach()) * x.tape().constant(shares.clone());

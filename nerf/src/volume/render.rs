@@ -1,4 +1,4 @@
-//! What arrives at the eye from samples along rays, with a name for everything.
+//! Rendered rays, with a name for each quantity.
 
 use super::accumulate::Accumulate;
 use super::depth::OpticalDepth;
@@ -8,14 +8,14 @@ use crate::field::Density;
 use raygrad_autograd::{Scalar, Segments, Tensor, Var};
 use std::ops::Add;
 
-/// How often fields were asked.
+/// Counts of field evaluations.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Evaluations {
-    /// For a density.
+    /// Density evaluations.
     pub density: u64,
-    /// For a colour.
+    /// Colour evaluations.
     pub color: u64,
-    /// How often it would have been for each if nothing but the outside of the box were left out.
+    /// Evaluations of each without skipping within the box.
     pub unskipped: u64,
 }
 
@@ -31,10 +31,10 @@ impl Add for Evaluations {
 }
 
 impl<'t, T: Scalar> Density<'t, T> {
-    /// The optical depth of samples that stand for intervals of length `delta`, each `[samples]`: see [`OpticalDepth`].
+    /// Computes the optical depth of samples with intervals of length `delta`, both `[samples]`: see [`OpticalDepth`].
     ///
     /// # Panics
-    /// If an interval is negative or NaN, or there is not one for each sample.
+    /// If an interval is negative or NaN, or there is not one per sample.
     #[track_caller]
     pub fn optical_depth(&self, delta: &Tensor<T>) -> Var<'t, T> {
         let of = if self.log { OpticalDepth::of_log_density } else { OpticalDepth::new };
@@ -42,26 +42,25 @@ impl<'t, T: Scalar> Density<'t, T> {
     }
 }
 
-/// The weights of samples of optical depths `x` `[samples]`, front to back along their rays: see [`Weights`].
+/// Computes weights `[samples]` from optical depths `x` `[samples]`: see [`Weights`].
 ///
 /// # Panics
-/// If there is not one optical depth for each sample.
+/// If `x` has not one entry per sample.
 #[track_caller]
 pub fn weights<'t, T: Scalar>(x: &Var<'t, T>, segments: &Segments) -> Var<'t, T> {
     x.tape().apply(Weights::new(segments.clone()), &[x])
 }
 
-/// The sums of `values` `[samples, channels]` times `weights` `[samples]` along rays, `[rays, channels]`: see
-/// [`Accumulate`].
+/// Sums `values` `[samples, channels]` times `weights` `[samples]` along rays, to `[rays, channels]`: see [`Accumulate`].
 ///
 /// # Panics
-/// If there is not one weight and one row of values for each sample.
+/// If there is not one weight and one row of values per sample.
 #[track_caller]
 pub fn accumulate<'t, T: Scalar>(weights: &Var<'t, T>, values: &Var<'t, T>, segments: &Segments) -> Var<'t, T> {
     weights.tape().apply(Accumulate(segments.clone()), &[weights, values])
 }
 
-/// How samples are weighted.
+/// Weights of samples and optical depths of rays.
 pub struct RayWeights<'t, T: Scalar> {
     /// The weight of each sample, `[samples]`.
     pub weights: Var<'t, T>,
@@ -69,60 +68,59 @@ pub struct RayWeights<'t, T: Scalar> {
     pub optical_depth: Var<'t, T>,
 }
 
-/// What is seen along rays, front to back: everything that a picture shows or a loss can use. Each may be differentiated.
+/// Rendered rays: everything that an image or a loss can use, differentiable.
 pub struct Rendered<'t, T: Scalar> {
-    /// Where the field was asked.
+    /// The samples at which the field was evaluated.
     pub samples: Samples<T>,
-    /// The places, `[samples, 3]`: on the tape where a [query](super::Query) has them there.
+    /// Positions of the samples, `[samples, 3]`; variables if the [query](super::Query) makes them so.
     pub positions: Var<'t, T>,
-    /// Unit directions of the rays, `[rays, 3]`: on the tape where rays are variables.
+    /// Unit directions of the rays, `[rays, 3]`; variables if rays are.
     pub directions: Var<'t, T>,
-    /// The density there.
+    /// The density at the samples.
     pub density: Density<'t, T>,
-    /// How much of each sample arrives at the eye, `[samples]`.
+    /// Weights `w = T alpha` of the samples, `[samples]`.
     pub weights: Var<'t, T>,
     /// The optical depth of each ray, `[rays]`.
     pub optical_depth: Var<'t, T>,
-    /// Colour without a background, `[rays, 3]`: at most the opacity.
+    /// Colour `sum w c` without a background, `[rays, 3]`, at most the opacity.
     pub color: Var<'t, T>,
 }
 
 impl<'t, T: Scalar> Rendered<'t, T> {
-    /// The sums of `values` `[samples, channels]` times the weights along rays, `[rays, channels]`.
+    /// Sums `values` `[samples, channels]` times the weights along rays, to `[rays, channels]`.
     #[track_caller]
     pub fn accumulate(&self, values: &Var<'t, T>) -> Var<'t, T> {
         accumulate(&self.weights, values, &self.samples.segments)
     }
 
-    /// Light that is left behind the last sample, `[rays]`, 0 to 1: what a background is multiplied by.
+    /// Computes the transmittance behind the last sample, `[rays]`, 0 to 1: the factor of a background.
     #[track_caller]
     pub fn transmittance(&self) -> Var<'t, T> {
         (-&self.optical_depth).exp()
     }
 
-    /// Light that samples have blocked, `[rays]`, 0 to 1: the sum of the weights, with all digits where it is small.
+    /// Computes the opacity `sum w`, `[rays]`, 0 to 1, with full relative precision where it is small.
     #[track_caller]
     pub fn opacity(&self) -> Var<'t, T> {
         -(-&self.optical_depth).expm1()
     }
 
-    /// The distance times the light that comes from there, `[rays]`, in scene units: divided by the opacity, the expected
-    /// distance of what is seen.
+    /// Computes the depth sum `sum w t`, `[rays]`, in scene units. Divided by the opacity, it is the expected distance.
     #[track_caller]
     pub fn depth(&self) -> Var<'t, T> {
         let t = self.samples.t.reshape(&[self.samples.len(), 1]);
         self.accumulate(&self.weights.tape().constant(t)).reshape(&[self.samples.segments.len()])
     }
 
-    /// The colour over a background `[rays, 3]`.
+    /// Composites the colour over a background `[rays, 3]`.
     #[track_caller]
     pub fn over(&self, background: &Tensor<T>) -> Var<'t, T> {
         let left = self.transmittance().reshape(&[self.samples.segments.len(), 1]);
         &self.color + left * self.color.tape().constant(background.clone())
     }
 
-    /// The unit normal at each sample, `-grad sigma / |grad sigma|`, `[samples, 3]`; 0 where the density is constant. It
-    /// is recorded, so that losses of normals have gradients of their own.
+    /// Computes the unit normal `-grad sigma / |grad sigma|` at each sample, `[samples, 3]`; 0 where the density is constant. It is
+    /// recorded, so that losses of normals are differentiable.
     ///
     /// # Panics
     /// If positions are not on the tape: see [`Query::slopes`](super::Query::slopes).
@@ -132,8 +130,8 @@ impl<'t, T: Scalar> Rendered<'t, T> {
         downhill(&self.density.value.sum().grad_graph(&[&self.positions]).remove(0))
     }
 
-    /// The normals that are seen along the rays: the sums of [those of samples](Self::normals) times the weights,
-    /// `[rays, 3]`, no longer than the opacity, as numbers.
+    /// Computes the sum of weights times [normals](Self::normals) along rays, `[rays, 3]`, as plain numbers. Its length is at most the
+    /// opacity.
     ///
     /// # Panics
     /// As [`normals`](Self::normals), or if the density does not depend on positions.

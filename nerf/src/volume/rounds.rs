@@ -1,4 +1,4 @@
-//! Rays that are followed front to back, until their light is used up.
+//! Marching rays front to back, in rounds, until they terminate.
 
 use super::query::Query;
 use crate::camera::rays::Samples;

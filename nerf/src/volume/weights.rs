@@ -1,4 +1,4 @@
-//! Weights: how much of what each sample shows arrives at the eye.
+//! Weights of samples.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
@@ -6,45 +6,56 @@ use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeErr
 use raygrad_tensor::map;
 use std::sync::Arc;
 
-/// The weights `w_i = T_i alpha_i` of samples of optical depths `x`, front to back along their rays (Mildenhall et al.
-/// 2020, equation 3; Max 1995): `[samples]` to `[samples]`, with `alpha_i = 1 - exp(-x_i)` and the transmittance
-/// `T_i = exp(-sum of x_j for j < i)` in front of the sample. With what is left behind the last sample, `exp(-sum x)`, the
-/// weights of a ray add up to 1.
+/// The operation `w_i = T_i alpha_i`: optical depths `x` `[samples]` to weights `[samples]`, front to back along each ray
+/// (Mildenhall et al. 2020, equation 3; Max 1995).
 ///
-/// The gradient runs back to front, `B_i = alpha_i g_i + (1 - alpha_i) B_(i+1)` and `dx_i = T_(i+1) (g_i - B_(i+1))`:
-/// nothing is divided by a transmittance, so it is accurate behind opaque samples too.
+/// `alpha_i = 1 - exp(-x_i)`, and `T_i = exp(-sum of x_j for j < i)` is the transmittance in front of the sample. Together with
+/// the transmittance behind the last sample, `exp(-sum x)`, the weights of a ray sum to 1.
+///
+/// The gradient runs back to front: `B_i = alpha_i g_i + (1 - alpha_i) B_(i+1)` and `dx_i = T_(i+1) (g_i - B_(i+1))`. It divides
+/// by no transmittance, so it is accurate behind opaque samples too.
+///
+/// ```
+/// use raygrad_autograd::{Segments, Tape, Tensor};
+/// use raygrad_nerf::volume::weights;
+/// let tape = Tape::<f64>::new();
+/// // One ray; each interval blocks half of the light that reaches it.
+/// let x = tape.leaf(Tensor::full(&[3], f64::ln(2.0)));
+/// let w = weights(&x, &Segments::new([0, 3]));
+/// assert!(w.value().as_slice().iter().zip([0.5, 0.25, 0.125]).all(|(w, half)| (w - half).abs() < 1e-15));
+/// ```
 #[derive(Debug, Clone)]
 pub struct Weights {
     segments: Segments,
-    /// Optical depth in front of each ray's first sample, if there is any.
+    /// Optical depth in front of each ray's first sample, if any.
     before: Option<Arc<[f64]>>,
 }
 
 impl Weights {
-    /// Of the samples of these rays.
+    /// Creates the operation for the samples of these rays.
     pub fn new(segments: Segments) -> Self {
         Weights { segments, before: None }
     }
 
-    /// The same with an optical depth of `before` `[rays]`, at least 0, in front of each ray's first sample: a ray that is
-    /// followed piece by piece.
+    /// Creates the operation with an optical depth `before` `[rays]`, at least 0, in front of each ray's first sample, for rays that
+    /// are marched piece by piece.
     ///
     /// # Panics
-    /// If there is not one for each ray.
+    /// If `before` has not one entry per ray.
     #[track_caller]
     pub fn behind(segments: Segments, before: impl Into<Arc<[f64]>>) -> Self {
         let before = before.into();
-        assert_eq!(before.len(), segments.len(), "one optical depth for each ray");
+        assert_eq!(before.len(), segments.len(), "`before` must have one entry per ray");
         Weights { segments, before: Some(before) }
     }
 
-    /// The transmittance `T_i` in front of each sample, `[samples]`, for optical depths `x` `[samples]`.
+    /// Computes the transmittance `T_i` in front of each sample, `[samples]`, from optical depths `x` `[samples]`.
     ///
     /// # Panics
-    /// If there is not one optical depth for each sample.
+    /// If `x` has not one entry per sample.
     #[track_caller]
     pub fn transmittance<T: Scalar>(&self, x: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
-        assert_eq!(x.shape(), [self.segments.rows()], "one optical depth for each sample");
+        assert_eq!(x.shape(), [self.segments.rows()], "optical depths must have one entry per sample");
         let mut before = pool.tensor(x.shape());
         let (depth, out) = (x.as_slice(), before.as_mut_slice());
         for (ray, rows) in self.segments.ranges().enumerate() {
@@ -75,7 +86,7 @@ impl<T: Scalar> Op<T> for Weights {
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
         match x[0] == [self.segments.rows()] {
             true => Ok(x[0].into()),
-            false => Err(format!("optical depths must be [{}], one for each sample", self.segments.rows())),
+            false => Err(format!("optical depths must be [{}], one per sample", self.segments.rows())),
         }
     }
 

@@ -1,4 +1,4 @@
-//! How far from the axis a lens keeps directions in order: where the image folds back.
+//! The domain of a distortion: how far from the axis it is monotonic, before the image folds back.
 
 /// The highest power of the determinant of a distortion along a line from the axis, and one.
 const TERMS: usize = 23;

@@ -1,4 +1,4 @@
-//! Where a place was before a lens moved it.
+//! The inverse of a distortion.
 
 use crate::camera::lens::fold::Domain;
 use crate::camera::lens::maps;

@@ -1,4 +1,4 @@
-//! The formulas of lenses, for any kind of number: numbers are put in their places by them, variables differentiated.
+//! The formulas of lenses, generic over the number type, so that the same code gives values and derivatives.
 //!
 //! In the image plane a lens's distortion is a map of places to places: of `(x / z, y / z)` for [`rational`], of the
 //! direction's angle to the axis, laid off towards `(x, y)`, for [`thin_prism`].

@@ -1,13 +1,14 @@
-//! Lenses on a tape, with gradients by their coefficients.
+//! Differentiable projection through lenses.
 
 use crate::camera::lens::Lens;
 use raygrad_autograd::{Scalar, Var, record};
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::{Tensor, check::Entry};
 
-/// Places `[.., 2]` of directions `[.., 3]`, of any length, through a lens of the kind of `lens` with the coefficients `[n]`
-/// or, for each direction its own, `[.., n]`, in the order of [`Lens::coefficients`]: [`Lens::project`] with variables. The
-/// axes are those of [`Lens`].
+/// Projects directions `[.., 3]` of any length to places `[.., 2]`, differentiable with respect to both arguments.
+///
+/// `lens` only chooses the model. `coefficients` are `[n]`, or `[.., n]` for one lens per direction, in the order of
+/// [`Lens::coefficients`]. The axes are those of [`Lens`]; [`Lens::project`] is the formula.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -22,12 +23,16 @@ use raygrad_autograd::{Tensor, check::Entry};
 /// ```
 ///
 /// # Panics
-/// If the last extent of directions is not 3, or the coefficients are not as many as the lens has.
+/// If the last axis of directions is not 3, or that of coefficients is not the number that the lens has.
 #[track_caller]
 pub fn lens_places<'t, T: Scalar>(lens: &Lens, coefficients: &Var<'t, T>, directions: &Var<'t, T>) -> Var<'t, T> {
-    assert_eq!(directions.shape().last(), Some(&3), "directions of three elements");
+    assert_eq!(directions.shape().last(), Some(&3), "the last axis of directions must be 3");
     let count = lens.coefficients().len();
-    assert_eq!(coefficients.shape().last(), Some(&count), "coefficients of {lens:?}");
+    assert_eq!(
+        coefficients.shape().last(),
+        Some(&count),
+        "the last axis of coefficients must be the number that {lens:?} has"
+    );
     let inputs = (0..3).map(|i| directions.slice_axis(-1, i..i + 1));
     let inputs: Vec<_> = inputs.chain((0..count).map(|i| coefficients.slice_axis(-1, i..i + 1))).collect();
     let places = match count {

@@ -1,8 +1,7 @@
 //! The NeRF-synthetic format (Mildenhall et al. 2020): `transforms_train.json`, `transforms_val.json` and
 //! `transforms_test.json`, written by Blender.
 //!
-//! Programs that write it beside others give cameras in the fields of [`transforms`](super::transforms), which count here
-//! too; but `camera_angle_y` is that of Blender's sensor and not of the image, and passes.
+//! Camera fields of [`transforms`](super::transforms) count here too, except `camera_angle_y`, which is that of Blender's sensor.
 
 use super::frames::{Dialect, views};
 use super::json::{self, Object};
@@ -15,7 +14,7 @@ use crate::error::{Error, Result};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// How far numbers of cameras may be apart that are the same, as a share of them.
+/// Relative tolerance within which cameras' numbers count as equal.
 const SAME: f64 = 1e-9;
 
 /// The file that describes a split.
@@ -32,12 +31,13 @@ pub(crate) fn detect(folder: &Path) -> bool {
     Split::ALL.into_iter().any(|split| file_of(folder, split).is_file())
 }
 
-/// Reads the files of all splits that there are, in the order train, val, test. The capture names the first of them;
-/// views of the others have the name of theirs in [`field`](View::field). A file that gives no size has images of the size
-/// of the first that exists.
+/// Reads the files of all splits, in the order train, val, test.
+///
+/// [`Capture::file`] is the first of them; views of the others name theirs in [`field`](View::field). Without a size in the file,
+/// all images have that of the first existing one.
 ///
 /// # Errors
-/// If there is no file, or one cannot be read, lacks a field or has one that is wrong or cannot be followed.
+/// If there is no file, or one cannot be read, lacks a field, or has a field that is wrong or unsupported.
 pub fn read(folder: &Path) -> Result<Capture> {
     let mut capture: Option<Capture> = None;
     for split in Split::ALL {
@@ -59,20 +59,21 @@ pub fn read(folder: &Path) -> Result<Capture> {
             None => capture = Some(Capture { aabb_scale, ..Capture::new(folder, file, Format::Blender, views) }),
         }
     }
-    let what = "is not a dataset in this format: expected a file transforms_train.json, transforms_val.json or \
+    let what = "is not a Blender dataset: expected transforms_train.json, transforms_val.json or \
                 transforms_test.json";
     capture.ok_or_else(|| Error::file(folder, what))
 }
 
-/// Writes a file for each split that has views, or `transforms_train.json` if no view has a split. The format has a size and
-/// a field of view for all images; points, depths and sharpness have no place in it.
+/// Writes a file for each split that has views, or `transforms_train.json` if no view has a split.
+///
+/// The format has one size and one field of view for all images, and no points, depths or sharpness.
 ///
 /// # Errors
-/// If there are no views; if they have masks, or splits only some; if cameras differ, or are not pinholes with square
-/// pixels whose image is centred; or if a file cannot be written.
+/// If there are no views, some have masks, only some have splits, cameras differ, or cameras are not centred pinholes with square
+/// pixels; or if a file cannot be written.
 pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
-    let bad = |what: String| Err(Error::file(folder, format!("cannot be written in the format of Blender: {what}")));
-    let Some(first) = capture.views.first() else { return bad("there are no photographs".to_owned()) };
+    let bad = |what: String| Err(Error::file(folder, format!("cannot be written in Blender's format: {what}")));
+    let Some(first) = capture.views.first() else { return bad("there are no images".to_owned()) };
     for view in &capture.views {
         if let Some(what) = unfit(view, first) {
             return bad(format!("{} {what}", view.name));
@@ -103,25 +104,26 @@ fn unfit(view: &View, first: &View) -> Option<String> {
     let ([fx, fy], [cx, cy], [w, h]) = (camera.focal, camera.centre, [camera.width as f64, camera.height as f64]);
     let undistort = "undistort the images first (`raygrad prepare --undistort`)";
     if camera.lens != Lens::Pinhole {
-        return Some(format!("has a lens that distorts: {undistort}"));
+        return Some(format!("has lens distortion: {undistort}"));
     }
     if !near(fx, fy) {
-        return Some(format!("has pixels that are not square, with focal lengths of {fx} and {fy}: {undistort}"));
+        return Some(format!("has the focal lengths {fx} and {fy}, so no square pixels: {undistort}"));
     }
     if !(near(2.0 * cx, w) && near(2.0 * cy, h)) {
-        return Some(format!("has its principal point at {cx}, {cy} and not in the middle: {undistort}"));
+        return Some(format!("has its principal point at {cx}, {cy}, not at the centre: {undistort}"));
     }
     let other = &first.camera;
     if (camera.width, camera.height) != (other.width, other.height) || !near(fx, other.focal[0]) {
-        return Some(format!("has another size or focal length than {}: {undistort}", first.name));
+        return Some(format!("differs in size or focal length from {}: {undistort}", first.name));
     }
     if !(w > 0.0 && h > 0.0 && fx > 0.0 && camera.pose.is_finite()) {
-        return Some("has a camera that is not whole: without a size, or with a number that is not finite".to_owned());
+        return Some("has a camera without a size or with a non-finite number: correct it".to_owned());
     }
     if view.mask.is_some() {
-        return Some("has a mask, which the format has no place for: make what it hides transparent".to_owned());
+        return Some("has a mask, which the format does not support: make its pixels transparent".to_owned());
     }
-    (view.split.is_some() != first.split.is_some()).then(|| "is in no split, or alone is in one".to_owned())
+    (view.split.is_some() != first.split.is_some())
+        .then(|| "has no split while others do, or the reverse: give all images a split or none".to_owned())
 }
 
 fn frame(view: &View) -> Value {

@@ -1,9 +1,9 @@
 //! COLMAP's sparse reconstructions (Schönberger and Frahm 2016): `cameras`, `images` and `points3D`, each a `.bin` or
 //! a `.txt` file.
 //!
-//! A pose there goes from the world to a camera that looks along its `+z` with `+y` down, as a quaternion with its
-//! real part first and a translation. Pixels are counted as [`Camera`] counts them. Since version 3.12 `rigs` and
-//! `frames` stand beside: they say how cameras are mounted, and the poses of the images are in `images` still.
+//! Poses are world-to-camera, a quaternion (real part first) and a translation, for a camera that looks along `+z` with `+y` down.
+//! Pixel coordinates are those of [`Camera`]. `rigs` and `frames` of version 3.12 and later are not read: image poses are still in
+//! `images`.
 
 mod beside;
 mod binary;
@@ -47,11 +47,11 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// Reads the cameras and points of `folder`, views in the order of their names. No image is decoded.
 ///
 /// # Errors
-/// If a file is absent or damaged, an image belongs to no camera, an identifier or a name is there twice, a camera's
-/// model is not supported, or a number is not finite. The error names the file and the entry, or the line.
+/// If a file is absent or damaged, an image has no camera, an identifier or name is duplicated, a camera model is not supported, or
+/// a number is not finite. The error names the file and the entry or line.
 pub fn read(folder: &Path) -> Result<Capture> {
     let Some((model, encoding)) = find(folder) else {
-        let what = "holds no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
+        let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
         return Err(Error::file(folder, what));
     };
     let files = encoding.files(&model);
@@ -64,21 +64,21 @@ pub fn read(folder: &Path) -> Result<Capture> {
     Ok(capture)
 }
 
-/// Writes the cameras and points of `capture` to `sparse/0` in `folder`. Images are the caller's: each must be in
-/// `images` by the name of its view. Views with the same camera share an entry; which photographs show a point is not
-/// written.
+/// Writes the cameras and points of `capture` to `sparse/0` in `folder`.
+///
+/// The caller puts each image in `images` under the name of its view. Views with equal cameras share an entry. Tracks of points
+/// are not written.
 ///
 /// # Errors
-/// If COLMAP has no model for a camera, a name or a number cannot be written, another model is in the folder that
-/// would be read in place of this or together with it, or a file cannot be written. The error names the view or the
-/// file.
+/// If COLMAP has no model for a camera, a name or number cannot be written, the folder holds another model that would be read
+/// instead, or a file cannot be written. The error names the view or the file.
 pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()> {
     let table = Table::new(capture, encoding)?;
     let folder = folder.join("sparse").join("0");
     let mut others = ["rigs.bin", "frames.bin", "rigs.txt", "frames.txt"].map(|name| folder.join(name)).to_vec();
     Encoding::ALL.iter().filter(|other| **other != encoding).for_each(|other| others.extend(other.files(&folder)));
     if let Some(other) = others.iter().find(|file| file.exists()) {
-        return Err(Error::file(other, "belongs to another model in the same folder: move that away first"));
+        return Err(Error::file(other, "belongs to another model in this folder: move that away first"));
     }
     std::fs::create_dir_all(&folder).map_err(|e| Error::file(&folder, format!("cannot be made: {e}")))?;
     let bytes = match encoding {
@@ -110,13 +110,13 @@ fn parse(
     distinct(images_file, "image_id", images.iter().map(|entry| (entry.id, entry.place)))?;
     distinct(images_file, "name", images.iter().map(|entry| (entry.name.as_str(), entry.place)))?;
     if images.is_empty() {
-        return Err(Error::field(images_file, "images", "is empty: there is nothing to load"));
+        return Err(Error::field(images_file, "images", "is empty: add at least one image"));
     }
     let cameras: HashMap<u32, Camera> = cameras.into_iter().map(|entry| (entry.id, entry.camera)).collect();
     let view = |entry: ImageEntry| {
         let ImageEntry { place, pose, name, camera: id, .. } = entry;
         let Some(camera) = cameras.get(&id) else {
-            let what = format!("is {id}, but {} has no such camera", cameras_file.display());
+            let what = format!("is {id}, but {} has no camera with this id", cameras_file.display());
             return Err(place.error(images_file, "camera_id", what));
         };
         Ok(View::new(name, place.name(), Camera { pose, ..camera.clone() }))

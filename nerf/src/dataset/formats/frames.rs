@@ -72,7 +72,8 @@ fn beside(frame: &Object<'_>, folder: &Path, name: &str, needed: bool) -> Result
     let path = paths::normal(frame, name, value)?;
     match paths::find(folder, &path) {
         None if needed => {
-            let what = format!("there is no file {path}: remove the field if the photograph is to be used without it");
+            let what =
+                format!("there is no file {path}: copy it there, or remove the field to use the image without it");
             Err(frame.error(name, what))
         }
         found => Ok(found),

@@ -10,7 +10,7 @@ use glam::DAffine3;
 use serde_json::{Map, Value};
 use std::f64::consts::PI;
 
-/// Fields of instant-ngp and nerfstudio that change where light falls or which pixels count, and that are not read here. Dropped without a word they would spoil every picture.
+/// Camera fields of instant-ngp and nerfstudio that are not supported. Ignoring them silently would spoil every image.
 const NOT_READ: [&str; 14] = [
     "x_fov",
     "y_fov",
@@ -51,15 +51,15 @@ pub(super) fn check_known(object: &Object<'_>) -> Result<()> {
     let Some((name, value)) = named else { return Ok(()) };
     let what = match name {
         "x_fov" | "y_fov" => "write the field of view in radians as camera_angle_x and camera_angle_y",
-        "latlong" | "equirectangular" => "write camera_model EQUIRECTANGULAR if the images are such panoramas",
+        "latlong" | "equirectangular" => "write camera_model EQUIRECTANGULAR for such panoramas",
         "distortion_params" => "write the coefficients by name (k1, k2, p1, p2) with their camera_model",
         "fisheye_crop_radius" => "write masks of the pixels to use, as mask_path",
         "rolling_shutter" | "transform_matrix_start" | "transform_matrix_end" => {
-            "cameras that move while they take a photograph are not supported"
+            "rolling shutter is not supported; remove it to ignore it"
         }
-        _ => "such cameras are not supported",
+        _ => "such cameras are not supported; remove it to ignore it",
     };
-    Err(object.error(name, format!("is {}, and cannot be followed: {what}", shown(value))))
+    Err(object.error(name, format!("is {}, which raygrad does not read: {what}", shown(value))))
 }
 
 impl Layers<'_, '_> {
@@ -67,7 +67,7 @@ impl Layers<'_, '_> {
     fn side(&self, name: &str) -> Result<Option<usize>> {
         match self.number(name)? {
             Some(x) if !((1.0..=SIDE).contains(&x) && x.fract() == 0.0) => {
-                Err(self.error(name, format!("must be a whole number of pixels, of 1 to {SIDE}, is {x}")))
+                Err(self.error(name, format!("must be an integer number of pixels, 1 to {SIDE}, is {x}")))
             }
             other => Ok(other.map(|x| x as usize)),
         }
@@ -102,7 +102,7 @@ impl Layers<'_, '_> {
         for (value, name) in centre.iter_mut().zip(["cx", "cy"]) {
             *value = self.number(name)?.unwrap_or(*value);
             if value.abs() > CENTRE {
-                return Err(self.error(name, format!("must be a place in pixels, is {value}")));
+                return Err(self.error(name, format!("must be a position in pixels, is {value}")));
             }
         }
         let focal = self.focal([width, height], angle_y)?;
@@ -123,7 +123,7 @@ impl Layers<'_, '_> {
             ([x, _], [Some(a), Some(b)]) if a != b => {
                 let [given, missing] = if x.is_some() { ["fl_x", "fl_y"] } else { ["fl_y", "fl_x"] };
                 let what = format!(
-                    "is missing beside the frame's own `{given}`: the file's focal lengths differ, {a} and {b}"
+                    "is missing beside the frame's `{given}`: give both, since the file's focal lengths differ, {a} and {b}"
                 );
                 Err(self.frame.error(missing, what))
             }
@@ -147,10 +147,7 @@ impl Layers<'_, '_> {
         for (name, allowed, slack) in rules {
             let Some(value) = self.number(name)? else { continue };
             if width > 0 && !allowed.iter().any(|x| (value - x).abs() <= f64::max(PANORAMA * x, slack)) {
-                let what = format!(
-                    "is {value}, and must be {:.3} or absent: a camera_model EQUIRECTANGULAR shows all directions",
-                    allowed[1]
-                );
+                let what = format!("must be {:.3} or absent for camera_model EQUIRECTANGULAR, is {value}", allowed[1]);
                 return Err(self.error(name, what));
             }
         }
@@ -163,7 +160,7 @@ fn focal_of(object: &Object<'_>, size: [usize; 2], angle_y: bool) -> Result<[Opt
     let axis = |length: &str, angle: &str, side: usize| {
         if let Some(f) = object.number(length)? {
             if !FOCAL.contains(&f) {
-                return Err(object.error(length, format!("must be a focal length in pixels, of 1e-3 to 1e9, is {f}")));
+                return Err(object.error(length, format!("must be a focal length in pixels, 1e-3 to 1e9, is {f}")));
             }
             return Ok(Some(f));
         }

@@ -84,7 +84,7 @@ impl<'a> Object<'a> {
         let frames = self.get("frames").ok_or_else(|| self.error("frames", "is missing"))?;
         let frames = frames.as_array().ok_or_else(|| self.error("frames", "must be a list"))?;
         if frames.is_empty() {
-            return Err(self.error("frames", "is empty: there is nothing to load"));
+            return Err(self.error("frames", "is empty: add at least one frame"));
         }
         let object = |(i, frame): (usize, &'a Value)| {
             let path = format!("frames[{i}]");

@@ -27,9 +27,7 @@ pub(super) fn read(layers: &Layers<'_, '_>) -> Result<Lens> {
     let name = named.unwrap_or(default);
     let Some(model) = Model::named(name) else {
         let known = MODELS.map(|model| model.name).join(", ");
-        return Err(
-            layers.error("camera_model", format!("is {:.40}, which is not one of {known}", name.escape_debug()))
-        );
+        return Err(layers.error("camera_model", format!("is {:.40}; use one of {known}", name.escape_debug())));
     };
     if fisheye.is_some_and(|fisheye| fisheye != matches!(model.kind, Lens::Fisheye { .. })) {
         let what = format!("contradicts `camera_model`, which is {name}: remove one of them");
@@ -43,7 +41,7 @@ pub(super) fn read(layers: &Layers<'_, '_>) -> Result<Lens> {
         } else if value.abs() > NOTHING {
             let what = match (coefficient, name) {
                 ("k4", "OPENCV") => format!(
-                    "is {value}, which nerfstudio multiplies by the eighth power of the radius and OpenCV divides by: set it \
+                    "is {value}, a numerator term r^8 in nerfstudio and a denominator term in OpenCV: set it \
                      to 0, or name the camera_model FULL_OPENCV if it is OpenCV's"
                 ),
                 _ => format!(

@@ -1,8 +1,8 @@
-//! `poses_bounds.npy` of local light field fusion (Mildenhall et al. 2019): a row of 17 numbers for each image.
+//! `poses_bounds.npy` of LLFF (Mildenhall et al. 2019): a row of 17 numbers for each image.
 //!
-//! The first 15 are a matrix of three rows and five columns: the directions down, right and backwards of the camera,
-//! its position, and height, width and focal length in pixels. Then come the nearest and the farthest depth that the
-//! image shows. Rows belong to the images of the folder `images` in the order of their names.
+//! The first 15 are a 3x5 matrix: the camera's directions down, right and backwards, its position, and height, width and focal
+//! length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of the folder `images` in the order
+//! of their names.
 
 use super::limits::MOST_PIXELS;
 use super::npy::Matrix;
@@ -27,8 +27,8 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// Reads the cameras of `folder`. No image is decoded.
 ///
 /// # Errors
-/// If a file is absent or damaged, there are not as many images as cameras, or a number cannot be that of a camera.
-/// The error names the file and the row, which are counted from 0.
+/// If a file is absent or damaged, the numbers of images and cameras differ, or a number is not valid for a camera. The error names
+/// the file and the row, counted from 0.
 pub fn read(folder: &Path) -> Result<Capture> {
     let file = folder.join(FILE);
     let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
@@ -41,15 +41,15 @@ fn parse(folder: &Path, bytes: &[u8], images: Vec<(String, PathBuf)>) -> Result<
     let matrix = Matrix::read(bytes).map_err(|what| Error::file(&file, what))?;
     let shape = |what: String| Error::field(&file, "shape", what);
     if matrix.columns != COLUMNS {
-        return Err(shape(format!("must be {COLUMNS} columns, is {}", matrix.columns)));
+        return Err(shape(format!("must have {COLUMNS} columns, has {}", matrix.columns)));
     }
     if matrix.rows == 0 {
-        return Err(shape("has no row: there is nothing to load".into()));
+        return Err(shape("has no rows: add one per image".into()));
     }
     if matrix.rows != images.len() {
         let beside =
             images.first().and_then(|(_, path)| path.parent()).map_or("".into(), |p| format!(" in {}", p.display()));
-        let what = "every row must have its image, in the order of their names";
+        let what = "give each row its image, in the order of their names";
         return Err(shape(format!("has {} rows, but there are {} images{beside}: {what}", matrix.rows, images.len())));
     }
     let rows = matrix.values.chunks_exact(COLUMNS).zip(images).enumerate();
@@ -83,7 +83,7 @@ fn camera(row: &[f64; COLUMNS]) -> std::result::Result<(Camera, [f64; 2]), Strin
     }
     let [near, far] = [row[15], row[16]];
     if !(near >= 0.0 && far > near) {
-        return Err(format!("depths must be 0 or more and the second the larger, are {near} and {far}"));
+        return Err(format!("depths must be at least 0 and rise, are {near} and {far}"));
     }
     let centre = [0.5 * width as f64, 0.5 * height as f64];
     Ok((Camera { width, height, focal: [focal; 2], centre, lens: Lens::Pinhole, pose }, [near, far]))
@@ -109,7 +109,7 @@ fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
             return Ok(found.into_iter().map(|name| (name.clone(), folder.join(name))).collect());
         }
     }
-    let what = "there are no images (png, jpg): expected them in this folder or in images_4, images_8";
+    let what = "has no images (png, jpg): put them in this folder, or in images_4 or images_8";
     Err(Error::file(folder.join("images"), what))
 }
 
@@ -129,31 +129,33 @@ fn names(folder: &Path) -> Result<Vec<String>> {
     entries.map(name).collect()
 }
 
-/// Writes the cameras of `capture` to `poses_bounds.npy` in `folder`, which must exist. Images are the caller's: each
-/// must be in `images` by the name of its view.
+/// Writes the cameras of `capture` to `poses_bounds.npy` in `folder`, which must exist.
+///
+/// The caller puts each image in `images` under the name of its view.
 ///
 /// # Errors
-/// If the cameras differ in more than their poses, have a lens or a principal point beside the middle, or a view has
-/// no bounds or no plain name of an image; if the file cannot be written. The error names the view.
+/// If the cameras differ in more than their poses, are not centred pinholes, or a view has no bounds or no plain image name; or if
+/// the file cannot be written. The error names the view.
 pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     let mut views: Vec<&View> = capture.views.iter().collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let Some(first) = views.first() else {
-        return Err(Error::file(&capture.file, "has no view: there is nothing to write"));
+        return Err(Error::file(&capture.file, "has no images to write: add at least one"));
     };
     let mut values = Vec::with_capacity(COLUMNS * views.len());
     for (index, view) in views.iter().enumerate() {
         let bad = |member: &str, what| Error::field(&capture.file, format!("{}.{member}", view.field), what);
         if !is_image(&view.name) || view.name.contains(['/', '\\']) {
-            let what = format!("`{}` must be the plain name of a png or jpg file: LLFF has a single folder", view.name);
+            let what =
+                format!("`{}` must be a plain png or jpg name without folders, as LLFF has one folder", view.name);
             return Err(bad("name", what));
         }
         if index > 0 && views[index - 1].name == view.name {
-            return Err(bad("name", format!("`{}` is there twice", view.name)));
+            return Err(bad("name", format!("`{}` is there twice: rename one", view.name)));
         }
         plain(&view.camera, &first.camera).map_err(|what| bad("camera", what))?;
         let Some([near, far]) = view.bounds else {
-            return Err(bad("bounds", "are not known, and LLFF needs the nearest and the farthest depth".into()));
+            return Err(bad("bounds", "are missing; LLFF needs the nearest and the farthest depth".into()));
         };
         let Camera { width, height, focal, pose, .. } = &view.camera;
         let size = [*height as f64, *width as f64, focal[0]];
@@ -172,17 +174,17 @@ pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
 
 /// What keeps a camera from being written, beside one that is.
 fn plain(camera: &Camera, first: &Camera) -> std::result::Result<(), String> {
-    const UNDISTORT: &str = "LLFF holds equal pinhole cameras alone: undistort first (raygrad prepare --undistort)";
+    const UNDISTORT: &str = "LLFF needs equal pinhole cameras: undistort first (`raygrad prepare --undistort`)";
     let Camera { width, height, focal, centre, lens, .. } = camera;
     if *lens != Lens::Pinhole {
-        return Err(format!("has a lens; {UNDISTORT}"));
+        return Err(format!("has lens distortion; {UNDISTORT}"));
     }
     if focal[0] != focal[1] {
-        return Err(format!("has focal lengths {} and {}, which differ; {UNDISTORT}", focal[0], focal[1]));
+        return Err(format!("has different focal lengths, {} and {}; {UNDISTORT}", focal[0], focal[1]));
     }
     if *centre != [0.5 * *width as f64, 0.5 * *height as f64] {
         let [x, y] = centre;
-        return Err(format!("has its principal point at ({x}, {y}), not in the middle; {UNDISTORT}"));
+        return Err(format!("has its principal point at ({x}, {y}), not at the centre; {UNDISTORT}"));
     }
     if (*width, *height, *focal) != (first.width, first.height, first.focal) {
         return Err(format!("differs in size or focal length from the others; {UNDISTORT}"));

@@ -12,7 +12,7 @@ pub(super) fn affine(object: &Object<'_>, name: &str) -> Result<Option<DAffine3>
     let transform = rows(matrix).map_err(|what| object.error(name, what))?;
     let determinant = transform.matrix3.determinant();
     if !(determinant != 0.0 && determinant.is_finite()) {
-        return Err(object.error(name, format!("cannot be undone: its determinant is {determinant}")));
+        return Err(object.error(name, format!("must be invertible, but its determinant is {determinant}")));
     }
     Ok(Some(transform))
 }
@@ -50,7 +50,7 @@ fn rigid(transform: DAffine3) -> std::result::Result<DAffine3, String> {
     let scales = scale > 0.0 && scale.is_finite() && is_orthonormal(&(m * scale.recip()), TOLERANCE);
     if scales && !is_orthonormal(&m, TOLERANCE) {
         return Err(format!(
-            "the upper left 3x3 must be a rotation, but it also scales by {scale:.6}: divide these nine numbers by \
+            "the upper left 3x3 must be a rotation, but scales by {scale:.6}: divide these nine numbers by \
              that, and leave the position in the last column as it is"
         ));
     }

@@ -1,5 +1,7 @@
-//! The formats that captures come in, each in a file of its own that knows none of the others: `detect` says whether a
-//! folder holds one, `read` parses it without decoding any image, and `write` writes its files but for the images.
+//! Readers and writers of capture formats: [`blender`], [`transforms`], [`colmap`] and [`llff`].
+//!
+//! Start with [`read`], which recognises the format. Each module's `read` parses cameras without decoding images; its `write`
+//! writes everything but the images.
 
 pub mod blender;
 pub mod colmap;
@@ -22,8 +24,10 @@ use super::capture::Capture;
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// Reads what a folder holds. Where it has several formats, the first of `transforms.json`, Blender's, COLMAP's and LLFF's
-/// counts: the earlier ones say more, and are what other programs have made of the later.
+/// Reads the capture in a folder, in whatever format it has.
+///
+/// If there are several, it takes the first of `transforms.json`, Blender, COLMAP and LLFF: earlier ones hold more, and are usually
+/// derived from later ones.
 ///
 /// # Errors
 /// If the folder holds none of them, or as the format's own `read`.
@@ -40,8 +44,8 @@ pub fn read(folder: &Path) -> Result<Capture> {
         None => Err(Error::file(
             folder,
             "is not a dataset: expected transforms.json (instant-ngp, nerfstudio), transforms_train.json (Blender), \
-             sparse/0/cameras.bin or .txt (COLMAP) or poses_bounds.npy (LLFF); `raygrad prepare` makes one of a video or \
-             of photographs",
+            sparse/0/cameras.bin or .txt (COLMAP) or poses_bounds.npy (LLFF); `raygrad prepare` makes one from a video or \
+            images",
         )),
     }
 }

@@ -17,7 +17,7 @@ pub(in crate::dataset) struct Matrix {
 pub(in crate::dataset) const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// What a file that is no npy file is told.
-const BROKEN: &str = "is not a whole npy file: was it copied completely?";
+const BROKEN: &str = "is not a complete npy file: copy it again";
 
 impl Matrix {
     /// The matrix of a `.npy` file of f32 or f64 numbers, in either order of elements; or what is wrong, as the end of
@@ -32,7 +32,7 @@ impl Matrix {
             _ => {
                 let found = start(descr);
                 let what = "not `<f8` or `<f4`: write it with astype(numpy.float64)";
-                return Err(format!("holds numbers of type `{found}`, {what}"));
+                return Err(format!("has elements of type `{found}`, {what}"));
             }
         };
         let [rows, columns] = shape(header)?;
@@ -40,7 +40,7 @@ impl Matrix {
         let announced = rows.checked_mul(columns).and_then(|count| count.checked_mul(size));
         if announced != Some(data.len()) {
             return Err(format!(
-                "has {} bytes of elements, which is not what shape ({rows}, {columns}) needs",
+                "has {} bytes of elements, which do not fit the shape ({rows}, {columns}): copy it again",
                 data.len()
             ));
         }

@@ -15,7 +15,7 @@ const LONGEST: usize = 1024;
 pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<String> {
     let path = value.as_str().ok_or_else(|| object.error(name, "must be a string"))?;
     if path.len() > LONGEST || path.chars().any(char::is_control) {
-        let what = format!("must be a path, without control characters and of at most {LONGEST} bytes");
+        let what = format!("must be a path without control characters, of at most {LONGEST} bytes");
         return Err(object.error(name, what));
     }
     // Written on Windows. A name with a backslash in it is not one that a dataset has.
@@ -25,7 +25,7 @@ pub(super) fn normal(object: &Object<'_>, name: &str, value: &Value) -> Result<S
         rest = shorter.trim_start_matches('/');
     }
     match rest {
-        "" | "." => Err(object.error(name, "is empty, and must be the path of a file")),
+        "" | "." => Err(object.error(name, "must be the path of a file, is empty")),
         rest => Ok(rest.to_owned()),
     }
 }

@@ -63,9 +63,9 @@ fn line(reader: &mut impl BufRead) -> std::result::Result<String, String> {
     let mut bytes = vec![];
     let read = reader.by_ref().take(LONGEST_LINE).read_until(b'\n', &mut bytes);
     match read.map_err(|e| format!("cannot be read: {e}"))? as u64 {
-        0 => Err("ends too early".to_owned()),
-        LONGEST_LINE => Err(format!("has a line of {LONGEST_LINE} bytes or more")),
-        _ => String::from_utf8(bytes).map_err(|_| "has a line that is no text".to_owned()),
+        0 => Err("ends too early: copy it again".to_owned()),
+        LONGEST_LINE => Err(format!("has a line of {LONGEST_LINE} bytes or more, too long for a PLY file")),
+        _ => String::from_utf8(bytes).map_err(|_| "has a line that is not UTF-8 text".to_owned()),
     }
 }
 
@@ -73,7 +73,7 @@ impl Header {
     fn read(reader: &mut impl BufRead) -> std::result::Result<Self, String> {
         let cut = |text: &str| text.chars().filter(|c| !c.is_control()).take(60).collect::<String>();
         if line(reader)?.trim_end() != "ply" {
-            return Err("is no PLY file: its first line must be `ply`".to_owned());
+            return Err("is not a PLY file: its first line must be `ply`".to_owned());
         }
         let (mut ascii, mut count, mut properties, mut vertex) = (None, None, vec![], false);
         for _ in 0..MOST_LINES {
@@ -84,18 +84,19 @@ impl Header {
                 ["format", "ascii", _] => ascii = Some(true),
                 ["format", "binary_little_endian", _] => ascii = Some(false),
                 ["format", ..] => {
-                    return Err(format!(
-                        "has the line `{}`: must be ascii or binary_little_endian",
-                        cut(line.trim_end())
-                    ));
+                    return Err(format!("has the line `{}`: use ascii or binary_little_endian", cut(line.trim_end())));
                 }
                 ["element", "vertex", number] if count.is_none() => {
-                    count = Some(number.parse().map_err(|_| format!("has `{}` vertices", cut(number)))?);
+                    count = Some(
+                        number.parse().map_err(|_| format!("must have a number of vertices, has `{}`", cut(number)))?,
+                    );
                     vertex = true;
                 }
                 // What comes after the vertices is not read.
                 ["element", ..] if count.is_some() => vertex = false,
-                ["element", name, ..] => return Err(format!("has `{}` before its vertices", cut(name))),
+                ["element", name, ..] => {
+                    return Err(format!("has the element `{}` before `vertex`: put the vertices first", cut(name)));
+                }
                 ["property", kind, name] if vertex => match Property::new(name, kind) {
                     Some(property) => properties.push(property),
                     None => return Err(format!("has a property `{}` of the unknown type `{}`", cut(name), cut(kind))),
@@ -107,11 +108,11 @@ impl Header {
                     return Ok(Header { ascii, count, properties });
                 }
                 _ => {
-                    return Err(format!("has a line in its header that is not understood: `{}`", cut(line.trim_end())));
+                    return Err(format!("has an unknown header line: `{}`", cut(line.trim_end())));
                 }
             }
         }
-        Err(format!("has a header of more than {MOST_LINES} lines"))
+        Err(format!("has a header of more than {MOST_LINES} lines, too long for a PLY file"))
     }
 
     fn index(&self, name: &str) -> Option<usize> {
@@ -124,7 +125,7 @@ impl Header {
         match found.iter().flatten().count() {
             0 => Ok(None),
             n if n == N => Ok(Some(found.map(Option::unwrap_or_default))),
-            _ => Err(format!("has only some of the properties {}", names.join(", "))),
+            _ => Err(format!("has only some of the properties {}: give all or none", names.join(", "))),
         }
     }
 }
@@ -146,16 +147,16 @@ pub(super) fn read(path: &Path) -> Result<Vec<Point>> {
 /// As [`read`], of a file of `length` bytes.
 fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Point>, String> {
     let header = Header::read(reader)?;
-    let position = header.all(["x", "y", "z"])?.ok_or("has no properties x, y and z of its vertices")?;
+    let position = header.all(["x", "y", "z"])?.ok_or("has no vertex properties x, y and z")?;
     let color = header.all(["red", "green", "blue"])?;
     if color.is_some_and(|color| color.iter().any(|&i| !header.properties[i].is_byte)) {
-        return Err("has colours that are not of the type uchar".to_owned());
+        return Err("has colours of another type than uchar: convert them".to_owned());
     }
     let stride: usize = header.properties.iter().map(|property| property.size).sum();
     // In text a number takes a character and a space.
     let least = if header.ascii { 2 * header.properties.len() } else { stride } as u64;
     if header.count.checked_mul(least).is_none_or(|bytes| bytes > length.saturating_add(1)) {
-        return Err(format!("ends too early: {length} bytes cannot hold {} vertices", header.count));
+        return Err(format!("ends too early: {length} bytes cannot hold {} vertices, copy it again", header.count));
     }
     let (mut points, mut bytes) = (vec![], vec![0; stride]);
     let mut values = vec![0.0; header.properties.len()];
@@ -165,7 +166,7 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
             let mut words = line.split_whitespace();
             for (value, Property { name, .. }) in values.iter_mut().zip(&header.properties) {
                 let number = words.next().and_then(|word| word.parse().ok());
-                *value = number.ok_or_else(|| format!("has a vertex {i} without a number for {name:.20}"))?;
+                *value = number.ok_or_else(|| format!("has no number for {name:.20} of vertex {i}"))?;
             }
         } else {
             let whole = reader.read_exact(&mut bytes);
@@ -175,11 +176,11 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
         }
         let position = DVec3::from_array(position.map(|i| values[i]));
         if !position.is_finite() {
-            return Err(format!("has a vertex {i} whose place is not finite: {position}"));
+            return Err(format!("has a vertex {i} with a non-finite position: {position}"));
         }
         let byte = |i: usize| match values[i] {
             x if (0.0..=255.0).contains(&x) => Ok(x as u8),
-            x => Err(format!("has a vertex {i} with a colour of {x}, which must be of 0 to 255")),
+            x => Err(format!("has a vertex {i} with a colour of {x}; use 0 to 255")),
         };
         let color = match color {
             Some([r, g, b]) => [byte(r)?, byte(g)?, byte(b)?],

@@ -1,4 +1,4 @@
-//! Whether a matrix of a file is a rotation.
+//! Checks of rotations and poses from files.
 
 use glam::{DAffine3, DMat3};
 
@@ -10,10 +10,10 @@ pub(crate) fn is_orthonormal(matrix: &DMat3, tolerance: f64) -> bool {
     (matrix.transpose() * *matrix - DMat3::IDENTITY).to_cols_array().iter().all(|x| x.abs() <= tolerance)
 }
 
-/// What is wrong with a matrix that should be a rotation, as the end of a sentence that begins with its name.
+/// Checks that a matrix is a rotation.
 ///
 /// # Errors
-/// If it is none, to 1e-3.
+/// If it is not one, to 1e-3; the text is a predicate to follow the matrix's name.
 pub fn rotation(matrix: &DMat3) -> Result<(), String> {
     if !matrix.is_finite() {
         return Err("must be a rotation, but an entry is not a finite number".to_owned());
@@ -22,20 +22,20 @@ pub fn rotation(matrix: &DMat3) -> Result<(), String> {
         return Err("must be a rotation, but its columns are not orthonormal to 1e-3".to_owned());
     }
     if matrix.determinant() < 0.0 {
-        return Err("must be a rotation, but it mirrors: its determinant is -1".to_owned());
+        return Err("must be a rotation, but mirrors: its determinant is -1".to_owned());
     }
     Ok(())
 }
 
-/// As [`rotation`], for a rotation and a translation.
+/// Checks that a pose is a rotation and a finite translation.
 ///
 /// # Errors
-/// As these, or if the position is not finite.
+/// As [`rotation`], or if the position is not finite.
 pub fn pose(pose: &DAffine3) -> Result<(), String> {
     rotation(&pose.matrix3)?;
     match pose.translation.is_finite() {
         true => Ok(()),
-        false => Err("has a position that is not finite".to_owned()),
+        false => Err("must have a finite position".to_owned()),
     }
 }
 

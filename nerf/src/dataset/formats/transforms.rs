@@ -1,8 +1,7 @@
-//! `transforms.json`, which instant-ngp (Mueller et al. 2022) and nerfstudio (Tancik et al. 2023) read and write.
+//! `transforms.json` of instant-ngp (Mueller et al. 2022) and nerfstudio (Tancik et al. 2023).
 //!
-//! Camera parameters stand at the top of the file or in its frames, where those of a frame count. Poses are as the file has
-//! them: instant-ngp's `scale` and `offset` only say how it puts the scene into its unit cube, and nerfstudio orients and
-//! scales poses when it reads them. `scale` and other fields that do not bear on cameras pass.
+//! Camera parameters stand at the top of the file or in its frames; those of a frame take precedence. Poses are read unchanged:
+//! instant-ngp's `scale` and `offset`, and other fields that do not affect cameras, are ignored.
 
 use super::frames::{Dialect, views};
 use super::json::{self, Object, shown};
@@ -28,12 +27,14 @@ pub(crate) fn detect(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
 
-/// Reads the file. A photograph is in the split whose list of file names has it; one that is listed for validation and for
-/// tests, as nerfstudio wants it where there is one set for both, is for tests.
+/// Reads `transforms.json`, without decoding images.
+///
+/// Splits come from `train_filenames`, `val_filenames` and `test_filenames`; an image in both of the latter, as nerfstudio writes
+/// for a single held-out set, is a test image.
 ///
 /// # Errors
-/// If the file cannot be read, lacks a field or has one that is wrong or cannot be followed; if a mask, a file of depths or
-/// the file of points is damaged or, but for that of points, absent.
+/// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported; if a mask or depth file is absent or
+/// damaged; or if the points file is damaged.
 pub fn read(folder: &Path) -> Result<Capture> {
     let file = folder.join(FILE);
     let document = json::read(&file)?;
@@ -73,11 +74,11 @@ fn read_splits(top: &Object<'_>, views: &mut [View]) -> Result<()> {
             let field = format!("{field}[{i}]");
             let name = paths::normal(top, &field, name)?;
             let Some(places) = named.get(name.as_str()) else {
-                return Err(top.error(&field, format!("no frame has the file_path {name}")));
+                return Err(top.error(&field, format!("lists {name}, but no frame has this file_path")));
             };
             for &place in places {
                 if split != Split::Train && splits[place] == Some(Split::Train) {
-                    let what = format!("{name} is in train_filenames too: take it out of one, or results mean nothing");
+                    let what = format!("lists {name}, which train_filenames has too: remove it from one of them");
                     return Err(top.error(&field, what));
                 }
                 splits[place] = Some(split);
@@ -88,23 +89,23 @@ fn read_splits(top: &Object<'_>, views: &mut [View]) -> Result<()> {
     Ok(())
 }
 
-/// Writes `transforms.json` into `folder`, as nerfstudio reads it, and `sparse_pc.ply` if there are points. Images, masks
-/// and depths are to be copied to where they were in the capture's folder. What a photograph says of the
-/// [bounds](View::bounds) of its scene has no place in the format.
+/// Writes `transforms.json` into `folder`, as nerfstudio reads it, and `sparse_pc.ply` if there are points.
+///
+/// The caller copies images, masks and depths to the same relative paths. The format has no [bounds](View::bounds) of views.
 ///
 /// # Errors
-/// If there are no views, if one's camera is not whole, or if a file cannot be written.
+/// If there are no views, a camera has no size or a non-finite number, or a file cannot be written.
 pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     let file = folder.join(FILE);
     if capture.views.is_empty() {
-        return Err(Error::file(&file, "cannot be written: there are no photographs"));
+        return Err(Error::file(&file, "cannot be written: there are no images"));
     }
     for view in &capture.views {
         check(view, &file)?;
     }
     let whole = capture.applied.is_finite() && capture.aabb_scale.is_none_or(f64::is_finite);
     if !whole || capture.points.iter().any(|point| !point.position.is_finite()) {
-        let what = "cannot be written: the transform before, the box or a point has a number that is not finite";
+        let what = "cannot be written: `applied`, `aabb_scale` or a point has a non-finite number";
         return Err(Error::file(&file, what));
     }
     let models = models(&capture.views);
@@ -164,13 +165,14 @@ fn check(view: &View, file: &Path) -> Result<()> {
     let unit = view.depth.as_ref().is_none_or(|(_, unit)| unit.is_finite());
     // JSON has no other numbers than finite ones: the rest becomes null.
     if !numbers || !unit || *width == 0 || *height == 0 {
-        let what = format!("cannot be written: the camera of {} has no size or a number that is not finite", view.name);
+        let what = format!("cannot be written: the camera of {} has no size or a non-finite number", view.name);
         return Err(Error::file(file, what));
     }
     let [w, h] = [*width as f64, *height as f64];
     let whole = [w / (2.0 * std::f64::consts::PI), h / std::f64::consts::PI];
     if *lens == Lens::Equirectangular && (*focal != whole || *centre != [0.5 * w, 0.5 * h]) {
-        let what = format!("cannot be written: the panorama {} does not show all directions", view.name);
+        let what =
+            format!("cannot be written: the equirectangular camera of {} does not cover all directions", view.name);
         return Err(Error::file(file, what));
     }
     Ok(())

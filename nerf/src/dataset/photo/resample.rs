@@ -1,4 +1,4 @@
-//! A photograph on another grid of pixels.
+//! Resampling of images to another pixel grid.
 
 use super::{Photo, Values};
 use crate::dataset::average::Stored;
@@ -10,17 +10,16 @@ const COVERED: f64 = 1.25;
 const MOST_PLACES: usize = 16;
 
 impl Photo {
-    /// The photograph on another grid: `from` says of each continuous position in the new one where it is in this.
+    /// Resamples to another pixel grid; `from` maps each continuous position in the new image to one in this image.
     ///
-    /// Between pixels values are interpolated by cubic splines (Catmull and Rom 1974), which blur less than straight lines;
-    /// where a new pixel covers several, it is the average over as many places in it. Outside of the photograph it goes on
-    /// as at its border. Colours are weighted by their alpha.
+    /// Values are interpolated by cubic splines (Catmull and Rom 1974). A new pixel that covers several is the average over as many
+    /// places. Outside of the image the border repeats. Colours are weighted by alpha.
     ///
     /// # Panics
     /// If a side is 0.
     #[track_caller]
     pub fn resampled(&self, [width, height]: [usize; 2], from: impl Fn([f64; 2]) -> [f64; 2]) -> Photo {
-        assert!(width > 0 && height > 0, "a {width}x{height} photograph has no pixels");
+        assert!(width > 0 && height > 0, "both sides must be at least 1, are {width}x{height}");
         let places = places([width, height], from);
         let values = match &self.values {
             Values::Bytes(values) => Values::Bytes(self.at(values, places)),

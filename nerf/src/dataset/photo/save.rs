@@ -1,4 +1,4 @@
-//! Photographs to files.
+//! Writing of images to files.
 
 use super::{Photo, Values, decoder};
 use crate::error::{Error, Result};
@@ -21,11 +21,10 @@ struct About {
 }
 
 impl Photo {
-    /// Writes the photograph as the ending of the file's name says: PNG, with 16 bits where it has them; JPEG of quality 95;
-    /// or WebP without loss.
+    /// Writes the image in the format of the file extension: PNG (16 bits where it has them), JPEG of quality 95, or lossless WebP.
     ///
     /// # Errors
-    /// If the ending is another, JPEG is to hold an alpha channel, or the file cannot be written.
+    /// If the extension is another, a JPEG would need an alpha channel, or the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         let [width, height] = [self.width as u32, self.height as u32];
@@ -43,13 +42,14 @@ impl Photo {
                 }
             }
         };
-        let decoded = decoded.ok_or_else(|| Error::file(path, "has another number of pixels than its size says"))?;
+        let decoded = decoded.ok_or_else(|| Error::file(path, "has a number of values that does not fit its size"))?;
         save(&decoded, path, About::default())
     }
 }
 
-/// Copies an image file. Where its EXIF orientation says that it is to be turned, its pixels are, and the rest of what it
-/// says stays, such as the focal length; otherwise it is copied as it is, if it can be decoded.
+/// Copies an image file and applies its EXIF orientation to the pixels.
+///
+/// Other EXIF data, such as the focal length, stays. Without a rotation, the file is copied byte for byte if it can be decoded.
 ///
 /// # Errors
 /// If the file cannot be read, decoded or written.

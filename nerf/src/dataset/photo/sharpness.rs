@@ -1,10 +1,11 @@
-//! How sharp a photograph is.
+//! Sharpness of images.
 
 use super::Photo;
 
 impl Photo {
-    /// The variance of the Laplacian of its brightness (Pech-Pacheco et al. 2000): more is sharper, among photographs of one
-    /// thing and one size. 0 if a side is shorter than 3 pixels.
+    /// Computes the variance of the Laplacian of brightness (Pech-Pacheco et al. 2000).
+    ///
+    /// More is sharper, among images of one subject and size. It is 0 if a side is shorter than 3 pixels.
     pub fn sharpness(&self) -> f64 {
         let luma = |[r, g, b, _]: [f32; 4]| 0.299 * r + 0.587 * g + 0.114 * b;
         let line = |y: usize| (0..self.width).map(|x| luma(self.pixel(x, y))).collect();

@@ -1,4 +1,4 @@
-//! Intervals that are halved until halving them changes little.
+//! Adaptive quadrature: intervals are halved until that changes the pixel little.
 
 use super::Quadrature;
 use super::nodes::placed;

@@ -1,9 +1,8 @@
-//! How the integral along a ray is approximated.
+//! Quadrature of the volume rendering integral, which [`analytic`](crate::analytic) defines.
 //!
-//! The integral is that of [`analytic`](crate::analytic). A [`Quadrature`] says where in each interval of a ray the field
-//! is asked, and how the answers are summed up. With n intervals of length h, density and colour smooth, the error falls
-//! as h, or as h^2, or as h^4 ([`Quadrature::order`]); where the density jumps, it falls as h for all of them but
-//! [`Quadrature::Adaptive`]. In 128 evaluations of the scenes of [`analytic::scenes`](crate::analytic::scenes), colour:
+//! A [`Quadrature`] chooses the nodes in each interval of a ray and their weights. For smooth density and colour the error falls
+//! with the interval length h as h, h^2 or h^4 ([`Quadrature::order`]). Where the density jumps, it falls as h, except for
+//! [`Quadrature::Adaptive`]. Colour errors with 128 evaluations of [`analytic::scenes`](crate::analytic::scenes):
 //!
 //! | | exponential | gaussian | narrow gaussian | slabs |
 //! |---|---|---|---|---|
@@ -12,8 +11,8 @@
 //! | piecewise-linear | 5.8e-5 | 4.9e-5 | 8.5e-3 | 1.5e-3 |
 //! | gauss2 | 2.4e-8 | 1.2e-7 | 8.2e-3 | 9.0e-3 |
 //!
-//! (a test prints and asserts the table). In training the midpoint rule's samples lie at random places of their intervals, and
-//! the intervals of the other rules are shifted at random: errors change from step to step.
+//! A test prints and checks this table. Training jitters the midpoint rule's samples within their intervals, and shifts the
+//! intervals of the other rules at random.
 
 mod adaptive;
 mod nodes;

@@ -1,4 +1,4 @@
-//! Where a rule asks the field, and how it weights the answers.
+//! Nodes of the rules, and their weights.
 
 use super::Quadrature;
 use super::share::gauss_share;
@@ -60,16 +60,15 @@ pub(super) fn placed<T: Scalar>(steps: &Samples<T>, offsets: Vec<u32>, places: V
 }
 
 impl Quadrature {
-    /// Whether the rule weights intervals of two nodes, and not samples.
+    /// Whether the rule weights intervals of two nodes instead of samples.
     pub(crate) fn has_intervals(self) -> bool {
         !matches!(self, Quadrature::Left | Quadrature::Midpoint)
     }
 
-    /// The samples at which the rule asks the field, for steps along rays that are each the middle of an interval of length
-    /// `delta`. An adaptive rule begins with these.
+    /// Returns the nodes of the rule for `steps`, each the centre of an interval of length `delta`. An adaptive rule starts with
+    /// these.
     ///
-    /// Where the rule has two nodes an interval, `delta` of the first one is the interval's length. That of a node at which
-    /// no interval begins is 0.
+    /// With two nodes per interval, `delta` of the first one is the interval's length; it is 0 for nodes where no interval begins.
     pub fn nodes<T: Scalar>(self, steps: &Samples<T>) -> Samples<T> {
         if self == Quadrature::Midpoint {
             return steps.clone();
@@ -101,8 +100,7 @@ impl Quadrature {
         placed(steps, offsets, nodes)
     }
 
-    /// How many intervals a ray is cut into for at most so many evaluations, at least one; an adaptive rule begins with as
-    /// many.
+    /// Returns the number of intervals per ray for at most `evaluations` nodes, at least one. An adaptive rule starts with as many.
     pub fn intervals(self, evaluations: usize) -> usize {
         let intervals = match self {
             Quadrature::Left | Quadrature::Midpoint | Quadrature::Adaptive { .. } => evaluations,
@@ -112,7 +110,7 @@ impl Quadrature {
         intervals.max(1)
     }
 
-    /// The weights of the rule's [nodes](Self::nodes) of this density.
+    /// Computes the weights of the rule's [nodes](Self::nodes) from their density.
     #[track_caller]
     #[inline(never)]
     pub fn weighted<'t, T: Scalar>(self, density: &Density<'t, T>, nodes: &Samples<T>) -> RayWeights<'t, T> {
@@ -134,7 +132,7 @@ impl Quadrature {
         RayWeights { weights, optical_depth: depth.segment_sum(&intervals.segments) }
     }
 
-    /// What the rule's [nodes](Self::nodes) show of a field.
+    /// Renders the rule's [nodes](Self::nodes) of a field.
     #[track_caller]
     pub fn render_nodes<'t, T: Scalar>(self, query: &Query<'_, 't, T>, nodes: Samples<T>) -> Rendered<'t, T> {
         let positions = query.positions(&nodes);
@@ -142,7 +140,7 @@ impl Quadrature {
         self.render_density(query, nodes, positions, density)
     }
 
-    /// As [`render_nodes`](Self::render_nodes), of a density that is known at the nodes' positions.
+    /// Renders as [`render_nodes`](Self::render_nodes), with a known density at the nodes.
     #[track_caller]
     pub(crate) fn render_density<'t, T: Scalar>(
         self,

@@ -1,11 +1,11 @@
-//! The rules.
+//! The quadrature rules.
 
 use crate::Result;
 use crate::range::check_range;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// A rule for the integral along a ray.
+/// A quadrature rule for the integral along a ray.
 ///
 /// In a configuration it is a word, such as `"gauss2"`, or `{"adaptive": {"tolerance": 1e-3}}`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -14,7 +14,7 @@ pub enum Quadrature {
     /// One evaluation at the near end of each interval (Mildenhall et al. 2020, equation 3). The last interval ends
     /// where the ray does.
     Left,
-    /// One evaluation in the middle of each interval, or at a random place in training.
+    /// One evaluation at the centre of each interval, or at a random place in training.
     #[default]
     Midpoint,
     /// One evaluation at each end of an interval, shared with the next. Density is linear in between, with the mean
@@ -32,10 +32,10 @@ pub enum Quadrature {
 }
 
 impl Quadrature {
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     pub fn check(self) -> Result<()> {
         match self {
             Quadrature::Adaptive { tolerance } => check_range("quadrature.adaptive.tolerance", tolerance, 1e-9, 1.0),
@@ -43,8 +43,7 @@ impl Quadrature {
         }
     }
 
-    /// The power of the interval length that the error falls with, for smooth scenes; `None` if intervals have no common
-    /// length.
+    /// Returns the order of convergence in the interval length for smooth scenes, or `None` if intervals differ in length.
     pub fn order(self) -> Option<u32> {
         match self {
             Quadrature::Left => Some(1),

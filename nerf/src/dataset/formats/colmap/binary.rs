@@ -31,21 +31,21 @@ impl<'a> Cursor<'a> {
     fn count(&mut self, list: &str, least: usize) -> Result<usize> {
         let bad = |what: String| Error::field(self.file, list, what);
         let Some((head, rest)) = self.rest.split_first_chunk() else {
-            return Err(bad("the file ends before their number: was it copied completely?".into()));
+            return Err(bad("the file ends before their number: copy it again".into()));
         };
         let (count, most) = (u64::from_le_bytes(*head), rest.len() / least);
         self.rest = rest;
         match usize::try_from(count) {
             Ok(count) if count <= most => Ok(count),
             _ => Err(bad(format!(
-                "announces {count} entries, but {} bytes follow, which hold {most} at most: was it copied completely?",
+                "announces {count} entries, but {} bytes hold {most} at most: copy the file again",
                 rest.len()
             ))),
         }
     }
 
     fn ended(&self, place: Place, member: &str) -> Error {
-        place.error(self.file, member, "the file ends here: was it copied completely?")
+        place.error(self.file, member, "the file ends here: copy it again")
     }
 
     fn array<const N: usize>(&mut self, place: Place, member: &str) -> Result<[u8; N]> {
@@ -92,7 +92,7 @@ impl<'a> Cursor<'a> {
         let bytes = usize::try_from(count).ok().and_then(|count| count.checked_mul(size));
         let Some((_, rest)) = bytes.and_then(|bytes| self.rest.split_at_checked(bytes)) else {
             let what =
-                format!("announces {count} entries, but {} bytes follow: was it copied completely?", self.rest.len());
+                format!("announces {count} entries, but only {} bytes follow: copy the file again", self.rest.len());
             return Err(place.error(self.file, member, what));
         };
         self.rest = rest;

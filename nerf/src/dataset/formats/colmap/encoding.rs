@@ -1,11 +1,11 @@
-//! The two ways in which COLMAP's files are written.
+//! COLMAP's binary and text encodings.
 
 use std::path::{Path, PathBuf};
 
-/// How COLMAP's files are written. Both hold the same numbers, bit for bit.
+/// The encoding of COLMAP's files. Both hold the same numbers, bit for bit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
-    /// `.bin`, little-endian: what COLMAP writes by default.
+    /// `.bin`, little-endian, COLMAP's default.
     Binary,
     /// `.txt`.
     Text,

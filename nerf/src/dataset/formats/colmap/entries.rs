@@ -66,7 +66,11 @@ impl ImageEntry {
             return Err(place.error(file, "name", "is empty"));
         }
         if name.chars().any(char::is_control) {
-            return Err(place.error(file, "name", format!("`{}` has a control character", start(&name))));
+            return Err(place.error(
+                file,
+                "name",
+                format!("`{}` has a control character: rename the image", start(&name)),
+            ));
         }
         Ok(ImageEntry { place, id, pose, camera, name })
     }

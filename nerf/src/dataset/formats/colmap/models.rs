@@ -56,7 +56,7 @@ pub(super) fn camera(
     }
     let lens = match model.lens(or_zero) {
         Lens::Fov { omega } if omega.abs() >= PI => {
-            return Err(("omega", format!("must be an angle of less than pi, is {}", omega.abs())));
+            return Err(("omega", format!("must be below pi (radians), is {}", omega.abs())));
         }
         // COLMAP's formula has the same value for both signs.
         Lens::Fov { omega } => Lens::Fov { omega: omega.abs() },
@@ -83,7 +83,7 @@ fn simplest(lens: Lens) -> Lens {
 pub(super) fn model_of(camera: &Camera) -> Result<(&'static Model, Vec<f64>), String> {
     let lens = simplest(camera.lens);
     let Ok(model) = by_name(least(&lens, 2)) else {
-        return Err("is equirectangular, which COLMAP's models are not: cut it into pinhole views first".into());
+        return Err("is equirectangular, which COLMAP does not support: cut it into pinhole views first".into());
     };
     let value = |name| match name {
         "fx" => camera.focal[0],

@@ -14,7 +14,7 @@ fn rotation(q: [f64; 4]) -> Option<DMat3> {
 /// The pose of an image; or what is wrong, and with which of its members.
 pub(super) fn from_file(q: [f64; 4], t: [f64; 3]) -> Result<DAffine3, (&'static str, String)> {
     let Some(to_camera) = rotation(q) else {
-        return Err(("qvec", "is a quaternion of length 0, which is no rotation".into()));
+        return Err(("qvec", "is a quaternion of length 0; use one of length 1".into()));
     };
     let to_world = to_camera.transpose();
     let translation = -(to_world * DVec3::from_array(t));

@@ -37,7 +37,7 @@ impl<'a> Table<'a> {
     /// The table of a capture; or an error that names what COLMAP's files cannot hold.
     pub fn new(capture: &'a Capture, encoding: Encoding) -> Result<Self> {
         if capture.views.is_empty() {
-            return Err(Error::file(&capture.file, "has no view: there is nothing to write"));
+            return Err(Error::file(&capture.file, "has no images to write: add at least one"));
         }
         let (mut cameras, mut ids, mut names) = (vec![], HashMap::new(), HashSet::new());
         let mut images = Vec::with_capacity(capture.views.len());
@@ -46,7 +46,7 @@ impl<'a> Table<'a> {
                 |member: &str, what: String| Error::field(&capture.file, format!("{}.{member}", view.field), what);
             check_name(view, encoding).map_err(|what| bad("name", what))?;
             if !names.insert(&view.name) {
-                return Err(bad("name", format!("`{}` is there twice", view.name)));
+                return Err(bad("name", format!("`{}` is there twice: rename one", view.name)));
             }
             let row = CameraRow::new(&view.camera).map_err(|what| bad("camera", what))?;
             let key = row.key();
@@ -61,7 +61,11 @@ impl<'a> Table<'a> {
             images.push(ImageRow { id, q, t, camera, name: &view.name });
         }
         if let Some(index) = capture.points.iter().position(|p| !p.position.is_finite() || !p.error.is_finite()) {
-            return Err(Error::field(&capture.file, format!("points[{index}]"), "has a number that is not finite"));
+            return Err(Error::field(
+                &capture.file,
+                format!("points[{index}]"),
+                "has a non-finite number: remove the point",
+            ));
         }
         Ok(Table { cameras, images, points: &capture.points })
     }
@@ -90,11 +94,11 @@ impl CameraRow {
 fn check_name(view: &View, encoding: Encoding) -> std::result::Result<(), String> {
     let name = &view.name;
     if name.is_empty() || name.starts_with("./") || name.contains(char::is_control) || name.trim() != name {
-        return Err(format!("{name:?} cannot be the name of an image: rename the file"));
+        return Err(format!("{name:?} is not a valid image name: rename the file"));
     }
     // We could read it, but COLMAP ends a name at its first space.
     if encoding == Encoding::Text && name.contains(char::is_whitespace) {
-        return Err(format!("`{name}` has a space, which COLMAP's texts cannot hold: write binary files"));
+        return Err(format!("`{name}` has a space, which COLMAP's text files do not support: write binary files"));
     }
     Ok(())
 }

@@ -35,7 +35,7 @@ impl<'a> Words<'a> {
         let word = self.word(member)?;
         word.parse().map_err(|_| {
             let most = 8 * size_of::<T>();
-            self.error(member, format!("must be a whole number of {most} bits, is `{}`", start(word)))
+            self.error(member, format!("must be an integer of {most} bits, is `{}`", start(word)))
         })
     }
 
@@ -75,7 +75,7 @@ pub(super) fn cameras(file: &Path, bytes: &[u8]) -> Result<Vec<CameraEntry>> {
         let size = [line.integer("WIDTH")?, line.integer("HEIGHT")?];
         let params = models::params(model).map(|name| line.number(name)).collect::<Result<Vec<f64>>>()?;
         if !line.rest.trim().is_empty() {
-            return Err(line.error("PARAMS", format!("{} has {}, here are more", model.name, params.len())));
+            return Err(line.error("PARAMS", format!("{} takes {}: remove the others", model.name, params.len())));
         }
         let camera = models::camera(model, size, &params).map_err(|(member, what)| line.error(member, what))?;
         Ok(CameraEntry { place: line.place, id, camera })
@@ -111,7 +111,7 @@ fn observations(line: &Words<'_>) -> Result<()> {
         (count, last) = (count + 1, word);
     }
     if count % 3 != 0 || last.parse::<i64>().is_err() {
-        let what = "must be triples X Y POINT3D_ID of the image in the line before; leave it empty if there are none";
+        let what = "must be triples X Y POINT3D_ID of the image in the line before, or empty";
         return Err(line.error("POINTS2D", what));
     }
     Ok(())
