@@ -237,6 +237,9 @@ mod tests {
             let error = read(&path).unwrap_err().to_string();
             assert!(error.contains("eval-test.json") && error.contains(expected), "{error}");
         }
+        std::fs::File::create(&path).unwrap().set_len(300 << 20).unwrap();
+        let expected = format!("{}: not an eval result (300 MiB; the limit is 256 MiB)", path.display());
+        assert_eq!(read(&path).unwrap_err().to_string(), expected);
         let text =
             r#"{"psnr_mean":3.5,"model":{"seed":4},"per_view":[{"name":"b","psnr":1},{"name":"a"}],"scene":"x"}"#;
         std::fs::write(&path, text).unwrap();
