@@ -188,7 +188,7 @@ impl<'a> Watch<'a> {
             self.cut(trainer)
         });
         let step = trainer.stats().step;
-        let what = format!("raygrad: warning: training diverged before step {end}: its values are not finite{reason}");
+        let what = format!("raygrad: warning: training diverged by step {end}: its values are not finite{reason}");
         match &back {
             Ok(()) => {
                 self.back = Some(step);
