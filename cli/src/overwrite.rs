@@ -65,7 +65,7 @@ impl Job {
 
 /// The error that a file is in the way.
 pub fn taken(file: &Path) -> Error {
-    Error::file(file, "exists, and this command did not write it: choose another output or add --overwrite")
+    Error::file(file, "exists, and another command or other options made it: choose another output or add --overwrite")
 }
 
 /// Whether bytes hold a word.
@@ -134,7 +134,7 @@ mod tests {
         assert!(own.check(&path).is_ok() && job(1, false) == own);
         // Another one's, and a photograph.
         let refused = |job: Job| job.check(&path).unwrap_err().to_string();
-        let expected = "exists, and this command did not write it: choose another output or add --overwrite";
+        let expected = "exists, and another command or other options made it: choose another output or add --overwrite";
         assert_eq!(refused(job(2, false)), format!("{}: {expected}", path.display()));
         assert!(Job::new("export", &json!({ "size": 1 }), false).check(&path).is_err());
         std::fs::write(&path, image.to_png()).unwrap();

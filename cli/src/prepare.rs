@@ -126,18 +126,20 @@ fn prepare(args: &Args) -> Work<()> {
     }
     let is_video = input.is_file();
     if !is_video && Capture::read(input).is_ok() {
-        let what = "already has camera poses: choose the format to convert it to with --to";
+        let what = "already has camera poses: train on it, or choose a format to convert it to with --to";
         return Err(Error::file(input, what).into());
     }
-    // Before work that may take long.
+    // The input first: nobody should install a program for a folder without images.
+    let images = if is_video { vec![] } else { photographs::find(input)? };
     if is_video {
+        photographs::check_no_image(input)?;
         program::FFMPEG.check()?;
     }
     poses::check()?;
     let place = Workplace::new(&args.out)?;
     let count = match is_video {
         true => video::frames(input, args.frames, &place)?,
-        false => photographs::copy(input, args.allow_outside, &place)?,
+        false => photographs::copy(input, &images, args.allow_outside, &place)?,
     };
     let what = if is_video { "sharp frames from" } else { "images from" };
     print(&format!("images   {count} {what} {}\n", input.display()))?;

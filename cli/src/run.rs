@@ -287,7 +287,7 @@ pub fn choose_folder(wanted: Option<&Path>) -> Result<PathBuf> {
 fn holds_a_run(folder: &Path) -> Error {
     match Lock::is_taken(&folder.join(LOCK)) {
         true => Error::file(folder, "another raygrad is training it: stop that one or choose another --out"),
-        false => Error::file(folder, "already holds a run: choose another --out or remove that folder"),
+        false => Error::file(folder, "already holds a run: choose another --out, or continue it with --resume"),
     }
 }
 

@@ -16,10 +16,8 @@ const READ: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 /// Endings of images that cannot.
 const NOT_READ: [&str; 9] = ["heic", "heif", "avif", "tif", "tiff", "dng", "cr2", "nef", "arw"];
 
-/// Copies the photographs in a folder, or in its folder `images`, to `images`, each turned as it was held. Links that lead
-/// elsewhere are followed if they are allowed to.
-pub fn copy(folder: &Path, outside: bool, place: &Workplace) -> Work<usize> {
-    let found = find(folder)?;
+/// Copies the images `found` in a folder to `images`, each turned upright. Follows links that lead elsewhere if `outside`.
+pub fn copy(folder: &Path, found: &[PathBuf], outside: bool, place: &Workplace) -> Work<usize> {
     if !outside {
         let root = Root::new(folder)?;
         found.iter().try_for_each(|path| root.check(path)).map_err(|what| Error::file(folder, what))?;
@@ -31,16 +29,26 @@ pub fn copy(folder: &Path, outside: bool, place: &Workplace) -> Work<usize> {
     Ok(found.len())
 }
 
-/// The photographs, in no order in particular. Warns of those that cannot be read.
-fn find(folder: &Path) -> Result<Vec<PathBuf>> {
+/// Whether the file's name has one of these extensions.
+fn ends(path: &Path, endings: &[&str]) -> bool {
+    let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+    endings.iter().any(|known| known.eq_ignore_ascii_case(ending))
+}
+
+/// Refuses a single image where a folder or a video belongs.
+pub fn check_no_image(file: &Path) -> Result<()> {
+    match ends(file, &READ) || ends(file, &NOT_READ) {
+        true => Err(Error::file(file, "is a single image: name the folder that holds the images")),
+        false => Ok(()),
+    }
+}
+
+/// The images, in no order in particular. Warns of those that raygrad cannot read.
+pub fn find(folder: &Path) -> Result<Vec<PathBuf>> {
     let inner = folder.join("images");
     for folder in [folder, &inner] {
         let Ok(entries) = std::fs::read_dir(folder) else { continue };
         let files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(|path| path.is_file()).collect();
-        let ends = |path: &Path, endings: &[&str]| {
-            let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
-            endings.iter().any(|known| known.eq_ignore_ascii_case(ending))
-        };
         let others = files.iter().filter(|path| ends(path, &NOT_READ)).count();
         let found: Vec<PathBuf> = files.into_iter().filter(|path| ends(path, &READ)).collect();
         if others > 0 {

@@ -24,7 +24,7 @@ impl Workplace {
         let bad = |e: std::io::Error| Error::file(out, format!("cannot be created: {e}"));
         let is_inside = match others(out) {
             Ok(others) if !others.is_empty() => {
-                return Err(Error::file(out, "is not empty: choose another --out or remove that folder"));
+                return Err(Error::file(out, "is not empty: choose another --out"));
             }
             Ok(_) => true,
             Err(e) if out.is_dir() => return Err(Error::file(out, format!("cannot be read: {e}"))),

@@ -186,7 +186,10 @@ mod tests {
         for video in [VideoFormat::Gif, VideoFormat::Apng] {
             std::fs::write(&out, b"footage").unwrap();
             let Err(Stop::Failed(error)) = write(video, false) else { panic!("{video:?} is written") };
-            assert!(error.to_string().contains("walk.gif: exists, and this command did not write it"), "{error}");
+            assert!(
+                error.to_string().contains("walk.gif: exists, and another command or other options made it"),
+                "{error}"
+            );
             assert_eq!(std::fs::read(&out).unwrap(), b"footage");
             write(video, true).unwrap();
             // Its own is replaced.

@@ -151,10 +151,7 @@ fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
     transforms["frames"][1].as_object_mut().unwrap().remove("mask_path");
     std::fs::write(place.path("scene/transforms.json"), transforms.to_string()).unwrap();
     place.fails("prepare scene --to llff --undistort --out made", &["more_9.png", "would both become"]);
-    place.fails_with(
-        "prepare scene --to colmap --out scene",
-        "scene: is not empty: choose another --out or remove that folder",
-    );
+    place.fails_with("prepare scene --to colmap --out scene", "scene: is not empty: choose another --out");
     std::fs::write(place.path("scene/images/5.png"), "no picture").unwrap();
     place.fails("prepare scene --to colmap --out made", &["`frames[5]`", "5.png: cannot be decoded"]);
     assert_eq!(std::fs::read_dir(place.path("")).unwrap().count(), 1, "nothing is left");

@@ -473,7 +473,7 @@ fn nothing_is_overwritten() {
     }
     place.fails_with(
         "train scene --preset small --steps 1 --out run",
-        "run: already holds a run: choose another --out or remove that folder",
+        "run: already holds a run: choose another --out, or continue it with --resume",
     );
     place.fails_with(
         "train scene --preset small --steps 1 --out scene",

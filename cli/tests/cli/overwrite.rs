@@ -22,8 +22,9 @@ fn photograph() -> Image {
 #[track_caller]
 fn refuses(place: &Place, arguments: &str, file: &str) {
     let before = place.bytes(file);
-    let expected =
-        format!("{file}: exists, and this command did not write it: choose another output or add --overwrite");
+    let expected = format!(
+        "{file}: exists, and another command or other options made it: choose another output or add --overwrite"
+    );
     place.fails(arguments, &[&expected]);
     assert!(place.bytes(file) == before, "{arguments} has changed {file}");
 }

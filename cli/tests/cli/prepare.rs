@@ -209,6 +209,15 @@ fn programs_that_are_absent_are_named_with_how_to_install_them() {
         &bare("prepare photos --out made"),
         &["`colmap`: is not on the PATH", &install("colmap"), "winget"],
     );
+    // Faults of the input come before those of the machine.
+    std::fs::create_dir(place.path("empty")).unwrap();
+    complained("empty", &bare("prepare empty --out made"), &["empty: holds no images"]);
+    std::fs::write(place.path("one.heic"), "").unwrap();
+    complained(
+        "one",
+        &bare("prepare one.heic --out made"),
+        &["one.heic: is a single image: name the folder that holds the images"],
+    );
     assert_eq!(made(&place), [""; 0]);
 }
 
@@ -275,7 +284,7 @@ fn bad_inputs_are_named() {
     complained_of(
         "a dataset",
         &run(&place, "prepare made --out other"),
-        "made: already has camera poses: choose the format to convert it to with --to",
+        "made: already has camera poses: train on it, or choose a format to convert it to with --to",
     );
     std::fs::write(place.path("photos/4.JPG"), "no picture").unwrap();
     complained("a damaged one", &run(&place, "prepare photos --out other"), &["4.JPG: cannot be decoded"]);

@@ -72,7 +72,10 @@ impl Capture {
     pub fn read(folder: impl AsRef<Path>) -> Result<Capture> {
         let folder = folder.as_ref();
         if !folder.is_dir() {
-            let what = if folder.exists() { "is not a folder" } else { "there is no such folder" };
+            let what = match folder.exists() {
+                true => "is not a folder: name the folder that holds it",
+                false => "there is no such folder",
+            };
             return Err(Error::file(folder, what));
         }
         let mut capture = formats::read(folder)?;

@@ -94,5 +94,8 @@ mod tests {
         std::fs::write(&file, "{}").unwrap();
         fails(&file, "is not a folder");
         fails(folder.path(), "`frames`: is missing");
+        let images = folder.path().join("images");
+        std::fs::create_dir(&images).unwrap();
+        fails(&images, &format!("is not a dataset, but `{}` is: use that folder", folder.path().display()));
     }
 }

@@ -39,9 +39,13 @@ pub fn read(folder: &Path) -> Result<Capture> {
         (colmap::detect, colmap::read),
         (llff::detect, llff::read),
     ];
-    match KNOWN.iter().find(|(detect, _)| detect(folder)) {
-        Some((_, read)) => read(folder),
-        None => Err(Error::file(
+    let known = |folder: &Path| KNOWN.iter().find(|(detect, _)| detect(folder));
+    match (known(folder), folder.parent()) {
+        (Some((_, read)), _) => read(folder),
+        (None, Some(parent)) if known(parent).is_some() => {
+            Err(Error::file(folder, format!("is not a dataset, but `{}` is: use that folder", parent.display())))
+        }
+        (None, _) => Err(Error::file(
             folder,
             "is not a dataset: expected transforms.json (instant-ngp, nerfstudio), transforms_train.json (Blender), \
             sparse/0/cameras.bin or .txt (COLMAP) or poses_bounds.npy (LLFF); `raygrad prepare` makes one from a video or \
