@@ -1,7 +1,8 @@
 //! Instantiations for f32 and f64 that are compiled in this crate, so that no caller compiles them again.
 //!
-//! A generic function is compiled in every crate that uses it, unless it is marked `#[inline(never)]` and a crate below has
-//! used it for the same types. So marked are the entries that stand for much code (of this crate and of those below).
+//! A generic function is compiled in every crate that uses it, unless it is marked `#[inline(never)]` and a crate below
+//! has used it for the same types. So marked are the entries that stand for much code (of this crate and of those
+//! below).
 
 use crate::analytic::{Integral, integrate};
 use crate::volume::quadrature::Quadrature;

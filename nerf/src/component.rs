@@ -1,4 +1,5 @@
-//! Custom fields, samplers and loss terms: implement [`ComponentConfig`] for a configuration, then [`register`] its name.
+//! Custom fields, samplers and loss terms: implement [`ComponentConfig`] for a configuration, then [`register`] its
+//! name.
 //!
 //! A [`Config`](crate::Config) holds each as an [`AnyConfig`], which reads and writes `{"kind": "<KIND>", ..}`.
 
@@ -15,8 +16,8 @@ use std::any::Any;
 use std::fmt;
 use std::sync::{PoisonError, RwLock};
 
-/// A type of component that a configuration chooses by name: [`Fields`](crate::Fields), [`Samplers`](crate::Samplers) or
-/// [`LossTerms`](crate::LossTerms).
+/// A type of component that a configuration chooses by name: [`Fields`](crate::Fields), [`Samplers`](crate::Samplers)
+/// or [`LossTerms`](crate::LossTerms).
 pub trait ComponentType: Sized + 'static {
     /// The word for such a component in messages, such as `field`.
     const WHAT: &'static str;
@@ -48,8 +49,8 @@ impl<T: Scalar> BuildContext<'_, T> {
 /// A named configuration of a field (`ComponentConfig<Fields>`), a sampler (`ComponentConfig<Samplers>`) or a loss term
 /// (`ComponentConfig<LossTerms>`).
 ///
-/// In a file it is `{"kind": "<KIND>", ..}` with the configuration's own fields. [`register`] the name before reading such
-/// a file.
+/// In a file it is `{"kind": "<KIND>", ..}` with the configuration's own fields. [`register`] the name before reading
+/// such a file.
 pub trait ComponentConfig<F: ComponentType>:
     Serialize + DeserializeOwned + Clone + fmt::Debug + Send + Sync + 'static
 {

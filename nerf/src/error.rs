@@ -1,8 +1,8 @@
-//! Errors that name the file, the field and what to do.
+//! The crate's error type.
 
 use std::path::{Path, PathBuf};
 
-/// What can go wrong between a folder of photographs and a trained field. Every message is one line.
+/// An error of this crate. Every message is one line: it names the file, field or setting, what is wrong, and the fix.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file or folder that cannot be read, written or decoded.
@@ -10,41 +10,41 @@ pub enum Error {
     File {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it and what to do.
+        /// The problem and the fix.
         what: String,
     },
-    /// A field of a file that has no usable value.
+    /// A field of a file with an unusable value.
     #[error("{}: `{field}`: {what}", path.display())]
     Field {
         /// The file.
         path: PathBuf,
-        /// The field, written as a path into the document: `frames[3].transform_matrix`.
+        /// The path of the field in the document, such as `frames[3].transform_matrix`.
         field: String,
-        /// What is wrong with it and what to do.
+        /// The problem and the fix.
         what: String,
     },
-    /// A setting that contradicts another or lies outside its range.
+    /// A setting that is out of range or contradicts another.
     #[error("`{name}`: {what}")]
     Setting {
         /// The setting.
         name: String,
-        /// What is wrong with it and what to do.
+        /// The problem and the fix.
         what: String,
     },
 }
 
 impl Error {
-    /// An error about the file `path`.
+    /// Creates an error about the file `path`.
     pub fn file(path: impl AsRef<Path>, what: impl ToString) -> Self {
         Error::File { path: path.as_ref().into(), what: line(what) }
     }
 
-    /// An error about one field of the file `path`.
+    /// Creates an error about one field of the file `path`.
     pub fn field(path: impl AsRef<Path>, field: impl ToString, what: impl ToString) -> Self {
         Error::Field { path: path.as_ref().into(), field: line(field), what: line(what) }
     }
 
-    /// An error about the setting `name`.
+    /// Creates an error about the setting `name`.
     pub fn setting(name: impl ToString, what: impl ToString) -> Self {
         Error::Setting { name: line(name), what: line(what) }
     }
@@ -53,7 +53,7 @@ impl Error {
 /// The most characters of a part of a message: one may repeat a name from a file.
 const LONGEST: usize = 1000;
 
-/// A text on one line, whatever names in it come from files; none of them moves a terminal's cursor.
+/// Escapes control characters, which names from files may contain, and truncates long text.
 fn line(text: impl ToString) -> String {
     let text = text.to_string();
     if text.len() <= LONGEST && !text.contains(char::is_control) {

@@ -1,9 +1,9 @@
-//! Files that are written as a whole.
+//! Atomic writing of files.
 
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// Writes `bytes` to the file `path`, which afterwards holds all of them or is untouched: see
+/// Writes `bytes` to the file `path` atomically: afterwards it holds all of them or is unchanged. See
 /// [`raygrad_nn::write_atomic`].
 ///
 /// # Errors

@@ -1,9 +1,63 @@
-//! Neural radiance fields on the [`raygrad_autograd`] tape. This crate knows no command line.
+//! Neural radiance fields on the [`raygrad_autograd`] tape, on a CPU.
 //!
-//! There is a room for each stage that data passes, and each knows only those before it:
-//! [`camera`] → [`dataset`] → [`encoding`] → [`space`] → [`field`] → [`volume`] → [`sampling`] → [`losses`] →
-//! [`model`] → [`rendering`] → [`geometry`] and [`training`]; [`doctor`], [`imaging`] and [`analytic`] stand beside them, and [`component`] is how a field, a
-//! sampler or a term of the loss of one's own comes in. Each stage can be used alone.
+//! The crate reads images with cameras, trains a model, and renders images, meshes and point clouds. Start with
+//! [`dataset::load`] and [`Trainer`]:
+//!
+//! ```no_run
+//! use raygrad_nerf::dataset::{Split, load};
+//! use raygrad_nerf::imaging::metrics::psnr;
+//! use raygrad_nerf::{Background, Budget, Config, Preset, Trainer};
+//! use std::{ops::ControlFlow, sync::Arc, time::Duration};
+//!
+//! // Images and cameras of a folder, at half of their size.
+//! let train = Arc::new(load("lego", Split::Train, 2)?);
+//! let config = Config::preset(Preset::Instant).with_scene_type(train.scope);
+//!
+//! // Train for a minute, and print the PSNR of the training rays.
+//! let mut trainer = Trainer::new(config, train)?;
+//! trainer.run(Budget::Time(Duration::from_secs(60)), |trainer| {
+//!     let stats = trainer.stats();
+//!     if stats.step % 100 == 0 {
+//!         println!("step {}: {:.2} dB", stats.step, stats.psnr);
+//!     }
+//!     ControlFlow::Continue(())
+//! });
+//! trainer.model.save("model.safetensors")?;
+//!
+//! // Render a held-out image and compare.
+//! let test = load("lego", Split::Test, 2)?;
+//! let (frame, white) = (&test.frames[0], Background::White.shown());
+//! let render = trainer.model.render(&frame.camera, white);
+//! println!("{}: {:.2} dB", frame.name, psnr(&render.color, &frame.image.over(white)));
+//! render.color.save_png("render.png")?;
+//! # Ok::<(), raygrad_nerf::Error>(())
+//! ```
+//!
+//! # Modules
+//!
+//! Data flows from top to bottom; a module uses only those above it.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`camera`] | cameras, lenses, camera paths, rays and samples |
+//! | [`dataset`] | images, captures and their formats, scene transform, type of scene |
+//! | [`encoding`] | hash grid, positional encoding, spherical harmonics |
+//! | [`space`] | map to the unit cube, scene contraction, occupancy grids |
+//! | [`field`] | radiance fields |
+//! | [`volume`] | volume rendering: notation, weights, quadrature, early termination |
+//! | [`sampling`] | samplers along rays |
+//! | [`losses`] | photometric loss and loss terms |
+//! | [`model`] | configuration, model, camera optimizer, exposure model |
+//! | [`rendering`] | images, depth, normals |
+//! | [`geometry`] | meshes, point clouds and their files |
+//! | [`training`] | trainer, budget, statistics |
+//!
+//! | module beside these | content |
+//! |---|---|
+//! | [`component`] | custom fields, samplers and loss terms |
+//! | [`imaging`] | PSNR, SSIM, LPIPS, colour maps, PNG and JPEG |
+//! | [`doctor`] | checks of captures, with advice |
+//! | [`analytic`] | scenes with exact integrals, for tests |
 
 pub mod analytic;
 pub mod camera;

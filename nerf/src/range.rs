@@ -1,4 +1,4 @@
-//! Settings within their ranges.
+//! Range checks of settings.
 
 use crate::{Error, Result};
 use raygrad_nn::Schedule;
@@ -7,7 +7,7 @@ use serde::de::IntoDeserializer;
 use serde::de::value::{Error as Unknown, StrDeserializer};
 use std::fmt;
 
-/// The variant that files call by this name.
+/// The enum variant with this name in files.
 pub(crate) fn by_name<'a, V: Deserialize<'a>>(name: &'a str) -> Option<V> {
     let name: StrDeserializer<'a, Unknown> = name.into_deserializer();
     V::deserialize(name).ok()
@@ -21,16 +21,15 @@ pub(crate) fn check_range<V: PartialOrd + fmt::Display>(name: &str, value: V, lo
     Err(Error::setting(name, format!("is {value}; use {low} to {high}")))
 }
 
-/// An error if a field would have more parameters than fit the memory of any machine that this runs on: an allocation that
-/// fails ends the program.
+/// An error if a field would have too many parameters: a failed allocation aborts the program.
 pub(crate) fn check_parameters(count: usize) -> Result<()> {
     const MOST: usize = 1 << 33;
     if count <= MOST {
         return Ok(());
     }
-    Err(Error::setting("field", format!("has {count} parameters; use smaller numbers, for at most {MOST} parameters")))
+    Err(Error::setting("field", format!("has {count} parameters; use smaller sizes, for at most {MOST}")))
 }
-/// Whether the learning rate of this name makes sense, if there is one.
+/// Checks the learning-rate schedule of this name, if there is one.
 pub(crate) fn check_schedule(name: &str, schedule: Option<Schedule>) -> Result<()> {
     let Some(schedule) = schedule else { return Ok(()) };
     schedule.check().map_err(|error| Error::setting(format!("{name}.{}.{}", schedule.name(), error.name), error.what))

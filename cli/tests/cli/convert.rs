@@ -135,7 +135,7 @@ fn lenses_and_poses_survive_every_format() {
 fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
     let place = Place::empty();
     with_lens(&place);
-    place.fails("prepare scene --to blender --out made", &["has a lens", "--undistort"]);
+    place.fails("prepare scene --to blender --out made", &["has lens distortion", "--undistort"]);
     let output = place.command("prepare scene --to llff --out made").output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(

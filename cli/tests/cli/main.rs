@@ -700,7 +700,7 @@ fn bad_arguments_are_usage_errors() {
         ("train --background grey", "white, black or random"),
         ("train --refine all", "use poses, focal, lens, exposure or vignetting"),
         ("eval", "required arguments"),
-        ("eval run --split all", "must be train, val or test"),
+        ("eval run --split all", "use train, val or test"),
         ("eval run --views 0", "0 is not in 1.."),
         ("render run --size 0x0", "WIDTHxHEIGHT"),
         ("render run --path fly", "use orbit, spiral, spline, test or a FILE.json"),

@@ -4,22 +4,22 @@ use super::{Layer, Layers, Medium};
 use crate::camera::pinhole::Ray;
 use glam::DVec3;
 
-/// A ball of one density and one colour.
+/// A ball of constant density and colour.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ball {
-    /// Its centre, in scene units.
+    /// Centre, in scene units.
     pub centre: DVec3,
-    /// Its radius.
+    /// Radius, in scene units.
     pub radius: f64,
-    /// Its density, more than 0.
+    /// Density, above 0, in 1 / scene unit.
     pub sigma: f64,
-    /// Its colour.
+    /// Colour, the same grey in all channels.
     pub color: f64,
 }
 
 impl Ball {
-    /// The ball as a ray sees it: one layer, or none. `z` of the layer is the distance along the ray, whose direction has
-    /// length 1.
+    /// Returns the ball along a ray with a unit direction: one layer, or none. The layer's `z` is the distance along
+    /// the ray.
     pub fn along(&self, ray: &Ray) -> Layers {
         let to_centre = self.centre - ray.origin;
         let nearest = to_centre.dot(ray.direction);

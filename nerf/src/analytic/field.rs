@@ -6,8 +6,7 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use raygrad_nn::{Bound, ParamId, Params};
 use std::sync::Arc;
 
-/// A medium that is rendered like any field. Its amplitudes are a parameter, so they have gradients and can be trained;
-/// positions have none.
+/// A medium as a field. Its amplitudes are a trainable parameter; positions have no gradient.
 #[derive(Debug, Clone)]
 pub struct AnalyticField {
     medium: Arc<dyn Medium>,
@@ -15,7 +14,7 @@ pub struct AnalyticField {
 }
 
 impl AnalyticField {
-    /// A field with one new parameter, `amplitudes` `[amplitudes]`, in `params`.
+    /// Creates a field with one parameter, `amplitudes` `[amplitudes]`, in `params`.
     pub fn new<T: Scalar>(medium: Arc<dyn Medium>, params: &mut Params<T>) -> Self {
         let values: Vec<T> = medium.amplitudes().into_iter().map(T::from_f64).collect();
         let amplitudes = params.add("amplitudes", Tensor::from_vec(&[values.len()], values));

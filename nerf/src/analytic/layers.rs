@@ -2,37 +2,37 @@
 
 use super::{Exact, Medium};
 
-/// A layer of one density.
+/// A layer of constant density.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Layer {
-    /// Where it begins, in scene units.
+    /// Start along z, in scene units.
     pub from: f64,
-    /// Where it ends.
+    /// End along z, in scene units.
     pub to: f64,
-    /// Its density, more than 0.
+    /// Density, above 0, in 1 / scene unit.
     pub sigma: f64,
-    /// Its colour `color[0] + color[1] z`.
+    /// Coefficients of the colour `color[0] + color[1] z`.
     pub color: [f64; 2],
 }
 
-/// Layers across the z axis, with nothing between them. Each density is an amplitude.
+/// A medium of layers across the z axis, empty in between. Each density is an amplitude.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layers(Vec<Layer>);
 
 impl Layers {
-    /// These layers, which rise and do not overlap.
+    /// Creates a medium of layers in rising order without overlap.
     ///
     /// # Panics
-    /// If they do not, or if a density is not more than 0.
+    /// If layers overlap or are not in order, or a density is not above 0.
     #[track_caller]
     pub fn new(layers: &[Layer]) -> Self {
         let rising = layers.windows(2).all(|pair| pair[0].to <= pair[1].from);
-        assert!(rising && layers.iter().all(|layer| layer.from < layer.to), "layers rise and do not overlap");
-        assert!(layers.iter().all(|layer| layer.sigma > 0.0), "a layer has a density");
+        assert!(rising && layers.iter().all(|layer| layer.from < layer.to), "layers must rise and must not overlap");
+        assert!(layers.iter().all(|layer| layer.sigma > 0.0), "a layer's density must be above 0");
         Layers(layers.to_vec())
     }
 
-    /// What is seen from z = 0 along the z axis up to `length`, over a background.
+    /// Computes the exact integrals from z = 0 along the z axis up to `length`, over a background.
     pub fn exact(&self, length: f64, background: f64) -> Exact {
         let parts: Vec<Layer> = self.0.iter().map(|layer| layer.clipped(length)).collect();
         let mut transmittance = vec![1.0];
@@ -85,7 +85,8 @@ impl Layer {
         self.sigma * (self.to - self.from)
     }
 
-    /// The integral of `sigma e^(-sigma (z - from)) (color[0] + color[1] z)` over the layer, and its derivative by sigma.
+    /// The integral of `sigma e^(-sigma (z - from)) (color[0] + color[1] z)` over the layer, and its derivative by
+    /// sigma.
     fn emitted(&self, color: [f64; 2]) -> [f64; 2] {
         let (x, length) = (self.depth(), self.to - self.from);
         let through = (-x).exp();

@@ -1,4 +1,4 @@
-//! What a rule makes of a scene that is known exactly.
+//! Quadrature of analytic scenes.
 
 use super::{AnalyticField, AnalyticScene};
 use crate::camera::rays::Rays;
@@ -10,25 +10,25 @@ use crate::volume::query::Query;
 use raygrad_autograd::{Scalar, Tape, Var};
 use raygrad_nn::Params;
 
-/// An approximation of [`Exact`](crate::analytic::Exact), and what it took.
+/// An approximation of [`Exact`](crate::analytic::Exact), with its number of evaluations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Integral {
     /// Colour over the background.
     pub color: f64,
-    /// Distance times weight.
+    /// Depth sum, in scene units.
     pub depth: f64,
-    /// Light that is left.
+    /// Transmittance at the end of the ray, 0 to 1.
     pub transmittance: f64,
-    /// The derivative of the colour by each amplitude.
+    /// Derivative of the colour with respect to each amplitude.
     pub d_color: Vec<f64>,
-    /// That of the depth.
+    /// Derivative of the depth with respect to each amplitude.
     pub d_depth: Vec<f64>,
-    /// How often density and colour were asked for.
+    /// Number of evaluations of density and colour.
     pub evaluations: usize,
 }
 
-/// Renders a scene and differentiates what is seen, in the precision `T`, with at most `evaluations` evaluations; an
-/// adaptive rule begins with as many intervals and asks as often as it needs.
+/// Renders and differentiates a scene in the precision `T`, with at most `evaluations` evaluations. An adaptive rule
+/// starts with as many intervals and takes what it needs.
 #[inline(never)]
 pub fn integrate<T: Scalar>(scene: &AnalyticScene, rule: Quadrature, evaluations: usize) -> Integral {
     let mut params = Params::<T>::new();

@@ -1,14 +1,13 @@
-//! Scenes whose pictures are known exactly: what a quadrature, a renderer or a gradient is measured against.
+//! Scenes with exact volume rendering integrals, to measure quadratures, renderers and gradients against.
 //!
-//! A [`Medium`] says what density and colour are at a place; an [`AnalyticScene`] is one of them seen along one ray, with
-//! the colour, the depth and the transmittance that the integrals of volume rendering
+//! Start with [`scenes`] and [`integrate`]. A [`Medium`] defines density and colour; an [`AnalyticScene`] is a medium
+//! along one ray, with the exact colour, depth and transmittance
 //!
 //! ```text
 //! C = integral of T sigma c dt + T(D) background,   Z = integral of T sigma t dt,   T(t) = exp(-integral of sigma)
 //! ```
 //!
-//! have over `[0, D]`, and their derivatives. [`AnalyticField`] makes a medium a [`Field`](crate::Field), so that everything
-//! that renders or trains a field does the same with these.
+//! over `[0, D]`, and their derivatives. [`AnalyticField`] makes a medium a [`Field`](crate::Field) to render or train.
 
 mod ball;
 mod field;
@@ -29,20 +28,21 @@ use glam::DVec3;
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// Density and colour at every place.
+/// A medium: density and colour at every position.
 ///
-/// The density is a sum of amplitudes, each times a shape of its own: with respect to the amplitudes there are gradients.
+/// The density is a sum of amplitudes times shapes; gradients are with respect to the amplitudes.
 pub trait Medium: Debug + Send + Sync {
-    /// The amplitudes, in 1 / scene unit.
+    /// Returns the amplitudes, in 1 / scene unit.
     fn amplitudes(&self) -> Vec<f64>;
 
-    /// What each amplitude is multiplied by at a place; `out` has one slot for each.
+    /// Writes each amplitude's shape at a position to `out`, one entry per amplitude.
     fn shapes(&self, position: [f64; 3], out: &mut [f64]);
 
-    /// The colour at a place, the same grey in all channels, 0 to 1. Where there is no density it is what a neighbour has.
+    /// Returns the colour at a position, the same grey in all channels, 0 to 1. Without density it is that of a
+    /// neighbour.
     fn color(&self, position: [f64; 3]) -> f64;
 
-    /// The density at a place, in 1 / scene unit.
+    /// Returns the density at a position, in 1 / scene unit.
     fn sigma(&self, position: [f64; 3]) -> f64 {
         let amplitudes = self.amplitudes();
         let mut shapes = vec![0.0; amplitudes.len()];
@@ -56,51 +56,53 @@ pub trait Medium: Debug + Send + Sync {
 pub struct Exact {
     /// Colour over the background.
     pub color: f64,
-    /// Distance times weight, not divided by the opacity, in scene units.
+    /// Depth sum (integral of `T sigma t`), not divided by the opacity, in scene units.
     pub depth: f64,
-    /// Light that is left at the end.
+    /// Transmittance at the end of the ray, 0 to 1.
     pub transmittance: f64,
-    /// The derivative of the colour by each amplitude.
+    /// Derivative of the colour with respect to each amplitude.
     pub d_color: Vec<f64>,
-    /// That of the depth.
+    /// Derivative of the depth with respect to each amplitude.
     pub d_depth: Vec<f64>,
-    /// That of the transmittance.
+    /// Derivative of the transmittance with respect to each amplitude.
     pub d_transmittance: Vec<f64>,
 }
 
-/// A medium, the ray that it is seen along, and what is seen.
+/// A medium along one ray, with its exact integrals.
 #[derive(Debug, Clone)]
 pub struct AnalyticScene {
     /// A short name.
     pub name: &'static str,
-    /// What there is.
+    /// The medium.
     pub medium: Arc<dyn Medium>,
-    /// Where from, and in which direction.
+    /// The ray.
     pub ray: Ray,
     /// The length `D` of the ray, in scene units.
     pub length: f64,
-    /// The colour behind it.
+    /// The background colour.
     pub background: f64,
-    /// What is seen.
+    /// The exact integrals.
     pub exact: Exact,
 }
 
 impl AnalyticScene {
-    /// Density and colour at distance `t`.
+    /// Returns density and colour at distance `t`.
     pub fn at(&self, t: f64) -> [f64; 2] {
         let position = self.ray.at(t).to_array();
         [self.medium.sigma(position), self.medium.color(position)]
     }
 
-    /// A box around the ray, of side `length`: lower and upper corner.
+    /// Returns a box of side `length` around the ray: lower and upper corner.
     pub fn bounds(&self) -> [DVec3; 2] {
         let middle = self.ray.at(0.5 * self.length);
         [middle - 0.5 * self.length, middle + 0.5 * self.length]
     }
 }
 
-/// The scenes of the benchmark, each on a ray of length 4 over white: constant density with constant and with linear
-/// colour, an exponential atmosphere, a wide and a narrow Gaussian layer, two slabs, and a ball seen off its centre.
+/// Returns the scenes of the benchmark, each on a ray of length 4 over white.
+///
+/// They are constant density with constant and with linear colour, an exponential atmosphere, a wide and a narrow
+/// Gaussian layer, two slabs, and a ball off its centre.
 pub fn scenes() -> Vec<AnalyticScene> {
     const LENGTH: f64 = 4.0;
     const BACKGROUND: f64 = 1.0;

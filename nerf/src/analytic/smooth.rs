@@ -4,22 +4,23 @@ use super::{Exact, Medium};
 use raygrad_tensor::vmath::f64::erf;
 use std::f64::consts::{FRAC_PI_2, SQRT_2};
 
-/// An atmosphere: density `sigma e^(-rate z)`, colour `color[0] + color[1] e^(-rate z)`. Its amplitude is `sigma`.
+/// An exponential atmosphere: density `sigma e^(-rate z)`, colour `color[0] + color[1] e^(-rate z)`. The amplitude is
+/// `sigma`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exponential {
     /// Density at z = 0, more than 0; at most 500 times the rate.
     pub sigma: f64,
-    /// Falls by a factor of e in `1 / rate` scene units; more than 0.
+    /// Rate of decay, above 0: a factor of e in `1 / rate` scene units.
     pub rate: f64,
-    /// The colour far up, and what is added to it at z = 0.
+    /// The colour at infinity, and its increase at z = 0.
     pub color: [f64; 2],
 }
 
 impl Exponential {
-    /// What is seen from z = 0 along the z axis up to `length`, over a background.
+    /// Computes the exact integrals from z = 0 along the z axis up to `length`, over a background.
     ///
-    /// By optical depth tau the colour is the straight line `color[0] + color[1] (1 - rate tau / sigma)`. The integral of
-    /// the transmittance, which the depth holds, is one of exponential integrals Ei.
+    /// In optical depth tau the colour is linear: `color[0] + color[1] (1 - rate tau / sigma)`. The depth contains the
+    /// integral of the transmittance, a difference of exponential integrals Ei.
     pub fn exact(&self, length: f64, background: f64) -> Exact {
         let Exponential { sigma, rate, color: [far, near] } = *self;
         let per_sigma = -(-rate * length).exp_m1() / rate;
@@ -72,19 +73,19 @@ impl Medium for Exponential {
     }
 }
 
-/// A soft layer: density `sigma e^(-(z - mean)^2 / (2 width^2))`, and a colour that rises with the optical depth, from
-/// `color[0]` at z = 0 to `color[0] + color[1]` at `length`. Its amplitude is `sigma`.
+/// A Gaussian layer: density `sigma e^(-(z - mean)^2 / (2 width^2))`, and a colour that rises with the optical depth,
+/// from `color[0]` at z = 0 to `color[0] + color[1]` at `length`. The amplitude is `sigma`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gaussian {
-    /// The largest density.
+    /// The maximum density, in 1 / scene unit.
     pub sigma: f64,
-    /// Where that is.
+    /// The position of the maximum along z.
     pub mean: f64,
     /// The standard deviation, in scene units.
     pub width: f64,
-    /// The colour at z = 0, and how much it rises.
+    /// The colour at z = 0, and its increase up to `length`.
     pub color: [f64; 2],
-    /// Where it has risen.
+    /// The end of the increase along z, in scene units.
     pub length: f64,
 }
 
@@ -95,9 +96,9 @@ impl Gaussian {
         self.width * FRAC_PI_2.sqrt() * (at(z - self.mean) + at(self.mean))
     }
 
-    /// What is seen from z = 0 along the z axis up to `length`, over a background.
+    /// Computes the exact integrals from z = 0 along the z axis up to `length`, over a background.
     ///
-    /// The depth has no closed form: that integral is taken numerically, to 1e-12.
+    /// The depth has no closed form; it is integrated numerically to 1e-12.
     pub fn exact(&self, background: f64) -> Exact {
         let per_sigma = self.unit_depth(self.length);
         let tau = self.sigma * per_sigma;

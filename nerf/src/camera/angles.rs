@@ -4,8 +4,8 @@ use raygrad_autograd::Real;
 
 /// `sin(r) / r` and `cos(r)` for `r = sqrt(s)`, smooth through 0; `s` is at least 0.
 ///
-/// Written with [`Real`], so that with variables it has derivatives of every order. Each branch sees an argument that it
-/// is good for, since a gradient of 0 times infinity would be NaN.
+/// Written with [`Real`], so that with variables it has derivatives of every order. Each branch sees an argument that
+/// it is good for, since a gradient of 0 times infinity would be NaN.
 #[inline(always)]
 pub(crate) fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
     let one = s.like(1.0);
@@ -23,8 +23,8 @@ pub(crate) fn sinc_and_cos_of_root<E: Real>(s: E) -> [E; 2] {
     [excess.if_positive(sinc, series(2)), excess.if_positive(root.cos(), series(1))]
 }
 
-/// `atan2(v, w) / v` for `v = sqrt(v2)`: the angle of the vector `(w, v)`, from 0 to pi, over its side `v`. Smooth through
-/// `v = 0` for `w > 0`; for `w <= 0`, `v` must not be 0.
+/// `atan2(v, w) / v` for `v = sqrt(v2)`: the angle of the vector `(w, v)`, from 0 to pi, over its side `v`. Smooth
+/// through `v = 0` for `w > 0`; for `w <= 0`, `v` must not be 0.
 #[inline(always)]
 pub(crate) fn angle_over<E: Real>(v2: E, w: E) -> E {
     let one = w.like(1.0);

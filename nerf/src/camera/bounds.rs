@@ -5,8 +5,8 @@ use glam::DVec3;
 
 /// Returns the distances at which a ray enters and leaves a box (lower and upper corner), or `None` if it misses.
 ///
-/// A ray that starts inside enters at 0. For a direction component of 0 the origin must lie between the faces, faces included.
-/// NaN misses.
+/// A ray that starts inside enters at 0. For a direction component of 0 the origin must lie between the faces, faces
+/// included. NaN misses.
 pub fn intersect_box(ray: &Ray, [low, high]: [DVec3; 2]) -> Option<[f64; 2]> {
     let (mut enter, mut leave) = (0.0, f64::INFINITY);
     for axis in 0..3 {

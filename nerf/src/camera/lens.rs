@@ -16,8 +16,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 /// A lens model: the map between directions and places in the image plane.
 ///
-/// Directions and places use image axes: `x` right, `y` down, `z` into the scene. A place is relative to the principal point in
-/// units of the focal length: `[(column - cx) / fx, (row - cy) / fy]`.
+/// Directions and places use image axes: `x` right, `y` down, `z` into the scene. A place is relative to the principal
+/// point in units of the focal length: `[(column - cx) / fx, (row - cy) / fy]`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Lens {
@@ -68,8 +68,8 @@ impl Lens {
         self.solve(place).ok().filter(|direction| direction.is_finite())
     }
 
-    /// Returns [`direction`](Self::direction) or, if there is none, the outermost direction towards `place`. It is finite for every
-    /// finite place.
+    /// Returns [`direction`](Self::direction) or, if there is none, the outermost direction towards `place`. It is
+    /// finite for every finite place.
     pub fn nearest(&self, place: [f64; 2]) -> DVec3 {
         let (Ok(direction) | Err(direction)) = self.solve(place);
         // Only coefficients and places beyond all measure have no answer in numbers.
@@ -78,8 +78,8 @@ impl Lens {
 
     /// Projects a direction, of any length but 0, to the image plane.
     ///
-    /// Returns `None` for directions beyond the first fold of the image, and for those behind the image plane unless the lens is a
-    /// fisheye or equirectangular.
+    /// Returns `None` for directions beyond the first fold of the image, and for those behind the image plane unless
+    /// the lens is a fisheye or equirectangular.
     pub fn place(&self, direction: DVec3) -> Option<[f64; 2]> {
         // Squares of what is left neither overflow nor vanish.
         let [x, y, z] = (direction / direction.abs().max_element()).to_array();
@@ -101,10 +101,11 @@ impl Lens {
         place.iter().all(|x| x.is_finite()).then_some(place)
     }
 
-    /// Evaluates the formula of [`place`](Self::place) for any number type, with these [`coefficients`](Self::coefficients).
+    /// Evaluates the formula of [`place`](Self::place) for any number type, with these
+    /// [`coefficients`](Self::coefficients).
     ///
-    /// With variables it is differentiable with respect to all arguments. It does not check for folds or for directions behind the
-    /// lens.
+    /// With variables it is differentiable with respect to all arguments. It does not check for folds or for directions
+    /// behind the lens.
     ///
     /// # Panics
     /// If there is another number of coefficients than the lens has.

@@ -1,7 +1,7 @@
 //! Cameras with lenses and poses, camera paths, and the rays through pixels.
 //!
-//! Start with [`Camera`] and [`Camera::look_at`]; [`CameraPath`] and [`Spiral`] make videos. [`Rays`] and [`Samples`] are
-//! the packed batches that fields and samplers take.
+//! Start with [`Camera`] and [`Camera::look_at`]; [`CameraPath`] and [`Spiral`] make videos. [`Rays`] and [`Samples`]
+//! are the packed batches that fields and samplers take.
 
 pub(crate) mod angles;
 pub(crate) mod axes;

@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 
 /// The NDC frustum of a forward-facing scene (Mildenhall et al. 2020, appendix C).
 ///
-/// [`Space::cube`](crate::Space::cube) maps it to the unit cube: x and y are image coordinates, z is even in inverse depth, from
-/// the near plane to infinity. Straight lines stay straight. The paper uses the frustum of one camera, which crops what other
-/// cameras see. This frustum starts far enough behind the cameras to hold all of theirs.
+/// [`Space::cube`](crate::Space::cube) maps it to the unit cube: x and y are image coordinates, z is even in inverse
+/// depth, from the near plane to infinity. Straight lines stay straight. The paper uses the frustum of one camera,
+/// which crops what other cameras see. This frustum starts far enough behind the cameras to hold all of theirs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ndc {
@@ -27,7 +27,8 @@ pub struct Ndc {
 
 /// The factor by which it is wider than the cameras' views: renders are taken beside them, and refined cameras move.
 const MARGIN: f64 = 1.1;
-/// The picture is at most so much wider than that of the usual camera: 15 degrees to either side of what is 60 degrees wide.
+/// The picture is at most so much wider than that of the usual camera: 15 degrees to either side of what is 60 degrees
+/// wide.
 const TURNED: f64 = 1.75;
 /// No camera is so many times as far from the middle of all as the usual one.
 const LOST: f64 = 5.0;
@@ -36,8 +37,8 @@ impl Ndc {
     /// Finds the frustum of everything that cameras see beyond the distance `near` from each.
     ///
     /// # Errors
-    /// If there is no camera or the scene is not forward-facing: cameras are rotated against each other, surround an object, move
-    /// more along their axes than across them, or one stands far from all others.
+    /// If there is no camera, or the scene is not forward-facing. In such a scene cameras look in one direction, move
+    /// more across their axes than along them, and none is far from all others.
     pub fn around<'a>(cameras: impl IntoIterator<Item = &'a Camera>, near: f64) -> Result<Self> {
         let cameras: Vec<&Camera> = cameras.into_iter().collect();
         let mean = |of: fn(&Camera) -> DVec3| mean(cameras.iter().map(|camera| of(camera)));
@@ -221,7 +222,11 @@ mod tests {
         // Half of the width is 27 degrees, and 1.75 times as wide 41.
         let turned = |degrees: f64| [camera([0.0; 3], -degrees), camera([1.0, 0.0, 0.0], degrees)];
         assert!(Ndc::around(&turned(14.0), 1.0).is_ok());
-        assert!(error(&turned(15.0), 1.0).contains("turned from each other"), "{}", error(&turned(15.0), 1.0));
+        assert!(
+            error(&turned(15.0), 1.0).contains("cameras look in different directions"),
+            "{}",
+            error(&turned(15.0), 1.0)
+        );
         // An arc of 60 degrees about an object is none either.
         let arc = |degrees: f64| {
             let (sin, cos) = degrees.to_radians().sin_cos();
@@ -239,7 +244,7 @@ mod tests {
         assert!(error(&row, 1.0).contains("far from all others"), "{}", error(&row, 1.0));
         assert!(error(&[camera([0.0; 3], 0.0)], 0.0).contains("near plane"));
         assert!(error(&[camera([0.0; 3], 0.0)], f64::NAN).contains("near plane"));
-        assert!(error(&[], 1.0).contains("no way in common"));
+        assert!(error(&[], 1.0).contains("cameras have no common viewing direction"));
         let panorama = Camera { lens: Lens::Equirectangular, focal: [16.0; 2], ..camera([0.0; 3], 0.0) };
         assert!(error(&[panorama], 1.0).contains("turned"));
     }

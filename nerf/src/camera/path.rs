@@ -29,8 +29,8 @@ impl Keyframe {
 
     /// Interpolates to another keyframe; a `share` below 0 or above 1 extrapolates.
     ///
-    /// Positions lie on a straight line, rotations turn about one axis the short way round (slerp, Shoemake 1985), and the focal
-    /// length changes geometrically.
+    /// Positions lie on a straight line, rotations turn about one axis the short way round (slerp, Shoemake 1985), and
+    /// the focal length changes geometrically.
     pub fn mix(&self, other: &Keyframe, share: f64) -> Keyframe {
         let (from, to) = (&self.pose, &other.pose);
         let turn = DQuat::from_scaled_axis(share * turn(from, to));
@@ -56,13 +56,13 @@ fn turn(from: &DAffine3, to: &DAffine3) -> DVec3 {
 /// The type of curve between keyframes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Curve {
-    /// An interpolating Catmull-Rom spline, as in nerfstudio: the pyramid of Barry and Goldman (1988) of [`Keyframe::mix`], for
-    /// rotations after Schlag (1991). Velocities are continuous. Between keyframes a camera should turn by less than a right
-    /// angle. The position over time is a monotone cubic function (Fritsch and Butland 1984), so uneven times never reverse the
-    /// camera.
+    /// An interpolating Catmull-Rom spline, as in nerfstudio: the pyramid of Barry and Goldman (1988) of
+    /// [`Keyframe::mix`], for rotations after Schlag (1991). Velocities are continuous. Between keyframes a camera
+    /// should turn by less than a right angle. The position over time is a monotone cubic function (Fritsch and Butland
+    /// 1984), so uneven times never reverse the camera.
     Through,
-    /// An approximating uniform cubic B-spline, as in instant-ngp: at a keyframe's time it has the weight 4/6 and its neighbours
-    /// 1/6 each. Rotations are weighted means of quaternions.
+    /// An approximating uniform cubic B-spline, as in instant-ngp: at a keyframe's time it has the weight 4/6 and its
+    /// neighbours 1/6 each. Rotations are weighted means of quaternions.
     Near,
 }
 
@@ -96,8 +96,9 @@ const LEAST_TIME: f64 = 1e-6;
 impl CameraPath {
     /// Creates a path of [`Curve::Through`], which returns to the first keyframe if `closed`.
     ///
-    /// The time between keyframes is the square root of their distance, in which turning and moving count equally over the path.
-    /// With this centripetal parameter, curves have neither loops nor cusps (Yuksel, Schaefer and Keyser 2011).
+    /// The time between keyframes is the square root of their distance, in which turning and moving count equally over
+    /// the path. With this centripetal parameter, curves have neither loops nor cusps (Yuksel, Schaefer and Keyser
+    /// 2011).
     ///
     /// # Panics
     /// If there is no keyframe.
@@ -118,8 +119,8 @@ impl CameraPath {
 
     /// Creates a path with given times between keyframes, in any unit.
     ///
-    /// There is one time fewer than keyframes or, if the path is `closed`, as many. A time below a millionth of the longest counts
-    /// as that. Times do not bend the curve: its parameter rises by one between keyframes.
+    /// There is one time fewer than keyframes or, if the path is `closed`, as many. A time below a millionth of the
+    /// longest counts as that. Times do not bend the curve: its parameter rises by one between keyframes.
     ///
     /// # Panics
     /// If there is no keyframe, another number of times, or a time that is not above 0 and finite.
@@ -174,8 +175,8 @@ impl CameraPath {
         share * share * (3.0 - 2.0 * share) * rise + share * left * (left * start - share * end)
     }
 
-    /// How fast the parameter rises at a key: the weighted harmonic mean of the legs around it, and at an end what the slope of a
-    /// parabola through three keys is, but not backwards.
+    /// How fast the parameter rises at a key: the weighted harmonic mean of the legs around it, and at an end what the
+    /// slope of a parabola through three keys is, but not backwards.
     fn speed(&self, key: usize) -> f64 {
         let legs = self.times.len() - 1;
         let of = |leg: usize| {
@@ -198,7 +199,8 @@ impl CameraPath {
         }
     }
 
-    /// Returns `count` keyframes evenly in time, from start to end. On a closed path the last one leads back to the first.
+    /// Returns `count` keyframes evenly in time, from start to end. On a closed path the last one leads back to the
+    /// first.
     pub fn frames(&self, count: usize) -> Vec<Keyframe> {
         let steps = if self.closed { count } else { count.saturating_sub(1).max(1) };
         (0..count).map(|i| self.at(i as f64 / steps as f64)).collect()

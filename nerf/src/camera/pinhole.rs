@@ -22,9 +22,9 @@ impl Ray {
 
 /// A camera: image size, intrinsics, lens and pose.
 ///
-/// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates are
-/// continuous, with `(0, 0)` at the upper left corner of the image. So the centre of the pixel in column `i` and row `j` is
-/// `(i + 0.5, j + 0.5)`.
+/// Axes follow OpenGL and Blender: the camera looks along its `-z`, `+x` points right and `+y` up. Pixel coordinates
+/// are continuous, with `(0, 0)` at the upper left corner of the image. So the centre of the pixel in column `i` and
+/// row `j` is `(i + 0.5, j + 0.5)`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Camera {

@@ -79,8 +79,8 @@ pub struct Samples<T: Scalar> {
     pub directions: Tensor<T>,
     /// Distances `t` along the rays, `[samples]`, in scene units, rising within a ray.
     pub t: Tensor<T>,
-    /// Length of each sample's interval, `[samples]`, in scene units. With two nodes per interval it is the length of the interval
-    /// that begins at the node, or 0.
+    /// Length of each sample's interval, `[samples]`, in scene units. With two nodes per interval it is the length of
+    /// the interval that begins at the node, or 0.
     pub delta: Tensor<T>,
     /// The rows of each ray's samples.
     pub segments: Segments,
@@ -190,7 +190,7 @@ impl<T: Scalar> Samples<T> {
         self.segments.rows()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no samples.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -6,9 +6,9 @@ use raygrad_autograd::{Real, Scalar, Shape, Var, record};
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::{Tensor, check::Entry};
 
-/// The matrix, row by row, of the rotation by `|w|` radians about `w` (Rodrigues): `1 + a K + b K^2` with the matrix K of
-/// `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`. Both come from half the angle, as for a quaternion: `b` as
-/// `2 sin^2(|w|/2) / |w|^2` has all its digits, and rounding leaves the matrix a rotation, also near half a turn.
+/// The matrix, row by row, of the rotation by `|w|` radians about `w` (Rodrigues): `1 + a K + b K^2` with the matrix K
+/// of `w x`, `a = sin|w| / |w|` and `b = (1 - cos|w|) / |w|^2`. Both come from half the angle, as for a quaternion: `b`
+/// as `2 sin^2(|w|/2) / |w|^2` has all its digits, and rounding leaves the matrix a rotation, also near half a turn.
 #[inline(always)]
 pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
     let [xx, yy, zz] = [x * x, y * y, z * z];
@@ -35,7 +35,8 @@ pub(crate) fn exp<E: Real>([x, y, z]: [E; 3]) -> [E; 9] {
     ]
 }
 
-/// Returns the rotation matrix of a rotation vector, whose length is the angle in radians; equals [`rotation_exp`] bit for bit.
+/// Returns the rotation matrix of a rotation vector, whose length is the angle in radians; equals [`rotation_exp`] bit
+/// for bit.
 pub fn rotation_matrix(vector: DVec3) -> DMat3 {
     DMat3::from_cols_array(&exp(vector.to_array())).transpose()
 }

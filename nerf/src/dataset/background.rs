@@ -25,7 +25,8 @@ pub enum Background {
 }
 
 impl Background {
-    /// Returns the colour behind a training ray. Only [`Random`](Self::Random) draws from `rng`: three uniform values, 0 to 1.
+    /// Returns the colour behind a training ray. Only [`Random`](Self::Random) draws from `rng`: three uniform values,
+    /// 0 to 1.
     pub fn draw(self, rng: &mut (impl Rng + ?Sized)) -> [f32; 3] {
         match self {
             Background::Random => rng.random(),
@@ -56,8 +57,8 @@ impl FromStr for Background {
     }
 }
 
-/// Composites one pixel over a background colour: `alpha c + (1 - alpha) background` for RGBA with straight alpha. RGB passes
-/// through.
+/// Composites one pixel over a background colour: `alpha c + (1 - alpha) background` for RGBA with straight alpha. RGB
+/// passes through.
 ///
 /// # Panics
 /// If the pixel has neither 3 nor 4 channels.
@@ -134,7 +135,7 @@ mod tests {
             assert_eq!(serde_json::to_string(&background).unwrap(), format!("\"{background}\""));
         }
         let message = "grey".parse::<Background>().unwrap_err().to_string();
-        assert_eq!(message, "`background`: must be white, black or random, is `grey`");
+        assert_eq!(message, "`background`: is `grey`; use white, black or random");
     }
 
     proptest! {

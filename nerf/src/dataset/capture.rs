@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 /// The file format of a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// NeRF-synthetic: `transforms_train.json`, `.._val.json`, `.._test.json`, written by Blender (Mildenhall et al. 2020).
+    /// NeRF-synthetic: `transforms_train.json`, `.._val.json`, `.._test.json`, written by Blender (Mildenhall et al.
+    /// 2020).
     Blender,
     /// `transforms.json` of instant-ngp and nerfstudio.
     Transforms,
@@ -47,8 +48,8 @@ pub struct Capture {
     pub points_file: Option<PathBuf>,
     /// instant-ngp's `aabb_scale`: half the side of the scene box in units of its unit cube, if given.
     pub aabb_scale: Option<f64>,
-    /// The transform that was applied to the original (COLMAP) coordinates: nerfstudio's `applied_transform` and `applied_scale`.
-    /// The identity if not given.
+    /// The transform that was applied to the original (COLMAP) coordinates: nerfstudio's `applied_transform` and
+    /// `applied_scale`. The identity if not given.
     pub applied: DAffine3,
 }
 

@@ -1,7 +1,7 @@
 //! The sRGB transfer curve between linear light and stored values.
 //!
-//! NeRF is trained and blended in stored values: half of white over black is 0.5, while half of the light would be 0.735. Use these
-//! operations for a model with linear colours.
+//! NeRF is trained and blended in stored values: half of white over black is 0.5, while half of the light would be
+//! 0.735. Use these operations for a model with linear colours.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
@@ -15,18 +15,18 @@ const EXPONENT: f64 = 2.4;
 
 /// The operation y = 12.92 x up to x = 0.0031308, else 1.055 x^(1/2.4) - 0.055: linear light to sRGB values.
 ///
-/// The line extends below 0 and the curve beyond 1, so the gradient is finite everywhere, at most 12.92. The standard's rounded
-/// constants leave a step of 2.9e-8 at the knee. NaN stays NaN.
+/// The line extends below 0 and the curve beyond 1, so the gradient is finite everywhere, at most 12.92. The standard's
+/// rounded constants leave a step of 2.9e-8 at the knee. NaN stays NaN.
 #[derive(Debug, Clone, Copy)]
 pub struct SrgbEncode;
 
-/// The operation y = x / 12.92 up to x = 0.04045, else ((x + 0.055) / 1.055)^2.4: sRGB values to linear light, the inverse of
-/// [`SrgbEncode`] up to the standard's rounding.
+/// The operation y = x / 12.92 up to x = 0.04045, else ((x + 0.055) / 1.055)^2.4: sRGB values to linear light, the
+/// inverse of [`SrgbEncode`] up to the standard's rounding.
 #[derive(Debug, Clone, Copy)]
 pub struct SrgbDecode;
 
-/// `x` where it is beyond the knee, else the knee: what the power sees, so that the branch that is not taken has a finite
-/// gradient too.
+/// `x` where it is beyond the knee, else the knee: what the power sees, so that the branch that is not taken has a
+/// finite gradient too.
 #[inline(always)]
 fn beyond<E: Real>(x: E, knee: f64) -> [E; 2] {
     let excess = x - x.like(knee);

@@ -9,10 +9,9 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Luma};
 use std::io::Cursor;
 use std::path::Path;
 
-/// Reads a file of depths along the optical axis, a PNG of integers or a `.npy` array of floats, in units of which each
-/// has the length `unit` in those of the scene: the distance along the ray through the centre of each of the camera's
-/// pixels, in scene units, and 0 where nothing was measured. Depths of another size are looked up and never averaged:
-/// halfway between what is near and what is behind it there is nothing.
+/// Reads depths along the optical axis, a PNG of integers or a `.npy` array of floats, in multiples of `unit` scene
+/// units. Returns distances along the rays through the camera's pixel centres, in scene units; 0 where nothing was
+/// measured. Other sizes are resampled by nearest neighbour: an average of a near and a far depth would be wrong.
 pub(super) fn distances(path: &Path, unit: f64, camera: &Camera) -> Result<Image> {
     let wrong = |what: String| Error::file(path, what);
     let ([width, height], depths) = decoded(path)?;
@@ -74,7 +73,8 @@ impl Depths {
         decoded(path.as_ref()).map(drop)
     }
 
-    /// Converts distances along rays, as a [`Render`](crate::Render) has them, to depths, and multiplies them by `scale`.
+    /// Converts distances along rays, as a [`Render`](crate::Render) has them, to depths, and multiplies them by
+    /// `scale`.
     ///
     /// A `scale` of 1 over [`SceneTransform::scale`](super::SceneTransform::scale) gives units of the capture.
     ///
@@ -94,8 +94,8 @@ impl Depths {
         Depths { size: [camera.width, camera.height], values }
     }
 
-    /// Encodes a 16-bit PNG of one channel, in multiples of `unit`, rounded. Also returns the number of depths that do not fit and
-    /// are written as 0.
+    /// Encodes a 16-bit PNG of one channel, in multiples of `unit`, rounded. Also returns the number of depths that do
+    /// not fit and are written as 0.
     ///
     /// # Panics
     /// If it has no pixels.
@@ -236,6 +236,6 @@ mod tests {
         ImageBuffer::<Luma<u8>, _>::new(2, 3).save(folder.path().join("turned.png")).unwrap();
         ImageBuffer::<Luma<u8>, _>::new(9, 3).save(folder.path().join("wide.png")).unwrap();
         fails("turned.png", "has 2x3 depths");
-        fails("wide.png", "has 9x3 depths, and its photograph 3x2 pixels");
+        fails("wide.png", "has 9x3 depths but the image 3x2 pixels; use one aspect ratio");
     }
 }

@@ -71,8 +71,8 @@ pub struct Frame {
     pub image: Photo,
     /// The mask of used pixels; `None` uses all.
     pub mask: Option<Arc<Mask>>,
-    /// Measured distances for the [depth loss](crate::losses::DepthConfig): one channel of the same size, along the ray through each
-    /// pixel's centre, in scene units; 0 where unknown.
+    /// Measured distances for the [depth loss](crate::losses::DepthConfig): one channel of the same size, along the ray
+    /// through each pixel's centre, in scene units; 0 where unknown.
     pub distances: Option<Image>,
 }
 
@@ -89,7 +89,8 @@ pub struct Dataset {
     pub far: f64,
     /// Bounded, unbounded or forward-facing.
     pub scope: SceneType,
-    /// The NDC frustum of all images of the capture, other splits included, if it is [forward-facing](SceneType::ForwardFacing).
+    /// The NDC frustum of all images of the capture, other splits included, if it is
+    /// [forward-facing](SceneType::ForwardFacing).
     pub ndc: Option<Ndc>,
     /// The transform from the files' coordinates to those of the scene, which all fields use.
     pub placement: SceneTransform,
@@ -98,10 +99,11 @@ pub struct Dataset {
 }
 
 impl Dataset {
-    /// Returns the number of pixels along the longest side of the scene box, seen at its centre: the median over images.
+    /// Returns the number of pixels along the longest side of the scene box, seen at its centre: the median over
+    /// images.
     ///
-    /// A camera inside the box counts as if it stood at its side. For a forward-facing scene it counts the pixels across the
-    /// [NDC frustum](Self::ndc) at that depth.
+    /// A camera inside the box counts as if it stood at its side. For a forward-facing scene it counts the pixels
+    /// across the [NDC frustum](Self::ndc) at that depth.
     pub fn pixels_per_side(&self) -> f64 {
         let [lower, upper] = self.bounds;
         let (middle, side) = (0.5 * (lower + upper), (upper - lower).max_element());
@@ -128,8 +130,8 @@ impl Dataset {
     /// Checks the [distances](Frame::distances) of all images; with `needed`, at least one image must have some.
     ///
     /// # Errors
-    /// If distances have another size than their image or several channels, if one is negative or not finite, or if they are needed
-    /// and missing.
+    /// If distances have another size than their image or several channels, if one is negative or not finite, or if
+    /// they are needed and missing.
     pub fn check_distances(&self, needed: bool) -> Result<()> {
         let mut found = false;
         for Frame { name, image, distances, .. } in &self.frames {
@@ -188,7 +190,8 @@ impl Dataset {
     }
 }
 
-/// Returns at most `count` of the items, in order and evenly spaced: of `n` items those with index `i n / count`, rounded down.
+/// Returns at most `count` of the items, in order and evenly spaced: of `n` items those with index `i n / count`,
+/// rounded down.
 pub fn evenly_spaced<T>(items: Vec<T>, count: usize) -> Vec<T> {
     let (n, count) = (items.len(), count.min(items.len()));
     let mut wanted = (0..count).map(|i| i * n / count).peekable();

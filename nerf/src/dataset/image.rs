@@ -4,8 +4,8 @@ use super::average::average;
 
 /// An image of f32 values, row by row from the top, `[height, width, channels]`.
 ///
-/// Colours keep the transfer curve of their file (sRGB for PNG and JPEG) and lie in 0 to 1; NeRF is trained and evaluated in that
-/// space. Alpha, the fourth channel, is straight (not premultiplied).
+/// Colours keep the transfer curve of their file (sRGB for PNG and JPEG) and lie in 0 to 1; NeRF is trained and
+/// evaluated in that space. Alpha, the fourth channel, is straight (not premultiplied).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Image {
     /// Width in pixels.
@@ -56,10 +56,12 @@ impl Image {
 
     /// Downscales by an integer factor: each pixel is the average of `factor x factor` pixels.
     ///
-    /// RGBA colours are weighted by alpha, so colours of transparent pixels do not bleed. A fully transparent box becomes zero.
+    /// RGBA colours are weighted by alpha, so colours of transparent pixels do not bleed. A fully transparent box
+    /// becomes zero.
     ///
     /// # Panics
-    /// If `factor` is 0 or does not divide both the width and the height. (Cropping would change the camera's field of view.)
+    /// If `factor` is 0 or does not divide both the width and the height. (Cropping would change the camera's field of
+    /// view.)
     #[track_caller]
     pub fn downscaled(&self, factor: usize) -> Image {
         let divides = factor > 0 && self.width.is_multiple_of(factor) && self.height.is_multiple_of(factor);
@@ -141,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "a factor of 3 does not divide a 4x6 image")]
+    #[should_panic(expected = "the factor 3 must divide both sides of a 4x6 image")]
     fn downscaling_does_not_crop() {
         Image::new(4, 6, 3).downscaled(3);
     }

@@ -19,13 +19,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Of photographs that no file puts in a split, every one of this number, from the first by name, is held out to test on.
+/// Without splits in the files, one image in this many is held out, from the first by name.
 const HELD_OUT: usize = 8;
-/// Photographs that are looked at to find out whether they show nothing somewhere.
+/// Images that are read to decide whether the background is empty.
 const LOOKED_AT: usize = 3;
-/// How much of such a photograph is so.
+/// The transparent share of an image that counts as an empty background.
 const CLEAR: f64 = 0.05;
-/// How much of the border of photographs is white that show an object before white.
+/// The white share of the border of images that show an object before white.
 const WHITE_BORDER: f64 = 0.98;
 /// How much of a pixel of a mask must be white for it to be used.
 pub(super) const WHITE: f32 = 0.99;
@@ -64,11 +64,13 @@ impl LoadOptions<'_> {
 impl Capture {
     /// Reads the cameras of a folder in any [format](super::formats), without decoding images.
     ///
-    /// Without splits in the files, every eighth image by name, from the first, is held out as [test](Split::Test) image, whether its
-    /// file exists or not; the others are training images. If the files list only training images, the others are test images.
+    /// Without splits in the files, every eighth image by name, from the first, is a [test](Split::Test) image, even if
+    /// its file does not exist. The others are training images. If the files list only training images, the others are
+    /// test images.
     ///
     /// # Errors
-    /// If the folder is absent or has no known format, a file has a bad field, or an image is in both the training and the test split.
+    /// If the folder is absent or has no known format, a file has a bad field, or an image is in both the training and
+    /// the test split.
     pub fn read(folder: impl AsRef<Path>) -> Result<Capture> {
         let folder = folder.as_ref();
         if !folder.is_dir() {
@@ -97,7 +99,8 @@ impl Capture {
         }
     }
 
-    /// Returns whether the held-out images are every eighth by name, as [`read`](Self::read) chooses without splits in the files.
+    /// Returns whether the held-out images are every eighth by name, as [`read`](Self::read) chooses without splits in
+    /// the files.
     pub fn holds_out_every_eighth(&self) -> bool {
         let mut views: Vec<&View> = self.views.iter().collect();
         views.sort_by(|a, b| a.name.cmp(&b.name));
@@ -121,7 +124,8 @@ impl Capture {
         Ok(())
     }
 
-    /// Returns the images of a split. A capture with a single held-out set returns it for [`Split::Val`] and [`Split::Test`].
+    /// Returns the images of a split. A capture with a single held-out set returns it for [`Split::Val`] and
+    /// [`Split::Test`].
     ///
     /// # Errors
     /// If there is none.
@@ -142,7 +146,8 @@ impl Capture {
         Ok(found)
     }
 
-    /// Finds the scene transform, type, box, near and far plane from cameras and a few images; `asked` overrides the type.
+    /// Finds the scene transform, type, box, near and far plane from cameras and a few images; `asked` overrides the
+    /// type.
     ///
     /// # Errors
     /// If an image with an alpha channel cannot be read, or as [`SceneAnalysis::new`].
@@ -187,9 +192,9 @@ impl Capture {
     /// Reads the images of a split, in parallel, and maps their cameras to the scene by `survey`.
     ///
     /// # Errors
-    /// If none of the split's images exists, an image cannot be decoded or has another aspect ratio than its camera, or `downscale` or
-    /// `views` is 0. Which of several errors is reported does not depend on timing. Single absent images are not an
-    /// error: see [`Dataset::skipped`].
+    /// If none of the split's images exists, an image cannot be decoded or has another aspect ratio than its camera, or
+    /// `downscale` or `views` is 0. Which of several errors is reported does not depend on timing. Single absent images
+    /// are not an error: see [`Dataset::skipped`].
     pub fn load(&self, split: Split, survey: &SceneAnalysis, reading: &LoadOptions<'_>) -> Result<Dataset> {
         reading.check()?;
         let (present, absent): (Vec<&View>, Vec<&View>) =
@@ -225,13 +230,13 @@ impl Capture {
         })
     }
 
-    /// An error with where the files speak of the photograph that it is about.
+    /// Adds the entry of the image in the files to an error.
     fn named<T>(&self, view: &View, result: Result<T>) -> Result<T> {
         result.map_err(|error| Error::field(&self.file, &view.field, error))
     }
 }
 
-/// How one photograph is read.
+/// The plan to read one image.
 struct Plan<'a> {
     view: &'a View,
     path: PathBuf,
@@ -290,8 +295,8 @@ pub(super) fn open(path: &Path, camera: &Camera) -> Result<Photo> {
     Photo::open(path, Some(size_for(path, camera)?))
 }
 
-/// The same image in a folder of images that somebody has made smaller by this factor, as `images_4` beside `images`, and
-/// what is left to do; or the image itself.
+/// The image in a folder of downscaled images, as `images_4` beside `images`, with the remaining factor; or the image
+/// itself.
 fn made_smaller(folder: &Path, path: &Path, downscale: usize) -> (PathBuf, usize) {
     let inside = path.strip_prefix(folder).unwrap_or(Path::new(""));
     let mut parts = inside.components();
@@ -320,7 +325,7 @@ pub(crate) fn same_shape([width, height]: [usize; 2], camera: &Camera) -> bool {
     cw > 0.0 && ch > 0.0 && (w * ch - h * cw).abs() <= 0.51 * cw.max(ch).max(w).max(h)
 }
 
-/// Reads a mask, white where the photograph is used, of a photograph of the size `of` that becomes one of the size `to`.
+/// Reads a mask (white where pixels are used) of an image of the size `of`, downscaled to the size `to`.
 fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
     let mask = Photo::open(path, Some(of))?;
     let [width, height] = to;
@@ -336,7 +341,7 @@ fn read_mask(path: &Path, of: [usize; 2], to: [usize; 2]) -> Result<Mask> {
     Ok(Mask::new(width, height, |x, y| mask.pixel(x, y)[0] >= WHITE))
 }
 
-/// The pixels that light reaches, found once for all photographs of a camera.
+/// The pixels that a lens sees, found once per camera.
 #[derive(Default)]
 struct Lit(Mutex<Vec<(Camera, Option<Arc<Mask>>)>>);
 

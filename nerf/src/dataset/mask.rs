@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "no pixel of this photograph")]
+    #[should_panic(expected = "the mask has no used pixel")]
     fn a_photograph_without_pixels_has_none_to_draw() {
         Mask::new(3, 3, |_, _| false).draw(&mut StdRng::seed_from_u64(1));
     }

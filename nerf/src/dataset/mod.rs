@@ -41,8 +41,8 @@ use std::path::Path;
 
 use crate::error::Result;
 
-/// Reads one split of the dataset in `folder`, with images [averaged](Photo::resized) down by the factor `downscale` (1 keeps
-/// them).
+/// Reads one split of the dataset in `folder`, with images [averaged](Photo::resized) down by the factor `downscale` (1
+/// keeps them).
 ///
 /// It combines [`Capture::read`], [`Capture::analyze_scene`] and [`Capture::load`].
 ///
@@ -77,7 +77,7 @@ mod tests {
             assert_eq!(serde_json::to_string(&split).unwrap(), format!("\"{split}\""));
         }
         let message = "Train".parse::<Split>().unwrap_err().to_string();
-        assert_eq!(message, "`split`: must be train, val or test, is `Train`");
+        assert_eq!(message, "`split`: is `Train`; use train, val or test");
     }
 
     #[test]

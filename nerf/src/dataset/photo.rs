@@ -55,12 +55,12 @@ impl From<Image> for Photo {
 impl Photo {
     /// Reads a PNG, JPEG or WebP file, by its contents: RGBA if it has transparency, otherwise RGB.
     ///
-    /// It applies the EXIF orientation, unless `size`, the width and height of the camera, is that of the stored pixels: programs that
-    /// calibrate cameras use these.
+    /// It applies the EXIF orientation, unless `size`, the width and height of the camera, is that of the stored
+    /// pixels: programs that calibrate cameras use these.
     ///
     /// # Errors
-    /// If the file cannot be read or decoded, or claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte of the file. The
-    /// error names it.
+    /// If the file cannot be read or decoded, or claims more than 2^28 pixels or more than 64 MiB plus 16 KiB per byte
+    /// of the file. The error names it.
     pub fn open(path: impl AsRef<Path>, size: Option<[usize; 2]>) -> Result<Self> {
         let path = path.as_ref();
         let (mut decoder, stored) = decoder(path)?;
@@ -179,7 +179,8 @@ impl Photo {
 
     /// Downsizes by area averaging, rounded to the integers of the file.
     ///
-    /// RGBA colours are weighted by alpha, so colours of transparent pixels do not bleed. Fully transparent areas become zero.
+    /// RGBA colours are weighted by alpha, so colours of transparent pixels do not bleed. Fully transparent areas
+    /// become zero.
     ///
     /// # Panics
     /// If a side is 0 or longer than before.
@@ -227,8 +228,8 @@ fn turned_size([width, height]: [usize; 2], turn: Orientation) -> [usize; 2] {
 
 /// More pixels than any camera has: a file that says so is damaged, and would take all memory.
 const MOST_PIXELS: usize = 1 << 28;
-/// The most bytes that a file is decoded to: so many for each of its own, and so many whatever its length. A PNG file of one bit
-/// and one colour comes to half of the former; a damaged header says anything.
+/// The most bytes that a file is decoded to: so many for each of its own, and so many whatever its length. A PNG file
+/// of one bit and one colour comes to half of the former; a damaged header says anything.
 const MOST_BYTES: [u64; 2] = [1 << 14, 1 << 26];
 
 /// What decodes a file, and the size of its pixels as they are stored.
@@ -267,8 +268,8 @@ pub(super) fn decoder_of<'a, R: BufRead + Seek + 'a>(
     Ok((decoder, size))
 }
 
-/// Whether the parts of a WebP file of that many bytes lie in it: what decodes it takes as much memory for one as its header says.
-/// The reader is at the beginning, before and after.
+/// Whether the parts of a WebP file of that many bytes lie in it: what decodes it takes as much memory for one as its
+/// header says. The reader is at the beginning, before and after.
 fn chunks_fit(reader: &mut (impl Read + Seek), length: u64) -> std::io::Result<bool> {
     // `RIFF`, the length of what follows, `WEBP`; then a name and a length before each part.
     let mut size = [0; 4];

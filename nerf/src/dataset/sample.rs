@@ -1,4 +1,4 @@
-//! Photographs for unit tests: a ball of two colours in the middle of the world.
+//! Images for unit tests: a ball of two colours at the origin.
 
 use super::{Dataset, Frame, Image, SceneTransform, SceneType, Split};
 use crate::camera::{Camera, Ndc, Ray};
@@ -18,7 +18,7 @@ pub(crate) fn cameras_around(count: usize, size: usize) -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
-/// The ball in 60 square photographs to train on, 10 to validate and 20 to test, with nothing behind it.
+/// The ball in 60 square training images, 10 validation and 20 test images, without a background.
 pub(crate) fn ball(split: Split, size: usize) -> Dataset {
     let (count, skipped) = match split {
         Split::Train => (60, 0),
@@ -37,7 +37,7 @@ pub(crate) fn ball(split: Split, size: usize) -> Dataset {
     }
 }
 
-/// The ball in four photographs from a window before it, all in one direction.
+/// The ball in four forward-facing images.
 pub(crate) fn ball_ahead(size: usize) -> Dataset {
     let corners = [[-1.0, -0.5], [1.0, -0.5], [-1.0, 0.5], [1.0, 0.5]];
     let camera = |[x, z]: [f64; 2]| {

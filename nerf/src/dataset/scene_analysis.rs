@@ -33,15 +33,18 @@ pub struct SceneAnalysis {
 
 /// Half of a box's side in scene units, as in the NeRF-synthetic scenes.
 const HALF_BOX: f64 = 1.5;
-/// Near and far of the NeRF-synthetic scenes: their files do not say where the scene lies, and all work on them uses these.
+/// Near and far of the NeRF-synthetic scenes: their files do not say where the scene lies, and all work on them uses
+/// these.
 const CONVENTION: [f64; 2] = [2.0, 6.0];
-/// Where nothing else is known, a ray of an unbounded scene begins at this share of the cameras' distance from its middle.
+/// Where nothing else is known, a ray of an unbounded scene begins at this share of the cameras' distance from its
+/// middle.
 const NEAR_SHARE: f64 = 0.05;
 /// An unbounded scene's end, in sides of its box.
 const FAR_SIDES: f64 = 1000.0;
 /// Half of the box of an unbounded scene, as a share of the cameras' distance from its middle.
 const INNER_SHARE: f64 = 0.5;
-/// Where cameras look about nothing in common and nothing says how far they see: how much farther than they stand apart.
+/// Where cameras look about nothing in common and nothing says how far they see: how much farther than they stand
+/// apart.
 const AHEAD: f64 = 5.0;
 /// The same where they look all around.
 const AROUND: f64 = 3.0;
@@ -51,11 +54,12 @@ const ROUNDS: usize = 8;
 impl SceneAnalysis {
     /// Analyses the cameras of all images that exist.
     ///
-    /// `empty` is the reason why the background seems empty, which only pixels show; [`Capture::analyze_scene`] finds it. `asked`
-    /// overrides the type of scene.
+    /// `empty` is the reason why the background seems empty, which only pixels show; [`Capture::analyze_scene`] finds
+    /// it. `asked` overrides the type of scene.
     ///
     /// # Errors
-    /// If there is no image, if all cameras stand in one place, or if `asked` is forward-facing and the cameras are not.
+    /// If there is no image, if all cameras stand in one place, or if `asked` is forward-facing and the cameras are
+    /// not.
     pub fn new(capture: &Capture, empty: Option<&str>, asked: Option<SceneType>) -> Result<SceneAnalysis> {
         let cameras: Vec<&Camera> = capture.present().map(|view| &view.camera).collect();
         if cameras.is_empty() {
@@ -165,7 +169,8 @@ struct Layout {
 }
 
 impl Layout {
-    /// `depths` are the nearest and farthest that each camera sees, if all are known, and `points` some of what they see.
+    /// `depths` are the nearest and farthest that each camera sees, if all are known, and `points` some of what they
+    /// see.
     fn new(cameras: &[&Camera], depths: &[[f64; 2]], points: &[DVec3]) -> Self {
         let distances = |middle: DVec3| median(cameras.iter().map(|camera| camera.pose.translation.distance(middle)));
         if depths.len() == cameras.len() {
@@ -191,8 +196,8 @@ impl Layout {
     }
 }
 
-/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. `None` where
-/// they do not look at one place, as in a room or along a wall.
+/// The middle of what cameras look at: the place nearest to their optical axes, in the sense of least squares. `None`
+/// where they do not look at one place, as in a room or along a wall.
 fn middle(cameras: &[&Camera]) -> Option<DVec3> {
     let mean = average(cameras, |pose| pose.translation);
     let spread = cameras.iter().map(|camera| camera.pose.translation.distance(mean)).fold(0.0, f64::max);
@@ -234,8 +239,8 @@ fn ahead(cameras: &[&Camera], depths: &[[f64; 2]]) -> DVec3 {
     }))
 }
 
-/// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal axes
-/// (the least principal axis of these), on the side of their own up.
+/// A rotation after which up is along z: as people hold cameras level, up is what is across all of their horizontal
+/// axes (the least principal axis of these), on the side of their own up.
 fn upright(cameras: &[&Camera]) -> DMat3 {
     let mean = average(cameras, |pose| pose.matrix3.y_axis);
     let mut spread = DMat3::from_diagonal(DVec3::splat(1e-4));

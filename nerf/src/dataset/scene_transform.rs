@@ -28,8 +28,8 @@ impl Default for SceneTransform {
 }
 
 impl SceneTransform {
-    /// Finds the similarity from `from` to `to` with the least sum of squared distances (Umeyama 1991; the rotation as a quaternion,
-    /// Horn 1987).
+    /// Finds the similarity from `from` to `to` with the least sum of squared distances (Umeyama 1991; the rotation as
+    /// a quaternion, Horn 1987).
     ///
     /// Returns `None` if there are fewer than three points, their numbers differ, or all lie on a line.
     pub fn between(from: &[DVec3], to: &[DVec3]) -> Option<Self> {

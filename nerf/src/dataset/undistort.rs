@@ -26,8 +26,8 @@ const ROUNDING: f64 = 1e-4;
 impl Camera {
     /// Finds the largest pinhole camera that all of `cameras` cover, so that its images have no empty pixel.
     ///
-    /// It has the pose of the first camera, square pixels, a centred principal point, and their (median) focal length. Its field
-    /// of view is at most 100 degrees if a lens is a fisheye.
+    /// It has the pose of the first camera, square pixels, a centred principal point, and their (median) focal length.
+    /// Its field of view is at most 100 degrees if a lens is a fisheye.
     ///
     /// # Errors
     /// If there is no camera, one is equirectangular, or one does not see its own optical axis.
@@ -71,8 +71,8 @@ fn last(mut low: f64, good: impl Fn(f64) -> bool) -> f64 {
     low
 }
 
-/// Whether a camera sees the rectangle of directions with these half sides. What it sees has no holes, so that its border
-/// tells.
+/// Whether a camera sees the rectangle of directions with these half sides. What it sees has no holes, so that its
+/// border tells.
 fn sees_all(camera: &Camera, [x, y]: [f64; 2]) -> bool {
     let most = match camera.lens {
         Lens::Fisheye { .. } | Lens::Fov { .. } => (0.5 * WIDEST).tan(),

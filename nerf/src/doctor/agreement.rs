@@ -1,8 +1,8 @@
 //! Agreement of images with their cameras along epipolar lines.
 //!
-//! Patches of one image are searched in another: along the epipolar line, and along parallel lines beside it. The share of
-//! patches whose best match is on the epipolar line measures agreement: a fifth by chance, nearly all for right cameras.
-//! Errors such as reflections affect all lines alike.
+//! Patches of one image are searched in another: along the epipolar line, and along parallel lines beside it. The share
+//! of patches whose best match is on the epipolar line measures agreement: a fifth by chance, nearly all for right
+//! cameras. Errors such as reflections affect all lines alike.
 
 use super::nearby::usual_gap;
 use super::picture::{Patch, Picture};
@@ -106,7 +106,8 @@ struct Transfer<'a> {
 }
 
 impl Transfer<'_> {
-    /// Where the other picture shows what lies at the inverse depth `inverse` behind a pixel; `None` if behind its camera.
+    /// Where the other picture shows what lies at the inverse depth `inverse` behind a pixel; `None` if behind its
+    /// camera.
     fn place(&self, [x, y]: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
         let Picture { focal, centre, .. } = self.from;
         let direction = DVec3::new((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0);
@@ -149,8 +150,8 @@ fn matched(a: Placed<'_>, b: Placed<'_>, nearest: f64) -> Tally {
     tally
 }
 
-/// Whether the line itself, and not one beside it, has the best match of a patch; `None` if none has a good one, or they are
-/// not of like length within the picture.
+/// Whether the line itself, and not one beside it, has the best match of a patch; `None` if none has a good one, or
+/// they are not of like length within the picture.
 fn best_line(transfer: &Transfer<'_>, corner: [f64; 2], patch: &Patch, most: f64) -> Option<bool> {
     let start = transfer.place(corner, 0.0)?;
     let mut last = most;

@@ -215,7 +215,8 @@ fn coverage(places: &[DVec3], focus: Focus, up: DVec3, findings: &mut Findings) 
 }
 
 fn in_the_box(views: &[&View], survey: &SceneAnalysis, findings: &mut Findings) {
-    /// Rays that are tried along each side of an image; the second where all of the first miss a box that may lie between.
+    /// Rays that are tried along each side of an image; the second where all of the first miss a box that may lie
+    /// between.
     const RAYS: [usize; 2] = [12, 200];
     if survey.scene_type != SceneType::Bounded {
         return;

@@ -70,7 +70,7 @@ fn look_at(view: &View) -> Result<Look> {
     Ok(Look { transparent, hash: hasher.finish(), sharpness, luminance, balance, used, picture })
 }
 
-/// A photograph whose longest side is at most this.
+/// Downsizes an image so that its longest side is at most this.
 fn shrunk(photo: &Photo, longest: usize) -> Photo {
     let Photo { width, height, .. } = *photo;
     let share = (longest as f64 / width.max(height) as f64).min(1.0);

@@ -1,7 +1,7 @@
 //! Checks a capture for problems and gives advice, before time is spent on training.
 //!
-//! Start with [`examine`], which reads all images: sharpness, exposure, and agreement with neighbours along epipolar lines.
-//! [`examine_cameras`] checks only poses, lenses and image headers, in milliseconds.
+//! Start with [`examine`], which reads all images: sharpness, exposure, and agreement with neighbours along epipolar
+//! lines. [`examine_cameras`] checks only poses, lenses and image headers, in milliseconds.
 
 mod agreement;
 mod consistency;
@@ -27,7 +27,8 @@ use report::Findings;
 /// Options of [`examine`].
 #[derive(Clone, Copy)]
 pub struct DoctorOptions<'a> {
-    /// Maximum number of images, evenly spaced, that are compared with their neighbours. All images are read regardless.
+    /// Maximum number of images, evenly spaced, that are compared with their neighbours. All images are read
+    /// regardless.
     pub compared: usize,
     /// Progress callback `(read, total)`, in images; called from several threads.
     pub progress: &'a (dyn Fn(usize, usize) + Sync),
@@ -41,8 +42,8 @@ impl Default for DoctorOptions<'_> {
 
 /// Examines poses, lenses and image headers, without reading pixels.
 ///
-/// `survey` comes from [`Capture::analyze_scene`], which fails for captures without a size. Without it, checks of the up
-/// direction and the scene box are left out.
+/// `survey` comes from [`Capture::analyze_scene`], which fails for captures without a size. Without it, checks of the
+/// up direction and the scene box are left out.
 pub fn examine_cameras(capture: &Capture, survey: Option<&SceneAnalysis>) -> Report {
     let mut findings = Findings::default();
     let facts = without_pixels(capture, survey, &mut findings);

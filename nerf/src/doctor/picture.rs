@@ -11,7 +11,8 @@ pub(super) const PATCH: usize = (2 * HALF as usize + 1).pow(2);
 const CELL: usize = 16;
 /// Patches of a picture at most.
 const PATCHES: usize = 36;
-/// Smallest contrast of a patch, as the root of the mean square of its steps from pixel to pixel across its weakest direction.
+/// Smallest contrast of a patch, as the root of the mean square of its steps from pixel to pixel across its weakest
+/// direction.
 const CONTRAST: f32 = 0.02;
 
 /// What transparent pixels are put over.
@@ -33,7 +34,7 @@ pub(super) struct Picture {
 pub(super) type Patch = [f32; PATCH];
 
 impl Picture {
-    /// Of a small photograph of a camera; `None` if its lens has no middle that a pinhole could show.
+    /// Undistorts a small image; `None` if its lens is equirectangular.
     pub fn new(camera: &Camera, photo: &Photo, mask: Option<&Photo>) -> Option<Picture> {
         let camera = camera.resized(photo.width, photo.height);
         if camera.lens == Lens::Equirectangular || !(camera.focal[0] > 0.0 && camera.focal[1] > 0.0) {
@@ -74,8 +75,8 @@ impl Picture {
         above + t * (below - above)
     }
 
-    /// The patch around a place whose columns and rows step by these vectors; `None` where something is not known or there
-    /// is no contrast.
+    /// The patch around a place whose columns and rows step by these vectors; `None` where something is not known or
+    /// there is no contrast.
     pub fn patch(&self, [x, y]: [f64; 2], [across, down]: [[f64; 2]; 2]) -> Option<Patch> {
         let mut patch = [0.0; PATCH];
         let mut sum = 0.0;
@@ -95,8 +96,8 @@ impl Picture {
         Some(patch)
     }
 
-    /// In each cell the place that moves most in whatever direction the image is shifted (Shi and Tomasi 1994), the best
-    /// first.
+    /// In each cell the place that moves most in whatever direction the image is shifted (Shi and Tomasi 1994), the
+    /// best first.
     fn find_corners(&self) -> Vec<[f64; 2]> {
         let border = HALF as usize + 2;
         if self.width <= 2 * border + 1 || self.height <= 2 * border + 1 {

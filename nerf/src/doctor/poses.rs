@@ -96,8 +96,8 @@ impl Focus {
     }
 }
 
-/// How far places are from one another: the root of the mean square of their distance from their mean, along the principal
-/// axes, the greatest first.
+/// How far places are from one another: the root of the mean square of their distance from their mean, along the
+/// principal axes, the greatest first.
 pub(super) fn extents(places: &[DVec3]) -> [f64; 3] {
     let mean = mean(places.iter().copied());
     let mut scatter = DMat3::ZERO;

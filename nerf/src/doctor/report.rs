@@ -55,8 +55,8 @@ pub struct CaptureSubset {
     pub absent: usize,
 }
 
-/// The scene as [`SceneAnalysis`](crate::dataset::SceneAnalysis) found it. Lengths are in scene units; `up` and `middle` are
-/// in the capture's coordinates.
+/// The scene as [`SceneAnalysis`](crate::dataset::SceneAnalysis) found it. Lengths are in scene units; `up` and
+/// `middle` are in the capture's coordinates.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SceneLayout {
     /// Bounded, unbounded or forward-facing.
@@ -98,8 +98,8 @@ pub struct Facts {
     pub points: usize,
     /// The scene layout, if it can be found.
     pub layout: Option<SceneLayout>,
-    /// Agreement of images with their cameras along epipolar lines: 0 is chance, 1 is perfect, 0.3 is usual in a good capture.
-    /// `None` if it was not measured or too few patches match.
+    /// Agreement of images with their cameras along epipolar lines: 0 is chance, 1 is perfect, 0.3 is usual in a good
+    /// capture. `None` if it was not measured or too few patches match.
     pub agreement: Option<f64>,
 }
 

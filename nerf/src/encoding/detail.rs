@@ -1,10 +1,12 @@
-//! Detail that comes in from coarse to fine.
+//! Coarse-to-fine weights of levels of detail.
 
 use std::f64::consts::PI;
 
-/// The weight of each of `levels` resolutions, coarsest first, with the share `detail` of them in use, 0 to 1: the first
-/// `first` are always there, and each further one comes in as half a wave, `(1 - cos(pi clamp(alpha - level, 0, 1))) / 2`,
-/// where `alpha` rises from `first` to `levels` (Lin et al. 2021, "BARF", equation 14). `None` if all are there.
+/// Returns the weight of each of `levels`, coarsest first, at the share `detail`, 0 to 1 (Lin et al. 2021, "BARF",
+/// equation 14).
+///
+/// The first `first` levels have weight 1. Level `l` of the others has `(1 - cos(pi clamp(alpha - l, 0, 1))) / 2`,
+/// where `alpha` rises from `first` to `levels`. Returns `None` if all weights are 1.
 ///
 /// ```
 /// use raygrad_nerf::encoding::detail_weights;

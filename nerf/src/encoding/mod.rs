@@ -1,4 +1,4 @@
-//! Encodings: what networks see in place of bare coordinates.
+//! Encodings of positions and directions: [`hash_grid`], [`PositionalEncoding`] and [`SphericalHarmonics`].
 
 mod detail;
 pub mod hash_grid;

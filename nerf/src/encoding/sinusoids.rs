@@ -1,20 +1,20 @@
-//! Positional encoding: sinusoids of rising frequency let a network hold fine detail.
+//! Positional encoding by sinusoids.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
 
-/// y = (x, sin(pi x), cos(pi x), sin(2 pi x), cos(2 pi x), .. cos(2^(levels-1) pi x)), each for all channels of x in turn
-/// (Mildenhall et al. 2020, equation 4); the leading x can be left out.
+/// The operation y = (x, sin(pi x), cos(pi x), sin(2 pi x), cos(2 pi x), .. cos(2^(levels-1) pi x)) (Mildenhall et al.
+/// 2020, equation 4), each for all channels of x in turn; the leading x is optional.
 ///
-/// `[.., channels]` becomes `[.., channels * (input + 2 levels)]`. Arguments are reduced exactly before they are
-/// multiplied by pi, so the error stays below 3e-7 in f32 at any level. The gradient of level k grows as 2^k pi.
+/// `[.., channels]` becomes `[.., channels * (input + 2 levels)]`. Arguments are reduced exactly before the product
+/// with pi, so the error stays below 3e-7 in f32 at any level. The gradient of level k grows as 2^k pi.
 #[derive(Debug, Clone, Copy)]
 pub struct PositionalEncoding {
     /// Number of frequencies.
     pub levels: usize,
-    /// Whether x itself comes first.
+    /// Whether the output starts with x itself.
     pub input: bool,
 }
 
@@ -22,7 +22,7 @@ pub struct PositionalEncoding {
 const BLOCK: usize = 192;
 
 impl PositionalEncoding {
-    /// Channels of the output for `channels` of the input.
+    /// Returns the number of output channels for `channels` of the input.
     pub fn width(&self, channels: usize) -> usize {
         channels * (usize::from(self.input) + 2 * self.levels)
     }
@@ -46,7 +46,9 @@ impl<T: Scalar> Op<T> for PositionalEncoding {
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        let Some((&channels, rows)) = x[0].split_last() else { return Err("a scalar has no channels".into()) };
+        let Some((&channels, rows)) = x[0].split_last() else {
+            return Err("the input must have a channel axis".into());
+        };
         Ok(rows.iter().copied().chain([self.width(channels)]).collect())
     }
 

@@ -1,16 +1,16 @@
-//! Spherical harmonics: a smooth basis for what depends on the direction of view.
+//! Spherical harmonics of viewing directions.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Real, Scalar, Shape, ShapeError, Tensor, Var, Vjp, record};
 use raygrad_tensor::simd;
 
-/// The real spherical harmonics of the bands below a degree, as polynomials in the coordinates of a unit vector.
+/// The operation of real spherical harmonics: unit directions `[rays, 3]` to `[rays, degree^2]`.
 ///
-/// Directions `[rays, 3]` become `[rays, degree^2]`: the bands `l = 0, 1, ..`, each from order `m = -l` to `l`. They are
-/// orthonormal on the sphere and have the Condon-Shortley phase: band 1 is `(-y, z, -x)` times `sqrt(3 / (4 pi))` (Sloan
-/// 2008, "Stupid Spherical Harmonics Tricks", appendix A2). A vector of another length is taken as it stands, and the
-/// gradient is the one of the polynomials in free x, y and z.
+/// The output has the bands `l = 0, 1, ..` below `degree`, each from order `m = -l` to `l`. They are orthonormal on the
+/// sphere with the Condon-Shortley phase: band 1 is `(-y, z, -x)` times `sqrt(3 / (4 pi))` (Sloan 2008, "Stupid
+/// Spherical Harmonics Tricks", appendix A2). Vectors are not normalised; the gradient is that of the polynomials in
+/// free x, y and z.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SphericalHarmonics {
     degree: usize,
@@ -35,17 +35,17 @@ const BAND_3: [f64; 5] = [
 ];
 
 impl SphericalHarmonics {
-    /// The harmonics of the bands below `degree`.
+    /// Creates the harmonics of the bands below `degree`, 1 to 4.
     ///
     /// # Panics
     /// If `degree` is not in 1..=4.
     #[track_caller]
     pub fn new(degree: usize) -> Self {
-        assert!((1..=4).contains(&degree), "spherical harmonics of degree {degree}; use 1 to 4");
+        assert!((1..=4).contains(&degree), "the degree of spherical harmonics must be 1 to 4, is {degree}");
         SphericalHarmonics { degree }
     }
 
-    /// Channels of the output: `degree^2`.
+    /// Returns the number of output channels, `degree^2`.
     pub fn width(&self) -> usize {
         self.degree * self.degree
     }

@@ -38,8 +38,8 @@ pub struct ClassicConfig {
 }
 
 impl ClassicConfig {
-    /// Returns the paper's network: 8 layers of 256 with a skip connection at the sixth, 128 for the direction, 10 and 4
-    /// frequencies. The density is softplus instead of the paper's ReLU.
+    /// Returns the paper's network: 8 layers of 256 with a skip connection at the sixth, 128 for the direction, 10 and
+    /// 4 frequencies. The density is softplus instead of the paper's ReLU.
     pub fn paper() -> Self {
         ClassicConfig {
             depth: 8,
@@ -81,8 +81,8 @@ impl ComponentConfig<Fields> for ClassicConfig {
 
 /// The field of the NeRF paper (Mildenhall et al. 2020, figure 7).
 ///
-/// A deep network maps the encoded position to a density and a feature vector; with the direction, that gives the colour.
-/// Positions are scaled so that the scene box becomes -1 to 1.
+/// A deep network maps the encoded position to a density and a feature vector; with the direction, that gives the
+/// colour. Positions are scaled so that the scene box becomes -1 to 1.
 #[derive(Debug, Clone)]
 pub struct Classic {
     config: ClassicConfig,

@@ -55,8 +55,8 @@ impl ComponentConfig<Fields> for InstantConfig {
 
 /// The field of instant-ngp (Mueller et al. 2022, section 5.4).
 ///
-/// A multiresolution hash grid feeds a density network of one hidden layer. Its outputs and the direction feed a colour network.
-/// No layer has a bias. The density is the exponential of the first output.
+/// A multiresolution hash grid feeds a density network of one hidden layer. Its outputs and the direction feed a colour
+/// network. No layer has a bias. The density is the exponential of the first output.
 #[derive(Debug, Clone)]
 pub struct Instant {
     density: DensityNetwork,

@@ -1,7 +1,7 @@
 //! Radiance fields: density and colour as functions of position and direction.
 //!
-//! [`Instant`] is a hash grid, [`Classic`] the NeRF paper's network, [`Voxel`] a voxel grid. Implement [`Field`] for a custom
-//! one; see docs/library/custom-field.md.
+//! [`Instant`] is a hash grid, [`Classic`] the NeRF paper's network, [`Voxel`] a voxel grid. Implement [`Field`] for a
+//! custom one; see docs/library/custom-field.md.
 
 mod classic;
 mod density_network;
@@ -65,13 +65,14 @@ pub struct ViewInputs<'a, 't, T: Scalar> {
 
 /// A radiance field: density from position, colour from position and viewing direction.
 ///
-/// A custom field implements this trait and, for its configuration, [`ComponentConfig<Fields>`](crate::ComponentConfig). After
-/// [`register`](crate::component::register) it trains, renders, saves and loads like the built-in fields.
+/// A custom field implements this trait and, for its configuration,
+/// [`ComponentConfig<Fields>`](crate::ComponentConfig). After [`register`](crate::component::register) it trains,
+/// renders, saves and loads like the built-in fields.
 pub trait Field<T: Scalar>: Any + Send + Sync {
     /// Computes the density at `positions` `[samples, 3]`, in scene units.
     ///
-    /// Each row must depend on its own position only. Training evaluates many positions, keeps some, and reuses the rows of
-    /// [cacheable](raygrad_autograd::Op::is_cacheable) operations from the first pass.
+    /// Each row must depend on its own position only. Training evaluates many positions, keeps some, and reuses the
+    /// rows of [cacheable](raygrad_autograd::Op::is_cacheable) operations from the first pass.
     fn density<'t>(&self, params: &Bound<'t, T>, positions: &Var<'t, T>) -> Density<'t, T>;
 
     /// Computes colours `[samples, 3]`, 0 to 1, from rows of the features that [`density`](Self::density) returned.
@@ -79,8 +80,8 @@ pub trait Field<T: Scalar>: Any + Send + Sync {
 
     /// Returns the field with a share of its detail, 0 to 1, and the same parameters.
     ///
-    /// Pose refinement enables detail [from coarse to fine](crate::model::CameraOptimizerConfig::coarse). `None`, the default, is
-    /// for fields without levels of detail.
+    /// Pose refinement enables detail [from coarse to fine](crate::model::CameraOptimizerConfig::coarse). `None`, the
+    /// default, is for fields without levels of detail.
     fn with_detail(&self, _detail: f64) -> Option<Arc<dyn Field<T>>> {
         None
     }

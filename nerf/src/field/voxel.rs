@@ -14,8 +14,8 @@ use std::sync::Arc;
 
 /// Configuration of a [`Voxel`] field.
 ///
-/// The table has `(resolution + 1)^3` rows of `1 + 3 direction_degree^2` numbers, rounded up to a power of two: 137 MB at
-/// 128 and degree 2. Training takes four times as much, for the gradient and two moments.
+/// The table has `(resolution + 1)^3` rows of `1 + 3 direction_degree^2` numbers, rounded up to a power of two: 137 MB
+/// at 128 and degree 2. Training takes four times as much, for the gradient and two moments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VoxelConfig {
@@ -38,16 +38,17 @@ impl ComponentConfig<Fields> for VoxelConfig {
     }
 }
 
-/// Factor of the log density: without a network it changes by little more than the learning rate per step, and has further to
-/// go than a colour.
+/// Factor of the log density: without a network it changes by little more than the learning rate per step, and has
+/// further to go than a colour.
 const LOG_DENSITY_GAIN: f64 = 10.0;
 
-/// A voxel grid of densities and spherical harmonics (Fridovich-Keil et al. 2022, "Plenoxels: Radiance Fields without Neural
-/// Networks", section 3.2).
+/// A voxel grid of densities and spherical harmonics (Fridovich-Keil et al. 2022, "Plenoxels: Radiance Fields without
+/// Neural Networks", section 3.2).
 ///
-/// Each corner of a dense grid has a log density and spherical harmonics per colour channel, interpolated trilinearly. The
-/// colour is the sigmoid of the harmonics' sum. Unlike the paper, the density is an exponential, and the grid is neither
-/// refined nor pruned. A row of the table is the log density, then the coefficients of red, green and blue, then padding.
+/// Each corner of a dense grid has a log density and spherical harmonics per colour channel, interpolated trilinearly.
+/// The colour is the sigmoid of the harmonics' sum. Unlike the paper, the density is an exponential, and the grid is
+/// neither refined nor pruned. A row of the table is the log density, then the coefficients of red, green and blue,
+/// then padding.
 #[derive(Debug, Clone)]
 pub struct Voxel {
     grid: Grid,

@@ -1,4 +1,4 @@
-//! What files hold: a mesh or points, and how they look.
+//! Meshes and points with normals and colours, as files hold them.
 
 use super::mesh::Mesh;
 use crate::dataset::SceneTransform;
@@ -9,21 +9,21 @@ use glam::DVec3;
 pub struct ColoredMesh {
     /// Vertices and triangles.
     pub mesh: Mesh,
-    /// For each vertex the unit normal, outwards.
+    /// Outward unit normal of each vertex.
     pub normals: Vec<DVec3>,
-    /// For each vertex its colour in sRGB, as photographs store it.
+    /// sRGB colour of each vertex.
     pub colors: Vec<[u8; 3]>,
 }
 
 impl From<Mesh> for ColoredMesh {
-    /// The mesh with the [normals](Mesh::normals) of its triangles, white.
+    /// Adds the [normals](Mesh::normals) of the triangles and white colours.
     fn from(mesh: Mesh) -> Self {
         ColoredMesh { normals: mesh.normals(), colors: vec![[255; 3]; mesh.positions.len()], mesh }
     }
 }
 
 impl ColoredMesh {
-    /// The same in the coordinates of the capture, from those of the scene.
+    /// Maps scene coordinates to those of the capture.
     pub fn placed_back(mut self, placement: &SceneTransform) -> Self {
         self.mesh.positions.iter_mut().for_each(|place| *place = placement.point_back(*place));
         let back = placement.rotation.transpose();

@@ -1,5 +1,5 @@
-//! Fewer triangles: edges are drawn together where that moves the surface least (Garland and Heckbert 1997, "Surface
-//! simplification using quadric error metrics").
+//! Mesh simplification by edge collapse (Garland and Heckbert 1997, "Surface simplification using quadric error
+//! metrics").
 
 use super::mesh::{Mesh, sides};
 use glam::{DMat3, DVec3};
@@ -62,8 +62,8 @@ impl Quadric {
     }
 }
 
-/// An edge that may be drawn together: the bits of its cost, which is at least 0, so that they are in the same order; its
-/// vertices, and how often each had been moved when this was worked out. The one that costs least is the greatest.
+/// An edge that may be drawn together: the bits of its cost, which is at least 0, so that they are in the same order;
+/// its vertices, and how often each had been moved when this was worked out. The one that costs least is the greatest.
 type Candidate = Reverse<(u64, [u32; 2], [u32; 2])>;
 
 /// A mesh of which edges are drawn together.
@@ -78,11 +78,11 @@ struct Work<'a> {
 }
 
 impl Mesh {
-    /// Makes triangles fewer until there are at most `count`, or no edge is left that can be drawn together: so that the mesh
-    /// stays closed if it is (and in any case each side of a triangle belongs to no more triangles than before), no triangle
-    /// turns over, and borders stay where they are as well as may be.
+    /// Simplifies the mesh to at most `count` triangles, or until no edge can be collapsed.
     ///
-    /// `progress` is told what share of the work is done, 0 to 1.
+    /// A closed mesh stays closed, no side gets more triangles than before, no triangle flips, and borders are kept as
+    /// well as possible. It minimises quadric errors (Garland and Heckbert 1997). `progress` receives the share of the
+    /// work, 0 to 1.
     pub fn decimate(&mut self, count: usize, progress: &mut dyn FnMut(f64)) {
         let all = self.triangles.len();
         if all <= count {
@@ -188,8 +188,8 @@ impl<'a> Work<'a> {
         self.heap.push(Reverse((self.cheapest(edge).0.to_bits(), edge, moved)));
     }
 
-    /// Draws an edge together, if its vertices have been moved no more often than `moved` says and nothing speaks against it.
-    /// Says how many triangles that takes away.
+    /// Draws an edge together, if its vertices have been moved no more often than `moved` says and nothing speaks
+    /// against it. Says how many triangles that takes away.
     fn collapse(&mut self, edge: [u32; 2], moved: [u32; 2]) -> usize {
         if edge.map(|vertex| self.moved[vertex as usize]) != moved {
             return 0;

@@ -1,4 +1,4 @@
-//! The surface on which a function of positions has a value.
+//! Isosurfaces of functions by marching cubes.
 
 use super::marching_cubes_table::cases;
 use super::mesh::Mesh;
@@ -16,7 +16,7 @@ pub(super) const MOST_CELLS: usize = 4096;
 /// Vertices, at most: with what belongs to them, some gigabytes.
 const MOST_VERTICES: usize = 1 << 26;
 
-/// Where a surface is looked for: nodes at even distances along each axis.
+/// A lattice of evenly spaced nodes, on which [`isosurface`] evaluates a function.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lattice {
     /// The first node.
@@ -28,15 +28,21 @@ pub struct Lattice {
 }
 
 impl Lattice {
-    /// Over a box (lower and upper corner), with so many cells along its longest side, 1 to 4096, and of nearly the same edge
-    /// along the others. A `closed` one goes half a cell beyond the box: of a function that is 0 there, surfaces have no border.
+    /// Creates a lattice over a box (lower and upper corner), with `resolution` cells along its longest side, 1 to
+    /// 4096.
+    ///
+    /// Cells are nearly cubes. A `closed` lattice extends half a cell beyond the box, so that surfaces of functions
+    /// that are 0 there have no border.
     ///
     /// # Errors
-    /// If the box is flat or not finite, or the number of cells out of range.
+    /// If the box is flat or not finite, or `resolution` is out of range.
     pub fn over([low, high]: [DVec3; 2], resolution: usize, closed: bool) -> Result<Self> {
         let size = high - low;
         if !(size.is_finite() && size.cmpgt(DVec3::ZERO).all()) {
-            return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
+            return Err(Error::setting(
+                "bounds",
+                format!("is {low} to {high}; use finite corners, the lower below the upper"),
+            ));
         }
         if !(1..=MOST_CELLS).contains(&resolution) {
             return Err(Error::setting("resolution", format!("is {resolution}; use 1 to {MOST_CELLS}")));
@@ -47,7 +53,7 @@ impl Lattice {
         Ok(Lattice { low, cell, nodes: cells.to_array().map(|cells| cells as usize + more) })
     }
 
-    /// The longest edge of a cell.
+    /// Returns the longest edge of a cell.
     pub fn cell(&self) -> f64 {
         self.cell.max_element()
     }
@@ -73,13 +79,12 @@ struct Layer {
     vertices: [Vec<u32>; 3],
 }
 
-/// The surface that parts places where `density` is more than `level` from all others, facing the latter: marching cubes
-/// (Lorensen and Cline 1987) with cases in which neighbouring cells agree, so that it has no holes and each side of a triangle
-/// exactly two triangles. Only at the lattice's own border it ends. On the edges of the lattice, which hold the vertices, the
-/// place where the level is passed is found by bisection.
+/// Extracts the surface around all points where `density` exceeds `level`, facing outwards.
 ///
-/// Places are asked for in f32, and memory is in proportion to a layer of the lattice and to the surface. `progress` is told
-/// what share of the lattice is done, 0 to 1.
+/// It is marching cubes (Lorensen and Cline 1987) with a consistent table: the surface has no holes and each side of a
+/// triangle has two triangles, except at the lattice's border. Vertices on lattice edges are found by bisection.
+/// Positions are f32. Memory is proportional to a layer of the lattice and to the surface. `progress` receives the
+/// share of the lattice, 0 to 1.
 ///
 /// # Errors
 /// If there are more than 2^26 vertices.
@@ -127,7 +132,9 @@ fn limited(
             }
         }
         if crossings.len() > most {
-            let what = format!("is too fine: the surface has more than {most} vertices; fog has another level");
+            let what = format!(
+                "is too fine: the surface has more than {most} vertices; use fewer cells, or another iso-value for fog"
+            );
             return Err(Error::setting("resolution", what));
         }
         if let Some(below) = &below {

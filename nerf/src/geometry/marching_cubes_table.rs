@@ -1,14 +1,13 @@
-//! How a surface passes through a cell of a lattice, for each of the 256 ways in which its corners can be dense (Lorensen and
-//! Cline 1987, "Marching cubes").
+//! The marching cubes table: triangles of a cell for each of the 256 sets of dense corners (Lorensen and Cline 1987).
 //!
-//! Nothing is listed by hand. On each face of the cell, a piece of the outline cuts off each run of dense corners, so that two
-//! dense corners that lie across from each other are parted; that depends on the face alone, and the cells on both
-//! sides of it see the same pieces. The pieces join to loops, and loops are cut into triangles: the surface has no holes,
-//! whatever is dense.
+//! The table is computed. On each face of the cell, a segment cuts off each run of dense corners, so that diagonal
+//! dense corners are separated. That depends on the face alone, so both cells at a face agree. The segments join to
+//! loops, which are triangulated: the surface has no holes.
 
 use std::collections::BTreeMap;
 
-/// An edge of a cell, by its axis and its lower corner. Bit `a` of a corner says whether it is the upper one along axis `a`.
+/// An edge of a cell, by its axis and its lower corner. Bit `a` of a corner says whether it is the upper one along axis
+/// `a`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Edge {
     pub axis: usize,
@@ -28,8 +27,8 @@ impl Edge {
     }
 }
 
-/// For each set of dense corners (bit `c` for corner `c`) the triangles, whose vertices lie on these edges, anticlockwise as
-/// seen from where it is not dense.
+/// For each set of dense corners (bit `c` for corner `c`) the triangles, whose vertices lie on these edges,
+/// anticlockwise as seen from where it is not dense.
 pub(super) fn cases() -> Vec<Vec<[Edge; 3]>> {
     (0..=255).map(|dense| loops(dense).iter().flat_map(|outline| fan(outline)).collect()).collect()
 }
@@ -71,8 +70,8 @@ fn loops(dense: u8) -> Vec<Vec<Edge>> {
     loops
 }
 
-/// Triangles that fill a loop, all from one vertex: one from which no side of a triangle lies in a face of the cell, where the
-/// neighbour may have the same one. There always is such a vertex.
+/// Triangles that fill a loop, all from one vertex: one from which no side of a triangle lies in a face of the cell,
+/// where the neighbour may have the same one. There always is such a vertex.
 fn fan(outline: &[Edge]) -> impl Iterator<Item = [Edge; 3]> + '_ {
     let count = outline.len();
     let apex = (0..count).find(|&apex| is_inside(outline, apex)).unwrap_or(0);

@@ -1,45 +1,46 @@
-//! Triangle meshes: what belongs together, and what is left out.
+//! Triangle meshes and their components.
 
 use glam::DVec3;
 use std::collections::HashMap;
 
-/// Triangles with common vertices.
+/// A triangle mesh with shared vertices.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Mesh {
-    /// Where the vertices are.
+    /// Positions of the vertices.
     pub positions: Vec<DVec3>,
-    /// The numbers of three vertices each, anticlockwise as seen from outside. A mesh without triangles is a set of points.
+    /// Indices of three vertices each, anticlockwise as seen from outside. A mesh without triangles is a point cloud.
     pub triangles: Vec<[u32; 3]>,
 }
 
 impl Mesh {
-    /// The places of a triangle's vertices.
+    /// Returns the positions of a triangle's vertices.
     ///
     /// # Panics
-    /// If there is no such triangle.
+    /// If `triangle` is out of range.
     pub fn corners(&self, triangle: usize) -> [DVec3; 3] {
         self.triangles[triangle].map(|vertex| self.positions[vertex as usize])
     }
 
-    /// The box around the vertices, lower and upper corner; `None` if there are none.
+    /// Returns the bounding box of the vertices (lower and upper corner), or `None` if there are none.
     pub fn bounds(&self) -> Option<[DVec3; 2]> {
         bounds(&self.positions)
     }
 
-    /// The area of all triangles, in square units.
+    /// Returns the area of all triangles, in square units.
     pub fn area(&self) -> f64 {
         (0..self.triangles.len()).map(|i| area(self.corners(i))).sum()
     }
 
-    /// The volume within a closed mesh, in cubic units: negative if its triangles face inwards (the theorem of Gauss, triangle
-    /// by triangle).
+    /// Returns the volume within a closed mesh, in cubic units, by the divergence theorem. It is negative if triangles
+    /// face inwards.
     pub fn volume(&self) -> f64 {
         // Seen from a vertex, as far from the origin products lose what they differ in.
         let from = self.positions.first().copied().unwrap_or_default();
         (0..self.triangles.len()).map(|i| volume(self.corners(i).map(|corner| corner - from))).sum()
     }
 
-    /// For each vertex the unit normal: the mean of those of its triangles, weighted by their areas; up where there is none.
+    /// Computes a unit normal per vertex: the mean of its triangles' normals, weighted by area. Vertices without
+    /// triangles get +z.
     pub fn normals(&self) -> Vec<DVec3> {
         let mut normals = vec![DVec3::ZERO; self.positions.len()];
         for (i, triangle) in self.triangles.iter().enumerate() {
@@ -50,8 +51,8 @@ impl Mesh {
         normals.into_iter().map(|normal| normal.try_normalize().unwrap_or(DVec3::Z)).collect()
     }
 
-    /// Whether each side of a triangle belongs to exactly one more, which passes it the other way: the surface has no border,
-    /// and everywhere an inside and an outside.
+    /// Returns whether the mesh is closed (watertight and consistently oriented): each side of a triangle belongs to
+    /// exactly one other triangle, in the opposite direction.
     pub fn is_closed(&self) -> bool {
         let mut passed: Vec<[u32; 2]> = self.triangles.iter().flat_map(sides).collect();
         passed.sort_unstable();
@@ -59,8 +60,9 @@ impl Mesh {
         is_once && passed.iter().all(|&[from, to]| passed.binary_search(&[to, from]).is_ok())
     }
 
-    /// For each triangle the number of the part that it belongs to, and how many parts there are. Triangles of a part are
-    /// joined by vertices; parts are numbered in the order of their first triangles.
+    /// Finds connected components: returns the component of each triangle, and the number of components.
+    ///
+    /// Triangles that share a vertex are connected. Components are numbered in the order of their first triangles.
     pub fn components(&self) -> (Vec<usize>, usize) {
         let mut leader: Vec<u32> = (0..self.positions.len() as u32).collect();
         for &[a, b, c] in &self.triangles {
@@ -78,8 +80,8 @@ impl Mesh {
         (parts, numbers.len())
     }
 
-    /// Leaves out parts whose area is less than this share, 0 to 1, of that of the largest, and says how many those were. 0
-    /// leaves out none.
+    /// Removes components whose area is below this share, 0 to 1, of the largest one's, and returns their number. 0
+    /// removes none.
     pub fn drop_small_components(&mut self, share: f64) -> usize {
         let (parts, count) = self.components();
         let mut areas = vec![0.0; count];
@@ -92,7 +94,7 @@ impl Mesh {
         stays.iter().filter(|stays| !**stays).count()
     }
 
-    /// Leaves out vertices that no triangle has; the others keep their order.
+    /// Removes vertices without triangles; the others keep their order.
     pub fn drop_unreferenced_vertices(&mut self) {
         const UNUSED: u32 = u32::MAX;
         let mut number = vec![UNUSED; self.positions.len()];

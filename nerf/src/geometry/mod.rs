@@ -1,15 +1,13 @@
-//! What a model knows of shape: triangle meshes and point clouds.
+//! Meshes and point clouds from models.
 //!
-//! A [`Mesh`] is made of any function of positions by [`isosurface`], and of a model by
-//! [`Model::surface`](crate::Model::surface), which chooses the level of density, looks only where pictures do, leaves out
-//! small parts and says how vertices look. [`Model::point_cloud`](crate::Model::point_cloud) gives what cameras see, point by
-//! point. Either is a [`ColoredMesh`], and [`files`] writes it.
+//! Start with [`Model::surface`](crate::Model::surface) or [`Model::point_cloud`](crate::Model::point_cloud); [`files`]
+//! writes their [`ColoredMesh`]. [`isosurface`] meshes any function of positions:
 //!
 //! ```
 //! use glam::DVec3;
 //! use raygrad_nerf::geometry::{Lattice, isosurface};
 //!
-//! // A ball of radius .5.
+//! // A ball of radius 0.5.
 //! let ball = |points: &[[f32; 3]], out: &mut [f32]| {
 //!     for (point, out) in points.iter().zip(out) {
 //!         *out = 1.0 - point.iter().map(|x| x * x).sum::<f32>().sqrt();

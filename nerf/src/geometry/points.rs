@@ -1,4 +1,4 @@
-//! What cameras see of a model, as points.
+//! Point clouds of the visible surface.
 
 use super::colored_mesh::ColoredMesh;
 use super::mesh::{Mesh, bounds};
@@ -14,27 +14,30 @@ use std::collections::HashMap;
 
 /// Rays for each point that is wanted: some see nothing solid, and the places of several are one point.
 const RAYS: f64 = 12.0;
-/// Times that the span of the logarithms of the voxels' possible edges, about 14, is halved: then the edge is known to a thousandth.
+/// Times that the span of the logarithms of the voxels' possible edges, about 14, is halved: then the edge is known to
+/// a thousandth.
 const HALVINGS: usize = 14;
 
-/// A point cloud, and how it was made.
+/// An extracted point cloud.
 #[derive(Debug, Clone)]
 pub struct PointCloud {
     /// The points, in scene units.
     pub colored_mesh: ColoredMesh,
-    /// How many places the points were chosen of.
+    /// Number of visible points before thinning.
     pub sights: usize,
-    /// How often the model was asked.
+    /// Number of field evaluations.
     pub evaluations: Evaluations,
 }
 
 impl Model<f32> {
-    /// Points that `cameras` see: the places within the model's box at which half of a ray's light is blocked, of rays that end
-    /// in something solid, with normals and colours as [`surface`](Self::surface) has them. They are thinned to at most
-    /// `count`, one in each voxel of a grid, so that they are about evenly spaced.
+    /// Extracts visible points within the scene box, with normals and colours as in [`surface`](Self::surface).
+    ///
+    /// A point lies where half of a ray's light is blocked, for opaque rays of the `cameras`. Points are thinned to at
+    /// most `count`, one per voxel of a grid, so that they are about evenly spaced. `progress` receives the stage and
+    /// its progress, 0 to 1.
     ///
     /// # Errors
-    /// If no camera sees anything solid.
+    /// If no camera sees a surface.
     pub fn point_cloud(
         &self,
         cameras: &[Camera],
@@ -48,7 +51,10 @@ impl Model<f32> {
         let seen = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten().map(|sight| sight.place));
         let places: Vec<DVec3> = seen.filter(|place| self.scene_box.contains(*place)).collect();
         if places.is_empty() {
-            return Err(Error::setting("points", "are none: no camera sees anything solid"));
+            return Err(Error::setting(
+                "points",
+                "cannot be found: no camera sees a surface; train longer or check the cameras",
+            ));
         }
         let seeing = views.iter().fold(Evaluations::default(), |sum, (_, seen)| sum + seen.evaluations);
         drop(views);
@@ -63,8 +69,8 @@ impl Model<f32> {
     }
 }
 
-/// At most `count` of these places, the one nearest to its middle in each voxel that has any, in voxels that are as small as
-/// that allows.
+/// At most `count` of these places, the one nearest to its middle in each voxel that has any, in voxels that are as
+/// small as that allows.
 fn thinned(places: &[DVec3], count: usize) -> Vec<DVec3> {
     let bounds = bounds(places).unwrap_or_default();
     let size = (bounds[1] - bounds[0]).max_element();

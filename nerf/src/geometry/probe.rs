@@ -1,4 +1,4 @@
-//! Asking a model at places, as its pictures show them.
+//! Evaluation of a model at points, as renders see it.
 
 use super::unseen::Hidden;
 use crate::camera::pinhole::Ray;
@@ -38,8 +38,8 @@ impl<'a> Probe<'a> {
         densities(&*self.model.field, &self.model.params, &self.pool, points, out);
     }
 
-    /// The same as pictures have it: 0 outside of the model's box and where the grid, if there is one, is not occupied. What is
-    /// hidden there has an infinite one. Gives the largest of those that are not hidden.
+    /// The same as pictures have it: 0 outside of the model's box and where the grid, if there is one, is not occupied.
+    /// What is hidden there has an infinite one. Gives the largest of those that are not hidden.
     pub fn shown(
         &self,
         grid: Option<&OccupancyGrid>,
@@ -67,8 +67,9 @@ impl<'a> Probe<'a> {
 
     /// For each place the unit normal, and the colour that is seen when one looks along it from outside, in sRGB.
     ///
-    /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it, along each axis:
-    /// the field's own gradient is that of noise finer than a pixel. Where there is no slope the normal is up.
+    /// The normal is against the slope of `ln(1 + reach density)` from `reach` before a place to `reach` behind it,
+    /// along each axis: the field's own gradient is that of noise finer than a pixel. Where there is no slope the
+    /// normal is up.
     pub fn look(&self, grid: Option<&OccupancyGrid>, reach: f64, places: &[DVec3]) -> (Vec<DVec3>, Vec<[u8; 3]>) {
         let gains = self.model.gain();
         let chunks: Vec<&[DVec3]> = places.chunks(POINTS).collect();

@@ -1,4 +1,4 @@
-//! What rays from cameras meet: the place where half of their light is blocked.
+//! The visible surface: the point on each ray where half of the light is blocked.
 
 use crate::camera::Camera;
 use crate::camera::rays::Rays;
@@ -10,12 +10,12 @@ use glam::DVec3;
 use raygrad_autograd::Pool;
 use std::f64::consts::LN_2;
 
-/// Rays that let more light through than this meet nothing.
+/// Rays with a higher transmittance hit nothing.
 const MOST_LEFT: f64 = 0.05;
-/// Rays that are worked out together.
+/// Rays per tile.
 const TILE: usize = 256;
 
-/// Where a ray ends, for whoever looks along it.
+/// The hit point of a ray.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Sight {
     /// The place up to which half of the light is blocked, in scene units.
@@ -34,7 +34,8 @@ pub(super) struct Seen {
     pub evaluations: Evaluations,
 }
 
-/// What cameras see in pictures of `scale` times their size, and these cameras. `progress` is told what share of them is done.
+/// What cameras see in pictures of `scale` times their size, and these cameras. `progress` is told what share of them
+/// is done.
 pub(super) fn views(
     model: &Model<f32>,
     cameras: &[Camera],
@@ -56,7 +57,7 @@ fn sights(model: &Model<f32>, camera: &Camera) -> Seen {
     let mut sights = vec![None; camera.width * camera.height];
     let see = |pool: &Pool<f32>, _, rays: &Rays<f32>, out: &mut [Option<Sight>]| see(model, rays, pool, out);
     let evaluations = model.tiles(camera, &RenderOptions::over([0.0; 3]), TILE, sights.chunks_mut(TILE), see);
-    Seen { sights, evaluations: evaluations.expect("nobody stops it") }
+    Seen { sights, evaluations: evaluations.expect("never cancelled") }
 }
 
 fn see(model: &Model<f32>, rays: &Rays<f32>, pool: &Pool<f32>, out: &mut [Option<Sight>]) -> Evaluations {

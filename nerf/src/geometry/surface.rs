@@ -1,4 +1,4 @@
-//! The surface that a model's pictures show.
+//! Surface extraction from a model.
 
 use super::colored_mesh::ColoredMesh;
 use super::isosurface::{Lattice, MOST_CELLS, isosurface};
@@ -16,29 +16,29 @@ use glam::DVec3;
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Cells of a lattice along each cell of an occupancy grid, unless it is said otherwise.
+/// Cells of a lattice along each cell of an occupancy grid, by default.
 const FINER: usize = 2;
 /// Where a sampler has no grid, one is made of cells that hold at least this share of the level.
 const FAINT: f64 = 0.1;
 /// Pixels along the longer side of the pictures that say what is seen, at most.
 const PIXELS: f64 = 128.0;
 
-/// Which surface of a model is made.
+/// Configuration of [`Model::surface`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SurfaceConfig {
-    /// Cells of the lattice along the longest side of the box, 1 to 4096; without it two for each of the model's occupancy
-    /// grid, or of a grid of 128 cells.
+    /// Lattice cells along the longest side of the box, 1 to 4096. `None` takes two per cell of the model's occupancy
+    /// grid, or 256 without a grid.
     pub resolution: Option<usize>,
-    /// The density on the surface, in 1 / scene unit, above 0; without it the one at which cameras see it.
+    /// Iso-value: the density on the surface, in 1 / scene unit, above 0. `None` estimates it from `cameras`.
     pub iso_value: Option<f64>,
-    /// Parts of less than this share of the largest one's area, 0 to 1, are left out.
+    /// Components below this share of the largest one's area are removed, 0 to 1.
     pub min_component: f64,
-    /// How many triangles there may be, at least 4, if not as many as it takes.
+    /// Maximum number of triangles, at least 4; `None` does not simplify.
     pub triangles: Option<usize>,
-    /// Whether what no camera sees is taken to be dense, further than a cell of the occupancy grid behind what is seen: there the
-    /// field was never judged, and holds sponges and voids. What pictures leave out stays empty.
+    /// Whether space that no camera sees counts as solid, from one occupancy cell behind the visible surface. The field
+    /// was never trained there and has holes. Skipped cells stay empty.
     pub fill_unseen: bool,
-    /// Whether the surface is closed where it meets the box. Otherwise it ends there.
+    /// Whether the surface is closed at the box; otherwise it has an open boundary there.
     pub closed: bool,
 }
 
@@ -60,52 +60,52 @@ impl SurfaceConfig {
         check_range("min_component", self.min_component, 0.0, 1.0)?;
         self.resolution.map_or(Ok(()), |cells| check_range("resolution", cells, 1, MOST_CELLS))?;
         if let Some(level) = self.iso_value.filter(|level| !(*level > 0.0 && level.is_finite())) {
-            return Err(Error::setting("level", format!("is {level}; use a density above 0")));
+            return Err(Error::setting("iso_value", format!("is {level}; use a density above 0")));
         }
         self.triangles.map_or(Ok(()), |count| check_range("triangles", count, 4, u32::MAX as usize))
     }
 }
 
-/// What is being done.
+/// The stage of an extraction, for progress callbacks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
-    /// Looking for the places that cameras see.
+    /// Finding visible points.
     Seeing,
-    /// Looking for the surface.
+    /// Extracting the surface.
     Meshing,
-    /// Making triangles fewer.
+    /// Simplifying the mesh.
     Simplifying,
-    /// Finding normals and colours.
+    /// Computing normals and colours.
     Coloring,
 }
 
-/// A surface, and how it was made.
+/// An extracted surface.
 #[derive(Debug, Clone)]
 pub struct Surface {
     /// The surface, in scene units.
     pub colored_mesh: ColoredMesh,
-    /// The density on it, in 1 / scene unit.
+    /// The iso-value, in 1 / scene unit.
     pub iso_value: f64,
-    /// Cells of the lattice along the longest side of the box.
+    /// Lattice cells along the longest side of the box.
     pub resolution: usize,
-    /// How many small parts were left out.
+    /// Number of removed components.
     pub dropped: usize,
-    /// How often the model was asked.
+    /// Number of field evaluations.
     pub evaluations: Evaluations,
 }
 
 impl Model<f32> {
-    /// The surface within the model's box (of a scene that goes on, the part of it where the cameras look), with normals
-    /// against the slope of the density (over an edge of the occupancy grid's cells, as finer slopes are noise) and the colours that are seen along these.
+    /// Extracts the surface within the scene box; in an unbounded scene, the part of it that cameras look at.
     ///
-    /// It is where the density has one [level](SurfaceConfig::iso_value). If none is given, it is the lower quartile of the
-    /// densities at the places where half of a ray's light is blocked, over rays of the `cameras` that end in something solid: so
-    /// the surface lies where pictures show it, and has few holes. What pictures leave out, cells that are not occupied, counts as empty.
+    /// It is the isosurface of the density at the [iso-value](SurfaceConfig::iso_value). The default iso-value is the
+    /// lower quartile of the densities where half of a ray's light is blocked, over opaque rays of the `cameras`. So
+    /// the surface lies where renders show it, with few holes. Unoccupied cells are empty. Normals are density
+    /// gradients over the edge of an occupancy cell; colours are those seen along the normals.
     ///
-    /// `progress` is told what is being done, and what share of that is, 0 to 1.
+    /// `progress` receives the stage and its progress, 0 to 1.
     ///
     /// # Errors
-    /// If a number of the configuration is out of range, there is no surface, or it is too large.
+    /// If the configuration is out of range, there is no surface, or it is too large.
     pub fn surface(
         &self,
         cameras: &[Camera],
@@ -142,10 +142,7 @@ impl Model<f32> {
         };
         let mut mesh = isosurface(&lattice, level as f32, &shown, &mut |done| progress(Stage::Meshing, done))?;
         if mesh.triangles.is_empty() || !is_met.into_inner() {
-            return Err(Error::setting(
-                "level",
-                format!("is {level}, and there is no such density: use a smaller one"),
-            ));
+            return Err(Error::setting("iso_value", format!("is {level}, above all densities; use a smaller one")));
         }
         let dropped = mesh.drop_small_components(config.min_component);
         if let Some(count) = config.triangles {
@@ -163,32 +160,32 @@ impl Model<f32> {
         })
     }
 
-    /// The cells that views look at, if they leave out any.
+    /// The occupancy grid of renders, if they skip cells.
     pub(super) fn cells(&self) -> Option<&OccupancyGrid> {
         self.marching().map(Marching::view_grid).or_else(|| self.sampler.grid())
     }
 
-    /// The length, in scene units, below which photographs hardly judged the field: an edge of a cell of the grid.
+    /// The length, in scene units, below which images hardly determine the field: the edge of a grid cell.
     pub(super) fn judged(&self, grid: Option<&OccupancyGrid>) -> f64 {
         let cells = grid.map_or_else(|| OccupancyConfig::default().resolution, OccupancyGrid::resolution);
         self.scene_box.space().side() / cells as f64
     }
 
-    /// The lower quartile of the density of the places within the box that cameras see. Where the density is less the surface has
-    /// holes, and where it is more it lies but a little too far out.
+    /// The lower quartile of the density of the places within the box that cameras see. Where the density is less the
+    /// surface has holes, and where it is more it lies but a little too far out.
     fn level(&self, views: &[(Camera, Seen)]) -> Result<f64> {
         let sights = views.iter().flat_map(|(_, seen)| seen.sights.iter().flatten());
         let mut sigmas: Vec<f64> =
             sights.filter(|sight| self.scene_box.contains(sight.place)).map(|sight| sight.sigma).collect();
         let quarter = sigmas.len() / 4;
         if sigmas.is_empty() {
-            return Err(Error::setting("level", "is not known: no camera sees anything solid. Give one"));
+            return Err(Error::setting("iso_value", "is missing, and no camera sees a surface to estimate it; set it"));
         }
         Ok(*sigmas.select_nth_unstable_by(quarter, f64::total_cmp).1)
     }
 }
 
-/// The largest box within this one whose corners are numbers in f32: places on its faces are in the box when they are asked for.
+/// The largest box within this one with f32 corners, so that points on its faces stay in the box.
 fn within([low, high]: [DVec3; 2]) -> [DVec3; 2] {
     let above = |x: f64| {
         let near = x as f32;

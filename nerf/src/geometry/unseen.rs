@@ -1,25 +1,25 @@
-//! What no camera sees: the inside of solid things, which no photograph has judged.
+//! Space that no camera sees: the inside of solid objects, where the field was never trained.
 
 use super::sight::{Seen, Sight};
 use crate::camera::Camera;
 use glam::DVec3;
 
-/// How far cameras see, pixel by pixel.
+/// The visible distance of each camera's pixels.
 pub(super) struct Hidden {
     views: Vec<(Camera, Vec<f64>)>,
-    /// Places up to so far behind what is seen are not hidden, in scene units.
+    /// Distance behind the visible surface up to which points are not hidden, in scene units.
     margin: f64,
 }
 
 impl Hidden {
-    /// What these cameras do not see; each has what its pixels see, row by row.
+    /// Space that these cameras do not see.
     pub fn new(views: &[(Camera, Seen)], margin: f64) -> Self {
         let distance = |sight: &Option<Sight>| sight.map_or(f64::INFINITY, |sight| sight.distance);
         let view = |(camera, seen): &(Camera, Seen)| (camera.clone(), seen.sights.iter().map(distance).collect());
         Hidden { views: views.iter().map(view).collect(), margin }
     }
 
-    /// Whether a place is in the picture of a camera, and behind what is seen in every picture that it is in.
+    /// Whether a point is in the view of a camera, and hidden in every view that it is in.
     pub fn holds(&self, place: DVec3) -> bool {
         let mut behind = false;
         for (camera, distances) in &self.views {

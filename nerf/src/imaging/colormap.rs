@@ -1,14 +1,14 @@
-//! Numbers as colours: depth maps and error maps.
+//! Colour maps of depth and error.
 
 use crate::dataset::image::Image;
 
-/// The mean absolute error that [`error_map`] shows as the brightest colour.
+/// The mean absolute error at which [`error_map`] reaches the brightest colour.
 pub const ERROR_MAP_RANGE: f32 = 0.25;
 
-/// The colour of `t` in the viridis map: 0 is dark violet, 1 is yellow, and lightness grows evenly between them.
+/// Returns the viridis colour of `t`: 0 is dark violet, 1 is yellow, and lightness rises evenly.
 ///
-/// `t` is clamped to 0..=1; NaN is black, a colour that the map does not hold. The sixth-degree polynomial is Matt
-/// Zucker's fit (<https://www.shadertoy.com/view/WlfXRN>, CC0) to matplotlib's table, within 0.02 of it.
+/// `t` is clamped to 0 to 1; NaN is black, which the map does not contain. The sixth-degree polynomial is Matt Zucker's
+/// fit (<https://www.shadertoy.com/view/WlfXRN>, CC0) to matplotlib's table, within 0.02 of it.
 pub fn viridis(t: f32) -> [f32; 3] {
     const COEFFICIENTS: [[f32; 3]; 7] = [
         [0.2777273272234177, 0.005407344544966578, 0.3340998053353061],
@@ -26,14 +26,14 @@ pub fn viridis(t: f32) -> [f32; 3] {
     std::array::from_fn(|c| COEFFICIENTS.iter().rev().fold(0.0, |sum, row| sum * t + row[c]).clamp(0.0, 1.0))
 }
 
-/// An RGB picture of a one-channel depth image, in [`viridis`]: yellow at `near` and closer, dark violet at `far` and
-/// beyond, linear in depth between. A depth of 0 says that nothing is there: it is black, as NaN is.
+/// Maps a one-channel depth image to [`viridis`] colours: yellow at `near`, dark violet at `far`, linear in between and
+/// clamped outside. Depths of 0 (no surface) and NaN are black.
 ///
 /// # Panics
 /// If `depth` has more than one channel, or unless `near < far`.
 #[track_caller]
 pub fn depth_map(depth: &Image, near: f64, far: f64) -> Image {
-    assert_eq!(depth.channels, 1, "a depth image has one channel");
+    assert_eq!(depth.channels, 1, "a depth image must have one channel");
     assert!(near < far, "near {near} must be less than far {far}");
     let nearness = |z: f32| ((far - f64::from(z)) / (far - near)) as f32;
     let color = |&z: &f32| viridis(if z == 0.0 { f32::NAN } else { nearness(z) });
@@ -41,10 +41,10 @@ pub fn depth_map(depth: &Image, near: f64, far: f64) -> Image {
     Image { width: depth.width, height: depth.height, channels: 3, data }
 }
 
-/// An RGB picture of where two images differ, in [`viridis`]: dark violet where they agree, yellow where the absolute
-/// difference, averaged over the channels of the pixel, is [`ERROR_MAP_RANGE`] or more. NaN is black.
+/// Maps the absolute difference of two images, averaged over channels, to [`viridis`] colours: dark violet is 0, yellow
+/// is [`ERROR_MAP_RANGE`] or more. NaN is black.
 ///
-/// The scale is fixed so that maps of different images can be compared.
+/// The scale is fixed, so maps of different images are comparable.
 ///
 /// # Panics
 /// If the images differ in size or channels.

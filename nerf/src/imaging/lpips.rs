@@ -1,8 +1,8 @@
-//! LPIPS: how far apart two images are for a network that has learned to see.
+//! LPIPS, a perceptual distance of images. Start with [`Lpips::open`].
 //!
-//! Zhang, Isola, Efros, Shechtman and Wang, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric" (CVPR
-//! 2018), version 0.1, as the authors' package `lpips` computes it. raygrad ships no weights: a file of them is made from
-//! that package's by `benches/peers/lpips_weights.py`.
+//! Zhang, Isola, Efros, Shechtman and Wang, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"
+//! (CVPR 2018), version 0.1, as the authors' package `lpips` computes it. raygrad ships no weights;
+//! `benches/peers/lpips_weights.py` converts those of the package.
 
 use crate::dataset::image::Image;
 use crate::error::{Error, Result};
@@ -14,14 +14,13 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// The network whose features are compared. Distances of one are no measure of those of the other: a figure means something
-/// beside others of the same alone.
+/// The network whose features LPIPS compares. Distances of different networks are not comparable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backbone {
-    /// AlexNet: quick.
+    /// AlexNet: fast.
     Alex,
-    /// VGG-16: some 20 times the work.
+    /// VGG-16: about 20 times the work of AlexNet.
     Vgg,
 }
 
@@ -49,7 +48,8 @@ const fn same(layer: usize, outputs: usize, kernel: usize) -> Convolution {
 
 /// A network, whose features are compared at the ends of five slices.
 struct Network {
-    /// For each slice the window of the max pooling before it, every second one of which is taken, and its convolutions.
+    /// For each slice the window of the max pooling before it, every second one of which is taken, and its
+    /// convolutions.
     slices: [(Option<usize>, &'static [Convolution]); 5],
     smallest: usize,
     bytes: f64,
@@ -90,12 +90,12 @@ impl Backbone {
         }
     }
 
-    /// Width and height of the smallest image that the network can see, in pixels.
+    /// Returns the smallest side of an image that the network accepts, in pixels.
     pub fn smallest(self) -> usize {
         self.network().smallest
     }
 
-    /// About how many bytes of memory [`Lpips::distance`] takes for each pixel of an image.
+    /// Returns the approximate memory of [`Lpips::distance`], in bytes per pixel of an image.
     pub fn bytes(self) -> f64 {
         self.network().bytes
     }
@@ -104,26 +104,24 @@ impl Backbone {
 /// Longest file that is read, in bytes: the weights of VGG-16 are 59 MB.
 const LONGEST: u64 = 1 << 27;
 /// What to do where a file does not serve.
-const MAKE: &str = "benches/peers/lpips_weights.py makes the file from the package `lpips`";
+const MAKE: &str = "make the file with benches/peers/lpips_weights.py";
 
-/// The mean and the spread of photographs from -1 to 1, in each channel, as the package has them.
+/// The mean and standard deviation of images from -1 to 1, per channel, as in the package.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 /// Added to the length of features before they are divided by it.
 const EPSILON: f64 = 1e-10;
 
-/// The weights of LPIPS, which say how far apart images are: 0 for identical ones, and more the less they are alike, up to
-/// about 1.
+/// LPIPS weights, which compute a perceptual distance: 0 for identical images, up to about 1.
 ///
-/// Both images pass the first layers of a network that was trained to tell 1000 kinds of things apart. At the ends of five
-/// slices `l` of it, the features `f` of each place are divided by their length, and
+/// Both images pass through the first layers of an ImageNet classifier. At the ends of five slices `l`, the features
+/// `f` of each place are normalised, and
 ///
 /// ```text
 /// u = f / (|f| + 1e-10)        d = sum over l of mean over places of sum over channels c of w_lc (u_lc(a) - u_lc(b))^2
 /// ```
 ///
-/// with weights `w >= 0` that were fitted to people's judgement. The figure depends on the network and on the weights: it
-/// means something beside figures of the same.
+/// with weights `w >= 0` that were fitted to human judgements. Distances depend on the network and the weights.
 #[derive(Debug, Clone)]
 pub struct Lpips<T: Scalar = f32> {
     backbone: Backbone,
@@ -140,13 +138,14 @@ struct Slice<T: Scalar> {
 }
 
 impl Lpips<f32> {
-    /// Reads weights from a safetensors file with tensors in f32, named as in the `state_dict` of the package's
-    /// `lpips.LPIPS(net="alex")` or `lpips.LPIPS(net="vgg")`; by them it is known which it is. Other tensors of the file are
-    /// not looked at.
+    /// Reads weights from a safetensors file of f32 tensors, and recognises the network by their names.
+    ///
+    /// Names are those of the `state_dict` of the package's `lpips.LPIPS(net="alex")` or `lpips.LPIPS(net="vgg")`.
+    /// Other tensors are ignored.
     ///
     /// # Errors
-    /// If the file cannot be read, is no such file, or lacks a tensor; if a tensor has another shape or type, a number in it is
-    /// not finite, or one by which a channel counts is negative.
+    /// If the file cannot be read, is not a safetensors file, or lacks a tensor. If a tensor has another shape or type
+    /// or a non-finite number, or a channel weight is negative.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let unread = |error: std::io::Error| Error::file(path, format!("cannot be read: {error}"));
@@ -155,21 +154,20 @@ impl Lpips<f32> {
         if bytes.len() as u64 > LONGEST {
             return Err(Error::file(
                 path,
-                format!("has more than {LONGEST} bytes, too many for weights of LPIPS: {MAKE}"),
+                format!("has more than {LONGEST} bytes, too many for LPIPS weights: {MAKE}"),
             ));
         }
         let file = SafeTensors::deserialize(&bytes)
-            .map_err(|error| Error::file(path, format!("not a safetensors file: {error}; {MAKE}")))?;
+            .map_err(|error| Error::file(path, format!("is not a safetensors file ({error}): {MAKE}")))?;
         let has = |backbone: &Backbone| file.tensor(backbone.network().sign).is_ok();
         let Some(backbone) = [Backbone::Alex, Backbone::Vgg].into_iter().find(has) else {
             let [alex, vgg] = [ALEX.sign, VGG.sign];
-            let what = format!("has no weights of LPIPS, neither `{alex}` (alex) nor `{vgg}` (vgg): {MAKE}");
+            let what = format!("has no LPIPS weights, neither `{alex}` (alex) nor `{vgg}` (vgg): {MAKE}");
             return Err(Error::file(path, what));
         };
         let read = |name: &str, shape: &[usize], least: f32| {
-            tensor(&file, name, shape, least).map_err(|what| {
-                Error::field(path, name, format!("{what}, in weights of LPIPS with {backbone}: {MAKE}"))
-            })
+            tensor(&file, name, shape, least)
+                .map_err(|what| Error::field(path, name, format!("{what}, in LPIPS weights for {backbone}: {MAKE}")))
         };
         let (mut slices, mut inputs) = (vec![], SHIFT.len());
         for (i, (window, layers)) in backbone.network().slices.into_iter().enumerate() {
@@ -192,25 +190,25 @@ impl Lpips<f32> {
 
 /// A tensor of a file whose numbers are finite and not less than `least`; or what is wrong with it.
 fn tensor(file: &SafeTensors<'_>, name: &str, shape: &[usize], least: f32) -> std::result::Result<Tensor<f32>, String> {
-    let Ok(found) = file.tensor(name) else { return Err(format!("is missing; F32{shape:?} is expected")) };
+    let Ok(found) = file.tensor(name) else { return Err(format!("is missing, should be F32{shape:?}")) };
     if found.dtype() != Dtype::F32 || found.shape() != shape {
-        return Err(format!("is {:?}{:?}, not F32{shape:?}", found.dtype(), found.shape()));
+        return Err(format!("is {:?}{:?}, should be F32{shape:?}", found.dtype(), found.shape()));
     }
     let values: Vec<f32> = found.data().chunks_exact(size_of::<f32>()).map(f32::read_le).collect();
     match values.iter().find(|x| !(x.is_finite() && **x >= least)) {
-        Some(x) if x.is_finite() => Err(format!("holds {x}, and may hold nothing negative")),
-        Some(x) => Err(format!("holds {x}, and must be finite")),
+        Some(x) if x.is_finite() => Err(format!("has the value {x}, should be at least 0")),
+        Some(x) => Err(format!("has the value {x}, should be finite")),
         None => Ok(Tensor::from_vec(shape, values)),
     }
 }
 
 impl<T: Scalar> Lpips<T> {
-    /// The network whose features are compared.
+    /// Returns the network whose features are compared.
     pub fn backbone(&self) -> Backbone {
         self.backbone
     }
 
-    /// The same weights as numbers of another type.
+    /// Converts the weights to another precision.
     pub fn cast<U: Scalar>(&self) -> Lpips<U> {
         let slice = |slice: &Slice<T>| Slice {
             pool: slice.pool,
@@ -220,18 +218,21 @@ impl<T: Scalar> Lpips<T> {
         Lpips { backbone: self.backbone, slices: self.slices.iter().map(slice).collect() }
     }
 
-    /// The distance of two RGB images with values in 0..=1; NaN when a value is NaN.
+    /// Computes the distance of two RGB images with values of 0 to 1; NaN if a value is NaN. Nothing is recorded.
     ///
-    /// Nothing is recorded, and features are kept for no longer than until they have been compared. Two images of 400x400
-    /// take 0.1 s and 0.1 GB with AlexNet and 0.9 s and 0.5 GB with VGG-16, of 800x800 0.2 s and 0.2 GB, and 4.5 s and
-    /// 1.7 GB (two threads; `/usr/bin/time -v target/release/examples/lpips FILE.safetensors FIRST.png SECOND.png`).
+    /// | image | AlexNet | VGG-16 |
+    /// |---|---|---|
+    /// | 400x400 | 0.1 s, 0.1 GB | 0.9 s, 0.5 GB |
+    /// | 800x800 | 0.2 s, 0.2 GB | 4.5 s, 1.7 GB |
+    ///
+    /// (Two threads; `/usr/bin/time -v target/release/examples/lpips FILE.safetensors FIRST.png SECOND.png`.)
     ///
     /// # Panics
-    /// If the images differ in size, have no three channels, or are smaller than [`Backbone::smallest`].
+    /// If the images differ in size, do not have three channels, or are smaller than [`Backbone::smallest`].
     #[track_caller]
     pub fn distance(&self, a: &Image, b: &Image) -> f64 {
         a.assert_same_shape(b);
-        assert_eq!(a.channels, SHIFT.len(), "LPIPS needs red, green and blue");
+        assert_eq!(a.channels, SHIFT.len(), "LPIPS needs three channels: red, green and blue");
         // AlexNet's first windows leave out up to three columns and rows at the end.
         if a.data.iter().chain(&b.data).any(|value| value.is_nan()) {
             return f64::NAN;
@@ -244,15 +245,15 @@ impl<T: Scalar> Lpips<T> {
         self.loss(&a, &b).item().to_f64()
     }
 
-    /// The distances `[n]` of `n` pairs of images `[n, 3, height, width]` with values in 0..=1: ordinary operations on the
-    /// tape, so that it serves as a loss. The weights are constants.
+    /// Computes the distances `[n]` of `n` pairs of images `[n, 3, height, width]`, values 0 to 1, as a differentiable
+    /// loss.
     ///
-    /// Where all features of a place are 0 their gradient is too, as that of the ReLU that made them. A recorded pass keeps
-    /// the features of all layers, and its gradient unfolds each image whole: crops cost what their pixels do.
+    /// The weights are constants. Where all features of a place are 0, so is their gradient. The tape keeps the
+    /// features of all layers; use crops to save memory.
     ///
     /// ```no_run
     /// use raygrad_autograd::{Tape, Tensor};
-    /// use raygrad_nerf::pictures::lpips::Lpips;
+    /// use raygrad_nerf::imaging::lpips::Lpips;
     /// let lpips = Lpips::open("lpips-vgg.safetensors")?;
     /// let tape = Tape::new();
     /// let (rendered, target) = (tape.leaf(Tensor::zeros(&[2, 3, 64, 48])), Tensor::ones(&[2, 3, 64, 48]));
@@ -262,7 +263,7 @@ impl<T: Scalar> Lpips<T> {
     /// ```
     ///
     /// # Panics
-    /// If the shapes differ or are others, or the images are smaller than [`Backbone::smallest`].
+    /// If the shapes differ or are not `[n, 3, height, width]`, or the images are smaller than [`Backbone::smallest`].
     #[track_caller]
     pub fn loss<'t>(&self, a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
         let mut layers = self.layers(a, b).into_iter();
@@ -270,17 +271,21 @@ impl<T: Scalar> Lpips<T> {
         layers.fold(first.unwrap_or_else(|| unreachable!("there are five layers")), |sum, layer| sum + layer)
     }
 
-    /// What each of the five slices adds to [`loss`](Self::loss), `[n]` each.
+    /// Computes the parts of [`loss`](Self::loss) from the five slices, `[n]` each.
     ///
     /// # Panics
     /// As [`loss`](Self::loss).
     #[track_caller]
     pub fn layers<'t>(&self, a: &Var<'t, T>, b: &Var<'t, T>) -> Vec<Var<'t, T>> {
-        assert_eq!(a.shape(), b.shape(), "LPIPS compares images of one size");
+        assert_eq!(a.shape(), b.shape(), "LPIPS needs images of one size");
         let &[_, 3, height, width] = a.shape() else { panic!("LPIPS needs images [n, 3, h, w], not {:?}", a.shape()) };
         let side = self.backbone.smallest();
         let fits = width >= side && height >= side;
-        assert!(fits, "LPIPS with {} needs {side}x{side} pixels, the images have {width}x{height}", self.backbone);
+        assert!(
+            fits,
+            "LPIPS with {} needs at least {side}x{side} pixels, the images have {width}x{height}",
+            self.backbone
+        );
         let [shift, scale] = [SHIFT, SCALE].map(|x| Tensor::from_fn(&[3, 1, 1], |i| T::from_f64(x[i].into())));
         let mut features = [a, b].map(|x| (x * 2.0 - 1.0 - &shift) / &scale);
         let each = |slice: &Slice<T>| {

@@ -1,12 +1,12 @@
-//! How alike two images are: mean squared error, PSNR, SSIM.
+//! Image metrics: mean squared error, PSNR and SSIM.
 //!
-//! All take images of one shape with values in 0..=1, sum in f64, and give NaN when a value is NaN.
+//! All take two images of one shape with values of 0 to 1, sum in f64, and return NaN if a value is NaN.
 
 use raygrad_tensor::parallel;
 
 use crate::dataset::image::Image;
 
-/// Mean squared error over all pixels and channels; NaN for images without pixels.
+/// Computes the mean squared error over all pixels and channels; NaN for images without pixels.
 ///
 /// # Panics
 /// If the images differ in size or channels.
@@ -17,9 +17,9 @@ pub fn mse(a: &Image, b: &Image) -> f64 {
     squares.sum::<f64>() / a.data.len() as f64
 }
 
-/// Peak signal-to-noise ratio in decibels for a peak of 1: `-10 log10(mse)`. Identical images give +infinity.
+/// Computes the peak signal-to-noise ratio in dB for a peak of 1: `-10 log10(mse)`. Identical images give +infinity.
 ///
-/// The published figure of a test set is the mean of the images' PSNR, not the PSNR of their mean error.
+/// The published PSNR of a test set is the mean over images, not the PSNR of the mean error.
 ///
 /// # Panics
 /// If the images differ in size or channels.
@@ -28,26 +28,26 @@ pub fn psnr(a: &Image, b: &Image) -> f64 {
     psnr_from_mse(mse(a, b))
 }
 
-/// Peak signal-to-noise ratio in decibels of a mean squared error, for a peak of 1: 0 gives +infinity.
+/// Computes the PSNR in dB from a mean squared error, for a peak of 1; 0 gives +infinity.
 pub fn psnr_from_mse(mse: f64) -> f64 {
     // The reciprocal rather than a minus sign: an error of 1 is 0 dB, not -0.
     10.0 * mse.recip().log10()
 }
 
-/// Side of the window of [`ssim`] in pixels: the smallest image it can measure.
+/// Side of the window of [`ssim`] in pixels, and so the smallest side of its images.
 pub const SSIM_WINDOW: usize = 11;
 
-/// Structural similarity (Wang, Bovik, Sheikh and Simoncelli 2004), at most 1, and 1 for identical images.
+/// Computes the structural similarity (Wang, Bovik, Sheikh and Simoncelli 2004), at most 1; 1 for identical images.
 ///
-/// An 11x11 Gaussian window with standard deviation 1.5 pixels moves over all places where it lies inside the image.
-/// With the window's means `mu`, variances and covariance (weights that sum to 1, no sample correction), C1 = 0.01^2
-/// and C2 = 0.03^2 for a range of 1,
+/// An 11x11 Gaussian window with standard deviation 1.5 pixels moves over all positions inside the image. With the
+/// window's means `mu`, variances and covariance (weights that sum to 1, no sample correction), C1 = 0.01^2 and C2 =
+/// 0.03^2,
 ///
 /// ```text
 /// ssim = (2 mu_a mu_b + C1) (2 cov_ab + C2) / ((mu_a^2 + mu_b^2 + C1) (var_a + var_b + C2))
 /// ```
 ///
-/// and the result is its mean over places and channels.
+/// and the result is the mean over positions and channels.
 ///
 /// # Panics
 /// If the images differ in size or channels, or are smaller than the window.
@@ -57,7 +57,7 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     const C2: f64 = 0.03 * 0.03;
     a.assert_same_shape(b);
     let fits = a.width >= SSIM_WINDOW && a.height >= SSIM_WINDOW;
-    assert!(fits, "SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW} pixels, the images have {}x{}", a.width, a.height);
+    assert!(fits, "SSIM needs at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, the images have {}x{}", a.width, a.height);
 
     // In terms of s = a + b and d = a - b,
     //     2 mu_a mu_b = (mu_s^2 - mu_d^2) / 2   and   mu_a^2 + mu_b^2 = (mu_s^2 + mu_d^2) / 2,
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "differ in height, width or channels")]
+    #[should_panic(expected = "images must have the same height, width and channels")]
     fn other_shapes_are_refused() {
         psnr(&Image::new(2, 3, 3), &Image::new(3, 2, 3));
     }

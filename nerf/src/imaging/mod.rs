@@ -1,4 +1,5 @@
-//! Pictures: how far apart two are, maps in colour, and files.
+//! Image metrics ([`metrics`], [`lpips`]), colour maps ([`colormap`]) and PNG and JPEG output of an
+//! [`Image`](crate::Image).
 
 pub mod colormap;
 pub mod lpips;

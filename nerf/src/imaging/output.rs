@@ -1,4 +1,4 @@
-//! Images to files: 8-bit quantisation and PNG.
+//! Image output: 8-bit quantisation, PNG and JPEG.
 
 use std::path::Path;
 
@@ -10,27 +10,32 @@ use crate::dataset::image::Image;
 use crate::error::Result;
 use crate::files::write_atomic;
 
-/// A value of 0..=1 as a byte: `round(255 clamp(x, 0, 1))`. NaN becomes 0.
+/// Quantises a value to a byte: `round(255 clamp(x, 0, 1))`. NaN becomes 0.
 pub fn quantise(value: f32) -> u8 {
     // A float cast to an integer turns NaN into 0.
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
 impl Image {
-    /// The image as an 8-bit PNG file in memory: grey, RGB or RGBA by its channels, each value [quantised](quantise).
+    /// Encodes an 8-bit PNG file in memory: grey, RGB or RGBA by its channels, each value [quantised](quantise).
     ///
     /// # Panics
-    /// If the image has no pixels, has another number of channels than 1, 3 or 4, or holds another number of values
-    /// than its size says.
+    /// If the image has no pixels, another number of channels than 1, 3 or 4, or a number of values that does not fit
+    /// its size.
     #[track_caller]
     pub fn to_png(&self) -> Vec<u8> {
         let colour = match self.channels {
             1 => ExtendedColorType::L8,
             3 => ExtendedColorType::Rgb8,
             4 => ExtendedColorType::Rgba8,
-            other => panic!("a PNG has 1, 3 or 4 channels, not {other}"),
+            other => panic!("a PNG needs 1, 3 or 4 channels, not {other}"),
         };
-        assert!(self.width > 0 && self.height > 0, "a {}x{} image has no pixels", self.width, self.height);
+        assert!(
+            self.width > 0 && self.height > 0,
+            "a PNG needs at least one pixel, not {}x{}",
+            self.width,
+            self.height
+        );
         let mut png = Vec::new();
         self.encode(PngEncoder::new(&mut png), colour);
         png
@@ -44,28 +49,28 @@ impl Image {
             .expect("the shape is checked before, and writing to memory does not fail");
     }
 
-    /// The image as a JPEG file in memory: grey or RGB by its channels, each value [quantised](quantise). `quality` is from 1 to
+    /// Encodes a JPEG file in memory: grey or RGB by its channels, each value [quantised](quantise). `quality` is 1 to
     /// 100.
     ///
     /// # Panics
-    /// If the image has no pixels or more than 65535 on a side, has another number of channels than 1 or 3, or holds another
-    /// number of values than its size says.
+    /// If the image has no pixels, a side above 65535, another number of channels than 1 or 3, or a number of values
+    /// that does not fit its size.
     #[track_caller]
     pub fn to_jpeg(&self, quality: u8) -> Vec<u8> {
         let colour = match self.channels {
             1 => ExtendedColorType::L8,
             3 => ExtendedColorType::Rgb8,
-            other => panic!("a JPEG has 1 or 3 channels, not {other}"),
+            other => panic!("a JPEG needs 1 or 3 channels, not {other}"),
         };
         let sides = 1..=usize::from(u16::MAX);
         let fits = sides.contains(&self.width) && sides.contains(&self.height);
-        assert!(fits, "a {}x{} image is no JPEG", self.width, self.height);
+        assert!(fits, "a JPEG needs sides of 1 to 65535 pixels, not {}x{}", self.width, self.height);
         let mut jpeg = Vec::new();
         self.encode(JpegEncoder::new_with_quality(&mut jpeg, quality), colour);
         jpeg
     }
 
-    /// Writes the image to the file `path` as [PNG](Self::to_png), replacing it [as a whole](write_atomic).
+    /// Writes the image to `path` as [PNG](Self::to_png), [atomically](write_atomic).
     ///
     /// # Errors
     /// If the file cannot be written; the error names it.
@@ -109,7 +114,7 @@ mod tests {
             std::panic::catch_unwind(move || image.to_jpeg(90)).unwrap_err().downcast::<String>().unwrap()
         };
         for size in [[0, 1], [1, 0], [1 << 16, 1], [1, 1 << 16]] {
-            assert!(refused(size, 3).contains("is no JPEG"), "{size:?}");
+            assert!(refused(size, 3).contains("a JPEG needs sides of 1 to 65535 pixels"), "{size:?}");
         }
         assert!(refused([1, 1], 4).contains("1 or 3 channels"));
     }

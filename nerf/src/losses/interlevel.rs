@@ -6,8 +6,8 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 
 /// Computes the interlevel loss of a proposal, a sum over rays (Barron et al. 2022, equation 13).
 ///
-/// Each sample adds `max(0, w - bound)^2 / w` for its weight `w` `[samples]`. The bound is the sum of the proposal's bins that the
-/// sample's interval touches. The weights are constants: the proposal follows the field, not the reverse.
+/// Each sample adds `max(0, w - bound)^2 / w` for its weight `w` `[samples]`. The bound is the sum of the proposal's
+/// bins that the sample's interval touches. The weights are constants: the proposal follows the field, not the reverse.
 ///
 /// # Panics
 /// If there is not one weight per sample, or the samples belong to other rays.

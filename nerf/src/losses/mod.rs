@@ -48,12 +48,13 @@ pub struct LossInputs<'a, 't, T: Scalar> {
 
 /// A loss term that is added to the photometric loss.
 ///
-/// A custom term implements this trait and, for its configuration, [`ComponentConfig<LossTerms>`](crate::ComponentConfig).
+/// A custom term implements this trait and, for its configuration,
+/// [`ComponentConfig<LossTerms>`](crate::ComponentConfig).
 pub trait LossTerm<T: Scalar>: Any + Send + Sync {
     /// Computes the term as a sum over rays, a scalar, times its weight.
     ///
-    /// Training minimises its mean over rays and three channels, as for the squared errors: a weight of 1 counts as three squared
-    /// errors.
+    /// Training minimises its mean over rays and three channels, as for the squared errors: a weight of 1 counts as
+    /// three squared errors.
     fn loss<'t>(&self, seen: &LossInputs<'_, 't, T>) -> Var<'t, T>;
 
     /// Returns whether it reads [normals](Rendered::normals), for which positions must be on the tape.
@@ -61,7 +62,8 @@ pub trait LossTerm<T: Scalar>: Any + Send + Sync {
         false
     }
 
-    /// Returns whether it needs measured [distances](LossInputs::distances); training a dataset without them is then an error.
+    /// Returns whether it needs measured [distances](LossInputs::distances); training a dataset without them is then an
+    /// error.
     fn needs_distances(&self) -> bool {
         false
     }

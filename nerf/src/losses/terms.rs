@@ -9,11 +9,11 @@ use raygrad_autograd::{Scalar, Tensor, Var};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// The [distortion](Distortion) loss (kind `distortion`): it concentrates weights along each ray, against floaters and fog
-/// (Barron et al. 2022, equation 15).
+/// The [distortion](Distortion) loss (kind `distortion`): it concentrates weights along each ray, against floaters and
+/// fog (Barron et al. 2022, equation 15).
 ///
-/// Distances are shares of the ray's span. In an unbounded scene, distances beyond half the box's side count by their inverses, as
-/// in the [contraction](crate::Contraction).
+/// Distances are shares of the ray's span. In an unbounded scene, distances beyond half the box's side count by their
+/// inverses, as in the [contraction](crate::Contraction).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DistortionConfig {
@@ -21,8 +21,8 @@ pub struct DistortionConfig {
     pub weight: f64,
 }
 
-/// The entropy loss (kind `entropy`): `-o ln o - (1 - o) ln(1 - o)` of each ray's opacity `o`, which drives it to 0 or 1 (Kim et
-/// al. 2022, "InfoNeRF", for whole rays).
+/// The entropy loss (kind `entropy`): `-o ln o - (1 - o) ln(1 - o)` of each ray's opacity `o`, which drives it to 0 or
+/// 1 (Kim et al. 2022, "InfoNeRF", for whole rays).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EntropyConfig {
@@ -30,11 +30,11 @@ pub struct EntropyConfig {
     pub weight: f64,
 }
 
-/// The orientation loss (kind `orientation`): `sum w max(0, n . d)^2` penalises surfaces that face away from the camera (Verbin
-/// et al. 2022, "Ref-NeRF", equation 11).
+/// The orientation loss (kind `orientation`): `sum w max(0, n . d)^2` penalises surfaces that face away from the camera
+/// (Verbin et al. 2022, "Ref-NeRF", equation 11).
 ///
-/// w are weights, n [normals](crate::Rendered::normals) and d ray directions. It differentiates the density twice, which takes
-/// several times as long as a step without it.
+/// w are weights, n [normals](crate::Rendered::normals) and d ray directions. It differentiates the density twice,
+/// which takes several times as long as a step without it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OrientationConfig {
@@ -45,10 +45,10 @@ pub struct OrientationConfig {
 /// The depth loss (kind `depth`): `sum w e(t) + T e(far)` with `e(t) = min(1, ((t - d) / u)^2)`.
 ///
 /// w are the weights of samples at t, T is the transmittance at the far end of the span, d the measured
-/// [distance](crate::dataset::Frame::distances) and u the scene's [unit](crate::Space::unit). It is minimal if all weight lies at
-/// d, or, if d lies beyond the span, if no light is blocked. Rays without a measurement, or with one before the span, add
-/// nothing. It is related to Deng et al. 2022, "Depth-supervised NeRF", section 4; the clamped square replaces their likelihood, so
-/// that it is finite everywhere.
+/// [distance](crate::dataset::Frame::distances) and u the scene's [unit](crate::Space::unit). It is minimal if all
+/// weight lies at d, or, if d lies beyond the span, if no light is blocked. Rays without a measurement, or with one
+/// before the span, add nothing. It is related to Deng et al. 2022, "Depth-supervised NeRF", section 4; the clamped
+/// square replaces their likelihood, so that it is finite everywhere.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {

@@ -14,9 +14,9 @@ use std::sync::Arc;
 /// The total variation loss of a table (kind `total_variation`): it smooths cells that images do not determine.
 ///
 /// It is the mean over cells of the squared differences of neighbours, summed over axes and channels (Chen et al. 2022,
-/// "TensoRF", section 4.3; Fridovich-Keil et al. 2022, "Plenoxels", equation 3, without its root). Each step draws random cells
-/// per ray, with the same expectation; only their rows of a lazy table are updated. Adam moves cells that no ray touches by about
-/// the learning rate, whatever the weight.
+/// "TensoRF", section 4.3; Fridovich-Keil et al. 2022, "Plenoxels", equation 3, without its root). Each step draws
+/// random cells per ray, with the same expectation; only their rows of a lazy table are updated. Adam moves cells that
+/// no ray touches by about the learning rate, whatever the weight.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TotalVariationConfig {
@@ -232,11 +232,11 @@ mod tests {
         }
         let mut few = Params::<f64>::new();
         few.add("field.table", Tensor::zeros(&[100, 2]));
-        assert!(build(&config(Some(vec![5, 7])), &mut few).is_err(), "35 cells are not those of 100 rows");
+        assert!(build(&config(Some(vec![5, 7])), &mut few).is_err(), "35 cells do not fit 100 rows");
         assert!(build(&config(Some(vec![5, 8])), &mut few).is_ok(), "60 rows of padding");
         few.set_lazy(|_| true, true);
         let error = build(&config(None), &mut few).err().unwrap().to_string();
-        assert!(error.contains("say its `cells`"), "{error}");
+        assert!(error.contains("needs `cells` along each axis"), "{error}");
         for shape in [&[7][..], &[]] {
             let mut line = Params::<f64>::new();
             line.add("field.table", Tensor::zeros(shape));

@@ -32,10 +32,10 @@ const VIEW_STEP: f64 = 1.0 / 150.0;
 const SAMPLES: usize = 4;
 /// How much longer they are for each unit of distance.
 const CONE: f64 = 1.0 / 64.0;
-/// Weight of the distortion of rays through an unbounded scene, of which photographs show every place from few sides.
+/// Weight of the distortion loss in unbounded scenes, where few images show each place.
 const DISTORTION: f64 = 0.1;
 
-/// Learning rates of cameras, at the beginning of a run and at its end: radians that a photograph moves by, logarithms of
+/// Learning rates of cameras, at the beginning of a run and at its end: radians that an image moves by, logarithms of
 /// focal lengths, coefficients of lenses.
 const POSE_RATE: [f64; 2] = [3e-3, 3e-5];
 const FOCAL_RATE: [f64; 2] = [5e-3, 5e-5];
@@ -244,9 +244,9 @@ impl Config {
     /// Adapts the hash grid and the sampling to a training budget.
     ///
     /// `samples` is [`Budget::samples`](crate::Budget::samples), `footprints` is
-    /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side). [`HashGridConfig::cpu`] chooses the table's size
-    /// and resolution. Beyond 200 million samples (100 seconds on two cores) steps along a ray shrink during training, down to
-    /// a pixel's footprint. Beyond 600 million a training step has twice as many samples.
+    /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side). [`HashGridConfig::cpu`] chooses the
+    /// table's size and resolution. Beyond 200 million samples (100 seconds on two cores) steps along a ray shrink
+    /// during training, down to a pixel's footprint. Beyond 600 million a training step has twice as many samples.
     pub fn for_budget(mut self, samples: f64, footprints: f64) -> Self {
         if let Some(field) = self.field.get_mut::<InstantConfig>() {
             field.grid = HashGridConfig::cpu(samples, footprints);
@@ -262,9 +262,10 @@ impl Config {
 
     /// Adapts the configuration to the type of scene; a second call with the same type changes nothing.
     ///
-    /// For an unbounded scene it marches through cascades with growing steps, spreads proposals in inverse distance, doubles the
-    /// resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. It overrides the steps that
-    /// [`for_budget`](Self::for_budget) chose. Figures are in docs/benchmarks/results.md, section Captures.
+    /// For an unbounded scene it marches through cascades with growing steps and spreads proposals in inverse distance.
+    /// It doubles the resolution of a hash grid and adds a [distortion loss](DistortionConfig) against fog. It
+    /// overrides the steps of [`for_budget`](Self::for_budget). Figures are in docs/benchmarks/results.md, section
+    /// Captures.
     pub fn with_scene_type(mut self, scope: SceneType) -> Self {
         let before = std::mem::replace(&mut self.unbounded, scope.is_unbounded());
         if before == self.unbounded {

@@ -40,11 +40,11 @@ impl ExposureConfig {
 /// Learned gains from the scene's colours to those of each image; parameters of 0 leave colours unchanged.
 ///
 /// The gain is `exp(e + v1 s + v2 s^2 + v3 s^3)`, applied to stored (sRGB) values:
-/// - `exposure` `[images, 3]`: e for red, green and blue, which includes white balance (per-image exposure of Mueller et al.
-///   2022, instant-ngp). Between 0.2 and 1, a gain of light is nearly a gain of stored values.
-/// - `vignetting` `[3]`: v1, v2 and v3, shared by all images. s is the square of a pixel's
-///   [distance from the optical axis](crate::camera::Camera::off_axis) in units of half the diagonal (Goldman and Chen 2005,
-///   "Vignette and exposure calibration and compensation", equation 2, as a logarithm, so that no gain is negative).
+/// - `exposure` `[images, 3]`: e for red, green and blue, which includes white balance (per-image exposure of Mueller
+///   et al. 2022, instant-ngp). Between 0.2 and 1, a gain of light is nearly a gain of stored values.
+/// - `vignetting` `[3]`: v1, v2 and v3, shared by all images. s is the square of a pixel's [distance from the optical
+///   axis](crate::camera::Camera::off_axis) in units of half the diagonal (Goldman and Chen 2005, "Vignette and
+///   exposure calibration and compensation", equation 2, as a logarithm, so that no gain is negative).
 ///
 /// The background is not multiplied. Renders use the geometric mean of all exposures, or the exposure of
 /// [`appearance_image`](crate::Model::appearance_image), and no vignetting unless
@@ -134,7 +134,7 @@ mod tests {
 
     const RATE: Option<Schedule> = Some(Schedule::Constant { rate: 0.1 });
 
-    /// A tone of two photographs that has learned something.
+    /// A trained exposure model of two images.
     fn learned() -> (ExposureModel, Params<f64>) {
         let mut params = Params::new();
         let config = ExposureConfig { exposure: RATE, vignetting: RATE };

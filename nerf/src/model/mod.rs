@@ -62,8 +62,8 @@ pub struct Model<T: Scalar> {
     pub camera_optimizer: Option<CameraOptimizer>,
     /// The exposure model, if it is learned.
     pub exposure: Option<ExposureModel>,
-    /// The index of the training image whose appearance embedding and exposure renders use; `None` uses the mean of all.
-    /// Rendering panics if it is out of range.
+    /// The index of the training image whose appearance embedding and exposure renders use; `None` uses the mean of
+    /// all. Rendering panics if it is out of range.
     pub appearance_image: Option<u32>,
     /// Whether renders have the [`ExposureModel`]'s vignetting; initially `false`.
     pub vignetted: bool,
@@ -133,8 +133,8 @@ impl<T: Scalar> Model<T> {
         space(&self.config, &self.scene_box)
     }
 
-    /// Returns the box within which rays are sampled, lower and upper corner in scene units. It is infinite for an unbounded
-    /// scene without an occupancy grid.
+    /// Returns the box within which rays are sampled, lower and upper corner in scene units. It is infinite for an
+    /// unbounded scene without an occupancy grid.
     pub fn reach(&self) -> [DVec3; 2] {
         match self.sampler.grid() {
             Some(grid) => grid.outer_bounds(),
@@ -145,8 +145,8 @@ impl<T: Scalar> Model<T> {
 
     /// Returns the near and far plane of renders, in scene units.
     ///
-    /// For a bounded scene they enclose the whole box from any camera. For an unbounded scene they are those of training, which
-    /// has not learned what is nearer to cameras.
+    /// For a bounded scene they enclose the whole box from any camera. For an unbounded scene they are those of
+    /// training, which has not learned what is nearer to cameras.
     pub fn view_near_far(&self) -> [f64; 2] {
         let [near, far] = self.scene_box.near_far;
         match self.space() {
@@ -170,8 +170,8 @@ impl<T: Scalar> Model<T> {
             .map_or_else(|| camera.clone(), |refine| refine.camera(&self.params, number, camera))
     }
 
-    /// Returns a camera of the capture that took no training image, such as a held-out one, in the refined coordinates: see
-    /// [`CameraOptimizer::other_cameras`].
+    /// Returns a camera of the capture that took no training image, such as a held-out one, in the refined coordinates:
+    /// see [`CameraOptimizer::other_cameras`].
     pub fn other_camera(&self, camera: &Camera) -> Camera {
         self.other_cameras(std::slice::from_ref(camera)).remove(0)
     }
@@ -207,9 +207,11 @@ impl<T: Scalar> Model<T> {
         (&*self.sampler as &dyn Any).downcast_ref()
     }
 
-    /// Returns the [`ExposureModel`]'s gain of red, green and blue at the image centre, each above 0; 1 without such a model.
+    /// Returns the [`ExposureModel`]'s gain of red, green and blue at the image centre, each above 0; 1 without such a
+    /// model.
     ///
-    /// It is that of [`appearance_image`](Self::appearance_image), or the mean of all. Renders clip colours at 1 after it.
+    /// It is that of [`appearance_image`](Self::appearance_image), or the mean of all. Renders clip colours at 1 after
+    /// it.
     ///
     /// # Panics
     /// If `appearance_image` is out of range.
@@ -234,8 +236,8 @@ impl<T: Scalar> Model<T> {
 
     /// Returns the photometric loss at fixed samples, differentiable with respect to the parameters.
     ///
-    /// It is the sum over fields, rays and channels of the configured loss against `target` `[rays, 3]`, over `background`
-    /// `[rays, 3]`. Rays use the mean appearance, and cameras are not refined.
+    /// It is the sum over fields, rays and channels of the configured loss against `target` `[rays, 3]`, over
+    /// `background` `[rays, 3]`. Rays use the mean appearance, and cameras are not refined.
     ///
     /// # Panics
     /// If there are more sets of samples than [`fields`](Self::fields).
@@ -286,8 +288,8 @@ impl Model<f32> {
         densities(&*self.field, &self.params, &Pool::new(), points, out);
     }
 
-    /// Sets how renders skip empty space and weak samples. It does not undo skipping in training, and has no effect without an
-    /// occupancy grid.
+    /// Sets how renders skip empty space and weak samples. It does not undo skipping in training, and has no effect
+    /// without an occupancy grid.
     pub fn set_skip(&mut self, skip: impl Into<Skipping>) {
         if let Some(marching) = self.marching_mut() {
             // What training left out cannot be put back.

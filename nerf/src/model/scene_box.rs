@@ -54,7 +54,8 @@ impl SceneBox {
         place.cmpge(low).all() && place.cmple(high).all()
     }
 
-    /// Returns the map to the unit cube of a bounded scene; [`Model::space`](crate::Model::space) contracts unbounded ones.
+    /// Returns the map to the unit cube of a bounded scene; [`Model::space`](crate::Model::space) contracts unbounded
+    /// ones.
     pub fn space(&self) -> Space {
         Space { unit: self.unit, ndc: self.ndc, ..Space::within(self.bounds) }
     }

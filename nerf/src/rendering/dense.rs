@@ -28,8 +28,9 @@ const TILE: usize = 64;
 impl<T: Scalar> Model<T> {
     /// Renders every sample with arithmetic in `T`, at steps `finer` times smaller than configured.
     ///
-    /// It skips only the cells that the occupancy grid marks empty. In f64 with several times the steps it is a reference for
-    /// faster renders: `model.cast::<f64>()?.render_reference(..)`. Samplers without steps ignore `finer`.
+    /// It skips only the cells that the occupancy grid marks empty. In f64 with several times the steps it is a
+    /// reference for faster renders: `model.cast::<f64>()?.render_reference(..)`. Samplers without steps ignore
+    /// `finer`.
     ///
     /// # Panics
     /// If `finer` is 0.

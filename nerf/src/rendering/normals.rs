@@ -13,12 +13,12 @@ use raygrad_autograd::{Pool, Scalar};
 const TILE: usize = 64;
 
 impl<T: Scalar> Model<T> {
-    /// Renders normals, three channels in the scene's axes: along each ray the sum of `-w grad sigma / |grad sigma|` (Verbin et
-    /// al. 2022, equation 3 and after).
+    /// Renders normals, three channels in the scene's axes: along each ray the sum of `-w grad sigma / |grad sigma|`
+    /// (Verbin et al. 2022, equation 3 and after).
     ///
-    /// A normal's length is the pixel's opacity where all visible surfaces face one way, and less elsewhere. Light beyond
-    /// [early termination](crate::RayTolerance) does not count. The gradient of each sample takes about as long as a training
-    /// step on as many rays.
+    /// A normal's length is the pixel's opacity where all visible surfaces face one way, and less elsewhere. Light
+    /// beyond [early termination](crate::RayTolerance) does not count. The gradient of each sample takes about as long
+    /// as a training step on as many rays.
     ///
     /// # Panics
     /// If the field's density does not depend on positions through operations of the tape.

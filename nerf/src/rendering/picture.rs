@@ -33,7 +33,8 @@ impl Render {
         Render { color: image(3), depth: image(1), opacity: image(1), evaluations: Evaluations::default() }
     }
 
-    /// Removes the background that was rendered over: returns RGBA with the opacity as straight alpha; 0 where nothing is visible.
+    /// Removes the background that was rendered over: returns RGBA with the opacity as straight alpha; 0 where nothing
+    /// is visible.
     ///
     /// ```
     /// use raygrad_nerf::{Evaluations, Image, Render};
@@ -115,7 +116,8 @@ const EVERYWHERE: [DVec3; 2] = [DVec3::NEG_INFINITY, DVec3::INFINITY];
 impl Model<f32> {
     /// Renders the image of `camera` over a background colour (RGB, 0 to 1).
     ///
-    /// Samples lie at the centres of their bins, so the result has the same bits each time and on any number of threads.
+    /// Samples lie at the centres of their bins, so the result has the same bits each time and on any number of
+    /// threads.
     pub fn render(&self, camera: &Camera, background: [f32; 3]) -> Render {
         self.whole_view(camera, &RenderOptions::over(background))
     }

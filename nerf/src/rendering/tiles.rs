@@ -14,8 +14,8 @@ use raygrad_tensor::parallel::{self, Scratch, locked};
 use std::sync::{Mutex, PoisonError};
 
 impl<T: Scalar> Model<T> {
-    /// Samples `rays` as renders do, at steps `finer` times smaller than configured, and passes the samples to `see` with the
-    /// field and the model's appearance.
+    /// Samples `rays` as renders do, at steps `finer` times smaller than configured, and passes the samples to `see`
+    /// with the field and the model's appearance.
     pub(crate) fn along<R>(
         &self,
         rays: &Rays<T>,
@@ -30,8 +30,8 @@ impl<T: Scalar> Model<T> {
         see(&query, self.sampler.sample(&query, rays, Purpose::View { finer }, &mut Jitter::Middle))
     }
 
-    /// Calls `see` for tiles of `tile` pixels, row by row, on all cores: with the index of the tile's first pixel, its rays and
-    /// its part of `out`. `None` if it was cancelled.
+    /// Calls `see` for tiles of `tile` pixels, row by row, on all cores: with the index of the tile's first pixel, its
+    /// rays and its part of `out`. `None` if it was cancelled.
     pub(crate) fn tiles<P: Send>(
         &self,
         camera: &Camera,
@@ -61,8 +61,8 @@ impl<T: Scalar> Model<T> {
         seen.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Renders a camera's pixels, row by row, in tiles of `tile`; `keep` stores a tile's pixels in its part of `out`. `None` if it
-    /// was cancelled.
+    /// Renders a camera's pixels, row by row, in tiles of `tile`; `keep` stores a tile's pixels in its part of `out`.
+    /// `None` if it was cancelled.
     pub(crate) fn pixels<P: Send>(
         &self,
         camera: &Camera,

@@ -148,8 +148,8 @@ impl Marching {
         self.pruned.as_ref().unwrap_or(&self.grid)
     }
 
-    /// Places samples in the occupied cells of a grid, at even steps from each ray's near end; also returns their number if all
-    /// cells were occupied. Positions are computed in f32, so they are the same in every precision.
+    /// Places samples in the occupied cells of a grid, at even steps from each ray's near end; also returns their
+    /// number if all cells were occupied. Positions are computed in f32, so they are the same in every precision.
     pub fn march<T: Scalar>(
         &self,
         grid: &OccupancyGrid,
@@ -228,8 +228,8 @@ impl<T: Scalar> Sampler<T> for Marching {
         true
     }
 
-    /// Samples the occupied cells densely and finds those that renders may skip within the configured error bound. The saved grid
-    /// of training does not change.
+    /// Samples the occupied cells densely and finds those that renders may skip within the configured error bound. The
+    /// saved grid of training does not change.
     ///
     /// Cells that training skipped stay empty: the field was never trained there.
     fn finish(&mut self, densities: &DensityFn<'_>) {

@@ -43,7 +43,8 @@ pub struct Sampled<'t, T: Scalar> {
     pub samples: Samples<T>,
     /// Renders of the sampler's coarse fields along the same rays, which are trained on the images too.
     pub coarse: Vec<Rendered<'t, T>>,
-    /// Histograms of proposal fields, which the [interlevel loss](crate::losses::interlevel) fits to the field's weights.
+    /// Histograms of proposal fields, which the [interlevel loss](crate::losses::interlevel) fits to the field's
+    /// weights.
     pub histograms: Vec<ProposalHistogram<'t, T>>,
     /// The sampler's own evaluations, and the number of samples without skipping.
     pub evaluations: Evaluations,
@@ -69,13 +70,14 @@ pub struct ProposalHistogram<'t, T: Scalar> {
 
 /// The tolerances of a render, per ray.
 ///
-/// Each changes a pixel by at most its value times the range of colours. The remaining samples are scaled to compensate.
+/// Each changes a pixel by at most its value times the range of colours. The remaining samples are scaled to
+/// compensate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RayTolerance {
     /// Early termination: a ray ends where its transmittance falls below this, 0 to 1.
     pub early_stop_eps: f32,
-    /// Samples whose weights sum to at most this take no colour evaluation, 0 to 1. Quadratures with two nodes per interval ignore
-    /// it.
+    /// Samples whose weights sum to at most this take no colour evaluation, 0 to 1. Quadratures with two nodes per
+    /// interval ignore it.
     pub color_budget: f32,
 }
 
@@ -111,10 +113,10 @@ pub struct Progress {
 
 /// Places samples along rays.
 ///
-/// Only [`sample`](Self::sample), [`batch_size`](Self::batch_size) and [`boxed`](Self::boxed) are required; the rest is for
-/// samplers that learn, skip samples or have state. A custom sampler implements this trait and, for its configuration,
-/// [`ComponentConfig<Samplers>`](crate::ComponentConfig). After [`register`](crate::component::register) it trains, renders,
-/// saves and loads like the built-in samplers.
+/// Only [`sample`](Self::sample), [`batch_size`](Self::batch_size) and [`boxed`](Self::boxed) are required; the rest is
+/// for samplers that learn, skip samples or have state. A custom sampler implements this trait and, for its
+/// configuration, [`ComponentConfig<Samplers>`](crate::ComponentConfig). After [`register`](crate::component::register)
+/// it trains, renders, saves and loads like the built-in samplers.
 pub trait Sampler<T: Scalar>: Any + Send + Sync {
     /// Places samples of the field of `query` along `rays`. No gradient flows through their positions.
     fn sample<'t>(
@@ -180,8 +182,8 @@ pub trait Sampler<T: Scalar>: Any + Send + Sync {
         vec![]
     }
 
-    /// Returns named state that is saved to resume training: everything that the next steps depend on, beyond the arguments of
-    /// [`update`](Self::update).
+    /// Returns named state that is saved to resume training: everything that the next steps depend on, beyond the
+    /// arguments of [`update`](Self::update).
     fn training_state(&self) -> Vec<(&'static str, Vec<u8>)> {
         self.state()
     }

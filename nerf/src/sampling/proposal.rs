@@ -131,9 +131,9 @@ impl<T: Scalar> Field<T> for Proposer {
 
 /// Proposal sampling (Barron et al. 2022, mip-NeRF 360, section 3).
 ///
-/// Each proposal is a small density field. Its weights along a ray are the histogram from which the next proposal's samples are
-/// drawn, and finally those of the field. Proposals are not trained on images but on the field's weights, with
-/// [`interlevel`](crate::losses::interlevel).
+/// Each proposal is a small density field. Its weights along a ray are the histogram from which the next proposal's
+/// samples are drawn, and finally those of the field. Proposals are not trained on images but on the field's weights,
+/// with [`interlevel`](crate::losses::interlevel).
 #[derive(Debug, Clone)]
 pub struct Proposal {
     /// The configuration.
@@ -168,7 +168,8 @@ impl Scale {
 }
 
 impl Proposal {
-    /// The samples at the centres of bins, with bin edges as distances; `shares` are the edges as shares of each ray's span.
+    /// The samples at the centres of bins, with bin edges as distances; `shares` are the edges as shares of each ray's
+    /// span.
     fn steps<T: Scalar>(
         &self,
         rays: &Rays<T>,
@@ -193,8 +194,8 @@ impl Proposal {
         (Samples::new(rays, segments, t, delta, pool), edges)
     }
 
-    /// Edges of `bins` bins per ray, as shares of its span, around samples drawn from a histogram over `shares`. With `whole` the
-    /// outermost bins extend to the ends of the span.
+    /// Edges of `bins` bins per ray, as shares of its span, around samples drawn from a histogram over `shares`. With
+    /// `whole` the outermost bins extend to the ends of the span.
     fn resampled<T: Scalar>(
         &self,
         shares: &[f64],

@@ -7,12 +7,13 @@ use crate::random::Jitter;
 use crate::{Error, Result};
 use raygrad_autograd::{Pool, Scalar, Segments};
 
-/// Adds `count` samples per ray, drawn from the histogram of `weights`, merged with the `coarse` samples in order (Mildenhall
-/// et al. 2020, section 5.2).
+/// Adds `count` samples per ray, drawn from the histogram of `weights`, merged with the `coarse` samples in order
+/// (Mildenhall et al. 2020, section 5.2).
 ///
-/// `weights` `[coarse samples]` has one entry per stratified sample. The density is a mixture: `1 - uniform_share` from the
-/// weights, the rest uniform. A ray whose weights are all zero is sampled evenly; so is a ray with a weight that is negative,
-/// infinite or NaN. `delta` of a sample reaches half way to its neighbours, of the outermost ones to near and far.
+/// `weights` `[coarse samples]` has one entry per stratified sample. The density is a mixture: `1 - uniform_share` from
+/// the weights, the rest uniform. A ray whose weights are all zero is sampled evenly; so is a ray with a weight that is
+/// negative, infinite or NaN. `delta` of a sample reaches half way to its neighbours, of the outermost ones to near and
+/// far.
 ///
 /// # Panics
 /// If there is not one weight per sample.
@@ -68,9 +69,9 @@ fn voronoi<T: Scalar>(t: &[T], [near, far]: [T; 2], delta: &mut [T]) {
 
 /// Inverts the CDF of a histogram at the rising numbers `u` in `[0, 1)`, into `out`.
 ///
-/// `edges` are `bins + 1` rising numbers, of which neighbours may be equal. The density is `1 - uniform_share` times that of the
-/// weights, constant within a bin, plus `uniform_share` times a uniform one. It is uniform if the weights sum to 0. Weights need
-/// no normalisation. `out[i]` rises with `u[i]` and lies between the first and the last edge.
+/// `edges` are `bins + 1` rising numbers, of which neighbours may be equal. The density is `1 - uniform_share` times
+/// that of the weights, constant within a bin, plus `uniform_share` times a uniform one. It is uniform if the weights
+/// sum to 0. Weights need no normalisation. `out[i]` rises with `u[i]` and lies between the first and the last edge.
 ///
 /// ```
 /// use raygrad_nerf::sampling::steps::invert_cdf;

@@ -1,18 +1,20 @@
-//! Scene contraction: all of space in a ball of radius 2, for scenes without bounds.
+//! Scene contraction: all of space in a ball of radius 2, for unbounded scenes.
 
 #[cfg(any(test, feature = "check"))]
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Shape, ShapeError, Tensor, Var, Vjp};
 
-/// y = x inside the unit ball, else (2 - 1/r) x / r with r = |x|: space outside is squeezed between radius 1 and 2, evenly
-/// in disparity (Barron et al. 2022, mip-NeRF 360, equation 10). Rows of the last axis are points.
+/// The operation y = x inside the unit ball, else (2 - 1/r) x / r with r = |x| (Barron et al. 2022, mip-NeRF 360,
+/// equation 10).
+///
+/// Rows of the last axis are points. Space outside of the unit ball maps to radii of 1 to 2, evenly in disparity.
 ///
 /// dx = (f/r) g + (f' - f/r) (n . g) n with n = x/r, f = 2 - 1/r, f' = 1/r^2: the identity inside, and continuous where
 /// the two meet.
 ///
-/// Rows are divided by their largest element first, so a point as far away as the type can hold keeps its direction.
-/// Beyond 1e4 all points of a direction are one, at radius 1.9999, with gradient 0 along the ray: so that the result is
-/// always inside of the ball. That holds for infinite elements too; NaN gives a row of NaN.
+/// Rows are divided by their largest element first, so the farthest representable point keeps its direction. Beyond a
+/// radius of 1e4 all points of a direction map to radius 1.9999, with gradient 0 along the ray, so the result is always
+/// inside of the ball. That holds for infinite elements too; NaN gives a row of NaN.
 #[derive(Debug, Clone, Copy)]
 pub struct Contraction;
 
@@ -65,7 +67,7 @@ impl<T: Scalar> Op<T> for Contraction {
     }
 
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> {
-        if x[0].is_empty() { Err("a scalar is no point".into()) } else { Ok(x[0].into()) }
+        if x[0].is_empty() { Err("points must have at least one axis".into()) } else { Ok(x[0].into()) }
     }
 
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> {
@@ -124,7 +126,7 @@ impl<T: Scalar> Op<T> for Contraction {
     }
 }
 
-/// Points `[.., d]` with all of space squeezed into a ball of radius 2; see [`Contraction`].
+/// Contracts points `[.., d]` into a ball of radius 2; see [`Contraction`].
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};

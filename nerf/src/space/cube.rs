@@ -7,22 +7,20 @@ use glam::{DMat3, DVec3};
 use raygrad_autograd::{Scalar, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
-/// Where a scene is: the one map from scene units to the unit cube, in which encodings and grids live.
+/// The map from scene units to the unit cube of encodings and grids.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Space {
-    /// Lower and upper corner of the box that holds the scene, in scene units.
+    /// Lower and upper corner of the scene box, in scene units.
     pub bounds: [DVec3; 2],
-    /// Whether the scene goes on beyond the box: then all of space is [contracted](crate::contract) into the cube, the ball
-    /// around the box's middle that touches its nearest sides onto a ball of radius 1/4.
+    /// Whether the scene is unbounded: all of space is then [contracted](crate::contract) into the cube. The ball
+    /// around the box's centre that touches its nearest sides maps to a ball of radius 1/4.
     #[serde(default)]
     pub unbounded: bool,
-    /// The length, in scene units, that fields measure their densities by: a density of 1 is 1 / `unit`. In files from
-    /// before there was a choice it is 1.
+    /// The unit of length of densities, in scene units: a density of 1 is 1 / `unit`. Files of early versions imply 1.
     #[serde(default = "one")]
     pub unit: f64,
-    /// Where an unbounded scene was photographed by cameras that all look the same way: then what they see, and not all of
-    /// space, is the cube.
+    /// The NDC frustum of a forward-facing scene, which then maps to the cube instead of all space.
     #[serde(default)]
     pub ndc: Option<Ndc>,
 }
@@ -31,26 +29,29 @@ fn one() -> f64 {
     1.0
 }
 
-/// The longest side of a box in its own units: so a new field hides as much of what is behind it whatever unit the scene
-/// is in.
+/// The longest side of a box in its own units: so a new field hides as much of what is behind it whatever unit the
+/// scene is in.
 const UNITS: f64 = 3.0;
 
 impl Space {
-    /// A scene within a box, lower and upper corner in scene units.
+    /// Creates the map of a bounded scene, from its box (lower and upper corner, scene units).
     pub fn within(bounds: [DVec3; 2]) -> Self {
         let unit = (bounds[1] - bounds[0]).max_element() / UNITS;
         Space { bounds, unbounded: false, unit, ndc: None }
     }
 
-    /// Whether the box is one.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If a corner is not finite or the lower one is not below the upper one along each axis, the unit is no length, or
-    /// normalised device coordinates hold a number out of range.
+    /// If a corner is not finite or the lower one is not below the upper one along each axis, if `unit` is not above 0,
+    /// or as [`Ndc::check`].
     pub fn check(&self) -> Result<()> {
         let [low, high] = self.bounds;
         if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
-            return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
+            return Err(Error::setting(
+                "bounds",
+                format!("is {low} to {high}; use finite corners, the lower below the upper"),
+            ));
         }
         self.ndc.as_ref().map_or(Ok(()), Ndc::check)?;
         if self.unit > 0.0 && self.unit.is_finite() {
@@ -59,14 +60,16 @@ impl Space {
         Err(Error::setting("unit", format!("is {}; use a length above 0", self.unit)))
     }
 
-    /// The longest side of the box, in scene units.
+    /// Returns the longest side of the box, in scene units.
     pub fn side(&self) -> f64 {
         (self.bounds[1] - self.bounds[0]).max_element()
     }
 
-    /// Positions `[samples, 3]` in scene units as positions in the unit cube. In a bounded space the box's lower corner is
-    /// the origin and its longest side has length 1; what lies outside of the box lies outside of the cube. In
-    /// [normalised device coordinates](Ndc) the cube's last axis is 1 - near / depth, from the near plane to infinity.
+    /// Maps positions `[samples, 3]` from scene units to the unit cube.
+    ///
+    /// For a bounded scene the box's lower corner maps to the origin, and its longest side has length 1; points outside
+    /// of the box map outside of the cube. In [NDC](Ndc) the last axis is `1 - near / depth`, from the near plane to
+    /// infinity.
     #[track_caller]
     pub fn cube<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
         let row = |x: DVec3| positions.tape().constant(Tensor::from_vec(&[3], x.to_array().map(T::from_f64).to_vec()));
@@ -82,8 +85,8 @@ impl Space {
         contract(&(positions * scale + row(-0.5 * (low + high) * scale))) * 0.25 + 0.5
     }
 
-    /// The same in the cube from -1 to 1 around the middle of the box, as networks of sinusoids have it: a bounded box's
-    /// longest side is from -1 to 1.
+    /// Maps positions `[samples, 3]` from scene units to the cube from -1 to 1 around the box's centre, for positional
+    /// encodings. The longest side of a bounded box spans -1 to 1.
     #[track_caller]
     pub fn centred<'t, T: Scalar>(&self, positions: &Var<'t, T>) -> Var<'t, T> {
         if self.unbounded {

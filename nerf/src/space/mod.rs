@@ -1,4 +1,5 @@
-//! The region of a scene: which parts of it hold something, and all of space in a ball.
+//! The map from the scene to the unit cube ([`Space`]), scene [contraction](contract) and occupancy grids
+//! ([`occupancy`]).
 
 pub(crate) mod contraction;
 pub(crate) mod cube;

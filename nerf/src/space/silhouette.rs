@@ -1,4 +1,4 @@
-//! Carving with silhouettes: where a photograph is fully transparent, nothing lies between its camera and infinity.
+//! Visual hull carving: a fully transparent pixel shows that its ray is empty.
 
 use crate::camera::lens::Lens;
 use crate::camera::pinhole::Camera;
@@ -6,10 +6,10 @@ use crate::dataset::{Dataset, Frame};
 use crate::space::occupancy::OccupancyGrid;
 use glam::{DAffine3, DVec3};
 
-/// Pixels around a place that must be transparent too: the footprint of the filter that the photograph was made with.
+/// Pixels around a place that must be transparent too: the footprint of the image's filter.
 const MARGIN: f64 = 1.5;
 
-/// Where one photograph shows something.
+/// The silhouette of one image.
 struct Silhouette<'a> {
     camera: &'a Camera,
     world_to_camera: DAffine3,
@@ -18,7 +18,7 @@ struct Silhouette<'a> {
 }
 
 impl<'a> Silhouette<'a> {
-    /// `None` if the photograph has no transparency, or a lens that bends lines.
+    /// `None` if the image has no transparency, or its lens distorts.
     fn new(frame: &'a Frame) -> Option<Self> {
         let Frame { camera, image, mask, .. } = frame;
         if !image.has_alpha() || camera.lens != Lens::Pinhole {
@@ -37,7 +37,7 @@ impl<'a> Silhouette<'a> {
         Some(Silhouette { camera, world_to_camera: camera.pose.inverse(), sums })
     }
 
-    /// Whether all of a ball is in the picture and every pixel that it could be seen in is fully transparent.
+    /// Whether a ball projects into the image entirely, onto fully transparent pixels only.
     fn is_clear(&self, centre: DVec3, radius: f64) -> bool {
         let local = self.world_to_camera.transform_point3(centre);
         let depth = -local.z;
@@ -63,12 +63,12 @@ impl<'a> Silhouette<'a> {
     }
 }
 
-/// Photographs of which one is asked to see through a cell, at least.
+/// Images per required vote, if there are few images.
 const EACH: usize = 8;
 
-/// Empties for good the cells of a grid that `votes` photographs of the dataset see through, or one of eight if they are
-/// few. What is left is the visual hull (Laurentini 1994), up to wrong masks in fewer photographs. Photographs without
-/// transparency say nothing; 0 votes empty nothing.
+/// Permanently empties the cells that `votes` images see through; of few images, one in eight suffices. The rest is the
+/// visual hull (Laurentini 1994), robust to wrong masks in fewer images. Images without transparency do not vote; 0
+/// votes carve nothing.
 pub(crate) fn carve(grid: &mut OccupancyGrid, data: &Dataset, votes: u32) {
     let views = data.frames.iter().filter_map(Silhouette::new);
     carve_views(grid, &views.collect::<Vec<_>>(), votes);

@@ -1,11 +1,11 @@
-//! What no photograph shows.
+//! Cells outside of every training camera's view.
 
 use crate::camera::pinhole::Camera;
 use crate::dataset::Dataset;
 use crate::space::occupancy::OccupancyGrid;
 use glam::DVec3;
 
-/// The cone around all that a camera sees.
+/// The cone around a camera's view.
 struct Cone {
     eye: DVec3,
     axis: DVec3,
@@ -21,7 +21,7 @@ impl Cone {
         Cone { eye: camera.pose.translation, axis, half_angle }
     }
 
-    /// Whether some of a ball may be seen farther away than `near`.
+    /// Whether a part of a ball may be visible farther away than `near`.
     fn sees(&self, centre: DVec3, radius: f64, near: f64) -> bool {
         let offset = centre - self.eye;
         let distance = offset.length();
@@ -32,8 +32,8 @@ impl Cone {
     }
 }
 
-/// Empties for good the cells of a grid that no photograph shows: nothing could be learned of them, and what a field says there
-/// would float before cameras that look from elsewhere.
+/// Permanently empties the cells outside of every camera's view: nothing is learned there, and floaters would be
+/// visible from other cameras.
 pub(crate) fn carve_unseen(grid: &mut OccupancyGrid, data: &Dataset) {
     let cones: Vec<Cone> = data.frames.iter().map(|frame| Cone::new(&frame.camera)).collect();
     grid.carve(&|centre, radius| !cones.iter().any(|cone| cone.sees(centre, radius, data.near)));

@@ -9,8 +9,8 @@ use raygrad_nn::{Adam, AdamConfig, Optimizer, OptimizerState, Params, Schedule, 
 /// Parameters of cameras, each with its own schedule.
 const CAMERAS: [&str; 5] = [POSES, FOCAL, LENS, EXPOSURE, VIGNETTING];
 
-/// The optimizer of all parameters. A parameter belongs to the first configured group that matches its name; otherwise to
-/// that of its camera parameter, of the tables (updated by rows), or of the rest.
+/// The optimizer of all parameters. A parameter belongs to the first configured group that matches its name; otherwise
+/// to that of its camera parameter, of the tables (updated by rows), or of the rest.
 pub(crate) struct Groups {
     adam: Adam<f32>,
     /// Of each group, as the optimiser numbers them.

@@ -63,8 +63,8 @@ fn alive_share(model: &Model<f32>, field: &dyn Field<f32>) -> f64 {
     moved as f64 / PROBES as f64
 }
 
-/// Whether a model in its first steps shows nothing at all: the collapse to an all-background image. `steps` is how many
-/// it has taken, and `collapses` how many models of the run have collapsed before it.
+/// Whether a model in its first steps shows nothing at all: the collapse to an all-background image. `steps` is how
+/// many it has taken, and `collapses` how many models of the run have collapsed before it.
 pub(crate) fn has_collapsed(steps: u64, opacity: f64, collapses: u32) -> bool {
     JUDGED.contains(&steps) && opacity < 1e-3 && collapses < COLLAPSES
 }

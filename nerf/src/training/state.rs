@@ -17,8 +17,8 @@ const MOST_RAYS: usize = 1 << 20;
 /// The name of the trainer's own numbers in the bytes.
 const TRAINER: &str = "trainer";
 
-/// A trainer's state beside model and optimizer. There is no random state: every random number is a function of the seed, the
-/// step and the tile.
+/// A trainer's state beside model and optimizer. There is no random state: every random number is a function of the
+/// seed, the step and the tile.
 #[derive(Serialize, Deserialize)]
 struct Counts {
     config: Config,
@@ -66,8 +66,8 @@ fn failed(what: impl ToString) -> Error {
 impl Trainer {
     /// Returns the training state as a safetensors file, to [resume](Self::load_state) from.
     ///
-    /// It holds parameters in full precision with their settings, the states of optimizer and sampler, the step, the training
-    /// time and the number of rays. Configuration and images are not part of it.
+    /// It holds parameters in full precision with their settings, the states of optimizer and sampler, the step, the
+    /// training time and the number of rays. Configuration and images are not part of it.
     ///
     /// # Errors
     /// If the format cannot hold it.
@@ -137,7 +137,7 @@ impl Trainer {
             let is_own = |other: &str| other == name;
             if !(*rate >= 0.0 && rate.is_finite() && *decay >= 0.0 && decay.is_finite()) {
                 return Err(failed(format!(
-                    "has an lr scale of {rate} and a weight decay scale of {decay} for `{name}`; use finite numbers of at least 0"
+                    "has an lr scale of {rate} and a weight decay scale of {decay} for `{name}`; use at least 0"
                 )));
             }
             if *frozen {
@@ -164,8 +164,8 @@ impl Trainer {
 impl Model<f32> {
     /// Returns the model of a training [state](Trainer::state), ready to render.
     ///
-    /// It keeps this model's [`appearance_image`](Self::appearance_image) and skipping, and updates the occupancy grid as
-    /// [`load`](Self::load) does.
+    /// It keeps this model's [`appearance_image`](Self::appearance_image) and skipping, and updates the occupancy grid
+    /// as [`load`](Self::load) does.
     ///
     /// ```no_run
     /// use raygrad_nerf::dataset::{Split, load};
@@ -272,11 +272,11 @@ mod tests {
             params.to_safetensors(Storage::Full, &BTreeMap::new(), &blobs).unwrap()
         };
         let states = [
-            (written(&|counts| counts.batch = 0), "steps of 0 rays"),
+            (written(&|counts| counts.batch = 0), "has 0 rays per step; use 1 to 1048576"),
             (written(&|counts| counts.batch = usize::MAX), "rays; use 1 to"),
-            (written(&|counts| counts.settings[0].rate = -1.0), "a learning rate times -1"),
-            (written(&|counts| counts.settings[1].decay = -2.0), "a decay times -2"),
-            (written(&|counts| counts.pace = -1.0), "learning rates times -1"),
+            (written(&|counts| counts.settings[0].rate = -1.0), "has an lr scale of -1"),
+            (written(&|counts| counts.settings[1].decay = -2.0), "a weight decay scale of -2"),
+            (written(&|counts| counts.pace = -1.0), "has an lr scale of -1; use a finite number of at least 0"),
             (written(&|counts| counts.groups = 9), "lacks a part of the optimizer's state"),
             (written(&|counts| counts.groups = 0), "groups"),
             (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),

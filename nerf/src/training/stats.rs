@@ -111,8 +111,8 @@ impl StepStats {
         self.non_finite_steps >= STUCK
     }
 
-    /// Returns whether a run that ends at this step has diverged: as [`has_diverged`](Self::has_diverged), or without a finite
-    /// gradient in its second half.
+    /// Returns whether a run that ends at this step has diverged: as [`has_diverged`](Self::has_diverged), or without a
+    /// finite gradient in its second half.
     pub fn ends_diverged(&self) -> bool {
         self.has_diverged() || (self.non_finite_steps > 0 && 2 * self.non_finite_steps >= self.step)
     }

@@ -78,8 +78,8 @@ impl Trainer {
     /// Creates a model and its trainer for a dataset.
     ///
     /// # Errors
-    /// If the configuration is out of range or does not fit the [type of scene](Dataset::scope), if the dataset has no frame, or
-    /// if none of its rays [meets the scene box](Dataset::check_reach).
+    /// If the configuration is out of range or does not fit the [type of scene](Dataset::scope). If the dataset has no
+    /// frame, or none of its rays [meets the scene box](Dataset::check_reach).
     pub fn new(config: Config, data: Arc<Dataset>) -> Result<Self> {
         if data.scope.is_unbounded() && !config.unbounded {
             let what = "is false, but the dataset is unbounded; use `Config::with_scene_type` with the dataset's type";
@@ -104,8 +104,8 @@ impl Trainer {
         Trainer::with_clock(config, data, extent, move || start.elapsed())
     }
 
-    /// Creates a trainer as [`with_extent`](Self::with_extent), with a clock for training time: it returns the time since a fixed
-    /// moment.
+    /// Creates a trainer as [`with_extent`](Self::with_extent), with a clock for training time: it returns the time
+    /// since a fixed moment.
     ///
     /// # Errors
     /// As [`new`](Self::new).
@@ -264,7 +264,8 @@ impl Trainer {
         self.pace
     }
 
-    /// Sets the lr scale, which multiplies all learning rates from the next step on. It is part of the [state](Self::state).
+    /// Sets the lr scale, which multiplies all learning rates from the next step on. It is part of the
+    /// [state](Self::state).
     ///
     /// # Panics
     /// If it is negative or not finite.
@@ -273,7 +274,8 @@ impl Trainer {
         self.pace = pace;
     }
 
-    /// Finds the first infinite or NaN value that the next step would compute, with `fraction` as in [`step`](Self::step).
+    /// Finds the first infinite or NaN value that the next step would compute, with `fraction` as in
+    /// [`step`](Self::step).
     ///
     /// The error names the operation or gradient, the source line that recorded it and the element; see
     /// [`Tape::check_finite`]. Returns `None` if all values are finite. It explains why a run [has

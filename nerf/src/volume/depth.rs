@@ -9,8 +9,8 @@ use raygrad_tensor::map;
 
 /// The operation `x_i = sigma_i delta_i`: densities `[samples]` to optical depths `[samples]`.
 ///
-/// Densities are at least 0, or given as logarithms (see [`of_log_density`](Self::of_log_density)). A density of 0 has the
-/// optical depth 0 even if `delta` is infinite; where `delta` is infinite the gradient is defined as 0.
+/// Densities are at least 0, or given as logarithms (see [`of_log_density`](Self::of_log_density)). A density of 0 has
+/// the optical depth 0 even if `delta` is infinite; where `delta` is infinite the gradient is defined as 0.
 #[derive(Debug, Clone)]
 pub struct OpticalDepth<T: Scalar> {
     delta: Tensor<T>,
@@ -45,8 +45,8 @@ impl<T: Scalar> OpticalDepth<T> {
 
     /// Creates the operation for log densities z, `sigma = e^z`.
     ///
-    /// The fused exponential keeps gradients finite: its gradient is `x`, and [weights](super::Weights) multiply it by `e^-x`. A
-    /// separate exponential would give infinity times 0.
+    /// The fused exponential keeps gradients finite: its gradient is `x`, and [weights](super::Weights) multiply it by
+    /// `e^-x`. A separate exponential would give infinity times 0.
     ///
     /// # Panics
     /// If an interval is negative or NaN.
@@ -161,8 +161,8 @@ impl<T: Scalar> Op<T> for OpticalDepth<T> {
     }
 }
 
-/// The catalogue entries of this file. [`OpticalDepth`] holds a tensor of its own number type, so each precision has its
-/// own.
+/// The catalogue entries of this file. [`OpticalDepth`] holds a tensor of its own number type, so each precision has
+/// its own.
 #[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let delta = || Tensor::<f64>::from_vec(&[7], vec![0.25, 0.5, 0.125, 0.5, 1.0, 0.0, 0.375]);

@@ -4,8 +4,8 @@
 use raygrad_autograd::check::Entry;
 use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeError, Tensor, Var, Vjp};
 
-/// The operation `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` for each ray: weights `w` `[samples]` to `[rays]`, with
-/// midpoints `m` and interval lengths `d` (Barron et al. 2022, mip-NeRF 360, equation 15).
+/// The operation `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` for each ray: weights `w` `[samples]` to `[rays]`,
+/// with midpoints `m` and interval lengths `d` (Barron et al. 2022, mip-NeRF 360, equation 15).
 ///
 /// The double sum is `w . D w` with `(D w)_i = sum_j w_j |m_i - m_j|`, of which two passes give the part from the left,
 /// `L_(i+1) = L_i + W_i (m_(i+1) - m_i)` with W the sum of the weights so far, and the part from the right. Nothing is
@@ -23,8 +23,8 @@ impl<T: Scalar> Distortion<T> {
     /// Creates the operation for midpoints `[samples]`, rising within each ray, and interval lengths `[samples]`.
     ///
     /// # Panics
-    /// If there is not one midpoint and one length per row of the segments, midpoints fall within a ray, or a length is negative or
-    /// NaN.
+    /// If there is not one midpoint and one length per row of the segments, midpoints fall within a ray, or a length is
+    /// negative or NaN.
     #[track_caller]
     pub fn new(midpoints: Tensor<T>, lengths: Tensor<T>, segments: Segments) -> Self {
         for (what, values) in [("midpoint", &midpoints), ("length", &lengths)] {
@@ -128,7 +128,8 @@ impl<T: Scalar> Op<T> for Distortion<T> {
     }
 }
 
-/// The catalogue entries of this file. [`Distortion`] holds tensors of its own number type, so each precision has its own.
+/// The catalogue entries of this file. [`Distortion`] holds tensors of its own number type, so each precision has its
+/// own.
 #[cfg(any(test, feature = "check"))]
 pub(crate) fn entries() -> Vec<Entry> {
     let midpoints = || Tensor::<f64>::from_vec(&[7], vec![0.125, 0.25, 0.75, 0.5, 0.0, 0.0, 0.875]);
@@ -153,7 +154,7 @@ mod tests {
     use raygrad_autograd::Tape;
 
     #[test]
-    #[should_panic(expected = "the midpoints of ray 1 do not rise")]
+    #[should_panic(expected = "the midpoints of ray 1 must rise")]
     fn midpoints_must_rise() {
         Distortion::new(
             Tensor::from_vec(&[3], vec![0.9, 0.5, 0.4]),

@@ -17,16 +17,17 @@ pub struct VisibleSamples<'t, T: Scalar> {
     pub visible: usize,
 }
 
-/// Samples that each ray takes in the first round. Each further round takes twice as many: few rounds, and at most about
-/// as many samples in vain as there were needed.
+/// Samples that each ray takes in the first round. Each further round takes twice as many: few rounds, and at most
+/// about as many samples in vain as there were needed.
 const FIRST_ROUND: usize = 4;
 
 impl Quadrature {
     /// Renders `steps` by this rule, with early ray termination in two passes.
     ///
-    /// An unrecorded pass finds the visible samples, where the transmittance exceeds `termination`. A recorded pass evaluates those
-    /// and reuses the outputs of [cacheable](raygrad_autograd::Op::is_cacheable) operations. With a `termination` of 0 there is only
-    /// the second pass, on all samples. Dropped samples change a pixel by at most `termination` times the range of colours.
+    /// An unrecorded pass finds the visible samples, where the transmittance exceeds `termination`. A recorded pass
+    /// evaluates those and reuses the outputs of [cacheable](raygrad_autograd::Op::is_cacheable) operations. With a
+    /// `termination` of 0 there is only the second pass, on all samples. Dropped samples change a pixel by at most
+    /// `termination` times the range of colours.
     pub fn render<'t, T: Scalar>(
         self,
         query: &Query<'_, 't, T>,

@@ -1,8 +1,8 @@
 //! Volume rendering: from densities and colours of samples to the colours of rays.
 //!
-//! Training, renders and references share the operations
-//! [density](crate::Density) → [`OpticalDepth`] → [`Weights`] → [`Accumulate`] (of colours, distances or normals).
-//! [`Rendered`] holds all results of a batch of rays. A [`quadrature::Quadrature`] chooses the samples and their weights.
+//! Training, renders and references share the operations [density](crate::Density) → [`OpticalDepth`] → [`Weights`] →
+//! [`Accumulate`] (of colours, distances or normals). [`Rendered`] holds all results of a batch of rays. A
+//! [`quadrature::Quadrature`] chooses the samples and their weights.
 //!
 //! # Notation
 //!
@@ -17,8 +17,8 @@
 //! | `w = T alpha` | weight of a sample | `[samples]` | 0 to 1 |
 //! | `c` | colour of a sample | `[samples, 3]` | 0 to 1 |
 //!
-//! The colour of a ray is `sum w c`, its opacity `sum w`, its depth sum `sum w t` (Mildenhall et al. 2020, equation 3; Max
-//! 1995). Samples are packed: those of all rays stand one after another, and `Segments` holds the rows of each ray.
+//! The colour of a ray is `sum w c`, its opacity `sum w`, its depth sum `sum w t` (Mildenhall et al. 2020, equation 3;
+//! Max 1995). Samples are packed: those of all rays stand one after another, and `Segments` holds the rows of each ray.
 //!
 //! # Example
 //!

@@ -51,7 +51,8 @@ pub fn weights<'t, T: Scalar>(x: &Var<'t, T>, segments: &Segments) -> Var<'t, T>
     x.tape().apply(Weights::new(segments.clone()), &[x])
 }
 
-/// Sums `values` `[samples, channels]` times `weights` `[samples]` along rays, to `[rays, channels]`: see [`Accumulate`].
+/// Sums `values` `[samples, channels]` times `weights` `[samples]` along rays, to `[rays, channels]`: see
+/// [`Accumulate`].
 ///
 /// # Panics
 /// If there is not one weight and one row of values per sample.
@@ -119,8 +120,8 @@ impl<'t, T: Scalar> Rendered<'t, T> {
         &self.color + left * self.color.tape().constant(background.clone())
     }
 
-    /// Computes the unit normal `-grad sigma / |grad sigma|` at each sample, `[samples, 3]`; 0 where the density is constant. It is
-    /// recorded, so that losses of normals are differentiable.
+    /// Computes the unit normal `-grad sigma / |grad sigma|` at each sample, `[samples, 3]`; 0 where the density is
+    /// constant. It is recorded, so that losses of normals are differentiable.
     ///
     /// # Panics
     /// If positions are not on the tape: see [`Query::slopes`](super::Query::slopes).
@@ -130,8 +131,8 @@ impl<'t, T: Scalar> Rendered<'t, T> {
         downhill(&self.density.value.sum().grad_graph(&[&self.positions]).remove(0))
     }
 
-    /// Computes the sum of weights times [normals](Self::normals) along rays, `[rays, 3]`, as plain numbers. Its length is at most the
-    /// opacity.
+    /// Computes the sum of weights times [normals](Self::normals) along rays, `[rays, 3]`, as plain numbers. Its length
+    /// is at most the opacity.
     ///
     /// # Panics
     /// As [`normals`](Self::normals), or if the density does not depend on positions.

@@ -63,8 +63,8 @@ impl<'a, T: Scalar> FrontToBack<'a, T> {
         (ROUND / self.depths.len().max(1)).max(LEAST)
     }
 
-    /// At most `count` samples of each ray that still has light; `None` if no ray has any. The caller adds their optical
-    /// depth to `depths`.
+    /// At most `count` samples of each ray that still has light; `None` if no ray has any. The caller adds their
+    /// optical depth to `depths`.
     pub fn take(&mut self, count: usize, pool: &Pool<T>) -> Option<Stretch<T>> {
         let piece = |(ray, rows): (usize, Range<usize>)| {
             let start = rows.start + self.passed;

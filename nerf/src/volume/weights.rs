@@ -6,14 +6,14 @@ use raygrad_autograd::{Grads, Op, Pool, Reads, Scalar, Segments, Shape, ShapeErr
 use raygrad_tensor::map;
 use std::sync::Arc;
 
-/// The operation `w_i = T_i alpha_i`: optical depths `x` `[samples]` to weights `[samples]`, front to back along each ray
-/// (Mildenhall et al. 2020, equation 3; Max 1995).
+/// The operation `w_i = T_i alpha_i`: optical depths `x` `[samples]` to weights `[samples]`, front to back along each
+/// ray (Mildenhall et al. 2020, equation 3; Max 1995).
 ///
-/// `alpha_i = 1 - exp(-x_i)`, and `T_i = exp(-sum of x_j for j < i)` is the transmittance in front of the sample. Together with
-/// the transmittance behind the last sample, `exp(-sum x)`, the weights of a ray sum to 1.
+/// `alpha_i = 1 - exp(-x_i)`, and `T_i = exp(-sum of x_j for j < i)` is the transmittance in front of the sample.
+/// Together with the transmittance behind the last sample, `exp(-sum x)`, the weights of a ray sum to 1.
 ///
-/// The gradient runs back to front: `B_i = alpha_i g_i + (1 - alpha_i) B_(i+1)` and `dx_i = T_(i+1) (g_i - B_(i+1))`. It divides
-/// by no transmittance, so it is accurate behind opaque samples too.
+/// The gradient runs back to front: `B_i = alpha_i g_i + (1 - alpha_i) B_(i+1)` and `dx_i = T_(i+1) (g_i - B_(i+1))`.
+/// It divides by no transmittance, so it is accurate behind opaque samples too.
 ///
 /// ```
 /// use raygrad_autograd::{Segments, Tape, Tensor};
@@ -37,8 +37,8 @@ impl Weights {
         Weights { segments, before: None }
     }
 
-    /// Creates the operation with an optical depth `before` `[rays]`, at least 0, in front of each ray's first sample, for rays that
-    /// are marched piece by piece.
+    /// Creates the operation with an optical depth `before` `[rays]`, at least 0, in front of each ray's first sample,
+    /// for rays that are marched piece by piece.
     ///
     /// # Panics
     /// If `before` has not one entry per ray.

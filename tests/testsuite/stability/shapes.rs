@@ -127,11 +127,11 @@ impl Einsum for V<'_> {
 /// index out of bounds, an overflow, an `unwrap`.
 const MESSAGES: [&str; 6] = [
     "one_hot: index",
-    "rotation vectors of three elements",
+    "the last axis of rotation vectors must be 3",
     "searchsorted in a scalar",
     "searchsorted of shapes",
     "segment offsets do not fall",
-    "spherical harmonics of degree",
+    "the degree of spherical harmonics must be 1 to 4",
 ];
 
 /// Whether a panic is one that was written for a user.

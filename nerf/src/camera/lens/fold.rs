@@ -62,8 +62,8 @@ impl Domain {
         slope
     }
 
-    /// The distance from the axis up to which the distortion is of use in this direction, of length 1; `None` if that is
-    /// more than `end`.
+    /// The distance from the axis up to which the distortion is of use in this direction, of length 1; `None` if that
+    /// is more than `end`.
     pub(crate) fn edge(&self, e: [f64; 2], end: f64) -> Option<f64> {
         let s = end * end;
         let pole = first_root(&self.denominator, s).map(f64::sqrt);

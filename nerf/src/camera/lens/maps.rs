@@ -40,8 +40,8 @@ pub(crate) fn rational<E: Real>(c: [E; 8], [x, y]: [E; 2]) -> [E; 2] {
     decentred(rational_factor(c, x * x + y * y), [c[6], c[7]], [x, y])
 }
 
-/// COLMAP's distortion of places of THIN_PRISM_FISHEYE, with the coefficients `k1 .. k4, p1, p2, sx1, sy1`; OpenCV's and
-/// COLMAP's of other fisheyes with zeros in place of the last four.
+/// COLMAP's distortion of places of THIN_PRISM_FISHEYE, with the coefficients `k1 .. k4, p1, p2, sx1, sy1`; OpenCV's
+/// and COLMAP's of other fisheyes with zeros in place of the last four.
 #[inline(always)]
 pub(crate) fn thin_prism<E: Real>(c: [E; 8], [x, y]: [E; 2]) -> [E; 2] {
     let s = x * x + y * y;

@@ -1,7 +1,8 @@
 //! The NeRF-synthetic format (Mildenhall et al. 2020): `transforms_train.json`, `transforms_val.json` and
 //! `transforms_test.json`, written by Blender.
 //!
-//! Camera fields of [`transforms`](super::transforms) count here too, except `camera_angle_y`, which is that of Blender's sensor.
+//! Camera fields of [`transforms`](super::transforms) count here too, except `camera_angle_y`, which is that of
+//! Blender's sensor.
 
 use super::frames::{Dialect, views};
 use super::json::{self, Object};
@@ -33,8 +34,8 @@ pub(crate) fn detect(folder: &Path) -> bool {
 
 /// Reads the files of all splits, in the order train, val, test.
 ///
-/// [`Capture::file`] is the first of them; views of the others name theirs in [`field`](View::field). Without a size in the file,
-/// all images have that of the first existing one.
+/// [`Capture::file`] is the first of them; views of the others name theirs in [`field`](View::field). Without a size in
+/// the file, all images have that of the first existing one.
 ///
 /// # Errors
 /// If there is no file, or one cannot be read, lacks a field, or has a field that is wrong or unsupported.
@@ -69,8 +70,8 @@ pub fn read(folder: &Path) -> Result<Capture> {
 /// The format has one size and one field of view for all images, and no points, depths or sharpness.
 ///
 /// # Errors
-/// If there are no views, some have masks, only some have splits, cameras differ, or cameras are not centred pinholes with square
-/// pixels; or if a file cannot be written.
+/// If there are no views, some have masks, only some have splits, cameras differ, or cameras are not centred pinholes
+/// with square pixels; or if a file cannot be written.
 pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     let bad = |what: String| Err(Error::file(folder, format!("cannot be written in Blender's format: {what}")));
     let Some(first) = capture.views.first() else { return bad("there are no images".to_owned()) };

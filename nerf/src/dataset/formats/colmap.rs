@@ -1,9 +1,9 @@
 //! COLMAP's sparse reconstructions (Schönberger and Frahm 2016): `cameras`, `images` and `points3D`, each a `.bin` or
 //! a `.txt` file.
 //!
-//! Poses are world-to-camera, a quaternion (real part first) and a translation, for a camera that looks along `+z` with `+y` down.
-//! Pixel coordinates are those of [`Camera`]. `rigs` and `frames` of version 3.12 and later are not read: image poses are still in
-//! `images`.
+//! Poses are world-to-camera, a quaternion (real part first) and a translation, for a camera that looks along `+z` with
+//! `+y` down. Pixel coordinates are those of [`Camera`]. `rigs` and `frames` of version 3.12 and later are not read:
+//! image poses are still in `images`.
 
 mod beside;
 mod binary;
@@ -47,8 +47,8 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// Reads the cameras and points of `folder`, views in the order of their names. No image is decoded.
 ///
 /// # Errors
-/// If a file is absent or damaged, an image has no camera, an identifier or name is duplicated, a camera model is not supported, or
-/// a number is not finite. The error names the file and the entry or line.
+/// If a file is absent or damaged, an image has no camera, an identifier or name is duplicated, a camera model is not
+/// supported, or a number is not finite. The error names the file and the entry or line.
 pub fn read(folder: &Path) -> Result<Capture> {
     let Some((model, encoding)) = find(folder) else {
         let what = "has no COLMAP model: expected cameras.bin and images.bin, or both as .txt, in sparse/0";
@@ -66,12 +66,12 @@ pub fn read(folder: &Path) -> Result<Capture> {
 
 /// Writes the cameras and points of `capture` to `sparse/0` in `folder`.
 ///
-/// The caller puts each image in `images` under the name of its view. Views with equal cameras share an entry. Tracks of points
-/// are not written.
+/// The caller puts each image in `images` under the name of its view. Views with equal cameras share an entry. Tracks
+/// of points are not written.
 ///
 /// # Errors
-/// If COLMAP has no model for a camera, a name or number cannot be written, the folder holds another model that would be read
-/// instead, or a file cannot be written. The error names the view or the file.
+/// If COLMAP has no model for a camera, or a name or number cannot be written. If the folder holds another model that
+/// would be read instead, or a file cannot be written. The error names the view or the file.
 pub fn write(capture: &Capture, folder: &Path, encoding: Encoding) -> Result<()> {
     let table = Table::new(capture, encoding)?;
     let folder = folder.join("sparse").join("0");

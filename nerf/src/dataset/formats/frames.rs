@@ -80,8 +80,8 @@ fn beside(frame: &Object<'_>, folder: &Path, name: &str, needed: bool) -> Result
     }
 }
 
-/// A file of depths with its unit: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which is only used with
-/// an `integer_depth_scale`.
+/// A file of depths with its unit: nerfstudio's `depth_file_path`, or instant-ngp's `depth_path`, which is only used
+/// with an `integer_depth_scale`.
 fn depth(top: &Object<'_>, frame: &Object<'_>, folder: &Path, needed: bool) -> Result<Option<(PathBuf, f64)>> {
     let layers = Layers { top, frame };
     let unit = layers.find("depth_unit_scale_factor", |object, name| object.positive(name))?;

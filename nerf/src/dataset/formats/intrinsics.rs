@@ -83,8 +83,8 @@ impl Layers<'_, '_> {
         }
     }
 
-    /// The camera at `pose`. `header` is asked for the size of the image where the file says none, and gives zeros where
-    /// there is no image either. `angle_y`: whether `camera_angle_y` is that of the image; Blender's is that of its sensor.
+    /// The camera at `pose`. `header` reads the image size where the file gives none, and returns zeros without an
+    /// image. `angle_y`: whether `camera_angle_y` is that of the image; Blender's is that of its sensor.
     pub(super) fn camera(
         &self,
         pose: DAffine3,
@@ -109,7 +109,8 @@ impl Layers<'_, '_> {
         Ok(Camera { width, height, focal, centre, lens, pose })
     }
 
-    /// Focal lengths: those of the frame if it has any, otherwise the file's. One alone counts for both, as in instant-ngp.
+    /// Focal lengths: those of the frame if it has any, otherwise the file's. One alone counts for both, as in
+    /// instant-ngp.
     fn focal(&self, size: [usize; 2], angle_y: bool) -> Result<[f64; 2]> {
         let [top, frame] = [focal_of(self.top, size, angle_y)?, focal_of(self.frame, size, angle_y)?];
         let given = if frame == [None; 2] { top } else { frame };

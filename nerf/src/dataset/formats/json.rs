@@ -21,8 +21,8 @@ pub(super) fn write(file: &Path, object: &Value) -> Result<()> {
     write_atomic(file, (text + "\n").as_bytes())
 }
 
-/// Parses JSON. Python also writes NaN and Infinity, which JSON does not have: they are read as strings, so that the error
-/// can name the field instead of a line. (As null they would count as absent.)
+/// Parses JSON. Python also writes NaN and Infinity, which JSON does not have: they are read as strings, so that the
+/// error can name the field instead of a line. (As null they would count as absent.)
 fn parse(text: &str) -> serde_json::Result<Value> {
     let text = text.trim_start_matches('\u{feff}');
     serde_json::from_str(text).or_else(|error| serde_json::from_str(&quoted(text)).map_err(|_| error))

@@ -67,7 +67,7 @@ pub(super) fn is_whole(capture: &Capture) {
     }
 }
 
-/// A capture of one photograph, which is written to `images`, that every format can hold.
+/// A capture of one image, written to `images`, that every format can hold.
 pub(super) fn picture_with_camera(folder: &Path) -> Capture {
     let image = folder.join("images/0.png");
     picture(&image, 8, 6);

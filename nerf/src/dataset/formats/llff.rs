@@ -1,8 +1,8 @@
 //! `poses_bounds.npy` of LLFF (Mildenhall et al. 2019): a row of 17 numbers for each image.
 //!
-//! The first 15 are a 3x5 matrix: the camera's directions down, right and backwards, its position, and height, width and focal
-//! length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of the folder `images` in the order
-//! of their names.
+//! The first 15 are a 3x5 matrix: the camera's directions down, right and backwards, its position, and height, width
+//! and focal length in pixels. The last two are the nearest and farthest depth. Rows belong to the images of the folder
+//! `images` in the order of their names.
 
 use super::limits::MOST_PIXELS;
 use super::npy::Matrix;
@@ -27,8 +27,8 @@ pub(crate) fn detect(folder: &Path) -> bool {
 /// Reads the cameras of `folder`. No image is decoded.
 ///
 /// # Errors
-/// If a file is absent or damaged, the numbers of images and cameras differ, or a number is not valid for a camera. The error names
-/// the file and the row, counted from 0.
+/// If a file is absent or damaged, the numbers of images and cameras differ, or a number is not valid for a camera. The
+/// error names the file and the row, counted from 0.
 pub fn read(folder: &Path) -> Result<Capture> {
     let file = folder.join(FILE);
     let bytes = std::fs::read(&file).map_err(|e| Error::file(&file, format!("cannot be read: {e}")))?;
@@ -134,8 +134,8 @@ fn names(folder: &Path) -> Result<Vec<String>> {
 /// The caller puts each image in `images` under the name of its view.
 ///
 /// # Errors
-/// If the cameras differ in more than their poses, are not centred pinholes, or a view has no bounds or no plain image name; or if
-/// the file cannot be written. The error names the view.
+/// If the cameras differ in more than their poses, or are not centred pinholes. If a view has no bounds or no plain
+/// image name, or the file cannot be written. The error names the view.
 pub fn write(capture: &Capture, folder: &Path) -> Result<()> {
     let mut views: Vec<&View> = capture.views.iter().collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));

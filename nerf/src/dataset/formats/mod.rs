@@ -1,7 +1,7 @@
 //! Readers and writers of capture formats: [`blender`], [`transforms`], [`colmap`] and [`llff`].
 //!
-//! Start with [`read`], which recognises the format. Each module's `read` parses cameras without decoding images; its `write`
-//! writes everything but the images.
+//! Start with [`read`], which recognises the format. Each module's `read` parses cameras without decoding images; its
+//! `write` writes everything but the images.
 
 pub mod blender;
 pub mod colmap;
@@ -26,8 +26,8 @@ use std::path::Path;
 
 /// Reads the capture in a folder, in whatever format it has.
 ///
-/// If there are several, it takes the first of `transforms.json`, Blender, COLMAP and LLFF: earlier ones hold more, and are usually
-/// derived from later ones.
+/// If there are several, it takes the first of `transforms.json`, Blender, COLMAP and LLFF: earlier ones hold more, and
+/// are usually derived from later ones.
 ///
 /// # Errors
 /// If the folder holds none of them, or as the format's own `read`.

@@ -16,7 +16,7 @@ pub(in crate::dataset) struct Matrix {
 /// How a file begins.
 pub(in crate::dataset) const MAGIC: &[u8] = b"\x93NUMPY";
 
-/// What a file that is no npy file is told.
+/// The error of a damaged file.
 const BROKEN: &str = "is not a complete npy file: copy it again";
 
 impl Matrix {
@@ -152,17 +152,17 @@ mod tests {
         let of = |descr: &str, shape: &str, size: usize| {
             file(1, &format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}"), &vec![0; size])
         };
-        fails(b"", "not a whole npy file");
-        fails(b"\x93NUMPY\x01\x00\xff\xff{}", "not a whole npy file");
-        fails(&file(4, "{}", &[]), "not a whole npy file");
+        fails(b"", "is not a complete npy file: copy it again");
+        fails(b"\x93NUMPY\x01\x00\xff\xff{}", "is not a complete npy file: copy it again");
+        fails(&file(4, "{}", &[]), "is not a complete npy file: copy it again");
         fails(&of("<i8", "1, 1", 8), "of type `<i8`");
         fails(&of("<f8\n", "1, 1", 8), "of type `<f8\\n`");
         fails(&of("<f8", "1,", 8), "has 1 axes");
         fails(&of("<f8", "1, 1, 1", 8), "has 3 axes");
-        fails(&of("<f8", "1, x", 8), "not a whole npy file");
-        fails(&of("<f8", "2, 1", 8), "8 bytes of elements, which is not what shape (2, 1) needs");
+        fails(&of("<f8", "1, x", 8), "is not a complete npy file: copy it again");
+        fails(&of("<f8", "2, 1", 8), "has 8 bytes of elements, which do not fit the shape (2, 1): copy it again");
         // Announces more than any memory holds.
         fails(&of("<f8", "4294967296, 4294967297", 8), "8 bytes of elements");
-        fails(&of("<f8", "99999999999999999999, 1", 8), "not a whole npy file");
+        fails(&of("<f8", "99999999999999999999, 1", 8), "is not a complete npy file: copy it again");
     }
 }

@@ -1,7 +1,7 @@
 //! `transforms.json` of instant-ngp (Mueller et al. 2022) and nerfstudio (Tancik et al. 2023).
 //!
-//! Camera parameters stand at the top of the file or in its frames; those of a frame take precedence. Poses are read unchanged:
-//! instant-ngp's `scale` and `offset`, and other fields that do not affect cameras, are ignored.
+//! Camera parameters stand at the top of the file or in its frames; those of a frame take precedence. Poses are read
+//! unchanged: instant-ngp's `scale` and `offset`, and other fields that do not affect cameras, are ignored.
 
 use super::frames::{Dialect, views};
 use super::json::{self, Object, shown};
@@ -29,12 +29,12 @@ pub(crate) fn detect(folder: &Path) -> bool {
 
 /// Reads `transforms.json`, without decoding images.
 ///
-/// Splits come from `train_filenames`, `val_filenames` and `test_filenames`; an image in both of the latter, as nerfstudio writes
-/// for a single held-out set, is a test image.
+/// Splits come from `train_filenames`, `val_filenames` and `test_filenames`; an image in both of the latter, as
+/// nerfstudio writes for a single held-out set, is a test image.
 ///
 /// # Errors
-/// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported; if a mask or depth file is absent or
-/// damaged; or if the points file is damaged.
+/// If the file cannot be read, lacks a field, or has a field that is wrong or unsupported. If a mask or depth file is
+/// absent or damaged, or the points file is damaged.
 pub fn read(folder: &Path) -> Result<Capture> {
     let file = folder.join(FILE);
     let document = json::read(&file)?;
@@ -57,7 +57,7 @@ pub fn read(folder: &Path) -> Result<Capture> {
     Ok(Capture { points, points_file, aabb_scale, applied, ..capture })
 }
 
-/// The field that lists the photographs of a split.
+/// The field that lists the images of a split.
 fn list(split: Split) -> String {
     format!("{split}_filenames")
 }
@@ -91,7 +91,8 @@ fn read_splits(top: &Object<'_>, views: &mut [View]) -> Result<()> {
 
 /// Writes `transforms.json` into `folder`, as nerfstudio reads it, and `sparse_pc.ply` if there are points.
 ///
-/// The caller copies images, masks and depths to the same relative paths. The format has no [bounds](View::bounds) of views.
+/// The caller copies images, masks and depths to the same relative paths. The format has no [bounds](View::bounds) of
+/// views.
 ///
 /// # Errors
 /// If there are no views, a camera has no size or a non-finite number, or a file cannot be written.
@@ -208,8 +209,8 @@ fn relative(capture: &Capture, folder: &Path, path: &Path, file: &Path) -> Resul
     Ok(if cfg!(windows) { text.replace('\\', "/") } else { text.to_owned() })
 }
 
-/// Writes the lists of the splits, if there are any. nerfstudio then wants all: where there is no set for validation it is
-/// that for tests, which [`read`] knows.
+/// Writes the lists of the splits, if there are any. nerfstudio then wants all: where there is no set for validation it
+/// is that for tests, which [`read`] knows.
 fn write_splits(views: &[View], top: &mut Map<String, Value>) {
     if views.iter().all(|view| view.split.is_none()) {
         return;

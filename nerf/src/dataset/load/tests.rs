@@ -229,10 +229,7 @@ fn an_object_before_white_is_bounded() {
         capture.analyze_scene(None).unwrap()
     };
     let white = paint(1.0, 0);
-    assert_eq!(
-        (white.scene_type, &white.reason[..41]),
-        (SceneType::Bounded, "photographs show an object before white; ")
-    );
+    assert_eq!((white.scene_type, &white.reason[..41]), (SceneType::Bounded, "images show an object before white; "));
     assert_eq!(paint(0.9, 0).scene_type, SceneType::Unbounded);
     assert_eq!(paint(1.0, 9).scene_type, SceneType::Unbounded, "a spot on the border of each");
     // Of three that are looked at, all have to be so.

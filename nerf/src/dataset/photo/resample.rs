@@ -3,8 +3,8 @@
 use super::{Photo, Values};
 use crate::dataset::average::Stored;
 
-/// How many pixels of the photograph a new one must be wide before it is averaged over more than one place. A little above
-/// one: less shows no aliasing, and an average would only blur.
+/// The width of a new pixel, in pixels of the image, above which it is averaged over more than one place. A little
+/// above one: less shows no aliasing, and an average would only blur.
 const COVERED: f64 = 1.25;
 /// Places in a row and in a column of a new pixel, at most.
 const MOST_PLACES: usize = 16;
@@ -12,8 +12,8 @@ const MOST_PLACES: usize = 16;
 impl Photo {
     /// Resamples to another pixel grid; `from` maps each continuous position in the new image to one in this image.
     ///
-    /// Values are interpolated by cubic splines (Catmull and Rom 1974). A new pixel that covers several is the average over as many
-    /// places. Outside of the image the border repeats. Colours are weighted by alpha.
+    /// Values are interpolated by cubic splines (Catmull and Rom 1974). A new pixel that covers several is the average
+    /// over as many places. Outside of the image the border repeats. Colours are weighted by alpha.
     ///
     /// # Panics
     /// If a side is 0.
@@ -53,14 +53,14 @@ impl Photo {
     }
 }
 
-/// Where a new pixel is in the photograph: its middle, and how far one goes by a pixel across and down.
+/// The position of a new pixel in the image: its centre, and the steps of a pixel across and down.
 struct Place {
     middle: [f64; 2],
     across: [f64; 2],
     down: [f64; 2],
 }
 
-/// The places of all pixels row by row. `from` is asked for each once: steps are the differences of neighbours.
+/// The places of all pixels, row by row. `from` is evaluated once per pixel: steps are the differences of neighbours.
 fn places([width, height]: [usize; 2], from: impl Fn([f64; 2]) -> [f64; 2]) -> impl Iterator<Item = Place> {
     // From the one before the first pixel to the one after the last.
     let row = move |y: f64| -> Vec<[f64; 2]> { (0..width + 2).map(|x| from([x as f64 - 0.5, y])).collect() };

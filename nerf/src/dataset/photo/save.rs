@@ -21,7 +21,8 @@ struct About {
 }
 
 impl Photo {
-    /// Writes the image in the format of the file extension: PNG (16 bits where it has them), JPEG of quality 95, or lossless WebP.
+    /// Writes the image in the format of the file extension: PNG (16 bits where it has them), JPEG of quality 95, or
+    /// lossless WebP.
     ///
     /// # Errors
     /// If the extension is another, a JPEG would need an alpha channel, or the file cannot be written.
@@ -49,7 +50,8 @@ impl Photo {
 
 /// Copies an image file and applies its EXIF orientation to the pixels.
 ///
-/// Other EXIF data, such as the focal length, stays. Without a rotation, the file is copied byte for byte if it can be decoded.
+/// Other EXIF data, such as the focal length, stays. Without a rotation, the file is copied byte for byte if it can be
+/// decoded.
 ///
 /// # Errors
 /// If the file cannot be read, decoded or written.

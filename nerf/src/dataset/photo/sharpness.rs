@@ -13,7 +13,8 @@ impl Photo {
     }
 }
 
-/// The variance of the Laplacian of a grey image, which gives its lines by their number; 0 if a side is shorter than 3 pixels.
+/// The variance of the Laplacian of a grey image, which gives its lines by their number; 0 if a side is shorter than 3
+/// pixels.
 pub(crate) fn laplacian_variance([width, height]: [usize; 2], line: impl Fn(usize) -> Vec<f32>) -> f64 {
     if width < 3 || height < 3 {
         return 0.0;

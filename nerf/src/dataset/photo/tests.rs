@@ -45,7 +45,7 @@ fn sizes_that_do_not_divide_share_pixels() {
 }
 
 #[test]
-#[should_panic(expected = "cannot be averaged to 4x1")]
+#[should_panic(expected = "cannot be downsized to 4x1")]
 fn averaging_does_not_enlarge() {
     bytes(3, 1, 3, &[0; 9]).resized([4, 1]);
 }

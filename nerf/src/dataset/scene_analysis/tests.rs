@@ -86,7 +86,7 @@ fn what_cameras_that_look_the_same_way_show_lies_ahead() {
     assert!(survey.transform.origin.distance(mean + 5.0 * spread * DVec3::Y) < 1e-9, "{}", survey.transform.origin);
     assert_eq!(
         survey.reason,
-        "photographs are opaque, so they show what lies behind, and all look ahead; cameras look the same way"
+        "images are opaque, so they show a background, and all cameras look ahead; cameras look the same way"
     );
     assert_eq!(survey.scene_type, SceneType::ForwardFacing);
     let placed: Vec<Camera> = wall.views.iter().map(|view| survey.transform.camera(&view.camera)).collect();
@@ -97,7 +97,7 @@ fn what_cameras_that_look_the_same_way_show_lies_ahead() {
         SceneAnalysis {
             scene_type: SceneType::Unbounded,
             ndc: None,
-            reason: "as asked; cameras look the same way".into(),
+            reason: "as requested; cameras look the same way".into(),
             ..survey
         }
     );
@@ -142,7 +142,7 @@ fn a_walk_ahead_is_no_view_from_a_window() {
         .unwrap_err()
         .to_string();
     assert!(asked.contains("`scope`") && asked.contains("forward"), "{asked}");
-    assert!(survey.reason.starts_with("photographs are opaque, so they show what lies behind; "), "{}", survey.reason);
+    assert!(survey.reason.starts_with("images are opaque, so they show a background; "), "{}", survey.reason);
 }
 
 #[test]

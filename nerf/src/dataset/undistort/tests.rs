@@ -126,8 +126,8 @@ fn one_pinhole_serves_cameras_that_differ() {
         let message = Camera::undistorted(&[&camera]).unwrap_err().to_string();
         assert!(message.starts_with("`undistort`: ") && message.contains(expected), "{message}");
     };
-    bad(Camera { centre: [-20.0, 60.0], ..camera(Lens::Pinhole) }, "its own optical axis");
-    bad(camera(Lens::Equirectangular), "a panorama");
+    bad(Camera { centre: [-20.0, 60.0], ..camera(Lens::Pinhole) }, "cameras that see their optical axis");
+    bad(camera(Lens::Equirectangular), "equirectangular images");
     assert!(Camera::undistorted(&[]).is_err());
 }
 

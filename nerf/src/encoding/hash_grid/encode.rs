@@ -31,7 +31,7 @@ impl HashGrid {
     }
 
     fn encode_rows<T: Scalar, const F: usize>(&self, positions: &[T], table: &[T], out: &mut [T]) {
-        assert_eq!(table.len(), self.rows() * F, "a table of the grid's rows");
+        assert_eq!(table.len(), self.rows() * F, "the table must have the grid's rows");
         let (table, _) = table.as_chunks::<F>();
         let (levels, width) = (self.levels(), self.width());
         simd::dispatch(
@@ -55,18 +55,19 @@ impl HashGrid {
         );
     }
 
-    /// Adds to `grad` the gradient of one level's rows that `d_out` (`[samples, width]`, the gradient of the encoding of
-    /// `positions`, `[samples, 3]`) makes, in the order of the samples. Samples whose gradient on this level is all zero
-    /// touch nothing; one with a NaN coordinate gives NaN.
+    /// Adds the gradient of one level's rows to `grad`, in the order of the samples.
+    ///
+    /// `positions` are `[samples, 3]`, `d_out` `[samples, width]` is the gradient of their encoding. Samples with a
+    /// zero gradient on this level add nothing; a NaN coordinate gives NaN.
     ///
     /// # Panics
-    /// If there is no such level or a length does not fit.
+    /// If `level` is out of range or a length does not fit.
     #[track_caller]
     pub fn scatter_level<T: Scalar>(&self, level: usize, positions: &[T], d_out: &[T], grad: &mut RowSums<T>) {
         let (rows, samples) = (self.levels()[level].rows.len(), positions.len() / 3);
-        assert_eq!(positions.len(), 3 * samples, "positions of three coordinates");
-        assert_eq!(d_out.len(), samples * self.width(), "gradients of {samples} encoded positions");
-        assert_eq!(grad.table_rows(), rows, "sums of the rows of level {level}");
+        assert_eq!(positions.len(), 3 * samples, "positions must be [samples, 3]");
+        assert_eq!(d_out.len(), samples * self.width(), "gradients must be [{samples}, width]");
+        assert_eq!(grad.table_rows(), rows, "sums must have the rows of level {level}");
         with_features!(self, scatter_rows(level, positions, d_out, grad))
     }
 
@@ -133,15 +134,14 @@ impl HashGrid {
     }
 }
 
-/// The features of positions on all levels of a grid, interpolated trilinearly between the corners of their cells.
+/// The operation of the hash encoding: features of positions on all levels, interpolated trilinearly within cells.
 ///
-/// Inputs are positions `[samples, 3]` in the unit cube and the table `[rows, features]` of the grid; the output is
-/// `[samples, levels * features]`, coarsest level first. On a level of `N` cells a side, `x N` lies in the cell
+/// Inputs are positions `[samples, 3]` in the unit cube and the table `[rows, features]`; the output is
+/// `[samples, levels * features]`, coarsest level first. On a level of `N` cells per side, `x N` lies in the cell
 /// `min(floor(x N), N - 1)`.
 ///
-/// A position outside of the cube counts as the nearest one on it, with gradient 0 along the axes that are outside. A NaN
-/// coordinate makes the sample's features NaN. The gradient of the position jumps where cells meet; there it is the one
-/// of the upper cell.
+/// Positions outside of the cube are clamped, with gradient 0 along the clamped axes. A NaN coordinate makes the
+/// sample's features NaN. The gradient of a position jumps between cells; there it is that of the upper cell.
 #[derive(Debug, Clone)]
 pub struct HashEncoding(
     /// The grid.

@@ -1,10 +1,9 @@
-//! The gradient of the table: where samples are, and the gradients of their features, until an optimiser adds them up
-//! level by level.
+//! The sparse gradient of the table, which an optimizer sums level by level.
 
 use super::grid::HashGrid;
 use raygrad_autograd::{RowShare, RowSums, Scalar, SparseGrad, Tensor};
 
-/// What a tile leaves for the table: where its samples are, and the gradients of their features.
+/// The sparse gradient of a hash grid's table from one tile: positions of samples and gradients of their features.
 #[derive(Debug, Clone)]
 pub struct HashGrad<T: Scalar> {
     /// The grid.
@@ -34,7 +33,11 @@ impl<T: Scalar> SparseGrad<T> for HashGrad<T> {
 impl<T: Scalar> RowShare<T> for HashGrad<T> {
     fn scatter(&self, sums: &mut RowSums<T>) {
         let features = self.grid.features();
-        assert_eq!([sums.table_rows(), sums.features()], [self.grid.rows(), features], "sums of the grid's rows");
+        assert_eq!(
+            [sums.table_rows(), sums.features()],
+            [self.grid.rows(), features],
+            "sums must have the grid's rows"
+        );
         for (number, level) in self.grid.levels().iter().enumerate() {
             let mut part = RowSums::new(level.rows.len(), features);
             self.grid.scatter_level(number, self.positions.as_slice(), self.d_out.as_slice(), &mut part);

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// The numbers behind a [`HashGrid`] (Müller et al. 2022, table 1).
+/// Configuration of a [`HashGrid`] (Müller et al. 2022, table 1).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HashGridConfig {
@@ -30,17 +30,17 @@ impl HashGridConfig {
     /// The largest `log2_table`: a grid of 512 cells along an axis then still has a row for each corner.
     pub(crate) const MOST_LOG2_TABLE: u32 = 28;
 
-    /// The paper's: 16 levels of 2 features from 16 to 2048, tables of 2^19 rows.
+    /// Returns the paper's values: 16 levels of 2 features from 16 to 2048, tables of 2^19 rows.
     pub fn paper() -> Self {
         HashGridConfig { levels: 16, features: 2, log2_table: 19, coarsest: 16, finest: 2048 }
     }
 
-    /// Rows of more features on fewer levels, so fewer places of memory to visit; and as many of both as pay for what it is
-    /// trained with: more of them hold more detail, but take longer, the more so if they do not fit the caches.
+    /// Returns values for CPUs: more features on fewer levels, which need fewer memory accesses, sized for a training
+    /// budget.
     ///
-    /// `samples` are those of the whole [training](crate::Budget::samples), and `pixels_per_side` how many
-    /// [pixels of the photographs](crate::dataset::Dataset::pixels_per_side) lie along a side of the scene: no cell is smaller
-    /// than half of one, as nothing would be seen of it.
+    /// `samples` is that of the whole [training](crate::Budget::samples). `footprints` is
+    /// [`Dataset::pixels_per_side`](crate::dataset::Dataset::pixels_per_side): no cell is smaller than half a pixel.
+    /// Larger tables hold more detail but take longer, above all beyond the caches.
     pub fn cpu(samples: f64, footprints: f64) -> Self {
         let (log2_table, finest) = match samples {
             ..=2e8 => (17, 512),
@@ -64,14 +64,14 @@ impl HashGridConfig {
     }
 }
 
-/// One resolution of a [`HashGrid`].
+/// One level of a [`HashGrid`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HashLevel {
-    /// Cells along an axis.
+    /// Resolution: cells along an axis.
     pub resolution: u32,
-    /// Whether corners share rows by their hash; if not, each corner has a row of its own.
+    /// Whether corners are hashed to shared rows; otherwise each corner has its own row.
     pub hashed: bool,
-    /// This level's rows of the table.
+    /// The level's rows of the table.
     pub rows: Range<usize>,
 }
 
@@ -94,13 +94,13 @@ impl HashLevel {
 /// Multipliers of the hash.
 pub(super) const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 
-/// Levels of rising resolution over the unit cube, and the rows of one table that they take their features from. A clone
-/// is a reference count.
+/// The geometry of a hash grid: levels of rising resolution over the unit cube, and their rows of one table. Clones are
+/// cheap.
 ///
 /// Level `l` has `N_l = floor(coarsest b^l)` cells along an axis, `b = (finest / coarsest)^(1 / (levels - 1))`
-/// (equations 2 and 3), so `N_l + 1` corners. A level with few enough corners has a row for each; a finer one hashes its
-/// corners to `2^log2_table` rows. Rows are rounded up to a multiple of 16, so that
-/// each level begins with a line of the caches.
+/// (equations 2 and 3), so `N_l + 1` corners. A level with at most `2^log2_table` corners has a row for each; a finer
+/// one hashes its corners to that many rows. Rows are rounded up to a multiple of 16, so that each level is aligned to
+/// a cache line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HashGrid {
     levels: Arc<[HashLevel]>,
@@ -109,10 +109,10 @@ pub struct HashGrid {
 }
 
 impl HashGrid {
-    /// The grid of these numbers.
+    /// Creates a grid.
     ///
     /// # Errors
-    /// If one is out of the range that its field states.
+    /// If a value is out of the range that its field states.
     pub fn new(config: &HashGridConfig) -> Result<Self> {
         config.check()?;
         let growth = (config.finest as f64 / config.coarsest as f64).ln() / (config.levels - 1).max(1) as f64;
@@ -131,33 +131,32 @@ impl HashGrid {
         Ok(HashGrid { levels, shape: [first, config.features] })
     }
 
-    /// The levels, coarsest first.
+    /// Returns the levels, coarsest first.
     pub fn levels(&self) -> &[HashLevel] {
         &self.levels
     }
 
-    /// Features in a row of the table.
+    /// Returns the number of features per row of the table.
     pub fn features(&self) -> usize {
         self.shape[1]
     }
 
-    /// Rows of the table.
+    /// Returns the number of rows of the table.
     pub fn rows(&self) -> usize {
         self.shape[0]
     }
 
-    /// Features of a sample: levels times features.
+    /// Returns the number of features per sample: levels times features.
     pub fn width(&self) -> usize {
         self.levels.len() * self.features()
     }
 
-    /// The shape of the table, `[rows, features]`.
+    /// Returns the shape of the table, `[rows, features]`.
     pub fn shape(&self) -> &[usize] {
         &self.shape
     }
 
-    /// A table `[rows, features]` to start from, uniform in -1e-4..1e-4 (section 4): near zero, so that the first steps
-    /// see no random colours, and not zero, so that features differ.
+    /// Returns an initial table `[rows, features]`, uniform in -1e-4 to 1e-4 (section 4).
     #[inline(never)]
     pub fn init<T: Scalar>(&self, seed: u64) -> Tensor<T> {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);

@@ -1,10 +1,10 @@
-//! The loops of the hash grid: where the corners of a sample's cell are, and what is read or added there.
+//! The inner loops of the hash grid.
 //!
 //! Samples come in blocks. For a block and a level, rows and weights of all corners are computed first, side by side in
-//! vector registers; then the rows are visited one sample after the other. While a level is read, the rows of
-//! the next one are prefetched: the table is larger than the caches near a core, and without that reading takes twice as
-//! long. Adding visits one level of many samples at a time; there the rows of the next block are prefetched. Products are
-//! not fused, so the bits are the same on every instruction set.
+//! vector registers; then the rows are visited one sample after the other. While a level is read, the rows of the next
+//! one are prefetched: the table is larger than the caches near a core, and without that reading takes twice as long.
+//! Adding visits one level of many samples at a time; there the rows of the next block are prefetched. Products are not
+//! fused, so the bits are the same on every instruction set.
 
 use super::grid::{HashLevel, PRIMES};
 use raygrad_autograd::{RowAdder, Scalar};
@@ -54,10 +54,11 @@ impl<T: Scalar> Cells<T> {
         Cells { rows: [[0; BLOCK]; 8], place: [[T::ZERO; BLOCK]; 3], weights: [[T::ZERO; BLOCK]; 8], len: 0 }
     }
 
-    /// Rows, places and weights for `points` on `level`. Every row is below the number of the level's rows, whatever the
-    /// points are; a NaN coordinate counts as cell 0 and makes the weights NaN.
+    /// Rows, places and weights for `points` on `level`. Every row is below the number of the level's rows, whatever
+    /// the points are; a NaN coordinate counts as cell 0 and makes the weights NaN.
     ///
-    /// It is a function of its own, for all numbers of features: inlined where it is called, it was compiled thirty times.
+    /// It is a function of its own, for all numbers of features: inlined where it is called, it was compiled thirty
+    /// times.
     #[inline(never)]
     pub(super) fn locate(&mut self, level: &HashLevel, points: &Points<T>) {
         simd::dispatch(
@@ -111,7 +112,8 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// Writes the interpolated features to column `column` of each row of `out`, `[len, width]`; `table` is the level's.
+    /// Writes the interpolated features to column `column` of each row of `out`, `[len, width]`; `table` is the
+    /// level's.
     #[inline(always)]
     pub(super) fn gather<const F: usize>(&self, table: &[[T; F]], out: &mut [T], width: usize, column: usize) {
         for (i, out) in out.chunks_exact_mut(width).enumerate().take(self.len) {
@@ -198,8 +200,8 @@ impl<T: Scalar> Cells<T> {
         }
     }
 
-    /// The adjoint of [`gather`](Self::gather) in the positions: adds to each row of `grad`, `[len, 3]`, the level's part
-    /// of the gradient, as if no position were clamped. `scale` is the resolution.
+    /// The adjoint of [`gather`](Self::gather) in the positions: adds to each row of `grad`, `[len, 3]`, the level's
+    /// part of the gradient, as if no position were clamped. `scale` is the resolution.
     #[inline(always)]
     pub(super) fn slopes<const F: usize>(
         &self,

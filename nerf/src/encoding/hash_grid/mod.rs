@@ -1,9 +1,9 @@
-//! Multiresolution hash encoding: trainable features on grids of rising resolution, a small table for each (Müller et
-//! al. 2022, "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding", section 3).
+//! Multiresolution hash encoding (Müller et al. 2022, "Instant Neural Graphics Primitives with a Multiresolution Hash
+//! Encoding", section 3).
 //!
-//! [`HashGrid`] is the geometry: which rows of the table the eight corners of a cell are, on each level.
-//! [`HashEncoding`] is the operation on the tape. The gradient of its table is a [`HashGrad`], which a lazy optimiser (see
-//! [`Params::set_lazy`](raygrad_nn::Params::set_lazy)) adds up level by level, in parallel, and never makes dense.
+//! [`HashGrid`] is the geometry of levels and table rows, [`HashEncoding`] the operation. Its table's gradient is a
+//! sparse [`HashGrad`], which a lazy optimizer ([`Params::set_lazy`](raygrad_nn::Params::set_lazy)) sums level by
+//! level.
 
 mod encode;
 mod gradient;

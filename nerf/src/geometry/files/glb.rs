@@ -6,7 +6,8 @@ use glam::DVec3;
 use raygrad_autograd::Formula;
 use serde_json::{Value, json};
 
-/// Numbers of the specification: component types, targets of buffer views, modes of primitives, and the kinds of chunks.
+/// Numbers of the specification: component types, targets of buffer views, modes of primitives, and the kinds of
+/// chunks.
 const UNSIGNED_SHORT: u32 = 5123;
 const UNSIGNED_INT: u32 = 5125;
 const FLOAT: u32 = 5126;
@@ -20,7 +21,7 @@ const BIN: &[u8; 4] = b"BIN\0";
 /// The file, or what is wrong.
 pub(super) fn to_bytes(shape: &ColoredMesh, generator: &str) -> Result<Vec<u8>, String> {
     let ColoredMesh { mesh, normals, colors } = shape;
-    let [low, high] = mesh.bounds().ok_or("would have no vertices, which glTF does not allow")?;
+    let [low, high] = mesh.bounds().ok_or("needs at least one vertex in glTF")?;
     let middle = 0.5 * (low + high);
     let near = |place: &DVec3| (*place - middle).as_vec3().to_array();
     let places: Vec<[f32; 3]> = mesh.positions.iter().map(near).collect();
@@ -69,7 +70,7 @@ pub(super) fn to_bytes(shape: &ColoredMesh, generator: &str) -> Result<Vec<u8>, 
     let length = 12 + 8 + text.len() + 8 + buffer.bytes.len();
     let number = |length: usize| u32::try_from(length).map(u32::to_le_bytes);
     let [whole, first, second] = [length, text.len(), buffer.bytes.len()].map(number);
-    let too_large = |_| "would be larger than the 4 GiB that glTF allows: use fewer triangles, or .ply";
+    let too_large = |_| "would exceed glTF's limit of 4 GiB: use fewer triangles, or .ply";
     let mut out = Vec::with_capacity(length);
     out.extend(b"glTF");
     out.extend(2_u32.to_le_bytes());

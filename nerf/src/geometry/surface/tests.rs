@@ -10,8 +10,8 @@ use raygrad_nn::Bound;
 use std::f64::consts::{LN_2, PI};
 use std::sync::Arc;
 
-/// Balls whose density rises inwards by a factor of e in each 40th of a unit, from 1 at their rims. From where one looks at
-/// it against a direction d, a place has the colour (d + 1) / 2 channel by channel.
+/// Balls whose density rises inwards by a factor of e in each 40th of a unit, from 1 at their rims. From where one
+/// looks at it against a direction d, a place has the colour (d + 1) / 2 channel by channel.
 struct Balls(Vec<(DVec3, f64)>);
 
 const STEEPNESS: f64 = 40.0;
@@ -191,13 +191,13 @@ fn what_cannot_be_made_is_said() {
         ball().surface(cameras, &config, &mut |_, _| ()).err().unwrap().to_string()
     };
     let cases = [
-        (SurfaceConfig { iso_value: Some(-1.0), ..CONFIG }, "`level`: is -1"),
-        (SurfaceConfig { iso_value: Some(f64::NAN), ..CONFIG }, "`level`: is NaN"),
-        (SurfaceConfig { iso_value: Some(1e30), ..CONFIG }, "`level`: is 1000000000000000000000000000000"),
+        (SurfaceConfig { iso_value: Some(-1.0), ..CONFIG }, "`iso_value`: is -1"),
+        (SurfaceConfig { iso_value: Some(f64::NAN), ..CONFIG }, "`iso_value`: is NaN"),
+        (SurfaceConfig { iso_value: Some(1e30), ..CONFIG }, "`iso_value`: is 1000000000000000000000000000000"),
         // What is hidden is not dense enough for it.
         (
             SurfaceConfig { iso_value: Some(1e30), fill_unseen: true, ..CONFIG },
-            "`level`: is 1000000000000000000000000000000",
+            "`iso_value`: is 1000000000000000000000000000000",
         ),
         (SurfaceConfig { min_component: 1.5, ..CONFIG }, "`parts`: is 1.5"),
         (SurfaceConfig { triangles: Some(3), ..CONFIG }, "`triangles`: is 3"),
@@ -210,9 +210,9 @@ fn what_cannot_be_made_is_said() {
     let away = Camera::from_angle(8, 8, 0.3, Camera::look_at(DVec3::splat(5.0), DVec3::splat(9.0), DVec3::Z));
     for cameras in [vec![], vec![away.clone()]] {
         let said = message(CONFIG, &cameras);
-        assert!(said.contains("`level`: is not known"), "{said}");
+        assert!(said.contains("`iso_value`: is missing, and no camera sees a surface"), "{said}");
         let said = ball().point_cloud(&cameras, 10, &mut |_, _| ()).err().unwrap().to_string();
-        assert!(said.contains("`points`: are none"), "{said}");
+        assert!(said.contains("`points`: cannot be found: no camera sees a surface"), "{said}");
     }
 }
 

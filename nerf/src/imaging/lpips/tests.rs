@@ -186,13 +186,13 @@ fn images_that_are_too_small_are_refused() {
 }
 
 #[test]
-#[should_panic(expected = "differ in height, width or channels")]
+#[should_panic(expected = "images must have the same height, width and channels")]
 fn other_shapes_are_refused() {
     WITH_ALEX.distance(&Image::new(40, 41, 3), &Image::new(41, 40, 3));
 }
 
 #[test]
-#[should_panic(expected = "LPIPS needs red, green and blue")]
+#[should_panic(expected = "LPIPS needs three channels: red, green and blue")]
 fn transparency_is_refused() {
     WITH_ALEX.distance(&Image::new(40, 41, 4), &Image::new(40, 41, 4));
 }
@@ -228,7 +228,7 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
         let quoted = format!("\"{absent}\"");
         let at = whole.windows(quoted.len()).position(|part| part == quoted.as_bytes()).unwrap();
         others[at + 1] = b'x';
-        refused(&others, &[&format!("`{absent}`: is missing; F32{shape:?} is expected"), "with alex"]);
+        refused(&others, &[&format!("`{absent}`: is missing, should be F32{shape:?}"), "with alex"]);
     }
     let changed = |name: &str, value: Tensor<f32>| {
         let mut params = Params::new();
@@ -245,7 +245,7 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
         ("net.slice5.10.bias", f32::NAN, "holds NaN, and must be finite"),
         ("net.slice1.0.weight", f32::INFINITY, "holds inf, and must be finite"),
         ("lin4.model.1.weight", f32::INFINITY, "holds inf, and must be finite"),
-        ("lin2.model.1.weight", -1e-3, "holds -0.001, and may hold nothing negative"),
+        ("lin2.model.1.weight", -1e-3, "has the value -0.001, should be at least 0"),
     ] {
         let mut tensor = good.get(good.find(name).unwrap()).clone();
         let last = tensor.len() - 1;

@@ -1,9 +1,9 @@
 //! Preconditioning of pose corrections.
 //!
-//! A camera that turns left and one that moves left show nearly the same, so an optimizer makes slow progress along that
-//! valley. Decorrelated parameters avoid it (Park et al. 2023, "CamP: Camera Preconditioning for Neural Radiance Fields",
-//! section 4). Here the Cholesky factor replaces the matrix square root, and angles of directions replace pixels, which
-//! serves every lens.
+//! A camera that turns left and one that moves left show nearly the same, so an optimizer makes slow progress along
+//! that valley. Decorrelated parameters avoid it (Park et al. 2023, "CamP: Camera Preconditioning for Neural Radiance
+//! Fields", section 4). Here the Cholesky factor replaces the matrix square root, and angles of directions replace
+//! pixels, which serves every lens.
 
 use crate::camera::bounds::clip_near_far;
 use crate::camera::pinhole::Camera;
@@ -15,16 +15,16 @@ pub(super) const POSE: usize = 6;
 /// A matrix, row by row.
 pub(super) type Matrix = [[f64; POSE]; POSE];
 
-/// Pixels along each side of a photograph, and places along the ray through each, that are followed.
+/// Sampled pixels along each side of an image, and points along each of their rays.
 const PLACES: [usize; 2] = [6, 3];
 /// What is added to the diagonal, as a part of it: how far a valley is widened at most.
 const DAMPING: f64 = 0.1;
 /// What a number moves at least, squared: a single ray along an axis shows nothing of a turn about that.
 const LEAST: f64 = 1e-12;
 
-/// The matrix from six numbers to a rotation vector (radians, in the axes of the scene) about the camera's centre and a
-/// translation (scene units), upper triangular: 1 of any of the six moves what the camera sees of the box by about a radian,
-/// and no two of them alike. What it sees of a scene that goes on beyond counts as well, infinitely far away.
+/// The upper triangular matrix from six numbers to a rotation vector (radians, scene axes) about the camera's centre
+/// and a translation (scene units). A unit of each moves the image of the box by about a radian, independently of the
+/// others. In an unbounded scene, points infinitely far away count too.
 pub(super) fn balance(camera: &Camera, bounds: [DVec3; 2], span: [f64; 2], unit: f64, unbounded: bool) -> Matrix {
     let [columns, depths] = PLACES;
     let mut sum = [[0.0; POSE]; POSE];
@@ -67,8 +67,8 @@ pub(super) fn plain(unit: f64) -> Matrix {
     std::array::from_fn(|a| std::array::from_fn(|b| entry(a, b)))
 }
 
-/// How the direction to a place at the distance `t` along a unit direction moves, seen from a camera that turns or moves:
-/// rows of three components, columns of six numbers.
+/// How the direction to a place at the distance `t` along a unit direction moves, seen from a camera that turns or
+/// moves: rows of three components, columns of six numbers.
 fn slopes(direction: DVec3, t: f64) -> [[f64; POSE]; 3] {
     let axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let turned = axes.map(|axis| -axis.cross(direction));

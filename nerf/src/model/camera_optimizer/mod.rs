@@ -28,16 +28,16 @@ const SAME: f64 = 1e-9;
 
 /// Learned corrections of the training cameras; parameters of 0 leave them unchanged.
 ///
-/// - `poses` `[images, 6]`: preconditioned pose corrections (Park et al. 2023, "CamP"). A constant matrix per image maps them
-///   to a rotation vector (radians, scene axes) about the camera's centre and a translation. A unit of each moves the image of
-///   the scene box by about a radian, independently of the others. Without known cameras, they are the rotation vector and the
-///   translation in units of [`SceneBox::unit`](crate::SceneBox::unit). The gradient comes through the [rays](RayVars) of the
-///   samples (Lin et al. 2021, "BARF", equation 5); the part along a ray is dropped.
-/// - `focal` `[cameras, 2]`: the logarithm of a factor of the focal length, along columns and rows. Images of equal focal
-///   length, principal point and lens (at one size) share a camera. If poses are learned too, the camera moves away from
-///   the scene's centre by the same factor: the scene keeps its size, and only the perspective changes.
-/// - `lens` `[cameras, 4]`: added to the distortion coefficients `k1, k2, p1, p2` (fisheye: `k1, k2`; FOV model: omega). A
-///   pinhole becomes a [`Lens::Brown`].
+/// - `poses` `[images, 6]`: preconditioned pose corrections (Park et al. 2023, "CamP"). A constant matrix per image
+///   maps them to a rotation vector (radians, scene axes) about the camera's centre and a translation. A unit of each
+///   moves the image of the scene box by about a radian, independently of the others. Without known cameras, they are
+///   the rotation vector and the translation in units of [`SceneBox::unit`](crate::SceneBox::unit). The gradient comes
+///   through the [rays](RayVars) of the samples (Lin et al. 2021, "BARF", equation 5); the part along a ray is dropped.
+/// - `focal` `[cameras, 2]`: the logarithm of a factor of the focal length, along columns and rows. Images of equal
+///   focal length, principal point and lens (at one size) share a camera. If poses are learned too, the camera moves
+///   away from the scene's centre by the same factor: the scene keeps its size, and only the perspective changes.
+/// - `lens` `[cameras, 4]`: added to the distortion coefficients `k1, k2, p1, p2` (fisheye: `k1, k2`; FOV model:
+///   omega). A pinhole becomes a [`Lens::Brown`].
 ///
 /// Visual hull carving is off while cameras are refined.
 ///
@@ -83,8 +83,8 @@ fn grouped(cameras: &[Camera]) -> (Vec<u32>, usize) {
 
 /// The same origins, with the gradient of what moves them across their rays alone.
 ///
-/// A ray that begins further back is the same line and shows the same. Its samples keep their distances, so they slide along
-/// it, which changes the quadrature's error. That gradient would pull cameras towards thin parts of the scene.
+/// A ray that begins further back is the same line and shows the same. Its samples keep their distances, so they slide
+/// along it, which changes the quadrature's error. That gradient would pull cameras towards thin parts of the scene.
 fn across<'t, T: Scalar>(origins: &Var<'t, T>, directions: &Var<'t, T>) -> Var<'t, T> {
     let (start, along) = (origins.detach(), directions.detach());
     let moved = origins - &start;
@@ -104,11 +104,12 @@ fn with_glass(camera: &Camera) -> Camera {
 impl CameraOptimizer {
     /// Creates corrections of 0; returns `None` if nothing is learned.
     ///
-    /// `cameras` are those of the images, or empty if only poses are learned; the `bool` says whether the scene is unbounded.
+    /// `cameras` are those of the images, or empty if only poses are learned; the `bool` says whether the scene is
+    /// unbounded.
     ///
     /// # Errors
-    /// If `extent.frames` is 0, if there is not one camera per image, or if focal lengths or lenses are learned and all cameras
-    /// are equirectangular or missing.
+    /// If `extent.frames` is 0, if there is not one camera per image, or if focal lengths or lenses are learned and all
+    /// cameras are equirectangular or missing.
     pub fn new<T: Scalar>(
         poses: bool,
         config: &CameraOptimizerConfig,
@@ -160,7 +161,8 @@ impl CameraOptimizer {
 
     /// Corrects rays through pixel centres: returns them as variables, and as numbers clipped to `span` and `bounds`.
     ///
-    /// `rays` are those of the given cameras; `frames` (image indices) and `pixels` (column, row) have one entry per ray.
+    /// `rays` are those of the given cameras; `frames` (image indices) and `pixels` (column, row) have one entry per
+    /// ray.
     ///
     /// # Panics
     /// If `frames` or `pixels` has another length than `rays`, or an index is out of range.
@@ -270,8 +272,8 @@ impl CameraOptimizer {
         Camera { pose, ..camera }
     }
 
-    /// The factor of a camera's distance from the scene's centre, from the focal length of its group or the mean of all; 1 unless
-    /// poses and focal lengths are learned.
+    /// The factor of a camera's distance from the scene's centre, from the focal length of its group or the mean of
+    /// all; 1 unless poses and focal lengths are learned.
     fn growth<T: Scalar>(&self, params: &Params<T>, group: Option<u32>) -> f64 {
         let (Some(focal), Some(_)) = (self.focal, self.poses) else { return 1.0 };
         let all = params.get(focal).as_slice();
@@ -286,8 +288,9 @@ impl CameraOptimizer {
         stepped
     }
 
-    /// The similarity from the given cameras, each moved by its growth, to the refined ones, by least squares. Orientations count
-    /// as much as positions, so that cameras on a line suffice. `None` if poses are not learned or cameras are not known.
+    /// The similarity from the given cameras, each moved by its growth, to the refined ones, by least squares.
+    /// Orientations count as much as positions, so that cameras on a line suffice. `None` if poses are not learned or
+    /// cameras are not known.
     fn similarity<T: Scalar>(&self, params: &Params<T>, growths: &[f64]) -> Option<SceneTransform> {
         self.poses?;
         let count = self.cameras.len() as f64;
@@ -304,8 +307,8 @@ impl CameraOptimizer {
         SceneTransform::between(&given.collect::<Vec<_>>(), &found.collect::<Vec<_>>())
     }
 
-    /// Returns the similarity that maps the given cameras closest to the refined ones, by least squares. `None` if poses are not
-    /// learned or cameras are not known.
+    /// Returns the similarity that maps the given cameras closest to the refined ones, by least squares. `None` if
+    /// poses are not learned or cameras are not known.
     pub fn transform<T: Scalar>(&self, params: &Params<T>) -> Option<SceneTransform> {
         let growth = self.growth(params, None);
         let rest = self.similarity(params, &vec![growth; self.cameras.len()])?;
@@ -314,8 +317,8 @@ impl CameraOptimizer {
         Some(SceneTransform { scale: rest.scale * growth, origin, ..rest })
     }
 
-    /// Maps other cameras of the capture, such as held-out ones, by [`transform`](Self::transform). A camera with the intrinsics
-    /// of a training camera also gets its refined focal length and lens.
+    /// Maps other cameras of the capture, such as held-out ones, by [`transform`](Self::transform). A camera with the
+    /// intrinsics of a training camera also gets its refined focal length and lens.
     pub fn other_cameras<T: Scalar>(&self, params: &Params<T>, cameras: &[Camera]) -> Vec<Camera> {
         let growths: Vec<f64> = self.groups.iter().map(|group| self.growth(params, Some(*group))).collect();
         let similarity = self.similarity(params, &growths);

@@ -1,8 +1,8 @@
 //! Ray directions of pixels, differentiable with respect to focal length and lens.
 //!
-//! The direction of a pixel is the root of an equation: the lens must project it to the pixel. A solver finds it in plain
-//! numbers. One step of Newton's method from there, recorded on the tape with a constant Jacobian, does not move it and has
-//! its exact gradient, by the implicit function theorem.
+//! The direction of a pixel is the root of an equation: the lens must project it to the pixel. A solver finds it in
+//! plain numbers. One step of Newton's method from there, recorded on the tape with a constant Jacobian, does not move
+//! it and has its exact gradient, by the implicit function theorem.
 
 use crate::camera::lens::Lens;
 use crate::camera::lens_places;
@@ -17,8 +17,8 @@ pub(super) const CORRECTIONS: usize = 4;
 /// Below this determinant of its Jacobian a lens is so near to a fold that its inverse has no slope to speak of.
 const FOLDED: f64 = 1e-6;
 
-/// The coefficients of a lens that are corrected, by their number: `k1, k2, p1, p2`, and of a fisheye `k1, k2`; the others
-/// hardly show in photographs, and what does not show drifts.
+/// The coefficients of a lens that are corrected, by their number: `k1, k2, p1, p2`, and of a fisheye `k1, k2`; the
+/// others hardly affect images and would drift.
 pub(super) fn corrected(lens: &Lens) -> &'static [usize] {
     match lens {
         Lens::Pinhole | Lens::Equirectangular => &[],
@@ -79,9 +79,9 @@ fn slopes(lens: &Lens, local: DVec3) -> Option<[DVec3; 2]> {
 
 /// Unit directions `[rays, 3]`, in the axes of the scene and before any turn of the cameras, of pixels.
 ///
-/// Each ray has the camera as it was given, the same as it is found now, and the continuous position of its pixel. `focal`
-/// `[rays, 2]` are the logarithms of the factors by which focal lengths have grown, `lens` `[rays, 4]` what was added to
-/// the coefficients; what is `None` is not learned.
+/// Each ray has the camera as it was given, the same as it is found now, and the continuous position of its pixel.
+/// `focal` `[rays, 2]` are the logarithms of the factors by which focal lengths have grown, `lens` `[rays, 4]` what was
+/// added to the coefficients; what is `None` is not learned.
 pub(super) fn directions<'t, T: Scalar>(
     tape: &'t Tape<T>,
     pixels: &[(&Camera, &Camera, [f64; 2])],

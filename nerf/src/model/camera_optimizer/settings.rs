@@ -15,7 +15,8 @@ pub(crate) const FOCAL: &str = "focal";
 /// The name of the parameter of lenses.
 pub(crate) const LENS: &str = "lens";
 
-/// Configuration of the [`CameraOptimizer`](crate::model::CameraOptimizer), beside [`Config::poses`](crate::Config::poses).
+/// Configuration of the [`CameraOptimizer`](crate::model::CameraOptimizer), beside
+/// [`Config::poses`](crate::Config::poses).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraOptimizerConfig {

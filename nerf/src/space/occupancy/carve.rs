@@ -1,4 +1,4 @@
-//! Cells that are known to be empty before anything is learned, and stay so.
+//! Carving: cells that stay empty permanently.
 
 use super::lattice::{CARVED, CELLS, cell, uncarved};
 use super::{OccupancyGrid, TASK};
@@ -7,8 +7,10 @@ use raygrad_tensor::parallel;
 use std::sync::Arc;
 
 impl OccupancyGrid {
-    /// Marks as empty for good the cells for which `is_empty(centre, radius)` holds, a ball around the cell in scene
-    /// units. They are never looked at again. What is occupied changes with the next [`threshold`](Self::threshold) or
+    /// Permanently empties the cells for which `is_empty(centre, radius)` holds, with a ball around the cell in scene
+    /// units.
+    ///
+    /// They are never sampled again. Occupancy changes with the next [`threshold`](Self::threshold) or
     /// [`occupy_all_but_carved`](Self::occupy_all_but_carved).
     pub fn carve(&mut self, is_empty: &(dyn Fn(DVec3, f64) -> bool + Sync)) {
         let lattice = &self.lattice;
@@ -34,7 +36,7 @@ impl OccupancyGrid {
         });
     }
 
-    /// Makes all cells that are not carved the occupied ones.
+    /// Marks all cells occupied, except carved ones.
     pub fn occupy_all_but_carved(&mut self) {
         let words = self.exceeding(CARVED);
         self.occupy(words, false);

@@ -1,4 +1,4 @@
-//! How far a ray may leap over empty blocks.
+//! The largest empty cubes, over which rays skip.
 
 use super::lattice::Lattice;
 use raygrad_tensor::parallel;

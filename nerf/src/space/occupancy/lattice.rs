@@ -1,4 +1,4 @@
-//! How cells are numbered: blocks of 4 x 4 x 4 cells, nested boxes, and where a cell lies in the scene.
+//! Numbering of cells: blocks of 4 x 4 x 4 cells, cascades, and the position of a cell in the scene.
 
 use glam::DVec3;
 use std::ops::Range;
@@ -81,8 +81,8 @@ impl Lattice {
         [low + cell * DVec3::from(block.map(|b| (b * EDGE) as f64)), cell]
     }
 
-    /// The word and the bit of the smallest cell that holds a place; `None` if none does. Upper faces of a box belong to its last
-    /// cells.
+    /// The word and the bit of the smallest cell that holds a place; `None` if none does. Upper faces of a box belong
+    /// to its last cells.
     pub fn holding(&self, place: DVec3) -> Option<(usize, usize)> {
         (0..self.cascades).find_map(|cascade| {
             let [low, high] = self.extent(cascade);

@@ -1,4 +1,4 @@
-//! Marching rays through the occupied cells of a grid.
+//! Ray marching through the occupied cells of a grid.
 
 use super::OccupancyGrid;
 use crate::camera::rays::{Rays, Samples};
@@ -15,16 +15,16 @@ use frame::{Frame, LatticeRay, Numbering};
 use spacing::{Cone, LANES, Spacing, Uniform};
 pub use spacing::{MAX_STEPS, Step};
 
-/// The samples that rays have in occupied cells, packed. Kept from call to call, so that nothing is allocated.
+/// Packed samples of rays in occupied cells. Reuse it across calls to avoid allocations.
 #[derive(Debug, Clone, Default)]
 pub struct MarchBuffer {
-    /// Distances along the rays in scene units, those of all rays one after another, never falling within a ray.
+    /// Distances `t` along the rays in scene units, ray after ray, never falling within a ray.
     pub t: Vec<f32>,
-    /// For each sample the length of the interval that it stands for, in scene units.
+    /// Interval length of each sample, in scene units.
     pub delta: Vec<f32>,
     /// The samples of ray `r` are `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
-    /// How many samples there would be if every cell were occupied: what skipping is measured against.
+    /// Number of samples if every cell were occupied, to measure skipping against.
     pub steps: u64,
     /// `growth[i] = ((1 + c)^i - 1) / c` for the cone `c` of the last call that had one.
     growth: Vec<f32>,
@@ -32,10 +32,10 @@ pub struct MarchBuffer {
 }
 
 impl MarchBuffer {
-    /// The samples with positions and directions, in any precision.
+    /// Converts to [`Samples`], in any precision.
     ///
     /// # Panics
-    /// If these are not the rays that were marched.
+    /// If `rays` has another number of rays than were marched.
     pub fn samples<T: Scalar>(&self, rays: &Rays<T>, pool: &Pool<T>) -> Samples<T> {
         let copy = |values: &[f32]| {
             let mut out = pool.tensor(&[values.len()]);
@@ -47,14 +47,15 @@ impl MarchBuffer {
 }
 
 impl OccupancyGrid {
-    /// The samples of rays that lie in occupied cells.
+    /// Places the samples of rays that lie in occupied cells, into `out`.
     ///
-    /// A ray's samples lie `step` apart from where it enters the outermost box (or from the near end of its span, or 0)
-    /// up to where it leaves it (or the far end), as [`Step`] describes; the first after `jitter` of a step, drawn once
-    /// for each ray. Exactly those are returned that lie in occupied cells, up to the step's `max_samples` a ray. Sample
-    /// `i` is at the same distance whatever is occupied, and stands for the interval between `i` and `i + 1` whole steps
-    /// from the entry: the last one may stick out of the box, and with a random jitter the integral has no bias. A
-    /// sample that rounding puts outside of the box is dropped. A ray with a number that is not finite has no samples.
+    /// Samples are spaced by [`Step`] between the ray's entry into the outermost box (or its near plane, or 0) and its
+    /// exit (or the far plane). The first lies `jitter` of a step behind the entry, drawn once per ray. Each ray has at
+    /// most `step.max_samples`.
+    ///
+    /// Sample `i` lies at the same distance whatever is occupied. Its interval is that between `i` and `i + 1` whole
+    /// steps from the entry, so the last may reach beyond the box, and with random jitter the integral is unbiased.
+    /// Samples that rounding puts outside of the box are dropped. A ray with a non-finite number has no samples.
     ///
     /// # Panics
     /// If the step is out of range, or there are 2^32 samples or more.
@@ -89,7 +90,10 @@ impl OccupancyGrid {
                         };
                     }
                     // 2^32 samples are 16 GiB of distances.
-                    out.offsets.push(u32::try_from(found.len).unwrap_or_else(|_| panic!("2^32 samples or more")));
+                    out.offsets.push(
+                        u32::try_from(found.len)
+                            .unwrap_or_else(|_| panic!("there are 2^32 samples or more; march fewer rays")),
+                    );
                 }
             },
         );

@@ -1,23 +1,21 @@
-//! Which parts of a scene's box hold something, for any field, and marching rays through those parts only.
+//! Occupancy grids, to skip empty space along rays (instant-ngp, Mueller et al. 2022).
 //!
-//! The box is divided into cells; each remembers the largest density that was met in it and is *occupied* if that
-//! exceeds a threshold. Rays are sampled at equal steps, and a sample is taken only if its cell is occupied: on a scene
-//! of solid objects that leaves a few percent of them.
+//! Start with [`OccupancyGrid`]: each cell keeps the largest density that was sampled in it, and is *occupied* if that
+//! exceeds a threshold. Rays are sampled only in occupied cells, a few percent of a scene of solid objects.
 //!
-//! # What skipping may cost
-//! A ray that skips samples with a total optical depth `tau` changes its colour by at most `(1 - e^-tau)` times the
-//! range of colours (background included). If every skipped cell really holds no more than [`Skip::min_sigma`] of the
-//! longest path through the grid, `tau` is at most [`Skip::max_depth`], whatever the step, and the error at most
-//! [`Skip::error_bound`]: .005 for [`Skip::NearLossless`] and .049 for [`Skip::Fast`]. That is the worst case, a fog just
-//! below the threshold along the whole ray; on scenes of solids with faint fog the error is a tenth of it.
+//! # Error of skipping
+//! Skipping samples with a total optical depth `tau` changes a colour by at most `1 - e^-tau` times the range of
+//! colours (background included). If every skipped cell holds at most [`Skip::min_sigma`] of the longest path, `tau` is
+//! at most [`Skip::max_depth`], and the error at most [`Skip::error_bound`]: 0.005 for [`Skip::NearLossless`] and 0.049
+//! for [`Skip::Fast`]. This is the worst case, fog just below the threshold along the whole ray. On solid scenes with
+//! faint fog the error is a tenth of it.
 //!
-//! What a grid knows of a cell comes from points in it. [`OccupancyGrid::update`] looks at one random point a cell and
-//! keeps decaying maxima, which suits training: what it misses now it finds later. [`OccupancyGrid::rebuild`] looks at
-//! eight around everything that was found and adds a margin, which suits rendering.
+//! [`OccupancyGrid::update`] samples one random point per cell and keeps decaying maxima, which suits training.
+//! [`OccupancyGrid::rebuild`] samples eight points around all occupied cells and adds a margin, which suits rendering.
 //!
 //! # Layout
-//! One 64-bit word for each block of 4 x 4 x 4 cells, and for each block the largest empty cube before it in each of the
-//! eight octants of directions: a ray crosses an empty box in a few leaps.
+//! One 64-bit word per block of 4 x 4 x 4 cells, and for each block the largest empty cube in each of the eight octants
+//! of directions, so that a ray crosses empty space in a few steps.
 //!
 //! ```
 //! use glam::DVec3;
@@ -77,7 +75,7 @@ const BYTES_PER_CELL: f64 = 4.125;
 /// Words that one task works on.
 const TASK: usize = 256;
 
-/// How fine a grid is, and what it may cost.
+/// Configuration of an [`OccupancyGrid`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(from = "Stored")]
 pub struct OccupancyConfig {
@@ -98,7 +96,7 @@ impl Default for OccupancyConfig {
     }
 }
 
-/// What a file may say.
+/// The form in files.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Stored {
@@ -126,10 +124,10 @@ impl From<Stored> for OccupancyConfig {
 }
 
 impl OccupancyConfig {
-    /// Whether the numbers make sense together.
+    /// Checks that all values are in range and fit each other.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     pub fn check(&self) -> Result<()> {
         if !(1..=8).contains(&self.cascades) {
             return Err(Error::setting("occupancy.cascades", format!("is {}; use 1 to 8", self.cascades)));
@@ -143,7 +141,7 @@ impl OccupancyConfig {
         let cells = self.resolution.pow(3) * self.cascades;
         if cells > MOST_CELLS {
             let what = format!(
-                "{} with {} cascades takes {:.1} GB; use at most 2^30 cells ({:.1} GB)",
+                "is {} with {} cascades, which takes {:.1} GB; use at most 2^30 cells ({:.1} GB)",
                 self.resolution,
                 self.cascades,
                 BYTES_PER_CELL * cells as f64 / 1e9,
@@ -155,27 +153,26 @@ impl OccupancyConfig {
     }
 }
 
-/// Which cells are occupied.
+/// The rule that decides which cells are occupied, see [`OccupancyGrid::threshold`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Threshold {
-    /// Cells with more than this density, in 1 / scene unit, are occupied; those of each further cascade with more than half of
-    /// that of the one before, as they are twice as large and steps through them as long.
+    /// Cells with more than this density, in 1 / scene unit, are occupied. The threshold halves from cascade to
+    /// cascade, as cells and steps double.
     pub min_sigma: f32,
-    /// Whether cells below the mean density of all cells are passed over instead, where that is smaller: the customary rule
-    /// in training, with which a field that is faint everywhere is not skipped before it has taken shape.
+    /// Whether the mean density of all cells is the threshold instead where it is smaller: the usual rule in training,
+    /// which keeps a field that is still faint everywhere.
     pub or_mean: bool,
-    /// Whether the 26 cells around an occupied cell are occupied too.
+    /// Whether the 26 neighbours of an occupied cell are occupied too.
     pub dilate: bool,
 }
 
-/// Cells of a box, or of nested boxes, and whether they hold something.
+/// An occupancy grid over a box, or over nested boxes (cascades).
 #[derive(Debug, Clone)]
 pub struct OccupancyGrid {
     lattice: Lattice,
-    /// For each cell, in the order of the words and their bits, the decayed largest density, as many times over as the cell is
-    /// larger than those of cascade 0; NaN if never looked at.
-    /// Shared with copies until one of them looks.
+    /// For each cell, in the order of the words and their bits, the decayed largest density, as many times over as the
+    /// cell is larger than those of cascade 0; NaN if never looked at. Shared with copies until one of them looks.
     densities: Arc<Vec<f32>>,
     /// For each block its occupied cells; see [`bits::coarsen`] for the inner blocks of larger cascades.
     words: Vec<u64>,
@@ -183,15 +180,18 @@ pub struct OccupancyGrid {
 }
 
 impl OccupancyGrid {
-    /// A grid over the box with these lower and upper corners (scene units). Every cell is occupied until looked at.
+    /// Creates a grid over a box (lower and upper corner, scene units). Every cell is occupied until it is sampled.
     ///
     /// # Errors
-    /// If the configuration is out of range or the box is not finite or flat.
+    /// If the configuration is out of range, or the box is flat or not finite.
     pub fn new(bounds: [DVec3; 2], config: &OccupancyConfig) -> Result<Self> {
         config.check()?;
         let [low, high] = bounds;
         if !(low.is_finite() && high.is_finite() && low.cmplt(high).all()) {
-            return Err(Error::setting("bounds", format!("{low} to {high} is no box")));
+            return Err(Error::setting(
+                "bounds",
+                format!("is {low} to {high}; use finite corners, the lower below the upper"),
+            ));
         }
         let lattice = Lattice { bounds, resolution: config.resolution, cascades: config.cascades };
         let words = vec![u64::MAX; lattice.words()];
@@ -199,56 +199,61 @@ impl OccupancyGrid {
         Ok(OccupancyGrid { densities: Arc::new(vec![f32::NAN; CELLS * words.len()]), lattice, words, leaps })
     }
 
-    /// The box of cascade 0 as it was given.
+    /// Returns the box of the first cascade: lower and upper corner.
     pub fn bounds(&self) -> [DVec3; 2] {
         self.lattice.bounds
     }
 
-    /// The outermost box.
+    /// Returns the outermost box: lower and upper corner.
     pub fn outer_bounds(&self) -> [DVec3; 2] {
         self.lattice.extent(self.lattice.cascades - 1)
     }
 
-    /// The longest path through the grid, in scene units and as thresholds have it: that through each further
-    /// cascade is twice as long, and its thresholds half as high, so that each counts as the first, the diagonal of the box.
+    /// Returns the longest path through the grid for [`Skip::min_sigma`], in scene units.
+    ///
+    /// Each cascade counts as the first box's diagonal: its paths are twice as long as the previous one's, and its
+    /// threshold half as high.
     pub fn longest_path(&self) -> f64 {
         let [low, high] = self.bounds();
         self.cascades() as f64 * low.distance(high)
     }
 
-    /// Cells along each axis of a cascade.
+    /// Returns the number of cells along each axis of a cascade.
     pub fn resolution(&self) -> usize {
         self.lattice.resolution
     }
 
-    /// Number of nested boxes.
+    /// Returns the number of cascades.
     pub fn cascades(&self) -> usize {
         self.lattice.cascades
     }
 
-    /// Number of cells that make up the grid, each part of space counted in the smallest cascade that holds it.
+    /// Returns the number of cells, each part of space counted in the smallest cascade that holds it.
     pub fn cells(&self) -> usize {
         self.lattice.used_cells()
     }
 
-    /// The share of the [`cells`](Self::cells) that are occupied, 0 to 1.
+    /// Returns the share of the [`cells`](Self::cells) that are occupied, 0 to 1.
     pub fn occupied_share(&self) -> f64 {
         bits::count(&self.words, &self.lattice) as f64 / self.cells() as f64
     }
 
-    /// The occupied cells, a word for each block of 4 x 4 x 4 of them: blocks x fastest, then y, z and cascade; bit `x + 4 y + 16 z`
-    /// is the cell `(x, y, z)` of the block.
+    /// Returns the occupied cells as bits, one word per block of 4 x 4 x 4.
+    ///
+    /// Blocks are ordered x fastest, then y, z and cascade. Bit `x + 4 y + 16 z` is the cell `(x, y, z)` of the block.
     pub fn words(&self) -> &[u64] {
         &self.words
     }
 
-    /// Whether a place (scene units) is in an occupied cell: of the smallest cascade that holds it. Outside of all it is not.
+    /// Returns whether a point (scene units) is in an occupied cell of the smallest cascade that holds it; `false`
+    /// outside of all.
     pub fn is_occupied(&self, place: DVec3) -> bool {
         self.lattice.holding(place).is_some_and(|(word, bit)| self.words[word] >> bit & 1 == 1)
     }
 
-    /// The mean density of the cells that were looked at, in 1 / scene unit, that of each cell as many times over as it is
-    /// larger than those of cascade 0; 0 if there are none. Carved cells do not count.
+    /// Returns the mean density of the sampled cells, in 1 / scene unit, or 0 if there are none.
+    ///
+    /// Densities are multiplied by the cell's size relative to the first cascade. Carved cells do not count.
     pub fn mean_density(&self) -> f64 {
         // In tasks of fixed size, so that the sum has the same bits at any number of threads.
         let parts: Vec<&[f32]> = self.densities.chunks(CELLS * TASK).collect();
@@ -260,7 +265,7 @@ impl OccupancyGrid {
         if count == 0 { 0.0 } else { sum / count as f64 }
     }
 
-    /// Decides anew which cells are occupied. A cell that was never looked at, or whose density is NaN, is.
+    /// Updates which cells are occupied. Cells that were never sampled, or whose density is NaN, are occupied.
     pub fn threshold(&mut self, rule: &Threshold) {
         let mut limit = rule.min_sigma;
         if rule.or_mean {

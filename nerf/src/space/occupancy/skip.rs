@@ -1,4 +1,4 @@
-//! How much empty-looking space may be skipped.
+//! Skipping of empty space, by error bound.
 
 use crate::range::{by_name, check_range};
 use crate::{Error, Result};
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// What a grid may skip when rendering, by what it may cost.
+/// A preset of [`Skipping`], by its error bound.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Skip {
@@ -21,7 +21,7 @@ pub enum Skip {
 }
 
 impl Skip {
-    /// The optical depth that may be skipped along one ray.
+    /// Returns the optical depth that may be skipped along one ray.
     pub fn max_depth(self) -> f64 {
         match self {
             Skip::Off => 0.0,
@@ -30,21 +30,21 @@ impl Skip {
         }
     }
 
-    /// The largest change of a colour, as a share of the range of colours: `1 - e^-max_depth`.
+    /// Returns the largest change of a colour, as a share of the range of colours: `1 - e^-max_depth`.
     pub fn error_bound(self) -> f64 {
         -(-self.max_depth()).exp_m1()
     }
 
-    /// The density (1 / scene unit) up to which cells may be skipped if a ray's path through all of them is no longer
-    /// than `path` scene units: `max_depth / path`, and for [`Skip::Off`] minus infinity, which no density is below.
+    /// Returns the density (1 / scene unit) up to which cells may be skipped, for paths of at most `path` scene units:
+    /// `max_depth / path`, or minus infinity for [`Skip::Off`].
     ///
-    /// With 500 steps along the path, that is 1e-5 of optical depth a step for [`Skip::NearLossless`] and 1e-4 for
+    /// With 500 steps along the path, that is 1e-5 of optical depth per step for [`Skip::NearLossless`] and 1e-4 for
     /// [`Skip::Fast`].
     ///
     /// # Panics
-    /// If the path is not longer than 0.
+    /// If `path` is not above 0.
     pub fn min_sigma(self, path: f64) -> f32 {
-        assert!(path > 0.0, "a path of length {path}");
+        assert!(path > 0.0, "the path length must be above 0, is {path}");
         match self {
             Skip::Off => f32::NEG_INFINITY,
             Skip::NearLossless | Skip::Fast => (self.max_depth() / path) as f32,
@@ -52,8 +52,8 @@ impl Skip {
     }
 }
 
-/// What is left out, switch by switch: a [`Skip`] is a set of these, and a configuration may say each for itself. In a file
-/// it is such a name, or an object with these fields.
+/// Skipping in training and renders, with one field per technique. In a file it is the name of a [`Skip`], or an object
+/// with these fields.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(from = "Stored")]
 pub struct Skipping {
@@ -74,7 +74,7 @@ pub struct Skipping {
     pub colors: f64,
 }
 
-/// Photographs that must agree that a cell is empty.
+/// Images that must agree that a cell is empty.
 const VOTES: u32 = 3;
 
 impl From<Skip> for Skipping {
@@ -88,7 +88,7 @@ impl From<Skip> for Skipping {
     }
 }
 
-/// What a file may say.
+/// The form in files.
 #[derive(Deserialize)]
 #[serde(untagged, deny_unknown_fields)]
 enum Stored {
@@ -115,10 +115,10 @@ impl From<Stored> for Skipping {
 }
 
 impl Skipping {
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     pub fn check(&self) -> Result<()> {
         check_range("occupancy.skip.pruning", self.pruning, 0.0, 1.0)?;
         check_range("occupancy.skip.early_stop_eps", self.early_stop_eps, 0.0, 1.0)?;
@@ -136,8 +136,7 @@ impl FromStr for Skip {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        by_name(name)
-            .ok_or_else(|| Error::setting("skip", format!("there is no `{name}`; use off, near-lossless or fast")))
+        by_name(name).ok_or_else(|| Error::setting("skip", format!("is `{name}`; use off, near-lossless or fast")))
     }
 }
 

@@ -1,4 +1,4 @@
-//! Grids as bytes, to be stored beside a model.
+//! Serialisation of grids.
 
 use super::empty_cubes::Leaps;
 use super::lattice::CELLS;
@@ -14,8 +14,8 @@ const OCCUPIED: [u8; 8] = *b"raygocb1";
 const HEADER: usize = 8 + 2 * 4 + 6 * 8;
 
 impl OccupancyGrid {
-    /// The whole grid, to go on training with: a header, one word for each block, one `f32` for each cell; little-endian.
-    /// 8.7 MB at 128^3.
+    /// Serialises the whole grid, to resume training: a header, one word per block and one `f32` per cell,
+    /// little-endian. It takes 8.7 MB at 128^3.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = self.header_and_words(WHOLE);
         bytes.reserve(4 * self.densities.len());
@@ -23,8 +23,7 @@ impl OccupancyGrid {
         bytes
     }
 
-    /// Which cells are occupied, all that rendering reads: [`to_bytes`](Self::to_bytes) without the densities. 0.26 MB at
-    /// 128^3.
+    /// Serialises only the occupied cells, which suffice for rendering. It takes 0.26 MB at 128^3.
     pub fn occupied_to_bytes(&self) -> Vec<u8> {
         self.header_and_words(OCCUPIED)
     }
@@ -42,16 +41,16 @@ impl OccupancyGrid {
         bytes
     }
 
-    /// The grid that [`to_bytes`](Self::to_bytes) or [`occupied_to_bytes`](Self::occupied_to_bytes) wrote. Of the latter an
-    /// occupied cell counts as never looked at, and any other as empty.
+    /// Deserialises [`to_bytes`](Self::to_bytes) or [`occupied_to_bytes`](Self::occupied_to_bytes). After the latter,
+    /// occupied cells count as never sampled, and others as empty.
     ///
     /// # Errors
-    /// If the bytes are cut short, too long or no grid.
+    /// If the bytes are too short, too long or not a grid.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let error = |what: String| Error::setting("occupancy grid", what);
         let magic = bytes.first_chunk().filter(|magic| [WHOLE, OCCUPIED].contains(magic));
         if bytes.len() < HEADER || magic.is_none() {
-            return Err(error("is not an occupancy grid of this version".into()));
+            return Err(error("is not an occupancy grid of this version; save the model again".into()));
         }
         let is_whole = magic == Some(&WHOLE);
         let mut rest = &bytes[WHOLE.len()..];
@@ -63,7 +62,7 @@ impl OccupancyGrid {
         let cells = resolution.pow(3) * cascades;
         let needed = HEADER + cells / CELLS * 8 + if is_whole { cells * 4 } else { 0 };
         if bytes.len() != needed {
-            return Err(error(format!("has {} bytes where {needed} belong; write it again", bytes.len())));
+            return Err(error(format!("has {} bytes, should have {needed}; save the model again", bytes.len())));
         }
         let mut grid = OccupancyGrid::new(corners, &config)?;
         grid.words.iter_mut().for_each(|word| *word = u64::from_le_bytes(take(&mut rest)));

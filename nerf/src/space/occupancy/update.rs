@@ -1,4 +1,4 @@
-//! Looking at a field: a few cells at a time in training, all that matter before rendering.
+//! Updates of the grid from a field: some cells at a time in training, all relevant ones before rendering.
 
 use super::lattice::{CELLS, Lattice, cell, uncarved};
 use super::{OccupancyGrid, TASK, bits, exceeding};
@@ -10,11 +10,12 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A field's density: writes that of each position (scene units) into the slot of the same number (1 / scene unit).
-/// It is called from several threads at a time, with [`POINTS`] positions or fewer that lie close together.
+/// A function that writes the density (1 / scene unit) at each position (scene units) to the same index of the output.
+///
+/// It is called from several threads, with at most [`POINTS`] positions that lie close together.
 pub type DensityFn<'a> = dyn Fn(&[[f32; 3]], &mut [f32]) + Sync + 'a;
 
-/// The most positions in one call of a [`DensityFn`].
+/// Maximum number of positions per call of a [`DensityFn`].
 pub const POINTS: usize = 4096;
 /// Samples along each edge of a cell in [`OccupancyGrid::rebuild`].
 const REBUILD: usize = 2;
@@ -22,25 +23,25 @@ const REBUILD: usize = 2;
 /// Samples along each edge of a cell that [`OccupancyGrid::prune`] would empty.
 const CLOSELY: usize = 4;
 
-/// Which cells an update looks at, and how.
+/// The cells that [`OccupancyGrid::update`] samples, and how.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Update {
-    /// Every cell is looked at once in so many updates, at least 1.
+    /// Every cell is sampled once in this many updates, at least 1.
     pub every: u32,
-    /// Every occupied cell is looked at once in so many updates, at least 1.
+    /// Every occupied cell is sampled once in this many updates, at least 1.
     pub occupied_every: u32,
-    /// Samples along each edge of a cell, 1 to 4: 2 means 2 x 2 x 2 samples, one at a random place in each octant.
+    /// Samples along each edge of a cell, 1 to 4: 2 means 2 x 2 x 2 samples, one random point per octant.
     pub samples: u32,
-    /// What is left of a cell's old density when it is looked at, 0 to 1; the larger of that and the new is kept.
+    /// Factor of a cell's old density when it is sampled, 0 to 1; the larger of that and the new density is kept.
     pub decay: f32,
 }
 
 impl Update {
-    /// All cells: the customary choice for the first 256 steps of training.
+    /// All cells, the usual choice for the first 256 steps of training.
     pub const ALL: Update = Update { every: 1, occupied_every: 1, samples: 1, decay: 0.95 };
-    /// Occupied cells and one in sixteen of the others, for later: as good as one in four, which is customary, on scenes
-    /// of solid objects, at half of the cost.
+    /// Occupied cells and one in sixteen of the others, for later steps. On scenes of solid objects it is as good as
+    /// the usual one in four, at half the cost.
     pub const PARTIAL: Update = Update { every: 16, ..Update::ALL };
 }
 
@@ -77,8 +78,8 @@ struct Waiting {
 }
 
 impl Waiting {
-    /// Looks at what waits; `scale` is what the densities of a word's cells are multiplied by, and `keep` makes a cell's density
-    /// of its old one and the largest new one.
+    /// Looks at what waits; `scale` is what the densities of a word's cells are multiplied by, and `keep` makes a
+    /// cell's density of its old one and the largest new one.
     fn flush(
         &mut self,
         density: &DensityFn<'_>,
@@ -117,18 +118,18 @@ fn turn(word: usize, step: u64, every: u32) -> u64 {
 }
 
 impl OccupancyGrid {
-    /// Looks at some cells and returns the number of densities that were asked for. What is occupied changes only with
-    /// the next [`threshold`](Self::threshold).
+    /// Samples some cells and returns the number of density evaluations.
     ///
-    /// `step` counts the updates: with it and `seed` the same cells and places are chosen at any number of threads.
-    /// Each density becomes `max(decay * old, largest new)`.
+    /// Each cell's density becomes `max(decay * old, largest new)`. Occupancy changes only with the next
+    /// [`threshold`](Self::threshold). `step` counts the updates; with `seed` it determines cells and points, on any
+    /// number of threads.
     ///
     /// # Panics
-    /// If a number of the plan is out of range.
+    /// If a value of `plan` is out of range.
     pub fn update(&mut self, plan: &Update, seed: u64, step: u64, density: &DensityFn<'_>) -> u64 {
-        assert!(plan.every > 0 && plan.occupied_every > 0, "every cell has its turn: {plan:?}");
-        assert!((1..=4).contains(&plan.samples), "1 to 4 samples along each edge: {plan:?}");
-        assert!((0.0..=1.0).contains(&plan.decay), "a share is left: {plan:?}");
+        assert!(plan.every > 0 && plan.occupied_every > 0, "`every` and `occupied_every` must be at least 1: {plan:?}");
+        assert!((1..=4).contains(&plan.samples), "`samples` must be 1 to 4: {plan:?}");
+        assert!((0.0..=1.0).contains(&plan.decay), "`decay` must be 0 to 1: {plan:?}");
         let words = std::mem::take(&mut self.words);
         let chosen = |word: usize| turn(word, step, plan.every) | words[word] & turn(word, step, plan.occupied_every);
         let rng = |task: usize| stream(seed, [step, task as u64]);
@@ -139,16 +140,15 @@ impl OccupancyGrid {
         count
     }
 
-    /// Forgets what was known and finds out which cells a finished field occupies, for rendering. Returns the number of
-    /// densities that were asked for.
+    /// Finds the occupied cells of a trained field anew, for rendering, and returns the number of density evaluations.
     ///
-    /// Samples are the middles of the eight octants of each cell. First one of them is looked at in each cell, then all
-    /// eight in each empty cell that touches an occupied one, until none is left. So the occupied cells are those that
-    /// eight samples in every cell would find, except for groups of touching cells of which none shows in its first
-    /// sample. Whatever contains a box of one cell's size with more than `min_sigma` everywhere is not missed; of what
-    /// is found, each cell is that contains such a box of half that edge.
+    /// Samples are the centres of a cell's eight octants. One is evaluated in each cell; then all eight in each empty
+    /// cell that touches an occupied one, until there are no more. The result equals eight samples in every cell,
+    /// except for groups of touching cells that all miss in their first sample. A box of one cell's size with more than
+    /// `min_sigma` everywhere is never missed. Of a group that is found, each cell with such a box of half that edge is
+    /// occupied.
     ///
-    /// With `dilate`, the 26 cells around each of them are occupied too.
+    /// With `dilate`, the 26 neighbours of each occupied cell are occupied too.
     pub fn rebuild(&mut self, min_sigma: f32, dilate: bool, density: &DensityFn<'_>) -> u64 {
         let all = Places::middles(REBUILD);
         let one = Places { corners: all.corners[..1].to_vec(), ..all };
@@ -176,11 +176,11 @@ impl OccupancyGrid {
         count
     }
 
-    /// Looks at the occupied cells of a finished field, and empties those where no density exceeds `min_sigma`: first at
-    /// the middles of their eight octants and then, in what that would empty, at one random place in each of 64 parts, so
-    /// that what is thinner than an octant is seldom missed. Returns the number of densities that were asked for.
+    /// Empties the occupied cells of a trained field where no sampled density exceeds `min_sigma`, and returns the
+    /// number of density evaluations.
     ///
-    /// What was known of the cells stays: a copy of a grid that is pruned shares it with the grid.
+    /// It samples the centres of a cell's eight octants, and before emptying it one random point in each of 64 parts,
+    /// so that thin structures are seldom missed. Stored densities do not change, so copies of the grid share them.
     pub fn prune(&mut self, min_sigma: f32, density: &DensityFn<'_>) -> u64 {
         let (fixed, random) = (Places::middles(REBUILD), Places::random(CLOSELY));
         let (lattice, mut occupied) = (&self.lattice, self.words.clone());
@@ -243,8 +243,8 @@ struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// Looks at the chosen cells of each word of a task, whose densities these are, and returns how many densities were asked
-    /// for.
+    /// Looks at the chosen cells of each word of a task, whose densities these are, and returns how many densities were
+    /// asked for.
     fn at(
         &self,
         task: usize,

@@ -25,7 +25,7 @@ fn cameras_from_which_nothing_of_the_box_is_seen_are_an_error() {
         frame.camera.pose.translation *= 3.0;
     }
     let message = Trainer::new(tiny(), Arc::new(data.clone())).err().unwrap().to_string();
-    let expected = "no ray of the 3 photographs meets the box";
+    let expected = "no ray of the 3 images meets the box";
     assert!(message.contains(expected) && message.contains("on average"), "{message}");
     // One that sees a part is enough.
     data.frames[2].camera.pose.translation /= 3.0;

@@ -9,7 +9,7 @@ use raygrad_autograd::{Real, Scalar};
 /// No interval is halved more often.
 const MOST_HALVINGS: usize = 24;
 
-/// What the field says at one place.
+/// The field's values at one place.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     t: f64,
@@ -27,9 +27,9 @@ struct Link {
     open: bool,
 }
 
-/// The [nodes](Quadrature::nodes) of an adaptive rule, and how often density and colour were queried to find them: halves
-/// the intervals between the ends of `steps` until the estimated change of the pixel by halving one is at most `tolerance`.
-/// The change is bounded over all colours in 0..=1 that may lie behind.
+/// The [nodes](Quadrature::nodes) of an adaptive rule, and how often density and colour were queried to find them:
+/// halves the intervals between the ends of `steps` until the estimated change of the pixel by halving one is at most
+/// `tolerance`. The change is bounded over all colours in 0..=1 that may lie behind.
 ///
 /// Intervals that no more light than `least` reaches are left out. Nothing is recorded: no gradient flows through the
 /// choice of places. A feature that shows at no node of `steps` is not found.
@@ -99,8 +99,8 @@ fn halved(links: &[Link], middles: &[f64], found: &mut impl Iterator<Item = Node
     out
 }
 
-/// The most that a pixel can change when the interval from a to b of this length is halved, if all light reaches it; NaN if
-/// a number is.
+/// The most that a pixel can change when the interval from a to b of this length is halved, if all light reaches it;
+/// NaN if a number is.
 fn change(a: Node, middle: Node, b: Node, length: f64) -> f64 {
     let passed = |a: Node, b: Node, length: f64| (-0.5 * length * (a.sigma + b.sigma)).exp();
     let [whole, near, far] = [passed(a, b, length), passed(a, middle, 0.5 * length), passed(middle, b, 0.5 * length)];

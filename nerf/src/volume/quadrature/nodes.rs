@@ -65,10 +65,11 @@ impl Quadrature {
         !matches!(self, Quadrature::Left | Quadrature::Midpoint)
     }
 
-    /// Returns the nodes of the rule for `steps`, each the centre of an interval of length `delta`. An adaptive rule starts with
-    /// these.
+    /// Returns the nodes of the rule for `steps`, each the centre of an interval of length `delta`. An adaptive rule
+    /// starts with these.
     ///
-    /// With two nodes per interval, `delta` of the first one is the interval's length; it is 0 for nodes where no interval begins.
+    /// With two nodes per interval, `delta` of the first one is the interval's length; it is 0 for nodes where no
+    /// interval begins.
     pub fn nodes<T: Scalar>(self, steps: &Samples<T>) -> Samples<T> {
         if self == Quadrature::Midpoint {
             return steps.clone();
@@ -100,7 +101,8 @@ impl Quadrature {
         placed(steps, offsets, nodes)
     }
 
-    /// Returns the number of intervals per ray for at most `evaluations` nodes, at least one. An adaptive rule starts with as many.
+    /// Returns the number of intervals per ray for at most `evaluations` nodes, at least one. An adaptive rule starts
+    /// with as many.
     pub fn intervals(self, evaluations: usize) -> usize {
         let intervals = match self {
             Quadrature::Left | Quadrature::Midpoint | Quadrature::Adaptive { .. } => evaluations,
@@ -156,7 +158,8 @@ impl Quadrature {
         Rendered { samples, positions, directions, density, weights, optical_depth, color }
     }
 
-    /// The nodes of the intervals that more than `early_stop_eps` of the light reaches, and which of all nodes they are.
+    /// The nodes of the intervals that more than `early_stop_eps` of the light reaches, and which of all nodes they
+    /// are.
     pub(crate) fn visible_nodes<T: Scalar>(
         self,
         density: &Density<'_, T>,

@@ -43,7 +43,8 @@ impl Quadrature {
         }
     }
 
-    /// Returns the order of convergence in the interval length for smooth scenes, or `None` if intervals differ in length.
+    /// Returns the order of convergence in the interval length for smooth scenes, or `None` if intervals differ in
+    /// length.
     pub fn order(self) -> Option<u32> {
         match self {
             Quadrature::Left => Some(1),

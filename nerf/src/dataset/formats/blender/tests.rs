@@ -74,7 +74,7 @@ fn all_splits_are_read() {
     file("test", "{}".to_owned()).unwrap();
     says(&failure(read(folder.path()), "transforms_test.json"), &["`frames`: is missing"]);
     let none = tempfile::tempdir().unwrap();
-    says(&read(none.path()).unwrap_err().to_string(), &["is not a dataset in this format", "transforms_val.json"]);
+    says(&read(none.path()).unwrap_err().to_string(), &["is not a Blender dataset", "transforms_val.json"]);
 }
 
 #[test]
@@ -136,7 +136,7 @@ fn fields_of_other_programs_count() {
     assert_eq!(of(json!({ "k1": 0, "camera_model": "SIMPLE_RADIAL", "is_fisheye": 0 })), plain);
     let own = good(|d| d["frames"][1]["camera_angle_x"] = json!(0.9));
     assert_eq!(own.views[1].camera.focal, [4.0 / 0.45f64.tan(); 2]);
-    fails(|d| d["x_fov"] = json!(45.8), &["`x_fov`: is 45.8, and cannot be followed"]);
+    fails(|d| d["x_fov"] = json!(45.8), &["`x_fov`: is 45.8, which raygrad does not read"]);
 }
 
 #[test]
@@ -207,23 +207,23 @@ fn what_has_no_place_in_the_format_is_named() {
         let mut capture = before.clone();
         change(&mut capture.views[1]);
         let message = write(&capture, folder.path()).unwrap_err().to_string();
-        says(&message, &["cannot be written in the format of Blender: images/r_1 "]);
+        says(&message, &["cannot be written in Blender's format: images/r_1 "]);
         says(&message, parts);
         assert!(!detect(folder.path()));
     };
     let undistort = "`raygrad prepare --undistort`";
     fails(|v| v.camera.lens = Lens::Fov { omega: 0.9 }, &["distorts", undistort]);
     fails(|v| v.camera.focal[1] *= 1.01, &["not square", undistort]);
-    fails(|v| v.camera.centre[0] += 0.5, &["at 4.5, 3 and not in the middle", undistort]);
-    fails(|v| v.camera.centre[1] += 0.5, &["at 4, 3.5 and not in the middle", undistort]);
-    fails(|v| v.camera.focal = [9.0; 2], &["another size or focal length than images/r_0", undistort]);
-    fails(|v| (v.camera.height, v.camera.centre[1]) = (8, 4.0), &["another size", undistort]);
-    fails(|v| v.camera.pose.translation.x = f64::NAN, &["not finite"]);
+    fails(|v| v.camera.centre[0] += 0.5, &["at 4.5, 3, not at the centre", undistort]);
+    fails(|v| v.camera.centre[1] += 0.5, &["at 4, 3.5, not at the centre", undistort]);
+    fails(|v| v.camera.focal = [9.0; 2], &["differs in size or focal length from images/r_0", undistort]);
+    fails(|v| (v.camera.height, v.camera.centre[1]) = (8, 4.0), &["differs in size", undistort]);
+    fails(|v| v.camera.pose.translation.x = f64::NAN, &["non-finite number"]);
     fails(|v| v.camera.focal = [f64::NAN; 2], &["not square"]);
     fails(|v| v.mask = Some("mask.png".into()), &["has a mask"]);
     fails(|v| v.split = None, &["in no split"]);
     let empty = Capture { views: vec![], ..before.clone() };
-    says(&write(&empty, folder.path()).unwrap_err().to_string(), &["there are no photographs"]);
+    says(&write(&empty, folder.path()).unwrap_err().to_string(), &["there are no images"]);
 }
 
 #[test]

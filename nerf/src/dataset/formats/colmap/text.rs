@@ -103,8 +103,8 @@ pub(super) fn images(file: &Path, bytes: &[u8]) -> Result<Vec<ImageEntry>> {
     Ok(images)
 }
 
-/// That a line is one of observations. Where somebody has left out an empty one, the next image is in its place, and
-/// must not be lost in silence.
+/// Checks that a line holds observations. If an empty one is missing, the next image is in its place, and must not be
+/// lost silently.
 fn observations(line: &Words<'_>) -> Result<()> {
     let (mut count, mut last) = (0, "-1");
     for word in line.rest.split_whitespace() {

@@ -168,7 +168,7 @@ fn every_coefficient_of_every_model_counts_and_others_are_errors() {
     for model in ["OPENCV", "FULL_OPENCV"] {
         assert_eq!(with(json!({ "camera_model": model, "k1": 0 })).lens, Lens::Pinhole, "{model}");
     }
-    fails(|d| d["k4"] = json!(0.1), &["`k4`", "nerfstudio", "OpenCV divides", "FULL_OPENCV"]);
+    fails(|d| d["k4"] = json!(0.1), &["`k4`", "nerfstudio", "a denominator term in OpenCV", "FULL_OPENCV"]);
     for omega in [json!(null), json!(0), json!(-0.5), json!(3.2)] {
         let change = |d: &mut Value| set(d, &json!({ "camera_model": "FOV", "omega": omega }));
         fails(change, &["omega`: must be the field of view in radians"]);
@@ -274,8 +274,8 @@ fn numbers_that_are_none_are_named() {
         }
     }
     for value in [json!(0), json!(-64), json!(64.5), json!(1e9)] {
-        fails(|d| d["w"] = value.clone(), &["`w`: must be a whole number of pixels, of 1 to 1048576"]);
-        fails(|d| d["frames"][0]["h"] = value, &["`frames[0].h`: must be a whole number"]);
+        fails(|d| d["w"] = value.clone(), &["`w`: must be an integer number of pixels, 1 to 1048576"]);
+        fails(|d| d["frames"][0]["h"] = value, &["`frames[0].h`: must be an integer number of pixels"]);
     }
     for value in [json!(0), json!(-100), json!(1e-9), json!(1e300)] {
         fails(|d| d["fl_x"] = value.clone(), &["`fl_x`: must be a focal length"]);
@@ -288,7 +288,7 @@ fn numbers_that_are_none_are_named() {
         };
         fails(change, &["`camera_angle_x`: must be an angle in radians between 0 and pi"]);
     }
-    fails(|d| d["cx"] = json!(1e12), &["`cx`: must be a place in pixels"]);
+    fails(|d| d["cx"] = json!(1e12), &["`cx`: must be a position in pixels"]);
     fails(|d| remove(d, "h"), &["`h`: is missing beside `w`"]);
     fails(|d| remove(d, "w"), &["`w`: is missing beside `h`"]);
 }

@@ -89,12 +89,12 @@ fn errors_name_the_row() {
     fails(4, 0.4, "height must be 1 to");
     fails(9, 1e300, "width must be 1 to");
     fails(14, 0.0, "focal length must be more than 0");
-    fails(15, -1.0, "depths must be 0 or more");
-    fails(16, 2.5, "depths must be 0 or more");
+    fails(15, -1.0, "depths must be at least 0 and rise");
+    fails(16, 2.5, "depths must be at least 0 and rise");
     fails_as(&npy(&ROWS[..1]), "`shape`: has 1 rows, but there are 2 images");
     fails_as(&npy(&[]), "`shape`: has no row");
-    fails_as(&Matrix { rows: 2, columns: 15, values: vec![0.0; 30] }.write(), "`shape`: must be 17 columns, is 15");
-    fails_as(b"?", "is not a whole npy file");
+    fails_as(&Matrix { rows: 2, columns: 15, values: vec![0.0; 30] }.write(), "`shape`: must have 17 columns, has 15");
+    fails_as(b"?", "is not a complete npy file: copy it again");
 }
 
 #[test]
@@ -130,15 +130,18 @@ fn what_cannot_be_written_is_named() {
     };
     camera(
         &|c| c.lens = Lens::Fov { omega: 1.0 },
-        "has a lens; LLFF holds equal pinhole cameras alone: undistort first",
+        "has lens distortion; LLFF needs equal pinhole cameras: undistort first",
     );
-    camera(&|c| c.centre[1] = 14.0, "has its principal point at (20, 14), not in the middle");
-    camera(&|c| c.focal[1] = 14.0, "has focal lengths 55.5 and 14, which differ");
-    camera(&|c| c.focal = [14.0; 2], "differs in size or focal length from the others; LLFF holds");
+    camera(&|c| c.centre[1] = 14.0, "has its principal point at (20, 14), not at the centre");
+    camera(&|c| c.focal[1] = 14.0, "has different focal lengths, 55.5 and 14");
+    camera(&|c| c.focal = [14.0; 2], "differs in size or focal length from the others; LLFF needs");
     camera(&|c| c.pose.matrix3 *= 2.0, "its first three columns (down, right, backwards): must be a rotation");
     fails(&|capture| capture.views[1].bounds = None, "`row 1.bounds`: are not known");
-    fails(&|capture| capture.views[1].name = "a/b.png".into(), "`row 1.name`: `a/b.png` must be the plain name");
-    fails(&|capture| capture.views[1].name = "b".into(), "`row 1.name`: `b` must be the plain name");
+    fails(
+        &|capture| capture.views[1].name = "a/b.png".into(),
+        "`row 1.name`: `a/b.png` must be a plain png or jpg name",
+    );
+    fails(&|capture| capture.views[1].name = "b".into(), "`row 1.name`: `b` must be a plain png or jpg name");
     fails(&|capture| capture.views[1].name = "a.png".into(), "`row 1.name`: `a.png` is there twice");
     fails(&|capture| capture.views.clear(), "has no view");
 }

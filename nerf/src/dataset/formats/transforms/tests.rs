@@ -86,7 +86,7 @@ fn a_pose_that_is_none_is_named() {
     bad(with(2, 2, -1.0), "mirrors");
     bad(with(3, 3, 0.0), "the last row must be 0 0 0 1, is 0 0 0 0");
     bad(with(3, 1, 0.5), "the last row must be 0 0 0 1");
-    bad(json!([[2, 0, 0, 0], [0, 0, -2, 0], [0, 2, 0, 4]]), "also scales by 2.000000: divide");
+    bad(json!([[2, 0, 0, 0], [0, 0, -2, 0], [0, 2, 0, 4]]), "but scales by 2.000000: divide");
     bad(json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]), "not orthonormal");
     bad(json!([[1, 0, 0, null], [0, 1, 0, 0], [0, 0, 1, 0]]), "row 0, column 3 is not a finite number: null");
     for value in ["NaN", "Infinity", "-Infinity"] {
@@ -203,7 +203,7 @@ fn lists_of_names_are_splits() {
         d["train_filenames"] = json!(["images/0.png"]);
         d["test_filenames"] = json!(["images/0.png"]);
     };
-    fails(twice, &["`test_filenames[0]`: images/0.png is in train_filenames too"]);
+    fails(twice, &["`test_filenames[0]`: lists images/0.png, which train_filenames has too"]);
 }
 
 #[test]

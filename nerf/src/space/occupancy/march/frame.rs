@@ -1,4 +1,4 @@
-//! Rays in units of cells, and which cell holds a point.
+//! Rays in units of cells, and lookup of the cell that holds a point.
 
 use super::super::lattice::{EDGE, Lattice};
 use super::spacing::whole;

@@ -1,9 +1,9 @@
-//! Where along a ray the samples of a march lie: equally far apart, or ever farther.
+//! Spacing of samples along a ray: uniform, or growing with distance.
 
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// A ray is marched for no more steps than this.
+/// Maximum number of steps along a ray.
 pub const MAX_STEPS: usize = 1 << 20;
 
 /// Samples that are worked on at a time.
@@ -11,36 +11,36 @@ pub(super) const LANES: usize = 16;
 /// What the steps of a cone hold beyond the last: a group may begin at the last sample of another.
 const SPARE: usize = 2 * LANES;
 
-/// How far apart samples are.
+/// The spacing of samples along rays.
 ///
-/// At distance `t` a step is `length + cone t` long. Sample `i` of a ray that enters at `near` lies at
-/// `t_i = t_0 + (length + cone t_0) ((1 + cone)^i - 1) / cone` with `t_0 = near + jitter (length + cone near)`, which is
-/// `t_0 + i length` for a cone of 0: each directly from `i`, so within 1 ULP, or 2 with a cone, however large `i` is.
+/// At distance `t` a step is `length + cone t` long. Sample `i` of a ray that enters at `near` lies at `t_i = t_0 +
+/// (length + cone t_0) ((1 + cone)^i - 1) / cone` with `t_0 = near + jitter (length + cone near)`, which is `t_0 + i
+/// length` for a cone of 0: each directly from `i`, so within 1 ULP, or 2 with a cone, however large `i` is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Step {
-    /// Length in scene units, greater than 0. Where it is less than an ULP of the distance, samples coincide.
+    /// Step length in scene units, above 0. If it is below an ULP of the distance, samples coincide.
     pub length: f32,
-    /// How much longer a step is for each scene unit of distance, 0 to 1. 0 is a uniform march; about the angle of a
-    /// pixel in radians makes steps grow with what a pixel covers; 1/256 is customary for large scenes.
+    /// Growth of the step per scene unit of distance, 0 to 1; 0 is uniform. The angle of a pixel in radians makes steps
+    /// grow with the pixel's footprint; 1/256 is usual for large scenes.
     pub cone: f32,
-    /// Samples a ray may have; what lies behind is not sampled.
+    /// Maximum number of samples per ray.
     pub max_samples: usize,
 }
 
 impl Step {
-    /// Steps of one length, and as many samples as there are.
+    /// Creates uniform steps without a limit on samples.
     pub fn uniform(length: f32) -> Self {
         Step { length, cone: 0.0, max_samples: usize::MAX }
     }
 
-    /// Whether the numbers make sense.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// If one is out of range.
+    /// If a value is out of range.
     pub fn check(&self) -> Result<()> {
         if !(self.length > 0.0 && self.length.is_finite()) {
-            return Err(Error::setting("step.length", format!("is {}; use more than 0", self.length)));
+            return Err(Error::setting("step.length", format!("is {}; use a finite length above 0", self.length)));
         }
         if !(0.0..=1.0).contains(&self.cone) {
             return Err(Error::setting("step.cone", format!("is {}; use 0 to 1", self.cone)));

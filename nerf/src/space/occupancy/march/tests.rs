@@ -308,7 +308,7 @@ fn a_buffer_can_be_used_again() {
 }
 
 #[test]
-#[should_panic(expected = "`step.length`: is 0; use more than 0")]
+#[should_panic(expected = "`step.length`: is 0; use a finite length above 0")]
 fn a_step_of_no_length_is_refused() {
     march(&random_grid(BOX, 8, 1, 1.0, 0), &one(DVec3::ZERO, DVec3::X, [0.0, 1.0]), &Step::uniform(0.0));
 }

@@ -128,7 +128,7 @@ fn what_cannot_be_written_is_named() {
         fails(&|capture| change(&mut capture.views[1].camera), Encoding::Binary, &format!("`frames[b.png].{expected}"));
     };
     camera(&|c| c.lens = Lens::Equirectangular, "camera`: is equirectangular");
-    camera(&|c| c.lens = Lens::Fov { omega: 4.0 }, "camera`: omega: must be an angle of less than pi");
+    camera(&|c| c.lens = Lens::Fov { omega: 4.0 }, "camera`: omega: must be below pi (radians)");
     camera(&|c| c.lens = Lens::Brown { k: [f64::NAN; 6], p: [0.0; 2] }, "camera`: k1: must be a finite number");
     camera(&|c| c.focal[1] = 0.0, "camera`: focal length: must be more than 0");
     camera(&|c| c.centre[0] = f64::INFINITY, "camera`: cx: must be a finite number");
@@ -151,7 +151,11 @@ fn what_cannot_be_written_is_named() {
     }
     name("x y", Encoding::Text, "`x y` has a space");
     let point = Point { position: DVec3::splat(f64::NAN), color: [0; 3], error: 0.0, views: 0 };
-    fails(&|capture| capture.points = vec![point], Encoding::Text, "`points[0]`: has a number that is not finite");
+    fails(
+        &|capture| capture.points = vec![point],
+        Encoding::Text,
+        "`points[0]`: has a non-finite number: remove the point",
+    );
 }
 
 #[test]

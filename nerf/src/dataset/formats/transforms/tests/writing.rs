@@ -188,13 +188,13 @@ fn what_cannot_be_written_is_named() {
         says(&message, &["transforms.json: cannot be written: ", part]);
         assert!(!capture.file.exists());
     };
-    fails(|c| c.views.clear(), "no photographs");
+    fails(|c| c.views.clear(), "there are no images");
     fails(|c| c.views[1].camera.width = 0, "camera of images/1.png");
     fails(|c| c.views[1].camera.focal[1] = f64::NAN, "camera of images/1.png");
     fails(|c| c.views[1].camera.centre[0] = f64::INFINITY, "camera of images/1.png");
     fails(|c| c.views[1].camera.pose.translation.x = f64::NAN, "camera of images/1.png");
     fails(|c| c.views[1].camera.lens = Lens::Fov { omega: f64::NAN }, "camera of images/1.png");
-    fails(|c| c.views[1].camera.lens = Lens::Equirectangular, "images/1.png does not show all directions");
+    fails(|c| c.views[1].camera.lens = Lens::Equirectangular, "images/1.png does not cover all directions");
     fails(|c| c.views[1].depth.as_mut().unwrap().1 = f64::NAN, "camera of images/1.png");
     fails(|c| c.applied.translation.x = f64::NAN, "transform before");
     fails(|c| c.aabb_scale = Some(f64::INFINITY), "the box");
