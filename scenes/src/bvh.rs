@@ -1,18 +1,18 @@
-//! A bounding volume hierarchy: which of many shapes a ray meets, or a point is near to, without asking each.
+//! A bounding volume hierarchy for ray and distance queries of many shapes.
 
 use glam::DVec3;
 
 use super::shape::{Shape, Surface};
 use raygrad_nerf::Ray;
 
-/// Where a ray meets a surface.
+/// The hit of a ray with a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hit {
     /// Distance from the ray's origin, in scene units.
     pub distance: f64,
     /// The outward unit normal.
     pub normal: DVec3,
-    /// The index of the solid that it belongs to.
+    /// The index of the solid.
     pub solid: usize,
 }
 
@@ -48,7 +48,7 @@ impl<S: Surface> Bvh<S> {
     /// # Panics
     /// If there are none.
     pub fn new(shapes: Vec<S>) -> Self {
-        assert!(!shapes.is_empty(), "a scene has at least one solid");
+        assert!(!shapes.is_empty(), "a scene must have at least one solid");
         let shapes: Vec<_> = shapes.into_iter().enumerate().collect();
         let nodes = vec![Node { min: DVec3::ZERO, max: DVec3::ZERO, first: 0, count: 0 }];
         let mut bvh = Bvh { nodes, shapes };

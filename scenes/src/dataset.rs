@@ -1,4 +1,4 @@
-//! The scenes as datasets: what a capture's files would give.
+//! The scenes as datasets.
 
 use glam::DVec3;
 use raygrad_nerf::dataset::{Dataset, Frame, Image, SceneTransform, SceneType, Split};
@@ -13,9 +13,9 @@ const NEAR: f64 = 0.05;
 /// Nothing but the sky is farther from a camera than this, in scene units.
 const FAR: f64 = 1e4;
 
-/// The views of the procedural bulldozer: 60 to train on, 10 to validate, 20 to test, each a square of `size` pixels.
+/// Renders a split of the bulldozer: 60 training, 10 validation or 20 test images, each a square of `size` pixels.
 ///
-/// Ray-traced on the current rayon pool in about a second at 200 pixels.
+/// It takes about a second at 200 pixels on the current rayon pool.
 pub fn embedded(split: Split, size: usize) -> Dataset {
     let scene = Scene::bulldozer();
     // Room around the model, as a real capture would have it.
@@ -26,7 +26,7 @@ pub fn embedded(split: Split, size: usize) -> Dataset {
     dataset(frames, bounds, [DISTANCE - reach, DISTANCE + reach], SceneType::Bounded)
 }
 
-/// The cameras of [`embedded`] of a split, whose images are `size` pixels wide and high.
+/// Returns the cameras of a split of [`embedded`], for images of `size` pixels a side.
 pub fn embedded_cameras(split: Split, size: usize) -> Vec<Camera> {
     match split {
         Split::Train => train_cameras(60, size),
@@ -35,8 +35,7 @@ pub fn embedded_cameras(split: Split, size: usize) -> Vec<Camera> {
     }
 }
 
-/// The views of the procedural bulldozer in a landscape that goes out to a thousand units and has a sky: 100 to train on,
-/// 10 to validate, 20 to test, each `width` pixels wide, three quarters of that high, and opaque.
+/// Renders a split of the bulldozer in an unbounded landscape: 100 training, 10 validation or 20 test images.
 ///
 /// [`landscape_distances`] tells what in them is near, far and sky. The bounds are those of the bulldozer and the
 /// cameras: most visible surfaces lie beyond them.
@@ -53,8 +52,9 @@ pub fn landscape(split: Split, width: usize) -> Dataset {
     dataset(frames, [bounds[0] - 0.02, bounds[1] + 0.02], [NEAR, FAR], SceneType::Unbounded)
 }
 
-/// The same landscape as it is seen ahead from a window before the bulldozer: 30 views to train on, 3 to validate, 6 to test,
-/// between them. The bounds are 3 units about the bulldozer, and nothing is nearer than half a unit.
+/// Renders a split of forward-facing images of the landscape: 30 training, 3 validation or 6 test images.
+///
+/// The scene box reaches 3 units around the bulldozer, and nothing is nearer than half a unit.
 ///
 /// # Panics
 /// If `width` is not a multiple of 4.
@@ -72,7 +72,7 @@ fn dataset(frames: Vec<Frame>, bounds: [DVec3; 2], [near, far]: [f64; 2], scope:
     Dataset { frames, bounds, near, far, scope, ndc: None, placement: SceneTransform::default(), skipped: vec![] }
 }
 
-/// What cameras of a split see.
+/// The frames of some cameras.
 fn frames(split: Split, cameras: Vec<Camera>, render: impl Fn(&Camera) -> Image) -> Vec<Frame> {
     let frame = |(i, camera): (usize, Camera)| {
         let image = render(&camera).into();
@@ -81,16 +81,16 @@ fn frames(split: Split, cameras: Vec<Camera>, render: impl Fn(&Camera) -> Image)
     cameras.into_iter().enumerate().map(frame).collect()
 }
 
-/// What the cameras of a split see of the landscape.
+/// The landscape as a dataset of some cameras.
 #[track_caller]
 fn outdoors(split: Split, width: usize, cameras: fn(Split, usize) -> Vec<Camera>) -> Vec<Frame> {
-    assert!(width.is_multiple_of(4), "a width of {width} pixels has no whole number of rows at 4:3");
+    assert!(width.is_multiple_of(4), "the width must be a multiple of 4, is {width}");
     let landscape = Landscape::new();
     frames(split, cameras(split, width), |camera| landscape.render(camera, SAMPLES))
 }
 
-/// The exact distances to what a camera sees of the [`landscape`]: one channel, along the unit ray through each pixel's
-/// centre to the first surface, in scene units; 0 for the sky.
+/// Computes exact distances to the [`landscape`]: one channel, along the unit ray through each pixel's centre, in scene
+/// units; 0 for the sky.
 pub fn landscape_distances(camera: &Camera) -> Image {
     Landscape::new().distances(camera)
 }

@@ -1,4 +1,4 @@
-//! The bulldozer out in the open: a plane to the hills on the horizon, things on it near and far, and a sky.
+//! The bulldozer in an unbounded landscape: a plane with scenery, hills on the horizon, and a sky.
 
 use glam::{DVec3, Vec3Swizzles};
 use raygrad_tensor::parallel;
@@ -22,13 +22,12 @@ const STEEPEST: f64 = 8.0;
 /// The bulldozer dims the sky's light on the ground up to this distance from the middle, in scene units.
 const DIMMED: f64 = 2.0;
 
-/// The [bulldozer](Scene::bulldozer) on a plane that reaches to hills a thousand units away, under a sky that is
-/// infinitely far.
+/// The [bulldozer](Scene::bulldozer) on a plane that reaches to hills a thousand units away, under an infinitely
+/// distant sky.
 ///
-/// Everything is analytic: distances are exact to rounding, from a hand's breadth to the horizon. Trees, houses, rocks
-/// and towers stand at distances that grow by a constant factor, and their sizes with them, so that near and far ones
-/// cover about as many pixels. The ground has detail of every size; of it and of all patterns a pixel shows what it can
-/// resolve, so that nothing flickers from view to view.
+/// Everything is analytic, so distances are exact to rounding. Trees, houses, rocks and towers stand at distances that
+/// grow by a constant factor, and so do their sizes: near and far ones cover about as many pixels. The ground has
+/// detail of every size, filtered to the pixel, so that nothing flickers between views.
 #[derive(Debug, Clone)]
 pub struct Landscape {
     bulldozer: Scene,
@@ -43,7 +42,7 @@ impl Default for Landscape {
     }
 }
 
-/// What a ray meets.
+/// The hit of a ray.
 enum Part<'a> {
     Bulldozer(&'a Material),
     Thing(&'a (Placed, Paint)),
@@ -51,14 +50,14 @@ enum Part<'a> {
 }
 
 impl Landscape {
-    /// The one landscape that there is.
+    /// Creates the landscape.
     pub fn new() -> Self {
         let things = scenery::solids();
         let scenery = Bvh::new(things.iter().map(|(solid, _)| solid.clone()).collect());
         Landscape { bulldozer: Scene::bulldozer(), scenery, things }
     }
 
-    /// The smallest and the largest corner of an axis-aligned box that contains the bulldozer, in scene units.
+    /// Returns the lower and upper corner of the bulldozer's bounding box, in scene units.
     pub fn bulldozer_bounds(&self) -> [DVec3; 2] {
         self.bulldozer.bounds()
     }
@@ -68,7 +67,8 @@ impl Landscape {
 
     /// Where a ray first meets a surface, or `None` if it leaves into the sky.
     ///
-    /// The solids are numbered: those of the bulldozer as in [its own scene](Scene), then all others, and the ground last.
+    /// [`Hit::solid`] counts the solids of the bulldozer as in [its own scene](Scene), then all others, and the ground
+    /// last.
     pub fn trace(&self, ray: &Ray) -> Option<Hit> {
         let first = self.bulldozer.materials.len();
         let height = ray.origin.z - GROUND;
@@ -93,19 +93,19 @@ impl Landscape {
         }
     }
 
-    /// Renders what a camera sees with `samples` rays a pixel, as [`Scene::render`] does, but for a sky behind it: three
-    /// channels, sRGB-encoded, in 0..=1. The same bits on any number of threads.
+    /// Renders the landscape with `samples` rays per pixel, as [`Scene::render`], before a sky: three sRGB channels, 0
+    /// to 1, with the same bits on any number of threads.
     ///
     /// # Panics
     /// If `samples` is 0.
     pub fn render(&self, camera: &Camera, samples: usize) -> Image {
-        assert!(samples > 0, "rendering takes at least one sample a pixel");
+        assert!(samples > 0, "`samples` must be at least 1");
         let pattern = Pattern::new(samples);
         rows(camera, 3, |column, row, out| out.copy_from_slice(&self.pixel(camera, column, row, &pattern)))
     }
 
-    /// The exact distances to what a camera sees: one channel, along the unit ray through each pixel's centre, in scene
-    /// units; 0 for the sky, as in [`View::depth`](super::View::depth).
+    /// Computes exact distances: one channel, along the unit ray through each pixel's centre, in scene units; 0 for the
+    /// sky, as in [`View::depth`](super::View::depth).
     pub fn distances(&self, camera: &Camera) -> Image {
         rows(camera, 1, |column, row, out| {
             out[0] = self.trace(&camera.pixel_ray(column, row)).map_or(0.0, |hit| hit.distance as f32);

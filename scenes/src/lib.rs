@@ -1,16 +1,11 @@
-//! Scenes that need no download: a bulldozer of plastic bricks, ray-traced with exact cameras, depth and normals, and a
-//! landscape around it without bounds. [`embedded`] and [`landscape`] are their photographs as datasets.
+//! Ray-traced test scenes that need no download: a bulldozer of plastic bricks, and an unbounded landscape around it.
 //!
-//! The scene stands at the origin with z up, fits the cube of +-1.5 and is seen by cameras 4 units away, like the
-//! synthetic scenes of the NeRF paper. Its plastic is glossy, so that colours depend on the viewing direction. All
-//! solids are analytic: depth is exact to rounding at any resolution, and images are the same bits on every run.
+//! Start with the datasets [`embedded`], [`landscape`] (unbounded) and [`landscape_ahead`] (forward-facing).
+//! [`Scene::render`] also returns exact depth and normals.
 //!
-//! - `shape`: convex solids, where a ray meets them and how far a point is from them;
-//! - `bvh`: the same questions for many solids at once;
-//! - `shade`: materials and light;
-//! - `kit` and `bulldozer`: bricks, and the model built from them;
-//! - `render`: images;
-//! - `views`: cameras for training, validation and testing.
+//! The bulldozer stands at the origin with z up and fits the cube of +-1.5; cameras are 4 units away, as in the
+//! synthetic scenes of the NeRF paper. Its plastic is glossy, so colours depend on the viewing direction. All solids
+//! are analytic: depth is exact to rounding at any resolution, and images have the same bits on every run.
 //!
 //! ```
 //! use raygrad_scenes::{Scene, train_cameras};
@@ -19,7 +14,7 @@
 //! let cameras = train_cameras(3, 32);
 //! let views: Vec<_> = cameras.iter().map(|camera| scene.render(camera, 5)).collect();
 //!
-//! // Depth is measured along the ray through the pixel's centre, so it leads back to the surface.
+//! // Depth is the distance along the ray through the pixel's centre.
 //! let ray = cameras[0].pixel_ray(16, 16);
 //! let depth = views[0].depth.pixel(16, 16)[0];
 //! let hit = scene.trace(&ray).expect("the bulldozer is in the middle of every view");
@@ -66,7 +61,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// A yellow bulldozer with its driver and some loose bricks on a studded base plate.
+    /// Creates a yellow bulldozer with its driver and some loose bricks on a studded base plate.
     ///
     /// It is about 2.3 long (x, the blade towards +x), 1.4 wide and 1.15 high.
     pub fn bulldozer() -> Self {
@@ -74,14 +69,13 @@ impl Scene {
         Scene { bvh: Bvh::new(shapes), materials }
     }
 
-    /// The smallest and the largest corner of an axis-aligned box that contains everything, in scene units.
+    /// Returns the lower and upper corner of the bounding box, in scene units.
     pub fn bounds(&self) -> [DVec3; 2] {
         self.bvh.bounds()
     }
 
-    /// Where a ray first meets a surface, or `None` if it leaves the scene.
-    ///
-    /// A ray that starts inside a solid meets the surface where it leaves that solid.
+    /// Returns the first hit of a ray, or `None` if it leaves the scene. A ray that starts inside a solid hits where it
+    /// leaves it.
     pub fn trace(&self, ray: &Ray) -> Option<Hit> {
         self.bvh.trace(ray)
     }

@@ -9,29 +9,28 @@ use raygrad_nerf::Camera;
 use raygrad_nerf::Image;
 use raygrad_nerf::SrgbEncode;
 
-/// One image of a scene, with what a camera cannot photograph.
+/// A rendered image of a scene with exact depth and normals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
-    /// RGBA: sRGB-encoded colour, not premultiplied, over a transparent background; alpha is the share of the pixel
-    /// that the scene covers. All in 0..=1; a pixel that nothing covers is all 0.
+    /// RGBA, 0 to 1: sRGB colour with straight alpha, the share of the pixel that the scene covers. Empty pixels are 0.
     pub color: Image,
-    /// One channel: distance along the unit ray through the pixel's centre, in scene units; 0 where it hits nothing.
+    /// One channel: distance along the unit ray through the pixel's centre, in scene units; 0 without a hit.
     pub depth: Image,
-    /// Three channels: the outward unit normal in world space where that ray hits; 0 where it hits nothing.
+    /// Three channels: the outward unit normal in world space where that ray hits; 0 without a hit.
     pub normal: Image,
 }
 
 impl Scene {
-    /// Renders what a camera sees with `samples` rays a pixel: 1 leaves jagged edges, 9 few, 25 hardly any.
+    /// Renders the scene with `samples` rays per pixel: 1 leaves jagged edges, 9 few, 25 hardly any.
     ///
-    /// The first ray passes through the pixel's centre and gives depth and normal; the others lie around it in opposite
-    /// pairs, so an odd number of samples has its mean at the centre. Rows are rendered in parallel, and the result
-    /// does not depend on the number of threads.
+    /// The first ray passes through the pixel's centre and gives depth and normal. The others lie around it in opposite
+    /// pairs, so an odd number has its mean at the centre. Rows are rendered in parallel; the result does not depend on
+    /// the number of threads.
     ///
     /// # Panics
     /// If `samples` is 0.
     pub fn render(&self, camera: &Camera, samples: usize) -> View {
-        assert!(samples > 0, "rendering takes at least one sample a pixel");
+        assert!(samples > 0, "`samples` must be at least 1");
         let Camera { width, height, .. } = *camera;
         let mut view = View {
             color: Image::new(width, height, 4),
@@ -82,8 +81,8 @@ impl Scene {
         ([r, g, b, covered as f32 / pattern.0.len() as f32], centre)
     }
 
-    /// How much of the sky the scene leaves to a place that is hit: sampled once for each run of hits on one side of a solid,
-    /// of which `last` keeps the last.
+    /// How much of the sky the scene leaves to a place that is hit: sampled once for each run of hits on one side of a
+    /// solid, of which `last` keeps the last.
     pub(super) fn openness(&self, hit: &Hit, point: DVec3, last: &mut Option<(Hit, f64)>) -> f64 {
         let openness = match *last {
             Some((near, openness)) if near.solid == hit.solid && near.normal.dot(hit.normal) > 0.9 => openness,

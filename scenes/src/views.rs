@@ -14,17 +14,18 @@ pub const ANGLE_X: f64 = 0.6911112;
 /// Elevation of the [`test_cameras`] above the horizon, in radians.
 const ORBIT_ELEVATION: f64 = PI / 6.0;
 
-/// `count` cameras spread evenly over the upper hemisphere, for training: square images of `size` pixels a side.
+/// Returns `count` training cameras, spread evenly over the upper hemisphere, for square images of `size` pixels a
+/// side.
 pub fn train_cameras(count: usize, size: usize) -> Vec<Camera> {
     spiral(count, size, 0.5, 0.5)
 }
 
-/// As [`train_cameras`] from other points, for validation.
+/// Returns `count` validation cameras, as [`train_cameras`] from other points.
 pub fn val_cameras(count: usize, size: usize) -> Vec<Camera> {
     spiral(count, size, 0.3, 1.0)
 }
 
-/// `count` cameras on one circle around the scene, evenly spaced and in order, for testing: a turntable film.
+/// Returns `count` test cameras on a circle around the scene, evenly spaced and in order, as for a turntable video.
 pub fn test_cameras(count: usize, size: usize) -> Vec<Camera> {
     (0..count).map(|i| camera(i as f64 / count as f64 * TAU, ORBIT_ELEVATION.sin(), size)).collect()
 }

@@ -1,4 +1,4 @@
-//! Cameras around the bulldozer in the landscape, placed as somebody with a telephone would walk around it.
+//! Cameras of a walk around the bulldozer with a phone.
 
 use std::f64::consts::{PI, TAU};
 
@@ -10,16 +10,16 @@ use raygrad_nerf::dataset::Split;
 
 /// Horizontal field of view in radians.
 const ANGLE_X: f64 = PI / 3.0;
-/// Once around the bulldozer each: the height of the camera over the ground, its distance from the vertical axis, and the
-/// height over the ground of the point of that axis at which it aims, in scene units.
+/// Once around the bulldozer each: the height of the camera over the ground, its distance from the vertical axis, and
+/// the height over the ground of the point of that axis at which it aims, in scene units.
 const LAPS: [[f64; 3]; 3] = [[0.65, 3.75, 0.7], [1.45, 4.1, 0.85], [2.4, 4.2, 1.0]];
-/// Photographs to train on.
+/// Number of training images.
 const TRAIN: usize = 100;
 
-/// The cameras of a split: 100 to train on, 10 to validate and 20 to test, `width` pixels wide and three quarters of that
-/// high. All see the bulldozer and the landscape behind it.
+/// Returns the cameras of a split of the landscape: 100 training, 10 validation or 20 test cameras.
 ///
-/// The training views are evenly spaced on three laps; the others lie in the middles between them.
+/// Images are `width` pixels wide and three quarters of that high. All show the bulldozer and the landscape behind it.
+/// Training cameras are evenly spaced on three laps; the others lie half way between them.
 pub fn walk_cameras(split: Split, width: usize) -> Vec<Camera> {
     let ways: Vec<f64> = match split {
         Split::Train => (0..TRAIN).map(|i| i as f64 + 0.5).collect(),

@@ -1,4 +1,4 @@
-//! Cameras that look ahead at the bulldozer in the landscape, as somebody holds a telephone up here and there.
+//! Forward-facing cameras before the bulldozer in the landscape.
 
 use std::f64::consts::PI;
 
@@ -10,14 +10,16 @@ use raygrad_nerf::dataset::Split;
 
 /// Horizontal field of view in radians.
 const ANGLE_X: f64 = PI / 3.0;
-/// Photographs to train on, from left to right and from below upwards.
+/// Training images, from left to right and from below upwards.
 const TRAIN: [usize; 2] = [6, 5];
-/// How far apart they are taken, in scene units.
+/// Distance between neighbouring cameras, in scene units.
 const APART: [f64; 2] = [0.3, 0.25];
 
-/// The cameras of a split: 30 to train on, 3 to validate and 6 to test, `width` pixels wide and three quarters of that
-/// high. All look the same way, but for a hand that shakes, over the bulldozer to the hills; those that are not trained on
-/// stand between the others.
+/// Returns the cameras of a split of [`landscape_ahead`](crate::landscape_ahead): 30 training, 3 validation or 6 test
+/// cameras.
+///
+/// Images are `width` pixels wide and three quarters of that high. All look over the bulldozer to the hills, with a
+/// little shake. Held-out cameras stand between the training cameras.
 pub fn window_cameras(split: Split, width: usize) -> Vec<Camera> {
     let [columns, rows] = TRAIN;
     let places: Vec<[f64; 2]> = match split {
