@@ -232,7 +232,7 @@ mod tests {
         std::fs::write(folder.path().join("broken.png"), b"x").unwrap();
         fails("broken.png", "cannot be decoded");
         ImageBuffer::<Rgb<u8>, _>::new(3, 2).save(folder.path().join("color.png")).unwrap();
-        fails("color.png", "has colours");
+        fails("color.png", "has colour channels; use one channel of 8 or 16 bits, or a .npy array");
         ImageBuffer::<Luma<u8>, _>::new(2, 3).save(folder.path().join("turned.png")).unwrap();
         ImageBuffer::<Luma<u8>, _>::new(9, 3).save(folder.path().join("wide.png")).unwrap();
         fails("turned.png", "has 2x3 depths");

@@ -161,7 +161,7 @@ mod tests {
             SceneTransform { rotation: -rotation, ..placement },
             SceneTransform { origin: DVec3::INFINITY, ..placement },
         ] {
-            assert!(wrong.check().unwrap_err().to_string().starts_with("`placement`"));
+            assert!(wrong.check().unwrap_err().to_string().starts_with("`transform`"));
         }
     }
 }

@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "use 1 to 4")]
+    #[should_panic(expected = "the degree of spherical harmonics must be 1 to 4, is 5")]
     fn a_degree_beyond_the_table_panics() {
         SphericalHarmonics::new(5);
     }

@@ -225,7 +225,7 @@ mod tests {
         params.add("field.table", Tensor::zeros(&[60, 2]));
         let mut message = |config: TotalVariationConfig| build(&config, &mut params).err().unwrap().to_string();
         let error = message(TotalVariationConfig { params: "table".into(), ..config(None) });
-        assert!(error.starts_with("`total_variation`") && error.contains("there are field.table"), "{error}");
+        assert!(error.starts_with("`total_variation`") && error.contains("use one of field.table"), "{error}");
         for wrong in [vec![3, 4, 6], vec![0, 4], vec![3, usize::MAX / 2], vec![]] {
             let error = message(config(Some(wrong.clone())));
             assert!(error.contains(&format!("{wrong:?}")) && error.contains("[60, 2]"), "{error}");

@@ -172,6 +172,6 @@ mod tests {
         assert!(pairs.clone().count() == 15 && pairs.clone().all(|(c, u)| (c - (2.0 * u - 1.0)).abs() < 1e-15));
         assert_eq!((within.side(), within.unit), (4.0, 4.0 / 3.0));
         let error = Space::within([DVec3::ONE, DVec3::ONE]).check().unwrap_err().to_string();
-        assert!(error.contains("is no box"), "{error}");
+        assert!(error.contains("use finite corners, the lower below the upper"), "{error}");
     }
 }

@@ -273,15 +273,15 @@ mod tests {
         };
         let states = [
             (written(&|counts| counts.batch = 0), "has 0 rays per step; use 1 to 1048576"),
-            (written(&|counts| counts.batch = usize::MAX), "rays; use 1 to"),
+            (written(&|counts| counts.batch = usize::MAX), "rays per step; use 1 to 1048576"),
             (written(&|counts| counts.settings[0].rate = -1.0), "has an lr scale of -1"),
             (written(&|counts| counts.settings[1].decay = -2.0), "a weight decay scale of -2"),
             (written(&|counts| counts.pace = -1.0), "has an lr scale of -1; use a finite number of at least 0"),
             (written(&|counts| counts.groups = 9), "lacks a part of the optimizer's state"),
             (written(&|counts| counts.groups = 0), "groups"),
             (written(&|counts| counts.extent.unit *= 2.0), "another configuration"),
-            (written(&|counts| counts.detail = 1.5), "a share of 1.5"),
-            (written(&|counts| counts.detail = -1.0), "a share of -1"),
+            (written(&|counts| counts.detail = 1.5), "has a detail of 1.5; use 0 to 1"),
+            (written(&|counts| counts.detail = -1.0), "has a detail of -1; use 0 to 1"),
         ];
         // What does not move is a number that a run may have.
         let still = written(&|counts| {

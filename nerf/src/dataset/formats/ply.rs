@@ -63,7 +63,7 @@ fn line(reader: &mut impl BufRead) -> std::result::Result<String, String> {
     let mut bytes = vec![];
     let read = reader.by_ref().take(LONGEST_LINE).read_until(b'\n', &mut bytes);
     match read.map_err(|e| format!("cannot be read: {e}"))? as u64 {
-        0 => Err("ends too early: copy it again".to_owned()),
+        0 => Err("ends too early, copy it again".to_owned()),
         LONGEST_LINE => Err(format!("has a line of {LONGEST_LINE} bytes or more, too long for a PLY file")),
         _ => String::from_utf8(bytes).map_err(|_| "has a line that is not UTF-8 text".to_owned()),
     }
@@ -162,7 +162,7 @@ fn points(reader: &mut impl BufRead, length: u64) -> std::result::Result<Vec<Poi
     let mut values = vec![0.0; header.properties.len()];
     for i in 0..header.count {
         if header.ascii {
-            let line = line(reader).map_err(|what| format!("{what}: after {i} of {} vertices", header.count))?;
+            let line = line(reader).map_err(|what| format!("{what} (after {i} of {} vertices)", header.count))?;
             let mut words = line.split_whitespace();
             for (value, Property { name, .. }) in values.iter_mut().zip(&header.properties) {
                 let number = words.next().and_then(|word| word.parse().ok());
@@ -266,23 +266,23 @@ mod tests {
     #[test]
     fn what_is_wrong_is_said() {
         for (from, to, expected) in [
-            ("ply\n", "obj\n", "is no PLY file"),
+            ("ply\n", "obj\n", "is not a PLY file: its first line must be `ply`"),
             ("ascii", "binary_big_endian", "use ascii or binary_little_endian"),
             ("format ascii 1.0\n", "", "has no line `format`"),
-            ("element vertex 2\n", "", "not understood: `property float x`"),
-            ("vertex 2", "vertex 3", "ends too early: after 2 of 3"),
+            ("element vertex 2\n", "", "has an unknown header line: `property float x`"),
+            ("vertex 2", "vertex 3", "ends too early, copy it again (after 2 of 3 vertices)"),
             ("vertex 2", "vertex 18446744073709551615", "cannot hold"),
-            ("vertex 2", "vertex -1", "has `-1` vertices"),
+            ("vertex 2", "vertex -1", "must have a number of vertices, has `-1`"),
             ("element vertex", "element face", "has the element `face` before `vertex`: put the vertices first"),
             ("float y", "float w", "only some of the properties x, y, z"),
             ("float y", "quad y", "unknown type `quad`"),
-            ("float y", "list uchar int y", "not understood"),
+            ("float y", "list uchar int y", "has an unknown header line"),
             ("uint8 red", "float red", "has colours of another type than uchar: convert them"),
             ("uint8 red", "uint8 rot", "only some of the properties red, green, blue"),
             ("-1.250000", "nan", "has a vertex 0 with a non-finite position"),
-            ("-1.250000", "x", "vertex 0 without a number for y"),
+            ("-1.250000", "x", "has no number for y of vertex 0"),
             ("255", "256", "a colour of 256"),
-            ("end_header", "end", "not understood: `end`"),
+            ("end_header", "end", "has an unknown header line: `end`"),
         ] {
             let what = parse(TEXT.replacen(from, to, 1).as_bytes()).unwrap_err();
             assert!(what.contains(expected), "{from} -> {to}: {what}");

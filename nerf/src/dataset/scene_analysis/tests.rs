@@ -141,7 +141,8 @@ fn a_walk_ahead_is_no_view_from_a_window() {
     let asked = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, Some(SceneType::ForwardFacing))
         .unwrap_err()
         .to_string();
-    assert!(asked.contains("`scope`") && asked.contains("forward"), "{asked}");
+    let expected = "cannot be forward-facing: cameras look in different directions; use unbounded";
+    assert_eq!(asked, format!("`scene-type`: {expected}"));
     assert!(survey.reason.starts_with("images are opaque, so they show a background; "), "{}", survey.reason);
 }
 
@@ -231,7 +232,7 @@ fn what_is_asked_for_counts_then_the_convention_then_transparency() {
     }
     assert_eq!("unbounded".parse::<SceneType>().unwrap().to_string(), "unbounded");
     let message = "endless".parse::<SceneType>().unwrap_err().to_string();
-    assert!(message.starts_with("`scope`"), "{message}");
+    assert_eq!(message, "`scene-type`: is `endless`; use bounded, unbounded or forward-facing");
 }
 
 #[test]

@@ -175,9 +175,9 @@ fn lattices_have_cells_of_nearly_one_edge() {
     for (bounds, resolution, what) in [
         (BOX, 0, "`resolution`: is 0"),
         (BOX, 4097, "`resolution`: is 4097"),
-        ([DVec3::ZERO, DVec3::X], 5, "is no box"),
-        ([DVec3::ZERO, DVec3::NAN], 5, "is no box"),
-        ([BOX[1], BOX[0]], 5, "is no box"),
+        ([DVec3::ZERO, DVec3::X], 5, "use finite corners, the lower below the upper"),
+        ([DVec3::ZERO, DVec3::NAN], 5, "use finite corners, the lower below the upper"),
+        ([BOX[1], BOX[0]], 5, "use finite corners, the lower below the upper"),
     ] {
         let message = Lattice::over(bounds, resolution, true).unwrap_err().to_string();
         assert!(message.contains(what), "{message}");

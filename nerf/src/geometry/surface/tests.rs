@@ -199,7 +199,7 @@ fn what_cannot_be_made_is_said() {
             SurfaceConfig { iso_value: Some(1e30), fill_unseen: true, ..CONFIG },
             "`iso_value`: is 1000000000000000000000000000000",
         ),
-        (SurfaceConfig { min_component: 1.5, ..CONFIG }, "`parts`: is 1.5"),
+        (SurfaceConfig { min_component: 1.5, ..CONFIG }, "`min_component`: is 1.5; use 0 to 1"),
         (SurfaceConfig { triangles: Some(3), ..CONFIG }, "`triangles`: is 3"),
         (SurfaceConfig { resolution: Some(0), ..CONFIG }, "`resolution`: is 0"),
     ];

@@ -178,7 +178,7 @@ fn images_that_are_too_small_are_refused() {
         };
         assert!(of(side, side).unwrap() > 0.0);
         let expected = |size: String| {
-            format!("LPIPS with {} needs {side}x{side} pixels, the images have {size}", lpips.backbone())
+            format!("LPIPS with {} needs at least {side}x{side} pixels, the images have {size}", lpips.backbone())
         };
         assert_eq!(of(side - 1, side).unwrap_err(), expected(format!("{}x{side}", side - 1)));
         assert_eq!(of(side, side - 1).unwrap_err(), expected(format!("{side}x{}", side - 1)));
@@ -228,7 +228,7 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
         let quoted = format!("\"{absent}\"");
         let at = whole.windows(quoted.len()).position(|part| part == quoted.as_bytes()).unwrap();
         others[at + 1] = b'x';
-        refused(&others, &[&format!("`{absent}`: is missing, should be F32{shape:?}"), "with alex"]);
+        refused(&others, &[&format!("`{absent}`: is missing, should be F32{shape:?}"), "for alex"]);
     }
     let changed = |name: &str, value: Tensor<f32>| {
         let mut params = Params::new();
@@ -238,13 +238,13 @@ fn files_that_do_not_serve_are_errors_that_say_why() {
         bytes(&params)
     };
     let swapped = changed("net.slice3.6.weight", Tensor::zeros(&[192, 384, 3, 3]));
-    refused(&swapped, &["`net.slice3.6.weight`: is F32[192, 384, 3, 3], not F32[384, 192, 3, 3]", "with alex"]);
+    refused(&swapped, &["`net.slice3.6.weight`: is F32[192, 384, 3, 3], should be F32[384, 192, 3, 3]", "for alex"]);
     let half = good.to_safetensors(Storage::F16, &BTreeMap::new(), &[]).unwrap();
-    refused(&half, &["`net.slice1.0.weight`: is F16[64, 3, 11, 11], not F32[64, 3, 11, 11]"]);
+    refused(&half, &["`net.slice1.0.weight`: is F16[64, 3, 11, 11], should be F32[64, 3, 11, 11]"]);
     for (name, value, expected) in [
-        ("net.slice5.10.bias", f32::NAN, "holds NaN, and must be finite"),
-        ("net.slice1.0.weight", f32::INFINITY, "holds inf, and must be finite"),
-        ("lin4.model.1.weight", f32::INFINITY, "holds inf, and must be finite"),
+        ("net.slice5.10.bias", f32::NAN, "has the value NaN, should be finite"),
+        ("net.slice1.0.weight", f32::INFINITY, "has the value inf, should be finite"),
+        ("lin4.model.1.weight", f32::INFINITY, "has the value inf, should be finite"),
         ("lin2.model.1.weight", -1e-3, "has the value -0.001, should be at least 0"),
     ] {
         let mut tensor = good.get(good.find(name).unwrap()).clone();

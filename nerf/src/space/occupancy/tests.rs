@@ -366,7 +366,7 @@ fn grids_survive_being_stored() {
     assert!(edited(0, b"?").contains("not an occupancy grid"));
     assert!(edited(8, &u32::MAX.to_le_bytes()).contains("occupancy.resolution"));
     assert!(edited(12, &9_u32.to_le_bytes()).contains("occupancy.cascades"));
-    assert!(edited(16, &f64::NAN.to_le_bytes()).contains("is no box"));
+    assert!(edited(16, &f64::NAN.to_le_bytes()).contains("use finite corners, the lower below the upper"));
 }
 
 #[test]

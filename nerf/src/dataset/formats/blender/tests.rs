@@ -212,16 +212,16 @@ fn what_has_no_place_in_the_format_is_named() {
         assert!(!detect(folder.path()));
     };
     let undistort = "`raygrad prepare --undistort`";
-    fails(|v| v.camera.lens = Lens::Fov { omega: 0.9 }, &["distorts", undistort]);
-    fails(|v| v.camera.focal[1] *= 1.01, &["not square", undistort]);
+    fails(|v| v.camera.lens = Lens::Fov { omega: 0.9 }, &["has lens distortion", undistort]);
+    fails(|v| v.camera.focal[1] *= 1.01, &["so no square pixels", undistort]);
     fails(|v| v.camera.centre[0] += 0.5, &["at 4.5, 3, not at the centre", undistort]);
     fails(|v| v.camera.centre[1] += 0.5, &["at 4, 3.5, not at the centre", undistort]);
     fails(|v| v.camera.focal = [9.0; 2], &["differs in size or focal length from images/r_0", undistort]);
     fails(|v| (v.camera.height, v.camera.centre[1]) = (8, 4.0), &["differs in size", undistort]);
     fails(|v| v.camera.pose.translation.x = f64::NAN, &["non-finite number"]);
-    fails(|v| v.camera.focal = [f64::NAN; 2], &["not square"]);
+    fails(|v| v.camera.focal = [f64::NAN; 2], &["so no square pixels"]);
     fails(|v| v.mask = Some("mask.png".into()), &["has a mask"]);
-    fails(|v| v.split = None, &["in no split"]);
+    fails(|v| v.split = None, &["has no split while others do, or the reverse"]);
     let empty = Capture { views: vec![], ..before.clone() };
     says(&write(&empty, folder.path()).unwrap_err().to_string(), &["there are no images"]);
 }

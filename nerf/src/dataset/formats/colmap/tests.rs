@@ -113,7 +113,7 @@ fn both_encodings_say_what_they_say_wherever_they_are() {
     }
     let empty = tempfile::tempdir().unwrap();
     assert!(!detect(empty.path()));
-    assert!(read(empty.path()).unwrap_err().to_string().contains("holds no COLMAP model"));
+    assert!(read(empty.path()).unwrap_err().to_string().contains("has no COLMAP model"));
 }
 
 #[test]

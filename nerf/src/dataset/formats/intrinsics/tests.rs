@@ -201,7 +201,10 @@ fn instant_ngp_says_that_a_lens_is_a_fisheye() {
 #[test]
 fn unknown_models_are_named() {
     for model in ["OPENCV5", "opencv", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_L", ""] {
-        fails(|d| d["camera_model"] = json!(model), &["`camera_model`", &format!("is {model},"), "THIN_PRISM_FISHEYE"]);
+        fails(
+            |d| d["camera_model"] = json!(model),
+            &["`camera_model`", &format!("is {model}; use one of "), "THIN_PRISM_FISHEYE"],
+        );
         fails(|d| d["frames"][1]["camera_model"] = json!(model), &["`frames[1].camera_model`"]);
     }
     fails(|d| d["camera_model"] = json!(4), &["`camera_model`: must be a string, is 4"]);
@@ -229,7 +232,10 @@ fn panoramas_show_all_directions() {
     for (name, value) in
         [("fl_x", 64.0), ("fl_y", 16.0), ("cx", 30.0), ("cy", 18.0), ("camera_angle_x", PI), ("camera_angle_y", 1.5)]
     {
-        fails(panorama(json!({ name: value })), &[&format!("`{name}`: is {value}, and must be"), "all directions"]);
+        fails(
+            panorama(json!({ name: value })),
+            &[&format!("`{name}`: must be "), &format!("for camera_model EQUIRECTANGULAR, is {value}")],
+        );
     }
     fails(panorama(json!({ "k1": 0.1 })), &["`k1`", "EQUIRECTANGULAR has no such"]);
     // Axes for themselves.
@@ -248,11 +254,11 @@ fn fields_that_cannot_be_followed_are_named() {
         ("ftheta_p4", json!("NaN"), "not supported"),
         ("latlong", json!(true), "EQUIRECTANGULAR"),
         ("equirectangular", json!(1), "EQUIRECTANGULAR"),
-        ("rolling_shutter", json!([0, 0, 1, 0]), "move"),
-        ("transform_matrix_start", json!([[1, 0, 0, 0]]), "move"),
-        ("transform_matrix_end", json!([[1, 0, 0, 0]]), "move"),
+        ("rolling_shutter", json!([0, 0, 1, 0]), "rolling shutter is not supported; remove it to ignore it"),
+        ("transform_matrix_start", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
+        ("transform_matrix_end", json!([[1, 0, 0, 0]]), "rolling shutter is not supported; remove it to ignore it"),
     ] {
-        fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "cannot be followed"]);
+        fails(|d| d[name] = value.clone(), &[&format!("`{name}`: is "), hint, "which raygrad does not read"]);
         fails(|d| d["frames"][1][name] = value, &[&format!("`frames[1].{name}`: is "), hint]);
         for nothing in [json!(null), json!(false), json!(0), json!([0, 0.0, 0]), json!([])] {
             assert_eq!(cameras(|d| d[name] = nothing), cameras(|_| {}), "{name}");

@@ -68,7 +68,7 @@ fn reduced_images_stand_in_for_absent_ones() {
     assert_eq!(read(all.path()).unwrap().views[0].name, "2.png", "an empty folder has none");
     let none = folder(&npy(&ROWS), &[]);
     let message = read(none.path()).unwrap_err().to_string();
-    assert!(message.contains("images") && message.contains("there are no images"), "{message}");
+    assert!(message.contains("images") && message.contains("has no images (png, jpg)"), "{message}");
 }
 
 #[test]
@@ -84,7 +84,11 @@ fn errors_name_the_row() {
     };
     fails(3, f64::NAN, "column 3 is not a finite number");
     fails(16, f64::INFINITY, "column 16 is not a finite number");
-    fails(2, -1.0, "its first three columns (down, right, backwards): must be a rotation, but it mirrors");
+    fails(
+        2,
+        -1.0,
+        "its first three columns (down, right, backwards): must be a rotation, but mirrors: its determinant is -1",
+    );
     fails(2, 1.002, "its first three columns (down, right, backwards): must be a rotation, but its columns are not");
     fails(4, 0.4, "height must be 1 to");
     fails(9, 1e300, "width must be 1 to");
@@ -92,7 +96,7 @@ fn errors_name_the_row() {
     fails(15, -1.0, "depths must be at least 0 and rise");
     fails(16, 2.5, "depths must be at least 0 and rise");
     fails_as(&npy(&ROWS[..1]), "`shape`: has 1 rows, but there are 2 images");
-    fails_as(&npy(&[]), "`shape`: has no row");
+    fails_as(&npy(&[]), "`shape`: has no rows: add one per image");
     fails_as(&Matrix { rows: 2, columns: 15, values: vec![0.0; 30] }.write(), "`shape`: must have 17 columns, has 15");
     fails_as(b"?", "is not a complete npy file: copy it again");
 }
@@ -136,14 +140,17 @@ fn what_cannot_be_written_is_named() {
     camera(&|c| c.focal[1] = 14.0, "has different focal lengths, 55.5 and 14");
     camera(&|c| c.focal = [14.0; 2], "differs in size or focal length from the others; LLFF needs");
     camera(&|c| c.pose.matrix3 *= 2.0, "its first three columns (down, right, backwards): must be a rotation");
-    fails(&|capture| capture.views[1].bounds = None, "`row 1.bounds`: are not known");
+    fails(
+        &|capture| capture.views[1].bounds = None,
+        "`row 1.bounds`: are missing; LLFF needs the nearest and the farthest depth",
+    );
     fails(
         &|capture| capture.views[1].name = "a/b.png".into(),
         "`row 1.name`: `a/b.png` must be a plain png or jpg name",
     );
     fails(&|capture| capture.views[1].name = "b".into(), "`row 1.name`: `b` must be a plain png or jpg name");
     fails(&|capture| capture.views[1].name = "a.png".into(), "`row 1.name`: `a.png` is there twice");
-    fails(&|capture| capture.views.clear(), "has no view");
+    fails(&|capture| capture.views.clear(), "has no images to write: add at least one");
 }
 
 proptest! {

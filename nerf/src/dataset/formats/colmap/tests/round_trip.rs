@@ -134,7 +134,7 @@ fn what_cannot_be_written_is_named() {
     camera(&|c| c.centre[0] = f64::INFINITY, "camera`: cx: must be a finite number");
     camera(&|c| c.width = 0, "camera`: width: must be 1 to");
     camera(&|c| c.pose.matrix3 *= 1.01, "pose`: must be a rotation");
-    camera(&|c| c.pose.translation.x = f64::NAN, "pose`: has a position");
+    camera(&|c| c.pose.translation.x = f64::NAN, "pose`: must have a finite position");
     let name = |name: &str, encoding, expected: &str| {
         fails(
             &|capture| name.clone_into(&mut capture.views[1].name),
@@ -144,10 +144,10 @@ fn what_cannot_be_written_is_named() {
     };
     for encoding in Encoding::ALL {
         for bad in ["", "x\ny", " x", "x ", "./x", "x\0"] {
-            name(bad, encoding, &format!("{bad:?} cannot be the name"));
+            name(bad, encoding, &format!("{bad:?} is not a valid image name: rename the file"));
         }
         name("a.png", encoding, "`a.png` is there twice");
-        fails(&|capture| capture.views.clear(), encoding, "has no view");
+        fails(&|capture| capture.views.clear(), encoding, "has no images to write: add at least one");
     }
     name("x y", Encoding::Text, "`x y` has a space");
     let point = Point { position: DVec3::splat(f64::NAN), color: [0; 3], error: 0.0, views: 0 };

@@ -196,8 +196,8 @@ fn what_cannot_be_written_is_named() {
     fails(|c| c.views[1].camera.lens = Lens::Fov { omega: f64::NAN }, "camera of images/1.png");
     fails(|c| c.views[1].camera.lens = Lens::Equirectangular, "images/1.png does not cover all directions");
     fails(|c| c.views[1].depth.as_mut().unwrap().1 = f64::NAN, "camera of images/1.png");
-    fails(|c| c.applied.translation.x = f64::NAN, "transform before");
-    fails(|c| c.aabb_scale = Some(f64::INFINITY), "the box");
+    fails(|c| c.applied.translation.x = f64::NAN, "`applied`, `aabb_scale` or a point has a non-finite number");
+    fails(|c| c.aabb_scale = Some(f64::INFINITY), "`applied`, `aabb_scale` or a point has a non-finite number");
     fails(|c| c.points[2].position.y = f64::NAN, "a point");
     let absent = folder.path().join("absent");
     says(
