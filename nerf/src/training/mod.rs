@@ -1,7 +1,7 @@
 //! Training of models on images.
 //!
-//! Start with [`Trainer`], whose example trains from a folder; [`Budget`] is the length of a run. [`fitted_cameras`]
-//! aligns held-out cameras to a trained model.
+//! Start with [`Trainer`]; the crate's landing page has an example. [`Budget`] is the length of a run, and
+//! [`fitted_cameras`] aligns held-out cameras to a trained model.
 
 mod fitted;
 pub(crate) mod groups;

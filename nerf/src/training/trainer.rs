@@ -24,7 +24,9 @@ const RAYS: [usize; 2] = [256, 1 << 16];
 /// Steps between two trims of unused memory: the number of samples changes during training.
 const TRIM_EVERY: u64 = 256;
 
-/// A model in training.
+/// Trains a model on a dataset: [`run`](Self::run) for a budget, or [`step`](Self::step) by step.
+///
+/// Results have the same bits on any number of threads. The [state](Self::state) saves a run to resume it.
 pub struct Trainer {
     /// The current model.
     pub model: Model<f32>,
