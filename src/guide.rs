@@ -145,7 +145,7 @@
 //!
 //! ```
 //! use rand::SeedableRng;
-//! use raygrad::{Activation, Adam, AdamConfig, Init, Linear, Optimizer, Params, Pass, Schedule, Sequential};
+//! use raygrad::{Activation, Adam, AdamConfig, Init, Linear, Optimizer, Params, Mode, Schedule, Sequential};
 //! use raygrad::{Tape, Tensor};
 //!
 //! let mut rng = rand::rngs::StdRng::seed_from_u64(1);
@@ -162,7 +162,7 @@
 //! for step in 0..2000 {
 //!     let tape = Tape::new();
 //!     let bound = params.bind(&tape);
-//!     let y = model.forward(&bound, &tape.constant(x.clone()), Pass::Train(step));
+//!     let y = model.forward(&bound, &tape.constant(x.clone()), Mode::Train(step));
 //!     let loss = y.mse_loss(&tape.constant(wave.clone()));
 //!     last = loss.item();
 //!     let grads = bound.backward(&loss);

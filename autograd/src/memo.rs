@@ -71,16 +71,16 @@ impl<T: Scalar> Tape<T> {
     ///     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError> { Ok(x[0].into()) }
     ///     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T> { map([x[0]], pool, |[x]| x * x) }
     ///     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T> { Grads::one(cx.g() * &cx.x(0) * 2.0) }
-    ///     fn is_kept(&self) -> bool { true }
+    ///     fn is_cacheable(&self) -> bool { true }
     /// }
     ///
     /// let tape = Tape::<f64>::new();
     /// let x = tape.leaf(Tensor::from([1.0, 2.0, 3.0]));
-    /// let (y, memo) = tape.no_grad(|| tape.remember(|| tape.apply(Square, &[&x])));
+    /// let (y, memo) = tape.no_grad(|| tape.cache_outputs(|| tape.apply(Square, &[&x])));
     /// let large: Vec<u32> = (0..3).filter(|&i| y.value().as_slice()[i as usize] > 2.0).collect();
     /// let rows: Vec<[u32; 2]> = large.iter().map(|&row| [0, row]).collect();
     /// let memo = Memo::gather(&[memo], &rows, tape.pool());
-    /// let again = tape.recall(memo, || tape.apply(Square, &[&x.gather_rows(large)]));
+    /// let again = tape.reuse_outputs(memo, || tape.apply(Square, &[&x.gather_rows(large)]));
     /// assert_eq!(again.value(), [4.0, 9.0]);
     /// assert_eq!(again.sum().grad(&[&x])[0], [0.0, 4.0, 6.0]);
     /// ```

@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// let inside = x.gt(0.0) & x.lt(2.0);
 /// assert_eq!((inside.as_slice(), inside.count()), (&[false, false, true][..], 1));
 /// assert_eq!(x.where_(&inside, 9.0), Tensor::from([9.0, 9.0, 0.5]));
-/// assert_eq!(x.masked(&!inside), Tensor::from([3.0, -1.0]));
+/// assert_eq!(x.masked_select(&!inside), Tensor::from([3.0, -1.0]));
 /// ```
 #[derive(Clone, PartialEq, Eq)]
 pub struct Mask {

@@ -31,14 +31,14 @@ impl Dropout {
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
-    /// use raygrad_nn::{Dropout, Pass};
+    /// use raygrad_nn::{Dropout, Mode};
     /// let tape = Tape::<f32>::new();
     /// let x = tape.leaf(Tensor::ones(&[1000]));
     /// let dropout = Dropout::new(0.75);
-    /// assert_eq!(dropout.forward(&x, Pass::Evaluate).value(), x.value());
-    /// let y = dropout.forward(&x, Pass::Train(7));
+    /// assert_eq!(dropout.forward(&x, Mode::Evaluate).value(), x.value());
+    /// let y = dropout.forward(&x, Mode::Train(7));
     /// assert!(y.value().as_slice().iter().all(|&y| y == 0.0 || y == 4.0));
-    /// assert_eq!(dropout.forward(&x, Pass::Train(7)).value(), y.value());
+    /// assert_eq!(dropout.forward(&x, Mode::Train(7)).value(), y.value());
     /// ```
     #[track_caller]
     pub fn forward<'t, T: Scalar>(&self, x: &Var<'t, T>, pass: Mode) -> Var<'t, T> {

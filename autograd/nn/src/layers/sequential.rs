@@ -11,7 +11,7 @@ use std::sync::Arc;
 ///
 /// ```
 /// use raygrad_autograd::{Activation, Tape, Tensor};
-/// use raygrad_nn::{Dropout, Init, Linear, Params, Pass, Sequential};
+/// use raygrad_nn::{Dropout, Init, Linear, Params, Mode, Sequential};
 /// use rand::SeedableRng;
 /// let mut rng = rand::rngs::StdRng::seed_from_u64(1);
 /// let mut params = Params::<f32>::new();
@@ -25,7 +25,7 @@ use std::sync::Arc;
 ///     .then(dense(&mut params, "out", [16, 3]));
 /// let tape = Tape::new();
 /// let x = tape.constant(Tensor::ones(&[5, 2]));
-/// assert_eq!(model.forward(&params.bind(&tape), &x, Pass::Evaluate).shape(), [5, 3]);
+/// assert_eq!(model.forward(&params.bind(&tape), &x, Mode::Evaluate).shape(), [5, 3]);
 /// ```
 pub struct Sequential<T: Scalar> {
     layers: Vec<Arc<dyn Layer<T>>>,
