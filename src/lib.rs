@@ -22,7 +22,15 @@ pub use raygrad_nn as nn;
 pub use raygrad_nn::*;
 pub use raygrad_tensor as tensor;
 
-/// The README's examples, as tests.
+/// The examples of the README and of the book's library pages, as tests.
 #[cfg(all(doctest, feature = "nerf"))]
-#[doc = include_str!("../README.md")]
-pub struct Readme;
+mod documents {
+    #[doc = include_str!("../README.md")]
+    pub struct Readme;
+    #[doc = include_str!("../docs/library/tutorial.md")]
+    pub struct Tutorial;
+    #[doc = include_str!("../docs/library/custom-operation.md")]
+    pub struct CustomOperation;
+    #[doc = include_str!("../docs/library/custom-field.md")]
+    pub struct CustomField;
+}

@@ -50,7 +50,11 @@ const TITLES: [(&str, &str, &str); 29] = [
     ),
     ("AdamConfig", "Adam", "Constants of the Adam optimizer."),
     ("GroupConfig", "Parameter group", "Parameters with Adam constants and a learning rate of their own."),
-    ("CameraOptimizerConfig", "Camera optimizer", "What is learned of the cameras beside their poses."),
+    (
+        "CameraOptimizerConfig",
+        "Camera optimizer",
+        "Optimization of focal lengths and lenses. The learning rate of poses is the key `poses`.",
+    ),
 ];
 /// The last of them.
 const EXPOSURE: (&str, &str, &str) =
