@@ -71,8 +71,8 @@ impl Viewpoint {
     pub fn check(&self) -> Result<()> {
         let positive = |x: f64| x > 0.0 && x.is_finite();
         let checks = [
-            ("viewpoint.width", self.width as f64, (1..=LARGEST).contains(&self.width), "1 to 65536 pixels"),
-            ("viewpoint.height", self.height as f64, (1..=LARGEST).contains(&self.height), "1 to 65536 pixels"),
+            ("viewpoint.width", self.width as f64, (1..=LARGEST).contains(&self.width), "1 to 65536"),
+            ("viewpoint.height", self.height as f64, (1..=LARGEST).contains(&self.height), "1 to 65536"),
             (
                 "viewpoint.angle_x",
                 self.angle_x,

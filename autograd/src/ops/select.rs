@@ -157,7 +157,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     #[track_caller]
     pub fn masked_select(&self, mask: &Mask) -> Self {
         let same = ensure(mask.shape() == self.shape(), || format!("the mask has the shape {:?}", mask.shape()));
-        self.fits("masked", same);
+        self.fits("masked_select", same);
         self.reshape(&[self.value().len()]).gather_rows(mask.nonzero())
     }
 

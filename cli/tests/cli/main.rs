@@ -598,7 +598,7 @@ fn bad_runs_are_named() {
             ["run/config.json", "`scene_box.near_far`: is 6 to 2; near must"],
         ),
         (edited("/scene_box/bounds/0/0", json!(9.0)), ["`bounds`", "is no box"]),
-        (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`: is 0; use 1 to 65536 pixels"]),
+        (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`: is 0; use 1 to 65536"]),
         (edited("/config/sampler/batch", json!(0)), ["run/config.json", "`batch`"]),
         (edited("/config/field/width", json!(64)), ["run/model.safetensors", "in the file"]),
         (edited("/config/field/depth", json!(3)), ["run/model.safetensors", "another configuration"]),

@@ -62,8 +62,9 @@ impl ComponentConfig<Fields> for ClassicConfig {
             check_range(name, value, 1, 1 << 14)?;
         }
         check_parameters(self.depth * self.width * (self.width + 200))?;
-        if self.position_levels > 24 || self.direction_levels > 24 {
-            return Err(Error::setting("position_levels", "has more frequencies than f32 can resolve; use at most 24"));
+        // More frequencies are beyond what f32 can resolve.
+        for (name, value) in [("position_levels", self.position_levels), ("direction_levels", self.direction_levels)] {
+            check_range(name, value, 0, 24)?;
         }
         match self.skip_layers.iter().find(|&&skip| !(1..self.depth).contains(&skip)) {
             Some(skip) => Err(Error::setting(
