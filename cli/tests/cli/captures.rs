@@ -307,7 +307,7 @@ fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
     std::fs::write(place.path("captured/transforms.json"), transforms.to_string()).unwrap();
     let said = place.succeeds(&format!("train captured --steps 1 --out ahead {SMALL} --set sampler.step=0.1"));
     assert!(
-        said.contains("forward-facing: photographs are opaque, so they show what lies behind, and all look ahead"),
+        said.contains("forward-facing: images are opaque, so they show a background, and all cameras look ahead"),
         "{said}"
     );
     let ndc = model(&place, "ahead").scene_box.ndc.unwrap();

@@ -140,7 +140,7 @@ fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(
         output.status.code() == Some(1)
-            && said.contains("has a lens")
+            && said.contains("has lens distortion")
             && said.contains("1 masks are not converted: LLFF has none"),
         "{said}"
     );

@@ -146,8 +146,8 @@ fn shapes_are_in_the_coordinates_of_the_capture() {
     let (points, header) = vertices(&place, "points.ply");
     assert!(said.contains(&format!("exported {} points, from ", points.len())) && !header.contains("face"), "{said}");
     assert!((10..=50).contains(&points.len()) && within(&points, 1e-9));
-    place.fails("export run no.ply --iso-value=-1", &["`level`: is -1"]);
-    place.fails("export run no.ply --iso-value 1e30 --no-fill-unseen", &["`level`: is 1", "use a smaller one"]);
+    place.fails("export run no.ply --iso-value=-1", &["`iso_value`: is -1; use a density above 0"]);
+    place.fails("export run no.ply --iso-value 1e30 --no-fill-unseen", &["`iso_value`: is 1", "use a smaller"]);
     place.fails_with(
         "export run cameras.json --triangles 9",
         "`triangles`: applies to meshes and point clouds: name a .ply, .obj or .glb file",

@@ -138,7 +138,10 @@ fn weights_that_do_not_serve_are_refused_before_anything_is_rendered() {
     place.fails("eval run --lpips absent", &["absent: cannot be read"]);
     let bytes = place.bytes("alex.safetensors");
     std::fs::write(place.path("part.safetensors"), &bytes[..bytes.len() / 2]).unwrap();
-    place.fails("eval run --lpips part.safetensors", &["part.safetensors: not a safetensors file", "lpips_weights.py"]);
+    place.fails(
+        "eval run --lpips part.safetensors",
+        &["part.safetensors: is not a safetensors file", "lpips_weights.py"],
+    );
     let model = "run/model.safetensors";
     place.fails(&format!("eval run --lpips {model}"), &[model, "has no LPIPS weights"]);
     let left = std::fs::read_dir(place.path("run")).unwrap().map(|entry| entry.unwrap().file_name());

@@ -362,7 +362,10 @@ fn the_doctor_says_what_is_wrong_by_its_exit_code_too() {
     std::fs::write(place.path("capture/transforms.json"), transforms.to_string()).unwrap();
 
     let table = place.succeeds("doctor capture");
-    assert!(table.contains("no problems found") && table.contains("bounded: photographs are transparent"), "{table}");
+    assert!(
+        table.contains("no problems found") && table.contains("bounded: images have a transparent background"),
+        "{table}"
+    );
     assert!(
         table.contains("  resolution     64x64\n") && table.contains("  images         35 train, 5 test\n"),
         "{table}"
@@ -597,7 +600,7 @@ fn bad_runs_are_named() {
             edited("/scene_box/near_far", json!([6.0, 2.0])),
             ["run/config.json", "`scene_box.near_far`: is 6 to 2; near must"],
         ),
-        (edited("/scene_box/bounds/0/0", json!(9.0)), ["`bounds`", "is no box"]),
+        (edited("/scene_box/bounds/0/0", json!(9.0)), ["`bounds`", "use finite corners, the lower below the upper"]),
         (edited("/viewpoint/width", json!(0)), ["run/config.json", "`viewpoint.width`: is 0; use 1 to 65536"]),
         (edited("/config/sampler/batch", json!(0)), ["run/config.json", "`batch`"]),
         (edited("/config/field/width", json!(64)), ["run/model.safetensors", "in the file"]),

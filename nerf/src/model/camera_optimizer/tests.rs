@@ -214,7 +214,7 @@ fn cameras_have_to_be_known_where_they_are_corrected() {
     let panoramas = vec![cameras[5].clone(); 2];
     assert!(
         message(true, &CameraOptimizerConfig { focal: None, ..all() }, 2, &panoramas)
-            .starts_with("`camera_optimizer.lens`: equirect")
+            .starts_with("`camera_optimizer.lens`: cannot be refined: equirect")
     );
     assert!(new(true, &none, 2, &panoramas).unwrap().is_some());
     assert!(
