@@ -77,17 +77,12 @@ impl Viewpoint {
                 "viewpoint.angle_x",
                 self.angle_x,
                 positive(self.angle_x) && self.angle_x < PI,
-                "an angle between 0 and pi",
+                "more than 0 and less than pi",
             ),
             ("viewpoint.distance", self.distance, self.distance >= 0.0 && self.distance.is_finite(), "0 or more"),
-            (
-                "viewpoint.elevation",
-                self.elevation,
-                self.elevation.abs() < FRAC_PI_2,
-                "an angle between -pi/2 and pi/2",
-            ),
+            ("viewpoint.elevation", self.elevation, self.elevation.abs() < FRAC_PI_2, "between -pi/2 and pi/2"),
             ("viewpoint.azimuth", self.azimuth, self.azimuth.is_finite(), "a finite angle"),
-            ("viewpoint.reach", self.reach, (0.0..=PI).contains(&self.reach), "an angle from 0 to pi"),
+            ("viewpoint.reach", self.reach, (0.0..=PI).contains(&self.reach), "0 to pi"),
         ];
         match checks.iter().find(|(_, _, good, _)| !good) {
             Some((name, value, _, range)) => Err(Error::setting(name, format!("is {value}; use {range}"))),
