@@ -363,7 +363,10 @@ impl Config {
             let part = format!("groups.{}", group.params);
             named(&part, group.schedule.check())?;
             named(&part, group.adam.check())?;
-            check_range("groups.weight_decay", group.weight_decay, 0.0, 1e30)?;
+            let decay = group.weight_decay;
+            if !(0.0..=1e30).contains(&decay) {
+                return Err(Error::setting("groups.weight_decay", format!("is {decay:?}; use 0 to 1e30")));
+            }
         }
         if let Some(marching) = self.sampler.get::<MarchingConfig>() {
             let cascades = marching.occupancy.cascades;
