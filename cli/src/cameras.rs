@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn photographs_from_one_side_are_known_by_their_direction() {
+    fn one_sided_images_are_known_by_direction() {
         let mut data = embedded(Split::Train, 8);
         let centre = 0.5 * (data.bounds[0] + data.bounds[1]);
         // Within 40 degrees of the y axis.

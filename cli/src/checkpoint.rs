@@ -180,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_cut_off_anywhere_or_changed_anywhere_is_no_checkpoint() {
+    fn damaged_checkpoint_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("00000007.checkpoint");
         let state: Vec<u8> = (0..200_u8).collect();

@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn what_differs_is_a_column_or_a_warning_and_the_rest_is_said_once() {
+    fn compare_shows_differences_as_columns() {
         let one = [("psnr_mean", "31.126"), ("split", "test"), ("model.seed", "0"), ("views", "8")];
         let other = [("psnr_mean", "NaN"), ("split", "test"), ("model.seed", "7"), ("views", "80"), ("threads", "2")];
         let text = table(&[row("first", &one), row("b", &other)]);
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn lpips_is_a_column_where_it_was_measured_and_of_other_weights_is_warned_of() {
+    fn compare_shows_lpips_and_warns_of_other_weights() {
         let plain = [("psnr_mean", "31.126"), ("ssim_mean", "0.9")];
         let with = |crc32: &'static str, backbone: &'static str| {
             [("lpips_mean", "0.05678"), ("lpips_crc32", crc32), ("lpips_backbone", backbone)]

@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_file_has_a_later_name_whatever_the_clock_says() {
+    fn later_event_file_has_a_later_name() {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path().join("made");
         for number in 0..2 {

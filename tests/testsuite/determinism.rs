@@ -73,7 +73,7 @@ fn outcome(data: &Arc<Dataset>, config: Config, steps: u32, threads: Option<usiz
 }
 
 #[test]
-fn training_and_rendering_give_the_same_bits_on_any_number_of_threads() {
+fn training_and_views_any_threads_give_same_bits() {
     let data = Arc::new(embedded(Split::Val, 32));
     // Marched models take more steps: their occupancy grids are to change on the way.
     for (name, config, steps) in [("hierarchical", config(7), 5), ("instant", instant(7), 40), ("voxel", voxel(7), 40)]

@@ -288,7 +288,7 @@ fn one_image_under_two_names() {
 }
 
 #[test]
-fn photographs_that_are_blurred_bright_or_of_another_colour() {
+fn doctor_finds_blur_exposure_and_colour_jumps() {
     let planted = Planted::new();
     planted.redraw(6, |image| blurred(image, 3));
     found(&planted.report(), Kind::Blurred, Warning, &[6], &[]);
@@ -406,7 +406,7 @@ fn tinted(image: &Image, factors: [f32; 3]) -> Image {
 }
 
 #[test]
-fn a_good_capture_through_a_lens_half_masked_and_lying_on_its_side_has_none_either() {
+fn good_capture_with_lens_and_masks_has_no_findings() {
     let mut planted = Planted::new();
     let size = [200, 130];
     let scene = Scene::bulldozer();
@@ -483,7 +483,7 @@ fn each_of_several_equal_poses_is_named_once() {
 }
 
 #[test]
-fn photographs_from_one_place_in_other_directions_are_not_alike() {
+fn images_from_one_place_are_not_duplicates() {
     let finds = |to: usize, angle: f64, kind: Kind| {
         let mut planted = Planted::new();
         let pose = planted.camera(8).pose;

@@ -139,7 +139,7 @@ fn hierarchical(field: ClassicConfig, coarse: usize, fine: usize) -> Config {
 }
 
 #[test]
-fn the_training_loss_has_the_first_and_second_derivatives_that_differences_show() {
+fn training_loss_derivatives_match_differences() {
     // Between two kinks of its ReLUs the loss is smooth. A step of 1e-6 rarely meets a kink, and costs the differences
     // about ten of their sixteen digits; the seed is one of those that meet none.
     let loss = Loss::new(tiny(), 3, 1).double();
@@ -209,7 +209,7 @@ fn along(params: &[Tensor<f64>], direction: &[Tensor<f64>], h: f64) -> Vec<Tenso
 /// A difference across the kink of a ReLU is none: it counts at the step at which it is nearest. A wrong derivative is wrong
 /// at every step.
 #[test]
-fn deep_relu_networks_pass_in_every_one_of_twenty_directions() {
+fn deep_relu_network_passes_in_twenty_directions() {
     let field = ClassicConfig { depth: 8, width: 24, view_width: 12, ..ClassicConfig::paper() };
     let config = hierarchical(field, 16, 16);
     for config in [config.clone(), config.with_relu_density()] {
@@ -246,7 +246,7 @@ fn relative_error<T: Scalar, U: Scalar>(got: &Tensor<T>, expected: &Tensor<U>) -
 }
 
 #[test]
-fn single_precision_gradients_agree_with_double_precision() {
+fn f32_gradients_agree_with_f64() {
     for (preset, rays) in [(Preset::Small, 16), (Preset::Classic, 4)] {
         let mut names = vec![];
         let mut errors: Vec<Vec<f64>> = vec![];
@@ -329,7 +329,7 @@ fn fused_operations_agree<T: Scalar>(tolerance: f64) {
 }
 
 #[test]
-fn fused_operations_agree_with_plain_ones_in_both_precisions() {
+fn fused_operations_agree_with_plain_in_f32_and_f64() {
     fused_operations_agree::<f64>(1e-14);
     fused_operations_agree::<f32>(2e-6);
 }

@@ -98,7 +98,7 @@ fn proposals_are_trained_rendered_and_stored() {
 }
 
 #[test]
-fn what_lies_beyond_the_box_is_trained_and_seen_if_the_scene_goes_on() {
+fn unbounded_scene_beyond_the_box_is_trained() {
     let mut data = (**DATA).clone();
     data.bounds = data.bounds.map(|corner| 0.4 * corner);
     let mut config = instant();
@@ -170,7 +170,7 @@ impl<T: Scalar> Field<T> for Bare {
 }
 
 #[test]
-fn a_field_of_ones_own_is_built_trained_rendered_saved_and_loaded() {
+fn custom_field_is_trained_rendered_saved_and_loaded() {
     let text = r#"{"kind": "bare", "width": 8}"#;
     let read = || serde_json::from_str::<FieldConfig>(text);
     let config = Config { field: FieldConfig::new(BareConfig { width: 8 }), ..instant() };
@@ -217,7 +217,7 @@ fn busy() -> (Model<f64>, Rays<f64>) {
 }
 
 #[test]
-fn two_passes_show_and_differentiate_what_one_does_with_every_rule() {
+fn two_passes_equal_one_with_every_quadrature() {
     let (model, rays) = busy();
     let rules = [Quadrature::Left, Quadrature::Midpoint, Quadrature::PiecewiseLinear, Quadrature::Gauss2];
     for rule in rules {
@@ -249,7 +249,7 @@ fn two_passes_show_and_differentiate_what_one_does_with_every_rule() {
 }
 
 #[test]
-fn rays_that_are_variables_have_the_gradients_that_differences_show() {
+fn ray_variables_have_gradients_of_differences() {
     let (model, rays) = busy();
     let color = |origins: &Tensor<f64>, directions: &Tensor<f64>, grad: bool| {
         let tape = Tape::new();
@@ -359,7 +359,7 @@ fn terms_of_a_file_take_part_in_training() {
 }
 
 #[test]
-fn a_budget_of_time_is_measured_by_the_clock_that_is_given_and_not_while_others_look() {
+fn time_budget_follows_the_given_clock() {
     let clock = Arc::new(AtomicU64::new(0));
     let tick = clock.clone();
     // Every look at the clock takes a second.
@@ -377,7 +377,7 @@ fn a_budget_of_time_is_measured_by_the_clock_that_is_given_and_not_while_others_
 }
 
 #[test]
-fn switches_are_five_and_those_of_the_first_edition_are_understood() {
+fn skip_switches_of_earlier_versions_are_read() {
     let read = |text: &str| serde_json::from_str::<OccupancyConfig>(text).unwrap().skip;
     let carving = |text: &str| read(text).carving;
     assert_eq!(carving(r#"{"skip": "fast"}"#), 3);

@@ -74,7 +74,7 @@ fn pictures(view: &View) -> [(&'static str, Image); 3] {
 /// Everything goes through one [`Camera`], so that a mistake of it would show nowhere but in pictures that were looked at
 /// once and kept.
 #[test]
-fn the_scene_looks_as_it_did_from_a_camera_that_no_symmetry_helps() {
+fn scene_looks_the_same_from_asymmetric_camera() {
     for (name, image) in all_pictures() {
         let kept = Image::open(golden(name)).unwrap();
         assert_eq!([kept.width, kept.height], [image.width, image.height], "{name}");
@@ -94,7 +94,7 @@ fn write_golden_pictures() {
 
 /// A point of the scene is seen where the formula of a pinhole puts it, written out.
 #[test]
-fn points_are_seen_where_the_formula_of_a_pinhole_puts_them() {
+fn points_project_as_the_pinhole_formula_says() {
     for number in 0..5 {
         let camera = camera(number);
         for (column, row) in [(0, 0), (59, 3), (17, 43), (33, 19)] {
@@ -157,7 +157,7 @@ fn normals_apart(model: &Model<f32>, camera: &Camera, truth: &Image) -> f64 {
 }
 
 #[test]
-fn what_is_learned_has_the_colours_distances_and_normals_of_the_scene() {
+fn learned_scene_has_true_colour_depth_and_normals() {
     let scene = Scene::bulldozer();
     let frame = |number: usize| {
         let camera = camera(number);
@@ -247,7 +247,7 @@ fn medium(scene: &AnalyticScene, rule: Quadrature, skip: Skip) -> Model<f32> {
 }
 
 #[test]
-fn views_of_known_media_are_exact_by_every_rule_and_within_every_limit() {
+fn views_of_known_media_are_exact_within_limits() {
     let rules = [
         (Quadrature::Left, 6e-3),
         (Quadrature::Midpoint, 4e-3),

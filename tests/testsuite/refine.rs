@@ -201,7 +201,7 @@ fn detail_comes_in_from_coarse_to_fine() {
 }
 
 #[test]
-fn exposures_and_vignetting_are_found_in_a_scene_that_is_known() {
+fn exposure_and_vignetting_of_known_scene_are_found() {
     let right = photographs(24, 32, Lens::Pinhole);
     let mut seen = right.clone();
     // From .55 to 1 times as bright, so that nothing is cut off, the red more than the blue; and corners at half of the
@@ -257,7 +257,7 @@ fn exposures_and_vignetting_are_found_in_a_scene_that_is_known() {
 }
 
 #[test]
-fn photographs_that_were_not_trained_on_are_found_where_they_belong_and_nothing_else_moves() {
+fn fit_poses_finds_held_out_cameras_alone() {
     let right = photographs(30, 48, Lens::Pinhole);
     let (mut known, mut held_out) = (right.clone(), right);
     held_out.frames = known.frames.split_off(24);

@@ -74,7 +74,7 @@ fn a_variable_used_often_gathers_every_share() {
 }
 
 #[test]
-fn gradients_of_interior_nodes_and_of_what_is_not_reached() {
+fn interior_and_unreached_nodes_have_gradients() {
     let tape = Tape::new();
     let x = tape.leaf(vector(&[0.2, 0.4]));
     let inner = x.sin();
@@ -91,7 +91,7 @@ fn gradients_of_interior_nodes_and_of_what_is_not_reached() {
 }
 
 #[test]
-fn detached_values_constants_and_no_grad_stop_gradients() {
+fn detach_constants_and_no_grad_stop_gradients() {
     let tape = Tape::new();
     let x = tape.leaf(vector(&[3.0]));
     let y = (&x * x.detach()).sum();
@@ -130,7 +130,7 @@ fn a_freed_graph_says_so() {
 }
 
 #[test]
-fn a_cleared_tape_gives_the_same_bits_without_allocating() {
+fn cleared_tape_gives_same_bits_without_allocating() {
     let mut tape = Tape::<f32>::new();
     let mut first = None;
     let mut allocated = 0;
@@ -282,7 +282,7 @@ fn a_gradient_can_be_taken_inside_a_vjp() {
 }
 
 #[test]
-fn a_fused_operation_keeps_the_shares_of_dependent_inputs_apart() {
+fn fused_operation_keeps_dependent_inputs_apart() {
     // x is a function of w, and both are inputs of the dense layer.
     let derivatives = |layer: for<'t> fn(&Var<'t, f64>, &Var<'t, f64>) -> Var<'t, f64>| {
         let tape = Tape::new();
@@ -299,7 +299,7 @@ fn a_fused_operation_keeps_the_shares_of_dependent_inputs_apart() {
 }
 
 #[test]
-fn shape_errors_name_the_operation_the_shapes_and_the_line() {
+fn shape_errors_name_operation_shapes_and_line() {
     let tape = Tape::<f32>::new();
     let (a, b) = (tape.leaf(Tensor::zeros(&[2, 3])), tape.leaf(Tensor::zeros(&[4, 5])));
     let check = |message: String, parts: [&str; 3], line: u32| {
@@ -359,7 +359,7 @@ fn the_nan_finder_says_where_a_bad_value_came_in() {
 }
 
 #[test]
-fn the_nan_finder_checks_recorded_gradients_sums_and_sparse_ones() {
+fn nan_finder_checks_recorded_and_sparse_gradients() {
     let tape = Tape::<f32>::new();
     tape.check_finite(true);
     let starts = |message: String, expected: &str, line: u32| {
@@ -455,7 +455,7 @@ fn scopes_without_recording_nest_and_end() {
 }
 
 #[test]
-fn empty_and_scalar_tensors_pass_through_everything_of_a_tape() {
+fn empty_and_scalar_tensors_pass_through_a_tape() {
     for shape in [&[][..], &[0], &[3, 0, 2], &[1]] {
         let tape = Tape::<f64>::new();
         tape.check_finite(true);
@@ -480,7 +480,7 @@ fn slope<'t>(x: &[Var<'t, f64>]) -> Var<'t, f64> {
 }
 
 #[test]
-fn a_gradient_can_be_taken_inside_of_whatever_runs_a_function() {
+fn gradient_inside_a_running_function_is_taken() {
     // A checkpoint runs it unrecorded first.
     let tape = Tape::<f64>::new();
     let x = tape.leaf(Tensor::scalar(3.0));
@@ -695,7 +695,7 @@ impl Op<f64> for Broken {
 }
 
 #[test]
-fn what_an_operation_promises_is_checked_in_every_build() {
+fn operation_promises_are_checked_in_every_build() {
     let tape = Tape::<f64>::new();
     let x = tape.leaf(vector(&[1.0, 2.0]));
     let run = |op: Broken, recorded: bool| {
@@ -723,7 +723,7 @@ fn what_an_operation_promises_is_checked_in_every_build() {
 }
 
 #[test]
-fn only_what_leads_to_a_wanted_variable_is_passed_and_freed() {
+fn only_paths_to_wanted_variables_are_swept() {
     // In both orders of the leaves.
     for late in [false, true] {
         let tape = Tape::<f64>::new();
@@ -749,7 +749,7 @@ fn only_what_leads_to_a_wanted_variable_is_passed_and_freed() {
 }
 
 #[test]
-fn a_graph_of_a_million_nodes_is_swept_dropped_and_cleared() {
+fn million_node_graph_is_swept_dropped_and_cleared() {
     let mut tape = Tape::<f64>::new();
     for free in [false, true] {
         let x = tape.leaf(Tensor::scalar(1.0));
@@ -769,7 +769,7 @@ fn a_graph_of_a_million_nodes_is_swept_dropped_and_cleared() {
 }
 
 #[test]
-fn many_small_gradients_on_a_long_tape_cost_their_own_nodes_only() {
+fn small_gradients_on_long_tape_cost_own_nodes_only() {
     // A gradient of three nodes, again and again: on a tape that is a thousand times longer it is not slower by much.
     let time = |before: usize| {
         let tape = Tape::<f64>::new();

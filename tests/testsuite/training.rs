@@ -186,7 +186,7 @@ fn codes_take_up_what_photographs_differ_in() {
 }
 
 #[test]
-fn poses_that_are_off_are_found_in_a_scene_that_is_known() {
+fn pose_refinement_finds_known_offsets() {
     let right = photographs(24, 32);
     let config = Config { poses: Some(Schedule::Exponential { from: 4e-3, to: 4e-4, warmup: 0.0 }), ..instant() };
     let mut known = Trainer::new(config.clone(), Arc::new(right.clone())).unwrap();
@@ -266,7 +266,7 @@ fn scene_and_poses_are_learned_together() {
 }
 
 #[test]
-fn distances_that_were_measured_show_where_surfaces_are() {
+fn depth_loss_finds_measured_surfaces() {
     let scene = Scene::bulldozer();
     let mut data = photographs(60, 24);
     let test = data.frames.split_off(57);
@@ -376,7 +376,7 @@ fn a_table_that_is_to_be_smooth_becomes_smoother() {
 }
 
 #[test]
-fn samples_near_a_camera_learn_less_where_that_is_asked_for() {
+fn gradient_scaling_damps_samples_near_cameras() {
     let mut data = photographs(12, 24);
     // Its unit is 2, and the nearest samples are 2 away.
     data.bounds = [DVec3::splat(-3.0), DVec3::splat(3.0)];

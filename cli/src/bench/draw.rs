@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_is_drawn_with_its_letters_and_without_those_of_the_system() {
+    fn figure_draws_its_own_font() {
         let axis = || Axis::log("evaluations");
         let points = vec![[8.0, 1e-2], [64.0, 1e-4], [128.0, 0.0]];
         let series = vec![

@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_page_has_a_place_for_everything_and_asks_nothing_of_the_network() {
+    fn scene_page_is_complete_and_offline() {
         let names = ["title", "facts", "findings", "stage", "mark"];
         let page = filled(PAGE, &names.map(|name| (name, format!("<{{{{{name}}}}}>"))));
         assert!(names.iter().all(|name| page.contains(&format!("<{{{{{name}}}}}>"))), "{page}");

@@ -423,7 +423,7 @@ mod tests {
     use std::sync::Arc;
 
     #[test]
-    fn gains_make_up_for_an_exposure_and_the_other_half_is_compared() {
+    fn fit_half_gains_correct_exposure() {
         let mut frame = embedded(Split::Test, 26).frames.remove(0);
         let truth = frame.image.over([1.0; 3]);
         // Too dark by a factor for each channel, but for one pixel on the right.

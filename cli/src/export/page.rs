@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn layers_are_filled_up_to_four_and_codes_are_what_they_add_on_average() {
+    fn scene_page_pads_layers_and_averages_embeddings() {
         let config = small();
         let mut model = model(config.clone(), as_it_is);
         let count = |from: u32, count: u32| (from..from + count).map(|x| x as f32).collect::<Vec<f32>>();

@@ -202,7 +202,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn symbolic_links_are_followed_and_permissions_are_usual() {
+    fn atomic_write_follows_links_keeps_permissions() {
         use std::os::unix::fs::{PermissionsExt, symlink};
         let folder = tempfile::tempdir().unwrap();
         let [target, link, lost] = ["target", "link", "lost"].map(|name| folder.path().join(name));

@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_of_an_apng_are_shown_for_as_long_as_they_should() {
+    fn apng_frames_last_as_long_as_they_should() {
         for fps in [0.01, 0.015, 0.7, 1.0, 12.5, 29.97, 240.0] {
             let mut bytes = vec![];
             let mut animation = Animation::apng(&mut bytes, [4, 3], fps, 1, "a comment").unwrap();

@@ -301,13 +301,13 @@ mod tests {
     use raygrad::nerf::glam::DVec3;
 
     #[test]
-    fn the_focus_of_a_spiral_is_that_of_the_published_code() {
+    fn spiral_focus_matches_published_code() {
         // close_depth, inf_depth = bds.min()*.9, bds.max()*5.; dt = .75; 1./(((1.-dt)/close_depth + dt/inf_depth))
         assert!((llff_focus([2.0, 30.0]) - 6.949806949806949).abs() < 1e-12);
     }
 
     #[test]
-    fn a_spiral_winds_about_photographs_from_one_side_and_about_the_orbit_of_others() {
+    fn spiral_winds_about_images_or_the_orbit() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::new(1.0, 1.0, 3.0)], [0.5, 9.0]);
         let view =
             Viewpoint { width: 40, height: 30, angle_x: 0.8, distance: 4.0, elevation: 0.3, azimuth: 0.0, reach: 0.4 };

@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_written_by_one_program_at_a_time_which_says_what_differs() {
+    fn frames_folder_has_one_writer_and_names_changes() {
         let place = tempfile::tempdir().unwrap();
         let again = || Frames::new(place.path().into(), json!({}), &job(0, false), 3, &[]);
         let frames = again().unwrap();

@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn colors_stand_before_the_background_by_their_opacity() {
+    fn frame_colours_blend_over_background() {
         let seen = over(&image(3, &[1.0, 0.0, 0.5, 1.0, 0.0, 0.5]), &image(1, &[0.25, 1.0]), [0.0, 1.0, 0.5]);
         assert_eq!(seen.data, [0.25, 0.75, 0.5, 1.0, 0.0, 0.5]);
     }

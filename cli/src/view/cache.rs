@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn one_thing_is_made_at_a_time_and_why_it_failed_is_told_once() {
+    fn cache_makes_one_value_and_tells_an_error_once() {
         let store = Cache::new(2);
         let ((go, waits), (done, ended)) = (channel::<()>(), channel());
         let slow = move || {

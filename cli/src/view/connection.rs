@@ -371,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_have_as_many_bytes_as_they_are_said_to_have() {
+    fn binary_messages_have_their_stated_length() {
         assert_eq!(framed(Outgoing::Text("\u{e4}x".to_owned())), (3, Message::Text("\u{e4}x".into())));
         assert_eq!(framed(Outgoing::Bytes(vec![7; 5])), (5, Message::Binary(vec![7; 5].into())));
     }
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn reasons_are_as_long_as_there_is_room_and_end_with_a_letter() {
+    fn close_reasons_fit_and_end_with_a_letter() {
         assert_eq!(shortened("not taken".to_owned()), "not taken");
         assert_eq!(shortened("x".repeat(500)), "x".repeat(REASON));
         assert_eq!(shortened("\u{e4}".repeat(100)), "\u{e4}".repeat(REASON / 2));

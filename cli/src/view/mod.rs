@@ -179,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_placed_and_has_moved_is_found_where_it_was() {
+    fn sweep_finds_moved_folders() {
         let placement =
             SceneTransform { rotation: DMat3::from_rotation_z(0.7), scale: 2.5, origin: DVec3::new(1.0, -2.0, 0.5) };
         let learned =

@@ -243,7 +243,7 @@ mod tests {
     const UNIT: [DVec3; 2] = [DVec3::NEG_ONE, DVec3::ONE];
 
     #[test]
-    fn photographs_that_were_trained_on_are_where_they_were_found_and_others_beside_them() {
+    fn trained_images_stand_where_they_were_found() {
         let at = |x: f64, y: f64| DVec3::new(x, y, 3.0);
         let places = [
             (Split::Train, at(0.0, 1.0)),
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_photograph_stands_near_and_looks_the_same_way() {
+    fn nearest_image_is_near_and_looks_alike() {
         let mut photos = photos(Scene::Embedded, &[(Split::Train, DVec3::new(0.0, 0.0, 5.0)); 3]);
         let model = model([DVec3::ZERO, DVec3::splat(2.0)], &[], false);
         // Two away and turned by a right angle; six away, held alike; the same place, turned round.
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn figures_are_those_of_evaluations_where_these_see_the_same() {
+    fn viewer_psnr_matches_eval() {
         let mut photos =
             photos(Scene::Folder(PathBuf::new()), &[(Split::Train, DVec3::ZERO), (Split::Test, DVec3::ONE)]);
         let model = model(UNIT, &[], false);
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn photographs_that_are_built_in_are_made_by_their_split_and_number() {
+    fn built_in_images_are_rendered_by_split_and_number() {
         let places = [(Split::Train, DVec3::ZERO), (Split::Test, DVec3::ZERO), (Split::Test, DVec3::ZERO)];
         let photos = photos(Scene::Landscape, &places);
         let tests = landscape(Split::Test, 16).frames;

@@ -157,7 +157,7 @@ pub mod tests {
     }
 
     #[test]
-    fn a_piece_is_as_large_as_there_is_time_for_and_shows_what_is_asked_for() {
+    fn render_piece_fits_the_time_it_has() {
         let model = fog();
         let painted = |view: &View, rate: f64| {
             let Eye::Free { pose, fov } = &view.eye else { panic!() };

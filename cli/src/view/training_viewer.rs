@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_painted_for_nobody_and_nothing_that_is_not_owed() {
+    fn nothing_is_rendered_for_nobody() {
         let all = [(0, false), (0, true), (1, false), (1, true)].map(|(pages, paused)| is_unseen(pages, paused));
         assert_eq!(all, [true, false, false, false]);
         assert_eq!([0.0, 1e-9, -1e-9].map(is_owed), [false, true, false]);
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_alone_for_long_is_known_until_somebody_comes() {
+    fn lonely_training_is_known_until_a_page_comes() {
         let mut alone = Alone::default();
         let short = Duration::from_millis(20);
         assert!(!alone.is_longer(0, short) && !alone.is_longer(1, Duration::ZERO));

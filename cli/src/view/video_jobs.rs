@@ -317,7 +317,7 @@ mod tests {
         }
 
         #[test]
-        fn a_video_that_is_ended_has_its_place_until_its_program_has_ended() {
+        fn cancelled_video_keeps_its_place_until_it_ends() {
             let place = Place::new();
             let go = place.folder.path().join("go");
             let first = place.script(
@@ -353,7 +353,7 @@ mod tests {
         }
 
         #[test]
-        fn nobody_waits_while_it_is_found_out_what_videos_can_be_made() {
+        fn video_formats_are_found_without_blocking() {
             let place = Place::new();
             let script = place.script("script", "cat > /dev/null\nexit 130");
             let ((asks, asked), (answers, answer)) = (channel(), channel());
@@ -383,7 +383,7 @@ mod tests {
         }
 
         #[test]
-        fn what_cannot_be_started_leaves_nothing_and_the_next_is_made() {
+        fn video_that_cannot_start_leaves_nothing() {
             let place = Place::new();
             for _ in 0..2 {
                 let refused = place.make(&place.folder.path().join("absent")).unwrap_err();

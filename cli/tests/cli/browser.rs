@@ -136,7 +136,7 @@ fn shows_the_scene(mut browser: Browser, place: &Place, server: &Server) {
 }
 
 #[test]
-fn a_browser_keeps_pictures_and_paths_that_are_the_programs() {
+fn browser_saves_images_and_paths_of_the_program() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 60 --out run --scene-type unbounded {SMALL} --set sampler.cone=0.1"));
     let server = serve(&place, "view run");
@@ -404,7 +404,7 @@ fn reaches_everything(mut browser: Browser, place: &Place, server: &Server) {
 }
 
 #[test]
-fn a_browser_comes_back_to_a_program_that_does_and_fits_a_phone() {
+fn browser_reconnects_and_fits_a_phone() {
     let Some(mut browser) = Browser::open(Kind::Chromium) else { return };
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 100 --out run {SMALL}"));
@@ -601,7 +601,7 @@ fn detail(file: &[u8]) -> f64 {
 
 /// Of scenes that end, that go on, that all photographs look ahead at, and whose training was ended before all detail had come.
 #[test]
-fn a_browser_renders_a_page_as_the_program_renders_the_scene() {
+fn browser_renders_scene_page_as_the_program() {
     let place = Place::with_scene();
     place.add_landscape();
     // All look the same way: what they show is wrong, and the same for both.

@@ -111,7 +111,7 @@ fn apart(a: &Image, b: &Image) -> f32 {
 }
 
 #[test]
-fn photographs_are_compared_from_where_the_model_has_their_cameras() {
+fn eval_uses_the_models_cameras() {
     let place = Place::with_scene();
     // At a rate at which they go astray, so that it can be seen.
     let fast = r#"--set poses={"constant":{"rate":0.1}} --set camera_optimizer={"focal":{"constant":{"rate":0.02}}}"#;
@@ -151,7 +151,7 @@ fn photographs_are_compared_from_where_the_model_has_their_cameras() {
 }
 
 #[test]
-fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
+fn eval_states_exposure_of_held_out_images() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 12 --out plain {SMALL}"));
     let fast =
@@ -201,7 +201,7 @@ fn what_is_done_about_exposures_of_photographs_that_were_held_out_is_said() {
 }
 
 #[test]
-fn scenes_that_are_moved_to_where_models_want_them_are_seen_from_where_they_were_photographed() {
+fn moved_captures_are_seen_from_their_cameras() {
     let place = Place::with_scene();
     place.succeeds(&format!(
         "train scene --scene-type unbounded --steps 12 --out run {SMALL} --refine exposure,vignetting"
@@ -231,7 +231,7 @@ fn a_model_is_as_fine_as_its_photographs() {
 }
 
 #[test]
-fn opaque_photographs_have_a_plain_background_unless_another_is_asked_for() {
+fn opaque_images_have_plain_background() {
     let place = Place::empty();
     let background = |flag: &str, run: &str| {
         place.succeeds(&format!("train landscape --downscale 20 --steps 1 --out {run} {SMALL} {flag}"));
@@ -292,7 +292,7 @@ fn what_was_trained_on_is_no_test() {
 }
 
 #[test]
-fn photographs_that_all_look_ahead_are_seen_as_one_picture() {
+fn forward_facing_capture_trains_in_ndc() {
     let place = Place::with_scene();
     place.succeeds("prepare scene --to nerfstudio --out captured");
     let mut transforms = place.json("captured/transforms.json");

@@ -132,7 +132,7 @@ fn lenses_and_poses_survive_every_format() {
 }
 
 #[test]
-fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
+fn unsupported_formats_are_refused_before_writing() {
     let place = Place::empty();
     with_lens(&place);
     place.fails("prepare scene --to blender --out made", &["has lens distortion", "--undistort"]);
@@ -158,7 +158,7 @@ fn what_a_format_cannot_hold_is_said_before_anything_is_written() {
 }
 
 #[test]
-fn undistorted_images_are_pinholes_that_every_format_holds() {
+fn undistorted_images_fit_every_format() {
     let place = Place::empty();
     with_lens(&place);
     place.succeeds("prepare scene --undistort --out flat");
@@ -197,7 +197,7 @@ fn undistorted_images_are_pinholes_that_every_format_holds() {
 }
 
 #[test]
-fn cameras_that_differ_become_one_where_a_format_has_one() {
+fn differing_cameras_become_one_where_needed() {
     let place = Place::empty();
     with_lens(&place);
     let mut transforms = place.json("scene/transforms.json");

@@ -20,7 +20,7 @@ fn cameras(folder: &Path) -> Vec<(String, Option<Split>, Camera)> {
 }
 
 #[test]
-fn cameras_come_back_as_they_were_given_unless_they_were_learned() {
+fn exported_cameras_return_as_given() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 1 --out plain {SMALL}"));
     let said = place.succeeds("export plain cameras.json");

@@ -59,7 +59,7 @@ fn piece(drawing: &Image, number: usize) -> Image {
 }
 
 #[test]
-fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
+fn lpips_stands_beside_psnr_and_ssim() {
     let place = Place::with_run();
     place.succeeds("eval run");
     let plain = place.json("run/eval-test.json");
@@ -128,7 +128,7 @@ fn lpips_stands_beside_psnr_and_ssim_where_it_is_asked_for() {
 }
 
 #[test]
-fn weights_that_do_not_serve_are_refused_before_anything_is_rendered() {
+fn unusable_lpips_weights_are_refused_early() {
     let place = Place::with_run();
     weights(&place, "alex.safetensors", ALEX);
     place.fails_with(

@@ -458,7 +458,7 @@ fn the_embedded_scene_needs_no_files() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
+fn same_seed_any_threads_give_same_bits() {
     let place = Place::with_scene();
     for (seed, threads, out) in [(7, 1, "one"), (7, 2, "two"), (8, 2, "other")] {
         place.succeeds(&format!("train scene --steps 4 --seed {seed} --threads {threads} --out {out} {CLASSIC}"));
@@ -541,7 +541,7 @@ fn absent_images_are_skipped_with_a_warning() {
 
 /// The folder of a run that was trained before files held less than the whole grid: such files load for ever.
 #[test]
-fn a_run_of_the_first_edition_loads_and_looks_the_same() {
+fn run_of_first_version_loads_and_renders_the_same() {
     let place = Place::empty();
     std::fs::create_dir(place.path("run")).unwrap();
     for name in ["config.json", "model.safetensors"] {
@@ -556,7 +556,7 @@ fn a_run_of_the_first_edition_loads_and_looks_the_same() {
 }
 
 #[test]
-fn marched_models_come_back_with_their_occupancy_grids() {
+fn marched_models_restore_occupancy_grids() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --preset instant --steps 2 {SMALL}"));
     let voxel = "--set field.resolution=24 --set sampler.view_step=0.02 --set loss={\"huber\":{\"delta\":0.1}}";
@@ -788,7 +788,7 @@ fn any_quadrature_can_be_chosen_and_comes_back() {
 }
 
 #[test]
-fn the_quadrature_benchmark_leaves_tables_plots_and_a_page() {
+fn quadrature_benchmark_writes_tables_and_page() {
     let place = Place::empty();
     let bench = "bench --suite quadrature --quick --out";
     // One that is killed at its beginning is begun again.

@@ -88,7 +88,7 @@ fn only_there(place: &Place, commands: &[&str]) {
 }
 
 #[test]
-fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
+fn transforms_json_paths_are_never_written_to() {
     let (place, views) = place();
     let mask = "../../elsewhere/mask.png";
     let frames = views.iter().enumerate().map(|(i, (name, matrix))| {
@@ -145,7 +145,7 @@ fn nothing_is_written_where_a_transforms_json_says_that_photographs_are() {
 }
 
 #[test]
-fn nothing_is_written_where_a_model_of_colmap_says_that_photographs_are() {
+fn colmap_paths_are_never_written_to() {
     let (place, views) = place();
     std::fs::create_dir_all(place.path("work/scene/sparse/0")).unwrap();
     let focal = 0.5 * SIZE as f64 / (0.5_f64 * 0.69).tan();

@@ -30,7 +30,7 @@ fn refuses(place: &Place, arguments: &str, file: &str) {
 }
 
 #[test]
-fn outputs_of_others_are_refused_and_own_ones_replaced() {
+fn foreign_outputs_are_refused_own_ones_replaced() {
     let place = place(&["p/0001.png", "scene/depth/0000.png", "photo.png", "video.gif.frames/0000.png"]);
     std::fs::write(place.path("walk.mp4"), b"footage").unwrap();
     std::fs::write(place.path("walk.gif"), b"footage").unwrap();

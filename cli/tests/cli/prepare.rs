@@ -170,7 +170,7 @@ fn a_video_becomes_a_dataset_of_its_sharp_frames() {
 }
 
 #[test]
-fn photographs_become_a_dataset_turned_as_they_were_held() {
+fn images_become_an_upright_dataset() {
     let place = place();
     std::fs::write(place.path("photos/notes.txt"), "").unwrap();
     // Stored across, shown upright: another size than the rest, so that each has its own camera.
@@ -194,7 +194,7 @@ fn photographs_become_a_dataset_turned_as_they_were_held() {
 }
 
 #[test]
-fn programs_that_are_absent_are_named_with_how_to_install_them() {
+fn missing_programs_are_named_with_install_commands() {
     let place = place();
     let bare = |arguments: &str| command(&place, arguments).env("PATH", place.path("photos")).output().unwrap();
     let install =
@@ -222,7 +222,7 @@ fn programs_that_are_absent_are_named_with_how_to_install_them() {
 }
 
 #[test]
-fn programs_that_fail_show_their_last_words_and_nothing_is_left() {
+fn failing_programs_show_their_last_words() {
     let place = place();
     for step in ["feature_extractor", "exhaustive_matcher", "mapper"] {
         let output = command(&place, "prepare photos --out made").env("FAILS", step).output().unwrap();
@@ -302,7 +302,7 @@ fn bad_inputs_are_named() {
 }
 
 #[test]
-fn of_many_photographs_each_is_compared_with_those_that_follow() {
+fn many_images_are_matched_in_sequence() {
     let place = place();
     let photo = std::fs::read(place.path("photos/0.JPG")).unwrap();
     for (count, matcher, said) in [(200, "exhaustive_matcher", false), (201, "sequential_matcher", true)] {
@@ -318,7 +318,7 @@ fn of_many_photographs_each_is_compared_with_those_that_follow() {
 }
 
 #[test]
-fn photographs_behind_links_are_copied_where_that_is_allowed() {
+fn linked_images_are_copied_if_allowed() {
     use std::os::unix::fs::symlink;
     let place = place();
     // Within the folder of photographs, whose other files are none: links that lead to its neighbours lead out of it.

@@ -48,7 +48,7 @@ fn event_files(place: &Place, run: &str) -> Vec<PathBuf> {
 }
 
 #[test]
-fn tensorboard_reads_what_metrics_say_and_no_more_after_a_run_went_on() {
+fn tensorboard_reads_metrics_of_a_resumed_run() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 40 --checkpoint-every 0.001s --tensorboard --out run {SMALL}"));
     assert_eq!(event_files(&place, "run").len(), 1);
@@ -100,7 +100,7 @@ fn tensorboard_reads_what_metrics_say_and_no_more_after_a_run_went_on() {
 }
 
 #[test]
-fn event_files_that_cannot_be_written_do_not_end_a_run() {
+fn event_file_failures_do_not_end_a_run() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 10 --out run {SMALL}"));
     std::fs::write(place.path("run/tensorboard"), b"in the way").unwrap();

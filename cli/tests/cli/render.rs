@@ -18,7 +18,7 @@ fn apart(a: &Image, b: &Image) -> f32 {
 }
 
 #[test]
-fn paths_go_where_photographs_were_taken_and_where_files_say() {
+fn paths_follow_images_and_files() {
     let place = Place::with_run();
     assert!(place.succeeds("render run --path test --frames 2 --out two").contains("rendered 2 frames"));
     place.succeeds("render run --path test --out test");
@@ -338,7 +338,7 @@ pub fn has_ffmpeg() -> bool {
 }
 
 #[test]
-fn ffmpeg_writes_videos_whose_colors_are_those_of_the_frames() {
+fn ffmpeg_videos_have_the_frames_colours() {
     if !has_ffmpeg() {
         return;
     }
@@ -385,7 +385,7 @@ fn ffmpeg_writes_videos_whose_colors_are_those_of_the_frames() {
 }
 
 #[test]
-fn without_ffmpeg_it_is_said_what_to_do_before_anything_is_rendered() {
+fn missing_ffmpeg_is_named_before_rendering() {
     let place = Place::with_run();
     let output = place.command("render run --out video.mp4").env("PATH", place.path("")).output().unwrap();
     complained(
@@ -398,7 +398,7 @@ fn without_ffmpeg_it_is_said_what_to_do_before_anything_is_rendered() {
 
 #[cfg(unix)]
 #[test]
-fn what_ffmpeg_says_last_is_shown_and_encoders_that_it_lacks_are_found_before_anything_is_rendered() {
+fn ffmpeg_errors_and_missing_encoders_are_shown() {
     use std::os::unix::fs::PermissionsExt;
     let place = Place::with_run();
     let with = |script: &str| {

@@ -34,7 +34,7 @@ pub fn assert_same(place: &Place, a: &str, b: &str) {
 
 /// `KILLS=50 cargo test --release --test cli killed` is the campaign.
 #[test]
-fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
+fn killed_run_ends_as_if_it_had_not_been() {
     let kills: u32 = std::env::var("KILLS").map_or(4, |kills| kills.parse().unwrap());
     let place = Place::with_scene();
     let steps = 30 * kills.max(4);
@@ -71,7 +71,7 @@ fn a_run_that_is_killed_again_and_again_ends_as_if_it_had_not_been() {
 }
 
 #[test]
-fn an_interrupted_run_says_how_to_go_on_and_a_longer_one_goes_on_from_its_end() {
+fn interrupted_run_names_resume_and_can_be_extended() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 200 --out whole {SMALL}"));
     let arguments = format!("train scene --steps 200 --out run {SMALL}");
@@ -183,7 +183,7 @@ fn what_is_damaged_leaves_the_checkpoint_before_it() {
 }
 
 #[test]
-fn what_cannot_be_written_for_a_while_does_not_end_a_run() {
+fn write_failures_do_not_end_a_run() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 150 --out whole {SMALL}"));
     let arguments = format!("train scene --steps 150 --out run --checkpoint-every 0.01s {SMALL}");
@@ -236,7 +236,7 @@ fn a_run_goes_on_alone_and_with_its_own_photographs() {
 
 /// A run that was ended after 20 steps when checkpoints were new: such files are gone on from for ever.
 #[test]
-fn a_run_with_a_checkpoint_of_the_first_version_goes_on() {
+fn checkpoint_of_first_version_resumes() {
     let place = Place::empty();
     let stored = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/reference/run-checkpoint-1");
     std::fs::create_dir_all(place.path("run/checkpoints")).unwrap();
@@ -279,7 +279,7 @@ fn complaints(place: &Place, arguments: &str) -> (bool, String) {
 }
 
 #[test]
-fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
+fn diverged_run_returns_at_a_lower_lr() {
     let place = Place::empty();
     let (succeeds, said) = complaints(
         &place,
@@ -318,7 +318,7 @@ fn a_run_that_diverges_goes_back_and_on_at_a_lower_rate() {
 }
 
 #[test]
-fn a_run_that_diverges_again_and_again_ends_with_the_reason_and_its_last_good_model() {
+fn run_diverging_again_ends_with_last_good_model() {
     let place = Place::empty();
     // It learns, until its rate leaves all bounds.
     let schedule = r#"{"exponential":{"from":0.0001,"to":1e30,"warmup":0.0}}"#;

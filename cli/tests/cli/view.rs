@@ -296,7 +296,7 @@ fn what_a_page_shows_is_what_the_program_renders() {
 }
 
 #[test]
-fn a_picture_is_painted_once_and_none_for_who_looks_away() {
+fn image_is_rendered_once_and_none_for_hidden_pages() {
     let place = Place::with_scene();
     let server = serve(&place, &format!("--threads 1 train scene --steps 1000000 --view --out run {SMALL}"));
     let (mut page, about) = Page::open(&server.address);
@@ -385,7 +385,7 @@ fn captures_keep_their_proportions_and_their_places() {
 }
 
 #[test]
-fn photographs_of_scenes_that_are_built_in_are_each_their_own() {
+fn built_in_images_are_each_their_own() {
     let place = Place::empty();
     place.succeeds(&format!("train embedded --downscale 20 --steps 1 --out run {SMALL}"));
     let server = serve(&place, "view run");
@@ -398,7 +398,7 @@ fn photographs_of_scenes_that_are_built_in_are_each_their_own() {
 }
 
 #[test]
-fn photographs_are_compared_with_what_is_seen_from_where_they_were_taken() {
+fn images_are_compared_from_their_cameras() {
     let place = trained();
     place.succeeds("eval run --split val");
     let scores = place.json("run/eval-val-fast.json");
@@ -538,7 +538,7 @@ fn a_page_is_opened_in_the_browser() {
 }
 
 #[test]
-fn nobody_from_elsewhere_is_served_and_others_come_with_the_token_alone() {
+fn viewer_refuses_others_without_the_token() {
     let place = trained();
     let server = serve(&place, "view run");
     let address = &server.address;
@@ -561,7 +561,7 @@ fn nobody_from_elsewhere_is_served_and_others_come_with_the_token_alone() {
 }
 
 #[test]
-fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
+fn malformed_message_closes_its_connection() {
     let place = trained();
     let server = serve(&place, "view run");
     let (mut good, about) = Page::open(&server.address);
@@ -598,7 +598,7 @@ fn the_newest_camera_wins() {
 }
 
 #[test]
-fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
+fn training_viewer_pauses_and_stops_same_model() {
     let place = Place::with_scene();
     place.succeeds(&format!("train scene --steps 300 --out whole {SMALL}"));
     let said = std::fs::File::create(place.path("said")).unwrap();
@@ -664,7 +664,7 @@ fn training_is_looked_at_held_and_ended_and_is_the_same_as_without() {
 }
 
 #[test]
-fn checkpoints_and_what_is_left_out_are_seen_as_the_program_renders_them() {
+fn viewer_checkpoints_and_skips_equal_render() {
     let place = Place::with_scene();
     // Of even steps, short ones leave out what shows.
     let train = format!("train scene --steps 150 --checkpoint-every 0.02s {SMALL} --set sampler.cone=0");
@@ -852,7 +852,7 @@ fn videos_are_made_one_at_a_time_beside_what_is_seen() {
 }
 
 #[test]
-fn pages_know_where_photographs_are_found_to_have_been_taken() {
+fn viewer_knows_refined_cameras() {
     let place = Place::with_scene();
     let server =
         serve(&place, &format!("--threads 1 train scene --steps 1000000 --refine poses --view --out run {SMALL}"));
@@ -926,7 +926,7 @@ fn turned(view: &Value, angle: f64) -> Value {
 
 /// `VIEWED=RUN,RUN cargo test --release --test cli milliseconds -- --nocapture` measures runs of one's own, by their whole paths.
 #[test]
-fn milliseconds_from_a_drag_to_the_first_picture_and_to_the_whole_one() {
+fn milliseconds_from_drag_to_first_and_final_image() {
     let place = trained();
     let given = std::env::var("VIEWED").ok();
     let runs = given.as_deref().unwrap_or("run").split(',');
@@ -1044,7 +1044,7 @@ fn what_pages_cost_training() {
 
 /// `LOAD=all cargo test --release --test cli many_pages -- --nocapture` is the campaign: fifty pages, ten thousand messages that are none.
 #[test]
-fn many_pages_and_much_nonsense_leave_memory_and_training_as_they_are() {
+fn many_pages_leave_memory_and_training_alone() {
     let all = std::env::var("LOAD").is_ok_and(|which| which == "all");
     let (pages, nonsense, steps) = if all { (50, 10_000, 6000) } else { (6, 100, 150) };
     let place = Place::with_scene();

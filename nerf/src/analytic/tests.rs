@@ -57,7 +57,7 @@ fn the_constants_that_were_known_before() {
 }
 
 #[test]
-fn a_ball_covers_the_part_of_the_picture_that_it_should() {
+fn ball_covers_the_expected_part_of_the_image() {
     let ball = Ball { centre: DVec3::ZERO, radius: 0.5, sigma: 3.0, color: 1.0 };
     // pi R^2 - pi (1 - e^(-2 sigma R) (1 + 2 sigma R)) / (2 sigma^2)
     let expected = 0.645_623_168_915_405_2;
@@ -86,7 +86,7 @@ fn a_layer_beyond_the_ray_is_not_seen() {
 }
 
 #[test]
-fn as_fields_they_are_rendered_and_differentiated_like_any_other() {
+fn media_as_fields_are_rendered_and_differentiated() {
     for scene in scenes() {
         let mut params = Params::<f64>::new();
         let field = AnalyticField::new(scene.medium.clone(), &mut params);

@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn all_that_cameras_see_lies_in_the_picture_and_little_else() {
+    fn ndc_holds_all_that_cameras_see() {
         let cameras = [camera([-1.0, 0.1, 0.0], 5.0), camera([1.0, -0.2, 0.3], 12.0), camera([0.3, 0.0, -0.4], 1.0)];
         let ndc = Ndc::around(&cameras, 0.5).unwrap();
         ndc.check().unwrap();

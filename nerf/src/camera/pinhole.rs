@@ -147,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn how_far_a_pixel_is_off_the_axis_is_measured_from_the_principal_point_in_half_diagonals() {
+    fn off_axis_distance_is_in_half_diagonals() {
         let camera = Camera::from_angle(30, 20, 0.8, DAffine3::IDENTITY);
         assert!((camera.off_axis([29, 19]) - (14.5 * 14.5 + 9.5 * 9.5) / 325.0).abs() < 1e-12);
         let shifted = Camera { centre: [10.0, 5.0], ..camera };

@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn it_winds_around_the_average_camera_as_far_as_most_go() {
+    fn spiral_winds_around_the_average_camera() {
         // Eleven in a row, a unit apart, all looking along -y; heights and depths differ less.
         let camera = |i: usize| {
             let x = i as f64;

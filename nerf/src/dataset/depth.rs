@@ -134,7 +134,7 @@ mod tests {
     use image::Rgb;
 
     #[test]
-    fn what_is_written_is_depth_along_the_axis_and_read_back_as_it_was() {
+    fn depth_files_come_back_as_written() {
         let folder = tempfile::tempdir().unwrap();
         let pose = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Z);
         let camera = Camera::from_angle(5, 3, 1.4, pose);
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn depths_become_distances_along_rays_and_are_never_averaged() {
+    fn depths_become_distances_and_are_not_averaged() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("depth.png");
         // Twice as large as the photograph: 0 is not known.
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn arrays_of_floats_are_read_and_what_is_no_depth_is_not_known() {
+    fn float_arrays_are_read_unknown_depth_is_zero() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("depth.npy");
         let values = vec![1.0, f64::NAN, -1.0, f64::INFINITY, 2.5, 1e300];
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn small_files_are_looked_up_and_nothing_is_behind_a_camera() {
+    fn low_resolution_depth_is_looked_up_per_ray() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("depth.png");
         ImageBuffer::<Luma<u8>, _>::from_fn(2, 1, |x, _| Luma([[0, 200][x as usize]])).save(&path).unwrap();
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_file_of_depths_is_an_error_that_names_it() {
+    fn depth_file_of_other_form_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let camera = Camera::from_angle(3, 2, 0.1, DAffine3::IDENTITY);
         let fails = |name: &str, expected: &str| {

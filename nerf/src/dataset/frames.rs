@@ -204,7 +204,7 @@ mod tests {
     use crate::dataset::sample::ball;
 
     #[test]
-    fn footprints_are_pixels_side_by_side_where_photographs_show_the_middle() {
+    fn pixels_per_side_counts_pixels_at_the_centre() {
         let mut data = ball(Split::Train, 8);
         data.frames.truncate(3);
         data.bounds = [DVec3::new(-1.0, -2.0, -1.0), DVec3::new(1.0, 2.0, 3.0)];
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_box_anywhere_in_the_picture_is_found_and_one_beside_it_is_not() {
+    fn small_box_is_found_anywhere_in_the_image() {
         let mut data = ball(Split::Train, 8);
         data.frames.truncate(1);
         let pose = Camera::look_at(DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO, DVec3::Y);

@@ -98,7 +98,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_similarity_is_found_again_among_points_that_are_not_in_a_line() {
+    fn similarity_is_found_from_noncollinear_points() {
         let rotation = DMat3::from_quat(DQuat::from_rotation_y(2.9) * DQuat::from_rotation_z(-1.0));
         let truth = SceneTransform { rotation, scale: 0.3, origin: DVec3::new(1.0, 2.0, -30.0) };
         // In a plane, as cameras around an object are, and everywhere.

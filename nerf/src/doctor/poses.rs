@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_around_a_thing_look_at_it_and_flipped_ones_away() {
+    fn cameras_around_subject_look_at_it_flipped_away() {
         let poses: Vec<DAffine3> = cameras_around(20, 8).into_iter().map(|camera| camera.pose).collect();
         let focus = Focus::of(&poses).unwrap();
         assert!(focus.place.length() < 1e-9 && (focus.distance - 4.0).abs() < 1e-9 && focus.is_inward());

@@ -178,7 +178,7 @@ mod tests {
     use raygrad_nn::Params;
 
     #[test]
-    fn frequencies_come_in_from_low_to_high_and_each_of_all_three_coordinates() {
+    fn detail_comes_in_from_low_to_high_frequency() {
         let config = ClassicConfig { depth: 1, width: 8, skip_layers: vec![], view_width: 4, ..ClassicConfig::paper() };
         let config = ClassicConfig { position_levels: 6, ..config };
         let mut params = Params::<f64>::new();

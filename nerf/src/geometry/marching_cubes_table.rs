@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn triangles_lie_on_the_edges_that_are_crossed_and_face_what_is_not_dense() {
+    fn isosurface_lies_on_crossed_edges_facing_out() {
         let middle = |edge: Edge| {
             let place = |axis: usize| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 };
             glam::DVec3::new(place(0), place(1), place(2))

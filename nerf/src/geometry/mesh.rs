@@ -140,7 +140,7 @@ pub(super) mod tests {
     use super::*;
 
     #[test]
-    fn a_mesh_far_from_the_origin_has_its_volume_and_every_one_its_normals() {
+    fn mesh_far_from_origin_has_volume_and_normals() {
         let far = tetrahedron(DVec3::new(320_000.3, 5_800_000.7, 43.1), 2.0);
         assert!((far.volume() / (8.0 / 6.0) - 1.0).abs() < 1e-6, "{}", far.volume());
         let corner = tetrahedron(DVec3::ONE, 3.0);

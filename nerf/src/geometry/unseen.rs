@@ -52,7 +52,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_behind_what_is_seen_in_all_pictures_is_hidden() {
+    fn points_hidden_in_all_views_are_unseen() {
         // Along +y, with +x to the right.
         let first = || from(DVec3::ZERO, DVec3::Y);
         let alone = Hidden::new(&[first()], 0.5);

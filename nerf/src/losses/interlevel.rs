@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn a_proposal_that_covers_the_weights_costs_nothing_and_one_that_does_not_grows_there() {
+    fn interlevel_loss_is_zero_where_proposal_covers() {
         let tape = Tape::<f64>::new();
         let edges = vec![0.0, 1.0, 2.0, 4.0, 0.0, 0.5, 1.0, 4.0];
         let segments = Segments::uniform(2, 3);

@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn terms_say_what_they_should_and_have_the_gradients_that_differences_show() {
+    fn loss_terms_match_formulas_and_differences() {
         let terms: [&dyn LossTerm<f64>; 4] = [
             &Evenness { weight: 2.0, reach: None },
             &EntropyConfig { weight: 0.5 },

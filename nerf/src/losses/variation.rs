@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_the_mean_over_cells_of_squared_differences_along_every_axis() {
+    fn total_variation_is_mean_of_squared_differences() {
         let [planes, rows, columns, channels] = [3, 4, 5, 2];
         let number = |i: usize| (i as f64 * 0.7).sin();
         for cells in [None, Some(vec![planes, rows, columns])] {
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_table_of_such_cells_is_an_error_that_says_so() {
+    fn total_variation_of_other_tables_is_an_error() {
         let mut params = Params::<f64>::new();
         params.add("field.table", Tensor::zeros(&[60, 2]));
         let mut message = |config: TotalVariationConfig| build(&config, &mut params).err().unwrap().to_string();

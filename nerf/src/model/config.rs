@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_is_as_large_as_its_budget_and_its_photographs_ask_for() {
+    fn model_size_follows_budget_and_images() {
         let made = |samples: f64, footprints: f64| {
             let config = Config::preset(Preset::Instant).for_budget(samples, footprints);
             config.check().unwrap();

@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_was_ended_early_comes_back_with_the_detail_that_it_had() {
+    fn stopped_run_restores_its_share_of_detail() {
         let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], [2.0, 6.0]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("model.safetensors");
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_from_before_there_was_a_choice_of_losses_still_loads() {
+    fn config_without_loss_choice_is_read() {
         let mut value = serde_json::to_value(voxel(2)).unwrap();
         value.as_object_mut().unwrap().remove("loss").unwrap();
         assert_eq!(serde_json::from_value::<Config>(value).unwrap(), voxel(2));

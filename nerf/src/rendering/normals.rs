@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_of_nothing_has_no_normals_and_any_number_of_threads_gives_the_same() {
+    fn view_of_nothing_has_no_normals() {
         let model = model(false);
         let away = Camera::look_at(DVec3::new(0.0, -4.0, 0.0), DVec3::new(0.0, -9.0, 0.0), DVec3::Z);
         assert!(model.normals(&Camera::from_angle(9, 5, 0.6, away)).data.iter().all(|x| *x == 0.0));

@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_that_ends_is_seen_from_nearer_and_from_farther_than_its_photographs() {
+    fn bounded_scene_is_seen_beyond_training_distances() {
         let seen = |span: [f64; 2], unbounded: bool, distance: f64| {
             let extent = SceneBox::new([DVec3::NEG_ONE, DVec3::ONE], span);
             let model: Model<f32> =

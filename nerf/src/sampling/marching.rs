@@ -285,7 +285,7 @@ mod tests {
 
     /// A ball that lies beyond the box is seen through the outer cascades, with even steps and with growing ones.
     #[test]
-    fn cascades_show_what_lies_beyond_the_box_and_cones_take_fewer_steps() {
+    fn cascades_show_beyond_the_box_in_fewer_steps() {
         let scene = scenes().into_iter().find(|scene| scene.name == "sphere").unwrap();
         let mut params = Params::<f64>::new();
         let field = AnalyticField::new(scene.medium.clone(), &mut params);
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_photograph_shows_is_left_out_from_the_start() {
+    fn space_unseen_by_images_is_left_out() {
         let mut data = ball(Split::Train, 16);
         data.frames.truncate(1);
         data.bounds = [DVec3::splat(-0.6), DVec3::splat(0.6)];

@@ -314,7 +314,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn samples_go_where_proposals_point_and_cover_what_they_should() {
+    fn proposal_samples_follow_histograms() {
         let config = ProposalConfig { uniform_share: 0.0, samples: 8, ..ProposalConfig::default() };
         let sampler = Proposal { config, fields: vec![], trust: 1.0 };
         let shares = even_edges(10).repeat(2);
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn trust_grows_as_the_bias_function_of_schlick_and_is_whole_at_last() {
+    fn proposal_anneal_follows_schlick_bias() {
         let config = ProposalConfig { anneal: 100, spacing: Spacing::Disparity, ..ProposalConfig::default() };
         let mut sampler: Box<Proposal> = Box::new(Proposal { config, fields: vec![], trust: 0.0 });
         let mut at = |step: u64| {

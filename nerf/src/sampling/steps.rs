@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn stratified_samples_stay_in_their_bins_and_cover_the_span() {
+    fn stratified_samples_stay_in_their_bins() {
         let rays = rays(3);
         let samples = stratified(&rays, 8, &mut Jitter::Random(&mut Pcg64Mcg::seed_from_u64(1)), &Pool::new());
         for (ray, rows) in samples.segments.ranges().enumerate() {
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn zero_weights_are_uniform_and_one_hot_stays_in_its_bin() {
+    fn importance_sampling_handles_zero_and_one_hot() {
         let u: Vec<f64> = (0..100).map(|i| (i as f64 + 0.5) / 100.0).collect();
         let mut out = vec![0.0; 100];
         invert_cdf(&even_edges(7), &[0.0_f32; 7], 0.01, &u, &mut out).unwrap();

@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_is_clear_only_where_every_pixel_that_could_show_it_is() {
+    fn ball_is_carved_only_where_every_pixel_shows_it() {
         let frame = view(DVec3::new(0.0, 0.0, 10.0), DVec3::Y);
         let silhouette = Silhouette::new(&frame).unwrap();
         // At distance 10 the picture is 5.1 wide, a pixel .085.
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn one_wrong_mask_empties_nothing_where_two_have_to_agree() {
+    fn one_wrong_mask_carves_nothing() {
         // Sixteen cameras around the box, one of which has a picture that is transparent throughout.
         let around = |i: usize| {
             let angle = i as f64 * std::f64::consts::TAU / 16.0;

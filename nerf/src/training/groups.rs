@@ -107,7 +107,7 @@ mod tests {
     use raygrad_autograd::Tensor;
 
     #[test]
-    fn each_group_has_its_rate_and_decay_and_each_parameter_one_group() {
+    fn parameter_groups_have_own_lr_and_weight_decay() {
         let mut config = Config::preset(Preset::Instant);
         config.schedule = Schedule::Constant { rate: 0.1 };
         let group = |params: &str, rate, decay| GroupConfig {

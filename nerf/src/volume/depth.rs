@@ -184,7 +184,7 @@ mod tests {
     use raygrad_autograd::Tape;
 
     #[test]
-    fn logarithms_have_an_upper_end_and_infinite_intervals_a_lower_one() {
+    fn log_density_is_capped_and_infinite_delta_finite() {
         let depth = |z: f32, delta: f32| {
             let tape = Tape::new();
             let z = tape.leaf(Tensor::from([z]));

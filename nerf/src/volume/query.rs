@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_learn_less_by_the_square_of_their_distance_up_to_where_it_is_near() {
+    fn gradient_scaling_follows_square_of_distance() {
         let mut params = Params::<f64>::new();
         params.add("much", Tensor::scalar(0.7));
         let mut rays = Rays::new();

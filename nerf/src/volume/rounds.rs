@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_go_on_until_their_light_is_used_up_or_they_end() {
+    fn rays_continue_until_light_or_samples_end() {
         let mut rays = Rays::new();
         for (origin, far) in [(-8.0, 1.0), (0.0, 0.0), (-3.0, 8.0), (0.0, 8.0)] {
             rays.push(&Ray { origin: DVec3::new(origin, 0.0, 0.0), direction: DVec3::X }, [0.0, far]);

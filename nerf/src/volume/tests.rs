@@ -48,7 +48,7 @@ fn the_exponential_density_has_no_bad_gradient() {
 }
 
 #[test]
-fn constant_density_and_colour_give_the_exact_integral() {
+fn constant_medium_gives_the_exact_integral() {
     // The rendering integrals, without the background: c (1 - E) and E.
     let n = 64;
     let [out, ..] = one_ray::<f64>(&vec![1.3; n], &vec![4.0 / n as f64; n], &vec![0.8; n]);

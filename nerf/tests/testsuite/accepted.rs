@@ -222,7 +222,7 @@ fn campaign_llff() {
 
 /// Counts and sizes that no memory holds.
 #[test]
-fn captures_that_announce_what_no_memory_holds_are_refused_and_take_little() {
+fn captures_announcing_huge_sizes_are_refused() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let refused = |kind: Kind, file: usize, change: &(dyn Fn(&mut Vec<u8>) + Sync)| {
         let folder = tempfile::tempdir().unwrap();

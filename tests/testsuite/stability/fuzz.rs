@@ -420,7 +420,7 @@ const JSON: Bound = Bound { times: 256, plus: 1 << 16 };
 
 /// What says that it holds more than there is.
 #[test]
-fn files_that_announce_what_no_memory_holds_are_refused_and_take_little() {
+fn files_announcing_huge_sizes_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let refused =
         |what: &str, bytes: &[u8], name: &str, bound: Bound, parse: &(dyn Fn(&Path) -> Result<(), String> + Sync)| {

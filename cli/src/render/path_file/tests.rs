@@ -194,7 +194,7 @@ fn instant_ngps_cameras_are_taken_out_of_its_cube() {
 }
 
 #[test]
-fn what_would_change_the_picture_and_is_not_understood_is_named() {
+fn path_file_with_unknown_fields_is_refused() {
     let fails = |mut document: Value, at: &str, value: Value, expected: &str| {
         let (parent, name) = at.rsplit_once('/').unwrap();
         let parent = document.pointer_mut(parent).unwrap();

@@ -108,7 +108,7 @@ fn what_cannot_be_seen_is_said_and_the_rest_is_seen() {
 }
 
 #[test]
-fn a_picture_says_how_it_was_made_and_what_is_expected_follows() {
+fn ping_of_a_frame_names_its_render() {
     let model = fog();
     let (mut renderer, _, outbox) = renderer(free(0.0, [48, 36]));
     renderer.rates.insert((Show::Color, None), 1e6);

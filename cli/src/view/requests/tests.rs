@@ -30,7 +30,7 @@ fn sent(outbox: &Outbox) -> Option<u8> {
 }
 
 #[test]
-fn pages_that_want_the_same_share_it_and_the_newest_wish_counts() {
+fn pages_share_a_request_and_the_newest_wins() {
     let requests = Requests::default();
     let ([a, b], [from_a, from_b]) = {
         let [(a, out), (b, other)] = [requests.join(9), requests.join(9)].map(Option::unwrap);
@@ -197,7 +197,7 @@ fn is_news(requests: &Requests) -> bool {
 }
 
 #[test]
-fn who_paints_is_woken_by_all_that_changes_what_there_is_to_paint() {
+fn renderer_is_woken_by_every_change() {
     let requests = Requests::default();
     let (page, _outbox) = requests.join(9).unwrap();
     assert!(!requests.paused() && !requests.stops() && !is_news(&requests));
@@ -219,7 +219,7 @@ fn who_paints_is_woken_by_all_that_changes_what_there_is_to_paint() {
 }
 
 #[test]
-fn who_waits_is_woken_by_what_came_before_and_meanwhile() {
+fn waiter_is_woken_by_earlier_and_later_changes() {
     let requests = Arc::new(Requests::default());
     requests.wake();
     let start = Instant::now();

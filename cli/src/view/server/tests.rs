@@ -144,7 +144,7 @@ impl Client {
 type Result<T, E> = std::result::Result<T, E>;
 
 #[test]
-fn nobody_from_elsewhere_is_served_and_nothing_but_the_page() {
+fn server_refuses_other_hosts_and_other_paths() {
     let listener = Listener::bind("127.0.0.1", 0).unwrap();
     let link = serve(listener, Arc::new(Requests::default()), None, None, [1.0; 3]).unwrap();
     let address = link.strip_prefix("http://").unwrap().strip_suffix('/').unwrap().to_owned();
@@ -266,7 +266,7 @@ fn it_goes_out_by_an_address_of_its_own() {
 }
 
 #[test]
-fn a_message_that_is_none_closes_its_connection_and_nothing_else() {
+fn malformed_message_closes_its_connection() {
     let (address, requests) = served(Limits { rate: 0.0, burst: 3.0, ..Limits::USUAL });
     let mut good = Client::open(&address);
     // Reasons end with a letter, however long these are.
@@ -316,7 +316,7 @@ fn a_message_is_so_long_and_no_longer() {
 }
 
 #[test]
-fn so_many_pages_are_served_and_no_more_until_one_goes() {
+fn server_limits_the_number_of_pages() {
     // Connections are for those that are no pages yet.
     let silence = Duration::from_millis(400);
     let (address, requests) = served(Limits { pages: 3, connections: 1, silence, ..Limits::USUAL });
@@ -338,7 +338,7 @@ fn so_many_pages_are_served_and_no_more_until_one_goes() {
 }
 
 #[test]
-fn a_page_that_only_looks_on_is_asked_whether_it_is_there_and_stays() {
+fn idle_page_is_pinged_and_stays() {
     let (idle, silence) = (Duration::from_millis(100), Duration::from_secs(2));
     let connected = Duration::from_millis(200);
     let (address, requests) = served(Limits { idle, silence, connected, ..Limits::USUAL });
@@ -374,7 +374,7 @@ fn who_is_slow_is_not_gone_in_the_middle_of_a_message() {
 }
 
 #[test]
-fn a_message_that_is_not_taken_is_not_waited_for_for_ever() {
+fn unread_messages_time_out() {
     let patience = Duration::from_millis(200);
     let (address, requests) = served(Limits { patience, slowest: 1 << 40, ..Limits::USUAL });
     let page = Client::open(&address);
@@ -440,7 +440,7 @@ fn a_page_that_takes_no_picture_is_dropped() {
 }
 
 #[test]
-fn connections_that_ask_for_nothing_do_not_hold_others_up_for_long() {
+fn silent_connections_time_out() {
     let patience = Duration::from_millis(300);
     let (address, _) = served(Limits { connections: 3, patience, ..Limits::USUAL });
     let start = Instant::now();

@@ -59,7 +59,7 @@ fn a_path_passes_its_keys_with_continuous_speeds() {
 }
 
 #[test]
-fn positions_are_those_of_hermites_form_with_centripetal_times() {
+fn spline_positions_are_centripetal_hermite() {
     // Without turns times are square roots of distances; 1, 4 and 9 apart in a line, and 4 aside.
     let places = [[0.0, 0.0], [1.0, 0.0], [5.0, 0.0], [5.0, 9.0]].map(|[x, y]| DVec3::new(x, y, 2.0));
     let keys = places.map(|place| Keyframe { pose: DAffine3::from_translation(place), angle_y: 1.0 });
@@ -199,7 +199,7 @@ fn legs_of_no_time_to_speak_of_are_passed() {
 }
 
 #[test]
-fn times_move_cameras_along_a_curve_that_they_do_not_bend() {
+fn keyframe_times_do_not_bend_the_curve() {
     // Equal steps along x, of which a curve through them makes x its parameter.
     let key = |x: f64| Keyframe { pose: DAffine3::from_translation(DVec3::new(x, 1.0, 2.0)), angle_y: 0.8 };
     let keys: Vec<Keyframe> = (0..5).map(|i| key(f64::from(i))).collect();

@@ -27,7 +27,7 @@ fn numbers(views: &[&View]) -> Vec<String> {
 }
 
 #[test]
-fn every_eighth_photograph_is_held_out_whether_others_exist_or_not() {
+fn every_eighth_image_is_held_out() {
     let folder = tempfile::tempdir().unwrap();
     let mut whole = capture(folder.path(), 17);
     whole.hold_out();
@@ -83,7 +83,7 @@ fn no_image_is_trained_and_tested_on() {
 }
 
 #[test]
-fn cameras_follow_their_images_to_any_size_and_into_the_scene() {
+fn cameras_follow_images_to_any_size() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
@@ -114,7 +114,7 @@ fn cameras_follow_their_images_to_any_size_and_into_the_scene() {
 }
 
 #[test]
-fn images_of_another_shape_than_their_camera_are_errors_and_the_first_is_named() {
+fn image_of_other_shape_than_camera_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 9);
     capture.hold_out();
@@ -143,7 +143,7 @@ fn images_of_another_shape_than_their_camera_are_errors_and_the_first_is_named()
 }
 
 #[test]
-fn smaller_images_that_stand_beside_are_not_made_smaller_again() {
+fn downscaled_image_folders_are_used_as_they_are() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
     capture.hold_out();
@@ -161,7 +161,7 @@ fn smaller_images_that_stand_beside_are_not_made_smaller_again() {
 }
 
 #[test]
-fn masks_leave_out_what_is_not_white_and_what_no_light_reaches() {
+fn masks_drop_black_and_unlit_pixels() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
     capture.hold_out();
@@ -265,7 +265,7 @@ fn distances_are_read_where_they_are_asked_for() {
 }
 
 #[test]
-fn pixels_that_no_light_reaches_are_left_out_with_and_without_a_mask() {
+fn unlit_pixels_are_dropped_with_or_without_mask() {
     let folder = tempfile::tempdir().unwrap();
     let mut capture = capture(folder.path(), 4);
     capture.hold_out();

@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn smaller_photographs_are_averages_and_not_every_fifth_pixel() {
+    fn downscaled_images_are_averages() {
         // Stripes of one pixel: any single place shows black or white.
         let stripes = photo(100, 10, |x, _| (x as usize % 2) as f64);
         let small = stripes.resampled([20, 2], |[x, y]| [5.0 * x, 5.0 * y]);

@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn copies_are_upright_and_keep_what_else_their_file_says() {
+    fn upright_copies_keep_metadata() {
         let folder = tempfile::tempdir().unwrap();
         let [from, to] = ["from.jpg", "to.jpg"].map(|name| folder.path().join(name));
         // Two entries: the orientation, and the focal length as on film of 35 mm.

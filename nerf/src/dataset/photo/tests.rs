@@ -21,7 +21,7 @@ fn every_pixel_format_becomes_rgb_or_rgba() {
 }
 
 #[test]
-fn a_photograph_takes_as_many_bytes_as_its_file_has_values() {
+fn image_takes_as_many_bytes_as_its_file_has_values() {
     assert_eq!(bytes(4, 3, 3, &[7; 36]).bytes(), 36);
     assert_eq!(bytes(4, 3, 3, &[7; 36]).resized([2, 1]).bytes(), 6);
     assert_eq!(Photo::from(Image::new(4, 3, 1)).bytes(), 4 * 36);
@@ -62,7 +62,7 @@ fn jpeg(orientation: u8) -> Vec<u8> {
 }
 
 #[test]
-fn photographs_are_turned_as_the_camera_was_held_unless_their_camera_was_measured_before() {
+fn images_are_turned_upright_unless_calibrated() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("photo.jpg");
     let white = |photo: &Photo, x: usize, y: usize| photo.pixel(x, y)[0] > 0.5;

@@ -30,7 +30,7 @@ fn quarter(radius: f64) -> Vec<Camera> {
 }
 
 #[test]
-fn the_middle_is_what_cameras_look_at_and_up_is_theirs() {
+fn centre_and_up_come_from_cameras() {
     let survey = SceneAnalysis::new(&capture(Format::Colmap, quarter(4.0)), None, None).unwrap();
     assert_eq!(survey.scene_type, SceneType::Unbounded);
     // Axes are held back a little towards the cameras.
@@ -50,7 +50,7 @@ fn the_middle_is_what_cameras_look_at_and_up_is_theirs() {
 }
 
 #[test]
-fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
+fn outward_cameras_stand_at_the_centre() {
     let outwards = [[1.0, 0.0], [0.0, 1.0], [0.3, -1.0], [2.0, 0.5]].map(|[x, y]| {
         let eye = DVec3::new(x, y, 0.0);
         camera(eye, 3.0 * eye, DVec3::Z)
@@ -74,7 +74,7 @@ fn cameras_that_look_outwards_stand_in_the_middle_themselves() {
 }
 
 #[test]
-fn what_cameras_that_look_the_same_way_show_lies_ahead() {
+fn parallel_cameras_show_what_lies_ahead() {
     let wall = (0..5).map(|i| {
         let eye = DVec3::new(0.1 * f64::from(i), 0.05 * f64::from(i % 2), 0.0);
         camera(eye, eye + DVec3::Y, DVec3::Z)
@@ -159,7 +159,7 @@ fn cameras_that_look_down_have_the_sky_behind_them() {
 }
 
 #[test]
-fn a_bounded_scene_is_as_wide_as_what_cameras_see_of_it() {
+fn bounded_scene_is_as_wide_as_cameras_see() {
     let eyes = [DVec3::new(3.0, 0.0, 0.0), DVec3::new(0.0, 4.0, 0.0), DVec3::new(-8.0, 0.0, 0.0)];
     let cameras = eyes.map(|eye| camera(eye, DVec3::ZERO, DVec3::Z));
     let survey =
@@ -208,7 +208,7 @@ fn points_and_depths_say_where_a_scene_begins() {
 }
 
 #[test]
-fn what_is_asked_for_counts_then_the_convention_then_transparency() {
+fn scene_type_flag_beats_convention_beats_alpha() {
     let around = |radius: f64| {
         let mut capture = capture(Format::Blender, quarter(radius));
         capture.views.iter_mut().for_each(|view| view.camera.pose.translation -= CENTRE);

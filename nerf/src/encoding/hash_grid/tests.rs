@@ -70,7 +70,7 @@ fn the_papers_grid_has_the_papers_levels() {
 }
 
 #[test]
-fn a_grid_is_as_large_as_pays_and_as_fine_as_photographs() {
+fn hash_grid_size_follows_budget_and_resolution() {
     let size = |samples: f64, footprints: f64| {
         let config = HashGridConfig::cpu(samples, footprints);
         let grid = HashGrid::new(&config).unwrap();
@@ -101,7 +101,7 @@ fn settings_out_of_range_are_named() {
 }
 
 #[test]
-fn agrees_with_the_formula_at_every_width_and_block_length() {
+fn hash_encoding_agrees_with_formula_at_any_width() {
     for features in [1, 2, 4, 8, 16, 32] {
         let grid = grid(5, features, 9, 3, 40);
         assert!(!grid.levels()[0].hashed && grid.levels()[4].hashed);
@@ -179,7 +179,7 @@ fn values_are_continuous_across_cell_borders() {
 }
 
 #[test]
-fn outside_of_the_cube_counts_as_its_border_without_gradient() {
+fn hash_encoding_outside_the_cube_has_no_gradient() {
     let grid = grid(3, 2, 7, 2, 9);
     let table = grid.init::<f64>(1);
     assert_eq!(encode(&grid, &[-1e-9, 0.3, 1.5], &table), encode(&grid, &[0.0, 0.3, 1.0], &table));
@@ -252,7 +252,7 @@ fn store(grid: &HashGrid, tiles: &[Arc<HashGrad<f32>>]) -> (Params<f32>, Gradien
 }
 
 #[test]
-fn a_table_moves_by_the_same_bits_on_any_number_of_threads() {
+fn hash_table_any_threads_give_same_bits() {
     let grid = grid(5, 2, 10, 4, 64);
     let tiles = tiles(&grid, 3);
     let run = |threads| {
@@ -269,7 +269,7 @@ fn a_table_moves_by_the_same_bits_on_any_number_of_threads() {
 }
 
 #[test]
-fn a_table_moves_level_by_level_as_its_dense_gradient_says() {
+fn hash_table_moves_by_level_as_dense_gradient() {
     let grid = grid(3, 2, 6, 4, 16);
     let tiles = tiles(&grid, 2);
     let start = grid.init::<f32>(1);

@@ -219,7 +219,7 @@ fn other_endings_are_refused() {
 }
 
 #[test]
-fn a_bare_mesh_is_written_white_and_half_a_shape_is_an_error() {
+fn bare_mesh_is_written_white_half_mesh_refused() {
     let bare = ColoredMesh::from(shape().mesh);
     assert!(bare.normals == bare.mesh.normals() && bare.colors == [[255; 3]; 4]);
     assert!(written(&bare, "a.ply").len() > 4 * 39);

@@ -83,7 +83,7 @@ fn a_torus_has_a_hole() {
 }
 
 #[test]
-fn what_crosses_the_border_of_the_box_is_closed_there_if_it_is_to_be() {
+fn surface_is_closed_at_the_box_if_wanted() {
     // A slab across the box: from y = -1.2 to -.2 and from border to border in x and z.
     let slab = |x: DVec3| 5.0 * (0.5 - (x.y + 0.7).abs());
     let mesh = within(BOX, 50, 1.0, true, slab);
@@ -185,7 +185,7 @@ fn lattices_have_cells_of_nearly_one_edge() {
 }
 
 #[test]
-fn of_densities_without_end_the_border_is_in_the_same_place_from_both_sides() {
+fn isosurface_of_infinite_density_is_symmetric() {
     // What is hidden has them: at the lower end of edges in one case, at the upper end in the other.
     let border = |above: bool| {
         let hidden = of(move |x: DVec3| if (x.x > 0.31) == above { f64::INFINITY } else { 0.0 });

@@ -151,7 +151,7 @@ fn gradients_are_what_differences_show() {
 }
 
 #[test]
-fn where_nothing_answers_is_no_distance_and_no_gradient() {
+fn ray_without_density_has_no_depth_or_gradient() {
     let mut params = VGG_WEIGHTS.clone();
     for name in ["net.slice1.2.bias", "net.slice3.14.bias"] {
         let id = params.find(name).unwrap();

@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_seen_moves_alike_for_each_number_and_not_together() {
+    fn correction_steps_move_images_alike() {
         for lens in [Lens::Pinhole, Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] }] {
             let camera = Camera { lens, ..camera() };
             let matrix = balance(&camera, BOX, [0.1, 9.0], 1.0, false);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_sees_nothing_is_turned_and_moved_as_it_is() {
+    fn camera_that_sees_nothing_is_moved_unscaled() {
         let away = Camera::from_angle(4, 4, 0.5, Camera::look_at(DVec3::X * 5.0, DVec3::X * 9.0, DVec3::Z));
         let matrix = balance(&away, BOX, [0.1, 9.0], 1.5, true);
         assert!((0..POSE).all(|i| matrix[i][i] == if i < 3 { 1.0 } else { 1.5 }) && matrix[0][4] == 0.0);

@@ -106,7 +106,7 @@ fn seen<'t>(vars: &RayVars<'t, f64>) -> Var<'t, f64> {
 }
 
 #[test]
-fn corrections_have_the_gradients_that_differences_show() {
+fn camera_corrections_match_differences() {
     let cameras = cameras();
     let mut layout = Params::<f64>::new();
     let refine = CameraOptimizer::new(true, &all(), (&extent(6), false), &cameras, &mut layout).unwrap().unwrap();
@@ -224,7 +224,7 @@ fn cameras_have_to_be_known_where_they_are_corrected() {
 }
 
 #[test]
-fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass() {
+fn held_out_cameras_move_with_the_training_cameras() {
     let cameras = cameras();
     let mut params = Params::<f64>::new();
     let refine = CameraOptimizer::new(true, &all(), (&extent(6), false), &cameras, &mut params).unwrap().unwrap();
@@ -275,7 +275,7 @@ fn cameras_of_other_photographs_move_with_all_and_share_what_was_found_of_glass(
 }
 
 #[test]
-fn a_model_tells_its_cameras_whether_the_scene_goes_on() {
+fn model_tells_cameras_whether_scene_is_unbounded() {
     let cameras = cameras();
     let bounded = Config { poses: all().focal, ..Config::preset(Preset::Voxel) };
     let unbounded = bounded.clone().with_scene_type(SceneType::Unbounded);

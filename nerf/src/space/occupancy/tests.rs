@@ -116,7 +116,7 @@ fn coarser_cascades_hold_what_finer_ones_do() {
 }
 
 #[test]
-fn thresholds_of_each_further_cascade_are_half_as_high() {
+fn cascade_thresholds_halve_each_time() {
     for (sigma, expected) in [(0.9, [false, true, true]), (1.1, [true, true, true]), (0.4, [false, false, true])] {
         let mut grid = grid(32, 3);
         grid.update(&Update::ALL, 0, 0, &|points, out| out[..points.len()].fill(sigma));
@@ -155,7 +155,7 @@ fn cells_tile_the_boxes() {
 }
 
 #[test]
-fn a_new_grid_is_occupied_and_so_is_what_was_never_looked_at() {
+fn new_grid_and_unqueried_cells_are_occupied() {
     let mut grid = grid(16, 2);
     assert_eq!(grid.occupied_share(), 1.0);
     grid.threshold(&Threshold { min_sigma: 0.1, or_mean: true, dilate: false });
@@ -250,7 +250,7 @@ fn same_bits_at_any_number_of_threads() {
 }
 
 #[test]
-fn rebuilding_finds_what_eight_samples_in_every_cell_find() {
+fn rebuild_finds_what_eight_samples_a_cell_find() {
     for (cascades, dilate) in [(1, false), (1, true), (2, true)] {
         let mut grid = grid(32, cascades);
         let mut calls = 0;
@@ -301,7 +301,7 @@ fn pruning_empties_faint_cells_and_fills_none() {
 }
 
 #[test]
-fn pruning_keeps_a_sheet_that_lies_between_the_octants_middles() {
+fn pruning_keeps_a_sheet_between_octant_centres() {
     let mut grid = grid(32, 1);
     let [low, high] = grid.bounds();
     let (first, size) = (low.x as f32, ((high.x - low.x) / 32.0) as f32);

@@ -18,7 +18,7 @@ use raygrad_autograd::Tensor;
 use raygrad_nn::Schedule;
 
 #[test]
-fn cameras_from_which_nothing_of_the_box_is_seen_are_an_error() {
+fn cameras_without_view_of_the_box_are_an_error() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(3);
     for frame in &mut data.frames {
@@ -37,7 +37,7 @@ fn cameras_from_which_nothing_of_the_box_is_seen_are_an_error() {
 }
 
 #[test]
-fn fields_live_in_the_picture_of_all_that_photographs_show() {
+fn forward_facing_fields_use_ndc() {
     let data = ball_ahead(8);
     let ndc = data.ndc.unwrap();
     assert!(data.frames.iter().all(|frame| ndc.pixels(&frame.camera, DVec3::ZERO) < 20.0));
@@ -77,7 +77,7 @@ fn fields_live_in_the_picture_of_all_that_photographs_show() {
 }
 
 #[test]
-fn what_steps_did_adds_up_and_an_error_is_of_one_of_them() {
+fn step_stats_add_up_and_name_the_failing_step() {
     let mut data = ball(Split::Train, 8);
     data.frames.truncate(3);
     let config = Config { background: crate::Background::White, ..tiny_table() };
@@ -227,7 +227,7 @@ fn frozen_parameters_rest_others_have_own_lr() {
 }
 
 #[test]
-fn a_run_whose_networks_overflow_ends_although_parameters_move() {
+fn overflowing_networks_end_the_run() {
     let data = Arc::new(ball(Split::Train, 12));
     let mut trainer = Trainer::new(tiny_table(), data).unwrap();
     trainer.step(0.0);
@@ -303,7 +303,7 @@ fn a_slower_run_moves_less() {
 }
 
 #[test]
-fn steps_get_as_many_rays_as_have_the_samples_that_are_wanted() {
+fn batch_size_follows_wanted_samples() {
     let mut trainer = Trainer::new(tiny_table(), Arc::new(ball(Split::Train, 12))).unwrap();
     let mut next = |batch: usize, marched: u64| {
         trainer.batch = batch;

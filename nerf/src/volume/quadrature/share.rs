@@ -39,7 +39,7 @@ mod tests {
     use raygrad_autograd::{Tape, Tensor};
 
     #[test]
-    fn the_share_is_that_of_the_formula_and_has_a_slope_everywhere() {
+    fn gauss_share_matches_formula_and_slope() {
         let tape = Tape::<f64>::new();
         for (a, b) in [(1.0, 0.0), (0.0, 1.0), (3.0, 5.0), (0.0, 0.0), (1e-30, 1e30), (2.0, 2.0)] {
             for x in [0.0, 1e-6, 0.3, 0.499, 0.5, 0.7, 5.0, 100.0, 1e30_f64] {

@@ -94,7 +94,7 @@ fn what_is_constant_is_exact_with_every_rule() {
 }
 
 #[test]
-fn gauss_integrates_colour_linear_in_optical_depth_exactly() {
+fn gauss_rule_integrates_linear_colour_exactly() {
     let scene = find("linear colour");
     for intervals in [8, 16, 33] {
         let seen = integrate::<f64>(&scene, Quadrature::Gauss2, 2 * intervals);
@@ -112,7 +112,7 @@ fn share(a: f64, b: f64, x: f64) -> f64 {
 }
 
 #[test]
-fn the_share_is_smooth_symmetric_where_thin_and_never_extrapolates() {
+fn gauss_share_is_smooth_and_never_extrapolates() {
     for x in [1e-12, 1e-3, 0.499_999_999, 0.5, 0.500_000_001, 3.0] {
         let [below, at, above] = [x * (1.0 - 1e-9), x, x * (1.0 + 1e-9)].map(|x| share(1.0, 1.0, x));
         assert!((above - below).abs() < 1e-8 && at <= 0.5, "{x}");
@@ -128,7 +128,7 @@ fn the_share_is_smooth_symmetric_where_thin_and_never_extrapolates() {
 }
 
 #[test]
-fn adaptive_bisection_stays_near_its_tolerance_with_few_evaluations() {
+fn adaptive_quadrature_stays_near_its_tolerance() {
     for (name, tolerance, most, at_most) in [
         ("slabs", 1e-6, 180, 3e-7),
         ("narrow gaussian", 1e-7, 870, 1.3e-6),
@@ -198,7 +198,7 @@ fn every_rule_trains_and_is_part_of_the_configuration() {
 }
 
 #[test]
-fn a_configuration_from_before_there_was_a_choice_of_rules_still_loads() {
+fn config_without_quadrature_choice_is_read() {
     let mut value = serde_json::to_value(small(Quadrature::Midpoint)).unwrap();
     value["sampler"].as_object_mut().unwrap().remove("quadrature").unwrap();
     assert_eq!(serde_json::from_value::<Config>(value).unwrap(), small(Quadrature::Midpoint));

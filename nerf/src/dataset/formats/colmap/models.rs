@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn models_have_the_numbers_names_and_parameters_of_colmaps_list() {
+    fn colmap_models_match_colmaps_list() {
         // docs of COLMAP, "Camera Models", and the numbers of sensor/models.h.
         let list = [
             (0, "SIMPLE_PINHOLE", 3),

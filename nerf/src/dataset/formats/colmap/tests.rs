@@ -127,7 +127,7 @@ fn entries_are_named_by_where_they_are() {
 }
 
 #[test]
-fn binary_files_come_first_and_files_of_rigs_are_passed_over() {
+fn colmap_binary_comes_first_rigs_are_skipped() {
     let folder = folder(Encoding::Binary, "sparse/0", &binary());
     let model = folder.path().join("sparse/0");
     for file in ["cameras.txt", "images.txt", "rigs.bin", "frames.bin"] {

@@ -102,7 +102,7 @@ fn angles_stand_where_focal_lengths_are_absent() {
 }
 
 #[test]
-fn every_coefficient_of_every_model_counts_and_others_are_errors() {
+fn every_lens_coefficient_counts() {
     let brown = |k: [f64; 6], p: [f64; 2]| Lens::Brown { k, p };
     let fisheye = |k: [f64; 4], p: [f64; 2], s: [f64; 2]| Lens::Fisheye { k, p, s };
     let zero = [0.0; 2];

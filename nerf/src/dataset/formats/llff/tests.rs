@@ -41,7 +41,7 @@ fn folder(bytes: &[u8], images: &[&str]) -> tempfile::TempDir {
 const IMAGES: [&str; 4] = ["images/b.JPG", "images/a.png", "images/notes.txt", "images/c.png/x"];
 
 #[test]
-fn rows_are_cameras_of_images_in_the_order_of_their_names() {
+fn llff_rows_follow_image_names() {
     let folder = folder(&npy(&ROWS), &IMAGES);
     assert!(detect(folder.path()));
     let capture = read(folder.path()).unwrap();

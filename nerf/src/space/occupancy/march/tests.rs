@@ -219,7 +219,7 @@ fn rays_that_are_not_finite_have_no_samples() {
 
 /// docs/library/numerics.md, "Sampling", march: the entry at 0, 2, 1e3, 32768 and 1e6, and steps below an ULP.
 #[test]
-fn far_from_the_origin_samples_do_not_drift_and_the_march_ends() {
+fn march_far_from_origin_does_not_drift() {
     let length = 3.0_f32.sqrt() / 1024.0;
     for start in [0.0, 2.0, 1e3, 32768.0, 1e6] {
         let bounds = BOX.map(|corner| corner + DVec3::X * (start + 1.5));
@@ -247,7 +247,7 @@ fn far_from_the_origin_samples_do_not_drift_and_the_march_ends() {
 
 /// docs/library/numerics.md, "Sampling", cone stepping.
 #[test]
-fn cones_follow_their_recurrence_and_tend_to_uniform_steps() {
+fn cone_steps_follow_recurrence_and_tend_to_uniform() {
     let config = OccupancyConfig { resolution: 16, cascades: 6, ..OccupancyConfig::default() };
     let grid = OccupancyGrid::new(BOX, &config).unwrap();
     let rays = one(DVec3::new(0.1, 0.1, 0.1), DVec3::new(0.6, 0.0, 0.8), [0.25, 40.0]);

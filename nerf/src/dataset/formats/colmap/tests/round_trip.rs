@@ -98,7 +98,7 @@ fn the_smallest_exact_model_is_written() {
 }
 
 #[test]
-fn equal_cameras_share_an_entry_and_coefficients_of_zero_are_a_pinhole() {
+fn equal_colmap_cameras_share_one_entry() {
     let none = Lens::Brown { k: [0.0; 6], p: [0.0; 2] };
     let lenses = [Lens::Pinhole, none, Lens::Fov { omega: 0.0 }, Lens::Fov { omega: 0.5 }, Lens::Fov { omega: 0.5 }];
     let views: Vec<View> =
