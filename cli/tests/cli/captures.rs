@@ -333,7 +333,7 @@ fn forward_facing_capture_trains_in_ndc() {
     assert_eq!(model(&place, "around").scene_box.ndc, None);
     place.fails(
         &format!("train scene --scene-type forward-facing --steps 1 {SMALL}"),
-        &["`scene-type`", "turned from each other", "use unbounded"],
+        &["`scene-type`", "cannot be forward-facing: ", "use unbounded"],
     );
     place
         .fails(&format!("train embedded --downscale 20 --scene-type forward-facing --steps 1 {SMALL}"), &["unbounded"]);
