@@ -13,10 +13,14 @@ pub use photometric::Loss;
 pub use terms::{DepthConfig, DistortionConfig, EntropyConfig, OrientationConfig};
 pub use variation::TotalVariationConfig;
 
-use crate::camera::rays::Rays;
+use crate::camera::rays::{Rays, stratified};
 use crate::component::{AnyConfig, ComponentType};
+use crate::field::Field;
+use crate::random::Jitter;
+use crate::volume::quadrature::Quadrature;
+use crate::volume::query::Query;
 use crate::volume::render::Rendered;
-use raygrad_autograd::{Scalar, Tensor, Var};
+use raygrad_autograd::{Pool, Scalar, Tensor, Var};
 use raygrad_nn::Bound;
 use std::any::Any;
 use std::sync::Arc;
@@ -44,6 +48,61 @@ pub struct LossInputs<'a, 't, T: Scalar> {
     pub target: &'a Tensor<T>,
     /// The background of each ray, `[rays, 3]`.
     pub background: &'a Tensor<T>,
+}
+
+impl<'t, T: Scalar> LossInputs<'_, 't, T> {
+    /// Renders rays through a field and passes them to `evaluate` as loss inputs, for tests of loss terms.
+    ///
+    /// The middles of `samples` equal bins of each ray are sampled, and integrated with the midpoint rule. Positions
+    /// are variables, so that terms can read [normals](Rendered::normals). Targets and backgrounds are black; images,
+    /// pixels, distances, the seed and `train_frac` are 0. The closure can replace any of them.
+    ///
+    /// ```
+    /// use raygrad_autograd::check::{Check, check_function};
+    /// use raygrad_nerf::losses::{EntropyConfig, LossInputs};
+    /// use raygrad_nerf::{LossTerm, Ray, Rays, VoxelConfig, glam::DVec3};
+    /// # use raygrad_nerf::{BuildContext, ComponentConfig, Space};
+    /// # use raygrad_nn::Params;
+    /// # use rand::SeedableRng;
+    /// # let mut params = Params::<f64>::new();
+    /// # let rng = &mut rand_pcg::Pcg64Mcg::seed_from_u64(0);
+    /// # let space = Space::within([DVec3::splat(-1.0), DVec3::ONE]);
+    /// # let config = VoxelConfig { resolution: 4, direction_degree: 1 };
+    /// # let field = config.build(BuildContext { space, frames: 0, params: &mut params, name: "field", rng })?;
+    /// let mut rays = Rays::new();
+    /// rays.push(&Ray { origin: DVec3::new(0.1, 0.2, -2.0), direction: DVec3::Z }, [1.0, 3.0]);
+    /// let term = EntropyConfig { weight: 0.5 };
+    /// let report = check_function(&Check::default(), params.values(), |x| {
+    ///     let params = params.layout().bind(x.to_vec());
+    ///     LossInputs::render(&*field, &params, &rays, 8, |inputs| term.loss(&inputs))
+    /// });
+    /// assert!(report.is_ok());
+    /// # Ok::<(), raygrad_nerf::Error>(())
+    /// ```
+    #[track_caller]
+    pub fn render<R>(
+        field: &dyn Field<T>,
+        params: &Bound<'t, T>,
+        rays: &Rays<T>,
+        samples: usize,
+        evaluate: impl FnOnce(LossInputs<'_, 't, T>) -> R,
+    ) -> R {
+        let query = Query { slopes: true, ..Query::new(field, params) };
+        let samples = stratified(rays, samples, &mut Jitter::Middle, &Pool::new());
+        let black = &Tensor::zeros(&[rays.len(), 3]);
+        evaluate(LossInputs {
+            params,
+            rays,
+            frames: &vec![0; rays.len()],
+            pixels: &vec![[0; 2]; rays.len()],
+            distances: &vec![0.0; rays.len()],
+            seed: 0,
+            train_frac: 0.0,
+            rendered: &Quadrature::Midpoint.render_nodes(&query, samples),
+            target: black,
+            background: black,
+        })
+    }
 }
 
 /// A loss term that is added to the photometric loss.

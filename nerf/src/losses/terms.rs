@@ -197,17 +197,14 @@ impl<T: Scalar> LossTerm<T> for Depth {
 mod tests {
     use super::*;
     use crate::camera::pinhole::Ray;
-    use crate::camera::rays::{Rays, stratified};
+    use crate::camera::rays::Rays;
     use crate::field::{Density, Field, ViewInputs};
-    use crate::random::Jitter;
     use crate::space::cube::Space;
-    use crate::volume::quadrature::Quadrature;
-    use crate::volume::query::Query;
     use glam::DVec3;
     use rand::SeedableRng;
     use rand_pcg::Pcg64Mcg;
+    use raygrad_autograd::Tape;
     use raygrad_autograd::check::{Check, check_function};
-    use raygrad_autograd::{Pool, Tape};
     use raygrad_nn::{Bound, Params};
 
     /// A density that rises or falls along z, with two parameters: how much there is, and how steep it is.
@@ -239,24 +236,8 @@ mod tests {
         for shift in [0.0, 0.25] {
             rays.push(&Ray { origin: DVec3::new(shift, 0.0, -1.0), direction: DVec3::Z }, [0.5 + shift, 2.0]);
         }
-        let samples = stratified(&rays, 5, &mut Jitter::Middle, &Pool::new());
-        let query = Query { slopes: term.needs_normals(), ..Query::new(&Slope, &bound) };
-        let rendered = &Quadrature::Midpoint.render_nodes(&query, samples);
-        let nothing = &Tensor::zeros(&[2, 3]);
-        let (params, rays, frames, pixels) = (&bound, &rays, &[0, 0][..], &[[0, 0]; 2][..]);
-        let distances = &[distance as f32, 0.0][..];
-        let (target, background, seed, fraction) = (nothing, nothing, 0, 0.5);
-        term.loss(&LossInputs {
-            params,
-            rays,
-            frames,
-            pixels,
-            distances,
-            seed,
-            train_frac: fraction,
-            rendered,
-            target,
-            background,
+        LossInputs::render(&Slope, &bound, &rays, 5, |inputs| {
+            term.loss(&LossInputs { distances: &[distance as f32, 0.0], ..inputs })
         })
     }
 
@@ -354,25 +335,11 @@ mod tests {
         let bound = params.bind(&tape);
         let mut rays = Rays::new();
         rays.push(&Ray { origin: DVec3::new(0.1, -0.2, 0.3), direction: DVec3::new(0.6, 0.0, 0.8) }, [0.5, 2.0]);
-        let samples = stratified(&rays, 5, &mut Jitter::Middle, &Pool::new());
-        let rendered =
-            &Quadrature::Midpoint.render_nodes(&Query { slopes: true, ..Query::new(&Tilted, &bound) }, samples);
-        let nothing = &Tensor::zeros(&[1, 3]);
-        let seen = LossInputs {
-            params: &bound,
-            rays: &rays,
-            frames: &[0],
-            pixels: &[[0; 2]],
-            distances: &[0.0],
-            seed: 0,
-            train_frac: 0.0,
-            rendered,
-            target: nothing,
-            background: nothing,
-        };
         let away = (2.0 * 0.6 + 2.0 * 0.8) / 3.0_f64;
-        let expected = 0.5 * away * away * rendered.opacity().item();
-        let found = OrientationConfig { weight: 0.5 }.loss(&seen).item();
+        let [found, expected] = LossInputs::render(&Tilted, &bound, &rays, 5, |inputs| {
+            let expected = 0.5 * away * away * inputs.rendered.opacity().item();
+            [OrientationConfig { weight: 0.5 }.loss(&inputs).item(), expected]
+        });
         assert!((found - expected).abs() < 1e-9 && expected > 0.01, "{found} {expected}");
     }
 

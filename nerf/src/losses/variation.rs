@@ -124,16 +124,13 @@ impl<T: Scalar> LossTerm<T> for TotalVariation {
 mod tests {
     use super::*;
     use crate::camera::pinhole::Ray;
-    use crate::camera::rays::{Rays, stratified};
-    use crate::random::Jitter;
+    use crate::camera::rays::Rays;
     use crate::space::cube::Space;
-    use crate::volume::quadrature::Quadrature;
-    use crate::volume::query::Query;
     use glam::DVec3;
     use rand::SeedableRng;
     use rand_pcg::Pcg64Mcg;
     use raygrad_autograd::check::{Check, check_function};
-    use raygrad_autograd::{Pool, Tape, Tensor};
+    use raygrad_autograd::{Tape, Tensor};
     use raygrad_nn::Params;
 
     fn config(cells: Option<Vec<usize>>) -> TotalVariationConfig {
@@ -158,21 +155,7 @@ mod tests {
         let mut own = Params::new();
         let field = crate::analytic::AnalyticField::new(medium, &mut own);
         let bound = own.bind_constant(params.tape());
-        let samples = stratified(&rays, 1, &mut Jitter::Middle, &Pool::new());
-        let rendered = &Quadrature::Midpoint.render_nodes(&Query::new(&field, &bound), samples);
-        let nothing = &Tensor::zeros(&[count, 3]);
-        term.loss(&LossInputs {
-            params,
-            rays: &rays,
-            frames: &vec![0; count],
-            pixels: &vec![[0; 2]; count],
-            distances: &vec![0.0; count],
-            seed,
-            train_frac: 0.0,
-            rendered,
-            target: nothing,
-            background: nothing,
-        })
+        LossInputs::render(&field, &bound, &rays, 1, |inputs| term.loss(&LossInputs { params, seed, ..inputs }))
     }
 
     #[test]
