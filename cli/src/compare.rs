@@ -105,7 +105,7 @@ fn results(folder: &Path, only: Option<&str>) -> Result<Vec<PathBuf>> {
     Ok(entries(folder)?.into_iter().filter(is_result).collect())
 }
 
-/// The fields of a result, those of the model with `model.` before them, and in place of the views how they are called.
+/// The fields of a result under dotted names, and in place of the views their names.
 fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     let bad = |what: String| Error::file(path, what);
     let length = std::fs::metadata(path).map_err(|e| bad(format!("cannot be read: {e}")))?.len();
@@ -119,24 +119,35 @@ fn read(path: &Path) -> Result<BTreeMap<String, String>> {
     if !all.contains_key("psnr_mean") {
         return Err(bad("not an eval result: it has no `psnr_mean`".into()));
     }
-    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let mut fields = BTreeMap::new();
-    for (name, value) in &all {
+    for (name, value) in all {
         match (name.as_str(), value) {
             ("per_view", Value::Array(views)) => {
-                let names: Vec<String> = views.iter().map(|view| text(&view["name"])).collect();
+                let names: Vec<String> = views.iter().map(|view| shown(&view["name"])).collect();
                 fields.insert("images".to_owned(), names.join(", "));
             }
-            ("model", Value::Object(model)) => {
-                fields.extend(model.iter().map(|(name, value)| (format!("model.{name}"), text(value))));
-            }
-            _ => drop(fields.insert(name.clone(), text(value))),
+            (_, value) => flatten(name, value, &mut fields),
         }
     }
     Ok(fields)
 }
 
-/// The rows, under what differs between them; then what does not.
+/// Adds a value under its name, and those inside of it under dotted names.
+fn flatten(name: String, value: Value, fields: &mut BTreeMap<String, String>) {
+    match value {
+        Value::Object(inner) => {
+            inner.into_iter().for_each(|(key, value)| flatten(format!("{name}.{key}"), value, fields))
+        }
+        value => drop(fields.insert(name, shown(&value))),
+    }
+}
+
+/// A value as users read it: a string without its quotes.
+fn shown(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+/// The rows with a column for each differing condition; below them the common conditions.
 fn table(rows: &[Row]) -> String {
     let mut conditions: Vec<&str> = rows.iter().flat_map(|row| row.fields.keys().map(String::as_str)).collect();
     conditions.sort_unstable();
@@ -180,8 +191,9 @@ fn table(rows: &[Row]) -> String {
     if weights.iter().any(|crc32| *crc32 != weights[0]) {
         text += "different LPIPS weights (lpips_crc32), so the LPIPS values are not comparable\n";
     }
-    let common: Vec<String> = common.iter().map(|name| format!("{name} {}", value(&rows[0], name))).collect();
-    text + &format!("same for all: {}\n", common.join("; "))
+    let width = common.iter().map(|name| name.len()).max().unwrap_or(0);
+    let common = common.iter().map(|name| format!("  {name:width$}  {}\n", value(&rows[0], name)));
+    text + "same for all:\n" + &common.collect::<String>()
 }
 
 #[cfg(test)]
@@ -203,7 +215,7 @@ mod tests {
         assert_eq!(lines[1], "first  eval-test  31.13  -     -       0           -");
         assert_eq!(lines[2], "b      eval-test  NaN    -     -       7           2");
         assert_eq!(lines[3], "different views, so these results are not comparable:");
-        assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "same for all: split test"]);
+        assert_eq!(lines[4..], ["  first eval-test: 8", "  b eval-test: 80", "same for all:", "  split  test"]);
     }
 
     #[test]
@@ -217,11 +229,15 @@ mod tests {
         assert_eq!(lines[0], "run  result     PSNR   SSIM    LPIPS   s/view  lpips_backbone  lpips_crc32");
         assert_eq!(lines[1], "a    eval-test  31.13  0.9000  -       -       -               -");
         assert_eq!(lines[2], "b    eval-test  31.13  0.9000  0.0568  -       vgg             0a");
-        assert_eq!(lines[3..], ["same for all: "]);
+        assert_eq!(lines[3..], ["same for all:"]);
         let text = table(&[row("a", &with("0b", "vgg")), row("b", &plain), row("c", &with("0a", "vgg"))]);
         assert!(text.contains("\ndifferent LPIPS weights (lpips_crc32)"), "{text}");
         let text = table(&[row("a", &with("0a", "vgg")), row("b", &with("0a", "vgg"))]);
-        assert!(!text.contains("different") && text.contains("lpips_backbone vgg; lpips_crc32 0a"), "{text}");
+        assert!(
+            !text.contains("different")
+                && text.ends_with("\nsame for all:\n  lpips_backbone  vgg\n  lpips_crc32     0a\n"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -240,10 +256,15 @@ mod tests {
         std::fs::File::create(&path).unwrap().set_len(300 << 20).unwrap();
         let expected = format!("{}: not an eval result (300 MiB; the limit is 256 MiB)", path.display());
         assert_eq!(read(&path).unwrap_err().to_string(), expected);
-        let text =
-            r#"{"psnr_mean":3.5,"model":{"seed":4},"per_view":[{"name":"b","psnr":1},{"name":"a"}],"scene":"x"}"#;
+        let text = r#"{"psnr_mean":3.5,"model":{"seed":4,"budget":{"steps":9}},"per_view":[{"name":"b","psnr":1},{"name":"a"}],"scene":"x"}"#;
         std::fs::write(&path, text).unwrap();
-        let expected = [("model.seed", "4"), ("images", "b, a"), ("psnr_mean", "3.5"), ("scene", "x")];
+        let expected = [
+            ("model.seed", "4"),
+            ("model.budget.steps", "9"),
+            ("images", "b, a"),
+            ("psnr_mean", "3.5"),
+            ("scene", "x"),
+        ];
         let expected: BTreeMap<_, _> = expected.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
         assert_eq!(read(&path).unwrap(), expected);
         for name in ["eval.json", "evaluation.json", "eval-val.json.tmp", "eval-val.json"] {

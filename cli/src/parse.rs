@@ -1,19 +1,33 @@
 //! Values on the command line: counts, durations and image sizes.
 
-use std::ops::RangeInclusive;
+use std::fmt::Display;
+use std::ops::Bound::Included;
+use std::ops::{RangeBounds, RangeInclusive};
+use std::str::FromStr;
 use std::time::Duration;
 
-use clap::builder::{RangedU64ValueParser, TypedValueParser};
 use serde_json::Value;
 
 /// A whole number from 1 to `most`.
-pub fn count(most: usize) -> impl TypedValueParser<Value = usize> {
-    RangedU64ValueParser::<usize>::new().range(1..=most as u64)
+pub fn count(most: usize) -> impl Fn(&str) -> Result<usize, String> + Clone + Send + Sync + 'static {
+    within(1..=most)
 }
 
-/// A whole number of these.
-pub fn within(numbers: RangeInclusive<usize>) -> impl TypedValueParser<Value = usize> {
-    RangedU64ValueParser::<usize>::new().range(*numbers.start() as u64..=*numbers.end() as u64)
+/// A whole number in a range, which has a first number.
+pub fn within<N, R>(range: R) -> impl Fn(&str) -> Result<N, String> + Clone + Send + Sync + 'static
+where
+    N: FromStr + PartialOrd + Display + 'static,
+    R: RangeBounds<N> + Clone + Send + Sync + 'static,
+{
+    move |text| {
+        text.parse().ok().filter(|number| range.contains(number)).ok_or_else(|| {
+            match (range.start_bound(), range.end_bound()) {
+                (Included(least), Included(most)) => format!("write a whole number from {least} to {most}"),
+                (Included(least), _) => format!("write a whole number of at least {least}"),
+                _ => "write a whole number".to_owned(),
+            }
+        })
+    }
 }
 
 /// A duration such as `90s`, `10m` or `1.5h`.
@@ -105,6 +119,19 @@ pub fn weight(text: &str) -> Result<(String, f64), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn whole_numbers() {
+        let keep = within(2..=16384usize);
+        assert_eq!((keep("2"), keep("16384")), (Ok(2), Ok(16384)));
+        for bad in ["", "1", "16385", "-2", "2.5", "1e3", "99999999999999999999"] {
+            assert_eq!(keep(bad), Err("write a whole number from 2 to 16384".to_owned()), "{bad}");
+        }
+        let steps = within(1u64..);
+        assert_eq!(steps("18446744073709551615"), Ok(u64::MAX));
+        assert_eq!(steps("0"), Err("write a whole number of at least 1".to_owned()));
+        assert_eq!((count(3)("3"), count(3)("0").is_err(), count(3)("4").is_err()), (Ok(3), true, true));
+    }
 
     #[test]
     fn durations() {

@@ -1,4 +1,6 @@
-//! `raygrad train`: photographs to a model.
+//! `raygrad train`: trains a model on the images of a capture.
+
+mod config;
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -9,32 +11,34 @@ use std::time::Duration;
 use clap::Parser;
 use raygrad::Schedule;
 use raygrad::nerf::dataset::{Dataset, SceneType, Split};
-use raygrad::nerf::losses::DepthConfig;
 use raygrad::nerf::model::RefinedParam;
-use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
-use raygrad::nerf::sampling::marching::MarchingConfig;
 use raygrad::nerf::space::occupancy::Skip;
-use raygrad::nerf::{Background, Budget, Config, Error, LossTermConfig, Preset, Result, StepStats, Trainer};
+use raygrad::nerf::{Background, Budget, Error, Preset, Result, StepStats, Trainer};
 use serde_json::Value;
 
-use super::cameras::Viewpoint;
 use super::lock::Lock;
 use super::output::{complain, print};
 use super::preview::Preview;
 use super::progress::spoken;
-use super::run::{CHECKPOINTS, Run, RunConfig, choose_folder, usual_checkpoints};
+use super::run::{CHECKPOINTS, Run, RunConfig, choose_folder};
 use super::scene::{Opened, Scene};
 use super::summary::Ended;
 use super::view::{Listener, PlaceArgs, TrainingViewer};
 use super::watch::Watch;
 use super::{checkpoint, doctor, interrupt, machine, memory, parse, watch};
+use config::set_near;
+
+#[cfg(test)]
+pub use config::changed;
 
 /// Bytes of photographs that many a computer has not, where it does not say how many it has.
 const HEAVY: f64 = 4e9;
 /// How often a run that has diverged goes back to its last checkpoint.
 const RETREATS: u32 = 3;
+/// What is said of a run that has nothing left to do.
+const FINISHED: &str = ", the end of its budget: add --steps or --budget with a larger total to train on";
 
-/// What is said of a new run alone.
+/// Flags of new runs only.
 const NEW: [&str; 15] = [
     "scene",
     "preset",
@@ -96,7 +100,7 @@ pub struct Args {
     /// Training steps, instead of a time
     ///
     /// The same seed and number of steps give the same model, bit for bit.
-    #[arg(long, help_heading = "Time", value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, help_heading = "Time", value_name = "N", value_parser = parse::within(1u64..))]
     steps: Option<u64>,
     /// Random seed
     #[arg(long, help_heading = "Advanced", value_name = "N", default_value_t = 0)]
@@ -286,7 +290,9 @@ fn resume(args: &Args, folder: &Path, listener: Option<Listener>) -> Result<Trai
         run.write()?;
     }
     describe(&run, &trainer, &data, &scene)?;
-    print(&format!("resumed  at step {}\n", trainer.stats().step))?;
+    let stats = trainer.stats();
+    let end = if watch::remaining(budget, &stats).0 < 1.0 { "" } else { FINISHED };
+    print(&format!("resumed  at step {}{end}\n", stats.step))?;
     let preview = Preview::choose(&scene, downscale, &data, background);
     train((run, lock), trainer, budget, args, preview, listener)
 }
@@ -355,73 +361,6 @@ fn train(
     Ok(Trained { folder: run.folder, interrupted, diverged: diverged.is_some() })
 }
 
-impl Args {
-    fn config(&self, data: &Dataset) -> Result<Config> {
-        let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
-        config = config.for_budget(self.budget().samples(), data.pixels_per_side());
-        if let Some(background) = self.background {
-            config.background = background;
-        }
-        // Asked for, it tells fog from what opaque photographs show.
-        if config.background == Background::Random && !data.has_alpha() && self.background.is_none() {
-            config.background = Background::White;
-        }
-        if let Some(skip) = self.skip {
-            config = config.with_skip(skip);
-        }
-        config = config.with_scene_type(data.scope);
-        if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
-            let what = format!(
-                "{} spaces samples evenly, too few for the long rays of an unbounded scene: use instant or voxel, or \
-                 add --skip fast or --scene-type bounded",
-                self.preset
-            );
-            return Err(Error::setting("preset", what));
-        }
-        if let Some(carve) = self.carve {
-            let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
-                let what = format!("the preset {} has no occupancy grid to carve: add --skip fast", self.preset);
-                return Err(Error::setting("carve", what));
-            };
-            sampler.occupancy.skip.carving = carve;
-        }
-        config = config.with_refined(&self.refine);
-        if let Some(weight) = self.depth_loss {
-            config.loss_terms.push(LossTermConfig::new(DepthConfig { weight }));
-        }
-        for (kind, weight) in &self.loss {
-            config = with_term(config, kind, *weight)?;
-        }
-        if self.no_positional_encoding {
-            config = config.without_positional_encoding();
-        }
-        self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))
-    }
-
-    fn run_config(&self, trainer: &Trainer, data: &Dataset) -> Result<RunConfig> {
-        Ok(RunConfig {
-            raygrad: env!("CARGO_PKG_VERSION").to_owned(),
-            scene: self.scene.absolute()?,
-            downscale: self.downscale,
-            scene_box: trainer.model.scene_box,
-            viewpoint: Viewpoint::of(data),
-            photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
-            budget: Some(self.budget()),
-            keep_checkpoints: self.keep_checkpoints.unwrap_or_else(usual_checkpoints),
-            config: trainer.model.config.clone(),
-        })
-    }
-
-    fn budget(&self) -> Budget {
-        self.given().unwrap_or_else(|| Budget::Time(default_budget(self.preset)))
-    }
-
-    /// The budget that was asked for.
-    fn given(&self) -> Option<Budget> {
-        self.steps.map(Budget::Steps).or(self.budget.map(Budget::Time))
-    }
-}
-
 /// Says what photographs will take if more is not free, or is not known to be, before they are read.
 fn warn_of_memory(scene: &Opened, downscale: usize) {
     let Some((capture, _)) = &scene.capture else { return };
@@ -449,54 +388,6 @@ fn foresee_memory(trainer: &Trainer, data: &Dataset) -> Result<()> {
         complain(&warning);
     }
     print(&format!("memory   about {:.1} GB\n", need / 1e9))
-}
-
-/// Photographs before whose cameras nothing is looked for nearer than that, in the units of their files.
-fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
-    let far = data.far / data.placement.scale;
-    if !(0.0..far).contains(&near) {
-        return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, the far plane")));
-    }
-    let near = near * data.placement.scale;
-    data.ndc = data.ndc.map(|ndc| ndc.with_near(data.near, near));
-    data.near = near;
-    Ok(())
-}
-
-/// The configuration with a term of the loss of that weight, and without it at 0.
-fn with_term(mut config: Config, kind: &str, weight: f64) -> Result<Config> {
-    config.loss_terms.retain(|term| term.kind() != kind);
-    if weight != 0.0 {
-        let bad = |e| Error::setting("loss", format!("cannot be {kind}={weight}: {e}"));
-        // Which terms there are, a configuration knows when it is read.
-        let mut all = serde_json::to_value(&config).map_err(bad)?;
-        if let Some(terms) = all.get_mut("loss_terms").and_then(Value::as_array_mut) {
-            terms.push(serde_json::json!({ "kind": kind, "weight": weight }));
-        }
-        config = serde_json::from_value(all).map_err(bad)?;
-    }
-    Ok(config)
-}
-
-/// The configuration with the number of that dotted name replaced.
-pub fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
-    let unknown = |_| Error::setting(name, "cannot be changed");
-    let mut all = serde_json::to_value(config).map_err(unknown)?;
-    let pointer = format!("/{}", name.replace('.', "/"));
-    let place = all
-        .pointer_mut(&pointer)
-        .ok_or_else(|| Error::setting(name, "is not a config key; config.json in a run folder lists them"))?;
-    *place = value.clone();
-    serde_json::from_value(all).map_err(|e| Error::setting(name, format!("cannot be {value}: {e}")))
-}
-
-/// Training time after which a preset shows what it can do.
-fn default_budget(preset: Preset) -> Duration {
-    match preset {
-        Preset::Instant | Preset::Voxel => Duration::from_secs(45),
-        Preset::Small => Duration::from_secs(100),
-        Preset::Classic => Duration::from_secs(3600),
-    }
 }
 
 fn describe(run: &Run, trainer: &Trainer, data: &Dataset, scene: &Opened) -> Result<()> {

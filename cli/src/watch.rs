@@ -299,7 +299,7 @@ impl<'a> Watch<'a> {
 }
 
 /// Share of a run that is done, and the seconds of training that are left.
-fn remaining(budget: Budget, stats: &StepStats) -> (f64, f64) {
+pub fn remaining(budget: Budget, stats: &StepStats) -> (f64, f64) {
     match budget {
         Budget::Time(time) => {
             let total = time.as_secs_f64();

@@ -57,7 +57,7 @@ pub struct Args {
     #[arg(long, help_heading = "Scene", default_value = "test")]
     split: Split,
     /// Use N evenly spaced views [default: all]
-    #[arg(long, help_heading = "Scene", value_name = "N", value_parser = parse::count(usize::MAX))]
+    #[arg(long, help_heading = "Scene", value_name = "N", value_parser = parse::within(1usize..))]
     views: Option<usize>,
     /// Empty-space skipping: off, near-lossless, fast
     ///

@@ -68,8 +68,8 @@ pub struct Args {
 pub struct PlaceArgs {
     /// Address to serve on
     ///
-    /// 127.0.0.1 serves this machine only. With any other address, everyone who has the link with its token can
-    /// connect. The connection is not encrypted.
+    /// 127.0.0.1 serves this machine only. With any other address, the link gives access, since it holds a token.
+    /// The connection is not encrypted.
     #[arg(long, help_heading = "Viewer", default_value = HOST)]
     host: String,
     /// Port to serve on [default: a free one]
@@ -101,7 +101,7 @@ pub fn run(args: &Args) -> Result<()> {
     let video_jobs = Arc::new(VideoJobs::new(run.clone(), args.scene.clone(), requests.clone()));
     let background = model.config.background.shown();
     let link = server::serve(args.place.listen()?, requests.clone(), photos.clone(), Some(video_jobs), background)?;
-    print(&format!("view     {link}\n"))?;
+    print(&format!("view     {link}\n         Ctrl-C ends the viewer\n"))?;
     if args.open
         && let Err(error) = open::that_detached(&link)
     {

@@ -1,0 +1,138 @@
+//! The configuration of a new run: the preset, changed by flags.
+
+use std::time::Duration;
+
+use raygrad::nerf::dataset::Dataset;
+use raygrad::nerf::losses::DepthConfig;
+use raygrad::nerf::sampling::hierarchical::HierarchicalConfig;
+use raygrad::nerf::sampling::marching::MarchingConfig;
+use raygrad::nerf::{Background, Budget, Config, Error, LossTermConfig, Preset, Result, Trainer};
+use serde_json::Value;
+
+use super::super::cameras::Viewpoint;
+use super::super::run::{RunConfig, usual_checkpoints};
+use super::Args;
+
+impl Args {
+    /// The configuration of a new run.
+    pub fn config(&self, data: &Dataset) -> Result<Config> {
+        let mut config = Config { seed: self.seed, ..Config::preset(self.preset) };
+        config = config.for_budget(self.budget().samples(), data.pixels_per_side());
+        if let Some(background) = self.background {
+            config.background = background;
+        }
+        // Opaque images need no random background, unless a flag sets it.
+        if config.background == Background::Random && !data.has_alpha() && self.background.is_none() {
+            config.background = Background::White;
+        }
+        if let Some(skip) = self.skip {
+            config = config.with_skip(skip);
+        }
+        config = config.with_scene_type(data.scope);
+        if config.unbounded && config.sampler.get::<HierarchicalConfig>().is_some() {
+            let what = format!(
+                "{} spaces samples evenly, too few for the long rays of an unbounded scene: use instant or voxel, or \
+                 add --skip fast or --scene-type bounded",
+                self.preset
+            );
+            return Err(Error::setting("preset", what));
+        }
+        if let Some(carve) = self.carve {
+            let Some(sampler) = config.sampler.get_mut::<MarchingConfig>() else {
+                let what = format!("the preset {} has no occupancy grid to carve: add --skip fast", self.preset);
+                return Err(Error::setting("carve", what));
+            };
+            sampler.occupancy.skip.carving = carve;
+        }
+        config = config.with_refined(&self.refine);
+        if let Some(weight) = self.depth_loss {
+            config.loss_terms.push(LossTermConfig::new(DepthConfig { weight }));
+        }
+        for (kind, weight) in &self.loss {
+            config = with_term(config, kind, *weight)?;
+        }
+        if self.no_positional_encoding {
+            config = config.without_positional_encoding();
+        }
+        self.set.iter().try_fold(config, |config, (name, value)| changed(&config, name, value))
+    }
+
+    /// The record of a new run.
+    pub fn run_config(&self, trainer: &Trainer, data: &Dataset) -> Result<RunConfig> {
+        Ok(RunConfig {
+            raygrad: env!("CARGO_PKG_VERSION").to_owned(),
+            scene: self.scene.absolute()?,
+            downscale: self.downscale,
+            scene_box: trainer.model.scene_box,
+            viewpoint: Viewpoint::of(data),
+            photographs: data.frames.iter().map(|frame| frame.name.clone()).collect(),
+            budget: Some(self.budget()),
+            keep_checkpoints: self.keep_checkpoints.unwrap_or_else(usual_checkpoints),
+            config: trainer.model.config.clone(),
+        })
+    }
+
+    /// The budget of a new run.
+    pub fn budget(&self) -> Budget {
+        self.given().unwrap_or_else(|| Budget::Time(default_budget(self.preset)))
+    }
+
+    /// The budget, if a flag sets it.
+    pub fn given(&self) -> Option<Budget> {
+        self.steps.map(Budget::Steps).or(self.budget.map(Budget::Time))
+    }
+}
+
+/// Sets the near plane, given in capture units.
+///
+/// # Errors
+/// If the near plane is negative or not in front of the far plane.
+pub fn set_near(data: &mut Dataset, near: f64) -> Result<()> {
+    let far = data.far / data.placement.scale;
+    if !(0.0..far).contains(&near) {
+        return Err(Error::setting("near", format!("is {near}; use 0 to less than {far:.4}, the far plane")));
+    }
+    let near = near * data.placement.scale;
+    data.ndc = data.ndc.map(|ndc| ndc.with_near(data.near, near));
+    data.near = near;
+    Ok(())
+}
+
+/// The configuration with a loss term of this weight; a weight of 0 removes the term.
+fn with_term(mut config: Config, kind: &str, weight: f64) -> Result<Config> {
+    config.loss_terms.retain(|term| term.kind() != kind);
+    if weight != 0.0 {
+        let bad = |e| Error::setting("loss", format!("cannot be {kind}={weight}: {e}"));
+        // Reading a configuration checks the name.
+        let mut all = serde_json::to_value(&config).map_err(bad)?;
+        if let Some(terms) = all.get_mut("loss_terms").and_then(Value::as_array_mut) {
+            terms.push(serde_json::json!({ "kind": kind, "weight": weight }));
+        }
+        config = serde_json::from_value(all).map_err(bad)?;
+    }
+    Ok(config)
+}
+
+/// The configuration with the value of this dotted key replaced.
+///
+/// # Errors
+/// If there is no such key or the value does not fit it.
+pub fn changed(config: &Config, name: &str, value: &Value) -> Result<Config> {
+    let unknown = |_| Error::setting(name, "cannot be changed");
+    let mut all = serde_json::to_value(config).map_err(unknown)?;
+    let pointer = format!("/{}", name.replace('.', "/"));
+    let place = all
+        .pointer_mut(&pointer)
+        .ok_or_else(|| Error::setting(name, "is not a config key; config.json in a run folder lists them"))?;
+    *place = value.clone();
+    serde_json::from_value(all).map_err(|e| Error::setting(name, format!("cannot be {value}: {e}")))
+}
+
+/// Training time in which a preset reaches a good picture.
+fn default_budget(preset: Preset) -> Duration {
+    match preset {
+        Preset::Instant | Preset::Voxel => Duration::from_secs(45),
+        Preset::Small => Duration::from_secs(100),
+        Preset::Classic => Duration::from_secs(3600),
+    }
+}
