@@ -47,14 +47,16 @@ pub(crate) fn is_worthwhile(work: usize) -> bool {
     work >= WORTHWHILE && !SERIAL.get() && rayon::current_num_threads() > 1
 }
 
-/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool; operations within keep to their thread.
+/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool, or within [`serial`] on this one.
 ///
-/// Every parallel loop is this one, and calls `f` through a pointer, so that rayon is compiled once and not for each loop.
+/// Operations within `f` keep to their thread; a single call may use all threads itself. Loops call `f` through a pointer,
+/// so that rayon is compiled once and not for each loop.
 #[inline(never)]
 pub fn each(count: usize, f: &(dyn Fn(usize) + Sync)) {
     match count {
         0 => (),
         1 => f(0),
+        _ if SERIAL.get() => (0..count).for_each(f),
         _ => (0..count).into_par_iter().for_each(|i| serial(|| f(i))),
     }
 }
@@ -132,7 +134,7 @@ pub fn chunks<T: Send, S: Send>(
 
 #[cfg(test)]
 mod tests {
-    use super::{is_worthwhile, serial};
+    use super::{collect, is_worthwhile, serial};
     use crate::extremum::extremum;
     use crate::matmul::{Matrix, gemm};
     use crate::{Layout, Mask, Pool, Real, Scalar, Tensor, map_real, rows, sum, sum_axes};
@@ -275,6 +277,21 @@ mod tests {
         assert_eq!(inside, [true, false, true]);
         let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         assert!(!alone.install(|| is_worthwhile(1 << 30)));
+    }
+
+    #[test]
+    fn serial_keeps_loops_on_their_thread() {
+        // Each call waits for a moment, so that idle threads would take part.
+        let threads = || {
+            collect(64, |_| {
+                std::thread::sleep(std::time::Duration::from_millis(1));
+                rayon::current_thread_index()
+            })
+        };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        let (own, alone, together) = pool.install(|| (rayon::current_thread_index(), serial(threads), threads()));
+        assert_eq!(alone, [own; 64]);
+        assert!(together.iter().any(|thread| *thread != own));
     }
 
     #[test]

@@ -241,7 +241,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ or `delta` is not positive.
     #[track_caller]
     pub fn huber(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
-        self.fits("huber", ensure(delta > 0.0, || format!("the width is {delta}")));
+        self.fits("huber", ensure(delta > 0.0, || format!("delta is {delta}; it must be above 0")));
         self.loss(Huber { delta }, target)
     }
 
@@ -260,7 +260,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// If the shapes differ or `beta` is negative.
     #[track_caller]
     pub fn smooth_l1(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
-        self.fits("smooth_l1", ensure(beta >= 0.0, || format!("the width is {beta}")));
+        self.fits("smooth_l1", ensure(beta >= 0.0, || format!("beta is {beta}; it must be at least 0")));
         self.loss(SmoothL1 { beta }, target)
     }
 

@@ -2,7 +2,7 @@
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::extremum::extremum;
-use raygrad_tensor::rows::variance_rows;
+use raygrad_tensor::rows::{at_least_zero, variance_rows};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, map, sum_to};
 
 /// Whether a tensor of shape `x` is reduced to `to` over its last axes alone: the number of elements in each row.
@@ -27,14 +27,27 @@ fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &P
         variance_rows(x.as_slice(), n, out.as_mut_slice());
     } else {
         // As `variance_rows`: measured from the rounded mean, less what its rounding adds.
-        let mean_of = |x: &Tensor<T>| sum_to(x, shape, pool) * T::from_f64(1.0 / count);
+        let count = T::from_f64(count);
+        let mean_of = |x: &Tensor<T>| {
+            map(
+                [&sum_to(x, shape, pool)],
+                pool,
+                #[inline(always)]
+                |[sum]| sum / count,
+            )
+        };
         let deviation = map(
             [x, &mean_of(x)],
             pool,
             #[inline(always)]
             |[x, mean]| x - mean,
         );
-        out = mean_of(&deviation.square()) - mean_of(&deviation).square();
+        out = map(
+            [&mean_of(&deviation.square()), &mean_of(&deviation)],
+            pool,
+            #[inline(always)]
+            |[square, rest]| at_least_zero(square - rest * rest),
+        );
     }
     if correction == 0.0 { out } else { out * ratio }
 }

@@ -90,7 +90,13 @@ impl Pick {
             }
             Places::Elements(index) => {
                 let same = picked == index.shape();
-                ensure(same, || format!("indices of shape {:?} for {x:?}, along axis {}", index.shape(), self.axis))?;
+                ensure(same, || {
+                    let (axis, own) = (self.axis, index.shape());
+                    format!(
+                        "indices of shape {own:?} for {x:?}: they need {} axes, of the same extents except along axis {axis}",
+                        x.len()
+                    )
+                })?;
                 check_index(index.as_slice(), extent, self.axis)
             }
         }
@@ -344,7 +350,9 @@ impl<T: Scalar> Tape<T> {
     #[track_caller]
     pub fn one_hot(&self, index: impl Into<Indices>, classes: usize) -> Var<'_, T> {
         let index = index.into();
-        self.fits("one_hot", &[], check_index(index.as_slice(), classes, 0));
+        let known = index.as_slice().iter().enumerate().find(|&(_, &at)| at as usize >= classes);
+        let known = known.map_or(Ok(()), |(i, at)| Err(format!("index {i} is {at}, but there are {classes} classes")));
+        self.fits("one_hot", &[], known);
         self.constant(index.one_hot(classes))
     }
 }
@@ -387,12 +395,25 @@ mod tests {
             (put(rows(&[0]), 5), "1 indices for [2, 3] along axis 0"),
             (picked(Pick { axis: 2, ..rows(&[0]) }), "there is no axis 2"),
             (picked(elements(1, &[2, 1], &[0, 3])), "index 1 is 3, but axis 1 has 3 entries"),
-            (picked(elements(1, &[1, 2], &[0, 0])), "indices of shape [1, 2] for [2, 3], along axis 1"),
-            (picked(elements(1, &[2], &[0, 0])), "indices of shape [2] for [2, 3], along axis 1"),
-            (put(elements(0, &[1, 3], &[0, 0, 0]), 4), "indices of shape [1, 3] for [2, 3], along axis 0"),
+            (
+                picked(elements(1, &[1, 2], &[0, 0])),
+                "indices of shape [1, 2] for [2, 3]: they need 2 axes, of the same extents except along axis 1",
+            ),
+            (
+                picked(elements(1, &[2], &[0, 0])),
+                "indices of shape [2] for [2, 3]: they need 2 axes, of the same extents except along axis 1",
+            ),
+            (
+                put(elements(0, &[1, 3], &[0, 0, 0]), 4),
+                "indices of shape [1, 3] for [2, 3]: they need 2 axes, of the same extents except along axis 0",
+            ),
             (put(elements(0, &[2, 3], &[0, 0, 0, 1, 1, 4]), 4), "index 5 is 4, but axis 0 has 4 entries"),
             // A result that is larger than memory.
             (put(rows(&[0, 0]), 1 << 63), "too many elements"),
+            (
+                tape.try_run(|| tape.one_hot([1, 3], 3)).unwrap_err().to_string(),
+                "index 1 is 3, but there are 3 classes",
+            ),
         ] {
             assert!(error.contains(expected), "{error} and {expected}");
         }

@@ -56,7 +56,8 @@ fn misfit_is_an_error_at_the_callers_line() {
     refused(&tape, || x.reshape(&[1, 2, 3]).cross_entropy(Indices::new(&[2, 1], [0, 0])));
     refused(&tape, || x.cross_entropy([0]));
     refused(&tape, || x.mse_loss(0.0));
-    refused(&tape, || x.huber(&x, 0.0));
+    assert!(refused(&tape, || x.huber(&x, 0.0)).to_string().contains("delta is 0; it must be above 0"));
+    assert!(refused(&tape, || x.smooth_l1(&x, -1.0)).to_string().contains("beta is -1; it must be at least 0"));
     refused(&tape, || x.clamp(1.0, 0.0));
     refused(&tape, || x.gt(x.t()));
     refused(&tape, || x.where_(&Mask::new(&[2], [true, false]), 0.0));

@@ -202,6 +202,29 @@ fn moments_of_numbers_far_from_zero_keep_their_digits() {
     }
 }
 
+#[test]
+fn deviations_of_equal_numbers_are_zero() {
+    fn check<T: Scalar>() {
+        let tape = Tape::<T>::new();
+        for n in 1..100 {
+            for value in [0.1, 0.3, 0.7, 0.9, 1.1, 3.3, -7.7, 1e10 / 3.0, 1e-10 / 3.0] {
+                let x = tape.leaf(Tensor::full(&[n, 3], T::from_f64(value)));
+                for (x, axis) in [(x.clone(), 0), (x.t(), 1)] {
+                    let y = x.std_over(axis, 0);
+                    let grad = y.sum().grad(&[&x]).remove(0);
+                    // The rounding of the mean may leave a last digit.
+                    let within = |x: &Tensor<T>, most: f64| x.as_slice().iter().all(|x| x.to_f64().abs() <= most);
+                    let what = format!("{n} times {value} in {} along axis {axis}", T::NAME);
+                    assert!(within(y.value(), T::EPSILON * value.abs()), "{what}: {:?}", y.value());
+                    assert!(within(&grad, 1.1), "gradient of {what}: {grad:?}");
+                }
+            }
+        }
+    }
+    check::<f32>();
+    check::<f64>();
+}
+
 /// The product of `x` and its gradient, recorded and not, against exact values to a few roundings.
 fn product_is<T: Scalar>(x: &[f64], value: f64, gradient: &[f64]) {
     let tape = Tape::<T>::new();

@@ -6,7 +6,7 @@
 mod moments;
 mod softmax;
 
-pub use moments::{layer_norm_rows, layer_norm_rows_grad, variance_rows};
+pub use moments::{at_least_zero, layer_norm_rows, layer_norm_rows_grad, variance_rows};
 pub use softmax::{
     cross_entropy_rows, cross_entropy_rows_grad, log_softmax_rows, log_softmax_rows_grad, logsumexp_rows, softmax_rows,
     softmax_rows_grad,

@@ -23,7 +23,13 @@ fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
         |x, _| [x - mean, (x - mean) * (x - mean)],
     );
     let rest = rest / count;
-    ([mean, rest], square / count - rest * rest)
+    ([mean, rest], at_least_zero(square / count - rest * rest))
+}
+
+/// 0 in place of a negative number, as rounding makes of the variance of equal numbers. NaN stays.
+#[inline(always)]
+pub fn at_least_zero<T: Scalar>(x: T) -> T {
+    if x < T::ZERO { T::ZERO } else { x }
 }
 
 /// The mean squared deviation from the mean, of each row of `n` elements; NaN for an empty row.

@@ -77,9 +77,7 @@ impl AdamConfig {
 struct Group<T> {
     config: AdamConfig,
     decay: f64,
-    /// For each step of a row, from 1 on, the factors of learning rate and epsilon that correct the moments' bias:
-    /// `sqrt(1 - beta2^t) / (1 - beta1^t)` and `sqrt(1 - beta2^t)`. The last stands for all later ones. Made for the first
-    /// lazy parameter.
+    /// The [`correction`] of each step of a row, from 1 on, as far as they are kept. Made for the first lazy parameter.
     corrections: Vec<[T; 2]>,
 }
 
@@ -88,8 +86,15 @@ fn biases(AdamConfig { beta1, beta2, .. }: AdamConfig, step: u32) -> [f64; 2] {
     [beta1, beta2].map(|beta| -(f64::from(step) * beta.ln()).exp_m1())
 }
 
+/// The factors of learning rate and epsilon that correct the moments' bias at a step, from 1 on:
+/// `sqrt(1 - beta2^t) / (1 - beta1^t)` and `sqrt(1 - beta2^t)`.
+fn correction<T: Scalar>(config: AdamConfig, step: u32) -> [T; 2] {
+    let [first, second] = biases(config, step);
+    [second.sqrt() / first, second.sqrt()].map(T::from_f64)
+}
+
 impl<T: Scalar> Group<T> {
-    /// Where the corrections end even if they are not yet 1, which matters to a beta2 above 0.9998 only.
+    /// Most corrections that are kept. Beyond them, a beta2 above 0.9998 has them computed for each row.
     const LONGEST: usize = 1 << 17;
 
     #[track_caller]
@@ -101,8 +106,16 @@ impl<T: Scalar> Group<T> {
     /// Fills the corrections, if they are not.
     fn correct_rows(&mut self) {
         while self.corrections.len() < Self::LONGEST && self.corrections.last() != Some(&[T::ONE; 2]) {
-            let [first, second] = biases(self.config, self.corrections.len() as u32 + 1);
-            self.corrections.push([second.sqrt() / first, second.sqrt()].map(T::from_f64));
+            self.corrections.push(correction(self.config, self.corrections.len() as u32 + 1));
+        }
+    }
+
+    /// The correction of a step, from 1 on.
+    fn correction(&self, step: u32) -> [T; 2] {
+        match self.corrections.get(step as usize - 1) {
+            Some(known) => *known,
+            None if self.corrections.last() == Some(&[T::ONE; 2]) => [T::ONE; 2],
+            None => correction(self.config, step),
         }
     }
 
@@ -197,16 +210,16 @@ impl<T: Scalar> Adam<T> {
             if part.lazy {
                 group.correct_rows();
             }
-            let (Group { config, corrections, .. }, rate) = (&*group, part.rate);
+            let (group, rate) = (&*group, part.rate);
             let update = group.update(rate, part.decay);
             let whole = |step| {
-                let [first, second] = biases(*config, step);
+                let [first, second] = biases(group.config, step);
                 let root = second.sqrt();
                 let rate = T::from_f64(rate * root / first);
-                Update { rate, epsilon: T::from_f64(config.eps * root), ..update }
+                Update { rate, epsilon: T::from_f64(group.config.eps * root), ..update }
             };
             let row = |step: u32| {
-                let [rate, epsilon] = corrections[(step as usize).min(corrections.len()) - 1];
+                let [rate, epsilon] = group.correction(step);
                 Update { rate: update.rate * rate, epsilon: update.epsilon * epsilon, ..update }
             };
             self.memory.update(part, whole, row, &mut report);
@@ -349,7 +362,11 @@ mod tests {
         );
         assert_eq!(report.bad, [("x".to_owned(), 3)]);
         let message = report.check().unwrap_err().to_string();
-        assert_eq!(message, "3 of 4 elements stay where they are, for their gradient is not finite: 3 of `x`");
+        assert_eq!(
+            message,
+            "3 of 4 elements were not updated, because the gradient or the new value is not finite: 3 of `x`; lower the \
+                 learning rate or clip the gradients"
+        );
         assert_eq!(&params.values()[0].as_slice()[1..], [2.0, 3.0, f32::MAX]);
         for _ in 0..10_000 {
             step(&mut adam, &mut params, Tensor::zeros(&[4]), 0.1);
@@ -408,6 +425,13 @@ mod tests {
                 step(&mut adam, &mut params, Tensor::ones(&[2, 1]), 0.1);
                 let count = adam.groups[0].corrections.len();
                 assert!((least..=most).contains(&count), "{count} for a beta2 of {beta2}");
+            }
+            for step in [1, 5, 1 << 17, (1 << 17) + 1, 1 << 20, u32::MAX] {
+                let root = (1.0 - f64::powf(beta2, step.into())).sqrt();
+                let [rate, epsilon] = adam.groups[0].correction(step).map(f64::from);
+                let expected = root / (1.0 - f64::powf(0.9, step.into()));
+                assert!((rate - expected).abs() < 1e-6 * expected, "{rate} for {expected} at {step}");
+                assert!((epsilon - root).abs() < 1e-6 * root, "{epsilon} for {root} at {step}");
             }
         }
     }

@@ -7,7 +7,7 @@ use std::fmt;
 /// An element whose gradient is infinite or NaN stays where it is. That saves a run from a single overflow, but a run
 /// that has diverged would stand still without a word: so the report asks to be looked at. [`check`](Self::check) ends a
 /// run at the first bad gradient; who wants to go on looks whether it [`has_only_non_finite`](Self::has_only_non_finite) for many steps.
-#[must_use = "elements whose gradient is infinite or NaN stay where they are: `check` says whether there are any"]
+#[must_use = "elements with a non-finite gradient are not updated: `check` is an error if there are any"]
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct UpdateReport {
     /// Elements that were moved. Of a lazy parameter those of the rows that got a gradient.
@@ -55,10 +55,11 @@ impl std::error::Error for NonFinite {}
 impl fmt::Display for NonFinite {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let UpdateReport { moved, skipped, bad } = &self.0;
-        write!(f, "{skipped} of {} elements stay where they are, for their gradient is not finite:", moved + skipped)?;
+        let what = "elements were not updated, because the gradient or the new value is not finite:";
+        write!(f, "{skipped} of {} {what}", moved + skipped)?;
         for (place, (name, count)) in bad.iter().enumerate() {
             write!(f, "{} {count} of `{name}`", if place > 0 { "," } else { "" })?;
         }
-        Ok(())
+        f.write_str("; lower the learning rate or clip the gradients")
     }
 }
