@@ -1,4 +1,5 @@
-//! Checkpointing (rematerialisation): a part of a computation keeps only its inputs, and runs again in the backward pass.
+//! Gradient checkpointing (rematerialisation): a part of a computation saves only its inputs, and runs again in the
+//! backward pass.
 
 use crate::op::Given;
 use crate::sweep::parts;
@@ -6,10 +7,10 @@ use crate::{Error, Grads, Op, ShapeError, Tape, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
 
-/// y = f(x), of which nothing but x is kept.
+/// y = f(x), of which the tape saves only x.
 ///
-/// The backward pass runs `f` once more, on a tape of its own that shares the pool, and sweeps back over that. As `f` is
-/// also its own reference, a recorded pass goes through the plain operations.
+/// The backward pass runs `f` again on a separate tape that shares the pool, and differentiates there. `f` is also its
+/// own reference, so a recorded pass goes through the plain operations.
 struct Checkpoint<F> {
     f: F,
     shape: Shape,
@@ -74,25 +75,26 @@ where
     }
 }
 
-/// The value of `f` on a tape of its own, which is gone afterwards. It is recorded there, so that `f` may take gradients.
+/// The value of `f` on a temporary tape. It is recorded there, so that `f` may take gradients.
 fn run<T: Scalar>(f: impl for<'a> Fn(&[Var<'a, T>]) -> Var<'a, T>, tape: &Tape<T>, x: &[&Tensor<T>]) -> Tensor<T> {
     let x: Vec<_> = x.iter().map(|&x| tape.unchecked_leaf(x.clone(), tape.line())).collect();
     f(&x).into_value()
 }
 
 impl<T: Scalar> Tape<T> {
-    /// `f(inputs)`, of which the tape keeps nothing but the inputs: the backward pass runs `f` again and differentiates
-    /// that. A chain of `n` operations cut into `sqrt(n)` such segments needs memory for about `2 sqrt(n)` values
-    /// instead of `n`, for the time of one more forward pass (Chen et al. 2016, "Training Deep Nets with Sublinear
-    /// Memory Cost").
+    /// Gradient checkpointing: computes `f(inputs)`, of which the tape saves only the inputs.
     ///
-    /// `f` gets the inputs in their order and must compute the same at each run: what is random comes from a seed. It
-    /// cannot capture variables, so that none escapes differentiation; constants are tensors that it puts on
-    /// `x[0].tape()`. Segments nest.
+    /// The backward pass runs `f` again and differentiates that run. A chain of `n` operations cut into `sqrt(n)` such
+    /// segments needs memory for about `2 sqrt(n)` values instead of `n`. The price is one more forward pass (Chen et
+    /// al. 2016, "Training Deep Nets with Sublinear Memory Cost").
     ///
-    /// A gradient has the same bits as without a checkpoint, and stays sparse where it would be. The gradient of a
-    /// gradient works too, but saves nothing: a recorded pass (`grad_graph`, `vjp`) records what `f` does, and sums
-    /// shares in another order.
+    /// `f` gets the inputs in order. It must compute the same values in each run, so random numbers must come from a
+    /// seed. It cannot capture variables, so that gradients reach all of them. To use a constant, capture a tensor and
+    /// put it on the tape `x[0].tape()`. Checkpoints may nest.
+    ///
+    /// A gradient has the same bits as without a checkpoint, and stays sparse where it would be sparse. The gradient of
+    /// a gradient works, but saves no memory: a recorded pass (`grad_graph`, `vjp`) records the operations of `f`. It
+    /// also sums contributions to a gradient in another order.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -104,7 +106,7 @@ impl<T: Scalar> Tape<T> {
     /// ```
     ///
     /// # Panics
-    /// If an input belongs to another tape, and where `f` panics.
+    /// If an input belongs to another tape, or if `f` panics.
     #[track_caller]
     pub fn checkpoint<'t>(
         &'t self,

@@ -1,12 +1,16 @@
-//! Conventions: what operations give at ties, kinks and the edges of their domains.
+//! Conventions: values and gradients at ties, kinks and the edges of domains.
 //!
-//! Wherever a function has no derivative, the one below is what its operation gives: the value and the gradient of each
-//! input for an output gradient of ones. Inputs are separated by semicolons. The table is a test: it is read from this
-//! text, and every row is evaluated in `f32` and `f64`, with the gradient recorded and not recorded.
+//! Where a function has no derivative, its operation returns the value and gradients below. A gradient is that of each
+//! input for an output gradient of ones. Semicolons separate inputs. A test reads this table and evaluates every row in
+//! `f32` and `f64`, with the gradient recorded and not recorded.
 //!
-//! The rules behind it: NaN goes through, unless the result does not depend on it; a tie is shared evenly; a step has
-//! gradient 0; a kink has the gradient of the side that its formula takes; and where infinity times 0 would be NaN but
-//! a limit exists, that limit is the value.
+//! The rules behind the table:
+//!
+//! * NaN propagates, unless the result does not depend on it.
+//! * Tied elements share the gradient evenly.
+//! * A step has gradient 0.
+//! * A kink has the gradient of the side that its formula takes.
+//! * Where infinity times 0 would be NaN but a limit exists, the value is that limit.
 //!
 //! ## Kinks and steps
 //!

@@ -1,8 +1,9 @@
-//! Derivatives of functions: products with the Jacobian from either side, the Jacobian, the Hessian and products with it.
+//! Derivatives of functions: gradient, vector-Jacobian and Jacobian-vector products, Jacobian, Hessian and
+//! Hessian-vector products. Start with [`value_and_grad`].
 //!
-//! A function takes variables and gives one; it is differentiated at tensors. The [`Var`] methods of the same names work
-//! on a graph that is there already, and those that record ([`Var::vjp`], [`Var::jvp`], [`Var::hvp`],
-//! [`Var::grad_graph`]) can be taken of each other to any order:
+//! Each function here takes a closure from variables to one variable, and the tensors to differentiate at. The [`Var`]
+//! methods of the same names work on a recorded graph. Those that record ([`Var::vjp`], [`Var::jvp`], [`Var::hvp`],
+//! [`Var::grad_graph`]) can be nested to any order:
 //!
 //! ```
 //! use raygrad_autograd::{Tape, Tensor};
@@ -16,12 +17,12 @@
 //! assert_eq!(second.grad(&[&x])[0].item(), 48.0); // 24 x
 //! ```
 //!
-//! An operation that is not differentiable somewhere has the conventions of its own documentation there.
+//! Where an operation is not differentiable, the [conventions](crate::conventions) apply.
 
 use crate::{Tape, Var};
 use raygrad_tensor::{Scalar, Shape, Tensor};
 
-/// Runs `f` at `x` on a tape of its own, and `then` on the result and the leaves.
+/// Runs `f` at `x` on a temporary tape, and `then` on the result and the leaves.
 fn at<T: Scalar, R>(
     f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>,
     x: &[Tensor<T>],
@@ -34,7 +35,8 @@ fn at<T: Scalar, R>(
     then(y, &leaves.iter().collect::<Vec<_>>())
 }
 
-/// The value of a function of one-element result, and its gradient with respect to each input.
+/// The value of a function with a one-element result, and its gradient with respect to each input
+/// (`jax.value_and_grad`).
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::value_and_grad};
@@ -53,7 +55,7 @@ pub fn value_and_grad<T: Scalar>(
     at(f, x, |y, wrt| (y.item(), y.grad(wrt)))
 }
 
-/// The value and the vector-Jacobian product (reverse mode): for each input the gradient of `sum(f(x) * seed)`.
+/// The value and the vector-Jacobian product (reverse mode): for each input, the gradient of `sum(f(x) * seed)`.
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::vjp};
@@ -73,8 +75,8 @@ pub fn vjp<T: Scalar>(
     at(f, x, |y, wrt| (y.value().clone(), y.vjp_values(seed, wrt)))
 }
 
-/// The value and the Jacobian-vector product (forward mode): the derivative of `f(x + h v)` by `h` at 0, of the shape of
-/// the result. See [`Var::jvp`] for how and at what cost.
+/// The value and the Jacobian-vector product (forward mode): the derivative of `f(x + h v)` by `h` at 0. It has the
+/// shape of the result. [`Var::jvp`] describes the method and its work.
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::jvp};
@@ -97,8 +99,8 @@ pub fn jvp<T: Scalar>(
     })
 }
 
-/// The Jacobian: for each input a tensor of the shape of the result followed by that of the input. See
-/// [`Var::jacobian`] for the cost.
+/// The Jacobian: for each input, a tensor whose shape is that of the result followed by that of the input.
+/// [`Var::jacobian`] states the work.
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::jacobian};
@@ -110,8 +112,8 @@ pub fn jacobian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &
     at(f, x, |y, wrt| y.jacobian(wrt))
 }
 
-/// The Hessian of a function of one-element result: `[i][j]` is the derivative of the gradient of input `i` by input
-/// `j`, a tensor of the shape of input `i` followed by that of input `j`.
+/// The Hessian of a function with a one-element result: `[i][j]` is the derivative of the gradient of input `i` by
+/// input `j`. Its shape is that of input `i` followed by that of input `j`.
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::hessian};
@@ -129,8 +131,8 @@ pub fn hessian<T: Scalar>(f: impl for<'t> Fn(&[Var<'t, T>]) -> Var<'t, T>, x: &[
     at(f, x, |y, wrt| y.hessian(wrt))
 }
 
-/// The product of the Hessian of a function of one-element result with `v`, which holds a tensor for each input: about
-/// three gradients' work, whatever the number of inputs.
+/// The Hessian-vector product of a function with a one-element result. `v` holds a tensor for each input. The work is
+/// about that of three gradients, for any number of inputs.
 ///
 /// ```
 /// use raygrad_autograd::{Tensor, derivatives::hvp};
@@ -156,13 +158,13 @@ pub fn hvp<T: Scalar>(
 impl<'t, T: Scalar> Var<'t, T> {
     /// The Jacobian-vector product, recorded: the derivative of this tensor when each of `wrt` moves along its tangent.
     ///
-    /// It is the gradient of a gradient: the vector-Jacobian product `u J` is linear in its seed `u`, so that the
-    /// gradient of `(u J) . v` by `u` is `J v`, at any `u`. That takes one recorded sweep and one more, about three
-    /// times the work of a gradient, but no rule of its own for any operation.
+    /// It is the gradient of a gradient. The vector-Jacobian product `u J` is linear in its seed `u`, so the gradient
+    /// of `(u J) . v` by `u` is `J v`, at any `u`. This takes one recorded backward pass and one more, about three
+    /// times the work of a gradient. It works for any operation, without a forward-mode rule.
     ///
     /// # Panics
-    /// If there is not one tangent of the same shape for each variable, the graph was freed, or the NaN finder is on
-    /// and finds something.
+    /// If there is not one tangent of the same shape for each variable, or the graph was freed. Also if
+    /// [`Tape::check_finite`] is on and finds a value that is not finite.
     #[track_caller]
     pub fn jvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Var<'t, T> {
         let slope = self.tape.enable_grad(|| {
@@ -173,11 +175,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         slope.recorded_or_constant()
     }
 
-    /// The product of the Hessian of this one-element tensor with the tangents, recorded: for each of `wrt` the
-    /// derivative of its gradient when all move along their tangents.
+    /// The Hessian-vector product of this one-element tensor, recorded: for each of `wrt`, the derivative of its
+    /// gradient when all move along their tangents.
     ///
     /// # Panics
-    /// If this tensor has not exactly one element, and as [`jvp`](Self::jvp).
+    /// If this tensor has not exactly one element, and where [`jvp`](Self::jvp) panics.
     #[track_caller]
     pub fn hvp(&self, wrt: &[&Var<'t, T>], tangents: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         let products = self.tape.enable_grad(|| {
@@ -187,12 +189,13 @@ impl<'t, T: Scalar> Var<'t, T> {
         products.into_iter().map(Var::recorded_or_constant).collect()
     }
 
-    /// The Jacobian with respect to each of `wrt`: tensors of the shape of this one followed by that of the variable.
+    /// The Jacobian with respect to each of `wrt`. Each has the shape of this tensor followed by that of the variable.
     ///
-    /// It takes as many sweeps as there are elements, in this tensor or in the variables, whichever are fewer.
+    /// It takes one backward pass for each element of this tensor, or for each element of the variables, whichever are
+    /// fewer.
     ///
     /// # Panics
-    /// If the graph was freed, or the NaN finder is on and finds something.
+    /// If the graph was freed, or if [`Tape::check_finite`] is on and finds a value that is not finite.
     #[track_caller]
     pub fn jacobian(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
         let inputs: usize = wrt.iter().map(|x| x.value.len()).sum();
@@ -223,13 +226,13 @@ impl<'t, T: Scalar> Var<'t, T> {
         all
     }
 
-    /// The Hessian of this one-element tensor: `[i][j]` is the derivative of the gradient of `wrt[i]` by `wrt[j]`, of the
-    /// shape of the one followed by that of the other.
+    /// The Hessian of this one-element tensor: `[i][j]` is the derivative of the gradient of `wrt[i]` by `wrt[j]`. Its
+    /// shape is that of `wrt[i]` followed by that of `wrt[j]`.
     ///
-    /// It takes a recorded sweep and another one for each element of the variables.
+    /// It takes one recorded backward pass, and one more for each element of the variables.
     ///
     /// # Panics
-    /// If this tensor has not exactly one element, and as [`jacobian`](Self::jacobian).
+    /// If this tensor has not exactly one element, and where [`jacobian`](Self::jacobian) panics.
     #[track_caller]
     pub fn hessian(&self, wrt: &[&Var<'t, T>]) -> Vec<Vec<Tensor<T>>> {
         let grads = self.tape.enable_grad(|| self.grad_graph(wrt));
@@ -243,7 +246,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         grads.into_iter().map(Var::into_value).collect()
     }
 
-    /// A result of the tape as it records now: a constant in [`Tape::no_grad`].
+    /// This result as a constant if the tape does not record ([`Tape::no_grad`]).
     fn recorded_or_constant(self) -> Self {
         if self.tape.is_recording() { self } else { self.detach() }
     }

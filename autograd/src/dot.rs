@@ -1,4 +1,4 @@
-//! The graph as a drawing.
+//! The graph as a drawing in the DOT language.
 
 use crate::Tape;
 use crate::nodes::CONSTANT;
@@ -7,11 +7,11 @@ use raygrad_tensor::Scalar;
 use std::fmt::Write;
 
 impl<T: Scalar> Tape<T> {
-    /// The recorded operations in the DOT language of Graphviz: `dot -Tsvg` draws them.
+    /// The recorded operations in the DOT language of Graphviz. `dot -Tsvg` draws them.
     ///
-    /// A node shows its number, operation, shape and the line of the user's code; leaves are boxes, and what
-    /// [`Var::backward`](crate::Var::backward) has freed is dashed. An edge runs from an input to what is computed from it and shows which input it
-    /// is if there are several. Constants are not on the graph.
+    /// A node shows its number, operation, shape and the line of the user's code. Leaves are boxes. Nodes that
+    /// [`Var::backward`](crate::Var::backward) has freed are dashed. An edge runs from an input to its result, with the
+    /// number of the input if there are several. Constants are not on the graph.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -1,4 +1,4 @@
-//! Dual numbers: forward-mode derivatives, from which a formula's gradients follow.
+//! Dual numbers: forward-mode derivatives, which give the gradients of a formula.
 
 use crate::ops::piecewise::share;
 use crate::ops::power::{slope_of_base, slope_of_exponent};
@@ -9,9 +9,9 @@ use std::ops::{Add, Div, Mul, Neg, Sub};
 
 /// A number and its derivatives in `N` directions: `value + sum of slopes[i] e_i`, with `e_i e_j = 0`.
 ///
-/// A slope of `None` is 0 because the number does not depend on that direction, which costs nothing and meets no
-/// infinity. A formula that is read for dual numbers has the derivatives of its operations, with the conventions of
-/// [`conventions`](crate::conventions) at ties and kinks.
+/// A slope of `None` means that the number does not depend on that direction. It is an exact 0: it takes no arithmetic,
+/// and infinity times it is not NaN. A formula evaluated on dual numbers has the derivatives of its operations.
+/// [`conventions`](crate::conventions) lists those at ties and kinks.
 ///
 /// ```
 /// use raygrad_autograd::{Dual, Real};
@@ -29,13 +29,13 @@ pub struct Dual<E, const N: usize> {
 
 // The loops of this file are written out, since calls of closures by `std::array` end vectorisation.
 impl<E: Real, const N: usize> Dual<E, N> {
-    /// A number that depends on nothing.
+    /// A constant: a number that depends on no direction.
     #[inline(always)]
     fn constant(value: E) -> Self {
         Dual { value, slopes: [None; N] }
     }
 
-    /// The function with value `y`, and with the slope that `slope` makes of a slope of its argument.
+    /// The function with value `y`. `slope` maps a slope of the argument to one of the result.
     #[inline(always)]
     fn map(self, y: E, slope: impl Fn(E) -> E) -> Self {
         let (mut slopes, mut k) = (self.slopes, 0);

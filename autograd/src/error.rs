@@ -1,9 +1,9 @@
-//! Errors of a graph: what was asked, of which shapes, at which line of the user's code.
+//! Errors of a graph: the operation, the shapes, and the line of the user's code.
 
 use raygrad_tensor::Shape;
 use std::panic::Location;
 
-/// Why an operation or a gradient could not be computed. The panicking forms show the same text.
+/// The reason that an operation or a gradient cannot be computed. The panicking methods show the same text.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum Error {
     /// The shapes do not fit the operation.
@@ -13,9 +13,9 @@ pub enum Error {
         op: &'static str,
         /// The shapes of its inputs.
         shapes: Vec<Shape>,
-        /// What does not fit.
+        /// The mismatch.
         what: String,
-        /// The line of the user's code that asked for it.
+        /// The line of the user's code that called it.
         at: &'static Location<'static>,
     },
     /// [`Tape::check_finite`](crate::Tape::check_finite) is on and a value is infinite or NaN.
@@ -23,16 +23,16 @@ pub enum Error {
     NonFinite {
         /// The operation.
         op: &'static str,
-        /// `output`, or the input whose gradient it is.
+        /// `output`, or the input whose gradient is not finite.
         what: String,
-        /// The first bad value.
+        /// The first value that is not finite.
         value: f64,
         /// Its index.
         index: Shape,
         /// The line of the user's code that recorded the operation.
         at: &'static Location<'static>,
     },
-    /// A gradient was asked of something that is not one number.
+    /// The gradient of a tensor that has not exactly one element.
     #[error("gradient of a tensor of shape {shape:?}: reduce it to one element first, or use `Var::vjp` (at {at})")]
     NotScalar {
         /// Its shape.
@@ -40,24 +40,24 @@ pub enum Error {
         /// The line of the user's code.
         at: &'static Location<'static>,
     },
-    /// A gradient was asked of a constant.
+    /// The gradient of a constant.
     #[error(
         "gradient of a constant: it was computed from constants only, or while nothing was recorded (in `no_grad`); what a \
          gradient is taken of begins with a leaf (`Tape::leaf`, `Var::tracked`) and is recorded (`Tape::enable_grad`) (at {at})"
     )]
     OfConstant {
-        /// The line that asked for the gradient.
+        /// The line that requested the gradient.
         at: &'static Location<'static>,
     },
-    /// A gradient was asked with respect to a constant.
+    /// The gradient with respect to a constant.
     #[error(
         "gradient with respect to a constant, number {index} of the variables asked for: make it a leaf (`Tape::leaf`), or \
          begin with `Var::tracked` where an argument may be a constant (at {at})"
     )]
     ByConstant {
-        /// Which of the variables it is, from 0.
+        /// Number of the constant among the variables, from 0.
         index: usize,
-        /// The line that asked for the gradient.
+        /// The line that requested the gradient.
         at: &'static Location<'static>,
     },
     /// The graph was freed by an earlier [`Var::backward`](crate::Var::backward) or [`Tape::free`](crate::Tape::free).
@@ -65,15 +65,15 @@ pub enum Error {
         "the graph was freed by an earlier `backward` or `Tape::free`; use `grad` for all gradients but the last (at {at})"
     )]
     Freed {
-        /// The line that asked for the gradient.
+        /// The line that requested the gradient.
         at: &'static Location<'static>,
     },
 }
 
-/// What an operation says of shapes that do not fit it.
+/// The text of a shape error, as [`Op::shape`](crate::Op::shape) returns it.
 pub type ShapeError = String;
 
-/// Nothing, or what does not fit.
+/// Ok, or the mismatch as an error.
 pub(crate) fn ensure(holds: bool, what: impl FnOnce() -> String) -> Result<(), ShapeError> {
     if holds { Ok(()) } else { Err(what()) }
 }

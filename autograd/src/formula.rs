@@ -1,4 +1,4 @@
-//! Elementwise operations from one formula: its value in one pass, and all its gradients in one more.
+//! Elementwise operations from one formula: one pass for the value, one more for all gradients.
 
 use crate::reading::Reading;
 use crate::recorded::{Recorded, Sheet};
@@ -8,12 +8,14 @@ use smallvec::SmallVec;
 use std::array::from_fn;
 use std::slice;
 
-/// A function of `N` numbers, applied to each element of `N` tensors with NumPy's broadcasting.
+/// A custom elementwise operation: a function of `N` numbers, applied to `N` tensors with NumPy's broadcasting.
 ///
-/// A name and the formula are all it takes. The formula is read in several ways: for numbers, as one vectorised loop
-/// without arrays in between; for [`Dual`] numbers, which gives the gradients of all operands in one more such loop; and
-/// for variables, which records it where a gradient is itself differentiated. [`formula!`](crate::formula) writes one in
-/// a line.
+/// An implementation needs a name and the formula; [`formula!`](crate::formula) writes one in a line. The formula is
+/// evaluated on three types of number:
+///
+/// * on floats, as one vectorised loop without temporary arrays;
+/// * on [`Dual`] numbers, as one such loop that gives the gradients of all operands;
+/// * on variables, which records it where a gradient is itself differentiated.
 ///
 /// ```
 /// use raygrad_autograd::{Formula, Real, Tape, Tensor};
@@ -41,28 +43,28 @@ use std::slice;
 pub trait Formula<const N: usize>: Copy + Send + Sync + 'static {
     /// The operation's name.
     const NAME: &'static str;
-    /// Whether sines and cosines are worth a second reading of the formula: they cost a third then, with the same bits
-    /// (see [`raygrad_tensor::Lane`]), and everything is compiled twice.
+    /// Whether to evaluate the formula first with a short argument reduction for sines and cosines. They then take a
+    /// third of the time, with the same bits (see [`raygrad_tensor::Lane`]). All kernels are compiled twice.
     const ANGLES: bool = false;
 
     /// The function.
     fn f<E: Real>(&self, x: [E; N]) -> E;
 
-    /// Its vector-Jacobian product: the gradient of each operand for the gradient `g` of `y = f(x)`. What it reads of `x`
-    /// and `y` the tape keeps.
+    /// Its vector-Jacobian product: the gradient of each operand for the gradient `g` of `y = f(x)`. The tape saves
+    /// those of `x` and `y` that it reads.
     ///
-    /// Unless it is overridden, because another form has more digits or reads a `y` that was dear to compute, it is what
-    /// dual numbers make of [`f`](Self::f).
+    /// The default evaluates [`f`](Self::f) on dual numbers. Override it if another form is more accurate, or can reuse
+    /// a `y` that is expensive to compute.
     #[inline(always)]
     fn vjp<E: Real>(&self, g: E, x: [E; N], _y: E) -> [E; N] {
         derived(self, g, x)
     }
 
-    /// Where checks sample the function, and exact values at extremes:
-    /// [`check::Entry::examined`](crate::check::Entry::examined) asks for them.
+    /// Adds sampling ranges, and exact values at extremes, for
+    /// [`check::Entry::examined`](crate::check::Entry::examined).
     fn cases(&self, _cases: &mut Cases) {}
 
-    /// The function of variables.
+    /// Applies the formula to variables, elementwise with broadcasting.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
@@ -72,7 +74,7 @@ pub trait Formula<const N: usize>: Copy + Send + Sync + 'static {
     }
 }
 
-/// The gradients of a formula by dual numbers. Their slopes begin as `g`, since each element of the Jacobian is on its
+/// The gradients of a formula by dual numbers. Their slopes start as `g`, since each element of the Jacobian is on its
 /// diagonal.
 #[inline(always)]
 pub(crate) fn derived<F: Formula<N>, E: Real, const N: usize>(formula: &F, g: E, x: [E; N]) -> [E; N] {
@@ -100,7 +102,7 @@ pub(crate) fn derived<F: Formula<N>, E: Real, const N: usize>(formula: &F, g: E,
 pub struct Elementwise<F, const N: usize>(pub F);
 
 impl<F: Formula<N>, const N: usize> Elementwise<F, N> {
-    /// What each gradient is made of.
+    /// The values that each gradient depends on.
     #[inline(always)]
     fn readings(&self) -> [Reading; N] {
         const { assert!(N > 0 && N < 32, "a formula of 1 to 31 operands") };
@@ -213,7 +215,7 @@ fn given<'s, 't, T: Scalar, const N: usize>(
     (sheet.given(cx.g().clone()), x, if reads.output() { sheet.given(cx.y()) } else { unread })
 }
 
-/// The gradients that are needed, on the tape.
+/// The required gradients, on the tape.
 fn recorded<'t, T: Scalar>(cx: &Vjp<'t, '_, T>, sheet: &Sheet<'t, T>, grads: &[Recorded<'_, 't, T>]) -> Grads<'t, T> {
     let needed: SmallVec<[_; 4]> = (0..grads.len()).filter(|&i| cx.needs(i)).map(|i| grads[i]).collect();
     let mut vars = sheet.vars(cx.g(), &needed).into_iter();
@@ -222,7 +224,7 @@ fn recorded<'t, T: Scalar>(cx: &Vjp<'t, '_, T>, sheet: &Sheet<'t, T>, grads: &[R
     Grads::new((0..grads.len()).map(|i| if cx.needs(i) { vars.next().map(|grad| stretched(grad, i)) } else { None }))
 }
 
-/// The gradients that are needed, summed to the shapes of their operands. Apart from the loop, so that it is compiled once
+/// The required gradients, summed to the shapes of their operands. Separate from the loop, so that it is compiled once
 /// and not for each formula.
 fn gradients<'t, T: Scalar, const N: usize>(
     cx: &Vjp<'t, '_, T>,
@@ -253,7 +255,7 @@ fn gradients<'t, T: Scalar, const N: usize>(
     })
 }
 
-/// [`gradients`] of single numbers, without tensors in between.
+/// [`gradients`] of single numbers, without temporary tensors.
 fn of_numbers<'t, T: Scalar, const N: usize>(
     cx: &Vjp<'t, '_, T>,
     readings: &[Reading; N],
@@ -276,10 +278,10 @@ fn of_numbers<'t, T: Scalar, const N: usize>(
     })
 }
 
-/// A [`Formula`] from a closure-like line: `formula!(|x, a, b| (x * a + b).tanh() * x)`.
+/// A [`Formula`] from a line like a closure: `formula!(|x, a, b| (x * a + b).tanh() * x)`.
 ///
-/// The operands are [`Number`](crate::Number)s, so that constants mix with them as `f64`; functions are methods. Numbers
-/// from outside are listed in front, as anything that is `Into<f64>`.
+/// The operands are [`Number`](crate::Number)s: they mix with `f64` constants, and functions are methods. List captured
+/// numbers first, in brackets; each is `Into<f64>`.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor, formula};
@@ -317,7 +319,7 @@ macro_rules! formula {
             }
         }
         impl Written {
-            /// [`Formula::on`]($crate::Formula::on), which then need not be in scope.
+            /// [`Formula::on`]($crate::Formula::on), without an import of the trait.
             #[allow(dead_code)]
             #[track_caller]
             fn on<'t, T: $crate::Scalar>(

@@ -1,4 +1,4 @@
-//! Gradients of a variable: what a user asks of a tape.
+//! Gradients of a variable with respect to other variables.
 
 use crate::sum::Sum;
 use crate::sweep::{Keep, sweep};
@@ -7,12 +7,14 @@ use raygrad_tensor::{Scalar, Shape, Tensor};
 use std::panic::Location;
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The gradients of this one-element tensor with respect to `wrt`; zeros where it does not depend on one. The graph
-    /// stays, so further gradients can be taken.
+    /// The gradients of this one-element tensor with respect to `wrt`, in their order (`torch.autograd.grad`). A
+    /// gradient is zero where this tensor does not depend on the variable. The graph stays, so further gradients can be
+    /// taken.
     ///
     /// # Panics
-    /// If this tensor has not exactly one element; if it or one of `wrt` is a constant, which has no gradient; if one of
-    /// `wrt` belongs to another tape; if the graph was freed; or if the NaN finder is on and finds something.
+    /// If this tensor has not exactly one element, or if the graph was freed. If this tensor or one of `wrt` is a
+    /// constant, which has no gradient, or if one of `wrt` belongs to another tape. If [`Tape::check_finite`] is on and
+    /// finds a value that is not finite.
     #[track_caller]
     pub fn grad(&self, wrt: &[&Var<'t, T>]) -> Vec<Tensor<T>> {
         self.tape.or_raise(self.try_grad(wrt))
@@ -21,7 +23,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`grad`](Self::grad), with an error instead of a panic.
     ///
     /// # Errors
-    /// Where `grad` panics, but for a variable of another tape.
+    /// Where [`grad`](Self::grad) panics, except for a variable of another tape.
     ///
     /// # Panics
     /// If one of `wrt` belongs to another tape.
@@ -32,9 +34,12 @@ impl<'t, T: Scalar> Var<'t, T> {
         Ok(sums.into_iter().zip(wrt).map(value).collect())
     }
 
-    /// The gradients of this one-element tensor with respect to `wrt` in the form in which operations give them: sparse
-    /// shares, such as the rows of a table, stay apart. Saved values are freed as the sweep passes, so that their buffers
-    /// serve again at once. That is what a training step wants; [`grad`](Self::grad) is for everything else.
+    /// The gradients for a training step: as [`grad`](Self::grad), but it frees the graph and keeps sparse gradients
+    /// sparse.
+    ///
+    /// Each [`Gradient`] keeps sparse contributions, such as the rows of a table, apart from the dense sum. The
+    /// backward pass frees each saved value after its last use, so that the pool can reuse its buffer. For all other
+    /// purposes use [`grad`](Self::grad).
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -66,7 +71,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         Ok(sums.into_iter().zip(wrt).map(|(sum, x)| Sum::gradient(sum, x.shape())).collect())
     }
 
-    /// The gradients as variables on the graph: they can be differentiated again. In [`Tape::no_grad`] they are constants.
+    /// The gradients as variables on the graph, which can be differentiated again (PyTorch's `create_graph`). In
+    /// [`Tape::no_grad`] they are constants.
     ///
     /// ```
     /// use raygrad_autograd::Tape;
@@ -99,11 +105,12 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.recorded(self.seed()?, wrt)
     }
 
-    /// The vector-Jacobian product: the gradients of `sum(self * seed)` with respect to `wrt`, as
-    /// [`grad_graph`](Self::grad_graph) gives them. This tensor may have any shape.
+    /// The vector-Jacobian product: the gradients of `sum(self * seed)` with respect to `wrt`. They are variables on
+    /// the graph, as those of [`grad_graph`](Self::grad_graph). This tensor may have any shape.
     ///
     /// # Panics
-    /// If `seed` has another shape than this tensor, and as [`grad`](Self::grad).
+    /// If `seed` has another shape than this tensor, and where [`grad`](Self::grad) panics, except for the number of
+    /// elements.
     #[track_caller]
     pub fn vjp(&self, seed: &Var<'t, T>, wrt: &[&Var<'t, T>]) -> Vec<Var<'t, T>> {
         self.tape.or_raise(self.try_vjp(seed, wrt))
@@ -112,7 +119,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// As [`vjp`](Self::vjp), with an error instead of a panic.
     ///
     /// # Errors
-    /// If `seed` has another shape than this tensor, and as [`try_grad`](Self::try_grad).
+    /// If `seed` has another shape than this tensor, and where [`try_grad`](Self::try_grad) fails, except for the
+    /// number of elements.
     ///
     /// # Panics
     /// As [`try_grad`](Self::try_grad).
@@ -137,8 +145,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         Ok(self.tape.constant(self.tape.pool().full(self.shape(), T::ONE)))
     }
 
-    /// The gradients as variables, all of them on the graph if the tape records: also one that is constant can be
-    /// differentiated again, and its gradient is zero.
+    /// The gradients as variables, all of them on the graph if the tape records. A constant gradient can be
+    /// differentiated again too; its gradient is zero.
     #[track_caller]
     fn recorded(&self, seed: Var<'t, T>, wrt: &[&Var<'t, T>]) -> Result<Vec<Var<'t, T>>, Error> {
         let sums = self.sums(seed, wrt, Keep::GraphAndGradients)?;
@@ -149,7 +157,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         Ok(sums.into_iter().zip(wrt).map(gradient).collect())
     }
 
-    /// A sweep from this variable, if it and all of `wrt` have a gradient at all.
+    /// The backward pass from this variable, if it and all of `wrt` can have a gradient.
     #[track_caller]
     fn sums(&self, seed: Var<'t, T>, wrt: &[&Var<'t, T>], keep: Keep) -> Result<Vec<Option<Sum<'t, T>>>, Error> {
         let at = Location::caller();

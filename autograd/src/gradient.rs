@@ -1,4 +1,4 @@
-//! A gradient: a sum of shares, dense or in whatever form an operation finds cheap.
+//! The gradient of a variable: a dense sum, and sparse contributions beside it.
 
 use crate::RowSums;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
@@ -6,46 +6,50 @@ use std::any::Any;
 use std::fmt;
 use std::sync::Arc;
 
-/// A share of a gradient that has a form of its own: of a table of which few rows were used (an embedding, a hash grid),
-/// it is much smaller than the table.
+/// A sparse contribution to a gradient. For a table of which few rows were used (an embedding, a hash grid), it is much
+/// smaller than the table.
 ///
-/// An operation gives one with [`Grads::with_sparse`](crate::Grads::with_sparse). It reaches an optimizer unchanged, in
-/// a [`Gradient`]; [`Gradient::into_dense`] adds it up.
+/// An operation returns one with [`Grads::with_sparse`](crate::Grads::with_sparse). It reaches an optimizer unchanged,
+/// in a [`Gradient`]. [`Gradient::into_dense`] adds it to a dense tensor.
 pub trait SparseGrad<T: Scalar>: Any + Send + Sync {
-    /// The shape of the tensor whose gradient it is.
+    /// The shape of the variable.
     fn shape(&self) -> &[usize];
 
-    /// Adds it to a dense gradient of that shape.
+    /// Adds this contribution to a dense gradient of that shape.
     fn add_to(&self, dense: &mut Tensor<T>);
 
-    /// The same as rows, if it consists of rows along the first axis: what an optimiser that moves single rows wants.
+    /// This contribution as rows along the first axis, if it consists of rows. Optimizers that update single rows use
+    /// it.
     fn as_rows(&self) -> Option<&dyn RowShare<T>> {
         None
     }
 
-    /// Whether it is to be added to a dense gradient as soon as it arrives there, instead of staying as it is: the gradient
-    /// of a slice is the gradient of a whole of which most is zero, and many slices of one tensor are to cost one sum.
+    /// Whether the backward pass adds this contribution to a dense gradient on arrival. The default keeps it sparse
+    /// until the end.
+    ///
+    /// The gradient of a slice does this: most of it is zero, and many slices of one tensor then share one dense sum.
     fn is_passing(&self) -> bool {
         false
     }
 }
 
-/// A share of a gradient that consists of rows along the first axis.
+/// A sparse contribution that consists of rows along the first axis.
 pub trait RowShare<T: Scalar>: Send + Sync {
-    /// Adds the rows to the sums of their table's rows, in a fixed order.
+    /// Adds the rows to the sums of their table rows, in a fixed order.
     ///
     /// # Panics
     /// If `sums` belongs to a table of another size.
     #[track_caller]
     fn scatter(&self, sums: &mut RowSums<T>);
 
-    /// The rows of each part of the table, one part after another, that [`scatter_part`](Self::scatter_part) can add up by
-    /// itself, at the same time as others: the levels of a hash grid. Empty for a table without parts.
+    /// Numbers of rows of the parts of the table, in order, such as the levels of a hash grid.
+    /// [`scatter_part`](Self::scatter_part) can add each part separately and in parallel. Empty for a table without
+    /// parts.
     fn parts(&self) -> Vec<usize> {
         vec![]
     }
 
-    /// As [`scatter`](Self::scatter) for the rows of one part, whose first row is row 0 of `sums`.
+    /// As [`scatter`](Self::scatter) for the rows of one part. Row 0 of `sums` is the first row of the part.
     ///
     /// # Panics
     /// If `sums` belongs to a table of another size.
@@ -55,8 +59,8 @@ pub trait RowShare<T: Scalar>: Send + Sync {
     }
 }
 
-/// The gradient of one variable, as [`Var::backward`](crate::Var::backward) gives it: the sum of a dense tensor and of
-/// sparse shares, in the order in which they came. With neither it is zero.
+/// The gradient of one variable, as [`Var::backward`](crate::Var::backward) returns it. It is the sum of a dense tensor
+/// and of sparse contributions, in the order of their arrival. With neither it is zero.
 ///
 /// ```
 /// use raygrad_autograd::{Pool, RowSums, Tape, Tensor};
@@ -77,7 +81,7 @@ pub struct Gradient<T: Scalar> {
 }
 
 impl<T: Scalar> Gradient<T> {
-    /// Zero, without a share.
+    /// The zero gradient, without contributions.
     pub fn zero(shape: &[usize]) -> Self {
         Gradient { shape: shape.into(), dense: None, sparse: vec![] }
     }
@@ -87,35 +91,35 @@ impl<T: Scalar> Gradient<T> {
         &self.shape
     }
 
-    /// Whether there is no share at all: nothing depends on the variable.
+    /// Whether there is no contribution: the result does not depend on the variable.
     pub fn is_zero(&self) -> bool {
         self.dense.is_none() && self.sparse.is_empty()
     }
 
-    /// Whether no share is sparse.
+    /// Whether no contribution is sparse.
     pub fn is_dense(&self) -> bool {
         self.sparse.is_empty()
     }
 
-    /// Whether all shares are rows.
+    /// Whether all contributions are rows.
     pub fn is_rows(&self) -> bool {
         self.dense.is_none() && self.sparse.iter().all(|share| share.as_rows().is_some())
     }
 
-    /// The sum of the dense shares, if there are any.
+    /// The sum of the dense contributions, if there are any.
     pub fn dense(&self) -> Option<&Tensor<T>> {
         self.dense.as_ref()
     }
 
-    /// The sparse shares.
+    /// The sparse contributions, in the order of their arrival.
     pub fn sparse(&self) -> &[Arc<dyn SparseGrad<T>>] {
         &self.sparse
     }
 
-    /// The gradient as a dense tensor: the dense share, to which the sparse ones are added in their order.
+    /// The gradient as a dense tensor: the dense sum, plus the sparse contributions in their order.
     ///
     /// # Panics
-    /// If a [`SparseGrad::add_to`] puts a tensor of another shape in the place of the sum.
+    /// If [`SparseGrad::add_to`] replaces the sum with a tensor of another shape.
     #[track_caller]
     pub fn into_dense(self, pool: &Pool<T>) -> Tensor<T> {
         let mut sum = self.dense.unwrap_or_else(|| pool.full(&self.shape, T::ZERO));
@@ -124,7 +128,8 @@ impl<T: Scalar> Gradient<T> {
         sum
     }
 
-    /// Adds the gradient to the sums of a table's rows if all shares are rows, and says whether; else nothing is added.
+    /// Adds the gradient to the row sums of a table if all contributions are rows, and returns whether it did.
+    /// Otherwise `sums` does not change.
     ///
     /// # Panics
     /// If `sums` belongs to a table of another size.
@@ -137,12 +142,12 @@ impl<T: Scalar> Gradient<T> {
         is_rows
     }
 
-    /// Takes all sparse shares out, in their order.
+    /// Removes and returns all sparse contributions, in their order.
     pub fn take_sparse(&mut self) -> Vec<Arc<dyn SparseGrad<T>>> {
         std::mem::take(&mut self.sparse)
     }
 
-    /// Takes the sparse shares of type `G` out, in their order. All others stay.
+    /// Removes and returns the sparse contributions of type `G`, in their order. All others stay.
     pub fn take<G: SparseGrad<T>>(&mut self) -> Vec<Arc<G>> {
         let mut taken = vec![];
         for share in std::mem::take(&mut self.sparse) {
@@ -155,7 +160,7 @@ impl<T: Scalar> Gradient<T> {
         taken
     }
 
-    /// Adds the shares of another gradient: the dense one to the dense one, the sparse ones behind those that are here.
+    /// Adds the contributions of another gradient. The sparse ones come after those of this gradient.
     ///
     /// # Panics
     /// If it has another shape.
@@ -167,7 +172,7 @@ impl<T: Scalar> Gradient<T> {
         other.sparse.into_iter().for_each(|share| self.add_sparse(share));
     }
 
-    /// Adds a dense share.
+    /// Adds a dense contribution.
     ///
     /// # Panics
     /// If it has another shape.
@@ -180,7 +185,7 @@ impl<T: Scalar> Gradient<T> {
         }
     }
 
-    /// Adds a sparse share.
+    /// Adds a sparse contribution.
     ///
     /// # Panics
     /// If it has another shape.

@@ -1,4 +1,4 @@
-//! Hooks: functions that see or change a gradient on its way back.
+//! Hooks: functions that read or change a gradient during the backward pass.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
@@ -35,11 +35,12 @@ where
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The same value; its gradient passes through `f` in every backward pass, after all shares have been added.
+    /// The same value, with a hook that replaces its gradient: in every backward pass, the summed gradient goes through
+    /// `f`.
     ///
-    /// `f` works with variables, so in a recorded pass what it does is recorded too, and differentiated with the rest.
-    /// It is not called where no gradient arrives. What is computed from `self` directly goes past the hook: go on with
-    /// the result.
+    /// `f` works on variables, so a recorded pass records it and differentiates it too. `f` is not called if no
+    /// gradient arrives. The hook sees the gradients of the returned variable alone; use that variable in place of
+    /// `self`.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -50,13 +51,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// The backward pass panics if `f` gives another shape than it got.
+    /// The backward pass panics if `f` returns another shape than it got.
     #[track_caller]
     pub fn map_grad(&self, f: impl for<'a> Fn(&Var<'a, T>) -> Var<'a, T> + Send + Sync + 'static) -> Self {
         self.tape().apply(Hook(f), &[self])
     }
 
-    /// The same value; `f` sees its gradient in every backward pass, after all shares have been added.
+    /// The same value, with a hook that reads its gradient: in every backward pass, `f` gets the summed gradient.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -1,5 +1,6 @@
-//! Reverse-mode automatic differentiation over [`raygrad_tensor`], with gradients of gradients. This crate knows no
-//! models: parameters, layers and optimisers are in `raygrad-nn`.
+//! Reverse-mode automatic differentiation of [`raygrad_tensor`] tensors, with gradients of gradients.
+//!
+//! Start with [`Tape`] and [`Var`]. Parameters, layers and optimizers are in `raygrad-nn`.
 //!
 //! ```
 //! use raygrad_autograd::{Tape, Tensor};
@@ -9,13 +10,13 @@
 //! assert_eq!(y.grad(&[&x])[0], [27.0, 3.0]); // 3 x^2
 //! ```
 //!
-//! * [`Tape`], [`Var`]: what is recorded; every operation is a method of [`Var`].
-//! * [`derivatives`]: of functions: Jacobian, Hessian, and products with them.
+//! * [`Tape`], [`Var`]: the record of a computation, and a tensor on it. Every operation is a method of [`Var`].
+//! * [`derivatives`]: derivatives of functions: Jacobian, Hessian, and products with them.
 //! * [`conventions`]: values and gradients at ties, kinks and the edges of domains.
-//! * [`Formula`], [`formula!`]: custom elementwise operations, in one pass forward and one backward.
-//! * [`Op`]: any other operation.
-//! * [`Gradient`], [`SparseGrad`]: what an optimiser gets: a dense sum, and shares of a few rows beside it.
-//! * `check` (with the feature of this name): the examination that every operation here has to pass.
+//! * [`Formula`], [`formula!`]: custom elementwise operations, in one forward and one backward pass.
+//! * [`Op`]: any other custom operation.
+//! * [`Gradient`], [`SparseGrad`]: the gradient of a training step: a dense sum, and sparse rows beside it.
+//! * `check` (with the feature of this name): gradient checks, which every operation here passes.
 
 mod cases;
 #[cfg(feature = "check")]

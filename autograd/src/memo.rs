@@ -1,4 +1,4 @@
-//! Outputs that one pass hands to another.
+//! Outputs of operations that one pass saves and another reuses.
 
 #[cfg(doc)]
 use crate::Op;
@@ -6,23 +6,23 @@ use crate::Tape;
 use crate::tape::with_cell;
 use raygrad_tensor::{Pool, Scalar, Tensor};
 
-/// The outputs of those operations of a pass that [are worth keeping](Op::is_cacheable), in the order in which they ran.
+/// Saved outputs of the [cacheable](Op::is_cacheable) operations of a pass, in the order in which they ran.
 #[derive(Debug, Clone)]
 pub struct Memo<T: Scalar> {
     values: Vec<Tensor<T>>,
 }
 
 impl<T: Scalar> Memo<T> {
-    /// The values, in order.
+    /// The outputs, in order.
     pub fn values(&self) -> &[Tensor<T>] {
         &self.values
     }
 
-    /// Rows of several memos of the same operations, `[memo, row]` each, as one: where those have looked at other rows of
-    /// one tensor each.
+    /// Rows of several memos of the same operations, joined to one memo. Row `i` of the result is row `row` of memo
+    /// `memo`, for `[memo, row] = rows[i]`. Use it where each memo comes from other rows of one tensor.
     ///
     /// # Panics
-    /// If the memos are not of the same operations, an output has no rows, or a row is out of range.
+    /// If the memos are not of the same operations, an output is a scalar, or a row is out of range.
     #[track_caller]
     pub fn gather(memos: &[Memo<T>], rows: &[[u32; 2]], pool: &Pool<T>) -> Memo<T> {
         let Some(first) = memos.first() else { return Memo { values: vec![] } };
@@ -46,7 +46,7 @@ impl<T: Scalar> Memo<T> {
 }
 
 impl<T: Scalar> Tape<T> {
-    /// Runs `f`, and gives beside its result the outputs of those of its operations that [are kept](Op::is_cacheable): for
+    /// Runs `f`, and returns its result and the outputs of its [cacheable](Op::is_cacheable) operations, for
     /// [`reuse_outputs`](Self::reuse_outputs).
     pub fn cache_outputs<R>(&self, f: impl FnOnce() -> R) -> (R, Memo<T>) {
         let (result, values) = with_cell(&self.remembered, Some(vec![]), f);
@@ -56,9 +56,11 @@ impl<T: Scalar> Tape<T> {
         (result, Memo { values })
     }
 
-    /// Runs `f`, in which the operations that [are kept](Op::is_cacheable) take their outputs from a memo of the same operations
-    /// on the same inputs, instead of working them out again; they are recorded as ever. So a pass that was not recorded
-    /// can find out which rows matter, and a recorded one go on with what is known of those.
+    /// Runs `f`, whose [cacheable](Op::is_cacheable) operations take their outputs from `memo` instead of computing
+    /// them.
+    ///
+    /// The memo must come from the same operations on the same inputs. The operations are recorded as usual. So an
+    /// unrecorded pass can find the rows that matter, and a recorded pass can reuse their outputs.
     ///
     /// ```
     /// use raygrad_autograd::{Grads, Memo, Op, ShapeError, Tape, Vjp};
@@ -85,9 +87,8 @@ impl<T: Scalar> Tape<T> {
     /// assert_eq!(again.sum().grad(&[&x])[0], [0.0, 4.0, 6.0]);
     /// ```
     ///
-    /// # Panics
-    /// If `f` runs fewer or other such operations than the memo holds outputs of, as far as shapes tell. (An empty memo
-    /// stands for no pass at all: everything is worked out.)
+    /// If `f` runs fewer or other cacheable operations than those of the memo; other operations are found by their
+    /// shapes. An empty memo is ignored: all outputs are computed.
     #[track_caller]
     pub fn reuse_outputs<R>(&self, memo: Memo<T>, f: impl FnOnce() -> R) -> R {
         if memo.values.is_empty() {
@@ -98,7 +99,7 @@ impl<T: Scalar> Tape<T> {
         result
     }
 
-    /// The output of an operation from a memo, if one is being recalled.
+    /// The output of an operation from the memo, if one is in use.
     #[track_caller]
     pub(crate) fn recalled(&self, op: &'static str, shape: &[usize]) -> Option<Tensor<T>> {
         let mut values = self.recalled.take()?;
@@ -109,7 +110,7 @@ impl<T: Scalar> Tape<T> {
         Some(value)
     }
 
-    /// Keeps an output, if outputs are being remembered.
+    /// Saves an output, if outputs are being saved.
     pub(crate) fn keep(&self, value: &Tensor<T>) {
         if let Some(mut values) = self.remembered.take() {
             values.push(value.clone());

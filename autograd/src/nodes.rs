@@ -1,25 +1,26 @@
-//! The nodes of a tape: a list that grows without moving what is in it, so that a node can be read while others are added.
+//! The nodes of a tape: a list that grows without moving its entries, so that a node can be read while others are
+//! added.
 
 use std::cell::{OnceCell, RefCell};
 
 /// Stands for an input that is no node.
 pub(crate) const CONSTANT: u32 = u32::MAX;
 
-/// Where a node lies; None after it was freed.
+/// The storage of a node; None after it was freed.
 type Place<N> = RefCell<Option<N>>;
 
 /// Nodes in the first chunk; each further chunk is twice as long.
 const FIRST: usize = 16;
 const CHUNKS: usize = 29;
 
-/// Nodes in the order in which they were added, and which of them each one was computed from.
+/// Nodes in the order in which they were added, each with its inputs.
 pub(crate) struct Nodes<N> {
     chunks: [OnceCell<Box<[Place<N>]>>; CHUNKS],
     edges: RefCell<Edges>,
 }
 
-/// For each node the nodes that its inputs are, one after another: compact, since a sweep reads them first to find out
-/// which nodes it has to visit. They stay when a node is freed.
+/// For each node its input nodes, one after another. The list is compact, since a backward pass reads it first to find
+/// the nodes to visit. Entries stay when a node is freed.
 #[derive(Default)]
 pub(crate) struct Edges {
     ends: Vec<u32>,
@@ -32,7 +33,7 @@ impl Edges {
         self.ends.len()
     }
 
-    /// The inputs of a node, some of them [`CONSTANT`].
+    /// The inputs of a node; an input may be [`CONSTANT`].
     #[inline]
     pub fn of(&self, node: u32) -> &[u32] {
         let node = node as usize;
@@ -46,17 +47,17 @@ impl<N> Nodes<N> {
         Nodes { chunks: [const { OnceCell::new() }; CHUNKS], edges: RefCell::default() }
     }
 
-    /// Number of nodes, freed ones too.
+    /// Number of nodes, including freed ones.
     pub fn len(&self) -> usize {
         self.edges.borrow().len()
     }
 
-    /// Runs `f` on the edges; nothing can be added meanwhile.
+    /// Runs `f` on the edges. No node can be added meanwhile.
     pub fn with_edges<R>(&self, f: impl FnOnce(&Edges) -> R) -> R {
         f(&self.edges.borrow())
     }
 
-    /// The place of a node that was added.
+    /// The storage of a node that was added.
     #[track_caller]
     pub fn place(&self, node: u32) -> &Place<N> {
         let (chunk, offset) = locate(node as usize);
@@ -66,7 +67,7 @@ impl<N> Nodes<N> {
         }
     }
 
-    /// Adds a node whose inputs are these, and returns its number.
+    /// Adds a node with these inputs, and returns its number.
     ///
     /// # Panics
     /// If there are 2^32 - 1 nodes or inputs.
@@ -92,7 +93,7 @@ impl<N> Nodes<N> {
         }
     }
 
-    /// Frees what every node holds that `which` chooses, as [`free`](Self::free) does.
+    /// Frees the contents of every node that `which` selects, as [`free`](Self::free) does.
     pub fn free_those(&self, which: impl Fn(&N) -> bool) {
         for node in 0..self.len() as u32 {
             if let Ok(mut place) = self.place(node).try_borrow_mut() {
@@ -101,7 +102,7 @@ impl<N> Nodes<N> {
         }
     }
 
-    /// Forgets every node, and keeps the memory of as many as there were.
+    /// Removes every node, and keeps the memory for as many.
     pub fn clear(&mut self) {
         let edges = self.edges.get_mut();
         let mut left = edges.len();

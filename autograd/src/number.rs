@@ -1,16 +1,16 @@
-//! The numbers of a formula as [`formula!`](crate::formula) writes it, which mix with constants.
+//! The numbers inside a [`formula!`](crate::formula), which mix with constants.
 
 use raygrad_tensor::Real;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// A number of a [`formula!`](crate::formula): the functions of [`Real`] as methods, and arithmetic with `f64` on either
-/// side.
+/// A number inside a [`formula!`](crate::formula). It has the functions of [`Real`] as methods, and arithmetic with
+/// `f64` on either side.
 #[derive(Debug, Clone, Copy)]
 pub struct Number<E>(pub E);
 
-/// What a [`Number`] meets: another one, or an `f64`.
+/// An operand of arithmetic with a [`Number`]: another [`Number`], or an `f64`.
 pub trait Term<E> {
-    /// As a number of the kind of `x`.
+    /// Converts to the number type of `x`.
     fn term(self, x: E) -> E;
 }
 

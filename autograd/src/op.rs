@@ -1,4 +1,4 @@
-//! What an operation is: a forward kernel and a vector-Jacobian product.
+//! An operation: a forward kernel and a vector-Jacobian product.
 
 use crate::nodes::CONSTANT;
 use crate::reading::Reading;
@@ -7,7 +7,7 @@ use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use smallvec::SmallVec;
 use std::sync::Arc;
 
-/// An operation of one output. A user's own operation implements this too, and runs with [`Tape::apply`].
+/// An operation with one output. Implement it for a custom operation, and run it with [`Tape::apply`].
 ///
 /// ```
 /// use raygrad_autograd::{Grads, Op, ShapeError, Tape, Vjp};
@@ -33,11 +33,11 @@ use std::sync::Arc;
 /// assert_eq!(first.grad(&[&x])[0].item(), 12.0); // second derivative: 6 x
 /// ```
 pub trait Op<T: Scalar>: Send + Sync + 'static {
-    /// The operation's name, as errors and the catalogue show it.
+    /// The operation's name, for errors and the catalogue.
     fn name(&self) -> &'static str;
 
-    /// The number of inputs, if it is always the same: the tape then sees to it. With `None` that is up to
-    /// [`shape`](Self::shape).
+    /// The number of inputs, if it is fixed; the tape then checks it. With `None`, [`shape`](Self::shape) has to check
+    /// it.
     fn arity(&self) -> Option<usize> {
         None
     }
@@ -45,30 +45,32 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
     /// The shape of the output for inputs of these shapes.
     ///
     /// # Errors
-    /// If the shapes do not fit, in words that need no further context.
+    /// If the shapes do not fit. The tape adds the operation, the shapes and the line to the message.
     fn shape(&self, x: &[&[usize]]) -> Result<Shape, ShapeError>;
 
-    /// The output. Shapes were accepted by [`shape`](Self::shape).
+    /// Computes the output. [`shape`](Self::shape) has accepted the shapes of the inputs.
     fn forward(&self, x: &[&Tensor<T>], pool: &Pool<T>) -> Tensor<T>;
 
-    /// What [`vjp`](Self::vjp) reads and the tape therefore keeps.
+    /// The values that [`vjp`](Self::vjp) reads (PyTorch's `save_for_backward`). The tape saves these.
     fn reads(&self) -> Reads {
         Reads::INPUTS
     }
 
-    /// As [`reads`](Self::reads), where `has_gradient` says which inputs are on the graph: the others need no gradient, so
-    /// that what only theirs would read is not kept. The tape calls this one, unless the operation
-    /// [is fused](Self::is_fused).
+    /// As [`reads`](Self::reads), where `has_gradient(i)` tells whether input `i` is on the graph. Inputs that are not
+    /// need no gradient, so values read for their gradients alone need not be saved. The tape calls this method, unless
+    /// the operation [is fused](Self::is_fused).
     fn reads_for(&self, _has_gradient: &dyn Fn(usize) -> bool) -> Reads {
         self.reads()
     }
 
-    /// The gradient of each input, given the gradient `cx.g()` of the output. Inputs for which `cx.needs(i)` is false
-    /// may be left out. There is an entry for each input, of its shape, or the sweep panics.
+    /// The gradient of each input, given the gradient `cx.g()` of the output.
+    ///
+    /// Each gradient has the shape of its input. An input for which `cx.needs(i)` is false may get `None`. A wrong
+    /// number of gradients or a wrong shape makes the backward pass panic.
     fn vjp<'t>(&self, cx: &Vjp<'t, '_, T>) -> Grads<'t, T>;
 
-    /// As [`vjp`](Self::vjp), for an operation that takes gradients itself and hands their errors on. The sweep calls
-    /// this one.
+    /// As [`vjp`](Self::vjp), for an operation that takes gradients itself and returns their errors. The backward pass
+    /// calls this method.
     ///
     /// # Errors
     /// None, unless the operation overrides it.
@@ -76,28 +78,30 @@ pub trait Op<T: Scalar>: Send + Sync + 'static {
         Ok(self.vjp(cx))
     }
 
-    /// Whether [`Tape::cache_outputs`] keeps the output, for [`Tape::reuse_outputs`] to take it from there: worth it for an operation
-    /// that costs far more than a copy of its output. Each row of the output along the first axis must follow from the
-    /// same row of the first input and from inputs that no row is special in (parameters).
+    /// Whether [`Tape::cache_outputs`] saves the output, for [`Tape::reuse_outputs`]. Return true if computing the
+    /// output takes far longer than copying it.
+    ///
+    /// Each row of the output along the first axis must follow from the same row of the first input. All other inputs
+    /// must affect every row alike, as parameters do.
     fn is_cacheable(&self) -> bool {
         false
     }
 
-    /// Whether the tape goes through [`reference`](Self::reference), which then gives a value, where a gradient is itself
-    /// differentiated. The operation then reads all its inputs. An operation whose [`vjp`](Self::vjp) can be recorded
-    /// leaves this false, and may still have a reference as an oracle.
+    /// Whether a recorded backward pass goes through [`reference`](Self::reference) instead of [`vjp`](Self::vjp). The
+    /// reference must then return a value, and [`reads`](Self::reads) must list all inputs. An operation whose
+    /// [`vjp`](Self::vjp) can be recorded returns false; its reference, if any, then serves tests alone.
     fn is_fused(&self) -> bool {
         false
     }
 
-    /// For a fused operation: the same function out of plain operations. It is the oracle of its tests, and where a
-    /// gradient is itself differentiated the tape goes through it instead of [`vjp`](Self::vjp).
+    /// The same function made of unfused operations, for a fused operation. Tests compare the operation with it. A
+    /// recorded backward pass differentiates it instead of calling [`vjp`](Self::vjp).
     fn reference<'t>(&self, _x: &[Var<'t, T>]) -> Option<Var<'t, T>> {
         None
     }
 }
 
-/// Which values an operation's [`vjp`](Op::vjp) reads. Shapes are always known.
+/// The values that an operation's [`vjp`](Op::vjp) reads. Shapes are always available.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Reads {
     inputs: u32,
@@ -105,7 +109,7 @@ pub struct Reads {
 }
 
 impl Reads {
-    /// Shapes only.
+    /// Shapes alone.
     pub const NOTHING: Reads = Reads { inputs: 0, output: false };
     /// Every input.
     pub const INPUTS: Reads = Reads { inputs: !0, output: false };
@@ -134,12 +138,12 @@ impl Reads {
         Reads { output: true, ..self }
     }
 
-    /// These, and `more` where that is so.
+    /// These values, and `more` if `so` is true.
     pub const fn and_if(self, so: bool, more: Reads) -> Reads {
         if so { Reads { inputs: self.inputs | more.inputs, output: self.output || more.output } } else { self }
     }
 
-    /// Whether input `i` is read. Operations of more than 32 inputs read all or none of the rest, as input 31.
+    /// Whether input `i` is read. Inputs from number 31 on share one flag.
     pub fn input(self, i: usize) -> bool {
         self.inputs >> i.min(31) & 1 == 1
     }
@@ -150,7 +154,7 @@ impl Reads {
     }
 }
 
-/// What the tape remembers of one operand.
+/// The saved value of one operand, or its shape alone.
 pub(crate) enum Kept<T: Scalar> {
     Value(Tensor<T>),
     Shape(Shape),
@@ -169,7 +173,7 @@ impl<T: Scalar> Kept<T> {
     }
 }
 
-/// What [`Op::vjp`] may use.
+/// The arguments of [`Op::vjp`]: the gradient of the output, saved values and shapes.
 pub struct Vjp<'t, 'a, T: Scalar> {
     pub(crate) tape: &'t Tape<T>,
     pub(crate) g: Var<'t, T>,
@@ -188,7 +192,7 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
         &self.g
     }
 
-    /// Input `i`, on the graph if this pass is recorded.
+    /// Input `i` as a variable. It is on the graph if this pass is recorded.
     ///
     /// # Panics
     /// If the operation's [`Reads`] leave it out.
@@ -198,7 +202,7 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
         self.kept(&self.inputs[i], node, "an input")
     }
 
-    /// The output, on the graph if this pass is recorded.
+    /// The output as a variable. It is on the graph if this pass is recorded.
     ///
     /// # Panics
     /// If the operation's [`Reads`] leave it out.
@@ -253,12 +257,12 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
         self.inputs.is_empty()
     }
 
-    /// Whether anybody wants the gradient of input `i`.
+    /// Whether the gradient of input `i` is needed.
     pub fn needs(&self, i: usize) -> bool {
         self.needs[i]
     }
 
-    /// Whether this pass is itself recorded. If not, `vjp` may work on tensors directly.
+    /// Whether this backward pass is itself recorded. If not, `vjp` may work on tensors directly.
     pub fn recording(&self) -> bool {
         self.tape.is_recording()
     }
@@ -268,7 +272,7 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
         self.tape
     }
 
-    /// The tape's pool, for tensors that `vjp` makes itself.
+    /// The tape's pool, for temporary tensors and results.
     pub fn pool(&self) -> &'t Pool<T> {
         self.tape.pool()
     }
@@ -279,20 +283,20 @@ impl<'t, T: Scalar> Vjp<'t, '_, T> {
     }
 }
 
-/// The gradients of an operation's inputs, in their order.
+/// The gradients of an operation's inputs, in order.
 pub struct Grads<'t, T: Scalar>(pub(crate) SmallVec<[Option<Given<'t, T>>; 2]>);
 
-/// One gradient that an operation gives.
+/// One gradient that an operation returns.
 #[derive(Clone)]
 pub(crate) enum Given<'t, T: Scalar> {
     Dense(Var<'t, T>),
     Sparse(Arc<dyn SparseGrad<T>>),
-    /// Several gradients to add in this order, none of them `Parts`.
+    /// Several contributions to add in this order, none of them `Parts`.
     Parts(Vec<Given<'t, T>>),
 }
 
 impl<T: Scalar> Given<'_, T> {
-    /// Panics if it is not what an operation may give for its input `i` of this shape.
+    /// Panics if this is not a valid gradient for input `i` of this shape.
     pub(crate) fn check(&self, op: &str, i: usize, shape: &[usize], recording: bool) {
         let given = match self {
             Given::Dense(grad) => grad.shape(),
@@ -313,13 +317,13 @@ impl<'t, T: Scalar> Grads<'t, T> {
         Grads(smallvec::smallvec![Some(Given::Dense(grad))])
     }
 
-    /// The gradients of several inputs; `None` where it is zero or nobody needs it.
+    /// The gradients of several inputs; `None` where a gradient is zero or not needed.
     pub fn new(grads: impl IntoIterator<Item = Option<Var<'t, T>>>) -> Self {
         Grads(grads.into_iter().map(|grad| grad.map(Given::Dense)).collect())
     }
 
-    /// The same with a sparse gradient for input `i`. Only where the pass is not recorded: a sparse gradient cannot be
-    /// differentiated, and a recorded sweep that gets one panics.
+    /// Replaces the gradient of input `i` with a sparse one. Use it only where the pass is not recorded. A sparse
+    /// gradient cannot be differentiated, so a recorded backward pass panics.
     ///
     /// # Panics
     /// If there is no input `i`.

@@ -5,7 +5,7 @@ use raygrad_tensor::{Scalar, Tensor};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssign};
 
-/// What stands beside a variable: another one, or as a constant a tensor or a number.
+/// The other operand of a variable: a variable, or a tensor or number as a constant.
 ///
 /// ```
 /// use raygrad_autograd::{Tape, Tensor};
@@ -16,7 +16,7 @@ use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssi
 /// assert_eq!(x.maximum(0.0).mse_loss(&weights).item(), 41.0);
 /// ```
 pub trait Operand<'t, T: Scalar> {
-    /// The operand on a tape.
+    /// This operand as a variable on `tape`.
     fn on(self, tape: &'t Tape<T>) -> Var<'t, T>;
 }
 
@@ -44,9 +44,9 @@ impl<'t, T: Scalar> Operand<'t, T> for &Tensor<T> {
     }
 }
 
-/// Numbers of the language, which become constants of a tape's own type.
+/// Number types that become constants of the tape's type: `f32`, `f64` and `i32`.
 pub trait Constant: Copy {
-    /// The number in full.
+    /// The number as `f64`, without rounding.
     fn number(self) -> f64;
 }
 
@@ -69,7 +69,8 @@ macro_rules! constant {
 
 constant!(f32 f64 i32);
 
-/// An operator for every pair of forms. `$op` takes references to variables; `$right` and `$left` take a number on that side.
+/// An operator for every pair of operand types. `$op` takes references to variables. `$right` and `$left` take a number
+/// on that side.
 macro_rules! operator {
     ($trait:ident $method:ident, $assign:ident $assign_method:ident, $op:expr, |$x:ident, $c:ident| $right:expr, $left:expr) => {
         operator!(pair $trait $method ['t] (&Var<'t, T>) (&Var<'t, T>) |a, b| $op(a, b));
@@ -109,7 +110,7 @@ macro_rules! operator {
         where
             for<'a> &'a Var<'t, T>: $trait<O, Output = Var<'t, T>>,
         {
-            /// This variable becomes the result; what it was before stays on the tape.
+            /// Replaces this variable with the result. The tape keeps the old value as long as a gradient needs it.
             #[track_caller]
             fn $assign_method(&mut self, other: O) {
                 *self = $trait::$method(&*self, other);
@@ -151,11 +152,11 @@ impl<'t, T: Scalar> Neg for Var<'t, T> {
 }
 
 impl<'t, T: Scalar> Sum for Var<'t, T> {
-    /// The sum of variables that broadcast together, in their order.
+    /// The sum of variables that broadcast together, in order.
     ///
     /// # Panics
-    /// If there is none: there would be no tape for a 0. Or if the shapes do not broadcast; the line that the message names is
-    /// then that of `Iterator::sum`.
+    /// If there are none, since a result needs a tape. If the shapes do not broadcast; the message then names the line
+    /// of `Iterator::sum`.
     #[track_caller]
     fn sum<I: Iterator<Item = Var<'t, T>>>(vars: I) -> Self {
         let mut vars = vars;

@@ -1,15 +1,15 @@
-//! The way of a sweep: the nodes that lead from a root to the variables whose gradients are wanted.
+//! The path of a backward pass: the nodes between a root and the variables whose gradients are wanted.
 
 use crate::nodes::{CONSTANT, Nodes};
 
 /// The nodes that the root depends on, from the root down to the lowest wanted variable. Finding them takes time in
-/// proportion to their inputs, however long the tape is.
+/// proportion to their inputs, for any length of the tape.
 pub(crate) struct Path {
-    /// Highest first: a node comes before those that it depends on.
+    /// Highest first: a node comes before its inputs.
     nodes: Vec<u32>,
     marks: Vec<Mark>,
-    /// For each of `nodes` its place in it. Entries of other nodes are left from earlier sweeps (a sparse set, Briggs and
-    /// Torczon 1993), so that nothing has to be cleared.
+    /// For each of `nodes` its place in it. Entries of other nodes are left over from earlier passes (a sparse set,
+    /// Briggs and Torczon 1993), so that no pass has to clear them.
     places: Vec<u32>,
 }
 
@@ -17,13 +17,13 @@ pub(crate) struct Path {
 struct Mark {
     /// Whether its own gradient is wanted.
     wanted: bool,
-    /// Whether an input of it is wanted, or leads to one that is.
+    /// Whether an input of it is wanted, or leads to a wanted node.
     leads: bool,
 }
 
 impl Path {
-    /// The way from `root` to the nodes `wanted`, which may be anywhere on the tape. `scratch` is what [`into_scratch`]
-    /// gave, of the same tape, or nothing.
+    /// The path from `root` to the nodes `wanted`, which may be anywhere on the tape. `scratch` is empty, or comes from
+    /// [`into_scratch`] of a path of the same tape.
     ///
     /// [`into_scratch`]: Self::into_scratch
     pub fn new<N>(nodes: &Nodes<N>, scratch: Vec<u32>, root: u32, wanted: impl Iterator<Item = u32> + Clone) -> Self {
@@ -66,30 +66,30 @@ impl Path {
         &self.nodes
     }
 
-    /// Where a node stands in [`nodes`](Self::nodes).
+    /// The place of a node in [`nodes`](Self::nodes).
     #[inline]
     pub fn place(&self, node: u32) -> Option<usize> {
         let place = *self.places.get(node as usize)? as usize;
         (self.nodes.get(place) == Some(&node)).then_some(place)
     }
 
-    /// Whether the gradient of the node at this place is itself wanted.
+    /// Whether the gradient of the node at this place is wanted.
     pub fn wants(&self, place: usize) -> bool {
         self.marks[place].wanted
     }
 
-    /// Whether the sweep continues from the node at this place.
+    /// Whether the backward pass continues from the node at this place.
     pub fn leads(&self, place: usize) -> bool {
         self.marks[place].leads
     }
 
-    /// Whether the gradient of a node is wanted or leads to one that is.
+    /// Whether the gradient of a node is wanted or leads to a wanted one.
     #[inline]
     pub fn needs(&self, node: u32) -> bool {
         self.place(node).is_some_and(|place| self.marks[place].wanted || self.marks[place].leads)
     }
 
-    /// What the next path can be made with.
+    /// The memory of this path, for the next one.
     pub fn into_scratch(self) -> Vec<u32> {
         self.places
     }

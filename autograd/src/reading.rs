@@ -1,14 +1,14 @@
-//! What a derivative reads, found out by reading the derivative.
+//! Finds the values that a derivative reads, by evaluating the derivative on numbers that track them.
 
 use raygrad_tensor::Real;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// A number without a value, which remembers what it was made of.
+/// A number without a value, which tracks the numbers that it was computed from.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Reading {
     /// A bit for each input, and the highest one for the output.
     pub(crate) of: u32,
-    /// Whether this is the gradient of the output as it came.
+    /// Whether this is the unchanged gradient of the output.
     pub(crate) is_gradient: bool,
 }
 
@@ -16,13 +16,13 @@ impl Reading {
     /// The bit of the output.
     pub(crate) const OUTPUT: u32 = 1 << 31;
 
-    /// A number that is made of these.
+    /// A number that was computed from these.
     #[inline(always)]
     pub(crate) fn of(of: u32) -> Self {
         Reading { of, is_gradient: false }
     }
 
-    /// The gradient of the output, which is always there.
+    /// The gradient of the output, which is always available.
     #[inline(always)]
     pub(crate) fn gradient() -> Self {
         Reading { of: 0, is_gradient: true }

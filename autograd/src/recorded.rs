@@ -1,4 +1,4 @@
-//! Formulas on a tape: a number that stands for a variable.
+//! Formulas on a tape: numbers that stand for variables.
 
 use crate::Var;
 use raygrad_tensor::{Real, Scalar};
@@ -6,14 +6,14 @@ use std::array::from_fn;
 use std::cell::RefCell;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// A number of a formula that [`record`] writes on a tape.
+/// A number inside a formula that [`record`] writes on a tape.
 #[derive(Clone, Copy)]
 pub struct Recorded<'s, 't, T: Scalar> {
     sheet: &'s Sheet<'t, T>,
     index: usize,
 }
 
-/// How a number comes about.
+/// The origin of a number.
 enum Step<'t, T: Scalar> {
     Given(Var<'t, T>),
     Constant(f64),
@@ -34,7 +34,7 @@ impl<'t, T: Scalar> Step<'t, T> {
     }
 }
 
-/// A formula that is written down before any of it is computed: what its results do not need never is.
+/// A formula as a list of steps, before any is computed. Steps that the results do not need are never computed.
 pub(crate) struct Sheet<'t, T: Scalar>(RefCell<Vec<Step<'t, T>>>);
 
 impl<'t, T: Scalar> Sheet<'t, T> {
@@ -86,8 +86,9 @@ impl<'t, T: Scalar> Sheet<'t, T> {
     }
 }
 
-/// The results of a formula as variables, recorded operation by operation: for a function that is written for any kind of
-/// number and has several results. (One result is a [`Formula`](crate::Formula), which is computed in one pass.)
+/// Runs a function of numbers on variables, and records it operation by operation. For functions that are generic over
+/// [`Real`] and have several results. For a function with one result, a [`Formula`](crate::Formula) is faster: it runs
+/// in one pass.
 ///
 /// ```
 /// use raygrad_autograd::{Real, Tape, Tensor, record};

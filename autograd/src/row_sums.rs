@@ -1,17 +1,17 @@
-//! Sums of gradients for tables of which a step touches few rows.
+//! Sums of sparse gradients by table row.
 
 use raygrad_tensor::{Scalar, checked_len, simd};
 
-/// What has been added to some rows of a table: the rows that got a share, and their sums beside each other.
+/// Sparse row sums of a table: the rows that got a contribution, and their sums side by side.
 ///
-/// A step of training touches a small part of a large table, at random places. Here these places only hold a number of
-/// four bytes; the sums, in the order in which their rows came first, fit the caches near a core, and an optimiser has a
-/// list of the rows to visit.
+/// A training step touches few rows of a large table, at random places. Here each row of the table has only a 4-byte
+/// entry. The sums are stored in the order in which their rows first came, so they fit the caches. An optimizer gets
+/// the list of rows to visit.
 #[derive(Debug, Clone)]
 pub struct RowSums<T> {
-    /// For each row of the table the place of its sum, counted from 1; 0 if there is none.
+    /// For each row of the table, the place of its sum counted from 1; 0 if it has none.
     places: Vec<u32>,
-    /// The row of each sum. It and the sums are long enough for all rows, and one entry longer.
+    /// The row of each sum. This and `sums` have room for all rows and one more.
     rows: Vec<u32>,
     /// Zero from `len` on.
     sums: Vec<T>,
@@ -20,7 +20,7 @@ pub struct RowSums<T> {
 }
 
 impl<T: Scalar> RowSums<T> {
-    /// Nothing added yet to a table of `rows` rows of `features` numbers.
+    /// Empty sums for a table of `rows` rows of `features` numbers.
     ///
     /// # Panics
     /// If `features` is 0, there are 2^32 - 1 rows or more, or the table is larger than memory.
@@ -38,17 +38,17 @@ impl<T: Scalar> RowSums<T> {
         }
     }
 
-    /// Rows of the table.
+    /// Number of rows of the table.
     pub fn table_rows(&self) -> usize {
         self.places.len()
     }
 
-    /// Numbers in a row.
+    /// Number of elements in a row.
     pub fn features(&self) -> usize {
         self.features
     }
 
-    /// The rows that got a share, in the order of their first one.
+    /// The rows that got a contribution, in the order of the first one.
     pub fn rows(&self) -> &[u32] {
         &self.rows[..self.len]
     }
@@ -58,10 +58,10 @@ impl<T: Scalar> RowSums<T> {
         &self.sums[..self.len * self.features]
     }
 
-    /// Adds to a row.
+    /// Adds `share` to the sum of a row.
     ///
     /// # Panics
-    /// If there is no such row or `share` has not the width of a row.
+    /// If there is no such row, or if `share` does not have the length of a row.
     #[track_caller]
     pub fn add(&mut self, row: usize, share: &[T]) {
         assert_eq!(share.len(), self.features, "a share of another width");
@@ -71,10 +71,10 @@ impl<T: Scalar> RowSums<T> {
         }
     }
 
-    /// The sums as rows of a width that is known when the program is compiled, for loops that add very often.
+    /// The same sums with the row length as a compile-time constant, for loops that add very often.
     ///
     /// # Panics
-    /// If the rows have another width.
+    /// If the rows have another length.
     #[track_caller]
     pub fn of_width<const F: usize>(&mut self) -> RowAdder<'_, T, F> {
         assert_eq!(F, self.features, "sums of another width");
@@ -100,7 +100,7 @@ impl<T: Scalar> RowSums<T> {
         }
     }
 
-    /// Forgets everything that was added.
+    /// Removes all sums.
     pub fn clear(&mut self) {
         for &row in &self.rows[..self.len] {
             self.places[row as usize] = 0;
@@ -110,7 +110,7 @@ impl<T: Scalar> RowSums<T> {
     }
 }
 
-/// [`RowSums`] of `F` features: see [`RowSums::of_width`].
+/// [`RowSums`] with `F` elements in a row; see [`RowSums::of_width`].
 #[derive(Debug)]
 pub struct RowAdder<'a, T, const F: usize> {
     places: &'a mut [u32],
@@ -120,7 +120,7 @@ pub struct RowAdder<'a, T, const F: usize> {
 }
 
 impl<T: Scalar, const F: usize> RowAdder<'_, T, F> {
-    /// Adds to a row.
+    /// Adds `share` to the sum of a row.
     ///
     /// # Panics
     /// If there is no such row.
@@ -132,15 +132,15 @@ impl<T: Scalar, const F: usize> RowAdder<'_, T, F> {
         }
     }
 
-    /// Asks the caches for what [`add`](Self::add) to this row reads first.
+    /// Prefetches the entry that [`add`](Self::add) for this row reads first.
     #[inline(always)]
     pub fn prefetch(&self, row: usize) {
         simd::prefetch(self.places.as_ptr().wrapping_add(row));
     }
 }
 
-/// The place of a row's sum, a new one if it has none. Whether it is new cannot be foreseen, so there is no branch: the row
-/// is entered as the next one in any case.
+/// The place of a row's sum, a new one if it has none. A branch would be unpredictable, so there is none: the row is
+/// written as the next one in any case.
 #[inline(always)]
 fn place(places: &mut [u32], rows: &mut [u32], len: &mut usize, row: usize) -> usize {
     let known = places[row];

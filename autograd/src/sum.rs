@@ -1,4 +1,4 @@
-//! What arrives at a node in the course of a sweep.
+//! The gradient that accumulates at a node during a backward pass.
 
 use crate::op::Given;
 use crate::tape::find_non_finite;
@@ -7,19 +7,19 @@ use raygrad_tensor::{Scalar, Tensor};
 use std::panic::Location;
 use std::sync::Arc;
 
-/// The shares of a gradient that have arrived so far.
+/// The contributions to a gradient so far.
 #[derive(Clone)]
 pub(crate) enum Sum<'t, T: Scalar> {
-    /// The sum of dense shares.
+    /// The sum of dense contributions.
     Dense(Var<'t, T>),
-    /// The same, if there is one, and sparse shares in the order in which they came.
+    /// The dense sum, if there is one, and sparse contributions in the order of their arrival.
     Mixed(Option<Var<'t, T>>, Vec<Arc<dyn SparseGrad<T>>>),
-    /// Shares that somebody else is to add, in the order in which they came.
+    /// Contributions that the caller adds, in the order of their arrival.
     Apart(Vec<Given<'t, T>>),
 }
 
 impl<'t, T: Scalar> Sum<'t, T> {
-    /// Adds `given`, the share of a gradient of this shape, to what is there.
+    /// Adds `given`, a contribution to a gradient of this shape.
     pub fn gather(sum: &mut Option<Self>, given: Given<'t, T>, shape: &[usize], tape: &'t Tape<T>) {
         match (&mut *sum, given) {
             (_, Given::Parts(parts)) => parts.into_iter().for_each(|part| Sum::gather(sum, part, shape, tape)),
@@ -48,7 +48,7 @@ impl<'t, T: Scalar> Sum<'t, T> {
         }
     }
 
-    /// One variable.
+    /// The sum as one variable.
     pub fn dense(self, tape: &'t Tape<T>) -> Var<'t, T> {
         match self {
             Sum::Dense(sum) => sum,
@@ -67,7 +67,7 @@ impl<'t, T: Scalar> Sum<'t, T> {
         }
     }
 
-    /// An error for the first bad element.
+    /// An error for the first element that is not finite.
     pub fn check(
         &self,
         tape: &'t Tape<T>,
@@ -91,7 +91,7 @@ fn gradient<T: Scalar>(dense: Option<Var<'_, T>>, sparse: Vec<Arc<dyn SparseGrad
     gradient
 }
 
-/// Recorded, it is a new sum; else the share is added in place.
+/// Adds `share` as a recorded operation if the tape records, else in place.
 fn add<'t, T: Scalar>(sum: &mut Var<'t, T>, share: Var<'t, T>) {
     if sum.tape.is_recording() {
         *sum = &*sum + share;
@@ -100,7 +100,7 @@ fn add<'t, T: Scalar>(sum: &mut Var<'t, T>, share: Var<'t, T>) {
     }
 }
 
-/// Adds a dense share to a sum of the same shape.
+/// Adds a dense contribution to a sum of the same shape.
 pub(crate) fn add_share<T: Scalar>(sum: &mut Tensor<T>, share: &Tensor<T>) {
     if share.len() == 1 {
         // The loop is not worth its start.

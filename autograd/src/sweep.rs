@@ -1,4 +1,4 @@
-//! The backward sweep: from the root down the tape, through those nodes alone that lead to a wanted gradient.
+//! The backward pass: from the root down the tape, through the nodes alone that lead to a wanted gradient.
 
 use crate::op::Given;
 use crate::path::Path;
@@ -9,18 +9,18 @@ use raygrad_tensor::Scalar;
 use smallvec::SmallVec;
 use std::panic::Location;
 
-/// What a sweep leaves behind.
+/// The state of the graph after a backward pass.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Keep {
     /// The graph stays as it is.
     Graph,
-    /// Saved values are freed as the sweep passes.
+    /// Saved values are freed after their last use.
     Nothing,
     /// The graph stays, and the gradients are recorded on it if the tape records.
     GraphAndGradients,
 }
 
-/// What has arrived at each of `wrt`, if anything, as a gradient of `sum(root * seed)`.
+/// The contributions to each of `wrt`, if any, to the gradient of `sum(root * seed)`.
 pub(crate) fn sweep<'t, T: Scalar>(
     root: &Var<'t, T>,
     seed: Var<'t, T>,
@@ -31,8 +31,8 @@ pub(crate) fn sweep<'t, T: Scalar>(
     sums(root, seed, wrt, keep, false, at)
 }
 
-/// As an unrecorded sweep that frees the graph, but with the shares of each of `leaves` apart, in the order in which they
-/// came. Who adds them to a sum gets the bits of a sweep that had not been interrupted.
+/// As an unrecorded pass that frees the graph, but keeps the contributions to each of `leaves` apart, in the order of
+/// their arrival. Added to a sum, they give the bits of an uninterrupted pass.
 #[inline(never)]
 pub(crate) fn parts<'t, T: Scalar>(
     root: &Var<'t, T>,
@@ -72,11 +72,11 @@ fn sums<'t, T: Scalar>(
     Ok(sums)
 }
 
-/// A sweep under way.
+/// A backward pass in progress.
 struct Sweep<'t, T: Scalar> {
     tape: &'t Tape<T>,
     keep: Keep,
-    /// Who asked for it.
+    /// The line that requested it.
     at: &'static Location<'static>,
     path: Path,
     arrived: Arrived<'t, T>,
@@ -87,7 +87,7 @@ impl<'t, T: Scalar> Sweep<'t, T> {
         Sum::gather(self.arrived.slot(place), given, shape, self.tape);
     }
 
-    /// Hands the gradient of a node, if one has arrived, on to its inputs.
+    /// Passes the gradient of a node, if one has arrived, to its inputs.
     fn visit(&mut self, place: usize) -> Result<(), Error> {
         let (tape, leads, checks) = (self.tape, self.path.leads(place), self.tape.checks_finite());
         if !(leads || checks) || self.arrived.get(place).is_none() {
@@ -143,10 +143,10 @@ impl<'t, T: Scalar> Sweep<'t, T> {
     }
 }
 
-/// The sums under way. A sum takes a slot when its first share arrives and gives it back when the sweep has passed, so that
-/// there are as many as are under way at a time, however long the path is.
+/// The sums in progress. A sum takes a slot when its first contribution arrives, and returns the slot when the pass has
+/// used it. So there are as many slots as sums in progress at a time, for any length of the path.
 struct Arrived<'t, T: Scalar> {
-    /// For each place of the path the slot of its sum, counted from 1; 0 if it has none.
+    /// For each place of the path, the slot of its sum counted from 1; 0 if it has none.
     slots: Vec<u32>,
     sums: Vec<Option<Sum<'t, T>>>,
     free: Vec<u32>,

@@ -9,8 +9,8 @@ use std::cell::{Cell, RefCell};
 use std::fmt;
 use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
 
-/// Records operations and differentiates them. One tape belongs to one thread at a time; any number of tapes work
-/// side by side, since nothing is global.
+/// Records operations and differentiates them (TensorFlow's `GradientTape`). A tape belongs to one thread at a time.
+/// Any number of tapes work side by side, since there is no global state.
 ///
 /// ```
 /// use raygrad_autograd::Tape;
@@ -23,23 +23,23 @@ use std::panic::{AssertUnwindSafe, Location, catch_unwind, resume_unwind};
 /// ```
 pub struct Tape<T: Scalar> {
     pub(crate) nodes: Nodes<Node<T>>,
-    /// What sweeps work with, kept from one to the next: as many as there were sweeps inside of each other.
+    /// Scratch memory of backward passes, reused by the next: one for each level of nesting.
     pub(crate) scratch: RefCell<Vec<Vec<u32>>>,
     pool: Pool<T>,
     recording: Cell<bool>,
     check_finite: Cell<bool>,
-    /// Whether errors go to a [`Tape::try_run`].
+    /// Whether errors go to [`Tape::try_run`].
     trying: Cell<bool>,
-    /// While a gradient is worked out: the line of the user's code that recorded what is being differentiated.
+    /// While a gradient is computed: the line of the user's code that recorded the differentiated operation.
     differentiating: Cell<Option<&'static Location<'static>>>,
-    /// While a method that is made of operations runs: the line of the user's code that called it.
+    /// While a method that consists of several operations runs: the line of the user's code that called it.
     within: Cell<Option<&'static Location<'static>>>,
-    /// Outputs that are remembered, and those that are recalled.
+    /// Outputs being saved, and outputs being reused ([`crate::Memo`]).
     pub(crate) remembered: Cell<Option<Vec<Tensor<T>>>>,
     pub(crate) recalled: Cell<Option<std::vec::IntoIter<Tensor<T>>>>,
 }
 
-/// One recorded operation, or a leaf. The nodes that its inputs are stand in the edges of [`Nodes`].
+/// One recorded operation, or a leaf. [`Nodes`] holds the edges to its inputs.
 pub(crate) struct Node<T: Scalar> {
     /// None for a leaf.
     pub op: Option<Box<dyn Op<T>>>,
@@ -61,7 +61,7 @@ impl<T: Scalar> Default for Tape<T> {
 }
 
 impl<T: Scalar> Tape<T> {
-    /// An empty tape with a pool of its own.
+    /// An empty tape with a new pool.
     pub fn new() -> Self {
         Tape::with_pool(Pool::new())
     }
@@ -82,7 +82,8 @@ impl<T: Scalar> Tape<T> {
         }
     }
 
-    /// An empty tape for a part of what this one does: with its pool, its NaN finder and the line that it is at.
+    /// An empty tape for a part of this one's work, with the same pool, [`check_finite`](Self::check_finite) setting
+    /// and line.
     pub(crate) fn nested(&self) -> Self {
         let tape = Tape::with_pool(self.pool.clone());
         tape.check_finite.set(self.check_finite.get());
@@ -91,12 +92,12 @@ impl<T: Scalar> Tape<T> {
         tape
     }
 
-    /// Forgets every operation; the pool stays. The borrow proves that no [`Var`] is left.
+    /// Removes every operation; the pool stays. The exclusive borrow proves that no [`Var`] is left.
     pub fn clear(&mut self) {
         self.nodes.clear();
     }
 
-    /// Frees the operations that are recorded and the values that only they hold; variables keep their values, but have no
+    /// Frees the recorded operations, and the values that they alone hold. Variables keep their values, but have no
     /// gradient any more.
     pub fn free(&self) {
         self.nodes.free_those(|node| node.op.is_some());
@@ -112,17 +113,17 @@ impl<T: Scalar> Tape<T> {
         self.nodes.len()
     }
 
-    /// Whether nothing is recorded.
+    /// Whether the tape has neither operations nor leaves.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Turns the NaN finder on or off: every leaf, every value, every share of a gradient and every sum of shares is
-    /// checked, and the first one that is infinite or NaN is an error that says operation, line and index.
+    /// Turns the search for NaN and infinity on or off.
     ///
-    /// The line is always the user's own: where a recorded gradient is at fault, that of the operation whose gradient
-    /// it is. What an operation computes inside its vector-Jacobian product may overflow as long as the gradient that
-    /// comes out is finite.
+    /// If it is on, the tape checks every leaf, every output, and every contribution to a gradient and their sums. The
+    /// first one that is not finite is an error with the operation, the line of the user's code and the index. For a
+    /// recorded gradient, the line is that of the operation whose gradient it is. Values inside a vector-Jacobian
+    /// product may overflow, as long as the resulting gradient is finite.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -140,7 +141,8 @@ impl<T: Scalar> Tape<T> {
         self.check_finite.get()
     }
 
-    /// Whether values are checked now: not while a gradient is worked out, since the gradient itself is checked then.
+    /// Whether values are checked now. They are not while a gradient is computed, since the gradient itself is checked
+    /// then.
     fn checks_values(&self) -> bool {
         self.check_finite.get() && self.differentiating.get().is_none()
     }
@@ -150,15 +152,15 @@ impl<T: Scalar> Tape<T> {
         self.recording.get()
     }
 
-    /// Runs `f` without recording: its results are constants.
+    /// Runs `f` without recording: its results are constants (`torch.no_grad`).
     ///
-    /// A gradient of such a constant is an error. Code that takes a gradient inside of a computation, as a force is the
-    /// gradient of an energy, has what it differentiates recorded in any case with [`enable_grad`](Self::enable_grad).
+    /// The gradient of such a constant is an error. Code that takes a gradient inside a computation should record it
+    /// with [`enable_grad`](Self::enable_grad), as the force that is the gradient of an energy.
     pub fn no_grad<R>(&self, f: impl FnOnce() -> R) -> R {
         self.with_recording(false, f)
     }
 
-    /// Runs `f` with recording, also inside of [`no_grad`](Self::no_grad): for a gradient that is part of what is computed.
+    /// Runs `f` with recording, also inside [`no_grad`](Self::no_grad). For a computation that includes a gradient.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor, Var};
@@ -179,14 +181,12 @@ impl<T: Scalar> Tape<T> {
         self.with_recording(true, f)
     }
 
-    /// Runs `f`, and gives the first [`Error`] of an operation or a gradient of this tape as an error instead of a panic. So
-    /// code out of ordinary methods and operators serves where what it works on is not known to fit: a model that a user
-    /// put together, shapes that come from a file.
+    /// Runs `f`, and returns the first [`Error`] of an operation or a gradient of this tape instead of panicking. So
+    /// code with plain methods and operators can process unchecked input: a user's model, or shapes from a file.
     ///
-    /// The error ends `f` by unwinding, like a panic but without its message, since every operation gives a plain variable
-    /// and there is none to go on with. All other panics pass through: they are no errors of this tape. What `f` recorded
-    /// until then stays. In a program that is built with `panic = "abort"`, errors abort it;
-    /// [`try_apply`](Self::try_apply) and the `try_` gradients do without unwinding.
+    /// The error unwinds out of `f` like a panic, but prints no message. Other panics pass through. The operations that
+    /// `f` recorded before the error stay. In a program built with `panic = "abort"`, errors abort it; use
+    /// [`try_apply`](Self::try_apply) and the `try_` gradients there, which do not unwind.
     ///
     /// ```
     /// use raygrad_autograd::{Error, Tape, Tensor};
@@ -197,9 +197,8 @@ impl<T: Scalar> Tape<T> {
     /// assert_eq!(tape.try_run(|| x.sum().item()).unwrap(), 12.0);
     /// ```
     ///
-    /// # Errors
-    /// The one that would have been the message of a panic: shapes that do not fit, what the NaN finder finds, a gradient
-    /// that does not exist.
+    /// If shapes do not fit, [`check_finite`](Self::check_finite) finds a value that is not finite, or a gradient does
+    /// not exist. The error has the text of the panic.
     pub fn try_run<R>(&self, f: impl FnOnce() -> R) -> Result<R, Error> {
         // Nothing is left half done in the tape: cells get their values back as the stack unwinds, and a node is recorded
         // after everything that can fail.
@@ -211,7 +210,8 @@ impl<T: Scalar> Tape<T> {
         })
     }
 
-    /// A value, or the error as a panic with its text; in [`try_run`](Self::try_run) as what that waits for.
+    /// The value, or the error as a panic with its text; inside [`try_run`](Self::try_run) as the unwinding that it
+    /// catches.
     #[track_caller]
     pub(crate) fn or_raise<R>(&self, result: Result<R, Error>) -> R {
         match result {
@@ -221,7 +221,7 @@ impl<T: Scalar> Tape<T> {
         }
     }
 
-    /// A value, or what is wrong with the inputs of operation `op`, as [`or_raise`](Self::or_raise) has it.
+    /// The value, or the mismatch of the inputs of operation `op`, raised as by [`or_raise`](Self::or_raise).
     #[track_caller]
     pub(crate) fn fits<R>(&self, op: &'static str, inputs: &[&Var<'_, T>], result: Result<R, ShapeError>) -> R {
         let at = self.line();
@@ -233,7 +233,7 @@ impl<T: Scalar> Tape<T> {
         with_cell(&self.recording, on, f).0
     }
 
-    /// Runs `f` as part of the gradient of what was recorded at `at`: nodes that it adds carry that line.
+    /// Runs `f` as part of the gradient of the operation recorded at `at`. Nodes that it adds carry that line.
     pub(crate) fn differentiating<R>(&self, at: &'static Location<'static>, f: impl FnOnce() -> R) -> R {
         with_cell(&self.differentiating, Some(at), f).0
     }
@@ -244,16 +244,16 @@ impl<T: Scalar> Tape<T> {
         self.differentiating.get().or(self.within.get()).unwrap_or(Location::caller())
     }
 
-    /// Runs operations that belong to the caller's line, also where closures hide it.
+    /// Runs operations that belong to the caller's line, even where closures hide it.
     #[track_caller]
     pub(crate) fn as_one<R>(&self, f: impl FnOnce() -> R) -> R {
         with_cell(&self.within, Some(self.line()), f).0
     }
 
-    /// A variable that gradients can be taken with respect to.
+    /// A leaf: a variable to differentiate by (`requires_grad=True` in PyTorch).
     ///
     /// # Panics
-    /// If the NaN finder is on and the value is not finite.
+    /// If [`check_finite`](Self::check_finite) is on and the value is not finite.
     #[track_caller]
     pub fn leaf(&self, value: Tensor<T>) -> Var<'_, T> {
         let at = self.line();
@@ -263,14 +263,14 @@ impl<T: Scalar> Tape<T> {
         self.unchecked_leaf(value, at)
     }
 
-    /// A leaf whose value the NaN finder does not look at.
+    /// A leaf whose value [`check_finite`](Self::check_finite) does not check.
     pub(crate) fn unchecked_leaf(&self, value: Tensor<T>, at: &'static Location<'static>) -> Var<'_, T> {
         let output = Kept::Shape(Shape::from_slice(value.shape()));
         let node = self.nodes.push(Node { op: None, inputs: SmallVec::new(), output, at }, std::iter::empty());
         Var { tape: self, value, node: Some(node) }
     }
 
-    /// A value that gradients do not flow into.
+    /// A constant: a variable without a gradient.
     pub fn constant(&self, value: Tensor<T>) -> Var<'_, T> {
         Var { tape: self, value, node: None }
     }
@@ -278,9 +278,9 @@ impl<T: Scalar> Tape<T> {
     /// Runs an operation, and records it if an input is on the graph.
     ///
     /// # Panics
-    /// If the shapes do not fit, an input belongs to another tape, or the NaN finder is on and finds something; the
-    /// message names the operation and the caller's line. And if the operation does not keep to what it says: the number
-    /// of its inputs, the shape of its output.
+    /// If the shapes do not fit, an input belongs to another tape, or [`check_finite`](Self::check_finite) is on and
+    /// the output is not finite. The message names the operation and the caller's line. Also if the operation breaks
+    /// its contract: its number of inputs or the shape of its output.
     #[track_caller]
     pub fn apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Var<'t, T> {
         self.or_raise(self.try_apply(op, inputs))
@@ -289,16 +289,16 @@ impl<T: Scalar> Tape<T> {
     /// As [`apply`](Self::apply), with an error instead of a panic.
     ///
     /// # Errors
-    /// If the shapes do not fit, or the NaN finder is on and finds something.
+    /// If the shapes do not fit, or [`check_finite`](Self::check_finite) is on and the output is not finite.
     ///
     /// # Panics
-    /// If an input belongs to another tape.
+    /// If an input belongs to another tape, or the operation breaks its contract.
     #[track_caller]
     pub fn try_apply<'t>(&'t self, op: impl Op<T>, inputs: &[&Var<'t, T>]) -> Result<Var<'t, T>, Error> {
         self.apply_boxed(Box::new(op), inputs, self.line())
     }
 
-    /// [`try_apply`](Self::try_apply) for any operation, so that it is compiled once.
+    /// [`try_apply`](Self::try_apply) for a boxed operation, so that it is compiled once.
     #[track_caller]
     fn apply_boxed<'t>(
         &'t self,
@@ -310,7 +310,7 @@ impl<T: Scalar> Tape<T> {
         Ok(self.record(op, inputs, value, at))
     }
 
-    /// The output of an operation, without a record, from the memory of the tape if it is there.
+    /// The output of an operation, not recorded. It comes from the memo if there is one.
     #[track_caller]
     fn run(&self, op: &dyn Op<T>, inputs: &[&Var<'_, T>], at: &'static Location<'static>) -> Result<Tensor<T>, Error> {
         let shape = self.check_shapes(op, inputs, at)?;
@@ -327,7 +327,8 @@ impl<T: Scalar> Tape<T> {
         Ok(value)
     }
 
-    /// If the NaN finder is on and the output is not finite: an error that also says which input was so before.
+    /// If [`check_finite`](Self::check_finite) is on and the output is not finite: an error that also names the first
+    /// such input.
     fn check_output(
         &self,
         op: &'static str,
@@ -410,10 +411,11 @@ impl<T: Scalar> Tape<T> {
 /// An error on its way to [`Tape::try_run`].
 struct Raised(Error);
 
-/// What errors and drawings call a node without operation.
+/// The name of a node without operation in errors and drawings.
 pub(crate) const LEAF: &str = "leaf";
 
-/// Runs `f` with another value in a cell, and gives what is in it at the end. The old value returns, even if `f` panics.
+/// Runs `f` with another value in a cell, and returns the result and the final value. The old value returns, even if
+/// `f` panics.
 pub(crate) fn with_cell<V: Default, R>(cell: &Cell<V>, value: V, f: impl FnOnce() -> R) -> (R, V) {
     struct Restore<'a, V: Default>(&'a Cell<V>, V);
     impl<V: Default> Drop for Restore<'_, V> {

@@ -4,10 +4,10 @@ use crate::{ShapeError, Tape};
 use raygrad_tensor::{Axes, Reduction, Scalar, Tensor, find_axis};
 use std::fmt;
 
-/// A tensor on a tape. A clone is a reference count.
+/// A variable: a tensor on a tape. Cloning is cheap: it copies a reference.
 ///
-/// Arithmetic works on references and values, between variables, tensors (with NumPy's broadcasting) and numbers; tensors and
-/// numbers are constants ([`Operand`](crate::Operand)).
+/// Operators work on references and values. Each operand is a variable, a tensor or a number, with NumPy's
+/// broadcasting. Tensors and numbers become constants ([`Operand`](crate::Operand)).
 #[derive(Clone)]
 pub struct Var<'t, T: Scalar> {
     pub(crate) tape: &'t Tape<T>,
@@ -17,12 +17,12 @@ pub struct Var<'t, T: Scalar> {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The value.
+    /// The value of this variable.
     pub fn value(&self) -> &Tensor<T> {
         &self.value
     }
 
-    /// The value, without the place on the tape.
+    /// The value of this variable, without its place on the tape.
     pub fn into_value(self) -> Tensor<T> {
         self.value
     }
@@ -35,13 +35,13 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The one element of a one-element value.
     ///
     /// # Panics
-    /// If there is another number of elements.
+    /// If the value has not exactly one element.
     #[track_caller]
     pub fn item(&self) -> T {
         self.value.item()
     }
 
-    /// The tape that this variable lives on.
+    /// The tape of this variable.
     pub fn tape(&self) -> &'t Tape<T> {
         self.tape
     }
@@ -51,8 +51,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape.constant(self.value.clone())
     }
 
-    /// This variable if gradients can flow to it, else a new leaf of the same value: what code begins with that takes
-    /// gradients with respect to an argument which may be a constant ([`Tape::enable_grad`] shows it).
+    /// This variable if it is on the graph, else a new leaf with the same value. Use it in functions that differentiate
+    /// by an argument which may be a constant; [`Tape::enable_grad`] has an example.
     #[track_caller]
     pub fn tracked(&self) -> Self {
         match self.node {
@@ -66,13 +66,13 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape.constant(self.tape.pool().full(&[], T::from_f64(value)))
     }
 
-    /// A value, or what is wrong with this input of operation `op`, as an error of the tape.
+    /// The value, or the mismatch of this input of operation `op`, raised as an error of the tape.
     #[track_caller]
     pub(crate) fn fits<R>(&self, op: &'static str, result: Result<R, ShapeError>) -> R {
         self.tape.fits(op, &[self], result)
     }
 
-    /// The number of an axis that may be counted from the last one.
+    /// The index of an axis; negative numbers count from the last axis.
     #[track_caller]
     pub(crate) fn axis(&self, op: &'static str, axis: isize) -> usize {
         self.fits(op, find_axis(axis, self.shape()))
@@ -84,7 +84,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.fits(op, axes.into().find(self.shape()))
     }
 
-    /// Whether gradients can flow to this variable.
+    /// Whether this variable is on the graph, so that gradients can flow to it.
     pub fn is_on_graph(&self) -> bool {
         self.node.is_some()
     }

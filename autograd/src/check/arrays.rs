@@ -1,4 +1,4 @@
-//! The part of the catalogue that works on whole arrays: shape, indexing, linear algebra, convolution.
+//! Catalogue entries of operations on whole arrays: shape, indexing, linear algebra, convolution.
 
 use super::Entry;
 use super::spread;

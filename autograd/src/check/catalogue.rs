@@ -1,4 +1,4 @@
-//! The catalogue: every operation with the inputs it is checked on and its values at extremes.
+//! The catalogue: every operation with sample inputs, and with exact values at extremes.
 
 use crate::cases::Extreme;
 use crate::formula::derived;
@@ -29,15 +29,15 @@ impl Cases {
 /// An elementwise formula and its derivatives by dual numbers, of the operands and the gradient of the result.
 pub(crate) type DualFormula = dyn Fn(&[f64], f64) -> (f64, Vec<f64>);
 
-/// One operation as the checks see it: for f64, for f32, and what to feed it.
+/// A catalogue entry: one operation in f64 and f32, with sample inputs and exact values.
 pub struct Entry {
     /// The operation's name.
     pub name: &'static str,
     /// Whether it is linear in all inputs together.
     pub linear: bool,
-    /// Sets of inputs.
+    /// Sets of sample inputs, each with one tensor per operand.
     pub samples: Vec<Vec<Tensor<f64>>>,
-    /// Exact values.
+    /// Exact values and gradients at single points.
     pub extremes: Vec<Extreme>,
     /// The operation in double precision.
     pub f64: Arc<dyn Op<f64>>,
@@ -47,19 +47,19 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// An operation without samples.
+    /// An entry without samples.
     pub fn new<O: Op<f64> + Op<f32> + Clone>(op: O) -> Self {
         Entry::of(op.clone(), op)
     }
 
-    /// As [`new`](Self::new), for an operation that holds tensors and so has a value of its own in each precision.
+    /// An entry without samples, with one operation for each precision. For an operation that holds tensors.
     pub fn of(f64: impl Op<f64>, f32: impl Op<f32>) -> Self {
         let name = f64.name();
         let (f64, f32) = (Arc::new(f64), Arc::new(f32));
         Entry { name, linear: false, samples: vec![], extremes: vec![], f64, f32, dual: None }
     }
 
-    /// A further set of inputs, of these shapes, with values in -1..1.
+    /// Adds a set of inputs of these shapes, with values in -1..1.
     pub fn sample(mut self, shapes: &[&[usize]]) -> Self {
         let inputs =
             shapes.iter().enumerate().map(|(i, shape)| spread(shape, &[-1.0..1.0], i + 7 * self.samples.len()));
@@ -68,18 +68,18 @@ impl Entry {
         self
     }
 
-    /// A further set of inputs.
+    /// Adds a set of inputs.
     pub fn sample_of(mut self, inputs: Vec<Tensor<f64>>) -> Self {
         self.samples.push(inputs);
         self
     }
 
-    /// The operation is linear, which is checked too.
+    /// Marks the operation as linear. The checks then verify linearity too.
     pub fn linear(self) -> Self {
         Entry { linear: true, ..self }
     }
 
-    /// A formula, with the [cases](Formula::cases) that it has with it.
+    /// An entry for a formula, with the formula's own [cases](Formula::cases).
     ///
     /// # Panics
     /// If there is not one domain for each operand.
@@ -89,14 +89,14 @@ impl Entry {
         Entry::formula(formula, &cases)
     }
 
-    /// [`examined`](Self::examined), of a formula that is the method `name` of [`Var`](crate::Var).
+    /// [`examined`](Self::examined) for the formula of method `name` of [`Var`](crate::Var).
     pub(crate) fn method<const N: usize>(name: &str, formula: impl Formula<N>) -> Self {
         let entry = Entry::examined(formula);
         assert_eq!(entry.name, name, "the formula of a method has its name");
         entry
     }
 
-    /// A formula, sampled in as many domains as it has operands.
+    /// An entry for a formula, with one or more sampling ranges for each operand.
     ///
     /// ```
     /// use raygrad_autograd::check::{Cases, Check, Entry, check_op};
@@ -125,7 +125,7 @@ impl Entry {
     }
 }
 
-/// Reproducible values that fill the ranges evenly and follow no pattern that an error could hide in.
+/// Reproducible values that fill the ranges evenly and follow no pattern that could hide an error.
 pub(crate) fn spread(shape: &[usize], ranges: &[Range<f64>], salt: usize) -> Tensor<f64> {
     const GOLDEN: f64 = 0.618_033_988_749_894_9;
     Tensor::from_fn(shape, |i| {
@@ -135,7 +135,7 @@ pub(crate) fn spread(shape: &[usize], ranges: &[Range<f64>], salt: usize) -> Ten
     })
 }
 
-/// Every operation of this crate.
+/// The entries of all operations of this crate.
 pub fn catalogue() -> Vec<Entry> {
     let formulas = [
         arithmetic::entries(),
@@ -149,7 +149,7 @@ pub fn catalogue() -> Vec<Entry> {
     formulas.into_iter().chain([core(), choices(), reductions(), losses()]).flatten().collect()
 }
 
-/// What chooses between numbers, and mixes them.
+/// Selection by a mask, and interpolation.
 fn choices() -> Vec<Entry> {
     // Values that are equal in places, and that no step of a difference takes past each other.
     let ranks = |shape: &[usize], step: usize| Tensor::from_fn(shape, |i| ((i * step) % 5) as f64);
@@ -167,7 +167,7 @@ fn choices() -> Vec<Entry> {
     ]
 }
 
-/// What makes fewer numbers out of many, and what runs along an axis.
+/// Reductions, and operations along an axis.
 fn reductions() -> Vec<Entry> {
     let shape = |extents: &[usize]| Shape::from_slice(extents);
     let variance = |extents: &[usize], correction| moments::Variance { shape: shape(extents), correction };

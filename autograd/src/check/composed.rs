@@ -1,4 +1,4 @@
-//! A function made of operations, seen as one operation: so that the checks examine it as hard.
+//! A function made of operations, wrapped as one operation, so that the same checks apply to it.
 
 use super::Entry;
 use crate::{Grads, Op, ShapeError, Tape, Var, Vjp};
@@ -48,7 +48,7 @@ where
 }
 
 impl Entry {
-    /// A function made of operations, given once for each precision, which the checks then examine as if it were one.
+    /// An entry for a function made of operations, given once for each precision. The checks treat it as one operation.
     ///
     /// ```
     /// use raygrad_autograd::check::{Check, Entry, check_op};

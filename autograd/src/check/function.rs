@@ -4,37 +4,38 @@ use super::spread;
 use crate::{Tape, Var};
 use raygrad_tensor::Tensor;
 
-/// How hard to check, and what error to accept.
+/// Settings of a gradient check: tolerance, step, number of directions.
 #[derive(Debug, Clone)]
 pub struct Check {
-    /// Worst error of first and second derivatives against finite differences, relative to the norm of the gradient of the
-    /// input that moves. What the rounding of the function's values makes of a difference comes on top.
+    /// Largest accepted error of first and second derivatives against finite differences. It is relative to the norm of
+    /// the gradient by the input that moves. The rounding error of the function's values is allowed in addition.
     pub tolerance: f64,
     /// Step of the central differences, relative to `max(1, |x|)`.
     pub step: f64,
-    /// Number of directions along which the derivative by an input is taken if it has more elements than that.
+    /// Largest number of directions for each input. An input with more elements is checked along this many directions.
     pub directions: usize,
-    /// Whether gradients of gradients are checked.
+    /// Whether to check gradients of gradients too.
     pub second_order: bool,
 }
 
 impl Default for Check {
-    /// 1e-7, with Richardson-extrapolated central differences of step 1e-3 along at most 48 directions an input.
+    /// Tolerance 1e-7, with Richardson-extrapolated central differences of step 1e-3. At most 48 directions for each
+    /// input, and second derivatives too.
     fn default() -> Self {
         Check { tolerance: 1e-7, step: 1e-3, directions: 48, second_order: true }
     }
 }
 
-/// The worst errors that a check saw, each relative to the scale of what was compared.
+/// The worst errors of a check, each relative to the scale of the compared values.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Report {
     /// First derivatives against finite differences.
     pub first_order: f64,
     /// Second derivatives against finite differences of first ones.
     pub second_order: f64,
-    /// Values and gradients in f32 against f64, as a distance relative to the norm.
+    /// Values and gradients in f32 against f64: the distance relative to the norm.
     pub single: f64,
-    /// The same element by element, in units in the last place of f32; an element that is smaller than the root mean
+    /// The worst element of the same comparison, in units in the last place of f32. An element below the root mean
     /// square of its tensor counts as that large.
     pub ulps: f64,
     /// Number of comparisons.
@@ -42,7 +43,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// Takes the worse of each error, and all comparisons.
+    /// Keeps the larger of each error, and adds the comparisons.
     pub fn merge(&mut self, other: Report) {
         self.first_order = self.first_order.max(other.first_order);
         self.second_order = self.second_order.max(other.second_order);
@@ -52,8 +53,7 @@ impl Report {
     }
 }
 
-/// A comparison that NaN fails: the error of `got` against `expected` relative to `scale`, which must not exceed
-/// `tolerance`.
+/// The error of `got` against `expected`, relative to `scale`. It must not exceed `tolerance`; NaN fails.
 pub(crate) fn compare(what: &str, got: f64, expected: f64, scale: f64, tolerance: f64) -> Result<f64, String> {
     if got == expected {
         return Ok(0.0);
@@ -89,8 +89,9 @@ fn moved(x: &[Tensor<f64>], d: &[Tensor<f64>], h: f64) -> Vec<Tensor<f64>> {
     x.iter().zip(d).map(pair).collect()
 }
 
-/// Directions in which input number `which` of `x` moves alone: along each coordinate if there are few, else vectors without
-/// a pattern. With the size of an element that moves: the derivative is of the order of the gradient's norm times that.
+/// Directions in which input number `which` of `x` moves alone: each coordinate if there are few, else vectors without
+/// a pattern. Each comes with the size of a moved element: the derivative is of the order of the gradient's norm times
+/// that size.
 fn directions(x: &[Tensor<f64>], which: usize, most: usize) -> Vec<(Vec<Tensor<f64>>, f64)> {
     let along = |d: Tensor<f64>| -> Vec<_> {
         (0..x.len()).map(|k| if k == which { d.clone() } else { Tensor::zeros(x[k].shape()) }).collect()
@@ -110,11 +111,11 @@ fn directions(x: &[Tensor<f64>], which: usize, most: usize) -> Vec<(Vec<Tensor<f
     if x.len() > most { (0..most).map(random).collect() } else { (0..x.len()).map(unit).collect() }
 }
 
-/// Roundings that the value of a function is taken to have, of the size of its terms.
+/// Rounding errors that the value of a function may have, in units of the size of its terms.
 const ROUNDINGS: f64 = 16.0;
 
-/// Compares `grads`, the gradients of `f` at `x`, with Richardson-extrapolated central differences. `f` gives its value and
-/// the size of the terms that add up to it.
+/// Compares `grads`, the gradients of `f` at `x`, with Richardson-extrapolated central differences. `f` returns its
+/// value and the size of the terms of that sum.
 fn against_differences(
     what: &str,
     check: &Check,
@@ -142,8 +143,8 @@ fn against_differences(
 
 /// Checks the first and second derivatives of `f` at `x` against finite differences in f64.
 ///
-/// `f` must use its inputs only through the tape, so that it can be evaluated elsewhere; its result may have any
-/// shape.
+/// `f` must use its inputs only through the tape, because the check evaluates it on other tapes. Its result may have
+/// any shape.
 ///
 /// ```
 /// use raygrad_autograd::check::{Check, check_function};
@@ -153,7 +154,7 @@ fn against_differences(
 /// ```
 ///
 /// # Errors
-/// If a derivative is wrong or NaN, in words.
+/// If a derivative is wrong or NaN. The text names the derivative and both values.
 pub fn check_function(
     check: &Check,
     x: &[Tensor<f64>],

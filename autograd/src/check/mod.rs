@@ -1,8 +1,9 @@
-//! The examination of operations: finite differences, dual numbers, precisions, extremes, second order.
+//! Gradient checks of functions and operations: finite differences, dual numbers, both precisions, exact values. Start
+//! with [`check_function`].
 //!
 //! * [`check_function`]: the derivatives of any function against finite differences.
-//! * [`check_op`]: of one operation all that it promises; an [`Entry`] is the operation with what to feed it.
-//! * [`catalogue`](catalogue()): every operation of this crate.
+//! * [`check_op`]: all checks of one operation. An [`Entry`] is the operation with its sample inputs.
+//! * [`catalogue`](catalogue()): the entries of all operations of this crate.
 
 mod arrays;
 mod catalogue;

@@ -1,5 +1,5 @@
-//! The examination of an operation: by finite differences, dual numbers, its reference, its adjoint, in f32, on inputs
-//! of any origin, and at extremes.
+//! All checks of one operation: finite differences, dual numbers, reference, adjoint, f32, inputs of any layout, and
+//! values at extremes.
 
 use super::catalogue::DualFormula;
 use super::function::{compare, inner};
@@ -9,9 +9,10 @@ use crate::{Op, Tape, Var};
 use raygrad_tensor::{Pool, Scalar, Tensor};
 use std::sync::Arc;
 
-/// Worst distance of f32 results from f64 ones, relative to the norm, and for one element in units in the last place.
+/// Largest accepted distance of f32 results from f64 ones: relative to the norm, and for one element in units in the
+/// last place.
 const SINGLE: (f64, f64) = (2e-6, 32.0);
-/// In place of a norm of 0, of which nothing is a share.
+/// Replaces a norm of 0 as the divisor of a relative error.
 const TINY: f64 = f64::MIN_POSITIVE;
 
 impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
@@ -47,21 +48,23 @@ impl<T: Scalar> Op<T> for Arc<dyn Op<T>> {
     }
 }
 
-/// Examines an operation as the catalogue describes it. On every sample:
+/// Runs all checks on a catalogue entry.
+///
+/// On every sample it checks:
 ///
 /// - first and second derivatives against finite differences in f64 ([`check_function`]);
-/// - the same bits when run again, on buffers that hold other numbers from before, and on inputs that come from transposed and
-///   reversed arrays;
-/// - the same value and derivatives where one variable is passed for two inputs as where two equal ones are;
-/// - the same derivatives by the other inputs where one is a constant, of which the tape then keeps less;
+/// - that a second run gives the same bits, on buffers with old values too;
+/// - that inputs from transposed and reversed arrays give the same results;
+/// - that one variable passed as two inputs gives the value and derivatives of two equal variables;
+/// - that a constant input leaves the derivatives by the other inputs unchanged;
 /// - f32 against f64, by norm and by units in the last place;
-/// - a fused operation against its reference, an elementwise formula against dual numbers;
-/// - a linear operation for linearity, and its gradient for being the adjoint: `<J x, u> = <x, J' u>`.
+/// - a fused operation against its reference, and an elementwise formula against dual numbers;
+/// - linearity of a linear operation, and that its gradient is the adjoint: `<J x, u> = <x, J' u>`.
 ///
-/// And at its extremes: exact values and gradients in f64 and f32.
+/// At the extremes it compares values and gradients with the exact ones, in f64 and f32.
 ///
 /// # Errors
-/// If a check fails, in words.
+/// If a check fails. The text names the operation, the sample and the check.
 pub fn check_op(check: &Check, entry: &Entry) -> Result<Report, String> {
     let mut report = Report::default();
     for (k, x) in entry.samples.iter().enumerate() {
@@ -128,7 +131,7 @@ fn apply(op: &Arc<dyn Op<f64>>) -> impl for<'t> Fn(&[Var<'t, f64>]) -> Var<'t, f
     hint(|x| x[0].tape().apply(op.clone(), &x.iter().collect::<Vec<_>>()))
 }
 
-/// The output's gradient that all these checks use.
+/// The output gradient that all these checks use.
 fn seed(shape: &[usize]) -> Tensor<f64> {
     spread(shape, &[0.3..1.3], 3)
 }
@@ -157,8 +160,8 @@ fn reference(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>]) -> Option<Vec<Tensor<f64>
     results(x, &Pool::new(), |x| op.reference(x))
 }
 
-/// A pool whose buffers of up to about a thousand elements hold old numbers: what an operation forgets to write shows. (New
-/// buffers, and those of tensors of up to 64 elements, hold NaN where assertions are on.)
+/// A pool whose buffers of up to about a thousand elements hold old values, so that an element that an operation
+/// forgets to write shows. (New buffers, and those of tensors of up to 64 elements, hold NaN where assertions are on.)
 fn used() -> Pool<f64> {
     let pool = Pool::new();
     let sizes = (4..9).flat_map(|power| (4..8).map(move |quarters| quarters << power));
@@ -167,18 +170,18 @@ fn used() -> Pool<f64> {
     pool
 }
 
-/// How far a result from views may be from that of copies, relative to the largest element: kernels may add up in the order
-/// of memory.
+/// Largest accepted distance of a result on views from that on copies, relative to the largest element. Kernels may add
+/// in memory order.
 const VIEW_LIMIT: f64 = 1e-14;
 
-/// Whether two results have the same shape and agree; a NaN agrees with nothing.
+/// Whether two results have the same shape and agree. NaN agrees with no value.
 fn within(a: &Tensor<f64>, b: &Tensor<f64>, limit: f64) -> bool {
     let size = b.as_slice().iter().filter(|b| b.is_finite()).map(|b| b.abs()).fold(0.0, f64::max);
     let close = |(a, b): (&f64, &f64)| a == b || (a - b).abs() <= limit * size;
     a.shape() == b.shape() && a.as_slice().iter().zip(b.as_slice()).all(close)
 }
 
-/// That results do not depend on anything but the values of the inputs; the number of comparisons.
+/// Checks that results depend on the values of the inputs alone. Returns the number of comparisons.
 fn independent(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], expected: &[Tensor<f64>]) -> Result<usize, String> {
     let transposed =
         |x: &Tensor<f64>| x.view().reversed_axes().as_standard_layout().into_owned().reversed_axes().into();
@@ -208,15 +211,15 @@ fn independent(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], expected: &[Tensor<f64>
     Ok(count)
 }
 
-/// Whether value and gradients are numbers where input `j` is equal to input `i`.
+/// Whether value and gradients are not NaN where input `j` is equal to input `i`.
 fn evaluates(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], i: usize, j: usize) -> bool {
     let mut x = x.to_vec();
     x[j] = x[i].clone();
     evaluate(op, &x, &Pool::new()).iter().all(|result| result.as_slice().iter().all(|x| !x.is_nan()))
 }
 
-/// Value, recorded gradients and gradients of a weighting of these, with inputs `i` and `j` both equal to input `values`: as
-/// one variable or as two of which the derivatives are added.
+/// Value, recorded gradients, and gradients of a weighting of these, with inputs `i` and `j` both equal to input
+/// `values`. They are passed as one variable, or as two whose derivatives are added.
 fn twice(
     op: &Arc<dyn Op<f64>>,
     x: &[Tensor<f64>],
@@ -247,7 +250,7 @@ fn weighted<'t>(grads: &[Var<'t, f64>]) -> Var<'t, f64> {
     grads.iter().enumerate().map(part).sum::<Var<'t, f64>>().tracked()
 }
 
-/// Gradients, recorded gradients and gradients of a weighting of these, by all inputs but the one that is `held`.
+/// Gradients, recorded gradients, and gradients of a weighting of these, by all inputs but input `held`.
 fn by_others(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], held: usize, constant: bool) -> Vec<Tensor<f64>> {
     let tape = Tape::new();
     let input = |(i, x): (usize, &Tensor<f64>)| {
@@ -263,7 +266,7 @@ fn by_others(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], held: usize, constant: bo
     loss.grad(&wrt).into_iter().chain(all).collect()
 }
 
-/// Element `j` added to element `i`, of a pair `(i, j)`, and removed; `j` is behind `i`.
+/// Adds element `j` of a pair `(i, j)` to element `i` and removes it; `j` comes after `i`.
 fn joined<'t>(mut grads: Vec<Var<'t, f64>>, pair: Option<(usize, usize)>) -> Vec<Var<'t, f64>> {
     if let Some((i, j)) = pair {
         let other = grads.remove(j);
@@ -272,8 +275,8 @@ fn joined<'t>(mut grads: Vec<Var<'t, f64>>, pair: Option<(usize, usize)>) -> Vec
     grads
 }
 
-/// Compares lists of tensors by their L2 distance relative to the norm. NaN fails, on both sides too: no sample is where it
-/// would be right. A norm below `least` counts as that.
+/// Compares lists of tensors by their L2 distance relative to the norm. NaN fails, even on both sides: no sample
+/// expects one. A norm below `least` counts as `least`.
 fn compare_all<T: Scalar>(
     what: &str,
     got: &[Tensor<T>],
@@ -312,7 +315,7 @@ fn compare_ulps(got: &[Tensor<f32>], expected: &[Tensor<f64>]) -> Result<f64, St
     Ok(worst)
 }
 
-/// That `f(-2 x) = -2 f(x)` with the same gradients, and that the gradient is the adjoint.
+/// Checks that `f(-2 x) = -2 f(x)` with the same gradients, and that the gradient is the adjoint.
 fn linear(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], double: &[Tensor<f64>]) -> Result<(), String> {
     let (grads, y) = double.split_at(x.len());
     let scaled: Vec<_> = x.iter().map(|x| Tensor::from_fn(x.shape(), |i| -2.0 * x.as_slice()[i])).collect();
@@ -327,7 +330,8 @@ fn linear(op: &Arc<dyn Op<f64>>, x: &[Tensor<f64>], double: &[Tensor<f64>]) -> R
     Ok(())
 }
 
-/// An elementwise operation on inputs of equal shape against its formula on dual numbers; the number of comparisons.
+/// Compares an elementwise operation on inputs of equal shape with its formula on dual numbers. Returns the number of
+/// comparisons.
 fn against_duals(formula: &DualFormula, got: &[Tensor<f64>], x: &[Tensor<f64>]) -> Result<usize, String> {
     if x.iter().any(|other| other.shape() != x[0].shape()) {
         return Ok(0);

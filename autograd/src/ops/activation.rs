@@ -149,7 +149,7 @@ impl Formula<1> for Gelu {
     }
 }
 
-/// y = x s(2 u), u = sqrt(2/pi) (x + 0.044715 x^3): [`Gelu`] by way of tanh, within 5e-4 of it.
+/// y = x s(2 u), u = sqrt(2/pi) (x + 0.044715 x^3): the tanh approximation of [`Gelu`], within 5e-4 of it.
 #[derive(Clone, Copy)]
 pub struct GeluTanh;
 impl Formula<1> for GeluTanh {
@@ -197,7 +197,7 @@ impl Formula<1> for Silu {
     }
 }
 
-/// `x share` for a share that tends to 0 faster than x grows: 0, and not NaN, where the share is 0.
+/// `x share` for a factor `share` that tends to 0 faster than x grows: 0 where the factor is 0, not NaN.
 #[inline(always)]
 fn scaled<E: Real>(x: E, share: E) -> E {
     let product = x * share;
@@ -216,13 +216,13 @@ fn gelu_argument<E: Real>(x: E) -> E {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// `self` where it is positive, else `slope * self`. The gradient at 0 is `slope`.
+    /// Leaky ReLU: `self` where it is positive, else `slope * self`. The gradient at 0 is `slope`.
     #[track_caller]
     pub fn leaky_relu(&self, slope: f64) -> Self {
         LeakyRelu { slope }.on([self])
     }
 
-    /// `self` where it is positive, else `alpha (e^self - 1)`. The gradient at 0 is `alpha`.
+    /// ELU: `self` where it is positive, else `alpha (e^self - 1)`. The gradient at 0 is `alpha`.
     #[track_caller]
     pub fn elu(&self, alpha: f64) -> Self {
         Elu { alpha }.on([self])
@@ -230,19 +230,19 @@ impl<'t, T: Scalar> Var<'t, T> {
 }
 
 elementwise! {
-    /// `max(self, 0)`; NaN stays NaN. The gradient at 0 is 0.
+    /// ReLU: `max(self, 0)`; NaN stays NaN. The gradient at 0 is 0.
     relu() = Relu;
-    /// `1 / (1 + e^-self)`, accurate at both ends.
+    /// The logistic sigmoid, `1 / (1 + e^-self)`. Accurate at both ends.
     sigmoid() = Sigmoid;
-    /// `ln(1 + e^self)`, accurate at both ends.
+    /// Softplus: `ln(1 + e^self)`. Accurate at both ends.
     softplus() = Softplus;
-    /// `ln(sigmoid(self))`, accurate at both ends.
+    /// The logarithm of the sigmoid, `ln(sigmoid(self))`. Accurate at both ends.
     log_sigmoid() = LogSigmoid;
-    /// `self` times the normal distribution function of `self`: the exact form, by way of the error function.
+    /// GELU: `self` times the normal distribution function of `self`. This is the exact form with the error function.
     gelu() = Gelu;
-    /// [`gelu`](Self::gelu) in the form with tanh, which older models were trained with; within 5e-4 of the exact one.
+    /// The tanh approximation of [`gelu`](Self::gelu), as in older models. Within 5e-4 of the exact form.
     gelu_tanh() = GeluTanh;
-    /// `self * sigmoid(self)`, also called swish.
+    /// SiLU, also called swish: `self * sigmoid(self)`.
     silu() = Silu;
     also examined: LeakyRelu { slope: 0.125 }, Elu { alpha: 1.5 };
 }

@@ -1,4 +1,4 @@
-//! The four operations, and multiplication and addition of constants.
+//! Addition, subtraction, multiplication and division, also with constants.
 
 use super::power::ConstPowi;
 use crate::{Cases, Formula, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
@@ -50,7 +50,7 @@ impl Formula<2> for Mul {
     }
 }
 
-/// y = a / b; da = g / b, db = -g y / b. Division by 0 gives what IEEE 754 says.
+/// y = a / b; da = g / b, db = -g y / b. Division by 0 follows IEEE 754.
 #[derive(Clone, Copy)]
 pub struct Div;
 impl Formula<2> for Div {
@@ -87,7 +87,7 @@ impl Formula<1> for Affine {
     }
 }
 
-/// y = x, as a new node: separates an input's own share of a gradient from that of inputs which depend on it.
+/// y = x, as a new node. It separates an input's own contribution to a gradient from that of inputs which depend on it.
 #[derive(Clone, Copy)]
 pub struct Alias;
 impl Formula<1> for Alias {
@@ -156,7 +156,7 @@ pub(crate) fn div<'t, T: Scalar>(a: &Var<'t, T>, b: &Var<'t, T>) -> Var<'t, T> {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// `scale * self + shift` for constants.
+    /// `scale * self + shift`, for constants `scale` and `shift`.
     #[track_caller]
     pub fn affine(&self, scale: f64, shift: f64) -> Self {
         Affine { scale, shift }.on([self])
@@ -174,8 +174,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         Alias.on([self])
     }
 
-    /// `yes` where this is greater than 0, else (also where it is NaN) `no`; all three broadcast together. The
-    /// gradient goes to whichever was chosen, and none to `self`.
+    /// `yes` where this tensor is greater than 0, else `no`; also `no` where it is NaN. All three broadcast together.
+    /// The gradient goes to the selected operand; `self` has gradient 0.
     ///
     /// ```
     /// # use raygrad_autograd::Tape;

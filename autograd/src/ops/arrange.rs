@@ -1,11 +1,11 @@
-//! Rearrangements that are made of other operations: axes added and dropped, tensors stacked, split, tiled and rolled.
+//! Rearrangements made of other operations: transpose, squeeze, stack, split, tile, repeat, roll.
 
 use crate::Var;
 use crate::error::ensure;
 use raygrad_tensor::{Layout, Scalar, Shape, repeated, split_places, tiled};
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// Two axes exchanged.
+    /// Swaps two axes, without a copy. Negative axes count from the last one.
     ///
     /// # Panics
     /// If an axis does not exist.
@@ -14,16 +14,16 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.view("transpose", |layout| layout.transposed(a, b))
     }
 
-    /// The last two axes exchanged: the transpose of a matrix, or of each matrix of a batch; nothing is copied.
+    /// Transposes the last two axes, of a matrix or of each matrix of a batch, without a copy.
     ///
     /// # Panics
-    /// If there are less than two axes.
+    /// If there are fewer than two axes.
     #[track_caller]
     pub fn t(&self) -> Self {
         self.view("t", |layout| layout.transposed(-1, -2))
     }
 
-    /// This tensor without `axis`, which has extent 1; nothing is copied.
+    /// Removes `axis`, whose extent is 1, without a copy.
     ///
     /// # Panics
     /// If the axis does not exist or has another extent.
@@ -32,20 +32,20 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.reshape(self.fits("squeeze", Layout::contiguous(self.shape()).squeezed(axis)).shape())
     }
 
-    /// This tensor with a new axis of extent 1 that stands at place `axis`, which may be counted from behind the last one;
-    /// nothing is copied.
+    /// Adds a new axis of extent 1 at position `axis`, without a copy. A negative position counts from behind the last
+    /// axis.
     ///
     /// # Panics
-    /// If there is no such place.
+    /// If there is no such position.
     #[track_caller]
     pub fn unsqueeze(&self, axis: isize) -> Self {
         self.reshape(self.fits("unsqueeze", Layout::contiguous(self.shape()).unsqueezed(axis)).shape())
     }
 
-    /// Tensors of one shape along a new axis, which stands at place `axis`.
+    /// Joins tensors of one shape along a new axis at position `axis`.
     ///
     /// # Panics
-    /// If there is none, their shapes differ, or there is no place `axis`.
+    /// If there are no tensors, their shapes differ, or there is no position `axis`.
     #[track_caller]
     pub fn stack(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("stack of no tensors") };
@@ -58,7 +58,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         })
     }
 
-    /// Consecutive parts along `axis`, of these extents: the inverse of [`concat`](Self::concat).
+    /// Splits along `axis` into consecutive parts of these extents: the inverse of [`concat`](Self::concat).
     ///
     /// # Panics
     /// If the axis does not exist or the extents do not sum up to its extent.
@@ -68,8 +68,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         places.into_iter().map(|place| self.slice_axis(axis, place)).collect()
     }
 
-    /// The whole tensor `counts[i]` times along each axis `i` (`numpy.tile`, `torch.repeat`). More counts than axes add
-    /// leading axes, fewer leave the leading axes as they are.
+    /// Repeats the whole tensor `counts[i]` times along each axis `i` (`numpy.tile`, `torch.Tensor.repeat`). More
+    /// counts than axes add leading axes; fewer leave the leading axes unchanged.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -87,7 +87,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.reshape(&narrow).broadcast_to(&wide).reshape(&shape)
     }
 
-    /// Each entry along `axis`, `count` times (`numpy.repeat`, `torch.repeat_interleave`).
+    /// Repeats each entry along `axis` `count` times (`numpy.repeat`, `torch.repeat_interleave`).
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -97,8 +97,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.reshape(&narrow).broadcast_to(&wide).reshape(&shape)
     }
 
-    /// The entries along `axis` moved `shift` places towards the end; what leaves there comes in at the start. A
-    /// negative shift moves towards the start. (`numpy.roll` and `torch.roll` take the shift first.)
+    /// Rotates the entries along `axis` by `shift` places towards the end. Entries that leave at the end enter at the
+    /// start. A negative shift rotates towards the start. (`numpy.roll` and `torch.roll` take the shift first.)
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -114,11 +114,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         Var::concat(&[&tail, &head], axis)
     }
 
-    /// The coordinates of a grid: for vectors of lengths `[a, b, ..]` as many tensors of shape `[a, b, ..]`, number `i`
-    /// varying along axis `i` alone (`indexing="ij"`).
+    /// The coordinates of a grid. Vectors of lengths `[a, b, ..]` give as many tensors of shape `[a, b, ..]`; tensor
+    /// `i` varies along axis `i` alone (`indexing="ij"`).
     ///
     /// # Panics
-    /// If one is not a vector.
+    /// If an operand is not a vector.
     #[track_caller]
     pub fn meshgrid(axes: &[&Self]) -> Vec<Self> {
         for x in axes {

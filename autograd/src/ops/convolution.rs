@@ -1,8 +1,9 @@
-//! 2-D convolution of images `[n, channels, height, width]`, and the two products that are its gradients: with it they
-//! form a closed set, so gradients of any order stay convolutions.
+//! 2-D convolution of images `[n, channels, height, width]`, and the two products that are its gradients. These three
+//! form a closed set, so gradients of any order are convolutions.
 //!
-//! Each image is unfolded to a matrix of windows ("im2col") and multiplied, a large one in strips. Images run on rayon's threads; sums over
-//! images are taken in a fixed number of groups, so results have the same bits at any number of threads.
+//! The kernel unfolds each image to a matrix of windows ("im2col"), a large image in strips, and multiplies. Images run
+//! in parallel on rayon's threads. Sums over images use a fixed number of groups, so results have the same bits for any
+//! number of threads.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::matmul::{Matrix, gemm};
@@ -14,11 +15,11 @@ use smallvec::smallvec;
 /// Groups of images over which a weight's gradient is summed first.
 const SLOTS: usize = 16;
 
-/// Elements of an image that are unfolded at a time for its convolution, about: unfolded as a whole, one of 64 channels and
-/// 800x800 pixels would be 1.5 GB for a kernel of 3x3.
+/// Elements of an image that are unfolded at a time for its convolution, about. Without strips, an image of 64 channels
+/// and 800x800 pixels would take 1.5 GB for a 3x3 kernel.
 const STRIP: usize = 1 << 22;
 
-/// How the kernel of a 2-D convolution moves over an image, by axis: `[rows, columns]`.
+/// Stride, padding and dilation of a 2-D convolution, by axis: `[rows, columns]`.
 ///
 /// ```
 /// use raygrad_autograd::Conv2dConfig;
@@ -118,7 +119,7 @@ impl Sizes {
         (STRIP / (self.rows * columns).max(1)).clamp(1, rows)
     }
 
-    /// Space for an unfolded strip of an image, and for what becomes of it.
+    /// Scratch space for an unfolded strip of an image, and for its product.
     fn strip_scratch<T: Scalar>(&self, pool: &Pool<T>) -> [Tensor<T>; 2] {
         let count = self.strip() * self.windows.output()[1];
         if self.strip() == self.windows.output()[0] {
@@ -127,12 +128,12 @@ impl Sizes {
         [pool.tensor(&[self.rows * count]), pool.tensor(&[self.o * count])]
     }
 
-    /// Space for an unfolded image.
+    /// Scratch space for an unfolded image.
     fn scratch<T: Scalar>(&self, pool: &Pool<T>) -> Tensor<T> {
         pool.tensor(&[if self.windows.are_pixels() { 0 } else { self.rows * self.count }])
     }
 
-    /// Image `i` unfolded, in `scratch` if that is needed.
+    /// Image `i` unfolded, in `scratch` if needed.
     fn unfolded<'a, T: Scalar>(&self, x: &'a Tensor<T>, i: usize, scratch: &'a mut Tensor<T>) -> Matrix<'a, T> {
         let image = &x.as_slice()[i * self.image..][..self.image];
         if self.windows.are_pixels() {
@@ -308,8 +309,10 @@ impl<T: Scalar> Op<T> for Conv2dWeight {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// 2-D convolution (as networks mean it: the kernel is not flipped) of images `[n, channels, height, width]` with
-    /// a `weight` `[outputs, channels, kernel height, kernel width]`. The result is `[n, outputs, oh, ow]`, where
+    /// 2-D convolution of images `[n, channels, height, width]` with a `weight`
+    /// `[outputs, channels, kernel height, kernel width]` (`torch.nn.functional.conv2d`).
+    ///
+    /// As in neural networks, the kernel is not flipped. The result is `[n, outputs, oh, ow]`, where
     /// `oh = (height + 2 padding - dilation (kernel - 1) - 1) / stride + 1`, rounded down.
     ///
     /// ```
@@ -323,26 +326,28 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If the shapes do not fit, the kernel is larger than the padded image, a stride or dilation is 0, or the padded image
-    /// or the result is too large.
+    /// If the shapes do not fit, or a stride or dilation is 0. If the kernel is larger than the padded image, or the
+    /// padded image or the result is too large.
     #[track_caller]
     pub fn conv2d(&self, weight: &Self, config: &Conv2dConfig) -> Self {
         self.tape().apply(Conv2d(*config), &[self, weight])
     }
 
-    /// As [`conv2d`](Self::conv2d), with a `bias` `[outputs]` added in the same pass.
+    /// As [`conv2d`](Self::conv2d), and adds a `bias` `[outputs]` in the same pass.
     ///
     /// # Panics
-    /// As [`conv2d`](Self::conv2d), and if the bias has another shape.
+    /// Where [`conv2d`](Self::conv2d) panics, and if the bias has another shape.
     #[track_caller]
     pub fn conv2d_bias(&self, weight: &Self, bias: &Self, config: &Conv2dConfig) -> Self {
         self.tape().apply(Conv2d(*config), &[self, weight, bias])
     }
 
-    /// The transposed convolution, the adjoint of [`conv2d`](Self::conv2d): `[n, inputs, oh, ow]` with a `weight`
-    /// `[inputs, channels, kernel height, kernel width]` to images `[n, channels, height, width]` of the extents
-    /// `image`, from which the convolution would make `oh` times `ow` pixels. Extents that a stride leaves open are
-    /// chosen by `image`; the smallest is `(oh - 1) stride - 2 padding + dilation (kernel - 1) + 1`.
+    /// The transposed convolution: the adjoint of [`conv2d`](Self::conv2d).
+    ///
+    /// Takes `[n, inputs, oh, ow]` and a `weight` `[inputs, channels, kernel height, kernel width]` to images
+    /// `[n, channels, height, width]`. `image` is `[height, width]`; a convolution of such images must give `oh` times
+    /// `ow` pixels. Several image sizes do so if the stride is above 1. The smallest height is
+    /// `(oh - 1) stride - 2 padding + dilation (kernel - 1) + 1`.
     ///
     /// # Panics
     /// If the shapes do not fit, or a convolution of `image` would have other extents than this tensor.

@@ -13,7 +13,7 @@ struct Labelled<'t, T: Scalar> {
 /// The letters of each operand and of the result.
 ///
 /// # Errors
-/// If the equation is malformed or does not fit the shapes, in words.
+/// If the equation is malformed or does not fit the shapes.
 fn parse(equation: &str, shapes: &[&[usize]]) -> Result<(Vec<Vec<char>>, Vec<char>), ShapeError> {
     let compact: String = equation.chars().filter(|c| !c.is_whitespace()).collect();
     let (left, right) = match compact.split_once("->") {
@@ -68,7 +68,7 @@ impl<'t, T: Scalar> Labelled<'t, T> {
         self.labels.iter().zip(self.x.shape()).find(|(other, _)| **other == label).map_or(1, |(_, &extent)| extent)
     }
 
-    /// Each letter once: the diagonal of the axes that share one.
+    /// Takes the diagonal of the axes that share a letter.
     fn diagonals(mut self) -> Self {
         while let Some((a, b)) = self.repeated() {
             let x = self.x.view("einsum", |layout| Ok(layout.diagonal(a, b, 0)));
@@ -85,7 +85,7 @@ impl<'t, T: Scalar> Labelled<'t, T> {
         (0..self.labels.len()).find_map(|b| Some((self.labels[..b].iter().position(|&a| a == self.labels[b])?, b)))
     }
 
-    /// Summed over the axes whose letters nobody else has.
+    /// Sums over the axes whose letters are not wanted.
     fn summed(self, wanted: impl Fn(char) -> bool) -> Self {
         let alone: Vec<_> = (0..self.labels.len()).filter(|&axis| !wanted(self.labels[axis])).collect();
         if alone.is_empty() {
@@ -107,7 +107,7 @@ impl<'t, T: Scalar> Labelled<'t, T> {
         self.x.reordered(&axes)
     }
 
-    /// As matrices `[batch.., rows, columns]`; whatever order the tensor has already is not copied.
+    /// As matrices `[batch.., rows, columns]`, without a copy of axes that are already in order.
     fn matrices(&self, batch: &[char], rows: &[char], columns: &[char]) -> Var<'t, T> {
         let transpose = !rows.is_empty() && !columns.is_empty() && self.labels == [batch, columns, rows].concat();
         let (first, second) = if transpose { (columns, rows) } else { (rows, columns) };
@@ -144,9 +144,10 @@ fn contract<'t, T: Scalar>(operands: Vec<Labelled<'t, T>>, result: &[char]) -> V
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// Einstein summation of one or two tensors: each axis has a letter, axes that share one run together, and letters
-    /// that are not in the result are summed over. Without `->` the result has the letters that occur once, in
-    /// alphabetical order. Spaces are ignored.
+    /// Einstein summation of one or two tensors (`numpy.einsum`, without `...`).
+    ///
+    /// Each axis has a letter. Axes that share a letter run together, and letters that are not in the result are summed
+    /// over. Without `->`, the result has the letters that occur once, in alphabetical order. Spaces are ignored.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor, Var};
@@ -162,9 +163,9 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If there are not one or two operands, the equation has another character than a letter, a comma or the arrow
-    /// (there is no `...`), it does not fit the number of operands or their axes, a letter stands for two extents, or
-    /// the result repeats a letter or has one that no operand has.
+    /// If there are not one or two operands, or the equation does not fit the number of operands or their axes. If it
+    /// has a character other than a letter, a comma or the arrow; `...` is not supported. If a letter stands for two
+    /// extents, or the result repeats a letter or has a letter of no operand.
     #[track_caller]
     pub fn einsum(equation: &str, operands: &[&Self]) -> Self {
         let Some(first) = operands.first() else { panic!("einsum {equation:?} of no tensors") };

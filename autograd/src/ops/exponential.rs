@@ -154,7 +154,7 @@ impl Formula<1> for Erf {
 }
 
 elementwise! {
-    /// `e^self`.
+    /// The exponential, `e^self`.
     exp() = Exp;
     /// `e^self - 1`, accurate near 0.
     expm1() = Expm1;

@@ -1,19 +1,19 @@
-//! The greatest and smallest elements along axes, and where they are.
+//! The largest and smallest elements along axes, and their indices.
 
 use crate::error::ensure;
 use crate::{Axes, Grads, Indices, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::extremum::{Middle, extremum, extremum_grad};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
-/// y = the greatest (or smallest) element over axes `from..behind`, which stay with extent 1; dx = g, shared evenly
+/// y = the largest (or smallest) element over axes `from..behind`, which stay with extent 1. dx = g, shared evenly
 /// among the elements that equal y, as PyTorch's `amax` does it.
 #[derive(Debug, Clone, Copy)]
 pub struct Extremum {
     /// The first axis.
     pub from: usize,
-    /// The axis behind the last one.
+    /// One past the last axis.
     pub behind: usize,
-    /// The greatest element, not the smallest.
+    /// Whether to take the largest element, not the smallest.
     pub greatest: bool,
 }
 
@@ -78,17 +78,17 @@ impl<'t, T: Scalar> Var<'t, T> {
         y.reshape(&axes.result())
     }
 
-    /// The greatest element, as a scalar; see [`max_over`](Self::max_over).
+    /// The largest element, as a scalar; see [`max_over`](Self::max_over).
     ///
     /// # Panics
-    /// If there is none.
+    /// If the tensor is empty.
     #[track_caller]
     pub fn max(&self) -> Self {
         self.max_over(..)
     }
 
-    /// The greatest elements over any axes, NaN if one is NaN. Equal ones share the gradient evenly (as in PyTorch's
-    /// `amax`); if the result is NaN there is no gradient.
+    /// The largest elements over any axes; NaN if one is NaN (`torch.amax`). Equal elements share the gradient evenly.
+    /// A NaN result has gradient 0.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -109,7 +109,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The smallest element, as a scalar; see [`max_over`](Self::max_over).
     ///
     /// # Panics
-    /// If there is none.
+    /// If the tensor is empty.
     #[track_caller]
     pub fn min(&self) -> Self {
         self.min_over(..)
@@ -118,7 +118,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The smallest elements over any axes; see [`max_over`](Self::max_over).
     ///
     /// # Panics
-    /// As [`max_over`](Self::max_over).
+    /// Where [`max_over`](Self::max_over) panics.
     #[track_caller]
     pub fn min_over(&self, axes: impl Into<Axes>) -> Self {
         self.extremum(axes.into(), false)
@@ -138,8 +138,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.value().clone()
     }
 
-    /// Where the greatest elements along `axis` are: an index for each element of the shape that remains without that
-    /// axis. The first of equal ones, and the first NaN if there is one. There is no gradient.
+    /// The indices of the largest elements along `axis`. The result has the shape of this tensor without that axis. It
+    /// holds the first of equal elements, and the first NaN if there is one. There is no gradient.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -156,10 +156,10 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.chosen("argmax", axis).argmax(axis)
     }
 
-    /// Where the smallest elements along `axis` are; see [`argmax`](Self::argmax).
+    /// The indices of the smallest elements along `axis`; see [`argmax`](Self::argmax).
     ///
     /// # Panics
-    /// As [`argmax`](Self::argmax).
+    /// Where [`argmax`](Self::argmax) panics.
     #[track_caller]
     pub fn argmin(&self, axis: isize) -> Indices {
         self.chosen("argmin", axis).argmin(axis)

@@ -62,9 +62,10 @@ impl<T: Scalar> Op<T> for LayerNorm {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// Layer normalisation along the last axis, `(self - mean) / sqrt(variance + eps) * gain + bias`: `[.., n]` with
-    /// `gain` and `bias` of shape `[n]`. The variance is divided by `n`; mean and variance are taken in two passes, so
-    /// a large mean costs no digits.
+    /// Layer normalisation along the last axis, `(self - mean) / sqrt(variance + eps) * gain + bias`.
+    ///
+    /// This tensor is `[.., n]`; `gain` and `bias` are `[n]`. The variance is divided by `n`. Mean and variance take
+    /// two passes, so a large mean loses no digits.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

@@ -6,26 +6,26 @@ use raygrad_tensor::parallel::chunks;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, map, simd, sum_to};
 use serde::{Deserialize, Serialize};
 
-/// What a dense layer applies to its output. Its derivative follows from the output alone.
+/// The activation at the output of a dense layer. Its derivative follows from the output alone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
-    /// Nothing.
+    /// No activation.
     Identity,
     /// `max(x, 0)`.
     Relu,
 }
 
-/// y = activation(x w + b), with x `[.., inputs]`, w `[inputs, outputs]` and, if there is one, b `[outputs]`.
+/// y = activation(x w + b), with x `[.., inputs]`, w `[inputs, outputs]` and an optional b `[outputs]`.
 ///
-/// With h the gradient behind the activation: dx = h w', dw = x' h, db = sum of the rows of h.
+/// With h the gradient of the activation's input: dx = h w', dw = x' h, db = sum of the rows of h.
 #[derive(Clone, Copy)]
 pub struct LinearOp(
     /// The activation.
     pub Activation,
 );
 
-/// Elements of a piece that one thread finishes, about.
+/// Elements of a block for one thread, about.
 const PIECE: usize = 1 << 15;
 
 /// Adds the bias to each row and applies ReLU, in place.
@@ -138,7 +138,8 @@ impl<T: Scalar> Op<T> for LinearOp {
 impl<'t, T: Scalar> Var<'t, T> {
     /// A dense layer in one fused operation: `activation(self weight + bias)`.
     ///
-    /// `self` is `[.., inputs]`, `weight` is `[inputs, outputs]`, `bias` is `[outputs]`; the result is `[.., outputs]`.
+    /// This tensor is `[.., inputs]`, `weight` is `[inputs, outputs]` and `bias` is `[outputs]`. The result is
+    /// `[.., outputs]`. `weight` is the transpose of PyTorch's.
     ///
     /// # Panics
     /// If the shapes do not fit.

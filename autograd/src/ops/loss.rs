@@ -1,4 +1,4 @@
-//! Losses: how far predictions are from their targets.
+//! Losses between predictions and targets.
 
 use crate::cases::INF;
 use crate::error::ensure;
@@ -40,7 +40,7 @@ impl Formula<2> for AbsoluteError {
 /// With r = a - b: y = r^2 / 2 for |r| <= delta, else delta (|r| - delta / 2); da = g r limited to +-delta, db = -da.
 #[derive(Clone, Copy)]
 pub struct Huber {
-    /// Where the parabola goes over into its tangents.
+    /// The residual where the parabola meets its tangents.
     pub delta: f64,
 }
 impl Formula<2> for Huber {
@@ -65,7 +65,7 @@ impl Formula<2> for Huber {
 /// For beta = 0 this is |r|.
 #[derive(Clone, Copy)]
 pub struct SmoothL1 {
-    /// Where the parabola goes over into its tangents; may be 0.
+    /// The residual where the parabola meets its tangents; may be 0.
     pub beta: f64,
 }
 impl Formula<2> for SmoothL1 {
@@ -91,16 +91,16 @@ impl Formula<2> for SmoothL1 {
 }
 
 impl SmoothL1 {
-    /// What the parabola is divided by: any number if there is none.
+    /// The divisor of the parabola; arbitrary if beta is 0.
     #[inline(always)]
     fn width(&self) -> f64 {
         if self.beta == 0.0 { 1.0 } else { self.beta }
     }
 }
 
-/// y = b softplus(-a) + (1 - b) softplus(a): minus the logarithm of the probability that a logit a gives to a target b
-/// in 0..=1; da = g (s(a) - b), from s(-|a|), db = -g a. No term of y cancels another, so small losses keep their digits;
-/// so do small gradients at the targets 0 and 1.
+/// y = b softplus(-a) + (1 - b) softplus(a), for a logit a and a target b in 0..=1: minus the log-probability of b.
+/// da = g (s(a) - b), from s(-|a|); db = -g a. The terms of y do not cancel, so small losses keep their
+/// digits; so do small gradients at the targets 0 and 1.
 #[derive(Clone, Copy)]
 pub struct BinaryCrossEntropy;
 impl Formula<2> for BinaryCrossEntropy {
@@ -139,7 +139,7 @@ impl Formula<2> for BinaryCrossEntropy {
 /// y = ln sum e^x - x[class] of each row of logits: `[.., n]` to `[..]`; dx = g (softmax - 1 at the class).
 #[derive(Clone)]
 pub struct CrossEntropy {
-    /// The class of each row. A clone is a reference count.
+    /// The class of each row.
     pub classes: Arc<[u32]>,
 }
 
@@ -189,7 +189,7 @@ impl<T: Scalar> Op<T> for CrossEntropy {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// A loss of each element; no broadcasting, which in a loss is a mistake more often than not.
+    /// A loss of each element. Shapes must be equal: broadcasting in a loss is most often a mistake.
     #[track_caller]
     fn loss<F: Formula<2>>(&self, loss: F, target: impl Operand<'t, T>) -> Self {
         let target = target.on(self.tape());
@@ -198,7 +198,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         loss.on([self, &target])
     }
 
-    /// `(self - target)^2` of each element.
+    /// The squared error of each element, `(self - target)^2`.
     ///
     /// # Panics
     /// If the shapes differ.
@@ -216,7 +216,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.squared_error(target).mean()
     }
 
-    /// `|self - target|` of each element. The gradient at equality is 0.
+    /// The absolute error of each element, `|self - target|`. The gradient at equality is 0.
     ///
     /// # Panics
     /// If the shapes differ.
@@ -234,8 +234,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.absolute_error(target).mean()
     }
 
-    /// Huber's loss of each element: with `r = self - target`, `r^2 / 2` up to `|r| = delta`, and beyond the tangents
-    /// `delta (|r| - delta / 2)`.
+    /// The Huber loss of each element. With `r = self - target` it is `r^2 / 2` for `|r| <= delta`, and
+    /// `delta (|r| - delta / 2)` beyond.
     ///
     /// # Panics
     /// If the shapes differ or `delta` is not positive.
@@ -248,13 +248,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The mean of [`huber`](Self::huber), as a scalar.
     ///
     /// # Panics
-    /// As [`huber`](Self::huber).
+    /// Where [`huber`](Self::huber) panics.
     #[track_caller]
     pub fn huber_loss(&self, target: impl Operand<'t, T>, delta: f64) -> Self {
         self.huber(target, delta).mean()
     }
 
-    /// Huber's loss divided by `beta`, so that its tangents have slope 1; for `beta` 0 the absolute error.
+    /// The Huber loss divided by `beta`, of each element: the slope is 1 beyond `beta`. For `beta` 0 it is the absolute
+    /// error.
     ///
     /// # Panics
     /// If the shapes differ or `beta` is negative.
@@ -267,14 +268,15 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The mean of [`smooth_l1`](Self::smooth_l1), as a scalar.
     ///
     /// # Panics
-    /// As [`smooth_l1`](Self::smooth_l1).
+    /// Where [`smooth_l1`](Self::smooth_l1) panics.
     #[track_caller]
     pub fn smooth_l1_loss(&self, target: impl Operand<'t, T>, beta: f64) -> Self {
         self.smooth_l1(target, beta).mean()
     }
 
-    /// The cross-entropy of each element, `-t ln s - (1 - t) ln(1 - s)`, with `s` the [`sigmoid`](Self::sigmoid) of
-    /// this logit and `t` the target in 0..=1. Finite and accurate for any finite logit.
+    /// The binary cross-entropy of each element, from logits: `-t ln s - (1 - t) ln(1 - s)`. Here `s` is the
+    /// [`sigmoid`](Self::sigmoid) of this logit and `t` is the target in 0..=1. Finite and accurate for any finite
+    /// logit.
     ///
     /// # Panics
     /// If the shapes differ.
@@ -292,8 +294,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.binary_cross_entropy(target).mean()
     }
 
-    /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` with a class below `n` for each
-    /// row, in a list or an array `[..]`, to `[..]`.
+    /// The cross-entropy of each row of logits, `-ln softmax(row)[class]`: `[.., n]` to `[..]`. `classes` has one class
+    /// below `n` for each row, as a list or an array `[..]`.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -320,7 +322,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// The mean of [`cross_entropy`](Self::cross_entropy) over the rows, as a scalar; NaN for no rows.
     ///
     /// # Panics
-    /// As [`cross_entropy`](Self::cross_entropy).
+    /// Where [`cross_entropy`](Self::cross_entropy) panics.
     #[track_caller]
     pub fn cross_entropy_loss(&self, classes: impl Into<Indices>) -> Self {
         self.cross_entropy(classes).mean()

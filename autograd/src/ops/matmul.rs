@@ -6,8 +6,8 @@ use raygrad_tensor::matmul::matmul;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
 use std::borrow::Cow;
 
-/// y = a b over the last two axes; leading axes count matrices and broadcast. dA = g B', dB = A' g, summed over what was
-/// broadcast.
+/// y = a b over the last two axes. Leading axes count matrices and broadcast. dA = g B', dB = A' g, summed over
+/// broadcast axes.
 #[derive(Clone, Copy)]
 pub struct Matmul;
 
@@ -48,11 +48,12 @@ impl<T: Scalar> Op<T> for Matmul {
 
 impl<'t, T: Scalar> Var<'t, T> {
     /// The matrix product, with NumPy's conventions:
-    /// - two matrices, `[m, k]` times `[k, n]`;
-    /// - more axes count matrices, and broadcast: `[b, 1, m, k]` times `[c, k, n]` gives `[b, c, m, n]`;
-    /// - a transpose ([`t`](Self::t)) and any other view is read without a copy;
-    /// - a vector `[k]` on the left is a row, on the right a column, and that axis is missing from the result, which is
-    ///   a scalar for two vectors.
+    /// * two matrices: `[m, k]` times `[k, n]`;
+    /// * more axes count matrices and broadcast: `[b, 1, m, k]` times `[c, k, n]` gives `[b, c, m, n]`;
+    /// * a vector `[k]` on the left is a row, on the right a column. That axis is missing from the result, which is a
+    ///   scalar for two vectors.
+    ///
+    /// A transpose ([`t`](Self::t)) or any other view is read without a copy.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -100,10 +101,10 @@ impl<'t, T: Scalar> Var<'t, T> {
         y
     }
 
-    /// The inner product of two vectors, as a scalar; summed pairwise.
+    /// The inner product of two vectors, as a scalar. The sum is pairwise.
     ///
     /// # Panics
-    /// If the operands are not vectors of one length.
+    /// If the operands are not vectors of equal length.
     #[track_caller]
     pub fn dot(&self, other: impl Operand<'t, T>) -> Self {
         let other = &other.on(self.tape());

@@ -4,12 +4,12 @@ use crate::error::ensure;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Layout, Pool, Scalar, Shape, Tensor, checked_len};
 
-/// y = x where column - row is at least (upper) or at most (lower) a number, else 0; dx is the same of g.
+/// y = x where column - row is at least (upper) or at most (lower) `diagonal`, else 0; dx is the same of g.
 #[derive(Clone, Copy)]
 pub struct Triangle {
-    /// Whether the upper triangle stays.
+    /// Whether to keep the upper triangle, not the lower.
     pub upper: bool,
-    /// Column minus row on the diagonal that bounds the triangle and belongs to it.
+    /// Column minus row of the diagonal that bounds the triangle; it belongs to the triangle.
     pub diagonal: isize,
 }
 
@@ -46,38 +46,38 @@ impl<T: Scalar> Op<T> for Triangle {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The lower triangle of each matrix, zeros elsewhere: what stands on or below the diagonal number `diagonal`,
-    /// which counts from the main one towards the upper right.
+    /// The lower triangle of each matrix: elements on or below a diagonal, and zeros elsewhere. Diagonal 0 is the main
+    /// one; `diagonal` counts towards the upper right.
     ///
     /// # Panics
-    /// If there are less than two axes.
+    /// If there are fewer than two axes.
     #[track_caller]
     pub fn tril(&self, diagonal: isize) -> Self {
         self.tape().apply(Triangle { upper: false, diagonal }, &[self])
     }
 
-    /// The upper triangle of each matrix, zeros elsewhere: what stands on or above the diagonal number `diagonal`,
-    /// which counts from the main one towards the upper right.
+    /// The upper triangle of each matrix: elements on or above a diagonal, and zeros elsewhere. Diagonal 0 is the main
+    /// one; `diagonal` counts towards the upper right.
     ///
     /// # Panics
-    /// If there are less than two axes.
+    /// If there are fewer than two axes.
     #[track_caller]
     pub fn triu(&self, diagonal: isize) -> Self {
         self.tape().apply(Triangle { upper: true, diagonal }, &[self])
     }
 
-    /// A diagonal of each matrix, `[.., m, n]` to `[.., k]`. Number `diagonal` counts from the main one towards the upper
-    /// right; it is empty beyond the corners.
+    /// A diagonal of each matrix, `[.., m, n]` to `[.., k]`. Diagonal 0 is the main one; `diagonal` counts towards the
+    /// upper right. Beyond the corners it is empty.
     ///
     /// # Panics
-    /// If there are less than two axes.
+    /// If there are fewer than two axes.
     #[track_caller]
     pub fn diagonal(&self, diagonal: isize) -> Self {
         self.view("diagonal", |layout| layout.last_diagonal(diagonal))
     }
 
-    /// Matrices with the rows of this tensor on a diagonal and zeros elsewhere, `[.., k]` to `[.., n, n]` with
-    /// `n = k + abs(diagonal)`: the adjoint of [`diagonal`](Self::diagonal).
+    /// Matrices with the rows of this tensor on a diagonal and zeros elsewhere: `[.., k]` to `[.., n, n]`, where
+    /// `n = k + abs(diagonal)`. The adjoint of [`diagonal`](Self::diagonal).
     ///
     /// # Panics
     /// If this is a scalar.

@@ -1,8 +1,9 @@
-//! The operations, each in one place: formula, derivative, documentation, sample inputs and extreme values. An
-//! operation is added by writing it in the file of its kind and listing it in `check/catalogue.rs`.
+//! The operations. The file of each has its formula, derivative, documentation, sample inputs and exact values. To add
+//! one, write it in the file of its kind and list it in `check/catalogue.rs`.
 
-/// The elementwise functions of a file: as `name(other) = Formula;` a method of [`Var`](crate::Var) for each formula of one
-/// operand or two that has no parameters, and in `entries` all of them for the catalogue, together with those `also examined`.
+/// The elementwise functions of a file. A line `name(other) = Formula;` makes a method of [`Var`](crate::Var) from a
+/// formula of one or two operands without parameters. `entries` lists all of them for the catalogue, and those
+/// `also examined`.
 macro_rules! elementwise {
     (
         $($(#[$doc:meta])+ $name:ident($($other:ident)?) = $formula:ident;)*

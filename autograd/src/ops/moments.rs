@@ -5,7 +5,7 @@ use raygrad_tensor::extremum::extremum;
 use raygrad_tensor::rows::{at_least_zero, variance_rows};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, map, sum_to};
 
-/// Whether a tensor of shape `x` is reduced to `to` over its last axes alone: the number of elements in each row.
+/// The number of elements in each row, if a tensor of shape `x` is reduced to `to` over its last axes alone.
 fn trailing(x: &[usize], to: &[usize]) -> Option<usize> {
     let first = (0..x.len()).find(|&axis| x[axis] != to[axis]).unwrap_or(x.len());
     to[first..].iter().all(|&extent| extent == 1).then(|| x[first..].iter().product())
@@ -53,7 +53,7 @@ fn variance<T: Scalar>(x: &Tensor<T>, shape: &[usize], correction: f64, pool: &P
 }
 
 /// y = the variance over the axes along which `shape` has extent 1: the sum of squared deviations from the mean,
-/// divided by `n - correction`; dx = 2 g (x - mean) / (n - correction).
+/// divided by `n - correction`. dx = 2 g (x - mean) / (n - correction).
 #[derive(Clone)]
 pub struct Variance {
     /// The shape of the output, with as many axes as the input.
@@ -125,7 +125,7 @@ fn over_unless_zero<'t, T: Scalar>(g: &Var<'t, T>, y: &Var<'t, T>) -> Var<'t, T>
     zero.where_(&is_zero, &(g / one.where_(&is_zero, y)))
 }
 
-/// y = sqrt(sum of x^2) over the axes along which `shape` has extent 1, without overflow on the way; dx = g x / y, 0
+/// y = sqrt(sum of x^2) over the axes along which `shape` has extent 1, without overflow on the way. dx = g x / y, 0
 /// where y is 0.
 #[derive(Clone)]
 pub struct Norm {
@@ -200,8 +200,8 @@ impl<T: Scalar> Op<T> for Norm {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// This tensor less its mean over the axes along which `shape` has extent 1. Twice: the second time takes out what the
-    /// rounding of a large mean has left.
+    /// This tensor minus its mean over the axes along which `shape` has extent 1. It subtracts twice: the second time
+    /// removes the rounding error of a large mean.
     pub(crate) fn centred(&self, shape: &[usize]) -> Self {
         let share = shape.iter().product::<usize>() as f64 / self.value().len() as f64;
         let once = self - self.sum_to(shape) * share;
@@ -214,9 +214,12 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.var_over(.., correction)
     }
 
-    /// The variance over any axes: the sum of squared deviations from the mean, divided by the number of elements less
-    /// `correction` (`ddof` in NumPy: 0 for the elements at hand, 1 for an unbiased estimate from a sample). NaN or
-    /// infinite if that is not positive. Two passes, so a large mean costs no digits.
+    /// The variance over any axes: the sum of squared deviations from the mean, divided by the number of elements minus
+    /// `correction`.
+    ///
+    /// `correction` is `ddof` in NumPy: 0 for the variance of these elements, 1 for an unbiased estimate from a sample.
+    /// The result is NaN or infinite if the divisor is not positive. It takes two passes, so a large mean loses no
+    /// digits.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.
@@ -233,8 +236,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.std_over(.., correction)
     }
 
-    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over), with gradient 0 where it
-    /// is 0.
+    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over). Where it is 0, the
+    /// gradient is 0.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.
@@ -251,8 +254,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.norm_over(..)
     }
 
-    /// The Euclidean norm over any axes, `sqrt(sum of squares)`: accurate even where the squares would overflow or
-    /// vanish. The gradient is 0 where the norm is.
+    /// The Euclidean norm over any axes, `sqrt(sum of squares)`. Accurate even where the squares would overflow or
+    /// underflow. Where the norm is 0, the gradient is 0.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -272,13 +275,13 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Norm { shape: axes.kept() }, &[self]).reshape(&axes.result())
     }
 
-    /// The sum of absolute values of all elements, as a scalar.
+    /// The L1 norm: the sum of absolute values of all elements, as a scalar.
     #[track_caller]
     pub fn norm_l1(&self) -> Self {
         self.norm_l1_over(..)
     }
 
-    /// The sum of absolute values over any axes. The gradient of an element that is 0 is 0.
+    /// The L1 norm over any axes: the sum of absolute values. An element that is 0 has gradient 0.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.

@@ -1,5 +1,5 @@
-//! Picking entries or elements along an axis by number, and its adjoint. Indices are whole numbers outside the graph;
-//! gradients flow through what is picked.
+//! Indexing along an axis by integer arrays, and its adjoint. Indices are not on the graph; gradients flow through the
+//! values.
 
 use super::row_grad::{RowGrad, add_rows};
 use crate::error::ensure;
@@ -8,12 +8,12 @@ use raygrad_tensor::parallel::{PIECE, chunks};
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor};
 use std::sync::Arc;
 
-/// Which method picks.
+/// The method that picks.
 #[derive(Debug, Clone, Copy)]
 pub struct Method {
     /// Its name, and that of its adjoint.
     pub names: [&'static str; 2],
-    /// Whether few elements meet at one place, so that sums need no f64.
+    /// Whether few elements meet at one place, so that sums do not need f64.
     pub few_meet: bool,
 }
 
@@ -23,34 +23,34 @@ pub const ROWS: Method = Method { names: ["gather_rows", "scatter_rows"], few_me
 pub const ENTRIES: Method = Method { names: ["index_select", "index_add"], few_meet: false };
 /// Elements: [`Var::gather`], [`Var::scatter_add`].
 pub const ELEMENTS: Method = Method { names: ["gather", "scatter_add"], few_meet: false };
-/// Pixels of planes, each of which is the greatest of few windows: [`Var::max_pool2d`].
+/// Pixels of planes, each the maximum of few windows: [`Var::max_pool2d`].
 pub const PIXELS: Method = Method { names: ["gather_planes", "scatter_planes"], few_meet: true };
 
-/// What is picked along an axis.
+/// The indices along an axis.
 #[derive(Clone)]
 pub enum Places {
-    /// Entry `i` of the result is entry `index[i]`, with all that lies in it.
+    /// Entry `i` of the result is the whole entry `index[i]`.
     Entries(Arc<[u32]>),
-    /// Each element of the result has an index of its own.
+    /// Each element of the result has its own index.
     Elements(Indices),
 }
 
-/// y[.., i, ..] = x[.., index[i], ..] along an axis, or x[.., index[.., i, ..], ..]; dx = [`Put`] of g, of whole rows
-/// unrecorded as a sparse [`RowGrad`].
+/// y[.., i, ..] = x[.., index[i], ..] along an axis, or x[.., index[.., i, ..], ..]. dx = [`Put`] of g, or a sparse
+/// [`RowGrad`] for whole rows in an unrecorded pass.
 #[derive(Clone)]
 pub struct Pick {
     /// The method.
     pub method: Method,
     /// The axis.
     pub axis: usize,
-    /// What is picked along it.
+    /// The indices along it.
     pub places: Places,
 }
 
 /// The adjoint of [`Pick`]: zeros to which each entry or element of x is added at its place; dx = [`Pick`] of g.
 #[derive(Clone)]
 pub struct Put {
-    /// What would pick them again.
+    /// The inverse selection.
     pub pick: Pick,
     /// The extent of the output along the axis.
     pub extent: usize,
@@ -80,7 +80,8 @@ impl Pick {
         }
     }
 
-    /// Whether the indices are those of a result of the shape `picked`, and below `extent`; `x` is what was given.
+    /// Checks that the indices fit a result of the shape `picked` and are below `extent`. `x` is the shape of the
+    /// input.
     fn check(&self, x: &[usize], picked: &[usize], extent: usize) -> Result<(), ShapeError> {
         match &self.places {
             Places::Entries(index) => {
@@ -102,13 +103,13 @@ impl Pick {
         }
     }
 
-    /// `[elements of a block, elements of an entry]` of a shape: a block is what one index of the axes before leads to.
+    /// `[elements of a block, elements of an entry]` of a shape. A block is the part for one index of the axes before.
     fn sizes(&self, x: &[usize]) -> [usize; 2] {
         [self.axis, self.axis + 1].map(|axis| x[axis..].iter().product())
     }
 }
 
-/// Calls `f(i, j)` for each index of a block, `i` counting the indices and `j` the elements of what is picked from.
+/// Calls `f(i, j)` for each index of a block; `i` counts the indices, and `j` the elements of the source.
 #[inline(always)]
 fn each_element(index: &[u32], inner: usize, mut f: impl FnMut(usize, usize)) {
     for (row, index) in index.chunks_exact(inner).enumerate() {
@@ -118,7 +119,7 @@ fn each_element(index: &[u32], inner: usize, mut f: impl FnMut(usize, usize)) {
     }
 }
 
-/// [`chunks`] of `len` elements, the blocks: as many in one task as make it worth its while.
+/// [`chunks`] of `len` elements, the blocks. A task gets enough blocks to be worth its start.
 fn in_blocks<T: Send, S: Send>(
     out: &mut [T],
     len: usize,
@@ -238,7 +239,8 @@ impl<T: Scalar> Op<T> for Put {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// Rows by number: `[rows, ..]` to `[index.len(), ..]`, row `i` of the result being row `index[i]` of this tensor.
+    /// Selects rows by index: `[rows, ..]` to `[index.len(), ..]`. Row `i` of the result is row `index[i]` of this
+    /// tensor. In [`backward`](Self::backward), the gradient is sparse.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -257,8 +259,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Pick { method: ROWS, axis: 0, places: Places::Entries(index) }, &[self])
     }
 
-    /// The adjoint of [`gather_rows`](Self::gather_rows): `[index.len(), ..]` to `[rows, ..]`, zeros to which row `i` of
-    /// this tensor is added at row `index[i]`. Sums are carried in f64.
+    /// The adjoint of [`gather_rows`](Self::gather_rows): `[index.len(), ..]` to `[rows, ..]`. The result is zeros to
+    /// which row `i` of this tensor is added at row `index[i]`. Sums are in f64.
     ///
     /// # Panics
     /// If there is not one index for each row, or one is not below `rows`.
@@ -268,9 +270,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Put { pick, extent: rows }, &[self])
     }
 
-    /// Elements by number along `axis`: `y[i][j] = x[index[i][j]][j]` for axis 0 of two, and likewise for others. The
-    /// result has the shape of `index`, which agrees with this tensor in all other axes. The gradient is
-    /// [scattered](Self::scatter_add) back.
+    /// Selects elements by index along `axis` (`torch.gather`, `numpy.take_along_axis`): `y[i][j] = x[index[i][j]][j]`
+    /// for axis 0 of two.
+    ///
+    /// The result has the shape of `index`, which agrees with this tensor in all other axes. The gradient is that of
+    /// [`scatter_add`](Self::scatter_add).
     ///
     /// ```
     /// use raygrad_autograd::{Indices, Tape, Tensor};
@@ -289,9 +293,11 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Pick { method: ELEMENTS, axis, places: Places::Elements(index.into()) }, &[self])
     }
 
-    /// This tensor with the elements of `source` added at the positions that `index` names along `axis`:
-    /// `y[index[i][j]][j] += source[i][j]` for axis 0 of two. `source` has the shape of `index`, which agrees with this
-    /// tensor in all other axes. Elements that meet are added in row-major order of `index`.
+    /// Adds the elements of `source` to this tensor at the positions of `index` along `axis`:
+    /// `y[index[i][j]][j] += source[i][j]` for axis 0 of two.
+    ///
+    /// `source` has the shape of `index`, which agrees with this tensor in all other axes. Elements at one position are
+    /// added in row-major order of `index`.
     ///
     /// # Panics
     /// If the axis does not exist, the shapes do not fit, or an index is not below the extent of the axis.
@@ -301,8 +307,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.plus(Pick { method: ELEMENTS, axis, places: Places::Elements(index.into()) }, source)
     }
 
-    /// Entries along `axis` by number: `[.., n, ..]` to `[.., index.len(), ..]`. The gradient is
-    /// [added](Self::index_add) back to the entries that were picked; along the first axis it is sparse, as that of
+    /// Selects entries along `axis` by index: `[.., n, ..]` to `[.., index.len(), ..]`. The gradient is
+    /// [added](Self::index_add) to the selected entries. Along the first axis it is sparse, as that of
     /// [`gather_rows`](Self::gather_rows).
     ///
     /// # Panics
@@ -313,7 +319,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Pick { method: ENTRIES, axis, places: Places::Entries(index) }, &[self])
     }
 
-    /// This tensor with entry `i` of `source` along `axis` added to entry `index[i]`, in the order of `i`.
+    /// Adds entry `i` of `source` along `axis` to entry `index[i]` of this tensor, in the order of `i`.
     ///
     /// # Panics
     /// If the axis does not exist, the shapes do not fit, or an index is not below the extent of the axis.
@@ -323,7 +329,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.plus(Pick { method: ENTRIES, axis, places: Places::Entries(index) }, source)
     }
 
-    /// The sum with `source` at the places where `pick` would take it from.
+    /// The sum with `source` at the places that `pick` selects.
     #[track_caller]
     fn plus(&self, pick: Pick, source: &Self) -> Self {
         let (name, extent) = (pick.method.names[1], self.shape()[pick.axis]);
@@ -333,7 +339,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self + sum
     }
 
-    /// Indices along one axis.
+    /// The indices as a list.
     #[track_caller]
     pub(crate) fn line(&self, op: &'static str, index: impl Into<Indices>) -> Arc<[u32]> {
         let index = index.into();
@@ -343,7 +349,7 @@ impl<'t, T: Scalar> Var<'t, T> {
 }
 
 impl<T: Scalar> Tape<T> {
-    /// Indicator vectors `[.., classes]` as a constant: 1 at each index, 0 elsewhere.
+    /// One-hot vectors `[.., classes]` as a constant: 1 at each index, 0 elsewhere.
     ///
     /// # Panics
     /// If an index is not below `classes`.

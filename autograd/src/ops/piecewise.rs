@@ -1,4 +1,4 @@
-//! Functions with kinks and steps: absolute value, sign, extremes, limits, rounding.
+//! Functions with kinks and steps: absolute value, sign, maximum, minimum, clamp, rounding.
 
 use crate::cases::{INF, NAN};
 use crate::error::ensure;
@@ -33,7 +33,7 @@ impl Formula<1> for Sign {
     }
 }
 
-/// y = the greater of a and b, NaN if one is; its gradient is g, and each has half of it at a tie.
+/// y = the larger of a and b, NaN if one is NaN. The larger one gets g; at a tie each gets half.
 #[derive(Clone, Copy)]
 pub struct Maximum;
 impl Formula<2> for Maximum {
@@ -49,7 +49,7 @@ impl Formula<2> for Maximum {
     }
 }
 
-/// y = the smaller of a and b, NaN if one is; its gradient is g, and each has half of it at a tie.
+/// y = the smaller of a and b, NaN if one is NaN. The smaller one gets g; at a tie each gets half.
 #[derive(Clone, Copy)]
 pub struct Minimum;
 impl Formula<2> for Minimum {
@@ -65,7 +65,7 @@ impl Formula<2> for Minimum {
     }
 }
 
-/// g where `lead` > 0, 0 where it is negative, half of g at a tie (and where nothing can be said).
+/// g where `lead` > 0, 0 where it is negative, half of g at a tie or NaN.
 #[inline(always)]
 pub(crate) fn share<E: Real>(g: E, lead: E) -> E {
     let (zero, half) = (g.like(0.0), g.like(0.5) * g);
@@ -148,11 +148,11 @@ impl Formula<1> for Round {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The elements limited to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is
-    /// 0 beyond. An infinite limit is none.
+    /// Limits the elements to `low..=high`; NaN stays NaN. The gradient passes between the limits and on them, and is 0
+    /// beyond. An infinite limit has no effect.
     ///
     /// # Panics
-    /// If `low` is not at most `high`, or one is NaN.
+    /// If `low` is above `high`, or if one is NaN.
     #[track_caller]
     pub fn clamp(&self, low: f64, high: f64) -> Self {
         self.fits("clamp", ensure(low <= high, || format!("no number is between {low} and {high}")));
@@ -163,23 +163,23 @@ impl<'t, T: Scalar> Var<'t, T> {
 elementwise! {
     /// The absolute value. The gradient at 0 is 0.
     abs() = Abs;
-    /// 1 for positive elements, -1 for negative ones, 0 and NaN for 0 and NaN. The gradient is 0.
+    /// The sign: 1 for positive elements, -1 for negative ones; 0 and NaN stay. The gradient is 0.
     sign() = Sign;
-    /// The greater of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
+    /// The larger of two elements, NaN if one is NaN. Shapes broadcast. At a tie each gets half of the gradient.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     maximum(other) = Maximum;
-    /// The smaller of two elements, NaN if one is NaN; broadcasts. At a tie each gets half of the gradient.
+    /// The smaller of two elements, NaN if one is NaN. Shapes broadcast. At a tie each gets half of the gradient.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     minimum(other) = Minimum;
-    /// The next whole number below. The gradient is 0.
+    /// The largest whole number that is not above. The gradient is 0.
     floor() = Floor;
-    /// The next whole number above. The gradient is 0.
+    /// The smallest whole number that is not below. The gradient is 0.
     ceil() = Ceil;
-    /// The nearest whole number, the even one of two. The gradient is 0.
+    /// The nearest whole number; ties go to the even one. The gradient is 0.
     round() = Round;
     also examined: Clamp { low: -1.0, high: 2.0 };
 }

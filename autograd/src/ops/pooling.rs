@@ -1,4 +1,4 @@
-//! Max and average pooling of images `[n, channels, height, width]`. Channels run on rayon's threads.
+//! Max and average pooling of images `[n, channels, height, width]`. Channels run in parallel on rayon's threads.
 
 use super::pick::{PIXELS, Pick, Places, Put};
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
@@ -6,10 +6,10 @@ use raygrad_tensor::parallel::chunks;
 use raygrad_tensor::{Indices, Pool, Scalar, Shape, Tensor, Windows};
 use serde::{Deserialize, Serialize};
 
-/// The windows of a 2-D pooling, by axis: `[rows, columns]`.
+/// Kernel, stride and padding of a 2-D pooling, by axis: `[rows, columns]`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Pool2dConfig {
-    /// Extents of a window.
+    /// Height and width of a window.
     pub kernel: [usize; 2],
     /// Pixels from one window to the next; at least 1.
     pub stride: [usize; 2],
@@ -18,7 +18,7 @@ pub struct Pool2dConfig {
 }
 
 impl Pool2dConfig {
-    /// Windows side by side, without padding.
+    /// Adjacent windows without overlap or padding.
     pub fn new(kernel: [usize; 2]) -> Self {
         Pool2dConfig { kernel, stride: kernel, padding: [0, 0] }
     }
@@ -34,7 +34,7 @@ impl Pool2dConfig {
         Windows::new([height, width], self.kernel, self.stride, self.padding, [1, 1])
     }
 
-    /// The windows of a shape that [`windows`](Self::windows) has accepted.
+    /// The windows for a shape that [`windows`](Self::windows) has accepted.
     fn accepted(&self, shape: &[usize]) -> Windows {
         match self.windows(shape) {
             Ok(windows) => windows,
@@ -48,8 +48,8 @@ impl Pool2dConfig {
     }
 }
 
-/// y = the largest element of each window, NaN if there is one; padding does not count. dx = [`Put`] of g: to the
-/// first element that is the largest.
+/// y = the largest element of each window, NaN if there is one; padding is ignored. dx = [`Put`] of g at the first
+/// largest element.
 #[derive(Clone, Copy)]
 pub struct MaxPool2d(
     /// The windows.
@@ -63,7 +63,7 @@ pub struct AvgPool2d(
     pub Pool2dConfig,
 );
 
-/// The adjoint of [`AvgPool2d`]: each element, divided by the size of a window, added to all of its window.
+/// The adjoint of [`AvgPool2d`]: adds each element, divided by the size of a window, to all of its window.
 #[derive(Clone, Copy)]
 pub struct AvgPool2dInput {
     /// The windows.
@@ -80,12 +80,12 @@ fn with_plane(shape: &[usize], plane: [usize; 2]) -> Shape {
     out
 }
 
-/// Elements of the last two axes together.
+/// Number of elements of the last two axes together.
 fn plane_len(shape: &[usize]) -> usize {
     shape[shape.len() - 2..].iter().product()
 }
 
-/// A tensor of `shape` of which `f(plane of x, plane of the output)` writes each plane.
+/// A tensor of `shape`; `f(plane of x, plane of the output)` writes each plane.
 fn planes<T: Scalar>(
     x: &Tensor<T>,
     shape: &[usize],
@@ -100,7 +100,7 @@ fn planes<T: Scalar>(
 }
 
 impl MaxPool2d {
-    /// Where the largest elements stand in each image of one channel: `[images, windows]`.
+    /// The indices of the largest elements in each single-channel image: `[images, windows]`.
     fn index<T: Scalar>(&self, x: &Tensor<T>) -> Indices {
         let windows = self.0.accepted(x.shape());
         let (from, to) = (plane_len(x.shape()), windows.count());
@@ -206,9 +206,11 @@ impl<T: Scalar> Op<T> for AvgPool2dInput {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The largest element of each window of images `[n, channels, height, width]`, NaN if there is one; padding does
-    /// not count. The result is `[n, channels, oh, ow]` with `oh = (height + 2 padding - kernel) / stride + 1`, rounded
-    /// down. The gradient goes to the first of equal elements, in row-major order.
+    /// Max pooling: the largest element of each window of images `[n, channels, height, width]`. It is NaN if the
+    /// window has a NaN; padding is ignored.
+    ///
+    /// The result is `[n, channels, oh, ow]` with `oh = (height + 2 padding - kernel) / stride + 1`, rounded down. The
+    /// gradient goes to the first of equal elements, in row-major order.
     ///
     /// ```
     /// use raygrad_autograd::{Pool2dConfig, Tape, Tensor};
@@ -220,19 +222,20 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If there are not four axes, the image has no pixels or 2^32 and more, a window is larger than the padded image, the
-    /// padding is more than half a window, or a stride is 0.
+    /// If there are not four axes, or an image has no pixels or at least 2^32. If a window is larger than the padded
+    /// image, the padding is more than half a window, or a stride is 0.
     #[track_caller]
     pub fn max_pool2d(&self, config: &Pool2dConfig) -> Self {
         self.tape().apply(MaxPool2d(*config), &[self])
     }
 
-    /// The mean of each window of images `[n, channels, height, width]`, where padding counts as zeros. The result is
-    /// `[n, channels, oh, ow]` with `oh = (height + 2 padding - kernel) / stride + 1`, rounded down. The gradient is
-    /// spread evenly over the window.
+    /// Average pooling: the mean of each window of images `[n, channels, height, width]`. Padding counts as zeros.
+    ///
+    /// The result is `[n, channels, oh, ow]` with `oh = (height + 2 padding - kernel) / stride + 1`, rounded down. The
+    /// gradient is spread evenly over the window.
     ///
     /// # Panics
-    /// As [`max_pool2d`](Self::max_pool2d).
+    /// Where [`max_pool2d`](Self::max_pool2d) panics.
     #[track_caller]
     pub fn avg_pool2d(&self, config: &Pool2dConfig) -> Self {
         self.tape().apply(AvgPool2d(*config), &[self])

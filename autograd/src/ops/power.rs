@@ -52,7 +52,7 @@ impl Formula<1> for Powi {
     }
 }
 
-/// [`Powi`] with an exponent that the compiler knows: where it is small, a few products that vectorise.
+/// [`Powi`] with an exponent known at compile time: for small exponents, a few products that vectorise.
 #[derive(Clone, Copy)]
 pub struct ConstPowi<const N: i32>;
 impl<const N: i32> Formula<1> for ConstPowi<N> {
@@ -66,7 +66,7 @@ impl<const N: i32> Formula<1> for ConstPowi<N> {
     }
 }
 
-/// y = x^p, NaN for a negative x and a broken p; dx = g p x^(p - 1), 0 for p = 0.
+/// y = x^p, NaN for a negative x and a fractional p; dx = g p x^(p - 1), 0 for p = 0.
 #[derive(Clone, Copy)]
 pub struct Powf {
     /// The exponent.
@@ -90,8 +90,8 @@ impl Formula<1> for Powf {
     }
 }
 
-/// y = a^b; da = g b a^(b - 1), db = g y ln a. At a = 0 da is 0 for b = 0, and db is 0 for b >= 0; NaN for a negative a
-/// and a broken b.
+/// y = a^b; da = g b a^(b - 1), db = g y ln a. At a = 0, da is 0 for b = 0, and db is 0 for b >= 0. NaN for a negative
+/// a and a fractional b.
 #[derive(Clone, Copy)]
 pub struct Pow;
 impl Formula<2> for Pow {
@@ -131,7 +131,7 @@ pub(crate) fn slope_of_exponent<E: Real>(a: E, b: E, y: E) -> E {
     size.if_positive(full, at_zero)
 }
 
-/// y = a ln b, 0 for a = 0 unless b is NaN; da = g ln b, but 0 where a = 0 and b <= 0; db = g a / b, but 0 where a = 0.
+/// y = a ln b, 0 for a = 0 unless b is NaN. da = g ln b, but 0 where a = 0 and b <= 0. db = g a / b, but 0 where a = 0.
 #[derive(Clone, Copy)]
 pub struct Xlogy;
 impl Formula<2> for Xlogy {
@@ -157,7 +157,7 @@ impl Formula<2> for Xlogy {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// `self` to a whole power; exponent 0 gives 1, with gradient 0, whatever the base.
+    /// `self` to an integer power. Exponent 0 gives 1, with gradient 0, for any base.
     #[track_caller]
     pub fn powi(&self, exponent: i32) -> Self {
         match exponent {
@@ -169,8 +169,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         }
     }
 
-    /// `self` to a constant real power: NaN for a negative base and a broken exponent; exponent 0 gives 1 with gradient
-    /// 0.
+    /// `self` to a constant real power; NaN for a negative base and a fractional exponent. Exponent 0 gives 1, with
+    /// gradient 0.
     #[track_caller]
     pub fn powf(&self, exponent: f64) -> Self {
         Powf { exponent }.on([self])
@@ -178,15 +178,15 @@ impl<'t, T: Scalar> Var<'t, T> {
 }
 
 elementwise! {
-    /// `1 / self`.
+    /// The reciprocal, `1 / self`.
     reciprocal() = Reciprocal;
-    /// `self` to the power of `exponent`; broadcasts. At base 0 the gradient of the exponent is 0 unless that is
-    /// negative, and for a negative base it is NaN.
+    /// `self` to the power of `exponent`. Shapes broadcast. At base 0 the gradient of the exponent is 0, unless the
+    /// exponent is negative. For a negative base it is NaN.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
     pow(exponent) = Pow;
-    /// `self * ln(y)`, which is 0 where `self` is 0 even if `y` is 0 or negative; broadcasts. An entropy is
+    /// `self * ln(y)`, which is 0 where `self` is 0, even if `y` is 0 or negative. Shapes broadcast. An entropy is
     /// `-p.xlogy(&p)`.
     ///
     /// # Panics

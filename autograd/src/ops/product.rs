@@ -1,4 +1,4 @@
-//! The product of the elements of each row, without overflow or underflow on the way.
+//! The product of the elements of each row, without overflow or underflow of partial products.
 
 use super::scan::{Cumprod, Walk};
 use crate::{Axes, Grads, Op, ShapeError, Var, Vjp};
@@ -6,8 +6,8 @@ use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 
 /// y = the product of each row (along the last axis); dx = g times the product of all others.
 ///
-/// Products are formed of [`balanced`] factors, so a value or a gradient that the type can hold comes out whatever the
-/// products of some of the elements are.
+/// Products use [`balanced`] factors. So a value or gradient in the range of the type is right, even if partial
+/// products are out of range.
 #[derive(Clone, Copy)]
 pub struct Product;
 
@@ -52,7 +52,7 @@ impl<T: Scalar> Op<T> for Product {
     }
 }
 
-/// The gradient as a formula of `x` and `g`: the products before and behind each entry. The powers of two that balance
+/// The gradient as a formula of `x` and `g`: the products before and after each entry. The powers of two that balance
 /// them are constants.
 fn recorded<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
     let (axis, shape) = (x.shape().len() - 1, x.shape());
@@ -82,7 +82,7 @@ fn recorded<'t, T: Scalar>(x: &Var<'t, T>, g: &Var<'t, T>) -> Var<'t, T> {
     around(false) * around(true) * up * g.reshape(&column) * up_too
 }
 
-/// Of each element of a row the product of all others: `products[i] * 2^(total - exponents[i])`.
+/// For each element of a row, the product of all others: `products[i] * 2^(total - exponents[i])`.
 #[derive(Default)]
 struct Others {
     factors: Vec<f64>,
@@ -112,8 +112,8 @@ impl Others {
     }
 }
 
-/// Calls `f(i, factor, exponent)` with each element as `factor * 2^exponent`, such that the product of any run of
-/// neighbouring factors lies between 1/2 and 2. Zeros, infinities and NaN stay as they are and do not count.
+/// Calls `f(i, factor, exponent)` with each element as `factor * 2^exponent`. The product of any run of neighbouring
+/// factors is between 1/2 and 2. Zeros, infinities and NaN stay unchanged and do not count.
 fn balanced<T: Scalar>(row: &[T], mut f: impl FnMut(usize, f64, i64)) {
     // The product of all factors so far, in 1..2.
     let mut product = 1.0;
@@ -171,8 +171,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.prod_over(..)
     }
 
-    /// The product over any axes; 1 over none of the elements. The gradient is right whatever elements are 0, and
-    /// neither product nor gradient depends on whether the product of some of the elements is in the range of the type.
+    /// The product over any axes; 1 if there are no elements. The gradient is right even if elements are 0. Product and
+    /// gradient are right even if partial products are out of the type's range.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};

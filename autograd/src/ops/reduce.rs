@@ -1,13 +1,13 @@
-//! Sums, means and their adjoint, broadcasting.
+//! Sums, means and broadcasting, the adjoint of the sum.
 
 use crate::{Axes, Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::Reduction;
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape, sum_to};
 
-/// y = x summed over the axes along which `shape` would have to be stretched to become x; dx = g broadcast.
+/// y = x summed over the axes along which `shape` broadcasts to the shape of x; dx = g broadcast.
 #[derive(Clone)]
 pub struct SumTo {
-    /// The shape of the output: broadcasts to the shape of the input.
+    /// The shape of the output, which broadcasts to the shape of the input.
     pub shape: Shape,
 }
 
@@ -36,7 +36,7 @@ impl<T: Scalar> Op<T> for SumTo {
     }
 }
 
-/// y = x stretched to `shape`; dx = g summed over the stretched axes.
+/// y = x broadcast to `shape`; dx = g summed over the broadcast axes.
 #[derive(Clone)]
 pub struct BroadcastTo {
     /// The shape of the output.
@@ -69,7 +69,7 @@ impl<T: Scalar> Op<T> for BroadcastTo {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The sum of all elements, pairwise, as a scalar.
+    /// The sum of all elements, as a scalar. The sum is pairwise.
     #[track_caller]
     pub fn sum(&self) -> Self {
         self.sum_to(&[])
@@ -81,7 +81,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.sum() / self.value().len() as f64
     }
 
-    /// The sum over any axes; 0 over none of the elements.
+    /// The sum over any axes; 0 if there are no elements.
     ///
     /// ```
     /// use raygrad_autograd::{Axes, Tape, Tensor};
@@ -99,7 +99,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.sum_to(&axes.kept()).reshape(&axes.result())
     }
 
-    /// The mean over any axes; NaN over none of the elements.
+    /// The mean over any axes; NaN if there are no elements.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.
@@ -109,7 +109,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         (self.sum_to(&axes.kept()) / axes.count() as f64).reshape(&axes.result())
     }
 
-    /// `[elements that stay, elements that are reduced]`, with the reduced axes moved to the end.
+    /// `[kept elements, reduced elements]`, with the reduced axes moved to the end.
     #[track_caller]
     pub(crate) fn rows_over(&self, axes: &Reduction) -> Self {
         let order = axes.reduced_last();
@@ -118,7 +118,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         if sorted { self.clone() } else { self.reordered(&order) }.reshape(&[rows, axes.count()])
     }
 
-    /// The sum over the axes along which `shape` would have to be stretched to become the shape of this tensor.
+    /// Sums over the axes along which `shape` broadcasts to the shape of this tensor: the adjoint of
+    /// [`broadcast_to`](Self::broadcast_to).
     ///
     /// # Panics
     /// If `shape` does not broadcast to the shape of this tensor.
@@ -130,10 +131,10 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(SumTo { shape: shape.into() }, &[self])
     }
 
-    /// This tensor stretched to `shape`.
+    /// Broadcasts this tensor to `shape`, with NumPy's rules.
     ///
     /// # Panics
-    /// If it does not broadcast to `shape`.
+    /// If this tensor does not broadcast to `shape`.
     #[track_caller]
     pub fn broadcast_to(&self, shape: &[usize]) -> Self {
         if self.shape() == shape {

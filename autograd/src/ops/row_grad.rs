@@ -1,13 +1,13 @@
-//! The gradient of a table of which some rows were used.
+//! The sparse gradient of a table of which some rows were used.
 
 use super::pick::check_index;
 use crate::{RowShare, RowSums, SparseGrad};
 use raygrad_tensor::{Scalar, Shape, Tensor};
 use std::sync::Arc;
 
-/// Adds row `i` of `rows`, of `width` numbers, to row `index[i]` of `dense`, with sums in f64: a sum of any number of rows is
-/// off by its own rounding alone, where 10^5 of them added in f32 lose three digits. A table that is larger than what is
-/// added to it gets no second one for the sums.
+/// Adds row `i` of `rows`, of `width` numbers, to row `index[i]` of `dense`, with sums in f64. A sum of any number of
+/// rows then has its own rounding error alone; 10^5 rows added in f32 lose three digits. If the table is larger than
+/// the added rows, it gets no second table for the sums.
 pub(super) fn add_rows<T: Scalar>(dense: &mut [T], rows: &[T], index: &[u32], width: usize, sums: &mut Vec<f64>) {
     let add = |sums: &mut [f64], row: usize| {
         for (sum, x) in sums.iter_mut().zip(&rows[row * width..][..width]) {
@@ -34,7 +34,7 @@ pub(super) fn add_rows<T: Scalar>(dense: &mut [T], rows: &[T], index: &[u32], wi
     }
 }
 
-/// The gradient of a table of which some rows were gathered: the rows of the output's gradient and where they belong.
+/// The sparse gradient of a table of which some rows were gathered: rows of the output's gradient, and their indices.
 #[derive(Debug, Clone)]
 pub struct RowGrad<T: Scalar> {
     shape: Shape,
@@ -43,7 +43,7 @@ pub struct RowGrad<T: Scalar> {
 }
 
 impl<T: Scalar> RowGrad<T> {
-    /// The gradient of a table of this shape to which `rows` `[index.len(), ..]` are to be added at `index`.
+    /// The gradient of a table of this shape: `rows` `[index.len(), ..]`, to be added at `index`.
     ///
     /// # Panics
     /// If the table is a scalar, an index is not below its number of rows, or the rows have another shape.
@@ -58,7 +58,7 @@ impl<T: Scalar> RowGrad<T> {
         RowGrad { shape: shape.into(), index, rows }
     }
 
-    /// For each row its place in the table. A row of the table can come several times.
+    /// The table row of each of [`rows`](Self::rows). An index may occur several times.
     pub fn index(&self) -> &Arc<[u32]> {
         &self.index
     }

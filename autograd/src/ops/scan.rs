@@ -1,4 +1,4 @@
-//! Cumulative sums and products, and the recurrence that their derivatives lead to.
+//! Cumulative sums and products, and the recurrence in their derivatives.
 
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
@@ -9,7 +9,7 @@ use std::ops::Range;
 pub struct Walk {
     /// The axis.
     pub axis: usize,
-    /// From the last entry to the first.
+    /// Whether to walk from the last entry to the first.
     pub reverse: bool,
 }
 
@@ -22,8 +22,8 @@ impl Walk {
         if self.axis < x.len() { Ok(Shape::from_slice(x)) } else { Err(format!("there is no axis {}", self.axis)) }
     }
 
-    /// Calls `f(state, i)` for every element in the order of the walk, with one state, that starts as `start`, for each
-    /// line along the axis. States are f64: what is carried on is not rounded.
+    /// Calls `f(state, i)` for every element in the order of the walk. Each line along the axis has one state, which
+    /// starts as `start`. States are f64, so they are not rounded to the type.
     #[inline(always)]
     fn run(self, shape: &[usize], start: f64, mut f: impl FnMut(&mut f64, usize)) {
         let (count, inner) = (shape[self.axis], shape[self.axis + 1..].iter().product::<usize>());
@@ -65,8 +65,8 @@ impl Walk {
     }
 }
 
-/// Calls `f(state, i)` for every element of these ranges of rows of `inner` elements, from the first row of a range to its
-/// last or the `reverse`, with a state for each column that starts as `start` in every range.
+/// Calls `f(state, i)` for every element of these ranges of rows, with `inner` elements in a row. It walks from the
+/// first row of a range to the last, or in `reverse`. Each column of a range has a state that starts as `start`.
 #[inline(always)]
 pub(super) fn walk_rows(
     ranges: impl Iterator<Item = Range<usize>>,
@@ -87,7 +87,7 @@ pub(super) fn walk_rows(
     }
 }
 
-/// y = sum of x up to and with each entry; dx = the sum of g the other way.
+/// y = the sum of x up to and including each entry; dx = the sum of g the other way.
 #[derive(Clone, Copy)]
 pub struct Cumsum(
     /// The order.
@@ -122,8 +122,8 @@ impl<T: Scalar> Op<T> for Cumsum {
     }
 }
 
-/// y = product of x up to and with each entry. dx: the gradients of all later products, carried back by [`Recurrence`],
-/// times the product before the entry; nothing is divided, so zeros do no harm.
+/// y = the product of x up to and including each entry. dx: [`Recurrence`] carries the gradients of all later products
+/// back, times the product before the entry. Nothing is divided, so zeros do no harm.
 #[derive(Clone, Copy)]
 pub struct Cumprod(
     /// The order.
@@ -160,8 +160,8 @@ impl<T: Scalar> Op<T> for Cumprod {
     }
 }
 
-/// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence, the other way, of g with the
-/// next factor; da = db y[i - 1].
+/// y[i] = a[i] y[i - 1] + b[i], with 0 before the first entry. db: the same recurrence of g in the other direction,
+/// with the next factor; da = db y[i - 1].
 #[derive(Clone, Copy)]
 pub struct Recurrence(
     /// The order.
@@ -203,7 +203,7 @@ impl<T: Scalar> Op<T> for Recurrence {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// A scan along an axis that may be counted from the last one; a scalar counts as one entry.
+    /// A scan along an axis; a scalar counts as one entry.
     #[track_caller]
     fn walk(&self, op: &'static str, axis: isize, reverse: bool, scan: impl Fn(Walk, &Self) -> Self) -> Self {
         if self.shape().is_empty() {
@@ -213,7 +213,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().as_one(|| scan(walk, self))
     }
 
-    /// The sums of the entries along `axis` up to each one and with it, carried in f64.
+    /// The cumulative sum along `axis`, with the running sum in f64. Each sum includes its own entry.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -222,7 +222,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk("cumsum", axis, false, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
-    /// The sums of the entries along `axis` from each one (with it) to the last, carried in f64.
+    /// The cumulative sum along `axis` from the last entry back, with the running sum in f64. Each sum includes its own
+    /// entry.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -231,8 +232,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk("reverse_cumsum", axis, true, |walk, x| x.tape().apply(Cumsum(walk), &[x]))
     }
 
-    /// The products of the entries along `axis` up to each one and with it, carried in f64. The gradient is right
-    /// whatever entries are 0.
+    /// The cumulative product along `axis`, with the running product in f64. Each product includes its own entry. The
+    /// gradient is right even if entries are 0.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -241,8 +242,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.walk("cumprod", axis, false, |walk, x| x.tape().apply(Cumprod(walk), &[x]))
     }
 
-    /// `y[i] = self[i] y[i - 1] + summand[i]` along `axis`, with 0 before the first entry: a first-order linear
-    /// recurrence, such as a discounted sum or an exponential moving average.
+    /// A first-order linear recurrence along `axis`: `y[i] = self[i] y[i - 1] + summand[i]`, with 0 before the first
+    /// entry. It computes discounted sums and exponential moving averages.
     ///
     /// # Panics
     /// If the shapes differ or the axis does not exist.

@@ -1,4 +1,4 @@
-//! Operations along segments: rows of a tensor that belong together, such as the samples of one ray.
+//! Operations along segments: consecutive rows that belong together, such as the samples of a ray.
 
 use super::scan::walk_rows;
 use crate::{Grads, Op, Reads, ShapeError, Var, Vjp};
@@ -6,7 +6,7 @@ use raygrad_tensor::{Pool, Scalar, Shape, Tensor};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// A division of `0..rows` into consecutive segments, some of which may be empty. A clone is a reference count.
+/// A division of `0..rows` into consecutive segments; some may be empty. Cloning copies a reference.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Segments(Arc<[u32]>);
 
@@ -14,7 +14,7 @@ impl Segments {
     /// Segment `i` holds rows `offsets[i]..offsets[i + 1]`.
     ///
     /// # Panics
-    /// If the offsets do not start at 0 or fall.
+    /// If the offsets do not start at 0, or if they decrease.
     #[track_caller]
     pub fn new(offsets: impl Into<Arc<[u32]>>) -> Self {
         let offsets = offsets.into();
@@ -54,18 +54,18 @@ impl Segments {
     /// The rows of segment `i`.
     ///
     /// # Panics
-    /// If there is no such segment.
+    /// If there is no segment `i`.
     #[inline]
     pub fn range(&self, i: usize) -> Range<usize> {
         self.0[i] as usize..self.0[i + 1] as usize
     }
 
-    /// The rows of each segment in turn.
+    /// The rows of each segment, in order.
     pub fn ranges(&self) -> impl ExactSizeIterator<Item = Range<usize>> + '_ {
         (0..self.len()).map(|i| self.range(i))
     }
 
-    /// The offsets.
+    /// The offsets: segment `i` holds rows `offsets[i]..offsets[i + 1]`.
     pub fn offsets(&self) -> &[u32] {
         &self.0
     }
@@ -159,14 +159,14 @@ impl<T: Scalar> Op<T> for SegmentExpand {
     }
 }
 
-/// y = cumulative sum of x within each segment. The adjoint runs the other way.
+/// y = the cumulative sum of x within each segment. The adjoint runs the other way.
 #[derive(Clone)]
 pub struct SegmentCumsum {
     /// The segments.
     pub segments: Segments,
-    /// Leave a row's own value out of its sum.
+    /// Whether a row's sum leaves out its own value.
     pub exclusive: bool,
-    /// From the last row of a segment to the first.
+    /// Whether to run from the last row of a segment to the first.
     pub reverse: bool,
 }
 
@@ -204,7 +204,7 @@ impl<T: Scalar> Op<T> for SegmentCumsum {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The sum of the rows of each segment: `[rows, ..]` to `[segments, ..]`.
+    /// Sums the rows of each segment: `[rows, ..]` to `[segments, ..]`.
     ///
     /// # Panics
     /// If the first extent is not the number of rows.
@@ -213,7 +213,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(SegmentSum(segments.clone()), &[self])
     }
 
-    /// Row `i` at every row of segment `i`: `[segments, ..]` to `[rows, ..]`.
+    /// Repeats row `i` at every row of segment `i`: `[segments, ..]` to `[rows, ..]`.
     ///
     /// # Panics
     /// If the first extent is not the number of segments.
@@ -222,7 +222,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(SegmentExpand(segments.clone()), &[self])
     }
 
-    /// The cumulative sum down the rows of each segment; `exclusive` leaves a row's own value out of its sum.
+    /// The cumulative sum along the rows of each segment. With `exclusive`, a row's sum leaves out its own value.
     ///
     /// # Panics
     /// If the first extent is not the number of rows.

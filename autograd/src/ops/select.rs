@@ -1,10 +1,10 @@
-//! Choices: comparisons, selection by a mask, and interpolation.
+//! Comparisons, selection by a mask, and interpolation.
 
 use crate::error::ensure;
 use crate::{Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Mask, Pool, Scalar, Shape, Tensor, broadcast_shape, choose, map};
 
-/// y = yes where the mask holds, else no.
+/// y = yes where the mask is true, else no.
 #[derive(Clone)]
 pub struct Where(pub Mask);
 
@@ -78,8 +78,10 @@ impl<'t, T: Scalar> Var<'t, T> {
         holds(self.value(), other.value())
     }
 
-    /// Where `self > other`; broadcasts. A NaN compares as in Rust: it equals nothing. There is nothing to differentiate:
-    /// the result is a [`Mask`], for [`where_`](Self::where_), [`masked_select`](Self::masked_select), and as numbers by [`Mask::cast`].
+    /// Where `self > other`. Shapes broadcast. NaN compares as in Rust: it equals no number.
+    ///
+    /// The result is a [`Mask`], which has no gradient. Use it in [`where_`](Self::where_) and
+    /// [`masked_select`](Self::masked_select), or convert it to numbers with [`Mask::cast`].
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -131,8 +133,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.compare("elementwise_eq", other, |a, b| a.elementwise_eq(b))
     }
 
-    /// `self` where `mask` holds, else `other`: PyTorch's `where`, with the underscore because Rust keeps that word to
-    /// itself. All three broadcast together. The gradient goes to whichever was chosen.
+    /// `self` where `mask` is true, else `other` (`torch.where`; `where` is a Rust keyword). All three broadcast
+    /// together. The gradient goes to the selected operand.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -150,7 +152,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Where(mask.clone()), &[self, &other.on(self.tape())])
     }
 
-    /// The elements where `mask` holds, as a vector in row-major order: NumPy's `x[mask]`, PyTorch's `masked_select`.
+    /// The elements where `mask` is true, as a vector in row-major order (`x[mask]` in NumPy, `torch.masked_select`).
     ///
     /// # Panics
     /// If the mask has another shape.
@@ -161,7 +163,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.reshape(&[self.value().len()]).gather_rows(mask.nonzero())
     }
 
-    /// `self + weight * (end - self)`: linear interpolation, exact at weights 0 and 1; broadcasts.
+    /// Linear interpolation, `self + weight * (end - self)`, exact at weights 0 and 1. Shapes broadcast.
     ///
     /// # Panics
     /// If the shapes do not broadcast.

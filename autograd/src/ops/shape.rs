@@ -5,7 +5,7 @@ use crate::{Grads, Op, Reads, ShapeError, SparseGrad, Var, Vjp};
 use raygrad_tensor::{Layout, Pool, Scalar, Shape, Slice, SliceInfoElem, Tensor, checked_len, concat, inferred};
 use std::sync::Arc;
 
-/// y = x under another shape.
+/// y = x with another shape.
 #[derive(Clone)]
 pub struct Reshape {
     /// The shape of the output.
@@ -37,17 +37,17 @@ impl<T: Scalar> Op<T> for Reshape {
     }
 }
 
-/// y = the elements of x that a layout names: permute, slice and flip; nothing is copied. dx = [`Scatter`] of g, unrecorded
-/// a [`ViewGrad`].
+/// y = the elements of x that a layout selects: permute, slice and flip. Without a copy. dx = [`Scatter`] of g, or a
+/// [`ViewGrad`] in an unrecorded pass.
 #[derive(Clone)]
 pub struct View {
     /// The shape of the input.
     pub from: Shape,
-    /// Where each element of the output stands in the input.
+    /// The position of each output element in the input.
     pub layout: Layout,
 }
 
-/// The adjoint of [`View`]: zeros of the input's shape, with g added where the layout says.
+/// The adjoint of [`View`]: zeros of the input's shape, with g added at the positions of the layout.
 #[derive(Clone)]
 pub struct Scatter(
     /// The view.
@@ -87,7 +87,7 @@ impl<T: Scalar> Op<T> for View {
     }
 }
 
-/// The gradient of what a [`View`] looks at: it is added in place, so that many views of one tensor cost one sum.
+/// The gradient of a [`View`]. It is added in place, so that many views of one tensor share one sum.
 struct ViewGrad<T: Scalar> {
     view: View,
     /// The gradient of the view.
@@ -135,12 +135,12 @@ impl<T: Scalar> Op<T> for Scatter {
     }
 }
 
-/// y = a constant, with x at the elements that a layout names; dx = the [`View`] of g.
+/// y = a constant, with x at the elements that a layout selects; dx = the [`View`] of g.
 #[derive(Clone)]
 pub struct Pad {
-    /// Where x stands in the output.
+    /// The position of x in the output.
     pub view: View,
-    /// What stands elsewhere.
+    /// The value elsewhere.
     pub value: f64,
 }
 
@@ -171,7 +171,7 @@ impl<T: Scalar> Op<T> for Pad {
     }
 }
 
-/// y = several tensors one after another along an axis; each gradient is the slice of g that it made.
+/// y = tensors joined along an axis; each gradient is the input's slice of g.
 #[derive(Clone, Copy)]
 pub struct Concat {
     /// The axis.
@@ -218,7 +218,7 @@ impl<T: Scalar> Op<T> for Concat {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The same elements under another shape; nothing is copied. One extent may be [`INFER`](crate::INFER): it follows from
+    /// The same elements with another shape, without a copy. One extent may be [`INFER`](crate::INFER): it follows from
     /// the others.
     ///
     /// ```
@@ -229,8 +229,8 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If the shape holds another number of elements, more than one extent is to be inferred, or the one does not
-    /// follow from the others because they do not divide the number of elements or one of them is 0.
+    /// If the shape has another number of elements, or more than one extent is [`INFER`](crate::INFER). If an inferred
+    /// extent does not follow from the others, because they do not divide the number of elements or one is 0.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
         if self.shape() == shape {
@@ -243,7 +243,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Reshape { shape }, &[self])
     }
 
-    /// The elements that a layout of this tensor's shape names; what is wrong with it is an error of operation `op`.
+    /// The elements that a layout of this tensor's shape selects. An invalid layout is an error of operation `op`.
     #[track_caller]
     pub(crate) fn view(&self, op: &'static str, layout: impl FnOnce(&Layout) -> Result<Layout, ShapeError>) -> Self {
         let whole = Layout::contiguous(self.shape());
@@ -254,19 +254,19 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(View { from: self.shape().into(), layout }, &[self])
     }
 
-    /// Zeros of this shape, with this tensor added where the layout says.
+    /// Zeros of this shape, with this tensor added at the positions of the layout.
     #[track_caller]
     pub(crate) fn scatter_view(&self, shape: &[usize], layout: Layout) -> Self {
         self.tape().apply(Scatter(View { from: shape.into(), layout }), &[self])
     }
 
-    /// Axis `i` of the result is axis `order[i]` of this tensor, for an order that is known to fit.
+    /// Axis `i` of the result is axis `order[i]` of this tensor, for a valid order.
     #[track_caller]
     pub(crate) fn reordered(&self, order: &[usize]) -> Self {
         self.view("permute", |layout| Ok(layout.permuted(order)))
     }
 
-    /// This tensor with `padding[i]` entries of `value` before and behind along each axis `i`.
+    /// Pads with `value`: `padding[i]` entries before and after along each axis `i`.
     ///
     /// # Panics
     /// If there is not one pair for each axis, or the result is too large.
@@ -285,17 +285,18 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.tape().apply(Pad { view: View { from, layout }, value }, &[self])
     }
 
-    /// Axis `i` of the result is axis `axes[i]` of this tensor; nothing is copied.
+    /// Reorders the axes, without a copy: axis `i` of the result is axis `axes[i]` of this tensor.
     ///
     /// # Panics
-    /// If `axes` does not name every axis once.
+    /// If `axes` does not list every axis once.
     #[track_caller]
     pub fn permute(&self, axes: &[isize]) -> Self {
         self.view("permute", |layout| layout.permuted_by(axes))
     }
 
-    /// Slices, single entries and new axes, as ndarray's `s![]` names them; nothing is copied. Negative places count from
-    /// the end, a negative step walks backwards from the last entry of its range, and axes that are not named stay whole.
+    /// Slices, single entries and new axes, in the notation of ndarray's `s![]`, without a copy. Negative positions
+    /// count from the end. A negative step walks backwards from the last entry of its range. Axes that are not listed
+    /// stay whole.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor, s};
@@ -307,14 +308,14 @@ impl<'t, T: Scalar> Var<'t, T> {
     /// ```
     ///
     /// # Panics
-    /// If more axes are named than there are, a place lies outside its axis, or a step is 0.
+    /// If more axes are listed than the tensor has, a position is outside its axis, or a step is 0.
     #[track_caller]
     pub fn slice(&self, places: impl AsRef<[SliceInfoElem]>) -> Self {
         self.view("slice", |layout| layout.sliced_by(places.as_ref()))
     }
 
-    /// The entries of a range along one axis, whose number may be known only when the program runs: `1..3`, `..-1`, or
-    /// with a step `Slice::from(..).step_by(-2)`; nothing is copied.
+    /// The entries of a range along one axis, without a copy. The range may be known only at run time: `1..3`, `..-1`,
+    /// or with a step `Slice::from(..).step_by(-2)`.
     ///
     /// ```
     /// use raygrad_autograd::{Slice, Tape, Tensor};
@@ -331,7 +332,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.view("slice_axis", |layout| layout.sliced_axis(axis, range))
     }
 
-    /// The entries along `axis` in reverse order; nothing is copied.
+    /// Reverses the entries along `axis`, without a copy.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -340,8 +341,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.view("flip", |layout| layout.flipped(axis))
     }
 
-    /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
-    /// entries in one; nothing is copied.
+    /// Sliding windows of `size` entries along `axis`, every `step`-th of them, without a copy. The axis counts
+    /// windows, and a new last axis the entries of a window.
     ///
     /// # Panics
     /// If the axis does not exist or is shorter than a window, or `size` or `step` is 0.
@@ -350,10 +351,10 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.view("windows", |layout| layout.windows(axis, size, step))
     }
 
-    /// Tensors one after another along `axis`.
+    /// Joins tensors along `axis`.
     ///
     /// # Panics
-    /// If there is none, the axis does not exist, or other extents differ.
+    /// If there are none, the axis does not exist, or other extents differ.
     #[track_caller]
     pub fn concat(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("concat of no tensors") };

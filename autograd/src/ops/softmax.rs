@@ -95,7 +95,7 @@ impl<T: Scalar> Op<T> for LogSoftmax {
     }
 }
 
-/// y = ln sum e^x along the last axis, which goes; dx = g e^(x - y), and 0 where y is -inf.
+/// y = ln sum e^x along the last axis, which is removed; dx = g e^(x - y), and 0 where y is -inf.
 #[derive(Clone, Copy)]
 pub struct LogSumExp;
 
@@ -137,7 +137,7 @@ impl<T: Scalar> Op<T> for LogSumExp {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// An operation along the last axis, done along another one; a scalar counts as one entry.
+    /// Applies an operation of the last axis along another one; a scalar counts as one entry.
     #[track_caller]
     fn along(&self, axis: isize, op: impl Op<T>) -> Self {
         let ndim = self.shape().len();
@@ -154,7 +154,7 @@ impl<'t, T: Scalar> Var<'t, T> {
     }
 
     /// Softmax along `axis`: `e^self` divided by its sum, without overflow. Entries of -inf get probability 0; a row of
-    /// nothing else is NaN. Fastest along the last axis.
+    /// -inf alone gives NaN. Fastest along the last axis.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -172,7 +172,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.along(axis, Softmax)
     }
 
-    /// The logarithm of [`softmax`](Self::softmax) along `axis`, accurate also where that vanishes.
+    /// The logarithm of [`softmax`](Self::softmax) along `axis`. Accurate even where the softmax underflows.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -187,8 +187,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.logsumexp_over(..)
     }
 
-    /// `ln(sum(e^self))` over any axes, without overflow; -inf, with gradient 0, over none of the elements and over
-    /// nothing but -inf.
+    /// `ln(sum(e^self))` over any axes, without overflow. If there are no elements, or all are -inf, it is -inf with
+    /// gradient 0.
     ///
     /// # Panics
     /// If an axis does not exist or is named twice.

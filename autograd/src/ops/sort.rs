@@ -1,14 +1,14 @@
-//! Order along an axis: sorting and searching. Indices are whole numbers outside the graph; gradients flow through what is
-//! sorted.
+//! Sorting and searching along an axis. Indices are not on the graph; gradients flow through sorted values.
 
 use crate::error::ensure;
 use crate::{Operand, Var};
 use raygrad_tensor::{Indices, Scalar};
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The elements sorted along `axis`, and where each stood: `y = x.gather(axis, &index)`. Equal elements keep their
-    /// order, and NaN counts as larger than every number ([`Tensor::argsort`](crate::Tensor::argsort)). The gradient goes back through the
-    /// permutation.
+    /// Sorts the elements along `axis`, and returns their indices too: `y = x.gather(axis, &index)`.
+    ///
+    /// Equal elements keep their order, and NaN counts as larger than every number
+    /// ([`Tensor::argsort`](crate::Tensor::argsort)). The gradient goes back through the permutation.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
@@ -27,7 +27,7 @@ impl<'t, T: Scalar> Var<'t, T> {
         (self.gather(axis, &index), index)
     }
 
-    /// Where the elements of the [sorted](Self::sort) tensor stand in this one; nothing to differentiate.
+    /// The indices that [`sort`](Self::sort) the elements along `axis`. There is no gradient.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -37,8 +37,8 @@ impl<'t, T: Scalar> Var<'t, T> {
         self.value().argsort(axis, descending)
     }
 
-    /// Where `values` would be inserted in the sorted rows of this tensor ([`Tensor::searchsorted`](crate::Tensor::searchsorted)); nothing to
-    /// differentiate.
+    /// The insertion positions of `values` in the sorted rows of this tensor
+    /// ([`Tensor::searchsorted`](crate::Tensor::searchsorted)). There is no gradient.
     ///
     /// # Panics
     /// If the shapes do not fit.

@@ -1,4 +1,4 @@
-//! Trigonometric and hyperbolic functions, and the inverse ones.
+//! Trigonometric and hyperbolic functions, and inverse ones.
 
 use crate::cases::{INF, PI};
 use crate::{Cases, Formula};
@@ -34,7 +34,7 @@ impl Formula<1> for Cos {
     }
 }
 
-/// y = sin(pi x); dx = g pi cos(pi x). Zero and extreme values are exact at every whole and half number.
+/// y = sin(pi x); dx = g pi cos(pi x). Zeros and extremes are exact at every whole and half number.
 #[derive(Clone, Copy)]
 pub struct SinPi;
 impl Formula<1> for SinPi {
@@ -49,7 +49,7 @@ impl Formula<1> for SinPi {
     }
 }
 
-/// y = cos(pi x); dx = -g pi sin(pi x). Zero and extreme values are exact at every whole and half number.
+/// y = cos(pi x); dx = -g pi sin(pi x). Zeros and extremes are exact at every whole and half number.
 #[derive(Clone, Copy)]
 pub struct CosPi;
 impl Formula<1> for CosPi {
@@ -191,7 +191,7 @@ pub(crate) fn complement<E: Real>(x: E) -> E {
     ((one - x) * (one + x)).sqrt()
 }
 
-/// `c / (a^2 + b^2)`, 0 at the origin; scaled, so that no square overflows or vanishes.
+/// `c / (a^2 + b^2)`, 0 at the origin. Scaled, so that no square overflows or underflows.
 #[inline(always)]
 pub(crate) fn turn<E: Real>(c: E, a: E, b: E) -> E {
     let scale = a.abs().maximum(b.abs());
@@ -237,21 +237,21 @@ elementwise! {
     sin() = Sin;
     /// Cosine of an angle in radians.
     cos() = Cos;
-    /// `sin(pi self)`: exact reduction, so it is accurate however large the argument.
+    /// `sin(pi self)`. The reduction is exact, so it is accurate for arguments of any size.
     sin_pi() = SinPi;
-    /// `cos(pi self)`: exact reduction, so it is accurate however large the argument.
+    /// `cos(pi self)`. The reduction is exact, so it is accurate for arguments of any size.
     cos_pi() = CosPi;
     /// Hyperbolic tangent.
     tanh() = Tanh;
     /// Tangent of an angle in radians.
     tan() = Tan;
-    /// The angle in -pi/2..=pi/2 whose sine this is; NaN outside -1..=1. The gradient is infinite at +-1.
+    /// Arcsine: the angle in -pi/2..=pi/2; NaN outside -1..=1. The gradient is infinite at +-1.
     asin() = Asin;
-    /// The angle in 0..=pi whose cosine this is; NaN outside -1..=1. The gradient is infinite at +-1.
+    /// Arccosine: the angle in 0..=pi; NaN outside -1..=1. The gradient is infinite at +-1.
     acos() = Acos;
-    /// The angle in -pi/2..=pi/2 whose tangent this is.
+    /// Arctangent: the angle in -pi/2..=pi/2.
     atan() = Atan;
-    /// The angle in -pi..=pi of the vector (`x`, `self`); both gradients are 0 at the origin.
+    /// The angle in -pi..=pi of the vector (`x`, `self`). Shapes broadcast. Both gradients are 0 at the origin.
     ///
     /// # Panics
     /// If the shapes do not broadcast.

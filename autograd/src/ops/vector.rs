@@ -1,4 +1,4 @@
-//! Vectors along the last axis: cross product and direction.
+//! Vectors along the last axis: cross product and normalisation.
 
 use crate::{Axes, Grads, Op, Operand, Reads, ShapeError, Var, Vjp};
 use raygrad_tensor::{Pool, Scalar, Shape, Tensor, broadcast_shape};
@@ -43,8 +43,8 @@ impl<T: Scalar> Op<T> for Cross {
 
 /// y = x / |x| along the last axis; dx = (g - y (y . g)) / |x|.
 ///
-/// Rows are divided by their largest element first, so that neither tiny nor huge ones lose digits. A row of zeros gives
-/// zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest number.
+/// Rows are divided by their largest element first, so that tiny and huge ones keep their digits. A row of zeros gives
+/// zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest finite number.
 #[derive(Clone, Copy)]
 pub struct Normalize;
 
@@ -161,18 +161,19 @@ impl<T: Scalar> Op<T> for Normalize {
 }
 
 impl<'t, T: Scalar> Var<'t, T> {
-    /// The cross product along the last axis, of extent 3; other axes broadcast.
+    /// The cross product along the last axis, whose extent is 3. Other axes broadcast.
     ///
     /// # Panics
-    /// If a last axis has not three entries or the shapes do not broadcast.
+    /// If a last axis does not have three entries, or the shapes do not broadcast.
     #[track_caller]
     pub fn cross(&self, other: impl Operand<'t, T>) -> Self {
         self.tape().apply(Cross, &[self, &other.on(self.tape())])
     }
 
-    /// The rows of the last axis divided by their length. Rows of any size keep their digits (1e-40 and 1e30 alike). A
-    /// row of zeros gives zeros with gradient 0; where the gradient of a tiny row would overflow it is the largest
-    /// number; NaN gives NaN, and so does a row with an infinite element.
+    /// Normalises the rows of the last axis to length 1. Rows of any size keep their digits (1e-40 and 1e30 alike).
+    ///
+    /// A row of zeros gives zeros, with gradient 0. Where the gradient of a tiny row would overflow, it is the largest
+    /// finite number. A row with NaN or an infinite element gives NaN.
     ///
     /// ```
     /// use raygrad_autograd::{Tape, Tensor};
