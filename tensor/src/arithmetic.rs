@@ -1,11 +1,11 @@
-//! Arithmetic and functions of tensors without a tape, with NumPy's broadcasting.
+//! Arithmetic and elementwise functions of tensors, with NumPy's broadcasting.
 
 use crate::parallel::{ELEMENT, chunks};
 use crate::{Real, Scalar, Tensor, map, map_real, simd};
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, DivAssign, Index, Mul, MulAssign, Neg, Sub, SubAssign};
 
-/// Elements of a tensor that are changed in place by one task.
+/// Elements that one task updates in place.
 const STRETCH: usize = 1 << 14;
 
 macro_rules! operator {
@@ -53,7 +53,7 @@ macro_rules! operator {
         operator!(left f32 $trait $method $op);
         operator!(left f64 $trait $method $op);
         impl<T: Scalar> $assign<&Tensor<T>> for Tensor<T> {
-            /// In place where nobody shares the elements.
+            /// Updates this tensor in place, unless another tensor shares its elements; then it copies them first.
             ///
             /// # Panics
             /// If `other` does not broadcast to the shape of this tensor.
@@ -64,7 +64,7 @@ macro_rules! operator {
             }
         }
         impl<T: Scalar> $assign<Tensor<T>> for Tensor<T> {
-            /// In place where nobody shares the elements.
+            /// Updates this tensor in place, unless another tensor shares its elements; then it copies them first.
             ///
             /// # Panics
             /// If `other` does not broadcast to the shape of this tensor.
@@ -74,7 +74,7 @@ macro_rules! operator {
             }
         }
         impl<T: Scalar> $assign<T> for Tensor<T> {
-            /// In place where nobody shares the elements.
+            /// Updates this tensor in place, unless another tensor shares its elements; then it copies them first.
             fn $assign_method(&mut self, other: T) {
                 let other = Tensor::scalar(other).broadcast_to(self.shape());
                 self.update(&other, |a, b| a $op b);
@@ -117,7 +117,7 @@ impl<T: Scalar> Neg for Tensor<T> {
 }
 
 impl<T: Scalar> Sum for Tensor<T> {
-    /// The sum of tensors that broadcast together; a scalar 0 of none.
+    /// The sum of tensors that broadcast together. For no tensors it is a scalar 0.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
@@ -128,10 +128,10 @@ impl<T: Scalar> Sum for Tensor<T> {
 
 impl<T: Scalar, const N: usize> Index<[usize; N]> for Tensor<T> {
     type Output = T;
-    /// One element: `x[[i, j]]`.
+    /// Reads one element: `x[[i, j]]`.
     ///
     /// # Panics
-    /// If there are not as many axes as places, or a place lies outside its axis.
+    /// If the number of indices is not the number of axes, or an index is outside its axis.
     #[track_caller]
     fn index(&self, index: [usize; N]) -> &T {
         let inside = N == self.ndim() && index.iter().zip(self.shape()).all(|(i, extent)| i < extent);
@@ -158,13 +158,13 @@ macro_rules! method {
     };
 }
 
-/// The functions of [`Real`].
+/// The functions of [`Real`], elementwise.
 impl<T: Scalar> Tensor<T> {
     crate::functions!(method());
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// `f` of each element, in one vectorised pass if `f` has no branches.
+    /// Applies `f` to each element. Vectorised if `f` has no branches.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -179,7 +179,7 @@ impl<T: Scalar> Tensor<T> {
         )
     }
 
-    /// `f` of the elements of two tensors that broadcast together.
+    /// Applies `f` to the elements of two tensors that broadcast together.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
@@ -232,28 +232,28 @@ impl<T: Scalar> Tensor<T> {
         self.pow(Tensor::scalar(exponent))
     }
 
-    /// Each element to the power of a whole number.
+    /// Each element to an integer power.
     pub fn powi(&self, exponent: i32) -> Self {
         map_real!([self], &self.pool(), |[x]| Real::powi(x, exponent))
     }
 
-    /// Each element's square.
+    /// The square of each element.
     pub fn square(&self) -> Self {
         self.map(|x| x * x)
     }
 
-    /// Each element limited to `low..=high`; NaN stays NaN. An infinite limit is none.
+    /// Limits each element to `low..=high`; NaN stays NaN. An infinite limit has no effect.
     ///
     /// # Panics
-    /// If `low` is not at most `high`, or one is NaN.
+    /// If `low` is above `high`, or if one is NaN.
     #[track_caller]
     pub fn clamp(&self, low: T, high: T) -> Self {
         assert!(low <= high, "clamp: no number is between {low} and {high}");
         self.map(|x| Real::minimum(Real::maximum(x, low), high))
     }
 
-    /// The product of matrices in the last two axes, as [`matmul`](crate::matmul::matmul) forms it. A vector on the left is
-    /// a row, on the right a column, and that axis is missing from the result.
+    /// The matrix product over the last two axes, with NumPy's conventions; see [`matmul`](crate::matmul::matmul). A
+    /// vector on the left is a row, on the right a column. That axis is missing from the result.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -282,8 +282,8 @@ impl<T: Scalar> Tensor<T> {
         if row { y.squeeze(if column { -1 } else { -2 }) } else { y }
     }
 
-    /// Whether the shapes are the same and every element of this tensor is within `absolute + relative * |y|` of the
-    /// element `y` of the other, or equal to it. A NaN is close to nothing.
+    /// Whether the shapes are equal and each element `x` is close to the element `y` of `other`:
+    /// `|x - y| <= absolute + relative * |y|`, or `x == y`. NaN is close to no number.
     pub fn is_close(&self, other: &Self, relative: f64, absolute: f64) -> bool {
         let close = |a: f64, b: f64| a == b || (b.is_finite() && (a - b).abs() <= absolute + relative * b.abs());
         self.shape() == other.shape() && self.iter().zip(other.iter()).all(|(a, b)| close(a.to_f64(), b.to_f64()))

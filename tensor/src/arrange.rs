@@ -1,11 +1,11 @@
-//! Tensors out of the elements of others, in another arrangement, and elements put in place.
+//! Rearrangements that copy elements, and assignment to slices: split, tile, repeat, roll, gather, assign.
 
 use crate::layout::checked_len;
 use crate::{Indices, Layout, Scalar, Shape, SliceInfoElem, Tensor, axis_of, concat, find_axis};
 use std::ops::{IndexMut, Range};
 
-/// The shapes that lead to a tensor which is `counts[i]` times the whole along axis `i`: that in which it is seen, that to
-/// which it is stretched, and the result's. Missing counts in front are 1, and further axes stand in front.
+/// The shapes of [`Tensor::tile`]: the shape to view the tensor in, the shape to broadcast that to, and the shape of
+/// the result. Missing counts in front are 1, and more counts than axes add leading axes.
 ///
 /// # Errors
 /// If there would be more elements than memory can hold.
@@ -20,7 +20,7 @@ pub fn tiled(shape: &[usize], counts: &[usize]) -> Result<[Shape; 3], String> {
     })
 }
 
-/// As [`tiled`], for each entry along an axis `count` times.
+/// The shapes of [`Tensor::repeat`], as those of [`tiled`].
 ///
 /// # Errors
 /// If the axis does not exist, or there would be more elements than memory can hold.
@@ -47,7 +47,7 @@ fn within_memory(narrow: Shape, wide: Shape, out: impl FnOnce(&[usize]) -> Shape
 /// The ranges of consecutive parts of an axis.
 ///
 /// # Errors
-/// If the axis does not exist or the extents do not add up to its own.
+/// If the axis does not exist, or the sum of the extents is not its extent.
 pub fn split_places(shape: &[usize], axis: isize, extents: &[usize]) -> Result<Vec<Range<usize>>, String> {
     let extent = shape[find_axis(axis, shape)?];
     if extents.iter().try_fold(0_usize, |total, &len| total.checked_add(len)) != Some(extent) {
@@ -62,7 +62,7 @@ pub fn split_places(shape: &[usize], axis: isize, extents: &[usize]) -> Result<V
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// Parts along `axis` with these extents, as views (`torch.split`).
+    /// Splits along `axis` into consecutive parts of these extents, as views (`torch.split`).
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -71,7 +71,7 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the axis does not exist or the extents do not add up to its own.
+    /// If the axis does not exist, or the sum of the extents is not its extent.
     #[track_caller]
     pub fn split(&self, axis: isize, extents: &[usize]) -> Vec<Self> {
         match split_places(self.shape(), axis, extents) {
@@ -80,8 +80,8 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// The whole tensor `counts[i]` times along each axis `i` (`numpy.tile`, `torch.repeat`). More counts than axes add
-    /// leading axes, fewer leave the leading axes as they are.
+    /// Repeats the whole tensor `counts[i]` times along each axis `i` (`numpy.tile`, `torch.Tensor.repeat`). More
+    /// counts than axes add leading axes; fewer leave the leading axes unchanged.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -95,7 +95,7 @@ impl<T: Scalar> Tensor<T> {
         self.spread("tile", tiled(self.shape(), counts))
     }
 
-    /// Each entry along `axis`, `count` times (`numpy.repeat`, `torch.repeat_interleave`).
+    /// Repeats each entry along `axis` `count` times (`numpy.repeat`, `torch.repeat_interleave`).
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -117,8 +117,8 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// Entries along `axis` moved on by `shift`, those that leave at the end coming in at the start. (`numpy.roll` and
-    /// `torch.roll` take the shift first.)
+    /// Rotates the entries along `axis` by `shift` places towards the end. Entries that leave at the end enter at the
+    /// start. (`numpy.roll` and `torch.roll` take the shift first.)
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -140,8 +140,8 @@ impl<T: Scalar> Tensor<T> {
         concat(&[&part(tail), &part(head)], axis, &self.pool())
     }
 
-    /// The elements that `index` names along `axis`: `y[i][j] = x[index[i][j]][j]` for axis 0 of two
-    /// (`numpy.take_along_axis`, `torch.gather`). `index` has the extents of this tensor in all other axes.
+    /// Selects elements by index along `axis` (`numpy.take_along_axis`, `torch.gather`): `y[i][j] = x[index[i][j]][j]`
+    /// for axis 0 of two. `index` has the extents of this tensor in all other axes.
     ///
     /// ```
     /// use raygrad_tensor::{Indices, Tensor};
@@ -169,7 +169,7 @@ impl<T: Scalar> Tensor<T> {
         Tensor::from_vec(index.shape(), index.as_slice().iter().enumerate().map(element).collect())
     }
 
-    /// Writes `values`, which broadcast, to the elements that a slice names: `x[:, 1:3] = values` of NumPy.
+    /// Assigns `values` to the elements of a slice, as `x[:, 1:3] = values` in NumPy. The values broadcast.
     ///
     /// ```
     /// use raygrad_tensor::{Tensor, s};
@@ -180,7 +180,7 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the slice leaves the tensor, or the values do not broadcast to its shape.
+    /// If a position is outside the tensor, or the values do not broadcast to the shape of the slice.
     #[track_caller]
     pub fn assign(&mut self, places: impl AsRef<[SliceInfoElem]>, values: impl Into<Tensor<T>>) {
         let layout = match Layout::contiguous(self.shape()).sliced_by(places.as_ref()) {
@@ -193,10 +193,10 @@ impl<T: Scalar> Tensor<T> {
 }
 
 impl<T: Scalar, const N: usize> IndexMut<[usize; N]> for Tensor<T> {
-    /// One element for writing: `x[[i, j]] = 1.0`. What another tensor shares is copied first.
+    /// Borrows one element for writing: `x[[i, j]] = 1.0`. Shared elements are copied first.
     ///
     /// # Panics
-    /// If there are not as many axes as places, or a place lies outside its axis.
+    /// If the number of indices is not the number of axes, or an index is outside its axis.
     #[track_caller]
     fn index_mut(&mut self, index: [usize; N]) -> &mut T {
         let inside = N == self.ndim() && index.iter().zip(self.shape()).all(|(i, extent)| i < extent);
@@ -207,7 +207,7 @@ impl<T: Scalar, const N: usize> IndexMut<[usize; N]> for Tensor<T> {
 }
 
 impl<T: Scalar, const N: usize> PartialEq<[T; N]> for Tensor<T> {
-    /// Whether this is a vector of these elements.
+    /// Whether this is a vector with these elements.
     fn eq(&self, other: &[T; N]) -> bool {
         self.shape() == [N] && self.as_slice() == other
     }
@@ -226,7 +226,7 @@ impl<T: Scalar, const N: usize, const M: usize> PartialEq<[[T; M]; N]> for &Tens
 }
 
 impl<T: Scalar, const N: usize, const M: usize> PartialEq<[[T; M]; N]> for Tensor<T> {
-    /// Whether this is a matrix of these rows.
+    /// Whether this is a matrix with these rows.
     fn eq(&self, other: &[[T; M]; N]) -> bool {
         self.shape() == [N, M] && self.as_slice() == other.as_flattened()
     }

@@ -1,13 +1,13 @@
-//! Which axes a reduction runs over.
+//! The axes of a reduction.
 
 use crate::Shape;
 use smallvec::SmallVec;
 use std::ops::RangeFull;
 
-/// The axes of a reduction: one (`-1`), several (`[0, -1]`), or all (`..`). A negative axis counts from the last one.
+/// The axes of a reduction: one (`-1`), several (`[0, -1]`), or all (`..`). Negative axes count from the last one.
 ///
-/// They disappear from the shape, unless [`keepdims`](Self::keepdims) leaves them there with extent 1, for the result
-/// to broadcast against the input.
+/// Reduced axes are removed from the shape. With [`keepdims`](Self::keepdims) they stay with extent 1, so that the
+/// result broadcasts against the input.
 ///
 /// ```
 /// use raygrad_tensor::{Axes, Tensor};
@@ -25,15 +25,15 @@ pub struct Axes {
 }
 
 impl Axes {
-    /// The same axes, which stay in the shape with extent 1.
+    /// The same axes, kept in the shape of the result with extent 1.
     pub fn keepdims(self) -> Self {
         Axes { keepdims: true, ..self }
     }
 
-    /// For a tensor of this shape: which axes are reduced.
+    /// Resolves the axes for a tensor of this shape.
     ///
     /// # Errors
-    /// If an axis does not exist or is named twice; in words.
+    /// If an axis does not exist or is listed twice.
     pub fn find(&self, shape: &[usize]) -> Result<Reduction, String> {
         let mut reduced: SmallVec<[bool; 4]> = SmallVec::from_elem(self.axes.is_none(), shape.len());
         for &axis in self.axes.iter().flatten() {
@@ -46,10 +46,10 @@ impl Axes {
         Ok(Reduction { shape: Shape::from_slice(shape), reduced, keepdims: self.keepdims })
     }
 
-    /// As [`find`](Self::find).
+    /// As [`find`](Self::find), with a panic instead of an error.
     ///
     /// # Panics
-    /// If an axis does not exist or is named twice.
+    /// If an axis does not exist or is listed twice.
     #[track_caller]
     pub fn resolve(&self, shape: &[usize]) -> Reduction {
         match self.find(shape) {
@@ -59,10 +59,10 @@ impl Axes {
     }
 }
 
-/// The number of an axis that may be counted from the last one: -1 is the last.
+/// The index of an axis; negative numbers count from the last one, which is -1.
 ///
 /// # Errors
-/// If it does not exist; in words.
+/// If the axis does not exist.
 pub fn find_axis(axis: isize, shape: &[usize]) -> Result<usize, String> {
     let from_start = if axis < 0 { axis.wrapping_add(shape.len() as isize) } else { axis };
     if (0..shape.len() as isize).contains(&from_start) {
@@ -71,10 +71,10 @@ pub fn find_axis(axis: isize, shape: &[usize]) -> Result<usize, String> {
     Err(format!("there is no axis {axis} in a tensor of shape {shape:?}"))
 }
 
-/// As [`find_axis`].
+/// As [`find_axis`], with a panic instead of an error.
 ///
 /// # Panics
-/// If it does not exist.
+/// If the axis does not exist.
 #[track_caller]
 pub fn axis_of(axis: isize, shape: &[usize]) -> usize {
     match find_axis(axis, shape) {
@@ -135,12 +135,12 @@ pub struct Reduction {
 }
 
 impl Reduction {
-    /// The shape with every reduced axis of extent 1.
+    /// The shape of the result if all reduced axes stay with extent 1.
     pub fn kept(&self) -> Shape {
         self.shape.iter().zip(&self.reduced).map(|(&extent, &reduced)| if reduced { 1 } else { extent }).collect()
     }
 
-    /// The shape that the caller gets.
+    /// The shape of the result.
     pub fn result(&self) -> Shape {
         if self.keepdims {
             return self.kept();
@@ -148,13 +148,13 @@ impl Reduction {
         self.shape.iter().zip(&self.reduced).filter(|(_, reduced)| !**reduced).map(|(&extent, _)| extent).collect()
     }
 
-    /// How many elements go into one.
+    /// Number of elements that are reduced to one.
     pub fn count(&self) -> usize {
         self.shape.iter().zip(&self.reduced).filter(|(_, reduced)| **reduced).map(|(&extent, _)| extent).product()
     }
 
-    /// The axes from the first to behind the last reduced one, if those between are all reduced (or of extent 1);
-    /// `None` if they are not neighbours.
+    /// The range `(first, end)` of axes that holds all reduced ones, if the axes between are all reduced or have extent
+    /// 1. `None` if they are not adjacent.
     pub fn run(&self) -> Option<(usize, usize)> {
         let Some(first) = self.reduced.iter().position(|&reduced| reduced) else { return Some((0, 0)) };
         let behind = self.reduced.iter().rposition(|&reduced| reduced)? + 1;
@@ -162,7 +162,7 @@ impl Reduction {
         dense.then_some((first, behind))
     }
 
-    /// The order of axes that puts the reduced ones last.
+    /// The order of axes with the reduced ones last.
     pub fn reduced_last(&self) -> SmallVec<[usize; 4]> {
         let of = |wanted: bool| (0..self.shape.len()).filter(move |&axis| self.reduced[axis] == wanted);
         of(false).chain(of(true)).collect()

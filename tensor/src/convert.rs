@@ -1,11 +1,11 @@
-//! From and to ndarray.
+//! Conversions between tensors and ndarray.
 
 use crate::{Layout, Scalar, Shape, Tensor};
 use ndarray::{Array, ArrayView, Axis, Dimension, IxDyn, ShapeBuilder};
 use std::fmt;
 
 impl<T: Scalar> Tensor<T> {
-    /// The elements as an ndarray view of the same strides, for ndarray's own indexing and iteration.
+    /// The elements as an ndarray view with the same strides.
     pub fn view(&self) -> ArrayView<'_, T, IxDyn> {
         let layout = self.layout();
         let (mut strides, mut start) = (Shape::with_capacity(self.ndim()), layout.offset());
@@ -30,8 +30,8 @@ impl<T: Scalar> Tensor<T> {
         view
     }
 
-    /// The elements as an ndarray array in row-major order; copied only if another tensor shares them or a view shows them
-    /// in another order.
+    /// The elements as an ndarray array in row-major order. It copies only if another tensor shares them, or if a view
+    /// has another order.
     pub fn into_array(self) -> Array<T, IxDyn> {
         let shape = IxDyn(self.shape());
         match Array::from_shape_vec(shape, self.into_vec()) {
@@ -42,7 +42,7 @@ impl<T: Scalar> Tensor<T> {
 }
 
 impl<T: Scalar, D: Dimension> From<Array<T, D>> for Tensor<T> {
-    /// Free: the tensor has the array's strides.
+    /// Converts an array without a copy: the tensor has its strides.
     fn from(array: Array<T, D>) -> Self {
         let (shape, strides) = (Shape::from_slice(array.shape()), array.strides().to_vec());
         if array.is_empty() {
@@ -57,21 +57,22 @@ impl<T: Scalar, D: Dimension> From<Array<T, D>> for Tensor<T> {
 }
 
 impl<T: Scalar, D: Dimension> From<ArrayView<'_, T, D>> for Tensor<T> {
-    /// A copy of the viewed elements, whatever their strides.
+    /// Copies the elements of a view of any strides.
     fn from(view: ArrayView<'_, T, D>) -> Self {
         Tensor::from(view.to_owned())
     }
 }
 
 impl<T: Scalar> From<T> for Tensor<T> {
-    /// A tensor without axes.
+    /// A scalar tensor.
     fn from(value: T) -> Self {
         Tensor::scalar(value)
     }
 }
 
 impl<T: Scalar> fmt::Display for Tensor<T> {
-    /// The elements as ndarray shows them, in nested brackets; a precision counts for each. Long axes are cut short.
+    /// Formats the elements in nested brackets, as ndarray does. A precision applies to each element. Long axes are
+    /// abbreviated.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(&self.view(), f)
     }

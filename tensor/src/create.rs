@@ -1,11 +1,11 @@
-//! Tensors from rules and from lists.
+//! Tensors from ranges, lists and other tensors.
 
 use crate::{Indices, Pool, Scalar, Shape, Tensor};
 
-/// Tensors one after another along an axis; at least one.
+/// Joins tensors along an axis.
 ///
 /// # Panics
-/// If there is none, the axis does not exist, other extents differ, or the extents add up to too much.
+/// If there are none, the axis does not exist, other extents differ, or the sum of the extents is too large.
 #[track_caller]
 pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> Tensor<T> {
     let Some(first) = parts.first() else { panic!("concat of no tensors") };
@@ -35,7 +35,8 @@ pub fn concat<T: Scalar>(parts: &[&Tensor<T>], axis: usize, pool: &Pool<T>) -> T
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// `start`, `start + step`, and so on up to, but without, `end`: `[n]` with n the ceiling of `(end - start) / step`.
+    /// `start`, `start + step`, and so on, below `end` (`numpy.arange`). The shape is `[n]`, with n the ceiling of
+    /// `(end - start) / step`.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -44,7 +45,7 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the step is 0, one of the numbers is not finite, or there are too many entries for memory.
+    /// If the step is 0, one of the numbers is not finite, or the result has more elements than memory can hold.
     #[track_caller]
     pub fn arange(start: T, end: T, step: T) -> Self {
         let (first, by) = (start.to_f64(), step.to_f64());
@@ -53,7 +54,8 @@ impl<T: Scalar> Tensor<T> {
         Tensor::from_fn(&[count.max(0.0) as usize], |i| T::from_f64(first + i as f64 * by))
     }
 
-    /// `count` numbers at equal distances from `start` to `end`, both of which are among them; one number is `start`.
+    /// `count` equally spaced numbers from `start` to `end`, both included (`numpy.linspace`). For `count` 1 it is
+    /// `start` alone.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -71,7 +73,7 @@ impl<T: Scalar> Tensor<T> {
         Tensor::from_fn(&[count], |i| T::from_f64(at(i)))
     }
 
-    /// The unit matrix `[n, n]`.
+    /// The identity matrix `[n, n]`.
     ///
     /// # Panics
     /// If it has more elements than memory can hold.
@@ -82,20 +84,20 @@ impl<T: Scalar> Tensor<T> {
         out
     }
 
-    /// Tensors one after another along `axis`.
+    /// Joins tensors along `axis`.
     ///
     /// # Panics
-    /// If there is none, the axis does not exist, other extents differ, or the extents add up to too much.
+    /// If there are none, the axis does not exist, other extents differ, or the sum of the extents is too large.
     #[track_caller]
     pub fn concat(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("concat of no tensors") };
         concat(parts, crate::axis_of(axis, first.shape()), &first.pool())
     }
 
-    /// Tensors of one shape along a new axis, which stands at place `axis`.
+    /// Joins tensors of one shape along a new axis at position `axis`.
     ///
     /// # Panics
-    /// If there is none, their shapes differ, or there is no such place.
+    /// If there are none, their shapes differ, or there is no such position.
     #[track_caller]
     pub fn stack(parts: &[&Self], axis: isize) -> Self {
         let Some(first) = parts.first() else { panic!("stack of no tensors") };
@@ -129,7 +131,7 @@ impl<T: Scalar, const N: usize, const M: usize> From<[[T; M]; N]> for Tensor<T> 
 }
 
 impl<T: Scalar> From<&Tensor<T>> for Tensor<T> {
-    /// A further reference.
+    /// Clones the tensor, which copies a reference.
     fn from(x: &Tensor<T>) -> Self {
         x.clone()
     }
@@ -143,7 +145,7 @@ impl<T: Scalar> FromIterator<T> for Tensor<T> {
 }
 
 impl<T: Scalar> From<&Indices> for Tensor<T> {
-    /// The indices as numbers; above 2^24 in f32 rounded to nearest.
+    /// The indices as numbers. In f32, indices above 2^24 are rounded to nearest.
     fn from(indices: &Indices) -> Self {
         Tensor::from_vec(indices.shape(), indices.as_slice().iter().map(|&i| T::from_f64(f64::from(i))).collect())
     }

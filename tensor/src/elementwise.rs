@@ -1,10 +1,10 @@
-//! One loop for every elementwise kernel, with broadcasting as NumPy does it.
+//! Elementwise loops with NumPy's broadcasting.
 
 use crate::fused::cut;
 use crate::{Block, Pool, Scalar, Shape, Tensor, map_fused, simd};
 
-/// The common shape of tensors that broadcast together: shapes are aligned at their last axis, and an axis of extent 1
-/// (or an absent one) stretches to the extent of the others. `None` if two extents disagree.
+/// The common shape of tensors that broadcast together, with NumPy's rules. Shapes are aligned at their last axis. An
+/// axis of extent 1, or a missing one, is repeated to the extent of the others. `None` if two extents disagree.
 ///
 /// ```
 /// use raygrad_tensor::broadcast_shape;
@@ -28,9 +28,9 @@ pub fn broadcast_shape(shapes: &[&[usize]]) -> Option<Shape> {
     Some(out)
 }
 
-/// `f` of the elements at each index of `N` tensors that broadcast together, in one vectorised pass.
+/// Applies `f` to the elements at each index of `N` tensors that broadcast together, in one vectorised pass.
 ///
-/// `f` should be branch-free and inlined for the loop to vectorise.
+/// The loop vectorises if `f` is branch-free and inlined.
 ///
 /// # Panics
 /// If the shapes do not broadcast.
@@ -39,7 +39,7 @@ pub fn map<T: Scalar, const N: usize>(x: [&Tensor<T>; N], pool: &Pool<T>, f: imp
     map_block(&x, pool, &|x, out| lanes::<T, N>(std::array::from_fn(|k| x[k]), out[0], &f))
 }
 
-/// [`map`] for a formula that is generic over [`Real`](crate::Real), in [`lanes_real!`](crate::lanes_real).
+/// [`map`] for a formula that is generic over [`Real`](crate::Real); see [`lanes_real!`](crate::lanes_real).
 ///
 /// ```
 /// use raygrad_tensor::{Pool, Real, Tensor, map_real};
@@ -54,9 +54,9 @@ macro_rules! map_real {
     };
 }
 
-/// `out[i] = formula([x[0][i], x[1][i], ..])` with the best instruction set of the processor. A formula with a sine or cosine
-/// is read for quick numbers, and once more for plain ones if an angle was too large for these (see
-/// [`Lane`](crate::Lane)): it costs a third that way, and the bits are the same.
+/// `out[i] = formula([x[0][i], x[1][i], ..])` with the processor's best instruction set. A formula with a sine or
+/// cosine runs with the short argument reduction first. If an argument was too large for that, it runs again with the
+/// full reduction (see [`Lane`](crate::Lane)). In most cases it takes a third of the time, and the bits are the same.
 #[macro_export]
 macro_rules! lanes_real {
     ($x:expr, $out:expr, |$arguments:pat_param| $formula:expr) => {{
@@ -81,7 +81,7 @@ macro_rules! lanes_real {
     }};
 }
 
-/// One result of a pass over tensors: see [`map_fused`].
+/// One result of a pass over tensors; see [`map_fused`].
 #[doc(hidden)]
 #[track_caller]
 pub fn map_block<T: Scalar>(x: &[&Tensor<T>], pool: &Pool<T>, block: &Block<'_, T>) -> Tensor<T> {
@@ -92,7 +92,7 @@ pub fn map_block<T: Scalar>(x: &[&Tensor<T>], pool: &Pool<T>, block: &Block<'_, 
     }
 }
 
-/// `out[i] = f([x[0][i], x[1][i], ..])` with the best instruction set of the processor.
+/// `out[i] = f([x[0][i], x[1][i], ..])` with the processor's best instruction set.
 ///
 /// # Panics
 /// If a slice is shorter than `out`.

@@ -1,4 +1,4 @@
-//! The greatest or smallest elements along an axis, and where they are.
+//! The largest or smallest elements along an axis, and their indices. Start with [`extremum`].
 
 use crate::indices::index;
 use crate::parallel::{ELEMENT, PIECE, chunks};
@@ -6,21 +6,21 @@ use crate::reduce::chunk;
 use crate::rows::fold_lanes;
 use crate::{Scalar, checked_len, simd};
 
-/// A tensor as the kernels see it: `[outer, count, inner]`, reduced along the axis in the middle.
+/// The shape of a tensor as `[outer, count, inner]`, to reduce along the middle axis.
 pub type Middle = [usize; 3];
 
-/// Columns that one task reduces, at least: some cache lines of each row.
+/// Least number of columns for one task: some cache lines of each row.
 const LEAST: usize = 64;
 
-/// That slices are as long as an array and its extremum.
+/// Checks that slices are as long as an array and its extremum.
 #[track_caller]
 fn check([outer, count, inner]: Middle, x: usize, out: usize) {
     let fits = checked_len(&[outer, count, inner]) == Some(x) && checked_len(&[outer, inner]) == Some(out);
     assert!(fits, "{x} and {out} numbers for an extremum of {:?}", [outer, count, inner]);
 }
 
-/// The greatest elements (the smallest ones without `greatest`) along the middle axis: `[outer, count, inner]` to
-/// `[outer, inner]`. A NaN among them is the result.
+/// The largest elements along the middle axis, or the smallest ones if `greatest` is false: `[outer, count, inner]` to
+/// `[outer, inner]`. NaN if one element is NaN.
 ///
 /// # Panics
 /// If the lengths do not fit, or `count` is 0 and `out` is not empty.
@@ -42,7 +42,7 @@ pub fn extremum<T: Scalar>(x: &[T], middle: Middle, greatest: bool, out: &mut [T
     });
 }
 
-/// [`extremum`] of the columns from `first` on: all, or some of one group.
+/// [`extremum`] of the columns from `first` on: all columns, or some of one group.
 fn columns<T: Scalar>(x: &[T], middle: Middle, first: usize, greatest: bool, out: &mut [T]) {
     if greatest {
         along(
@@ -91,8 +91,8 @@ fn along<T: Scalar>(x: &[T], [outer, count, inner]: Middle, first: usize, out: &
     );
 }
 
-/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements that equal it. If the result
-/// is NaN, no element does, and all get 0.
+/// The gradient of [`extremum`]: `g` of each result `y`, shared evenly among the elements equal to `y`. If `y` is NaN,
+/// all get 0.
 ///
 /// # Panics
 /// If the lengths do not fit.
@@ -144,8 +144,8 @@ pub fn extremum_grad<T: Scalar>(x: &[T], y: &[T], g: &[T], [outer, count, inner]
     );
 }
 
-/// Where the greatest elements (the smallest ones without `greatest`) are along the middle axis: the first of equal
-/// ones, and the first NaN if there is one.
+/// The indices of the largest elements along the middle axis, or the smallest ones if `greatest` is false. It is the
+/// first of equal elements, and the first NaN if there is one.
 ///
 /// # Panics
 /// If the length does not fit, `count` is 0 and the result is not empty, or `count` is above 2^32.

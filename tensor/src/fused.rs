@@ -1,4 +1,4 @@
-//! Elementwise loops of several results in one pass: a formula's value, or the gradients of all its operands.
+//! Elementwise loops with several results in one pass: a formula's value, or the gradients of all its operands.
 
 use crate::layout::{inverse, len_of};
 use crate::parallel::{ELEMENT, PIECE, each_of, is_worthwhile};
@@ -8,23 +8,23 @@ use std::array::from_fn;
 use std::ops::Range;
 use std::slice;
 
-/// What is computed of a block of elements: from slices of the operands to slices of the results, all of one length.
+/// The computation for a block of elements: from slices of the operands to slices of the results, all of one length.
 pub type Block<'a, T> = dyn Fn(&[&[T]], &mut [&mut [T]]) + Sync + 'a;
 
-/// Elements of a block: some arrays of them fit a core's first or second cache, and what a block costs besides does not
-/// show.
+/// Elements of a block. Some arrays of this length fit a core's first or second cache, and the overhead of a block is
+/// negligible.
 pub(crate) const BLOCK: usize = 4096;
 
-/// `M` results of one pass over tensors that broadcast together, each of the common shape. Results that are not `wanted`
-/// are computed too, since one loop computes all, but take no memory.
+/// `M` results of one pass over tensors that broadcast together, each of the common shape. Results that are not
+/// `wanted` are computed too, by the same loop, but take no memory.
 ///
-/// Views are read without a copy. Axes that all operands broadcast are computed once, and the results broadcast them. If no
-/// operand is in row-major order, the results have the order of an operand.
+/// Views are read without a copy. Axes that all operands broadcast are computed once, and the results broadcast them.
+/// If no operand is in row-major order, the results have the order of an operand.
 ///
-/// `block` is usually [`lanes_fused`], which is all of this that is compiled for each formula.
+/// `block` is usually [`lanes_fused`]; only it is compiled for each formula.
 ///
 /// # Panics
-/// If the shapes do not broadcast.
+/// If `x` is empty, or the shapes do not broadcast.
 #[track_caller]
 #[inline(never)]
 pub fn map_fused<T: Scalar, const M: usize>(
@@ -86,11 +86,11 @@ fn map_views<T: Scalar, const M: usize>(
 
 /// An operand of a loop over a common shape.
 pub(crate) enum Part<'a, T: Scalar> {
-    /// Its elements are in order.
+    /// Its elements are in row-major order.
     Packed(&'a [T]),
     /// One number.
     One(T),
-    /// They have to be brought into order.
+    /// Its elements have to be copied into row-major order.
     Strided(&'a [T], &'a Layout),
 }
 
@@ -103,7 +103,7 @@ impl<'a, T: Scalar> Part<'a, T> {
         }
     }
 
-    /// Space for `width` elements, if they are not in order; to be given back.
+    /// Scratch space for `width` elements if they are not in order. The caller returns it to the pool.
     pub(crate) fn scratch(&self, width: usize, pool: &Pool<T>) -> Vec<T> {
         match *self {
             Part::Packed(_) => vec![],
@@ -116,7 +116,7 @@ impl<'a, T: Scalar> Part<'a, T> {
         }
     }
 
-    /// `n` elements from `start` on.
+    /// The `n` elements from `start` on.
     pub(crate) fn cut<'s>(&'s self, start: usize, n: usize, scratch: &'s mut [T]) -> &'s [T] {
         match self {
             Part::Packed(x) => &x[start..][..n],
@@ -143,10 +143,10 @@ fn map_parts<T: Scalar, const M: usize>(
     results.map(|result| result.map(|values| pool.wrap(shape, values)))
 }
 
-/// The results' slices; `None` for those that are not wanted.
+/// The slices of the results; `None` for results that are not wanted.
 type Results<'a, T> = [Option<&'a mut [T]>];
 
-/// All blocks, on all threads if that is worth it.
+/// Runs all blocks, on all threads if that is worth it.
 fn run<T: Scalar>(x: &[Part<'_, T>], len: usize, out: &mut Results<'_, T>, pool: &Pool<T>, block: &Block<'_, T>) {
     if len <= PIECE || !is_worthwhile(len * ELEMENT * out.len()) {
         return piece(x, 0..len, out, pool, block);
@@ -160,7 +160,7 @@ fn run<T: Scalar>(x: &[Part<'_, T>], len: usize, out: &mut Results<'_, T>, pool:
     each_of(pieces, |_, (range, mut out)| piece(x, range, &mut out, pool, block));
 }
 
-/// The blocks of one thread: `out` is for the elements in `range`.
+/// Runs the blocks of one thread: `out` is for the elements in `range`.
 fn piece<T: Scalar>(
     x: &[Part<'_, T>],
     range: Range<usize>,
@@ -190,13 +190,15 @@ fn piece<T: Scalar>(
     scratch.into_iter().filter(|scratch| scratch.capacity() > 0).for_each(|scratch| pool.give(scratch));
 }
 
-/// Elements of which [`lanes_fused`] holds several results before it writes them: results in slices that might overlap
-/// would end vectorisation.
+/// Elements of which [`lanes_fused`] buffers several results before it writes them. Writing to slices that might
+/// overlap would prevent vectorisation.
 const HELD: usize = 128;
 
-/// `out[k][i] = f([x[0][i], .., x[K - 1][i]], [x[K][i], .., x[K + N - 1][i]])[k]` with the best instruction set of the
-/// processor. Whether one of the arguments of a sine was too large for `QUICK` numbers, so that the results mean nothing:
-/// see [`Lane`].
+/// `out[k][i] = f([x[0][i], .., x[K - 1][i]], [x[K][i], .., x[K + N - 1][i]])[k]` with the processor's best instruction
+/// set.
+///
+/// Returns whether an argument of a sine or cosine was too large for `QUICK` numbers; the results are then invalid (see
+/// [`Lane`]).
 ///
 /// # Panics
 /// If there are not `K + N` operands and `M` results, or their lengths differ.

@@ -1,11 +1,11 @@
-//! Integer arrays: what sorting and searching give, and what gathering takes.
+//! Integer arrays: indices for gathering, and the results of sorting and searching.
 
 use crate::{Scalar, Shape, Tensor, axis_of, checked_len};
 use std::cmp::Ordering;
 use std::fmt;
 use std::sync::Arc;
 
-/// Row-major whole numbers of some shape: positions along an axis, or classes. A clone is a reference count.
+/// An array of `u32` indices in row-major order: positions along an axis, or classes. Cloning copies a reference.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Indices {
     shape: Shape,
@@ -22,7 +22,7 @@ macro_rules! from {
     ($(<$(const $n:ident: usize)?> $list:ty;)+) => {
         $(
             impl<$(const $n: usize)?> From<$list> for Indices {
-                /// One axis.
+                /// A vector of indices.
                 fn from(values: $list) -> Self {
                     Indices::from(Arc::<[u32]>::from(values))
                 }
@@ -34,21 +34,21 @@ macro_rules! from {
 from! { <> Vec<u32>; <> &[u32]; <const N: usize> [u32; N]; }
 
 impl<const N: usize> From<&[u32; N]> for Indices {
-    /// One axis.
+    /// A vector of indices.
     fn from(values: &[u32; N]) -> Self {
         Indices::from(&values[..])
     }
 }
 
 impl From<&Vec<u32>> for Indices {
-    /// One axis.
+    /// A vector of indices.
     fn from(values: &Vec<u32>) -> Self {
         Indices::from(&values[..])
     }
 }
 
 impl From<&Arc<[u32]>> for Indices {
-    /// One axis; nothing is copied.
+    /// A vector of indices, without a copy.
     fn from(values: &Arc<[u32]>) -> Self {
         Indices::from(values.clone())
     }
@@ -61,7 +61,7 @@ impl From<&Indices> for Indices {
 }
 
 impl Indices {
-    /// Indices of this shape from their values in row-major order.
+    /// Indices of this shape, from values in row-major order.
     ///
     /// # Panics
     /// If the number of values is not the product of the shape.
@@ -83,12 +83,12 @@ impl Indices {
         &self.values
     }
 
-    /// The values in row-major order, shared.
+    /// The values in row-major order, as a shared slice.
     pub fn values(&self) -> &Arc<[u32]> {
         &self.values
     }
 
-    /// Indicator vectors `[.., classes]`: 1 at each index, 0 elsewhere.
+    /// One-hot vectors `[.., classes]`: 1 at each index, 0 elsewhere.
     ///
     /// ```
     /// use raygrad_tensor::{Indices, Tensor};
@@ -125,7 +125,7 @@ impl fmt::Debug for Indices {
     }
 }
 
-/// The order in which sorting places numbers: NaN behind all others, -0 and +0 equal.
+/// The sort order of numbers: NaN after all others, -0 and +0 equal.
 fn order<T: Scalar>(a: &T, b: &T) -> Ordering {
     // Only a NaN is not comparable with itself.
     let nan = |x: &T| x.partial_cmp(x).is_none();
@@ -139,9 +139,11 @@ pub(crate) fn index(i: usize) -> u32 {
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// For each place along `axis` of the sorted tensor, where its element stands in this one. Equal elements keep
-    /// their order ("stable"), whether ascending or `descending`. NaN counts as larger than every number: it comes last
-    /// in ascending order and first in descending order.
+    /// The indices that sort the elements along `axis`: entry `k` is the position of the element that sorting puts at
+    /// `k`.
+    ///
+    /// Equal elements keep their order (the sort is stable), ascending or `descending`. NaN counts as larger than every
+    /// number: it comes last in ascending order and first in descending order.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -171,11 +173,12 @@ impl<T: Scalar> Tensor<T> {
         Indices::new(self.shape(), values)
     }
 
-    /// For each of `values` the place where it would be inserted to keep the rows of this tensor, sorted in ascending
-    /// order, sorted: before equal elements, or behind them if `right`.
+    /// The positions at which to insert `values` into the rows of this tensor, which are sorted in ascending order, to
+    /// keep them sorted. A position is before equal elements, or after them if `right`.
     ///
-    /// This is `[.., n]` and `values` is `[.., m]` with the same leading extents, or this is `[n]` and `values` has any
-    /// shape; the result has the shape of `values` and lies in `0..=n`.
+    /// This tensor is `[.., n]` and `values` is `[.., m]` with the same leading extents, or this tensor is `[n]` and
+    /// `values` has any shape. The result has the shape of `values` and is in `0..=n`. For rows that are not sorted the
+    /// result is unspecified, but in this range.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -186,7 +189,7 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the shapes do not fit. What comes of rows that are not sorted is unspecified, but inside the range.
+    /// If the shapes do not fit.
     #[track_caller]
     pub fn searchsorted(&self, values: &Tensor<T>, right: bool) -> Indices {
         let shapes = (self.shape(), values.shape());

@@ -1,19 +1,19 @@
-//! The numbers of a vectorised loop over a formula, with the short reduction of sine and cosine where it is enough.
+//! The numbers of a vectorised loop over a formula, with the short reduction of sine and cosine where it is valid.
 
 use crate::{Real, Scalar};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// A number in a loop of [`lanes_fused`](crate::lanes_fused). With `QUICK`, its sine and cosine take the short argument
-/// reduction only, and it remembers whether that was enough; without, it is just a number.
+/// A number in a loop of [`lanes_fused`](crate::lanes_fused). With `QUICK`, its sine and cosine use the short argument
+/// reduction, and it records whether that was valid. Without, it is a plain number.
 ///
-/// The reduction for arguments of any size costs several times the rest of a sine, and hardly an argument needs it. A
-/// loop cannot branch for each element and stay vectorised. So a formula is read for quick numbers first, and once more
-/// for plain ones where a block of elements turns out to have had an argument that was too large. The bits are those of
-/// the plain numbers in any case. A formula without sines leaves no trace of this.
+/// The reduction for arguments of any size takes several times as long as the rest of a sine, and few arguments need
+/// it. A loop cannot branch for each element and stay vectorised. So a formula runs on quick numbers first. Blocks of
+/// elements with an argument that was too large run again on plain numbers. The bits are those of plain numbers in any
+/// case. A formula without sines has no overhead.
 #[derive(Debug, Clone, Copy)]
 pub struct Lane<T: Scalar, const QUICK: bool> {
     value: T,
-    /// Whether an argument on the way to `value` was too large: see [`Scalar::outside`].
+    /// Whether an argument on the way to `value` was too large; see [`Scalar::outside`].
     outside: T::Flags,
 }
 
@@ -34,8 +34,8 @@ impl<T: Scalar, const QUICK: bool> Lane<T, QUICK> {
     }
 }
 
-/// Whether the text of a formula has a sine or a cosine, for which alone [`Lane`]s come in two kinds. One that is hidden in
-/// a function of another name costs time and no digit.
+/// Whether the text of a formula has a sine or a cosine; only then [`Lane`]s have a quick version. A sine inside a
+/// function of another name is slower, but just as accurate.
 pub const fn has_angle(formula: &str) -> bool {
     let text = formula.as_bytes();
     let (mut start, mut i) = (0, 0);

@@ -1,41 +1,41 @@
-//! Strided layouts: which element of a buffer stands at each index.
+//! Strided layouts: a map from indices to elements of a buffer.
 
 use crate::Shape;
 use smallvec::SmallVec;
 
 mod views;
 
-/// The steps in a buffer from an element to its neighbour along each axis.
+/// The distance in a buffer from an element to its neighbour along each axis.
 pub(crate) type Strides = SmallVec<[isize; 4]>;
 
-/// Which element of a buffer stands at each index of a shape: `offset + sum(index[i] * strides[i])`.
+/// A map from each index of a shape to an element of a buffer: `offset + sum(index[i] * strides[i])`.
 ///
-/// Stride 0 repeats an element (broadcast), a negative stride walks backwards (flip). Every layout that can be made stays
-/// within its buffer.
+/// Stride 0 repeats an element (broadcast), and a negative stride walks backwards (flip). Every layout stays within its
+/// buffer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
     shape: Shape,
     strides: Strides,
     offset: isize,
-    /// Number of elements of the buffer that the layout points into.
+    /// Number of elements of the buffer.
     source: usize,
 }
 
-/// The number of elements of a shape; `None` if it is beyond `isize::MAX`, which no buffer can hold. Extents of 0 make it 0
-/// whatever the others are, as long as the product of these can be held.
+/// The number of elements of a shape. `None` if it is beyond `isize::MAX`, which no buffer can hold. An extent of 0
+/// makes it 0, as long as the product of the other extents is in range.
 pub fn checked_len(shape: &[usize]) -> Option<usize> {
     let all = shape.iter().filter(|&&extent| extent > 0).try_fold(1_usize, |all, &extent| all.checked_mul(extent))?;
     (all <= isize::MAX as usize).then(|| if shape.contains(&0) { 0 } else { all })
 }
 
-/// Stands for the extent that follows from the others, in a reshape.
+/// Marks the extent that follows from the others in a reshape (-1 in NumPy and PyTorch).
 pub const INFER: usize = usize::MAX;
 
 /// A shape for `len` elements in which one extent may be [`INFER`].
 ///
 /// # Errors
-/// If it holds another number of elements, more than one extent is to be inferred, or the one does not follow from the
-/// others because they do not divide the number of elements or one of them is 0; in words.
+/// If the shape has another number of elements, or more than one extent is [`INFER`]. If an inferred extent does not
+/// follow from the others, because they do not divide the number of elements or one of them is 0.
 pub fn inferred(shape: &[usize], len: usize) -> Result<Shape, String> {
     let mut known = Shape::from_slice(shape);
     if let Some(axis) = shape.iter().position(|&extent| extent == INFER) {
@@ -63,7 +63,7 @@ pub(crate) fn len_of(shape: &[usize]) -> usize {
     checked_len(shape).unwrap_or_else(|| panic!("a tensor of shape {shape:?} has too many elements"))
 }
 
-/// The permutation that undoes another one.
+/// The inverse of a permutation.
 pub(crate) fn inverse(order: &[usize]) -> Shape {
     let mut back = Shape::from_elem(0, order.len());
     order.iter().enumerate().for_each(|(i, &axis)| back[axis] = i);
@@ -85,13 +85,13 @@ impl Layout {
         Layout { shape: Shape::from_slice(shape), strides, offset: 0, source }
     }
 
-    /// A layout of any strides; `None` if it leaves a buffer of `source` elements.
+    /// A layout with any strides; `None` if it leaves a buffer of `source` elements.
     pub(crate) fn strided(shape: &[usize], strides: &[isize], offset: isize, source: usize) -> Option<Self> {
         let layout = Layout { shape: Shape::from_slice(shape), strides: Strides::from_slice(strides), offset, source };
         layout.is_inside().then_some(layout)
     }
 
-    /// Whether every index leads to an element of the buffer.
+    /// Whether every index maps to an element of the buffer.
     fn is_inside(&self) -> bool {
         if checked_len(&self.shape).is_none() || self.shape.len() != self.strides.len() {
             return false;
@@ -107,27 +107,27 @@ impl Layout {
         low >= 0 && high < self.source as i128
     }
 
-    /// The shape that the layout covers.
+    /// The extent of each axis.
     pub fn shape(&self) -> &[usize] {
         &self.shape
     }
 
-    /// The step in the buffer from an element to its neighbour along each axis.
+    /// The distance in the buffer from an element to its neighbour along each axis.
     pub fn strides(&self) -> &[isize] {
         &self.strides
     }
 
-    /// The position in the buffer of the element whose index is 0 along every axis.
+    /// The position in the buffer of the element whose indices are all 0.
     pub fn offset(&self) -> usize {
         self.offset as usize
     }
 
-    /// Number of elements of the buffer that the layout points into.
+    /// Number of elements of the buffer.
     pub fn source(&self) -> usize {
         self.source
     }
 
-    /// Number of elements that the layout covers.
+    /// Number of elements of the layout.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -137,7 +137,7 @@ impl Layout {
         self.shape.contains(&0)
     }
 
-    /// Whether the elements lie one behind the other in row-major order, from [`offset`](Self::offset) on.
+    /// Whether the elements are contiguous in row-major order, from [`offset`](Self::offset) on.
     pub fn is_packed(&self) -> bool {
         let mut step = 1;
         for (&extent, &stride) in self.shape.iter().zip(&self.strides).rev() {
@@ -149,10 +149,10 @@ impl Layout {
         true
     }
 
-    /// The same elements in the same order under another shape; `None` where strides cannot say that.
+    /// The same elements in the same order with another shape; `None` if strides cannot express it.
     ///
     /// # Panics
-    /// If the shapes hold different numbers of elements.
+    /// If the shapes have different numbers of elements.
     #[track_caller]
     pub fn reshaped(&self, shape: &[usize]) -> Option<Self> {
         assert_eq!(checked_len(shape), Some(self.len()), "cannot reshape {:?} to {shape:?}", self.shape);
@@ -185,8 +185,8 @@ impl Layout {
         Some(Layout { shape: Shape::from_slice(shape), strides, ..*self })
     }
 
-    /// The elements that this layout of a row-major buffer of `base`'s shape names, in the buffer of `base`: a view of a
-    /// view. `None` where strides cannot say that.
+    /// Composes two views: this layout of a row-major buffer of `base`'s shape, applied to the elements of `base`.
+    /// `None` if strides cannot express it.
     ///
     /// # Panics
     /// If this layout was made for another number of elements.
@@ -225,7 +225,7 @@ impl Layout {
         inside.then(|| Layout { shape: self.shape.clone(), strides, offset, source: base.source })
     }
 
-    /// The index of the element that stands at `position` in row-major order.
+    /// The index of the element at `position` in row-major order.
     fn index_of(&self, mut position: usize) -> SmallVec<[isize; 4]> {
         let mut index = SmallVec::from_elem(0, self.shape.len());
         for (i, &extent) in index.iter_mut().zip(&self.shape).rev() {
@@ -235,8 +235,8 @@ impl Layout {
         index
     }
 
-    /// For a layout that names every element of a row-major buffer once, such as a permutation or a flip: the layout of its
-    /// elements that names them in the order of that buffer.
+    /// The inverse of a layout that selects every element of a row-major buffer once, such as a permutation or a flip.
+    /// It selects the elements in the order of that buffer. `None` if the layout has no such inverse.
     pub fn inverted(&self) -> Option<Layout> {
         let mut order: Shape = (0..self.shape.len()).collect();
         order.sort_by_key(|&axis| std::cmp::Reverse(self.strides[axis].unsigned_abs()));
@@ -252,7 +252,8 @@ impl Layout {
         (whole && !self.is_empty()).then_some(back)
     }
 
-    /// Where what lies behind the first `lead` axes begins in the buffer, for every index of these, in row-major order.
+    /// The buffer positions of the sub-arrays behind the first `lead` axes, for every index of these, in row-major
+    /// order.
     pub(crate) fn offsets(&self, lead: usize) -> Vec<usize> {
         let mut offsets = vec![self.offset as usize];
         for (&extent, &stride) in self.shape[..lead].iter().zip(&self.strides) {
@@ -262,14 +263,14 @@ impl Layout {
         offsets
     }
 
-    /// The order of axes in which memory is walked from start to end, if the elements lie one behind the other that way.
+    /// The order of axes that walks memory from start to end, if the elements are contiguous in that order.
     pub(crate) fn memory_order(&self) -> Option<Shape> {
         let mut axes: Shape = (0..self.shape.len()).collect();
         axes.sort_by_key(|&axis| std::cmp::Reverse(self.strides[axis]));
         self.permuted(&axes).is_packed().then_some(axes)
     }
 
-    /// Axes of extent 1 dropped and neighbours that form one run merged: fewer, longer inner loops.
+    /// Drops axes of extent 1 and merges neighbours that form one run, for fewer and longer inner loops.
     pub(crate) fn collapsed(&self) -> SmallVec<[(usize, isize); 4]> {
         let mut axes = SmallVec::<[(usize, isize); 4]>::new();
         for (&extent, &stride) in self.shape.iter().zip(&self.strides) {

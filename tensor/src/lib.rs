@@ -1,20 +1,31 @@
-//! Dense tensors of `f32` or `f64` over [`ndarray`], and the kernels that work on them. This crate knows no graph.
+//! Dense CPU tensors of `f32` or `f64` on top of [`ndarray`], and the kernels that work on them.
 //!
-//! * [`Tensor`]: a shared buffer seen through a shape and strides; clones and views copy nothing.
-//! * [`Pool`]: gives the buffers of dropped tensors to the next ones.
-//! * [`matmul`]: matrix products with transposed operands by stride.
+//! Start with [`Tensor`]. This crate has no gradients: the tape is in `raygrad-autograd`.
+//!
+//! ```
+//! use raygrad_tensor::{Tensor, s};
+//! let x = Tensor::from([[1.0, 2.0], [3.0, 4.0_f32]]);
+//! assert_eq!(x.slice(s![.., 1]), [2.0, 4.0]); // a view, without a copy
+//! assert_eq!(x.matmul(&x.t()), [[5.0, 11.0], [11.0, 25.0]]);
+//! let mean = x.mean_over(0); // of each column
+//! assert_eq!(&x - &mean, [[-1.0, -1.0], [1.0, 1.0]]); // broadcasts as in NumPy
+//! ```
+//!
+//! * [`Tensor`]: a shared buffer with a shape and strides. Clones and views do not copy it.
+//! * [`Pool`]: reuses the buffers of dropped tensors.
+//! * [`matmul`]: matrix products; transposed operands are not copied.
 //! * [`map`] and [`lanes`]: elementwise loops with NumPy's broadcasting, vectorised for the processor at run time.
 //! * [`map_fused`] and [`lanes_fused`]: several results of one such loop.
 //! * [`sum`], [`sum_axes`], [`sum_to`]: pairwise sums.
 //! * [`Layout`]: the strides of a view: broadcast, permute, slice, flip, diagonal, windows, and their adjoints.
-//! * [`Windows`]: what a convolution or a pooling sees of an image.
-//! * [`Indices`], [`Mask`]: integer and boolean arrays, for sorting, searching, gathering, comparing and picking.
+//! * [`Windows`]: the windows of a convolution or pooling.
+//! * [`Indices`], [`Mask`]: integer and boolean arrays, for sorting, searching, gathering, comparing and selecting.
 //! * `random` (with the feature `rand`): uniform and normal numbers, permutations.
-//! * [`rows`] and [`extremum`]: softmax, layer normalisation and the like; the greatest and smallest elements.
-//! * [`vmath`]: exp, sin, tanh and the like, written so that loops over them vectorise.
+//! * [`rows`] and [`extremum`]: softmax, layer normalisation and cross-entropy; the largest and smallest elements.
+//! * [`vmath`]: exp, sin, tanh and others, in a form that vectorises in loops.
 //!
-//! Work on large tensors is spread over the threads of the caller's rayon pool; see [`parallel`]. The bits do not depend on
-//! it.
+//! Work on large tensors runs on all threads of the caller's rayon pool; see [`parallel`]. The bits of results do not
+//! depend on the number of threads.
 
 mod arithmetic;
 mod arrange;

@@ -1,4 +1,4 @@
-//! Boolean arrays: what comparisons give, and what picks elements.
+//! Boolean arrays: results of comparisons, and selections of elements.
 
 use crate::fused::Part;
 use crate::layout::checked_len;
@@ -8,7 +8,7 @@ use std::fmt;
 use std::ops::{BitAnd, BitOr, BitXor, Not};
 use std::sync::Arc;
 
-/// Row-major truth values of some shape. A clone is a reference count.
+/// A boolean array in row-major order. Cloning copies a reference.
 ///
 /// ```
 /// use raygrad_tensor::Tensor;
@@ -25,7 +25,7 @@ pub struct Mask {
 }
 
 impl Mask {
-    /// A mask of this shape from its values in row-major order.
+    /// A mask of this shape, from values in row-major order.
     ///
     /// # Panics
     /// If the number of values is not the product of the shape.
@@ -46,22 +46,22 @@ impl Mask {
         &self.values
     }
 
-    /// How many are true.
+    /// Number of true values.
     pub fn count(&self) -> usize {
         self.values.iter().filter(|&&x| x).count()
     }
 
-    /// Whether one is true; not of none.
+    /// Whether at least one value is true; false for an empty mask.
     pub fn any(&self) -> bool {
         self.values.contains(&true)
     }
 
-    /// Whether all are true; so of none.
+    /// Whether all values are true; true for an empty mask.
     pub fn all(&self) -> bool {
         !self.values.contains(&false)
     }
 
-    /// The places of the true ones in row-major order: `[count]`.
+    /// The row-major positions of the true values: `[count]`.
     ///
     /// # Panics
     /// If there are more than 2^32 elements.
@@ -71,7 +71,7 @@ impl Mask {
         Indices::new(&[places.len()], places)
     }
 
-    /// 1 where it is true, 0 elsewhere.
+    /// The mask as numbers: 1 where it is true, 0 elsewhere.
     pub fn cast<T: Scalar>(&self) -> Tensor<T> {
         let mut numbers = vec![T::ZERO; self.values.len()];
         chunks(&mut numbers, PIECE, self.values.len() * ELEMENT, || (), &|(), i, numbers| {
@@ -81,10 +81,10 @@ impl Mask {
         Tensor::from_vec(&self.shape, numbers)
     }
 
-    /// The mask stretched to another shape, as NumPy broadcasts.
+    /// Broadcasts the mask to `shape`, with NumPy's rules.
     ///
     /// # Panics
-    /// If the shape does not broadcast to `shape`.
+    /// If the mask does not broadcast to `shape`.
     #[track_caller]
     pub fn broadcast_to(&self, shape: &[usize]) -> Mask {
         if self.shape() == shape {
@@ -154,7 +154,7 @@ impl Not for Mask {
 }
 
 impl<const N: usize> PartialEq<[bool; N]> for Mask {
-    /// Whether this is a vector of these values.
+    /// Whether this is a vector with these values.
     fn eq(&self, other: &[bool; N]) -> bool {
         self.shape() == [N] && self.as_slice() == other
     }
@@ -221,34 +221,46 @@ impl<T: Scalar> Tensor<T> {
         Mask::new(&shape, holds)
     }
 
-    /// Where elements are less than those of another tensor or than a number.
+    /// Where elements are less than those of `other`, a tensor or a number.
     ///
     /// # Panics
-    /// If the shapes do not broadcast; so for the other comparisons.
+    /// If the shapes do not broadcast.
     #[track_caller]
     pub fn lt(&self, other: impl Into<Tensor<T>>) -> Mask {
         self.compare(&other.into(), |a, b| a < b)
     }
 
-    /// Where elements are at most those of another tensor or a number.
+    /// Where elements are at most those of `other`, a tensor or a number.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
     #[track_caller]
     pub fn le(&self, other: impl Into<Tensor<T>>) -> Mask {
         self.compare(&other.into(), |a, b| a <= b)
     }
 
-    /// Where elements are greater than those of another tensor or than a number.
+    /// Where elements are greater than those of `other`, a tensor or a number.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
     #[track_caller]
     pub fn gt(&self, other: impl Into<Tensor<T>>) -> Mask {
         self.compare(&other.into(), |a, b| a > b)
     }
 
-    /// Where elements are at least those of another tensor or a number.
+    /// Where elements are at least those of `other`, a tensor or a number.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
     #[track_caller]
     pub fn ge(&self, other: impl Into<Tensor<T>>) -> Mask {
         self.compare(&other.into(), |a, b| a >= b)
     }
 
-    /// Where elements equal those of another tensor or a number; a NaN equals nothing.
+    /// Where elements equal those of `other`, a tensor or a number. NaN equals no number.
+    ///
+    /// # Panics
+    /// If the shapes do not broadcast.
     #[track_caller]
     pub fn elementwise_eq(&self, other: impl Into<Tensor<T>>) -> Mask {
         self.compare(&other.into(), |a, b| a == b)
@@ -259,8 +271,8 @@ impl<T: Scalar> Tensor<T> {
         !self.elementwise_eq(self)
     }
 
-    /// The elements where `mask` is true, and those of `other` elsewhere; all three broadcast together (`numpy.where`,
-    /// `torch.where`, with the underscore because Rust keeps that word to itself).
+    /// The elements where `mask` is true, and those of `other` elsewhere (`numpy.where`, `torch.where`; `where` is a
+    /// Rust keyword). All three broadcast together.
     ///
     /// # Panics
     /// If the shapes do not broadcast.
@@ -269,7 +281,7 @@ impl<T: Scalar> Tensor<T> {
         choose(mask, self, &other.into(), &self.pool())
     }
 
-    /// The elements where a mask is true, in row-major order: `[count]`.
+    /// The elements where a mask is true, in row-major order: `[count]` (`x[mask]` in NumPy, `torch.masked_select`).
     ///
     /// # Panics
     /// If the mask has another shape.
@@ -281,7 +293,7 @@ impl<T: Scalar> Tensor<T> {
         Tensor::from_vec(&[kept.len()], kept)
     }
 
-    /// The entries with these numbers along `axis` (`numpy.take`): the axis becomes those of `index`.
+    /// Selects entries along `axis` by index (`numpy.take`). The axes of `index` replace `axis`.
     ///
     /// ```
     /// use raygrad_tensor::{Indices, Tensor};
@@ -290,7 +302,7 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the axis does not exist or a number is not below its extent.
+    /// If the axis does not exist, or an index is not below its extent.
     #[track_caller]
     pub fn take(&self, axis: isize, index: impl Into<Indices>) -> Self {
         let index = index.into();
@@ -318,7 +330,7 @@ impl<T: Scalar> Tensor<T> {
     /// The elements as indices.
     ///
     /// # Panics
-    /// If one is not a whole number from 0 to 2^32 - 1.
+    /// If an element is not a whole number from 0 to 2^32 - 1.
     #[track_caller]
     pub fn to_indices(&self) -> Indices {
         let whole = |x: T| {

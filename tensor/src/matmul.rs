@@ -1,10 +1,10 @@
-//! Matrix products: one function, with transposed operands by stride.
+//! Matrix products. Start with [`matmul`]; [`gemm`] works on slices with any strides.
 
 use crate::parallel::{chunks, each, is_worthwhile};
 use crate::{Layout, Pool, Scalar, Shape, Tensor, add_assign, broadcast_shape, sum_rows};
 use std::ops::Range;
 
-/// A matrix in a slice: element `(i, j)` is `data[offset + i * strides[0] + j * strides[1]]`.
+/// A strided matrix in a slice: element `(i, j)` is `data[offset + i * strides[0] + j * strides[1]]`.
 #[derive(Clone, Copy)]
 pub struct Matrix<'a, T> {
     data: &'a [T],
@@ -15,7 +15,7 @@ pub struct Matrix<'a, T> {
 }
 
 impl<'a, T: Scalar> Matrix<'a, T> {
-    /// The row-major matrix of `rows x columns` in `data`.
+    /// The row-major matrix `rows x columns` in `data`.
     ///
     /// # Panics
     /// If `data` has another length.
@@ -40,10 +40,10 @@ impl<'a, T: Scalar> Matrix<'a, T> {
         }
     }
 
-    /// The matrix that the last two axes of a layout see from `offset` on.
+    /// The matrix in the last two axes of a layout, from `offset` on.
     ///
     /// # Panics
-    /// If it leaves the buffer, or there are less than two axes.
+    /// If it leaves the buffer, or there are fewer than two axes.
     #[track_caller]
     pub fn of(data: &'a [T], layout: &Layout, offset: usize) -> Self {
         let (&[.., rows, columns], &[.., row, column]) = (layout.shape(), layout.strides()) else {
@@ -64,39 +64,40 @@ impl<'a, T: Scalar> Matrix<'a, T> {
         self.columns
     }
 
-    /// The rows of this range, which is not empty.
+    /// The rows of this range, which must not be empty.
     fn some_rows(self, range: Range<usize>) -> Self {
         debug_assert!(!range.is_empty() && range.end <= self.rows);
         Matrix { offset: self.offset + range.start as isize * self.strides[0], rows: range.len(), ..self }
     }
 
-    /// The columns of this range, which is not empty.
+    /// The columns of this range, which must not be empty.
     fn some_columns(self, range: Range<usize>) -> Self {
         self.t().some_rows(range).t()
     }
 
-    /// The same matrix with rows and columns exchanged; nothing is copied.
+    /// The transposed matrix, without a copy.
     pub fn t(self) -> Self {
         let [row, column] = self.strides;
         Matrix { rows: self.columns, columns: self.rows, strides: [column, row], ..self }
     }
 }
 
-/// Rows or columns of a piece of a product, about, at least, and pieces, at most: with less in a piece each thread would
-/// mostly rearrange the other factor for itself. Small products, of up to 64 x 64 or 256 elements, are added up in another
-/// order; no piece is as small.
+/// Least number of rows or columns of a piece, about, and largest number of pieces. With smaller pieces each thread
+/// would mostly rearrange the other factor again. Small products, of up to 64 x 64 or 256 elements, are summed in
+/// another order; no piece is so small.
 const ROWS: usize = 128;
 const PIECES: usize = 32;
-/// Terms of a sum that is cut, at least, in a product that is too small otherwise.
+/// Least number of terms in a part of a sum that is split, if a product is too small otherwise.
 const DEPTH: usize = 1 << 12;
-/// Multiplications and additions that take as long as one operation of a loop (see [`chunks`]).
+/// Multiply-adds that take as long as one operation of a loop (see [`chunks`]).
 const PER_OPERATION: usize = 8;
 
-/// `c = a b`, or `c += a b` if `accumulate`; `c` is row-major. A large product is cut by rows, by columns, or by depth, and
-/// its pieces are computed on all threads.
+/// `c = a b`, or `c += a b` if `accumulate`; `c` is row-major. A large product is split by rows, by columns, or by
+/// depth, and runs on all threads.
 ///
-/// Sums run in the order of the underlying kernel, which depends on the sizes and on the processor's instruction set
-/// but never on the number of threads; those of over 8192 terms in a small product are cut, and their parts added by pairs.
+/// Sums run in the order of the underlying kernel. It depends on the sizes and on the processor's instruction set, but
+/// never on the number of threads. Sums of over 8192 terms in a small product are split, and their parts are added in
+/// pairs.
 ///
 /// # Panics
 /// If the sizes do not fit together.
@@ -154,8 +155,8 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
     }
 }
 
-/// The product of the matrices in the last two axes of `a` `[.., m, k]` and `b` `[.., k, n]`; the axes before count matrices,
-/// and broadcast. Views, above all transposes, are read without a copy. All threads work on one large product, or on many
+/// The matrix product over the last two axes of `a` `[.., m, k]` and `b` `[.., k, n]`. Leading axes count matrices and
+/// broadcast. Views, such as transposes, are read without a copy. All threads work on one large product, or on many
 /// small ones.
 ///
 /// ```
@@ -165,7 +166,7 @@ pub fn gemm<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: &mut [T], accumula
 /// ```
 ///
 /// # Panics
-/// If a factor has less than two axes, the inner extents differ or the leading axes do not broadcast.
+/// If a factor has fewer than two axes, the inner extents differ, or the leading axes do not broadcast.
 #[track_caller]
 pub fn matmul<T: Scalar>(a: &Tensor<T>, b: &Tensor<T>, pool: &Pool<T>) -> Tensor<T> {
     let (&[ref a_lead @ .., m, k], &[ref b_lead @ .., inner, n]) = (a.shape(), b.shape()) else {
@@ -191,7 +192,7 @@ pub fn matmul<T: Scalar>(a: &Tensor<T>, b: &Tensor<T>, pool: &Pool<T>) -> Tensor
     })
 }
 
-/// Where tasks write, each to columns of its own.
+/// The destination of several tasks, each of which writes its own columns.
 #[derive(Clone, Copy)]
 struct Target<T>(*mut T);
 
@@ -204,10 +205,10 @@ impl<T> Target<T> {
     }
 }
 
-/// The product on this thread.
+/// Computes the product on this thread.
 ///
 /// # Safety
-/// `c` is valid for `a.rows` rows of `b.columns` elements, `row` apart, and nobody else reads or writes them.
+/// `c` is valid for `a.rows` rows of `b.columns` elements, `row` apart, and no other code reads or writes them.
 // SAFETY: kept by `gemm`.
 unsafe fn product<T: Scalar>(a: Matrix<'_, T>, b: Matrix<'_, T>, c: *mut T, row: usize, accumulate: bool) {
     let start = |x: &Matrix<'_, T>| (x.data.as_ptr().wrapping_offset(x.offset), x.strides);

@@ -1,29 +1,31 @@
-//! Large loops on all of rayon's threads, with the same bits at any number of them.
+//! Parallel loops on rayon's threads, with the same bits for any number of threads.
 //!
-//! An operation on a large tensor is cut into pieces, in a way that leaves what is added to what to the sizes alone. The
-//! threads of the caller's rayon pool work on the pieces. A caller that already runs in parallel wraps its operations in
-//! [`serial`]: waiting for other threads there would only delay it.
+//! The sizes alone determine how an operation on a large tensor is split, and so the order of sums. The threads of the
+//! caller's rayon pool work on the parts. A caller that already runs in parallel wraps its operations in [`serial`]:
+//! they run faster without waiting for other threads.
 
 use rayon::prelude::*;
 use std::cell::Cell;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Operations below which waking other threads costs more than it saves: some 50 microseconds of work.
+/// Number of operations below which other threads are not worth their start: some 50 microseconds of work.
 const WORTHWHILE: usize = 1 << 20;
 
-/// Elements of a piece: what two or three arrays of f32 may have in a core's second cache.
+/// Elements of a part of a loop: two or three such arrays of f32 fit a core's second-level cache.
 pub const PIECE: usize = 1 << 15;
 
-/// What an element costs that is read, computed with a few operations and written.
+/// Operations for an element that is read, computed with a few operations and written.
 pub(crate) const ELEMENT: usize = 8;
 
 thread_local! {
     static SERIAL: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Runs `f` with every operation on this thread alone: what the tasks of a loop that is itself parallel want, such as tiles
-/// with a tape each. A task that holds a lock needs it: a thread that waits for its helpers may take up another task
-/// meanwhile, and that would wait for the lock.
+/// Runs `f` with every operation on this thread alone. For the tasks of a loop that is itself parallel, such as tiles
+/// with a tape each.
+///
+/// A task that holds a lock needs it. A thread that waits for its helpers may start another task meanwhile, which would
+/// wait for the lock.
 ///
 /// ```
 /// use raygrad_tensor::{Tensor, parallel, sum};
@@ -42,15 +44,16 @@ pub fn serial<R>(f: impl FnOnce() -> R) -> R {
     f()
 }
 
-/// Whether `work` operations are worth more threads, and the caller has not cut the work already.
+/// Whether `work` operations are worth several threads, and the caller has not split the work already.
 pub(crate) fn is_worthwhile(work: usize) -> bool {
     work >= WORTHWHILE && !SERIAL.get() && rayon::current_num_threads() > 1
 }
 
-/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool, or within [`serial`] on this one.
+/// Calls `f(i)` for every `i` below `count`, on all threads of the caller's rayon pool. Operations inside `f` stay on
+/// their thread.
 ///
-/// Operations within `f` keep to their thread; a single call may use all threads itself. Loops call `f` through a pointer,
-/// so that rayon is compiled once and not for each loop.
+/// All parallel loops use this one, and it calls `f` through a pointer, so that rayon is compiled once and not for each
+/// loop.
 #[inline(never)]
 pub fn each(count: usize, f: &(dyn Fn(usize) + Sync)) {
     match count {
@@ -61,7 +64,7 @@ pub fn each(count: usize, f: &(dyn Fn(usize) + Sync)) {
     }
 }
 
-/// [`each`] with the parts of something that is cut, such as mutable chunks of a slice: calls `f(i, part i)`.
+/// As [`each`], with one item for each call, such as mutable chunks of a slice: calls `f(i, item i)`.
 pub fn each_of<P: Send>(parts: impl IntoIterator<Item = P>, f: impl Fn(usize, P) + Sync) {
     let parts: Vec<Mutex<Option<P>>> = parts.into_iter().map(|part| Mutex::new(Some(part))).collect();
     each(parts.len(), &|i| {
@@ -70,7 +73,7 @@ pub fn each_of<P: Send>(parts: impl IntoIterator<Item = P>, f: impl Fn(usize, P)
     });
 }
 
-/// [`each`] with results, which come in order.
+/// As [`each`], and collects the results in order.
 ///
 /// ```
 /// assert_eq!(raygrad_tensor::parallel::collect(4, |i| i * i), [0, 1, 4, 9]);
@@ -81,12 +84,12 @@ pub fn collect<R: Send>(count: usize, f: impl Fn(usize) -> R + Sync) -> Vec<R> {
     results.into_iter().flatten().collect()
 }
 
-/// Scratch space for the tasks of [`each`]: as many as run at once, which take turns.
+/// Scratch space for the tasks of [`each`]. As many exist as tasks run at once, and later tasks reuse them.
 #[derive(Debug, Default)]
 pub struct Scratch<S>(Mutex<Vec<S>>);
 
 impl<S: Default> Scratch<S> {
-    /// Calls `f` with one that nobody else uses.
+    /// Calls `f` with scratch space that no other task uses.
     pub fn with<R>(&self, f: impl FnOnce(&mut S) -> R) -> R {
         self.with_new(S::default, f)
     }
@@ -103,13 +106,14 @@ impl<S> Scratch<S> {
     }
 }
 
-/// What a mutex holds, also after a thread that held it has panicked.
+/// Locks a mutex, even if a thread panicked while it held the lock.
 pub fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Calls `f(scratch, i, chunk i)` for every chunk of `len` elements of `out` (the last may be shorter), each thread with
-/// scratch space of its own: on all threads if the `work` of all together, in operations of a processor, is worth it.
+/// Calls `f(scratch, i, chunk i)` for every chunk of `len` elements of `out`; the last one may be shorter. Each thread
+/// has its own scratch space. It uses all threads if `work` is large enough; `work` is the number of processor
+/// operations of all chunks.
 ///
 /// # Panics
 /// If `len` is 0 and `out` is not empty.
@@ -146,7 +150,7 @@ mod tests {
         Tensor::from_fn(shape, |i| T::from_f64(value(i * 7919 + seed) * magnitude(i * 31 + seed)))
     }
 
-    /// What every kernel that can be cut makes of tensors that are large enough, with extents that do not divide.
+    /// Results of all kernels that can be split, on large tensors with extents that do not divide.
     fn everything<T: Scalar>() -> Vec<Vec<T>> {
         let pool = Pool::new();
         let x = values::<T>(&[1031, 517], 1);

@@ -1,4 +1,4 @@
-//! A pool of buffers: the vectors of dropped tensors, given back to the next tensor of about that size.
+//! A pool that reuses the buffers of dropped tensors.
 
 use crate::layout::len_of;
 use crate::{Scalar, Shape, Tensor};
@@ -6,19 +6,20 @@ use std::collections::HashMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
-/// Gives out the buffers of tensors that were dropped before.
+/// Reuses the buffers of dropped tensors for new tensors of similar size.
 ///
-/// A clone is another handle on the same pool. Tensors made by a pool remember it and give their buffer back when the
-/// last reference goes, on whatever thread, as long as a handle on the pool is left; so a loop that builds and drops the same graph allocates nothing of tensor
-/// size after its first round. [`Pool::none`] makes plain tensors that free their memory.
+/// A clone is another handle to the same pool. A tensor made by a pool returns its buffer when its last reference is
+/// dropped, on any thread. If no handle to the pool exists then, the buffer is freed. So a loop that builds and drops
+/// the same graph allocates no tensor-sized buffers after its first round. [`Pool::none`] makes plain tensors that free
+/// their memory.
 #[derive(Clone)]
 pub struct Pool<T: Scalar>(Option<Arc<Mutex<Shelves<T>>>>);
 
-/// A pool as the buffers remember it that it gave out: they do not keep it, and what lies in it, alive.
+/// The reference of a buffer to its pool. It does not keep the pool and its buffers alive.
 pub(crate) struct Home<T>(Weak<Mutex<Shelves<T>>>);
 
 impl<T: Scalar> Home<T> {
-    /// The pool, if anybody still has it; else none.
+    /// The pool if a handle to it exists, else none.
     pub fn pool(&self) -> Pool<T> {
         Pool(self.0.upgrade())
     }
@@ -33,7 +34,7 @@ struct Shelves<T> {
 /// Free buffers of one class.
 struct Shelf<T> {
     buffers: Vec<Vec<T>>,
-    /// The fewest that lay here since the last [`Pool::trim`].
+    /// The smallest number of buffers here since the last [`Pool::trim`].
     idle: usize,
 }
 
@@ -52,23 +53,23 @@ impl<T> Shelf<T> {
     }
 }
 
-/// Tensors of at most this many elements, scalars above all, do without the pool: an allocator is quicker with them.
+/// Tensors of at most this many elements do not use the pool: the allocator is faster for them.
 const SMALL: usize = 64;
 
-/// Elements from which new memory is left to the system to clear.
+/// Number of elements from which the operating system clears new memory.
 const LARGE: usize = 1 << 18;
 
-/// Buffers are rounded up to a quarter of a power of two, so that sizes that vary from step to step share them; at
+/// Rounds a buffer size up to a quarter of a power of two, so that sizes that vary from step to step share buffers. At
 /// most 25 % of a buffer is unused.
 fn class(len: usize) -> usize {
     let quarter = (len.next_power_of_two() / 8).max(1);
     len.div_ceil(quarter) * quarter
 }
 
-/// A new buffer that is to be overwritten; where assertions are on, what is forgotten shows as NaN.
+/// A new buffer to be overwritten. Where assertions are on, elements that are not overwritten show as NaN.
 ///
-/// A little is cleared here: it is the slow way to ask the allocator for it. What is large is only promised by the system,
-/// and comes to be where it is written to, on all threads that write.
+/// Small buffers are cleared here: the allocator would be slower. For large ones the system provides zero pages on
+/// first use, on all threads that write.
 fn unspecified<T: Scalar>(len: usize, capacity: usize) -> Vec<T> {
     if capacity >= LARGE && !cfg!(debug_assertions) {
         let mut values = vec![T::ZERO; capacity];
@@ -86,7 +87,7 @@ impl<T: Scalar> Pool<T> {
         Pool(Some(Arc::new(Mutex::new(Shelves { free: HashMap::new(), allocated: 0 }))))
     }
 
-    /// No pool: tensors allocate and free as vectors do.
+    /// No pool: tensors allocate and free memory as vectors do.
     pub fn none() -> Self {
         Pool(None)
     }
@@ -96,12 +97,12 @@ impl<T: Scalar> Pool<T> {
         self.0.as_ref().map(|pool| pool.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// How many elements this pool has allocated so far: constant in a steady state.
+    /// Number of elements that this pool has allocated so far. It is constant in a steady state.
     pub fn allocated(&self) -> usize {
         self.shelves().map_or(0, |shelves| shelves.allocated)
     }
 
-    /// A vector of `len` elements with unspecified (old) values.
+    /// A vector of `len` elements with unspecified (old) values, from the pool if it has one.
     pub fn take(&self, len: usize) -> Vec<T> {
         let Some(mut shelves) = self.shelves() else { return unspecified(len, len) };
         let class = class(len);
@@ -118,7 +119,7 @@ impl<T: Scalar> Pool<T> {
         buffer
     }
 
-    /// Puts a vector that [`take`](Self::take) gave out back on its shelf; others are freed.
+    /// Returns a vector from [`take`](Self::take) to the pool. A vector of another capacity is freed.
     pub fn give(&self, buffer: Vec<T>) {
         let capacity = buffer.capacity();
         if capacity > 0
@@ -129,8 +130,7 @@ impl<T: Scalar> Pool<T> {
         }
     }
 
-    /// Frees the buffers that no tensor has needed since the last call: sizes that went out of use, and what only the
-    /// largest graph took.
+    /// Frees the buffers that no tensor has needed since the last call, such as those of sizes that are no longer used.
     pub fn trim(&self) {
         let Some(mut shelves) = self.shelves() else { return };
         for shelf in shelves.free.values_mut() {
@@ -142,14 +142,17 @@ impl<T: Scalar> Pool<T> {
     }
 
     /// A tensor of this shape with unspecified (old) values, to be overwritten.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold.
     #[track_caller]
     pub fn tensor(&self, shape: &[usize]) -> Tensor<T> {
         self.filled(shape, |_| ())
     }
 
-    /// A tensor of this shape whose elements `fill` writes; it finds unspecified (old) values there.
+    /// A tensor of this shape whose elements `fill` writes. `fill` gets unspecified (old) values.
     ///
-    /// It costs less than [`tensor`](Self::tensor) and writing to that.
+    /// It is faster than [`tensor`](Self::tensor) and a later write.
     ///
     /// # Panics
     /// If the shape has more elements than memory can hold.
@@ -166,18 +169,21 @@ impl<T: Scalar> Pool<T> {
         self.wrap(shape, values)
     }
 
-    /// A vector for [`wrap`](Self::wrap) to make a tensor of, with unspecified (old) values.
+    /// A vector with unspecified (old) values, for [`wrap`](Self::wrap).
     pub(crate) fn buffer(&self, len: usize) -> Vec<T> {
         if len <= SMALL { unspecified(len, len) } else { self.take(len) }
     }
 
-    /// The tensor of this shape whose elements are those of a [`buffer`](Self::buffer).
+    /// A tensor of this shape with the elements of a [`buffer`](Self::buffer).
     pub(crate) fn wrap(&self, shape: &[usize], values: Vec<T>) -> Tensor<T> {
         let small = values.len() <= SMALL;
         Tensor::pooled(Shape::from_slice(shape), values, if small { Pool::none() } else { self.clone() })
     }
 
-    /// A tensor filled with `value`, every element of which has a place of its own, to be written to.
+    /// A tensor filled with `value`, with memory for each element, for later writes.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold.
     #[track_caller]
     pub fn full(&self, shape: &[usize], value: T) -> Tensor<T> {
         self.filled(shape, |out| out.fill(value))
@@ -195,7 +201,7 @@ impl<T: Scalar> Pool<T> {
         })
     }
 
-    /// Where buffers of this pool go back to.
+    /// The reference to this pool for its buffers.
     pub(crate) fn home(&self) -> Home<T> {
         Home(self.0.as_ref().map_or_else(Weak::new, Arc::downgrade))
     }

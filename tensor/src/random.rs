@@ -5,20 +5,20 @@ use rand::{Rng, RngExt};
 use std::f64::consts::TAU;
 use std::ops::Range;
 
-/// A normal variable of mean 0 and variance 1 (Box and Muller 1958).
+/// A normal random number with mean 0 and variance 1 (Box and Muller 1958).
 pub fn standard_normal(rng: &mut (impl Rng + ?Sized)) -> f64 {
     // 1 - u is in (0, 1], so that the logarithm is finite.
     (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt() * (TAU * rng.random::<f64>()).cos()
 }
 
-/// One of the equally spaced numbers of a type's precision from 0 to 1, without 1, which rounding to `f32` would reach.
+/// A uniform number in 0..1 at the type's precision, so that rounding to `f32` cannot reach 1.
 fn unit<T: Scalar>(rng: &mut (impl Rng + ?Sized)) -> f64 {
     let digits = if size_of::<T>() == 4 { 24 } else { 53 };
     (rng.next_u64() >> (64 - digits)) as f64 / (1_u64 << digits) as f64
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// Uniform numbers from 0 to 1, without 1.
+    /// Uniform random numbers in 0..1 (`numpy.random.rand`). 1 is excluded.
     ///
     /// ```
     /// use rand::{SeedableRng, rngs::StdRng};
@@ -31,7 +31,7 @@ impl<T: Scalar> Tensor<T> {
         Tensor::from_fn(shape, |_| T::from_f64(unit::<T>(rng)))
     }
 
-    /// Uniform numbers of a range. Its end is not among them, unless rounding reaches it.
+    /// Uniform random numbers of a range. The end is excluded, unless rounding reaches it.
     ///
     /// # Panics
     /// If an end is infinite or NaN.
@@ -46,12 +46,12 @@ impl<T: Scalar> Tensor<T> {
         })
     }
 
-    /// Normal numbers of mean 0 and variance 1.
+    /// Normal random numbers with mean 0 and variance 1 (`torch.randn`).
     pub fn randn(shape: &[usize], rng: &mut (impl Rng + ?Sized)) -> Self {
         Tensor::normal(shape, 0.0, 1.0, rng)
     }
 
-    /// Normal numbers of this mean and standard deviation.
+    /// Normal random numbers with this mean and standard deviation.
     ///
     /// # Panics
     /// If the deviation is negative, infinite or NaN.
@@ -61,7 +61,7 @@ impl<T: Scalar> Tensor<T> {
         Tensor::from_fn(shape, |_| T::from_f64(mean + deviation * standard_normal(rng)))
     }
 
-    /// 1 with probability `p`, else 0.
+    /// 1 with probability `p`, else 0 (`torch.bernoulli`).
     ///
     /// # Panics
     /// If `p` is not within 0 to 1.
@@ -73,7 +73,7 @@ impl<T: Scalar> Tensor<T> {
 }
 
 impl Indices {
-    /// Whole numbers of a range, each equally likely (`torch.randint`).
+    /// Random integers of a range, each equally likely (`torch.randint`).
     ///
     /// # Panics
     /// If the range is empty and the shape is not.
@@ -83,7 +83,7 @@ impl Indices {
         Indices::new(shape, (0..len).map(|_| rng.random_range(range.clone())).collect::<Vec<_>>())
     }
 
-    /// The numbers from 0 to `n - 1` in an order of which every one is equally likely (Fisher and Yates): `[n]`.
+    /// A random permutation of `0..n`, each equally likely (Fisher and Yates): `[n]`.
     pub fn permutation(n: u32, rng: &mut (impl Rng + ?Sized)) -> Self {
         let mut order: Vec<u32> = (0..n).collect();
         for i in (1..order.len()).rev() {
@@ -99,8 +99,8 @@ mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
 
-    /// The largest distance of the distribution of some numbers from the one that they should have, in units of what is
-    /// expected by chance: beyond 1.95 it comes once in a thousand draws (Kolmogorov and Smirnov).
+    /// The largest distance between the distribution of some numbers and the expected one, in units of the distance
+    /// expected by chance. A value beyond 1.95 comes once in a thousand draws (Kolmogorov and Smirnov).
     fn distance(x: &Tensor<f32>, expected: impl Fn(f64) -> f64) -> f64 {
         let mut x: Vec<f64> = x.iter().map(f64::from).collect();
         x.sort_by(f64::total_cmp);
@@ -142,7 +142,7 @@ mod tests {
 
     #[test]
     fn uniform_f32_largest_is_below_one() {
-        /// Gives nothing but ones.
+        /// Returns ones alone.
         struct Ones;
         impl rand::TryRng for Ones {
             type Error = std::convert::Infallible;

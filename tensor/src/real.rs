@@ -1,10 +1,11 @@
-//! The numbers that an elementwise formula is written for.
+//! The number types that an elementwise formula can be evaluated on.
 
 use crate::vmath;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-/// The functions of [`Real`] in one list: `functions!(each(arguments))` writes for each of them
-/// `each! { (arguments) unary exp "`e^x`." }`, with the kind (`unary` or `binary`), the name and the documentation.
+/// The list of functions of [`Real`]. `functions!(each(arguments))` expands to
+/// `each! { (arguments) unary exp "`e^x`." }` for each function, with its kind (`unary` or `binary`), name and
+/// documentation.
 #[doc(hidden)]
 #[macro_export]
 macro_rules! functions {
@@ -59,21 +60,22 @@ macro_rules! declared {
     };
 }
 
-/// A real number, as an elementwise formula sees it.
+/// A real number in an elementwise formula: a float, a dual number, or a variable on a tape.
 ///
-/// A formula that is generic over `Real` is read in several ways: numbers compile to one vectorised loop, dual numbers
-/// carry derivatives along, and what stands for a variable of a tape writes the formula down there (gradients of
-/// gradients). Formulas have no branches: they choose with [`if_positive`](Self::if_positive). The derivative of
-/// steps (`sign`, `floor`, `ceil`, `round`) is 0.
+/// A formula that is generic over `Real` is evaluated in several ways. Floats compile to one vectorised loop, and dual
+/// numbers carry derivatives along. Numbers that stand for variables record the formula on a tape, for gradients of
+/// gradients. Formulas have no branches: they select with [`if_positive`](Self::if_positive). The derivative of steps
+/// (`sign`, `floor`, `ceil`, `round`) is 0.
 pub trait Real:
     Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {
-    /// The constant `value`, of this number's kind.
+    /// The constant `value` in the type of this number.
     fn like(&self, value: f64) -> Self;
-    /// `yes` where this number is greater than 0, else `no`; `no` where it is NaN. The choice itself has derivative 0.
+    /// `yes` where this number is greater than 0, else `no`; also `no` where it is NaN. The selection itself has
+    /// derivative 0.
     fn if_positive(&self, yes: Self, no: Self) -> Self;
     crate::functions!(declared());
-    /// `self` to a whole power; 1 for exponent 0, whatever the base.
+    /// `self` to an integer power. Exponent 0 gives 1 for any base.
     fn powi(self, exponent: i32) -> Self;
 }
 

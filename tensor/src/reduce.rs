@@ -1,4 +1,4 @@
-//! Pairwise sums: the error grows with the logarithm of the length.
+//! Pairwise sums, whose error grows with the logarithm of the length.
 
 use crate::layout::inverse;
 use crate::parallel::{ELEMENT, PIECE, chunks, is_worthwhile};
@@ -10,17 +10,17 @@ const LANES: usize = 32;
 const BLOCK: usize = 16;
 /// Columns that are summed together: four 512-bit registers of f32.
 const STRIP: usize = 64;
-/// The same for a matrix that does not fit a core's cache: memory wants longer runs, and registers do not matter then.
+/// The same for a matrix that does not fit a core's cache: memory favours longer runs, and registers do not matter.
 const WIDE_STRIP: usize = 512;
-/// What an element costs that is only read.
+/// Operations for an element that is only read.
 const READ: usize = ELEMENT / 2;
-/// Bytes from which a matrix counts as such.
+/// Bytes from which a matrix does not fit the cache.
 const CACHE: usize = 1 << 20;
 
 /// The sum of a slice.
 ///
-/// Pairwise: the error is at most about `(16 + log2(n / 512)) * epsilon * sum(abs(x))`, and the order of additions
-/// depends on the length alone.
+/// The sum is pairwise: the error is at most about `(16 + log2(n / 512)) * epsilon * sum(abs(x))`. The order of
+/// additions depends on the length alone.
 ///
 /// ```
 /// let x = vec![1e-4_f32; 1 << 24];
@@ -47,7 +47,7 @@ pub fn sum<T: Scalar>(x: &[T]) -> T {
     folded(pairs.finish())
 }
 
-/// The sums of the elements of a piece in each lane.
+/// The sums of the elements of a part in each lane.
 fn pairwise<T: Scalar>(x: &[T]) -> [T; LANES] {
     const DEPTH: usize = (PIECE / (LANES * BLOCK)).ilog2() as usize + 1;
     simd::dispatch(
@@ -62,9 +62,9 @@ fn pairwise<T: Scalar>(x: &[T]) -> [T; LANES] {
     )
 }
 
-/// A sum by pairs of terms that come one after another: pairs of terms, pairs of pairs, and so on.
+/// A pairwise sum of a stream of terms: pairs of terms, pairs of pairs, and so on.
 struct Pairs<T, const DEPTH: usize> {
-    /// Sums of runs of terms: as many as the 1s of `count` in binary, the longest first. `count` is below 2^DEPTH.
+    /// Sums of runs of terms, as many as `count` has 1 bits, the longest first. `count` is below 2^DEPTH.
     open: [[T; LANES]; DEPTH],
     count: u64,
 }
@@ -130,7 +130,7 @@ fn folded<T: Scalar>(mut lanes: [T; LANES]) -> T {
     lanes[0]
 }
 
-/// The sum of a slice that is not long.
+/// The sum of a short slice.
 #[inline(always)]
 pub(crate) fn chunk<T: Scalar>(x: &[T]) -> T {
     folded(lanes(x))
@@ -196,7 +196,7 @@ fn pairwise_rows<T: Scalar, const STRIP: usize>(
     )
 }
 
-/// The sum over `axes`, which stay as axes of extent 1.
+/// The sum over `axes`, which stay with extent 1.
 ///
 /// # Panics
 /// If an axis does not exist.
@@ -210,9 +210,8 @@ pub fn sum_axes<T: Scalar>(x: &Tensor<T>, axes: &[usize], pool: &Pool<T>) -> Ten
     sum_to(x, &shape, pool)
 }
 
-/// The sum over the axes along which `shape` would have to be stretched to become `x.shape()`: the adjoint of
-/// [`Tensor::broadcast_to`]. A view is summed without a copy: along broadcast axes the sum is a product, and permuted
-/// axes cost nothing extra.
+/// Sums over the axes along which `shape` broadcasts to the shape of `x`: the adjoint of [`Tensor::broadcast_to`]. A
+/// view is summed without a copy. Along broadcast axes the sum is a product, and permuted axes take no extra time.
 ///
 /// # Panics
 /// If `shape` does not broadcast to the shape of `x`.
@@ -268,7 +267,7 @@ fn sum_packed<T: Scalar>(x: &Tensor<T>, kept: &[usize], pool: &Pool<T>) -> Tenso
     current
 }
 
-/// The sum over axes `from..to`, which become extents of 1.
+/// The sum over axes `from..to`, which stay with extent 1.
 fn sum_middle<T: Scalar>(x: &Tensor<T>, from: usize, to: usize, pool: &Pool<T>) -> Tensor<T> {
     let mut shape = Shape::from_slice(x.shape());
     let count: usize = shape[from..to].iter().product();

@@ -1,4 +1,4 @@
-//! The number types a tensor can hold.
+//! The number types of tensors.
 
 use crate::{Real, vmath};
 use std::fmt::{Debug, Display};
@@ -11,7 +11,7 @@ mod sealed {
     impl Sealed for f64 {}
 }
 
-/// `f32` or `f64`.
+/// The number type of a tensor: `f32` or `f64`.
 pub trait Scalar:
     sealed::Sealed
     + Copy
@@ -42,11 +42,11 @@ pub trait Scalar:
     fn from_f64(x: f64) -> Self;
     /// The same number, exactly.
     fn to_f64(self) -> f64;
-    /// Neither infinite nor NaN.
+    /// Whether the number is neither infinite nor NaN.
     fn is_finite(self) -> bool;
-    /// Little-endian bytes, as safetensors stores them.
+    /// Appends the number as little-endian bytes, as in safetensors files.
     fn write_le(self, out: &mut Vec<u8>);
-    /// The inverse of [`write_le`](Self::write_le).
+    /// Reads a number from little-endian bytes: the inverse of [`write_le`](Self::write_le).
     ///
     /// # Panics
     /// If `bytes` has another length than the type.
@@ -55,7 +55,7 @@ pub trait Scalar:
     /// Flags of as many bits as the number, so that they share a vector's lanes. The highest bit is the flag.
     #[doc(hidden)]
     type Flags: Copy + Debug + Default + BitOr<Output = Self::Flags>;
-    /// Flagged if `sin_quick` and `cos_quick` do not hold for this number; NaN is, infinities are.
+    /// Flagged if `sin_quick` and `cos_quick` are not valid for this number. NaN is flagged, infinities are too.
     #[doc(hidden)]
     fn outside(self) -> Self::Flags;
     /// Whether the flag is set.
@@ -68,11 +68,11 @@ pub trait Scalar:
     #[doc(hidden)]
     fn cos_quick(self) -> Self;
 
-    /// `c = a b`, or `c += a b` with `accumulate`; sizes are checked by [`crate::matmul::gemm`], the one caller.
+    /// `c = a b`, or `c += a b` with `accumulate`. [`crate::matmul::gemm`] is the one caller, and checks the sizes.
     ///
     /// # Safety
-    /// `a` (`m x k`), `b` (`k x n`) and `c` (`m x n`) must be valid for every index that the dimensions and the
-    /// `[row, column]` strides reach, those of `c` being `[c_row, 1]`, and `c` must not overlap the others.
+    /// `a` (`m x k`), `b` (`k x n`) and `c` (`m x n`) must be valid for every index of these dimensions and
+    /// `[row, column]` strides. The strides of `c` are `[c_row, 1]`, and `c` must not overlap the others.
     #[doc(hidden)]
     // SAFETY: kept by `gemm`, which checks all sizes.
     unsafe fn gemm_raw(

@@ -1,11 +1,11 @@
-//! Run-time choice of instruction set: one binary, as fast on each machine as if it had been compiled for it.
+//! Selects the instruction set at run time, so that one binary uses each machine's best.
 //!
-//! [`dispatch`] calls a closure inside a function that was compiled for AVX-512, for AVX2 + FMA, or for whatever the
-//! target has without asking, and LLVM vectorises the plain loops it finds there. Nothing else in this crate mentions
-//! an instruction set.
+//! [`dispatch`] calls a closure inside a function that is compiled for AVX-512, for AVX2 + FMA, or for the target's
+//! baseline. LLVM vectorises the plain loops inside. The one other place that names instructions is the streaming
+//! store of large transposes.
 //!
-//! `RAYGRAD_SIMD` caps the choice, for tests and for measurements: `scalar` takes the plain fallback, `v3` at most
-//! AVX2 + FMA, `v4` (as when unset) all there is. It is read once, at the first call.
+//! `RAYGRAD_SIMD` caps the choice, for tests and measurements. `scalar` selects the plain fallback, `v3` at most AVX2 +
+//! FMA, and `v4` (the default) the best available. It is read once, at the first call.
 
 use std::sync::OnceLock;
 
@@ -13,15 +13,15 @@ use pulp::Arch;
 
 /// Calls `f` with the best instruction set of this machine and returns its result.
 ///
-/// Only code that is *inlined* into `f` is compiled for that instruction set; what stays a call leads back to baseline
-/// code, where a fused multiply-add is itself a call and a loop over `vmath` a hundred times slower. So:
+/// Only code that is *inlined* into `f` is compiled for that instruction set. A call leads back to baseline code. There
+/// a fused multiply-add is itself a call, and a loop over `vmath` takes a hundred times as long. So:
 /// - mark `#[inline(always)]` the closure, and every closure and function that is called for each element;
-/// - write the loop as `for`, not as `for_each`, `map` or `fold`: those are functions of the standard library, and a
-///   large body that was inlined into them is too large to be inlined any further;
-/// - cut slices to their common length inside the closure: what the compiler knew of lengths outside does not reach it,
-///   and a bounds check for each element ends vectorisation.
+/// - write the loop as `for`, not as `for_each`, `map` or `fold`. Those are functions of the standard library; a large
+///   body that was inlined into them is too large to be inlined further;
+/// - cut slices to their common length inside the closure. The compiler does not know lengths from outside, and a
+///   bounds check for each element prevents vectorisation.
 ///
-/// It costs two to three nanoseconds a call over a direct loop, so pass a whole slice rather than an element.
+/// A call takes two to three nanoseconds longer than a direct loop, so pass a whole slice rather than an element.
 ///
 /// ```
 /// use raygrad_tensor::{simd, vmath};
@@ -40,7 +40,7 @@ use pulp::Arch;
 /// ```
 ///
 /// # Panics
-/// At the first call, if `RAYGRAD_SIMD` is set to something else than `scalar`, `v3` or `v4`.
+/// At the first call, if `RAYGRAD_SIMD` has a value other than `scalar`, `v3` or `v4`.
 #[inline(always)]
 pub fn dispatch<R>(f: impl FnOnce() -> R) -> R {
     arch().dispatch(f)
@@ -62,7 +62,7 @@ pub fn name() -> &'static str {
     }
 }
 
-/// Asks for the cache line at `address`, which may be any, to be brought to the second-level cache.
+/// Prefetches the cache line at `address`, which may be any address, to the second-level cache.
 #[inline(always)]
 pub fn prefetch<T>(address: *const T) {
     #[cfg(target_arch = "x86_64")]
@@ -81,10 +81,10 @@ fn arch() -> Arch {
     *ARCH.get_or_init(|| from_environment().unwrap_or_else(|message| panic!("{message}")))
 }
 
-/// Whether `RAYGRAD_SIMD` has a usable value: for a program that wants to say so itself before [`dispatch`] panics.
+/// Checks `RAYGRAD_SIMD`, for a program that reports a bad value itself instead of the panic of [`dispatch`].
 ///
 /// # Errors
-/// What is wrong with it.
+/// If it has an unknown value.
 pub fn check_environment() -> Result<(), String> {
     from_environment().map(drop)
 }

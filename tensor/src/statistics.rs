@@ -1,4 +1,4 @@
-//! Sums, means, extremes and the like of tensors without a tape.
+//! Reductions of tensors: sum, mean, variance, maximum, minimum, norm.
 
 use crate::extremum::{arg_extremum, extremum};
 use crate::rows::variance_rows;
@@ -6,12 +6,12 @@ use crate::{Axes, Indices, Real, Reduction, Scalar, Shape, Tensor, axis_of, sum_
 use std::ops::Range;
 
 impl<T: Scalar> Tensor<T> {
-    /// The sum of all elements, pairwise.
+    /// The sum of all elements. The sum is pairwise.
     pub fn sum(&self) -> T {
         sum_to(self, &[], &self.pool()).item()
     }
 
-    /// The sum over any axes; 0 over none of the elements.
+    /// The sum over any axes; 0 if there are no elements.
     ///
     /// ```
     /// use raygrad_tensor::{Axes, Tensor};
@@ -21,19 +21,22 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If an axis does not exist or is named twice; so for the others with axes.
+    /// If an axis does not exist or is listed twice.
     #[track_caller]
     pub fn sum_over(&self, axes: impl Into<Axes>) -> Self {
         let axes = axes.into().resolve(self.shape());
         sum_to(self, &axes.kept(), &self.pool()).reshape(&axes.result())
     }
 
-    /// The mean of all elements; NaN of none.
+    /// The mean of all elements; NaN for an empty tensor.
     pub fn mean(&self) -> T {
         T::from_f64(self.sum().to_f64() / self.len() as f64)
     }
 
-    /// The mean over any axes; NaN over none of the elements.
+    /// The mean over any axes; NaN if there are no elements.
+    ///
+    /// # Panics
+    /// If an axis does not exist or is listed twice.
     #[track_caller]
     pub fn mean_over(&self, axes: impl Into<Axes>) -> Self {
         let axes = axes.into().resolve(self.shape());
@@ -46,8 +49,12 @@ impl<T: Scalar> Tensor<T> {
         self.permute(&order).reshape(&[axes.kept().iter().product(), axes.count()])
     }
 
-    /// The mean squared deviation from the mean, over any axes, with `correction` (1 for a sample of a population) taken
-    /// from the count; NaN over none of the elements.
+    /// The variance over any axes: the sum of squared deviations from the mean, divided by the number of elements minus
+    /// `correction`. `correction` is `ddof` in NumPy; 1 gives the unbiased estimate from a sample. NaN if there are no
+    /// elements.
+    ///
+    /// # Panics
+    /// If an axis does not exist or is listed twice.
     #[track_caller]
     pub fn var_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
         let axes = axes.into().resolve(self.shape());
@@ -57,17 +64,20 @@ impl<T: Scalar> Tensor<T> {
         out * scale
     }
 
-    /// The mean squared deviation of all elements from their mean; see [`var_over`](Self::var_over).
+    /// The variance of all elements; see [`var_over`](Self::var_over).
     pub fn var(&self, correction: usize) -> T {
         self.var_over(.., correction).item()
     }
 
-    /// The root of [`var`](Self::var).
+    /// The standard deviation of all elements: the square root of [`var`](Self::var).
     pub fn std(&self, correction: usize) -> T {
         self.std_over(.., correction).item()
     }
 
-    /// The root of [`var_over`](Self::var_over).
+    /// The standard deviation over any axes: the square root of [`var_over`](Self::var_over).
+    ///
+    /// # Panics
+    /// If an axis does not exist or is listed twice.
     #[track_caller]
     pub fn std_over(&self, axes: impl Into<Axes>, correction: usize) -> Self {
         self.var_over(axes, correction).sqrt()
@@ -97,37 +107,37 @@ impl<T: Scalar> Tensor<T> {
         self.pool().filled(&result, |out| extremum(x.as_slice(), middle, greatest, out))
     }
 
-    /// The greatest elements over any axes; NaN where one is.
+    /// The largest elements over any axes; NaN where one is NaN.
     ///
     /// # Panics
-    /// If there are none, or an axis does not exist or is named twice.
+    /// If there are no elements, or an axis does not exist or is listed twice.
     #[track_caller]
     pub fn max_over(&self, axes: impl Into<Axes>) -> Self {
         self.extremum_over(axes.into(), true)
     }
 
-    /// The smallest elements over any axes; NaN where one is.
+    /// The smallest elements over any axes; NaN where one is NaN.
     ///
     /// # Panics
-    /// As [`max_over`](Self::max_over).
+    /// Where [`max_over`](Self::max_over) panics.
     #[track_caller]
     pub fn min_over(&self, axes: impl Into<Axes>) -> Self {
         self.extremum_over(axes.into(), false)
     }
 
-    /// The greatest element; NaN if one is.
+    /// The largest element; NaN if one is NaN.
     ///
     /// # Panics
-    /// If there is none.
+    /// If the tensor is empty.
     #[track_caller]
     pub fn max(&self) -> T {
         self.max_over(..).item()
     }
 
-    /// The smallest element; NaN if one is.
+    /// The smallest element; NaN if one is NaN.
     ///
     /// # Panics
-    /// If there is none.
+    /// If the tensor is empty.
     #[track_caller]
     pub fn min(&self) -> T {
         self.min_over(..).item()
@@ -142,7 +152,8 @@ impl<T: Scalar> Tensor<T> {
         Indices::new(&shape, arg_extremum(self.as_slice(), [outer, count, inner], greatest))
     }
 
-    /// Where along an axis the greatest elements are: the first of equal ones, and the first NaN if there is one.
+    /// The indices of the largest elements along an axis: the first of equal elements, and the first NaN if there is
+    /// one.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -150,25 +161,25 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the axis does not exist, or has no entries while others do.
+    /// If the axis does not exist, or has extent 0 while others do not.
     #[track_caller]
     pub fn argmax(&self, axis: isize) -> Indices {
         self.arg_over(axis, true)
     }
 
-    /// Where along an axis the smallest elements are; as [`argmax`](Self::argmax).
+    /// The indices of the smallest elements along an axis; see [`argmax`](Self::argmax).
     ///
     /// # Panics
-    /// As [`argmax`](Self::argmax).
+    /// Where [`argmax`](Self::argmax) panics.
     #[track_caller]
     pub fn argmin(&self, axis: isize) -> Indices {
         self.arg_over(axis, false)
     }
 
-    /// The inner product of two vectors, pairwise.
+    /// The inner product of two vectors. The sum is pairwise.
     ///
     /// # Panics
-    /// If they are not vectors of one length.
+    /// If the tensors are not vectors of equal length.
     #[track_caller]
     pub fn dot(&self, other: &Self) -> T {
         let vectors = self.ndim() == 1 && self.shape() == other.shape();
@@ -176,7 +187,7 @@ impl<T: Scalar> Tensor<T> {
         (self * other).sum()
     }
 
-    /// The Euclidean norm of all elements, which overflows only where it is itself too large.
+    /// The Euclidean norm of all elements. It overflows only if the norm itself is too large.
     pub fn norm(&self) -> T {
         if self.is_empty() {
             return T::ZERO;
@@ -189,7 +200,8 @@ impl<T: Scalar> Tensor<T> {
         scaled.square().sum().sqrt() * largest
     }
 
-    /// The largest absolute difference of two tensors of one shape: 0 of no elements, NaN if there is one.
+    /// The largest absolute difference of two tensors of one shape. It is 0 for empty tensors, and NaN if a difference
+    /// is NaN.
     ///
     /// # Panics
     /// If the shapes differ.

@@ -1,4 +1,4 @@
-//! The tensor: a shared buffer, and which of its elements stands where.
+//! The tensor: a shared buffer with a shape and strides.
 
 use crate::layout::{checked_len, len_of};
 use crate::pool::Home;
@@ -10,13 +10,13 @@ use std::sync::{Arc, OnceLock};
 /// The extents of a tensor's axes; `[]` is a scalar.
 pub type Shape = SmallVec<[usize; 4]>;
 
-/// An n-dimensional array of `f32` or `f64`: a shared buffer seen through a shape and strides, as in ndarray.
+/// An n-dimensional array of `f32` or `f64`: a shared buffer with a shape and strides, as in ndarray.
 ///
-/// A clone is a reference count. A view (a slice, a transpose, a broadcast, ..) shares the buffer, and writing to a shared
-/// tensor copies it first, so a view never changes. One number needs no buffer, however far it is broadcast.
+/// Cloning copies a reference. A view (a slice, a transpose, a broadcast, ..) shares the buffer. Writing to a shared
+/// tensor copies it first, so a view never changes. A single number needs no buffer, even if it is broadcast.
 ///
-/// Kernels take views as they are where that is faster. Code that asks for a slice ([`as_slice`](Self::as_slice)) of a view
-/// whose elements do not lie one behind the other makes them lie so, once for the view and its clones.
+/// Kernels read views without a copy where that is faster. [`as_slice`](Self::as_slice) of a view that is not
+/// contiguous copies its elements in row-major order, once for the view and its clones.
 ///
 /// ```
 /// use raygrad_tensor::Tensor;
@@ -29,7 +29,7 @@ pub type Shape = SmallVec<[usize; 4]>;
 pub struct Tensor<T: Scalar> {
     shape: Shape,
     data: Data<T>,
-    /// None where the elements are the whole buffer in row-major order.
+    /// None if the elements are the whole buffer in row-major order.
     view: Option<Arc<View<T>>>,
 }
 
@@ -40,7 +40,7 @@ enum Data<T: Scalar> {
     Shared(Arc<Buffer<T>>),
 }
 
-/// Elements, and the pool that gets them when the last tensor goes.
+/// Elements, and the pool that gets them when the last tensor is dropped.
 struct Buffer<T: Scalar> {
     values: Vec<T>,
     home: Home<T>,
@@ -54,12 +54,12 @@ impl<T: Scalar> Drop for Buffer<T> {
 
 struct View<T: Scalar> {
     layout: Layout,
-    /// The elements in row-major order, if they do not lie so and somebody asked for a slice.
+    /// The elements in row-major order, if the layout has another order and [`Tensor::as_slice`] was called.
     packed: OnceLock<Buffer<T>>,
 }
 
 impl<T: Scalar> Tensor<T> {
-    /// A tensor of as many values as the shape holds.
+    /// A tensor with as many values as the shape has elements.
     pub(crate) fn pooled(shape: Shape, values: Vec<T>, pool: Pool<T>) -> Self {
         debug_assert_eq!(checked_len(&shape), Some(values.len()));
         let data = match values[..] {
@@ -69,17 +69,17 @@ impl<T: Scalar> Tensor<T> {
         Tensor { shape, data, view: None }
     }
 
-    /// One number under a shape of one element.
+    /// One number with a shape of one element.
     pub(crate) fn one(shape: Shape, value: T) -> Self {
         Tensor { shape, data: Data::One(value), view: None }
     }
 
-    /// The elements that a layout names of a buffer.
+    /// The elements of a buffer that a layout selects.
     pub(crate) fn strided(values: Vec<T>, layout: Layout) -> Self {
         Tensor::pooled(Shape::from_elem(values.len(), 1), values, Pool::none()).with_layout(layout)
     }
 
-    /// Other elements of the same buffer.
+    /// Another view of the same buffer.
     pub(crate) fn with_layout(&self, layout: Layout) -> Self {
         debug_assert_eq!(layout.source(), self.buffer().len());
         let shape = Shape::from_slice(layout.shape());
@@ -91,7 +91,7 @@ impl<T: Scalar> Tensor<T> {
         Tensor { shape, data: self.data.clone(), view }
     }
 
-    /// Where the buffer came from, for what is made of it.
+    /// The pool of the buffer, for results computed from this tensor.
     pub(crate) fn pool(&self) -> Pool<T> {
         match &self.data {
             Data::One(_) => Pool::none(),
@@ -99,7 +99,7 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// A tensor of this shape from its values in row-major order.
+    /// A tensor of this shape, from values in row-major order.
     ///
     /// # Panics
     /// If the number of values is not the product of the shape.
@@ -109,16 +109,19 @@ impl<T: Scalar> Tensor<T> {
         Tensor::pooled(Shape::from_slice(shape), values, Pool::none())
     }
 
-    /// A tensor of this shape whose element number `i` (row-major) is `f(i)`.
+    /// A tensor of this shape whose element number `i`, in row-major order, is `f(i)`.
     ///
     /// # Panics
-    /// If the shape has more elements than memory can hold; so for the next ones.
+    /// If the shape has more elements than memory can hold.
     #[track_caller]
     pub fn from_fn(shape: &[usize], f: impl FnMut(usize) -> T) -> Self {
         Tensor::from_vec(shape, (0..len_of(shape)).map(f).collect())
     }
 
-    /// A tensor filled with one value, which it holds once.
+    /// A tensor filled with one value, which is stored once.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold.
     #[track_caller]
     pub fn full(shape: &[usize], value: T) -> Self {
         if shape.iter().all(|&extent| extent == 1) {
@@ -128,18 +131,24 @@ impl<T: Scalar> Tensor<T> {
     }
 
     /// A tensor of zeros.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold.
     #[track_caller]
     pub fn zeros(shape: &[usize]) -> Self {
         Tensor::full(shape, T::ZERO)
     }
 
     /// A tensor of ones.
+    ///
+    /// # Panics
+    /// If the shape has more elements than memory can hold.
     #[track_caller]
     pub fn ones(shape: &[usize]) -> Self {
         Tensor::full(shape, T::ONE)
     }
 
-    /// A tensor without axes that holds one value.
+    /// A scalar: a tensor without axes, with one value.
     pub fn scalar(value: T) -> Self {
         Tensor::one(Shape::new(), value)
     }
@@ -164,8 +173,8 @@ impl<T: Scalar> Tensor<T> {
         self.shape.contains(&0)
     }
 
-    /// The buffer that [`layout`](Self::layout) points into: more than the elements of this tensor, or less where it
-    /// repeats some.
+    /// The buffer that [`layout`](Self::layout) maps to. It may have elements that this tensor does not use, or fewer
+    /// elements than this tensor if some repeat.
     pub fn buffer(&self) -> &[T] {
         match &self.data {
             Data::One(value) => slice::from_ref(value),
@@ -173,7 +182,7 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// Which element of [`buffer`](Self::buffer) stands at each index.
+    /// The map from each index to an element of [`buffer`](Self::buffer).
     pub fn layout(&self) -> Layout {
         match &self.view {
             Some(view) => view.layout.clone(),
@@ -181,14 +190,13 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// Whether the elements lie one behind the other in row-major order, so that [`as_slice`](Self::as_slice) has nothing
-    /// to do.
+    /// Whether the elements are contiguous in row-major order, so that [`as_slice`](Self::as_slice) is free.
     pub fn is_packed(&self) -> bool {
         self.view.as_ref().is_none_or(|view| view.layout.is_packed())
     }
 
-    /// The elements in row-major order. Those of a view that lie otherwise are copied the first time: the view and its
-    /// clones keep them.
+    /// The elements in row-major order. If a view has another order, the first call copies the elements; the view and
+    /// its clones keep the copy.
     pub fn as_slice(&self) -> &[T] {
         let Some(view) = &self.view else { return self.buffer() };
         if view.layout.is_packed() {
@@ -205,8 +213,8 @@ impl<T: Scalar> Tensor<T> {
         &view.packed.get_or_init(|| Buffer { values, home: pool.home() }).values
     }
 
-    /// The elements in row-major order for writing; what another tensor shares, or a view shows out of order, is copied
-    /// first.
+    /// The elements in row-major order, for writing. It copies the elements first if another tensor shares them, or if
+    /// a view has another order.
     pub fn as_mut_slice(&mut self) -> &mut [T] {
         let whole = self.view.is_none();
         if !(whole && matches!(&self.data, Data::Shared(buffer) if Arc::strong_count(buffer) == 1)) {
@@ -221,7 +229,7 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// Makes the elements the whole of a buffer of this tensor's own.
+    /// Gives this tensor a buffer that holds its elements alone, in row-major order, and that it does not share.
     fn own(&mut self) {
         if matches!(self.data, Data::One(_)) && self.view.is_none() {
             return;
@@ -240,7 +248,7 @@ impl<T: Scalar> Tensor<T> {
         };
     }
 
-    /// The same elements as the whole of a buffer, in row-major order: this tensor if they lie so, else a copy.
+    /// The same elements as a whole buffer in row-major order: this tensor if it is one, else a copy.
     pub fn packed(&self) -> Self {
         if self.view.is_none() {
             return self.clone();
@@ -250,7 +258,7 @@ impl<T: Scalar> Tensor<T> {
         copy
     }
 
-    /// The elements in row-major order, in a vector of the caller's own.
+    /// A copy of the elements in row-major order.
     pub fn to_vec(&self) -> Vec<T> {
         match self.is_packed() {
             true => self.as_slice().to_vec(),
@@ -262,7 +270,7 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// As [`to_vec`](Self::to_vec), without a copy where the buffer is this tensor's alone.
+    /// As [`to_vec`](Self::to_vec), without a copy if no other tensor shares the buffer.
     pub fn into_vec(mut self) -> Vec<T> {
         if self.view.is_none()
             && let Data::Shared(buffer) = &mut self.data
@@ -273,17 +281,17 @@ impl<T: Scalar> Tensor<T> {
         self.to_vec()
     }
 
-    /// The one element of a tensor with one element.
+    /// The element of a tensor with one element.
     ///
     /// # Panics
-    /// If the tensor has another number of elements.
+    /// If the tensor does not have exactly one element.
     #[track_caller]
     pub fn item(&self) -> T {
         assert_eq!(self.len(), 1, "item() of a tensor of shape {:?}", self.shape());
         self.as_slice()[0]
     }
 
-    /// The elements as another number type, rounded to nearest.
+    /// Converts the elements to another number type, rounded to nearest.
     pub fn cast<U: Scalar>(&self) -> Tensor<U> {
         // A view stays one: what it repeats is converted once.
         let values = self.buffer().iter().map(|&x| U::from_f64(x.to_f64())).collect();
@@ -306,7 +314,7 @@ impl<T: Scalar> Tensor<T> {
 }
 
 impl<T: Scalar> PartialEq for Tensor<T> {
-    /// Same shape and equal elements; NaN equals nothing.
+    /// Whether shapes and elements are equal. NaN equals no number.
     fn eq(&self, other: &Self) -> bool {
         self.shape == other.shape && self.view() == other.view()
     }

@@ -1,12 +1,12 @@
-//! Views of a tensor: other elements, or another order of them, without a copy.
+//! Views of a tensor, without a copy: reshape, slice, permute, broadcast, windows.
 
 use crate::layout::inferred;
 use crate::{Layout, Scalar, Tensor};
 use ndarray::{Slice, SliceInfoElem};
 
 impl<T: Scalar> Tensor<T> {
-    /// The elements that a layout of a row-major tensor of this shape names. Without a copy, unless the layout steps over
-    /// the ends of rows that do not lie one behind the other.
+    /// The elements that a layout of a row-major tensor of this shape selects. It copies only if the layout crosses the
+    /// ends of rows that are not contiguous in this tensor.
     ///
     /// # Panics
     /// If the layout was made for another number of elements.
@@ -18,7 +18,7 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// A view that a user asked for, or what is wrong with it as a panic.
+    /// A view from user input, or a panic that names the mistake.
     #[track_caller]
     fn seen_as(&self, name: &str, layout: Result<Layout, String>) -> Self {
         match layout {
@@ -27,11 +27,11 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// The same elements under another shape, in which one extent may be [`INFER`](crate::INFER): it follows from the
-    /// others. Copied only where strides cannot say that.
+    /// The same elements with another shape. One extent may be [`INFER`](crate::INFER): it follows from the others. It
+    /// copies only if strides cannot express the result.
     ///
     /// # Panics
-    /// If the shape holds another number of elements, or no extent follows.
+    /// If the shape has another number of elements, or an extent cannot be inferred.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
         let shape = match inferred(shape, self.len()) {
@@ -44,8 +44,8 @@ impl<T: Scalar> Tensor<T> {
         }
     }
 
-    /// Slices, single entries and new axes, as ndarray's `s![]` names them: negative places count from the end, a negative
-    /// step walks backwards from the last entry of its range, and axes that are not named stay whole.
+    /// Slices, single entries and new axes, in the notation of ndarray's `s![]`. Negative positions count from the end.
+    /// A negative step walks backwards from the last entry of its range. Axes that are not listed stay whole.
     ///
     /// ```
     /// use raygrad_tensor::{Tensor, s};
@@ -56,14 +56,14 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If more axes are named than there are, a place lies outside its axis, or a step is 0.
+    /// If more axes are listed than the tensor has, a position is outside its axis, or a step is 0.
     #[track_caller]
     pub fn slice(&self, places: impl AsRef<[SliceInfoElem]>) -> Self {
         self.seen_as("slice", self.layout().sliced_by(places.as_ref()))
     }
 
-    /// The entries of a range along one axis, whose number may be known only when the program runs: `1..3`, `..-1`, or
-    /// with a step `Slice::from(..).step_by(-2)`.
+    /// The entries of a range along one axis. The range may be known only at run time: `1..3`, `..-1`, or with a step
+    /// `Slice::from(..).step_by(-2)`.
     ///
     /// ```
     /// use raygrad_tensor::{Slice, Tensor};
@@ -79,16 +79,16 @@ impl<T: Scalar> Tensor<T> {
         self.seen_as("slice_axis", self.layout().sliced_axis(axis, range))
     }
 
-    /// Axis `i` of the result is axis `axes[i]` of this tensor.
+    /// Reorders the axes: axis `i` of the result is axis `axes[i]` of this tensor.
     ///
     /// # Panics
-    /// If `axes` does not name every axis once.
+    /// If `axes` does not list every axis once.
     #[track_caller]
     pub fn permute(&self, axes: &[isize]) -> Self {
         self.seen_as("permute", self.layout().permuted_by(axes))
     }
 
-    /// Two axes exchanged.
+    /// Swaps two axes. Negative axes count from the last one.
     ///
     /// # Panics
     /// If an axis does not exist.
@@ -97,16 +97,16 @@ impl<T: Scalar> Tensor<T> {
         self.seen_as("transpose", self.layout().transposed(a, b))
     }
 
-    /// The last two axes exchanged: the transpose of a matrix, or of each matrix of a batch.
+    /// Transposes the last two axes, of a matrix or of each matrix of a batch.
     ///
     /// # Panics
-    /// If there are less than two axes.
+    /// If there are fewer than two axes.
     #[track_caller]
     pub fn t(&self) -> Self {
         self.seen_as("t", self.layout().transposed(-1, -2))
     }
 
-    /// The entries along `axis` in reverse order.
+    /// Reverses the entries along `axis`.
     ///
     /// # Panics
     /// If the axis does not exist.
@@ -115,11 +115,11 @@ impl<T: Scalar> Tensor<T> {
         self.seen_as("flip", self.layout().flipped(axis))
     }
 
-    /// This tensor stretched to `shape`, as NumPy broadcasts: axes are aligned at the last one, and an axis of extent 1, or
-    /// an absent one, repeats its elements.
+    /// Broadcasts this tensor to `shape`, with NumPy's rules. Axes are aligned at the last one. An axis of extent 1, or
+    /// a missing one, repeats its elements.
     ///
     /// # Panics
-    /// If the shape does not broadcast to `shape`.
+    /// If this tensor does not broadcast to `shape`.
     #[track_caller]
     pub fn broadcast_to(&self, shape: &[usize]) -> Self {
         if self.shape() == shape {
@@ -128,18 +128,18 @@ impl<T: Scalar> Tensor<T> {
         self.seen_as("broadcast_to", self.layout().broadcast_to(shape))
     }
 
-    /// The diagonal through the last two axes, which becomes the last one. Number `diagonal` counts from the main one
-    /// towards the upper right; it is empty beyond the corners.
+    /// The diagonal of the last two axes, which becomes the last axis. Diagonal 0 is the main one; `diagonal` counts
+    /// towards the upper right. Beyond the corners it is empty.
     ///
     /// # Panics
-    /// If there are less than two axes.
+    /// If there are fewer than two axes.
     #[track_caller]
     pub fn diagonal(&self, diagonal: isize) -> Self {
         self.seen_as("diagonal", self.layout().last_diagonal(diagonal))
     }
 
-    /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
-    /// entries in one.
+    /// Sliding windows of `size` entries along `axis`, every `step`-th of them. The axis counts windows, and a new last
+    /// axis the entries of a window.
     ///
     /// ```
     /// use raygrad_tensor::Tensor;
@@ -149,13 +149,14 @@ impl<T: Scalar> Tensor<T> {
     /// ```
     ///
     /// # Panics
-    /// If the axis does not exist or is shorter than a window, or `size` or `step` is 0.
+    /// If the axis does not exist or is shorter than a window, `size` or `step` is 0, or the windows have too many
+    /// elements.
     #[track_caller]
     pub fn windows(&self, axis: isize, size: usize, step: usize) -> Self {
         self.seen_as("windows", self.layout().windows(axis, size, step))
     }
 
-    /// This tensor without `axis`, which has extent 1.
+    /// Removes `axis`, whose extent is 1.
     ///
     /// # Panics
     /// If the axis does not exist or has another extent.
@@ -164,10 +165,10 @@ impl<T: Scalar> Tensor<T> {
         self.seen_as("squeeze", self.layout().squeezed(axis))
     }
 
-    /// This tensor with a new axis of extent 1 that stands at place `axis`, which may be counted from behind the last one.
+    /// Adds a new axis of extent 1 at position `axis`. A negative position counts from behind the last axis.
     ///
     /// # Panics
-    /// If there is no such place.
+    /// If there is no such position.
     #[track_caller]
     pub fn unsqueeze(&self, axis: isize) -> Self {
         self.seen_as("unsqueeze", self.layout().unsqueezed(axis))

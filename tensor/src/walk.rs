@@ -1,4 +1,4 @@
-//! Walks along layouts: reading the elements that a layout names, writing them, and adding to them.
+//! Reads, writes and adds to the elements of a buffer that a layout selects.
 
 use crate::parallel::{ELEMENT, PIECE, chunks};
 use crate::simd::prefetch;
@@ -14,12 +14,12 @@ const TILE: usize = 16;
 const BLOCK: usize = 64;
 const COLUMNS: usize = 32;
 
-/// Elements of a transpose that is written past the caches, at least: nobody finds them there again.
+/// Least number of elements of a transpose that is written past the caches: no code finds them there again.
 const LARGE: usize = 1 << 20;
 /// Bytes of a cache line.
 const LINE: usize = 64;
 
-/// The parts of a range, `len` long but for the last.
+/// The parts of a range, each `len` long but for the last.
 fn starts(range: Range<usize>, len: usize) -> impl Iterator<Item = Range<usize>> {
     range.clone().step_by(len).map(move |start| start..range.end.min(start + len))
 }
@@ -41,13 +41,13 @@ fn stream<T: Scalar>(row: &[T; TILE], out: &mut [T]) {
     }
 }
 
-/// Where there is no such instruction: a copy.
+/// A plain copy, where there is no such instruction.
 #[cfg(not(target_arch = "x86_64"))]
 fn stream<T: Scalar>(row: &[T; TILE], out: &mut [T]) {
     out[..TILE].copy_from_slice(row);
 }
 
-/// While it lives rows may be [`stream`]ed; when it goes, they have been written before anything that follows.
+/// Rows may be [`stream`]ed while it exists. When it is dropped, they are written before any later write.
 struct Streams;
 
 impl Drop for Streams {
@@ -119,18 +119,18 @@ fn transpose<T: Scalar>(
     }
 }
 
-/// A run of a walk: elements at equal steps in the buffer.
+/// A run of a walk: elements at equal distances in the buffer.
 struct Run {
-    /// Where the first stands in the buffer.
+    /// The buffer position of the first element.
     position: usize,
     stride: isize,
-    /// Where the first stands in row-major order, and how many there are.
+    /// The row-major position of the first element, and the number of elements.
     start: usize,
     count: usize,
 }
 
 impl Run {
-    /// Where the elements stand, if they are neighbours in rising order.
+    /// The buffer range of the elements, if they are contiguous in rising order.
     #[inline(always)]
     fn neighbours(&self) -> Option<Range<usize>> {
         (self.stride == 1 || self.count == 1).then(|| self.position..self.position + self.count)
@@ -184,11 +184,11 @@ impl Layout {
         }
     }
 
-    /// Copies the elements that the layout names from `source`, in row-major order, to `out`. Large transposes go tile by
-    /// tile, so that each cache line is read and written once.
+    /// Copies the elements that the layout selects from `source`, in row-major order, to `out`. Large transposes run
+    /// tile by tile, so that each cache line is read and written once.
     ///
     /// # Panics
-    /// If a slice has another length than the layout says.
+    /// If `source` does not have the length of the buffer, or `out` that of the layout.
     pub fn read<T: Scalar>(&self, source: &[T], out: &mut [T]) {
         assert_eq!(source.len(), self.source(), "source of a layout of {:?}", self.shape());
         assert_eq!(out.len(), self.len(), "output of a layout of {:?}", self.shape());
@@ -211,7 +211,8 @@ impl Layout {
         });
     }
 
-    /// For a layout that turns matrices: the collapsed axis along which neighbours lie in memory, which is not the last.
+    /// For a layout that transposes matrices: the collapsed axis along which elements are contiguous in memory, if it
+    /// is not the last.
     pub(crate) fn rows_in_memory(&self) -> Option<usize> {
         let axes = self.collapsed();
         let &(columns, step) = axes.last()?;
@@ -231,7 +232,8 @@ impl Layout {
         });
     }
 
-    /// As [`read`](Self::read), where neighbours in memory lie along `axis` of the collapsed `axes` and not along the last.
+    /// As [`read`](Self::read), for elements that are contiguous in memory along `axis` of the collapsed `axes`, not
+    /// along the last.
     fn read_transposed<T: Scalar>(
         &self,
         axes: &[(usize, isize)],
@@ -280,11 +282,11 @@ impl Layout {
         }
     }
 
-    /// The inverse of [`read`](Self::read): copies `values` to the elements of `target` that the layout names; the
-    /// others stay.
+    /// Copies `values` to the elements of `target` that the layout selects: the inverse of [`read`](Self::read). Other
+    /// elements stay unchanged.
     ///
     /// # Panics
-    /// If a slice has another length than the layout says.
+    /// If `target` does not have the length of the buffer, or `values` that of the layout.
     pub fn write<T: Scalar>(&self, values: &[T], target: &mut [T]) {
         assert_eq!(target.len(), self.source(), "target of a layout of {:?}", self.shape());
         assert_eq!(values.len(), self.len(), "values of a layout of {:?}", self.shape());
@@ -297,11 +299,11 @@ impl Layout {
         });
     }
 
-    /// The adjoint of [`read`](Self::read): adds `values` to the elements of `target` that the layout names. Elements
-    /// that it names more than once receive a pairwise-accurate sum only along the innermost axis.
+    /// Adds `values` to the elements of `target` that the layout selects: the adjoint of [`read`](Self::read). For
+    /// elements that it selects more than once, the sum is pairwise only along the innermost axis.
     ///
     /// # Panics
-    /// If a slice has another length than the layout says.
+    /// If `target` does not have the length of the buffer, or `values` that of the layout.
     pub fn add<T: Scalar>(&self, values: &[T], target: &mut [T]) {
         assert_eq!(target.len(), self.source(), "target of a layout of {:?}", self.shape());
         assert_eq!(values.len(), self.len(), "values of a layout of {:?}", self.shape());

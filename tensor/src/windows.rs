@@ -1,12 +1,11 @@
-//! The windows that a 2-D convolution or pooling sees of an image. One image at a time: a batch is the caller's loop.
+//! The windows of a 2-D convolution or pooling. Kernels work on one image; a caller loops over a batch.
 
 use crate::parallel::{ELEMENT, chunks};
 use crate::{Scalar, checked_len, simd};
 use std::ops::Range;
 
-/// Where the windows lie: window `(i, j)` starts at row `i * stride[0] - padding[0]` and column
-/// `j * stride[1] - padding[1]` of the image, and its elements are `dilation` apart. What lies outside the image is
-/// padding.
+/// The positions of the windows of one image. Window `(i, j)` starts at row `i * stride[0] - padding[0]` and column
+/// `j * stride[1] - padding[1]`, and its elements are `dilation` apart. Positions outside the image are padding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Windows {
     image: [usize; 2],
@@ -22,8 +21,8 @@ impl Windows {
     /// `(image + 2 padding - span) / stride + 1` of them, rounded down, where `span = dilation (kernel - 1) + 1`.
     ///
     /// # Errors
-    /// If a kernel extent, stride or dilation is 0, a window is larger than the padded image, an extent of that is beyond
-    /// every number, or the image or all its windows have more elements than a buffer can hold; in words.
+    /// If a kernel extent, stride or dilation is 0, or a window is larger than the padded image. If an extent of the
+    /// padded image is out of range. If the image, or all its windows, have more elements than a buffer can hold.
     pub fn new(
         image: [usize; 2],
         kernel: [usize; 2],
@@ -75,7 +74,7 @@ impl Windows {
         self.kernel == [1, 1] && self.stride == [1, 1] && self.padding == [0, 0]
     }
 
-    /// Along one axis: the windows whose element `k` lies inside the image.
+    /// The windows along one axis whose element `k` is inside the image.
     #[inline(always)]
     fn inside(&self, axis: usize, k: usize) -> Range<usize> {
         let (stride, offset) = (self.stride[axis], k * self.dilation[axis]);
@@ -85,9 +84,10 @@ impl Windows {
         first.min(end)..end
     }
 
-    /// Calls `f(k, windows, first)` for each element `k` of a window and each row of windows, of those `among` all, in
-    /// which some see that element inside the image: the numbers of these windows, counted from the first row among
-    /// them, and where the first of these windows sees it. The next one sees it `stride[1]` further on.
+    /// Calls `f(k, windows, first)` for each element `k` of a window and each row of windows in `among`. It skips rows
+    /// in which `k` is outside the image for all windows. `windows` are the numbers of the other windows, counted from
+    /// the first row of `among`. `first` is the position of element `k` of the first of them; the next one is
+    /// `stride[1]` further.
     #[inline(always)]
     fn runs(&self, among: Range<usize>, mut f: impl FnMut(usize, Range<usize>, usize)) {
         for ki in 0..self.kernel[0] {
@@ -113,7 +113,7 @@ impl Windows {
         self.image[0] * self.image[1]
     }
 
-    /// That an image and its unfolded form, with `per_channel` values a channel, have as many channels.
+    /// Checks that an image and its unfolded form, with `per_channel` values a channel, have equal numbers of channels.
     #[track_caller]
     fn check(&self, image: usize, unfolded: usize, per_channel: usize) {
         let channels = unfolded / per_channel;
@@ -121,8 +121,8 @@ impl Windows {
         assert_eq!(Some(image), channels.checked_mul(self.pixels()), "an image of {image} values for windows {self:?}");
     }
 
-    /// Writes the windows of an image `[channels, height, width]` to `out` as the columns of a matrix
-    /// `[channels * kernel_len, count]`, padding as 0 ("im2col"). A convolution is then a matrix product.
+    /// Writes the windows of an image `[channels, height, width]` to `out` ("im2col"). They become the columns of a
+    /// matrix `[channels * kernel_len, count]`; padding is 0. A convolution is then a matrix product.
     ///
     /// # Panics
     /// If a slice has another length.
@@ -131,11 +131,11 @@ impl Windows {
         self.unfold_rows(image, 0..self.output[0], out);
     }
 
-    /// As [`unfold`](Self::unfold), of some rows of windows only: an unfolded image is as many times as large as a window
-    /// has elements, and can be worked on piece by piece. `out` is `[channels * kernel_len, rows * output()[1]]`.
+    /// As [`unfold`](Self::unfold), for some rows of windows. Unfolding multiplies the size of an image by the number
+    /// of elements of a window; doing it in parts saves memory. `out` is `[channels * kernel_len, rows * output()[1]]`.
     ///
     /// # Panics
-    /// If a slice has another length, or there are no such rows.
+    /// If a slice has another length, or `rows` is outside the rows of windows.
     #[track_caller]
     pub fn unfold_rows<T: Scalar>(&self, image: &[T], rows: Range<usize>, out: &mut [T]) {
         assert!(rows.start <= rows.end && rows.end <= self.output[0], "rows {rows:?} of windows {self:?}");
@@ -167,7 +167,7 @@ impl Windows {
         });
     }
 
-    /// The adjoint of [`unfold`](Self::unfold): adds each column to the pixels that its window sees ("col2im").
+    /// Adds each column to the pixels of its window ("col2im"): the adjoint of [`unfold`](Self::unfold).
     ///
     /// # Panics
     /// If a slice has another length.
@@ -214,7 +214,7 @@ impl Windows {
         );
     }
 
-    /// For each window of one channel `f(.. f(f(start, x), x') ..)` of the pixels it sees, in their order.
+    /// Folds the pixels of each window of one channel, in order: `f(.. f(f(start, x), x') ..)`.
     #[inline(always)]
     #[track_caller]
     fn reduce<T: Scalar>(&self, plane: &[T], out: &mut [T], start: T, f: impl Fn(T, T) -> T) {
@@ -254,7 +254,7 @@ impl Windows {
         );
     }
 
-    /// The adjoint of [`sums`](Self::sums): adds each value to every pixel that its window sees.
+    /// Adds each value to every pixel of its window: the adjoint of [`sums`](Self::sums).
     ///
     /// # Panics
     /// If a slice has another length.
@@ -268,8 +268,8 @@ impl Windows {
         );
     }
 
-    /// The largest element of each window of one channel `[height, width]`, NaN if there is one; padding does not
-    /// count. A window without a pixel gives `-inf`.
+    /// The largest element of each window of one channel `[height, width]`, NaN if there is one; padding is ignored. A
+    /// window that is all padding gives `-inf`.
     ///
     /// # Panics
     /// If a slice has another length.
@@ -284,11 +284,11 @@ impl Windows {
         );
     }
 
-    /// Where the elements stand that [`maxima`](Self::maxima) finds: the first one in row-major order where several
-    /// are equal, the last NaN where there is one. `best` is scratch space for the maxima.
+    /// The pixel positions of the elements that [`maxima`](Self::maxima) finds: the first of equal elements in
+    /// row-major order, or the last NaN if there is one. `best` is scratch space for the maxima.
     ///
     /// # Panics
-    /// If a slice has another length, a window sees no pixel, or there are more than 2^32 - 1 pixels.
+    /// If a slice has another length, a window is all padding, or there are more than 2^32 - 1 pixels.
     #[track_caller]
     pub fn arg_maxima<T: Scalar>(&self, plane: &[T], best: &mut [T], out: &mut [u32]) {
         self.check(plane.len(), out.len(), self.count());
@@ -320,7 +320,7 @@ impl Windows {
     }
 }
 
-/// Whether `x` takes the place of the largest element so far. NaN does, and keeps it but for another NaN.
+/// Whether `x` replaces the largest element so far. NaN does, and only another NaN replaces it.
 #[inline(always)]
 fn beats<T: Scalar>(x: T, best: T) -> bool {
     #[allow(clippy::eq_op)] // NaN differs from itself.

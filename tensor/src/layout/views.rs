@@ -1,7 +1,7 @@
-//! What a view shows: the layouts of slices, permutations, diagonals, windows, broadcasts.
+//! Layouts of views: slices, permutations, diagonals, windows, broadcasts.
 //!
-//! The forms that take what a user writes, axes from either end and places as of `s![..]`, say what is wrong with it in
-//! words; [`Tensor`](crate::Tensor) shows them as a panic, a graph as an error.
+//! The methods that take user input, such as negative axes and `s![..]`, return an error as text.
+//! [`Tensor`](crate::Tensor) turns it into a panic, and a graph into an error.
 
 use super::{Layout, Strides, checked_len, len_of};
 use crate::{Shape, find_axis};
@@ -9,8 +9,8 @@ use ndarray::{Slice, SliceInfoElem};
 use smallvec::SmallVec;
 
 impl Layout {
-    /// This layout stretched to shape `to`, as NumPy broadcasts: axes are aligned at the last one, and an axis of extent 1,
-    /// or an absent one, gets stride 0.
+    /// Broadcasts this layout to shape `to`, with NumPy's rules. Axes are aligned at the last one. An axis of extent 1,
+    /// or a missing one, gets stride 0.
     ///
     /// # Panics
     /// If the shape does not broadcast to `to`.
@@ -30,7 +30,7 @@ impl Layout {
         Layout { shape: Shape::from_slice(to), strides, ..*self }
     }
 
-    /// Axis `i` of the result is axis `axes[i]` of this layout.
+    /// Reorders the axes: axis `i` of the result is axis `axes[i]` of this layout.
     ///
     /// # Panics
     /// If `axes` is not a permutation of the axes.
@@ -49,10 +49,10 @@ impl Layout {
         }
     }
 
-    /// `len` elements along `axis`, from `start` on, every `step`-th; a negative step walks backwards.
+    /// The `len` elements along `axis` from `start` on, every `step`-th. A negative step walks backwards.
     ///
     /// # Panics
-    /// If an element lies outside the axis.
+    /// If an element is outside the axis.
     #[track_caller]
     pub fn sliced(&self, axis: usize, start: usize, len: usize, step: isize) -> Self {
         let extent = self.shape[axis];
@@ -72,8 +72,8 @@ impl Layout {
         out
     }
 
-    /// The diagonal through axes `a` and `b`, which becomes the last axis: the elements whose index along `b` is that
-    /// along `a` plus `offset`. It is empty if the offset leaves the matrix.
+    /// The diagonal through axes `a` and `b`, which becomes the last axis. It has the elements whose index along `b` is
+    /// that along `a` plus `offset`. It is empty if the offset leaves the matrix.
     ///
     /// # Panics
     /// If an axis does not exist or both are the same.
@@ -92,11 +92,12 @@ impl Layout {
         Layout { shape, strides, offset: self.offset + start, ..*self }
     }
 
-    /// What ndarray's `s![..]` asks for: a slice, one entry or a new axis for each place; axes that are not named stay whole.
-    /// Negative places count from the end, and a negative step walks backwards from the last entry of its range.
+    /// The view of ndarray's `s![..]`: a slice, one entry or a new axis for each position. Axes that are not listed
+    /// stay whole. Negative positions count from the end. A negative step walks backwards from the last entry of its
+    /// range.
     ///
     /// # Errors
-    /// If more axes are named than there are, a place lies outside its axis, or a step is 0; in words.
+    /// If more axes are listed than the layout has, a position is outside its axis, or a step is 0.
     pub fn sliced_by(&self, places: &[SliceInfoElem]) -> Result<Layout, String> {
         let named = places.iter().filter(|place| !matches!(place, SliceInfoElem::NewAxis)).count();
         if named > self.shape.len() {
@@ -150,11 +151,12 @@ impl Layout {
         Ok(out)
     }
 
-    /// Windows of `size` entries along `axis`, every `step`-th of them: the axis counts windows, and a new last axis the
-    /// entries in one.
+    /// Sliding windows of `size` entries along `axis`, every `step`-th of them. The axis counts windows, and a new last
+    /// axis the entries of a window.
     ///
     /// # Errors
-    /// If the axis does not exist, is shorter than a window, or `size` or `step` is 0; in words.
+    /// If the axis does not exist or is shorter than a window, `size` or `step` is 0, or the windows have too many
+    /// elements.
     pub fn windows(&self, axis: isize, size: usize, step: usize) -> Result<Self, String> {
         let (shape, axis) = (&self.shape, find_axis(axis, &self.shape)?);
         if !(1..=shape[axis]).contains(&size) || step == 0 {
@@ -172,10 +174,10 @@ impl Layout {
         Ok(out)
     }
 
-    /// The entries of a range along one axis, as `s![..]` has them.
+    /// The entries of a range along one axis, in the notation of `s![..]`.
     ///
     /// # Errors
-    /// If the axis does not exist, the range leaves it, or the step is 0; in words.
+    /// If the axis does not exist, the range leaves it, or the step is 0.
     pub fn sliced_axis(&self, axis: isize, range: impl Into<Slice>) -> Result<Self, String> {
         let (axis, Slice { start, end, step }) = (find_axis(axis, &self.shape)?, range.into());
         let mut places: SmallVec<[SliceInfoElem; 4]> =
@@ -184,10 +186,10 @@ impl Layout {
         self.sliced_by(&places)
     }
 
-    /// As [`permuted`](Self::permuted), with axes from either end.
+    /// As [`permuted`](Self::permuted), with negative axes too.
     ///
     /// # Errors
-    /// If they do not name every axis once; in words.
+    /// If `axes` does not list every axis once.
     pub fn permuted_by(&self, axes: &[isize]) -> Result<Self, String> {
         let order: Result<Shape, String> = axes.iter().map(|&axis| find_axis(axis, &self.shape)).collect();
         let order = order?;
@@ -198,20 +200,20 @@ impl Layout {
         Ok(self.permuted(&order))
     }
 
-    /// Two axes exchanged.
+    /// Swaps two axes.
     ///
     /// # Errors
-    /// If an axis does not exist; in words.
+    /// If an axis does not exist.
     pub fn transposed(&self, a: isize, b: isize) -> Result<Self, String> {
         let mut axes: Shape = (0..self.shape.len()).collect();
         axes.swap(find_axis(a, &self.shape)?, find_axis(b, &self.shape)?);
         Ok(self.permuted(&axes))
     }
 
-    /// The entries along an axis in reverse order.
+    /// Reverses the entries along an axis.
     ///
     /// # Errors
-    /// If the axis does not exist; in words.
+    /// If the axis does not exist.
     pub fn flipped(&self, axis: isize) -> Result<Self, String> {
         self.sliced_axis(axis, Slice::new(0, None, -1))
     }
@@ -219,15 +221,15 @@ impl Layout {
     /// The diagonal through the last two axes; see [`diagonal`](Self::diagonal).
     ///
     /// # Errors
-    /// If there are less than two axes; in words.
+    /// If there are fewer than two axes.
     pub fn last_diagonal(&self, offset: isize) -> Result<Self, String> {
         Ok(self.diagonal(find_axis(-2, &self.shape)?, find_axis(-1, &self.shape)?, offset))
     }
 
-    /// This layout stretched to shape `to`, as NumPy broadcasts.
+    /// Broadcasts this layout to shape `to`, with NumPy's rules.
     ///
     /// # Errors
-    /// If the shape does not broadcast to `to`; in words.
+    /// If this layout does not broadcast to `to`.
     pub fn broadcast_to(&self, to: &[usize]) -> Result<Self, String> {
         let fits = crate::broadcast_shape(&[&self.shape, to]).is_some_and(|wide| wide.as_slice() == to);
         match checked_len(to) {
@@ -237,10 +239,10 @@ impl Layout {
         }
     }
 
-    /// This layout without an axis of extent 1.
+    /// Removes an axis of extent 1.
     ///
     /// # Errors
-    /// If the axis does not exist or has another extent; in words.
+    /// If the axis does not exist or has another extent.
     pub fn squeezed(&self, axis: isize) -> Result<Self, String> {
         let axis = find_axis(axis, &self.shape)?;
         if self.shape[axis] != 1 {
@@ -252,10 +254,10 @@ impl Layout {
         Ok(out)
     }
 
-    /// This layout with a new axis of extent 1 at place `axis`, which may be counted from behind the last one.
+    /// Adds a new axis of extent 1 at position `axis`. A negative position counts from behind the last axis.
     ///
     /// # Errors
-    /// If there is no such place; in words.
+    /// If there is no such position.
     pub fn unsqueezed(&self, axis: isize) -> Result<Self, String> {
         let mut out = self.clone();
         out.shape.push(1);

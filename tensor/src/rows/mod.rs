@@ -1,7 +1,7 @@
-//! Kernels on the rows of a matrix: softmax and its relatives, layer normalisation.
+//! Kernels on the rows of a matrix: softmax, log-softmax, log-sum-exp, cross-entropy, layer normalisation.
 //!
-//! A matrix is worked on in blocks of whole rows that fit in a core's nearest cache. What an element needs on its own
-//! (an exponential) runs over the whole block, so that rows shorter than a register are as fast as long ones.
+//! A matrix is processed in blocks of whole rows that fit in a core's nearest cache. Elementwise parts (an exponential)
+//! run over the whole block, so that rows shorter than a register are as fast as long ones.
 
 mod moments;
 mod softmax;
@@ -26,16 +26,17 @@ fn block(n: usize) -> usize {
     n * (BLOCK / n).max(1)
 }
 
-/// What an element of a row costs: an exponential, and a few passes over what lies in cache.
+/// Operations for an element of a row: an exponential, and a few passes over cached data.
 const ROW_ELEMENT: usize = 16;
 
-/// That `len` numbers are whole rows of `n`: what follows the last whole row would keep its old values.
+/// Checks that `len` numbers are whole rows of `n`, since elements after the last whole row would keep their old
+/// values.
 #[track_caller]
 fn check_whole(len: usize, n: usize) {
     assert!(len == 0 || (n > 0 && len.is_multiple_of(n)), "{len} numbers are not whole rows of {n}");
 }
 
-/// That `len` numbers are `rows` rows of `n`.
+/// Checks that `len` numbers are `rows` rows of `n`.
 #[track_caller]
 fn check_rows(len: usize, n: usize, rows: usize) {
     assert_eq!(Some(len), n.checked_mul(rows), "{len} numbers are not {rows} rows of {n}");
@@ -44,15 +45,15 @@ fn check_rows(len: usize, n: usize, rows: usize) {
 /// See [`blocks`].
 type Kernel<'a, T> = &'a (dyn Fn(&mut [T], usize, &mut [T]) + Sync);
 
-/// Calls `f(scratch, start, rows)` for blocks of rows of `out`, each of `n` elements, which begin at element `start`, with
-/// `scratch` elements of space.
+/// Calls `f(scratch, start, rows)` for blocks of rows of `out`. Each row has `n` elements, each block begins at element
+/// `start`, and `scratch` is space of this many elements.
 fn blocks<T: Scalar>(out: &mut [T], n: usize, scratch: usize, pool: &Pool<T>, f: Kernel<'_, T>) {
     let (len, work) = (block(n), ROW_ELEMENT * out.len());
     let each = |scratch: &mut Tensor<T>, i: usize, out: &mut [T]| f(scratch.as_mut_slice(), i * len, out);
     chunks(out, len, work, || pool.tensor(&[scratch]), &each);
 }
 
-/// `pick` of all elements, which must not be none; `pick` may be applied in any order.
+/// Folds all elements with `pick`, in any order. There must be at least one.
 #[inline(always)]
 pub(crate) fn fold_lanes<T: Scalar>(x: &[T], pick: impl Fn(T, T) -> T) -> T {
     if x.len() < LANES {

@@ -4,14 +4,15 @@ use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, total, totals_o
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
-/// Rows whose gradients are added up in their own type before they go into f64 sums.
+/// Rows whose gradients are summed in their own type before they are added to f64 sums.
 const GROUP: usize = 16;
-/// Parts of a matrix, at most, that have sums of their own.
+/// Largest number of parts of a matrix that have separate sums.
 const PARTS: usize = 16;
 
-/// Mean and mean squared deviation of a row, the mean in two parts: their sum is accurate beyond the type's digits.
+/// Mean and mean squared deviation of a row. The mean has two parts, whose sum is accurate beyond the type's digits.
 ///
-/// Two passes. The second measures from the rounded mean, and takes out what the rounding of the mean adds to the sum.
+/// It takes two passes. The second measures deviations from the rounded mean, and corrects for the rounding of the
+/// mean.
 #[inline(always)]
 fn moments<T: Scalar>(x: &[T]) -> ([T; 2], T) {
     let count = T::from_f64(x.len() as f64);
@@ -32,7 +33,7 @@ pub fn at_least_zero<T: Scalar>(x: T) -> T {
     if x < T::ZERO { T::ZERO } else { x }
 }
 
-/// The mean squared deviation from the mean, of each row of `n` elements; NaN for an empty row.
+/// The variance of each row of `n` elements, divided by `n`; NaN for an empty row.
 ///
 /// # Panics
 /// If `x` is not `out.len()` rows of `n`.
@@ -87,10 +88,10 @@ pub fn layer_norm_rows<T: Scalar>(x: &[T], gain: &[T], bias: &[T], eps: f64, out
     });
 }
 
-/// The gradients of [`layer_norm_rows`]: that of `x` to `dx`; those of gain and bias to `sums`, if they are wanted.
+/// The gradients of [`layer_norm_rows`]: that of `x` in `dx`, and those of gain and bias in `sums` if wanted.
 ///
-/// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps), dgain = sum of g u
-/// and dbias = sum of g over the rows. These sums are carried in f64.
+/// With u the normalised row and h = g gain: dx = (h - mean h - u mean(h u)) / sqrt(variance + eps). Over the rows,
+/// dgain = sum of g u and dbias = sum of g. These sums are in f64.
 ///
 /// # Panics
 /// If `x` is not whole rows of the length of `gain`, `g` or `dx` is shorter than `x`, or `sums` have other lengths than

@@ -1,10 +1,10 @@
-//! Softmax, its logarithm, the logarithm of a sum of exponentials, and cross-entropy.
+//! Softmax, log-softmax, log-sum-exp and cross-entropy.
 
 use super::{ROW_ELEMENT, block, blocks, check_rows, check_whole, fold_lanes, total, totals_of};
 use crate::parallel::chunks;
 use crate::{Pool, Scalar, Tensor, simd};
 
-/// The greatest element of a row, as far as there is an order; a row with NaN comes out as NaN anyway.
+/// The largest element of a row without NaN; a row with NaN results in NaN anyway.
 #[inline(always)]
 fn top<T: Scalar>(x: &[T]) -> T {
     fold_lanes(
@@ -14,8 +14,8 @@ fn top<T: Scalar>(x: &[T]) -> T {
     )
 }
 
-/// `out = x - shift` for each row of the block, with `shift` its greatest element, or 0 if that is infinite and
-/// `limits` are wanted. The shifts go to `shifts`.
+/// `out = x - shift` for each row of the block. `shift` is the row's largest element, or 0 if that is infinite and
+/// `limits` is set. The shifts go to `shifts`.
 #[inline(always)]
 fn shifted<T: Scalar>(x: &[T], n: usize, out: &mut [T], shifts: &mut [T], limits: bool) {
     for ((x, out), shift) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(shifts) {
@@ -36,8 +36,8 @@ fn exponentials<T: Scalar>(x: &mut [T]) {
     }
 }
 
-/// `ln sum x` of powers of which at least one is 1, unless the row was not shifted by a finite element: without the 1,
-/// so that what little the others add to it is not rounded off.
+/// `ln sum x` of powers of which at least one is 1, unless the row was not shifted by a finite element. It leaves one 1
+/// out of the sum and uses `ln(1 + x)`, so that small contributions of the others are not rounded off.
 #[inline(always)]
 fn ln_total<T: Scalar>(powers: &[T]) -> T {
     let [rest, ones] = totals_of(
@@ -76,7 +76,7 @@ pub fn softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool<T>)
     });
 }
 
-/// The gradient of softmax, from its output: `y (g - sum g y)` in each row.
+/// The gradient of softmax from its output: `y (g - sum g y)` in each row.
 ///
 /// # Panics
 /// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
@@ -108,7 +108,7 @@ pub fn softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T]) {
     });
 }
 
-/// The logarithm of softmax of each row: `x - max - ln sum e^(x - max)`.
+/// Log-softmax of each row: `x - max - ln sum e^(x - max)`.
 ///
 /// # Panics
 /// If `x` is not whole rows of `n`, or `out` is shorter than `x`.
@@ -138,7 +138,7 @@ pub fn log_softmax_rows<T: Scalar>(x: &[T], n: usize, out: &mut [T], pool: &Pool
     });
 }
 
-/// The gradient of the logarithm of softmax, from its output: `g - e^y sum g` in each row.
+/// The gradient of log-softmax from its output: `g - e^y sum g` in each row.
 ///
 /// # Panics
 /// If `y` is not whole rows of `n`, or `g` or `out` is shorter than `y`.
@@ -166,7 +166,7 @@ pub fn log_softmax_rows_grad<T: Scalar>(y: &[T], g: &[T], n: usize, out: &mut [T
     });
 }
 
-/// `ln sum e^x` of each row of `n` elements; -inf for an empty row and for one of nothing but -inf.
+/// `ln sum e^x` of each row of `n` elements. It is -inf for an empty row and for a row of -inf alone.
 ///
 /// # Panics
 /// If `x` is not `out.len()` rows of `n`.
@@ -217,12 +217,12 @@ pub fn cross_entropy_rows<T: Scalar>(x: &[T], n: usize, classes: &[u32], out: &m
     ln_sums(x, n, out, pool, |row, shift, ln| (shift - x[row * n..][..n][classes[row] as usize]) + ln);
 }
 
-/// The gradient of [`cross_entropy_rows`]: `g (softmax - 1 at the class)`, with the probability of all other classes
-/// added up where 1 less that of the class would lose its digits.
+/// The gradient of [`cross_entropy_rows`]: `g (softmax - 1 at the class)`. Where 1 minus the probability of the class
+/// would lose digits, it sums the probabilities of the other classes.
 ///
 /// # Panics
-/// If `x` is not a row for each class, `g` has another length than `classes`, a class is not below `n`, or `out` is
-/// shorter than `x`.
+/// If `x` is not a row for each class, or a class is not below `n`. If `g` has another length than `classes`, or `out`
+/// is shorter than `x`.
 #[track_caller]
 pub fn cross_entropy_rows_grad<T: Scalar>(x: &[T], n: usize, classes: &[u32], g: &[T], out: &mut [T], pool: &Pool<T>) {
     assert_eq!(classes.len(), g.len(), "a class for each gradient");

@@ -1,5 +1,6 @@
-//! Functions without a polynomial of their own: short formulas, which vectorise, and the standard library's, which are right to
-//! an ULP or so on the usual platforms. Of these `tan`, `asin`, `acos`, `atan`, `atan2` and `pow` are calls, which end vectorisation.
+//! Functions from short formulas, which vectorise, and from the standard library, which are right to an ULP or so on
+//! the usual platforms. Of these, `tan`, `asin`, `acos`, `atan`, `atan2` and `pow` are calls, which prevent
+//! vectorisation.
 
 macro_rules! from_std {
     ($t:ident: $($f:ident)*) => {
@@ -15,7 +16,7 @@ macro_rules! from_std {
 
 macro_rules! functions_of {
     ($t:ident) => {
-        /// For this precision.
+        /// The functions in this precision.
         pub mod $t {
             use crate::vmath::$t::{exp, expm1};
 
@@ -33,14 +34,14 @@ macro_rules! functions_of {
                 $t::powf(x, exponent)
             }
 
-            /// The nearest whole number, the even one of two.
+            /// The nearest whole number; ties go to the even one.
             #[inline(always)]
             pub fn round(x: $t) -> $t {
                 $t::round_ties_even(x)
             }
 
-            /// Hyperbolic sine, within 4 ULP: from `expm1` near 0, and from the square of `e^(x/2)` where `e^-x` does not
-            /// matter, so that it overflows only where it must.
+            /// Hyperbolic sine, within 4 ULP. It uses `expm1` near 0, and the square of `e^(x/2)` where `e^-x` does not
+            /// matter, so that it overflows only if the result does.
             #[inline(always)]
             pub fn sinh(x: $t) -> $t {
                 let a = $t::abs(x);
@@ -59,20 +60,20 @@ macro_rules! functions_of {
                 if a < 20.0 { 0.5 * (t + 1.0 / t) } else { 0.5 * half * half }
             }
 
-            /// 1 for positive numbers, -1 for negative ones; zeros and NaN stay what they are.
+            /// 1 for positive numbers, -1 for negative ones. Zeros and NaN stay unchanged.
             #[inline(always)]
             pub fn sign(x: $t) -> $t {
                 let negative = if x < 0.0 { -1.0 } else { x };
                 if x > 0.0 { 1.0 } else { negative }
             }
 
-            /// The greater of two numbers; NaN if one of them is.
+            /// The larger of two numbers; NaN if one is NaN.
             #[inline(always)]
             pub fn maximum(a: $t, b: $t) -> $t {
                 if a > b || $t::is_nan(a) { a } else { b }
             }
 
-            /// The smaller of two numbers; NaN if one of them is.
+            /// The smaller of two numbers; NaN if one is NaN.
             #[inline(always)]
             pub fn minimum(a: $t, b: $t) -> $t {
                 if a < b || $t::is_nan(a) { a } else { b }

@@ -4,17 +4,17 @@ use super::{f32 as single, f64 as double};
 use crate::{Real, Scalar, lanes, lanes_real};
 use std::f64::consts::PI;
 
-/// A function as callers meet it: over slices, vectorised.
+/// A function over slices, vectorised, with its bound and reference.
 pub struct Function<T: Scalar> {
     /// Its name.
     pub name: &'static str,
     /// Ordinary arguments, for timing.
     pub range: [f64; 2],
-    /// The function of each element of the first slice, into the second.
+    /// Applies the function to each element of the first slice, and writes to the second.
     pub apply: fn(&[T], &mut [T]),
     /// The stated bound in ULP.
     pub bound: f64,
-    /// The standard library's in f64, or of the same accuracy: a reference for f32.
+    /// A reference for f32: the standard library's function in f64, or one of the same accuracy.
     pub reference: fn(f64) -> f64,
 }
 
@@ -55,12 +55,12 @@ macro_rules! all {
     }};
 }
 
-/// Those for f32.
+/// The functions in f32.
 pub fn singles() -> Vec<Function<f32>> {
     all!(single)
 }
 
-/// Those for f64, in the same order; a reference of the same precision is good for orientation only.
+/// The functions in f64, in the same order. Their references have the same precision, so they give a rough check only.
 pub fn doubles() -> Vec<Function<f64>> {
     all!(double)
 }

@@ -1,4 +1,4 @@
-//! The exponential and what follows from it.
+//! Exponentials, and the functions computed from them: tanh and the logistic function.
 //!
 //! All share one reduction, `x = n ln 2 + r` with integer n and |r| <= ln 2 / 2, and one polynomial for `e^r - 1`.
 
@@ -12,8 +12,8 @@ const LN_2_LOW: f32 = 1.428_606_8e-6;
 /// `e^r - 1 = r + r^2 q(r)` for |r| <= ln 2 / 2, relative error 2^-31.
 const EXPM1: [f32; 6] = [0.5, 0.166_666_66, 0.041_666_48, 0.008_333_564, 0.001_393_334_9, 0.000_197_458_07];
 
-/// Splits `x = n ln 2 + r` and returns `(e^r - 1, n)`. What the rounding of r cost is added back, or `exp` would miss
-/// 1 ULP.
+/// Splits `x = n ln 2 + r` and returns `(e^r - 1, n)`. It corrects for the rounding of r; otherwise `exp` would be off
+/// by more than 1 ULP.
 #[inline(always)]
 fn reduce(x: f32) -> (f32, i32) {
     let (n, bits) = round_product(x, LOG2_E);
@@ -49,8 +49,8 @@ pub fn exp(x: f32) -> f32 {
     scale(1.0 + p, n)
 }
 
-/// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps: 2^n cannot overflow, so n + 64 is the exponent of one
-/// factor, and the other is 2^-64. The rounding to n adds the exponent's bias as well.
+/// `e^-x` for x >= 0, the same bits as `exp(-x)` in fewer steps. 2^n cannot overflow, so n + 64 is the exponent of one
+/// factor, and the other is 2^-64. The rounding to n adds the exponent's bias too.
 #[inline(always)]
 pub(super) fn exp_minus(x: f32) -> f32 {
     const BIASED: f32 = ROUND + 191.0; // 127 + 64
@@ -74,8 +74,8 @@ pub fn exp2(x: f32) -> f32 {
 
 /// `e^x - 1` without cancellation near 0, within 2 ULP; -1 below -17.4, infinite above 88.72.
 ///
-/// `2^n (e^r - 1) + (2^n - 1)`, halved while it is added so that 2^128 does not overflow too early; for n = 0 just the
-/// first term, since halving would cost a subnormal its last bit.
+/// It is `2^n (e^r - 1) + (2^n - 1)`, halved during the addition so that 2^128 does not overflow too early. For n = 0
+/// it is the first term alone, since halving would lose a subnormal's last bit.
 #[inline(always)]
 pub fn expm1(x: f32) -> f32 {
     let (p, n) = reduce(clamp(x, -20.0, 89.0));
@@ -99,9 +99,9 @@ pub fn tanh(x: f32) -> f32 {
 
 /// The logistic function `1 / (1 + e^-x)`, within 2 ULP.
 ///
-/// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below, so nothing overflows and small results
-/// keep all their digits: `sigmoid(-89)` is the subnormal 2.23e-39. Below 1/4, one step of `y = e (1 - y)` makes up
-/// for the rounding of `1 + e` and of the quotient.
+/// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below. So it does not overflow, and small results
+/// keep all their digits: `sigmoid(-89)` is the subnormal 2.23e-39. Below 1/4, one step of `y = e (1 - y)` corrects the
+/// rounding of `1 + e` and of the quotient.
 #[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {
     let e = exp_minus(x.abs());

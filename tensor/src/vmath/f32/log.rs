@@ -50,7 +50,7 @@ fn split_any(x: f32) -> (f32, i32) {
     (m, if tiny { k.wrapping_sub(23) } else { k })
 }
 
-/// Puts in the results outside of 0 < x < infinity, where y, the logarithm of x, is meaningless.
+/// Replaces the results outside 0 < x < infinity, where y, the computed logarithm of x, is meaningless.
 #[inline(always)]
 fn specials(x: f32, y: f32) -> f32 {
     let y = if x < f32::INFINITY { y } else { x };
@@ -76,7 +76,7 @@ pub fn ln(x: f32) -> f32 {
 
 /// The logarithm to base 2, within 2 ULP and exact for powers of two; negative infinity at 0, NaN below.
 ///
-/// `k + log2(e) ln(m)`, the leading product with log2(e) in two parts.
+/// It is `k + log2(e) ln(m)`, with log2(e) in two parts in the leading product.
 #[inline(always)]
 pub fn log2(x: f32) -> f32 {
     let (m, k) = split_any(x);
@@ -87,7 +87,7 @@ pub fn log2(x: f32) -> f32 {
 
 /// `ln(1 + x)` without cancellation near 0, within 2 ULP; negative infinity at -1, NaN below.
 ///
-/// `1 + x` is rounded to u and `c = (1 + x) - u` is what the rounding lost; both are reduced by the same power of two.
+/// u is `1 + x` rounded, and `c = (1 + x) - u` is its rounding error. Both are scaled by the same power of two.
 #[inline(always)]
 pub fn ln1p(x: f32) -> f32 {
     let u = 1.0 + x;
@@ -104,7 +104,7 @@ pub fn ln1p(x: f32) -> f32 {
 
 /// `ln(1 + e^x)`, within 2 ULP.
 ///
-/// Computed as `max(x, 0) + ln(1 + e^-|x|)`: no overflow above, and `e^x` to all its digits far below 0.
+/// It is `max(x, 0) + ln(1 + e^-|x|)`: large x does not overflow, and far below 0 `e^x` has all its digits.
 ///
 /// ```
 /// use raygrad_tensor::vmath::f32::softplus;

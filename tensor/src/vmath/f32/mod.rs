@@ -12,8 +12,8 @@ pub use log::{ln, ln1p, log2, softplus};
 pub(crate) use trig::QUICK;
 pub use trig::{cos, cos_pi, cos_quick, sin, sin_pi, sin_quick};
 
-/// Adding this and subtracting it again rounds to the nearest integer (ties to even) for |x| < 2^22, because an ulp is
-/// one there; between the two, the low bits of the sum hold that integer.
+/// Adding and subtracting this number rounds to the nearest integer (ties to even) for |x| < 2^22, because an ULP is 1
+/// there. After the addition, the low bits of the sum hold that integer.
 const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23
 
 /// The nearest integer to `a * b`, |a b| < 2^22, as a number and as an integer. Meaningless, but harmless, on NaN.
@@ -36,8 +36,8 @@ fn clamp(x: f32, lo: f32, hi: f32) -> f32 {
     if x > hi { hi } else { x }
 }
 
-/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`: Horner's rule for the even and for the odd powers, side by side,
-/// because a single chain would be waited for.
+/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`. Horner's rule runs for even and odd powers side by side, since a
+/// single chain has a longer latency.
 #[inline(always)]
 fn polynomial<const N: usize>(x: f32, c: [f32; N]) -> f32 {
     let x2 = x * x;

@@ -3,8 +3,8 @@
 use super::polynomial;
 use std::f32::consts::{FRAC_2_PI, FRAC_PI_2, PI};
 
-/// Up to here `sin_quick` and `cos_quick` hold. The quotient by pi/2 has 16 bits then: what is wrong in its rounding
-/// stretches the reduced angle by a thousandth only.
+/// Largest argument of `sin_quick` and `cos_quick`. The quotient by pi/2 has at most 16 bits there, and its rounding
+/// error stretches the reduced angle by a thousandth only.
 pub(crate) const QUICK: f32 = 65_536.0;
 
 /// pi/2 in three parts of 24 bits each; the next would be 2^-77.
@@ -13,7 +13,7 @@ const HALF_PI: [f32; 3] = [FRAC_PI_2, -4.371_138_83e-8, -1.715_124_51e-15];
 const TWO_TO_MINUS_29: f64 = 1.0 / (1_u64 << 29) as f64;
 
 /// 1 / (2 pi) in five chunks of 29 bits and the 53 bits after them. An f32 has 24 bits, so its product with a chunk has
-/// 53 and is exact in f64. For arguments below 2^128 the rest of the expansion is nothing.
+/// 53 and is exact in f64. For arguments below 2^128 the rest of the expansion has no effect.
 const TURNS: [f64; 6] = [
     0x0517_cc1b as f64 * TWO_TO_MINUS_29,
     0x0e4e_4415 as f64 * TWO_TO_MINUS_29 * TWO_TO_MINUS_29,
@@ -26,9 +26,10 @@ const TURNS: [f64; 6] = [
 /// 1.5 * 2^52: adding it rounds to an integer, which the low bits of the sum then hold.
 const ROUND: f64 = 6_755_399_441_055_744.0;
 
-/// Reduces `0 <= x <= QUICK` to `r + n pi/2` with |r| <= pi/4 and a little; of n, only the last two bits are meant.
+/// Reduces `0 <= x <= QUICK` to `r + n pi/2` with |r| <= pi/4 and a little. Only the last two bits of n are valid.
 ///
-/// Cody and Waite's reduction: the first difference is exact, since x and n pi/2 are close; the others round once each.
+/// This is Cody and Waite's reduction. The first difference is exact, since x and n pi/2 are close; the others round
+/// once each.
 #[inline(always)]
 fn reduce_quick(x: f32) -> (f32, u32) {
     let t = x.mul_add(FRAC_2_PI, super::ROUND);
@@ -45,11 +46,11 @@ fn fraction(x: f64, chunk: f64) -> f64 {
     p - p.round_ties_even()
 }
 
-/// Reduces any `x >= 0` to `r + n pi/2` with |r| <= pi/4; of n, only the last two bits are meant.
+/// Reduces any `x >= 0` to `r + n pi/2` with |r| <= pi/4. Only the last two bits of n are valid.
 ///
-/// Payne and Hanek's idea without integers or tables: the whole turns in each chunk's product are dropped at once.
-/// The fractions that stay are summed twice, first to find n, then largest first with n taken away, so that what
-/// cancels next to a multiple of pi/2 cancels exactly too.
+/// It is Payne and Hanek's idea without integers or tables: the whole turns in each chunk's product are dropped at
+/// once. The fractions that stay are summed twice: first to find n, then from the largest on with n subtracted. So
+/// cancellation next to a multiple of pi/2 is exact too.
 #[inline(always)]
 fn reduce_far(x: f32) -> (f32, u32) {
     let x = f64::from(x);
@@ -65,7 +66,7 @@ fn reduce_far(x: f32) -> (f32, u32) {
     ((turns * std::f64::consts::TAU) as f32, n)
 }
 
-/// The reduction that x asks for: both are made and one is taken, so that there is no branch.
+/// The reduction for any x. It computes both reductions and selects one, so that there is no branch.
 #[inline(always)]
 fn reduce(x: f32) -> (f32, u32) {
     let (quick, far) = (reduce_quick(x), reduce_far(x));
@@ -88,7 +89,7 @@ fn cos_near(r: f32) -> f32 {
     t.mul_add(polynomial(t, C), 1.0)
 }
 
-/// From the sine and cosine of the reduced angle, the sine of the angle n quarter turns further.
+/// The sine of the angle n quarter turns further, from the sine and cosine of the reduced angle.
 #[inline(always)]
 fn quadrant(sin: f32, cos: f32, n: u32) -> f32 {
     let y = if n & 1 == 0 { sin } else { cos };
@@ -101,7 +102,7 @@ fn odd(y: f32, x: f32) -> f32 {
     f32::from_bits(y.to_bits() ^ (x.to_bits() & 0x8000_0000))
 }
 
-/// The sine of x radians, within 2 ULP for every finite x, however large; NaN for infinities.
+/// The sine of x radians, within 2 ULP for every finite x of any size; NaN for infinities.
 ///
 /// ```
 /// use raygrad_tensor::vmath::f32::sin;
@@ -113,22 +114,22 @@ pub fn sin(x: f32) -> f32 {
     odd(quadrant(sin_near(r), cos_near(r), n), x)
 }
 
-/// The cosine of x radians, within 2 ULP for every finite x, however large; NaN for infinities.
+/// The cosine of x radians, within 2 ULP for every finite x of any size; NaN for infinities.
 #[inline(always)]
 pub fn cos(x: f32) -> f32 {
     let (r, n) = reduce(x.abs());
     quadrant(sin_near(r), cos_near(r), n.wrapping_add(1))
 }
 
-/// The same bits as [`sin`] at a third of its cost for |x| <= 65536, meaningless beyond. [`map_real`](crate::map_real)
-/// uses it where it may.
+/// The same bits as [`sin`] in a third of the time for |x| <= 65536, and meaningless beyond.
+/// [`map_real`](crate::map_real) uses it where it is valid.
 #[inline(always)]
 pub fn sin_quick(x: f32) -> f32 {
     let (r, n) = reduce_quick(x.abs());
     odd(quadrant(sin_near(r), cos_near(r), n), x)
 }
 
-/// The same bits as [`cos`] at a third of its cost for |x| <= 65536, meaningless beyond.
+/// The same bits as [`cos`] in a third of the time for |x| <= 65536, and meaningless beyond.
 #[inline(always)]
 pub fn cos_quick(x: f32) -> f32 {
     let (r, n) = reduce_quick(x.abs());

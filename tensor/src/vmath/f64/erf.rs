@@ -4,8 +4,8 @@ use super::{clamp, exp::exp_minus, polynomial};
 
 /// The error function `2/sqrt(pi) * integral from 0 to x of e^-t^2 dt`, within 2 ULP; exactly +-1 beyond 5.93.
 ///
-/// Up to 0.92 it is `x + x p(x^2)`, relative error 2^-56. Beyond, `1 - e^q(|x|)` with q a polynomial for the logarithm
-/// of the complement, error 2^-58 of the result.
+/// Up to 0.92 it is `x + x p(x^2)`, relative error 2^-56. Beyond, it is `1 - e^q(|x|)`, where the polynomial q
+/// approximates the logarithm of the complement, error 2^-58 of the result.
 #[inline(always)]
 pub fn erf(x: f64) -> f64 {
     const P: [f64; 12] = [

@@ -1,4 +1,4 @@
-//! The exponential and what follows from it.
+//! Exponentials, and the functions computed from them: tanh and the logistic function.
 //!
 //! All share one reduction, `x = n ln 2 + r` with integer n and |r| <= ln 2 / 2, and one polynomial for `e^r - 1`.
 
@@ -45,11 +45,11 @@ fn expm1_of_rest(x: f64, n: f64) -> f64 {
     expm1_near(r, n.mul_add(-LN_2_LOW, high - r))
 }
 
-/// 2^64, by which results are scaled last: 2^n alone may be out of range, 2^(n - 64) or 2^(n + 64) is not.
+/// 2^64, the last scaling factor of results: 2^n alone may be out of range, 2^(n - 64) or 2^(n + 64) is not.
 const FAR: f64 = 18_446_744_073_709_551_616.0;
 
-/// What to add to a number of the sign of `x` so that its rounding to an integer n adds the exponent's bias as well, and
-/// moves it by 64 towards 0: the low bits of the sum are the exponent field of 2^(n - 64) or 2^(n + 64).
+/// A number to add to one of the sign of `x`. Its rounding to an integer n then adds the exponent's bias too, and moves
+/// it by 64 towards 0. The low bits of the sum are the exponent field of 2^(n - 64) or 2^(n + 64).
 #[inline(always)]
 fn bias(x: f64) -> f64 {
     if x > 0.0 { ROUND + (1023.0 - 64.0) } else { ROUND + (1023.0 + 64.0) }
@@ -102,8 +102,8 @@ pub fn exp2(x: f64) -> f64 {
 
 /// `e^x - 1` without cancellation near 0, within 2 ULP; -1 below -37.5, infinite above 709.78.
 ///
-/// `2^n (e^r - 1) + (2^n - 1)`, halved while it is added so that 2^1024 does not overflow too early; for n = 0 just the
-/// first term, since halving would cost a subnormal its last bit.
+/// It is `2^n (e^r - 1) + (2^n - 1)`, halved during the addition so that 2^1024 does not overflow too early. For n = 0
+/// it is the first term alone, since halving would lose a subnormal's last bit.
 #[inline(always)]
 pub fn expm1(x: f64) -> f64 {
     let x = clamp(x, -40.0, 710.0);
@@ -141,9 +141,8 @@ pub fn tanh(x: f64) -> f64 {
 
 /// The logistic function `1 / (1 + e^-x)`, within 2 ULP.
 ///
-/// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below, so nothing overflows and small results
-/// keep all their digits. Below 1/4, one step of `y = e (1 - y)` makes up
-/// for the rounding of `1 + e` and of the quotient.
+/// With `e = e^-|x|` it is `1 / (1 + e)` for x >= 0 and `e / (1 + e)` below. So it does not overflow, and small results
+/// keep all their digits. Below 1/4, one step of `y = e (1 - y)` corrects the rounding of `1 + e` and of the quotient.
 #[inline(always)]
 pub fn sigmoid(x: f64) -> f64 {
     let e = exp_minus(x.abs());

@@ -26,7 +26,7 @@ const R: [f64; 7] = [
 
 /// Bits below the exponent field.
 const FRACTION: u64 = 0x000f_ffff_ffff_ffff;
-/// With this in the bits of an integer below 2^52, they are those of 2^52 plus the integer.
+/// The bits of an integer below 2^52, combined with these, are the bits of 2^52 plus the integer.
 const INTEGER: f64 = 4_503_599_627_370_496.0;
 
 /// Splits a positive normal number into `(m, k)` with `x = 2^k m`, and returns `k + 1023` in place of k, as an integer.
@@ -49,7 +49,7 @@ fn split_any(x: f64) -> (f64, f64) {
 
 /// `ln(1 + f) - f` for sqrt(1/2) <= 1 + f <= sqrt(2).
 ///
-/// With `s = f / (2 + f)`, 1 + f is (1 + s) / (1 - s), and `2 s = f - s f` takes the quotient's rounding error out of the
+/// With `s = f / (2 + f)`, 1 + f is (1 + s) / (1 - s). `2 s = f - s f` removes the quotient's rounding error from the
 /// leading term.
 #[inline(always)]
 fn ln1p_tail(f: f64) -> f64 {
@@ -58,7 +58,7 @@ fn ln1p_tail(f: f64) -> f64 {
     s * z.mul_add(polynomial(z, R), -f)
 }
 
-/// Puts in the results outside of 0 < x < infinity, where y, the logarithm of x, is meaningless.
+/// Replaces the results outside 0 < x < infinity, where y, the computed logarithm of x, is meaningless.
 #[inline(always)]
 fn specials(x: f64, y: f64) -> f64 {
     let y = if x < f64::INFINITY { y } else { x };
@@ -86,7 +86,7 @@ pub fn log2(x: f64) -> f64 {
 
 /// `ln(1 + x)` without cancellation near 0, within 2 ULP; negative infinity at -1, NaN below.
 ///
-/// `1 + x` is rounded to u and `c = (1 + x) - u` is what the rounding lost; both are reduced by the same power of two.
+/// u is `1 + x` rounded, and `c = (1 + x) - u` is its rounding error. Both are scaled by the same power of two.
 #[inline(always)]
 pub fn ln1p(x: f64) -> f64 {
     let u = 1.0 + x;
@@ -103,7 +103,7 @@ pub fn ln1p(x: f64) -> f64 {
 
 /// `ln(1 + e^x)`, within 2 ULP.
 ///
-/// Computed as `max(x, 0) + ln(1 + e^-|x|)`: no overflow above, and `e^x` to all its digits far below 0.
+/// It is `max(x, 0) + ln(1 + e^-|x|)`: large x does not overflow, and far below 0 `e^x` has all its digits.
 #[inline(always)]
 pub fn softplus(x: f64) -> f64 {
     let e = exp_minus(x.abs());

@@ -1,4 +1,4 @@
-//! Double precision: at most 2 ULP, measured on large samples. Built like their single-precision namesakes.
+//! Double precision: at most 2 ULP, measured on large samples. The functions work as those in single precision.
 
 mod erf;
 mod exp;
@@ -12,8 +12,8 @@ pub use log::{ln, ln1p, log2, softplus};
 pub(crate) use trig::QUICK;
 pub use trig::{cos, cos_pi, cos_quick, sin, sin_pi, sin_quick};
 
-/// Adding this and subtracting it again rounds to the nearest integer (ties to even) for |x| < 2^51, because an ulp is
-/// one there; between the two, the low bits of the sum hold that integer.
+/// Adding and subtracting this number rounds to the nearest integer (ties to even) for |x| < 2^51, because an ULP is 1
+/// there. After the addition, the low bits of the sum hold that integer.
 const ROUND: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
 
 /// The nearest integer to `a * b`, as a number and, if it is below 2^31, as an integer.
@@ -36,8 +36,8 @@ fn clamp(x: f64, lo: f64, hi: f64) -> f64 {
     if x > hi { hi } else { x }
 }
 
-/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`: Horner's rule for the even and for the odd powers, side by side,
-/// because a single chain would be waited for.
+/// The polynomial `c[0] + c[1] x + c[2] x^2 + ...`. Horner's rule runs for even and odd powers side by side, since a
+/// single chain has a longer latency.
 #[inline(always)]
 fn polynomial<const N: usize>(x: f64, c: [f64; N]) -> f64 {
     let x2 = x * x;

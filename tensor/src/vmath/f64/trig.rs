@@ -3,8 +3,8 @@
 use super::{ROUND, polynomial, round_product};
 use std::f64::consts::{FRAC_2_PI, FRAC_PI_2, PI};
 
-/// Up to here `sin_quick` and `cos_quick` hold. The quotient by pi/2 has 30 bits then, and its rounding stretches the
-/// reduced angle by 2^-22.
+/// Largest argument of `sin_quick` and `cos_quick`. The quotient by pi/2 has at most 30 bits there, and its rounding
+/// error stretches the reduced angle by 2^-22.
 pub(crate) const QUICK: f64 = 1_073_741_824.0;
 
 /// pi/2 in three parts of 53 bits each; the next would be 2^-164.
@@ -34,9 +34,10 @@ const TWO_BY_PI: [u64; 20] = [
     0x5603_3046_fc7b_6bab,
 ];
 
-/// Reduces `0 <= x <= QUICK` to `r + n pi/2` with |r| <= pi/4 and a little; of n, only the last two bits are meant.
+/// Reduces `0 <= x <= QUICK` to `r + n pi/2` with |r| <= pi/4 and a little. Only the last two bits of n are valid.
 ///
-/// Cody and Waite's reduction: the first difference is exact, since x and n pi/2 are close; the others round once each.
+/// This is Cody and Waite's reduction. The first difference is exact, since x and n pi/2 are close; the others round
+/// once each.
 #[inline(always)]
 fn reduce_quick(x: f64) -> (f64, u64) {
     let t = x.mul_add(FRAC_2_PI, ROUND);
@@ -48,8 +49,8 @@ fn reduce_quick(x: f64) -> (f64, u64) {
 
 /// Reduces `x > QUICK` to `r + n pi/2` with |r| <= pi/4; NaN for infinities and NaN.
 ///
-/// Payne and Hanek's reduction in integers: `x = m 2^e` is multiplied by the 192 digits of 2/pi that follow those which
-/// give whole turns only. No f64 comes closer to a multiple of pi/2 than 2^-62, so at least 64 of the 126 fractional
+/// This is Payne and Hanek's reduction in integers. It multiplies `x = m 2^e` by 192 digits of 2/pi; the digits before
+/// them give only whole turns. No f64 is closer to a multiple of pi/2 than 2^-62, so at least 64 of the 126 fractional
 /// digits of the product are significant.
 #[cold]
 fn reduce_far(x: f64) -> (f64, u64) {
@@ -77,7 +78,7 @@ fn reduce_far(x: f64) -> (f64, u64) {
     ((r + r_low) * SCALE, n)
 }
 
-/// The reduction that x asks for, with a branch: only loops over the quick functions vectorise.
+/// The reduction for any x. It has a branch: only loops over the quick functions vectorise.
 #[inline(always)]
 fn reduce(x: f64) -> (f64, u64) {
     if x <= QUICK { reduce_quick(x) } else { reduce_far(x) }
@@ -114,29 +115,29 @@ fn cos_near(r: f64) -> f64 {
     t.mul_add(polynomial(t, C), 1.0)
 }
 
-/// The sine of x radians, within 2 ULP for every finite x, however large; NaN for infinities.
+/// The sine of x radians, within 2 ULP for every finite x of any size; NaN for infinities.
 #[inline(always)]
 pub fn sin(x: f64) -> f64 {
     let (r, n) = reduce(x.abs());
     odd(quadrant(sin_near(r), cos_near(r), n), x)
 }
 
-/// The cosine of x radians, within 2 ULP for every finite x, however large; NaN for infinities.
+/// The cosine of x radians, within 2 ULP for every finite x of any size; NaN for infinities.
 #[inline(always)]
 pub fn cos(x: f64) -> f64 {
     let (r, n) = reduce(x.abs());
     quadrant(sin_near(r), cos_near(r), n.wrapping_add(1))
 }
 
-/// The same bits as [`sin`] for |x| <= 2^30, meaningless beyond; without a branch, so that a loop vectorises.
-/// [`map_real`](crate::map_real) uses it where it may.
+/// The same bits as [`sin`] for |x| <= 2^30, and meaningless beyond. It has no branch, so that a loop vectorises.
+/// [`map_real`](crate::map_real) uses it where it is valid.
 #[inline(always)]
 pub fn sin_quick(x: f64) -> f64 {
     let (r, n) = reduce_quick(x.abs());
     odd(quadrant(sin_near(r), cos_near(r), n), x)
 }
 
-/// The same bits as [`cos`] for |x| <= 2^30, meaningless beyond; without a branch, so that a loop vectorises.
+/// The same bits as [`cos`] for |x| <= 2^30, and meaningless beyond. It has no branch, so that a loop vectorises.
 #[inline(always)]
 pub fn cos_quick(x: f64) -> f64 {
     let (r, n) = reduce_quick(x.abs());
@@ -178,7 +179,7 @@ fn reduce_pi(x: f64) -> (f64, f64, u64) {
     (sin, cos, n as u64)
 }
 
-/// From the sine and cosine of the reduced angle, the sine of the angle n quarter turns further.
+/// The sine of the angle n quarter turns further, from the sine and cosine of the reduced angle.
 #[inline(always)]
 fn quadrant(sin: f64, cos: f64, n: u64) -> f64 {
     let y = if n & 1 == 0 { sin } else { cos };
